@@ -351,3 +351,56 @@ def test_the_network_s_own_programme_takes_no_commands() -> None:
         finally:
             env.close()
     assert scores[0] == scores[1]
+
+
+def test_agents_see_their_last_commands_while_these_are_under_way() -> None:
+    env = ugat_marl.parallel_env("single-v1", "execution_delay=20", duration_s=60, commands=2)
+    try:
+        observations, _ = env.reset(seed=1)
+        width = len(observations["signal_0"])
+        seen: list[list[int]] = []
+        for command in (3, 6, 1):
+            observations, *_ = env.step({"signal_0": command})
+            vector = observations["signal_0"]
+            assert env.observation_space("signal_0").contains(vector)
+            one_hots = vector[width - 17 : width - 1].reshape(2, 8)
+            seen.append([int(row.argmax()) if row.any() else -1 for row in one_hots])
+        assert env.env_options["commands"] == 2
+    finally:
+        env.close()
+    assert seen == [[3, -1], [6, 3], [1, 6]]
+
+
+def test_the_service_of_one_lane_is_withheld_there_alone() -> None:
+    """Nine seconds reach over the first decision, in which the green has five."""
+    env = ugat_marl.parallel_env("single-v1", duration_s=60)
+    item = env.network.intersections[0]
+    env.close()
+    phase, state = next((k, p) for k, p in enumerate(item.phases) if k and p.count("G") > 1)
+    lane, other = [link for link in item.links if state[link.index] == "G"][:2]
+    domain = f"lane_service={lane.from_lane},9,0"
+    env = ugat_marl.parallel_env("single-v1", domain, duration_s=60, simulator="inprocess")
+    try:
+        env.reset(seed=1)
+        shown: list[str] = []
+        for _ in range(2):
+            env.step({"signal_0": phase})
+            shown.append(libsumo.trafficlight.getRedYellowGreenState(item.id))
+    finally:
+        env.close()
+    assert lane.from_lane != other.from_lane
+    assert [state[lane.index] for state in shown] == ["r", "G"]
+    assert [state[other.index] for state in shown] == ["G", "G"]
+
+
+def test_every_lane_may_have_its_own_service_and_the_last_one_counts() -> None:
+    scenario = ugat_marl.effects.load_scenario("single-v1")
+    texts = ("northA_A1_1,4,0", "southA_A1_1,2,1", "northA_A1_1,1,0")
+    domain = "+".join(f"lane_service={text}" for text in texts)
+    changed = ugat_marl.effects.scenario_in_domain(scenario, domain)
+    assert {x["lane"]: x["begin_s"] for x in changed.settings.effects} == {
+        "northA_A1_1": 1.0,
+        "southA_A1_1": 2.0,
+    }
+    with pytest.raises(UnknownNameError, match="norhtA_A1_1"):
+        ugat_marl.effects.scenario_in_domain(scenario, "lane_service=norhtA_A1_1,4,0")

@@ -209,3 +209,38 @@ def test_functions_and_waiting_need_waiting_times() -> None:
 def test_an_unknown_reward_names_the_nearest() -> None:
     with pytest.raises(UnknownNameError, match=r"'que'.* mean 'queue'.* function works as well"):
         Rewarder(NETWORK, "que")
+
+
+def test_commands_follow_with_the_age_of_the_green_the_latest_first() -> None:
+    observer = Observer(NETWORK, "count", neighbours=1, commands=2)
+    plain = Observer(NETWORK, "count", neighbours=1)
+    memory = observer.memory(10.0)
+    assert memory is not None and plain.memory(10.0) is None
+    assert observer.layouts[1] == AgentLayout(features=2, phases=2, context=5 + 3 + 2 * 2 + 1)
+
+    def remembered() -> list[list[float]]:
+        vectors = observer.observe(SEEN, PHASES, memory)
+        for vector, before, space in zip(
+            vectors, plain.observe(SEEN, PHASES), observer.spaces, strict=True
+        ):
+            np.testing.assert_array_equal(vector[: len(before)], before)
+            assert space.contains(vector)
+        widths = [len(before) for before in plain.observe(SEEN, PHASES)]
+        own = [v[width:].astype(float) for v, width in zip(vectors, widths, strict=True)]
+        return [np.round(row, 3).tolist() for row in own]
+
+    memory.reset([0, 0, 0])
+    assert remembered()[1] == [0, 0, 0, 0, 0]  # nothing was asked for
+    memory.add([2, 1, 0], [0, 1, 0])
+    assert remembered()[1] == [0, 1, 0, 0, 0.167]  # its green began in this decision
+    memory.add([1, 0, 0], [0, 1, 0])
+    assert remembered() == [
+        [0, 1, 0, 0, 0, 1, 0.333],
+        [1, 0, 0, 1, 0.333],
+        [1, 0, 1, 0, 0.333],
+    ]
+    for _ in range(9):
+        memory.add([0, 0, 0], [0, 1, 0])
+    assert remembered()[0][-1] == 1.0  # older than a minute
+    memory.reset([0, 0, 0])
+    assert remembered()[0] == [0, 0, 0, 0, 0, 0, 0]

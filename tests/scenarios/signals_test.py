@@ -24,6 +24,7 @@ from ugat_marl.scenarios import (
 )
 from ugat_marl.scenarios.signals import (
     GreenDelays,
+    Withheld,
     advance,
     check_phases,
     free_to_change,
@@ -394,6 +395,23 @@ def test_fractions_of_a_step_are_paid_with_the_next_green() -> None:
     delays.hold({"A": [(10.0, "Gr")]})
     delays.ask({"A": 1.5})
     assert delays.hold({"A": [(10.0, "rG")]})["A"] == [(2, "rr"), (8, "rG")]
+
+
+def test_green_is_withheld_from_single_links_at_its_beginning_and_in_every_decision() -> None:
+    """Link 0 loses 2 s at the beginning of its green, link 1 loses 1.5 s in each further decision.
+
+    The half second is paid with the next one: 1 s, then 2 s.
+    """
+    withheld = {"A": Withheld((2.0, 0.0), (0.0, 1.5))}
+    delays = GreenDelays({"A": "rr"}, {}, 1, withheld)
+    green = {"A": [(10.0, "GG")]}
+    assert delays.hold(green)["A"] == [(2, "rG"), (8, "GG")]
+    assert delays.hold(green)["A"] == [(1, "Gr"), (9, "GG")]
+    assert delays.hold(green)["A"] == [(2, "Gr"), (8, "GG")]
+    assert delays.hold({"A": [(3.0, "yy"), (7.0, "rr")]})["A"] == [(3, "yy"), (7, "rr")]
+    assert delays.hold(green)["A"] == [(2, "rG"), (8, "GG")]
+    other = {"B": [(10.0, "G")]}
+    assert GreenDelays({"B": "r"}, {}, 1, withheld).hold(other) == other
 
 
 def test_a_log_of_a_street_can_be_late() -> None:

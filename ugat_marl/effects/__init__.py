@@ -8,6 +8,7 @@ corrected scenario contains them.
 - `vehicles`, `fleet`, `demand`, `turning`, `roads`, `signals`, `engine`: effects on the simulation.
 - `detectors`: effects on the reports of detectors.
 - `sensors`, `actuators`, `objectives`: effects on controllers, made of the parts in `controllers`.
+- `service`: an effect on the green of single lanes.
 - `documents`, `places`: edits of SUMO's files, and the places of a network.
 """
 

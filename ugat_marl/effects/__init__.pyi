@@ -11,9 +11,12 @@ from .base import NumberParameter as NumberParameter
 from .base import TextParameter as TextParameter
 from .base import hashed_uniform as hashed_uniform
 from .controllers import Actuator as Actuator
+from .controllers import Commands as Commands
+from .controllers import ControllerPart as ControllerPart
 from .controllers import Cost as Cost
 from .controllers import Reading as Reading
 from .controllers import Sensor as Sensor
+from .controllers import Stage as Stage
 from .demand import DemandLevel as DemandLevel
 from .demand import DemandSurge as DemandSurge
 from .demand import DemandTiming as DemandTiming
@@ -63,6 +66,8 @@ from .sensors import DetectorFailure as DetectorFailure
 from .sensors import LostReadings as LostReadings
 from .sensors import ObservationDelay as ObservationDelay
 from .sensors import QuantisedCounts as QuantisedCounts
+from .service import LaneService as LaneService
+from .service import withheld as withheld
 from .signals import AllRedTime as AllRedTime
 from .signals import LateGreen as LateGreen
 from .signals import YellowTime as YellowTime

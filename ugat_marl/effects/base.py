@@ -9,9 +9,9 @@ from dataclasses import dataclass, fields, replace
 from numbers import Real
 from typing import Any, ClassVar, Literal
 
-from ugat_marl.effects.controllers import Actuator, Cost, Sensor
+from ugat_marl.effects.controllers import ControllerPart, Cost
 from ugat_marl.errors import OptionError, UnknownNameError
-from ugat_marl.scenarios import Detector, Network, Period, Scenario, SignalTiming
+from ugat_marl.scenarios import Detector, Period, Scenario
 
 EVERYWHERE = "*"
 """Place of an effect that means all places."""
@@ -78,7 +78,7 @@ class ExaminedStrengths:
 
 
 @dataclass(frozen=True)
-class Effect:
+class Effect(ControllerPart):
     """A physical effect; subclasses are frozen dataclasses whose fields are its parameters.
 
     An effect changes one of three things: the files of a scenario (`apply`), the reports of
@@ -99,7 +99,6 @@ class Effect:
         UnknownNameError: A name is not among the allowed ones.
     """
 
-    name: ClassVar[str]
     ranges: ClassVar[dict[str, NumberParameter]] = {}
     texts: ClassVar[dict[str, TextParameter]] = {}
     attribute: ClassVar[str] = ""
@@ -142,22 +141,6 @@ class Effect:
         """
         del detectors, owner
         return period
-
-    def sensor(self, network: Network, decision_interval_s: float) -> Sensor | None:
-        """Make the sensor that changes the counts of controllers; None without such a change."""
-        del network, decision_interval_s
-        return None
-
-    def actuator(
-        self, network: Network, timing: SignalTiming, decision_interval_s: float
-    ) -> Actuator | None:
-        """Make the actuator that changes commands of controllers; None without such a change.
-
-        Raises:
-            ScenarioError: The phases of an intersection do not allow it.
-        """
-        del network, timing, decision_interval_s
-        return None
 
     def cost(self) -> Cost | None:
         """Make the cost by which controllers are judged; None without a cost."""

@@ -11,11 +11,12 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from enum import IntEnum
+from typing import ClassVar
 
 import numpy as np
 from numpy.typing import NDArray
 
-from ugat_marl.scenarios import SignalState
+from ugat_marl.scenarios import Network, SignalState, SignalTiming
 
 Cost = Callable[[Mapping[str, float]], float]
 """Function from the measures of an episode, by name, to its cost."""
@@ -51,6 +52,36 @@ class Reading:
     counts: NDArray[np.float64]
     near: NDArray[np.float64]
     mean_left: NDArray[np.float64]
+
+
+class ControllerPart:
+    """Change of the link between controllers and their street: an effect, or what was fitted.
+
+    Attributes:
+        name: Name of the change; the last one of a name counts for sensors and actuators.
+    """
+
+    name: ClassVar[str]
+
+    def sensor(self, network: Network, decision_interval_s: float) -> Sensor | None:
+        """Make the sensor that changes the counts of controllers; None without such a change."""
+        del network, decision_interval_s
+        return None
+
+    def actuator(
+        self, network: Network, timing: SignalTiming, decision_interval_s: float
+    ) -> Actuator | None:
+        """Make the actuator that changes commands of controllers; None without such a change.
+
+        Raises:
+            ScenarioError: The phases of an intersection do not allow it.
+        """
+        del network, timing, decision_interval_s
+        return None
+
+    def service(self) -> Mapping[str, tuple[float, float]]:
+        """Return lane to red in its greens, in s: at their beginning, and in each decision."""
+        return {}
 
 
 class Sensor:

@@ -325,7 +325,11 @@ def domain_path(domain: Domain) -> Path | None:
     if not isinstance(domain, str):
         return None
     path = Path(domain).expanduser()
-    return path if path.suffix == ".sumocfg" or (path / "scenario.toml").is_file() else None
+    try:
+        named = path.suffix == ".sumocfg" or (path / "scenario.toml").is_file()
+    except OSError:  # a long list of effects is no possible path
+        return None
+    return path if named else None
 
 
 def _signals(scenario: Scenario) -> set[tuple[str, ...]]:

@@ -24,6 +24,7 @@ from ugat_marl.effects.fleet import DesiredSpeed, HeavyShare, SpeedSpread
 from ugat_marl.effects.objectives import JUDGING
 from ugat_marl.effects.roads import Incident, LaneClosure, LocalSpeed, Parking
 from ugat_marl.effects.sensors import OBSERVATION_EFFECTS
+from ugat_marl.effects.service import LaneService
 from ugat_marl.effects.signals import AllRedTime, LateGreen, YellowTime
 from ugat_marl.effects.turning import Turning
 from ugat_marl.effects.vehicles import (
@@ -59,7 +60,7 @@ _MEASURABLE: dict[str, type[Effect]] = {
 
 
 _ON_CONTROLLERS: dict[str, type[Effect]] = {
-    kind.name: kind for kind in (*OBSERVATION_EFFECTS, *ACTING, *JUDGING)
+    kind.name: kind for kind in (*OBSERVATION_EFFECTS, *ACTING, *JUDGING, LaneService)
 }
 _OTHERS: dict[str, type[Effect]] = {
     kind.name: kind for kind in (Incident, QueueModel, BlockerPatience, Reach)

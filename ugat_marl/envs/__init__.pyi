@@ -3,7 +3,10 @@ from .adapters.sb3 import AgentsVecEnv as AgentsVecEnv
 from .agents import ActionMask as ActionMask
 from .agents import AgentSet as AgentSet
 from .agents import agent_groups as agent_groups
+from .commands import CommandMemory as CommandMemory
+from .commands import memory_size as memory_size
 from .objectives import OBJECTIVE_MEASURES as OBJECTIVE_MEASURES
+from .observations import COUNT_SCALE as COUNT_SCALE
 from .observations import OBSERVATION_UNITS as OBSERVATION_UNITS
 from .observations import WAITING_SCALE_S as WAITING_SCALE_S
 from .observations import Observer as Observer

@@ -10,7 +10,7 @@ from collections.abc import Sequence
 import numpy as np
 from numpy.typing import NDArray
 
-from ugat_marl.effects import Actuator, Effect
+from ugat_marl.effects import Actuator, ControllerPart
 from ugat_marl.scenarios import Network, SignalState, SignalTiming, signals
 
 
@@ -39,7 +39,7 @@ class Actuators:
     @classmethod
     def of(
         cls,
-        effects: Sequence[Effect],
+        effects: Sequence[ControllerPart],
         network: Network,
         timing: SignalTiming,
         decision_interval_s: float,

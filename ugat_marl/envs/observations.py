@@ -1,12 +1,14 @@
 """Observations: from a snapshot to one vector per intersection, with its space.
 
 Every vector is ``features | own phase one-hot | context``. Features are measured at the
-intersection. The context holds features and phases of neighbours; it is empty by default.
+intersection. The context holds features and phases of neighbours and, at its end, the agent's own
+last commands with the age of its green (`CommandMemory`); it is empty by default.
 """
 
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import replace
 from typing import Literal, get_args
 
 import numpy as np
@@ -14,6 +16,7 @@ from gymnasium.spaces import Box
 from numpy.typing import NDArray
 
 from ugat_marl.data import AgentLayout
+from ugat_marl.envs.commands import CommandMemory, memory_size
 from ugat_marl.errors import OptionError, UnknownNameError
 from ugat_marl.scenarios import Network, group_names, member_names, within_hops
 from ugat_marl.simulation import Snapshot
@@ -46,6 +49,7 @@ class Observer:
         network: The network.
         name: One of `ObservationName`; ``"count"`` is the observation of the UGAT paper.
         neighbours: Distance in roads up to which features and phases of others are included.
+        commands: Number of own last commands that are included, with the age of the green.
 
     Attributes:
         layouts: Sizes of the parts of each intersection's vector, in the network's order.
@@ -56,12 +60,15 @@ class Observer:
         agents: Name ``<group>_<n>`` of each intersection.
     """
 
-    def __init__(self, network: Network, name: str = "count", neighbours: int = 0) -> None:
+    def __init__(
+        self, network: Network, name: str = "count", neighbours: int = 0, commands: int = 0
+    ) -> None:
         if name not in get_args(ObservationName):
             raise UnknownNameError("observation", str(name), get_args(ObservationName))
         if neighbours < 0:
             raise OptionError(f"neighbours = {neighbours}: must be 0 or a number of roads")
         self.name = name
+        self._commands = commands
         self._lanes = network.lane_table()
         items = network.intersections
         self._incoming = np.concatenate(
@@ -76,7 +83,8 @@ class Observer:
             AgentLayout(
                 features=size,
                 phases=phases,
-                context=sum(sizes[j] + self._phases[j] for j in near),
+                context=sum(sizes[j] + self._phases[j] for j in near)
+                + memory_size(phases, commands),
             )
             for size, phases, near in zip(sizes, self._phases, self._near, strict=True)
         ]
@@ -97,21 +105,39 @@ class Observer:
         """True if snapshots must hold waiting times."""
         return self.name == "waiting"
 
-    def observe(self, snapshot: Snapshot, phases: Sequence[int]) -> list[NDArray[np.float32]]:
+    @property
+    def recorded(self) -> list[AgentLayout]:
+        """Layouts of the vectors without the memory of commands, as logs record them."""
+        return [
+            replace(layout, context=layout.context - memory_size(layout.phases, self._commands))
+            for layout in self.layouts
+        ]
+
+    def memory(self, interval_s: float) -> CommandMemory | None:
+        """Return an empty memory of commands for `observe`; None if none are included."""
+        return CommandMemory(self._phases, self._commands, interval_s) if self._commands else None
+
+    def observe(
+        self, snapshot: Snapshot, phases: Sequence[int], memory: CommandMemory | None = None
+    ) -> list[NDArray[np.float32]]:
         """Return the vectors of all intersections.
 
         Args:
             snapshot: Measured lanes.
             phases: Phase of each intersection that is green or about to be.
+            memory: The last commands, for an observer that includes them.
 
         Returns:
-            For each intersection float32 ``(layout.size,)``, parts of one fresh array.
+            For each intersection float32 ``(layout.size,)``, in fresh memory.
         """
         vector = np.zeros(self._length, dtype=np.float32)
         vector[self._feature_places] = self._flat(snapshot)
         vector[self._first_phases + np.array(phases)] = 1.0
         seen = vector if self._context is None else vector[self._context]
-        return [seen[part] for part in self._parts]
+        rows = [seen[part] for part in self._parts]
+        if memory is None:
+            return rows
+        return [np.concatenate(both) for both in zip(rows, memory.vectors(), strict=True)]
 
     def _place(self) -> None:
         """Compute the places of all numbers in one row, and the places that each agent sees.
@@ -166,6 +192,7 @@ class Observer:
         for j in (index, *self._near[index]):
             parts.append(np.full(self._sizes[j], low, dtype=np.float32))
             parts.append(np.zeros(self._phases[j], dtype=np.float32))
+        parts.append(np.zeros(memory_size(self._phases[index], self._commands), dtype=np.float32))
         lows = np.concatenate(parts)
         return Box(lows, np.ones_like(lows), dtype=np.float32)
 

@@ -11,7 +11,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from ugat_marl.effects import Effect, Reading, Sensor
+from ugat_marl.effects import ControllerPart, Reading, Sensor
 from ugat_marl.scenarios import Network
 from ugat_marl.simulation import Snapshot
 
@@ -33,7 +33,7 @@ class Sensors:
 
     @classmethod
     def of(
-        cls, effects: Sequence[Effect], network: Network, decision_interval_s: float
+        cls, effects: Sequence[ControllerPart], network: Network, decision_interval_s: float
     ) -> Sensors | None:
         """Return the sensors of a scenario with these effects; None if there are none."""
         latest = {effect.name: effect for effect in effects}  # the last of a name counts

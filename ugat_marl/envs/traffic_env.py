@@ -14,6 +14,7 @@ from pettingzoo import ParallelEnv
 
 from ugat_marl.data import AgentLayout, EpisodeRecorder, Scores
 from ugat_marl.effects import (
+    ControllerPart,
     Domain,
     controller_effects,
     domain_label,
@@ -21,6 +22,7 @@ from ugat_marl.effects import (
     load_scenario,
     scenario_in_domain,
     with_late_green_programmes,
+    withheld,
 )
 from ugat_marl.envs.actions import checked_delays, checked_phases
 from ugat_marl.envs.actuators import Actuators
@@ -52,6 +54,7 @@ class TrafficEnv(ParallelEnv[str, Any, Any]):
         domain: Name of the domain.
         network: Lanes and intersections of the road network.
         layouts: Agent to the parts of its observation.
+        recorded_layouts: The same without the memory of commands; logs record these.
         intersection_of: Agent to SUMO's id of its traffic light.
         agent_groups: Group to its agents; agents of one group have the same spaces.
         np_random: Generator of the seeds of episodes; SuperSuit's frame_skip uses it, too.
@@ -79,12 +82,18 @@ class TrafficEnv(ParallelEnv[str, Any, Any]):
         self.decision_interval_s = self.scenario.control.decision_interval_s
         self._timing = self.scenario.timing
         self._lanes = self.network.lane_table()
-        self._observer = Observer(self.network, options.observation, options.neighbours)
+        self._observer = Observer(
+            self.network, options.observation, options.neighbours, options.commands
+        )
+        self._memory = self._observer.memory(self.decision_interval_s)
         self._rewarder = Rewarder(self.network, options.reward)
         effects = controller_effects(self.scenario)
-        self._sensors = Sensors.of(effects, self.network, self.decision_interval_s)
+        parts: tuple[ControllerPart, ...] = (*effects, *options.fitted)
+        self._sensors = Sensors.of(parts, self.network, self.decision_interval_s)
         interval_s = self.decision_interval_s
-        self._actuators = Actuators.of(effects, self.network, self._timing, interval_s)
+        self._actuators = Actuators.of(parts, self.network, self._timing, interval_s)
+        served = {lane: red for part in parts for lane, red in part.service().items()}
+        self._withheld = withheld(self.network, served)
         self._objectives = Objectives.of(effects, self.scenario)
         self._name_agents()
         self._state_space = joint_space(list(self.observation_spaces.values()))
@@ -113,7 +122,8 @@ class TrafficEnv(ParallelEnv[str, Any, Any]):
     @property
     def env_options(self) -> dict[str, Any]:
         """Options with which another environment gives the same observations."""
-        return {"observation": self.options.observation, "neighbours": self.options.neighbours}
+        shown = {"observation": self.options.observation, "neighbours": self.options.neighbours}
+        return shown | ({"commands": self.options.commands} if self.options.commands else {})
 
     @property
     def snapshot(self) -> Snapshot:
@@ -151,11 +161,14 @@ class TrafficEnv(ParallelEnv[str, Any, Any]):
         self._scores = None
         self._decision = 0
         self._states = [signals.initial_state(self._timing) for _ in self.agents]
+        if self._memory is not None:
+            self._memory.reset(self.phases)
         lights = self.network.intersections
         self._delays = signals.GreenDelays(
             {intersection.id: intersection.phases[0] for intersection in lights},
             late_greens(self.scenario),
             self.scenario.settings.step_length_s,
+            self._withheld,
         )
         self._recorder = EpisodeRecorder(
             self._lanes,
@@ -189,11 +202,13 @@ class TrafficEnv(ParallelEnv[str, Any, Any]):
             return {}, {}, {}, {}, {}
         if not self.agents:
             raise EpisodeError("step() needs a running episode; call reset() first")
-        requested = checked_phases(actions, self.agents, self.action_spaces)
+        asked = requested = checked_phases(actions, self.agents, self.action_spaces)
         if self._actuators is not None:
             requested = self._actuators.obey(requested, self._states)
         before = self._snapshot
         self._advance(requested)
+        if self._memory is not None:
+            self._memory.add(asked, self.phases)
         rewards = self._rewarder.rewards(before, self._snapshot)
         self._recorder.add(self._snapshot, sum(rewards) / len(rewards))
         self._decision += 1
@@ -234,7 +249,7 @@ class TrafficEnv(ParallelEnv[str, Any, Any]):
         """Return all observations, one after the other; also after the last step."""
         if not hasattr(self, "_states"):
             raise EpisodeError("state() has no meaning before the first reset()")
-        return np.concatenate(self._observer.observe(self._seen, self.phases))
+        return np.concatenate(self._observer.observe(self._seen, self.phases, self._memory))
 
     def scores(self) -> Scores:
         """Return the measures of the episode that has ended.
@@ -288,6 +303,7 @@ class TrafficEnv(ParallelEnv[str, Any, Any]):
             a: intersection.id for a, intersection in zip(agents, items, strict=True)
         }
         self.layouts: dict[str, AgentLayout] = dict(zip(agents, observer.layouts, strict=True))
+        self.recorded_layouts = dict(zip(agents, observer.recorded, strict=True))
         self.observation_spaces = dict(zip(agents, observer.spaces, strict=True))
         phases = [len(intersection.phases) for intersection in items]
         actions = {count: Discrete(count) for count in phases}
@@ -338,7 +354,7 @@ class TrafficEnv(ParallelEnv[str, Any, Any]):
         self._seen = snapshot if self._sensors is None else self._sensors.see(snapshot)
 
     def _observe(self) -> dict[str, NDArray[np.float32]]:
-        seen = self._observer.observe(self._seen, self.phases)
+        seen = self._observer.observe(self._seen, self.phases, self._memory)
         return dict(zip(self.agents, seen, strict=True))
 
     def _infos(self) -> dict[str, dict[str, Any]]:

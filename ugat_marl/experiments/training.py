@@ -112,7 +112,7 @@ def train_grounded(
         device: Device for the fits of f and h.
     """
     learner = make(env, seed)
-    transform = ugat.transform(env.layouts, seed, neighbours_of(env))
+    transform = ugat.transform(env.recorded_layouts, seed, neighbours_of(env))
     if placebo == "noise":
         answer_with_noise(transform.forward, seed)
     state = RunState(learner, transform)

@@ -176,6 +176,9 @@ class FieldLoop:
             intersection.id: Light(intersection.phases, site.timing, shown[intersection.id])
             for intersection in site.network.intersections
         }
+        self._memory = site.observer.memory(site.decision_interval_s)
+        if self._memory is not None:
+            self._memory.reset([light.phase for light in self.lights.values()])
         self._watchdog = Watchdog(site.capacity, site.halting, limits)
         self._held: frozenset[str] = frozenset()
         self._trust = Trust(site.lights, limits.return_after)
@@ -228,6 +231,9 @@ class FieldLoop:
                 phases[light] = phase
         interval = self._site.decision_interval_s
         plans = {name: light.advance(phases[name], interval) for name, light in self.lights.items()}
+        if self._memory is not None:
+            asked = [phases[name] for name in self.lights]
+            self._memory.add(asked, [light.phase for light in self.lights.values()])
         decision = Decision(now, phases, fallback, read_ms, _ms_since(begun))
         return decision, plans
 
@@ -279,7 +285,7 @@ class FieldLoop:
         """
         limits = self._limits
         phases = [light.phase for light in self.lights.values()]
-        observations = self._site.observe(counts, now, phases)
+        observations = self._site.observe(counts, now, phases, self._memory)
         within_ms = limits.answer_ms - limits.reserve_ms
         left_ms = within_ms - _ms_since(begun)
         if left_ms <= 0:
@@ -304,7 +310,8 @@ class FieldLoop:
     def _warm_up(self, policy: Policy) -> None:
         """Ask the policy once before the first decision: a network's first answer takes longest."""
         try:
-            nothing = self._site.observe({}, self._street.now_s(), [0] * len(self.lights))
+            now, phases = self._street.now_s(), [0] * len(self.lights)
+            nothing = self._site.observe({}, now, phases, self._memory)
             for function, arguments in (
                 (policy.reset, (0,)),
                 (self._answer, (nothing, self._infos())),

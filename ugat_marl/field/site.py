@@ -11,7 +11,7 @@ import numpy as np
 from gymnasium.spaces import Discrete
 from numpy.typing import NDArray
 
-from ugat_marl.envs import Observer
+from ugat_marl.envs import CommandMemory, Observer
 from ugat_marl.errors import OptionError
 from ugat_marl.field.street import LaneCount
 from ugat_marl.scenarios import Network, Scenario, SignalTiming, within_hops
@@ -80,7 +80,7 @@ class Site:
         )
         return cls(
             network,
-            Observer(network, name, hops),
+            Observer(network, name, hops, env_options.get("commands", 0)),
             scenario.timing,
             control.decision_interval_s,
             {
@@ -110,7 +110,11 @@ class Site:
         return {agent: Discrete(len(intersection.phases)) for agent, intersection in items}
 
     def observe(
-        self, counts: Mapping[str, LaneCount], now_s: float, phases: list[int]
+        self,
+        counts: Mapping[str, LaneCount],
+        now_s: float,
+        phases: list[int],
+        memory: CommandMemory | None = None,
     ) -> dict[str, NDArray[np.float32]]:
         """Return the observations of all agents.
 
@@ -119,6 +123,7 @@ class Site:
                 caller must ignore the answers of agents that observe such a lane.
             now_s: Time on the street's clock, s.
             phases: Phase that each light shows or clears towards, in the order of the lights.
+            memory: The last commands, for a policy that observes them.
         """
         lanes = self._lanes.ids
         nobody = LaneCount(now_s, 0.0, 0.0)
@@ -132,7 +137,7 @@ class Site:
             departed=0,
             backlog=0,
         )
-        seen = self.observer.observe(snapshot, phases)
+        seen = self.observer.observe(snapshot, phases, memory)
         return dict(zip(self.observer.agents, seen, strict=True))
 
     @cached_property

@@ -56,7 +56,7 @@ class Stack:
         """Return one observation per agent as ``(agents, 1, width)`` float32."""
         rows = np.zeros((len(self.agents), 1, self.width), np.float32)
         for row, agent, size in zip(rows, self.agents, self.sizes, strict=True):
-            row[0, :size] = observations[agent]
+            row[0, :size] = observations[agent][:size]  # a memory of commands follows
         return torch.from_numpy(rows)
 
     def masks(self, masks: Mapping[str, NDArray[np.int8] | None]) -> NDArray[np.bool_]:

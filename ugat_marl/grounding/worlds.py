@@ -283,10 +283,10 @@ class RecordedWorld:
     ) -> None:
         provenance = log.provenance
         for fact, given, wanted in (
-            ("agents", list(provenance.layouts), list(env.layouts)),
+            ("agents", list(provenance.layouts), list(env.recorded_layouts)),
             *(
                 (f"sizes at {agent}", provenance.layouts.get(agent), layout)
-                for agent, layout in env.layouts.items()
+                for agent, layout in env.recorded_layouts.items()
             ),
             ("observation", provenance.observation, env.options.observation),
             ("decision interval", provenance.decision_interval_s, env.decision_interval_s),
@@ -296,7 +296,7 @@ class RecordedWorld:
                     f"the real log's {fact} are {given}, the simulation's {wanted}; record it on "
                     f"{env.scenario.id!r} with the same options"
                 )
-        stack = Stack(env.layouts)
+        stack = Stack(env.recorded_layouts)
         split(stack_log(log, stack), held_out_every, stack)  # raises now instead of after hours
         self._log = log
 

@@ -9,7 +9,7 @@ import numpy as np
 import torch
 from pettingzoo.utils import BaseParallelWrapper
 
-from ugat_marl.envs import AnyParallelEnv, ResetResult, StepResult
+from ugat_marl.envs import AnyParallelEnv, ResetResult, StepResult, memory_size
 from ugat_marl.errors import ActionError, OptionError
 from ugat_marl.grounding.transform import Transform
 from ugat_marl.grounding.view import Moment
@@ -136,12 +136,14 @@ def _refuse_misfit(env: AnyParallelEnv, transform: Transform) -> None:
             f"environment has {len(env.possible_agents)} {tuple(env.possible_agents)[:4]}; "
             "use the same scenario"
         )
+    options = getattr(env.unwrapped, "env_options", {})
     for agent, layout in layouts.items():
         shape = env.observation_space(agent).shape
+        width = layout.size + memory_size(layout.phases, options.get("commands", 0))
         phases = int(getattr(env.action_space(agent), "n", 0))
-        if shape != (layout.size,) or phases != layout.phases:
+        if shape != (width,) or phases != layout.phases:
             raise OptionError(
-                f"the grounding expects observations of ({layout.size},) and {layout.phases} "
+                f"the grounding expects observations of ({width},) and {layout.phases} "
                 f"phases from {agent}; the environment has {shape} and {phases}; use the "
                 "observation options the models were fitted with"
             )

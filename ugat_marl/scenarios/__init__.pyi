@@ -65,6 +65,7 @@ from .signals import LateGreenMemory as LateGreenMemory
 from .signals import Segment as Segment
 from .signals import SignalState as SignalState
 from .signals import SignalTiming as SignalTiming
+from .signals import Withheld as Withheld
 from .signals import green_begins_at_once as green_begins_at_once
 from .signals import late_green_log as late_green_log
 from .signals import with_late_green as with_late_green

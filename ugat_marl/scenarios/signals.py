@@ -216,7 +216,10 @@ class LateGreenMemory(NamedTuple):
 
 
 def with_late_green(
-    segments: Sequence[Segment], late_s: float, step_s: float, before: LateGreenMemory
+    segments: Sequence[Segment],
+    late_s: float | Sequence[float],
+    step_s: float,
+    before: LateGreenMemory,
 ) -> tuple[LateGreenMemory, list[Segment]]:
     """Delay greens: every link that turns green stays red for `late_s` first.
 
@@ -230,7 +233,7 @@ def with_late_green(
 
     Args:
         segments: Commanded states.
-        late_s: Delay of each green, s.
+        late_s: Delay of each green, s; one for all links, or one for each.
         step_s: Length of a simulation step, s.
         before: Memory of earlier commands.
 
@@ -239,8 +242,9 @@ def with_late_green(
     """
     shown: list[Segment] = []
     state = before
+    late = [late_s] * len(state.commanded) if isinstance(late_s, float | int) else late_s
     for duration, commanded in segments:
-        state = _commanded(state, commanded, late_s, step_s)
+        state = _commanded(state, commanded, late, step_s)
         left = duration
         while left > _INSTANT_S:
             visible = "".join(
@@ -256,6 +260,18 @@ def with_late_green(
     return state, shown
 
 
+class Withheld(NamedTuple):
+    """Red that is shown to single links while they have green, in s.
+
+    Attributes:
+        begin_s: For each link, red at the beginning of its green.
+        each_s: For each link, red at the beginning of every decision in which its green goes on.
+    """
+
+    begin_s: tuple[float, ...]
+    each_s: tuple[float, ...]
+
+
 class GreenDelays:
     """Delay greens at many traffic lights: always by their late green, or once on request.
 
@@ -263,13 +279,19 @@ class GreenDelays:
         shown: Traffic light to the state it shows at the start.
         late_s: Traffic light to the delay of each green, s; lights left out have no delay.
         step_s: Length of a simulation step, s.
+        withheld: Traffic light to the red of its single links, beside `late_s`.
     """
 
     def __init__(
-        self, shown: Mapping[str, str], late_s: Mapping[str, float], step_s: float
+        self,
+        shown: Mapping[str, str],
+        late_s: Mapping[str, float],
+        step_s: float,
+        withheld: Mapping[str, Withheld] | None = None,
     ) -> None:
         self._late_s = late_s
         self._step_s = step_s
+        self._withheld = withheld or {}
         self._asked: Mapping[str, float] = {}
         self._commanded = dict(shown)
         self._held: dict[
@@ -284,10 +306,15 @@ class GreenDelays:
         """Return the segments shown instead of `plans`, which hold one decision of every light."""
         shown = dict(plans)
         for tls, plan in plans.items():
+            late: float | list[float]
             late = self._late_s.get(tls, 0.0) + self._asked.get(tls, 0.0)
             before = self._held.pop(tls, None)
-            if late or before:
+            withheld = self._withheld.get(tls)
+            if late or before or withheld:
                 before = before or LateGreenMemory.after(self._commanded[tls])
+                if withheld:
+                    late = [late + own for own in withheld.begin_s]
+                    before = _paused(before, plan[0][1], withheld.each_s, self._step_s)
                 after, shown[tls] = with_late_green(plan, late, self._step_s, before)
                 if after.shown != after.commanded or any(after.owed_s):
                     self._held[tls] = after
@@ -296,8 +323,23 @@ class GreenDelays:
         return shown
 
 
+def _paused(
+    state: LateGreenMemory, commanded: str, each_s: Sequence[float], step_s: float
+) -> LateGreenMemory:
+    """Return the memory after a pause has begun in every shown green that goes on."""
+    shown, waiting, owed = list(state.shown), list(state.waiting_s), list(state.owed_s)
+    for link, (letter, new) in enumerate(zip(state.shown, commanded, strict=True)):
+        if each_s[link] and letter in GREEN and new in GREEN:
+            total = owed[link] + each_s[link]
+            steps = math.floor(total / step_s + _INSTANT_S)
+            waiting[link], owed[link] = steps * step_s, total - steps * step_s
+            if steps:
+                shown[link] = "r"
+    return LateGreenMemory(state.commanded, "".join(shown), tuple(waiting), tuple(owed))
+
+
 def _commanded(
-    state: LateGreenMemory, commanded: str, late_s: float, step_s: float
+    state: LateGreenMemory, commanded: str, late_s: Sequence[float], step_s: float
 ) -> LateGreenMemory:
     """Return the memory when `commanded` begins; its `shown` holds the letters of delayed links."""
     if commanded == state.commanded:
@@ -305,7 +347,7 @@ def _commanded(
     shown, waiting, owed = list(state.shown), list(state.waiting_s), list(state.owed_s)
     for link, (old, new) in enumerate(zip(state.commanded, commanded, strict=True)):
         if new in GREEN and old not in GREEN:
-            total = owed[link] + late_s
+            total = owed[link] + late_s[link]
             steps = math.floor(total / step_s + _INSTANT_S)
             waiting[link], owed[link] = steps * step_s, total - steps * step_s
             shown[link] = "s" if old == "s" else "r"

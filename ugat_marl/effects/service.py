@@ -1,0 +1,73 @@
+"""Effect on the service of single lanes: seconds of green that their traffic does not use."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, replace
+from typing import ClassVar
+
+from ugat_marl.effects.base import ControllerEffect, NumberParameter, TextParameter
+from ugat_marl.effects.places import network_places
+from ugat_marl.scenarios import Intersection, Network, Scenario, Withheld
+
+Seconds = tuple[float, float]
+"""Red at the beginning of a green, and in every further decision, in s."""
+
+
+@dataclass(frozen=True)
+class LaneService(ControllerEffect):
+    """Links from a lane show red at the beginning of their green, and in each further decision.
+
+    The first is start-up lost time of this lane alone. The second lowers its saturation flow:
+    queues stop for some seconds in every decision in which the green goes on. Controllers command
+    and observe the full green. A network may have one such effect for each lane.
+    """
+
+    name: ClassVar[str] = "lane_service"
+    ranges: ClassVar[dict[str, NumberParameter]] = {
+        "begin_s": NumberParameter("s", 0.0, 30.0),
+        "each_s": NumberParameter("s", 0.0, 30.0),
+    }
+    texts: ClassVar[dict[str, TextParameter]] = {"lane": TextParameter("lane")}
+    lane: str
+    begin_s: float
+    each_s: float
+
+    def apply(self, scenario: Scenario) -> Scenario:
+        """List the effect in the scenario; the last of two of the same lane counts.
+
+        Raises:
+            UnknownNameError: No such lane.
+        """
+        places = network_places(scenario)
+        places.check(self.name, "lane", self.lane, places.lanes)
+        listed = [
+            item
+            for item in scenario.settings.effects
+            if (item.get("name"), item.get("lane")) != (self.name, self.lane)
+        ]
+        listed = sorted([*listed, self.record()], key=_key)
+        settings = scenario.settings.model_copy(update={"effects": tuple(listed)})
+        known = () if str(self) in scenario.applied else (str(self),)  # a scenario is loaded twice
+        return replace(scenario, settings=settings, applied=(*scenario.applied, *known))
+
+    def service(self) -> Mapping[str, Seconds]:
+        """Return the lane and its seconds."""
+        return {self.lane: (self.begin_s, self.each_s)}
+
+
+def withheld(network: Network, lanes: Mapping[str, Seconds]) -> dict[str, Withheld]:
+    """Return the red of single links by traffic light, for lights with such a lane."""
+    found = {item.id: _of_light(item, lanes) for item in network.intersections}
+    return {light: red for light, red in found.items() if any(red.begin_s) or any(red.each_s)}
+
+
+def _of_light(item: Intersection, lanes: Mapping[str, Seconds]) -> Withheld:
+    begin_s, each_s = ([0.0] * len(item.phases[0]) for _ in range(2))
+    for link in item.links:
+        begin_s[link.index], each_s[link.index] = lanes.get(link.from_lane, (0.0, 0.0))
+    return Withheld(tuple(begin_s), tuple(each_s))
+
+
+def _key(record: Mapping[str, object]) -> tuple[str, str]:
+    return str(record.get("name")), str(record.get("lane", ""))
