@@ -30,3 +30,4 @@ from .transitions import AgentLayout as AgentLayout
 from .transitions import Provenance as Provenance
 from .transitions import TransitionLog as TransitionLog
 from .transitions import TransitionRecorder as TransitionRecorder
+from .transitions import Transitions as Transitions

@@ -1,9 +1,9 @@
 """Transition logs: written by roll-outs, read by grounding.
 
 A log holds one row per (episode, step, agent): the observation of the intersection, the phase its
-policy requested, the phase that was served, the delay of its green, the reward, and the next
-observation. Simulated and measured logs have the same form. The provenance in the metadata of the
-Parquet file tells them apart.
+policy requested, the phases it was permitted, the phase that was served, the delay of its green,
+the reward, and the next observation. Simulated and measured logs have the same form. The provenance
+in the metadata of the Parquet file tells them apart.
 """
 
 from __future__ import annotations
@@ -49,10 +49,12 @@ SCHEMA: Mapping[str, pl.DataType] = {
     "reward": pl.Float32(),
     "next_observation": pl.List(pl.Float32()),
     "served_features": pl.List(pl.Float32()),
+    "mask": pl.List(pl.Int8()),
 }
 OPTIONAL: Mapping[str, pl.Expr] = {
     "delay_s": pl.lit(0.0, pl.Float32()),
     "served_features": pl.lit([], pl.List(pl.Float32())),
+    "mask": pl.lit([], pl.List(pl.Int8())),
 }
 """Columns that may be missing, with their default."""
 VECTORS = ("observation", "next_observation")
@@ -159,6 +161,8 @@ class Transitions:
         served_features: ``(n, features)`` float32, the features at the start of the step without
             the vehicles that left, averaged over the interval. They show how many vehicles were
             served and how early. ``(n, 0)`` if a row was not measured.
+        mask: ``(n, phases)`` bool, the phases that the policy was permitted to request. ``(n, 0)``
+            if a row has none.
         episode: ``(n,)`` int64.
         step: ``(n,)`` int64.
     """
@@ -170,6 +174,7 @@ class Transitions:
     reward: NDArray[np.float32]
     next_observation: NDArray[np.float32]
     served_features: NDArray[np.float32]
+    mask: NDArray[np.bool_]
     episode: NDArray[np.int64]
     step: NDArray[np.int64]
 
@@ -242,6 +247,9 @@ class TransitionLog:
             served_features=vectors("served_features", layout.features)
             if (rows["served_features"].list.len() == layout.features).all()
             else np.zeros((len(rows), 0), np.float32),
+            mask=vectors("mask", layout.phases).astype(np.bool_)
+            if (rows["mask"].list.len() == layout.phases).all()
+            else np.zeros((len(rows), 0), np.bool_),
             episode=numbers("episode"),
             step=numbers("step"),
         )
@@ -296,8 +304,18 @@ class TransitionLog:
             raise LogError(f"{path}: {error}") from None
 
 
-_Row = tuple[NDArray[np.float32], int, int, float, float, NDArray[np.float32], NDArray[np.float32]]
+_Row = tuple[
+    NDArray[np.float32],
+    int,
+    int,
+    float,
+    float,
+    NDArray[np.float32],
+    NDArray[np.float32],
+    NDArray[np.int8],
+]
 _NONE = np.zeros(0, np.float32)
+_NO_MASK = np.zeros(0, np.int8)
 
 
 class TransitionRecorder:
@@ -328,6 +346,7 @@ class TransitionRecorder:
         next_observations: Mapping[str, NDArray[np.float32]],
         delays_s: Mapping[str, float] | None = None,
         served: Mapping[str, NDArray[np.float32]] | None = None,
+        masks: Mapping[str, Any] | None = None,
     ) -> None:
         """Add one step of all agents; the arrays are copied.
 
@@ -341,6 +360,7 @@ class TransitionRecorder:
             next_observations: Observation of each agent after the step.
             delays_s: Intended delay of each agent's green, s; None for no delays.
             served: Served features of each agent; None if not measured.
+            masks: 1 for each phase an agent was permitted to request; None if not known.
 
         Raises:
             LogError: An agent of the provenance is missing in one of the mappings.
@@ -355,6 +375,7 @@ class TransitionRecorder:
                     float(rewards[agent]),
                     np.array(next_observations[agent], np.float32),
                     _NONE if served is None else np.array(served[agent], np.float32),
+                    _NO_MASK if masks is None else np.array(masks[agent], np.int8),
                 )
                 for agent in self._provenance.layouts
             ]
@@ -399,10 +420,11 @@ class TransitionRecorder:
                 "reward": np.array([row[4] for row in rows], np.float32),
                 "next_observation": _stacked(agent, layout, [row[5] for row in rows]),
                 "served_features": [row[6].tolist() for row in rows],
+                "mask": [row[7].tolist() for row in rows],
             },
             schema_overrides={
                 name: SCHEMA[name]
-                for name in ("observation", "next_observation", "served_features")
+                for name in ("observation", "next_observation", "served_features", "mask")
             },
         )
 
@@ -474,6 +496,7 @@ def checked(
     length = pl.col("served_features").list.len()
     wrong = (length != widths) & (length != 0)
     _refuse_rows(frame, wrong, "served_features", "has the wrong length")
+    _refuse_masks(frame, limit)
     for column in VECTORS:
         _refuse_rows(frame, pl.col(column).list.len() != size, column, "has the wrong length")
     for column in (*VECTORS, "served_features"):
@@ -488,6 +511,16 @@ def checked(
     key = ["episode", "step", "agent"]
     _refuse_rows(frame, pl.struct(key).is_duplicated(), "step", "occurs twice in its episode")
     return frame
+
+
+def _refuse_masks(frame: pl.DataFrame, phases: pl.Expr) -> None:
+    """Refuse masks of a wrong length, with other values than 0 and 1, or without any 1."""
+    length = pl.col("mask").list.len()
+    _refuse_rows(frame, (length != phases) & (length != 0), "mask", "has the wrong length")
+    values = pl.col("mask").list.eval(pl.element().is_in([0, 1]).fill_null(False)).list.all()
+    _refuse_rows(frame, ~values & (length != 0), "mask", "holds another number than 0 and 1")
+    nothing = (pl.col("mask").list.sum() == 0) & (length != 0)
+    _refuse_rows(frame, nothing, "mask", "permits no phase")
 
 
 def _converted(frame: pl.DataFrame) -> pl.DataFrame:
@@ -513,7 +546,8 @@ def _same_kind(given: pl.DataType, wanted: pl.DataType) -> bool:
     if isinstance(wanted, pl.List):
         if not isinstance(given, pl.List | pl.Array):
             return False
-        return given.inner.is_float()
+        inner: Any = given.inner
+        return inner.is_float() if wanted == pl.List(pl.Float32) else inner.is_integer()
     if wanted.is_integer():
         return given.is_integer()
     if wanted.is_float():

@@ -73,7 +73,7 @@ def roll_out(
     """
     observations, infos = env.reset(seed=seed)
     policy.reset(seed)
-    recording = _Recording(env, record, seed) if record else None
+    recording = _Recording(env, record, seed, infos) if record else None
     steps, total = 0, 0.0
     while env.agents:
         agents = list(env.agents)
@@ -106,13 +106,14 @@ def observer_of(env: AnyParallelEnv, name: str | None = None, neighbours: int = 
 class _Recording:
     """Transitions of one episode, seen by an observer; agents have the observer's names."""
 
-    def __init__(self, env: AnyParallelEnv, observer: Observer, seed: int) -> None:
+    def __init__(self, env: AnyParallelEnv, observer: Observer, seed: int, infos: Infos) -> None:
         self._base: Any = env.unwrapped
         self._observer = observer
         self._recorder = TransitionRecorder(provenance_of(env, observer, seed))
         self._names = dict(zip(self._base.possible_agents, observer.agents, strict=True))
         self._seen = self._look()
         self._before: Snapshot = self._base.seen
+        self._masks = self._renamed({agent: infos[agent]["action_mask"] for agent in self._names})
         self._step = 0
 
     def add(self, actions: Actions, rewards: Mapping[str, float], infos: Infos) -> None:
@@ -120,9 +121,12 @@ class _Recording:
         executed = {agent: int(infos[agent]["executed_action"]) for agent in self._names}
         held = {agent: float(infos[agent].get("delay_s", 0.0)) for agent in self._names}
         acted, served, got, held = map(self._renamed, (actions, executed, rewards, held))
-        row = self._seen, acted, served, got, then, held, self._served()
+        row = self._seen, acted, served, got, then, held, self._served(), self._masks
         self._recorder.record(0, self._step, *row)
         self._seen = then
+        if self._base.agents:
+            masks = {agent: infos[agent]["action_mask"] for agent in self._names}
+            self._masks = self._renamed(masks)
         self._step += 1
 
     def log(self) -> TransitionLog:
