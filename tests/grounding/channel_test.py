@@ -1,0 +1,181 @@
+"""The command channel on logs of a signal that was written by hand, with planted faults."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+
+import numpy as np
+import pytest
+
+from ugat_marl.data import AgentLayout, Provenance, TransitionLog, TransitionRecorder
+from ugat_marl.grounding.channel import CommandChannel, fit_channel
+from ugat_marl.scenarios import SignalState, SignalTiming
+
+PHASES = 4
+AGENTS = ("a_0", "b_0")
+LAYOUTS = {agent: AgentLayout(1, PHASES) for agent in AGENTS}
+TIMING = SignalTiming(yellow_s=3.0, all_red_s=2.0, min_green_s=5.0)
+INTERVAL_S = 10.0
+
+Mask = Callable[[int, int], Sequence[int]]
+"""Permitted phases, from the running phase and its age in decisions."""
+
+
+def anything(_running: int, _age: int) -> Sequence[int]:
+    return range(PHASES)
+
+
+def obeyed(command: int | None, running: int, allowed: Sequence[int]) -> int:
+    if command is not None and command in allowed:
+        return command
+    if running in allowed:
+        return running
+    return next((phase for phase in sorted(allowed) if phase > running), min(allowed))
+
+
+def log_of(
+    lag: int = 0,
+    lost: float = 0.0,
+    mask: Mask = anything,
+    told: bool = True,
+    rows: dict[str, int] | None = None,
+    seed: int = 0,
+) -> TransitionLog:
+    """Return a log of random commands that a street with these faults executed."""
+    generator = np.random.default_rng(seed)
+    recorder = TransitionRecorder(
+        Provenance("by hand", "", "street", (), INTERVAL_S, "count", LAYOUTS)
+    )
+    running, age = dict.fromkeys(AGENTS, 0), dict.fromkeys(AGENTS, 1)
+    given: dict[str, list[int]] = {agent: [] for agent in AGENTS}
+    for step in range(max((rows or {"": 360}).values())):
+        seen = {a: np.array([0.0, *np.eye(PHASES)[running[a]]]) for a in AGENTS}
+        masks = {a: np.isin(np.arange(PHASES), mask(running[a], age[a])) for a in AGENTS}
+        asked: dict[str, int] = {}
+        executed: dict[str, int] = {}
+        for agent in AGENTS:
+            choices = np.flatnonzero(masks[agent]) if told else np.arange(PHASES)
+            asked[agent] = int(generator.choice(choices))
+            given[agent].append(asked[agent])
+            arrives = given[agent][-1 - lag] if len(given[agent]) > lag else None
+            if generator.random() < lost:
+                arrives = None
+            executed[agent] = obeyed(arrives, running[agent], mask(running[agent], age[agent]))
+        then = {a: np.array([0.0, *np.eye(PHASES)[executed[a]]]) for a in AGENTS}
+        rewards = dict.fromkeys(AGENTS, 0.0)
+        shown = {a: masks[a].astype(np.int8) for a in AGENTS} if told else None
+        recorder.record(0, step, seen, asked, executed, rewards, then, masks=shown)
+        for agent in AGENTS:
+            age[agent] = 1 if executed[agent] != running[agent] else age[agent] + 1
+            running[agent] = executed[agent]
+    return recorder.log()
+
+
+def after_one_step(channel: CommandChannel, phase: int, age: int) -> list[int]:
+    """Return the phases that the fitted actuator permits."""
+    mask = np.ones(PHASES, dtype=np.int8)
+    actuator = channel.actuator(None, TIMING, INTERVAL_S)  # type: ignore[arg-type]
+    assert actuator is not None
+    elapsed_s = age * INTERVAL_S - TIMING.clearance_s
+    actuator.restrict(mask, 0, SignalState(phase, phase, elapsed_s))
+    return np.flatnonzero(mask).tolist()
+
+
+def test_an_obedient_street_has_no_channel() -> None:
+    channel = fit_channel(log_of())
+    assert not channel.changes
+    assert channel.memory == 0
+    assert channel.actuator(None, TIMING, INTERVAL_S) is None  # type: ignore[arg-type]
+
+
+@pytest.mark.parametrize("told", [True, False])
+def test_a_delay_of_two_decisions_with_lost_commands_is_recovered(told: bool) -> None:
+    channel = fit_channel(log_of(lag=2, lost=0.2, told=told))
+    assert channel.lag == 2
+    assert channel.lost == pytest.approx(0.2, abs=0.05)
+    assert channel.network[2] == pytest.approx(0.8, abs=0.05)
+    assert channel.memory == 2
+    assert "2 decisions late" in channel.describe()
+
+
+def test_an_order_of_phases_is_read_off_the_masks() -> None:
+    channel = fit_channel(log_of(mask=lambda running, _: (running, (running + 1) % PHASES)))
+    assert channel.network[0] == 1.0
+    assert after_one_step(channel, 1, age=1) == [1, 2]
+    assert after_one_step(channel, 3, age=2) == [0, 3]
+
+
+def test_an_order_of_phases_is_read_off_refused_commands_without_masks() -> None:
+    def order(running: int, _age: int) -> Sequence[int]:
+        return running, (running + 1) % PHASES
+
+    channel = fit_channel(log_of(mask=order, told=False, lost=0.1, rows={"": 600}))
+    assert after_one_step(channel, 1, age=1) == [1, 2]
+    assert channel.lost == pytest.approx(0.1, abs=0.04)
+
+
+def test_shortest_and_longest_greens_are_entries_of_the_table() -> None:
+    def limits(running: int, age: int) -> Sequence[int]:
+        others = [phase for phase in range(PHASES) if phase != running]
+        if age < 2:
+            return [running]
+        return others if age >= 4 else [running, *others]
+
+    channel = fit_channel(log_of(mask=limits, rows={"": 900}))
+    assert after_one_step(channel, 2, age=1) == [2]
+    assert after_one_step(channel, 2, age=3) == [0, 1, 2, 3]
+    assert after_one_step(channel, 2, age=4) == [0, 1, 3]
+    assert after_one_step(channel, 2, age=9) == [0, 1, 3]  # not seen: as the oldest that was
+
+
+def test_the_actuator_repeats_the_street() -> None:
+    channel = fit_channel(log_of(lag=2, lost=0.2))
+    actuator = channel.actuator(None, TIMING, INTERVAL_S)  # type: ignore[arg-type]
+    assert actuator is not None
+    arrived: list[tuple[int, int | None]] = []
+    actuator.reset(7)
+    for step in range(2000):
+        command = step % PHASES
+        arrived.append((command, actuator.send([command, command])[0]))
+    late = [arrival for _, arrival in arrived[2:]]
+    lost = sum(arrival is None for arrival in late) / len(late)
+    assert lost == pytest.approx(0.2, abs=0.05)
+    expected = [step % PHASES for step in range(len(late))]
+    assert all(a is None or a == b for a, b in zip(late, expected, strict=True))
+    assert list(actuator.under_way) == [[2, 2], [3, 3]]
+
+
+def test_the_seed_of_an_episode_decides_what_is_lost() -> None:
+    channel = fit_channel(log_of(lost=0.3))
+    actuator = channel.actuator(None, TIMING, INTERVAL_S)  # type: ignore[arg-type]
+    assert actuator is not None
+
+    def play(seed: int) -> list[list[int | None]]:
+        actuator.reset(seed)
+        return [list(actuator.send([1, 1])) for _ in range(50)]
+
+    assert play(1) == play(1)
+    assert play(1) != play(2)
+
+
+def test_weights_of_a_short_log_follow_the_network() -> None:
+    """An intersection whose log says little takes the weights of the others, never zero."""
+    channel = fit_channel(log_of(lag=1, lost=0.2))
+    silent = CommandChannel(
+        channel.agents,
+        channel.network,
+        np.array([channel.counts[0], np.zeros_like(channel.counts[0])]),
+        channel.tables,
+        channel.pull,
+    )
+    assert silent.weights[1] == pytest.approx(channel.network)
+    drawn = np.array([silent.drawn(seed) for seed in range(200)])
+    assert drawn.sum(-1) == pytest.approx(1.0)
+    assert drawn[:, 1].std(0).max() > 1.5 * drawn[:, 0].std(0).max()
+
+
+def test_a_channel_survives_its_checkpoint() -> None:
+    channel = fit_channel(log_of(lag=1, lost=0.1))
+    again = CommandChannel.from_state(channel.state_dict())
+    assert np.array_equal(again.network, channel.network)
+    assert all(np.array_equal(a, b) for a, b in zip(again.tables, channel.tables, strict=True))

@@ -1,0 +1,129 @@
+"""Faults of detectors that were planted in counts of a queue written by hand."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+import numpy as np
+import pytest
+
+from ugat_marl.data import AgentLayout, Provenance, TransitionLog, TransitionRecorder
+from ugat_marl.grounding.eyes import Eyes, fit_eyes
+from ugat_marl.grounding.summaries import LaneView
+
+LANES = 4
+PHASES = 2
+LAYOUTS = {"a_0": AgentLayout(LANES, PHASES)}
+GREEN = np.array([[True, False], [True, False], [False, True], [False, True]])
+VIEW = LaneView(tuple(f"lane_{k}" for k in range(LANES)), (GREEN,), (np.full(LANES, 40.0),), (0,))
+
+Fault = Callable[[np.ndarray, np.random.Generator], np.ndarray]
+"""Counts of an episode, ``(decisions, lanes)``, as faulty detectors report them."""
+
+
+def counted(decisions: int, generator: np.random.Generator) -> tuple[np.ndarray, np.ndarray]:
+    """Return counts ``(decisions + 1, lanes)`` and the phases that ran in between."""
+    counts = np.zeros((decisions + 1, LANES))
+    phases = (np.arange(decisions) // 3) % PHASES
+    for t, phase in enumerate(phases):
+        served = np.where(GREEN[:, phase], 4.0, 0.0)
+        arrivals = generator.poisson(1.7, LANES)
+        counts[t + 1] = np.minimum(np.maximum(counts[t] - served, 0.0) + arrivals, 30.0)
+    return counts, phases
+
+
+def log_of(fault: Fault | None = None, episodes: int = 4, seed: int = 0) -> TransitionLog:
+    generator = np.random.default_rng(seed)
+    recorder = TransitionRecorder(Provenance("by hand", "", "street", (), 10.0, "count", LAYOUTS))
+    for episode in range(episodes):
+        counts, phases = counted(300, generator)
+        shown = counts if fault is None else fault(counts, generator)
+        before = 0
+        for t, phase in enumerate(phases):
+            seen = np.array([*shown[t] / 40.0, *np.eye(PHASES)[before]])
+            then = np.array([*shown[t + 1] / 40.0, *np.eye(PHASES)[phase]])
+            did = {"a_0": int(phase)}
+            recorder.record(episode, t, {"a_0": seen}, did, did, {"a_0": 0.0}, {"a_0": then})
+            before = phase
+    return recorder.log()
+
+
+PERFECT = log_of(seed=99)
+
+
+def found(fault: Fault | None) -> Eyes:
+    return fit_eyes(log_of(fault), PERFECT, VIEW)
+
+
+def test_perfect_detectors_have_no_fault() -> None:
+    eyes = found(None)
+    assert not eyes.changes
+    assert "no fault" in eyes.describe()
+    assert eyes.parts(0, VIEW.lanes, 10.0) == []
+
+
+def test_a_dead_lane_is_found_and_no_other() -> None:
+    def dead(counts: np.ndarray, _: np.random.Generator) -> np.ndarray:
+        return counts * np.array([1.0, 0.0, 1.0, 1.0])
+
+    eyes = found(dead)
+    assert eyes.dead[1] > 0.7
+    assert np.delete(eyes.dead, 1).max() < 0.2
+    parts = eyes.parts(1, VIEW.lanes, 10.0)
+    assert [part.name for part in parts] == ["dead lanes"]
+
+
+def test_a_short_zone_is_found_by_what_is_never_counted() -> None:
+    def short(counts: np.ndarray, _: np.random.Generator) -> np.ndarray:
+        return np.minimum(counts, 3.0)
+
+    low_m, high_m = found(short).zone_m
+    assert low_m < 3 * 7.5 < high_m < 40.0
+
+
+def test_noise_is_found_with_its_size() -> None:
+    def relative(counts: np.ndarray, generator: np.random.Generator) -> np.ndarray:
+        return counts * np.maximum(1 + 0.1 * generator.standard_normal(counts.shape), 0)
+
+    def absolute(counts: np.ndarray, generator: np.random.Generator) -> np.ndarray:
+        return np.maximum(counts + 3.0 * generator.standard_normal(counts.shape), 0)
+
+    eyes = found(relative)
+    assert eyes.relative == pytest.approx(0.1, abs=0.05)
+    assert eyes.absolute <= 1.0
+    assert found(absolute).absolute == pytest.approx(3.0, abs=1.0)
+
+
+@pytest.mark.parametrize("lag", [1, 3])
+def test_late_counts_are_found_with_their_lag(lag: int) -> None:
+    def late(counts: np.ndarray, _: np.random.Generator) -> np.ndarray:
+        return np.concatenate([np.zeros((lag, LANES)), counts[:-lag]])
+
+    eyes = found(late)
+    assert eyes.lag == lag
+    (part,) = eyes.parts(0, VIEW.lanes, 10.0)
+    assert str(part) == f"observation_delay={10 * lag}"
+
+
+def test_lost_readings_are_told_from_queues_that_stand() -> None:
+    def lost(counts: np.ndarray, generator: np.random.Generator) -> np.ndarray:
+        shown = counts.copy()
+        for t in range(1, len(shown)):
+            gone = generator.random(LANES) < 0.2
+            shown[t] = np.where(gone, shown[t - 1], shown[t])
+        return shown
+
+    assert found(lost).lost == pytest.approx(0.2, abs=0.1)
+
+
+def test_coarse_counts_are_found_by_their_step() -> None:
+    def coarse(counts: np.ndarray, _: np.random.Generator) -> np.ndarray:
+        return np.round(counts / 5) * 5
+
+    assert found(coarse).step == 5.0
+
+
+def test_eyes_survive_their_checkpoint() -> None:
+    eyes = Eyes(np.array([0.0, 0.5]), (15.0, 26.0), 1.0, 0.1, 2, 0.3, 5.0)
+    again = Eyes.from_state(eyes.state_dict())
+    assert again.state_dict() == eyes.state_dict()

@@ -1,0 +1,97 @@
+"""Posterior over worlds on statistics with a known origin: coverage, pooling, correlation."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from ugat_marl.errors import CheckpointError, UnknownNameError
+from ugat_marl.grounding.posterior import FittedService, Posterior, Simulated, Values, Worlds
+from ugat_marl.grounding.summaries import NAMES, Summary
+
+LANES = tuple(f"lane_{k}" for k in range(8))
+WORLDS = Worlds.of(LANES, {})
+
+
+def summary(values: Values, seed: int, silent: int | None = None) -> Summary:
+    """Return statistics that the values decide, with noise; one lane may say nothing."""
+    generator = np.random.default_rng(seed)
+    scaled = (values.effects - 1.0) / 2.0
+    known = np.zeros((len(LANES), len(NAMES)))
+    known[:, :7] = np.tanh(scaled) + 0.3 * scaled[::-1]
+    known[:, 7] = 2.0 - 0.3 * values.service_s[:, 0]
+    known[:, 8] = 3.0 * np.exp(-0.4 * values.service_s[:, 1])
+    known += 0.05 * generator.standard_normal(known.shape)
+    if silent is not None:
+        known[silent] = np.nan
+    rows = np.full_like(known, 50.0)
+    return Summary(known, rows)
+
+
+SIMULATED = [Simulated(v, summary(v, k)) for k, v in ((k, WORLDS.draw(k)) for k in range(300))]
+
+
+def interval(sample: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    low, high = np.quantile(sample, (0.05, 0.95), axis=0)
+    return low - 1e-9, high + 1e-9
+
+
+def test_ninety_percent_intervals_hold_the_truth_as_often_as_they_say() -> None:
+    inside_effects: list[np.ndarray] = []
+    inside_service: list[np.ndarray] = []
+    for k in range(1000, 1060):
+        truth = WORLDS.draw(k)
+        posterior = Posterior.fit(WORLDS, SIMULATED, summary(truth, k))
+        effects, service_s = posterior.sample(300)
+        low, high = interval(effects)
+        inside_effects.append((truth.effects >= low) & (truth.effects <= high))
+        low, high = interval(service_s)
+        inside_service.append((truth.service_s >= low) & (truth.service_s <= high))
+    assert 0.8 <= np.mean(inside_effects) <= 0.97
+    assert 0.8 <= np.mean(inside_service) <= 0.99  # most lanes are exactly 0, which is inside
+
+
+def test_service_of_one_lane_is_found_at_this_lane() -> None:
+    service_s = np.zeros((len(LANES), 2))
+    service_s[3] = (4.0, 0.0)
+    truth = Values(np.array([x.nominal for x in WORLDS.library]), service_s)
+    found = Posterior.fit(WORLDS, SIMULATED, summary(truth, 5)).sample(300)[1].mean(0)
+    assert found[3, 0] == pytest.approx(4.0, abs=1.0)
+    assert np.delete(found[:, 0], 3).max() < 1.0
+
+
+def test_a_lane_without_data_follows_the_network_and_is_less_certain() -> None:
+    truth = Values(np.array([x.nominal for x in WORLDS.library]), np.full((len(LANES), 2), 2.0))
+    sample_s = Posterior.fit(WORLDS, SIMULATED, summary(truth, 5, silent=2)).sample(400)[1]
+    middle = sample_s.mean(0)
+    assert middle[2, 0] == pytest.approx(np.delete(middle[:, 0], 2).mean(), abs=0.8)
+    assert middle[2, 0] > 1.0  # not zero
+
+
+def test_draws_keep_to_their_ranges_and_name_only_what_changes() -> None:
+    posterior = Posterior.fit(WORLDS, SIMULATED, summary(WORLDS.draw(9), 9))
+    for seed in range(50):
+        values = posterior.draw(seed)
+        for item, value in zip(WORLDS.library, values.effects, strict=True):
+            assert item.low <= value <= item.high
+        assert values.service_s.min() >= 0.0
+    nominal = Values(np.array([x.nominal for x in WORLDS.library]), np.zeros((len(LANES), 2)))
+    assert WORLDS.effects(nominal) == ()
+    assert FittedService(LANES, nominal.service_s).service() == {}
+    names = [effect.name for effect in WORLDS.effects(posterior.draw(0))]
+    assert "demand_level" not in names[1:]  # demand changes before vehicles do
+
+
+def test_an_effect_can_be_left_out() -> None:
+    worlds = Worlds.of(LANES, {}, without=["headway"])
+    assert "headway" not in [item.name for item in worlds.library]
+    with pytest.raises(UnknownNameError, match="headwya"):
+        Worlds.of(LANES, {}, without=["headwya"])
+
+
+def test_a_posterior_survives_its_checkpoint_and_refuses_another_network() -> None:
+    posterior = Posterior.fit(WORLDS, SIMULATED, summary(WORLDS.draw(9), 9))
+    again = Posterior.from_state(WORLDS, posterior.state_dict())
+    assert np.array_equal(again.draw(4).effects, posterior.draw(4).effects)
+    with pytest.raises(CheckpointError, match="another network"):
+        Posterior.from_state(Worlds.of(LANES[:3], {}), posterior.state_dict())

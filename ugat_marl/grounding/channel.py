@@ -1,0 +1,443 @@
+"""Command channel of the street: which phase runs, given the phases that were asked for.
+
+On a street a command may be late, lost or refused. The channel is a mixture over the command that
+takes effect at a decision t, and a table of permitted phases:
+
+    arrives_t  = asked_(t - k) with chance w_k, k = 0, 1, ..., most_lag;  nothing with chance w_lost
+    executed_t = obeyed(arrives_t, running phase, age of its green)
+
+`obeyed` keeps the running phase if nothing arrives or if the command is forbidden. If the running
+phase itself must end, the next permitted one follows. A delay of two decisions is w_2 = 1; lost
+commands are w_lost; an order of phases and a longest green are entries of the table.
+
+The weights are found by expectation-maximisation, pooled over the network (partial pooling): the
+weights of an intersection have the prior Dirichlet(pull * w of the network).
+"""
+
+from __future__ import annotations
+
+from collections import deque
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any, ClassVar
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ugat_marl.data import AgentLayout, TransitionLog, Transitions
+from ugat_marl.effects import Actuator, Commands, ControllerPart
+from ugat_marl.errors import CheckpointError, LogError
+from ugat_marl.scenarios import Network, SignalState, SignalTiming
+from ugat_marl.seeding import numpy_generator
+
+Floats = NDArray[np.float64]
+Table = NDArray[np.bool_]
+"""Permitted phases of an intersection, bool ``(ages, phases, phases)``: entry (a, p, j) is True if
+phase j may run next while p has run for a decisions; row 0 is not used."""
+
+
+@dataclass(frozen=True)
+class ChannelConfig:
+    """Numbers of the method.
+
+    Attributes:
+        most_lag: Longest delay of a command, in decisions. Commands that are later still look like
+            lost ones.
+        ages: Number of ages of a green that are told apart, in decisions. Older greens count as the
+            oldest of these.
+        pull: Decisions that the network's weights count for at each intersection. Halved,
+            intersections with short logs are believed sooner.
+        least_rows: Fewest observations of an entry of the table before it may forbid a phase, where
+            the log has no masks. Halved, a few lost commands look like a forbidden phase.
+        refused: Share of the usual chance of being obeyed below which a phase is forbidden, where
+            the log has no masks.
+        least_share: Smallest weight of a lag, or of lost commands, that counts as found. Smaller
+            ones are set to 0: coincidences give weights below it.
+    """
+
+    most_lag: int = 6
+    ages: int = 12
+    pull: float = 30.0
+    least_rows: int = 5
+    refused: float = 0.2
+    least_share: float = 0.02
+
+
+@dataclass(frozen=True)
+class CommandChannel(ControllerPart):
+    """Fitted channel of all intersections.
+
+    Attributes:
+        agents: The agents, in the environment's order.
+        network: Weights pooled over the network, ``(most_lag + 2,)``: those of the lags 0, 1, ...
+            and, last, of lost commands.
+        counts: Expected number of decisions of each kind, ``(agents, most_lag + 2)``.
+        tables: Permitted phases of each intersection.
+        pull: Decisions that `network` counts for at each intersection.
+    """
+
+    name: ClassVar[str] = "command channel"
+    agents: tuple[str, ...]
+    network: Floats
+    counts: Floats
+    tables: tuple[Table, ...]
+    pull: float
+
+    @property
+    def weights(self) -> Floats:
+        """Mean weights of each intersection, ``(agents, most_lag + 2)``."""
+        total = self.pull * self.network + self.counts
+        return total / total.sum(1, keepdims=True)
+
+    @property
+    def lag(self) -> int:
+        """Most frequent delay of commands, in decisions."""
+        return int(self.network[:-1].argmax())
+
+    @property
+    def lost(self) -> float:
+        """Share of lost commands in the network."""
+        return float(self.network[-1])
+
+    @property
+    def forbids(self) -> bool:
+        """True if some phase is forbidden at some age."""
+        return not all(table[1:].all() for table in self.tables)
+
+    @property
+    def changes(self) -> bool:
+        """True if the channel is more than "every command is obeyed at once"."""
+        return bool(self.network[0] < 1.0) or self.forbids
+
+    @property
+    def memory(self) -> int:
+        """Number of own commands that a policy has to see; 0 for a channel that changes nothing."""
+        late = np.flatnonzero(self.network[:-1] > 0)
+        return max(1, int(late.max())) if self.changes else 0
+
+    def drawn(self, seed: int) -> Floats:
+        """Draw weights from the posterior, ``(agents, most_lag + 2)``."""
+        generator = numpy_generator(seed, "channel", "weights")
+        rows = np.zeros_like(self.counts)
+        found = self.network > 0
+        for row, counts in zip(rows, self.counts, strict=True):
+            row[found] = generator.dirichlet(self.pull * self.network[found] + counts[found])
+        return rows
+
+    def actuator(
+        self, network: Network, timing: SignalTiming, decision_interval_s: float
+    ) -> FittedActuator | None:
+        """Return an actuator that acts as the channel; each episode draws its weights."""
+        del network
+        return FittedActuator(self, timing, decision_interval_s) if self.changes else None
+
+    def describe(self) -> str:
+        """Return what was found in one line."""
+        if not self.changes:
+            return "commands: obeyed at once"
+        late = [(k, w) for k, w in enumerate(self.network[:-1]) if k and w > 0]
+        parts = [f"{100 * w:.0f} % {k} decisions late" for k, w in late]
+        parts += [f"{100 * self.lost:.0f} % lost"] if self.lost else []
+        parts += ["some phases forbidden"] if self.forbids else []
+        return "commands: " + ", ".join(parts)
+
+    def state_dict(self) -> dict[str, Any]:
+        """Return the channel as plain values."""
+        return {
+            "agents": list(self.agents),
+            "network": self.network.tolist(),
+            "counts": self.counts.tolist(),
+            "tables": [table.astype(int).tolist() for table in self.tables],
+            "pull": self.pull,
+        }
+
+    @classmethod
+    def from_state(cls, state: Mapping[str, Any]) -> CommandChannel:
+        """Restore `state_dict`.
+
+        Raises:
+            CheckpointError: A value is missing or of a wrong shape.
+        """
+        try:
+            channel = cls(
+                tuple(map(str, state["agents"])),
+                np.array(state["network"], float),
+                np.array(state["counts"], float),
+                tuple(np.array(table, bool) for table in state["tables"]),
+                float(state["pull"]),
+            )
+        except (KeyError, TypeError, ValueError) as error:
+            raise CheckpointError(f"the channel in the checkpoint is damaged: {error}") from None
+        agents, kinds = len(channel.agents), len(channel.network)
+        if channel.counts.shape != (agents, kinds) or len(channel.tables) != agents:
+            raise CheckpointError("the channel in the checkpoint has parts of unequal length")
+        return channel
+
+
+class FittedActuator(Actuator):
+    """Actuator that delays, loses and refuses commands as a fitted channel does.
+
+    Args:
+        channel: The fitted channel.
+        timing: Clearance of the simulation's signals.
+        interval_s: Seconds between two decisions.
+    """
+
+    def __init__(self, channel: CommandChannel, timing: SignalTiming, interval_s: float) -> None:
+        self._channel = channel
+        self._timing = timing
+        self._interval_s = interval_s
+        self._given: deque[Commands] = deque(maxlen=len(channel.network) - 1)
+        self._chances = channel.weights.cumsum(1)
+        self._generator = numpy_generator(0)
+
+    def reset(self, seed: int) -> None:
+        """Draw the weights of the episode."""
+        self._given.clear()
+        self._chances = self._channel.drawn(seed).cumsum(1)
+        self._generator = numpy_generator(seed, "channel", "commands")
+
+    def send(self, commands: Commands) -> Commands:
+        """Return the command that arrives at each intersection; None where nothing arrives."""
+        self._given.appendleft(list(commands))
+        draws = self._generator.random((len(commands), 1))
+        kinds = (draws > self._chances[:, :-1]).sum(1)
+        return [
+            self._given[kind][place] if kind < len(self._given) else None
+            for place, kind in enumerate(kinds.tolist())
+        ]
+
+    @property
+    def under_way(self) -> Sequence[Commands]:
+        """The commands that have not arrived at the most frequent delay, the oldest first."""
+        return list(self._given)[: self._channel.lag][::-1]
+
+    def restrict(self, mask: NDArray[np.int8], place: int, state: SignalState) -> None:
+        """Forbid the phases that the table forbids; a mask never becomes empty."""
+        table = self._channel.tables[place]
+        begun_s = state.elapsed_s + (0.0 if state.clearing else self._timing.clearance_s)
+        age = min(max(1, round(begun_s / self._interval_s)), len(table) - 1)
+        allowed = table[age, state.phase]
+        if (mask * allowed).any():
+            mask *= allowed
+
+
+def fit_channel(log: TransitionLog, config: ChannelConfig | None = None) -> CommandChannel:
+    """Fit the channel to a log of the street.
+
+    Args:
+        log: Transitions with the asked and the executed phases; with masks, if there are any.
+        config: Numbers of the method.
+
+    Raises:
+        LogError: An agent has fewer than two rows.
+    """
+    config = config or ChannelConfig()
+    courses = [
+        _Course.of(log.transitions(agent), layout, config.ages)
+        for agent, layout in log.provenance.layouts.items()
+    ]
+    masked = all(course.mask is not None for course in courses)
+    tables = [course.table_of_masks(0) if masked else course.free_table() for course in courses]
+    network, counts = _mixture(courses, tables, config)
+    lag = int(network[:-1].argmax())
+    if masked and lag:  # a mask is of the state in which the command will arrive
+        tables = [course.table_of_masks(lag) for course in courses]
+    elif not masked:
+        obeyed = float(network[lag])
+        tables = [course.table_of_refusals(lag, obeyed, config) for course in courses]
+    if not masked or lag:
+        network, counts = _mixture(courses, tables, config)
+    return CommandChannel(tuple(log.agents), network, counts, tuple(tables), config.pull)
+
+
+@dataclass(frozen=True)
+class _Course:
+    """Decisions of one intersection in order; n rows.
+
+    Attributes:
+        asked: ``(most_lag + 1, n)``, commands at this decision and at earlier ones; -1 before the
+            episode.
+        running: Phase that runs at the decision, ``(n,)``.
+        age: Decisions since it began, ``(n,)``; 0 if it began before the episode.
+        executed: Phase that runs afterwards, ``(n,)``.
+        mask: Permitted phases, ``(n, phases)``; None if the log has none.
+        left: Decisions until the end of the episode, ``(n,)``.
+        phases: Number of phases.
+        ages: Number of ages of the tables.
+    """
+
+    asked: NDArray[np.int64]
+    running: NDArray[np.int64]
+    age: NDArray[np.int64]
+    executed: NDArray[np.int64]
+    mask: NDArray[np.bool_] | None
+    left: NDArray[np.int64]
+    phases: int
+    ages: int
+
+    @classmethod
+    def of(cls, rows: Transitions, layout: AgentLayout, ages: int) -> _Course:
+        """Read the rows of an agent."""
+        count = len(rows)
+        if count < 2:
+            raise LogError("a channel needs a log with two decisions or more of every agent")
+        shown = rows.observation[:, layout.features : layout.features + layout.phases]
+        running = shown.argmax(1).astype(np.int64)
+        goes_on = (np.diff(rows.episode) == 0) & (np.diff(rows.step) == 1)
+        asked = np.full((ChannelConfig.most_lag + 1, count), -1, dtype=np.int64)
+        asked[0] = rows.action
+        for lag in range(1, len(asked)):
+            asked[lag, 1:] = np.where(goes_on, asked[lag - 1, :-1], -1)
+        age, left = np.zeros(count, dtype=np.int64), np.zeros(count, dtype=np.int64)
+        for t in range(1, count):
+            if goes_on[t - 1]:
+                same = running[t] == running[t - 1]
+                age[t] = (age[t - 1] + (age[t - 1] > 0)) if same else 1
+        for t in range(count - 2, -1, -1):
+            left[t] = left[t + 1] + 1 if goes_on[t] else 0
+        mask = rows.mask if rows.mask.shape[1] else None
+        age = np.minimum(age, ages - 1)
+        return cls(asked, running, age, rows.executed, mask, left, layout.phases, ages)
+
+    def free_table(self) -> Table:
+        """Return a table that permits everything."""
+        return np.ones((self.ages, self.phases, self.phases), dtype=np.bool_)
+
+    def table_of_masks(self, lag: int) -> Table:
+        """Return the table that the masks show, for commands that arrive `lag` decisions later."""
+        assert self.mask is not None
+        rows = np.flatnonzero(self.left >= lag)
+        states = rows + lag
+        rows, states = rows[self.age[states] > 0], states[self.age[states] > 0]
+        shape = (self.ages, self.phases, self.phases)
+        permitted, seen = np.zeros(shape), np.zeros(shape)
+        cells = self.age[states], self.running[states]
+        cell = np.ravel_multi_index(cells, shape[:2])
+        for phase in range(self.phases):
+            allowed = self.mask[rows, phase].astype(float)
+            permitted[:, :, phase] = _tally(cell, shape[:2], allowed)
+            seen[:, :, phase] = _tally(cell, shape[:2])
+        return _filled(permitted >= 0.5 * seen, seen[:, :, 0] > 0)
+
+    def table_of_refusals(self, lag: int, usual: float, config: ChannelConfig) -> Table:
+        """Return the table that refused commands show, for a log without masks.
+
+        A phase is forbidden if commands for it were hardly ever obeyed: after this running phase,
+        or at this age. A green must end at an age at which commands to keep it were refused.
+
+        Args:
+            lag: Delay of commands, in decisions.
+            usual: Usual chance that a command is obeyed.
+            config: Numbers of the method.
+        """
+        command = self.asked[lag]
+        valid = (command >= 0) & (self.age > 0)
+        changes = valid & (command != self.running)
+        stays = valid & (command == self.running)
+        obeyed = self.executed == command
+        shape = (self.phases, self.phases)
+        pairs = np.ravel_multi_index((self.running[changes], command[changes]), shape)
+        pair = _tally(pairs, shape), _tally(pairs, shape, obeyed[changes].astype(float))
+        by_age = [
+            (
+                _tally(self.age[rows], (self.ages,)),
+                _tally(self.age[rows], (self.ages,), obeyed[rows].astype(float)),
+            )
+            for rows in (changes, stays)
+        ]
+
+        def refused(numbers: tuple[Floats, Floats]) -> NDArray[np.bool_]:
+            enough = numbers[0] >= config.least_rows
+            return enough & (numbers[1] < config.refused * usual * numbers[0])
+
+        table = self.free_table()
+        table[:, refused(pair)] = False
+        other = ~np.eye(self.phases, dtype=np.bool_)
+        table[np.ix_(refused(by_age[0]))] &= ~other
+        must_end = np.maximum.accumulate(refused(by_age[1]))
+        table[must_end] &= other
+        return table
+
+    def obeyed(self, arriving: NDArray[np.int64], table: Table) -> NDArray[np.int64]:
+        """Return the phases that run if these commands arrive (-1: none), ``(n,)``."""
+        age = np.maximum(self.age, 1)
+        allowed = table[age, self.running]
+        allowed[self.age == 0] = True  # the age of a green from before the episode is not known
+        rows = np.arange(len(arriving))
+        taken = (arriving >= 0) & allowed[rows, np.maximum(arriving, 0)]
+        after = np.arange(self.phases) > self.running[:, None]
+        later, first = (allowed & after).argmax(1), allowed.argmax(1)
+        following = np.where((allowed & after).any(1), later, first)
+        stays = np.where(allowed[rows, self.running], self.running, following)
+        return np.where(taken, arriving, stays)
+
+
+def _tally(
+    cells: NDArray[np.int64], shape: tuple[int, ...], weights: Floats | None = None
+) -> Floats:
+    """Return the sum of weights (or the number of rows) in each cell, in this shape."""
+    size = int(np.prod(shape))
+    return np.bincount(cells, weights, size).astype(np.float64).reshape(shape)
+
+
+def _filled(table: Table, seen: NDArray[np.bool_]) -> Table:
+    """Return the table with ages that were not seen filled in from the nearest younger one.
+
+    Without a younger age the nearest older one serves; a phase that was never seen is free.
+    """
+    filled = table.copy()
+    for phase in range(table.shape[1]):
+        known = np.flatnonzero(seen[:, phase])
+        if not len(known):
+            filled[:, phase] = True
+            continue
+        for age in range(len(table)):
+            if not seen[age, phase]:
+                younger = known[known < age]
+                filled[age, phase] = table[younger[-1] if len(younger) else known[0], phase]
+    return filled
+
+
+def _mixture(
+    courses: Sequence[_Course], tables: Sequence[Table], config: ChannelConfig
+) -> tuple[Floats, Floats]:
+    """Find the weights of lags and of lost commands by expectation-maximisation.
+
+    Returns:
+        The network's weights, and expected numbers of decisions of each kind per intersection.
+    """
+    kinds = config.most_lag + 2
+    explains: list[NDArray[np.bool_]] = []
+    for course, table in zip(courses, tables, strict=True):
+        nothing = np.full_like(course.running, -1)
+        arriving = [*course.asked[: kinds - 1], nothing]
+        known = course.asked[kinds - 2] >= 0  # so that every lag can explain the row
+        same = np.stack([course.obeyed(a, table) == course.executed for a in arriving])
+        use = known & same.any(0) & ~same.all(0)  # other rows tell nothing of the weights
+        explains.append(same[:, use])
+    weights = np.full(kinds, 1.0 / kinds)
+    if not any(rows.shape[1] for rows in explains):
+        weights = np.eye(kinds)[0]
+    for support in (np.ones(kinds, dtype=np.bool_), None):
+        if support is None:  # again without what are coincidences
+            support = weights >= config.least_share
+        weights = np.where(support, np.maximum(weights, 1e-12), 0.0)
+        weights /= weights.sum()
+        for _ in range(200):
+            weights, before = _shares(explains, weights).sum(0), weights
+            total = weights.sum()
+            weights = weights / total if total else before
+            if np.abs(weights - before).max() < 1e-6:
+                break
+    return weights, _shares(explains, weights)
+
+
+def _shares(explains: Sequence[NDArray[np.bool_]], weights: Floats) -> Floats:
+    """Return the expected number of decisions of each kind, ``(agents, kinds)`` (the E step)."""
+    found = np.zeros((len(explains), len(weights)))
+    for row, same in zip(found, explains, strict=True):
+        chances = same * weights[:, None]
+        total = chances.sum(0)
+        row += (chances[:, total > 0] / total[total > 0]).sum(1)
+    return found

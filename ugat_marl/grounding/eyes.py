@@ -1,0 +1,377 @@
+"""Eyes of the street: dead lanes, short zones, noise, lag and dropout of detectors, from logs.
+
+Counts on a lane obey rules that no traffic breaks: nobody leaves while the light is red, a queue
+falls when it gets green, and counts are whole numbers. Where the street's counts break a rule that
+those of the simulation keep, a detector is at fault. Each fault is estimated from its own rule:
+
+- dead lane: it reports 0 in a whole episode, although vehicles arrive there in the simulation;
+- zone: no count is ever above n, although counts above n are common in the simulation;
+- noise: counts fall in red, as far and as often as those of the simulation do with the same noise;
+- coarse counts: all counts are multiples of a number;
+- lag: counts fall so many decisions after the green, and not with it;
+- dropout: a count stays the same while a long queue is served.
+"""
+
+from __future__ import annotations
+
+import itertools
+from collections.abc import Mapping, Sequence
+from dataclasses import asdict, dataclass
+from typing import Any, ClassVar
+
+import numpy as np
+
+from ugat_marl.data import TransitionLog
+from ugat_marl.effects import (
+    ControllerPart,
+    CountingError,
+    CountingNoise,
+    DetectionZone,
+    LostReadings,
+    ObservationDelay,
+    QuantisedCounts,
+    Reading,
+    Sensor,
+    Stage,
+)
+from ugat_marl.errors import CheckpointError
+from ugat_marl.grounding.summaries import Floats, LaneRows, LaneView
+from ugat_marl.scenarios import Network
+from ugat_marl.seeding import numpy_generator
+
+LEVELS = (0.0, 0.5, 2.0, 5.0, 9.0, np.inf)
+"""Limits of the classes of counts in which falls in red are compared."""
+VEHICLE_M = 7.5
+"""Length of a standing vehicle with its gap, in m."""
+
+
+@dataclass(frozen=True)
+class EyesConfig:
+    """Numbers of the method.
+
+    Attributes:
+        surprise: Smallest ratio of expected to tolerated decisions before a fault is found: so many
+            decisions of the simulation would have broken the street's limit. Halved, a quiet hour
+            looks like a zone or a dead lane.
+        together: Decisions that count as one observation, because queues change slowly.
+        pull: Episodes that the network's share of dead lanes counts for at each lane.
+        queue: Vehicles on a lane from which its count must fall when it has green.
+        fraction: Distance from a whole number, in vehicles, above which a count has noise.
+        most_lag: Longest lag, in decisions.
+        absolute: Standard deviations of the absolute error that are tried, in vehicles.
+        relative: Standard deviations of the relative error that are tried.
+        long_queue: Vehicles on a lane that is served without pause.
+        least_served: Fewest decisions with a long queue from which lost readings are estimated.
+        least_stays: Fewest of them in which the count stayed.
+        least_lost: Smallest share of lost readings that counts as found.
+    """
+
+    surprise: float = 8.0
+    together: float = 10.0
+    pull: float = 2.0
+    queue: float = 4.0
+    fraction: float = 0.02
+    most_lag: int = 4
+    absolute: tuple[float, ...] = (0.0, 1.0, 2.0, 3.0, 4.0, 5.0, 7.0, 10.0, 14.0, 20.0)
+    relative: tuple[float, ...] = (0.0, 0.03, 0.06, 0.1, 0.15, 0.2, 0.3)
+    long_queue: float = 7.0
+    least_served: int = 20
+    least_stays: int = 5
+    least_lost: float = 0.08
+
+
+@dataclass(frozen=True)
+class Eyes:
+    """Fitted faults of detectors.
+
+    Attributes:
+        dead: Expected chance that a lane is dead in an episode, ``(lanes,)``.
+        zone_m: Shortest and longest zone that the counts allow, in m; (0, 0) for whole lanes.
+        absolute: Standard deviation of an error that does not depend on the count, in vehicles.
+        relative: Standard deviation of an error relative to the count.
+        lag: Decisions by which counts are late.
+        lost: Share of readings that are lost.
+        step: Number of which all counts are multiples, in vehicles; 0 for whole numbers.
+    """
+
+    dead: Floats
+    zone_m: tuple[float, float]
+    absolute: float
+    relative: float
+    lag: int
+    lost: float
+    step: float = 0.0
+
+    @property
+    def changes(self) -> bool:
+        """True if some fault was found."""
+        faults = (self.zone_m[1], self.absolute, self.relative, self.lag, self.lost, self.step)
+        return bool(self.dead.any()) or any(faults)
+
+    def parts(self, seed: int, lanes: Sequence[str], interval_s: float) -> list[ControllerPart]:
+        """Return the faults of an episode, drawn where they are not certain.
+
+        Args:
+            seed: Seed of the episode.
+            lanes: Ids of the lanes.
+            interval_s: Seconds from one decision to the next.
+        """
+        generator = numpy_generator(seed, "eyes")
+        found: list[ControllerPart] = []
+        if self.zone_m[1]:
+            found.append(DetectionZone(float(generator.uniform(*self.zone_m))))
+        if self.absolute:
+            found.append(CountingError(self.absolute))
+        if self.relative:
+            found.append(CountingNoise(self.relative))
+        if self.lag:
+            found.append(ObservationDelay(self.lag * interval_s))
+        if self.lost:
+            found.append(LostReadings(self.lost))
+        if self.step:
+            found.append(QuantisedCounts(self.step))
+        dead = generator.random(len(lanes)) < self.dead
+        if dead.any():
+            found.append(DeadLanes([lane for lane, gone in zip(lanes, dead, strict=True) if gone]))
+        return found
+
+    def describe(self) -> str:
+        """Return what was found in one line."""
+        words = [
+            f"{self.dead.sum():.1f} of {len(self.dead)} lanes dead" if self.dead.any() else "",
+            f"zone {self.zone_m[0]:.0f} to {self.zone_m[1]:.0f} m" if self.zone_m[1] else "",
+            f"error {self.absolute:.1f} veh" if self.absolute else "",
+            f"error {100 * self.relative:.0f} %" if self.relative else "",
+            f"{self.lag} decisions late" if self.lag else "",
+            f"{100 * self.lost:.0f} % lost" if self.lost else "",
+            f"steps of {self.step:g} veh" if self.step else "",
+        ]
+        return "detectors: " + (", ".join(filter(None, words)) or "no fault found")
+
+    def state_dict(self) -> dict[str, Any]:
+        """Return the faults as plain values."""
+        return {**asdict(self), "dead": self.dead.tolist(), "zone_m": list(self.zone_m)}
+
+    @classmethod
+    def from_state(cls, state: Mapping[str, Any]) -> Eyes:
+        """Restore `state_dict`.
+
+        Raises:
+            CheckpointError: A value is missing.
+        """
+        try:
+            low_m, high_m = map(float, state["zone_m"])
+            return cls(
+                np.array(state["dead"], dtype=np.float64),
+                (low_m, high_m),
+                float(state["absolute"]),
+                float(state["relative"]),
+                int(state["lag"]),
+                float(state["lost"]),
+                float(state["step"]),
+            )
+        except (KeyError, TypeError, ValueError) as error:
+            raise CheckpointError(f"the eyes in the checkpoint are damaged: {error}") from None
+
+
+class DeadLanes(ControllerPart):
+    """Detectors of given lanes that report 0."""
+
+    name: ClassVar[str] = "dead lanes"
+
+    def __init__(self, lanes: Sequence[str]) -> None:
+        self._lanes = tuple(lanes)
+
+    def sensor(self, network: Network, decision_interval_s: float) -> Sensor:
+        """Make a sensor with these dead detectors."""
+        del decision_interval_s
+        table = network.lane_table()
+        alive = np.ones(len(table.ids))
+        alive[table.indices(self._lanes)] = 0.0
+        return _DeadSensor(alive)
+
+
+class _DeadSensor(Sensor):
+    stage = Stage.FAILURE
+
+    def __init__(self, alive: Floats) -> None:
+        self._alive = alive
+
+    def read(self, reading: Reading) -> Reading:
+        left = reading.mean_left
+        left = left * self._alive if len(left) else left
+        return Reading(reading.counts * self._alive, reading.near, left)
+
+
+def fit_eyes(
+    street: TransitionLog,
+    simulated: TransitionLog,
+    view: LaneView,
+    config: EyesConfig | None = None,
+) -> Eyes:
+    """Fit the faults of detectors to a log of the street.
+
+    Args:
+        street: Transitions of the street.
+        simulated: Transitions of the same policy in the simulation, whose detectors are perfect.
+        view: Lanes of the network.
+        config: Numbers of the method.
+    """
+    config = config or EyesConfig()
+    rows, perfect = view.rows(street), view.rows(simulated)
+    lag = _lag(rows, config)
+    noisy, step = _fraction(rows) > config.fraction, _step(rows)
+    absolute, relative = _noise(rows, perfect, config) if noisy else (0.0, 0.0)
+    return Eyes(
+        dead=_dead(rows, perfect, config),
+        zone_m=_zone(rows, perfect, absolute, config),
+        absolute=absolute,
+        relative=relative,
+        lag=lag,
+        lost=0.0 if noisy or step else _lost(rows, config),
+        step=step,
+    )
+
+
+def _dead(rows: Sequence[LaneRows], perfect: Sequence[LaneRows], config: EyesConfig) -> Floats:
+    """Return each lane's expected chance to be dead in an episode."""
+    dead, episodes = np.zeros(len(rows)), np.zeros(len(rows))
+    for place, (own, usual) in enumerate(zip(rows, perfect, strict=True)):
+        busy = float((usual.before > 0).mean()) if len(usual.before) else 0.0
+        for episode in np.unique(own.episode):
+            counts = own.before[own.episode == episode]
+            if busy * len(counts) / config.together < config.surprise:
+                continue  # nobody might have come
+            episodes[place] += 1
+            dead[place] += not counts.any()
+    share = dead.sum() / max(episodes.sum(), 1.0)
+    return (dead + config.pull * share) / np.maximum(episodes + config.pull, 1.0)
+
+
+def _zone(
+    rows: Sequence[LaneRows],
+    perfect: Sequence[LaneRows],
+    noise: float,
+    config: EyesConfig,
+) -> tuple[float, float]:
+    """Return the shortest and longest zone in m; (0, 0) if counts are not cut."""
+    alive = [place for place, own in enumerate(rows) if own.before.any()]
+    if not alive:
+        return 0.0, 0.0
+    counts = np.concatenate([rows[place].before for place in alive])
+    usual = np.concatenate([perfect[place].before for place in alive])
+    most = float(np.quantile(counts, 0.998)) - 2.0 * noise
+    cut = max(1.0, round(most))
+    beyond = float((usual > cut + 0.5).mean()) * len(counts)
+    if beyond / config.together < config.surprise * len(alive):
+        return 0.0, 0.0
+    return VEHICLE_M * max(cut - 1.0, 0.5), VEHICLE_M * (cut + 0.5)
+
+
+def _fraction(rows: Sequence[LaneRows]) -> float:
+    """Return the mean distance of counts from whole numbers."""
+    counts = np.concatenate([own.before for own in rows])
+    return float(np.abs(counts - np.round(counts)).mean())
+
+
+def _noise(
+    rows: Sequence[LaneRows], perfect: Sequence[LaneRows], config: EyesConfig
+) -> tuple[float, float]:
+    """Return the absolute and relative standard deviation of counting errors.
+
+    Both kinds of noise are added to the simulation's counts on a grid. The pair whose falls in red
+    are most like the street's is the answer.
+    """
+    generator = numpy_generator(0, "eyes", "noise")
+    before, after = _in_red(perfect)
+    if not len(before):
+        return 0.0, 0.0
+    drawn = generator.standard_normal((2, 2, len(before)))
+    wanted = _falls(*_in_red(rows))
+    best, answer = np.inf, (0.0, 0.0)
+    for absolute in config.absolute:
+        for relative in config.relative:
+            noisy = [
+                np.maximum(counts * np.maximum(1.0 + relative * z[0], 0.0) + absolute * z[1], 0.0)
+                for counts, z in zip((before, after), drawn, strict=True)
+            ]
+            misfit = float(((_falls(*noisy) - wanted) ** 2).sum())
+            if misfit < best:
+                best, answer = misfit, (absolute, relative)
+    return answer
+
+
+def _in_red(rows: Sequence[LaneRows]) -> tuple[Floats, Floats]:
+    """Return counts before and after the decisions in which a lane has red; dead lanes are out."""
+    alive = [own for own in rows if own.before.any()] or list(rows)
+    red = [~own.had & ~own.has for own in alive]
+    before = np.concatenate([own.before[use] for own, use in zip(alive, red, strict=True)])
+    after = np.concatenate([own.after[use] for own, use in zip(alive, red, strict=True)])
+    return before, after
+
+
+def _falls(before: Floats, after: Floats) -> Floats:
+    """Return root mean squares of falls by classes of the count, and the share of zeros."""
+    fall = np.maximum(before - after, 0.0) ** 2
+    found: list[float] = []
+    for low, high in itertools.pairwise(LEVELS):
+        use = (before >= low) & (before < high)
+        found.append(float(np.sqrt(fall[use].mean())) if use.sum() > 2 else 0.0)
+    return np.array([*found, float((before == 0).mean())])
+
+
+def _step(rows: Sequence[LaneRows]) -> float:
+    """Return the number of which all counts are multiples; 0 if it is 1 or there is none."""
+    counts = np.concatenate([own.before for own in rows])
+    counts = np.unique(counts[counts > 0])
+    if len(counts) < 2 or np.abs(counts - np.round(counts)).max() > 0:
+        return 0.0
+    step = float(np.gcd.reduce(counts.astype(np.int64)))
+    return step if step > 1 else 0.0
+
+
+def _lag(rows: Sequence[LaneRows], config: EyesConfig) -> int:
+    """Return the number of decisions after which counts fall with a green.
+
+    For every lag, the fall of counts is regressed on the green so many decisions before; the lag
+    that explains most of it is the answer.
+    """
+    gains = np.zeros(config.most_lag + 1)
+    for own in rows:
+        goes_on = (np.diff(own.episode) == 0) & (np.diff(own.step) == 1)
+        fall = own.before - own.after
+        green = own.has.astype(float)
+        known = own.before >= config.queue
+        for lag in range(len(gains)):
+            if lag:
+                green = np.concatenate([[np.nan], np.where(goes_on, green[:-1], np.nan)])
+            use = known & ~np.isnan(green)
+            with_green, without = fall[use & (green > 0)], fall[use & (green == 0)]
+            if len(with_green) > 2 and len(without) > 2:
+                gains[lag] += (with_green.mean() - without.mean()) * np.sqrt(use.sum())
+    return int(gains.argmax()) if gains.max() > 0 else 0
+
+
+def _lost(rows: Sequence[LaneRows], config: EyesConfig) -> float:
+    """Return the share of lost readings, from counts that stay while a long queue is served.
+
+    After a lost reading the count falls by what left in two decisions; after a decision in which
+    nobody left it falls as usual. With r the ratio of the two falls, r - 1 of the stays are lost.
+    """
+    stays: list[bool] = []
+    after_stay: list[float] = []
+    after_fall: list[float] = []
+    for own in rows:
+        served = own.had & own.has & (own.before >= config.long_queue)
+        follows = served[:-1] & served[1:] & (np.diff(own.step) == 1)
+        fall = own.before - own.after
+        stayed = follows & (fall[:-1] == 0)
+        stays += (fall[served] == 0).tolist()
+        after_stay += fall[1:][stayed].tolist()
+        after_fall += fall[1:][follows & (fall[:-1] > 0)].tolist()
+    if len(stays) < config.least_served or len(after_stay) < config.least_stays:
+        return 0.0
+    usual = float(np.mean(after_fall)) if after_fall else 0.0
+    ratio = float(np.mean(after_stay)) / usual if usual > 0 else 1.0
+    share = float(np.mean(stays)) * min(max(ratio - 1.0, 0.0), 1.0)
+    return share if share >= config.least_lost else 0.0

@@ -1,0 +1,340 @@
+"""Posterior over worlds: effects and the service of lanes that explain a log of the street.
+
+Worlds are drawn from a prior over the effects of the library and over the green that single lanes
+do not use. The policy of the log acts in each. A regression from the statistics of these logs
+(`summaries`) to the drawn values, and its residuals on worlds left out, give draws of the worlds
+that the street's log leaves possible (`regression`).
+
+All values are estimated together: one residual holds the errors of all effects and lanes of one
+simulated world. Lanes share the regression and the network's statistics, so where a lane's log says
+little its draws follow the network.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any, ClassVar
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ugat_marl.effects import EVERYWHERE, ControllerPart, Effect, known_effects
+from ugat_marl.errors import CheckpointError, UnknownNameError
+from ugat_marl.grounding.regression import Design, Floats, kernel, left_out, ridge
+from ugat_marl.grounding.summaries import Summary
+from ugat_marl.seeding import numpy_generator
+
+
+@dataclass(frozen=True)
+class Prior:
+    """Prior of an effect with one number for the whole network.
+
+    Attributes:
+        name: Name of the effect.
+        low: Smallest value, in the effect's unit.
+        high: Largest value.
+        nominal: Value that changes nothing.
+        group: Effects of a group are present or absent together: vehicles differ as a whole.
+        chance: Chance that the group is present; otherwise its values are nominal.
+    """
+
+    name: str
+    low: float
+    high: float
+    nominal: float
+    group: str = ""
+    chance: float = 0.35
+
+
+LIBRARY = (
+    Prior("acceleration", 0.4, 3.0, 2.6, "vehicles", 0.65),
+    Prior("deceleration", 1.2, 5.0, 4.5, "vehicles", 0.65),
+    Prior("emergency_deceleration", 2.0, 9.0, 9.0, "vehicles", 0.65),
+    Prior("startup_delay", 0.0, 1.0, 0.0, "vehicles", 0.65),
+    Prior("headway", 0.8, 2.2, 1.0),
+    Prior("desired_speed", 0.6, 1.1, 1.0),
+    Prior("demand_level", 0.8, 1.25, 1.0),
+)
+"""Effects whose values are estimated, with wide ranges around those of V1 to V4."""
+
+NO_SOFTER = ("emergency_deceleration", "deceleration")
+"""An emergency deceleration is at least the usual deceleration."""
+
+
+@dataclass(frozen=True)
+class ServicePrior:
+    """Prior of the green that single lanes do not use, see `ugat_marl.effects.LaneService`.
+
+    Attributes:
+        chance: Chance that the network's mean is above 0.
+        high_s: Largest mean, in s.
+        unequal: Chance that lanes differ.
+    """
+
+    chance: float
+    high_s: float
+    unequal: float = 0.5
+
+
+SERVICE = (ServicePrior(0.5, 5.0), ServicePrior(0.35, 3.0))
+"""Priors of the red at the beginning of a green, and of the red in each further decision."""
+
+
+@dataclass(frozen=True)
+class Values:
+    """Values of one world.
+
+    Attributes:
+        effects: ``(effects,)``, in the order of the library.
+        service_s: ``(lanes, 2)``, red at the beginning of greens and in each further decision.
+    """
+
+    effects: Floats
+    service_s: Floats
+
+
+@dataclass(frozen=True)
+class Worlds:
+    """Prior of the worlds of a network.
+
+    Attributes:
+        library: Effects with their priors.
+        lanes: Ids of the lanes.
+        service: True to estimate the service of lanes.
+    """
+
+    library: tuple[Prior, ...]
+    lanes: tuple[str, ...]
+    service: bool = True
+
+    @classmethod
+    def of(
+        cls,
+        lanes: Sequence[str],
+        nominal: Mapping[str, float],
+        without: Sequence[str] = (),
+        service: bool = True,
+    ) -> Worlds:
+        """Return the prior of a network.
+
+        Args:
+            lanes: Ids of the lanes.
+            nominal: Effect to its value in the simulation, where it differs from the library's.
+            without: Effects to leave out.
+            service: True to estimate the service of lanes.
+
+        Raises:
+            UnknownNameError: An effect to leave out is not in the library.
+        """
+        names = [item.name for item in LIBRARY]
+        for name in without:
+            if name not in names:
+                raise UnknownNameError("effect of the library", name, names)
+        library = tuple(
+            Prior(x.name, x.low, x.high, nominal.get(x.name, x.nominal), x.group, x.chance)
+            for x in LIBRARY
+            if x.name not in without
+        )
+        return cls(library, tuple(lanes), service)
+
+    def draw(self, seed: int) -> Values:
+        """Draw a world from the prior."""
+        generator = numpy_generator(seed, "worlds", "prior")
+        chances = {item.group or item.name: item.chance for item in self.library}
+        there = {name: generator.random() < chance for name, chance in chances.items()}
+        effects = np.array(
+            [
+                generator.uniform(x.low, x.high) if there[x.group or x.name] else x.nominal
+                for x in self.library
+            ]
+        )
+        service_s = np.zeros((len(self.lanes), len(SERVICE)))
+        for column, prior in zip(service_s.T, SERVICE, strict=True):
+            mean = (
+                generator.uniform(0.0, prior.high_s) if generator.random() < prior.chance else 0.0
+            )
+            unequal = generator.random() < prior.unequal
+            spread = generator.uniform(0.0, prior.high_s / 2) if unequal else 0.0
+            column += mean + spread * generator.standard_normal(len(self.lanes))
+        return self.clipped(Values(effects, service_s * self.service))
+
+    def clipped(self, values: Values) -> Values:
+        """Return the values within their ranges."""
+        low, high = (np.array([getattr(x, side) for x in self.library]) for side in ("low", "high"))
+        effects = np.clip(values.effects, low, high) if self.library else values.effects
+        names = [item.name for item in self.library]
+        if all(name in names for name in NO_SOFTER):
+            hard, soft = (names.index(name) for name in NO_SOFTER)
+            effects[hard] = max(effects[hard], effects[soft])
+        most_s = np.array([2.0 * prior.high_s for prior in SERVICE])
+        return Values(effects, np.clip(values.service_s, 0.0, most_s))
+
+    def effects(self, values: Values) -> tuple[Effect, ...]:
+        """Return the effects of a world that change something; those on demand come first."""
+        made: list[Effect] = []
+        for item, value in zip(self.library, values.effects, strict=True):
+            if abs(value - item.nominal) > 1e-3:
+                kind = known_effects()[item.name]
+                given = dict.fromkeys(kind.texts, EVERYWHERE) | {
+                    next(iter(kind.ranges)): round(float(value), 4)
+                }
+                made.append(kind(**given))
+        return tuple(sorted(made, key=lambda effect: effect.name != "demand_level"))
+
+
+class FittedService(ControllerPart):
+    """Red in the greens of single lanes, as a change of an environment.
+
+    Args:
+        lanes: Ids of the lanes.
+        service_s: ``(lanes, 2)``, as in `Values`.
+    """
+
+    name: ClassVar[str] = "fitted service"
+
+    def __init__(self, lanes: Sequence[str], service_s: Floats) -> None:
+        self._red = {
+            lane: (round(begin, 2), round(each, 2))
+            for lane, (begin, each) in zip(lanes, service_s.tolist(), strict=True)
+            if begin >= 0.01 or each >= 0.01
+        }
+
+    def service(self) -> Mapping[str, tuple[float, float]]:
+        """Return lane to red in its greens, in s: at their beginning, and in each decision."""
+        return self._red
+
+
+@dataclass(frozen=True)
+class Simulated:
+    """A simulated world and the statistics of its log."""
+
+    values: Values
+    summary: Summary
+
+
+@dataclass(frozen=True)
+class Posterior:
+    """Draws of the worlds that the street's log leaves possible.
+
+    Attributes:
+        worlds: The prior.
+        effects: Regression's answer for the street, ``(effects,)``.
+        service_s: The same for the lanes, ``(lanes, 2)``.
+        effect_errors: Residuals of the simulated worlds, ``(n, effects)``.
+        service_errors_s: The same for the lanes, ``(n, lanes, 2)``.
+        chances: Weights of the residuals, ``(n,)``.
+    """
+
+    worlds: Worlds
+    effects: Floats
+    service_s: Floats
+    effect_errors: Floats
+    service_errors_s: Floats
+    chances: Floats
+
+    @classmethod
+    def fit(cls, worlds: Worlds, simulated: Sequence[Simulated], street: Summary) -> Posterior:
+        """Fit the regression to simulated worlds and apply it to the street.
+
+        Args:
+            worlds: The prior.
+            simulated: At least ten simulated worlds.
+            street: Statistics of the street's log.
+        """
+        number, lanes = len(simulated), len(worlds.lanes)
+        network = np.stack([item.summary.network for item in simulated])
+        design = Design.of(network)
+        x, x_street = design.inputs(network), design.inputs(street.network[None])
+        effects = np.stack([item.values.effects for item in simulated])
+        service_s = np.stack([item.values.service_s for item in simulated])
+        mean_s = service_s.mean(1)
+        wanted = np.concatenate([effects, mean_s], axis=1)
+        predicted, penalty = left_out(x, wanted, np.arange(number))
+        answer = (x_street @ ridge(x, wanted, penalty))[0]
+        errors = wanted - predicted
+
+        # Lanes: their distance from the network's mean, from that of their statistics.
+        unlike = np.stack([s.summary.values - s.summary.network for s in simulated])
+        usual = np.stack([_mean(unlike[:, lane]) for lane in range(lanes)])
+        rows = (unlike - usual).reshape(number * lanes, -1)
+        own = Design.of(rows)
+        of_world = np.repeat(x[:, 1:], lanes, axis=0)
+        x_lane = np.concatenate([own.inputs(rows), of_world], axis=1)
+        offset_s = (service_s - mean_s[:, None]).reshape(number * lanes, -1)
+        found_s, lane_penalty = left_out(x_lane, offset_s, np.repeat(np.arange(number), lanes))
+        street_rows = own.inputs(street.values - street.network - usual)
+        x_street_lane = np.concatenate(
+            [street_rows, np.repeat(x_street[:, 1:], lanes, axis=0)], axis=1
+        )
+        answer_s = x_street_lane @ ridge(x_lane, offset_s, lane_penalty)
+        lane_errors = (offset_s - found_s).reshape(service_s.shape)
+        split = len(worlds.library)
+        return cls(
+            worlds,
+            answer[:split],
+            answer[split:] + answer_s,
+            errors[:, :split],
+            errors[:, None, split:] + lane_errors,
+            kernel(predicted, answer, errors),
+        )
+
+    def draw(self, seed: int) -> Values:
+        """Draw the values of a world."""
+        return self.drawn(numpy_generator(seed, "worlds", "posterior"))
+
+    def drawn(self, generator: np.random.Generator) -> Values:
+        """Draw the values of a world with a generator."""
+        row = int(generator.choice(len(self.chances), p=self.chances))
+        values = Values(
+            self.effects + self.effect_errors[row], self.service_s + self.service_errors_s[row]
+        )
+        return self.worlds.clipped(Values(values.effects, values.service_s * self.worlds.service))
+
+    def sample(self, number: int, seed: int = 0) -> tuple[Floats, Floats]:
+        """Return effects ``(number, effects)`` and service ``(number, lanes, 2)`` of draws."""
+        generator = numpy_generator(seed, "worlds", "sample")
+        drawn = [self.drawn(generator) for _ in range(number)]
+        return np.stack([v.effects for v in drawn]), np.stack([v.service_s for v in drawn])
+
+    def state_dict(self) -> dict[str, Any]:
+        """Return the posterior's numbers as plain values."""
+        return {name: getattr(self, name).tolist() for name in _NUMBERS}
+
+    @classmethod
+    def from_state(cls, worlds: Worlds, state: Mapping[str, Any]) -> Posterior:
+        """Restore `state_dict`.
+
+        Raises:
+            CheckpointError: A value is missing or of a wrong shape.
+        """
+        try:
+            parts: dict[str, NDArray[np.float64]]
+            parts = {name: np.array(state[name], dtype=np.float64) for name in _NUMBERS}
+        except (KeyError, TypeError, ValueError) as error:
+            raise CheckpointError(f"the worlds in the checkpoint are damaged: {error}") from None
+        number, effects, lanes = len(parts["chances"]), len(worlds.library), len(worlds.lanes)
+        shapes = {
+            "effects": (effects,),
+            "service_s": (lanes, 2),
+            "effect_errors": (number, effects),
+            "service_errors_s": (number, lanes, 2),
+            "chances": (number,),
+        }
+        for name, shape in shapes.items():
+            if parts[name].shape != shape:
+                raise CheckpointError(
+                    f"the worlds in the checkpoint are of another network or library: {name} is "
+                    f"{parts[name].shape}, expected {shape}"
+                )
+        return cls(worlds, **parts)
+
+
+_NUMBERS = ("effects", "service_s", "effect_errors", "service_errors_s", "chances")
+
+
+def _mean(rows: Floats) -> Floats:
+    """Return column means without NaN; 0 for a column without numbers."""
+    known = ~np.isnan(rows)
+    total = np.where(known, rows, 0.0).sum(0)
+    return total / np.maximum(known.sum(0), 1)

@@ -1,0 +1,397 @@
+"""Fitted street: the worlds that a log of the street leaves possible, to train a policy in.
+
+Where `PhaseTransform` and `TimedTransform` change single actions, this grounding changes the
+simulation: its command channel, its detectors, the service of its lanes and its effects. Each part
+is fitted from the transition log with its own uncertainty, and every training episode runs in
+another draw.
+
+    Input: policy pi, log D_real of pi, prior of worlds
+
+     1  fit the command channel to D_real (`channel`)
+     2  roll pi out in the simulation with this channel; fit the detectors (`eyes`)
+     3  for i = 1, ..., N: draw a world from the prior, roll pi out in it with channel and detectors
+     4  fit the posterior of worlds from the statistics of all logs (`posterior`)
+
+With no data this is domain randomisation; with much data it is the corrected simulation.
+"""
+
+from __future__ import annotations
+
+import copy
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from pettingzoo.utils import BaseParallelWrapper
+
+from ugat_marl.data import TransitionLog, read_checkpoint, write_checkpoint
+from ugat_marl.effects import ControllerPart, Domain, Effect
+from ugat_marl.envs import AgentSet, ResetResult, TrafficEnv, parallel_env
+from ugat_marl.errors import CheckpointError, OptionError, ScenarioError, UnknownNameError
+from ugat_marl.grounding.channel import ChannelConfig, CommandChannel, fit_channel
+from ugat_marl.grounding.eyes import Eyes, EyesConfig, fit_eyes
+from ugat_marl.grounding.posterior import FittedService, Posterior, Simulated, Worlds
+from ugat_marl.grounding.summaries import LaneView
+from ugat_marl.parallel import Stop, Workers, as_done, persistently
+from ugat_marl.policies import EpsilonGreedy, Policy, observer_of, roll_out, stop_callback
+from ugat_marl.scenarios import Scenario
+from ugat_marl.seeding import derive_seed, numpy_generator
+
+KIND = "street"
+"""Name of this kind of checkpoint, written into the file."""
+
+PARTS = ("channel", "eyes", "service", "effects")
+"""Parts of a street, each of which can be left out."""
+
+
+@dataclass(frozen=True)
+class StreetConfig:
+    """Settings of the fit of a street.
+
+    Attributes:
+        parts: Parts that are fitted.
+        simulations: N, worlds that are simulated for a posterior.
+        simulated_s: Length of an episode in such a world, in s.
+        without: Effects left out of the library.
+        channel: Numbers of the fit of the command channel.
+        eyes: Numbers of the fit of the detectors.
+    """
+
+    parts: tuple[str, ...] = PARTS
+    simulations: int = 160
+    simulated_s: float = 1800.0
+    without: tuple[str, ...] = ()
+    channel: ChannelConfig = field(default_factory=ChannelConfig)
+    eyes: EyesConfig = field(default_factory=EyesConfig)
+
+    def __post_init__(self) -> None:
+        object.__setattr__(self, "parts", tuple(self.parts))
+        object.__setattr__(self, "without", tuple(self.without))
+        for part in self.parts:
+            if part not in PARTS:
+                raise UnknownNameError("part of a street", part, PARTS)
+        if self.simulations < 20:
+            raise OptionError(f"simulations = {self.simulations}: must be at least 20")
+        if self.simulated_s <= 0:
+            raise OptionError(f"simulated_s = {self.simulated_s}: must be above 0")
+
+    @property
+    def simulates(self) -> bool:
+        """True if worlds are simulated."""
+        return "service" in self.parts or "effects" in self.parts
+
+
+@dataclass(frozen=True)
+class StreetWorld:
+    """One world: effects of the library, and changes of commands, detectors and greens."""
+
+    effects: tuple[Effect, ...] = ()
+    parts: tuple[ControllerPart, ...] = ()
+
+
+@dataclass(frozen=True)
+class FittedStreet:
+    """The fitted parts of a street; None for a part that was not fitted.
+
+    Attributes:
+        lanes: Ids of the lanes.
+        interval_s: Seconds from one decision to the next.
+        channel: The command channel.
+        eyes: The faults of detectors.
+        posterior: The worlds: effects, and service of lanes.
+    """
+
+    lanes: tuple[str, ...]
+    interval_s: float
+    channel: CommandChannel | None = None
+    eyes: Eyes | None = None
+    posterior: Posterior | None = None
+
+    @property
+    def commands(self) -> int:
+        """Number of own commands that a policy has to see; 0 for none."""
+        return 0 if self.channel is None else self.channel.memory
+
+    def world(self, seed: int) -> StreetWorld:
+        """Draw the world of an episode."""
+        parts: list[ControllerPart] = []
+        effects: tuple[Effect, ...] = ()
+        if self.channel is not None and self.channel.changes:
+            parts.append(self.channel)
+        if self.eyes is not None:
+            parts += self.eyes.parts(seed, self.lanes, self.interval_s)
+        if self.posterior is not None:
+            values = self.posterior.draw(seed)
+            effects = self.posterior.worlds.effects(values)
+            parts.append(FittedService(self.lanes, values.service_s))
+        return StreetWorld(effects, tuple(parts))
+
+    def describe(self) -> list[str]:
+        """Return what was found, a line for each part."""
+        lines = [part.describe() for part in (self.channel, self.eyes) if part is not None]
+        if self.posterior is not None:
+            effects, service_s = self.posterior.sample(200)
+            low, high = np.quantile(effects, (0.05, 0.95), axis=0)
+            ranges = zip(self.posterior.worlds.library, low, high, strict=True)
+            named = (f"{x.name} {a:.2g} to {b:.2g}" for x, a, b in ranges)
+            lines.append("effects: " + ", ".join(named))
+            begin_s, each_s = service_s.mean(0).T
+            lines.append(
+                f"greens: {begin_s.min():.1f} to {begin_s.max():.1f} s unused at their beginning, "
+                f"{each_s.min():.1f} to {each_s.max():.1f} s in each further decision"
+            )
+        return lines
+
+    def as_dict(self) -> dict[str, float]:
+        """Return flat numbers for the metrics of a run."""
+        numbers: dict[str, float] = {"street/commands": float(self.commands)}
+        if self.channel is not None:
+            weights = self.channel.network
+            numbers |= {f"channel/lag_{k}": float(w) for k, w in enumerate(weights[:-1]) if w > 0}
+            numbers["channel/lost"] = self.channel.lost
+        if self.eyes is not None:
+            numbers |= {
+                "eyes/dead": float(self.eyes.dead.sum()),
+                "eyes/zone_m": self.eyes.zone_m[1],
+                "eyes/absolute": self.eyes.absolute,
+                "eyes/relative": self.eyes.relative,
+                "eyes/lag": float(self.eyes.lag),
+                "eyes/lost": self.eyes.lost,
+            }
+        if self.posterior is not None:
+            effects, service_s = self.posterior.sample(200)
+            for place, item in enumerate(self.posterior.worlds.library):
+                low, middle, high = np.quantile(effects[:, place], (0.05, 0.5, 0.95))
+                numbers[f"effects/{item.name}"] = float(middle)
+                numbers[f"effects/{item.name}/low"] = float(low)
+                numbers[f"effects/{item.name}/high"] = float(high)
+            for lane, (begin_s, each_s) in zip(self.lanes, service_s.mean(0), strict=True):
+                numbers[f"service/begin_s/{lane}"] = float(begin_s)
+                numbers[f"service/each_s/{lane}"] = float(each_s)
+        return numbers
+
+    def save(self, path: Path) -> None:
+        """Write the street to a file, whole or not at all."""
+        content: dict[str, Any] = {"lanes": list(self.lanes), "interval_s": self.interval_s}
+        for name in ("channel", "eyes", "posterior"):
+            part = getattr(self, name)
+            content[name] = None if part is None else part.state_dict()
+        if self.posterior is not None:
+            content["library"] = [vars(item) for item in self.posterior.worlds.library]
+            content["service"] = self.posterior.worlds.service
+        write_checkpoint(path, KIND, content)
+
+    @classmethod
+    def load(cls, path: Path, worlds: Worlds) -> FittedStreet:
+        """Read a file of `save`.
+
+        Args:
+            path: The file.
+            worlds: Prior of the network.
+
+        Raises:
+            CheckpointError: The file is unreadable, or of another network.
+        """
+        content = read_checkpoint(path, KIND)
+        if tuple(content.get("lanes", ())) != worlds.lanes:
+            raise CheckpointError(f"{path}: the street has other lanes than this network")
+        if content.get("library") not in (None, [vars(item) for item in worlds.library]):
+            raise CheckpointError(f"{path}: the street was fitted with another library of effects")
+        channel, eyes, posterior = (content.get(x) for x in ("channel", "eyes", "posterior"))
+        return cls(
+            worlds.lanes,
+            float(content["interval_s"]),
+            None if channel is None else CommandChannel.from_state(channel),
+            None if eyes is None else Eyes.from_state(eyes),
+            None if posterior is None else Posterior.from_state(worlds, posterior),
+        )
+
+
+@dataclass(frozen=True)
+class Simulation:
+    """The simulation in which worlds are drawn, and its settings.
+
+    Attributes:
+        scenario: The network and its traffic.
+        sim: The simulation, as a domain.
+        options: Options of the environments.
+        epsilon: Chance of a random phase in roll-outs.
+        workers: Simulations at a time, or an executor.
+    """
+
+    scenario: Scenario
+    sim: Domain
+    options: Mapping[str, Any]
+    epsilon: float
+    workers: Workers = None
+
+    def env(self, world: StreetWorld, **options: Any) -> TrafficEnv:
+        """Return an environment of a world."""
+        fitted = (*self.options.get("fitted", ()), *world.parts)
+        given = {**self.options, **options, "fitted": fitted}
+        domain = _joined(self.sim, world.effects)
+        return parallel_env(self.scenario, domain, **given)
+
+    def play(self, world: StreetWorld, policy: Policy, seed: int, stop: Stop) -> TransitionLog:
+        """Run one episode in a world and record it."""
+        env = self.env(world, **policy.env_options, crossings=True)
+        exploring = EpsilonGreedy(copy.deepcopy(policy), self.epsilon)
+        observer = observer_of(env)
+        try:
+            played = persistently(
+                lambda: roll_out(env, exploring, seed, record=observer, on_step=stop_callback(stop))
+            )
+            assert played.log is not None
+            return played.log
+        finally:
+            env.close()
+
+    def logs(
+        self,
+        worlds: Sequence[StreetWorld],
+        policy: Policy,
+        seeds: Sequence[int],
+        duration_s: float | None,
+        on_done: Callable[[], object],
+    ) -> list[TransitionLog]:
+        """Run one episode in each world; return the logs in their order."""
+        stop = Stop()
+        options = {**self.options}
+        if duration_s is not None:
+            longest_s = self.options.get("duration_s") or self.scenario.settings.duration_s
+            options["duration_s"] = min(duration_s, longest_s)
+        short = Simulation(self.scenario, self.sim, options, self.epsilon)
+        parts = [(world, policy, seed, stop) for world, seed in zip(worlds, seeds, strict=True)]
+        logs: dict[int, TransitionLog] = {}
+        for number, log in as_done(self.workers, short.play, parts, stop):
+            logs[number] = log
+            on_done()
+        return [logs[number] for number in range(len(parts))]
+
+
+BASELINE_EPISODES = 2
+"""Episodes of the plain simulation with which detectors are compared."""
+
+
+def fit_street(
+    real: TransitionLog,
+    simulation: Simulation,
+    policy: Policy,
+    worlds: Worlds,
+    view: LaneView,
+    config: StreetConfig,
+    seed: int,
+    on_done: Callable[[], object] = lambda: None,
+) -> FittedStreet:
+    """Fit the parts of a street to its log (lines 1 to 4).
+
+    Args:
+        real: Transitions of the street.
+        simulation: The simulation.
+        policy: Policy of the log; it acts in the simulated worlds, too.
+        worlds: Prior of worlds.
+        view: Lanes of the network, as the log shows them.
+        config: Settings.
+        seed: Root of every random choice.
+        on_done: Called after each simulated episode.
+    """
+    lanes, interval_s = worlds.lanes, real.provenance.decision_interval_s
+    channel = fit_channel(real, config.channel) if "channel" in config.parts else None
+    street = FittedStreet(lanes, interval_s, channel)
+    if "eyes" in config.parts:
+        seeds = [derive_seed(seed, "street", "baseline", k) for k in range(BASELINE_EPISODES)]
+        plain = [street.world(one) for one in seeds]
+        logs = simulation.logs(plain, policy, seeds, None, on_done)
+        eyes = fit_eyes(real, TransitionLog.concatenate(logs), view, config.eyes)
+        street = FittedStreet(lanes, interval_s, channel, eyes)
+    if not config.simulates:
+        return street
+    seeds = [derive_seed(seed, "street", "world", k) for k in range(config.simulations)]
+    values = [worlds.draw(one) for one in seeds]
+    drawn = []
+    for one, value in zip(seeds, values, strict=True):
+        known = street.world(one)
+        service = FittedService(lanes, value.service_s)
+        drawn.append(StreetWorld(worlds.effects(value), (*known.parts, service)))
+    logs = simulation.logs(drawn, policy, seeds, config.simulated_s, on_done)
+    simulated = [
+        Simulated(value, view.summary(log)) for value, log in zip(values, logs, strict=True)
+    ]
+    posterior = Posterior.fit(worlds, simulated, view.summary(real))
+    return FittedStreet(lanes, interval_s, channel, street.eyes, posterior)
+
+
+def episodes_of_fit(config: StreetConfig) -> int:
+    """Return the number of episodes that `fit_street` simulates."""
+    baseline = BASELINE_EPISODES if "eyes" in config.parts else 0
+    return baseline + config.simulations * config.simulates
+
+
+class DrawnEnv(BaseParallelWrapper[str, Any, Any]):
+    """Environment with another world in every episode; the seed of `reset` decides the world.
+
+    The simulation of an episode ends before the next one begins.
+
+    Args:
+        make_env: Makes the environment of the world of a seed.
+    """
+
+    def __init__(self, make_env: Callable[[int], TrafficEnv]) -> None:
+        super().__init__(make_env(0))
+        self._make_env = make_env
+        self._agents = AgentSet.of(self.env)
+        self._generator = numpy_generator(0, "worlds")
+
+    def reset(self, seed: int | None = None, options: dict[str, Any] | None = None) -> ResetResult:
+        """Start an episode in a newly drawn world.
+
+        Args:
+            seed: Seed of world and traffic; None to draw it from the generator of the last seed.
+            options: Passed to the environment.
+
+        Raises:
+            ScenarioError: The world has other agents than the simulation.
+        """
+        if seed is not None:
+            self._generator = numpy_generator(seed, "worlds")
+        else:
+            seed = int(self._generator.integers(2**31))
+        self.env.close()
+        self.env = self._make_env(seed)
+        if AgentSet.of(self.env) != self._agents:
+            raise ScenarioError(
+                f"the world {self.env.domain} has other agents, observations or phases than the "
+                f"simulation: {AgentSet.of(self.env)}, not {self._agents}; draw effects on vehicles"
+            )
+        return self.env.reset(seed=seed, options=options)
+
+
+def street_env(street: FittedStreet, simulation: Simulation, commands: int) -> DrawnEnv:
+    """Return an environment that draws every episode's world from a fitted street.
+
+    Args:
+        street: The fitted street.
+        simulation: The simulation.
+        commands: Number of own commands that agents see.
+    """
+    return DrawnEnv(lambda seed: simulation.env(street.world(seed), commands=commands))
+
+
+def worlds_of(env: TrafficEnv, config: StreetConfig) -> Worlds:
+    """Return the prior of the worlds of an environment's network."""
+    view = LaneView.of(env.network, env.options.observation)
+    names = [item.name for item in Worlds.of((), {}).library]
+    left_out = tuple(names) if "effects" not in config.parts else config.without
+    return Worlds.of(view.lanes, {}, left_out, "service" in config.parts)
+
+
+def _joined(sim: Domain, effects: Sequence[Effect]) -> Domain:
+    if not effects:
+        return sim
+    if sim == "sim":
+        return tuple(effects)
+    if not isinstance(sim, str):
+        return (*sim, *effects)
+    return "+".join((sim, *map(str, effects)))

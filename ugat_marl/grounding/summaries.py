@@ -1,0 +1,209 @@
+"""Summary statistics of a transition log, by lane: how vehicles arrive and how greens serve them.
+
+A log shows the vehicles c on a lane at a decision, c' at the next one, and the mean number that
+had left during the interval, m (if it was measured). The statistics are means over decisions of one
+kind, by classes of c, so that they depend little on the length of queues.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ugat_marl.data import AgentLayout, TransitionLog, Transitions
+from ugat_marl.envs import COUNT_SCALE
+from ugat_marl.errors import OptionError
+from ugat_marl.scenarios import GREEN, Intersection, Network
+
+Floats = NDArray[np.float64]
+
+CLASSES = (2.0, 5.0, 9.0)
+"""Lower ends of the classes of vehicles on a lane."""
+CLOSE = 1e-4
+"""Distance in vehicles below which a count is a whole number."""
+LEAST_ROWS = 3
+"""Fewest decisions whose mean is used."""
+COUNTED = ("count", "density", "movements", "queue")
+"""Observations in vehicles; the others cannot be summarised."""
+
+BEGINS, GOES_ON = 0, 1
+GREENS = ("begins", "goes on")
+NAMES = (
+    *(
+        f"{what}, green {green}, {low:g} or more"
+        for what in ("left", "fall")
+        for green in GREENS
+        for low in CLASSES
+    ),
+    "rise in red",
+    "mean",
+    "spread",
+    "most",
+)
+"""Names of the statistics of a lane."""
+
+
+@dataclass(frozen=True)
+class Summary:
+    """Statistics of one log.
+
+    Attributes:
+        values: ``(lanes, len(NAMES))``, vehicles; NaN where too few decisions are of the kind.
+        rows: Decisions behind each value, ``(lanes, len(NAMES))``.
+    """
+
+    values: Floats
+    rows: Floats
+
+    @property
+    def network(self) -> Floats:
+        """Mean over the lanes, weighted by decisions, ``(len(NAMES),)``; NaN without any."""
+        rows = np.where(np.isnan(self.values), 0.0, self.rows)
+        total = rows.sum(0)
+        sums = (np.nan_to_num(self.values) * rows).sum(0)
+        return np.where(total > 0, sums / np.maximum(total, 1.0), np.nan)
+
+
+@dataclass(frozen=True)
+class LaneRows:
+    """Decisions of one lane, ordered by episode and step; arrays ``(n,)``.
+
+    Attributes:
+        episode: Number of the episode.
+        step: Number of the decision in its episode.
+        before: Vehicles at the decision.
+        after: Vehicles at the next decision.
+        left: Mean number of vehicles that had left in between; NaN if it was not measured.
+        had: True if the lane had green at the decision.
+        has: True if the lane has green afterwards.
+    """
+
+    episode: NDArray[np.int64]
+    step: NDArray[np.int64]
+    before: Floats
+    after: Floats
+    left: Floats
+    had: NDArray[np.bool_]
+    has: NDArray[np.bool_]
+
+
+@dataclass(frozen=True)
+class LaneView:
+    """Lanes of a network in the order of summaries, and the phases that serve them.
+
+    Attributes:
+        lanes: Ids of all incoming lanes, intersection by intersection.
+        green: For each intersection, bool ``(lanes, phases)``: True if a link has green.
+        scale: For each intersection, vehicles per unit of its features, ``(lanes,)``.
+        first: For each intersection, the position of the first count among its features.
+    """
+
+    lanes: tuple[str, ...]
+    green: tuple[NDArray[np.bool_], ...]
+    scale: tuple[Floats, ...]
+    first: tuple[int, ...]
+
+    @classmethod
+    def of(cls, network: Network, observation: str) -> LaneView:
+        """Return the lanes of a network for logs with this observation.
+
+        Raises:
+            OptionError: The observation holds no vehicles.
+        """
+        if observation not in COUNTED:
+            raise OptionError(
+                f"observation {observation!r} shows no numbers of vehicles, from which service is "
+                f"fitted; use one of {', '.join(COUNTED)}"
+            )
+        lanes: list[str] = []
+        green: list[NDArray[np.bool_]] = []
+        scale: list[Floats] = []
+        first: list[int] = []
+        for item in network.intersections:
+            own = item.incoming_lanes
+            lanes += own
+            green.append(_greens(item))
+            capacity = np.array([network.lanes[lane].capacity for lane in own])
+            fixed = observation in ("count", "queue")
+            scale.append(np.full(len(own), COUNT_SCALE) if fixed else capacity)
+            first.append(len(own) if observation == "movements" else 0)
+        return cls(tuple(lanes), tuple(green), tuple(scale), tuple(first))
+
+    def rows(self, log: TransitionLog) -> list[LaneRows]:
+        """Return the decisions of every lane, in the order of `lanes`."""
+        return [
+            row
+            for place, (agent, layout) in enumerate(log.provenance.layouts.items())
+            for row in self._rows_of(place, log.transitions(agent), layout)
+        ]
+
+    def summary(self, log: TransitionLog) -> Summary:
+        """Return the statistics of a log."""
+        parts = [_statistics(row) for row in self.rows(log)]
+        return Summary(
+            np.stack([values for values, _ in parts]), np.stack([number for _, number in parts])
+        )
+
+    def _rows_of(self, place: int, rows: Transitions, layout: AgentLayout) -> Iterator[LaneRows]:
+        """Return the decisions of the lanes of an intersection."""
+        green, scale, first = self.green[place], self.scale[place], self.first[place]
+        part = slice(first, first + len(scale))
+        before = rows.observation[:, part].astype(np.float64) * scale
+        after = rows.next_observation[:, part].astype(np.float64) * scale
+        left = np.full_like(before, np.nan)
+        if rows.served_features.shape[1]:
+            left = before - rows.served_features[:, part] * scale
+        phase = rows.observation[:, layout.features : layout.features + layout.phases].argmax(1)
+        had, has = green[:, phase], green[:, rows.executed]
+        for k in range(len(scale)):
+            yield LaneRows(
+                rows.episode,
+                rows.step,
+                _whole(before[:, k]),
+                _whole(after[:, k]),
+                left[:, k],
+                had[k],
+                has[k],
+            )
+
+
+def _whole(counts: Floats) -> Floats:
+    """Return counts without the error of float32: numbers close to a whole one become it."""
+    whole = np.round(counts)
+    return np.where(np.abs(counts - whole) < CLOSE, whole, counts)
+
+
+def _statistics(rows: LaneRows) -> tuple[Floats, Floats]:
+    """Return the statistics of a lane, and the numbers of decisions behind them."""
+    before, fall = rows.before, rows.before - rows.after
+    greens = (rows.has & ~rows.had, rows.has & rows.had)
+    ends = (*CLASSES[1:], np.inf)
+    cells = [
+        (outcome, green & (before >= low) & (before < end))
+        for outcome in (rows.left, fall)
+        for green in greens
+        for low, end in zip(CLASSES, ends, strict=True)
+    ]
+    cells.append((-fall, ~rows.has & ~rows.had))
+    means, counts = zip(*(_mean(outcome, use) for outcome, use in cells), strict=True)
+    whole = (before.mean(), before.std(), np.quantile(before, 0.99))
+    return np.array([*means, *whole]), np.array([*counts, *[float(len(before))] * len(whole)])
+
+
+def _mean(outcome: Floats, use: NDArray[np.bool_]) -> tuple[float, float]:
+    """Return the mean of the used decisions, and their number; NaN for too few."""
+    rows = outcome[use & ~np.isnan(outcome)]
+    return float(rows.mean()) if len(rows) >= LEAST_ROWS else np.nan, float(len(rows))
+
+
+def _greens(item: Intersection) -> NDArray[np.bool_]:
+    table = np.zeros((len(item.incoming_lanes), len(item.phases)), dtype=np.bool_)
+    places = {lane: k for k, lane in enumerate(item.incoming_lanes)}
+    for link in item.links:
+        if link.from_lane in places:
+            shown: Sequence[str] = [phase[link.index] for phase in item.phases]
+            table[places[link.from_lane]] |= np.array([letter in GREEN for letter in shown])
+    return table
