@@ -13,7 +13,7 @@ import pytest
 from ugat_marl.effects import load_scenario
 from ugat_marl.errors import CheckpointError
 from ugat_marl.experiments import evaluate, read_queues, rule_factory
-from ugat_marl.experiments.queues import QueueRecord
+from ugat_marl.experiments.queues import QueueRecord, write_queues
 from ugat_marl.scenarios import Network
 
 
@@ -100,6 +100,31 @@ def test_another_evaluation_adds_its_episodes(tmp_path: Path) -> None:
     assert again.filter(domain="V4")["queue"].sum() == 2 * first.filter(domain="V4")["queue"].sum()
     write("V1", 1.0, keep=False)
     assert set(read_queues(path)["domain"]) == {"V1"}
+
+
+def test_queues_of_several_policies_share_a_file_under_their_new_names(tmp_path: Path) -> None:
+    env = stub(decisions=1, interval_s=60.0)
+    record = QueueRecord()
+    for policy, halting in (("last", 3.0), ("first", 1.0)):
+        look = record.watch(policy, "V4", env)
+        env.snapshot = SimpleNamespace(halting=np.full(len(env.network.lane_table().ids), halting))
+        look(1)
+    record.write(tmp_path / "job.parquet")
+    (tmp_path / "damaged.parquet").write_bytes(b"PAR1 no more")
+    sources = {
+        "trained": (tmp_path / "job.parquet", "last"),
+        "damaged": (tmp_path / "damaged.parquet", "last"),
+        "missing": (tmp_path / "missing.parquet", "last"),
+        "unknown": (tmp_path / "job.parquet", "never played"),
+    }
+    write_queues(tmp_path / "queues.parquet", sources)
+    frame = read_queues(tmp_path / "queues.parquet")
+    assert set(frame["policy"]) == {"trained"}
+    last = record.frame().filter(policy="last")
+    assert frame.drop("policy").equals(last.drop("policy"))
+    assert not last.drop("policy").equals(record.frame().filter(policy="first").drop("policy"))
+    write_queues(tmp_path / "queues.parquet", {})
+    assert read_queues(tmp_path / "queues.parquet").is_empty()
 
 
 @pytest.mark.parametrize("content", [b"", b"PAR1 no more"])
