@@ -45,7 +45,8 @@ def build(name: str, into: Path) -> list[Path]:
 def measure(name: str, seeds: list[int], workers: int | None) -> Path:
     """Write the headroom of scenario `name` between the markers of its README."""
     # Building needs no simulation; only this does.
-    from ugat_marl.experiments import headroom_markdown, measure_headroom
+    from ugat_marl.experiments import measure_headroom
+    from ugat_marl.reporting import headroom_markdown
     from ugat_marl.scenarios import read_scenario
 
     readme = HERE / name / "README.md"

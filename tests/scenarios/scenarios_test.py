@@ -17,7 +17,8 @@ from typing import Any
 import pytest
 
 from ugat_marl.errors import OptionError, ScenarioError
-from ugat_marl.experiments import HeadroomRow, headroom_markdown, measure_headroom
+from ugat_marl.experiments import HeadroomRow, measure_headroom
+from ugat_marl.reporting import headroom_markdown
 from ugat_marl.scenarios import (
     Network,
     RoadPlan,

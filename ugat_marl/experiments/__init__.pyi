@@ -62,7 +62,6 @@ from .training_curves import means_by_step as means_by_step
 from .training_curves import means_by_stretch as means_by_stretch
 from .transfer_headroom import HOLDS_S as HOLDS_S
 from .transfer_headroom import HeadroomRow as HeadroomRow
-from .transfer_headroom import headroom_markdown as headroom_markdown
 from .transfer_headroom import measure_headroom as measure_headroom
 from .transfers import TRAININGS as TRAININGS
 from .transfers import TransferConfig as TransferConfig

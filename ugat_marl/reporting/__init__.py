@@ -5,8 +5,8 @@
 - `charts`, `network_maps`, `phase_diagrams`: records as figures.
 - `page`, ``templates/``: pages of HTML; `training_page` and `diagnosis_page` fill them in.
 - `run_records`, `run_groups`: trainings, read from their folders and put into groups.
-- `tables`, `gap_tables`, `comparison_tables`, `diagnosis_tables`, `learning_curves`: tables for
-  the terminal, as Markdown and as CSV.
+- `tables`, `gap_tables`, `comparison_tables`, `diagnosis_tables`, `headroom_table`,
+  `learning_curves`: tables for the terminal, as Markdown and as CSV.
 - `formats`, `diagnosis_words`: numbers and verdicts as texts.
 - `video`: episodes as videos.
 """

@@ -14,6 +14,7 @@ from .formats import percent_text as percent_text
 from .formats import share_text as share_text
 from .gap_tables import gap_matrix_table as gap_matrix_table
 from .gap_tables import objective_tables as objective_tables
+from .headroom_table import headroom_markdown as headroom_markdown
 from .learning_curves import curves_as_csv as curves_as_csv
 from .learning_curves import curves_page as curves_page
 from .phase_diagrams import draw_network as draw_network
