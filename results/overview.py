@@ -89,6 +89,11 @@ def reduction(setting: str, column: Column) -> float:
     return column[setting].gap_s / start - 1.0 if start > 0 else math.nan
 
 
+def heading(page: Path) -> str:
+    """Return the heading of a page of Markdown, which names its scenario and its table."""
+    return page.read_text(encoding="utf-8").partition("\n")[0].removeprefix("# ")
+
+
 def overview(folder: Path = FOLDER) -> str:
     """Return the overview as Markdown: every domain of every table of transfer, and means."""
     lines = [
@@ -98,9 +103,8 @@ def overview(folder: Path = FOLDER) -> str:
     ]
     for table in sorted(folder.glob("*/main*/table.csv")):
         found = known(table)
-        place = table.parent.relative_to(folder)
-        name = f"[{place.parts[0]}{place.name.removeprefix('main').replace('-', ', ')}]"
-        first = f"{name}({place}/table.md)"
+        page = table.with_suffix(".md")
+        first = f"[{heading(page)}]({page.relative_to(folder)})"
         # Effects that all domains of a table share are in its sim, too, and are left out.
         shared = {domain.partition("+")[2] for domain in found}
         for domain, column in found.items():

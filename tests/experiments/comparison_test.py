@@ -40,7 +40,7 @@ def found() -> Comparison:
         *trials("best rule, tuned there", {None: (80.0, 120.0)}),
     ]
     kinds = {"constants": ("constant delay 2 s",), "grounded": ("UGAT",)}
-    return Comparison("toy", "0" * 8, "sim", tuple(rows), {"table": "main"}, **kinds)
+    return Comparison("toy", "0" * 8, "sim", tuple(rows), {}, **kinds)
 
 
 def test_values_are_in_the_order_of_the_training_seeds(found: Comparison) -> None:
@@ -62,19 +62,19 @@ def test_regret_won_back_by_hand(found: Comparison) -> None:
 
 def test_nothing_to_win_has_no_share() -> None:
     rows = trials("direct transfer", {0: (70.0, 80.0)}) + trials("UGAT", {0: (70.0, 90.0)})
-    found = Comparison("toy", "0", "sim", tuple(rows), {"table": "main"})
+    found = Comparison("toy", "0", "sim", tuple(rows), {})
     assert math.isnan(found.won_back("UGAT", "V4", "direct transfer"))
 
 
 def test_what_loses_nothing_on_the_way_has_no_gap_to_make_smaller() -> None:
     rows = trials("direct transfer", {0: (90.0, 80.0)}) + trials("UGAT", {0: (70.0, 290.0)})
-    found = Comparison("toy", "0", "sim", tuple(rows), {"table": "main"})
+    found = Comparison("toy", "0", "sim", tuple(rows), {})
     assert math.isnan(found.reduction("UGAT", "V4", "direct transfer"))
     served = [
         replace(row, scores=replace(row.scores, throughput=30.0 if row.domain == "V4" else 50.0))
         for row in rows
     ]
-    found = Comparison("toy", "0", "sim", tuple(served), {"table": "main"})
+    found = Comparison("toy", "0", "sim", tuple(served), {})
     assert found.reduction("UGAT", "V4", "direct transfer", "throughput") == 0.0  # fewer: a gap
 
 
@@ -87,10 +87,12 @@ def test_episodes_that_broke_down_are_counted_one_by_one() -> None:
         episode("V4", 0, 100.0, 190.0), episode("V4", 0, 120.0, 180.0),
         episode("V4", 1, 700.0, 179.0), episode("sim", 1, 60.0, 0.0),
     ]  # fmt: skip
-    found = Comparison("toy", "0" * 8, "sim", tuple(rows), {"table": "main"})
+    found = Comparison("toy", "0" * 8, "sim", tuple(rows), {})
     assert found.median_s("direct transfer", "V4") == 120.0
     assert found.unserved("direct transfer", "V4") == pytest.approx(1 / 3)
-    assert "| direct transfer | 120, 33 % |" in comparison_page(found, "direct transfer", FACTS)
+    assert "| direct transfer | 120, 33 % |" in comparison_page(
+        found, "direct transfer", "main", FACTS
+    )
 
 
 @pytest.mark.parametrize("shared", ["", "+blocker_patience=60+reach=100", "+reach=100" * 6])
@@ -100,7 +102,7 @@ def test_bars_are_told_apart_within_the_picture(shared: str, tmp_path: Path) -> 
         for domain in (f"V{number}{shared}" for number in (1, 2, 3, 4))
     ]
     rows += [replace(row, domain="sim") for row in rows]
-    found = Comparison("toy", "0" * 8, "sim", tuple(rows), {"table": "main"})
+    found = Comparison("toy", "0" * 8, "sim", tuple(rows), {})
     path = tmp_path / "gaps.png"
     gap_picture(found, path)
     pixels = matplotlib.image.imread(path)[-130:, :, :3]
@@ -109,7 +111,7 @@ def test_bars_are_told_apart_within_the_picture(shared: str, tmp_path: Path) -> 
 
 
 def test_pages_hold_the_numbers(found: Comparison) -> None:
-    page = comparison_page(found, "direct transfer", FACTS)
+    page = comparison_page(found, "direct transfer", "main", FACTS)
     assert "# toy: main" in page
     assert "| UGAT | −54 % |" in page
     assert "| UGAT | 0.80 |" in page

@@ -38,6 +38,7 @@ def folder(tmp_path: Path) -> Path:
     place = tmp_path / "grid2x2-v1" / "main-short"
     place.mkdir(parents=True)
     (place / "table.csv").write_text(TABLE)
+    (place / "table.md").write_text("# grid2x2-v1: main, short\n\nText.\n")
     return tmp_path
 
 
@@ -52,7 +53,7 @@ def test_by_hand(folder: Path) -> None:
         [cell.strip() for cell in line.split("|")[1:-1]]
         for line in script.overview(folder).splitlines()[2:]
     ]
-    link = "[grid2x2-v1, short](grid2x2-v1/main-short/table.md)"
+    link = "[grid2x2-v1: main, short](grid2x2-v1/main-short/table.md)"
     # Of 25 s to the best constant timed grounding has 20; in V4 90 of 100 s to the rule.
     assert first == [link, "V1", "100 (25.0)", "**80.0** −50 %, 0.80", "", "", "75.0", "", "90.0"]
     assert second == ["", "V4", "200 (100)", "**110** −80 %, 0.90", "", "", "115", "", "100"]

@@ -41,6 +41,7 @@ class _Paper:
     Attributes:
         config: Settings of the trainings and of the evaluation.
         out: Folder of the tables.
+        title: Name of the table in its heading; default: that of the command.
         runs: Folder of the trainings.
         jobs: Trainings at a time; default: one per core.
         ray: Train on Ray instead, on machines that share the folder of the trainings.
@@ -48,6 +49,7 @@ class _Paper:
 
     config: Annotated[PaperConfig, arg(name="")]
     out: Path = Path("results")
+    title: str | None = None
     runs: Path = Path("runs/paper")
     jobs: int | None = None
     ray: RayAddress = None
@@ -71,7 +73,7 @@ class _Paper:
                 comparison = compare(
                     self.table, scenario, self.config, self.runs, workers, Bars(console)
                 )
-            _write(comparison, folder)
+            _write(comparison, self.title or self.table, folder)
             console.print(terminal_tables(comparison, DIRECT))
             console.print(f"table and pictures: {folder}\ntrainings: {self.runs}", soft_wrap=True)
         return 0
@@ -144,8 +146,9 @@ class Gap(_Paper):
     table: ClassVar[str] = "gap"
 
 
-def _write(comparison: Comparison, folder: Path) -> None:
-    write_whole(folder / "table.md", comparison_page(comparison, DIRECT, machine_facts()) + "\n")
+def _write(comparison: Comparison, title: str, folder: Path) -> None:
+    page = comparison_page(comparison, DIRECT, title, machine_facts())
+    write_whole(folder / "table.md", page + "\n")
     write_whole(folder / "table.csv", comparison_csv(comparison))
     write_whole(folder / "seeds.csv", seeds_csv(comparison))
     grounded = [*GROUNDED_NAME.values(), matched_name("timed")]

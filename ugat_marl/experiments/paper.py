@@ -376,7 +376,7 @@ def compare(
         loaded.hash,
         domain_label(config.sim),
         tuple(trials),
-        {"table": table, **({} if config.learner == DQN_NAME else {"learner": config.learner})},
+        {} if config.learner == DQN_NAME else {"learner": config.learner},
         constants=tuple(row.name for row in rows if row.name in late),
         grounded=tuple(row.name for row in rows if row.recipe == "grounded"),
     )

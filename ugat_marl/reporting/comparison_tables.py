@@ -56,16 +56,17 @@ def terminal_tables(found: Comparison, direct: str) -> RenderableType:
     return Group(*blocks)
 
 
-def comparison_page(found: Comparison, direct: str, facts: Mapping[str, Any]) -> str:
+def comparison_page(found: Comparison, direct: str, title: str, facts: Mapping[str, Any]) -> str:
     """Return the whole comparison as a page of Markdown.
 
     Args:
         found: The comparison.
         direct: Setting with which the others are compared.
+        title: Name of the table; the heading is "<scenario>: <title>".
         facts: Command, versions and processor (`experiments.machine_facts`).
     """
     lines = [
-        f"# {found.scenario}: {found.notes['table']}",
+        f"# {found.scenario}: {title}",
         "",
         "![Change of the gap of each setting](gaps.png)",
         "",
@@ -234,7 +235,7 @@ def _provenance(found: Comparison, facts: Mapping[str, Any]) -> list[str]:
         "Python": facts["python"],
         **facts["versions"],
         "date": facts["date"][:10],
-        **{key: value for key, value in found.notes.items() if key != "table"},
+        **found.notes,
     }
     return [*command_block(facts["command"]), "", *made_with(rows)]
 
