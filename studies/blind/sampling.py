@@ -15,7 +15,7 @@ from studies.blind.strengths import KINDS, MODELS, SCALE, STRENGTHS, nominal_of
 from ugat_marl.diagnosis import IN_THE_LOG
 from ugat_marl.effects import EVERYWHERE, PAPER_WORLDS, Effect, effect_from_record, known_effects
 from ugat_marl.errors import UnknownNameError
-from ugat_marl.scenarios import Scenario, edge_of
+from ugat_marl.scenarios import Scenario, edge_of_lane
 
 GROUPS: Mapping[str, float] = {
     "none": 0.25, "single": 0.45, "pair": 0.10, "setting": 0.08, "outside": 0.12,
@@ -237,7 +237,7 @@ def _outside(
         return Sample("outside", member, strength, (Driveway(edge, 0.1 * scale),))
     if member == "double_parking":
         parked = draw_effect("parking", strength, scenario, busy, generator)
-        edge = "" if parked is None else edge_of(str(parked.record()["lane"]))
+        edge = "" if parked is None else edge_of_lane(str(parked.record()["lane"]))
         ways = [turn for turn in busy.turns if turn[0] == edge]
         if parked is None or not ways:
             return None

@@ -30,7 +30,7 @@ from ugat_marl.scenarios import (
     Period,
     SignalLog,
     deciding_letter,
-    edge_of,
+    edge_of_lane,
 )
 
 Array = NDArray[np.float64]
@@ -145,7 +145,7 @@ class DetectorLayout:
     def places(self) -> tuple[tuple[int, str, str], ...]:
         """Index of the intersection, edge and lane of every place: incoming lanes, then exits."""
         incoming = [(lane.intersection, lane.edge, lane.id) for lane in self.lanes]
-        outgoing = [(owner, edge_of(name), name) for owner, name, _ in self.exits]
+        outgoing = [(owner, edge_of_lane(name), name) for owner, name, _ in self.exits]
         return (*incoming, *outgoing)
 
     @functools.cached_property

@@ -20,7 +20,7 @@ from ugat_marl.diagnosis.hypotheses import Hypothesis, Members, examined
 from ugat_marl.diagnosis.statistics import Distance, Reference
 from ugat_marl.diagnosis.thresholds import Thresholds
 from ugat_marl.effects import ExaminedStrengths
-from ugat_marl.scenarios import Passages, Period, Scenario, driven_routes, edge_of
+from ugat_marl.scenarios import Passages, Period, Scenario, driven_routes, edge_of_lane
 
 Array = NDArray[np.float64]
 
@@ -863,7 +863,7 @@ def one_behind_the_other(members: Members, layout: DetectorLayout) -> tuple[str,
     suspects = [known[str(name)] for name in short if name in known]
     for one in suspects:
         for other in suspects:
-            lane, edge = lanes.get(one.lane), edge_of(other.lane)
+            lane, edge = lanes.get(one.lane), edge_of_lane(other.lane)
             if lane is None:
                 continue
             if other.kind == "exit":

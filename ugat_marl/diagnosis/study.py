@@ -43,7 +43,7 @@ from ugat_marl.scenarios import (
     Scenario,
     SignalLog,
     driven_routes,
-    edge_of,
+    edge_of_lane,
 )
 
 
@@ -380,7 +380,7 @@ def unreached(
     Raises:
         MeasuredDataError: No route leads over any of the measured edges.
     """
-    edges = {detector.id: edge_of(detector.lane) for detector in detectors}
+    edges = {detector.id: edge_of_lane(detector.lane) for detector in detectors}
     counted: dict[str, int] = {}
     for period in measured.periods:
         for name, passages in period.passages.items():

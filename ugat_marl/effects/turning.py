@@ -16,7 +16,7 @@ from ugat_marl.effects.demand import TAGS, Routes, scaled_flow
 from ugat_marl.effects.documents import edit_scenario, is_demand, mentions
 from ugat_marl.effects.places import Places, network_places
 from ugat_marl.errors import UnknownNameError
-from ugat_marl.scenarios import Scenario, edge_of
+from ugat_marl.scenarios import Scenario, edge_of_lane
 
 Way = tuple[str, ...]
 
@@ -159,7 +159,7 @@ def _with_route(element: ET.Element, edges: Way) -> ET.Element:
     for key in ("route", "from", "to", "via", *_ENDS):
         made.attrib.pop(key, None)
     for child in list(made):
-        lane = edge_of(child.get("lane", ""))
+        lane = edge_of_lane(child.get("lane", ""))
         if child.tag == "route" or (child.tag == "stop" and lane not in edges):
             made.remove(child)
     route = ET.Element("route", {"edges": " ".join(edges)})

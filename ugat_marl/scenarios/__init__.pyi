@@ -29,7 +29,7 @@ from .junctions import Link as Link
 from .lanes import NO_UPSTREAM_LANES as NO_UPSTREAM_LANES
 from .lanes import LaneTable as LaneTable
 from .lanes import UpstreamLanes as UpstreamLanes
-from .naming import edge_of as edge_of
+from .naming import edge_of_lane as edge_of_lane
 from .naming import group_names as group_names
 from .naming import member_names as member_names
 from .network import Intersection as Intersection

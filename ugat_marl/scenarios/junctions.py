@@ -8,7 +8,7 @@ from collections import Counter, defaultdict
 from collections.abc import Container, Mapping, Sequence
 from dataclasses import dataclass, field
 
-from ugat_marl.scenarios.naming import edge_of
+from ugat_marl.scenarios.naming import edge_of_lane
 
 CROSSING = "c"
 """Direction of a link for people on foot."""
@@ -43,12 +43,12 @@ class Link:
     @property
     def from_edge(self) -> str:
         """Edge of the incoming lane."""
-        return edge_of(self.from_lane)
+        return edge_of_lane(self.from_lane)
 
     @property
     def to_edge(self) -> str:
         """Edge of the outgoing lane."""
-        return edge_of(self.to_lane)
+        return edge_of_lane(self.to_lane)
 
 
 def links_of(root: ET.Element) -> dict[str, list[Link]]:
@@ -210,7 +210,7 @@ def behind_of(
         that road begins within `reach_m`; they are spread evenly over the lanes of the road.
     """
     ways = _ways(root, lights)
-    widths = Counter(map(edge_of, ways.number))
+    widths = Counter(map(edge_of_lane, ways.number))
     upstream: dict[str, Upstream] = {}
     for lane in ways.at_lights:
         begins_m = _begins(lane, ways, lengths_m, reach_m)
@@ -220,7 +220,7 @@ def behind_of(
         shares = _shares(lane, near, ways)
         feeding = upstream[lane] = Upstream()
         for name in near:
-            road = edge_of(name)
+            road = edge_of_lane(name)
             feeding.roads[road] = feeding.roads.get(road, 0.0) + shares[name] / widths[road]
             for feeder, inside in ways.feeds.get(name, ()):
                 if feeder in begins_m and feeder not in ways.at_lights:

@@ -43,6 +43,6 @@ def letters(number: int) -> str:
     return text
 
 
-def edge_of(lane: str) -> str:
+def edge_of_lane(lane: str) -> str:
     """Return the edge in a lane's name ``<edge>_<n>``; empty if there is no underscore."""
     return lane.rpartition("_")[0]

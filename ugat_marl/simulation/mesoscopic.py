@@ -17,7 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ugat_marl.errors import OptionError
-from ugat_marl.scenarios import edge_of
+from ugat_marl.scenarios import edge_of_lane
 from ugat_marl.simulation.snapshots import HALTING_MPS
 
 
@@ -89,11 +89,11 @@ class MesoscopicLanes:
         self._index = [int(lane.rpartition("_")[2]) for lane in lanes]
         self._roads: dict[str, _Road] = {}
         for place, lane in enumerate(lanes):
-            edge, length = edge_of(lane), api.lane.getLength(lane)
+            edge, length = edge_of_lane(lane), api.lane.getLength(lane)
             segments = max(1, math.floor(length / segment_m + 0.5))
             road = self._roads.setdefault(edge, _Road(edge, [], defaultdict(list), 0.0, 0.0, {}))
             road.lanes.append(place)
-            for following in {edge_of(link[0]) for link in api.lane.getLinks(lane)}:
+            for following in {edge_of_lane(link[0]) for link in api.lane.getLinks(lane)}:
                 road.towards[following].append(place)
             road.segment_s = length / segments / api.lane.getMaxSpeed(lane)
             road.last_m = length * (1 - 1.5 / segments)

@@ -26,7 +26,7 @@ from ugat_marl.scenarios import (
     Scenario,
     Segment,
     UpstreamLanes,
-    edge_of,
+    edge_of_lane,
 )
 from ugat_marl.simulation.host import one_line_message
 from ugat_marl.simulation.mesoscopic import MesoscopicLanes, refuse_in_queues
@@ -346,7 +346,7 @@ class LibsumoSimulator:
         assert self._launch is not None
         now: dict[str, tuple[int, str]] = {}
         for index, lane in enumerate(self._launch.lanes):
-            place = index, edge_of(lane)
+            place = index, edge_of_lane(lane)
             now.update(dict.fromkeys(libsumo.lane.getLastStepVehicleIDs(lane), place))
         before, self._on = self._on, now
         for name, (index, road) in before.items():

@@ -20,7 +20,7 @@ from ugat_marl.scenarios import (
     Period,
     Scenario,
     deciding_letter,
-    edge_of,
+    edge_of_lane,
 )
 
 SHORT_S = 300.0
@@ -318,7 +318,7 @@ class _Silence:
 def _of_silence(measured: Measured) -> Iterator[Finding]:
     roads: dict[str, list[Detector]] = {}
     for silent in measured.detectors:
-        roads.setdefault(edge_of(silent.lane), []).append(silent)
+        roads.setdefault(edge_of_lane(silent.lane), []).append(silent)
     usual = _usual_rates(measured)
     silences: dict[tuple[str, str], list[_Silence]] = {}
     for period in measured.periods:

@@ -8,7 +8,7 @@ from typing import Any
 
 from ugat_marl.envs import Actions, Infos, Observations
 from ugat_marl.policies.rules.approaches import ControlledNetwork, allowed_phases, green_indices
-from ugat_marl.scenarios import Intersection, Link, edge_of
+from ugat_marl.scenarios import Intersection, Link, edge_of_lane
 
 
 @dataclass(frozen=True)
@@ -52,11 +52,11 @@ def _roads_from(
     agent: str, free: Mapping[str, Intersection], network: ControlledNetwork
 ) -> Iterator[Road]:
     entered = {
-        edge_of(lane): other
+        edge_of_lane(lane): other
         for other, intersection in free.items()
         for lane in intersection.incoming_lanes
     }
-    for edge in dict.fromkeys(edge_of(lane) for lane in free[agent].incoming_lanes):
+    for edge in dict.fromkeys(edge_of_lane(lane) for lane in free[agent].incoming_lanes):
         agents, edges, arrival_s, lanes = [agent], [edge], [0.0], 0
         while True:
             straight = _straight(free[agents[-1]], edges[-1])
