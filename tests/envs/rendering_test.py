@@ -10,7 +10,7 @@ import pytest
 from matplotlib.colors import to_rgb
 
 from ugat_marl.effects import load_scenario
-from ugat_marl.envs import Picture, parallel_env
+from ugat_marl.envs import NetworkRenderer, parallel_env
 from ugat_marl.envs.rendering import _RED, _SIGNALS, _SPEEDS
 from ugat_marl.scenarios import Network
 from ugat_marl.simulation import VehiclePositions
@@ -33,13 +33,13 @@ def near(pixels: np.ndarray, colour: str, tolerance: int = 12) -> np.ndarray:
     return np.argwhere(np.abs(pixels.astype(int) - rgb).max(axis=2) <= tolerance)
 
 
-def at(picture: Picture, pixels: np.ndarray, x: float, y: float) -> tuple[int, int]:
+def at(picture: NetworkRenderer, pixels: np.ndarray, x: float, y: float) -> tuple[int, int]:
     right, up = picture._view.pixels(np.array([x, y]))
     return int(pixels.shape[0] - up), int(right)
 
 
 def test_vehicles_are_where_they_are_in_the_colour_of_their_speed(network: Network) -> None:
-    picture = Picture(network)
+    picture = NetworkRenderer(network)
     lane = network.lanes["S_C_0"]
     (x, y0), (_, y1) = lane.shape[0], lane.shape[-1]
     slow, fast = (x, y0 + 0.3 * (y1 - y0)), (x, y0 + 0.7 * (y1 - y0))
@@ -59,7 +59,7 @@ def test_vehicles_are_where_they_are_in_the_colour_of_their_speed(network: Netwo
 
 def test_heads_show_the_state_by_colour_and_by_form(network: Network) -> None:
     (item,) = network.intersections
-    picture = Picture(network, size_px=3000)
+    picture = NetworkRenderer(network, size_px=3000)
     count = max(link.index for link in item.links) + 1
     shown: dict[str, np.ndarray] = {}
     for letter, colour in (("r", _RED), ("G", _SIGNALS["G"]), ("y", _SIGNALS["y"])):
@@ -77,7 +77,7 @@ def test_heads_show_the_state_by_colour_and_by_form(network: Network) -> None:
 def test_links_of_one_lane_have_heads_of_their_own() -> None:
     network = Network.read(load_scenario("single-v1"))
     (item,) = network.intersections
-    picture = Picture(network)
+    picture = NetworkRenderer(network)
     lines, colours = picture._heads.shown({item.id: "r" * 99})
     assert len(lines) == len(item.links) == len(colours)
     ends = {tuple(np.round(line, 6).ravel()) for line in lines}
@@ -85,19 +85,22 @@ def test_links_of_one_lane_have_heads_of_their_own() -> None:
 
 
 def test_names_are_written_where_there_is_room(network: Network) -> None:
-    plain, named = Picture(network), Picture(network, {"signal_0": network.intersections[0].id})
+    plain, named = (
+        NetworkRenderer(network),
+        NetworkRenderer(network, {"signal_0": network.intersections[0].id}),
+    )
     for picture in (plain, named):
         picture.draw(traffic(), {})
     changed = np.argwhere((plain.pixels() != named.pixels()).any(axis=2))
     row, column = at(plain, plain.pixels(), *network.intersections[0].position)
     assert len(changed) > 100
     assert np.abs(changed - (row, column)).max() < 140
-    Picture(network, {"$\\frac{$": network.intersections[0].id}).pixels()  # no formula
+    NetworkRenderer(network, {"$\\frac{$": network.intersections[0].id}).pixels()  # no formula
 
 
 def test_a_long_network_is_not_a_thread() -> None:
     network = Network.read(load_scenario("arterial1x5-v1"))
-    pixels = Picture(network, size_px=600).pixels()
+    pixels = NetworkRenderer(network, size_px=600).pixels()
     assert pixels.shape[1] == 600 and pixels.shape[0] >= 220
 
 

@@ -11,7 +11,7 @@ from .observations import OBSERVATION_UNITS as OBSERVATION_UNITS
 from .observations import WAITING_SCALE_S as WAITING_SCALE_S
 from .observations import Observer as Observer
 from .options import EnvOptions as EnvOptions
-from .rendering import Picture as Picture
+from .rendering import NetworkRenderer as NetworkRenderer
 from .traffic_env import TrafficEnv as TrafficEnv
 from .traffic_env import env as env
 from .traffic_env import parallel_env as parallel_env

@@ -33,7 +33,7 @@ _RED, _OFF = "#d1301f", "#888888"
 Floats = NDArray[np.float64]
 
 
-class Picture:
+class NetworkRenderer:
     """Draws frames of one network.
 
     A green signal is a line into the junction; a red or yellow one is a bar across the lane. So

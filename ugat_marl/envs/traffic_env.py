@@ -29,7 +29,7 @@ from ugat_marl.envs.actuators import Actuators
 from ugat_marl.envs.objectives import Objectives
 from ugat_marl.envs.observations import Observer, joint_space
 from ugat_marl.envs.options import EnvOptions
-from ugat_marl.envs.rendering import Picture
+from ugat_marl.envs.rendering import NetworkRenderer
 from ugat_marl.envs.rewards import Rewarder
 from ugat_marl.envs.sensors import Sensors
 from ugat_marl.errors import EpisodeError, OptionError
@@ -102,7 +102,7 @@ class TrafficEnv(ParallelEnv[str, Any, Any]):
         self.np_random = np.random.default_rng()
         self.agents: list[str] = []
         self._scores: Scores | None = None
-        self._picture: Picture | None = None
+        self._renderer: NetworkRenderer | None = None
 
     # --- spaces -------------------------------------------------------------------------------
 
@@ -271,11 +271,11 @@ class TrafficEnv(ParallelEnv[str, Any, Any]):
         """
         if self.render_mode != "rgb_array":
             return None
-        if self._picture is None:
-            self._picture = Picture(self.network, self.intersection_of)
+        if self._renderer is None:
+            self._renderer = NetworkRenderer(self.network, self.intersection_of)
         if self._simulator is not None and self.agents:
-            self._picture.draw(self._simulator.vehicles(), self._simulator.signals())
-        return self._picture.pixels()
+            self._renderer.draw(self._simulator.vehicles(), self._simulator.signals())
+        return self._renderer.pixels()
 
     def close(self) -> None:
         """End the simulation and its process and remove its files; a second call does nothing."""

@@ -15,7 +15,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from ugat_marl.envs import Picture, TrafficEnv
+from ugat_marl.envs import NetworkRenderer, TrafficEnv
 from ugat_marl.errors import OptionError, OutputError
 from ugat_marl.files import replacing
 from ugat_marl.policies import Policy, RollOutStopped, roll_out
@@ -183,7 +183,9 @@ def film_frames(films: Sequence[Film], size_px: int) -> Iterator[Frame]:
         films: Films of the same stretch of the same network.
         size_px: Longer side of each picture, in pixels.
     """
-    pictures = [Picture(each.env.network, each.env.intersection_of, size_px) for each in films]
+    pictures = [
+        NetworkRenderer(each.env.network, each.env.intersection_of, size_px) for each in films
+    ]
     write = _Captions()
     for scenes in zip(*(each.scenes for each in films), strict=True):
         shown: list[Frame] = []
