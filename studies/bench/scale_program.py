@@ -20,7 +20,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from studies.bench.memory_program import family, look, processes
-from ugat_marl.envs import AnyParallelEnv, Batch, VectorEnv, parallel_env, vector_env
+from ugat_marl.envs import AnyParallelEnv, VectorEnv, VectorStep, parallel_env, vector_env
 from ugat_marl.seeding import numpy_generator
 
 Request = Mapping[str, Any]
@@ -62,7 +62,7 @@ def steps(request: Request) -> dict[str, Any]:
         }
 
 
-def _by_halves(env: VectorEnv, batch: Batch, first: int, last: int) -> None:
+def _by_halves(env: VectorEnv, batch: VectorStep, first: int, last: int) -> None:
     """Step two halves in turn: one half decides while the other is simulated."""
     halves = env.halves()
     masks = [batch.masks[: halves[0].n], batch.masks[halves[0].n :]]

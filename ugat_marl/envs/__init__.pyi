@@ -21,8 +21,8 @@ from .types import Infos as Infos
 from .types import Observations as Observations
 from .types import ResetResult as ResetResult
 from .types import StepResult as StepResult
-from .vector.environment import Batch as Batch
 from .vector.environment import VectorEnv as VectorEnv
+from .vector.environment import VectorStep as VectorStep
 from .vector.environment import vector_env as vector_env
 from .wrappers import agent_indicator as agent_indicator
 from .wrappers import appended_mask as appended_mask

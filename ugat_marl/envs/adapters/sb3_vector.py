@@ -16,7 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ugat_marl.envs.adapters.sb3 import AgentsVecEnv, Step
-from ugat_marl.envs.vector.environment import Batch, VectorEnv
+from ugat_marl.envs.vector.environment import VectorEnv, VectorStep
 from ugat_marl.errors import OptionError
 
 _ELSEWHERE = (
@@ -104,7 +104,7 @@ class SimulationsVecEnv(AgentsVecEnv):
             raise OptionError(f"env_method({method_name!r}): {_ELSEWHERE}")
         return super().env_method(method_name, indices=indices)
 
-    def _seen(self, batch: Batch) -> NDArray[np.float32]:
+    def _seen(self, batch: VectorStep) -> NDArray[np.float32]:
         """Return the observations of all agents, ``(rows, size)``, and keep the masks."""
         masks = batch.masks.reshape(len(self.rows), -1)
         self._masks = masks.astype(np.bool_)
@@ -117,7 +117,7 @@ class SimulationsVecEnv(AgentsVecEnv):
             return seen
         return np.concatenate((seen, masks.astype(np.float32)), axis=1)
 
-    def _infos(self, batch: Batch) -> list[dict[str, Any]]:
+    def _infos(self, batch: VectorStep) -> list[dict[str, Any]]:
         masks = batch.masks.reshape(len(self.rows), -1)
         shown = batch.executed.reshape(-1).tolist()
         return [

@@ -36,7 +36,7 @@ Autoreset = Literal["same-step", "next-step", "disabled"]
 """Gymnasium's modes for the end of an episode.
 
 - ``"same-step"``: the step that ends an episode returns the first observation of the next one; the
-  last one is in `Batch.ended`.
+  last one is in `VectorStep.ended`.
 - ``"next-step"``: the following step begins the next episode and ignores its actions.
 - ``"disabled"``: the user calls `VectorEnv.reset`.
 """
@@ -62,7 +62,7 @@ class Ended:
 
 
 @dataclass(frozen=True)
-class Batch:
+class VectorStep:
     """Result of a reset or step of all environments; its arrays are copies.
 
     Agents are in the order of `VectorEnv.agents`. Observations are padded with zeros at the end;
@@ -166,7 +166,7 @@ class VectorEnv:
 
     def reset(
         self, seed: int | Sequence[int] | None = None, where: ArrayLike | None = None
-    ) -> Batch:
+    ) -> VectorStep:
         """Begin episodes; unfinished ones are dropped.
 
         Args:
@@ -186,7 +186,7 @@ class VectorEnv:
         self._memory.rewards[chosen] = 0.0
         return self._batch(np.zeros(self.n, dtype=np.bool_), ())
 
-    def step(self, actions: ArrayLike) -> Batch:
+    def step(self, actions: ArrayLike) -> VectorStep:
         """Show the chosen phases for one decision interval, in all environments.
 
         Args:
@@ -216,7 +216,7 @@ class VectorEnv:
         for index in self._begun:
             self._environments[index].begin(None, self._domains)
 
-    def step_wait(self) -> Batch:
+    def step_wait(self) -> VectorStep:
         """Wait for the step that `step_async` began.
 
         Raises:
@@ -343,9 +343,9 @@ class VectorEnv:
         seen, masks = memory.observations[index].copy(), memory.masks[index].copy()
         return Ended(index, episode, seen, masks, answer.scores)
 
-    def _batch(self, truncated: NDArray[np.bool_], ended: tuple[Ended, ...]) -> Batch:
+    def _batch(self, truncated: NDArray[np.bool_], ended: tuple[Ended, ...]) -> VectorStep:
         memory = self._memory
-        return Batch(
+        return VectorStep(
             memory.observations.copy(),
             memory.masks.copy(),
             memory.rewards.copy(),

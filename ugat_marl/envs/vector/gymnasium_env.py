@@ -10,7 +10,7 @@ from gymnasium.spaces import Box, Discrete
 from gymnasium.vector.utils import batch_space
 from numpy.typing import NDArray
 
-from ugat_marl.envs.vector.environment import Batch, VectorEnv
+from ugat_marl.envs.vector.environment import VectorEnv, VectorStep
 from ugat_marl.envs.wrappers import common_box
 from ugat_marl.errors import ActionError, OptionError
 
@@ -103,7 +103,7 @@ class GymnasiumVectorEnv(vector.VectorEnv[Any, Any, Any]):
     def _flat(self, values: NDArray[Any]) -> NDArray[Any]:
         return values.reshape(self.num_envs, *values.shape[2:])
 
-    def _infos(self, batch: Batch) -> dict[str, Any]:
+    def _infos(self, batch: VectorStep) -> dict[str, Any]:
         everyone = np.ones(self.num_envs, dtype=np.bool_)
         return {
             "action_mask": self._flat(batch.masks),
@@ -112,7 +112,7 @@ class GymnasiumVectorEnv(vector.VectorEnv[Any, Any, Any]):
             "_executed_action": everyone.copy(),
         }
 
-    def _final(self, batch: Batch, truncated: NDArray[np.bool_]) -> dict[str, Any]:
+    def _final(self, batch: VectorStep, truncated: NDArray[np.bool_]) -> dict[str, Any]:
         """Return final observations and infos in Gymnasium's form, None for running episodes."""
         observations = np.full(self.num_envs, None, dtype=object)
         masks = np.zeros((self.num_envs, self.env.agent_set.most_actions), dtype=np.int8)
