@@ -15,7 +15,7 @@ import pytest
 from rich.console import Console
 
 from ugat_marl.cli.import_atspm import ImportAtspm
-from ugat_marl.data import Measured, import_atspm, read_measured, split_periods
+from ugat_marl.data import MeasuredData, import_atspm, read_measured, split_periods
 from ugat_marl.errors import MeasuredDataError, UgatMarlError
 from ugat_marl.scenarios import Detector, Network, Passages, Period, Scenario, read_scenario
 
@@ -96,7 +96,7 @@ def log(
     )
 
 
-Import = Callable[..., Measured]
+Import = Callable[..., MeasuredData]
 
 
 @pytest.fixture
@@ -108,7 +108,7 @@ def imported(tmp_path: Path, scenario: Scenario, network: Network) -> Import:
         mapping: str = MAPPING,
         csv: bool = False,
         where: tuple[Scenario, Network] | None = None,
-    ) -> Measured:
+    ) -> MeasuredData:
         frame = log(LOG) if frame is None else frame
         file = tmp_path / f"events.{'csv' if csv else 'parquet'}"
         frame.write_csv(file) if csv else frame.write_parquet(file)
@@ -118,7 +118,7 @@ def imported(tmp_path: Path, scenario: Scenario, network: Network) -> Import:
     return run
 
 
-def texts(measured: Measured) -> str:
+def texts(measured: MeasuredData) -> str:
     return "\n".join(finding.text for finding in measured.findings)
 
 
@@ -291,7 +291,7 @@ def test_overlaps_arrows_and_links_that_yield(imported: Import) -> None:
     assert "phase 1 of device '12' is never logged: red" in texts(read)
 
 
-def as_log(measured: Measured, channels: dict[str, int]) -> pl.DataFrame:
+def as_log(measured: MeasuredData, channels: dict[str, int]) -> pl.DataFrame:
     """The log a controller would have kept of a recording on the crossing."""
     codes = {("r", "G"): (1,), ("G", "y"): (8,), ("y", "r"): (9, 10)}
     events: list[tuple[float, int, int]] = []
@@ -334,7 +334,7 @@ def test_a_recording_that_became_a_log_is_the_same_recording(
         )
         for i, s in enumerate(split_periods(3))
     )
-    street = Measured(detectors, days)
+    street = MeasuredData(detectors, days)
     zeros = ", ".join(f"2024-03-0{5 + i}T07:00:00" for i in range(3))
     mapping = MAPPING.replace("2024-03-05T07:00:00", zeros)
     read = imported(as_log(street, channels), mapping)

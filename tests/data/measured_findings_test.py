@@ -13,7 +13,7 @@ import numpy as np
 import polars as pl
 import pytest
 
-from ugat_marl.data import Finding, Measured, read_measured, split_periods, write_measured
+from ugat_marl.data import Finding, MeasuredData, read_measured, split_periods, write_measured
 from ugat_marl.data.measured import coverage
 from ugat_marl.effects import known_effects
 from ugat_marl.errors import MeasuredDataError
@@ -50,7 +50,7 @@ def vehicles(seed: int, every: float = 20.0) -> Passages:
     return Passages(on, np.round(on + 1, 3), np.full(len(on), 8.0), np.full(len(on), 5.0))
 
 
-def recording(periods: int = 3, **changes: object) -> Measured:
+def recording(periods: int = 3, **changes: object) -> MeasuredData:
     signals = {"C": tuple((20.0 * i, ("Gr", "rG")[i % 2]) for i in range(int(END / 20)))}
     days = tuple(
         Period(
@@ -63,10 +63,12 @@ def recording(periods: int = 3, **changes: object) -> Measured:
         )
         for i, split in enumerate(split_periods(periods))
     )
-    return replace(Measured(DETECTORS, days), **changes)  # pyright: ignore[reportArgumentType]
+    return replace(MeasuredData(DETECTORS, days), **changes)  # pyright: ignore[reportArgumentType]
 
 
-def passages(measured: Measured, detector: str, change: Callable[[Passages], Passages]) -> Measured:
+def passages(
+    measured: MeasuredData, detector: str, change: Callable[[Passages], Passages]
+) -> MeasuredData:
     """The recording with other vehicles over a detector."""
     days = tuple(
         replace(p, passages={**p.passages, detector: change(p.passages[detector])})
@@ -75,7 +77,7 @@ def passages(measured: Measured, detector: str, change: Callable[[Passages], Pas
     return replace(measured, periods=days)
 
 
-def without(measured: Measured, kind: str) -> Measured:
+def without(measured: MeasuredData, kind: str) -> MeasuredData:
     """The recording without the detectors of a kind."""
     kept = tuple(item for item in measured.detectors if item.kind != kind)
     names = {item.id for item in kept}
@@ -89,12 +91,12 @@ def without(measured: Measured, kind: str) -> Measured:
 @pytest.fixture
 def read(
     tmp_path: Path, scenario: Scenario, network: Network
-) -> Callable[..., tuple[Measured, dict[str, tuple[str, ...]]]]:
+) -> Callable[..., tuple[MeasuredData, dict[str, tuple[str, ...]]]]:
     """Writes a recording, changes the rows of its files, reads it: data, and findings by text."""
 
     def reading(
-        given: Measured | None = None, changes: Mapping[str, Rows] | None = None
-    ) -> tuple[Measured, dict[str, tuple[str, ...]]]:
+        given: MeasuredData | None = None, changes: Mapping[str, Rows] | None = None
+    ) -> tuple[MeasuredData, dict[str, tuple[str, ...]]]:
         directory = write_measured(given or recording(), tmp_path / "street")
         for name, change in (changes or {}).items():
             file = directory / f"{name}.parquet"
@@ -113,7 +115,7 @@ def only(findings: Mapping[str, tuple[str, ...]], *words: str) -> tuple[str, ...
     return findings[text]
 
 
-Read = Callable[..., tuple[Measured, dict[str, tuple[str, ...]]]]
+Read = Callable[..., tuple[MeasuredData, dict[str, tuple[str, ...]]]]
 
 
 def test_a_whole_recording_has_no_findings(read: Read) -> None:

@@ -10,7 +10,7 @@ import pytest
 from hypothesis import HealthCheck, event, given, settings
 from hypothesis import strategies as st
 
-from ugat_marl.data import Measured, read_measured, split_periods, write_measured
+from ugat_marl.data import MeasuredData, read_measured, split_periods, write_measured
 from ugat_marl.errors import UgatMarlError
 from ugat_marl.scenarios import Detector, Network, Passages, Period, Scenario, read_scenario
 
@@ -18,7 +18,7 @@ NAMES = ("periods", "detectors", "signals", "detections")
 JUNK = (b"\0", b"1e400", b"nan", b"-", b",", b'"', b"\n", b"\xff\xfe", b"9" * 40, b"\r", b"1e99")
 
 
-def recording() -> Measured:
+def recording() -> MeasuredData:
     detectors = (
         Detector("a", "S_C_0", 440.0, 2.0, "advance"),
         Detector("s", "W_C_0", 487.0, 0.0, "stop"),
@@ -35,12 +35,12 @@ def recording() -> Measured:
         )
         for i, split in enumerate(split_periods(2))
     )
-    return Measured(detectors, days)
+    return MeasuredData(detectors, days)
 
 
 def read_or_error(
     directory: Path, scenario: Scenario, network: Network
-) -> Measured | UgatMarlError:
+) -> MeasuredData | UgatMarlError:
     """Anything else that is raised fails the test."""
     try:
         return read_measured(directory, scenario, network)
@@ -90,7 +90,7 @@ def test_damaged_files_never_end_in_a_traceback(
     file.write_bytes(data.draw(damage(file.read_bytes())))
     outcome = read_or_error(broken, scenario, network)
     event(type(outcome).__name__)
-    if isinstance(outcome, Measured):
+    if isinstance(outcome, MeasuredData):
         assert outcome.hash
     else:
         assert any(f"{name}." in str(outcome) for name in NAMES)

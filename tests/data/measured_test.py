@@ -14,7 +14,7 @@ from hypothesis import assume, given, settings
 from hypothesis import strategies as st
 
 from ugat_marl.data import (
-    Measured,
+    MeasuredData,
     passages_as_written,
     read_measured,
     split_periods,
@@ -63,7 +63,7 @@ def vehicles(seed: int, count: int = 12, end: float = 200.0) -> Passages:
     )
 
 
-def recording(periods: int = 3) -> Measured:
+def recording(periods: int = 3) -> MeasuredData:
     """Days of a few vehicles per detector on the crossing of tests/data."""
     days = [
         Period(
@@ -76,7 +76,7 @@ def recording(periods: int = 3) -> Measured:
         )
         for i, split in enumerate(split_periods(periods))
     ]
-    return Measured(DETECTORS, tuple(days))
+    return MeasuredData(DETECTORS, tuple(days))
 
 
 def edit(file: Path, change: Change) -> None:
@@ -89,10 +89,12 @@ def edit(file: Path, change: Change) -> None:
 @pytest.fixture
 def reread(
     tmp_path: Path, crossing_scenario: Scenario, network: Network
-) -> Callable[..., Measured]:
+) -> Callable[..., MeasuredData]:
     """Writes a recording as CSV, changes files, and reads it."""
 
-    def read(changes: dict[str, Change] | None = None, given: Measured | None = None) -> Measured:
+    def read(
+        changes: dict[str, Change] | None = None, given: MeasuredData | None = None
+    ) -> MeasuredData:
         directory = write_measured(given or recording(), tmp_path / "street", csv=True)
         for name, change in (changes or {}).items():
             edit(directory / name, change)
@@ -101,7 +103,7 @@ def reread(
     return read
 
 
-def texts(measured: Measured) -> str:
+def texts(measured: MeasuredData) -> str:
     return "\n".join(finding.text for finding in measured.findings)
 
 
@@ -162,7 +164,7 @@ def test_the_hash_counts_milliseconds_and_every_passage() -> None:
 
 
 def test_a_vehicle_that_stands_on_the_detector_when_the_period_begins_or_ends(
-    reread: Callable[..., Measured],
+    reread: Callable[..., MeasuredData],
 ) -> None:
     nan = np.nan
     passages = Passages(
@@ -179,7 +181,9 @@ def test_a_vehicle_that_stands_on_the_detector_when_the_period_begins_or_ends(
     assert np.isnan(after.periods[0].passages["s"].off_s[2])
 
 
-def test_what_lies_outside_of_the_period_is_not_written(reread: Callable[..., Measured]) -> None:
+def test_what_lies_outside_of_the_period_is_not_written(
+    reread: Callable[..., MeasuredData],
+) -> None:
     passages = Passages(
         np.array([-3.0, -1.0, 50.0, 199.5, 201.0]),
         np.array([-2.0, 1.0, 51.0, 200.5, 202.0]),
@@ -195,7 +199,7 @@ def test_what_lies_outside_of_the_period_is_not_written(reread: Callable[..., Me
     np.testing.assert_array_equal(read.passages["s"].speed_mps, [2, 3, 4])
 
 
-def test_a_detector_is_on_or_off(reread: Callable[..., Measured]) -> None:
+def test_a_detector_is_on_or_off(reread: Callable[..., MeasuredData]) -> None:
     passages = Passages(
         np.array([10.0, 11.0]), np.array([11.4, 12.0]), np.array([1.0, 2.0]), np.full(2, np.nan)
     )
@@ -208,7 +212,7 @@ def test_a_detector_is_on_or_off(reread: Callable[..., Measured]) -> None:
     np.testing.assert_array_equal(read.passages["s"].speed_mps, [1, 2])
 
 
-def test_what_only_a_simulation_knows_is_not_logged(reread: Callable[..., Measured]) -> None:
+def test_what_only_a_simulation_knows_is_not_logged(reread: Callable[..., MeasuredData]) -> None:
     """Ends that are unknown in the middle: a vehicle that changed lanes on the zone."""
     nan = np.nan
     passages = Passages(
@@ -236,7 +240,7 @@ def test_what_only_a_simulation_knows_is_not_logged(reread: Callable[..., Measur
         np.testing.assert_array_equal(found.speed_mps, expected.speed_mps)
 
 
-def test_a_detector_that_is_on_all_the_time(reread: Callable[..., Measured]) -> None:
+def test_a_detector_that_is_on_all_the_time(reread: Callable[..., MeasuredData]) -> None:
     stuck = Passages(np.array([-5.0]), np.array([300.0]), np.full(1, np.nan), np.full(1, np.nan))
     base = recording(1)
     read = reread(given=replace(base, periods=(replace(base.periods[0], passages={"s": stuck}),)))
@@ -310,7 +314,9 @@ def test_a_write_that_fails_leaves_the_old_data(
     assert [path.name for path in tmp_path.iterdir()] == ["street"]
 
 
-def test_reading_leaves_the_files_alone(reread: Callable[..., Measured], tmp_path: Path) -> None:
+def test_reading_leaves_the_files_alone(
+    reread: Callable[..., MeasuredData], tmp_path: Path
+) -> None:
     reread()
     before = {
         p.name: (p.read_bytes(), p.stat().st_mtime_ns) for p in (tmp_path / "street").iterdir()
@@ -408,7 +414,9 @@ WRONG: dict[str, tuple[dict[str, Change], str]] = {
 
 
 @pytest.mark.parametrize("case", WRONG)
-def test_a_wrong_file_is_refused_with_its_place(case: str, reread: Callable[..., Measured]) -> None:
+def test_a_wrong_file_is_refused_with_its_place(
+    case: str, reread: Callable[..., MeasuredData]
+) -> None:
     changes, message = WRONG[case]
     name = next(iter(changes)) if case != "no known detector" else "detections.csv"
     with pytest.raises(MeasuredDataError, match=f"(?s){name}.*{message}"):
@@ -494,7 +502,7 @@ def test_numbers_as_names_and_other_column_types_are_understood(
     assert read_measured(directory, crossing_scenario, network).hash == renamed.hash
 
 
-def test_columns_that_nobody_reads_are_said(reread: Callable[..., Measured]) -> None:
+def test_columns_that_nobody_reads_are_said(reread: Callable[..., MeasuredData]) -> None:
     read = reread({"detections.csv": replaced("speed_mps", "speed_ms")})
     assert "'speed_ms' is not read; if it means 'speed_mps', rename it" in texts(read)
     assert "no speeds" in texts(read)

@@ -9,7 +9,7 @@ import numpy as np
 import polars as pl
 import pytest
 
-from ugat_marl.data import Measured
+from ugat_marl.data import MeasuredData
 from ugat_marl.diagnosis import DiagnosisConfig, Study
 from ugat_marl.diagnosis.study import unreached
 from ugat_marl.effects import load_scenario
@@ -20,7 +20,7 @@ SOUTH, WEST = Detector("s", "S_C_0", 90.0, 0.0, "stop"), Detector("w", "W_C_0", 
 TIMES = np.arange(5.0)
 SEEN = Passages(TIMES, TIMES + 0.4, TIMES + 9, TIMES + 5)
 DAY = Period("day1", 0.0, 200.0, "fit", {"C": ((0.0, "Gr"), (90.0, "rG"))}, {"s": SEEN, "w": SEEN})
-BOTH = Measured((SOUTH, WEST), (DAY,))
+BOTH = MeasuredData((SOUTH, WEST), (DAY,))
 
 
 @pytest.fixture(scope="module")
@@ -63,7 +63,7 @@ def test_counts_in_intervals_count_as_well(northbound: Scenario) -> None:
     counts = pl.DataFrame(
         {"period_id": ["day1"] * 2, "detector_id": ["w", "s"], "count": [7.0, 3.0]}
     )
-    alone = Measured((SOUTH, WEST), (replace(DAY, passages={}),), counts=counts)
+    alone = MeasuredData((SOUTH, WEST), (replace(DAY, passages={}),), counts=counts)
     (finding,) = unreached(northbound, alone, alone.detectors)
     assert "W_C, where detectors counted 7;" in finding.text
 
@@ -71,6 +71,6 @@ def test_counts_in_intervals_count_as_well(northbound: Scenario) -> None:
 def test_demand_that_reaches_no_measured_lane_is_refused_before_anything_runs(
     northbound: Scenario,
 ) -> None:
-    west = Measured((WEST,), (replace(DAY, passages={"w": SEEN}),))
+    west = MeasuredData((WEST,), (replace(DAY, passages={"w": SEEN}),))
     with pytest.raises(MeasuredDataError, match=r"no vehicle .* \(W_C\); check lane_id"):
         Study.of(northbound, west, DiagnosisConfig())

@@ -8,7 +8,7 @@ from pathlib import Path
 import polars as pl
 import pytest
 
-from ugat_marl.data import Measured
+from ugat_marl.data import MeasuredData
 from ugat_marl.diagnosis import DiagnosisConfig, diagnose
 from ugat_marl.diagnosis.features import (
     BIN_FEATURES,
@@ -58,7 +58,7 @@ def cycles(
 
 def found(scenario: Scenario, network: Network, log: SignalLog, tls: str = "C") -> list[str]:
     period = Period("day1", 0.0, 3600.0, "fit", {tls: log}, {})
-    measured = Measured(standard_detectors(network), (period,))
+    measured = MeasuredData(standard_detectors(network), (period,))
     return [str(effect) for effect in timing_effects(scenario, network, measured, THRESHOLDS)]
 
 
@@ -89,7 +89,7 @@ def test_what_the_log_tells_can_be_left_out(
     named: list[str],
 ) -> None:
     period = Period("day1", 0.0, 3600.0, "fit", {"C": cycles(30, 4.5, 0.5)}, {})
-    measured = Measured(standard_detectors(network), (period,))
+    measured = MeasuredData(standard_detectors(network), (period,))
     # Nothing is simulated within such a budget; the log is read all the same.
     config = DiagnosisConfig(budget_s=1e-9, leave_out=left_out, cache=tmp_path / "cache")
     diagnosis = diagnose(scenario, measured, tmp_path / "found", config)

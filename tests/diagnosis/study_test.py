@@ -10,7 +10,7 @@ import numpy as np
 import polars as pl
 import pytest
 
-from ugat_marl.data import Measured
+from ugat_marl.data import MeasuredData
 from ugat_marl.diagnosis import DiagnosisConfig, Study, Tally
 from ugat_marl.diagnosis.engine import Engine
 from ugat_marl.diagnosis.features import BIN_FEATURES, FEATURES, INDEX
@@ -27,7 +27,7 @@ DETECTORS = tuple(Detector(name, f"{name}_0", 1.0, 0.0, "stop") for name in NAME
 SEEN = Passages(np.array([1.0]), np.array([1.5]), np.array([10.0]), np.array([5.0]))
 
 
-def measured(*days: tuple[str, ...], silent: Passages | None = None) -> Measured:
+def measured(*days: tuple[str, ...], silent: Passages | None = None) -> MeasuredData:
     """Two days, on each of which these detectors saw a vehicle; others are as `silent`."""
     periods = tuple(
         Period(
@@ -44,7 +44,7 @@ def measured(*days: tuple[str, ...], silent: Passages | None = None) -> Measured
         )
         for number, saw in enumerate(days)
     )
-    return Measured(DETECTORS, periods)
+    return MeasuredData(DETECTORS, periods)
 
 
 def names(found: tuple[Detector, ...]) -> tuple[str, ...]:
@@ -74,7 +74,7 @@ def test_where_nobody_saw_anything_all_are_kept() -> None:
 
 def test_counts_in_intervals_say_nothing_of_silence() -> None:
     counts = pl.DataFrame({"period_id": ["day0"], "detector_id": ["one"], "count": [3]})
-    data = Measured(DETECTORS, (Period("day0", 0.0, 100.0, "fit", {}, {}),), counts=counts)
+    data = MeasuredData(DETECTORS, (Period("day0", 0.0, 100.0, "fit", {}, {}),), counts=counts)
     assert names(heard(data)) == NAMES
 
 

@@ -13,7 +13,7 @@ import polars as pl
 import pytest
 
 from ugat_marl.__main__ import main
-from ugat_marl.data import Measured, read_measured, write_measured
+from ugat_marl.data import MeasuredData, read_measured, write_measured
 from ugat_marl.effects import load_scenario
 from ugat_marl.errors import OptionError, UnknownNameError
 from ugat_marl.experiments import policy_factory, record
@@ -24,13 +24,13 @@ Crossing = Callable[..., Path]
 
 def measure(
     directory: Path, domain: str = "sim", policy: str = "fixed-time:20", **more: Any
-) -> Measured:
+) -> MeasuredData:
     options: dict[str, Any] = {"periods": 1, "workers": 1, **more}
     return record(load_scenario(directory), domain, policy_factory(policy), **options)
 
 
 @pytest.fixture(scope="module")
-def by_hand(data: Path) -> Measured:
+def by_hand(data: Path) -> MeasuredData:
     """A car every 20 s on each road, greens of 20 s in turn, and the tracks of all cars."""
     return measure(data / "crossing", same_demand=True, trajectories=True, lanes=True)
 
@@ -47,7 +47,7 @@ def passed(tracks: pl.DataFrame, lanes: tuple[str, ...], lane: str, position_m: 
     return set(ways.filter(pl.col("way_m") >= point)["vehicle_id"])
 
 
-def test_loops_count_the_cars_that_passed(by_hand: Measured) -> None:
+def test_loops_count_the_cars_that_passed(by_hand: MeasuredData) -> None:
     assert by_hand.trajectories is not None
     period = by_hand.periods[0]
     # 440 m at 10 m/s: the cars of 0, 20, ..., 140 s reach the advance detector within 200 s.
@@ -64,7 +64,7 @@ def test_loops_count_the_cars_that_passed(by_hand: Measured) -> None:
     assert counted > 40
 
 
-def test_passages_have_times_speeds_and_lengths(by_hand: Measured) -> None:
+def test_passages_have_times_speeds_and_lengths(by_hand: MeasuredData) -> None:
     seen = by_hand.periods[0].passages["advance:S_C_0"]
     assert seen.on_s[0] == pytest.approx((440.0 - 5.1) / 10, abs=0.2)
     assert (seen.off_s - seen.on_s)[0] == pytest.approx(5.0 / 10, abs=0.05)
@@ -72,14 +72,14 @@ def test_passages_have_times_speeds_and_lengths(by_hand: Measured) -> None:
     assert (seen.length_m == 5.0).all()
 
 
-def test_the_plan_of_the_controller_is_logged(by_hand: Measured) -> None:
+def test_the_plan_of_the_controller_is_logged(by_hand: MeasuredData) -> None:
     period = by_hand.periods[0]
     turns = tuple((20.0 * i, ("Gr", "rG")[i % 2]) for i in range(10))
     assert period.signals == {"C": turns}
     assert (period.begin_s, period.end_s, period.split) == (0.0, 200.0, "fit")
 
 
-def test_lanes_sum_up_the_tracks(by_hand: Measured) -> None:
+def test_lanes_sum_up_the_tracks(by_hand: MeasuredData) -> None:
     assert by_hand.lanes is not None
     assert by_hand.trajectories is not None
     assert by_hand.lanes.height == 4 * 200  # two roads before, two behind

@@ -11,7 +11,7 @@ from rich.console import Console
 from tyro.conf import Positional, arg
 
 from ugat_marl.cli.arguments import RayAddress, Workers, workers_of
-from ugat_marl.data import Measured, read_measured
+from ugat_marl.data import MeasuredData, read_measured
 from ugat_marl.diagnosis import (
     CORRECTED,
     FILE,
@@ -156,7 +156,7 @@ class Diagnose:
         console.print("\n" + "\n".join(lines), soft_wrap=True, markup=False)
 
 
-def _say_what_cannot_be_seen(measured: Measured, console: Console) -> None:
+def _say_what_cannot_be_seen(measured: MeasuredData, console: Console) -> None:
     """Print the effects that the data cannot show, before the first simulation."""
     ruled_out = {name for finding in measured.findings for name in finding.rules_out}
     if not ruled_out:

@@ -6,7 +6,7 @@ from .measured.coverage import is_actuated as is_actuated
 from .measured.passages import passages_as_written as passages_as_written
 from .measured.reading import read_measured as read_measured
 from .measured.values import Finding as Finding
-from .measured.values import Measured as Measured
+from .measured.values import MeasuredData as MeasuredData
 from .measured.values import split_periods as split_periods
 from .measured.writing import require_replaceable as require_replaceable
 from .measured.writing import write_measured as write_measured

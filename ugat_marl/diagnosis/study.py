@@ -13,7 +13,7 @@ from pathlib import Path
 
 import numpy as np
 
-from ugat_marl.data import Finding, Measured, is_actuated
+from ugat_marl.data import Finding, MeasuredData, is_actuated
 from ugat_marl.diagnosis.engine import Engine, default_cache
 from ugat_marl.diagnosis.features import (
     DetectorLayout,
@@ -105,7 +105,7 @@ class Study:
 
     scenario: Scenario
     network: Network
-    measured: Measured
+    measured: MeasuredData
     config: DiagnosisConfig
     layout: DetectorLayout
     engine: Engine
@@ -125,7 +125,7 @@ class Study:
         return self.fit + self.heldout if self.measured.of("heldout") else self.fit
 
     @classmethod
-    def of(cls, scenario: Scenario, measured: Measured, config: DiagnosisConfig) -> Study:
+    def of(cls, scenario: Scenario, measured: MeasuredData, config: DiagnosisConfig) -> Study:
         """Prepare a diagnosis; nothing is simulated yet.
 
         Raises:
@@ -327,7 +327,7 @@ def effort_for(intersections: int) -> Effort:
     return next((effort for most, effort in EFFORTS if intersections <= most), LEAST_EFFORT)
 
 
-def heard(measured: Measured) -> tuple[Detector, ...]:
+def heard(measured: MeasuredData) -> tuple[Detector, ...]:
     """Return the detectors to compare.
 
     If at least half of the detectors never saw a vehicle, they count as missing from the recording,
@@ -349,7 +349,7 @@ def heard(measured: Measured) -> tuple[Detector, ...]:
 def _tallies(
     layout: DetectorLayout,
     engine: Engine,
-    measured: Measured,
+    measured: MeasuredData,
     periods: Sequence[Period],
     thresholds: Thresholds,
 ) -> tuple[Tally, ...]:
@@ -368,7 +368,7 @@ _NAMED = 6
 
 
 def unreached(
-    scenario: Scenario, measured: Measured, detectors: Sequence[Detector]
+    scenario: Scenario, measured: MeasuredData, detectors: Sequence[Detector]
 ) -> tuple[Finding, ...]:
     """Return a finding on edges where detectors counted vehicles but no route of the demand leads.
 
@@ -426,7 +426,7 @@ _AMBER = frozenset("yY")
 
 
 def timing_effects(
-    scenario: Scenario, network: Network, measured: Measured, thresholds: Thresholds
+    scenario: Scenario, network: Network, measured: MeasuredData, thresholds: Thresholds
 ) -> tuple[Effect, ...]:
     """Return effects for yellow and all-red times of the log that differ from the scenario's.
 

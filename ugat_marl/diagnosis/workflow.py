@@ -11,7 +11,7 @@ from collections.abc import Collection
 from dataclasses import replace
 from pathlib import Path
 
-from ugat_marl.data import Measured, installed_versions
+from ugat_marl.data import MeasuredData, installed_versions
 from ugat_marl.diagnosis.engine import OutOfTime
 from ugat_marl.diagnosis.locate import disagreements, locate_gap
 from ugat_marl.diagnosis.records import (
@@ -50,7 +50,7 @@ ALTERNATIVES = 12
 
 def diagnose(
     scenario: Scenario,
-    measured: Measured,
+    measured: MeasuredData,
     directory: Path,
     config: DiagnosisConfig | None = None,
     reporter: Reporter | None = None,

@@ -14,7 +14,7 @@ from typing import Any
 
 import pytest
 
-from ugat_marl.data import Measured
+from ugat_marl.data import MeasuredData
 from ugat_marl.diagnosis import Diagnosis, DiagnosisConfig, diagnose
 from ugat_marl.diagnosis.hypotheses import library
 from ugat_marl.diagnosis.thresholds import Effort
@@ -53,14 +53,14 @@ class Street:
     scenario: Scenario
     cache: Path
 
-    def measure(self, domain: str, *, seed: int = 5, periods: int = 5) -> Measured:
+    def measure(self, domain: str, *, seed: int = 5, periods: int = 5) -> MeasuredData:
         """Days on which an effect is hidden, under fixed times."""
         policy = policy_factory("fixed-time:30")
         return record(self.scenario, domain, policy, periods=periods, seed=seed)
 
     def diagnose(
         self,
-        measured: Measured,
+        measured: MeasuredData,
         out: Path,
         *,
         among: Collection[str] = LIBRARY,

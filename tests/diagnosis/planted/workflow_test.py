@@ -11,7 +11,7 @@ import numpy as np
 import polars as pl
 import pytest
 
-from ugat_marl.data import Finding, Measured
+from ugat_marl.data import Finding, MeasuredData
 from ugat_marl.diagnosis import DiagnosisConfig
 from ugat_marl.diagnosis.engine import OutOfTime
 from ugat_marl.diagnosis.thresholds import Effort
@@ -23,15 +23,15 @@ DETECTORS = {"undercount", "dropout", "swapped"}
 
 
 @pytest.fixture(scope="module")
-def measured(street) -> Measured:
+def measured(street) -> MeasuredData:
     return street.measure("undercount=stop:S_C_0,0.3")
 
 
-def run(street, measured: Measured, out: Path, **options: Any) -> dict[str, Any]:
+def run(street, measured: MeasuredData, out: Path, **options: Any) -> dict[str, Any]:
     return street.diagnose(measured, out, **{"among": DETECTORS, "effort": FEW, **options})
 
 
-def test_the_same_inputs_give_the_same_file(street, measured: Measured, tmp_path: Path) -> None:
+def test_the_same_inputs_give_the_same_file(street, measured: MeasuredData, tmp_path: Path) -> None:
     def once(name: str, **options: Any) -> bytes:
         run(street, measured, tmp_path / name, **options)
         return (tmp_path / name / "diagnosis.json").read_bytes()
@@ -41,7 +41,7 @@ def test_the_same_inputs_give_the_same_file(street, measured: Measured, tmp_path
     assert once("other", workers=3) == cold
 
 
-def test_the_answer_is_the_file(street, measured: Measured, tmp_path: Path) -> None:
+def test_the_answer_is_the_file(street, measured: MeasuredData, tmp_path: Path) -> None:
     found = run(street, measured, tmp_path)
     assert json.loads((tmp_path / "diagnosis.json").read_text()) == found
     assert found["schema"] == "ugat-marl/diagnosis/2"
@@ -55,7 +55,9 @@ def test_the_answer_is_the_file(street, measured: Measured, tmp_path: Path) -> N
     assert "NaN" not in (tmp_path / "diagnosis.json").read_text()
 
 
-def test_without_held_out_periods_it_is_said(street, measured: Measured, tmp_path: Path) -> None:
+def test_without_held_out_periods_it_is_said(
+    street, measured: MeasuredData, tmp_path: Path
+) -> None:
     alone = replace(measured, periods=(replace(measured.periods[0], split="fit"),))
     found = run(street, alone, tmp_path)
     assert found["verified_on_fitted_periods"]
@@ -63,7 +65,7 @@ def test_without_held_out_periods_it_is_said(street, measured: Measured, tmp_pat
 
 
 def test_a_budget_that_is_too_small_for_anything_says_so(
-    street, measured: Measured, tmp_path: Path
+    street, measured: MeasuredData, tmp_path: Path
 ) -> None:
     found = run(street, measured, tmp_path, budget_s=1e-6, cache=tmp_path / "days", seed=1)
     assert found["verdict"] == "unknown"
@@ -75,7 +77,7 @@ def test_a_budget_that_is_too_small_for_anything_says_so(
 
 
 def test_when_the_budget_ends_half_way_the_answer_says_so(
-    street, measured: Measured, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    street, measured: MeasuredData, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     from ugat_marl.diagnosis.engine import Engine
 
@@ -99,7 +101,7 @@ def test_when_the_budget_ends_half_way_the_answer_says_so(
     assert whole_search["untried"] == []
 
 
-def test_what_data_rule_out_is_not_examined(street, measured: Measured, tmp_path: Path) -> None:
+def test_what_data_rule_out_is_not_examined(street, measured: MeasuredData, tmp_path: Path) -> None:
     finding = Finding("counts cannot be trusted", rules_out=("undercount", "dropout"))
     found = run(street, replace(measured, findings=(finding,)), tmp_path)
     assert found["ruled_out"] == ["dropout", "undercount"]
@@ -108,7 +110,7 @@ def test_what_data_rule_out_is_not_examined(street, measured: Measured, tmp_path
     assert all(effect["name"] == "swapped" for effect in found["effects"])
 
 
-def counts_of(measured: Measured, every_s: float) -> Measured:
+def counts_of(measured: MeasuredData, every_s: float) -> MeasuredData:
     """The same data as counts of all detectors, and nothing else."""
     rows = [
         (
@@ -162,7 +164,7 @@ def test_counts_alone_can_show_a_surge(street, tmp_path: Path) -> None:
 
 
 def test_data_without_a_single_vehicle_are_refused_or_named(
-    street, measured: Measured, tmp_path: Path
+    street, measured: MeasuredData, tmp_path: Path
 ) -> None:
     empty = replace(
         measured, periods=tuple(replace(period, passages={}) for period in measured.periods)
@@ -172,7 +174,7 @@ def test_data_without_a_single_vehicle_are_refused_or_named(
 
 
 def test_data_without_a_period_to_fit_are_refused(
-    street, measured: Measured, tmp_path: Path
+    street, measured: MeasuredData, tmp_path: Path
 ) -> None:
     held = tuple(replace(period, split="heldout") for period in measured.periods)
     with pytest.raises(MeasuredDataError, match="fit"):

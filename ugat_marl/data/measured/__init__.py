@@ -2,7 +2,7 @@
 
 - `values`: the data in memory.
 - `tables`: the files and their columns, checked while they are read.
-- `reading`: reader of a directory, which returns `values.Measured`.
+- `reading`: reader of a directory, which returns `values.MeasuredData`.
 - `passages`: passages of vehicles from on and off events.
 - `coverage`: findings on missing data.
 - `writing`: writer of a directory.

@@ -32,7 +32,7 @@ from ugat_marl.data.measured.tables import (
     to_texts,
     with_period,
 )
-from ugat_marl.data.measured.values import Finding, Measured
+from ugat_marl.data.measured.values import Finding, MeasuredData
 from ugat_marl.errors import MeasuredDataError
 from ugat_marl.scenarios import Network, Period, Scenario, SignalLog, deciding_letter, signal_widths
 
@@ -108,7 +108,7 @@ class _Event:
         return _COLOUR[self.code]
 
 
-def import_atspm(events: Path, mapping: Path, scenario: Scenario, network: Network) -> Measured:
+def import_atspm(events: Path, mapping: Path, scenario: Scenario, network: Network) -> MeasuredData:
     """Read a controllers' log as measured data.
 
     Args:
@@ -153,7 +153,7 @@ def import_atspm(events: Path, mapping: Path, scenario: Scenario, network: Netwo
     passages, broken = passages_of(
         events, with_period(events, stamps, periods, findings), periods, detectors, findings
     )
-    measured = Measured(
+    measured = MeasuredData(
         tuple(detector for detector in detectors if detector.id not in broken),
         tuple(
             replace(period, signals=shown, passages=seen)

@@ -9,7 +9,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from ugat_marl.data.measured.values import Finding, Measured
+from ugat_marl.data.measured.values import Finding, MeasuredData
 from ugat_marl.effects import known_effects
 from ugat_marl.scenarios import (
     GREEN,
@@ -88,7 +88,7 @@ NEEDS_TWO_KINDS = ("undercount",)
 """Effects that need two kinds of detectors: missed vehicles show in the next detector's count."""
 
 
-def coverage(measured: Measured, scenario: Scenario, network: Network) -> list[Finding]:
+def coverage(measured: MeasuredData, scenario: Scenario, network: Network) -> list[Finding]:
     """Return findings on all missing data, most important first."""
     return [
         *_of_periods(measured),
@@ -100,7 +100,7 @@ def coverage(measured: Measured, scenario: Scenario, network: Network) -> list[F
     ]
 
 
-def _of_periods(measured: Measured) -> Iterator[Finding]:
+def _of_periods(measured: MeasuredData) -> Iterator[Finding]:
     periods = measured.periods
     if not measured.of("heldout"):
         why = "only one period" if len(periods) == 1 else "every period is to be fitted"
@@ -116,7 +116,7 @@ def _of_periods(measured: Measured) -> Iterator[Finding]:
         )
 
 
-def _of_signals(measured: Measured, scenario: Scenario, network: Network) -> Iterator[Finding]:
+def _of_signals(measured: MeasuredData, scenario: Scenario, network: Network) -> Iterator[Finding]:
     periods = measured.periods
     if not any(period.signals for period in periods):
         yield Finding(
@@ -174,7 +174,7 @@ def _has_yellow(periods: Sequence[Period], tls: str) -> bool:
     return bool(letters & YELLOW) or not letters & GREEN or len(shown) < 2
 
 
-def _of_kinds(measured: Measured, network: Network) -> Iterator[Finding]:
+def _of_kinds(measured: MeasuredData, network: Network) -> Iterator[Finding]:
     if not measured.has_events:
         yield Finding(
             "counts only, no detections of single vehicles: only "
@@ -217,7 +217,7 @@ def _of_kinds(measured: Measured, network: Network) -> Iterator[Finding]:
     yield from _of_speeds(measured)
 
 
-def _of_speeds(measured: Measured) -> Iterator[Finding]:
+def _of_speeds(measured: MeasuredData) -> Iterator[Finding]:
     passages = [
         detector_passages
         for period in measured.periods
@@ -265,7 +265,7 @@ def _of_places(detectors: Sequence[Detector], network: Network) -> Iterator[Find
         )
 
 
-def _of_agreement(measured: Measured, network: Network) -> Iterator[Finding]:
+def _of_agreement(measured: MeasuredData, network: Network) -> Iterator[Finding]:
     """Yield a finding for each light whose vehicles mostly leave the stop line on red.
 
     The cause is a wrong lane or link, or a wrong clock.
@@ -315,7 +315,7 @@ class _Silence:
     meanwhile: int
 
 
-def _of_silence(measured: Measured) -> Iterator[Finding]:
+def _of_silence(measured: MeasuredData) -> Iterator[Finding]:
     roads: dict[str, list[Detector]] = {}
     for silent in measured.detectors:
         roads.setdefault(edge_of_lane(silent.lane), []).append(silent)
@@ -358,7 +358,7 @@ def _is_hole(times: NDArray[np.float64], begin_s: float, length_s: float) -> boo
     return length_s > HOLE_S and min(before, after) >= BUSY
 
 
-def _usual_rates(measured: Measured) -> dict[str, float]:
+def _usual_rates(measured: MeasuredData) -> dict[str, float]:
     """Return the vehicles per second at each detector over all periods."""
     counts: dict[str, float] = {}
     seconds = sum(period.end_s - period.begin_s for period in measured.periods)

@@ -25,7 +25,7 @@ from ugat_marl.data.measured.tables import (
     refuse_set_back,
     with_period,
 )
-from ugat_marl.data.measured.values import Finding, Measured, split_periods
+from ugat_marl.data.measured.values import Finding, MeasuredData, split_periods
 from ugat_marl.errors import MeasuredDataError, nearest
 from ugat_marl.scenarios import (
     SIGNAL_LETTERS,
@@ -49,7 +49,7 @@ LATE_S = 120.0
 """A log may begin this much later than its period (about one signal cycle)."""
 
 
-def read_measured(directory: Path, scenario: Scenario, network: Network) -> Measured:
+def read_measured(directory: Path, scenario: Scenario, network: Network) -> MeasuredData:
     """Read measured data; the files stay unchanged.
 
     Args:
@@ -110,7 +110,7 @@ def read_measured(directory: Path, scenario: Scenario, network: Network) -> Meas
     def extra(table: Table) -> pl.DataFrame | None:
         return None if paths[table.stem] is None else _extra(*rows(table), table, periods, findings)
 
-    measured = Measured(
+    measured = MeasuredData(
         detectors,
         periods,
         extra(tables.LANES),

@@ -30,7 +30,7 @@ class Finding:
 
 
 @dataclass(frozen=True, eq=False)
-class Measured:
+class MeasuredData:
     """All measured data of one network.
 
     Attributes:

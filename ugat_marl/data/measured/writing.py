@@ -24,12 +24,12 @@ from ugat_marl.data.measured.tables import (
     Table,
     frame_of,
 )
-from ugat_marl.data.measured.values import Measured
+from ugat_marl.data.measured.values import MeasuredData
 from ugat_marl.errors import OutputError
 from ugat_marl.scenarios import Passages, Period
 
 
-def write_measured(measured: Measured, directory: Path, *, csv: bool = False) -> Path:
+def write_measured(measured: MeasuredData, directory: Path, *, csv: bool = False) -> Path:
     """Write measured data. The directory appears whole or not at all.
 
     Passages are written in the form of `passages_as_written`: times in milliseconds, within their
@@ -131,7 +131,7 @@ def _write(frame: pl.DataFrame, path: Path) -> None:
         frame.write_parquet(path)
 
 
-def _detectors(measured: Measured) -> pl.DataFrame:
+def _detectors(measured: MeasuredData) -> pl.DataFrame:
     rows = [(d.id, d.lane, d.position_m, d.length_m, d.kind) for d in measured.detectors]
     return frame_of(DETECTORS, rows)
 

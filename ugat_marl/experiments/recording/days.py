@@ -19,7 +19,7 @@ from pathlib import Path
 import numpy as np
 import polars as pl
 
-from ugat_marl.data import Measured, passages_as_written, split_periods
+from ugat_marl.data import MeasuredData, passages_as_written, split_periods
 from ugat_marl.effects import (
     Domain,
     Effect,
@@ -119,7 +119,7 @@ def record(
     trajectories: bool = False,
     workers: int | None = None,
     reporter: Reporter | None = None,
-) -> Measured:
+) -> MeasuredData:
     """Measure a domain like a real street. The same arguments give the same data.
 
     Args:
@@ -178,7 +178,7 @@ def record(
     )
     with (reporter or Silent()).task("measuring", periods) as advance:
         days = _all_days(street, periods, workers or os.cpu_count() or 1, advance)
-    return Measured(
+    return MeasuredData(
         street.detectors,
         tuple(day.period for day in days),
         lanes=_together(day.lanes for day in days) if lanes else None,
