@@ -90,7 +90,7 @@ def travel_time_picture(records: Sequence[RunRecord], name: str) -> NamedFigure 
     domains: dict[str, list[tuple[float, float, float, float]]] = {}
     for domain in _domains(records):
         series = [record.series("iteration", f"att_s/{domain}") for record in records]
-        if rows := means_by_step([one for one in series if one]):
+        if rows := means_by_step([points for points in series if points]):
             domains[domain] = rows
     if not domains:
         return None
@@ -255,22 +255,22 @@ def _draw_estimates(
 
 
 @styled()
-def transfer_picture(found: Evaluation, metrics: Metrics, path: Path) -> None:
+def transfer_picture(evaluation: Evaluation, metrics: Metrics, path: Path) -> None:
     """Draw ATT by policy and domain, and ATT over the iterations, as PNG.
 
     Args:
-        found: The final evaluation.
+        evaluation: The final evaluation.
         metrics: The run's metrics, with ATT after each iteration.
         path: File to write.
     """
-    labels = [f"in {domain}" for domain in found.domains]
-    height = max(270.0, TOP + 22 + _ROW * len(found.policies) + 66)
-    picture = new_picture("gap", f"{found.scenario}: average travel time", height, 2 * WIDTH)
+    labels = [f"in {domain}" for domain in evaluation.domains]
+    height = max(270.0, TOP + 22 + _ROW * len(evaluation.policies) + 66)
+    picture = new_picture("gap", f"{evaluation.scenario}: average travel time", height, 2 * WIDTH)
     left = add_axes(picture, 186, TOP + 22, WIDTH + 10, 66)
-    _draw_policies(left, found)
+    _draw_policies(left, evaluation)
     right = add_axes(picture, WIDTH + 68, TOP + 22, 14, 66)
     _label(right, "iteration (0: direct transfer)", "after each iteration, one seed, s")
-    for number, domain in enumerate(found.domains):
+    for number, domain in enumerate(evaluation.domains):
         rows = [
             (step, value, math.nan, math.nan)
             for stage, step, name, value in sorted(metrics.rows)
@@ -278,11 +278,11 @@ def transfer_picture(found: Evaluation, metrics: Metrics, path: Path) -> None:
         ]
         if rows:
             _draw_curve(picture, right, number, rows)
-        rule = f"rule {found.notes.get(f'best rule in {domain}')}"
-        if rule in found.policies:
+        rule = f"rule {evaluation.notes.get(f'best rule in {domain}')}"
+        if rule in evaluation.policies:
             colour, level = (
                 curve_style(number)["color"],
-                found.estimate(rule, domain, "att_s").mean,
+                evaluation.estimate(rule, domain, "att_s").mean,
             )
             right.axhline(level, color=colour, linestyle=(0, (1, 2)), linewidth=1)
             right.annotate(
@@ -294,33 +294,33 @@ def transfer_picture(found: Evaluation, metrics: Metrics, path: Path) -> None:
     write_png(picture, path)
 
 
-def travel_times(found: Evaluation) -> dict[str, list[Estimated]]:
+def travel_times(evaluation: Evaluation) -> dict[str, list[Estimated]]:
     """Return domain to the travel time of each policy, s, with its interval."""
     return {
-        f"in {domain}": [_of(found.estimate(p, domain, "att_s")) for p in found.policies]
-        for domain in found.domains
+        f"in {domain}": [_of(evaluation.estimate(p, domain, "att_s")) for p in evaluation.policies]
+        for domain in evaluation.domains
     }
 
 
-def _draw_policies(axes: Any, found: Evaluation) -> None:
-    _draw_estimates(axes, found.policies, travel_times(found), "s")
-    seeds = len({result.seed for result in found.results})
+def _draw_policies(axes: Any, evaluation: Evaluation) -> None:
+    _draw_estimates(axes, evaluation.policies, travel_times(evaluation), "s")
+    seeds = len({result.seed for result in evaluation.results})
     title = f"final policies, {seeds} seeds, 95 % intervals, s"
     axes.set_title(title, color=LIGHT["soft"], x=-178 / _points_wide(axes))
 
 
 @styled()
-def gap_picture(found: Comparison, path: Path) -> None:
+def gap_picture(comparison: Comparison, path: Path) -> None:
     """Draw the gaps of ATT and throughput with intervals over training seeds, as PNG.
 
     Args:
-        found: The comparison.
+        comparison: The comparison.
         path: File to write.
     """
-    below = legend_height(found.targets, 2 * WIDTH)
-    row = max(24.0, 11.0 * len(found.targets) + 6)
-    height = TOP + 8 + row * len(found.settings) + 48 + below
-    title = f"{found.scenario}: real domain minus simulation"
+    below = legend_height(comparison.targets, 2 * WIDTH)
+    row = max(24.0, 11.0 * len(comparison.targets) + 6)
+    height = TOP + 8 + row * len(comparison.settings) + 48 + below
+    title = f"{comparison.scenario}: real domain minus simulation"
     picture = new_picture("gaps", title, height, 2 * WIDTH)
     for place, (measure, label, unit) in enumerate(
         (
@@ -332,17 +332,17 @@ def gap_picture(found: Comparison, path: Path) -> None:
         axes = add_axes(picture, side[0], TOP + 8, side[1], 48 + below)
         series = {
             target: [
-                _of(Interval.of(found.gaps(s, target, measure)))
-                if found.has(s, target)
+                _of(Interval.of(comparison.gaps(s, target, measure)))
+                if comparison.has(s, target)
                 else (math.nan, math.nan, math.nan)
-                for s in found.settings
+                for s in comparison.settings
             ]
-            for target in found.targets
+            for target in comparison.targets
         }
-        _draw_estimates(axes, found.settings, series, unit, named=place == 0)
+        _draw_estimates(axes, comparison.settings, series, unit, named=place == 0)
         axes.axvline(0, color=LIGHT["soft"], linewidth=1)
         axes.set_xlabel(label, loc="right")
-    add_legend(picture, found.targets, lines=False)
+    add_legend(picture, comparison.targets, lines=False)
     write_png(picture, path)
 
 
@@ -376,32 +376,34 @@ def radar_picture(
 
 
 @styled()
-def comparison_radar(found: Comparison, settings: Sequence[str], path: Path) -> None:
+def comparison_radar(comparison: Comparison, settings: Sequence[str], path: Path) -> None:
     """Draw the paper's five measures in sim and in each real domain, as PNG.
 
     Args:
-        found: The comparison.
+        comparison: The comparison.
         settings: Settings to draw. The first one is drawn in the simulation, too.
         path: File to write.
     """
-    columns = min(len(found.targets), 2)
-    rows = math.ceil(len(found.targets) / columns)
-    legend = [f"{settings[0]} in {found.sim}", *(f"{s} in the real domain" for s in settings)]
+    columns = min(len(comparison.targets), 2)
+    rows = math.ceil(len(comparison.targets) / columns)
+    legend = [f"{settings[0]} in {comparison.sim}", *(f"{s} in the real domain" for s in settings)]
     wide, high = 440.0, 310.0
     width = max(wide * columns, 560.0)
     below = legend_height(legend, width) + 12
     title = "simulation against real domain; the rim is the best"
-    picture = new_picture("radar", f"{found.scenario}: {title}", TOP + high * rows + below, width)
-    for place, target in enumerate(found.targets):
+    picture = new_picture(
+        "radar", f"{comparison.scenario}: {title}", TOP + high * rows + below, width
+    )
+    for place, target in enumerate(comparison.targets):
         left, top = wide * (place % columns), TOP + high * (place // columns)
         axes = add_axes(
             picture, left + 125, top + 70, width - left - wide + 125,
             below + high * (rows - 1 - place // columns) + 50, projection="polar",
         )  # fmt: skip
-        lines = [(settings[0], found.sim), *((s, target) for s in settings)]
+        lines = [(settings[0], comparison.sim), *((s, target) for s in settings)]
         table = [
-            [float(found.values(s, target, m, domain).mean()) for m in MEASURES]
-            if found.has(s, target)
+            [float(comparison.values(s, target, m, domain).mean()) for m in MEASURES]
+            if comparison.has(s, target)
             else [math.nan] * len(MEASURES)
             for s, domain in lines
         ]
@@ -411,18 +413,18 @@ def comparison_radar(found: Comparison, settings: Sequence[str], path: Path) -> 
     write_png(picture, path)
 
 
-def radar_lines(found: Evaluation, real: str) -> dict[str, list[float]]:
+def radar_lines(evaluation: Evaluation, real: str) -> dict[str, list[float]]:
     """Return the lines of a radar: direct transfer in the simulation, then policies in `real`.
 
     These policies are direct transfer, those of UGAT and the best rule, five at most.
     """
-    sim, policies = found.domains[0], found.policies
-    rule = f"rule {found.notes.get(f'best rule in {real}')}"
+    sim, policies = evaluation.domains[0], evaluation.policies
+    rule = f"rule {evaluation.notes.get(f'best rule in {real}')}"
     shown = [policies[0], *(p for p in policies if p.startswith("UGAT") and p != policies[0])]
     shown += [p for p in policies if p == rule and p not in shown]
 
     def means(policy: str, domain: str) -> list[float]:
-        return [float(found.values(policy, domain, measure).mean()) for measure in MEASURES]
+        return [float(evaluation.values(policy, domain, measure).mean()) for measure in MEASURES]
 
     lines = {f"{policies[0]} in {sim}": means(policies[0], sim)}
     return lines | {f"{policy} in {real}": means(policy, real) for policy in shown[:5]}

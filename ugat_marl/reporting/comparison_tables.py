@@ -33,50 +33,54 @@ Cell = Callable[[str, str], str]
 """Setting and domain to the text of a cell."""
 
 
-def terminal_tables(found: Comparison, direct: str) -> RenderableType:
+def terminal_tables(comparison: Comparison, direct: str) -> RenderableType:
     """Return ATT, change of the gap, regret and the share won back, in 80 columns."""
     blocks: list[RenderableType] = []
-    for title, cell in _headlines(found, direct):
+    for title, cell in _headlines(comparison, direct):
         table = Table(
             box=box.SIMPLE_HEAD,
-            title=Text(f"{found.scenario}: {title}"),
+            title=Text(f"{comparison.scenario}: {title}"),
             title_justify="left",
             pad_edge=False,
             padding=(0, 1, 0, 0),
         )
         table.add_column("policy", max_width=28, overflow="fold")
-        for target in found.targets:
+        for target in comparison.targets:
             table.add_column(target, justify="right", no_wrap=True)
-        for setting in found.settings:
-            row = [cell(setting, t) if found.has(setting, t) else "" for t in found.targets]
+        for setting in comparison.settings:
+            row = [
+                cell(setting, t) if comparison.has(setting, t) else "" for t in comparison.targets
+            ]
             table.add_row(Text(setting), *row)
         blocks.append(table)
-    count = len(found.training_seeds)
+    count = len(comparison.training_seeds)
     blocks.append(Text(f"{count} training seeds; intervals: 95 %, Student's, over them."))
     return Group(*blocks)
 
 
-def comparison_page(found: Comparison, direct: str, title: str, facts: Mapping[str, Any]) -> str:
+def comparison_page(
+    comparison: Comparison, direct: str, title: str, facts: Mapping[str, Any]
+) -> str:
     """Return the whole comparison as a page of Markdown.
 
     Args:
-        found: The comparison.
+        comparison: The comparison.
         direct: Setting with which the others are compared.
         title: Name of the table; the heading is "<scenario>: <title>".
         facts: Command, versions and processor (`experiments.machine_facts`).
     """
     lines = [
-        f"# {found.scenario}: {title}",
+        f"# {comparison.scenario}: {title}",
         "",
         "![Change of the gap of each setting](gaps.png)",
         "",
-        *_meaning(found, direct),
+        *_meaning(comparison, direct),
         "",
-        *_provenance(found, facts),
+        *_provenance(comparison, facts),
         "",
     ]
-    for title, cell in _headlines(found, direct):
-        lines += [f"## {title[0].upper()}{title[1:]}", "", *_grid(found, cell), ""]
+    for title, cell in _headlines(comparison, direct):
+        lines += [f"## {title[0].upper()}{title[1:]}", "", *_grid(comparison, cell), ""]
     lines += ["## Against direct transfer, seed by seed", ""]
     lines += [
         "Difference of ATT in s (95 % interval), two-sided p of the paired t-test, and in how many "
@@ -84,7 +88,7 @@ def comparison_page(found: Comparison, direct: str, title: str, facts: Mapping[s
         "on the same episodes, which intervals and tests take as given. So is a rule, which has no "
         "training seed.",
         "",
-        *_grid(found, lambda s, t: _tested(found.test(s, direct, t)), leave_out=direct),
+        *_grid(comparison, lambda s, t: _tested(comparison.test(s, direct, t)), leave_out=direct),
         "",
     ]
     lines += [
@@ -94,20 +98,20 @@ def comparison_page(found: Comparison, direct: str, title: str, facts: Mapping[s
         f"which fewer than {100 * LEAST_SHARE_ARRIVED:.0f} % of the vehicles due arrived.",
         "Where two outcomes are possible, means and intervals say little.",
         "",
-        *_grid(found, _episodes(found)),
+        *_grid(comparison, _episodes(comparison)),
         "",
     ]
-    if found.constants:
-        lines += _against_constants(found)
+    if comparison.constants:
+        lines += _against_constants(comparison)
     lines += ["## The paper's measures", "", "Mean in the real domain (Δ to the simulation).", ""]
     for measure, heading in MEASURES.items():
-        lines += [f"### {heading}", "", *_grid(found, _with_gap(found, measure)), ""]
+        lines += [f"### {heading}", "", *_grid(comparison, _with_gap(comparison, measure)), ""]
     return "\n".join(lines)
 
 
-def comparison_csv(found: Comparison) -> str:
+def comparison_csv(comparison: Comparison) -> str:
     """Return `Comparison.rows` as CSV with a heading; a missing value is an empty cell."""
-    rows = found.rows()
+    rows = comparison.rows()
     text = io.StringIO()
     writer = csv.DictWriter(text, list(rows[0]), lineterminator="\n")
     writer.writeheader()
@@ -116,100 +120,104 @@ def comparison_csv(found: Comparison) -> str:
     return text.getvalue()
 
 
-def seeds_csv(found: Comparison) -> str:
+def seeds_csv(comparison: Comparison) -> str:
     """Return every training with its mean ATT and throughput as CSV, for tests of a reader."""
     text = io.StringIO()
     writer = csv.writer(text, lineterminator="\n")
     writer.writerow(["setting", "domain", "training_seed", "att_s", "att_s_sim", "throughput"])
-    seeds = found.training_seeds
-    for setting in found.settings:
-        for target in found.targets:
-            if found.has(setting, target):
+    seeds = comparison.training_seeds
+    for setting in comparison.settings:
+        for target in comparison.targets:
+            if comparison.has(setting, target):
                 columns = [
-                    found.values(setting, target, "att_s"),
-                    found.values(setting, target, "att_s", found.sim),
-                    found.values(setting, target, "throughput"),
+                    comparison.values(setting, target, "att_s"),
+                    comparison.values(setting, target, "att_s", comparison.sim),
+                    comparison.values(setting, target, "throughput"),
                 ]
                 for seed, *values in zip(seeds, *(c.tolist() for c in columns), strict=True):
                     writer.writerow([setting, target, seed, *(round(v, 3) for v in values)])
     return text.getvalue()
 
 
-def _headlines(found: Comparison, direct: str) -> list[tuple[str, Cell]]:
+def _headlines(comparison: Comparison, direct: str) -> list[tuple[str, Cell]]:
     return [
-        ("average travel time in the real domain, s", _estimated(found, None)),
-        ("average travel time in the simulation, s", _estimated(found, found.sim)),
+        ("average travel time in the real domain, s", _estimated(comparison, None)),
+        ("average travel time in the simulation, s", _estimated(comparison, comparison.sim)),
         (
             "change of the gap Δ against direct transfer",
-            lambda s, t: percent_text(-found.reduction(s, t, direct)),
+            lambda s, t: percent_text(-comparison.reduction(s, t, direct)),
         ),
         (
             "transfer regret, s above the best in the table",
-            lambda s, t: with_interval(Interval.of(found.regret_s(s, t))),
+            lambda s, t: with_interval(Interval.of(comparison.regret_s(s, t))),
         ),
         (
             "share of the regret won back (1: the best in the table)",
-            lambda s, t: share_text(found.won_back(s, t, direct)),
+            lambda s, t: share_text(comparison.won_back(s, t, direct)),
         ),
     ]
 
 
-def _estimated(found: Comparison, domain: str | None) -> Cell:
-    return lambda s, t: with_interval(found.estimate(s, t, "att_s", domain))
+def _estimated(comparison: Comparison, domain: str | None) -> Cell:
+    return lambda s, t: with_interval(comparison.estimate(s, t, "att_s", domain))
 
 
-def _episodes(found: Comparison) -> Cell:
-    return lambda s, t: f"{number_text(found.median_s(s, t))}, {100 * found.unserved(s, t):.0f} %"
+def _episodes(comparison: Comparison) -> Cell:
+    return lambda s, t: (
+        f"{number_text(comparison.median_s(s, t))}, {100 * comparison.unserved(s, t):.0f} %"
+    )
 
 
-def _with_gap(found: Comparison, measure: str) -> Cell:
+def _with_gap(comparison: Comparison, measure: str) -> Cell:
     def cell(setting: str, target: str) -> str:
-        gap = float(found.gaps(setting, target, measure).mean())
-        mean = number_text(found.estimate(setting, target, measure).mean)
+        gap = float(comparison.gaps(setting, target, measure).mean())
+        mean = number_text(comparison.estimate(setting, target, measure).mean)
         return f"{mean} ({'+' if gap >= 0 else ''}{number_text(gap)})"
 
     return cell
 
 
-def _grid(found: Comparison, cell: Cell, leave_out: str = "") -> list[str]:
+def _grid(comparison: Comparison, cell: Cell, leave_out: str = "") -> list[str]:
     lines = [
-        f"| | {' | '.join(found.targets)} |",
-        f"|---|{'---:|' * len(found.targets)}",
+        f"| | {' | '.join(comparison.targets)} |",
+        f"|---|{'---:|' * len(comparison.targets)}",
     ]
-    for setting in found.settings:
+    for setting in comparison.settings:
         if setting != leave_out:
-            row = (cell(setting, t) if found.has(setting, t) else "" for t in found.targets)
+            row = (
+                cell(setting, t) if comparison.has(setting, t) else "" for t in comparison.targets
+            )
             lines.append(f"| {setting} | {' | '.join(row)} |")
     return lines
 
 
-def _against_constants(found: Comparison) -> list[str]:
+def _against_constants(comparison: Comparison) -> list[str]:
     lines = [
         "## Against the best constant delay, chosen in hindsight",
         "",
         "Per domain the constant with the lowest mean over all training seeds.",
         "",
-        f"| | {' | '.join(found.targets)} |",
-        f"|---|{'---:|' * len(found.targets)}",
+        f"| | {' | '.join(comparison.targets)} |",
+        f"|---|{'---:|' * len(comparison.targets)}",
     ]
-    best = {target: found.best(target, found.constants) for target in found.targets}
+    best = {target: comparison.best(target, comparison.constants) for target in comparison.targets}
     lines.append(f"| best constant | {' | '.join(best.values())} |")
-    for setting in found.grounded:
-        cells = (_tested(found.test(setting, best[t], t)) for t in found.targets)
+    for setting in comparison.grounded:
+        cells = (_tested(comparison.test(setting, best[t], t)) for t in comparison.targets)
         lines.append(f"| {setting} | {' | '.join(cells)} |")
     return [*lines, ""]
 
 
-def _meaning(found: Comparison, direct: str) -> list[str]:
+def _meaning(comparison: Comparison, direct: str) -> list[str]:
     """Return the meaning of the table: settings better than direct transfer, and the best ones."""
     better = [
         setting
-        for setting in found.settings
-        if setting != direct and _better_everywhere(found, setting, direct)
+        for setting in comparison.settings
+        if setting != direct and _better_everywhere(comparison, setting, direct)
     ]
     lowest: dict[str, list[str]] = {}
-    for target in found.targets:
-        lowest.setdefault(found.best(target), []).append(target)
+    for target in comparison.targets:
+        lowest.setdefault(comparison.best(target), []).append(target)
     best = listed([f"`{setting}` in {listed(targets)}" for setting, targets in lowest.items()])
     first = (
         f"Better than direct transfer in every domain, with p < {CERTAIN:g} in each: "
@@ -220,22 +228,26 @@ def _meaning(found: Comparison, direct: str) -> list[str]:
     return textwrap.wrap(f"{first} Lowest mean travel time: {best}.", PAGE_WIDTH)
 
 
-def _better_everywhere(found: Comparison, setting: str, direct: str) -> bool:
+def _better_everywhere(comparison: Comparison, setting: str, direct: str) -> bool:
     """Return True if a setting is faster than another in each domain, with p < `CERTAIN`."""
-    tests = [found.test(setting, direct, t) for t in found.targets if found.has(setting, t)]
+    tests = [
+        comparison.test(setting, direct, t)
+        for t in comparison.targets
+        if comparison.has(setting, t)
+    ]
     return all(test.difference.mean < 0 and test.p < CERTAIN for test in tests)
 
 
-def _provenance(found: Comparison, facts: Mapping[str, Any]) -> list[str]:
+def _provenance(comparison: Comparison, facts: Mapping[str, Any]) -> list[str]:
     cores = "1 core" if facts["cores"] == 1 else f"{facts['cores']} cores"
     rows = {
-        "training seeds": ", ".join(map(str, found.training_seeds)),
+        "training seeds": ", ".join(map(str, comparison.training_seeds)),
         "intervals": "95 %, Student's, over training seeds",
         "processor": f"{facts['cpu']}, {cores}",
         "Python": facts["python"],
         **facts["versions"],
         "date": facts["date"][:10],
-        **found.notes,
+        **comparison.notes,
     }
     return [*command_block(facts["command"]), "", *made_with(rows)]
 

@@ -223,17 +223,17 @@ def _where(diagnosis: Diagnosis) -> dict[str, Grid | None] | None:
     }
 
 
-def _disagreements(items: Sequence[Disagreement]) -> Grid:
+def _disagreements(disagreements: Sequence[Disagreement]) -> Grid:
     rows = [
         (
-            words.disagreement_place(item),
-            item.regime,
-            statistic(item.statistic),
-            f"{signed(item.size)} {item.unit}".rstrip(),
-            signed(item.z),
-            words.window(item.window),
+            words.disagreement_place(disagreement),
+            disagreement.regime,
+            statistic(disagreement.statistic),
+            f"{signed(disagreement.size)} {disagreement.unit}".rstrip(),
+            signed(disagreement.z),
+            words.window(disagreement.window),
         )
-        for item in items
+        for disagreement in disagreements
     ]
     return Grid(("place", "regime", "statistic", "size", "z", "window"), rows, ("size", "z"))
 
@@ -242,13 +242,15 @@ def _ranking(diagnosis: Diagnosis) -> list[dict[str, Any]]:
     """Return the simulated explanations, the chosen one first."""
     if not diagnosis.alternatives:
         return []
-    items: list[tuple[str, float | None, float | None, bool]] = []
+    explanations: list[tuple[str, float | None, float | None, bool]] = []
     if diagnosis.effects:
         best = diagnosis.best
         left, cost = (None, None) if best is None else (best.distance, best.cost)
-        items.append((_set(diagnosis.effects), left, cost, True))
-    items += [(_set(x.effects), x.distance, x.cost, False) for x in diagnosis.alternatives]
-    most = max((distance for _, distance, _, _ in items if distance is not None), default=1.0)
+        explanations.append((_set(diagnosis.effects), left, cost, True))
+    explanations += [(_set(x.effects), x.distance, x.cost, False) for x in diagnosis.alternatives]
+    most = max(
+        (distance for _, distance, _, _ in explanations if distance is not None), default=1.0
+    )
     return [
         {
             "effects": text,
@@ -257,7 +259,7 @@ def _ranking(diagnosis: Diagnosis) -> list[dict[str, Any]]:
             "width": f"{_logarithm(distance, most):.1f}",
             "chosen": chosen,
         }
-        for text, distance, cost, chosen in items
+        for text, distance, cost, chosen in explanations
     ]
 
 

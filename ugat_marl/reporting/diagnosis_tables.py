@@ -68,12 +68,17 @@ def _where(diagnosis: Diagnosis) -> Table:
     table.add_column("what", overflow="fold", max_width=36)
     table.add_column("size", justify="right", no_wrap=True)
     table.add_column("z", justify="right", no_wrap=True)
-    for item in words.strongest(diagnosis, _SHOWN):
-        size = f"{signed(item.size)} {item.unit}".rstrip()
-        what = f"{item.regime}: {statistic(item.statistic)}"
-        if item.window:
-            what += f", {words.window(item.window)}"
-        table.add_row(*map(Text, (words.disagreement_place(item), what, size, signed(item.z))))
+    for disagreement in words.strongest(diagnosis, _SHOWN):
+        size = f"{signed(disagreement.size)} {disagreement.unit}".rstrip()
+        observed = f"{disagreement.regime}: {statistic(disagreement.statistic)}"
+        if disagreement.window:
+            observed += f", {words.window(disagreement.window)}"
+        table.add_row(
+            *map(
+                Text,
+                (words.disagreement_place(disagreement), observed, size, signed(disagreement.z)),
+            )
+        )
     return table
 
 

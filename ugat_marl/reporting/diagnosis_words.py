@@ -93,7 +93,7 @@ def strongest(diagnosis: Diagnosis, count: int) -> list[Disagreement]:
     first: dict[str, Disagreement] = {}
     for disagreement in diagnosis.where:
         first.setdefault(disagreement.statistic, disagreement)
-    return sorted(first.values(), key=lambda item: -abs(item.z))[:count]
+    return sorted(first.values(), key=lambda each: -abs(each.z))[:count]
 
 
 def partial(diagnosis: Diagnosis) -> str | None:
@@ -101,8 +101,8 @@ def partial(diagnosis: Diagnosis) -> str | None:
     if diagnosis.complete:
         return None
     untried = diagnosis.untried
-    rest = f", … ({len(untried)} in all)" if len(untried) > UNTRIED else ""
-    left = f" Not examined yet: {joined(untried[:UNTRIED])}{rest}." if untried else ""
+    more = f", … ({len(untried)} in all)" if len(untried) > UNTRIED else ""
+    left = f" Not examined yet: {joined(untried[:UNTRIED])}{more}." if untried else ""
     return (
         f"Partial result: the budget of {number(diagnosis.budget_s)} s ended before the search "
         f"did.{left} The same command goes on where this one stopped."

@@ -14,19 +14,19 @@ from ugat_marl.experiments import Evaluation, domains_by_gap, gap_matrix
 from ugat_marl.reporting.formats import number_text
 
 
-def gap_matrix_table(found: Evaluation) -> RenderableType:
+def gap_matrix_table(evaluation: Evaluation) -> RenderableType:
     """Return the cost of each gap for each controller, then travel times by domain."""
-    gaps = domains_by_gap(found)
-    first = found.domains[0]
-    table = _table(f"{found.scenario}: what each gap costs each controller")
+    gaps = domains_by_gap(evaluation)
+    first = evaluation.domains[0]
+    table = _table(f"{evaluation.scenario}: what each gap costs each controller")
     table.add_column("policy", max_width=16, overflow="fold")
     table.add_column(f"{first}\nATT s", justify="right")
     for gap, domains in gaps.items():
         unit = "%" if gap == "reward" else "s"
         heading = f"{gap}\n({len(domains)}) {unit}"
         table.add_column(heading, justify="right", overflow="fold")
-    for policy, cells in gap_matrix(found).items():
-        start = found.estimate(policy, first, "att_s").mean
+    for policy, cells in gap_matrix(evaluation).items():
+        start = evaluation.estimate(policy, first, "att_s").mean
         table.add_row(
             Text(policy), number_text(start), *(f"{cell.cost.mean:+.1f}" for cell in cells.values())
         )
@@ -41,26 +41,26 @@ def gap_matrix_table(found: Evaluation) -> RenderableType:
         f"Mean over the gap's domains (how many) and seeds: ATT above that in {first}. reward: the "
         "hidden cost above that of the best of these policies, in %."
     )
-    return Group(table, Text(legend, style="dim"), _by_domain(found))
+    return Group(table, Text(legend, style="dim"), _by_domain(evaluation))
 
 
-def objective_tables(found: Evaluation) -> list[RenderableType]:
+def objective_tables(evaluation: Evaluation) -> list[RenderableType]:
     """Return the measures of domains with an objective; an empty list without such domains."""
-    told = {result.domain for result in found.results if result.scores.hidden}
-    domains = [domain for domain in found.domains if domain in told]
+    told = {result.domain for result in evaluation.results if result.scores.hidden}
+    domains = [domain for domain in evaluation.domains if domain in told]
     if not domains:
         return []
-    table = _table(f"{found.scenario}: cost of what is wanted, hidden from training")
+    table = _table(f"{evaluation.scenario}: cost of what is wanted, hidden from training")
     table.add_column("policy", max_width=22, overflow="fold")
     for domain in domains:
         table.add_column(domain.removeprefix("want-"), justify="right", overflow="fold")
-    for policy in found.policies:
-        costs = (found.estimate(policy, domain, "cost").mean for domain in domains)
+    for policy in evaluation.policies:
+        costs = (evaluation.estimate(policy, domain, "cost").mean for domain in domains)
         table.add_row(Text(policy), *map(number_text, costs))
     legend = ", ".join(OBJECTIVE_MEASURES[name] for name in _SHORT)
     return [
         table,
-        *_measured(found, domains),
+        *_measured(evaluation, domains),
         Text(f"{legend}. docs/reference/domains.md", style="dim"),
     ]
 
@@ -75,13 +75,13 @@ _SHORT = {
 }
 
 
-def _measured(found: Evaluation, domains: Sequence[str]) -> list[Table]:
+def _measured(evaluation: Evaluation, domains: Sequence[str]) -> list[Table]:
     """Return tables of the parts of the costs, one table for all domains with equal values."""
     alike: dict[tuple[float, ...], list[str]] = {}
     for domain in domains:
         values = [
-            found.estimate(policy, domain, name).mean
-            for policy in found.policies
+            evaluation.estimate(policy, domain, name).mean
+            for policy in evaluation.policies
             for name in _SHORT
         ]
         alike.setdefault(tuple(values), []).append(domain)
@@ -91,20 +91,22 @@ def _measured(found: Evaluation, domains: Sequence[str]) -> list[Table]:
         table.add_column("policy", max_width=22, overflow="fold")
         for heading in _SHORT.values():
             table.add_column(heading, justify="right")
-        for place, policy in enumerate(found.policies):
-            own = values[place * len(_SHORT) : (place + 1) * len(_SHORT)]
-            table.add_row(Text(policy), *map(number_text, own))
+        for place, policy in enumerate(evaluation.policies):
+            row = values[place * len(_SHORT) : (place + 1) * len(_SHORT)]
+            table.add_row(Text(policy), *map(number_text, row))
         tables.append(table)
     return tables
 
 
-def _by_domain(found: Evaluation) -> RenderableType:
+def _by_domain(evaluation: Evaluation) -> RenderableType:
     table = _table("average travel time in s, domain by domain")
     table.add_column("domain", max_width=22, overflow="fold")
-    for policy in found.policies:
+    for policy in evaluation.policies:
         table.add_column(policy, justify="right", overflow="fold")
-    for domain in found.domains:
-        values = (found.estimate(policy, domain, "att_s").mean for policy in found.policies)
+    for domain in evaluation.domains:
+        values = (
+            evaluation.estimate(policy, domain, "att_s").mean for policy in evaluation.policies
+        )
         table.add_row(Text(domain), *map(number_text, values))
     return table
 

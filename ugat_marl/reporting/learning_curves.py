@@ -14,19 +14,19 @@ from ugat_marl.reporting.comparison_tables import with_interval
 from ugat_marl.reporting.formats import command_block, made_with, number_text
 
 
-def curves_page(found: Curves, config: CurvesConfig, facts: Mapping[str, Any]) -> str:
+def curves_page(study: Curves, config: CurvesConfig, facts: Mapping[str, Any]) -> str:
     """Return a page of Markdown with the travel times of the learners and rules on a scenario.
 
     Args:
-        found: Trainings and rules; the rules include the programme and fixed time.
+        study: Trainings and rules; the rules include the programme and fixed time.
         config: Settings of training and evaluation.
         facts: Command, versions and processor (`experiments.machine_facts`).
     """
     fixed = min(
-        att_s for rule, att_s in found.rules.items() if rule.startswith(("programme", "fixed-time"))
+        att_s for rule, att_s in study.rules.items() if rule.startswith(("programme", "fixed-time"))
     )
     by_learner: dict[str, list[Curve]] = {}
-    for curve in found.curves:
+    for curve in study.curves:
         by_learner.setdefault(curve.learner, []).append(curve)
     rows = {
         "processor": facts["cpu"],
@@ -35,9 +35,9 @@ def curves_page(found: Curves, config: CurvesConfig, facts: Mapping[str, Any]) -
         "date": facts["date"][:10],
     }
     lines = [
-        f"# {found.scenario}: learners",
+        f"# {study.scenario}: learners",
         "",
-        f"Mean travel time in `{found.domain}` that each learner reaches, in s, beside the rules.",
+        f"Mean travel time in `{study.domain}` that each learner reaches, in s, beside the rules.",
         "",
         *command_block(facts["command"]),
         "",
@@ -57,10 +57,10 @@ def curves_page(found: Curves, config: CurvesConfig, facts: Mapping[str, Any]) -
         "| learner | library | seeds | decisions/s | ms/decision | best | last | last − fixed time "
         "| last below fixed time | last below the best rule |",
         "|---|---|---:|---:|---:|---:|---:|---:|---:|---:|",
-        *(_row(curves, fixed, found.rules[found.best]) for curves in by_learner.values()),
+        *(_row(curves, fixed, study.rules[study.best]) for curves in by_learner.values()),
     ]
-    for rule, att_s in found.rules.items():
-        mark = " (best tuned rule)" if rule == found.best else ""
+    for rule, att_s in study.rules.items():
+        mark = " (best tuned rule)" if rule == study.best else ""
         lines.append(f"| *{rule}*{mark} | | | | | | {number_text(att_s)} | | | |")
     return "\n".join(lines)
 

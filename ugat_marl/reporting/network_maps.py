@@ -60,7 +60,11 @@ def node_map(
         ends: Lower and upper end of the scale of colours.
         unit: Unit of the number.
     """
-    centres = {item.id: item.position for item in network.intersections if item.id in values}
+    centres = {
+        intersection.id: intersection.position
+        for intersection in network.intersections
+        if intersection.id in values
+    }
     picture, axes, scale = _map(name, title, network, list(centres.values()), 34)
     radius = _radius([(x * scale, y * scale) for x, y in centres.values()])
     for tls, (x, y) in centres.items():
@@ -104,7 +108,11 @@ def disagreement_map(
     if not known:
         return None
     shown = set(tls)
-    centres = {item.id: item.position for item in network.intersections if item.id in shown}
+    centres = {
+        intersection.id: intersection.position
+        for intersection in network.intersections
+        if intersection.id in shown
+    }
     around = [*centres.values()] or [network.lanes[next(iter(known))].shape[-1]]
     picture, axes, scale = _map(name, title, network, around, 8)
     width = max(3.0, _LANE_M * scale)

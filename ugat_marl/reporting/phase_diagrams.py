@@ -84,13 +84,13 @@ class _Place:
     """An intersection with all data for the panels of its sheet.
 
     Attributes:
-        item: The intersection.
+        intersection: The intersection.
         network: The network.
         walks: Lane of a crossing to its centre line, ``(points, 2)``, m.
         frame: Part of the network that is drawn.
     """
 
-    item: Intersection
+    intersection: Intersection
     network: Network
     walks: Mapping[str, NDArray[np.float64]]
     frame: Frame
@@ -98,13 +98,13 @@ class _Place:
 
 def _crossing_shapes(scenario: Scenario) -> dict[str, NDArray[np.float64]]:
     """Return lane of each crossing to its centre line, ``(points, 2)``, m."""
-    found: dict[str, NDArray[np.float64]] = {}
+    shapes: dict[str, NDArray[np.float64]] = {}
     for edge in scenario.network.parse().iter("edge"):
         if edge.get("function") == "crossing":
             for lane in edge.iter("lane"):
                 points = [point.split(",")[:2] for point in lane.get("shape", "").split()]
-                found[lane.get("id", "")] = np.array(points, dtype=np.float64)
-    return found
+                shapes[lane.get("id", "")] = np.array(points, dtype=np.float64)
+    return shapes
 
 
 def _file_name(tls: str, taken: set[str]) -> str:
@@ -128,14 +128,14 @@ def _picture(name: str, title: str, width_in: float, height_in: float) -> NamedF
 
 def _sheet(name: str, place: _Place, scenario: str, phases: range) -> NamedFigure:
     """Return a picture of an intersection: its plan and its phases, four panels in a row."""
-    item = place.item
+    intersection = place.intersection
     rows = math.ceil((len(phases) + 1) / _COLUMNS)
     columns = min(_COLUMNS, len(phases) + 1)
     width = max(columns, 3) * _PANEL_IN
     height = rows * (_PANEL_IN + 0.35) + 1.0
-    picture = _picture(name, f"{scenario}: {shortened(item.id, 40)}", width, height)
+    picture = _picture(name, f"{scenario}: {shortened(intersection.id, 40)}", width, height)
     figure = picture.figure
-    figure.text(0.02, 1 - 0.42 / height, _caption(item), size=8.5, va="top", color=_INK)
+    figure.text(0.02, 1 - 0.42 / height, _caption(intersection), size=8.5, va="top", color=_INK)
     for panel in range(len(phases) + 1):
         row, column = divmod(panel, _COLUMNS)
         left = (column + 0.04) / max(columns, 3)
@@ -146,34 +146,37 @@ def _sheet(name: str, place: _Place, scenario: str, phases: range) -> NamedFigur
             axes.set_title("plan: roads, and the numbers of their links", size=7.5, loc="center")
             _names(axes, place)
             continue
-        state = item.phases[phases[panel - 1]]
+        state = intersection.phases[phases[panel - 1]]
         axes.set_title(f"phase {phases[panel - 1]}", size=9, weight="bold", loc="center")
         _ways(axes, place, state)
-    _legend(figure, item, height)
+    _legend(figure, intersection, height)
     return picture
 
 
-def _caption(item: Intersection) -> str:
-    parts = [f"{len(item.phases)} phases", f"{len(item.incoming_lanes)} incoming lanes",
-             f"{len(item.links)} links"]  # fmt: skip
-    if item.crossings:
-        parts.append(f"{len(item.crossings)} crossings")
-    junctions = len({link.junction for link in item.links})
+def _caption(intersection: Intersection) -> str:
+    parts = [
+        f"{len(intersection.phases)} phases",
+        f"{len(intersection.incoming_lanes)} incoming lanes",
+        f"{len(intersection.links)} links",
+    ]
+    if intersection.crossings:
+        parts.append(f"{len(intersection.crossings)} crossings")
+    junctions = len({link.junction for link in intersection.links})
     if junctions > 1:
         parts.append(f"{junctions} junctions under one controller")
     return ", ".join(parts)
 
 
-def _legend(figure: Any, item: Intersection, height: float) -> None:
+def _legend(figure: Any, intersection: Intersection, height: float) -> None:
     from matplotlib.lines import Line2D
 
-    shown = {letter for phase in item.phases for letter in phase}
+    shown = {letter for phase in intersection.phases for letter in phase}
     lines = [
         Line2D([], [], color=colour, linestyle=style, linewidth=2, label=label)
         for letter, (colour, style, label) in STYLES.items()
         if letter in shown
     ]
-    if item.crossings:
+    if intersection.crossings:
         lines.append(
             Line2D([], [], color=_WALK, linewidth=5, linestyle=(0, (0.6, 0.4)),
                    dash_capstyle="butt", label="crossing, green")
@@ -184,11 +187,11 @@ def _legend(figure: Any, item: Intersection, height: float) -> None:
     )  # fmt: skip
 
 
-def _frame(item: Intersection, network: Network) -> Frame:
+def _frame(intersection: Intersection, network: Network) -> Frame:
     """Return the square to draw: all ways across the intersection and some road around them."""
     ends = np.array(
-        [network.lanes[link.from_lane].shape[-1] for link in item.links]
-        + [network.lanes[link.to_lane].shape[0] for link in item.links]
+        [network.lanes[link.from_lane].shape[-1] for link in intersection.links]
+        + [network.lanes[link.to_lane].shape[0] for link in intersection.links]
     )
     low, high = ends.min(axis=0), ends.max(axis=0)
     side = float(max(high - low)) + 2 * max(_ARM_M, 0.15 * float(max(high - low)))
@@ -199,20 +202,22 @@ def _frame(item: Intersection, network: Network) -> Frame:
 def _roads(axes: Any, place: _Place) -> None:
     from matplotlib.collections import LineCollection
 
-    item, network, frame = place.item, place.network, place.frame
+    intersection, network, frame = place.intersection, place.network, place.frame
     left, bottom, width, height = frame
     axes.set_xlim(left, left + width)
     axes.set_ylim(bottom, bottom + height)
     axes.set_aspect("equal")
     axes.axis("off")
-    names = {*item.incoming_lanes, *item.outgoing_lanes}
-    before = (network.lanes[lane].behind for lane in item.incoming_lanes)
-    names |= {name for found in before for name in found.lanes if name in network.lanes}
+    names = {*intersection.incoming_lanes, *intersection.outgoing_lanes}
+    before = (network.lanes[lane].behind for lane in intersection.incoming_lanes)
+    names |= {name for chain in before for name in chain.lanes if name in network.lanes}
     shapes = [np.array(network.lanes[name].shape) for name in sorted(names)]
     axes.add_collection(
         LineCollection(shapes, colors=_ROAD, linewidths=_points(2.9, frame), capstyle="butt")
     )
-    stops = [_stop_line(np.array(network.lanes[lane].shape)) for lane in item.incoming_lanes]
+    stops = [
+        _stop_line(np.array(network.lanes[lane].shape)) for lane in intersection.incoming_lanes
+    ]
     axes.add_collection(LineCollection(stops, colors=_INK, linewidths=1.0))
 
 
@@ -234,7 +239,7 @@ def _direction(start: NDArray[np.float64], end: NDArray[np.float64]) -> NDArray[
 def _ways(axes: Any, place: _Place, state: str) -> None:
     """Draw the links, red ones first so that green covers them, and the crossings."""
     order = "rsgG"
-    for link in sorted(place.item.links, key=lambda one: order.find(state[one.index])):
+    for link in sorted(place.intersection.links, key=lambda each: order.find(state[each.index])):
         letter = state[link.index] if state[link.index] in STYLES else "r"
         _arrow(axes, _curve(link, place.network), letter)
     _crossings(axes, place, state)
@@ -242,7 +247,7 @@ def _ways(axes: Any, place: _Place, state: str) -> None:
 
 def _crossings(axes: Any, place: _Place, state: str = "") -> None:
     """Draw crossings as stripes across the road: green ones in colour, others pale."""
-    for crossing in place.item.crossings:
+    for crossing in place.intersection.crossings:
         if crossing.to_lane not in place.walks:
             continue
         green = bool(state) and state[crossing.index] in "Gg"
@@ -292,10 +297,10 @@ def _curve(link: Link, network: Network) -> NDArray[np.float64]:
 
 def _names(axes: Any, place: _Place) -> None:
     """Draw all links, and beside every incoming road its name and the numbers of its links."""
-    item, network = place.item, place.network
+    intersection, network = place.intersection, place.network
     left, bottom, width, height = place.frame
     by_edge: dict[str, list[str]] = {}
-    for lane in item.incoming_lanes:
+    for lane in intersection.incoming_lanes:
         by_edge.setdefault(network.lanes[lane].edge, []).append(lane)
     for edge, lanes in by_edge.items():
         shapes = [np.array(network.lanes[lane].shape) for lane in lanes]
@@ -304,10 +309,10 @@ def _names(axes: Any, place: _Place) -> None:
         point = end + back * 0.17 * width
         point = np.clip(point, [left + 0.17 * width, bottom + 0.05 * height],
                         [left + 0.83 * width, bottom + 0.95 * height])  # fmt: skip
-        indices = sorted({link.index for link in item.links if link.from_edge == edge})
+        indices = sorted({link.index for link in intersection.links if link.from_edge == edge})
         text = f"{printable(shortened(edge, 16))}\n{_ranges(indices)}"
         axes.text(*point, text, size=6.5, ha="center", va="center", bbox=_UNDER_TEXT, zorder=6)
-    for link in item.links:
+    for link in intersection.links:
         _arrow(axes, _curve(link, network), "r")
     _crossings(axes, place)
 
@@ -340,13 +345,13 @@ def _overview(network: Network, scenario: str) -> NamedFigure:
     axes.add_collection(LineCollection(shapes, colors=LIGHT["stop"], linewidths=1.0))
     axes.set_xlim(low[0] - 0.02 * width, high[0] + 0.02 * width)
     axes.set_ylim(low[1] - 0.02 * height, high[1] + 0.02 * height)
-    places = np.array([item.position for item in network.intersections])
+    places = np.array([intersection.position for intersection in network.intersections])
     axes.plot(*places.T, "o", color=STYLES["G"][0], markersize=6, zorder=3)
     if count <= _NAMED:
-        for item in network.intersections:
+        for intersection in network.intersections:
             axes.annotate(
-                shortened(item.id, 18), item.position, xytext=(5, 5), textcoords="offset points",
-                size=7.5, color=_INK, zorder=4,
+                shortened(intersection.id, 18), intersection.position, xytext=(5, 5),
+                textcoords="offset points", size=7.5, color=_INK, zorder=4,
                 bbox=_UNDER_TEXT,
             )  # fmt: skip
     return picture

@@ -40,12 +40,12 @@ class Group:
 
 def groups(records: Sequence[RunRecord]) -> list[Group]:
     """Return all groups with more than one training."""
-    found: list[Group] = []
-    for own in _parted(records, _common).values():
-        trials, left_out = _trials(own)
-        if len(own) < 2 or not trials:
+    with_several: list[Group] = []
+    for members in _parted(records, _common).values():
+        trials, left_out = _trials(members)
+        if len(members) < 2 or not trials:
             continue
-        first = own[0]
+        first = members[0]
         trials.sort(key=lambda trial: _rank(trial.setting))
         comparison = Comparison(first.scenario, "", first.sim, tuple(trials), {})
         count = len(comparison.training_seeds)
@@ -53,8 +53,8 @@ def groups(records: Sequence[RunRecord]) -> list[Group]:
         note += "intervals: 95 %, Student's, over them." if count > 1 else "no intervals over them."
         title = f"{first.scenario}, trained in {first.sim}"
         title += "" if first.job else f", {first.grounding or 'unknown'} grounding"
-        found.append(Group(title, comparison.rows(), note, left_out))
-    return found
+        with_several.append(Group(title, comparison.rows(), note, left_out))
+    return with_several
 
 
 def seeds_of_one(records: Sequence[RunRecord]) -> list[list[RunRecord]]:
@@ -74,10 +74,10 @@ def _ugat(record: RunRecord) -> str:
 
 
 def _parted(records: Iterable[RunRecord], key: Any) -> dict[Any, list[RunRecord]]:
-    found: dict[Any, list[RunRecord]] = {}
+    parts: dict[Any, list[RunRecord]] = {}
     for record in records:
-        found.setdefault(key(record), []).append(record)
-    return found
+        parts.setdefault(key(record), []).append(record)
+    return parts
 
 
 def _trials(records: Sequence[RunRecord]) -> tuple[list[Trial], tuple[str, ...]]:
@@ -86,39 +86,39 @@ def _trials(records: Sequence[RunRecord]) -> tuple[list[Trial], tuple[str, ...]]
     trials: list[Trial] = []
     left_out: list[str] = []
     for record, name in zip(records, names, strict=True):
-        own = list(_of_job(record, name)) if record.job else list(_of_run(record))
-        trials += own
-        if not own:
+        of_record = list(_of_job(record, name)) if record.job else list(_of_run(record))
+        trials += of_record
+        if not of_record:
             left_out.append(record.name)
     return trials, tuple(left_out)
 
 
 def _of_run(record: RunRecord) -> Iterable[Trial]:
-    found = record.evaluation
-    if found is None or len(found.domains) != 2:
+    evaluation = record.evaluation
+    if evaluation is None or len(evaluation.domains) != 2:
         return
-    real = found.domains[1]
-    rule = f"rule {found.notes.get(f'best rule in {real}')}"
-    for r in found.results:
+    real = evaluation.domains[1]
+    rule = f"rule {evaluation.notes.get(f'best rule in {real}')}"
+    for r in evaluation.results:
         if r.policy.startswith("rule ") and r.policy != rule:
             continue
         setting = RULE if r.policy == rule else r.policy
-        domain = record.sim if r.domain == found.domains[0] else r.domain
+        domain = record.sim if r.domain == evaluation.domains[0] else r.domain
         yield Trial(setting, real, domain, _seed(record), r.seed, r.scores)
 
 
 def _of_job(record: RunRecord, name: str) -> Iterable[Trial]:
-    found = record.evaluation
-    if found is None:
+    evaluation = record.evaluation
+    if evaluation is None:
         return
-    seeds = {d: {r.seed for r in found.results if r.domain == d} for d in found.domains}
+    seeds = {d: {r.seed for r in evaluation.results if r.domain == d} for d in evaluation.domains}
     only = record.settings.get("target")
-    for target in found.domains:
+    for target in evaluation.domains:
         if target == record.sim or (only is not None and target != only):
             continue
         if seeds[target] != seeds.get(record.sim):
             continue  # the evaluation is not complete
-        for r in found.results:
+        for r in evaluation.results:
             if r.domain in (record.sim, target):
                 yield Trial(name, target, r.domain, _seed(record), r.seed, r.scores)
 
@@ -137,14 +137,16 @@ def job_labels(records: Sequence[RunRecord]) -> list[str]:
     """Return names of jobs; equal names get the settings of UGAT in which the jobs differ."""
     flat = [dict(_flat(record.ugat)) for record in records]
     names = [record.setting for record in records]
-    found: list[str] = []
-    for record, name, own in zip(records, names, flat, strict=True):
+    labels: list[str] = []
+    for record, name, settings in zip(records, names, flat, strict=True):
         others = [each for each, other in zip(flat, names, strict=True) if other == name]
-        varied = [key for key, value in own.items() if any(o.get(key) != value for o in others)]
+        varied = [
+            key for key, value in settings.items() if any(o.get(key) != value for o in others)
+        ]
         usual = {key: Counter(o.get(key) for o in others).most_common(1)[0][0] for key in varied}
-        unusual = [f"{key} {own[key]}" for key in varied if own[key] != usual[key]]
-        found.append(f"{name} ({', '.join(unusual)})" if record.job and unusual else name)
-    return found
+        unusual = [f"{key} {settings[key]}" for key in varied if settings[key] != usual[key]]
+        labels.append(f"{name} ({', '.join(unusual)})" if record.job and unusual else name)
+    return labels
 
 
 def _flat(settings: Mapping[str, Any], prefix: str = "") -> Iterable[tuple[str, str]]:

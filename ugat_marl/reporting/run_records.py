@@ -70,8 +70,8 @@ class RunRecord:
     @property
     def scenario(self) -> str:
         """Name of the scenario as the user gave it; "" if it is not known."""
-        found = self.settings.get("scenario") or (self.evaluation and self.evaluation.scenario)
-        return str(found or "")
+        name = self.settings.get("scenario") or (self.evaluation and self.evaluation.scenario)
+        return str(name or "")
 
     @property
     def sim(self) -> str:
@@ -93,8 +93,8 @@ class RunRecord:
     @property
     def ugat(self) -> Mapping[str, Any]:
         """Settings of the algorithm."""
-        found = self.settings.get("ugat")
-        return found if isinstance(found, Mapping) else {}
+        settings = self.settings.get("ugat")
+        return settings if isinstance(settings, Mapping) else {}
 
     @property
     def setting(self) -> str:
@@ -121,11 +121,11 @@ class RunRecord:
 
     def agents(self, name: str) -> dict[str, list[tuple[int, float]]]:
         """Return agent to the iterations and values logged under ``name/agent``."""
-        found: dict[str, dict[int, float]] = {}
+        by_agent: dict[str, dict[int, float]] = {}
         for stage, step, key, value in self.metrics.rows if self.metrics is not None else []:
             if stage == "iteration" and key.startswith(f"{name}/"):
-                found.setdefault(key.removeprefix(f"{name}/"), {})[step] = value
-        return {agent: sorted(values.items()) for agent, values in found.items()}
+                by_agent.setdefault(key.removeprefix(f"{name}/"), {})[step] = value
+        return {agent: sorted(values.items()) for agent, values in by_agent.items()}
 
 
 @dataclass(frozen=True)
@@ -154,12 +154,12 @@ class _Reader:
     directory: Path
     missing: list[str] = field(default_factory=list)
 
-    def read(self, name: str, how: Callable[[Path], T], without: str) -> T | None:
+    def read(self, name: str, parse: Callable[[Path], T], without: str) -> T | None:
         """Return a file's content; if it cannot be read, note why and return None.
 
         Args:
             name: Name of the file.
-            how: Function that reads it; its usual exceptions are noted, not raised.
+            parse: Function that reads it; its usual exceptions are noted, not raised.
             without: Second half of the noted sentence: what is unknown without the file.
         """
         path = self.directory / name
@@ -169,7 +169,7 @@ class _Reader:
                 return None
             if path.stat().st_size > _LONGEST:
                 raise ValueError(f"it has more than {_LONGEST // 1_000_000} MB")
-            return how(path)
+            return parse(path)
         except (UgatMarlError, OSError, ValueError, TypeError, KeyError, RecursionError) as error:
             reason = " ".join(str(error).replace(f"{path}: ", "").split())
             self.missing.append(f"{name} cannot be used ({reason[:160]}): {without}")
@@ -182,7 +182,7 @@ def read_records(paths: Sequence[Path]) -> list[RunRecord | TableRecord]:
     Raises:
         OptionError: A path is no folder, or it contains no file of the suite.
     """
-    found: dict[Path, Path] = {}
+    by_place: dict[Path, Path] = {}
     for path in paths:
         if not path.is_dir():
             text = "is a file; give the folder it lies in" if path.exists() else "no such folder"
@@ -194,11 +194,11 @@ def read_records(paths: Sequence[Path]) -> list[RunRecord | TableRecord]:
                 "paper` (job.json, table.csv) lies in it or in its folders"
             )
         for folder in folders:
-            found.setdefault(folder.resolve(), folder)
-    names = _names(list(found.values()))
+            by_place.setdefault(folder.resolve(), folder)
+    names = _names(list(by_place.values()))
     return [
         _table(folder, name) if (folder / TABLE_CSV).is_file() else _run(folder, name)
-        for folder, name in zip(found.values(), names, strict=True)
+        for folder, name in zip(by_place.values(), names, strict=True)
     ]
 
 
@@ -228,17 +228,17 @@ def _names(folders: Sequence[Path]) -> list[str]:
     """Return the shortest endings of the paths that differ from each other."""
     parts = [folder.resolve().parts for folder in folders]
     for length in range(1, max(map(len, parts), default=1) + 1):
-        names = ["/".join(one[-length:]) for one in parts]
+        names = ["/".join(folder_parts[-length:]) for folder_parts in parts]
         if len(set(names)) == len(names):
             return names
     return [str(folder) for folder in folders]
 
 
 def _object(path: Path) -> dict[str, Any]:
-    found = json.loads(path.read_text(encoding="utf-8", errors="replace"))
-    if not isinstance(found, dict):
+    content = json.loads(path.read_text(encoding="utf-8", errors="replace"))
+    if not isinstance(content, dict):
         raise ValueError("not a JSON object")
-    return found
+    return content
 
 
 def _run(directory: Path, name: str) -> RunRecord:

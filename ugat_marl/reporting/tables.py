@@ -16,14 +16,14 @@ from ugat_marl.experiments import Estimate, Evaluation, Tuned
 from ugat_marl.reporting.formats import number_text
 
 
-def transfer_table(found: Evaluation) -> RenderableType:
+def transfer_table(evaluation: Evaluation) -> RenderableType:
     """Return ATT of every policy in the simulation and the real domains, with gap and regret."""
-    first, *others = found.domains
+    first, *others = evaluation.domains
     table = Table(
         box=box.SIMPLE_HEAD,
-        title=Text(f"{found.scenario}: average travel time in s (95 % interval)"),
+        title=Text(f"{evaluation.scenario}: average travel time in s (95 % interval)"),
         title_justify="left",
-        caption=Text(_caption(found)),
+        caption=Text(_caption(evaluation)),
         caption_justify="left",
         pad_edge=False,
     )
@@ -32,25 +32,25 @@ def transfer_table(found: Evaluation) -> RenderableType:
     for domain in others:
         for heading in (domain, "Δ", "regret"):
             table.add_column(heading, justify="right")
-    for policy in found.policies:
-        cells = [_with_interval(found.estimate(policy, first, "att_s"))]
+    for policy in evaluation.policies:
+        cells = [_with_interval(evaluation.estimate(policy, first, "att_s"))]
         for domain in others:
             cells += [
-                _with_interval(found.estimate(policy, domain, "att_s")),
-                _signed(found.gap(policy, domain, "att_s")),
-                number_text(found.regret(policy, domain).mean),
+                _with_interval(evaluation.estimate(policy, domain, "att_s")),
+                _signed(evaluation.gap(policy, domain, "att_s")),
+                number_text(evaluation.regret(policy, domain).mean),
             ]
         table.add_row(Text(policy), *cells)
     return table
 
 
-def measures_table(found: Evaluation) -> RenderableType:
+def measures_table(evaluation: Evaluation) -> RenderableType:
     """Return a block per domain: measures, intervals, and gaps against the first domain."""
     blocks: list[RenderableType] = []
-    for domain in found.domains:
+    for domain in evaluation.domains:
         table = Table(
             box=box.SIMPLE_HEAD,
-            title=Text(f"{found.scenario} in {domain}"),
+            title=Text(f"{evaluation.scenario} in {domain}"),
             title_justify="left",
             pad_edge=False,
             padding=(0, 1, 0, 0),
@@ -59,23 +59,23 @@ def measures_table(found: Evaluation) -> RenderableType:
         headings = ("ATT s", "through.", "reward", "queue", "delay", "delay s", "regret s")
         for heading in headings:
             table.add_column(heading, justify="right", no_wrap=True)
-        for policy in found.policies:
-            estimates = [found.estimate(policy, domain, measure) for measure in MEASURES]
-            estimates.append(found.regret(policy, domain))
+        for policy in evaluation.policies:
+            estimates = [evaluation.estimate(policy, domain, measure) for measure in MEASURES]
+            estimates.append(evaluation.regret(policy, domain))
             table.add_row(Text(policy), *(number_text(e.mean) for e in estimates))
             if not math.isnan(estimates[0].low):
                 halves = (f"±{number_text((e.high - e.low) / 2)}" for e in estimates)
                 table.add_row(*_dim("  95 % interval", *halves))
-            if domain != found.domains[0]:
-                gaps = [found.gap(policy, domain, measure) for measure in MEASURES]
-                table.add_row(*_dim(f"  gap to {found.domains[0]}", *map(_signed, gaps)))
+            if domain != evaluation.domains[0]:
+                gaps = [evaluation.gap(policy, domain, measure) for measure in MEASURES]
+                table.add_row(*_dim(f"  gap to {evaluation.domains[0]}", *map(_signed, gaps)))
         blocks.append(table)
-        blocks += [Text(line, style="dim") for line in _backlog(found, domain)]
-    blocks.append(Text(_legend(found), style="dim"))
+        blocks += [Text(line, style="dim") for line in _backlog(evaluation, domain)]
+    blocks.append(Text(_legend(evaluation), style="dim"))
     return Group(*blocks)
 
 
-def tuning_table(title: str, found: Sequence[Tuned]) -> RenderableType:
+def tuning_table(title: str, results: Sequence[Tuned]) -> RenderableType:
     """Return the best settings of each rule, the best rule first."""
     table = Table(
         box=box.SIMPLE_HEAD,
@@ -92,7 +92,7 @@ def tuning_table(title: str, found: Sequence[Tuned]) -> RenderableType:
     table.add_column("best setting", max_width=28, overflow="fold")
     for heading in ("ATT s", "worst s", "settings", "episodes"):
         table.add_column(heading, justify="right")
-    for tuned in sorted(found, key=lambda each: each.best.att_s):
+    for tuned in sorted(results, key=lambda each: each.best.att_s):
         worst = max(trial.att_s for trial in tuned.trials)
         table.add_row(
             Text(tuned.best.spec),
@@ -147,49 +147,51 @@ def _limits(time: TravelTimeEstimate) -> str:
     return f"{number_text(time.low)}-{number_text(time.high)}"
 
 
-def _backlog(found: Evaluation, domain: str) -> list[str]:
+def _backlog(evaluation: Evaluation, domain: str) -> list[str]:
     """Return a line on vehicles that never entered; throughput and queue do not show them."""
-    waiting = {name: found.estimate(name, domain, "backlog").mean for name in found.policies}
+    waiting = {
+        name: evaluation.estimate(name, domain, "backlog").mean for name in evaluation.policies
+    }
     kept_out = [f"{name} {number_text(mean)}" for name, mean in waiting.items() if mean >= 0.5]
     return [f"vehicles due that never entered: {', '.join(kept_out)}"] if kept_out else []
 
 
-def _caption(found: Evaluation) -> str:
-    keys = [f"best rule in {domain}" for domain in found.domains]
-    lines = [f"{key}: {found.notes[key]}" for key in keys if key in found.notes]
-    if corrected := found.notes.get("corrected sim"):
+def _caption(evaluation: Evaluation) -> str:
+    keys = [f"best rule in {domain}" for domain in evaluation.domains]
+    lines = [f"{key}: {evaluation.notes[key]}" for key in keys if key in evaluation.notes]
+    if corrected := evaluation.notes.get("corrected sim"):
         lines.append(f"corrected sim: trained in {corrected}")
-    lines += _medians(found)
-    if len(found.domains) == 1:
-        return "\n".join([*lines, f"{_seeds(found)} seeds"])
+    lines += _medians(evaluation)
+    if len(evaluation.domains) == 1:
+        return "\n".join([*lines, f"{_seeds(evaluation)} seeds"])
     lines.append(
-        f"{_seeds(found)} seeds. Δ: minus {found.domains[0]}. regret: ATT above the best of "
-        "these policies in that domain."
+        f"{_seeds(evaluation)} seeds. Δ: minus {evaluation.domains[0]}. regret: ATT above the "
+        "best of these policies in that domain."
     )
     return "\n".join(lines)
 
 
-def _medians(found: Evaluation) -> list[str]:
+def _medians(evaluation: Evaluation) -> list[str]:
     """Return medians for domains in which a few locked-up episodes dominate the mean."""
     lines: list[str] = []
-    for domain in found.domains:
-        both = {name: found.estimate(name, domain, "att_s") for name in found.policies}
+    for domain in evaluation.domains:
+        both = {name: evaluation.estimate(name, domain, "att_s") for name in evaluation.policies}
         if any(abs(e.mean - e.median) > 0.1 * e.median for e in both.values()):
             values = ", ".join(f"{name} {number_text(e.median)}" for name, e in both.items())
             lines.append(f"medians in {domain}: {values}")
     return lines
 
 
-def _legend(found: Evaluation) -> str:
+def _legend(evaluation: Evaluation) -> str:
     return (
-        f"{_seeds(found)} seeds. ATT: all vehicles due, scheduled departure to arrival or end. "
-        "queue: halting vehicles per intersection. delay: 1 - v/vmax of incoming lanes. "
+        f"{_seeds(evaluation)} seeds. ATT: all vehicles due, scheduled departure to arrival or "
+        "end. queue: halting vehicles per intersection. delay: 1 - v/vmax of incoming lanes. "
         "delay s: time loss plus departure delay. regret: ATT above the best of these policies."
     )
 
 
-def _seeds(found: Evaluation) -> int:
-    return len({result.seed for result in found.results})
+def _seeds(evaluation: Evaluation) -> int:
+    return len({result.seed for result in evaluation.results})
 
 
 def _dim(*cells: str) -> list[Text]:

@@ -228,11 +228,11 @@ def _settings(page: Page, title: str, rows: Sequence[Mapping[str, Any]]) -> dict
         return Grid(["policy", *headings], lines, headings)
 
     def estimates(domain: str) -> list[charts.Estimated]:
-        own = [cells.get((label, domain), {}) for label in labels]
+        rows = [cells.get((label, domain), {}) for label in labels]
         return [
             (as_number(r.get("att_s")), as_number(r.get("att_s_low")),
              as_number(r.get("att_s_high")))
-            for r in own
+            for r in rows
         ]  # fmt: skip
 
     scores = charts.scores_picture(
@@ -278,14 +278,14 @@ def _seeds(page: Page, runs: Sequence[RunRecord]) -> list[Figure]:
     """Return curves of trainings that differ in their seed alone."""
     figures: list[Figure] = []
     over = "Mean over the seeds, with its 95 % interval."
-    for own in seeds_of_one(runs):
-        if len(own) < 2:
+    for trainings in seeds_of_one(runs):
+        if len(trainings) < 2:
             continue
-        name = _file_name(own[0].scenario, own[0].real, own[0].grounding, "seeds")
+        name = _file_name(trainings[0].scenario, trainings[0].real, trainings[0].grounding, "seeds")
         figures += page.figures(
-            (charts.learning_picture(own, f"{name}-learning"), f"{_STRETCH}the seeds."),
-            (charts.travel_time_picture(own, f"{name}-att"), over),
-            (charts.gate_picture(own, f"{name}-gate"), over),
+            (charts.learning_picture(trainings, f"{name}-learning"), f"{_STRETCH}the seeds."),
+            (charts.travel_time_picture(trainings, f"{name}-att"), over),
+            (charts.gate_picture(trainings, f"{name}-gate"), over),
         )
     return figures
 
@@ -598,7 +598,7 @@ def places_of(record: RunRecord) -> Places | str:
     except (UgatMarlError, OSError, ValueError, TypeError) as error:
         reason = " ".join(str(error).split())
         return f"no map: scenario {record.scenario!r} cannot be read here ({reason[:200]})"
-    tls = [item.id for item in network.intersections]
+    tls = [each.id for each in network.intersections]
     recorded = record.hashes.get("sim") or record.hashes.get(record.sim)
     changed = recorded not in (None, own_hash)
     note = "The scenario has changed since; the map shows it as it is now." if changed else ""

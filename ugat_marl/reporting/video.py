@@ -127,17 +127,17 @@ class Filmed:
 
 def between(plans: SignalPlans, begin_s: float, end_s: float) -> dict[str, list[tuple[float, str]]]:
     """Return the part of signal plans between two times, in s from the beginning of the plans."""
-    found: dict[str, list[tuple[float, str]]] = {}
+    parts: dict[str, list[tuple[float, str]]] = {}
     for tls, segments in plans.items():
-        start, own = 0.0, list[tuple[float, str]]()
+        start, shown_states = 0.0, list[tuple[float, str]]()
         for duration, state in segments:
             shown = min(start + duration, end_s) - max(start, begin_s)
             if shown > 0:
-                own.append((shown, state))
+                shown_states.append((shown, state))
             start += duration
-        if own:
-            found[tls] = own
-    return found
+        if shown_states:
+            parts[tls] = shown_states
+    return parts
 
 
 def film_episode(
