@@ -1,1 +1,1 @@
-"""Studies of the suite itself, run in a checkout: `bench`, `blind`, and `held` digests."""
+"""Studies of the suite itself, run in a checkout: `bench`, `blind` and `behaviour_digests`."""

@@ -1,8 +1,10 @@
 """Digests of behaviour, which must stay equal to the bit while the package is rearranged.
 
-    python -m studies.held write studies/held.json                 # plays every part twice
-    python -m studies.held check studies/held.json                 # one line per part
-    python -m studies.held check FILE --only episodes/single-v1 train/phase
+    python -m studies.behaviour_digests write FILE     # plays every part twice
+    python -m studies.behaviour_digests check FILE     # one line per part
+    python -m studies.behaviour_digests check FILE --only episodes/single-v1 train/phase
+
+The committed file is studies/behaviour_digests.json.
 
 Parts play episodes in process, in worker processes and in vectors, visit every named domain, and
 train, record and diagnose by the command line. They use only public names and the command line, so
@@ -444,7 +446,7 @@ def played(name: str) -> dict[str, Any]:
         RuntimeError: The part failed.
     """
     done = subprocess.run(
-        [sys.executable, "-m", "studies.held", "play", name],
+        [sys.executable, "-m", "studies.behaviour_digests", "play", name],
         env={**os.environ, **ENVIRONMENT},
         capture_output=True,
         text=True,
@@ -599,7 +601,9 @@ def selected(wanted: Iterable[str], names: Iterable[str]) -> list[str]:
 
 def main() -> int:
     """Run the script; see its docstring."""
-    parser = argparse.ArgumentParser(prog="python -m studies.held", description=__doc__)
+    parser = argparse.ArgumentParser(
+        prog="python -m studies.behaviour_digests", description=__doc__
+    )
     parser.formatter_class = argparse.RawDescriptionHelpFormatter
     parser.add_argument("verb", choices=("write", "check", "play"))
     parser.add_argument("file", help="the file of digests; for play, the name of a part")
