@@ -96,7 +96,7 @@ def perform_in_this_process(patch: pytest.MonkeyPatch) -> None:
     """Let the driver perform its jobs here, one at a time: an interpreter for each takes longer."""
     one_at_a_time = threading.Lock()
 
-    def perform_job(folder: str, _: object) -> None:
+    def perform_job(folder: str, *_: object) -> None:
         job = TypeAdapter(Job).validate_json(Path(folder, JOB).read_bytes())
         with one_at_a_time:
             perform(job, Path(folder), Silent())

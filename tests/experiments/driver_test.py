@@ -3,8 +3,13 @@
 from __future__ import annotations
 
 import json
+import os
+import signal
 import subprocess
 import sys
+import time
+from collections.abc import Callable, Iterator
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import asdict, replace
 from pathlib import Path
 
@@ -24,12 +29,24 @@ from ugat_marl.experiments import (
     record_of,
 )
 from ugat_marl.experiments.driver import LOG
-from ugat_marl.experiments.jobs import JOB, LEARNER, SCORES, evaluation_seeds, perform
+from ugat_marl.experiments.forked import SERVICE, jobs_fork_on, perform_forked
+from ugat_marl.experiments.jobs import (
+    JOB,
+    LEARNER,
+    SCORES,
+    evaluation_seeds,
+    perform,
+    perform_described,
+)
 from ugat_marl.experiments.paper import TABLES, settings_of
 from ugat_marl.grounding import FitConfig, UgatConfig
+from ugat_marl.parallel import Stop
 from ugat_marl.policies import BASELINES, DQN_NAME, DQNConfig, learner_is_installed
 from ugat_marl.progress import Silent
+from ugat_marl.simulation import kept_warm
+from ugat_marl.simulation.host import _WarmParent
 
+needs_forks = pytest.mark.skipif(not jobs_fork_on("cpu"), reason="jobs are not forked here")
 QUICK = LearnerSpec(dqn=DQNConfig(warmup_decisions=5, epsilon_decay_decisions=50))
 PLAIN = Job(
     Setting("direct transfer", "direct", learner=QUICK),
@@ -50,6 +67,13 @@ UGAT = UgatConfig(
     least_accuracy=None,  # so little training proves nothing
     fit=FitConfig(epochs=2),
 )
+
+
+@pytest.fixture(scope="module", autouse=True)
+def _one_warm_parent() -> Iterator[None]:
+    """One process loads torch for the jobs of all tests here."""
+    with kept_warm():
+        yield
 
 
 def after(base: Job, setting: Setting, episodes: int = 6) -> Job:
@@ -201,6 +225,60 @@ def test_a_job_ends_with_whoever_started_it(tmp_path: Path) -> None:
     assert process.wait(60) == 1
 
 
+def eventually(condition: Callable[[], object], within_s: float) -> bool:
+    deadline = time.monotonic() + within_s
+    while not condition() and time.monotonic() < deadline:
+        time.sleep(0.05)
+    return bool(condition())
+
+
+def writers(log: Path) -> set[str]:
+    """Processes that have the file open."""
+    found: set[str] = set()
+    for descriptor in Path("/proc").glob("[0-9]*/fd/*"):
+        try:
+            if descriptor.readlink() == log:
+                found.add(descriptor.parts[2])
+        except OSError:
+            continue
+    return found
+
+
+@needs_forks
+def test_a_forked_job_that_is_stopped_is_dead(tmp_path: Path) -> None:
+    replace(PLAIN, episodes=10**6).write(tmp_path)
+    stop = Stop()
+    with ThreadPoolExecutor(1) as pool:
+        with (tmp_path / LOG).open("wb") as log:
+            job = pool.submit(perform_forked, tmp_path, log, stop)
+            assert eventually((tmp_path / SCORES).exists, 60)
+            assert not job.done()
+            parent = _WarmParent._current[SERVICE]._process.pid
+            if os.environ.get("OMP_NUM_THREADS", "1") == "1":  # else numpy's BLAS has some
+                assert len(list(Path(f"/proc/{parent}/task").iterdir())) == 1
+            stop.set()
+            job.result()
+        assert eventually(lambda: not writers(tmp_path / LOG), 20)
+
+
+@needs_forks
+def test_a_forked_job_ends_with_a_killed_driver(python: list[str], tmp_path: Path) -> None:
+    replace(PLAIN, episodes=10**6).write(tmp_path)
+    program = """
+import sys
+from pathlib import Path
+from ugat_marl.experiments.forked import perform_forked
+from ugat_marl.parallel import Stop
+with Path(sys.argv[2]).open("wb") as log:
+    perform_forked(Path(sys.argv[1]), log, Stop())
+"""
+    with subprocess.Popen([*python, "-c", program, str(tmp_path), str(tmp_path / LOG)]) as driver:
+        assert eventually((tmp_path / SCORES).exists, 60)
+        assert len(writers(tmp_path / LOG)) >= 2
+        driver.send_signal(signal.SIGKILL)
+    assert eventually(lambda: not writers(tmp_path / LOG), 20)
+
+
 SCORE = Scores(1, 1, 1, 1, 1, 1, 1, 1, 1, 1)
 
 
@@ -212,9 +290,7 @@ def test_what_a_killed_job_was_writing_is_cleared(tmp_path: Path) -> None:
     whole_record().write(tmp_path)  # nothing is left to do
     PLAIN.write(tmp_path)
     (tmp_path / ".learner.pt.x1y2z3.tmp").write_bytes(b"half")
-    command = [sys.executable, "-m", "ugat_marl.experiments.jobs", str(tmp_path)]
-    with subprocess.Popen(command, stdin=subprocess.PIPE) as process:
-        assert process.wait(60) == 0  # its input stays open: it would end with whoever started it
+    assert perform_described(tmp_path) == 0
     assert {path.name for path in tmp_path.iterdir()} == {SCORES, JOB}
 
 

@@ -696,6 +696,7 @@ def test_hanging_up_waits_for_the_other_end_but_not_for_ever() -> None:
 def test_workers_import_what_their_user_imports() -> None:
     from ugat_marl.simulation.host import _environment
 
-    environment = _environment()
+    environment = _environment({"OF_A_SERVICE": "1", "PATH": "/nowhere"})
+    assert environment["OF_A_SERVICE"] == "1" and environment["PATH"] == os.environ["PATH"]
     assert environment["PYTHONPATH"].split(os.pathsep) == [p or str(Path.cwd()) for p in sys.path]
     assert environment["PYTHONSAFEPATH"] == "1"

@@ -1,5 +1,8 @@
 """Driver: performs many jobs, several at a time, and resumes them.
 
+Jobs are forked from a warm parent where that is possible. Where it is not, and with an executor,
+each job gets a new interpreter.
+
 A job's folder holds its description and its results. Workers on other machines therefore need a
 shared file system.
 """
@@ -16,10 +19,12 @@ from pathlib import Path
 
 from ugat_marl.data import lock_folder
 from ugat_marl.errors import MeasurementError
+from ugat_marl.experiments.forked import ONE_CORE, jobs_fork_on, perform_forked
 from ugat_marl.experiments.jobs import Job, Record, perform
 from ugat_marl.files import require_writable
-from ugat_marl.parallel import Stop, Workers, executor_of
+from ugat_marl.parallel import Stop, Workers, executor_of, in_this_process
 from ugat_marl.progress import Reporter
+from ugat_marl.simulation import kept_warm
 
 LOG = "job.log"
 _TAIL = 400
@@ -37,6 +42,7 @@ def record_of(job: Job, folder: Path) -> Record | None:
     return record if record.is_whole(job) else None
 
 
+@kept_warm()
 def perform_all(
     plan: Sequence[Job],
     folder: Path,
@@ -79,7 +85,8 @@ def perform_all(
                     left.remove(job)
                     place = folder.resolve() / job.name
                     job.write(place)
-                    running[pool.submit(_perform_apart, str(place), stop)] = job
+                    forked = in_this_process(workers) and jobs_fork_on(job.device)
+                    running[pool.submit(_perform_apart, str(place), stop, forked)] = job
                 # The timeout lets Ctrl-C interrupt the wait.
                 finished, _ = wait(running, timeout=0.2, return_when=FIRST_COMPLETED)
                 for future in finished:
@@ -122,15 +129,18 @@ def perform_here(
     return records
 
 
-def _perform_apart(folder: str, stop: Stop) -> None:
+def _perform_apart(folder: str, stop: Stop, forked: bool) -> None:
     """Perform the job in a folder in another process; end it when `stop` is set."""
     with Path(folder, LOG).open("wb") as log:
+        if forked:
+            perform_forked(Path(folder), log, stop)
+            return
         process = subprocess.Popen(
             [sys.executable, "-m", "ugat_marl.experiments.jobs", folder],
             stdin=subprocess.PIPE,
             stdout=log,
             stderr=subprocess.STDOUT,
-            env={"OMP_NUM_THREADS": "1", **os.environ},  # each job has one core
+            env={**ONE_CORE, **os.environ},
             start_new_session=True,  # Ctrl-C reaches this process only; it ends the jobs itself
         )
     try:

@@ -508,9 +508,8 @@ def _world(job: Job) -> AnyParallelEnv:
     return RandomDelays(env, setting.most_delay_s) if setting.recipe == "delays" else env
 
 
-def main(folder: Path) -> int:
-    """Perform the job in a folder and return the exit code."""
-    exit_when_input_ends()
+def perform_described(folder: Path) -> int:
+    """Perform the job that a folder describes; return the exit code and print what went wrong."""
     remove_temporaries(folder)
     try:
         job = TypeAdapter(Job).validate_json((folder / JOB).read_bytes())
@@ -522,4 +521,5 @@ def main(folder: Path) -> int:
 
 
 if __name__ == "__main__":
-    sys.exit(main(Path(sys.argv[1])))
+    exit_when_input_ends()
+    sys.exit(perform_described(Path(sys.argv[1])))

@@ -81,6 +81,15 @@ class Channel:
             offset += 8 * size
         return Message(header, arrays)
 
+    def is_readable(self, patience_s: float) -> bool:
+        """Return True if bytes, or the end of the stream, arrive within `patience_s` seconds.
+
+        Call it only between messages, and not on Windows, which cannot wait on a pipe.
+        """
+        waiting = select.poll()
+        waiting.register(self._reader.fileno(), select.POLLIN)
+        return bool(waiting.poll(1000 * patience_s))
+
     def hang_up(self, patience_s: float) -> bool:
         """Close this end; return True if the other end closed within `patience_s` seconds.
 

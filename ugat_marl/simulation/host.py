@@ -98,12 +98,18 @@ class Host:
     Args:
         service: ``"module:Class"`` of the `Service`.
         start_method: ``"forkserver"`` (the default where processes can fork) or ``"spawn"``.
+        defaults: Environment variables of the processes, unless the user has set them.
 
     Raises:
         OptionError: The method is unknown, or this system does not have it.
     """
 
-    def __init__(self, service: str, start_method: StartMethod | None = None) -> None:
+    def __init__(
+        self,
+        service: str,
+        start_method: StartMethod | None = None,
+        defaults: Mapping[str, str] | None = None,
+    ) -> None:
         method = start_method or ("forkserver" if _CAN_FORK else "spawn")
         if method not in ("forkserver", "spawn"):
             raise OptionError(f"start_method = {method!r}; allowed: 'forkserver', 'spawn'")
@@ -111,6 +117,7 @@ class Host:
             raise OptionError("start_method = 'forkserver' needs a system that can fork")
         self._service = service
         self._method: StartMethod = method
+        self._defaults = dict(defaults or {})
         self._parent: _WarmParent | None = None
 
     def start(self, order: Order, descriptors: Sequence[int] = ()) -> Worker:
@@ -124,7 +131,7 @@ class Host:
             SimulatorCrashed: No process can be started.
         """
         if self._method == "spawn":
-            return Worker.spawn(self._service, order)
+            return Worker.spawn(self._service, order, self._defaults)
         for _ in range(2):
             parent = self.warm()
             worker = parent.fork(order, descriptors)
@@ -139,7 +146,7 @@ class Host:
     def warm(self) -> _WarmParent:
         """Start the warm parent, if there is none. `start` calls this itself."""
         if self._parent is None or not self._parent.alive:
-            self._parent = _WarmParent.acquire(self._service)
+            self._parent = _WarmParent.acquire(self._service, self._defaults)
         return self._parent
 
     def tell(self, order: Order) -> None:
@@ -179,7 +186,7 @@ class Worker:
         self._ended = False
 
     @classmethod
-    def spawn(cls, service: str, order: Order) -> Worker:
+    def spawn(cls, service: str, order: Order, defaults: Mapping[str, str]) -> Worker:
         """Start a new interpreter; messages use its standard input and output."""
         said = tempfile.TemporaryFile()  # noqa: SIM115 - stays open as long as the worker
         process: subprocess.Popen[bytes] = subprocess.Popen(
@@ -187,7 +194,7 @@ class Worker:
             stdin=subprocess.PIPE,
             stdout=subprocess.PIPE,
             stderr=said,
-            env=_environment(),
+            env=_environment(defaults),
             start_new_session=True,  # so Ctrl-C reaches only the user's process, which ends this
         )
         assert process.stdin is not None
@@ -235,6 +242,13 @@ class Worker:
             raise error
         return reply
 
+    def has_answered(self, patience_s: float) -> bool:
+        """Return True if an answer waits, or the process has died, within `patience_s` seconds.
+
+        Not on Windows.
+        """
+        return self._channel.is_readable(patience_s)
+
     def end(self, patience_s: float = PATIENCE_S) -> None:
         """Close the connection and wait until the process exits. A second call does nothing.
 
@@ -249,6 +263,7 @@ class Worker:
         if not self._channel.hang_up(patience_s):
             with contextlib.suppress(ProcessLookupError):
                 os.kill(self._pid, signal.SIGTERM if os.name == "nt" else signal.SIGKILL)
+            self._channel.hang_up(PATIENCE_S)  # until it is dead
         if self._process is not None:
             try:
                 self._process.wait(PATIENCE_S)
@@ -302,7 +317,7 @@ class _WarmParent:
     _blocks: ClassVar[int] = 0
     """Number of `kept_warm` blocks being executed."""
 
-    def __init__(self, service: str) -> None:
+    def __init__(self, service: str, defaults: Mapping[str, str]) -> None:
         self._service = service
         self._users = 0
         self._owner = os.getpid()
@@ -312,13 +327,13 @@ class _WarmParent:
                 _command("parent", service, str(self._owner), str(its.fileno())),
                 stdin=subprocess.DEVNULL,
                 pass_fds=(its.fileno(),),
-                env=_environment(),
+                env=_environment(defaults),
                 start_new_session=True,
             )
         atexit.register(self.end)
 
     @classmethod
-    def acquire(cls, service: str) -> _WarmParent:
+    def acquire(cls, service: str, defaults: Mapping[str, str]) -> _WarmParent:
         """Return the warm parent of this process; start one if there is none."""
         if not cls._told_of_forks:
             os.register_at_fork(after_in_child=cls._forget)
@@ -326,7 +341,7 @@ class _WarmParent:
         with cls._lock:
             parent = cls._current.get(service)
             if parent is None or not parent.alive:
-                parent = cls._current[service] = cls(service)
+                parent = cls._current[service] = cls(service, defaults)
             parent._users += 1
             return parent
 
@@ -434,7 +449,7 @@ def _command(*arguments: str) -> list[str]:
     return [sys.executable, "-m", _PROGRAM, *arguments]
 
 
-def _environment() -> dict[str, str]:
+def _environment(defaults: Mapping[str, str]) -> dict[str, str]:
     """Return the environment variables, with this process's import path for the user's modules."""
     path = os.pathsep.join(entry or str(Path.cwd()) for entry in sys.path)
-    return {**os.environ, "PYTHONPATH": path, "PYTHONSAFEPATH": "1"}
+    return {**defaults, **os.environ, "PYTHONPATH": path, "PYTHONSAFEPATH": "1"}

@@ -192,6 +192,7 @@ def _main(kind: str, name: str, user: str, argument: str) -> None:
     service: Service = getattr(importlib.import_module(module), member)()
     if kind == "parent":
         _serve(service, int(user), int(argument))
+        os._exit(0)  # unloading SUMO or torch takes long
     else:
         _spawned(service, int(user), json.loads(argument))
 

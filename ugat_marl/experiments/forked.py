@@ -1,0 +1,97 @@
+"""Jobs in processes forked from a warm parent, which has loaded what every job needs.
+
+Loading torch takes a new interpreter seconds, and a forked process nothing. The warm parent runs no
+thread, because a forked process would lack it. It therefore does not load polars, which starts some
+as it is imported.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import importlib
+import os
+import sys
+import traceback
+from collections.abc import Callable, Sequence
+from pathlib import Path
+from typing import IO, Any
+
+from ugat_marl.parallel import Stop
+from ugat_marl.simulation import ChannelClosed, Host, Message
+
+PRELOADED = ("torch", "torch._dynamo", "scipy.stats", "libsumo", "pydantic", "rich.progress")
+"""Slow imports of a job that start no thread. The optimisers of torch import ``torch._dynamo``."""
+
+ONE_CORE = {"OMP_NUM_THREADS": "1"}
+"""Environment variables of a job, unless the user has set them."""
+
+SERVICE = "ugat_marl.experiments.forked:Jobs"
+
+
+def jobs_fork_on(device: str) -> bool:
+    """Return True if jobs on a device can be forked here.
+
+    Only Linux can: on macOS, torch's libraries do not bear a fork. Devices other than the
+    processor get a new interpreter, because their drivers do not bear one either.
+    """
+    return sys.platform == "linux" and device == "cpu"
+
+
+def perform_forked(folder: Path, log: IO[bytes], stop: Stop) -> None:
+    """Perform the job in a folder in a forked process; end it when `stop` is set.
+
+    Args:
+        folder: Folder of the job.
+        log: Open file for everything that the job prints.
+        stop: Flag that no one waits for the job any more.
+    """
+    with contextlib.closing(Host(SERVICE, "forkserver", ONE_CORE)) as host:
+        worker = host.start({"folder": str(folder)}, [log.fileno()])
+        patience_s = 0.0  # a job that is stopped would train on
+        try:
+            worker.ask("perform")
+            while not (answered := worker.has_answered(0.1)) and not stop.is_set():
+                pass
+            if answered:
+                worker.answer()
+                patience_s = 10.0
+        except ChannelClosed:
+            pass  # it died; its record lacks evaluations
+        finally:
+            worker.end(patience_s)
+
+
+class Jobs:
+    """Service that performs one job in each worker."""
+
+    def prepare(self, order: dict[str, Any]) -> None:
+        """Load what every job needs."""
+        del order
+        for name in PRELOADED:
+            importlib.import_module(name)
+
+    def open(
+        self, order: dict[str, Any], descriptors: Sequence[int]
+    ) -> Callable[[Message], Message]:
+        """Return a function that performs the job; everything it prints goes to its log."""
+        folder, (log,) = Path(order["folder"]), descriptors
+        os.dup2(log, 1)
+        os.dup2(log, 2)
+
+        def perform(_: Message) -> Message:
+            try:
+                from ugat_marl.experiments.jobs import perform_described
+
+                perform_described(folder)
+            except Exception:  # noqa: BLE001 - the log says why; the record lacks evaluations
+                traceback.print_exc()
+            sys.stdout.flush()  # the process exits without it
+            return Message({}, [])
+
+        return perform
+
+    def told(self, order: dict[str, Any]) -> None:
+        """Do nothing: no messages are sent here."""
+
+    def abandoned(self) -> None:
+        """Do nothing: what a killed job was writing is cleared when it is taken up again."""
