@@ -435,6 +435,7 @@ def _grounded(
             placebo=job.setting.placebo,
             probe=_probe(job, workers),
             device=job.device,
+            workers=workers,
         )
     assert state.direct is not None  # plain training comes first
     policies = {ugat.pretrain_episodes: state.direct, job.episodes: state.learner.policy()}

@@ -26,7 +26,9 @@ FINE_TUNED = "fine-tuned on the same data"
 ORACLE = "trained in real"
 RULE = "best rule, tuned there"
 
-GROUNDED_NAME = {"phase": UGAT, "timed": TIMED}
+STREET = "fitted street"
+
+GROUNDED_NAME = {"phase": UGAT, "timed": TIMED, "street": STREET}
 """Name of the row of each kind of grounding."""
 
 MOST_DELAY_S = 5

@@ -1,8 +1,8 @@
 """Training of one policy: episode by episode in an environment, or grounded by UGAT.
 
 `train_through` trains without grounding. It continues from the learner's current episode and stops
-at each mark for an evaluation. `train_grounded` is Algorithm 1 of the UGAT paper between two
-domains.
+at each mark for an evaluation. `train_grounded` trains across a gap: by Algorithm 1 of the UGAT
+paper, or in a fitted street.
 """
 
 from __future__ import annotations
@@ -10,6 +10,7 @@ from __future__ import annotations
 import contextlib
 import time
 from collections.abc import Callable, Iterable, Iterator, Mapping
+from dataclasses import fields
 from functools import partial
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -21,16 +22,21 @@ from ugat_marl.errors import OptionError
 from ugat_marl.grounding import (
     CHECKPOINT_EPISODES,
     MATCHED_REWARD,
+    LaneView,
     NegativeControl,
     Probe,
     RunState,
     ShuffledWorld,
     SimulatedWorld,
+    Simulation,
+    StreetFit,
+    StreetTraining,
     Ugat,
     UgatConfig,
     World,
     answer_with_noise,
     neighbours_of,
+    street_prior,
 )
 from ugat_marl.parallel import Workers
 from ugat_marl.policies import EpisodeCallback, Learner, LearnerFactory, NetworkPolicy, Policy
@@ -96,8 +102,9 @@ def train_grounded(
     placebo: NegativeControl = "none",
     probe: Probe | None = None,
     device: str = "cpu",
-) -> RunState:
-    """Train by UGAT, or resume the run, and return the final state.
+    workers: Workers = None,
+) -> RunState[Any]:
+    """Train by UGAT or in a fitted street, or resume the run, and return the final state.
 
     Args:
         ugat: Settings of the algorithm.
@@ -110,22 +117,61 @@ def train_grounded(
         placebo: A negative control.
         probe: Measures the policy after every iteration.
         device: Device for the fits of f and h.
+        workers: Simulations at a time, or an executor, for worlds of a fitted street.
+
+    Raises:
+        OptionError: The negative control does not fit the grounding.
     """
-    learner = make(env, seed)
-    transform = ugat.transform(env.recorded_layouts, seed, neighbours_of(env))
-    if placebo == "noise":
-        answer_with_noise(transform.forward, seed)
-    state = RunState(learner, transform)
-    if start is not None:
-        learner.load(start)
-        state.direct, state.pretrained = learner.policy(), ugat.pretrain_episodes
-    state.restore(run, NetworkPolicy.load)
     sim, real = worlds
     if placebo == "shuffled":
         real = ShuffledWorld(real)
+    common: dict[str, Any]
+    common = {"env": env, "real": real, "config": ugat, "seed": seed, "run": run, "probe": probe}
+    algorithm: Ugat | StreetTraining
+    if ugat.grounding == "street":
+        if placebo == "noise":
+            raise OptionError('the control "noise" needs f; grounding "street" has none')
+        algorithm = street_training(make, env, workers, **common)
+        fitted: Any = StreetFit(street_prior(env, ugat.street))
+        renew = algorithm.renew
+    else:
+        fitted = ugat.transform(env.recorded_layouts, seed, neighbours_of(env))
+        if placebo == "noise":
+            answer_with_noise(fitted.forward, seed)
+        algorithm, renew = Ugat(sim=sim, device=device, **common), _keep
+    state = RunState(make(env, seed), fitted)
+    if start is not None:
+        state.learner.load(start)
+        state.direct, state.pretrained = state.learner.policy(), ugat.pretrain_episodes
+    state.restore(run, NetworkPolicy.load, renew)
     with contextlib.closing(sim), contextlib.closing(real):
-        Ugat(env, sim, real, ugat, seed, run, probe, device).train(state)
+        algorithm.train(state)
     return state
+
+
+def _keep(_state: RunState[Any]) -> None:
+    """Leave the learner as it is."""
+
+
+def street_training(
+    make: LearnerFactory, env: TrafficEnv, workers: Workers, **common: Any
+) -> StreetTraining:
+    """Return the training in a fitted street.
+
+    Args:
+        make: Makes the learner.
+        env: The simulation.
+        workers: Simulations at a time, or an executor.
+        **common: Attributes of `Algorithm`.
+    """
+    options = {
+        field.name: getattr(env.options, field.name)
+        for field in fields(env.options)
+        if field.name != "crossings"
+    }
+    simulation = Simulation(env.scenario, "sim", options, common["config"].rollout_epsilon, workers)
+    view = LaneView.of(env.network, env.options.observation)
+    return StreetTraining(simulation=simulation, make=make, view=view, **common)
 
 
 def check_worlds(scenario: Scenario, sim: Domain, real: Domain, timed: bool = False) -> None:
@@ -192,8 +238,10 @@ def simulated_worlds(
         )
 
     def world(domain: Domain, name: str, episodes: int, most_delay_s: int = 0) -> SimulatedWorld:
-        crossings = ugat.most_delay_s > 0  # crossing vehicles show best when a green began
-        make = partial(parallel_env, scenario, domain, crossings=crossings, **options)
+        # crossing vehicles show best when a green began, and how fast it serves
+        crossings = ugat.most_delay_s > 0 or ugat.grounding == "street"
+        given = {"crossings": crossings, **options}
+        make = partial(parallel_env, scenario, domain, **given)
         return SimulatedWorld(make, name, episodes, ugat.rollout_epsilon, most_delay_s, workers)
 
     return (

@@ -11,7 +11,10 @@ paper. The modules, from data to the algorithm:
   `timed` (a delayed green, by the estimates of `delays`).
 - `wrappers`: the grounded environment; greens with random delays.
 - `worlds`, `controls`: sources of D_sim and D_real; negative controls.
-- `config`, `state`, `ugat`: settings, checkpoint, Algorithm 1.
+- `channel`, `eyes`, `summaries`, `regression`, `posterior`: commands, detectors and worlds of a
+  street, fitted from its log; `street` puts them together and draws the world of each episode.
+- `config`, `state`, `algorithm`: settings, checkpoint, plain training.
+- `ugat`, `street_training`: Algorithm 1; training in a fitted street.
 """
 
 import lazy_loader

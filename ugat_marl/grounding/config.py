@@ -13,11 +13,12 @@ from ugat_marl.grounding.forward import ForwardConfig
 from ugat_marl.grounding.gate import GateConfig
 from ugat_marl.grounding.inverse import InverseConfig
 from ugat_marl.grounding.phase import PhaseTransform
+from ugat_marl.grounding.street import StreetConfig
 from ugat_marl.grounding.timed import TimedConfig, TimedTransform
 from ugat_marl.grounding.transform import Transform
 from ugat_marl.grounding.view import InputsConfig, Neighbours
 
-GROUNDINGS = ("phase", "timed")
+GROUNDINGS = ("phase", "timed", "street")
 
 
 @dataclass(frozen=True)
@@ -26,7 +27,8 @@ class UgatConfig:
 
     Attributes:
         grounding: Kind of the grounded action: "phase" is another phase, as in the paper; "timed"
-            is the policy's own phase with a green that begins later.
+            is the policy's own phase with a green that begins later; "street" leaves actions alone
+            and trains in worlds fitted to the street.
         pretrain_episodes: M, episodes in plain sim before the first iteration.
         iterations: I, repetitions of rolling out, fitting and grounded training.
         grounded_episodes: E, episodes of training in the grounded sim per iteration.
@@ -43,9 +45,10 @@ class UgatConfig:
         fit: Settings of the training of f and h.
         gate: Settings of alpha.
         timed: Settings of the delays, with "timed".
+        street: Settings of the fit, with "street".
     """
 
-    grounding: Literal["phase", "timed"] = "phase"
+    grounding: Literal["phase", "timed", "street"] = "phase"
     pretrain_episodes: int = 60
     iterations: int = 4
     grounded_episodes: int = 10
@@ -59,6 +62,7 @@ class UgatConfig:
     fit: FitConfig = field(default_factory=FitConfig)
     gate: GateConfig = field(default_factory=GateConfig)
     timed: TimedConfig = field(default_factory=TimedConfig)
+    street: StreetConfig = field(default_factory=StreetConfig)
 
     @property
     def most_delay_s(self) -> int:
@@ -83,7 +87,12 @@ class UgatConfig:
             seed: Seed of the initial weights.
             neighbours: Agent to the agents one road away (`grounding.view.neighbours_of`); needed
                 for inputs with hops.
+
+        Raises:
+            OptionError: The grounding is "street", which changes no actions.
         """
+        if self.grounding == "street":
+            raise OptionError('grounding "street" changes the simulation and has no transform')
         if self.grounding == "timed":
             return TimedTransform(
                 layouts,

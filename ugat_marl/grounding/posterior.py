@@ -243,7 +243,9 @@ class Posterior:
             street: Statistics of the street's log.
         """
         number, lanes = len(simulated), len(worlds.lanes)
+        unknown = np.isnan(street.network)  # a statistic that the street's log does not have
         network = np.stack([item.summary.network for item in simulated])
+        network[:, unknown] = np.nan
         design = Design.of(network)
         x, x_street = design.inputs(network), design.inputs(street.network[None])
         effects = np.stack([item.values.effects for item in simulated])
@@ -256,6 +258,7 @@ class Posterior:
 
         # Lanes: their distance from the network's mean, from that of their statistics.
         unlike = np.stack([s.summary.values - s.summary.network for s in simulated])
+        unlike[:, :, unknown] = np.nan
         usual = np.stack([_mean(unlike[:, lane]) for lane in range(lanes)])
         rows = (unlike - usual).reshape(number * lanes, -1)
         own = Design.of(rows)

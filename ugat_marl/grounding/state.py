@@ -5,21 +5,35 @@ from __future__ import annotations
 from collections.abc import Callable
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any
+from typing import Any, Generic, Protocol, TypeVar
 
 from ugat_marl.data import Run, TransitionLog
 from ugat_marl.errors import OptionError
-from ugat_marl.grounding.transform import Transform
 from ugat_marl.policies import Learner, Policy
 
 
+class Savable(Protocol):
+    """Models or other fitted numbers that a checkpoint holds."""
+
+    def save(self, path: Path) -> None:
+        """Write everything to a file, whole or not at all."""
+        ...
+
+    def load(self, path: Path) -> None:
+        """Restore a file of `save`."""
+        ...
+
+
+Saved = TypeVar("Saved", bound=Savable)
+
+
 @dataclass
-class RunState:
+class RunState(Generic[Saved]):
     """Complete state of a run, as stored in a checkpoint.
 
     Attributes:
         learner: Learner of the policy.
-        transform: f, h and gate.
+        transform: What is fitted: f, h and gate, or a street.
         direct: Policy after plain training, for direct transfer.
         simulated: Logs of D_sim.
         real: Logs of D_real.
@@ -28,7 +42,7 @@ class RunState:
     """
 
     learner: Learner
-    transform: Transform
+    transform: Saved
     direct: Policy | None = None
     simulated: list[TransitionLog] = field(default_factory=list)
     real: list[TransitionLog] = field(default_factory=list)
@@ -53,8 +67,19 @@ class RunState:
 
         run.save({"pretrained": self.pretrained, "iteration": self.iteration}, write)
 
-    def restore(self, run: Run, load_policy: Callable[[Path], Policy]) -> None:
+    def restore(
+        self,
+        run: Run,
+        load_policy: Callable[[Path], Policy],
+        prepare: Callable[[RunState[Saved]], object] = lambda _: None,
+    ) -> None:
         """Restore the run's checkpoint into a fresh state; without one, nothing changes.
+
+        Args:
+            run: Folder of the run.
+            load_policy: Reads direct transfer.
+            prepare: Called after the transform is restored and before the learner is, which it may
+                replace by one that fits.
 
         Raises:
             CheckpointError: The checkpoint cannot be used.
@@ -64,8 +89,9 @@ class RunState:
             return
 
         def read(folder: Path) -> None:
-            self.learner.load(folder / "learner.pt")
             self.transform.load(folder / "grounding.pt")
+            prepare(self)
+            self.learner.load(folder / "learner.pt")
             if (folder / "direct.pt").exists():
                 self.direct = load_policy(folder / "direct.pt")
             self.simulated = _read_logs(folder, "sim")

@@ -234,6 +234,10 @@ class Simulation:
         domain = _joined(self.sim, world.effects)
         return parallel_env(self.scenario, domain, **given)
 
+    def plain(self, commands: int) -> TrafficEnv:
+        """Return the unchanged simulation, in which agents see so many own commands."""
+        return self.env(StreetWorld(), commands=commands)
+
     def play(self, world: StreetWorld, policy: Policy, seed: int, stop: Stop) -> TransitionLog:
         """Run one episode in a world and record it."""
         env = self.env(world, **policy.env_options, crossings=True)
@@ -379,7 +383,7 @@ def street_env(street: FittedStreet, simulation: Simulation, commands: int) -> D
     return DrawnEnv(lambda seed: simulation.env(street.world(seed), commands=commands))
 
 
-def worlds_of(env: TrafficEnv, config: StreetConfig) -> Worlds:
+def street_prior(env: TrafficEnv, config: StreetConfig) -> Worlds:
     """Return the prior of the worlds of an environment's network."""
     view = LaneView.of(env.network, env.options.observation)
     names = [item.name for item in Worlds.of((), {}).library]

@@ -43,60 +43,38 @@ from __future__ import annotations
 
 import concurrent.futures
 import warnings
-from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 
 import numpy as np
 import torch
 
-from ugat_marl.data import Run, TransitionLog
-from ugat_marl.envs import AnyParallelEnv
-from ugat_marl.grounding.config import UgatConfig
+from ugat_marl.data import TransitionLog
+from ugat_marl.grounding.algorithm import Algorithm, iteration_name
 from ugat_marl.grounding.delays import EpisodeRewards, episode_rewards
 from ugat_marl.grounding.fitting import Fitter
 from ugat_marl.grounding.gate import GateReport
 from ugat_marl.grounding.reports import FitReport
 from ugat_marl.grounding.state import RunState
+from ugat_marl.grounding.transform import Transform
 from ugat_marl.grounding.worlds import SimulatedWorld, World
 from ugat_marl.grounding.wrappers import GroundedEnv
 from ugat_marl.policies import Policy, device_of
 from ugat_marl.seeding import derive_seed
 
-CHECKPOINT_EPISODES = 10
-"""Episodes of plain training between two checkpoints."""
 
-DIRECT_LEARNER = "direct-learner.pt"
-"""File of the learner after plain training, in the run's folder; controls start from it."""
-
-Probe = Callable[[Policy], Mapping[str, float]]
-"""Measurement of a policy between iterations; the numbers are only logged."""
-
-
-@dataclass(frozen=True)
-class Ugat:
+@dataclass(frozen=True, kw_only=True)
+class Ugat(Algorithm):
     """Algorithm 1 on one network.
 
     Attributes:
-        env: E_sim for the training.
         sim: E_sim for the roll-outs of D_sim.
-        real: E_real, or a log of it, for the roll-outs of D_real.
-        config: Settings.
-        seed: Root of every random choice.
-        run: Folder of metrics and checkpoints.
-        probe: Measurement of the policy after every iteration.
         device: Device for the fit of f and h (`policies.device_of`); the learner has its own.
     """
 
-    env: AnyParallelEnv
     sim: SimulatedWorld
-    real: World
-    config: UgatConfig
-    seed: int
-    run: Run
-    probe: Probe | None = None
     device: str = "cpu"
 
-    def train(self, state: RunState) -> Policy:
+    def train(self, state: RunState[Transform]) -> Policy:
         """Run Algorithm 1 to its end.
 
         Args:
@@ -114,7 +92,7 @@ class Ugat:
             rewards = self._rewards(state, policy) if self.config.matches else None
             report = self._fit(state, device, rewards)  # lines 5 and 6
             self._prepare_gate(state, report)  # line 7
-            title = f"grounded, {_iteration(state)}"
+            title = f"grounded, {iteration_name(state)}"
             self._learn(state, grounded_env, self.config.grounded_episodes, title)  # lines 8 to 16
             gate = self._update_alpha(state)  # line 17
             self._log(state, report, gate)
@@ -122,28 +100,11 @@ class Ugat:
             state.save(self.run)
         return state.learner.policy()
 
-    def _pretrain(self, state: RunState) -> None:
-        """Train in plain E_sim for M episodes; keep the policy as direct transfer (line 1)."""
-        wanted = self.config.pretrain_episodes
-        while state.pretrained < wanted:
-            episodes = min(CHECKPOINT_EPISODES, wanted - state.pretrained)
-            numbers = f"{state.pretrained + 1}-{state.pretrained + episodes}"
-            self._learn(state, self.env, episodes, f"plain sim, episode {numbers}")
-            state.pretrained += episodes
-            if state.pretrained < wanted:
-                state.save(self.run)
-        if state.direct is None:
-            state.direct = state.learner.policy()
-            state.learner.save(self.run.directory / DIRECT_LEARNER)
-            if self.probe is not None:
-                self.run.log("iteration", 0, self.probe(state.direct))
-            state.save(self.run)
-
-    def _roll_out(self, state: RunState, policy: Policy) -> None:
+    def _roll_out(self, state: RunState[Transform], policy: Policy) -> None:
         """Roll the policy out in both worlds at the same time (lines 3 and 4)."""
         worlds: tuple[World, World] = (self.sim, self.real)
         with (
-            self.run.reporter.task(f"roll-outs, {_iteration(state)}", len(worlds)) as advance,
+            self.run.reporter.task(f"roll-outs, {iteration_name(state)}", len(worlds)) as advance,
             concurrent.futures.ThreadPoolExecutor(len(worlds)) as pool,
         ):
             running = [
@@ -162,27 +123,27 @@ class Ugat:
                     data.append(log)
                 advance()
 
-    def _rewards(self, state: RunState, policy: Policy) -> EpisodeRewards:
+    def _rewards(self, state: RunState[Transform], policy: Policy) -> EpisodeRewards:
         """Run the policy in E_sim under each delay; return its rewards there and in E_real.
 
         Only timed grounding with matched rewards needs this; it is not part of Algorithm 1.
         """
         agents = state.transform.stack.agents
         number = self.sim.roll_outs_under_delays
-        with self.run.reporter.task(f"under delays, {_iteration(state)}", number) as advance:
+        with self.run.reporter.task(f"under delays, {iteration_name(state)}", number) as advance:
             logs = self.sim.under_delays(policy, state.iteration, self.seed, advance)
         *before, street = [episode_rewards(log, agents) for log in state.real]
         simulated = np.array([episode_rewards(log, agents) for log in logs])
         return EpisodeRewards(street, simulated, before)
 
     def _fit(
-        self, state: RunState, device: torch.device, rewards: EpisodeRewards | None
+        self, state: RunState[Transform], device: torch.device, rewards: EpisodeRewards | None
     ) -> FitReport:
         """Update f with D_real and h with D_sim (lines 5 and 6); print warnings of the fit."""
         d_real, d_sim = map(TransitionLog.concatenate, (state.real, state.simulated))
         config, seed = self.config.fit, derive_seed(self.seed, "fit", state.iteration)
         most_epochs = 3 * config.epochs  # f, a model of the simulation, and h
-        title = f"fitting f and h, {_iteration(state)}"
+        title = f"fitting f and h, {iteration_name(state)}"
         with self.run.reporter.task(title, most_epochs) as advance:
 
             def on_epoch(model: str, _epoch: int, loss: float) -> None:
@@ -191,27 +152,17 @@ class Ugat:
             fitter = Fitter(config, seed, on_epoch, device)
             report = state.transform.fit(d_real, d_sim, fitter, rewards)
         for warning in report.warnings:
-            self.run.reporter.say(f"{_iteration(state)}: {warning}")
+            self.run.reporter.say(f"{iteration_name(state)}: {warning}")
         return report
 
-    def _prepare_gate(self, state: RunState, report: FitReport) -> None:
+    def _prepare_gate(self, state: RunState[Transform], report: FitReport) -> None:
         """Give the gate the trusted agents and the u to expect (lines 7 and 13)."""
         gate = state.transform.gate
         if self.config.least_accuracy is not None:
             gate.trust(report.trusted(self.config.least_accuracy))
         gate.begin(report.expected_u)
 
-    def _learn(self, state: RunState, env: AnyParallelEnv, episodes: int, title: str) -> None:
-        """Let the learner train in an environment; log every episode (lines 8 to 16)."""
-        with self.run.reporter.task(title, episodes) as advance:
-
-            def on_episode(number: int, numbers: Mapping[str, float]) -> None:
-                self.run.log("episode", number, numbers)
-                advance(note=f"return {numbers['return']:.0f}" if "return" in numbers else "")
-
-            state.learner.learn(env, episodes, self.seed, on_episode)
-
-    def _update_alpha(self, state: RunState) -> GateReport:
+    def _update_alpha(self, state: RunState[Transform]) -> GateReport:
         """Set alpha for the next iteration (line 17); warnings are shown beside the bars."""
         with warnings.catch_warnings():
             warnings.simplefilter("ignore")
@@ -220,13 +171,9 @@ class Ugat:
             self.run.reporter.say(report.warning)
         return report
 
-    def _log(self, state: RunState, report: FitReport, gate: GateReport) -> None:
+    def _log(self, state: RunState[Transform], report: FitReport, gate: GateReport) -> None:
         """Log the numbers of an iteration."""
         numbers = {**report.as_dict(), **{f"gate/{k}": v for k, v in gate.as_dict().items()}}
         if self.probe is not None:
             numbers |= self.probe(state.learner.policy())
         self.run.log("iteration", state.iteration + 1, numbers)
-
-
-def _iteration(state: RunState) -> str:
-    return f"iteration {state.iteration + 1}"

@@ -6,6 +6,7 @@ import copy
 from collections.abc import Callable, Mapping, Sequence
 from concurrent.futures import Executor
 from dataclasses import dataclass
+from functools import partial
 from typing import Any, Protocol
 
 from ugat_marl.data import Scores, TransitionLog
@@ -52,7 +53,7 @@ class SimulatedWorld:
     """Roll-outs in a domain.
 
     Args:
-        make_env: Function that makes an environment of the domain.
+        make_env: Function that makes an environment of the domain; options of the policy are added.
         name: Name that separates the seeds of two worlds.
         episodes: Number of roll-outs per iteration.
         epsilon: Chance of a random phase.
@@ -63,7 +64,7 @@ class SimulatedWorld:
 
     def __init__(
         self,
-        make_env: Callable[[], TrafficEnv],
+        make_env: Callable[..., TrafficEnv],
         name: str,
         episodes: int,
         epsilon: float,
@@ -77,6 +78,7 @@ class SimulatedWorld:
         self._most_delay_s = most_delay_s
         self._workers = workers
         self._env: AnyParallelEnv | None = None
+        self._commands = 0
         self._stop = Stop()
 
     def collect(self, policy: Policy, iteration: int, seed: int) -> TransitionLog | None:
@@ -88,10 +90,18 @@ class SimulatedWorld:
         if isinstance(self._workers, Executor):
             logs = self._played_by(self._workers, policy, [(s, None) for s in seeds])
             return TransitionLog.concatenate(logs)
-        if self._env is None:
-            self._env = _delayed(self._make_env, self._most_delay_s)
-        env, exploring = self._env, EpsilonGreedy(policy, self._epsilon)
+        exploring = EpsilonGreedy(policy, self._epsilon)
+        env = self._env_of(policy)
         return TransitionLog.concatenate([_recorded(env, exploring, s, self._stop) for s in seeds])
+
+    def _env_of(self, policy: Policy) -> AnyParallelEnv:
+        """Return the environment, with as many own commands in view as the policy needs."""
+        commands = int(policy.env_options.get("commands", 0))
+        if self._env is None or commands != self._commands:
+            self.close()
+            make_env = partial(self._make_env, commands=commands)
+            self._env, self._commands = _delayed(make_env, self._most_delay_s), commands
+        return self._env
 
     def under_delays(
         self, policy: Policy, iteration: int, seed: int, on_done: Callable[[], object]
@@ -177,14 +187,16 @@ class _RollOutAlone:
         epsilon: Chance of a random phase.
     """
 
-    make_env: Callable[[], TrafficEnv]
+    make_env: Callable[..., TrafficEnv]
     most_delay_s: int
     policy: Policy
     epsilon: float
 
     def play(self, seed: int, always_s: int | None, stop: Stop) -> TransitionLog:
         """Run one roll-out, with random delays or with the constant delay `always_s`."""
-        env = _delayed(self.make_env, self.most_delay_s, always_s)
+        commands = int(self.policy.env_options.get("commands", 0))
+        make_env = partial(self.make_env, commands=commands)
+        env = _delayed(make_env, self.most_delay_s, always_s)
         policy = copy.deepcopy(
             self.policy
         )  # policies with memory must not share it between threads

@@ -1,0 +1,76 @@
+"""Base of the algorithms that train across a gap: plain training, learning with checkpoints."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+from typing import Any
+
+from ugat_marl.data import Run
+from ugat_marl.envs import AnyParallelEnv
+from ugat_marl.grounding.config import UgatConfig
+from ugat_marl.grounding.state import RunState
+from ugat_marl.grounding.worlds import World
+from ugat_marl.policies import Policy
+
+CHECKPOINT_EPISODES = 10
+"""Episodes of plain training between two checkpoints."""
+
+DIRECT_LEARNER = "direct-learner.pt"
+"""File of the learner after plain training, in the run's folder; controls start from it."""
+
+Probe = Callable[[Policy], Mapping[str, float]]
+"""Measurement of a policy between iterations; the numbers are only logged."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Algorithm:
+    """Training of a policy in a simulation, for a real domain.
+
+    Attributes:
+        env: E_sim for the training.
+        real: E_real, or a log of it, for the roll-outs of D_real.
+        config: Settings.
+        seed: Root of every random choice.
+        run: Folder of metrics and checkpoints.
+        probe: Measurement of the policy after every iteration.
+    """
+
+    env: AnyParallelEnv
+    real: World
+    config: UgatConfig
+    seed: int
+    run: Run
+    probe: Probe | None = None
+
+    def _pretrain(self, state: RunState[Any]) -> None:
+        """Train in plain E_sim for M episodes; keep the policy as direct transfer (line 1)."""
+        wanted = self.config.pretrain_episodes
+        while state.pretrained < wanted:
+            episodes = min(CHECKPOINT_EPISODES, wanted - state.pretrained)
+            numbers = f"{state.pretrained + 1}-{state.pretrained + episodes}"
+            self._learn(state, self.env, episodes, f"plain sim, episode {numbers}")
+            state.pretrained += episodes
+            if state.pretrained < wanted:
+                state.save(self.run)
+        if state.direct is None:
+            state.direct = state.learner.policy()
+            state.learner.save(self.run.directory / DIRECT_LEARNER)
+            if self.probe is not None:
+                self.run.log("iteration", 0, self.probe(state.direct))
+            state.save(self.run)
+
+    def _learn(self, state: RunState[Any], env: AnyParallelEnv, episodes: int, title: str) -> None:
+        """Let the learner train in an environment; log every episode (lines 8 to 16)."""
+        with self.run.reporter.task(title, episodes) as advance:
+
+            def on_episode(number: int, numbers: Mapping[str, float]) -> None:
+                self.run.log("episode", number, numbers)
+                advance(note=f"return {numbers['return']:.0f}" if "return" in numbers else "")
+
+            state.learner.learn(env, episodes, self.seed, on_episode)
+
+
+def iteration_name(state: RunState[Any]) -> str:
+    """Return the name of the current iteration, for progress bars."""
+    return f"iteration {state.iteration + 1}"

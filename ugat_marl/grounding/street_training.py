@@ -1,0 +1,148 @@
+"""Training in a fitted street: each episode in a world that the log of the street leaves possible.
+
+    Input: policy pi, prior of worlds
+
+     1  pre-train pi for M episodes in E_sim
+     2  for i = 1, ..., I:
+     3      roll pi out in E_real, add the transitions to D_real
+     4      fit the street to D_real (`street`)
+     5      for e = 1, ..., E episodes: draw a world of the street, update pi in it
+
+If commands are late or lost, the policy needs to see its own last commands, which the pre-trained
+one does not. A new policy then begins in the fitted street, with M episodes more.
+"""
+
+from __future__ import annotations
+
+import contextlib
+from dataclasses import dataclass
+from pathlib import Path
+
+from ugat_marl.data import TransitionLog
+from ugat_marl.grounding.algorithm import Algorithm, iteration_name
+from ugat_marl.grounding.posterior import Worlds
+from ugat_marl.grounding.state import RunState
+from ugat_marl.grounding.street import (
+    FittedStreet,
+    Simulation,
+    episodes_of_fit,
+    fit_street,
+    street_env,
+)
+from ugat_marl.grounding.summaries import LaneView
+from ugat_marl.policies import LearnerFactory, Policy
+from ugat_marl.seeding import derive_seed
+
+
+@dataclass
+class StreetFit:
+    """A fitted street, as a part of a checkpoint.
+
+    Attributes:
+        worlds: Prior of worlds.
+        street: The street; None before the first fit.
+    """
+
+    worlds: Worlds
+    street: FittedStreet | None = None
+
+    @property
+    def commands(self) -> int:
+        """Number of own commands that a policy has to see; 0 before the first fit."""
+        return 0 if self.street is None else self.street.commands
+
+    def save(self, path: Path) -> None:
+        """Write the street to a file; nothing before the first fit."""
+        if self.street is not None:
+            self.street.save(path)
+
+    def load(self, path: Path) -> None:
+        """Restore a file of `save`; without one, nothing was fitted.
+
+        Raises:
+            CheckpointError: The file is unreadable, or of another network.
+        """
+        if path.exists():
+            self.street = FittedStreet.load(path, self.worlds)
+
+
+@dataclass(frozen=True, kw_only=True)
+class StreetTraining(Algorithm):
+    """Training in a fitted street.
+
+    Attributes:
+        simulation: The simulation in which worlds are drawn.
+        make: Makes the learner.
+        view: Lanes of the network.
+    """
+
+    simulation: Simulation
+    make: LearnerFactory
+    view: LaneView
+
+    def train(self, state: RunState[StreetFit]) -> Policy:
+        """Run the algorithm to its end.
+
+        Args:
+            state: A fresh state, or one restored from a checkpoint.
+
+        Returns:
+            The policy after the last iteration.
+        """
+        self._pretrain(state)  # line 1
+        while state.iteration < self.config.iterations:  # line 2
+            policy = state.learner.policy()
+            self._roll_out(state, policy)  # line 3
+            before = state.transform.commands
+            street = self._fit(state, policy)  # line 4
+            episodes = self.config.grounded_episodes
+            if street.commands != before:
+                self.renew(state)
+                episodes += self.config.pretrain_episodes
+            title = f"fitted street, {iteration_name(state)}"
+            env = street_env(street, self.simulation, street.commands)
+            with contextlib.closing(env):
+                self._learn(state, env, episodes, title)  # line 5
+            numbers = street.as_dict()
+            if self.probe is not None:
+                numbers |= self.probe(state.learner.policy())
+            self.run.log("iteration", state.iteration + 1, numbers)
+            state.iteration += 1
+            state.save(self.run)
+        return state.learner.policy()
+
+    def renew(self, state: RunState[StreetFit]) -> None:
+        """Replace the learner by a new one that sees as many commands as the street needs."""
+        commands = state.transform.commands
+        if not commands:
+            return
+        env = self.simulation.plain(commands)
+        with contextlib.closing(env):
+            state.learner = self.make(env, self.seed)
+
+    def _roll_out(self, state: RunState[StreetFit], policy: Policy) -> None:
+        """Roll the policy out on the street (line 3)."""
+        with self.run.reporter.task(f"roll-outs, {iteration_name(state)}", 1) as advance:
+            log = self.real.collect(policy, state.iteration, self.seed)
+            if log is not None:
+                state.real.append(log)
+            advance()
+
+    def _fit(self, state: RunState[StreetFit], policy: Policy) -> FittedStreet:
+        """Fit the street to D_real, and say what was found (line 4)."""
+        config, number = self.config.street, episodes_of_fit(self.config.street)
+        with self.run.reporter.task(f"fitting, {iteration_name(state)}", number) as advance:
+            street = fit_street(
+                TransitionLog.concatenate(state.real),
+                self.simulation,
+                policy,
+                state.transform.worlds,
+                self.view,
+                config,
+                derive_seed(self.seed, "fit", state.iteration),
+                advance,
+            )
+        state.transform.street = street
+        for line in street.describe():
+            self.run.reporter.say(f"{iteration_name(state)}: {line}")
+        return street
