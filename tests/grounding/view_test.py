@@ -105,18 +105,19 @@ def test_own_numbers_then_earlier_ones_then_neighbours_by_hand() -> None:
     view = View(STACK, 2, {"b_0": ("c_0", "a_0")})
     before, now = observed(1, {"a_0": 2, "b_0": 1, "c_0": 0}), observed(2, dict.fromkeys(ROW, 1))
     ran, running = torch.tensor([[1], [0], [1]]), torch.tensor([[2], [0], [1]])
+    asked = torch.tensor([[0], [1], [0]])  # the street ran something else: a late command
     stacked = STACK.observations(now)
-    seen = view.seen(stacked, running, [Moment(STACK.observations(before), ran)])
+    seen = view.seen(stacked, running, [Moment(STACK.observations(before), ran, asked)])
     wanted = [
         *now["b_0"],
-        *(*before["b_0"], 1, 0),
+        *(*before["b_0"], 1, 0, 0, 1),  # what ran, what was asked for
         *(*now["c_0"], 0, 1),
         *(*now["a_0"][:5], 0, 0, 1),  # features and phase; its context is somebody else's
     ]
     assert seen[1, 0, : len(wanted)].tolist() == pytest.approx(wanted)
-    assert view.sizes == [6 + 6 + 3, len(wanted), 5 + 5 + 2] and view.width == len(wanted)
-    assert not seen[0, 0, 15:].any() and not seen[2, 0, 12:].any()
-    lit = [False, True, True] * 2 + [True] * 2 + [False] * 3 + [True] * 4 + [False] * 2 + [True] * 6
+    assert view.sizes == [6 + 6 + 6, len(wanted), 5 + 5 + 4] and view.width == len(wanted)
+    assert not seen[0, 0, 18:].any() and not seen[2, 0, 14:].any()
+    lit = [False, True, True] * 2 + [True] * 4 + [False] * 3 + [True] * 4 + [False] * 2 + [True] * 6
     assert view.lights[1, 0].tolist() == lit
 
 
@@ -125,7 +126,7 @@ def test_where_nothing_was_before_the_oldest_stands_in_without_a_phase() -> None
     log = recorded([(0, 0), (0, 1), (0, 2), (0, 5), (1, 6), (1, 7)])
     data = stack_log(log, STACK)
     seen, own = view.of(data)[2], data.observation[2]
-    moments = [seen[:, start : start + 5] for start in (0, 5, 12, 19)]
+    moments = [seen[:, start : start + 5] for start in (0, 5, 14, 23)]
     # Row 3 comes after a gap, row 4 begins an episode.
     for moment, rows in zip(
         moments,
@@ -133,11 +134,12 @@ def test_where_nothing_was_before_the_oldest_stands_in_without_a_phase() -> None
         strict=True,
     ):
         assert torch.equal(moment, own[rows, :5])
-    known = torch.nn.functional.one_hot(data.executed[2], 2).float()
-    for start, lag, rows in ((10, 1, [1, 2, 5]), (17, 2, [2]), (24, 3, [])):
-        lights = seen[:, start : start + 2]
-        assert torch.equal(lights[rows], known[[row - lag for row in rows]])
-        assert not lights[[row for row in range(6) if row not in rows]].any()
+    for offset, phases in ((0, data.executed[2]), (2, data.asked[2])):
+        known = torch.nn.functional.one_hot(phases, 2).float()
+        for start, lag, rows in ((10, 1, [1, 2, 5]), (19, 2, [2]), (28, 3, [])):
+            lights = seen[:, start + offset : start + offset + 2]
+            assert torch.equal(lights[rows], known[[row - lag for row in rows]])
+            assert not lights[[row for row in range(6) if row not in rows]].any()
 
 
 def test_a_row_of_the_log_is_what_an_episode_shows_at_that_step() -> None:
@@ -147,7 +149,7 @@ def test_a_row_of_the_log_is_what_an_episode_shows_at_that_step() -> None:
     for k in range(6):
         now, ran = data.observation[:, k : k + 1], data.executed[:, k : k + 1]
         assert torch.equal(view.seen(now, ran, earlier), view.of(data)[:, k : k + 1])
-        earlier.insert(0, Moment(now, ran))
+        earlier.insert(0, Moment(now, ran, data.asked[:, k : k + 1]))
 
 
 class Cycling:
@@ -254,7 +256,7 @@ def test_agents_recorded_at_different_times_have_no_neighbours_but_a_past() -> N
     log = recorded([(0, k) for k in range(4)])
     frame = log.frame.filter(~((pl.col("agent") == "b_0") & (pl.col("step") == 2)))
     data = stack_log(TransitionLog(log.provenance, frame), STACK)
-    assert View(STACK, 3).of(data).shape == (3, 4, 24)
+    assert View(STACK, 3).of(data).shape == (3, 4, 30)
     with pytest.raises(LogError, match=r"rows of b_0 at other times than of a_0.*hops at 0"):
         View(STACK, 1, ROW).of(data)
 
@@ -310,7 +312,7 @@ def test_both_groundings_fit_and_ground_with_all_inputs(grounding: Any) -> None:
     assert made.forward.standardise.mean.shape[-1] == made.forward.view.width > STACK.width
     data = stack_log(log, STACK)
     now, own = data.observation[:, :1], np.array([1, 1, 1])
-    past = [Moment(data.observation[:, 5:6], data.executed[:, 5:6])]
+    past = [Moment(data.observation[:, 5:6], data.executed[:, 5:6], data.asked[:, 5:6])]
     outcomes = [made(now, own), made(now, own, earlier=past)]
     assert outcomes[0].u.tolist() != outcomes[1].u.tolist()
     other = dataclasses.replace(data, executed=data.executed.roll(1, 1))

@@ -131,7 +131,7 @@ def train_grounded(
     if ugat.grounding == "street":
         if placebo == "noise":
             raise OptionError('the control "noise" needs f; grounding "street" has none')
-        algorithm = street_training(make, env, workers, **common)
+        algorithm = street_training(make, workers, **common)
         fitted: Any = StreetFit(street_prior(env, ugat.street))
         renew = algorithm.renew
     else:
@@ -153,17 +153,15 @@ def _keep(_state: RunState[Any]) -> None:
     """Leave the learner as it is."""
 
 
-def street_training(
-    make: LearnerFactory, env: TrafficEnv, workers: Workers, **common: Any
-) -> StreetTraining:
+def street_training(make: LearnerFactory, workers: Workers, **common: Any) -> StreetTraining:
     """Return the training in a fitted street.
 
     Args:
         make: Makes the learner.
-        env: The simulation.
         workers: Simulations at a time, or an executor.
         **common: Attributes of `Algorithm`.
     """
+    env: TrafficEnv = common["env"]
     options = {
         field.name: getattr(env.options, field.name)
         for field in fields(env.options)

@@ -1,9 +1,11 @@
 """Views: the inputs of models beside an agent's own state, from earlier and from neighbours.
 
 A view widens the observations of a `Stack` to the right, so an agent's own numbers still begin at
-column 0: ``own | earlier ones, each with the phase that ran | neighbours, each with the phase that
-runs``. Logs and running episodes use the same function. At the start of an episode, its first
-observation, without a phase, replaces the missing earlier ones.
+column 0: ``own | earlier ones, each with the phase that ran and the one that was asked for |
+neighbours, each with the phase that runs``. A command that was asked for and did not run is late or
+lost; without it, no model of the street could know what is under way. Logs and running episodes use
+the same function. At the start of an episode, its first observation, without phases, replaces the
+missing earlier ones.
 """
 
 from __future__ import annotations
@@ -33,7 +35,7 @@ class InputsConfig:
 
     Attributes:
         history: Number of the last observations f sees, the current one included, with the phases
-            that ran between them.
+            that ran between them and those that were asked for.
         hops: Distance in roads up to which f and h see the features and phases of other
             intersections, with the phases that run in the step: the joint-local grounding of
             JL-GAT (Turnau et al. 2025).
@@ -87,10 +89,12 @@ class Moment:
     Attributes:
         observation: ``(agents, n, width)`` float32, padded observations.
         executed: ``(agents, n)`` int64, the phases that ran next; -1 if unknown.
+        asked: ``(agents, n)`` int64, the phases that the policy asked for; -1 if unknown.
     """
 
     observation: Tensor
     executed: Tensor
+    asked: Tensor
 
 
 class View:
@@ -116,7 +120,7 @@ class View:
         self.sizes = [len(agent_places) for agent_places in places]
         self.width = max(self.sizes)
         # Padding reads the last column of all, which is zero.
-        nothing = len(stack.agents) * history * (stack.width + stack.actions)
+        nothing = len(stack.agents) * history * self._block
         self._columns = torch.full((len(places), self.width), nothing)
         self.lights = torch.zeros(len(places), 1, self.width, dtype=torch.bool)
         for i, own in enumerate(places):
@@ -133,11 +137,15 @@ class View:
         """
         if self.history == 1 and not self.joint:
             return now
-        moments = [Moment(now, running), *earlier][: self.history]
+        moments = [Moment(now, running, running), *earlier][: self.history]
         while len(moments) < self.history:
             unknown = torch.full_like(running, UNKNOWN)
-            moments.append(Moment(moments[-1].observation, unknown))
-        parts = [part for m in moments for part in (m.observation, self._shown(m.executed))]
+            moments.append(Moment(moments[-1].observation, unknown, unknown))
+        parts = [
+            part
+            for m in moments
+            for part in (m.observation, self._shown(m.executed), self._shown(m.asked))
+        ]
         rows = torch.cat(parts, -1).transpose(0, 1).flatten(1)
         rows = nn.functional.pad(rows, (0, 1))[:, self._columns.flatten()]
         return rows.view(-1, *self._columns.shape).transpose(0, 1).contiguous()
@@ -160,9 +168,17 @@ class View:
         for lag in range(1, self.history):
             before = (row - lag).maximum(first)
             places = before[..., None].expand_as(data.observation)
-            executed = torch.where(row - lag >= first, data.executed.gather(1, before), UNKNOWN)
-            earlier.append(Moment(data.observation.gather(1, places), executed))
+            executed, asked = (
+                torch.where(row - lag >= first, phases.gather(1, before), UNKNOWN)
+                for phases in (data.executed, data.asked)
+            )
+            earlier.append(Moment(data.observation.gather(1, places), executed, asked))
         return self.seen(data.observation, data.executed, earlier)
+
+    @property
+    def _block(self) -> int:
+        """Width of one agent's numbers of one moment."""
+        return self.stack.width + 2 * self.stack.actions
 
     def _shown(self, phase: Tensor) -> Tensor:
         """Return phases ``(agents, n)`` as one-hot; zeros for an unknown phase."""
@@ -173,21 +189,24 @@ class View:
         """Return, for each input, its column in a row of all moments, and True for a phase."""
         stack = self.stack
 
-        def moment(name: str, lag: int, end: int, executed: bool) -> list[tuple[int, bool]]:
+        def moment(name: str, lag: int, end: int, phases: int) -> list[tuple[int, bool]]:
+            """Return the columns of a moment, with the executed phase (1) and the asked one (2)."""
             layout = stack.layouts[name]
-            start = (stack.agents.index(name) * self.history + lag) * (stack.width + stack.actions)
+            start = (stack.agents.index(name) * self.history + lag) * self._block
             lit = range(layout.features, layout.features + layout.phases)
             observed = [(start + k, k in lit) for k in range(end)]
-            first = start + stack.width
-            return observed + [(first + k, True) for k in range(layout.phases * executed)]
+            for kind in range(phases):
+                first = start + stack.width + kind * stack.actions
+                observed += [(first + k, True) for k in range(layout.phases)]
+            return observed
 
         size = stack.layouts[agent].size
-        columns = moment(agent, 0, size, executed=False)
+        columns = moment(agent, 0, size, phases=0)
         for lag in range(1, self.history):
-            columns += moment(agent, lag, size, executed=True)
+            columns += moment(agent, lag, size, phases=2)
         for name in self.near[agent]:
             layout = stack.layouts[name]
-            columns += moment(name, 0, layout.features + layout.phases, executed=True)
+            columns += moment(name, 0, layout.features + layout.phases, phases=1)
         return columns
 
 

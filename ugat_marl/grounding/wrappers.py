@@ -82,7 +82,7 @@ class GroundedEnv(BaseParallelWrapper[str, Any, Any]):
         observations, rewards, terminations, truncations, infos = self.env.step(executed)  # line 14
         if self.env.agents:
             ran = [infos.get(a, {}).get("executed_action", executed[a]) for a in stack.agents]
-            self._earlier.appendleft(Moment(self._seen, torch.tensor(ran)[:, None]))
+            self._earlier.appendleft(self._moment(ran, requested.tolist()))
             self._notice(observations, infos)
         else:
             self.transform.gate.end_epoch()
@@ -90,6 +90,11 @@ class GroundedEnv(BaseParallelWrapper[str, Any, Any]):
         rows = zip(*(column.tolist() for column in columns), strict=True)
         taken = dict(zip(stack.agents, rows, strict=True))
         return observations, rewards, terminations, truncations, _extended(infos, acting, taken)
+
+    def _moment(self, executed: list[int], asked: list[int]) -> Moment:
+        """Return the decision that has ended, for models with a history."""
+        phases = (torch.tensor(numbers)[:, None] for numbers in (executed, asked))
+        return Moment(self._seen, *phases)
 
     def _notice(self, observations: dict[str, Any], infos: Infos) -> None:
         """Keep copies for the next grounding, because learners may scale observations in place."""

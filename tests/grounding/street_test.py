@@ -1,0 +1,161 @@
+"""A fitted street in SUMO: a planted channel, its training, interruption, and controls."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from tests.interrupts import KillAt
+from tests.runs import SMALL, numbers, play_nothing, weights
+from ugat_marl.data import TransitionLog
+from ugat_marl.effects import load_scenario
+from ugat_marl.envs import parallel_env
+from ugat_marl.errors import CheckpointError, OptionError, UnknownNameError
+from ugat_marl.experiments import transfer
+from ugat_marl.grounding import (
+    FittedStreet,
+    LaneView,
+    Simulation,
+    StreetConfig,
+    UgatConfig,
+    fit_channel,
+    fit_street,
+    street_env,
+    street_prior,
+)
+from ugat_marl.policies import EpsilonGreedy, make_rule, observer_of, roll_out
+
+SCENARIO = load_scenario("single-v1")
+LATE = "execution_delay=20+lost_commands=0.2"
+QUICK = StreetConfig(simulations=20, simulated_s=60.0)
+
+
+def recorded(domain: str, seconds: float = 900.0, seed: int = 0) -> TransitionLog:
+    env = parallel_env(SCENARIO, domain, duration_s=seconds, crossings=True)
+    try:
+        rule = EpsilonGreedy(make_rule("fixed-time:20", env), 0.3)
+        log = roll_out(env, rule, seed, record=observer_of(env)).log
+    finally:
+        env.close()
+    assert log is not None
+    return log
+
+
+def simulation(seconds: float = 100.0) -> Simulation:
+    return Simulation(SCENARIO, "sim", {"duration_s": seconds}, epsilon=0.3, workers=1)
+
+
+@pytest.fixture(scope="module")
+def street() -> FittedStreet:
+    """The street of a log with late and lost commands."""
+    env = parallel_env(SCENARIO)
+    prior = street_prior(env, QUICK)
+    view = LaneView.of(env.network, env.options.observation)
+    rule = make_rule("fixed-time:20", env)
+    env.close()
+    return fit_street(recorded(LATE), simulation(), rule, prior, view, QUICK, seed=0)
+
+
+def test_the_planted_channel_of_a_simulated_street_is_found(street: FittedStreet) -> None:
+    assert street.channel is not None
+    assert street.channel.lag == 2
+    assert street.channel.lost == pytest.approx(0.2, abs=0.1)
+    assert street.commands == 2
+
+
+def test_the_fitted_simulation_executes_as_the_street_does(street: FittedStreet) -> None:
+    """A log of the fitted simulation has the channel that its own fit says."""
+    env = street_env(street, simulation(seconds=900.0), street.commands)
+    try:
+        rule = EpsilonGreedy(make_rule("fixed-time:20", env.env), 0.3)
+        log = roll_out(env, rule, 1, record=observer_of(env)).log
+    finally:
+        env.close()
+    assert log is not None
+    again = fit_channel(log)
+    assert again.lag == 2
+    assert again.lost == pytest.approx(0.2, abs=0.15)
+
+
+def test_every_episode_draws_its_own_world_and_a_seed_repeats_it(street: FittedStreet) -> None:
+    env = street_env(street, simulation(), street.commands)
+    domains: list[str] = []
+    try:
+        for seed in (1, 1, 2):
+            observations, _ = env.reset(seed=seed)
+            domains.append(env.env.domain)
+            assert env.observation_space("signal_0").contains(observations["signal_0"])
+    finally:
+        env.close()
+    assert domains[0] == domains[1] != domains[2]
+
+
+def test_a_street_survives_its_file_and_refuses_another_network(
+    street: FittedStreet, tmp_path: Path
+) -> None:
+    street.save(tmp_path / "street.pt")
+    env = parallel_env(SCENARIO)
+    prior = street_prior(env, QUICK)
+    env.close()
+    again = FittedStreet.load(tmp_path / "street.pt", prior)
+    assert again.world(3).effects == street.world(3).effects
+    assert again.as_dict() == street.as_dict()
+    with pytest.raises(CheckpointError, match="other lanes"):
+        FittedStreet.load(tmp_path / "street.pt", replace(prior, lanes=prior.lanes[:2]))
+    with pytest.raises(CheckpointError, match="another library"):
+        FittedStreet.load(tmp_path / "street.pt", replace(prior, library=prior.library[:2]))
+
+
+@pytest.mark.parametrize("part", ["channel", "eyes", "service", "effects"])
+def test_each_part_can_be_fitted_alone(part: str) -> None:
+    config = replace(QUICK, parts=(part,))
+    env = parallel_env(SCENARIO)
+    prior = street_prior(env, config)
+    view = LaneView.of(env.network, "count")
+    rule = make_rule("fixed-time:20", env)
+    env.close()
+    street = fit_street(recorded(LATE, 300), simulation(), rule, prior, view, config, seed=0)
+    fitted = {name for name in ("channel", "eyes", "posterior") if getattr(street, name)}
+    assert fitted == {{"service": "posterior", "effects": "posterior"}.get(part, part)}
+    if street.posterior is not None:
+        effects, service_s = street.posterior.sample(20)
+        assert bool(effects.size) == (part == "effects")
+        assert bool(service_s.any()) == (part == "service")
+
+
+def test_unknown_parts_and_too_few_simulations_are_refused() -> None:
+    with pytest.raises(UnknownNameError, match="eye"):
+        StreetConfig(parts=("eye",))
+    with pytest.raises(OptionError, match="at least 20"):
+        StreetConfig(simulations=3)
+    with pytest.raises(OptionError, match="no transform"):
+        UgatConfig(grounding="street").transform({}, 0)
+
+
+def test_an_interrupted_training_ends_as_an_unbroken_one(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    play_nothing(monkeypatch)
+    ugat = replace(SMALL.ugat, grounding="street", street=QUICK, iterations=2)
+    config = replace(SMALL, real=LATE, ugat=ugat)
+    transfer(config, tmp_path / "whole", workers=1)
+    for task in ("fitting, iteration 1", "fitted street, iteration 2"):
+        with pytest.raises(KeyboardInterrupt):
+            transfer(config, tmp_path / "broken", resume=True, reporter=KillAt(task), workers=1)
+    transfer(config, tmp_path / "broken", resume=True, workers=1)
+    for name in ("direct-transfer", "fitted-street"):
+        one, other = (weights(tmp_path / run, name) for run in ("whole", "broken"))
+        assert np.array_equal(one, other), name
+    logged = numbers(tmp_path / "whole")
+    assert logged == numbers(tmp_path / "broken")
+    assert logged[1, "channel/lag_2"] > 0.5
+    assert logged[2, "street/commands"] >= 2.0
+
+
+def test_noise_as_a_control_is_refused_without_f(tmp_path: Path) -> None:
+    ugat = replace(SMALL.ugat, grounding="street", street=QUICK)
+    with pytest.raises(OptionError, match="needs f"):
+        transfer(replace(SMALL, placebo="noise", ugat=ugat), tmp_path, workers=1)
