@@ -16,6 +16,7 @@ weights of an intersection have the prior Dirichlet(pull * w of the network).
 
 from __future__ import annotations
 
+import math
 from collections import deque
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
@@ -31,6 +32,9 @@ from ugat_marl.scenarios import Network, SignalState, SignalTiming
 from ugat_marl.seeding import numpy_generator
 
 Floats = NDArray[np.float64]
+
+UNEXPLAINED = 1e-3
+"""Chance of a decision that no lag explains."""
 Table = NDArray[np.bool_]
 """Permitted phases of an intersection, bool ``(ages, phases, phases)``: entry (a, p, j) is True if
 phase j may run next while p has run for a decisions; row 0 is not used."""
@@ -53,6 +57,8 @@ class ChannelConfig:
             the log has no masks.
         least_share: Smallest weight of a lag, or of lost commands, that counts as found. Smaller
             ones are set to 0: coincidences give weights below it.
+        gain: Gain in log likelihood that a further lag needs, in units of log(decisions). Halved
+            (the criterion of Schwarz), late commands are found that are only lost.
     """
 
     most_lag: int = 6
@@ -61,6 +67,7 @@ class ChannelConfig:
     least_rows: int = 5
     refused: float = 0.2
     least_share: float = 0.02
+    gain: float = 1.0
 
 
 @dataclass(frozen=True)
@@ -416,21 +423,43 @@ def _mixture(
         same = np.stack([course.obeyed(a, table) == course.executed for a in arriving])
         use = known & same.any(0) & ~same.all(0)  # other rows tell nothing of the weights
         explains.append(same[:, use])
-    weights = np.full(kinds, 1.0 / kinds)
-    if not any(rows.shape[1] for rows in explains):
+    rows = np.concatenate(explains, axis=1)
+    if not rows.shape[1]:
         weights = np.eye(kinds)[0]
-    for support in (np.ones(kinds, dtype=np.bool_), None):
-        if support is None:  # again without what are coincidences
-            support = weights >= config.least_share
-        weights = np.where(support, np.maximum(weights, 1e-12), 0.0)
-        weights /= weights.sum()
-        for _ in range(200):
-            weights, before = _shares(explains, weights).sum(0), weights
-            total = weights.sum()
-            weights = weights / total if total else before
-            if np.abs(weights - before).max() < 1e-6:
-                break
+        return weights, _shares(explains, weights)
+    # A lost command keeps the phase of the decision before, which a further lag explains almost as
+    # well. So lags are added one by one, as long as they explain more than chance does.
+    support: set[int] = {kinds - 1}
+    best = -np.inf
+    weights = np.eye(kinds)[-1]
+    while True:
+        tried = [(_maximum(rows, support | {k}), k) for k in range(kinds) if k not in support]
+        (likelihood, found), lag = max(tried, key=lambda trial: trial[0][0])
+        if likelihood < best + config.gain * math.log(rows.shape[1]):
+            break
+        best, weights, support = likelihood, found, support | {lag}
+        if len(support) == kinds:
+            break
+    weights = np.where(weights >= config.least_share, weights, 0.0)
+    weights /= weights.sum()
     return weights, _shares(explains, weights)
+
+
+def _maximum(rows: NDArray[np.bool_], support: set[int]) -> tuple[float, Floats]:
+    """Return the largest log likelihood of the decisions, and its weights.
+
+    Args:
+        rows: Kinds that explain each decision, ``(kinds, n)``.
+        support: Kinds that may have a weight.
+    """
+    weights = np.array([float(kind in support) for kind in range(len(rows))]) / len(support)
+    for _ in range(200):
+        weights, before = _shares([rows], weights)[0], weights
+        weights = weights / weights.sum() if weights.sum() else before
+        if np.abs(weights - before).max() < 1e-6:
+            break
+    chances = (rows * weights[:, None]).sum(0)
+    return float(np.log(np.maximum(chances, UNEXPLAINED)).sum()), weights
 
 
 def _shares(explains: Sequence[NDArray[np.bool_]], weights: Floats) -> Floats:
