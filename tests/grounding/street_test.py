@@ -30,7 +30,7 @@ from ugat_marl.policies import EpsilonGreedy, make_rule, observer_of, roll_out
 
 SCENARIO = load_scenario("single-v1")
 LATE = "execution_delay=20+lost_commands=0.2"
-QUICK = StreetConfig(simulations=20, simulated_s=60.0)
+QUICK = StreetConfig(simulations=20, further=4, simulated_s=60.0)
 
 
 def recorded(domain: str, seconds: float = 900.0, seed: int = 0) -> TransitionLog:
@@ -56,7 +56,7 @@ def street() -> FittedStreet:
     view = LaneView.of(env.network, env.options.observation)
     rule = make_rule("fixed-time:20", env)
     env.close()
-    return fit_street(recorded(LATE), simulation(), rule, prior, view, QUICK, seed=0)
+    return fit_street(recorded(LATE), simulation(), rule, prior, view, QUICK, seed=0)[0]
 
 
 def test_the_planted_channel_of_a_simulated_street_is_found(street: FittedStreet) -> None:
@@ -100,7 +100,7 @@ def test_a_street_survives_its_file_and_refuses_another_network(
     env = parallel_env(SCENARIO)
     prior = street_prior(env, QUICK)
     env.close()
-    again = FittedStreet.load(tmp_path / "street.pt", prior)
+    again, _ = FittedStreet.load(tmp_path / "street.pt", prior)
     assert again.world(3).effects == street.world(3).effects
     assert again.as_dict() == street.as_dict()
     with pytest.raises(CheckpointError, match="other lanes"):
@@ -117,7 +117,8 @@ def test_each_part_can_be_fitted_alone(part: str) -> None:
     view = LaneView.of(env.network, "count")
     rule = make_rule("fixed-time:20", env)
     env.close()
-    street = fit_street(recorded(LATE, 300), simulation(), rule, prior, view, config, seed=0)
+    log = recorded(LATE, 300)
+    street, _ = fit_street(log, simulation(), rule, prior, view, config, seed=0)
     fitted = {name for name in ("channel", "eyes", "posterior") if getattr(street, name)}
     assert fitted == {{"service": "posterior", "effects": "posterior"}.get(part, part)}
     if street.posterior is not None:

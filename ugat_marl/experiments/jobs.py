@@ -502,6 +502,8 @@ def _save(policy: Any, path: Path) -> None:
 def _world(job: Job) -> AnyParallelEnv:
     """Return the environment of plain training."""
     setting, options = job.setting, dict[str, Any](job.options)
+    if setting.commands:
+        options["commands"] = setting.commands
     scenario = load_scenario(job.scenario)
     if setting.recipe == "randomised":
         return randomised_env(scenario, options, job.sim)

@@ -25,6 +25,8 @@ from ugat_marl.experiments.settings import (
     RANDOM_DELAY,
     RANDOMISED,
     RULE,
+    SEEING_ORACLE,
+    SEEN_COMMANDS,
     LearnerSpec,
     Setting,
 )
@@ -32,9 +34,11 @@ from ugat_marl.experiments.training import check_worlds
 from ugat_marl.experiments.tuning import BUDGET, LEAST_BUDGET
 from ugat_marl.grounding import (
     MATCHED_REWARD,
+    PARTS,
     FitConfig,
     GateConfig,
     InputsConfig,
+    StreetConfig,
     TimedConfig,
     UgatConfig,
 )
@@ -61,7 +65,7 @@ def settings_of(
         table: One of `TABLES`.
         ugat: Settings that the rows share.
         sim: The simulation.
-        groundings: Kinds of grounding to try: "phase", "timed".
+        groundings: Kinds of grounding to try: "phase", "timed", "street".
         constants: Constant delays in s that "main" sweeps.
         learner: The learner of all rows; None for DQN with its default settings.
 
@@ -70,18 +74,21 @@ def settings_of(
     """
     for grounding in groundings:
         if grounding not in GROUNDED_NAME:
-            raise OptionError(f"grounding {grounding!r}: allowed are phase and timed")
+            raise OptionError(f"grounding {grounding!r}: allowed are {', '.join(GROUNDED_NAME)}")
     if not groundings:
         raise OptionError("groundings is empty; name phase, timed, or both")
     if wrong := [seconds for seconds in constants if seconds < 1]:
         raise OptionError(f"constants holds {wrong[0]}: delays are whole seconds, at least 1")
     # Phase grounding is the paper's: it uses f and h from the start, however accurate they are.
-    least = {"phase": None, "timed": ugat.least_accuracy}
+    least = {name: None if name == "phase" else ugat.least_accuracy for name in GROUNDED_NAME}
     alone = replace(ugat, timed=replace(ugat.timed, match=False))  # matching is a row of its own
     bases = {g: replace(alone, grounding=g, least_accuracy=least[g]) for g in groundings}
     direct, rule = Setting(DIRECT, "direct"), Setting(RULE, "rule")
     if table == "main":
-        rows = [direct, *_grounded(bases), *_controls(ugat, sim, constants), rule]
+        rows = [direct, *_grounded(bases), *_controls(ugat, sim, constants)]
+        if "street" in bases:
+            rows.append(Setting(SEEING_ORACLE, "scratch", commands=SEEN_COMMANDS))
+        rows.append(rule)
     elif table == "ablation":
         rows = [direct, Setting(CONTROL, "further", sim)]
         rows += [row for name, base in bases.items() for row in _ablated(name, base)]
@@ -151,6 +158,10 @@ def _controls(ugat: UgatConfig, sim: str, constants: Sequence[int]) -> list[Sett
 def _ablated(name: str, base: UgatConfig) -> list[Setting]:
     """Return Table 3 of the paper (static α, no uncertainty) and rows that change another part."""
     full = GROUNDED_NAME[name]
+    if name == "street":
+        parts = {f"{full}: {part} alone": replace(base.street, parts=(part,)) for part in PARTS}
+        alone = [_ugat(row, replace(base, street=street)) for row, street in parts.items()]
+        return [_ugat(full, base), *alone]
     ungated = replace(base, gate=replace(base.gate, mode="infinite"))
     variants = {
         full: base,
@@ -179,7 +190,7 @@ def _other_answers(name: str, base: UgatConfig) -> Setting:
 
 
 def _alphas(name: str, base: UgatConfig) -> list[Setting]:
-    full = GROUNDED_NAME[name]
+    full = _gated(name)
     alphas = (0.2, 0.4, 0.5, 0.6, 0.8)
     pooled = replace(base, gate=replace(base.gate, scope="pooled"))
     return [
@@ -189,12 +200,23 @@ def _alphas(name: str, base: UgatConfig) -> list[Setting]:
     ]
 
 
+def _gated(name: str) -> str:
+    """Return the name of the row of a grounding with a gate.
+
+    Raises:
+        OptionError: The grounding has none.
+    """
+    if name == "street":
+        raise OptionError("a fitted street has no gate: give --groundings phase timed")
+    return GROUNDED_NAME[name]
+
+
 def _static(base: UgatConfig, alpha: float) -> GateConfig:
     return replace(base.gate, mode="static", static_alpha=alpha)
 
 
 def _methods(name: str, base: UgatConfig) -> list[Setting]:
-    full = GROUNDED_NAME[name]
+    full = _gated(name)
     methods: dict[str, FitConfig] = {
         "evidential": replace(base.fit, uncertainty="edl"),
         "Concrete Dropout": replace(base.fit, uncertainty="dropout"),
@@ -223,7 +245,7 @@ class PaperConfig:
         grounded_episodes: Episodes of grounded training per iteration.
         sim_rollouts: Episodes added to D_sim per iteration.
         real_rollouts: Episodes added to D_real per iteration.
-        groundings: Kinds of grounding: phase, timed, or both.
+        groundings: Kinds of grounding: phase, timed, street.
         constants: Constant delays in s that "main" sweeps.
         rows: Names of the rows to train; direct transfer is always trained. Default: all rows.
         evaluation_seeds: Number of evaluation episodes of each policy in each domain.
@@ -243,6 +265,7 @@ class PaperConfig:
         fit: Settings of the fit of f and h; a row may replace some.
         gate: Settings of the gate and its threshold; a row may replace some.
         timed: Settings of timed grounding; a row may replace some.
+        street: Settings of the fit of a street; a row may replace some.
     """
 
     scenario: tuple[str, ...] = ("single-v1",)
@@ -272,6 +295,7 @@ class PaperConfig:
     fit: FitConfig = field(default_factory=FitConfig)
     gate: GateConfig = field(default_factory=GateConfig)
     timed: TimedConfig = field(default_factory=TimedConfig)
+    street: StreetConfig = field(default_factory=StreetConfig)
 
     def __post_init__(self) -> None:
         for name in ("seeds", "evaluation_seeds", "episodes"):
@@ -304,6 +328,7 @@ class PaperConfig:
             fit=self.fit,
             gate=self.gate,
             timed=self.timed,
+            street=self.street,
         )
 
     @property

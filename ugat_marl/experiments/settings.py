@@ -24,12 +24,16 @@ RANDOMISED = "domain randomisation"
 RANDOM_DELAY = "random delay"
 FINE_TUNED = "fine-tuned on the same data"
 ORACLE = "trained in real"
+SEEING_ORACLE = "trained in real, sees its commands"
 RULE = "best rule, tuned there"
 
 STREET = "fitted street"
 
 GROUNDED_NAME = {"phase": UGAT, "timed": TIMED, "street": STREET}
 """Name of the row of each kind of grounding."""
+
+SEEN_COMMANDS = 4
+"""Number of own commands that the agents of `SEEING_ORACLE` see."""
 
 MOST_DELAY_S = 5
 """Longest of the random delays of the recipe "delays", in s."""
@@ -101,6 +105,8 @@ class Setting:
             "shuffled" permutes the outcomes in D_real, "noise" replaces f by noise.
         episodes: Training episodes after those of direct transfer; None for as many as UGAT has.
         most_delay_s: Longest delay of "delays", in s.
+        commands: Number of own commands that agents see in training without grounding; a fitted
+            street decides it by itself.
         rules: Rules among which "rule" chooses; empty for all.
     """
 
@@ -112,6 +118,7 @@ class Setting:
     placebo: NegativeControl = "none"
     episodes: int | None = None
     most_delay_s: int = MOST_DELAY_S
+    commands: int = 0
     rules: tuple[str, ...] = ()
 
     def __post_init__(self) -> None:
@@ -159,4 +166,6 @@ class Setting:
             parts["placebo"] = self.placebo
         if self.recipe == "delays":
             parts["most_delay_s"] = self.most_delay_s
+        if self.commands:
+            parts["commands"] = self.commands
         return parts

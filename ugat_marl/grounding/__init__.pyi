@@ -24,6 +24,7 @@ from .reports import FitReport as FitReport
 from .stacked import Stack as Stack
 from .stacked import stack_log as stack_log
 from .state import RunState as RunState
+from .street import PARTS as PARTS
 from .street import DrawnEnv as DrawnEnv
 from .street import FittedStreet as FittedStreet
 from .street import Simulation as Simulation

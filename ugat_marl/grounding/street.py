@@ -24,7 +24,9 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+import torch
 from pettingzoo.utils import BaseParallelWrapper
+from torch import Tensor
 
 from ugat_marl.data import TransitionLog, read_checkpoint, write_checkpoint
 from ugat_marl.effects import ControllerPart, Domain, Effect
@@ -32,8 +34,8 @@ from ugat_marl.envs import AgentSet, ResetResult, TrafficEnv, parallel_env
 from ugat_marl.errors import CheckpointError, OptionError, ScenarioError, UnknownNameError
 from ugat_marl.grounding.channel import ChannelConfig, CommandChannel, fit_channel
 from ugat_marl.grounding.eyes import Eyes, EyesConfig, fit_eyes
-from ugat_marl.grounding.posterior import FittedService, Posterior, Simulated, Worlds
-from ugat_marl.grounding.summaries import LaneView
+from ugat_marl.grounding.posterior import FittedService, Posterior, Simulated, Values, Worlds
+from ugat_marl.grounding.summaries import LaneView, Summary
 from ugat_marl.parallel import Stop, Workers, as_done, persistently
 from ugat_marl.policies import EpsilonGreedy, Policy, observer_of, roll_out, stop_callback
 from ugat_marl.scenarios import Scenario
@@ -52,7 +54,8 @@ class StreetConfig:
 
     Attributes:
         parts: Parts that are fitted.
-        simulations: N, worlds that are simulated for a posterior.
+        simulations: N, worlds that are simulated for the first posterior.
+        further: Worlds that each further iteration adds, half of them drawn from the posterior.
         simulated_s: Length of an episode in such a world, in s.
         without: Effects left out of the library.
         channel: Numbers of the fit of the command channel.
@@ -61,6 +64,7 @@ class StreetConfig:
 
     parts: tuple[str, ...] = PARTS
     simulations: int = 160
+    further: int = 40
     simulated_s: float = 1800.0
     without: tuple[str, ...] = ()
     channel: ChannelConfig = field(default_factory=ChannelConfig)
@@ -74,6 +78,8 @@ class StreetConfig:
                 raise UnknownNameError("part of a street", part, PARTS)
         if self.simulations < 20:
             raise OptionError(f"simulations = {self.simulations}: must be at least 20")
+        if self.further < 0:
+            raise OptionError(f"further = {self.further}: must not be negative")
         if self.simulated_s <= 0:
             raise OptionError(f"simulated_s = {self.simulated_s}: must be above 0")
 
@@ -172,8 +178,13 @@ class FittedStreet:
                 numbers[f"service/each_s/{lane}"] = float(each_s)
         return numbers
 
-    def save(self, path: Path) -> None:
-        """Write the street to a file, whole or not at all."""
+    def save(self, path: Path, simulated: Sequence[Simulated] = ()) -> None:
+        """Write the street to a file, whole or not at all.
+
+        Args:
+            path: The file.
+            simulated: Simulated worlds for a further fit.
+        """
         content: dict[str, Any] = {"lanes": list(self.lanes), "interval_s": self.interval_s}
         for name in ("channel", "eyes", "posterior"):
             part = getattr(self, name)
@@ -181,15 +192,19 @@ class FittedStreet:
         if self.posterior is not None:
             content["library"] = [vars(item) for item in self.posterior.worlds.library]
             content["service"] = self.posterior.worlds.service
+        content["simulated"] = _arrays(simulated)
         write_checkpoint(path, KIND, content)
 
     @classmethod
-    def load(cls, path: Path, worlds: Worlds) -> FittedStreet:
+    def load(cls, path: Path, worlds: Worlds) -> tuple[FittedStreet, Known]:
         """Read a file of `save`.
 
         Args:
             path: The file.
             worlds: Prior of the network.
+
+        Returns:
+            The street, and what a further fit continues.
 
         Raises:
             CheckpointError: The file is unreadable, or of another network.
@@ -200,13 +215,14 @@ class FittedStreet:
         if content.get("library") not in (None, [vars(item) for item in worlds.library]):
             raise CheckpointError(f"{path}: the street was fitted with another library of effects")
         channel, eyes, posterior = (content.get(x) for x in ("channel", "eyes", "posterior"))
-        return cls(
+        street = cls(
             worlds.lanes,
             float(content["interval_s"]),
             None if channel is None else CommandChannel.from_state(channel),
             None if eyes is None else Eyes.from_state(eyes),
             None if posterior is None else Posterior.from_state(worlds, posterior),
         )
+        return street, Known(_simulated(content.get("simulated")), street.posterior)
 
 
 @dataclass(frozen=True)
@@ -279,6 +295,26 @@ BASELINE_EPISODES = 2
 """Episodes of the plain simulation with which detectors are compared."""
 
 
+@dataclass(frozen=True)
+class Known:
+    """Results of earlier fits, which a further fit continues.
+
+    Attributes:
+        simulated: Simulated worlds and the statistics of their logs.
+        posterior: The last posterior; None before the first one.
+    """
+
+    simulated: tuple[Simulated, ...] = ()
+    posterior: Posterior | None = None
+
+    def draw(self, worlds: Worlds, config: StreetConfig, seed: int) -> list[Values]:
+        """Draw the worlds to simulate next: from the prior, later half from the posterior."""
+        if self.posterior is None:
+            return [worlds.draw(derive_seed(seed, k)) for k in range(config.simulations)]
+        sources = (self.posterior, worlds)
+        return [sources[k % 2].draw(derive_seed(seed, k)) for k in range(config.further)]
+
+
 def fit_street(
     real: TransitionLog,
     simulation: Simulation,
@@ -288,7 +324,8 @@ def fit_street(
     config: StreetConfig,
     seed: int,
     on_done: Callable[[], object] = lambda: None,
-) -> FittedStreet:
+    known: Known | None = None,
+) -> tuple[FittedStreet, Known]:
     """Fit the parts of a street to its log (lines 1 to 4).
 
     Args:
@@ -300,7 +337,12 @@ def fit_street(
         config: Settings.
         seed: Root of every random choice.
         on_done: Called after each simulated episode.
+        known: Results of earlier fits to the same street.
+
+    Returns:
+        The street, and the results for a further fit.
     """
+    known = known or Known()
     lanes, interval_s = worlds.lanes, real.provenance.decision_interval_s
     channel = fit_channel(real, config.channel) if "channel" in config.parts else None
     street = FittedStreet(lanes, interval_s, channel)
@@ -311,26 +353,27 @@ def fit_street(
         eyes = fit_eyes(real, TransitionLog.concatenate(logs), view, config.eyes)
         street = FittedStreet(lanes, interval_s, channel, eyes)
     if not config.simulates:
-        return street
-    seeds = [derive_seed(seed, "street", "world", k) for k in range(config.simulations)]
-    values = [worlds.draw(one) for one in seeds]
-    drawn = []
+        return street, known
+    values = known.draw(worlds, config, derive_seed(seed, "street", "values"))
+    seeds = [derive_seed(seed, "street", "world", k) for k in range(len(values))]
+    drawn: list[StreetWorld] = []
     for one, value in zip(seeds, values, strict=True):
-        known = street.world(one)
         service = FittedService(lanes, value.service_s)
-        drawn.append(StreetWorld(worlds.effects(value), (*known.parts, service)))
+        parts = (*street.world(one).parts, service)
+        drawn.append(StreetWorld(worlds.effects(value), parts))
     logs = simulation.logs(drawn, policy, seeds, config.simulated_s, on_done)
-    simulated = [
-        Simulated(value, view.summary(log)) for value, log in zip(values, logs, strict=True)
-    ]
+    added = [Simulated(value, view.summary(log)) for value, log in zip(values, logs, strict=True)]
+    simulated = (*known.simulated, *added)
     posterior = Posterior.fit(worlds, simulated, view.summary(real))
-    return FittedStreet(lanes, interval_s, channel, street.eyes, posterior)
+    street = FittedStreet(lanes, interval_s, channel, street.eyes, posterior)
+    return street, Known(simulated, posterior)
 
 
-def episodes_of_fit(config: StreetConfig) -> int:
+def episodes_of_fit(config: StreetConfig, known: Known) -> int:
     """Return the number of episodes that `fit_street` simulates."""
     baseline = BASELINE_EPISODES if "eyes" in config.parts else 0
-    return baseline + config.simulations * config.simulates
+    worlds = config.simulations if known.posterior is None else config.further
+    return baseline + worlds * config.simulates
 
 
 class DrawnEnv(BaseParallelWrapper[str, Any, Any]):
@@ -389,6 +432,38 @@ def street_prior(env: TrafficEnv, config: StreetConfig) -> Worlds:
     names = [item.name for item in Worlds.of((), {}).library]
     left_out = tuple(names) if "effects" not in config.parts else config.without
     return Worlds.of(view.lanes, {}, left_out, "service" in config.parts)
+
+
+def _arrays(simulated: Sequence[Simulated]) -> dict[str, Tensor]:
+    """Return simulated worlds as tensors; statistics of too few decisions become 0."""
+    if not simulated:
+        return {}
+    values = np.nan_to_num(np.stack([item.summary.values for item in simulated]))
+    return {
+        "effects": torch.tensor(np.stack([item.values.effects for item in simulated])),
+        "service_s": torch.tensor(np.stack([item.values.service_s for item in simulated])),
+        "values": torch.tensor(values),
+        "rows": torch.tensor(np.stack([item.summary.rows for item in simulated])),
+    }
+
+
+def _simulated(arrays: Any) -> tuple[Simulated, ...]:
+    """Restore `_arrays`.
+
+    Raises:
+        CheckpointError: A tensor is missing, or their lengths differ.
+    """
+    if not arrays:
+        return ()
+    try:
+        names = ("effects", "service_s", "values", "rows")
+        columns = [arrays[name].numpy() for name in names]
+        return tuple(
+            Simulated(Values(effects, service_s), Summary.of(values, rows))
+            for effects, service_s, values, rows in zip(*columns, strict=True)
+        )
+    except (KeyError, TypeError, ValueError, AttributeError) as error:
+        raise CheckpointError(f"simulated worlds of the checkpoint are damaged: {error}") from None
 
 
 def _joined(sim: Domain, effects: Sequence[Effect]) -> Domain:

@@ -15,7 +15,7 @@ one does not. A new policy then begins in the fitted street, with M episodes mor
 from __future__ import annotations
 
 import contextlib
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 
 from ugat_marl.data import TransitionLog
@@ -24,6 +24,7 @@ from ugat_marl.grounding.posterior import Worlds
 from ugat_marl.grounding.state import RunState
 from ugat_marl.grounding.street import (
     FittedStreet,
+    Known,
     Simulation,
     episodes_of_fit,
     fit_street,
@@ -41,10 +42,12 @@ class StreetFit:
     Attributes:
         worlds: Prior of worlds.
         street: The street; None before the first fit.
+        known: Results of earlier fits.
     """
 
     worlds: Worlds
     street: FittedStreet | None = None
+    known: Known = field(default_factory=Known)
 
     @property
     def commands(self) -> int:
@@ -54,7 +57,7 @@ class StreetFit:
     def save(self, path: Path) -> None:
         """Write the street to a file; nothing before the first fit."""
         if self.street is not None:
-            self.street.save(path)
+            self.street.save(path, self.known.simulated)
 
     def load(self, path: Path) -> None:
         """Restore a file of `save`; without one, nothing was fitted.
@@ -63,7 +66,7 @@ class StreetFit:
             CheckpointError: The file is unreadable, or of another network.
         """
         if path.exists():
-            self.street = FittedStreet.load(path, self.worlds)
+            self.street, self.known = FittedStreet.load(path, self.worlds)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -130,9 +133,10 @@ class StreetTraining(Algorithm):
 
     def _fit(self, state: RunState[StreetFit], policy: Policy) -> FittedStreet:
         """Fit the street to D_real, and say what was found (line 4)."""
-        config, number = self.config.street, episodes_of_fit(self.config.street)
+        config, known = self.config.street, state.transform.known
+        number = episodes_of_fit(config, known)
         with self.run.reporter.task(f"fitting, {iteration_name(state)}", number) as advance:
-            street = fit_street(
+            street, state.transform.known = fit_street(
                 TransitionLog.concatenate(state.real),
                 self.simulation,
                 policy,
@@ -141,6 +145,7 @@ class StreetTraining(Algorithm):
                 config,
                 derive_seed(self.seed, "fit", state.iteration),
                 advance,
+                known,
             )
         state.transform.street = street
         for line in street.describe():

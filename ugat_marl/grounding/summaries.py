@@ -58,6 +58,11 @@ class Summary:
     values: Floats
     rows: Floats
 
+    @classmethod
+    def of(cls, values: Floats, rows: Floats) -> Summary:
+        """Return a summary in which values of too few decisions are NaN."""
+        return cls(np.where(rows < LEAST_ROWS, np.nan, values), rows)
+
     @property
     def network(self) -> Floats:
         """Mean over the lanes, weighted by decisions, ``(len(NAMES),)``; NaN without any."""
