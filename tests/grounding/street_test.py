@@ -27,6 +27,7 @@ from ugat_marl.grounding import (
     street_prior,
 )
 from ugat_marl.policies import EpsilonGreedy, make_rule, observer_of, roll_out
+from ugat_marl.simulation import kept_warm
 
 SCENARIO = load_scenario("single-v1")
 LATE = "execution_delay=20+lost_commands=0.2"
@@ -56,7 +57,8 @@ def street() -> FittedStreet:
     view = LaneView.of(env.network, env.options.observation)
     rule = make_rule("fixed-time:20", env)
     env.close()
-    return fit_street(recorded(LATE), simulation(), rule, prior, view, QUICK, seed=0)[0]
+    with kept_warm():
+        return fit_street(recorded(LATE), simulation(), rule, prior, view, QUICK, seed=0)[0]
 
 
 def test_the_planted_channel_of_a_simulated_street_is_found(street: FittedStreet) -> None:
