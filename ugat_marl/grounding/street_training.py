@@ -9,7 +9,8 @@
      5      for e = 1, ..., E episodes: draw a world of the street, update pi in it
 
 If commands are late or lost, the policy needs to see its own last commands, which the pre-trained
-one does not. A new policy then begins in the fitted street, with M episodes more.
+one does not. If detectors are at fault, the numbers it has learnt to read mean something else. A new
+policy then begins in the fitted street, with M episodes more.
 """
 
 from __future__ import annotations
@@ -50,9 +51,12 @@ class StreetFit:
     known: Known = field(default_factory=Known)
 
     @property
-    def commands(self) -> int:
-        """Number of own commands that a policy has to see; 0 before the first fit."""
-        return 0 if self.street is None else self.street.commands
+    def view(self) -> tuple[int, bool]:
+        """Number of own commands that a policy sees, and True if detectors are at fault."""
+        if self.street is None:
+            return 0, False
+        eyes = self.street.eyes
+        return self.street.commands, eyes is not None and eyes.changes
 
     def save(self, path: Path) -> None:
         """Write the street to a file; nothing before the first fit."""
@@ -96,10 +100,10 @@ class StreetTraining(Algorithm):
         while state.iteration < self.config.iterations:  # line 2
             policy = state.learner.policy()
             self._roll_out(state, policy)  # line 3
-            before = state.transform.commands
+            before = state.transform.view
             street = self._fit(state, policy)  # line 4
             episodes = self.config.grounded_episodes
-            if street.commands != before:
+            if state.transform.view != before:
                 self.renew(state)
                 episodes += self.config.pretrain_episodes
             title = f"fitted street, {iteration_name(state)}"
@@ -115,13 +119,11 @@ class StreetTraining(Algorithm):
         return state.learner.policy()
 
     def renew(self, state: RunState[StreetFit]) -> None:
-        """Replace the learner by a new one that sees as many commands as the street needs."""
-        commands = state.transform.commands
-        if not commands:
-            return
-        env = self.simulation.plain(commands)
-        with contextlib.closing(env):
-            state.learner = self.make(env, self.seed)
+        """Replace the learner by a new one, if policies see something else in the street."""
+        commands, faulty = state.transform.view
+        if commands or faulty:
+            with contextlib.closing(self.simulation.plain(commands)) as env:
+                state.learner = self.make(env, self.seed)
 
     def _roll_out(self, state: RunState[StreetFit], policy: Policy) -> None:
         """Roll the policy out on the street (line 3)."""
