@@ -9,8 +9,8 @@
      5      for e = 1, ..., E episodes: draw a world of the street, update pi in it
 
 If commands are late or lost, the policy needs to see its own last commands, which the pre-trained
-one does not. If detectors are at fault, the numbers it has learnt to read mean something else. A new
-policy then begins in the fitted street, with M episodes more.
+one does not. If detectors are at fault, the numbers that it learnt to read mean something else. A
+new policy then begins in the fitted street, with M episodes more.
 """
 
 from __future__ import annotations
