@@ -99,8 +99,8 @@ class SimulatedWorld:
         commands = int(policy.env_options.get("commands", 0))
         if self._env is None or commands != self._commands:
             self.close()
-            make_env = partial(self._make_env, commands=commands)
-            self._env, self._commands = _delayed(make_env, self._most_delay_s), commands
+            self._env = _delayed(_for_policy(self._make_env, policy), self._most_delay_s)
+            self._commands = commands
         return self._env
 
     def under_delays(
@@ -160,6 +160,12 @@ class SimulatedWorld:
             self._env = None
 
 
+def _for_policy(make_env: Callable[..., TrafficEnv], policy: Policy) -> Callable[[], TrafficEnv]:
+    """Return a function that makes environments in which a policy sees the commands it needs."""
+    commands = int(policy.env_options.get("commands", 0))
+    return partial(make_env, commands=commands) if commands else make_env
+
+
 def _delayed(
     make_env: Callable[[], TrafficEnv], most_delay_s: int, always_s: int | None = None
 ) -> AnyParallelEnv:
@@ -194,8 +200,7 @@ class _RollOutAlone:
 
     def play(self, seed: int, always_s: int | None, stop: Stop) -> TransitionLog:
         """Run one roll-out, with random delays or with the constant delay `always_s`."""
-        commands = int(self.policy.env_options.get("commands", 0))
-        make_env = partial(self.make_env, commands=commands)
+        make_env = _for_policy(self.make_env, self.policy)
         env = _delayed(make_env, self.most_delay_s, always_s)
         policy = copy.deepcopy(
             self.policy
