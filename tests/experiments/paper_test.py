@@ -157,7 +157,7 @@ def test_impossible_tables_are_refused(wrong: dict[str, Any], says: str) -> None
 def test_impossible_rows_are_refused() -> None:
     with pytest.raises(OptionError, match="delays are whole seconds"):
         settings_of("main", UgatConfig(), "sim", constants=(0, 2))
-    with pytest.raises(OptionError, match="phase and timed"):
+    with pytest.raises(OptionError, match="phase, timed, street"):
         settings_of("main", UgatConfig(), "sim", groundings=("fase",))
 
 
