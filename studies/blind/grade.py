@@ -7,7 +7,7 @@ import math
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
-from typing import Any, Literal, get_args
+from typing import Any, Literal
 
 from studies.blind.cases import (
     DIAGNOSIS,
@@ -22,6 +22,7 @@ from studies.blind.cases import (
     read_plan,
 )
 from studies.blind.strengths import KINDS
+from ugat_marl.diagnosis import Diagnosis, EffectRecord, PolicyGap
 from ugat_marl.effects import EVERYWHERE
 from ugat_marl.errors import BlindTestError
 from ugat_marl.files import write_whole
@@ -145,24 +146,27 @@ def grade_cases(directory: Path) -> tuple[Grade, ...]:
         folder = directory / case.case
         run = read_json(folder / RUN) if (folder / RUN).exists() else {}
         if (folder / DIAGNOSIS).exists():
-            diagnosis = read_json(folder / DIAGNOSIS)
+            diagnosis = _read_diagnosis(folder)
         elif run.get("error"):
-            diagnosis = {"verdict": "failed"}
+            diagnosis = None
         else:
             continue
-        try:
-            graded = grade(read_label(directory, case.case), diagnosis, run.get("wall_s"))
-            if case.case in judged:
-                found = _number(judged[case.case])
-                graded = replace(graded, visible=found is None or found >= SEEN)
-            grades.append(graded)
-        except (KeyError, TypeError, ValueError, AttributeError) as error:
-            raise BlindTestError(
-                f"{folder / DIAGNOSIS}: not a diagnosis ({type(error).__name__}: {error})"
-            ) from None
-    content = {"schema": SCHEMA, "grades": [asdict(item) for item in grades]}
+        graded = grade(read_label(directory, case.case), diagnosis, run.get("wall_s"))
+        if case.case in judged:
+            deviations = _number(judged[case.case])
+            graded = replace(graded, visible=deviations is None or deviations >= SEEN)
+        grades.append(graded)
+    content = {"schema": SCHEMA, "grades": [asdict(each) for each in grades]}
     write_whole(directory / GRADES, json.dumps(content, indent=1, allow_nan=False) + "\n")
     return tuple(grades)
+
+
+def _read_diagnosis(folder: Path) -> Diagnosis:
+    try:
+        return Diagnosis.read(folder)
+    except (OSError, ValueError) as error:
+        reason = str(error).splitlines()[0]
+        raise BlindTestError(f"{folder / DIAGNOSIS}: not a diagnosis ({reason})") from None
 
 
 def read_grades(directory: Path) -> tuple[Grade, ...]:
@@ -180,29 +184,24 @@ def read_grades(directory: Path) -> tuple[Grade, ...]:
         ) from None
 
 
-def grade(label: Label, diagnosis: Mapping[str, Any], wall_s: float | None = None) -> Grade:
+def grade(label: Label, diagnosis: Diagnosis | None, wall_s: float | None = None) -> Grade:
     """Compare a diagnosis with the truth.
 
     Args:
         label: Truth about the case.
-        diagnosis: Content of its ``diagnosis.json``.
+        diagnosis: The diagnosis; None if it failed.
         wall_s: Wall seconds of the diagnosis.
-
-    Raises:
-        ValueError: The verdict is unknown.
     """
-    verdict = diagnosis["verdict"]
-    if verdict not in get_args(Verdict):
-        raise ValueError(f"verdict {verdict!r}; allowed: {', '.join(get_args(Verdict))}")
-    given: list[Mapping[str, Any]] = list(diagnosis.get("effects") or ())
-    named = canonical([found_effect(item) for item in given], label)
+    verdict: Verdict = "failed" if diagnosis is None else diagnosis.verdict
+    effects = () if diagnosis is None else diagnosis.effects
+    named = canonical(map(hidden_of, effects), label)
     truth = canonical(label.effects, label)
     others = [
-        canonical(map(found_effect, other["effects"]), label)
-        for other in diagnosis.get("alternatives") or ()
+        canonical(map(hidden_of, other.effects), label)
+        for other in (() if diagnosis is None else diagnosis.alternatives)
         if verdict == "not_identifiable"  # with other verdicts these were tried, not named
     ]
-    sets = [{item.name for item in effects} for effects in (named, *others)]
+    sets = [{effect.name for effect in answer} for answer in (named, *others)]
     required, allowed = required_and_allowed(label, truth)
     outcome = _outcome(label, verdict, sets, required, allowed)
     fits = [required <= names <= allowed for names in sets]
@@ -229,12 +228,12 @@ def grade(label: Label, diagnosis: Mapping[str, Any], wall_s: float | None = Non
         window_iou=window_iou,
         estimates=tuple(
             estimate
-            for item, same in matched
+            for true, same in matched
             if same is not None
-            for estimate in _estimates(item, given, same, label)
+            for estimate in _estimates(true, effects, same, label)
         ),
-        shrink=_number((diagnosis.get("heldout") or {}).get("shrink")),
-        policy_shrink=_policy_shrink(diagnosis.get("policy_gap")),
+        shrink=None if diagnosis is None or diagnosis.heldout is None else diagnosis.heldout.shrink,
+        policy_shrink=None if diagnosis is None else _policy_shrink(diagnosis.policy_gap or {}),
         wall_s=_number(wall_s),
     )
 
@@ -288,27 +287,18 @@ def _overlap(one: tuple[float, float] | None, two: tuple[float, float] | None) -
 
 
 def _estimates(
-    truth: Hidden, given: Sequence[Mapping[str, Any]], same: Hidden, label: Label
+    truth: Hidden, effects: Sequence[EffectRecord], same: Hidden, label: Label
 ) -> list[Estimate]:
-    raw = next(
-        (
-            x.get("parameters") or {}
-            for x in given
-            if canonical_effect(found_effect(x), label) == same
-        ),
-        {},
-    )
-    found: list[Estimate] = []
+    spelled = (x.parameters for x in effects if canonical_effect(hidden_of(x), label) == same)
+    numbers = next(spelled, {})
+    estimates: list[Estimate] = []
     for key, true in truth.parameters.items():
         if key not in same.parameters:
             continue
         value = same.parameters[key]
         nominal = truth.nominal.get(key)
-        low, high = (
-            _number(raw[key].get(end)) if isinstance(raw.get(key), Mapping) else None
-            for end in ("low", "high")
-        )
-        found.append(
+        low, high = (numbers[key].low, numbers[key].high) if key in numbers else (None, None)
+        estimates.append(
             Estimate(
                 truth.name,
                 key,
@@ -321,28 +311,18 @@ def _estimates(
                 low <= true <= high if low is not None and high is not None else None,
             )
         )
-    return found
+    return estimates
 
 
-def _policy_shrink(gap: Any) -> float | None:
+def _policy_shrink(gaps: Mapping[str, PolicyGap]) -> float | None:
     """Return the share of the policy gap that the diagnosis removes, ``1 - |after| / |before|``.
 
-    The gap has the form ``{policy: {"before": Δ, "after": Δ}}``. The mean is over trained policies
-    (names with ``.pt`` or ``trained``); without any, over all policies.
+    The mean is over trained policies (names with ``.pt`` or ``trained``); without any, over all
+    policies.
     """
-    if not isinstance(gap, Mapping):
-        return None
-    entries: dict[str, Mapping[str, Any]] = {
-        str(name): item
-        for name, item in gap.items()
-        if isinstance(item, Mapping) and _number(item.get("before")) and "after" in item
-    }
-    trained = {k: v for k, v in entries.items() if ".pt" in k or "trained" in k}
-    shrinks = [
-        1 - abs(after) / abs(float(item["before"]))
-        for item in (trained or entries).values()
-        if (after := _number(item["after"])) is not None
-    ]
+    visible = {policy: gap for policy, gap in gaps.items() if gap.before}
+    trained = {k: v for k, v in visible.items() if ".pt" in k or "trained" in k}
+    shrinks = [1 - abs(gap.after) / abs(gap.before) for gap in (trained or visible).values()]
     return sum(shrinks) / len(shrinks) if shrinks else None
 
 
@@ -410,13 +390,10 @@ def _covers(window: tuple[float, float], label: Label) -> bool:
     return inside >= WHOLE * (label.end_s - label.begin_s)
 
 
-def found_effect(raw: Mapping[str, Any]) -> Hidden:
-    """Return an effect of a diagnosis, with values but without intervals."""
-    values = {
-        key: float(item["value"]) if isinstance(item, Mapping) else float(item)
-        for key, item in (raw.get("parameters") or {}).items()
-    }
-    return Hidden.from_dict({**raw, "parameters": values, "nominal": {}})
+def hidden_of(effect: EffectRecord) -> Hidden:
+    """Return an effect of a diagnosis in the form of a label, without intervals."""
+    values = {name: parameter.value for name, parameter in effect.parameters.items()}
+    return Hidden(effect.name, effect.place, effect.window, values, {})
 
 
 def match(item: Hidden, others: Sequence[Hidden]) -> Hidden | None:

@@ -20,6 +20,7 @@ from studies.blind.places import Busy, busy_places, telling
 from studies.blind.run import run_cases
 from studies.blind.sampling import OUTSIDE, Sample, Task, draw_effect, draw_sample, draw_tasks
 from studies.blind.strengths import KINDS
+from tests.studies.blind.diagnoses import says
 from ugat_marl.cli import run
 from ugat_marl.data import read_measured
 from ugat_marl.diagnosis import IN_THE_LOG, Routes
@@ -211,7 +212,9 @@ def test_cases_are_diagnosed_once_and_a_failure_is_noted(
         seen.append(case.case)
         if case.case == "case002":
             raise ZeroDivisionError("a bug")
-        (folder / "diagnosis.json").write_text('{"verdict": "no_discrepancy"}')
+        diagnosis = says("no_discrepancy")
+        assert diagnosis is not None
+        diagnosis.write(folder)
 
     assert run_cases(directory, diagnose, only=("case001", "case002")) == (1, 1)
     assert run_cases(directory, diagnose) == (2, 1)

@@ -12,10 +12,11 @@ import pytest
 from numpy.typing import NDArray
 
 from studies.blind import visibility
-from studies.blind.cases import DIAGNOSIS, Case, Hidden, Label, write_label, write_plan
+from studies.blind.cases import Case, Hidden, Label, write_label, write_plan
 from studies.blind.grade import SEEN, grade_cases
 from studies.blind.table import rows_of
 from studies.blind.visibility import effect_of, judge_visibility, separation
+from tests.studies.blind.diagnoses import says
 from ugat_marl.diagnosis import Reference, Tally
 from ugat_marl.diagnosis.features import BIN_FEATURES, EVENT_FEATURES, FEATURES
 from ugat_marl.diagnosis.statistics import Pools
@@ -107,7 +108,9 @@ def hide(directory: Path, **effects: str) -> None:
             ),
         )  # fmt: skip
         (directory / case).mkdir()
-        (directory / case / DIAGNOSIS).write_text(json.dumps({"verdict": "no_discrepancy"}))
+        diagnosis = says("no_discrepancy")
+        assert diagnosis is not None
+        diagnosis.write(directory / case)
 
 
 def test_what_the_log_shows_is_visible_and_the_table_says_so(tmp_path: Path) -> None:
