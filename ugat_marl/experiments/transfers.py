@@ -11,7 +11,7 @@ import contextlib
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Annotated, Any, Literal
 
 from tyro.conf import Positional, arg
 
@@ -54,7 +54,13 @@ from ugat_marl.experiments.settings import (
 )
 from ugat_marl.experiments.tuning import LEAST_BUDGET, TUNED_RULES
 from ugat_marl.files import write_whole
-from ugat_marl.grounding import DIRECT_LEARNER, NEGATIVE_CONTROLS, NegativeControl, UgatConfig
+from ugat_marl.grounding import (
+    DIRECT_LEARNER,
+    NEGATIVE_CONTROLS,
+    NegativeControl,
+    UgatConfig,
+    as_published,
+)
 from ugat_marl.parallel import Workers
 from ugat_marl.policies import (
     DQN_NAME,
@@ -83,6 +89,8 @@ class TransferConfig:
         real: The real domain: V1..V4 or an alias, effect=value+..., or a scenario directory. "none"
             needs `real_log`: only the log is known of the real domain.
         sim: The simulation to train in; "sim", or a domain like `real`.
+        preset: "paper" for Algorithm 1 exactly as published; it decides all settings of the
+            algorithm but the numbers of episodes.
         real_log: Transition log that replaces the roll-outs in the real domain.
         seed: Root of every random choice in training.
         observation: Kind of observation: count, queue, pressure, waiting, density, movements.
@@ -120,6 +128,7 @@ class TransferConfig:
     scenario: Annotated[Positional[str], arg(metavar="SCENARIO")]
     real: str = "V4"
     sim: str = "sim"
+    preset: Literal["paper"] | None = None
     real_log: Path | None = None
     seed: int = 0
     observation: str = "count"
@@ -144,6 +153,8 @@ class TransferConfig:
     dqn: DQNConfig = field(default_factory=DQNConfig)
 
     def __post_init__(self) -> None:
+        if self.preset is not None:
+            object.__setattr__(self, "ugat", as_published(self.ugat))
         for name in ("evaluation_seeds", "tuning_seeds"):
             if getattr(self, name) < 1:
                 raise OptionError(f"{name} = {getattr(self, name)}: must be at least 1")

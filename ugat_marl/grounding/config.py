@@ -130,3 +130,44 @@ class UgatConfig:
             value = getattr(self, name)
             if value is not None and not 0 <= value <= 1:
                 raise OptionError(f"{name} = {value}: must be from 0 to 1")
+
+
+COUNTS = (
+    "pretrain_episodes", "iterations", "grounded_episodes", "sim_rollouts", "real_rollouts",
+)  # fmt: skip
+"""Settings that Algorithm 1 leaves open: numbers of episodes and iterations."""
+
+PUBLISHED_EPOCHS = 300
+"""Epochs of the fits in the paper."""
+
+
+def as_published(config: UgatConfig) -> UgatConfig:
+    """Return Algorithm 1 of the paper without departures, with these numbers of episodes.
+
+    Every departure, its reason and what it changes: docs/explanation/departures.md.
+
+    Raises:
+        OptionError: Another setting than a number of episodes was changed.
+    """
+    counts = {name: getattr(config, name) for name in COUNTS}
+    published = UgatConfig(
+        **counts,
+        grounding="phase",
+        rollout_epsilon=0.0,
+        least_accuracy=None,
+        forward=ForwardConfig(include_phase=True),
+        inverse=InverseConfig(include_phase=True),
+        fit=FitConfig(
+            epochs=PUBLISHED_EPOCHS,
+            patience=PUBLISHED_EPOCHS,
+            kl_weight=1.0,
+            off_data_weight=0.0,
+        ),
+        gate=GateConfig(scope="pooled", window_epochs=config.grounded_episodes),
+    )
+    if config not in (UgatConfig(**counts), published):
+        raise OptionError(
+            'the preset "paper" decides all settings of the algorithm but the numbers of episodes '
+            f"({', '.join(COUNTS)}); leave the others out, or leave out the preset"
+        )
+    return published
