@@ -84,6 +84,15 @@ def test_the_window_holds_the_last_epochs_weighted_by_their_length() -> None:
     assert gate.alpha.tolist() == pytest.approx([0.3, 0.4])
 
 
+def test_alpha_forgets_what_is_older_than_twenty_episodes() -> None:
+    gate = Gate(AGENTS, GateConfig())
+    for u in (1.0,) * 5 + (0.25,) * 20:
+        run(gate, (u, u))
+        gate.end_epoch()
+    gate.update()
+    assert gate.alpha.tolist() == [0.25, 0.25]
+
+
 def test_static_and_infinite_do_not_move() -> None:
     static = Gate(AGENTS, GateConfig(mode="static", static_alpha=0.5))
     assert run(static, (0.4, 0.5)) == [[True, False]]

@@ -631,3 +631,40 @@ def test_factors_are_measured_once_and_kept_in_checkpoints(tmp_path: Path) -> No
     other.load(tmp_path / "learner.pt")
     assert torch.equal(other._inputs, measured)
     assert np.array_equal(other.learn(CueEnv(), 2, seed=1).parameters, learner.policy().parameters)
+
+
+def _constant(learner: DQN, online: list[float], target: list[float]) -> None:
+    """Let both networks answer with constants: all weights are zero but the last biases."""
+    for weights, network, values in (
+        (learner._weights, learner._online, online),
+        (learner._target_weights, learner._target, target),
+    ):
+        weights.data.zero_()
+        last = [p for name, p in network.named_parameters() if name.endswith("bias")][-1]
+        last.data.copy_(torch.tensor(values).view_as(last))
+
+
+def test_the_online_networks_choose_and_the_target_networks_evaluate():
+    """With Q = (0, 1) and Q' = (9, 2), y = 0.5 * Q'[argmax Q] = 1; plain Q-learning says 4.5."""
+    config = DQNConfig(hidden=(8,), discount=0.5, reward_scale=1.0, huber_delta=100.0)
+    learner = DQN.of(LeverEnv(), config)
+    state = np.eye(4, dtype=np.float32)[:1]
+    learner._replay.add(
+        state,
+        np.array([0]),
+        np.zeros(1, np.float32),
+        np.array([False]),
+        state,
+        np.ones((1, 2), bool),
+    )
+    _constant(learner, online=[0.0, 1.0], target=[9.0, 2.0])
+    loss, q = learner._update(torch.Generator().manual_seed(0))
+    assert q == 0.0
+    assert loss == pytest.approx(0.5 * 1.0**2)
+
+
+def test_the_policy_acts_by_the_target_networks():
+    learner = DQN.of(LeverEnv(), DQNConfig(hidden=(8,)))
+    _constant(learner, online=[0.0, 1.0], target=[9.0, 2.0])
+    seen = {"signal_0": np.eye(4, dtype=np.float32)[0]}
+    assert learner.policy().act(seen, {}) == {"signal_0": 0}
