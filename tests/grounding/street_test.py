@@ -20,6 +20,7 @@ from ugat_marl.grounding import (
     LaneView,
     Simulation,
     StreetConfig,
+    StreetFit,
     UgatConfig,
     fit_channel,
     fit_street,
@@ -127,6 +128,21 @@ def test_each_part_can_be_fitted_alone(part: str) -> None:
         effects, service_s = street.posterior.sample(20)
         assert bool(effects.size) == (part == "effects")
         assert bool(service_s.any()) == (part == "service")
+
+
+def test_a_log_of_the_simulation_itself_shows_no_fault() -> None:
+    """The negative control: nothing is late, nothing is dead, and no policy has to begin anew."""
+    config = replace(QUICK, parts=("channel", "eyes"))
+    env = parallel_env(SCENARIO)
+    prior, view = street_prior(env, config), LaneView.of(env.network, "count")
+    rule = make_rule("fixed-time:20", env)
+    env.close()
+    log = recorded("sim", seed=4)
+    street, _ = fit_street(log, simulation(900.0), rule, prior, view, config, seed=0)
+    assert street.channel is not None and not street.channel.changes
+    assert street.eyes is not None and not street.eyes.changes
+    assert StreetFit(prior, street).view == (0, False)
+    assert street.world(1).effects == street.world(1).parts == ()
 
 
 def test_unknown_parts_and_too_few_simulations_are_refused() -> None:
