@@ -12,6 +12,7 @@ from typing import Any
 import pytest
 from rich.console import Console
 
+from tests.runs import play_nothing
 from ugat_marl.__main__ import main
 from ugat_marl.data import Scores
 from ugat_marl.effects import load_scenario
@@ -23,16 +24,17 @@ from ugat_marl.experiments import (
     Tuned,
     best_rules,
     evaluation,
+    jobs,
     tune,
     tuned_rules,
     tuning,
 )
-from ugat_marl.experiments import transfers as transfer
 from ugat_marl.experiments.evaluation import race
-from ugat_marl.experiments.jobs import EVALUATION_SEED
+from ugat_marl.experiments.jobs import EVALUATION_SEED, RULE_FILE, Job, perform
 from ugat_marl.experiments.scores import Result, Trial
+from ugat_marl.experiments.settings import RULE, Setting
 from ugat_marl.experiments.tuning import rungs, settings_of
-from ugat_marl.policies import RULES, STANDARD_RULES, format_rule, parse_rule
+from ugat_marl.policies import RULES, format_rule, parse_rule
 from ugat_marl.progress import Silent
 from ugat_marl.reporting import tuning_table
 
@@ -185,26 +187,32 @@ def test_tuned_rules_are_better_than_their_defaults(streets: Streets) -> None:
     assert found == {"sim": "largest-queue:50", "V4": "largest-queue:20"}
 
 
+@pytest.mark.parametrize(
+    ("rule_budget", "best"),
+    [
+        (None, {"sim": "largest-queue:40", "V4": "largest-queue:20"}),
+        (24, {"sim": "fixed-time:50", "V4": "actuated:20:2"}),
+    ],
+)
 def test_a_run_is_judged_beside_tuned_rules_where_asked(
-    streets: Streets, monkeypatch: pytest.MonkeyPatch
+    streets: Streets,
+    monkeypatch: pytest.MonkeyPatch,
+    tmp_path: Path,
+    rule_budget: int | None,
+    best: dict[str, str],
 ) -> None:
-    def judged(scenario: Any, policies: Any, domains: Any, seeds: Any, **options: Any) -> Any:
-        return sorted(policies), options["notes"]
-
-    monkeypatch.setattr(transfer, "evaluate", judged)
-    scenario = load_scenario("single-v1")
-
-    def judge(rule_budget: int | None) -> Any:
-        config = TransferConfig("single-v1", rule_budget=rule_budget)
-        return transfer.judge(config, scenario, {}, Silent())
-
-    policies, notes = judge(None)
-    assert policies == ["rule largest-queue:20", "rule largest-queue:40"]
-    assert notes["rules searched"] == ", ".join(STANDARD_RULES)
-    policies, notes = judge(24)
-    assert policies == ["rule actuated:20:2", "rule fixed-time:50"]
-    assert notes["best rule in V4"] == "actuated:20:2"
-    assert notes["rules searched"].endswith("webster; each tuned with up to 24 episodes")
+    play_nothing(monkeypatch)
+    monkeypatch.setattr(jobs, "best_rules", best_rules)
+    config = TransferConfig("single-v1", rule_budget=rule_budget)
+    for domain, spec in best.items():
+        job = Job(Setting(RULE, "rule"), "single-v1", target=domain, domains=(domain,))
+        job = replace(job, rule_budget=config.rule_budget, evaluation_seeds=(1,))
+        folder = tmp_path / domain
+        folder.mkdir()
+        record = perform(job, folder, Silent())
+        assert record.is_whole(job)
+        assert (folder / RULE_FILE).read_text() == spec
+    assert streets.played
 
 
 def test_what_cannot_be_tuned_is_refused() -> None:
