@@ -636,3 +636,20 @@ def test_the_street_of_the_page_is_driven() -> None:
     assert (summary.decisions, summary.fallback_share, cabinet.polled) == (6, 0, 6)
     assert made_up.states[LIGHT] == SITE.network.intersections[0].phases[-1]
     assert not broken_rules(made_up.by_second)
+
+
+def test_a_policy_that_needs_its_last_commands_sees_those_the_loop_gave() -> None:
+    """Also those of the plan, while its light was on the plan: they are what is under way."""
+    site = Site.of(GRID, {"commands": 2})
+    street, policy = MadeUpStreet(site), Scripted()
+    loop = FieldLoop(site, policy, street, QUICK)
+    made = decide(loop, street, 3)
+    loop.close()
+    for place, light in enumerate(site.lights):
+        agent = site.observer.agents[place]
+        phases = len(site.network.intersections[place].phases)
+        shown = [seen[agent][-2 * phases - 1 : -1].reshape(2, phases) for seen in policy.seen[-3:]]
+        assert not shown[0].any()
+        assert shown[1].argmax(1)[0] == made[0].phases[light]
+        assert not shown[1][1].any()
+        assert shown[2].argmax(1).tolist() == [made[1].phases[light], made[0].phases[light]]
