@@ -13,13 +13,13 @@ from dataclasses import dataclass
 from pathlib import Path
 from statistics import fmean
 
-from ugat_marl.experiments import CONTROL, DIRECT, ORACLE, RULE, TIMED, matched_name
+from ugat_marl.experiments import CONTROL, DIRECT, ORACLE, RULE, STREET, TIMED, matched_name
 from ugat_marl.files import write_whole
 from ugat_marl.reporting import number_text, percent_text, share_text
 
 FOLDER = Path(__file__).parent
 BEGIN, END = "<!-- overview -->\n", "<!-- end of overview -->\n"
-GROUNDED = (TIMED, matched_name("timed"))
+GROUNDED = (TIMED, matched_name("timed"), STREET)
 CONSTANT = "constant delay"
 BESIDE = ("there", "*matched*")
 """Folders with tables of further settings in the same domains and with equal direct transfer."""
@@ -97,9 +97,9 @@ def heading(page: Path) -> str:
 def overview(folder: Path = FOLDER) -> str:
     """Return the overview as Markdown: every domain of every table of transfer, and means."""
     lines = [
-        "| table | | direct transfer (regret) | UGAT, timed | timed, rewards matched "
+        "| table | | direct transfer (regret) | UGAT, timed | timed, rewards matched | fitted street "
         "| more plain `sim` | constant delay | trained in real | best rule there |",
-        "|---|---|---:|---:|---:|---:|---:|---:|---:|",
+        "|---|---|---:|---:|---:|---:|---:|---:|---:|---:|",
     ]
     for table in sorted(folder.glob("*/main*/table.csv")):
         found = known(table)
