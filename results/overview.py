@@ -97,8 +97,8 @@ def heading(page: Path) -> str:
 def overview(folder: Path = FOLDER) -> str:
     """Return the overview as Markdown: every domain of every table of transfer, and means."""
     lines = [
-        "| table | | direct transfer (regret) | UGAT, timed | timed, rewards matched | fitted street "
-        "| more plain `sim` | constant delay | trained in real | best rule there |",
+        "| table | | direct transfer (regret) | UGAT, timed | timed, rewards matched "
+        "| fitted street | more plain `sim` | constant delay | trained in real | best rule there |",
         "|---|---|---:|---:|---:|---:|---:|---:|---:|---:|",
     ]
     for table in sorted(folder.glob("*/main*/table.csv")):
