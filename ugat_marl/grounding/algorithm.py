@@ -61,7 +61,7 @@ class Algorithm:
             state.save(self.run)
 
     def _learn(self, state: RunState[Any], env: AnyParallelEnv, episodes: int, title: str) -> None:
-        """Let the learner train in an environment; log every episode (lines 8 to 16)."""
+        """Let the learner train in an environment; log every episode."""
         with self.run.reporter.task(title, episodes) as advance:
 
             def on_episode(number: int, numbers: Mapping[str, float]) -> None:

@@ -110,6 +110,7 @@ class Gate:
         self.alpha: NDArray[np.float64] = np.full(len(self.agents), start)
         self.trusted: NDArray[np.bool_] = np.ones(len(self.agents), bool)
         self.iteration = 0
+        # Line 7 of Algorithm 1: the list U forgets what is older than the window.
         self._epochs: deque[NDArray[np.float64]] = deque(maxlen=config.window_epochs)
         self._running = np.zeros((2, len(self.agents)))  # sum and number of u in this epoch
         self._counts = np.zeros((4, len(self.agents)))  # decisions, accepted, changed, sum of u

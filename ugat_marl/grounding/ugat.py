@@ -27,15 +27,19 @@ The comments below give these line numbers. The learner does lines 8 and 16. The
 trains in (`wrappers.GroundedEnv`) does lines 9 to 15; it asks the transform (`phase`, `timed`) and
 its gate.
 
-The default options differ from the listing; the values named here restore it.
+The default options differ from the listing; the values named here restore it. `config.as_published`
+sets all of them, and the numbers of the paper (docs/explanation/departures.md).
 
 - Roll-outs take random phases now and then (lines 3 and 4): `rollout_epsilon` 0.
 - h is also trained to be unsure far from its data (line 6): `fit.off_data_weight` 0.
+- s' holds the traffic without the phase (lines 11 and 12): `forward.include_phase` and
+  `inverse.include_phase` True.
 - U keeps the last 20 episodes, also those of earlier iterations (line 7): `gate.window_epochs` E.
 - Every intersection has its own alpha (line 17): `gate.scope` "pooled".
 - Actions of an intersection are grounded only if f and h are better there than trivial answers,
   such as "no change" or the most frequent phase (line 13): `least_accuracy` None.
 
+Alpha, an input of the listing, begins at infinity: the first iteration takes every grounded action.
 D_real may also be a log that was recorded earlier (line 4).
 """
 
@@ -89,9 +93,9 @@ class Ugat(Algorithm):
         while state.iteration < self.config.iterations:  # line 2
             policy = state.learner.policy()
             self._roll_out(state, policy)  # lines 3 and 4
-            rewards = self._rewards(state, policy) if self.config.matches else None
+            rewards = self._rewards_under_delays(state, policy) if self.config.matches else None
             report = self._fit(state, device, rewards)  # lines 5 and 6
-            self._prepare_gate(state, report)  # line 7
+            self._prepare_gate(state, report)  # input alpha, line 13
             title = f"grounded, {iteration_name(state)}"
             self._learn(state, grounded_env, self.config.grounded_episodes, title)  # lines 8 to 16
             gate = self._update_alpha(state)  # line 17
@@ -123,7 +127,7 @@ class Ugat(Algorithm):
                     data.append(log)
                 advance()
 
-    def _rewards(self, state: RunState[Transform], policy: Policy) -> EpisodeRewards:
+    def _rewards_under_delays(self, state: RunState[Transform], policy: Policy) -> EpisodeRewards:
         """Run the policy in E_sim under each delay; return its rewards there and in E_real.
 
         Only timed grounding with matched rewards needs this; it is not part of Algorithm 1.
@@ -132,9 +136,9 @@ class Ugat(Algorithm):
         number = self.sim.roll_outs_under_delays
         with self.run.reporter.task(f"under delays, {iteration_name(state)}", number) as advance:
             logs = self.sim.under_delays(policy, state.iteration, self.seed, advance)
-        *before, street = [episode_rewards(log, agents) for log in state.real]
+        *earlier, latest = [episode_rewards(log, agents) for log in state.real]
         simulated = np.array([episode_rewards(log, agents) for log in logs])
-        return EpisodeRewards(street, simulated, before)
+        return EpisodeRewards(latest, simulated, earlier)
 
     def _fit(
         self, state: RunState[Transform], device: torch.device, rewards: EpisodeRewards | None
@@ -156,7 +160,7 @@ class Ugat(Algorithm):
         return report
 
     def _prepare_gate(self, state: RunState[Transform], report: FitReport) -> None:
-        """Give the gate the trusted agents and the u to expect (lines 7 and 13)."""
+        """Give the gate the trusted agents and the u to expect (the input alpha, line 13)."""
         gate = state.transform.gate
         if self.config.least_accuracy is not None:
             gate.trust(report.trusted(self.config.least_accuracy))

@@ -73,7 +73,7 @@ class GroundedEnv(BaseParallelWrapper[str, Any, Any]):
         requested = np.array([self._action(agent, actions) for agent in stack.agents])  # line 10
         outcome = self.transform(
             self._seen, requested, self._allowed, self._earlier
-        )  # lines 11 to 13
+        )  # lines 11 to 13 and 15
         executed = dict(zip(stack.agents, outcome.executed.tolist(), strict=True))
         if outcome.delay_s.any():
             delays = dict(zip(stack.agents, outcome.delay_s.tolist(), strict=True))
