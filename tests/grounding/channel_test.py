@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from ugat_marl.data import AgentLayout, Provenance, TransitionLog, TransitionRecorder
-from ugat_marl.grounding.channel import CommandChannel, fit_channel
+from ugat_marl.grounding.channel import ChannelConfig, CommandChannel, fit_channel
 from ugat_marl.scenarios import SignalState, SignalTiming
 
 PHASES = 4
@@ -179,3 +179,9 @@ def test_a_channel_survives_its_checkpoint() -> None:
     again = CommandChannel.from_state(channel.state_dict())
     assert np.array_equal(again.network, channel.network)
     assert all(np.array_equal(a, b) for a, b in zip(again.tables, channel.tables, strict=True))
+
+
+def test_a_command_may_be_later_than_by_default_if_the_method_is_told_so() -> None:
+    log = log_of(lag=8)
+    assert fit_channel(log).network.max() < 0.5  # beyond the longest lag all explain a little
+    assert fit_channel(log, ChannelConfig(most_lag=8)).lag == 8

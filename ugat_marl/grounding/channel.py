@@ -45,8 +45,8 @@ class ChannelConfig:
     """Numbers of the method.
 
     Attributes:
-        most_lag: Longest delay of a command, in decisions. Commands that are later still look like
-            lost ones.
+        most_lag: Longest delay of a command, in decisions. Commands that are later still spread
+            over all lags, since none explains them.
         ages: Number of ages of a green that are told apart, in decisions. Older greens count as the
             oldest of these.
         pull: Decisions that the network's weights count for at each intersection. Halved,
@@ -241,7 +241,7 @@ def fit_channel(log: TransitionLog, config: ChannelConfig | None = None) -> Comm
     """
     config = config or ChannelConfig()
     courses = [
-        _Course.of(log.transitions(agent), layout, config.ages)
+        _Course.of(log.transitions(agent), layout, config)
         for agent, layout in log.provenance.layouts.items()
     ]
     masked = all(course.mask is not None for course in courses)
@@ -284,7 +284,7 @@ class _Course:
     ages: int
 
     @classmethod
-    def of(cls, rows: Transitions, layout: AgentLayout, ages: int) -> _Course:
+    def of(cls, rows: Transitions, layout: AgentLayout, config: ChannelConfig) -> _Course:
         """Read the rows of an agent."""
         count = len(rows)
         if count < 2:
@@ -292,7 +292,7 @@ class _Course:
         shown = rows.observation[:, layout.features : layout.features + layout.phases]
         running = shown.argmax(1).astype(np.int64)
         goes_on = (np.diff(rows.episode) == 0) & (np.diff(rows.step) == 1)
-        asked = np.full((ChannelConfig.most_lag + 1, count), -1, dtype=np.int64)
+        asked = np.full((config.most_lag + 1, count), -1, dtype=np.int64)
         asked[0] = rows.action
         for lag in range(1, len(asked)):
             asked[lag, 1:] = np.where(goes_on, asked[lag - 1, :-1], -1)
@@ -304,8 +304,8 @@ class _Course:
         for t in range(count - 2, -1, -1):
             left[t] = left[t + 1] + 1 if goes_on[t] else 0
         mask = rows.mask if rows.mask.shape[1] else None
-        age = np.minimum(age, ages - 1)
-        return cls(asked, running, age, rows.executed, mask, left, layout.phases, ages)
+        age = np.minimum(age, config.ages - 1)
+        return cls(asked, running, age, rows.executed, mask, left, layout.phases, config.ages)
 
     def free_table(self) -> Table:
         """Return a table that permits everything."""
@@ -317,15 +317,13 @@ class _Course:
         rows = np.flatnonzero(self.left >= lag)
         states = rows + lag
         rows, states = rows[self.age[states] > 0], states[self.age[states] > 0]
-        shape = (self.ages, self.phases, self.phases)
-        permitted, seen = np.zeros(shape), np.zeros(shape)
-        cells = self.age[states], self.running[states]
-        cell = np.ravel_multi_index(cells, shape[:2])
-        for phase in range(self.phases):
-            allowed = self.mask[rows, phase].astype(float)
-            permitted[:, :, phase] = _tally(cell, shape[:2], allowed)
-            seen[:, :, phase] = _tally(cell, shape[:2])
-        return _filled(permitted >= 0.5 * seen, seen[:, :, 0] > 0)
+        shape = (self.ages, self.phases)
+        cells = np.ravel_multi_index((self.age[states], self.running[states]), shape)
+        seen = _tally(cells, shape)
+        permitted = np.stack(
+            [_tally(cells, shape, mask.astype(float)) for mask in self.mask[rows].T], axis=-1
+        )
+        return _filled(permitted >= 0.5 * seen[:, :, None], seen > 0)
 
     def table_of_refusals(self, lag: int, usual: float, config: ChannelConfig) -> Table:
         """Return the table that refused commands show, for a log without masks.

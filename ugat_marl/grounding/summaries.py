@@ -29,7 +29,6 @@ LEAST_ROWS = 3
 COUNTED = ("count", "density", "movements", "queue")
 """Observations in vehicles; the others cannot be summarised."""
 
-BEGINS, GOES_ON = 0, 1
 GREENS = ("begins", "goes on")
 NAMES = (
     *(

@@ -113,7 +113,7 @@ class _Recording:
         self._names = dict(zip(self._base.possible_agents, observer.agents, strict=True))
         self._seen = self._look()
         self._before: Snapshot = self._base.seen
-        self._masks = self._renamed({agent: infos[agent]["action_mask"] for agent in self._names})
+        self._masks = self._masks_of(infos)
         self._step = 0
 
     def add(self, actions: Actions, rewards: Mapping[str, float], infos: Infos) -> None:
@@ -125,8 +125,7 @@ class _Recording:
         self._recorder.record(0, self._step, *row)
         self._seen = then
         if self._base.agents:
-            masks = {agent: infos[agent]["action_mask"] for agent in self._names}
-            self._masks = self._renamed(masks)
+            self._masks = self._masks_of(infos)
         self._step += 1
 
     def log(self) -> TransitionLog:
@@ -148,6 +147,9 @@ class _Recording:
     def _look(self) -> dict[str, NDArray[np.float32]]:
         vectors = self._observer.observe(self._base.seen, self._base.phases)
         return dict(zip(self._observer.agents, vectors, strict=True))
+
+    def _masks_of(self, infos: Infos) -> dict[str, Any]:
+        return self._renamed({agent: infos[agent]["action_mask"] for agent in self._names})
 
     def _renamed(self, values: Mapping[str, Any]) -> dict[str, Any]:
         return {self._names[agent]: value for agent, value in values.items()}
