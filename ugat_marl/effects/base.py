@@ -194,12 +194,22 @@ class ControllerEffect(Effect):
 
     No files change. The scenario lists the effect in its `effects`, so it is hashed, written and
     read with the scenario. The environment asks the effect for its sensor, actuator or cost.
+
+    Attributes:
+        apart_by: Parts of the record that tell two effects of a scenario apart.
     """
 
+    apart_by: ClassVar[tuple[str, ...]] = ("name",)
+
     def apply(self, scenario: Scenario) -> Scenario:
-        """List the effect in the scenario; the last of two of the same name counts."""
-        others = [record for record in scenario.settings.effects if record.get("name") != self.name]
-        listed = sorted([*others, self.record()], key=lambda record: str(record.get("name")))
+        """List the effect in the scenario; the last of two with the same identity counts."""
+
+        def identity(record: Mapping[str, Any]) -> list[str]:
+            return [str(record.get(name, "")) for name in self.apart_by]
+
+        own = self.record()
+        others = [item for item in scenario.settings.effects if identity(item) != identity(own)]
+        listed = sorted([*others, own], key=identity)
         settings = scenario.settings.model_copy(update={"effects": tuple(listed)})
         known = () if str(self) in scenario.applied else (str(self),)  # a scenario is loaded twice
         return replace(scenario, settings=settings, applied=(*scenario.applied, *known))

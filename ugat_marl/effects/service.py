@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import ClassVar
 
 from ugat_marl.effects.base import ControllerEffect, NumberParameter, TextParameter
@@ -24,6 +24,7 @@ class LaneService(ControllerEffect):
     """
 
     name: ClassVar[str] = "lane_service"
+    apart_by: ClassVar[tuple[str, ...]] = ("name", "lane")
     ranges: ClassVar[dict[str, NumberParameter]] = {
         "begin_s": NumberParameter("s", 0.0, 30.0),
         "each_s": NumberParameter("s", 0.0, 30.0),
@@ -41,15 +42,7 @@ class LaneService(ControllerEffect):
         """
         places = network_places(scenario)
         places.check(self.name, "lane", self.lane, places.lanes)
-        listed = [
-            item
-            for item in scenario.settings.effects
-            if (item.get("name"), item.get("lane")) != (self.name, self.lane)
-        ]
-        listed = sorted([*listed, self.record()], key=_key)
-        settings = scenario.settings.model_copy(update={"effects": tuple(listed)})
-        known = () if str(self) in scenario.applied else (str(self),)  # a scenario is loaded twice
-        return replace(scenario, settings=settings, applied=(*scenario.applied, *known))
+        return super().apply(scenario)
 
     def service(self) -> Mapping[str, Seconds]:
         """Return the lane and its seconds."""
@@ -67,7 +60,3 @@ def _of_light(item: Intersection, lanes: Mapping[str, Seconds]) -> Withheld:
     for link in item.links:
         begin_s[link.index], each_s[link.index] = lanes.get(link.from_lane, (0.0, 0.0))
     return Withheld(tuple(begin_s), tuple(each_s))
-
-
-def _key(record: Mapping[str, object]) -> tuple[str, str]:
-    return str(record.get("name")), str(record.get("lane", ""))
