@@ -14,7 +14,7 @@ import multiprocessing
 import os
 import sys
 import threading
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from concurrent.futures import (
     FIRST_COMPLETED,
     Executor,
@@ -120,6 +120,29 @@ def as_done(
             stop.set()
             for future in numbers:
                 future.cancel()
+
+
+def in_order(
+    workers: Workers,
+    work: Callable[..., Done],
+    parts: Sequence[tuple[Any, ...]],
+    stop: Stop,
+    on_done: Callable[[Done], object],
+) -> list[Done]:
+    """Run parts as `as_done` does, and return their results in the order of the parts.
+
+    Args:
+        workers: Parts at a time, or an executor, as for `as_done`.
+        work: Function of one part.
+        parts: Arguments of each part.
+        stop: Flag for parts that run when the iteration ends.
+        on_done: Called with each result when it is there.
+    """
+    results: dict[int, Done] = {}
+    for number, result in as_done(workers, work, parts, stop):
+        results[number] = result
+        on_done(result)
+    return [results[number] for number in range(len(parts))]
 
 
 class LocalProcesses(Executor):

@@ -10,7 +10,7 @@ from ugat_marl.grounding.posterior import FittedService, Posterior, Simulated, V
 from ugat_marl.grounding.summaries import NAMES, Summary
 
 LANES = tuple(f"lane_{k}" for k in range(8))
-WORLDS = Worlds.of(LANES, {})
+WORLDS = Worlds.of(LANES)
 
 
 def summary(values: Values, seed: int, silent: int | None = None) -> Summary:
@@ -83,10 +83,10 @@ def test_draws_keep_to_their_ranges_and_name_only_what_changes() -> None:
 
 
 def test_an_effect_can_be_left_out() -> None:
-    worlds = Worlds.of(LANES, {}, without=["headway"])
+    worlds = Worlds.of(LANES, without=["headway"])
     assert "headway" not in [item.name for item in worlds.library]
     with pytest.raises(UnknownNameError, match="headwya"):
-        Worlds.of(LANES, {}, without=["headwya"])
+        Worlds.of(LANES, without=["headwya"])
 
 
 def test_a_posterior_survives_its_checkpoint_and_refuses_another_network() -> None:
@@ -94,4 +94,4 @@ def test_a_posterior_survives_its_checkpoint_and_refuses_another_network() -> No
     again = Posterior.from_state(WORLDS, posterior.state_dict())
     assert np.array_equal(again.draw(4).effects, posterior.draw(4).effects)
     with pytest.raises(CheckpointError, match="another network"):
-        Posterior.from_state(Worlds.of(LANES[:3], {}), posterior.state_dict())
+        Posterior.from_state(Worlds.of(LANES[:3]), posterior.state_dict())

@@ -81,6 +81,7 @@ from .table import effects_on_controllers as effects_on_controllers
 from .table import known_effects as known_effects
 from .table import load_scenario as load_scenario
 from .turning import Turning as Turning
+from .vehicles import NO_SOFTER as NO_SOFTER
 from .vehicles import Acceleration as Acceleration
 from .vehicles import Deceleration as Deceleration
 from .vehicles import DriverModel as DriverModel

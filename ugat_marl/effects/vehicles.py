@@ -115,6 +115,10 @@ class EmergencyDeceleration(VehicleEffect):
     mps2: float
 
 
+NO_SOFTER = {EmergencyDeceleration.name: Deceleration.name}
+"""Effects with their lower bound: an emergency deceleration is at least the usual deceleration."""
+
+
 @dataclass(frozen=True)
 class StartupDelay(VehicleEffect):
     """Time a stopped vehicle waits before it starts, in s (SUMO's `startupDelay`).

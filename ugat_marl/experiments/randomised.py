@@ -11,17 +11,12 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
-from pettingzoo.utils import BaseParallelWrapper
-
 from ugat_marl.diagnosis import Hypothesis, free_values, global_hypotheses, ordered
-from ugat_marl.effects import PAPER_WORLDS, Domain, Effect, scenario_in_domain
-from ugat_marl.envs import AgentSet, ResetResult, TrafficEnv, parallel_env
-from ugat_marl.errors import ScenarioError
+from ugat_marl.effects import NO_SOFTER, PAPER_WORLDS, Domain, Effect, scenario_in_domain
+from ugat_marl.envs import TrafficEnv, parallel_env
+from ugat_marl.grounding import DrawnEnv
 from ugat_marl.scenarios import Scenario
 from ugat_marl.seeding import numpy_generator
-
-NO_SOFTER = {"emergency_deceleration": "deceleration"}
-"""Effects with their lower bound: an emergency deceleration is at least the usual deceleration."""
 
 
 @dataclass(frozen=True)
@@ -78,10 +73,8 @@ def drawn(ranges: Sequence[Range], seed: int) -> tuple[Effect, ...]:
     return ordered([each.hypothesis.effect((values[each.name],)) for each in ranges])
 
 
-class RandomisedEnv(BaseParallelWrapper[str, Any, Any]):
-    """Environment with another world in every episode; the seed of `reset` decides the world.
-
-    The simulation of an episode ends before the next one begins.
+class RandomisedEnv(DrawnEnv):
+    """Environment with another world in every episode, drawn from ranges of effects.
 
     Args:
         make_env: Makes an environment of the simulation with some effects.
@@ -91,35 +84,7 @@ class RandomisedEnv(BaseParallelWrapper[str, Any, Any]):
     def __init__(
         self, make_env: Callable[[tuple[Effect, ...]], TrafficEnv], ranges: Sequence[Range]
     ) -> None:
-        super().__init__(make_env(()))
-        self._make_env = make_env
-        self._ranges = tuple(ranges)
-        self._agents = AgentSet.of(self.env)
-        self._generator = numpy_generator(0, "worlds")
-
-    def reset(self, seed: int | None = None, options: dict[str, Any] | None = None) -> ResetResult:
-        """Start an episode in a newly drawn world.
-
-        Args:
-            seed: Seed of world and traffic; None to draw it from the generator of the last seed.
-            options: Passed to the environment.
-
-        Raises:
-            ScenarioError: The world has other agents than the simulation.
-        """
-        if seed is not None:
-            self._generator = numpy_generator(seed, "worlds")
-        else:
-            seed = int(self._generator.integers(2**31))
-        self.env.close()
-        effects = drawn(self._ranges, seed)
-        self.env = self._make_env(effects)
-        if AgentSet.of(self.env) != self._agents:
-            raise ScenarioError(
-                f"the world {self.env.domain} has other agents, observations or phases than the "
-                f"simulation: {AgentSet.of(self.env)}, not {self._agents}; draw effects on vehicles"
-            )
-        return self.env.reset(seed=seed, options=options)
+        super().__init__(make_env(()), lambda seed: make_env(drawn(ranges, seed)))
 
 
 def randomised_env(

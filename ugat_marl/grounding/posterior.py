@@ -19,7 +19,7 @@ from typing import Any, ClassVar
 import numpy as np
 from numpy.typing import NDArray
 
-from ugat_marl.effects import EVERYWHERE, ControllerPart, Effect, known_effects
+from ugat_marl.effects import EVERYWHERE, NO_SOFTER, ControllerPart, Effect, known_effects
 from ugat_marl.errors import CheckpointError, UnknownNameError
 from ugat_marl.grounding.regression import Design, Floats, kernel, left_out, ridge
 from ugat_marl.grounding.summaries import Summary
@@ -57,9 +57,6 @@ LIBRARY = (
     Prior("demand_level", 0.8, 1.25, 1.0),
 )
 """Effects whose values are estimated, with wide ranges around those of V1 to V4."""
-
-NO_SOFTER = ("emergency_deceleration", "deceleration")
-"""An emergency deceleration is at least the usual deceleration."""
 
 
 @dataclass(frozen=True)
@@ -112,7 +109,6 @@ class Worlds:
     def of(
         cls,
         lanes: Sequence[str],
-        nominal: Mapping[str, float],
         without: Sequence[str] = (),
         service: bool = True,
     ) -> Worlds:
@@ -120,7 +116,6 @@ class Worlds:
 
         Args:
             lanes: Ids of the lanes.
-            nominal: Effect to its value in the simulation, where it differs from the library's.
             without: Effects to leave out.
             service: True to estimate the service of lanes.
 
@@ -131,11 +126,7 @@ class Worlds:
         for name in without:
             if name not in names:
                 raise UnknownNameError("effect of the library", name, names)
-        library = tuple(
-            Prior(x.name, x.low, x.high, nominal.get(x.name, x.nominal), x.group, x.chance)
-            for x in LIBRARY
-            if x.name not in without
-        )
+        library = tuple(item for item in LIBRARY if item.name not in without)
         return cls(library, tuple(lanes), service)
 
     def draw(self, seed: int) -> Values:
@@ -164,9 +155,10 @@ class Worlds:
         low, high = (np.array([getattr(x, side) for x in self.library]) for side in ("low", "high"))
         effects = np.clip(values.effects, low, high) if self.library else values.effects
         names = [item.name for item in self.library]
-        if all(name in names for name in NO_SOFTER):
-            hard, soft = (names.index(name) for name in NO_SOFTER)
-            effects[hard] = max(effects[hard], effects[soft])
+        for hard, soft in NO_SOFTER.items():
+            if hard in names and soft in names:
+                least = effects[names.index(soft)]
+                effects[names.index(hard)] = max(effects[names.index(hard)], least)
         most_s = np.array([2.0 * prior.high_s for prior in SERVICE])
         return Values(effects, np.clip(values.service_s, 0.0, most_s))
 

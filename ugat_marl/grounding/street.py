@@ -34,9 +34,16 @@ from ugat_marl.envs import AgentSet, ResetResult, TrafficEnv, parallel_env
 from ugat_marl.errors import CheckpointError, OptionError, ScenarioError, UnknownNameError
 from ugat_marl.grounding.channel import ChannelConfig, CommandChannel, fit_channel
 from ugat_marl.grounding.eyes import Eyes, EyesConfig, fit_eyes
-from ugat_marl.grounding.posterior import FittedService, Posterior, Simulated, Values, Worlds
+from ugat_marl.grounding.posterior import (
+    LIBRARY,
+    FittedService,
+    Posterior,
+    Simulated,
+    Values,
+    Worlds,
+)
 from ugat_marl.grounding.summaries import LaneView, Summary
-from ugat_marl.parallel import Stop, Workers, as_done, persistently
+from ugat_marl.parallel import Stop, Workers, in_order, persistently
 from ugat_marl.policies import EpsilonGreedy, Policy, observer_of, roll_out, stop_callback
 from ugat_marl.scenarios import Scenario
 from ugat_marl.seeding import derive_seed, numpy_generator
@@ -191,7 +198,6 @@ class FittedStreet:
             content[name] = None if part is None else part.state_dict()
         if self.posterior is not None:
             content["library"] = [vars(item) for item in self.posterior.worlds.library]
-            content["service"] = self.posterior.worlds.service
         content["simulated"] = _arrays(simulated)
         write_checkpoint(path, KIND, content)
 
@@ -284,11 +290,7 @@ class Simulation:
             options["duration_s"] = min(duration_s, longest_s)
         short = Simulation(self.scenario, self.sim, options, self.epsilon)
         parts = [(world, policy, seed, stop) for world, seed in zip(worlds, seeds, strict=True)]
-        logs: dict[int, TransitionLog] = {}
-        for number, log in as_done(self.workers, short.play, parts, stop):
-            logs[number] = log
-            on_done()
-        return [logs[number] for number in range(len(parts))]
+        return in_order(self.workers, short.play, parts, stop, lambda _: on_done())
 
 
 BASELINE_EPISODES = 2
@@ -382,11 +384,12 @@ class DrawnEnv(BaseParallelWrapper[str, Any, Any]):
     The simulation of an episode ends before the next one begins.
 
     Args:
+        env: The simulation, before the first episode; its agents are those of every world.
         make_env: Makes the environment of the world of a seed.
     """
 
-    def __init__(self, make_env: Callable[[int], TrafficEnv]) -> None:
-        super().__init__(make_env(0))
+    def __init__(self, env: TrafficEnv, make_env: Callable[[int], TrafficEnv]) -> None:
+        super().__init__(env)
         self._make_env = make_env
         self._agents = AgentSet.of(self.env)
         self._generator = numpy_generator(0, "worlds")
@@ -423,15 +426,18 @@ def street_env(street: FittedStreet, simulation: Simulation, commands: int) -> D
         simulation: The simulation.
         commands: Number of own commands that agents see.
     """
-    return DrawnEnv(lambda seed: simulation.env(street.world(seed), commands=commands))
+    return DrawnEnv(
+        simulation.plain(commands),
+        lambda seed: simulation.env(street.world(seed), commands=commands),
+    )
 
 
 def street_prior(env: TrafficEnv, config: StreetConfig) -> Worlds:
     """Return the prior of the worlds of an environment's network."""
     view = LaneView.of(env.network, env.options.observation)
-    names = [item.name for item in Worlds.of((), {}).library]
-    left_out = tuple(names) if "effects" not in config.parts else config.without
-    return Worlds.of(view.lanes, {}, left_out, "service" in config.parts)
+    everything = tuple(item.name for item in LIBRARY)
+    left_out = config.without if "effects" in config.parts else everything
+    return Worlds.of(view.lanes, left_out, "service" in config.parts)
 
 
 def _arrays(simulated: Sequence[Simulated]) -> dict[str, Tensor]:

@@ -16,7 +16,7 @@ from ugat_marl.errors import LogError
 from ugat_marl.grounding.fitting import FitConfig, split
 from ugat_marl.grounding.stacked import Stack, stack_log
 from ugat_marl.grounding.wrappers import RandomDelays
-from ugat_marl.parallel import Stop, Workers, as_done, persistently
+from ugat_marl.parallel import Stop, Workers, in_order, persistently
 from ugat_marl.policies import (
     EpsilonGreedy,
     Policy,
@@ -142,12 +142,9 @@ class SimulatedWorld:
         """Run a roll-out for each pair of seed and constant delay; return logs in this order."""
         alone = _RollOutAlone(self._make_env, self._most_delay_s, policy, self._epsilon)
         given = [(*part, self._stop) for part in parts]
-        logs: dict[int, TransitionLog] = {}
-        for number, log in as_done(workers, alone.play, given, self._stop):
-            logs[number] = log
-            on_done()
-        self._stop = Stop()  # `as_done` has set the old one at its end
-        return [logs[number] for number in range(len(parts))]
+        logs = in_order(workers, alone.play, given, self._stop, lambda _: on_done())
+        self._stop = Stop()  # the old one was set at the end
+        return logs
 
     def stop(self) -> None:
         """Stop the running roll-outs."""
@@ -272,13 +269,16 @@ def roll_outs(
         All transitions, and the scores of every episode.
     """
     stop = Stop()
-    played: dict[int, tuple[TransitionLog, Scores]] = {}
     with (reporter or Silent()).task(title, len(seeds)) as advance:
         parts = [(seed, stop) for seed in seeds]
-        for number, (log, scores) in as_done(workers, each.play, parts, stop):
-            played[number] = log, scores
-            advance(note=f"ATT {scores.att_s:.0f} s")
-    logs, scores = zip(*(played[number] for number in range(len(seeds))), strict=True)
+        played = in_order(
+            workers,
+            each.play,
+            parts,
+            stop,
+            lambda done: advance(note=f"ATT {done[1].att_s:.0f} s"),
+        )
+    logs, scores = zip(*played, strict=True)
     return TransitionLog.concatenate(list(logs)), tuple(scores)
 
 
