@@ -7,6 +7,7 @@ import shlex
 import tomllib
 from dataclasses import dataclass, fields, replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -94,6 +95,19 @@ def test_what_is_added_in_ten_lines_works(tmp_path: Path, monkeypatch: pytest.Mo
             assert value == -env.snapshot.halting[lanes.indices(own)].max()
     for names in made:
         names["env"].close()
+
+
+def test_the_example_of_drawn_networks_works(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    section = PAGE.partition("### Networks drawn from a seed")[2]
+    example = re.search(r"```python\n(.*?)```", section, flags=re.DOTALL)
+    assert example is not None
+    names: dict[str, Any] = {}
+    exec(example[1], names)  # the page's own words, in a namespace of their own
+    assert [town.id for town in names["towns"]] == ["town0", "town1"]
+    assert 0 < names["busiest"] < 0.8
 
 
 def test_every_uncertainty_is_documented() -> None:

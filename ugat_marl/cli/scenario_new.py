@@ -17,6 +17,7 @@ from ugat_marl.scenarios import (
     RoadSource,
     VehicleSource,
     arterial_roads,
+    drawn_sources,
     from_cityflow,
     from_counts,
     from_od,
@@ -28,7 +29,7 @@ from ugat_marl.scenarios import (
     make_scenario,
 )
 
-ROADS = ("grid", "arterial", "osm", "sumo", "cityflow")
+ROADS = ("grid", "arterial", "osm", "sumo", "cityflow", "draw")
 DEMANDS = ("routes", "vph", "counts", "od")
 _OWN = Annotated[float | None, arg(metavar="FLOAT", help_behavior_hint="(default: the source's)")]
 
@@ -41,10 +42,11 @@ def _none(metavar: str) -> Any:
 class ScenarioNew:
     """Make a scenario directory: roads with demand, ready for all other commands.
 
-    Name one source of roads and one of vehicles.
+    Name one source of roads and one of vehicles. --draw stands for both.
 
     Examples:
         ugat-marl scenario new my-grid --grid 4x4 --vph 400
+        ugat-marl scenario new drawn --draw 7
         ugat-marl scenario new my-city --sumo city.net.xml --routes cars.rou.xml
         ugat-marl scenario new my-city --sumo city.sumocfg
         ugat-marl scenario new my-city --osm city.osm.pbf --vph 300
@@ -58,6 +60,8 @@ class ScenarioNew:
         guess_signals: Put lights at large junctions of --osm that have none.
         sumo: SUMO configuration (with its vehicles) or network.
         cityflow: CityFlow's roadnet.json and flow.json (with its vehicles).
+        draw: Seed from which roads, phases, timing and vehicles are drawn, at 0.3 to 1.1 of
+            capacity.
         exact_drivers: Keep CityFlow's headways, and drive without randomness. Without this option,
             vehicles keep size, accelerations and speed, and follow each other as SUMO's do.
         routes: Route files for the network.
@@ -83,6 +87,7 @@ class ScenarioNew:
     guess_signals: bool = False
     sumo: Annotated[Path | None, _none("FILE")] = None
     cityflow: Annotated[tuple[Path, Path] | None, _none("ROADNET FLOW")] = None
+    draw: Annotated[int | None, _none("SEED")] = None
     exact_drivers: bool = False
     routes: Annotated[tuple[Path, ...], _none("FILE [FILE ...]")] = ()
     vph: Annotated[float | None, _none("N")] = None
@@ -100,7 +105,7 @@ class ScenarioNew:
 
     def run(self, console: Console) -> int:
         """Make the scenario and print its facts."""
-        roads, vehicles = self._roads(), self._vehicles()
+        roads, vehicles = self._sources()
         made = make_scenario(
             self.name,
             roads,
@@ -124,6 +129,21 @@ class ScenarioNew:
         where = shlex.quote(str(self.name))
         console.print(f"next: ugat-marl scenario check {where}", markup=False, soft_wrap=True)
         return 0
+
+    def _sources(self) -> tuple[RoadSource, VehicleSource | None]:
+        if self.draw is None:
+            return self._roads(), self._vehicles()
+        if others := [name for name in self._given() if name not in ("draw", "force")]:
+            raise OptionError(
+                "--draw draws roads and vehicles with all their settings; "
+                f"leave out {', '.join(map(_option, others))}"
+            )
+        return drawn_sources(self.draw)
+
+    def _given(self) -> list[str]:
+        """Return the options, without the name, that differ from their default."""
+        options = (f for f in fields(self) if f.default is not MISSING)
+        return [f.name for f in options if getattr(self, f.name) != f.default]
 
     def _roads(self) -> RoadSource:
         given = [name for name in ROADS if getattr(self, name) is not None]
@@ -180,18 +200,17 @@ class ScenarioNew:
     def _command(self) -> str:
         """Return the command line that makes the same scenario again."""
         words = ["ugat-marl", "scenario", "new", str(self.name)]
-        for option_field in fields(self):
-            value = getattr(self, option_field.name)
-            if option_field.name in ("name", "force") or (
-                option_field.default is not MISSING and value == option_field.default
-            ):
-                continue
-            option = f"--{option_field.name.replace('_', '-')}"
-            values = value if isinstance(value, tuple) else () if value is True else (value,)
-            words += [option, *map(str, values)]
+        for name in self._given():
+            value = getattr(self, name)
+            if name != "force":
+                values = value if isinstance(value, tuple) else () if value is True else (value,)
+                words += [_option(name), *map(str, values)]
         return shlex.join(words)
 
 
+def _option(name: str) -> str:
+    return f"--{name.replace('_', '-')}"
+
+
 def _listed(names: tuple[str, ...]) -> str:
-    options = [f"--{name}" for name in names]
-    return f"{', '.join(options[:-1])} or {options[-1]}"
+    return f"{', '.join(map(_option, names[:-1]))} or {_option(names[-1])}"

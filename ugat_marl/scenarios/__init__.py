@@ -9,8 +9,9 @@ hashes it. It also derives the static network. Nothing here runs a simulation of
 - `demand`, `routes`, `days`: checks of route files, routes of vehicles, other days of a demand.
 - `periods`: detectors, and the recordings of detectors and signals.
 - `inspection`: facts about a scenario.
+- `capacity`: demand as a share of capacity.
 - `programs`: SUMO's programs.
-- `importers`: scenarios from grids, OpenStreetMap, SUMO, CityFlow and counts.
+- `importers`: scenarios from a seed, grids, OpenStreetMap, SUMO, CityFlow and counts.
 """
 
 import lazy_loader

@@ -1,10 +1,16 @@
 from . import signals as signals
+from .capacity import degrees_of_saturation as degrees_of_saturation
 from .days import draw_day as draw_day
 from .demand import Demand as Demand
 from .demand import check_demand as check_demand
 from .importers.cityflow import from_cityflow as from_cityflow
 from .importers.counts import from_counts as from_counts
 from .importers.counts import from_od as from_od
+from .importers.drawn import DrawnNetwork as DrawnNetwork
+from .importers.drawn import NetworkRanges as NetworkRanges
+from .importers.drawn import draw_network as draw_network
+from .importers.drawn import draw_scenario as draw_scenario
+from .importers.drawn import drawn_sources as drawn_sources
 from .importers.making import RoadSource as RoadSource
 from .importers.making import VehicleSource as VehicleSource
 from .importers.making import make_scenario as make_scenario

@@ -9,6 +9,7 @@ from dataclasses import dataclass
 from itertools import combinations
 
 from ugat_marl.progress import Reporter
+from ugat_marl.scenarios.capacity import SATURATION_VPH
 from ugat_marl.scenarios.demand import Demand, check_demand
 from ugat_marl.scenarios.junctions import Link, foes_of, yields_of
 from ugat_marl.scenarios.network import Intersection, Network
@@ -19,9 +20,6 @@ from ugat_marl.scenarios.signals import GREEN
 
 SHORT_LANE_M = 50.0
 """Length below which a lane at a light shows little of a queue."""
-
-SATURATION_VPH = 1800.0
-"""Vehicles per hour that a lane discharges in permanent green: one every 2 s."""
 FILLINGS = 3.0
 """Least length of a useful episode, in multiples of the time in which the network fills."""
 

@@ -29,7 +29,7 @@ STRAIGHT_WITHIN_DEG = 45.0
 
 SIDE_STREET = ("sr", "l")
 MAIN_ROAD = ("sr", "s", "l")
-_NETCONVERT = {
+NETCONVERT = {
     "tls.cycle.time": 90, "tls.left-green.time": 10, "tls.minor-left.max-speed": 0,
     "tls.yellow.time": 3, "tls.allred.time": 2,
 }  # fmt: skip
@@ -49,11 +49,19 @@ class Node:
 
 @dataclass(frozen=True)
 class Road:
-    """Carriageway between two nodes; `lanes` holds the turns of each lane, kerb first."""
+    """Carriageway between two nodes.
+
+    Attributes:
+        start: Node at its start.
+        end: Node at its end.
+        lanes: Turns of each lane, kerb first.
+        speed_mps: Speed limit; None for the network's.
+    """
 
     start: str
     end: str
     lanes: tuple[str, ...]
+    speed_mps: float | None = None
 
     @property
     def id(self) -> str:
@@ -191,9 +199,8 @@ def netconvert_documents(plan: RoadPlan, speed_mps: float) -> dict[str, bytes]:
         ET.SubElement(nodes, "node", id=node.id, x=f"{node.x:g}", y=f"{node.y:g}", type=kind)
     for road in plan.roads.values():
         attributes = {"id": road.id, "from": road.start, "to": road.end}
-        ET.SubElement(
-            edges, "edge", attributes, numLanes=str(len(road.lanes)), speed=f"{speed_mps:g}"
-        )
+        limit = speed_mps if road.speed_mps is None else road.speed_mps
+        ET.SubElement(edges, "edge", attributes, numLanes=str(len(road.lanes)), speed=f"{limit:g}")
         if not plan.nodes[road.end].signal:
             continue
         for lane, entered, target in plan.connections(road):
@@ -287,7 +294,7 @@ def _drawn(plan: RoadPlan, speed_mps: float, description: str) -> RoadSource:
     def roads(folder: Path, reporter: Reporter) -> RoadFiles:
         del reporter
         write_whole(
-            folder / NETWORK, build_network(netconvert_documents(plan, speed_mps), _NETCONVERT)
+            folder / NETWORK, build_network(netconvert_documents(plan, speed_mps), NETCONVERT)
         )
         return RoadFiles(
             description,
