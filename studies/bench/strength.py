@@ -77,7 +77,7 @@ class StrengthBench:
     tuning_seeds: int = 2
     duration_s: float | None = None
     observation: str = "count"
-    reward: str = "queue"
+    reward: str = "total-queue"
     neighbours: int = 0
     learner: str = DQN_NAME
     learner_settings: tuple[str, ...] = ()

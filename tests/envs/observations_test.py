@@ -62,6 +62,7 @@ def snapshot(**lanes: tuple[float, float, float]) -> Snapshot:
         waiting_s=table[:, 2],
         departed=100,
         backlog=0,
+        queued_upstream=np.zeros(len(LANES)),
     )
 
 
@@ -168,6 +169,13 @@ BEFORE = snapshot(w=(9, 9, 300), n=(1, 0, 20), ab=(5, 5, 500), e=(2, 1, 3), x=(3
 
 def test_queue_is_minus_the_halting_vehicles_on_incoming_lanes() -> None:
     assert Rewarder(NETWORK, "queue").rewards(BEFORE, SEEN) == [-24.0, -45.0, -8.0]
+
+
+def test_total_queue_adds_the_vehicles_that_queue_upstream() -> None:
+    upstream = np.zeros(len(LANES))
+    upstream[[LANES.index("n"), LANES.index("y")]] = 2.5, 9.0  # y is no incoming lane
+    longer = replace(SEEN, queued_upstream=upstream)
+    assert Rewarder(NETWORK, "total-queue").rewards(BEFORE, longer) == [-26.5, -45.0, -8.0]
 
 
 def test_pressure_is_minus_the_imbalance_of_incoming_and_outgoing_lanes() -> None:

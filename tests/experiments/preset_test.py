@@ -31,3 +31,11 @@ def test_what_the_preset_decides_cannot_be_given_beside_it() -> None:
         TransferConfig(
             "single-v1", preset="paper", ugat=UgatConfig(gate=GateConfig(mode="infinite"))
         )
+
+
+def test_the_preset_is_paid_by_the_queue_at_the_light() -> None:
+    assert TransferConfig("single-v1").reward == "total-queue"
+    assert TransferConfig("single-v1", preset="paper").reward == "queue"
+    assert TransferConfig("single-v1", preset="paper", reward="queue").reward == "queue"
+    with pytest.raises(OptionError, match="not 'pressure'"):
+        TransferConfig("single-v1", preset="paper", reward="pressure")

@@ -22,7 +22,8 @@ class Scores:
         att_finished_s: Average travel time in s over the vehicles that arrived.
         throughput: Number of vehicles that arrived.
         reward: Mean over decisions and agents of the environment's reward. Evaluations use the
-            queue reward, independent of the reward in training.
+            reward total-queue, independent of the reward in training; where no queue is longer
+            than the lanes at the lights, it is minus the queue.
         queue: Mean over decisions and intersections of the halting vehicles on incoming lanes.
         delay: Mean over decisions and incoming lanes of 1 - v / v_max (no unit; 0 for an empty
             lane), as in the tables of the UGAT paper.

@@ -12,6 +12,7 @@ from .observations import WAITING_SCALE_S as WAITING_SCALE_S
 from .observations import Observer as Observer
 from .options import EnvOptions as EnvOptions
 from .rendering import NetworkRenderer as NetworkRenderer
+from .rewards import Rewarder as Rewarder
 from .traffic_env import TrafficEnv as TrafficEnv
 from .traffic_env import env as env
 from .traffic_env import parallel_env as parallel_env

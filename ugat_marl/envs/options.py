@@ -18,7 +18,8 @@ class EnvOptions:
 
     Attributes:
         observation: Name of the observation; see `ugat_marl.envs.observations.OBSERVATION_UNITS`.
-        reward: ``"queue"``, ``"pressure"``, ``"waiting"`` or a function of two `IntersectionView`.
+        reward: ``"total-queue"``, ``"queue"``, ``"pressure"``, ``"waiting"`` or a function of two
+            `IntersectionView`.
         neighbours: Distance in roads up to which agents see features and phases of others.
         commands: Number of its own last commands that an agent sees, and the age of its green with
             them; 0 for none. Needed where commands are late or lost.
@@ -35,7 +36,7 @@ class EnvOptions:
     """
 
     observation: str = "count"
-    reward: str | Callable[[Any, Any], float] = "queue"
+    reward: str | Callable[[Any, Any], float] = "total-queue"
     neighbours: int = 0
     commands: int = 0
     signals: str = "actions"

@@ -13,7 +13,7 @@ from ugat_marl.errors import UnknownNameError
 from ugat_marl.scenarios import Network
 from ugat_marl.simulation import Snapshot
 
-RewardName = Literal["queue", "pressure", "waiting"]
+RewardName = Literal["total-queue", "queue", "pressure", "waiting"]
 
 
 @dataclass(frozen=True)
@@ -27,6 +27,8 @@ class IntersectionView:
         mean_speed_mps: Mean speed per incoming lane, in m/s.
         waiting_s: Summed waiting time per incoming lane, in s.
         outgoing_vehicles: Number of vehicles per outgoing lane.
+        queued_upstream: Number of vehicles that queue for each incoming lane upstream of it or
+            outside the network.
     """
 
     time_s: float
@@ -35,6 +37,7 @@ class IntersectionView:
     mean_speed_mps: NDArray[np.float64]
     waiting_s: NDArray[np.float64]
     outgoing_vehicles: NDArray[np.float64]
+    queued_upstream: NDArray[np.float64]
 
 
 RewardFunction = Callable[[IntersectionView, IntersectionView], float]
@@ -47,12 +50,17 @@ class Rewarder:
     Args:
         network: The network.
         reward: Name of the reward, or a function of two `IntersectionView`. ``"queue"``: minus the
-            number of halting vehicles on incoming lanes (UGAT paper). ``"pressure"``: minus the
-            absolute difference of the numbers of vehicles on incoming and outgoing lanes (Wei et
-            al. 2019, PressLight). ``"waiting"``: decrease of the summed waiting time, in s.
+            number of halting vehicles on incoming lanes (UGAT paper). ``"total-queue"``: the same,
+            minus the vehicles that halt upstream of these lanes, up to the light before, and those
+            that wait to enter the network (`Snapshot.queued_upstream`). ``"queue"`` cannot fall
+            below what the lanes hold, so that a policy may be paid for blocking an entry;
+            ``"total-queue"`` can, and equals it where queues end on the lanes at the lights.
+            ``"pressure"``: minus the absolute difference of the numbers of vehicles on incoming and
+            outgoing lanes (Wei et al. 2019, PressLight). ``"waiting"``: decrease of the summed
+            waiting time, in s.
     """
 
-    def __init__(self, network: Network, reward: str | RewardFunction = "queue") -> None:
+    def __init__(self, network: Network, reward: str | RewardFunction = "total-queue") -> None:
         if not callable(reward) and reward not in get_args(RewardName):
             raise UnknownNameError(
                 "reward", str(reward), get_args(RewardName), "A function works as well."
@@ -73,10 +81,17 @@ class Rewarder:
         """True if snapshots must hold waiting times."""
         return self._reward == "waiting" or callable(self._reward)
 
+    @property
+    def needs_upstream(self) -> bool:
+        """True if snapshots must hold the vehicles that queue upstream of lanes."""
+        return self._reward == "total-queue" or callable(self._reward)
+
     def rewards(self, before: Snapshot, after: Snapshot) -> list[float]:
         """Return the rewards of all intersections, in the network's order."""
         if self._reward == "queue":
             return (-self._sum_in(after.halting)).tolist()
+        if self._reward == "total-queue":
+            return (-self._sum_in(after.halting + after.queued_upstream)).tolist()
         if self._reward == "pressure":
             difference = self._sum_in(after.vehicles) - self._sum_out(after.vehicles)
             return (-np.abs(difference)).tolist()
@@ -97,6 +112,7 @@ class Rewarder:
             snapshot.mean_speed_mps[incoming],
             snapshot.waiting_s[incoming],
             snapshot.vehicles[self._outgoing[index]],
+            snapshot.queued_upstream[incoming],
         )
 
 

@@ -324,6 +324,7 @@ class TrafficEnv(ParallelEnv[str, Any, Any]):
             zone_m=self._sensors.zone_m if self._sensors else 0.0,
             persons=self._objectives.persons if self._objectives else None,
             behind=self._lanes.behind,
+            turns=self._lanes.turns if self._rewarder.needs_upstream else (),
         )
         self.agents = []
         for part in (self._sensors, self._actuators):

@@ -33,7 +33,7 @@ from ugat_marl.experiments.settings import (
 from ugat_marl.experiments.training import check_worlds
 from ugat_marl.experiments.tuning import BUDGET, LEAST_BUDGET
 from ugat_marl.grounding import (
-    MATCHED_REWARD,
+    MATCHED_REWARDS,
     PARTS,
     FitConfig,
     GateConfig,
@@ -284,7 +284,7 @@ class PaperConfig:
     evaluation_seeds: int = 5
     rule_budget: int = BUDGET
     observation: str = "count"
-    reward: str = "queue"
+    reward: str = "total-queue"
     neighbours: int = 0
     duration_s: float | None = None
     learner: str = DQN_NAME
@@ -358,7 +358,7 @@ class PaperConfig:
             UnknownNameError: The table has no row of that name.
         """
         rows = settings_of(table, self.ugat, self.sim, self.groundings, self.constants, self.spec)
-        if self.reward != MATCHED_REWARD:
+        if self.reward not in MATCHED_REWARDS:
             rows = [setting for setting in rows if not setting.matches]
         names = [setting.name for setting in rows]
         for row in self.rows:

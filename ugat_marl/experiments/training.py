@@ -21,7 +21,7 @@ from ugat_marl.envs import AnyParallelEnv, TrafficEnv, parallel_env
 from ugat_marl.errors import OptionError
 from ugat_marl.grounding import (
     CHECKPOINT_EPISODES,
-    MATCHED_REWARD,
+    MATCHED_REWARDS,
     LaneView,
     NegativeControl,
     Probe,
@@ -228,10 +228,11 @@ def simulated_worlds(
         OptionError: `check_worlds` fails, or the rewards cannot be matched.
     """
     check_worlds(scenario, sim, real, ugat.grounding == "timed")
-    reward = options.get("reward", MATCHED_REWARD)
-    if ugat.matches and reward != MATCHED_REWARD:
+    reward = options.get("reward", MATCHED_REWARDS[0])
+    if ugat.matches and reward not in MATCHED_REWARDS:
         raise OptionError(
-            f"timed match compares mean rewards of the kind {MATCHED_REWARD!r}, not {reward!r}; "
+            f"timed match compares mean rewards that are queues ({', '.join(MATCHED_REWARDS)}), "
+            f"not {reward!r}; "
             "leave one of the two options out"
         )
 

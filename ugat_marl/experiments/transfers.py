@@ -56,6 +56,7 @@ from ugat_marl.experiments.tuning import LEAST_BUDGET, TUNED_RULES
 from ugat_marl.files import write_whole
 from ugat_marl.grounding import (
     DIRECT_LEARNER,
+    MATCHED_REWARDS,
     NEGATIVE_CONTROLS,
     NegativeControl,
     UgatConfig,
@@ -89,12 +90,12 @@ class TransferConfig:
         real: The real domain: V1..V4 or an alias, effect=value+..., or a scenario directory. "none"
             needs `real_log`: only the log is known of the real domain.
         sim: The simulation to train in; "sim", or a domain like `real`.
-        preset: "paper" for Algorithm 1 exactly as published; it decides all settings of the
-            algorithm but the numbers of episodes.
+        preset: "paper" for Algorithm 1 exactly as published; it decides the reward (queue) and all
+            settings of the algorithm but the numbers of episodes.
         real_log: Transition log that replaces the roll-outs in the real domain.
         seed: Root of every random choice in training.
         observation: Kind of observation: count, queue, pressure, waiting, density, movements.
-        reward: Kind of reward: queue, pressure, waiting.
+        reward: Kind of reward: total-queue, queue, pressure, waiting.
         neighbours: Agents also see the intersections up to so many roads away.
         duration_s: Length of an episode in s; default: the scenario's own.
         evaluation_seeds: Number of evaluation episodes of each policy in each domain.
@@ -132,7 +133,7 @@ class TransferConfig:
     real_log: Path | None = None
     seed: int = 0
     observation: str = "count"
-    reward: str = "queue"
+    reward: str = "total-queue"
     neighbours: int = 0
     duration_s: float | None = None
     evaluation_seeds: int = 5
@@ -155,6 +156,7 @@ class TransferConfig:
     def __post_init__(self) -> None:
         if self.preset is not None:
             object.__setattr__(self, "ugat", as_published(self.ugat))
+            object.__setattr__(self, "reward", _published_reward(self.reward))
         for name in ("evaluation_seeds", "tuning_seeds"):
             if getattr(self, name) < 1:
                 raise OptionError(f"{name} = {getattr(self, name)}: must be at least 1")
@@ -238,6 +240,17 @@ class TransferConfig:
     def episodes(self) -> int:
         """All training episodes of UGAT; the control and corrected sim get the same number."""
         return self.ugat.pretrain_episodes + self.ugat.iterations * self.ugat.grounded_episodes
+
+
+def _published_reward(reward: str) -> str:
+    """Return the reward of Algorithm 1 as published, in place of the default.
+
+    Raises:
+        OptionError: Another reward was given.
+    """
+    if reward not in MATCHED_REWARDS:
+        raise OptionError(f"preset paper trains with the reward 'queue', not {reward!r}")
+    return "queue"
 
 
 @kept_warm()

@@ -9,7 +9,7 @@ from .controls import NEGATIVE_CONTROLS as NEGATIVE_CONTROLS
 from .controls import NegativeControl as NegativeControl
 from .controls import ShuffledWorld as ShuffledWorld
 from .controls import answer_with_noise as answer_with_noise
-from .delays import MATCHED_REWARD as MATCHED_REWARD
+from .delays import MATCHED_REWARDS as MATCHED_REWARDS
 from .eyes import Eyes as Eyes
 from .eyes import fit_eyes as fit_eyes
 from .fitting import FitConfig as FitConfig

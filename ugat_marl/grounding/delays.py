@@ -171,9 +171,9 @@ def _between(rows: Tensor, seconds: float) -> Tensor:
 
 # --- matched rewards
 
-MATCHED_REWARD = "queue"
-"""Reward that can be matched: it falls with every delay, and its mean covers the whole episode. A
-sum of differences of waiting times contains only the waiting time at the end."""
+MATCHED_REWARDS = ("total-queue", "queue")
+"""Rewards that can be matched: they fall with every delay, and their mean covers the whole episode.
+A sum of differences of waiting times contains only the waiting time at the end."""
 CHANCE = 0.05
 """p-value of the lost time alone below which delays are moved to match rewards."""
 

@@ -34,6 +34,7 @@ from .inspection import survey as survey
 from .junctions import Link as Link
 from .lanes import NO_UPSTREAM_LANES as NO_UPSTREAM_LANES
 from .lanes import LaneTable as LaneTable
+from .lanes import Turns as Turns
 from .lanes import UpstreamLanes as UpstreamLanes
 from .naming import edge_of_lane as edge_of_lane
 from .naming import group_names as group_names

@@ -26,6 +26,11 @@ class UpstreamLanes(NamedTuple):
     roads: Shares = ()
 
 
+Turns = tuple[tuple[str, str, tuple[int, ...]], ...]
+"""Ways across the agents' lights: the road before, the road after, and the positions of the lanes
+that lead from one to the other in the arrays about lanes."""
+
+
 NO_UPSTREAM_LANES = UpstreamLanes()
 """No lane is counted with another."""
 
@@ -39,12 +44,14 @@ class LaneTable:
         capacity: Number of vehicles that fit on the lane, ``(lanes,)``, float64.
         speed_mps: Speed limit, ``(lanes,)``, float64.
         behind: Upstream lanes and roads counted with short lanes.
+        turns: Ways across the agents' lights, for the queues of `Snapshot.queued_upstream`.
     """
 
     ids: tuple[str, ...]
     capacity: NDArray[np.float64]
     speed_mps: NDArray[np.float64]
     behind: UpstreamLanes = NO_UPSTREAM_LANES
+    turns: Turns = ()
 
     def indices(self, lanes: Sequence[str]) -> NDArray[np.int64]:
         """Return the positions of `lanes` in the arrays, int64."""

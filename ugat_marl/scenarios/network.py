@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import xml.etree.ElementTree as ET
+from collections import defaultdict
 from collections.abc import Container, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from itertools import chain
@@ -22,7 +23,7 @@ from ugat_marl.scenarios.junctions import (
     right_on_red_of,
     yields_of,
 )
-from ugat_marl.scenarios.lanes import NO_UPSTREAM_LANES, LaneTable, UpstreamLanes
+from ugat_marl.scenarios.lanes import NO_UPSTREAM_LANES, LaneTable, Turns, UpstreamLanes
 from ugat_marl.scenarios.phases import (
     RightOfWay,
     conflict_free_phases,
@@ -205,6 +206,7 @@ class Network:
             )
             if any(upstream.lanes or upstream.roads for upstream in behind)
             else NO_UPSTREAM_LANES,
+            _turns(self.intersections, names),
         )
 
 
@@ -377,6 +379,15 @@ def _programmes(root: ET.Element, scenario: Scenario) -> dict[str, tuple[tuple[f
             if phases:
                 programmes[logic.get("id", "")] = phases
     return programmes
+
+
+def _turns(intersections: Sequence[Intersection], names: Sequence[str]) -> Turns:
+    """Return the ways across the lights of agents, each with the positions of its lanes."""
+    place = {lane: index for index, lane in enumerate(names)}
+    lanes: dict[tuple[str, str], dict[int, None]] = defaultdict(dict)
+    for link in chain.from_iterable(item.links for item in intersections):
+        lanes[link.from_edge, link.to_edge][place[link.from_lane]] = None
+    return tuple((start, end, tuple(places)) for (start, end), places in lanes.items())
 
 
 def _positions(root: ET.Element) -> dict[str, tuple[float, float]]:

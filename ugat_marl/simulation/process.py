@@ -13,6 +13,7 @@ from typing import Any
 import numpy as np
 
 from ugat_marl.errors import SimulatorCrashed, SimulatorError
+from ugat_marl.scenarios import UpstreamLanes
 from ugat_marl.simulation.channel import ChannelClosed, Message
 from ugat_marl.simulation.host import Host, StartMethod, Worker
 from ugat_marl.simulation.simulator import (
@@ -117,7 +118,7 @@ def simulator_of(option: str) -> Simulator:
 
 
 def _snapshot(reply: Message) -> Snapshot:
-    lanes, waiting, mean_left, *near = reply.arrays
+    lanes, waiting, mean_left, near, queued_upstream = reply.arrays
     header = reply.header
     return Snapshot(
         header["time_s"],
@@ -128,7 +129,8 @@ def _snapshot(reply: Message) -> Snapshot:
         header["departed"],
         header["backlog"],
         mean_left,
-        *near,
+        near,
+        queued_upstream,
     )
 
 
@@ -159,6 +161,7 @@ def _answer(simulator: Simulator, question: dict[str, Any]) -> Message:
         fields: dict[str, Any] = dict(question["launch"])
         for name in ("arguments", "lanes"):
             fields[name] = tuple(fields[name])
+        fields["behind"] = UpstreamLanes(*fields["behind"])
         return _message(simulator.start(Launch(**fields)))
     if request == "advance":
         return _message(simulator.advance(question["seconds"], question["plans"]))
@@ -183,5 +186,5 @@ def _message(snapshot: Snapshot) -> Message:
         "backlog": snapshot.backlog,
     }
     lanes = np.array([snapshot.vehicles, snapshot.halting, snapshot.mean_speed_mps])
-    measured = [lanes, snapshot.waiting_s, snapshot.mean_left]
-    return Message(header, [*measured, snapshot.near] if len(snapshot.near) else measured)
+    others = [snapshot.waiting_s, snapshot.mean_left, snapshot.near, snapshot.queued_upstream]
+    return Message(header, [lanes, *others])

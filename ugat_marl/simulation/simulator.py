@@ -25,6 +25,7 @@ from ugat_marl.scenarios import (
     Document,
     Scenario,
     Segment,
+    Turns,
     UpstreamLanes,
     edge_of_lane,
 )
@@ -32,6 +33,7 @@ from ugat_marl.simulation.host import one_line_message
 from ugat_marl.simulation.mesoscopic import MesoscopicLanes, refuse_in_queues
 from ugat_marl.simulation.snapshots import HALTING_MPS, Snapshot, Trips
 from ugat_marl.simulation.trips import measuring_options, read_trips
+from ugat_marl.simulation.upstream import UpstreamQueues
 
 SignalPlans = Mapping[str, Sequence[Segment]]
 """Traffic light to its states for the coming seconds. Lights left out continue as before."""
@@ -58,6 +60,8 @@ class Launch:
         persons: Vehicle types with the persons in each vehicle. If given, the hidden measures of
             `Trips` (CO2, persons, dangers) are taken.
         behind: Upstream lanes and roads, as in `ugat_marl.scenarios.lanes.LaneTable`.
+        turns: Ways across the agents' lights, to measure queues upstream of `lanes`; empty to leave
+            them out.
     """
 
     arguments: tuple[str, ...]
@@ -71,6 +75,7 @@ class Launch:
     zone_m: float = 0.0
     persons: tuple[tuple[str, float], ...] = ()
     behind: UpstreamLanes = NO_UPSTREAM_LANES
+    turns: Turns = ()
 
     @property
     def segment_m(self) -> float:
@@ -147,6 +152,7 @@ def launch_of(
     zone_m: float = 0.0,
     persons: Mapping[str, float] | None = None,
     behind: UpstreamLanes = NO_UPSTREAM_LANES,
+    turns: Turns = (),
 ) -> Launch:
     """Collect SUMO's options and the files it needs; write nothing.
 
@@ -162,6 +168,8 @@ def launch_of(
         persons: Vehicle type to the persons in each vehicle, "" for all other types. If given, the
             hidden measures of `Trips` (CO2, persons, dangers) are taken.
         behind: Upstream lanes and roads, as in `ugat_marl.scenarios.lanes.LaneTable`.
+        turns: Ways across the agents' lights, to measure queues upstream of `lanes`; empty to leave
+            them out.
     """
     settings = scenario.settings
     if "mesosim" in settings.sumo:
@@ -208,6 +216,7 @@ def launch_of(
         zone_m,
         tuple((persons or {}).items()),
         behind,
+        turns,
     )
 
 
@@ -238,6 +247,7 @@ class LibsumoSimulator:
         self._time_s = 0.0
         self._limits = np.empty(0)
         self._mesoscopic: MesoscopicLanes | None = None
+        self._upstream: UpstreamQueues | None = None
         self._on: dict[str, tuple[int, str]] = {}
         self._owner = 0
 
@@ -273,6 +283,9 @@ class LibsumoSimulator:
         self._mesoscopic = None
         if launch.segment_m:
             self._mesoscopic = MesoscopicLanes(libsumo, launch.lanes, launch.segment_m)
+        self._upstream = None
+        if launch.turns:
+            self._upstream = UpstreamQueues(libsumo, launch.lanes, launch.turns, launch.behind)
         return self._snapshot()
 
     def advance(self, seconds: float, plans: SignalPlans) -> Snapshot:
@@ -358,10 +371,14 @@ class LibsumoSimulator:
         statistic = libsumo.simulation.getParameter
         departed = int(statistic("", "stats.vehicles.inserted"))
         backlog = int(statistic("", "stats.vehicles.waiting"))
+        upstream = np.empty(0) if self._upstream is None else self._upstream.measure(backlog)
         if self._mesoscopic is not None:
             rows = self._mesoscopic.measure(self._time_s, self._limits)
             waiting = rows[3] if self._launch.waiting else np.empty(0)
-            return Snapshot(self._time_s, rows[0], rows[1], rows[2], waiting, departed, backlog)
+            return Snapshot(
+                self._time_s, rows[0], rows[1], rows[2], waiting, departed, backlog,
+                queued_upstream=upstream,
+            )  # fmt: skip
         lanes, api = self._launch.lanes, libsumo.lane
         vehicles = np.fromiter(map(api.getLastStepVehicleNumber, lanes), np.float64, len(lanes))
         taken = np.flatnonzero(vehicles)
@@ -387,6 +404,7 @@ class LibsumoSimulator:
             departed=departed,
             backlog=backlog,
             near=_near_the_end(lanes, names, self._launch.zone_m),
+            queued_upstream=upstream,
         )
 
     def _fail(self, action: str, error: Exception) -> None:

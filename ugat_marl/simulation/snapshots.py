@@ -31,6 +31,10 @@ class Snapshot:
             snapshot.
         near: Vehicles, halting vehicles and waiting time in the last `zone_m` metres of each lane,
             ``(3, lanes)``. Empty unless the simulator was started with `zone_m`.
+        queued_upstream: Vehicles that queue for a lane but are not in `vehicles`: they halt on
+            roads upstream of it, up to the light before, or wait to enter the network,
+            ``(lanes,)``; see `ugat_marl.simulation.upstream`. Empty unless the simulator was
+            started with `turns`. Detectors of a street do not know it.
     """
 
     time_s: float
@@ -42,6 +46,7 @@ class Snapshot:
     backlog: int
     mean_left: NDArray[np.float64] = field(default_factory=lambda: np.empty(0))
     near: NDArray[np.float64] = field(default_factory=lambda: np.empty(0))
+    queued_upstream: NDArray[np.float64] = field(default_factory=lambda: np.empty(0))
 
     def less(self, left: NDArray[np.float64]) -> Snapshot:
         """Return this snapshot without the vehicles that have `left`, ``(lanes,)``."""

@@ -1,0 +1,127 @@
+"""The reward total-queue: queues that do not end on the lanes at the lights."""
+
+from __future__ import annotations
+
+import subprocess
+
+import pytest
+
+import ugat_marl
+from ugat_marl.effects import load_scenario
+from ugat_marl.envs import Rewarder, TrafficEnv
+from ugat_marl.scenarios import Scenario, sumo_program
+
+PLACES = {"M": (0, 0), "N": (0, 200), "S": (0, -200), "W": (-200, 0), "w": (-18, 0), "E": (200, 0)}
+ROADS = ("Ww", "wM", "ME", "NM", "MS", "SM", "MN")
+
+
+@pytest.fixture(scope="module")
+def short_entry(tmp_path_factory: pytest.TempPathFactory) -> Scenario:
+    """A crossroads whose western road is cut 18 m before the light; 60 cars come from there."""
+    folder = tmp_path_factory.mktemp("short")
+    nodes = "".join(
+        f'<node id="{name}" x="{x}" y="{y}" type="{"traffic_light" if name == "M" else "priority"}"'
+        "/>"
+        for name, (x, y) in PLACES.items()
+    )
+    edges = "".join(f'<edge id="{r}" from="{r[0]}" to="{r[1]}" speed="13"/>' for r in ROADS)
+    (folder / "n.nod.xml").write_text(f"<nodes>{nodes}</nodes>")
+    (folder / "n.edg.xml").write_text(f"<edges>{edges}</edges>")
+    subprocess.run(
+        [str(sumo_program("netconvert")), "-n", "n.nod.xml", "-e", "n.edg.xml", "-o", "n.net.xml",
+         "--no-turnarounds"],
+        cwd=folder, check=True, capture_output=True,
+    )  # fmt: skip
+    cars = "".join(
+        f'<vehicle id="w{i}" depart="{5 * i}"><route edges="Ww wM ME"/></vehicle>'
+        f'<vehicle id="n{i}" depart="{5 * i}"><route edges="NM MS"/></vehicle>'
+        for i in range(60)
+    )
+    (folder / "r.rou.xml").write_text(f"<routes>{cars}</routes>")
+    (folder / "scenario.toml").write_text(
+        'network = "n.net.xml"\nroutes = ["r.rou.xml"]\nduration_s = 600\n'
+    )
+    return load_scenario(folder)
+
+
+def phase_with(env: TrafficEnv, lane: str) -> int:
+    """Return a phase that is green for a lane, of those that hold the others up."""
+    (item,) = env.network.intersections
+    letter = next(link.index for link in item.links if link.from_lane == lane)
+    return next(i for i, state in enumerate(item.phases) if state[letter] in "Gg")
+
+
+@pytest.mark.parametrize("domain", ["sim", "reach=100", "reach=300"])
+def test_every_car_that_is_held_up_counts_once(short_entry: Scenario, domain: str) -> None:
+    """North has green for ever: all sixty cars of the west wait, wherever they stand."""
+    env = ugat_marl.parallel_env(short_entry, domain)
+    env.reset(seed=1)
+    (agent,) = env.agents
+    green = phase_with(env, "NM_0")
+    rewards = [env.step({agent: green})[1][agent] for _ in range(60)]
+    assert env.snapshot.backlog > 20
+    assert rewards[-1] == pytest.approx(-60)
+    near = Rewarder(env.network, "queue").rewards(env.snapshot, env.snapshot)
+    assert near[0] > -5 if domain == "sim" else near[0] >= -60
+    env.close()
+
+
+def test_a_policy_is_not_paid_for_blocking_the_short_entry(short_entry: Scenario) -> None:
+    """Under `queue` green for the north pays most; west's cars are out of sight."""
+    paid: dict[str, dict[str, float]] = {"queue": {}, "total-queue": {}}
+    att_s: dict[str, float] = {}
+    for reward, returns in paid.items():
+        for policy in ("blocks west", "in turns"):
+            env = ugat_marl.parallel_env(short_entry, reward=reward)
+            env.reset(seed=1)
+            (agent,) = env.agents
+            ways = [phase_with(env, "NM_0"), phase_with(env, "wM_0")]
+            returns[policy] = 0.0
+            for decision in range(60):
+                turn = decision // 6 % 2 if policy == "in turns" else 0
+                returns[policy] += env.step({agent: ways[turn]})[1][agent]
+            att_s[policy] = env.scores().att_s
+            env.close()
+    assert att_s["blocks west"] > 2 * att_s["in turns"]
+    assert paid["queue"]["blocks west"] > paid["queue"]["in turns"]
+    assert paid["total-queue"]["blocks west"] < 2 * paid["total-queue"]["in turns"]
+
+
+def test_it_is_the_queue_where_queues_end_at_the_lights() -> None:
+    returns: list[list[float]] = []
+    for reward in ("queue", "total-queue"):
+        env = ugat_marl.parallel_env("single-v1", reward=reward, duration_s=600)
+        env.reset(seed=3)
+        returns.append(
+            [
+                env.step(dict.fromkeys(env.agents, decision // 2 % 4))[1]["signal_0"]
+                for decision in range(60)
+            ]
+        )
+        measured = env.snapshot.queued_upstream.size
+        assert measured == (len(env.snapshot.halting) if reward == "total-queue" else 0)
+        env.close()
+    assert returns[0] == returns[1]
+
+
+def test_a_process_answers_the_same(short_entry: Scenario) -> None:
+    played: list[list[float]] = []
+    for simulator in ("process", "inprocess"):
+        env = ugat_marl.parallel_env(short_entry, simulator=simulator)
+        env.reset(seed=1)
+        (agent,) = env.agents
+        played.append([env.step({agent: 0})[1][agent] for _ in range(40)])
+        env.close()
+    assert played[0] == played[1]
+    assert min(played[0]) < -20
+
+
+def test_the_queue_model_counts_who_cannot_enter(short_entry: Scenario) -> None:
+    env = ugat_marl.parallel_env(short_entry, "queue_model=100")
+    env.reset(seed=1)
+    (agent,) = env.agents
+    green = phase_with(env, "NM_0")
+    rewards = [env.step({agent: green})[1][agent] for _ in range(60)]
+    assert env.snapshot.queued_upstream.sum() >= env.snapshot.backlog > 10
+    assert rewards[-1] <= -env.snapshot.backlog
+    env.close()

@@ -1,0 +1,111 @@
+"""Queues upstream of the measured lanes, and vehicles that wait to enter the network.
+
+A queue that is longer than the lane at the light goes on upstream: on roads that end at a node
+without a light, and outside the network, where SUMO holds vehicles that are due but find no space.
+Each of these vehicles belongs to the next agent's light on its route.
+"""
+
+from __future__ import annotations
+
+from collections import defaultdict
+from collections.abc import Sequence
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ugat_marl.scenarios import Turns, UpstreamLanes
+from ugat_marl.simulation.snapshots import HALTING_MPS
+
+_Place = tuple[str, tuple[int, ...]]
+"""Road on which a vehicle was last seen, and the lanes of its next light."""
+
+
+class UpstreamQueues:
+    """Vehicles of a running simulation that queue for a lane without being on it.
+
+    These are vehicles that halt on a road that does not end at an agent's light, and vehicles that
+    wait to enter the network. A vehicle counts on the lanes that lead across the next agent's light
+    of its route, in equal parts. Vehicles whose route meets no such light any more do not count,
+    nor do vehicles that stand inside a junction. What short lanes with a reach count already is
+    left out.
+
+    SUMO is asked one question for each such road, and further ones only about roads with a queue.
+    The routes of vehicles are asked for once on each road.
+
+    Args:
+        api: The module `libsumo`, with a running simulation.
+        lanes: Measured lanes.
+        turns: Ways across the agents' lights.
+        behind: Lanes and roads that are counted with short lanes.
+    """
+
+    def __init__(self, api: Any, lanes: Sequence[str], turns: Turns, behind: UpstreamLanes) -> None:
+        self._api = api
+        self._count = len(lanes)
+        self._turns = {(start, end): places for start, end, places in turns}
+        at_lights = {start for start, _, _ in turns}
+        self._roads: list[str] = [
+            road
+            for road in api.edge.getIDList()
+            if not road.startswith(":") and road not in at_lights
+        ]
+        self._on_lane = _shares(behind.lanes)
+        self._outside = _shares(behind.roads)
+        self._known: dict[str, _Place] = {}
+
+    def measure(self, backlog: int) -> NDArray[np.float64]:
+        """Return the vehicles that queue upstream of each lane, ``(lanes,)``.
+
+        Args:
+            backlog: Number of vehicles that wait to enter the network; with 0 SUMO is not asked
+                about them.
+        """
+        queued = np.zeros(self._count)
+        known, self._known = self._known, {}
+        roads, vehicles = self._api.edge, self._api.vehicle
+        for road in self._roads:
+            if not roads.getLastStepHaltingNumber(road):
+                continue
+            for name in roads.getLastStepVehicleIDs(road):
+                if vehicles.getSpeed(name) < HALTING_MPS:
+                    counted = self._on_lane.get(vehicles.getLaneID(name), 0.0)
+                    self._add(queued, name, road, 1.0 - counted, known)
+        for name in self._api.simulation.getPendingVehicles() if backlog else ():
+            counted = self._outside.get(vehicles.getRoute(name)[0], 0.0) if self._outside else 0.0
+            self._add(queued, name, "", 1.0 - counted, known)
+        return queued
+
+    def _add(
+        self,
+        queued: NDArray[np.float64],
+        name: str,
+        road: str,
+        weight: float,
+        known: dict[str, _Place],
+    ) -> None:
+        """Add a vehicle to the lanes of its next light."""
+        place = known.get(name)
+        if place is None or place[0] != road:
+            place = road, self._next_lanes(name)
+        self._known[name] = place
+        for lane in place[1]:
+            queued[lane] += max(weight, 0.0) / len(place[1])
+
+    def _next_lanes(self, name: str) -> tuple[int, ...]:
+        """Return the lanes that lead across the next agent's light of a vehicle's route."""
+        route = self._api.vehicle.getRoute(name)
+        at = max(self._api.vehicle.getRouteIndex(name), 0)
+        for turn in zip(route[at:], route[at + 1 :], strict=False):
+            if turn in self._turns:
+                return self._turns[turn]
+        return ()
+
+
+def _shares(counted: Sequence[Sequence[tuple[str, float]]]) -> dict[str, float]:
+    """Return the share of the vehicles of each lane or road that short lanes count, at most 1."""
+    shares: dict[str, float] = defaultdict(float)
+    for of_lane in counted:
+        for name, share in of_lane:
+            shares[name] = min(1.0, shares[name] + share)
+    return dict(shares)
