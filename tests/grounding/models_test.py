@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 import torch
@@ -10,7 +12,7 @@ from torch import nn
 from ugat_marl.data import AgentLayout, Provenance, TransitionLog, TransitionRecorder
 from ugat_marl.errors import LogError, OptionError
 from ugat_marl.grounding import UNCERTAINTY_METHODS, InverseConfig, InverseModel, Stack, stack_log
-from ugat_marl.grounding.forward import ForwardConfig, ForwardModel
+from ugat_marl.grounding.forward import DelayedForward, ForwardConfig, ForwardModel
 from ugat_marl.grounding.networks import FARTHEST, Standardiser
 from ugat_marl.grounding.uncertainty import Method, MethodName
 from ugat_marl.seeding import torch_generator
@@ -95,6 +97,52 @@ def test_inverse_models_together_equal_each_alone(include_phase: bool, method: M
         assert torch.allclose(own_classes, expected.probability[0], atol=1e-6)
         assert not together.probability[i, :, layout.phases :].any()
         assert torch.allclose(own_classes.sum(-1), torch.ones(BATCH))
+
+
+def test_the_networks_of_f_predict_as_each_alone_and_together_as_their_mean() -> None:
+    stack, here, _, action = stacked()
+    config = ForwardConfig(hidden=(16,))
+    model = ForwardModel(stack, replace(config, members=3), torch_generator(0))
+    each = model.predict_each(here, action).unflatten(1, (3, BATCH))
+    for member in range(3):
+        alone = ForwardModel(stack, config, torch_generator(1))
+        state = model.state_dict()
+        for name, own in alone.state_dict().items():
+            if name.startswith("network"):
+                state[name] = state[name].view(3, *own.shape)[member]
+        alone.load_state_dict(state)
+        assert torch.allclose(each[:, member], alone.predict(here, action), atol=1e-6)
+    assert torch.allclose(each.mean(1), model.predict(here, action), atol=1e-6)
+    assert (each.std(1).amax((1, 2)) > 0.01).all()
+
+
+def test_f_begins_as_a_model_of_the_simulation_without_delays() -> None:
+    stack, here, there, action = stacked()
+    config = ForwardConfig(hidden=(16,), members=2)
+    delayed = DelayedForward(stack, config, 3, torch_generator(0))
+    delayed.fit_scale(here, delayed.change(here, there), torch.ones(3, BATCH))
+    f = ForwardModel(stack, config, torch_generator(1))
+    f.begin_as(delayed)
+    expected = delayed(here, action, delayed.extra(torch.zeros(3, BATCH))) * delayed.scale
+    assert torch.allclose(f(here, action) * f.scale, expected, atol=1e-6)
+
+
+@pytest.mark.parametrize("method", UNCERTAINTY_METHODS)
+def test_an_intersection_with_its_own_head_learns_from_itself_alone(method: MethodName) -> None:
+    stack, here, there, action = stacked()
+    config = InverseConfig(hidden=(8,), embedding=5, head="own")
+    h = InverseModel(stack, config, torch_generator(0), Method(method, members=2, passes=3))
+    assert h.parts == 3 * h.net.members
+    answer = h.predict(here, there)
+    for i, layout in enumerate(LAYOUTS.values()):
+        own = answer.probability[i, :, : layout.phases].sum(-1)
+        assert torch.allclose(own, torch.ones(BATCH))
+    wanted = h.predict(here, there).probability.gather(-1, action[..., None])
+    wanted[1].log().sum().backward()
+    weight = h.net.head.weight.grad
+    assert weight is not None
+    learnt = weight.view(h.net.members, 3, -1).abs().sum(-1)
+    assert (learnt[:, 1] > 0).all() and not learnt[:, [0, 2]].any()
 
 
 def test_an_agents_numbers_never_reach_another_agent() -> None:

@@ -316,7 +316,7 @@ def test_epochs_are_reported_for_each_of_the_three_models() -> None:
     real = street(PLANTED, seed=10, episodes=2)
     config = FitConfig(epochs=2)
     made.fit(real, SIMULATED, Fitter(config, 0, lambda name, n, _: seen.append((name, n))))
-    assert seen == [(name, n) for name in ("forward", "simulated", "inverse") for n in (1, 2)]
+    assert seen == [(name, n) for name in ("simulated", "forward", "inverse") for n in (1, 2)]
 
 
 def frozen(log: TransitionLog, agent: str) -> TransitionLog:

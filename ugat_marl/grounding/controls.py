@@ -36,16 +36,16 @@ def answer_with_noise(model: ForwardModel, seed: int) -> None:
         model: Forward model, changed in place.
         seed: Seed of the noise.
     """
-    learnt = model.read
+    learnt = model.read_each
 
     def noise(inputs: Tensor) -> Tensor:
         answer = learnt(inputs)
         question = zlib.crc32(inputs.cpu().numpy().tobytes())
         drawn = torch.randn(answer.shape, generator=torch_generator(seed, "placebo", question))
         # 0 * answer keeps the gradient graph, so training runs without an effect.
-        return 0.0 * answer + drawn.to(answer.device) * model.valid_outputs
+        return 0.0 * answer + drawn.to(answer.device) * model.valid_outputs[:, None]
 
-    model.read = noise  # all predictions call it; `renew` replaces the network but not this
+    model.read_each = noise  # all predictions call it; `renew` replaces the network but not this
 
 
 class ShuffledWorld:

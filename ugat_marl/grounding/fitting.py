@@ -286,6 +286,10 @@ class Fitter:
     on_epoch: EpochCallback | None = None
     device: torch.device = CPU
 
+    def further(self) -> Fitter:
+        """Return the same for a model that learns on from its current weights."""
+        return replace(self, config=replace(self.config, warm_start=True))
+
     def split(self, data: StackedTransitions, stack: Stack) -> Split:
         """Hold out episodes as `split` does, with the settings of this fit."""
         return split(data, self.config.held_out_every, stack)
@@ -310,7 +314,8 @@ class Fitter:
 
         def loss(columns: Tensor, _epoch: int) -> Tensor:
             error = model.read(taken(inputs, columns)) - taken(truth, columns)
-            return (error**2).sum(-1) / outputs
+            squares = (error**2).sum(-1)
+            return squares / outputs.view(-1, *[1] * (squares.dim() - 1))
 
         generator = torch_generator(self.seed, lesson.name, "batches")
         with on_device(self.device, model):

@@ -1,7 +1,8 @@
 """Forward models f_i: the outcome of a state and an action in the real world.
 
-Each intersection has one multi-layer perceptron; all are computed as one batch. A model predicts
-the *change* of the features over one decision interval, so an uninformed model predicts no change:
+Each intersection has one multi-layer perceptron, or an ensemble of them; all are computed as one
+batch. A model predicts the *change* of the features over one decision interval, so an uninformed
+model predicts no change:
 
     features of s' = features of s + scale * network(s, a)
 """
@@ -18,11 +19,15 @@ from ugat_marl.grounding.networks import (
     SMALLEST_SPREAD,
     Standardiser,
     TrainableModel,
+    by_member,
     rows_at_once,
 )
 from ugat_marl.grounding.stacked import Stack
 from ugat_marl.grounding.view import View
 from ugat_marl.policies import BatchedMLP, size_mask
+
+MOST = 100
+"""Largest number of networks; larger ones are taken for a mistake."""
 
 
 @dataclass(frozen=True)
@@ -33,14 +38,19 @@ class ForwardConfig:
         hidden: Sizes of the hidden layers.
         include_phase: True if the phase of s' is predicted, too. Off by default: the action gives
             this phase, so an inverse model that sees it can only answer with that action.
+        members: Number of networks per intersection. Several give f an uncertainty of its own:
+            they agree where there are data, and need not elsewhere.
     """
 
     hidden: tuple[int, ...] = (128, 128)
     include_phase: bool = False
+    members: int = 1
 
     def __post_init__(self) -> None:
         if not self.hidden or min(self.hidden) < 1:
             raise OptionError(f"forward hidden is {self.hidden}; allowed: one or more sizes >= 1")
+        if not 1 <= self.members <= MOST:
+            raise OptionError(f"forward members is {self.members}; allowed: 1 to {MOST}")
 
 
 class ForwardModel(TrainableModel):
@@ -85,25 +95,38 @@ class ForwardModel(TrainableModel):
 
     @property
     def members(self) -> int:
-        """One network per agent."""
-        return 1
+        """Number of networks per agent."""
+        return self.config.members
 
     @property
     def parts(self) -> int:
-        """Number of agents; they share no weight."""
-        return len(self.stack.agents)
+        """Number of networks; they share no weight."""
+        return self.members * len(self.stack.agents)
 
     def loss_by_part(self, loss: Tensor) -> Tensor:
-        """Return the loss of every agent unchanged."""
-        return loss
+        """Return the loss of every network, members first."""
+        return by_member(loss)
 
     def renew(self, generator: torch.Generator) -> None:
         """Make a new network with weights from `generator`; the model counts as unfitted."""
-        self.network = BatchedMLP(self._fan_in, self.config.hidden, self._outputs, generator)
+        fan_in = self._fan_in * self.members
+        self.network = BatchedMLP(fan_in, self.config.hidden, self._outputs, generator)
         self.fitted.fill_(False)
+
+    def begin_as(self, other: ForwardModel) -> None:
+        """Take over the weights of a fitted model of the same stack, view and networks.
+
+        It may have further inputs. This model then predicts what `other` does where they are 0.
+        """
+        state = dict(other.state_dict())
+        first = "network.layers.0.weight"
+        state[first] = state[first][:, : self.width]
+        self.load_state_dict(state)
 
     def forward(self, observation: Tensor, action: Tensor, extra: Tensor | None = None) -> Tensor:
         """Predict the change in units of ``scale``: ``(agents, batch, outputs)``, 0 in padding.
+
+        With several networks this is their mean.
 
         Args:
             observation: ``(agents, batch, view.width)`` inputs from `view`.
@@ -113,12 +136,28 @@ class ForwardModel(TrainableModel):
         return self.read(self.inputs(observation, action, extra))
 
     def read(self, inputs: Tensor) -> Tensor:
-        """Predict as `forward` does, from the ``(agents, batch, width)`` tensor of `inputs`."""
-        return self.network(inputs) * self.valid_outputs
+        """Predict as `forward` does, from the ``(agents, batch, width)`` tensor of `inputs`.
+
+        Members with rows of their own, ``(agents, members, batch, width)``, predict each for
+        themselves.
+        """
+        each = self.read_each(inputs)
+        if inputs.dim() == 4:
+            return each
+        return each[:, 0] if self.members == 1 else each.mean(1)
+
+    def read_each(self, inputs: Tensor) -> Tensor:
+        """Predict with every network, ``(agents, members, batch, outputs)``."""
+        if inputs.dim() == 3:
+            inputs = inputs[:, None].expand(-1, self.members, -1, -1)
+        agents, members, rows, width = inputs.shape
+        member_inputs = inputs.transpose(0, 1).reshape(members * agents, rows, width)
+        changes = self.network(member_inputs).view(members, agents, rows, -1)
+        return changes.transpose(0, 1) * self.valid_outputs[:, None]
 
     def read_all(self, inputs: Tensor) -> Tensor:
         """Predict as `read` does, for any number of rows, in parts to limit memory."""
-        parts = inputs.split(rows_at_once(len(inputs)), dim=1)
+        parts = inputs.split(rows_at_once(len(inputs) * self.members), dim=1)
         return torch.cat([self.read(part) for part in parts], 1)
 
     def inputs(self, observation: Tensor, action: Tensor, extra: Tensor | None = None) -> Tensor:
@@ -136,6 +175,21 @@ class ForwardModel(TrainableModel):
         """Predict the features (and phase, if included) of s', ``(agents, batch, outputs)``."""
         change = self.read_all(self.inputs(observation, action)) * self.scale
         return observation[..., : change.shape[-1]] * self.valid_outputs + change
+
+    def change_each(self, observation: Tensor, action: Tensor) -> Tensor:
+        """Predict the change with every network, ``(agents, members * batch, outputs)``.
+
+        The unit is that of the features. All rows of a network stand together.
+        """
+        inputs = self.inputs(observation, action)
+        parts = inputs.split(rows_at_once(len(inputs) * self.members), dim=1)
+        return torch.cat([self.read_each(part) for part in parts], 2).flatten(1, 2) * self.scale
+
+    def predict_each(self, observation: Tensor, action: Tensor) -> Tensor:
+        """Predict as `predict` does with every network, ``(agents, members * batch, outputs)``."""
+        change = self.change_each(observation, action)
+        known = observation[..., : change.shape[-1]] * self.valid_outputs
+        return known.repeat(1, self.members, 1) + change
 
     def change(self, observation: Tensor, next_observation: Tensor) -> Tensor:
         """Return the change that happened, ``(agents, batch, outputs)`` in the unit of features."""

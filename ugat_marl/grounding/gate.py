@@ -23,6 +23,7 @@ from ugat_marl.errors import CheckpointError, OptionError
 MODES = ("infinite", "static", "dynamic")
 SCOPES = ("intersection", "pooled")
 STARTS = ("open", "fitted")
+UNCERTAINTIES = ("h-after-f", "h")
 
 
 @dataclass(frozen=True)
@@ -38,6 +39,9 @@ class GateConfig:
             mean. Epochs of earlier iterations count, too.
         start: Alpha of "dynamic" before any u is logged: "open" is infinite, as in the paper;
             "fitted" is the mean u of h's answers to the predictions of f after the first fit.
+        uncertainty_of: The u that is compared: "h-after-f" asks h for the prediction of every
+            network of f, and counts their disagreement; "h" asks it for their mean, as in the
+            paper. With one network (`ForwardConfig.members`) both are the same.
     """
 
     mode: Literal["infinite", "static", "dynamic"] = "dynamic"
@@ -45,6 +49,7 @@ class GateConfig:
     scope: Literal["intersection", "pooled"] = "intersection"
     window_epochs: int = 20
     start: Literal["open", "fitted"] = "open"
+    uncertainty_of: Literal["h-after-f", "h"] = "h-after-f"
 
     def __post_init__(self) -> None:
         if self.mode not in MODES:
@@ -53,6 +58,11 @@ class GateConfig:
             raise OptionError(f"gate scope is {self.scope!r}; allowed: {', '.join(SCOPES)}")
         if self.start not in STARTS:
             raise OptionError(f"gate start is {self.start!r}; allowed: {', '.join(STARTS)}")
+        if self.uncertainty_of not in UNCERTAINTIES:
+            raise OptionError(
+                f"gate uncertainty_of is {self.uncertainty_of!r}; allowed: "
+                f"{', '.join(UNCERTAINTIES)}"
+            )
         if not 0.0 < self.static_alpha <= 1.0:
             raise OptionError(f"gate static_alpha is {self.static_alpha}; allowed: in (0, 1]")
         if self.window_epochs < 1:

@@ -1,18 +1,19 @@
 """Inverse models h_i: the action of the simulation that leads from one state to another.
 
-Every intersection has its own encoder; all share one head. Phases that an intersection does not
-have are masked, and its uncertainty uses its own number of phases.
+Every intersection has its own encoder; all share one head, or each has its own. Phases that an
+intersection does not have are masked, and its uncertainty uses its own number of phases.
 """
 
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Literal
 
 import torch
 from torch import Tensor
 
 from ugat_marl.errors import OptionError
-from ugat_marl.grounding.networks import Standardiser, TrainableModel, rows_at_once
+from ugat_marl.grounding.networks import Standardiser, TrainableModel, by_member, rows_at_once
 from ugat_marl.grounding.stacked import Stack
 from ugat_marl.grounding.uncertainty import (
     AnswerNet,
@@ -26,6 +27,8 @@ from ugat_marl.grounding.uncertainty import (
 )
 from ugat_marl.grounding.view import View
 
+HEADS = ("shared", "own")
+
 
 @dataclass(frozen=True)
 class InverseConfig:
@@ -36,13 +39,18 @@ class InverseConfig:
         embedding: Size of the output of an encoder, which the shared head reads.
         include_phase: True if h sees the phase of s'. Off by default: this phase alone reveals the
             action, and h would ignore the traffic.
+        head: "shared" for one head of all intersections, "own" for one per intersection. A shared
+            one learns from all of them.
     """
 
     hidden: tuple[int, ...] = (128, 128)
     embedding: int = 64
     include_phase: bool = False
+    head: Literal["shared", "own"] = "shared"
 
     def __post_init__(self) -> None:
+        if self.head not in HEADS:
+            raise OptionError(f"inverse head is {self.head!r}; allowed: {', '.join(HEADS)}")
         if not self.hidden or min(self.hidden) < 1:
             raise OptionError(f"inverse hidden is {self.hidden}; allowed: one or more sizes >= 1")
         if self.embedding < 1:
@@ -88,18 +96,22 @@ class AnswerModel(TrainableModel):
 
     @property
     def parts(self) -> int:
-        """Number of members; the agents share the head of a member, so they are one part."""
-        return self.net.members
+        """Number of members, times that of the agents if they share no head."""
+        return self.net.members * (len(self._fan_in) if self.net.own_heads else 1)
 
     def loss_by_part(self, loss: Tensor) -> Tensor:
-        """Return the mean loss over agents for each member, ``(members,)``."""
-        return loss.mean(0).view(-1)
+        """Return the mean loss over agents for each member, or every loss, members first."""
+        return by_member(loss) if self.net.own_heads else loss.mean(0).view(-1)
 
     def renew(self, method: Method, generator: torch.Generator) -> None:
         """Make a new, unfitted network of this method with weights from `generator`."""
         self.method = method
         shape = NetShape(
-            self._fan_in, self.config.hidden, self.config.embedding, self.valid_answers
+            self._fan_in,
+            self.config.hidden,
+            self.config.embedding,
+            self.valid_answers,
+            self.config.head == "own",
         )
         match method.name:
             case "edl":
@@ -117,6 +129,24 @@ class AnswerModel(TrainableModel):
         rows = rows_at_once(len(inputs) * self.net.members)
         parts = [self.net.answer(self.standardise(part)) for part in inputs.split(rows, dim=1)]
         return parts[0] if len(parts) == 1 else InversePrediction.joined(parts)
+
+    def answer_each(self, inputs: Tensor, draws: int) -> InversePrediction:
+        """Answer inputs of which each has several draws, with one answer that mixes them.
+
+        Args:
+            inputs: ``(agents, draws * batch, width)`` unscaled, all rows of a draw together.
+            draws: Number of draws; with one, the answer is that of `answer`.
+        """
+        answer = self.answer(inputs)
+        if draws == 1:
+            return answer
+
+        def apart(part: Tensor) -> Tensor:
+            return part.unflatten(1, (draws, -1)).transpose(0, 1)
+
+        return self.net.mixed(
+            InversePrediction(apart(answer.action), apart(answer.probability), apart(answer.u))
+        )
 
 
 class InverseModel(AnswerModel):
@@ -163,9 +193,18 @@ class InverseModel(AnswerModel):
         columns = self.columns.expand(-1, both.shape[1], -1)
         return both.gather(2, columns) * self.valid_inputs
 
-    def predict(self, observation: Tensor, next_features: Tensor) -> InversePrediction:
-        """Answer with the action that h assigns to the step from s to s'."""
-        return self.answer(self.inputs(observation, next_features))
+    def predict(
+        self, observation: Tensor, next_features: Tensor, draws: int = 1
+    ) -> InversePrediction:
+        """Answer with the action that h assigns to the step from s to s'.
+
+        Args:
+            observation: ``(agents, batch, view.width)`` inputs from `view`.
+            next_features: ``(agents, draws * batch, features)`` draws of s', see `inputs`.
+            draws: Number of draws.
+        """
+        inputs = self.inputs(observation.repeat(1, draws, 1), next_features)
+        return self.answer_each(inputs, draws)
 
 
 def _columns(sizes: list[int], heads: list[int]) -> tuple[Tensor, Tensor]:
@@ -239,6 +278,16 @@ class DelayModel(AnswerModel):
             columns[i, 0, start : start + layout.phases] = True
         return columns
 
-    def predict(self, observation: Tensor, action: Tensor, change: Tensor) -> InversePrediction:
-        """Answer with the delay that h assigns to a change."""
-        return self.answer(self.inputs(observation, action, change))
+    def predict(
+        self, observation: Tensor, action: Tensor, change: Tensor, draws: int = 1
+    ) -> InversePrediction:
+        """Answer with the delay that h assigns to a change.
+
+        Args:
+            observation: ``(agents, batch, view.width)`` inputs from `view`.
+            action: ``(agents, batch)`` int64, the phase that turns green.
+            change: ``(agents, draws * batch, features)`` draws of the change, unscaled.
+            draws: Number of draws.
+        """
+        seen, phases = observation.repeat(1, draws, 1), action.repeat(1, draws)
+        return self.answer_each(self.inputs(seen, phases, change), draws)

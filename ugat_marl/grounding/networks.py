@@ -70,6 +70,11 @@ def _is_exact(setting: Any) -> bool:
         return torch.equal(torch.bmm(numbers, one), numbers)
 
 
+def by_member(loss: Tensor) -> Tensor:
+    """Return losses ``(agents,)`` or ``(agents, members)`` as one row, members first."""
+    return loss if loss.dim() == 1 else loss.transpose(0, 1).reshape(-1)
+
+
 class Standardiser(nn.Module):
     """Maps each agent's inputs to mean 0 and standard deviation 1 over the fitted data.
 

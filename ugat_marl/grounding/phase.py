@@ -84,19 +84,23 @@ class PhaseTransform(Transform):
         simulated: TransitionLog,
         fitter: Fitter,
         rewards: EpisodeRewards | None = None,
+        *,
+        on_top: bool = False,
     ) -> PhaseReport:
         """Fit f on the real log, and h on the simulated log; rewards are not used."""
         del rewards
         refuse_mismatch(real, simulated)
         f, h = self.forward, self.inverse
         d_real, d_sim = stack_log(real, self.stack), stack_log(simulated, self.stack)
-        forward = _fit_forward(f, d_real, fitter)
+        if on_top:
+            f.begin_as(self._fit_simulated(d_sim, fitter))
+        forward = _fit_forward(f, d_real, fitter.further() if on_top else fitter)
         means = _expected(f, d_sim, fitter)
         pairs = means if fitter.config.pairs == "smoothed" else d_sim.next_observation
         inverse = _fit_inverse(h, d_sim, pairs, fitter)
         held_out = fitter.split(d_sim, self.stack).held_out
         held_out_real = fitter.split(d_real, self.stack).held_out
-        agreement, u_on_predictions = on_predictions(f, h, d_sim, held_out)
+        agreement, u_on_predictions = on_predictions(f, h, d_sim, held_out, self.draws)
         accuracy_on_real, u_on_real = inverse_accuracy(h, d_real, held_out_real)
         accuracy_on_means, _ = _accuracy(h, d_sim, means, held_out)
         return PhaseReport(
@@ -109,6 +113,20 @@ class PhaseTransform(Transform):
             mean_u_on_real=u_on_real,
             accuracy_on_means=accuracy_on_means,
         )
+
+    def lesson(self, data: StackedTransitions) -> tuple[Changes, Tensor]:
+        """Return the outcomes of what was asked; every decision can be grounded."""
+        seen = self.forward.view.of(data)
+        return Changes("forward", seen, data.next_observation, data.asked), data.weight
+
+    def _fit_simulated(self, data: StackedTransitions, fitter: Fitter) -> ForwardModel:
+        """Fit a model of the simulation with the shape and the inputs of f; return it."""
+        f = self.forward
+        generator = torch_generator(fitter.seed, "world")
+        model = ForwardModel(self.stack, f.config, generator, view=f.view)
+        lesson = Changes("world", f.view.of(data), data.next_observation, data.asked)
+        fitter.fit_changes(model, lesson, fitter.split(data, self.stack))
+        return model
 
     def ground(
         self,
@@ -127,9 +145,9 @@ class PhaseTransform(Transform):
         def answer(phases: NDArray[np.int64]) -> tuple[NDArray[np.int64], NDArray[np.float32]]:
             running = torch.from_numpy(phases)[:, None]
             seen = self.forward.view.seen(observations, running, earlier)
-            predicted = self.forward.predict(seen, asked)  # line 11
+            predicted = _predicted(self.forward, seen, asked, self.draws)  # line 11
             local = self.local.seen(observations, running)
-            inverse = self.inverse.predict(local, predicted)  # line 12
+            inverse = self.inverse.predict(local, predicted, self.draws)  # line 12
             return inverse.action[:, 0].numpy(), inverse.u[:, 0].numpy()
 
         if self.local.joint:
@@ -339,11 +357,28 @@ def _inverse_report(
 
 @torch.no_grad()
 def on_predictions(
-    forward: ForwardModel, inverse: InverseModel, data: StackedTransitions, held_out: Tensor
+    forward: ForwardModel,
+    inverse: InverseModel,
+    data: StackedTransitions,
+    held_out: Tensor,
+    draws: int = 1,
 ) -> tuple[Floats, Floats]:
-    """Return agreement and mean u, per agent, of h on predictions of f in held-out states."""
-    predicted = forward.predict(forward.view.of(data), data.executed)
-    return _accuracy(inverse, data, predicted, held_out)
+    """Return agreement and mean u, per agent, of h on predictions of f in held-out states.
+
+    Args:
+        forward: Fitted f.
+        inverse: Fitted h.
+        data: Transitions of the simulation.
+        held_out: ``(agents, n)`` weights of the rows.
+        draws: 1 for the mean of the networks of f, or else their number for every prediction.
+    """
+    predicted = _predicted(forward, forward.view.of(data), data.executed, draws)
+    return _accuracy(inverse, data, predicted, held_out, draws)
+
+
+def _predicted(model: ForwardModel, seen: Tensor, actions: Tensor, draws: int) -> Tensor:
+    """Return the mean prediction of f, or with more than one draw those of all its networks."""
+    return model.predict(seen, actions) if draws == 1 else model.predict_each(seen, actions)
 
 
 @torch.no_grad()
@@ -356,10 +391,14 @@ def inverse_accuracy(
 
 @torch.no_grad()
 def _accuracy(
-    inverse: InverseModel, data: StackedTransitions, next_features: Tensor, held_out: Tensor
+    inverse: InverseModel,
+    data: StackedTransitions,
+    next_features: Tensor,
+    held_out: Tensor,
+    draws: int = 1,
 ) -> tuple[Floats, Floats]:
     """Return accuracy and mean u, per agent, of h given `next_features`."""
-    answer = inverse.predict(inverse.view.of(data), next_features)
+    answer = inverse.predict(inverse.view.of(data), next_features, draws)
     share = held_out.double() / held_out.double().sum(1, keepdim=True)
     agreement = ((answer.action == data.executed) * share).sum(1)
     return agreement.numpy(), (answer.u * share).sum(1).numpy()

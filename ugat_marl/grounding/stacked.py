@@ -8,7 +8,7 @@ so an intersection's own numbers always start at column 0.
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 import torch
@@ -104,6 +104,15 @@ class StackedTransitions:
         number of vehicles has passed, and others have arrived.
         """
         return self.next_observation if self.served_features is None else self.served_features
+
+
+def alike(
+    one: StackedTransitions, two: StackedTransitions
+) -> tuple[StackedTransitions, StackedTransitions]:
+    """Return both with the served features, or both without."""
+    if one.served_features is None or two.served_features is None:
+        return replace(one, served_features=None), replace(two, served_features=None)
+    return one, two
 
 
 def refuse_other_agents(log: TransitionLog, stack: Stack) -> None:

@@ -42,7 +42,7 @@ from ugat_marl.grounding.reports import (
     complaint,
     flat,
 )
-from ugat_marl.grounding.stacked import Stack, StackedTransitions, stack_log
+from ugat_marl.grounding.stacked import Stack, StackedTransitions, alike, stack_log
 from ugat_marl.grounding.transform import Grounding, Transform
 from ugat_marl.grounding.uncertainty import Method
 from ugat_marl.grounding.view import InputsConfig, Moment, Neighbours
@@ -176,6 +176,8 @@ class TimedTransform(Transform):
         simulated: TransitionLog,
         fitter: Fitter,
         rewards: EpisodeRewards | None = None,
+        *,
+        on_top: bool = False,
     ) -> TimedReport:
         """Fit f on the street, a model with delays and h on the simulation, and the constants.
 
@@ -185,20 +187,24 @@ class TimedTransform(Transform):
             fitter: Settings, seed and device of the training.
             rewards: Rewards of the policy in both worlds. If lost time does not explain their
                 difference, all delays of an intersection are moved together until they match.
+            on_top: True if f begins as the model of the simulation without delays.
 
         Raises:
             LogError: The logs are refused by `Transform.fit`.
         """
         refuse_mismatch(real, simulated)
         stack, model = self.stack, self.simulated
-        street, data = _alike(stack_log(real, stack), stack_log(simulated, stack))
+        street, data = alike(stack_log(real, stack), stack_log(simulated, stack))
         view = self.forward.view
-        lesson = Changes("forward", view.of(street), street.outcome, street.asked)
-        f = fitter.fit_changes(self.forward, lesson, fitter.split(street, stack))
         rows = fitter.split(data, stack)
         extra = model.extra(data.delay_s)
         lesson = Changes("simulated", view.of(data), data.outcome, data.executed, extra)
         g = fitter.fit_changes(model, lesson, rows)
+        if on_top:
+            self.forward.begin_as(model)
+        own = fitter.further() if on_top else fitter
+        lesson = Changes("forward", view.of(street), street.outcome, street.asked)
+        f = own.fit_changes(self.forward, lesson, fitter.split(street, stack))
         begins = _begins(data, stack)
         known = ModelErrors.of(model, replace(data, weight=rows.train * begins))
         street = replace(street, weight=street.weight * _begins(street, stack))
@@ -210,6 +216,18 @@ class TimedTransform(Transform):
         h = self._fit_inverse(data, _where(begins, rows), known.spread[:, None], fitter)
         mean_u = self._mean_u(street)
         return TimedReport(stack.agents, f, h, mean_u, g, lost, self.timed.most_s, matched)
+
+    def lesson(self, data: StackedTransitions) -> tuple[Changes, Tensor]:
+        """Return the outcomes of what was asked; only greens that begin can be grounded."""
+        lesson = Changes("forward", self.forward.view.of(data), data.outcome, data.asked)
+        begins = self.stack.current_phase(data.observation) != data.asked
+        return lesson, data.weight * begins
+
+    def restrict(self, agents: NDArray[np.bool_]) -> None:
+        """Leave the greens of all other agents as they are, without constant delays, too."""
+        super().restrict(agents)
+        self.constants.delay_s.mul_(torch.from_numpy(agents)[:, None])
+        self.constants.beyond_s.mul_(torch.from_numpy(agents)[:, None])
 
     def _set_constants(
         self, lost: LostTime, learnt: NDArray[np.bool_], rewards: EpisodeRewards | None
@@ -332,8 +350,11 @@ class TimedTransform(Transform):
             local: ``(agents, batch, local.width)`` the same observations in the view of h.
             actions: ``(agents, batch)`` int64, phases that turn green.
         """
-        change = self.forward(seen, actions) * self.forward.scale
-        answer = self.inverse.predict(local, actions, change)
+        if self.draws == 1:
+            change = self.forward(seen, actions) * self.forward.scale
+        else:
+            change = self.forward.change_each(seen, actions)
+        answer = self.inverse.predict(local, actions, change, self.draws)
         usual = self.constants.delay_s.gather(1, actions)
         # h estimates the lost time alone, so matching is added afterwards.
         likely_s = likely_delay(answer.probability, usual, self.timed.spread_s)
@@ -365,15 +386,6 @@ def likely_delay(probability: Tensor, expected_s: Tensor, spread_s: float) -> Te
     between = log[..., below] * (1.0 - share) + log[..., below + 1] * share
     prior = -0.5 * ((fine - expected_s[..., None]) / spread_s) ** 2
     return fine[(between + prior).argmax(-1)]
-
-
-def _alike(
-    one: StackedTransitions, two: StackedTransitions
-) -> tuple[StackedTransitions, StackedTransitions]:
-    """Return both with the served features, or both without."""
-    if one.served_features is None or two.served_features is None:
-        return replace(one, served_features=None), replace(two, served_features=None)
-    return one, two
 
 
 def _begins(data: StackedTransitions, stack: Stack) -> Tensor:

@@ -21,12 +21,12 @@ from torch import Tensor, nn
 from ugat_marl.data import AgentLayout, TransitionLog, read_checkpoint, write_checkpoint
 from ugat_marl.errors import CheckpointError, EpisodeError, OptionError
 from ugat_marl.grounding.delays import EpisodeRewards
-from ugat_marl.grounding.fitting import Fitter
+from ugat_marl.grounding.fitting import Changes, Fitter
 from ugat_marl.grounding.forward import ForwardConfig, ForwardModel
 from ugat_marl.grounding.gate import Gate, GateConfig
 from ugat_marl.grounding.inverse import AnswerModel
 from ugat_marl.grounding.reports import FitReport
-from ugat_marl.grounding.stacked import Stack
+from ugat_marl.grounding.stacked import Stack, StackedTransitions
 from ugat_marl.grounding.uncertainty import Method
 from ugat_marl.grounding.view import InputsConfig, Moment, Neighbours, View
 from ugat_marl.policies import one_thread
@@ -106,6 +106,12 @@ class Transform(abc.ABC):
         """True once f and h have been fitted; actions cannot be grounded before."""
         return bool(self.forward.fitted) and bool(self.inverse.fitted)
 
+    @property
+    def draws(self) -> int:
+        """Number of predictions of f for which h is asked."""
+        composed = self.gate.config.uncertainty_of == "h-after-f"
+        return self.forward.members if composed else 1
+
     @abc.abstractmethod
     def fit(
         self,
@@ -113,6 +119,8 @@ class Transform(abc.ABC):
         simulated: TransitionLog,
         fitter: Fitter,
         rewards: EpisodeRewards | None = None,
+        *,
+        on_top: bool = False,
     ) -> FitReport:
         """Fit f on the real log and h on the simulated log, and measure both.
 
@@ -123,11 +131,27 @@ class Transform(abc.ABC):
                 delay, from the outcome.
             fitter: Settings, seed and device of the training.
             rewards: Rewards of the policy in both worlds, for a grounding that matches them.
+            on_top: True if f begins as a model of the simulation and learns from there.
 
         Raises:
             LogError: A log has other agents or is too short to be split, or the logs differ in
                 observation or decision interval.
         """
+
+    @abc.abstractmethod
+    def lesson(self, data: StackedTransitions) -> tuple[Changes, Tensor]:
+        """Return what f learns from transitions, and the decisions that can be grounded.
+
+        The second part is ``(agents, n)``, 1 for such a decision and 0 for others and for padding.
+        """
+
+    def restrict(self, agents: NDArray[np.bool_]) -> None:
+        """Leave the actions of all other agents as they are.
+
+        Args:
+            agents: ``(agents,)`` bool, true for agents whose actions may be grounded.
+        """
+        self.gate.trust(self.gate.trusted & agents)
 
     @abc.abstractmethod
     def ground(

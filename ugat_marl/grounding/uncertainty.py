@@ -1,8 +1,8 @@
 """Methods for the uncertainty of h: each has a loss for training, and answers with a u.
 
-The network of a method has one encoder per intersection and one head shared by all. The methods
-differ in how they read its outputs. u is always in [0, 1]. With u = 0 one action is certain; with
-u = 1 all phases of the intersection have the same probability.
+The network of a method has one encoder per intersection and one head shared by all, or a head per
+intersection. The methods differ in how they read its outputs. u is always in [0, 1]. With u = 0 one
+action is certain; with u = 1 all phases of the intersection have the same probability.
 
 - ``edl``: u = K / S of a Dirichlet distribution (Sensoy, Kaplan, Kandemir, "Evidential Deep
   Learning to Quantify Classification Uncertainty", NeurIPS 2018).
@@ -122,12 +122,14 @@ class NetShape:
         hidden: Sizes of the hidden layers of an encoder.
         embedding: Size of the output of an encoder, which the head reads.
         valid_actions: ``(agents, 1, actions)`` bool, the phases each agent has.
+        own_heads: True for a head per agent, False for one that all share.
     """
 
     fan_in: Sequence[int]
     hidden: Sequence[int]
     embedding: int
     valid_actions: Tensor
+    own_heads: bool = False
 
 
 class AnswerNet(nn.Module, abc.ABC):
@@ -147,11 +149,13 @@ class AnswerNet(nn.Module, abc.ABC):
         self.members = members
         fan_in = [*shape.fan_in] * members
         self.encoders = BatchedMLP(fan_in, shape.hidden, shape.embedding, generator)
-        bound = shape.embedding**-0.5
-        self.head = nn.Linear(shape.embedding, members * shape.valid_actions.shape[-1])
-        with torch.no_grad():  # nn.Linear drew from the global generator; redraw from ours
-            for part in self.head.parameters():
-                part.copy_((torch.rand(part.shape, generator=generator) * 2 - 1) * bound)
+        self.own_heads = shape.own_heads
+        classes = shape.valid_actions.shape[-1]
+        self.head: nn.Linear | BatchedLinear
+        if shape.own_heads:
+            self.head = BatchedLinear([shape.embedding] * len(fan_in), classes, generator)
+        else:
+            self.head = _linear(shape.embedding, members * classes, generator)
         self.register_buffer("valid_actions", shape.valid_actions, persistent=False)
 
     @abc.abstractmethod
@@ -195,6 +199,27 @@ class AnswerNet(nn.Module, abc.ABC):
     @abc.abstractmethod
     def answer(self, inputs: Tensor) -> InversePrediction:
         """Answer ``(agents, batch, width)`` standardised inputs, row by row."""
+
+    def mixed(self, answers: InversePrediction) -> InversePrediction:
+        """Return one answer to inputs that are themselves uncertain.
+
+        Its probabilities are the mean over the draws, and u is their normalised entropy. It rises
+        if the draws lead to different answers, even if each of them is certain.
+
+        Args:
+            answers: Answers to the draws of each input, ``(draws, agents, batch)``.
+        """
+        return prediction(answers.probability.mean(0), self.valid_actions)
+
+
+def _linear(n_in: int, n_out: int, generator: torch.Generator) -> nn.Linear:
+    """Return an affine map with initial weights from `generator`."""
+    layer = nn.Linear(n_in, n_out)
+    bound = n_in**-0.5
+    with torch.no_grad():  # nn.Linear drew from the global generator
+        for part in layer.parameters():
+            part.copy_((torch.rand(part.shape, generator=generator) * 2 - 1) * bound)
+    return layer
 
 
 def log_probability(logits: Tensor, mask: Tensor) -> Tensor:
@@ -305,6 +330,30 @@ class _Divergence(torch.autograd.Function):
         return gradients[0][..., None] * slope * mask, None
 
 
+def mixed_concentration(probability: Tensor, total: Tensor) -> tuple[Tensor, Tensor]:
+    """Return mean and S of the Dirichlet with mean and variance of a mixture of Dirichlets.
+
+        m = mean over draws of m_d
+        v = sum_k [mean of m_dk (1 - m_dk) / (S_d + 1) + variance of m_dk]
+        S = sum_k m_k (1 - m_k) / v - 1
+
+    Draws that are all equal keep their S. Draws that are certain and contradict each other have
+    S = 0: nothing is known.
+
+    Args:
+        probability: ``(draws, ..., K)`` means m_d.
+        total: ``(draws, ...)`` sums S_d of concentrations.
+
+    Returns:
+        m, ``(..., K)``, and S, ``(...)``; NaN where one class is certain.
+    """
+    mean = probability.mean(0)
+    own = (probability * (1.0 - probability)).sum(-1) / (total + 1.0)
+    between = ((probability - mean) ** 2).sum(-1)
+    variance = (own + between).mean(0)
+    return mean, (mean * (1.0 - mean)).sum(-1) / variance - 1.0
+
+
 def misleading(alpha: Tensor, target: Tensor) -> Tensor:
     """Return `alpha` without the evidence for the true class (Sensoy et al., section 3)."""
     truth = functional.one_hot(target, alpha.shape[-1])
@@ -358,6 +407,14 @@ class EvidentialNet(AnswerNet):
             probability=expected_probability(alpha),
             u=uncertainty(alpha, self.valid_actions),
         )
+
+    def mixed(self, answers: InversePrediction) -> InversePrediction:
+        """Return the Dirichlet with mean and variance of the draws' mixture; u = K / S."""
+        classes = self.valid_actions.sum(-1)
+        mean, total = mixed_concentration(answers.probability, classes / answers.u)
+        u = (classes / total.clamp(min=1e-6)).clamp(max=1.0)
+        alone = answers.u.mean(0)  # with one class the variance is 0
+        return InversePrediction(mean.argmax(-1), mean, torch.where(total.isnan(), alone, u))
 
 
 # --- dropout: thinned networks
@@ -441,7 +498,7 @@ class DropoutNet(AnswerNet):
         super().__init__(shape, generator)
         agents, widest = len(shape.fan_in), max(shape.fan_in)
         widths = [widest, *shape.hidden, shape.embedding]
-        owners = [agents] * (len(widths) - 1) + [1]  # the head is shared
+        owners = [agents] * (len(widths) - 1) + [agents if shape.own_heads else 1]
         start = math.log(START_RATE) - math.log(1.0 - START_RATE)
         self.slow_logits = nn.ParameterList(
             torch.full((n, 1, 1), start / RATE_SPEED) for n in owners
@@ -456,7 +513,7 @@ class DropoutNet(AnswerNet):
 
     @property
     def rates(self) -> list[Tensor]:
-        """Learned dropout rates of each layer: ``(agents,)``, and ``(1,)`` for the head."""
+        """Learned dropout rates of each layer: ``(agents,)``, and ``(1,)`` for a shared head."""
         return [torch.sigmoid(logit.detach()).flatten() for logit in self._logits()]
 
     def row_loss(self, outputs: Tensor, target: Tensor, lesson: Lesson) -> Tensor:
@@ -477,7 +534,7 @@ class DropoutNet(AnswerNet):
         return prediction(torch.cat(means, 1), self.valid_actions)
 
     def _logits(self) -> list[Tensor]:
-        """Return the log odds of every rate, ``(agents, 1, 1)`` and ``(1, 1, 1)``."""
+        """Return the log odds of every rate, ``(agents, 1, 1)``; ``(1, 1, 1)`` if shared."""
         return [RATE_SPEED * logit for logit in self.slow_logits]
 
     def outputs(self, inputs: Tensor, lesson: Lesson) -> Tensor:
@@ -505,12 +562,16 @@ class DropoutNet(AnswerNet):
         return log_probability(x, self.valid_actions[:, None]).exp().mean(1)
 
     def _divergence(self, rows: Tensor) -> Tensor:
-        """Return the divergence per row, ``(agents, 1)``; all rows share that of the head."""
-        *maps, head = (layer.weight for layer in self._maps())
+        """Return the divergence per row, ``(agents, 1)``; all rows share that of a shared head."""
+        maps = [layer.weight for layer in self._maps()]
         logits = [logit.flatten() for logit in self._logits()]
+        own = len(maps) if self.own_heads else len(maps) - 1
         total = divergence(maps[0] * self.own_inputs, logits[0], self.fan_in)
-        for weight, logit in zip(maps[1:], logits[1:-1], strict=True):
+        for weight, logit in zip(maps[1:own], logits[1:own], strict=True):
             total = total + divergence(weight, logit, weight.shape[-2])
+        if self.own_heads:
+            return (total / rows)[:, None]
+        head = maps[-1]
         shared = divergence(head[None], logits[-1], head.shape[-1])
         return (total / rows + shared / rows.sum())[:, None]
 
@@ -533,7 +594,10 @@ class EnsembleNet(AnswerNet):
             inputs = inputs[:, None].expand(-1, self.members, -1, -1)
         agents, members, rows, width = inputs.shape
         member_inputs = inputs.transpose(0, 1).reshape(members * agents, rows, width)
-        embedding = torch.relu(self.encoders(member_inputs)).view(members, agents * rows, -1)
+        encoded = torch.relu(self.encoders(member_inputs))
+        if self.own_heads:
+            return self.head(encoded).view(members, agents, rows, -1).transpose(0, 1)
+        embedding = encoded.view(members, agents * rows, -1)
         weight = self.head.weight.view(members, -1, embedding.shape[-1])
         bias = self.head.bias.view(members, 1, -1)
         out = torch.baddbmm(bias, embedding, weight.transpose(1, 2))
@@ -575,7 +639,13 @@ class PlainNet(EnsembleNet):
 
     def answer(self, inputs: Tensor) -> InversePrediction:
         """Return the likeliest action with u = 0."""
-        base_answer = super().answer(inputs)
-        return InversePrediction(
-            base_answer.action, base_answer.probability, torch.zeros_like(base_answer.u)
-        )
+        return _certain(super().answer(inputs))
+
+    def mixed(self, answers: InversePrediction) -> InversePrediction:
+        """Return the likeliest action of the mean with u = 0."""
+        return _certain(super().mixed(answers))
+
+
+def _certain(answer: InversePrediction) -> InversePrediction:
+    """Return the answer with u = 0."""
+    return InversePrediction(answer.action, answer.probability, torch.zeros_like(answer.u))
