@@ -63,6 +63,29 @@ def test_rows_share_what_is_given_and_keep_what_they_are_named_for() -> None:
     assert without == {f"{TIMED}: lost times without h"}
 
 
+def test_the_ablation_of_a_street_has_its_parts_and_its_residuals() -> None:
+    config = replace(SHORT, groundings=("street",))
+    rows = {s.name: s.ugat.street for s in config.settings("ablation") if s.ugat is not None}
+    assert [name.partition(": ")[2] for name in rows] == [
+        "", "channel alone", "eyes alone", "service alone", "effects alone",
+        "all parts and residual, phase", "all parts and residual, timed",
+    ]  # fmt: skip
+    kinds = [street.residual.kind for street in rows.values()]
+    assert kinds == ["none"] * 5 + ["phase", "timed"]
+    assert all(len(street.parts) == 4 for street in list(rows.values())[5:])
+
+
+def test_the_ablation_has_a_row_for_each_departure_from_the_paper() -> None:
+    rows = {s.name: s.ugat for s in SHORT.settings("ablation") if s.ugat is not None}
+    for name in ("UGAT", TIMED):
+        assert rows[f"{name}: own heads"].inverse.head == "own"
+        of_h, after_f = (rows[f"{name}: several f, u of h{x}"] for x in ("", " after f"))
+        assert of_h.forward == after_f.forward and of_h.forward.members > 1
+        assert (of_h.gate.uncertainty_of, after_f.gate.uncertainty_of) == ("h", "h-after-f")
+        assert rows[f"{name}: KL weight 1"].fit.kl_weight == 1.0
+        assert rows[f"{name}: no off-data loss"].fit.off_data_weight == 0.0
+
+
 def test_rewards_that_cannot_be_matched_have_no_such_row() -> None:
     names = [setting.name for setting in replace(SHORT, reward="pressure").settings("main")]
     assert "UGAT, timed" in names and "UGAT, timed: rewards matched" not in names

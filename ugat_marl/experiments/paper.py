@@ -27,6 +27,7 @@ from ugat_marl.experiments.settings import (
     RULE,
     SEEING_ORACLE,
     SEEN_COMMANDS,
+    STREET,
     LearnerSpec,
     Setting,
 )
@@ -45,6 +46,9 @@ from ugat_marl.grounding import (
 from ugat_marl.parallel import Workers
 from ugat_marl.policies import DQN_NAME, DQNConfig, require_device_name
 from ugat_marl.progress import Reporter
+
+SEVERAL = 5
+"""Networks of f in the rows that tell u of h from u of h after f."""
 
 TABLES = ("main", "ablation", "alpha", "uncertainty", "gap")
 
@@ -159,9 +163,7 @@ def _ablated(name: str, base: UgatConfig) -> list[Setting]:
     """Return Table 3 of the paper (static α, no uncertainty) and rows that change another part."""
     full = GROUNDED_NAME[name]
     if name == "street":
-        parts = {f"{full}: {part} alone": replace(base.street, parts=(part,)) for part in PARTS}
-        alone = [_ugat(row, replace(base, street=street)) for row, street in parts.items()]
-        return [_ugat(full, base), *alone]
+        return [_ugat(row, replace(base, street=x)) for row, x in _streets(base.street).items()]
     ungated = replace(base, gate=replace(base.gate, mode="infinite"))
     variants = {
         full: base,
@@ -175,8 +177,39 @@ def _ablated(name: str, base: UgatConfig) -> list[Setting]:
     proven = replace(base, least_accuracy=0.0)
     if base != proven:
         variants[f"{full}: where f and h are proven"] = proven
+    variants |= _departures(full, base)
     rows = [_ugat(variant, ugat) for variant, ugat in variants.items()]
     return [*rows, _other_answers(name, base), *_matching(name, base)]
+
+
+def _streets(base: StreetConfig) -> dict[str, StreetConfig]:
+    """Return fitted streets by their rows: all parts, each alone, and all with a residual."""
+    residual = base.residual
+    plain = replace(base, residual=replace(residual, kind="none"))
+    rows = {STREET: plain}
+    rows |= {f"{STREET}: {part} alone": replace(plain, parts=(part,)) for part in PARTS}
+    return rows | {
+        residual_name("phase"): replace(base, residual=replace(residual, kind="phase")),
+        residual_name("timed"): replace(base, residual=replace(residual, kind="timed")),
+    }
+
+
+def residual_name(kind: str) -> str:
+    """Return the name of the row of a fitted street with a residual."""
+    return f"{STREET}: all parts and residual, {kind}"
+
+
+def _departures(full: str, base: UgatConfig) -> dict[str, UgatConfig]:
+    """Return rows for the choices of docs/explanation/departures.md that concern f and h."""
+    several = replace(base, forward=replace(base.forward, members=SEVERAL))
+    of_h = replace(several, gate=replace(base.gate, uncertainty_of="h"))
+    return {
+        f"{full}: own heads": replace(base, inverse=replace(base.inverse, head="own")),
+        f"{full}: several f, u of h": of_h,
+        f"{full}: several f, u of h after f": several,
+        f"{full}: KL weight 1": replace(base, fit=replace(base.fit, kl_weight=1.0)),
+        f"{full}: no off-data loss": replace(base, fit=replace(base.fit, off_data_weight=0.0)),
+    }
 
 
 def _other_answers(name: str, base: UgatConfig) -> Setting:

@@ -131,8 +131,9 @@ def train_grounded(
     if ugat.grounding == "street":
         if placebo == "noise":
             raise OptionError('the control "noise" needs f; grounding "street" has none')
-        algorithm = street_training(make, workers, **common)
-        fitted: Any = StreetFit(street_prior(env, ugat.street))
+        algorithm = street_training(make, workers, device=device, **common)
+        residual = ugat.residual(env.recorded_layouts, seed, neighbours_of(env))
+        fitted: Any = StreetFit(street_prior(env, ugat.street), residual=residual)
         renew = algorithm.renew
     else:
         fitted = ugat.transform(env.recorded_layouts, seed, neighbours_of(env))

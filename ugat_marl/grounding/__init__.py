@@ -9,6 +9,7 @@ paper. The modules, from data to the algorithm:
 - `gate`: choice between the grounded action and the policy's action, by u and alpha.
 - `transform`: base of all groundings; `phase` (another phase, with `joint` for neighbours) and
   `timed` (a delayed green, by the estimates of `delays`).
+- `trust`, `residual`: where f is better than a fitted street; f and h on top of one.
 - `wrappers`: the grounded environment; greens with random delays.
 - `worlds`, `controls`: sources of D_sim and D_real; negative controls.
 - `channel`, `eyes`, `summaries`, `regression`, `posterior`: commands, detectors and worlds of a

@@ -22,6 +22,8 @@ from .phase import fit_inverse as fit_inverse
 from .phase import inverse_accuracy as inverse_accuracy
 from .posterior import Posterior as Posterior
 from .reports import FitReport as FitReport
+from .residual import Residual as Residual
+from .residual import ResidualConfig as ResidualConfig
 from .stacked import Stack as Stack
 from .stacked import stack_log as stack_log
 from .state import RunState as RunState
@@ -39,6 +41,7 @@ from .summaries import LaneView as LaneView
 from .timed import TimedConfig as TimedConfig
 from .timed import TimedTransform as TimedTransform
 from .transform import Transform as Transform
+from .trust import TrustConfig as TrustConfig
 from .ugat import Ugat as Ugat
 from .uncertainty import UNCERTAINTY_METHODS as UNCERTAINTY_METHODS
 from .view import InputsConfig as InputsConfig

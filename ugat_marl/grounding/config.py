@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Literal
 
 from ugat_marl.data import AgentLayout
@@ -13,6 +13,7 @@ from ugat_marl.grounding.forward import ForwardConfig
 from ugat_marl.grounding.gate import GateConfig
 from ugat_marl.grounding.inverse import InverseConfig
 from ugat_marl.grounding.phase import PhaseTransform
+from ugat_marl.grounding.residual import Residual
 from ugat_marl.grounding.street import StreetConfig
 from ugat_marl.grounding.timed import TimedConfig, TimedTransform
 from ugat_marl.grounding.transform import Transform
@@ -73,6 +74,35 @@ class UgatConfig:
     def matches(self) -> bool:
         """True if the delays are chosen so that rewards match those of the real domain."""
         return self.grounding == "timed" and self.timed.match
+
+    @property
+    def residual_delay_s(self) -> int:
+        """Longest random delay in the roll-outs of a fitted street, in s; 0 for none."""
+        return self.timed.most_s if self.street.residual.kind == "timed" else 0
+
+    def residual(
+        self,
+        layouts: Mapping[str, AgentLayout],
+        seed: int,
+        neighbours: Neighbours | None = None,
+    ) -> Residual | None:
+        """Return unfitted f, h and gate on top of a fitted street; None if there are none.
+
+        The arguments are those of `transform`.
+        """
+        own = self.street.residual
+        if self.grounding != "street" or own.kind == "none":
+            return None
+        other = own.kind == "phase"  # the phase of s' tells which request the street obeyed
+        base = replace(
+            self,
+            grounding=own.kind,
+            inputs=replace(self.inputs, history=max(self.inputs.history, own.history)),
+            forward=replace(self.forward, members=own.members, include_phase=other),
+            inverse=replace(self.inverse, include_phase=other),
+            timed=replace(self.timed, match=False),
+        )
+        return Residual(base.transform(layouts, seed, neighbours), own, self.least_accuracy)
 
     def transform(
         self,

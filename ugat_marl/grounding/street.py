@@ -12,14 +12,15 @@ another draw.
      3  for i = 1, ..., N: draw a world from the prior, roll pi out in it with channel and detectors
      4  fit the posterior of worlds from the statistics of all logs (`posterior`)
 
-With no data this is domain randomisation; with much data it is the corrected simulation.
+With no data this is domain randomisation; with much data it is the corrected simulation. What no
+part explains is left to f and h on top of it (`residual`).
 """
 
 from __future__ import annotations
 
 import copy
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
@@ -42,7 +43,9 @@ from ugat_marl.grounding.posterior import (
     Values,
     Worlds,
 )
+from ugat_marl.grounding.residual import ResidualConfig, of_one_street
 from ugat_marl.grounding.summaries import LaneView, Summary
+from ugat_marl.grounding.wrappers import RandomDelays
 from ugat_marl.parallel import Stop, Workers, in_order, persistently
 from ugat_marl.policies import EpsilonGreedy, Policy, observer_of, roll_out, stop_callback
 from ugat_marl.scenarios import Scenario
@@ -67,6 +70,7 @@ class StreetConfig:
         without: Effects left out of the library.
         channel: Numbers of the fit of the command channel.
         eyes: Numbers of the fit of the detectors.
+        residual: f, h and gate on top of the fitted street, for what its parts do not explain.
     """
 
     parts: tuple[str, ...] = PARTS
@@ -76,6 +80,7 @@ class StreetConfig:
     without: tuple[str, ...] = ()
     channel: ChannelConfig = field(default_factory=ChannelConfig)
     eyes: EyesConfig = field(default_factory=EyesConfig)
+    residual: ResidualConfig = field(default_factory=ResidualConfig)
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "parts", tuple(self.parts))
@@ -126,6 +131,11 @@ class FittedStreet:
     def commands(self) -> int:
         """Number of own commands that a policy has to see; 0 for none."""
         return 0 if self.channel is None else self.channel.memory
+
+    @property
+    def late(self) -> bool:
+        """True if some commands act in a later decision."""
+        return self.channel is not None and bool(self.channel.network[1:-1].any())
 
     def world(self, seed: int) -> StreetWorld:
         """Draw the world of an episode."""
@@ -241,6 +251,7 @@ class Simulation:
         options: Options of the environments.
         epsilon: Chance of a random phase in roll-outs.
         workers: Simulations at a time, or an executor.
+        most_delay_s: Longest random delay of greens in roll-outs, in s; 0 for none.
     """
 
     scenario: Scenario
@@ -248,6 +259,7 @@ class Simulation:
     options: Mapping[str, Any]
     epsilon: float
     workers: Workers = None
+    most_delay_s: int = 0
 
     def env(self, world: StreetWorld, **options: Any) -> TrafficEnv:
         """Return an environment of a world."""
@@ -262,7 +274,8 @@ class Simulation:
 
     def play(self, world: StreetWorld, policy: Policy, seed: int, stop: Stop) -> TransitionLog:
         """Run one episode in a world and record it."""
-        env = self.env(world, **policy.env_options, crossings=True)
+        made = self.env(world, **policy.env_options, crossings=True)
+        env = RandomDelays(made, self.most_delay_s) if self.most_delay_s else made
         exploring = EpsilonGreedy(copy.deepcopy(policy), self.epsilon)
         observer = observer_of(env)
         try:
@@ -288,7 +301,7 @@ class Simulation:
         if duration_s is not None:
             longest_s = self.options.get("duration_s") or self.scenario.settings.duration_s
             options["duration_s"] = min(duration_s, longest_s)
-        short = Simulation(self.scenario, self.sim, options, self.epsilon)
+        short = replace(self, options=options, workers=None)
         parts = [(world, policy, seed, stop) for world, seed in zip(worlds, seeds, strict=True)]
         return in_order(self.workers, short.play, parts, stop, lambda _: on_done())
 
@@ -369,6 +382,26 @@ def fit_street(
     posterior = Posterior.fit(worlds, simulated, view.summary(real))
     street = FittedStreet(lanes, interval_s, channel, street.eyes, posterior)
     return street, Known(simulated, posterior)
+
+
+def street_log(
+    street: FittedStreet,
+    simulation: Simulation,
+    policy: Policy,
+    seeds: Sequence[int],
+    on_done: Callable[[], object] = lambda: None,
+) -> TransitionLog:
+    """Roll the policy out in worlds drawn from a fitted street.
+
+    Args:
+        street: The fitted street.
+        simulation: The simulation; its delays are those of the roll-outs.
+        policy: Policy that acts.
+        seeds: A seed for each world.
+        on_done: Called after each episode.
+    """
+    worlds = [street.world(seed) for seed in seeds]
+    return of_one_street(simulation.logs(worlds, policy, seeds, None, on_done))
 
 
 def episodes_of_fit(config: StreetConfig, known: Known) -> int:

@@ -6,7 +6,12 @@
      2  for i = 1, ..., I:
      3      roll pi out in E_real, add the transitions to D_real
      4      fit the street to D_real (`street`)
-     5      for e = 1, ..., E episodes: draw a world of the street, update pi in it
+     5      roll pi out in worlds of the street; fit f to D_real, h to these roll-outs (`residual`)
+     6      for e = 1, ..., E episodes: draw a world of the street, update pi in it; where f is
+            trusted, ground its actions
+
+Line 5 is an option. Where commands are late, a grounded action would be late as well, and none is
+grounded.
 
 If commands are late or lost, the policy needs to see its own last commands, which the pre-trained
 one does not. If detectors are at fault, the numbers that it learnt to read mean something else. A
@@ -16,12 +21,14 @@ new policy then begins in the fitted street, with M episodes more.
 from __future__ import annotations
 
 import contextlib
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 
 from ugat_marl.data import TransitionLog
 from ugat_marl.grounding.algorithm import Algorithm, iteration_name
+from ugat_marl.grounding.fitting import Fitter
 from ugat_marl.grounding.posterior import Worlds
+from ugat_marl.grounding.residual import Residual
 from ugat_marl.grounding.state import RunState
 from ugat_marl.grounding.street import (
     FittedStreet,
@@ -30,10 +37,14 @@ from ugat_marl.grounding.street import (
     episodes_of_fit,
     fit_street,
     street_env,
+    street_log,
 )
 from ugat_marl.grounding.summaries import LaneView
-from ugat_marl.policies import LearnerFactory, Policy
+from ugat_marl.policies import LearnerFactory, Policy, device_of
 from ugat_marl.seeding import derive_seed
+
+RESIDUAL = "residual.pt"
+"""File of the residual, beside that of the street."""
 
 
 @dataclass
@@ -44,11 +55,13 @@ class StreetFit:
         worlds: Prior of worlds.
         street: The street; None before the first fit.
         known: Results of earlier fits.
+        residual: f, h and gate on top of the street; None without.
     """
 
     worlds: Worlds
     street: FittedStreet | None = None
     known: Known = field(default_factory=Known)
+    residual: Residual | None = None
 
     @property
     def view(self) -> tuple[int, bool]:
@@ -59,18 +72,22 @@ class StreetFit:
         return self.street.commands, eyes is not None and eyes.changes
 
     def save(self, path: Path) -> None:
-        """Write the street to a file; nothing before the first fit."""
+        """Write the street to a file, and the residual beside it; nothing before the first fit."""
         if self.street is not None:
             self.street.save(path, self.known.simulated)
+            if self.residual is not None:
+                self.residual.save(path.with_name(RESIDUAL))
 
     def load(self, path: Path) -> None:
         """Restore a file of `save`; without one, nothing was fitted.
 
         Raises:
-            CheckpointError: The file is unreadable, or of another network.
+            CheckpointError: A file is unreadable, or of another network.
         """
         if path.exists():
             self.street, self.known = FittedStreet.load(path, self.worlds)
+            if self.residual is not None:
+                self.residual.load(path.with_name(RESIDUAL))
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -81,11 +98,13 @@ class StreetTraining(Algorithm):
         simulation: The simulation in which worlds are drawn.
         make: Makes the learner.
         view: Lanes of the network.
+        device: Device for the fit of f and h (`policies.device_of`); the learner has its own.
     """
 
     simulation: Simulation
     make: LearnerFactory
     view: LaneView
+    device: str = "cpu"
 
     def train(self, state: RunState[StreetFit]) -> Policy:
         """Run the algorithm to its end.
@@ -96,6 +115,7 @@ class StreetTraining(Algorithm):
         Returns:
             The policy after the last iteration.
         """
+        device_of(self.device)  # refuses a missing GPU before anything runs
         self._pretrain(state)  # line 1
         while state.iteration < self.config.iterations:  # line 2
             policy = state.learner.policy()
@@ -106,11 +126,18 @@ class StreetTraining(Algorithm):
             if state.transform.view != before:
                 self.renew(state)
                 episodes += self.config.pretrain_episodes
+            numbers = street.as_dict()
+            residual = state.transform.residual
+            if residual is not None:
+                numbers |= self._fit_residual(state, policy, street, residual)  # line 5
             title = f"fitted street, {iteration_name(state)}"
             env = street_env(street, self.simulation, street.commands)
             with contextlib.closing(env):
-                self._learn(state, env, episodes, title)  # line 5
-            numbers = street.as_dict()
+                grounded = env if residual is None else residual.around(env)
+                self._learn(state, grounded, episodes, title)  # line 6
+            if residual is not None and residual.acts:
+                gate = residual.end_iteration().as_dict()
+                numbers |= {f"residual/gate/{name}": value for name, value in gate.items()}
             if self.probe is not None:
                 numbers |= self.probe(state.learner.policy())
             self.run.log("iteration", state.iteration + 1, numbers)
@@ -153,3 +180,59 @@ class StreetTraining(Algorithm):
         for line in street.describe():
             self.run.reporter.say(f"{iteration_name(state)}: {line}")
         return street
+
+    def _fit_residual(
+        self, state: RunState[StreetFit], policy: Policy, street: FittedStreet, residual: Residual
+    ) -> dict[str, float]:
+        """Fit the residual to D_real and the fitted street, and say where it acts (line 5).
+
+        Returns:
+            Numbers for the metrics.
+        """
+        say, title = self.run.reporter.say, iteration_name(state)
+        if street.late:
+            residual.rest()
+            say(f"{title}: residual: off, because a grounded action would be late, too")
+            return {"residual/acting": 0.0}
+        seed = derive_seed(self.seed, "residual", state.iteration)
+        logs = self._street_logs(state, policy, street, residual.config.worlds, seed)
+        # f, h, models of the world, and in each fold f and its rival
+        fits = 4 + 2 * residual.config.trust.folds
+        with self.run.reporter.task(
+            f"fitting the residual, {title}", fits * self.config.fit.epochs
+        ) as advance:
+
+            def on_epoch(model: str, _epoch: int, loss: float) -> None:
+                advance(note=f"{model} {loss:.2g}")
+
+            fitter = Fitter(self.config.fit, seed, on_epoch, device_of(self.device))
+            real = TransitionLog.concatenate(state.real)
+            report = residual.fit(real, logs[0], fitter, *logs[1:])
+        say(f"{title}: {report.describe()}")
+        for warning in report.fit.warnings if report.acting else ():
+            say(f"{title}: residual: {warning}")
+        return report.as_dict()
+
+    def _street_logs(
+        self,
+        state: RunState[StreetFit],
+        policy: Policy,
+        street: FittedStreet,
+        worlds: int,
+        seed: int,
+    ) -> list[TransitionLog]:
+        """Roll the policy out in worlds of the street; for timed grounding, with delays, too."""
+        longest_s = self.config.residual_delay_s
+        delays_s = (0, longest_s) if longest_s else (0,)
+        title = f"roll-outs in the street, {iteration_name(state)}"
+        with self.run.reporter.task(title, worlds * len(delays_s)) as advance:
+            return [
+                street_log(
+                    street,
+                    replace(self.simulation, most_delay_s=most_s),
+                    policy,
+                    [derive_seed(seed, "world", most_s, k) for k in range(worlds)],
+                    advance,
+                )
+                for most_s in delays_s
+            ]

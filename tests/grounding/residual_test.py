@@ -1,0 +1,278 @@
+"""f and h on top of a fitted world: trusted where it is wrong, idle where it is right."""
+
+from __future__ import annotations
+
+import copy
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import torch
+from scipy import stats
+
+from tests.grounding.planted_street_test import LANES, LAYOUTS, PHASES, STARTS, ByHand
+from tests.grounding.street_test import LATE, QUICK, SCENARIO
+from tests.grounding.timed_test import LAYOUTS as QUEUES
+from tests.grounding.timed_test import MOST_S, SHAPES
+from tests.grounding.timed_test import QUICK as FIT
+from tests.grounding.timed_test import street as queues
+from tests.interrupts import KillAt
+from tests.runs import SMALL, numbers, play_nothing, weights
+from ugat_marl.data import TransitionLog
+from ugat_marl.envs import parallel_env
+from ugat_marl.errors import OptionError, UnknownNameError
+from ugat_marl.experiments import transfer
+from ugat_marl.grounding import (
+    FitConfig,
+    Fitter,
+    GateConfig,
+    GroundedEnv,
+    InverseConfig,
+    Residual,
+    ResidualConfig,
+    StreetConfig,
+    TimedConfig,
+    TrustConfig,
+    UgatConfig,
+)
+from ugat_marl.grounding.forward import ForwardConfig
+from ugat_marl.grounding.residual import ResidualReport
+from ugat_marl.grounding.street_training import RESIDUAL
+from ugat_marl.grounding.trust import Trust, _p, compare
+from ugat_marl.grounding.uncertainty import mixed_concentration
+from ugat_marl.grounding.view import Moment
+
+PHASE = UgatConfig(
+    grounding="street",
+    street=StreetConfig(residual=ResidualConfig(kind="phase", members=2)),
+    forward=ForwardConfig(hidden=(48,)),
+    inverse=InverseConfig(hidden=(48,), embedding=16),
+    fit=FitConfig(epochs=25, learning_rate=3e-3),
+)
+TIMED = UgatConfig(
+    grounding="street",
+    street=StreetConfig(residual=ResidualConfig(kind="timed", members=2, history=1)),
+    **SHAPES,
+    fit=FIT,
+    timed=TimedConfig(most_s=MOST_S),
+)
+
+
+def world(seed: int) -> TransitionLog:
+    """A fitted world in which commands act at once."""
+    logs = [ByHand(0).collect(None, iteration, seed) for iteration in (1, 2)]
+    return TransitionLog.concatenate(logs)
+
+
+def planted(late: int, seed: int = 0) -> tuple[Residual, ResidualReport]:
+    """A residual of a street that obeys `late` decisions later than the fitted world."""
+    residual = PHASE.residual(LAYOUTS, seed)
+    assert residual is not None
+    street = ByHand(late).collect(None, 0, seed)
+    return residual, residual.fit(street, world(seed + 50), Fitter(PHASE.fit, seed))
+
+
+def test_a_left_out_lateness_is_seen_and_changes_actions() -> None:
+    residual, report = planted(late=1)
+    assert report.trust.better.tolist() == [True]
+    assert report.acting == ("a_0",) and residual.acts
+    assert "at 1 of 1 intersections; trusted at 1 (a_0)" in report.describe()
+    now = torch.tensor([[[STARTS] * LANES + [1.0, 0.0, 0.0]]])
+    for under_way in range(PHASES):
+        moment = Moment(now, torch.tensor([[0]]), torch.tensor([[under_way]]))
+        grounded = residual.transform(now, np.array([2 - under_way]), None, [moment] * 3)
+        # The street runs the phase under way, whatever is asked for; the world has to run it now.
+        assert grounded.executed.tolist() == [under_way]
+
+
+@pytest.fixture(scope="module")
+def same_world() -> tuple[Residual, ResidualReport]:
+    """A residual of a street that the fitted world explains."""
+    return planted(late=0)
+
+
+def test_the_same_world_is_left_alone(same_world: tuple[Residual, ResidualReport]) -> None:
+    residual, report = same_world
+    assert report.trust.better.tolist() == [False]
+    assert not residual.acts
+    assert "no action is grounded" in report.describe()
+    env = object()
+    assert residual.around(env) is env  # type: ignore[arg-type]
+
+
+@pytest.fixture(scope="module")
+def late_greens() -> tuple[Residual, ResidualReport]:
+    """A street whose first intersection has late greens that no part of the world has."""
+    residual = TIMED.residual(QUEUES, 0)
+    assert residual is not None
+    street = queues({"a_0": 2.0, "b_0": 0.0}, seed=2)
+    plain = queues({"a_0": 0.0, "b_0": 0.0}, seed=3, episodes=8)
+    delayed = queues(MOST_S, seed=1, episodes=8)
+    return residual, residual.fit(street, plain, Fitter(TIMED.fit, 0), delayed)
+
+
+def test_late_greens_are_seen_where_they_are(
+    late_greens: tuple[Residual, ResidualReport],
+) -> None:
+    residual, report = late_greens
+    assert report.trust.better.tolist() == [True, False]
+    assert report.trust.error[0] < 0.7 * report.trust.world_error[0]
+    delays_s = residual.transform.models["constants"].delay_s  # without h, too
+    assert isinstance(delays_s, torch.Tensor)
+    assert delays_s[0].mean() == pytest.approx(2.0, abs=0.4)
+    assert not delays_s[1].any()
+
+
+def test_a_residual_at_rest_leaves_every_green_alone(
+    late_greens: tuple[Residual, ResidualReport], tmp_path: Path
+) -> None:
+    residual, _ = late_greens
+    residual.save(tmp_path / "residual.pt")
+    other = TIMED.residual(QUEUES, 1)
+    assert other is not None
+    other.load(tmp_path / "residual.pt")
+    assert other.transform.gate.trusted.tolist() == residual.transform.gate.trusted.tolist()
+    other.rest()
+    stack = other.transform.stack
+    now = stack.observations({a: np.ones(v.size, np.float32) for a, v in QUEUES.items()})
+    for asked in ([0, 0], [1, 1], [2, 0]):
+        grounded = other.transform(now, np.array(asked))
+        assert not grounded.delay_s.any() and grounded.executed.tolist() == asked
+
+
+def test_too_few_decisions_prove_nothing() -> None:
+    residual = PHASE.residual(LAYOUTS, 0)
+    assert residual is not None
+    log = ByHand(1).collect(None, 0, 0)
+    few = TransitionLog(log.provenance, log.frame.filter(log.frame["step"] < 40))
+    trust = compare(residual.transform, few, log, Fitter(PHASE.fit, 0), TrustConfig())
+    assert not trust.better.any() and np.isnan(trust.world_error).all()
+
+
+def test_p_values_take_groups_for_independent_not_their_rows() -> None:
+    generator = np.random.default_rng(0)
+    group = np.repeat(np.arange(8), 30)
+    shared = np.repeat(generator.normal(0.3, 1.0, 8), 30)
+    eight = shared[::30]
+    spread = eight.std(ddof=1) / np.sqrt(8)
+    assert _p(shared, group) == pytest.approx(float(stats.t.sf(eight.mean() / spread, 7)))
+    assert _p(np.zeros(240), group) == 1.0
+    assert _p(np.ones(240), group) == 0.0
+
+
+def test_f_is_trusted_by_chance_no_more_often_than_the_level_says() -> None:
+    """Errors of f and its rival are drawn alike; the margin makes it rarer still."""
+    generator = np.random.default_rng(1)
+    group = np.repeat(np.arange(20), 30)
+    p = [_p(generator.normal(0, 1, 600), group) for _ in range(400)]
+    assert np.mean(np.array(p) < 0.05) == pytest.approx(0.05, abs=0.03)
+
+
+# --- u of h after f
+
+
+def test_equal_predictions_keep_the_u_of_h() -> None:
+    probability, total = torch.tensor([0.7, 0.2, 0.1]), torch.tensor(30.0)
+    mean, after = mixed_concentration(probability.expand(4, 3), total.expand(4))
+    assert torch.allclose(mean, probability) and after == pytest.approx(30.0, rel=1e-5)
+
+
+def test_contradicting_predictions_leave_no_evidence() -> None:
+    certain = torch.eye(2)
+    _, total = mixed_concentration(certain, torch.tensor([1e6, 1e6]))
+    assert total == pytest.approx(0.0, abs=1e-5)
+
+
+def test_u_is_high_where_two_f_disagree_though_h_is_sure(
+    same_world: tuple[Residual, ResidualReport],
+) -> None:
+    """h is certain of every prediction of f alone; the two networks of f name two outcomes."""
+    transform = copy.deepcopy(same_world[0].transform)
+    now = torch.tensor([[[STARTS] * LANES + [1.0, 0.0, 0.0]]])
+    asked, moments = np.array([1]), []
+    sure = transform(now, asked, None, moments)
+    assert sure.u[0] < 0.4
+    with torch.no_grad():  # the second network of f now predicts what another phase would do
+        last = list(transform.forward.network.parameters())[-1]
+        scale = transform.forward.scale.flatten()
+        change = torch.tensor([-0.2, 0.3, 0.0, 1.0, -1.0, 0.0]) / scale
+        last[1, 0] += change
+    torn = transform(now, asked, None, moments)
+    assert torn.u[0] > 2 * sure.u[0] and torn.u[0] > 0.7
+    alone = replace(PHASE, gate=GateConfig(uncertainty_of="h"))
+    assert alone.residual(LAYOUTS, 0).transform.draws == 1  # type: ignore[union-attr]
+    assert transform.draws == 2
+
+
+# --- with SUMO
+
+
+def test_without_a_residual_there_is_none() -> None:
+    assert UgatConfig(grounding="street").residual(LAYOUTS, 0) is None
+    assert replace(PHASE, grounding="phase").residual(LAYOUTS, 0) is None
+    with pytest.raises(UnknownNameError, match="phse"):
+        ResidualConfig(kind="phse")  # type: ignore[arg-type]
+    with pytest.raises(OptionError, match="folds"):
+        TrustConfig(folds=1)
+
+
+def test_an_environment_is_grounded_only_where_f_is_trusted() -> None:
+    env = parallel_env(SCENARIO, duration_s=100.0)
+    residual = PHASE.residual(env.recorded_layouts, 0)
+    assert residual is not None
+    residual.transform.forward.fitted.fill_(True)
+    residual.transform.inverse.fitted.fill_(True)
+    try:
+        assert isinstance(residual.around(env), GroundedEnv)
+        residual.rest()
+        assert residual.around(env) is env
+    finally:
+        env.close()
+
+
+def trusted_everywhere(*args: Any) -> Trust:
+    trust = compare(*args)
+    return replace(trust, better=np.ones_like(trust.better))
+
+
+def test_where_commands_are_late_no_action_is_grounded(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    play_nothing(monkeypatch)
+    residual = ResidualConfig(kind="phase")
+    street = replace(QUICK, parts=("channel",), residual=residual)
+    ugat = replace(SMALL.ugat, grounding="street", street=street, iterations=1)
+    config = replace(SMALL, real=LATE, duration_s=600, ugat=ugat)
+    transfer(config, tmp_path, workers=1)
+    logged = numbers(tmp_path)
+    assert logged[1, "street/commands"] >= 2
+    assert logged[1, "residual/acting"] == 0.0
+    assert (1, "residual/gate/decisions") not in logged
+
+
+def test_an_interrupted_training_ends_as_an_unbroken_one(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    play_nothing(monkeypatch)
+    monkeypatch.setattr("ugat_marl.grounding.trust.BLOCK", 3)
+    residual = ResidualConfig(kind="timed", worlds=4, members=2, trust=TrustConfig(folds=2))
+    street = replace(QUICK, parts=("eyes",), residual=residual)
+    fit = replace(SMALL.ugat.fit, epochs=3)
+    ugat = replace(SMALL.ugat, grounding="street", street=street, iterations=2, fit=fit)
+    config = replace(SMALL, real="V4", ugat=ugat)
+    monkeypatch.setattr("ugat_marl.grounding.residual.compare", trusted_everywhere)
+    transfer(config, tmp_path / "whole", workers=1)
+    for task in ("fitting the residual, iteration 1", "fitted street, iteration 2"):
+        with pytest.raises(KeyboardInterrupt):
+            transfer(config, tmp_path / "broken", resume=True, reporter=KillAt(task), workers=1)
+    assert list((tmp_path / "broken").glob(f"**/{RESIDUAL}"))
+    transfer(config, tmp_path / "broken", resume=True, workers=1)
+    for name in ("direct-transfer", "fitted-street"):
+        one, other = (weights(tmp_path / run, name) for run in ("whole", "broken"))
+        assert np.array_equal(one, other), name
+    logged = numbers(tmp_path / "whole")
+    assert logged == numbers(tmp_path / "broken")
+    assert logged[2, "residual/acting"] == 1.0
+    assert logged[2, "residual/gate/decisions"] > 0
