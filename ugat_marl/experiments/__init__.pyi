@@ -55,6 +55,9 @@ from .settings import TIMED as TIMED
 from .settings import UGAT as UGAT
 from .settings import LearnerSpec as LearnerSpec
 from .settings import Setting as Setting
+from .sim_check import SimCheck as SimCheck
+from .sim_check import check_run as check_run
+from .sim_check import check_table as check_table
 from .statistics import Floats as Floats
 from .statistics import Interval as Interval
 from .statistics import PairedTest as PairedTest

@@ -193,6 +193,7 @@ class Comparison:
                     columns[measure] = self.values(setting, target, measure)
                     columns[f"{measure}_sim"] = self.values(setting, target, measure, self.sim)
                     columns[f"{measure}_gap"] = self.gaps(setting, target, measure)
+                columns["backlog"] = self.values(setting, target, "backlog")
                 columns["regret_s"] = self.regret_s(setting, target)
                 for name, values in columns.items():
                     interval = Interval.of(values)

@@ -112,6 +112,7 @@ class Evaluation:
         for policy in self.policies:
             for domain in self.domains:
                 row: dict[str, Any] = {"policy": policy, "domain": domain}
+                row["backlog"] = asdict(self.estimate(policy, domain, "backlog"))
                 for measure in MEASURES:
                     row[measure] = asdict(self.estimate(policy, domain, measure))
                     if domain != self.domains[0]:

@@ -15,7 +15,13 @@ from rich.table import Table
 from rich.text import Text
 
 from ugat_marl.data import MEASURES
-from ugat_marl.experiments import LEAST_SHARE_ARRIVED, Comparison, Interval, PairedTest
+from ugat_marl.experiments import (
+    LEAST_SHARE_ARRIVED,
+    Comparison,
+    Interval,
+    PairedTest,
+    check_table,
+)
 from ugat_marl.reporting.formats import (
     PAGE_WIDTH,
     command_block,
@@ -53,6 +59,8 @@ def terminal_tables(comparison: Comparison, direct: str) -> RenderableType:
             ]
             table.add_row(Text(setting), *row)
         blocks.append(table)
+    if check := check_table(comparison):
+        blocks.append(Text(check.sentence("--episodes")))
     count = len(comparison.training_seeds)
     blocks.append(Text(f"{count} training seeds; intervals: 95 %, Student's, over them."))
     return Group(*blocks)
@@ -142,6 +150,7 @@ def seeds_csv(comparison: Comparison) -> str:
 def _headlines(comparison: Comparison, direct: str) -> list[tuple[str, Cell]]:
     return [
         ("average travel time in the real domain, s", _estimated(comparison, None)),
+        ("vehicles due that never entered, in the real domain", _backlog(comparison)),
         ("average travel time in the simulation, s", _estimated(comparison, comparison.sim)),
         (
             "change of the gap Δ against direct transfer",
@@ -160,6 +169,10 @@ def _headlines(comparison: Comparison, direct: str) -> list[tuple[str, Cell]]:
 
 def _estimated(comparison: Comparison, domain: str | None) -> Cell:
     return lambda s, t: with_interval(comparison.estimate(s, t, "att_s", domain))
+
+
+def _backlog(comparison: Comparison) -> Cell:
+    return lambda s, t: number_text(comparison.estimate(s, t, "backlog").mean)
 
 
 def _episodes(comparison: Comparison) -> Cell:
@@ -225,7 +238,17 @@ def _meaning(comparison: Comparison, direct: str) -> list[str]:
         if better
         else f"No setting is better than direct transfer in every domain with p < {CERTAIN:g}."
     )
-    return textwrap.wrap(f"{first} Lowest mean travel time: {best}.", PAGE_WIDTH)
+    check = check_table(comparison)
+    trained = (
+        check.sentence("`--episodes`")
+        if check
+        else f"Not compared with rules in {comparison.sim}: the table has no row of tuned rules."
+    )
+    return [
+        *textwrap.wrap(trained, PAGE_WIDTH),
+        "",
+        *textwrap.wrap(f"{first} Lowest mean travel time: {best}.", PAGE_WIDTH),
+    ]
 
 
 def _better_everywhere(comparison: Comparison, setting: str, direct: str) -> bool:

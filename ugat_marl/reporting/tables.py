@@ -12,7 +12,7 @@ from rich.text import Text
 
 from ugat_marl.data import MEASURES
 from ugat_marl.diagnosis import PolicyGap, TravelTimeEstimate
-from ugat_marl.experiments import Estimate, Evaluation, Tuned
+from ugat_marl.experiments import Estimate, Evaluation, Tuned, check_run
 from ugat_marl.reporting.formats import number_text
 
 
@@ -159,9 +159,13 @@ def _backlog(evaluation: Evaluation, domain: str) -> list[str]:
 def _caption(evaluation: Evaluation) -> str:
     keys = [f"best rule in {domain}" for domain in evaluation.domains]
     lines = [f"{key}: {evaluation.notes[key]}" for key in keys if key in evaluation.notes]
+    if check := check_run(evaluation):
+        lines.insert(0, check.sentence("--pretrain-episodes"))
     if corrected := evaluation.notes.get("corrected sim"):
         lines.append(f"corrected sim: trained in {corrected}")
     lines += _medians(evaluation)
+    for domain in evaluation.domains:
+        lines += [f"in {domain}, {line}" for line in _backlog(evaluation, domain)]
     if len(evaluation.domains) == 1:
         return "\n".join([*lines, f"{_seeds(evaluation)} seeds"])
     lines.append(

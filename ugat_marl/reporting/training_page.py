@@ -19,7 +19,7 @@ from ugat_marl.data import MEASURES
 from ugat_marl.effects import load_scenario, scenario_in_domain
 from ugat_marl.envs import OBJECTIVE_MEASURES, Observer
 from ugat_marl.errors import UgatMarlError
-from ugat_marl.experiments import Estimate, Evaluation
+from ugat_marl.experiments import Estimate, Evaluation, check_run
 from ugat_marl.reporting import charts
 from ugat_marl.reporting.figures import NamedFigure, printable
 from ugat_marl.reporting.formats import number, share, signed
@@ -380,8 +380,10 @@ def _scores(page: Page, record: RunRecord, evaluation: Evaluation) -> dict[str, 
         _file_name(record.name, "travel-times"),
     )
     caption = "Mean over the episodes with its 95 % interval."
+    check = check_run(evaluation)
     return {
         "sim": first,
+        "trained": None if check is None else check.sentence("--pretrain-episodes"),
         "episodes": len({result.seed for result in evaluation.results}),
         "table": Grid(headings, rows, headings[1:]),
         "measures": _measures(evaluation),
