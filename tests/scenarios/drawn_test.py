@@ -170,7 +170,7 @@ def test_lanes_of_an_approach(
 
 def open_vehicles(scenario: Scenario, duration_s: float) -> tuple[float, float]:
     """Vehicles due, and those that have not arrived at the end."""
-    name = "largest-queue:30"
+    name = "largest-queue:60"
     played = evaluate(
         scenario.with_duration(duration_s), {name: rule_factory(name)}, ("sim",), (1,), workers=1
     )
@@ -178,12 +178,17 @@ def open_vehicles(scenario: Scenario, duration_s: float) -> tuple[float, float]:
     return due, due - float(played.values(name, "sim", "throughput")[0])
 
 
-@pytest.mark.parametrize("seed", [3, 5, 6])
-def test_queues_do_not_grow_at_a_light_load(seed: int, tmp_path: Path) -> None:
-    ranges = NetworkRanges(load=(0.4, 0.4), profiles=CONSTANT, intersections=(1, 2))
-    scenario = draw_scenario(tmp_path / "light", seed, ranges)
-    (due, before), (all_due, after) = (open_vehicles(scenario, s) for s in (900, 1800))
-    assert after - before < 0.04 * (all_due - due)
+@pytest.mark.parametrize("seed", [20, 21, 22])
+def test_queues_grow_well_beyond_capacity_and_not_well_below(seed: int, tmp_path: Path) -> None:
+    """The load is an estimate: just above 1 some networks still flow."""
+    growth: dict[float, float] = {}
+    for load in (0.4, 1.3):
+        ranges = NetworkRanges(load=(load, load), profiles=CONSTANT, intersections=(1, 2))
+        scenario = draw_scenario(tmp_path / f"load{load}", seed, ranges)
+        (due, before), (all_due, after) = (open_vehicles(scenario, s) for s in (900, 1800))
+        growth[load] = (after - before) / (all_due - due)
+    assert growth[0.4] < 0.04
+    assert growth[1.3] > 0.04
 
 
 def test_on_the_command_line(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:

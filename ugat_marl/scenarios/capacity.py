@@ -32,8 +32,9 @@ from ugat_marl.scenarios.signals import GREEN
 SATURATION_VPH = 1800.0
 """Vehicles per hour that a lane discharges in permanent green: one every 2 s."""
 
-CYCLE_S = 120.0
-"""Cycle for the lost time, s: the longest in common use, so that capacity is not rated too low."""
+CYCLE_S = 180.0
+"""Cycle for the lost time, s. It is the longest that the rule of Webster uses; with a shorter one,
+capacity is rated too low for controllers that hold their phases for a minute."""
 
 LEFT_HEADWAY_S, RIGHT_HEADWAY_S = 2.25, 2.6
 """Least time between two cars that turn, s; measured like `through_headway_s`."""
