@@ -1,1 +1,4 @@
-"""Studies of the suite itself, run in a checkout: `bench`, `blind` and `behaviour_digests`."""
+"""Studies of the suite itself, run in a checkout.
+
+These are `bench`, `blind`, `behaviour_digests` and `osm_extracts`.
+"""
