@@ -15,7 +15,10 @@ LANES = 4
 PHASES = 2
 LAYOUTS = {"a_0": AgentLayout(LANES, PHASES)}
 GREEN = np.array([[True, False], [True, False], [False, True], [False, True]])
-VIEW = LaneView(tuple(f"lane_{k}" for k in range(LANES)), (GREEN,), (np.full(LANES, 40.0),), (0,))
+FULL = np.full(LANES, 40.0)
+VIEW = LaneView(
+    tuple(f"lane_{k}" for k in range(LANES)), (GREEN,), (FULL,), (0,), FULL, ((),) * LANES
+)
 
 Fault = Callable[[np.ndarray, np.random.Generator], np.ndarray]
 """Counts of an episode, ``(decisions, lanes)``, as faulty detectors report them."""

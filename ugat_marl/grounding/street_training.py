@@ -27,6 +27,7 @@ from pathlib import Path
 from ugat_marl.data import TransitionLog
 from ugat_marl.grounding.algorithm import Algorithm, iteration_name
 from ugat_marl.grounding.fitting import Fitter
+from ugat_marl.grounding.oversaturation import Oversaturation
 from ugat_marl.grounding.posterior import Worlds
 from ugat_marl.grounding.residual import Residual
 from ugat_marl.grounding.state import RunState
@@ -164,9 +165,14 @@ class StreetTraining(Algorithm):
         """Fit the street to D_real, and say what was found (line 4)."""
         config, known = self.config.street, state.transform.known
         number = episodes_of_fit(config, known)
+        real = TransitionLog.concatenate(state.real)
+        agents = list(real.provenance.layouts)
+        jams = Oversaturation.of(self.view, self.view.rows(real), agents)
+        for line in jams.describe():
+            self.run.reporter.say(f"{iteration_name(state)}: {line}")
         with self.run.reporter.task(f"fitting, {iteration_name(state)}", number) as advance:
             street, state.transform.known = fit_street(
-                TransitionLog.concatenate(state.real),
+                real,
                 self.simulation,
                 policy,
                 state.transform.worlds,

@@ -2,13 +2,14 @@
 
 A log shows the vehicles c on a lane at a decision, c' at the next one, and the mean number that
 had left during the interval, m (if it was measured). The statistics are means over decisions of one
-kind, by classes of c, so that they depend little on the length of queues.
+kind, by classes of c, so that they depend little on the length of queues. Greens that lead to a
+full lane say nothing of their service, and full lanes nothing of their arrivals: both are left out.
 """
 
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -24,6 +25,9 @@ CLASSES = (2.0, 5.0, 9.0)
 """Lower ends of the classes of vehicles on a lane."""
 CLOSE = 1e-4
 """Distance in vehicles below which a count is a whole number."""
+FULL = 0.9
+"""Share of the vehicles that fit on a lane from which it is full. At 0.8 long queues that still
+move are taken for full; at 1.0 trucks and gaps keep a jam from being seen."""
 LEAST_ROWS = 3
 """Fewest decisions whose mean is used."""
 COUNTED = ("count", "density", "movements", "queue")
@@ -83,6 +87,8 @@ class LaneRows:
         left: Mean number of vehicles that had left in between; NaN if it was not measured.
         had: True if the lane had green at the decision.
         has: True if the lane has green afterwards.
+        full: True if the lane is full at the decision or at the next one.
+        held: True if a lane that its green leads to is full at either of them.
     """
 
     episode: NDArray[np.int64]
@@ -92,6 +98,13 @@ class LaneRows:
     left: Floats
     had: NDArray[np.bool_]
     has: NDArray[np.bool_]
+    full: NDArray[np.bool_]
+    held: NDArray[np.bool_]
+
+    @property
+    def key(self) -> NDArray[np.int64]:
+        """A number for each decision, equal in all lanes of a network."""
+        return self.episode * (1 << 32) + self.step
 
 
 @dataclass(frozen=True)
@@ -103,12 +116,16 @@ class LaneView:
         green: For each intersection, bool ``(lanes, phases)``: True if a link has green.
         scale: For each intersection, vehicles per unit of its features, ``(lanes,)``.
         first: For each intersection, the position of the first count among its features.
+        holds: Vehicles that each lane holds, as far as the observation can tell, ``(lanes,)``.
+        onward: For each lane, the positions of the lanes at lights that its links lead to.
     """
 
     lanes: tuple[str, ...]
     green: tuple[NDArray[np.bool_], ...]
     scale: tuple[Floats, ...]
     first: tuple[int, ...]
+    holds: Floats
+    onward: tuple[tuple[int, ...], ...]
 
     @classmethod
     def of(cls, network: Network, observation: str) -> LaneView:
@@ -126,6 +143,7 @@ class LaneView:
         green: list[NDArray[np.bool_]] = []
         scale: list[Floats] = []
         first: list[int] = []
+        holds: list[float] = []
         for item in network.intersections:
             own = item.incoming_lanes
             lanes += own
@@ -133,15 +151,33 @@ class LaneView:
             capacity = np.array([network.lanes[lane].capacity for lane in own])
             fixed = observation in ("count", "queue")
             scale.append(np.full(len(own), COUNT_SCALE) if fixed else capacity)
+            holds += np.minimum(capacity, scale[-1]).tolist()
             first.append(len(own) if observation == "movements" else 0)
-        return cls(tuple(lanes), tuple(green), tuple(scale), tuple(first))
+        onward = _onward(network, lanes)
+        return cls(tuple(lanes), tuple(green), tuple(scale), tuple(first), np.array(holds), onward)
 
     def rows(self, log: TransitionLog) -> list[LaneRows]:
         """Return the decisions of every lane, in the order of `lanes`."""
-        return [
+        rows = [
             row
             for place, (agent, layout) in enumerate(log.provenance.layouts.items())
             for row in self._rows_of(place, log.transitions(agent), layout)
+        ]
+        limits = FULL * self.holds
+        full = [
+            (row.before >= limit) | (row.after >= limit)
+            for row, limit in zip(rows, limits, strict=True)
+        ]
+        jams = [row.key[jam] for row, jam in zip(rows, full, strict=True)]
+        return [
+            replace(
+                row,
+                full=jam,
+                held=np.isin(row.key, np.concatenate([jams[k] for k in ways]))
+                if ways
+                else np.zeros_like(jam),
+            )
+            for row, jam, ways in zip(rows, full, self.onward, strict=True)
         ]
 
     def summary(self, log: TransitionLog) -> Summary:
@@ -163,6 +199,7 @@ class LaneView:
         phase = rows.observation[:, layout.features : layout.features + layout.phases].argmax(1)
         had, has = green[:, phase], green[:, rows.executed]
         for k in range(len(scale)):
+            none = np.zeros(len(before), dtype=np.bool_)
             yield LaneRows(
                 rows.episode,
                 rows.step,
@@ -171,6 +208,8 @@ class LaneView:
                 left[:, k],
                 had[k],
                 has[k],
+                none,
+                none,
             )
 
 
@@ -186,12 +225,12 @@ def _statistics(rows: LaneRows) -> tuple[Floats, Floats]:
     greens = (rows.has & ~rows.had, rows.has & rows.had)
     ends = (*CLASSES[1:], np.inf)
     cells = [
-        (outcome, green & (before >= low) & (before < end))
+        (outcome, green & ~rows.held & (before >= low) & (before < end))
         for outcome in (rows.left, fall)
         for green in greens
         for low, end in zip(CLASSES, ends, strict=True)
     ]
-    cells.append((-fall, ~rows.has & ~rows.had))
+    cells.append((-fall, ~rows.has & ~rows.had & ~rows.full))
     means, counts = zip(*(_mean(outcome, use) for outcome, use in cells), strict=True)
     whole = (before.mean(), before.std(), np.quantile(before, 0.99))
     return np.array([*means, *whole]), np.array([*counts, *[float(len(before))] * len(whole)])
@@ -201,6 +240,17 @@ def _mean(outcome: Floats, use: NDArray[np.bool_]) -> tuple[float, float]:
     """Return the mean of the used decisions, and their number; NaN for too few."""
     rows = outcome[use & ~np.isnan(outcome)]
     return float(rows.mean()) if len(rows) >= LEAST_ROWS else np.nan, float(len(rows))
+
+
+def _onward(network: Network, lanes: Sequence[str]) -> tuple[tuple[int, ...], ...]:
+    """Return, for each lane, the positions in `lanes` of the lanes that its links lead to."""
+    places = {lane: k for k, lane in enumerate(lanes)}
+    ways: list[dict[int, None]] = [{} for _ in lanes]
+    for item in network.intersections:
+        for link in item.links:
+            if link.to_lane in places:
+                ways[places[link.from_lane]][places[link.to_lane]] = None
+    return tuple(map(tuple, ways))
 
 
 def _greens(item: Intersection) -> NDArray[np.bool_]:
