@@ -218,6 +218,16 @@ def test_without_a_residual_there_is_none() -> None:
         TrustConfig(folds=1)
 
 
+def test_only_a_grounded_phase_needs_a_history() -> None:
+    """With one, a lost time was found between the simulation and itself."""
+    other = replace(TIMED, street=StreetConfig(residual=ResidualConfig(kind="timed")))
+    for config, history in ((PHASE, 4), (other, 1)):
+        residual = config.residual(LAYOUTS, 0)
+        assert residual is not None
+        assert residual.transform.inputs.history == history
+        assert residual.transform.forward.config.include_phase == (history > 1)
+
+
 def test_an_environment_is_grounded_only_where_f_is_trusted() -> None:
     env = parallel_env(SCENARIO, duration_s=100.0)
     residual = PHASE.residual(env.recorded_layouts, 0)

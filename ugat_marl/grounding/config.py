@@ -94,10 +94,12 @@ class UgatConfig:
         if self.grounding != "street" or own.kind == "none":
             return None
         other = own.kind == "phase"  # the phase of s' tells which request the street obeyed
+        # With a history of delayed greens, a lost time was found between `sim` and itself.
+        history = max(self.inputs.history, own.history) if other else self.inputs.history
         base = replace(
             self,
             grounding=own.kind,
-            inputs=replace(self.inputs, history=max(self.inputs.history, own.history)),
+            inputs=replace(self.inputs, history=history),
             forward=replace(self.forward, members=own.members, include_phase=other),
             inverse=replace(self.inverse, include_phase=other),
             timed=replace(self.timed, match=False),
