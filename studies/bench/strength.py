@@ -27,7 +27,7 @@ from ugat_marl.experiments import (
     evaluation_seeds,
     perform_here,
 )
-from ugat_marl.policies import DQN_NAME, DQNConfig, require_device_name
+from ugat_marl.policies import UNIVERSAL_NAME, DQNConfig, require_device_name
 from ugat_marl.progress import Reporter, Silent
 
 STEADY = 1.05
@@ -56,13 +56,13 @@ class StrengthBench:
         rule: Rule to compare with; default: the best one of `evaluation.best_rules`.
         tuning_seeds: Episodes for the choice of the rule.
         duration_s: Simulated seconds per episode; default: the scenario's own.
-        observation: Observation of the agents.
+        observation: Observation of the agents; default: the one that the learner needs, or count.
         reward: Reward of the agents; they are judged by travel time.
         neighbours: Distance in roads up to which other intersections are observed too.
-        learner: Learner: dqn, or a baseline.
+        learner: Learner: universal, dqn, or a baseline.
         learner_settings: Settings of a baseline as NAME=VALUE.
         device: Device of dqn's updates: cpu, cuda, or cuda:N.
-        dqn: Settings of dqn.
+        dqn: Settings of the learners universal and dqn.
         out: JSON file to write.
     """
 
@@ -76,10 +76,10 @@ class StrengthBench:
     rule: str | None = None
     tuning_seeds: int = 2
     duration_s: float | None = None
-    observation: str = "count"
+    observation: str | None = None
     reward: str = "total-queue"
     neighbours: int = 0
-    learner: str = DQN_NAME
+    learner: str = UNIVERSAL_NAME
     learner_settings: tuple[str, ...] = ()
     device: str = "cpu"
     dqn: DQNConfig = field(default_factory=DQNConfig)
@@ -139,12 +139,11 @@ class StrengthBench:
             Target("mean of last / best evaluation, worst", worst, STEADY, at_least=False),
         ]
         named = "best rule" if self.rule is None else "rule"
-        learner = "DQN" if self.learner == DQN_NAME else self.learner
         seeds = evaluation_seeds(self.evaluation_seeds)
         notes = [
             f"{self.scenario} in {domain_label(self.domain)}: {named} {rule}, {rule_s:.1f} s; "
-            f"{learner} after {self.episodes} episodes {final_s:.1f} s. ATT over all vehicles due, "
-            f"on seeds {seeds[0]} to {seeds[-1]}."
+            f"{self.learner} after {self.episodes} episodes {final_s:.1f} s. ATT over all vehicles "
+            f"due, on seeds {seeds[0]} to {seeds[-1]}."
         ]
         rows = [_row(curve, self.last, rule_s) for curve in curves]
         settings = {**asdict(self), "rule": rule}
@@ -164,7 +163,7 @@ class StrengthBench:
             every=0 if is_rule else self.every,
             last=1 if is_rule else self.last,
             options={
-                "observation": self.observation,
+                **self.spec.env_options(self.observation),
                 "reward": self.reward,
                 "neighbours": self.neighbours,
                 "duration_s": self.duration_s,

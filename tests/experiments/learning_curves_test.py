@@ -67,7 +67,7 @@ def test_a_curve_is_the_means_of_a_record() -> None:
 
 def test_all_learners_have_a_seed_before_one_has_two() -> None:
     plan = CurvesConfig(seeds=2).trainings("single-v1")
-    names = ["dqn", *BASELINES]
+    names = ["dqn", "universal", *BASELINES]
     assert [job.setting.name for job in plan] == names * 2
     assert [job.seed for job in plan] == [0] * len(names) + [1] * len(names)
     with pytest.raises(OptionError, match="seeds = 0"):

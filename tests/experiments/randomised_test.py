@@ -14,7 +14,12 @@ import pytest
 from ugat_marl.effects import PAPER_WORLDS, load_scenario, scenario_in_domain
 from ugat_marl.envs import parallel_env
 from ugat_marl.errors import ScenarioError
-from ugat_marl.experiments.randomised import RandomisedEnv, drawn, effect_ranges, randomised_env
+from ugat_marl.experiments.randomised import (
+    RandomisedEnv,
+    drawn_effects,
+    effect_ranges,
+    randomised_env,
+)
 from ugat_marl.testing import ToyTraffic
 
 SINGLE = load_scenario("single-v1")
@@ -48,8 +53,8 @@ def test_the_ranges_hold_the_simulations_own_value() -> None:
 
 def test_draws_fill_the_ranges_and_follow_the_seed() -> None:
     ranges = effect_ranges(SINGLE)
-    draws = [drawn(ranges, seed) for seed in range(300)]
-    assert draws[7] == drawn(ranges, 7)
+    draws = [drawn_effects(ranges, seed) for seed in range(300)]
+    assert draws[7] == drawn_effects(ranges, 7)
     assert len({str(draw) for draw in draws}) == 300
     by_name = {
         item.name: np.array([value(e) for draw in draws for e in draw if e.name == item.name])
@@ -89,7 +94,7 @@ def test_the_seed_decides_world_and_episode_to_the_bit() -> None:
     again = episode(env, 1)
     assert first == again and env.scenario.hash == hash_1
     assert first != other and hash_1 != hash_2
-    plain = parallel_env(SINGLE, drawn(effect_ranges(SINGLE), 1), **SHORT)
+    plain = parallel_env(SINGLE, drawn_effects(effect_ranges(SINGLE), 1), **SHORT)
     assert plain.scenario.hash == hash_1
     assert episode(plain, 1) == first  # it is that world, and not merely called so
     unseeded = [episode(env, None) for _ in range(2)]

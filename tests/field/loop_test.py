@@ -22,7 +22,14 @@ from ugat_marl.errors import OptionError, SimulatorError
 from ugat_marl.field import DecisionLog, FieldLoop, LaneCount, Site, TrustLimits
 from ugat_marl.field.safety import fixed_time
 from ugat_marl.field.watchdog import Watchdog
-from ugat_marl.policies import DQN
+from ugat_marl.policies import (
+    DQN,
+    UNIVERSAL_NAME,
+    NumpyPolicy,
+    export_policy,
+    observed_options,
+    suite_config,
+)
 from ugat_marl.scenarios import GREEN
 
 GRID = load_scenario("grid2x2-v1")
@@ -653,3 +660,42 @@ def test_a_policy_that_needs_its_last_commands_sees_those_the_loop_gave() -> Non
         assert shown[1].argmax(1)[0] == made[0].phases[light]
         assert not shown[1][1].any()
         assert shown[2].argmax(1).tolist() == [made[1].phases[light], made[0].phases[light]]
+
+
+@pytest.mark.parametrize("form", ["torch", "numpy"])
+def test_the_universal_learner_acts_in_the_field_by_what_the_loop_shows_it(
+    form: str, tmp_path: Path
+) -> None:
+    env = parallel_env(GRID, **observed_options(UNIVERSAL_NAME))
+    trained = DQN.of(env, suite_config(UNIVERSAL_NAME)).policy()
+    acting: Any = trained
+    if form == "numpy":
+        export_policy(trained, tmp_path / "policy.npz", env)
+        acting = NumpyPolicy.load(tmp_path / "policy.npz")
+    site = Site.of(GRID, acting.env_options)
+    seen: list[tuple[Any, Any]] = []
+
+    class Watched:
+        env_options = acting.env_options
+        reset = acting.reset
+
+        def act(self, observations: Any, infos: Any) -> Any:
+            seen.append((observations, infos))
+            return acting.act(observations, infos)
+
+    street = MadeUpStreet(site)
+    loop = FieldLoop(site, Watched(), street, TrustLimits(answer_ms=2000))
+    made = decide(loop, street, 12)
+    loop.close()
+    assert {decision.source for decision in made} == {"policy"}
+    asked = [[decision.phases[light] for light in site.lights] for decision in made]
+    wanted = [trained.act(*shown) for shown in seen[-12:]]
+    assert asked == [[actions[agent] for agent in site.observer.agents] for actions in wanted]
+    assert len({tuple(phases) for phases in asked}) > 1
+    for place, agent in enumerate(site.observer.agents):  # the last of four commands, then the age
+        phases = len(site.network.intersections[place].phases)
+        memory = seen[-1][0][agent][-4 * phases - 1 :]
+        assert memory[:-1].reshape(4, phases).argmax(1).tolist() == [
+            phases_[place] for phases_ in asked[-2:-6:-1]
+        ]
+    assert not broken_rules(street.by_second)

@@ -22,7 +22,7 @@ from ugat_marl.__main__ import main
 from ugat_marl.effects import load_scenario, scenario_in_domain
 from ugat_marl.envs import parallel_env
 from ugat_marl.errors import OptionError, SimulatorError
-from ugat_marl.policies import make_rule
+from ugat_marl.policies import DQN, UNIVERSAL_NAME, make_rule, observed_options, suite_config
 from ugat_marl.scenarios import GREEN
 
 pytest.importorskip("traci")
@@ -103,14 +103,27 @@ def test_minutes_of_single_v1_in_snow(running: Callable[..., Any]) -> None:
     assert 20 < trips.travel_time_s.mean() < 240
 
 
+def cycling(env: Any) -> Any:
+    return make_rule("fixed-time:20", env)
+
+
+def universal(env: Any) -> Any:
+    return DQN.of(env, suite_config(UNIVERSAL_NAME)).policy()
+
+
+@pytest.mark.parametrize(
+    ("options", "make"),
+    [({"observation": "movements"}, cycling), (observed_options(UNIVERSAL_NAME), universal)],
+)
 def test_a_policy_sees_in_the_field_what_it_sees_in_an_environment(
-    running: Callable[..., Any], crossing: Callable[..., Path]
+    running: Callable[..., Any],
+    crossing: Callable[..., Path],
+    options: dict[str, Any],
+    make: Callable[[Any], Any],
 ) -> None:
     scenario = load_scenario(crossing())  # no clearance and no minimum green: both begin alike
-    env = parallel_env(scenario, observation="movements")
-    here = Remembering(make_rule("fixed-time:20", env))
-    there = Remembering(make_rule("fixed-time:20", env))
-    options = {"observation": "movements"}
+    env = parallel_env(scenario, **options)
+    here, there = Remembering(make(env)), Remembering(make(env))
     site = Site.of(scenario, options)
     _, street = running(scenario, site)
     FieldLoop(site, there, street).run(200.0)
@@ -123,7 +136,7 @@ def test_a_policy_sees_in_the_field_what_it_sees_in_an_environment(
     for place, (a, b) in enumerate(zip(here.seen, there.seen, strict=True)):
         for agent in a:
             np.testing.assert_array_equal(a[agent], b[agent], err_msg=f"decision {place}")
-    assert any(seen[agent][:2].any() for seen in here.seen for agent in seen), "no traffic"
+    assert any(seen[agent][:4].any() for seen in here.seen for agent in seen), "no traffic"
 
 
 AREAS = """<additional>

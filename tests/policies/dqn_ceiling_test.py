@@ -16,7 +16,7 @@ from tests.policies.dqn_test import QUICK
 from ugat_marl.envs import AgentSet
 from ugat_marl.errors import CheckpointError, OptionError
 from ugat_marl.policies import DQN, NetworkPolicy
-from ugat_marl.policies.export import NumpyPolicy, layers_of
+from ugat_marl.policies.export import NumpyPolicy, portable_network
 from ugat_marl.policies.learners.dqn import DQNConfig
 from ugat_marl.policies.learners.replay import Replay
 from ugat_marl.policies.learners.scaling import ceilings
@@ -86,7 +86,7 @@ def test_a_ceiling_of_other_agents_is_refused(tmp_path: Path) -> None:
 @pytest.mark.parametrize("hidden", [(16, 8), (8,), ()])
 def test_exported_it_is_a_layer_more(hidden: tuple[int, ...], shared: bool) -> None:
     held = policy_of(CEILING, hidden, shared)
-    exported = NumpyPolicy(AGENTS, layers_of(held), {})
+    exported = NumpyPolicy(AGENTS, portable_network(held), {})
     rng = np.random.default_rng(1)
     for _ in range(50):
         observations = seen(rng.uniform(-1, 3, 3).tolist(), rng.uniform(-1, 3, 2).tolist())

@@ -176,7 +176,7 @@ def test_what_one_agent_lives_through_the_others_learn():
             )
         generator = torch.Generator().manual_seed(0)
         for _ in range(600):
-            learner._update(generator)
+            learner.update(generator)
         values[shared] = learner.policy().q_values({"s0": state, "s1": state})["s1"]
     assert values[True][1] - values[True][0] > 2.5
     assert abs(values[False][1] - values[False][0]) < 1.0

@@ -212,7 +212,7 @@ def test_values_are_those_of_an_endless_or_an_ended_episode(terminates: bool):
         )
     generator = torch.Generator().manual_seed(0)
     for _ in range(800):
-        learner._update(generator)
+        learner.update(generator)
     value = learner.policy().q_values({agents.names[0]: end[0]})["signal_0"][0]
     assert value == pytest.approx(1.0 if terminates else 2.0, abs=0.05)  # 1, or 1 / (1 - 0.5)
 
@@ -232,7 +232,7 @@ def test_terminal_value_is_shifted_with_the_centre_of_the_rewards():
         np.ones((1, 2), bool),
     )
     for _ in range(3000):
-        learner._update(torch.Generator().manual_seed(0))
+        learner.update(torch.Generator().manual_seed(0))
     value = learner.policy().q_values({"signal_0": state[0]})["signal_0"][0]
     assert value == pytest.approx((-6.0 + 4.0) * 0.5 + 0.5 * (4.0 * 0.5 / 0.5), abs=0.05)
 
@@ -279,7 +279,7 @@ def test_agents_learn_independently_of_how_many_there_are():
             row,
             np.ones((n, 3), bool),
         )
-        learner._update(torch.Generator().manual_seed(0))
+        learner.update(torch.Generator().manual_seed(0))
     first = dict(alone._online.named_parameters())[weight]
     second = dict(beside._online.named_parameters())[weight]
     torch.testing.assert_close(first[0], second[0])
@@ -563,6 +563,28 @@ def test_replay_keeps_the_newest_and_draws_the_same_times_for_all():
     assert torch.equal(batch.next_observation, batch.observation + 1)
 
 
+@pytest.mark.parametrize("steps", [1, 3])
+def test_returns_of_several_decisions_stop_at_the_end_of_an_episode_and_at_the_newest(steps: int):
+    """Decision i pays i + 1 and leads to i + 1; episodes end after 2 and 5; 9 fill a ring of 7."""
+    replay, discount = Replay(AgentSet(("a",), (1,), (2,)), 7), 0.5
+    for i in range(9):
+        row, one = np.full((1, 1), i, np.float32), np.zeros(1, np.int64)
+        paid, mask = np.array([i + 1], np.float32), np.ones((1, 2), np.bool_)
+        replay.add(row, one, paid, np.array([i == 5]), row + 1, mask, i in (2, 5))
+    batch = replay.sample(200, torch.Generator().manual_seed(0), discount, steps)
+    drawn = batch.observation[0, :, 0].int().tolist()
+    assert set(drawn) == {2, 3, 4, 5, 6, 7, 8}
+    for k, first in enumerate(drawn):
+        end = next(i for i in (2, 5, 8) if i >= first)
+        covered = range(first, min(first + steps - 1, end) + 1)
+        powers = [discount**j for j in range(len(covered))]
+        assert batch.reward[0, k] == sum(p * (i + 1) for p, i in zip(powers, covered, strict=True))
+        assert batch.weight[k] == sum(powers)
+        assert batch.discount[k] == discount ** len(covered)
+        assert batch.next_observation[0, k, 0] == covered[-1] + 1
+        assert batch.terminal[0, k] == (covered[-1] == 5)
+
+
 class Operations(TorchDispatchMode):
     """Counts the operations that torch is asked for."""
 
@@ -582,9 +604,9 @@ def test_an_update_of_sixteen_agents_is_no_loop_over_agents() -> None:
                 row, np.zeros(n, np.int64), np.ones(n, np.float32), np.zeros(n, bool), row, ones
             )
         generator = torch.Generator()
-        learner._update(generator)  # the first one makes what later ones keep
+        learner.update(generator)  # the first one makes what later ones keep
         with Operations() as counted:
-            learner._update(generator)
+            learner.update(generator)
         return counted.count
 
     assert operations(16) == operations(1) > 0
@@ -658,7 +680,7 @@ def test_the_online_networks_choose_and_the_target_networks_evaluate():
         np.ones((1, 2), bool),
     )
     _constant(learner, online=[0.0, 1.0], target=[9.0, 2.0])
-    loss, q = learner._update(torch.Generator().manual_seed(0))
+    loss, q = learner.update(torch.Generator().manual_seed(0))
     assert q == 0.0
     assert loss == pytest.approx(0.5 * 1.0**2)
 

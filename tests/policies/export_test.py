@@ -21,8 +21,9 @@ from ugat_marl.__main__ import main
 from ugat_marl.envs import AgentSet
 from ugat_marl.errors import CheckpointError, OptionError
 from ugat_marl.policies import DQN, NetworkPolicy, export_policy
-from ugat_marl.policies.export import FORMATS, NumpyPolicy, layers_of
+from ugat_marl.policies.export import FORMATS, NumpyPolicy, portable_network
 from ugat_marl.policies.learners.dqn import DQNConfig
+from ugat_marl.policies.portable import PortableLayers
 from ugat_marl.testing import ToyTraffic, check_policy, check_report, failed_checks
 
 PAGE = (Path(__file__).parents[2] / "docs" / "how-to" / "export.md").read_text(encoding="utf-8")
@@ -76,11 +77,13 @@ def exported(policy: NetworkPolicy, suffix: str, folder: Path, env: Any = None) 
     return path
 
 
-def inputs(rng: np.random.Generator) -> tuple[dict[str, Any], dict[str, Any]]:
-    """Random observations of `AGENTS`, and masks that allow about half of the actions."""
+def inputs(
+    rng: np.random.Generator, agents: AgentSet = AGENTS
+) -> tuple[dict[str, Any], dict[str, Any]]:
+    """Random observations of the agents, and masks that allow about half of the actions."""
     observations, infos = {}, {}
     for name, size, count in zip(
-        AGENTS.names, AGENTS.observation_sizes, AGENTS.action_counts, strict=True
+        agents.names, agents.observation_sizes, agents.action_counts, strict=True
     ):
         mask = rng.integers(0, 2, count).astype(np.int8)
         mask[rng.integers(count)] = 1
@@ -141,7 +144,7 @@ def test_an_episode_is_the_same(
 @KINDS
 def test_numpy_has_the_same_values(shared: bool, hidden: tuple[int, ...]) -> None:
     policy = policy_of(shared, hidden)
-    numpy_policy = NumpyPolicy(AGENTS, layers_of(policy), {})
+    numpy_policy = NumpyPolicy(AGENTS, portable_network(policy), {})
     rng = np.random.default_rng(1)
     for _ in range(20):
         observations, _ = inputs(rng)
@@ -155,7 +158,7 @@ def test_a_value_by_hand() -> None:
     agents = AgentSet(("a_0", "b_0"), (1, 1), (2, 2))
     first = np.float32([[[2]], [[-1]]]), np.float32([[[1]], [[0]]])
     second = np.float32([[[1, -1]]]), np.float32([[[0, 5]]])
-    policy = NumpyPolicy(agents, [first, second], {})
+    policy = NumpyPolicy(agents, PortableLayers.of([first, second]), {})
     values = policy.values(np.float32([[3], [4]]))
     assert values.tolist() == [[7, -2], [0, 5]]
     observations = {"a_0": np.float32([3]), "b_0": np.float32([4])}
@@ -194,6 +197,7 @@ def test_the_side_car_says_what_the_rows_are(tmp_path: Path) -> None:
     about = json.loads(export_policy(policy, path, env).read_text())
     assert about.pop("kind") == "ugat_marl.exported_policy" and len(about.pop("sha256")) == 64
     assert about == {
+        "network": "mlp",
         "agents": ["cross_0", "tee_0", "cross_1"],
         "observation_sizes": [7, 5, 7],
         "action_counts": [3, 2, 3],
@@ -253,6 +257,8 @@ def test_damaged_files_are_refused(tmp_path: Path) -> None:
     for text in ("", "[]", "{", about.replace('"sha256"', '"sum"'), about[: len(about) // 2]):
         refused("export it again", about=text)
     refused("inputs|outputs|agents", about=about.replace('"a_1",', ""))
+    for name in ('"universal"', '"frap"', "null", "[]"):
+        refused("export it again", about=about.replace('"mlp"', name))
     refused("export it again", about=about.replace('"env_options": {', '"env_option": {'))
     path.unlink()
     with pytest.raises(CheckpointError, match="No such file"):
@@ -288,9 +294,21 @@ def _pickled(folder: Path) -> bytes:
     ],
 )
 def test_layers_that_do_not_fit_are_refused(says: str, change: Any) -> None:
-    weights, biases = zip(*layers_of(policy_of(False, (8,))), strict=True)
+    arrays = portable_network(policy_of(False, (8,))).arrays
+    weights, biases = ([arrays[f"{kind}_{i}"] for i in range(2)] for kind in ("weight", "bias"))
     with pytest.raises(ValueError, match=says):
-        NumpyPolicy(AGENTS, change(weights, biases), {})
+        NumpyPolicy(AGENTS, PortableLayers.of(change(weights, biases)), {})
+
+
+def test_layers_are_refused_if_one_lacks_its_bias_or_holds_other_numbers() -> None:
+    arrays = dict(portable_network(policy_of(False, (8,))).arrays)
+    for says, changed in (
+        ("bias_1", {name: array for name, array in arrays.items() if name != "bias_1"}),
+        ("odd", {**arrays, "odd": arrays["bias_0"]}),
+        ("float64", {**arrays, "bias_0": arrays["bias_0"].astype(np.float64)}),
+    ):
+        with pytest.raises(ValueError, match=says):
+            NumpyPolicy(AGENTS, PortableLayers(changed), {})
 
 
 @pytest.mark.parametrize("suffix", FORMATS)

@@ -3,6 +3,7 @@ from .adapters.sb3 import AgentsVecEnv as AgentsVecEnv
 from .agents import ActionMask as ActionMask
 from .agents import AgentSet as AgentSet
 from .agents import agent_groups as agent_groups
+from .commands import AGE_SCALE_S as AGE_SCALE_S
 from .commands import CommandMemory as CommandMemory
 from .commands import memory_size as memory_size
 from .objectives import OBJECTIVE_MEASURES as OBJECTIVE_MEASURES

@@ -34,6 +34,8 @@ from .policy_gaps import read_diagnosis as read_diagnosis
 from .policy_gaps import write_policy_gap as write_policy_gap
 from .queues import QUEUES as QUEUES
 from .queues import read_queues as read_queues
+from .randomised import drawn_effects as drawn_effects
+from .randomised import effect_ranges as effect_ranges
 from .recording.days import record as record
 from .scenario_check import RuleEpisode as RuleEpisode
 from .scenario_check import as_json as as_json
@@ -53,6 +55,7 @@ from .settings import RULE as RULE
 from .settings import STREET as STREET
 from .settings import TIMED as TIMED
 from .settings import UGAT as UGAT
+from .settings import UNTRAINED as UNTRAINED
 from .settings import LearnerSpec as LearnerSpec
 from .settings import Setting as Setting
 from .sim_check import SimCheck as SimCheck

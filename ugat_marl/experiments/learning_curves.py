@@ -17,7 +17,7 @@ from ugat_marl.experiments.jobs import RULE_FILE, Job, Record, evaluation_seeds
 from ugat_marl.experiments.settings import RULE, LearnerSpec, Setting
 from ugat_marl.experiments.tuning import LEAST_BUDGET
 from ugat_marl.parallel import Workers
-from ugat_marl.policies import BASELINES, DQN_NAME, learner_library
+from ugat_marl.policies import BASELINES, SUITE_LEARNERS, learner_library
 from ugat_marl.progress import Reporter
 from ugat_marl.scenarios import Scenario
 
@@ -124,7 +124,7 @@ class CurvesConfig:
         duration_s: Length of an episode in s; default: the scenario's own.
     """
 
-    learners: tuple[str, ...] = (DQN_NAME, *BASELINES)
+    learners: tuple[str, ...] = (*SUITE_LEARNERS, *BASELINES)
     seeds: int = 3
     episodes: int = 30
     evaluate_every: int = 10
@@ -163,7 +163,7 @@ class CurvesConfig:
             seed=seed,
             episodes=0 if is_rule else self.episodes,
             every=0 if is_rule else self.evaluate_every,
-            options={"duration_s": self.duration_s},
+            options={**setting.learner.env_options(None), "duration_s": self.duration_s},
             rule_budget=self.rule_budget if tuned else None,
             domains=(self.domain,),
             evaluation_seeds=evaluation_seeds(self.evaluation_seeds),

@@ -58,7 +58,7 @@ def effect_ranges(scenario: Scenario) -> tuple[Range, ...]:
     return tuple(ranges)
 
 
-def drawn(ranges: Sequence[Range], seed: int) -> tuple[Effect, ...]:
+def drawn_effects(ranges: Sequence[Range], seed: int) -> tuple[Effect, ...]:
     """Draw the world of an episode: each value uniform in its range, independent of the others.
 
     Args:
@@ -84,7 +84,7 @@ class RandomisedEnv(DrawnEnv):
     def __init__(
         self, make_env: Callable[[tuple[Effect, ...]], TrafficEnv], ranges: Sequence[Range]
     ) -> None:
-        super().__init__(make_env(()), lambda seed: make_env(drawn(ranges, seed)))
+        super().__init__(make_env(()), lambda seed: make_env(drawn_effects(ranges, seed)))
 
 
 def randomised_env(

@@ -2,7 +2,7 @@
 
 `rules` holds controllers that follow a rule. `learners` holds the algorithms that improve a policy.
 `networks` holds their neural networks. `export` writes trained policies to files that other
-programs read without this package.
+programs read without this package; `portable` holds networks in a form that needs no torch.
 """
 
 import lazy_loader

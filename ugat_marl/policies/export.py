@@ -6,6 +6,7 @@ observation_width)``, padded with zeros, and ``allowed``, bool ``(agents, action
 where padded. Its output is the allowed action of highest value, int64 ``(agents,)``. The JSON file
 holds:
 
+- ``network``: name of the network, as in `DQNConfig.network`.
 - ``agents``, ``observation_sizes``, ``action_counts``: the rows, and how many columns each uses.
 - ``observation_width``, ``action_width``: numbers of columns, padding included.
 - ``env_options``: options of `ugat_marl.parallel_env` that the policy was trained with.
@@ -22,7 +23,7 @@ import io
 import json
 import warnings
 import zipfile
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, cast
 
@@ -32,6 +33,14 @@ from numpy.typing import NDArray
 from ugat_marl.envs import Actions, AgentSet, AnyParallelEnv, Infos, Observations
 from ugat_marl.errors import CheckpointError, OptionError
 from ugat_marl.files import require_writable, write_whole
+from ugat_marl.policies.portable import (
+    PORTABLE,
+    Layer,
+    NumpyOperations,
+    PortableLayers,
+    PortableNetwork,
+    PortableUniversal,
+)
 
 if TYPE_CHECKING:
     from ugat_marl.policies.network_policy import NetworkPolicy
@@ -41,9 +50,6 @@ _OPSET = 17
 _IR_VERSION = 8
 _UNREADABLE = (OSError, EOFError, ValueError, LookupError, TypeError, zipfile.BadZipFile)
 """Errors that numpy and JSON raise for a damaged file."""
-
-Layer = tuple[NDArray[np.float32], NDArray[np.float32]]
-"""Weights ``(agents or 1, n_in, n_out)`` and biases ``(agents or 1, 1, n_out)``."""
 
 
 def export_policy(policy: NetworkPolicy, path: Path, env: AnyParallelEnv | None = None) -> Path:
@@ -60,7 +66,7 @@ def export_policy(policy: NetworkPolicy, path: Path, env: AnyParallelEnv | None 
 
     Raises:
         OptionError: The suffix is unknown, the extra is missing, the environment has other agents,
-            or a network with structure is to be written to another format than ``.ts``.
+            or FRAP or CoLight is to be written to another format than ``.ts``.
         CheckpointError: An option of the environment is not plain data.
         OutputError: A file cannot be written.
     """
@@ -78,20 +84,32 @@ def export_policy(policy: NetworkPolicy, path: Path, env: AnyParallelEnv | None 
     return side_car
 
 
-def layers_of(policy: NetworkPolicy) -> list[Layer]:
-    """Return the policy's network as affine maps with ReLU between them.
+def portable_network(policy: NetworkPolicy) -> PortableNetwork:
+    """Return the policy's network as arrays and operations, its ceiling included.
+
+    Raises:
+        OptionError: The network has no such form (FRAP, CoLight).
+    """
+    name = _network_name(policy)
+    if name not in PORTABLE:
+        raise OptionError(
+            f"a policy with network {name!r} cannot be written as .npz or .onnx; export it to .ts"
+        )
+    if name == "mlp":
+        return PortableLayers.of(_layers(policy))
+    network = policy._network
+    tensors = (*network.named_buffers(), *network.named_parameters())
+    # behind a ceiling the network is a part of `Held`
+    held = {name.removeprefix("network."): tensor.numpy().copy() for name, tensor in tensors}
+    return PortableUniversal(held)
+
+
+def _layers(policy: NetworkPolicy) -> list[Layer]:
+    """Return a network of layers as affine maps with ReLU between them.
 
     A shared first layer has one matrix of weights for all agents. A ceiling c adds a layer:
     ``min(x, c) = c - ReLU(c - x)``.
-
-    Raises:
-        OptionError: The network has structure (FRAP, CoLight) and is not made of such layers only.
     """
-    if policy.structure is not None:
-        raise OptionError(
-            f"a policy with network {policy.structure.network!r} is more than layers of matrices, "
-            "which is what .npz and .onnx hold here; export it to .ts"
-        )
     layers: list[Layer] = []
     parameters = [p.numpy().copy() for p in policy._network.parameters()]
     for weight, bias in zip(parameters[::2], parameters[1::2], strict=True):
@@ -112,19 +130,21 @@ class NumpyPolicy:
 
     Args:
         agents: The agents it acts for.
-        layers: Affine maps, as `layers_of` returns them.
+        network: Network, as `portable_network` returns it.
         env_options: Options of the environment that the policy relies on.
 
     Raises:
-        ValueError: The layers do not fit each other or the agents.
+        ValueError: The arrays of the network do not fit each other or the agents.
     """
 
     def __init__(
-        self, agents: AgentSet, layers: list[Layer], env_options: Mapping[str, Any]
+        self, agents: AgentSet, network: PortableNetwork, env_options: Mapping[str, Any]
     ) -> None:
-        _require_fitting(agents, layers)
+        if not len(agents.observation_sizes) == len(agents.action_counts) == len(agents):
+            raise ValueError(f"sizes and actions of other than {len(agents)} agents")
+        network.require_fitting(agents)
         self.agents = agents
-        self.layers = layers
+        self.network = network
         self.env_options: Mapping[str, Any] = dict(env_options)
 
     @classmethod
@@ -141,10 +161,9 @@ class NumpyPolicy:
             if about["kind"] != _KIND or about["sha256"] != hashlib.sha256(model).hexdigest():
                 raise ValueError("the JSON file beside it belongs to another model")
             with np.load(io.BytesIO(model), allow_pickle=False) as arrays:
-                count = len(arrays.files) // 2
-                layers = [(arrays[f"weight_{i}"], arrays[f"bias_{i}"]) for i in range(count)]
+                network = PORTABLE[about["network"]]({name: arrays[name] for name in arrays.files})
             sizes = (tuple(about[key]) for key in ("agents", "observation_sizes", "action_counts"))
-            return cls(AgentSet(*sizes), layers, about["env_options"])
+            return cls(AgentSet(*sizes), network, about["env_options"])
         except _UNREADABLE as error:
             raise CheckpointError(
                 f"{path}: not a whole exported policy ({error}); export it again"
@@ -170,10 +189,12 @@ class NumpyPolicy:
         Args:
             stacked: Observations padded with zeros, ``(agents, observation_width)``.
         """
-        hidden = stacked[:, None, :]
-        for place, (weight, bias) in enumerate(self.layers):
-            hidden = (np.maximum(hidden, 0) if place else hidden) @ weight + bias
-        return hidden[:, 0, :]
+        observations = stacked[:, None, :]
+        return self.network.values(NumpyOperations(), self.network.arrays, observations)[:, 0, :]
+
+
+def _network_name(policy: NetworkPolicy) -> str:
+    return "mlp" if policy.structure is None else policy.structure.network
 
 
 def _about(policy: NetworkPolicy, env: AnyParallelEnv | None) -> dict[str, Any]:
@@ -189,6 +210,7 @@ def _about(policy: NetworkPolicy, env: AnyParallelEnv | None) -> dict[str, Any]:
     base: Any = env.unwrapped if env is not None else None
     return {
         "kind": _KIND,
+        "network": _network_name(policy),
         **{key: description[key] for key in ("agents", "observation_sizes", "action_counts")},
         "observation_width": agents.widest_observation,
         "action_width": agents.most_actions,
@@ -205,29 +227,9 @@ def _brief(agents: AgentSet) -> str:
     return ", ".join(rows[:3]) + f" and {len(rows) - 3} more" * (len(rows) > 3)
 
 
-def _require_fitting(agents: AgentSet, layers: list[Layer]) -> None:
-    width, count = agents.widest_observation, len(agents)
-    if not len(agents.observation_sizes) == len(agents.action_counts) == count:
-        raise ValueError(f"sizes and actions of other than {count} agents")
-    for weight, bias in layers:
-        shapes = weight.shape, bias.shape
-        fits = len(shapes[0]) == len(shapes[1]) == 3 and shapes[0][1] == width
-        fits = fits and {shapes[0][0], shapes[1][0]} <= {1, count}
-        if not fits or shapes[1][1:] != (1, shapes[0][2]):
-            raise ValueError(f"a layer of shapes {shapes} for {count} agents and {width} inputs")
-        if not (np.isfinite(weight).all() and np.isfinite(bias).all()):
-            raise ValueError("a weight is NaN or infinite")
-        width = shapes[0][2]
-    if width != agents.most_actions or not layers:
-        raise ValueError(f"{width} outputs for {agents.most_actions} actions")
-
-
 def _matrices(policy: NetworkPolicy) -> bytes:
-    arrays: dict[str, NDArray[np.float32]] = {}
-    for place, (weight, bias) in enumerate(layers_of(policy)):
-        arrays |= {f"weight_{place}": weight, f"bias_{place}": bias}
     buffer = io.BytesIO()
-    np.savez(buffer, **cast(dict[str, Any], arrays))
+    np.savez(buffer, **cast(dict[str, Any], portable_network(policy).arrays))
     return buffer.getvalue()
 
 
@@ -280,35 +282,80 @@ def _onnx(policy: NetworkPolicy) -> bytes:
             "writing .onnx needs the package onnx; run pip install 'ugat-marl[onnx]', or export "
             "to .npz or .ts"
         ) from None
-    helper, kinds, layers, agents = onnx.helper, onnx.TensorProto, layers_of(policy), policy.agents
-    constants = {"one": np.array([1]), "never": np.array(-np.inf, np.float32)}
-    nodes = [helper.make_node("Unsqueeze", ["observations", "one"], ["in_0"])]
-    for i, (weight, bias) in enumerate(layers):
-        constants |= {f"weight_{i}": weight, f"bias_{i}": bias}
-        nodes.append(helper.make_node("MatMul", [f"in_{i}", f"weight_{i}"], [f"product_{i}"]))
-        nodes.append(helper.make_node("Add", [f"product_{i}", f"bias_{i}"], [f"sum_{i}"]))
-        if i + 1 < len(layers):
-            nodes.append(helper.make_node("Relu", [f"sum_{i}"], [f"in_{i + 1}"]))
-    nodes += [
-        helper.make_node("Squeeze", [f"sum_{len(layers) - 1}", "one"], ["values"]),
-        helper.make_node("Where", ["allowed", "values", "never"], ["permitted"]),
-        helper.make_node("ArgMax", ["permitted"], ["actions"], axis=1, keepdims=0),
-    ]
-    value, rows = helper.make_tensor_value_info, len(agents)
-    graph = helper.make_graph(
-        nodes,
+    network, agents, rows = portable_network(policy), policy.agents, len(policy.agents)
+    graph = _OnnxOperations(onnx, dict(network.arrays))
+    observations = graph.reshape("observations", (rows, 1, -1))
+    values = network.values(graph, {name: name for name in network.arrays}, observations)
+    graph.constants["never"] = np.array(-np.inf, np.float32)
+    permitted = graph.node("Where", "allowed", graph.reshape(values, (rows, -1)), "never")
+    helper, kinds = onnx.helper, onnx.TensorProto
+    greedy = helper.make_node("ArgMax", [permitted], ["actions"], axis=1, keepdims=0)
+    value = helper.make_tensor_value_info
+    whole = helper.make_graph(
+        [*graph.nodes, greedy],
         "ugat_marl_policy",
         [
             value("observations", kinds.FLOAT, [rows, agents.widest_observation]),
             value("allowed", kinds.BOOL, [rows, agents.most_actions]),
         ],
         [value("actions", kinds.INT64, [rows])],
-        [onnx.numpy_helper.from_array(array, name) for name, array in constants.items()],
+        [onnx.numpy_helper.from_array(array, name) for name, array in graph.constants.items()],
     )
     opset = [helper.make_opsetid("", _OPSET)]
-    model = helper.make_model(graph, opset_imports=opset, ir_version=_IR_VERSION)
+    model = helper.make_model(whole, opset_imports=opset, ir_version=_IR_VERSION)
     onnx.checker.check_model(model, full_check=True)
     return model.SerializeToString()
+
+
+class _OnnxOperations:
+    """The operations of a portable network as nodes of a graph; names stand for arrays.
+
+    Args:
+        onnx: The package.
+        constants: Arrays of the graph by name; more are added where an operation needs them.
+    """
+
+    def __init__(self, onnx: Any, constants: dict[str, NDArray[Any]]) -> None:
+        self._onnx = onnx
+        self.constants = constants
+        self.nodes: list[Any] = []
+
+    def node(self, kind: str, *inputs: str, **attributes: int) -> str:
+        """Add a node and return the name of its output."""
+        output = f"result_{len(self.nodes)}"
+        made = self._onnx.helper.make_node(kind, [*inputs], [output], **attributes)
+        self.nodes.append(made)
+        return output
+
+    def matmul(self, left: str, right: str) -> str:
+        return self.node("MatMul", left, right)
+
+    def add(self, left: str, right: str) -> str:
+        return self.node("Add", left, right)
+
+    def multiply(self, left: str, right: str) -> str:
+        return self.node("Mul", left, right)
+
+    def minimum(self, left: str, right: str) -> str:
+        return self.node("Min", left, right)
+
+    def relu(self, array: str) -> str:
+        return self.node("Relu", array)
+
+    def concat(self, arrays: Sequence[str]) -> str:
+        return self.node("Concat", *arrays, axis=-1)
+
+    def last(self, array: str) -> str:
+        # an index of one axis keeps the axis
+        return self.node("Gather", array, self._integers(-1), axis=-1)
+
+    def reshape(self, array: str, shape: tuple[int, ...]) -> str:
+        return self.node("Reshape", array, self._integers(*shape))
+
+    def _integers(self, *numbers: int) -> str:
+        name = "integers_" + "_".join(map(str, numbers))
+        self.constants[name] = np.array(numbers, np.int64)
+        return name
 
 
 FORMATS: dict[str, tuple[str, Callable[[Any], bytes]]] = {

@@ -37,6 +37,7 @@ def test_it_measures_what_training_and_evaluating_by_hand_give(tmp_path: Path) -
         tuning_seeds=1,
         duration_s=200,
         domain="V4",
+        learner="dqn",
         dqn=config,
         out=out,
     ).run()

@@ -1,4 +1,7 @@
-"""Every learner by name: the suite's own DQN, and those in the files of baselines/.
+"""Every learner by name: the suite's own two, and those in the files of baselines/.
+
+"dqn" learns a network for each intersection. "universal" is the same algorithm with one network for
+all, whose weights belong to none.
 
 A new learner needs a file in baselines/ and a row in `BASELINES`. The file holds a class that
 follows the protocol `Learner` and is made as ``Learner(env, config, seed)``, and a dataclass of its
@@ -11,7 +14,7 @@ from __future__ import annotations
 import importlib.util
 import sys
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import asdict, dataclass, field, fields
+from dataclasses import asdict, dataclass, field, fields, replace
 from pathlib import Path
 from types import ModuleType
 from typing import Any, get_type_hints
@@ -28,6 +31,24 @@ LearnerFactory = Callable[[AnyParallelEnv, int], Learner]
 """Make a new learner for the agents of an environment; a seed fixes its initial weights."""
 
 DQN_NAME = "dqn"
+UNIVERSAL_NAME = "universal"
+
+SUITE_LEARNERS: Mapping[str, DQNConfig] = {
+    DQN_NAME: DQNConfig(),
+    UNIVERSAL_NAME: DQNConfig(
+        network="universal",
+        hidden=(32, 32),
+        steps=3,
+        warmup_decisions=100,
+        epsilon_decay_decisions=1_200,
+    ),
+}
+"""The suite's own learners: settings of DQN by name."""
+
+OBSERVED: Mapping[str, Mapping[str, Any]] = {
+    UNIVERSAL_NAME: {"observation": "movements", "commands": 4}
+}
+"""Options of the environment that a learner needs, by its name."""
 
 
 @dataclass(frozen=True)
@@ -102,10 +123,11 @@ def learner_factory(
     """Return the maker of the named learner; its library is imported now.
 
     Args:
-        name: "dqn", or one of `BASELINES`.
+        name: One of `SUITE_LEARNERS` or of `BASELINES`.
         settings: Settings of a baseline, as ``NAME=VALUE``; commas separate the parts of a tuple.
-        dqn: Settings of "dqn"; None for the defaults.
-        device: Device of the updates of "dqn" (`devices.device_of`); baselines stay on the CPU.
+        dqn: Settings of the suite's own learners that differ from the defaults; None for none.
+        device: Device of the updates of the suite's own learners (`devices.device_of`); baselines
+            stay on the CPU.
 
     Raises:
         UnknownNameError: There is no such learner, or no such setting.
@@ -116,15 +138,35 @@ def learner_factory(
 
     require_known_learner(name)
     place = device_of(device)
-    if name == DQN_NAME:
+    if name in SUITE_LEARNERS:
         if settings:
-            raise OptionError(f"learner settings {' '.join(settings)}: those of dqn are --dqn.*")
+            raise OptionError(f"learner settings {' '.join(settings)}: those of {name} are --dqn.*")
         from ugat_marl.policies.learners.dqn import DQN
 
-        return lambda env, seed: DQN.of(env, dqn, seed, device=place)
+        suite = suite_config(name, dqn)
+        return lambda env, seed: DQN.of(env, suite, seed, device=place)
     config = _baseline_config(name, settings)
     make = getattr(load_baseline(name), BASELINES[name].learner)
     return lambda env, seed: make(env, config, seed)
+
+
+def suite_config(name: str, given: DQNConfig | None = None) -> DQNConfig:
+    """Return the settings of one of the suite's own learners.
+
+    Args:
+        name: One of `SUITE_LEARNERS`.
+        given: Settings of the user; those that differ from the defaults of DQN are taken.
+    """
+    usual = DQNConfig()
+    given = given or usual
+    values = {option.name: getattr(given, option.name) for option in fields(usual)}
+    changed = {key: value for key, value in values.items() if value != getattr(usual, key)}
+    return replace(SUITE_LEARNERS[name], **changed)
+
+
+def observed_options(name: str) -> dict[str, Any]:
+    """Return the options of the environment that a learner needs; empty if any will do."""
+    return dict(OBSERVED.get(name, {}))
 
 
 def baseline_settings(name: str, given: Sequence[str] = ()) -> dict[str, Any]:
@@ -151,10 +193,10 @@ def require_known_learner(name: str) -> None:
     """Refuse the name of a learner that does not exist.
 
     Raises:
-        UnknownNameError: It is neither "dqn" nor one of `BASELINES`.
+        UnknownNameError: It is neither one of `SUITE_LEARNERS` nor of `BASELINES`.
     """
-    if name != DQN_NAME and name not in BASELINES:
-        raise UnknownNameError("learner", name, (DQN_NAME, *BASELINES))
+    if name not in SUITE_LEARNERS and name not in BASELINES:
+        raise UnknownNameError("learner", name, (*SUITE_LEARNERS, *BASELINES))
 
 
 def learner_library(name: str) -> str:

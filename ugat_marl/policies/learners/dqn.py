@@ -25,21 +25,27 @@ from ugat_marl.policies.devices import CPU
 from ugat_marl.policies.learners.dqn_config import CEILING_DECISIONS, DQNConfig
 from ugat_marl.policies.learners.replay import Replay
 from ugat_marl.policies.learners.scaling import ceilings, input_factors
+from ugat_marl.policies.learners.start import Start
 from ugat_marl.policies.network_policy import NetworkPolicy, checkpoint_header, parse_header
 from ugat_marl.policies.networks.batched import one_thread
 from ugat_marl.policies.networks.q_network import (
+    bind_parameters,
     flatten_parameters,
     greedy_actions,
     parameters_for_unscaled,
     q_network,
 )
 from ugat_marl.policies.networks.structure import Structure, structure_in
+from ugat_marl.policies.networks.universal import SECONDS
 from ugat_marl.policies.protocols import EpisodeCallback
 from ugat_marl.seeding import derive_seed, numpy_generator, torch_generator
 
 _KIND = "ugat_marl.dqn"
 _COUNTERS = ("episodes", "decisions", "updates")
 _MOMENTS = ("step", "exp_avg", "exp_avg_sq")
+UNIVERSAL_SCALE = 0.05
+"""Factor on rewards for the network "universal": 20 halting vehicles are 1."""
+
 _SCALED = ("mlp", "colight")
 """Networks whose first weights multiply the observation, so that they can absorb its scale."""
 
@@ -187,10 +193,15 @@ class DQN:
         self._adam = torch.optim.Adam([self._weights], lr=self.config.learning_rate, fused=True)
         self._replay = Replay(agents, self.config.replay_capacity)
         self._centre = torch.zeros(len(agents), 1, device=device)
-        scale = self.config.reward_scale or 1.0
+        scale = self.config.reward_scale or (UNIVERSAL_SCALE if self._is_universal else 1.0)
         self._scale = torch.full((len(agents), 1), scale, device=device)
         self._inputs = torch.ones(len(agents), 1, agents.widest_observation)
+        tens = _tens_of_seconds(structure)
+        self._discount = self.config.discount**tens
+        self._steps = max(1, round(self.config.steps / tens))
         self._acting = Acting(self._online, self._weights)
+        if self.config.start is not None:
+            self.begin_with(Start.load(Path(self.config.start)))
 
     @classmethod
     def of(
@@ -290,13 +301,13 @@ class DQN:
             then, allowed = self.agents.stack(observations), self.agents.masks(infos)
             reward = self._finite(self.agents.values(rewards))
             terminal = self.agents.values(terminated).astype(np.bool_)
-            self._replay.add(now, actions, reward, terminal, then, allowed)
+            self._replay.add(now, actions, reward, terminal, then, allowed, not env.agents)
             now = then
             self.decisions += 1
             tally.decisions += 1
             tally.reward += float(reward.mean())
             if self._is_time_to_update():
-                loss, q = self._update(sampling)
+                loss, q = self.update(sampling)
                 tally.loss += loss
                 tally.q += q
                 tally.updates += 1
@@ -318,6 +329,10 @@ class DQN:
         )
 
     @property
+    def _is_universal(self) -> bool:
+        return self.config.network == "universal"
+
+    @property
     def _is_one_network(self) -> bool:
         return self.config.shared or self.config.network != "mlp"
 
@@ -328,19 +343,24 @@ class DQN:
             seen = self._replay.observations()
             factors = input_factors(seen, self.agents, pooled=self._is_one_network)
             self._inputs.copy_(factors.unsqueeze(1))
-        if config.reward_scale is not None:
+        if config.reward_scale is not None or self._is_universal:
             return
         deviation, mean = torch.std_mean(self._replay.rewards(), dim=1, keepdim=True, correction=0)
         scale = torch.where(deviation > 1e-6, 1.0 / deviation.clamp_min(1e-6), 1.0)
         self._centre, self._scale = mean.to(self.device), scale.to(self.device)
 
-    def _update(self, generator: torch.Generator) -> tuple[float, float]:
+    def update(self, generator: torch.Generator) -> tuple[float, float]:
         """Make one gradient step for all agents; return mean loss and mean Q before it.
 
         The loss is Huber's of Q(s, a) - y with ``y = r + discount * Q'(s', argmax_a' Q(s', a'))``,
-        where Q' is the target network and r the scaled reward.
+        where Q' is the target network and r the scaled reward. With `steps` = n, r is the
+        discounted sum over n decisions and s' the state after them.
+
+        Args:
+            generator: Source of the sample.
         """
-        batch = self._replay.sample(self.config.batch_size, generator)
+        config = self.config
+        batch = self._replay.sample(config.batch_size, generator, self._discount, self._steps)
         batch = batch.scaled(self._inputs).to(self.device)
         with torch.no_grad():
             # double Q-learning: the online networks choose, the target networks evaluate
@@ -348,10 +368,10 @@ class DQN:
             best = best.masked_fill_(~batch.next_allowed, -torch.inf).argmax(-1, keepdim=True)
             future = self._target(batch.next_observation).gather(-1, best).squeeze(-1)
             # sum of discount^t (0 - centre) scale: rewards of zero for ever, centred and scaled
-            nothing = -self._centre * self._scale / (1 - self.config.discount)
+            nothing = -self._centre * self._scale / (1 - self._discount)
             future = torch.where(batch.terminal, nothing, future)
-            reward = (batch.reward - self._centre) * self._scale
-            wanted = reward + self.config.discount * future
+            reward = (batch.reward - self._centre * batch.weight) * self._scale
+            wanted = reward + batch.discount * future
         chosen = self._online(batch.observation).gather(-1, batch.action.unsqueeze(-1)).squeeze(-1)
         losses = nn.functional.huber_loss(
             chosen, wanted, reduction="none", delta=self.config.huber_delta
@@ -381,6 +401,51 @@ class DQN:
                 "correct the reward function"
             )
         return reward
+
+    @property
+    def running_weights(self) -> Tensor:
+        """Running mean of the learned weights, with which `policy` acts (a copy)."""
+        return self._target_weights.detach().cpu().clone()
+
+    def begin_with(self, start: Start) -> None:
+        """Take the weights of a start.
+
+        Raises:
+            OptionError: The network is not "universal", or its observations are of another kind.
+        """
+        if not self._is_universal:
+            raise OptionError('only a network "universal" begins with the weights of another')
+        weights = start.weights_for(self._online)
+        self._weights.data.copy_(weights)
+        self._target_weights.data.copy_(weights)
+        self._acting.forget()
+
+    def set_learning_rate(self, rate: float) -> None:
+        """Change the step size of Adam."""
+        for group in self._adam.param_groups:
+            group["lr"] = rate
+
+    def share_weights(self, other: DQN) -> None:
+        """Learn the weights of another learner from now on; both update the same ones.
+
+        Args:
+            other: Learner with a network "universal" of the same size; its agents may differ.
+
+        Raises:
+            OptionError: The networks have other sizes, or weights that belong to intersections.
+        """
+        if not (self._is_universal and other._is_universal):
+            raise OptionError('only learners with network = "universal" share weights')
+        if self._weights.shape != other._weights.shape:
+            raise OptionError(
+                f"a network of {self._weights.numel()} weights cannot share the "
+                f"{other._weights.numel()} of another; give both the same options"
+            )
+        bind_parameters(self._online, other._weights)
+        bind_parameters(self._target, other._target_weights)
+        self._weights, self._target_weights = other._weights, other._target_weights
+        self._adam = other._adam
+        self._acting = Acting(self._online, self._weights)
 
     def save(self, path: Path) -> None:
         """Write the whole state; a learner that loads it continues exactly as this one.
@@ -465,6 +530,13 @@ class DQN:
 
 def _network_of(structure: Structure | None) -> str:
     return "mlp" if structure is None else structure.network
+
+
+def _tens_of_seconds(structure: Structure | None) -> float:
+    """Return the decision interval as a multiple of 10 s for "universal"; 1 for other networks."""
+    if structure is None or structure.network != "universal":
+        return 1.0
+    return (structure.junctions[0].interval_s or SECONDS) / SECONDS
 
 
 def _require_same(path: Path, attribute: str, saved: object, expected: object) -> None:

@@ -37,7 +37,10 @@ class DQNConfig:
     Attributes:
         hidden: Sizes of the hidden layers of every network.
         learning_rate: Step size of Adam.
-        discount: Weight of the next decision's value (gamma), 0.95-0.98 in the literature.
+        discount: Weight of the next decision's value (gamma), 0.95-0.98 in the literature. With
+            "universal" it is that of 10 s, so that values compare between decision intervals.
+        steps: Decisions whose rewards a target sums before it takes a value (n-step returns, Sutton
+            1988). With "universal" they are decisions of 10 s as well.
         batch_size: Transitions per update and agent.
         replay_capacity: Decisions that the replay memory holds.
         warmup_decisions: Decisions before the first update.
@@ -49,8 +52,9 @@ class DQNConfig:
         sticky_decisions: Longest bout of one exploratory action, in decisions; 1 is plain
             epsilon-greedy.
         huber_delta: Errors larger than this (in scaled reward) count linearly.
-        reward_scale: Factor on all rewards; None measures it for each agent.
-        scale_inputs: Scale observations (those of "frap" never).
+        reward_scale: Factor on all rewards; None measures it for each agent. With "universal" None
+            is 0.05 with mean 0: one network has to value equal states of all intersections alike.
+        scale_inputs: Scale observations (those of "frap" and "universal" never).
         shared: One network for all agents instead of one for each. It learns from the transitions
             of all agents and has a bias for each.
         network: Network that computes Q. "mlp": layers over an agent's observation. "frap": phases
@@ -58,6 +62,10 @@ class DQNConfig:
             intersections; `hidden` is the size of a demand and that of a pair of phases. "colight":
             attention to the neighbours (Wei et al. 2019), one network for all intersections;
             `hidden` is the size of an embedding and that of the layer after the attention.
+            "universal": one network for all intersections of any road network; `hidden` is the size
+            of a movement's embedding and that of the other hidden layers.
+        start: File of weights to begin with, for "universal", such as `studies.pretraining` writes.
+            None draws them.
         ceiling: Quantile at which policies cut each number of an observation. It is measured over
             the last 1000 decisions of training. In a fuller street than in training, a policy then
             acts as in the fullest street it knows. None cuts nothing.
@@ -80,6 +88,8 @@ class DQNConfig:
     scale_inputs: bool = True
     shared: bool = False
     network: NetworkName = "mlp"
+    start: str | None = None
+    steps: int = 1
     ceiling: float | None = None
 
     def __post_init__(self) -> None:
@@ -92,6 +102,7 @@ class DQNConfig:
             "update_every",
             "epsilon_decay_decisions",
             "sticky_decisions",
+            "steps",
         ):
             self._require(name, getattr(self, name) >= 1, "at least 1")
         self._require("hidden", all(width >= 1 for width in self.hidden), "sizes of at least 1")
@@ -120,6 +131,8 @@ class DQNConfig:
             self._require("hidden", len(self.hidden) == 2, two)
         alone = f"left away: network = {self.network!r} is one for all agents in any case"
         self._require("shared", self.network == "mlp" or not self.shared, alone)
+        begins = self.start is None or self.network == "universal"
+        self._require("start", begins, "left away: only network = 'universal' can begin with it")
 
     def _require(self, name: str, holds: bool, allowed: str) -> None:
         if not holds:

@@ -15,15 +15,17 @@ from ugat_marl.envs import ActionMask, AgentSet
 
 @dataclass(frozen=True)
 class Batch:
-    """Transitions of all agents at the same decisions.
+    """Transitions of all agents at the same decisions, over one decision or several.
 
     Attributes:
         observation: Observations ``(agents, batch, widest_observation)``.
         action: Actions of the agents, ``(agents, batch)``.
-        reward: Unscaled rewards, ``(agents, batch)``.
+        reward: Unscaled rewards ``(agents, batch)``; over several decisions their discounted sum.
         terminal: True where an agent terminated, ``(agents, batch)``; truncation is not terminal.
-        next_observation: Observations after the action, in the shape of `observation`.
-        next_allowed: Actions allowed after the action, ``(agents, batch, most_actions)``.
+        next_observation: Observations after the last decision, in the shape of `observation`.
+        next_allowed: Actions allowed after the last decision, ``(agents, batch, most_actions)``.
+        weight: Sum of the discounts of the rewards, ``(batch,)``; 1 for one decision.
+        discount: Discount of the value after the last decision, ``(batch,)``.
     """
 
     observation: Tensor
@@ -32,6 +34,8 @@ class Batch:
     terminal: Tensor
     next_observation: Tensor
     next_allowed: Tensor
+    weight: Tensor
+    discount: Tensor
 
     def scaled(self, factors: Tensor) -> Batch:
         """Return the batch with observations times factors ``(agents, 1, widest_observation)``."""
@@ -45,6 +49,12 @@ class Batch:
         return Batch(**{name: column.to(device) for name, column in vars(self).items()})
 
 
+_COLUMNS = (
+    "observation", "action", "reward", "terminal", "next_observation", "next_allowed",
+)  # fmt: skip
+"""Columns of the memory that have a row for each agent."""
+
+
 class Replay:
     """A ring of the last `capacity` decisions of all agents, as ``(agents, capacity, ...)``.
 
@@ -55,14 +65,15 @@ class Replay:
         n, width, actions = len(agents), agents.widest_observation, agents.most_actions
         self.capacity = capacity
         self.added = 0
-        self._columns = Batch(
-            observation=torch.zeros(n, capacity, width),
-            action=torch.zeros(n, capacity, dtype=torch.int64),
-            reward=torch.zeros(n, capacity),
-            terminal=torch.zeros(n, capacity, dtype=torch.bool),
-            next_observation=torch.zeros(n, capacity, width),
-            next_allowed=torch.zeros(n, capacity, actions, dtype=torch.bool),
-        )
+        self._columns = {
+            "observation": torch.zeros(n, capacity, width),
+            "action": torch.zeros(n, capacity, dtype=torch.int64),
+            "reward": torch.zeros(n, capacity),
+            "terminal": torch.zeros(n, capacity, dtype=torch.bool),
+            "next_observation": torch.zeros(n, capacity, width),
+            "next_allowed": torch.zeros(n, capacity, actions, dtype=torch.bool),
+        }
+        self._last = torch.zeros(1, capacity, dtype=torch.bool)
 
     def __len__(self) -> int:
         return min(self.added, self.capacity)
@@ -75,29 +86,66 @@ class Replay:
         terminal: NDArray[np.bool_],
         next_observation: NDArray[np.float32],
         next_allowed: ActionMask,
+        last: bool = False,
     ) -> None:
-        """Store one decision of all agents; a full ring loses its oldest decision."""
+        """Store one decision of all agents; a full ring loses its oldest decision.
+
+        Args:
+            observation: Observations ``(agents, widest_observation)``.
+            action: Actions ``(agents,)``.
+            reward: Rewards ``(agents,)``.
+            terminal: True for an agent that terminated, ``(agents,)``.
+            next_observation: Observations after the action.
+            next_allowed: Actions allowed after the action, ``(agents, most_actions)``.
+            last: True for the last decision of an episode.
+        """
         at, columns = self.added % self.capacity, self._columns
-        columns.observation[:, at] = torch.from_numpy(observation)
-        columns.action[:, at] = torch.from_numpy(action)
-        columns.reward[:, at] = torch.from_numpy(reward)
-        columns.terminal[:, at] = torch.from_numpy(terminal)
-        columns.next_observation[:, at] = torch.from_numpy(next_observation)
-        columns.next_allowed[:, at] = torch.from_numpy(next_allowed)
+        rows = (observation, action, reward, terminal, next_observation, next_allowed)
+        for name, row in zip(_COLUMNS, rows, strict=True):
+            columns[name][:, at] = torch.from_numpy(row)
+        self._last[:, at] = last
         self.added += 1
 
-    def sample(self, size: int, generator: torch.Generator) -> Batch:
-        """Draw `size` time indices with replacement; the same ones for every agent."""
+    def sample(
+        self, size: int, generator: torch.Generator, discount: float = 1.0, steps: int = 1
+    ) -> Batch:
+        """Draw `size` time indices with replacement; the same ones for every agent.
+
+        Args:
+            size: Number of transitions.
+            generator: Source of the indices.
+            discount: Discount of one decision.
+            steps: Decisions that a transition covers; fewer at the end of an episode.
+        """
         at = torch.randint(len(self), (size,), generator=generator)
-        return Batch(**{name: column.index_select(1, at) for name, column in self._fields()})
+        window = (at.unsqueeze(1) + torch.arange(steps)) % self.capacity
+        newest = (self.added - 1) % self.capacity
+        ends = self._last[0, window] | (window == newest)
+        # a decision counts as long as none before it ended the episode
+        counts = torch.ones_like(ends)
+        counts[:, 1:] = ~(ends[:, :-1].cumsum(1) > 0)
+        powers = discount ** torch.arange(steps) * counts
+        done = (counts.sum(1) - 1).unsqueeze(1)
+        final = window.gather(1, done).squeeze(1)
+        read = self._columns
+        return Batch(
+            observation=read["observation"].index_select(1, at),
+            action=read["action"].index_select(1, at),
+            reward=(read["reward"][:, window] * powers).sum(2),
+            terminal=read["terminal"].index_select(1, final),
+            next_observation=read["next_observation"].index_select(1, final),
+            next_allowed=read["next_allowed"].index_select(1, final),
+            weight=powers.sum(1),
+            discount=discount * powers.gather(1, done).squeeze(1),
+        )
 
     def rewards(self) -> Tensor:
         """Return all stored rewards, ``(agents, len(self))``."""
-        return self._columns.reward[:, : len(self)]
+        return self._columns["reward"][:, : len(self)]
 
     def observations(self) -> Tensor:
         """Return all stored observations, ``(agents, len(self), widest_observation)``."""
-        return self._columns.observation[:, : len(self)]
+        return self._columns["observation"][:, : len(self)]
 
     def recent(self, decisions: int) -> Tensor:
         """Return the last observations, ``(agents, n, widest_observation)``.
@@ -106,7 +154,7 @@ class Replay:
         """
         first = max(0, self.added - min(decisions, self.capacity))
         at = torch.arange(first, self.added) % self.capacity
-        return self._columns.observation.index_select(1, at)
+        return self._columns["observation"].index_select(1, at)
 
     def rows(self, added: int) -> dict[str, Tensor]:
         """Return views of the rows in use after `added` decisions."""
@@ -124,4 +172,4 @@ class Replay:
             rows.copy_(state[name])
 
     def _fields(self) -> list[tuple[str, Tensor]]:
-        return list(vars(self._columns).items())
+        return [*self._columns.items(), ("last", self._last)]

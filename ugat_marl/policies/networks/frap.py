@@ -50,7 +50,7 @@ class FRAP(nn.Module):
         super().__init__()
         demand, pair = hidden
         self.register_buffer("inputs", _inputs(agents, junctions), persistent=False)
-        self.register_buffer("greens", _greens(agents, junctions), persistent=False)
+        self.register_buffer("greens", green_shares(agents, junctions), persistent=False)
         served = (self.greens > 0).float()
         self.register_buffer("shared", (served @ served.transpose(1, 2) > 0).long(), False)
         self.register_buffer("rivals", _rivals(agents), persistent=False)
@@ -106,7 +106,7 @@ def _inputs(agents: AgentSet, junctions: Sequence[Junction]) -> Tensor:
     return selection.flatten(2)
 
 
-def _greens(agents: AgentSet, junctions: Sequence[Junction]) -> Tensor:
+def green_shares(agents: AgentSet, junctions: Sequence[Junction]) -> Tensor:
     """Return the share of each movement's links that each phase gives green.
 
     The shape is ``(agents, phases, movements)``, 0 where padded.

@@ -14,6 +14,7 @@ from ugat_marl.policies.networks.batched import BatchedMLP, SharedMLP
 from ugat_marl.policies.networks.colight import CoLight
 from ugat_marl.policies.networks.frap import FRAP
 from ugat_marl.policies.networks.structure import Structure
+from ugat_marl.policies.networks.universal import UniversalNetwork
 
 
 def q_network(
@@ -26,6 +27,8 @@ def q_network(
     """Build the network from ``(agents, batch, widest_observation)`` to values of actions."""
     if structure is not None and structure.network == "colight":
         return CoLight(agents, structure.neighbours, hidden, generator)
+    if structure is not None and structure.network == "universal":
+        return UniversalNetwork(agents, structure.junctions, hidden, generator)
     if structure is not None:
         return FRAP(agents, structure.junctions, hidden, generator)
     if shared:
@@ -73,16 +76,26 @@ def flatten_parameters(module: nn.Module) -> nn.Parameter:
     The module then computes on views of the vector. So the step of the optimiser and the update of
     the target network are single operations over all agents and layers.
     """
-    parameters = list(module.parameters())
-    flat = nn.Parameter(nn.utils.parameters_to_vector(parameters).detach().clone())
+    flat = nn.Parameter(nn.utils.parameters_to_vector(module.parameters()).detach().clone())
     flat.grad = torch.zeros_like(flat)
+    bind_parameters(module, flat)
+    return flat
+
+
+def bind_parameters(module: nn.Module, flat: nn.Parameter) -> None:
+    """Let all parameters of `module`, and their gradients, be views of one vector and its own.
+
+    Args:
+        module: The module; its numbers become those of the vector.
+        flat: Vector with a gradient, of as many numbers as `module` has.
+    """
+    assert flat.grad is not None
     start = 0
-    for parameter in parameters:
+    for parameter in module.parameters():
         end = start + parameter.numel()
         parameter.data = flat.data[start:end].view_as(parameter)
         parameter.grad = flat.grad[start:end].view_as(parameter)
         start = end
-    return flat
 
 
 def parameters_for_unscaled(network: nn.Module, factors: Tensor) -> Tensor:

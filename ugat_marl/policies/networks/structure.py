@@ -1,4 +1,4 @@
-"""Facts about intersections for FRAP and CoLight: movements and phases, or neighbours.
+"""Facts about intersections for networks with structure: movements and phases, or neighbours.
 
 The facts are plain numbers, so a saved policy needs neither network file nor environment.
 """
@@ -7,18 +7,18 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping, Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 from functools import partial
 from typing import Any, Literal
 
 from pydantic import TypeAdapter
 
 from ugat_marl.data import AgentLayout
-from ugat_marl.envs import AgentSet, AnyParallelEnv
+from ugat_marl.envs import COUNT_SCALE, AgentSet, AnyParallelEnv, memory_size
 from ugat_marl.errors import OptionError
-from ugat_marl.scenarios import GREEN, Intersection, Link, Network, turn_of
+from ugat_marl.scenarios import GREEN, Intersection, LaneTable, Link, Network, turn_of
 
-NetworkName = Literal["mlp", "frap", "colight"]
+NetworkName = Literal["mlp", "frap", "colight", "universal"]
 """Names of the networks that `q_network` builds."""
 
 MOST_NEIGHBOURS = 5
@@ -38,11 +38,22 @@ class Junction:
             observation `movements`, and one kind for the others.
         greens: For each phase, the share of each movement's links that it gives green.
         first_phase: Place in the observation at which the one-hot of the current phase begins.
+        vehicles: For each feature of the observation, the number of vehicles that makes it 1; empty
+            if features are not numbers of vehicles.
+        commands: Places at which the one-hots of the last own commands begin, the latest first.
+        age: Place of the age of the green; None if the observation does not hold it.
+        interval_s: Seconds from one decision to the next.
+        clearance_s: Seconds from the end of a green to the beginning of the next.
     """
 
     movements: tuple[tuple[Places, ...], ...]
     greens: tuple[tuple[float, ...], ...]
     first_phase: int
+    vehicles: tuple[float, ...] = ()
+    commands: Places = ()
+    age: int | None = None
+    interval_s: float = 0.0
+    clearance_s: float = 0.0
 
 
 @dataclass(frozen=True)
@@ -50,8 +61,9 @@ class Structure:
     """Name of a network, and the facts about intersections that it needs.
 
     Attributes:
-        network: "frap" or "colight"; "mlp" needs no structure.
-        junctions: For "frap", the intersection of each agent, in the order of the agents.
+        network: "frap", "universal" or "colight"; "mlp" needs no structure.
+        junctions: For "frap" and "universal", the intersection of each agent, in the order of the
+            agents.
         neighbours: For "colight", the positions of each agent's neighbours among the agents.
     """
 
@@ -65,7 +77,7 @@ class Structure:
 
         Raises:
             OptionError: The environment is not of the suite, or a wrapper has changed the
-                observations in which "frap" looks for movements.
+                observations in which "frap" and "universal" look for movements.
         """
         if network == "mlp":
             return None
@@ -91,11 +103,21 @@ class Structure:
                     f"{layout.size if layout else 0}: network {network!r} cannot tell what they "
                     "are; leave wrappers of observations away, or use the network 'mlp'"
                 )
-        halves = observation["observation"] == "movements"
-        rows = zip(roads.intersections, [x for x in agent_layouts if x is not None], strict=True)
-        return cls(
-            network, tuple(_junction(intersection, layout, halves) for intersection, layout in rows)
-        )
+        kind, commands = str(observation["observation"]), int(observation.get("commands", 0))
+        junctions: list[Junction] = []
+        lanes = roads.lane_table()
+        for intersection, layout in zip(roads.intersections, agent_layouts, strict=True):
+            assert layout is not None
+            junction = _junction(intersection, layout, kind == "movements")
+            if network == "universal":
+                junction = replace(
+                    _with_memory(junction, layout, commands),
+                    vehicles=_vehicles(intersection, lanes, kind),
+                    interval_s=base.decision_interval_s,
+                    clearance_s=base.scenario.timing.clearance_s,
+                )
+            junctions.append(junction)
+        return cls(network, tuple(junctions))
 
     def checked(self, agents: AgentSet) -> Structure:
         """Return the structure itself if it fits the agents.
@@ -127,7 +149,9 @@ class Structure:
         sizes = zip(self.junctions, agents.observation_sizes, agents.action_counts, strict=True)
         for junction, size, actions in sizes:
             places = [at for kinds in junction.movements for kind in kinds for at in kind]
-            places += [junction.first_phase, junction.first_phase + actions - 1]
+            places += [] if junction.age is None else [junction.age]
+            for first in (junction.first_phase, *junction.commands):
+                places += [first, first + actions - 1]
             shares = [share for row in junction.greens for share in row]
             widths = {len(row) for row in junction.greens}
             if (
@@ -144,7 +168,11 @@ class Structure:
 
 
 _READER = TypeAdapter(Structure)
-_READ: Mapping[NetworkName, str] = {"frap": "movements and phases", "colight": "neighbours"}
+_READ: Mapping[NetworkName, str] = {
+    "frap": "movements and phases",
+    "universal": "movements and phases",
+    "colight": "neighbours",
+}
 
 
 def structure_in(content: Mapping[str, Any], agents: AgentSet) -> Structure | None:
@@ -222,3 +250,25 @@ def _places(intersection: Intersection, links: Sequence[Link], halves: bool) -> 
         tuple(at + count for at in incoming),
         tuple(at + 2 * count for at in outgoing),
     )
+
+
+def _with_memory(junction: Junction, layout: AgentLayout, commands: int) -> Junction:
+    """Return a junction with the places of the last own commands and of the age of the green."""
+    if not commands:
+        return junction
+    first = layout.size - memory_size(layout.phases, commands)
+    places = tuple(first + lag * layout.phases for lag in range(commands))
+    return replace(junction, commands=places, age=layout.size - 1)
+
+
+def _vehicles(intersection: Intersection, lanes: LaneTable, observation: str) -> tuple[float, ...]:
+    """Return the number of vehicles that makes each feature 1; empty if it has none."""
+    if observation in ("count", "queue"):
+        return (COUNT_SCALE,) * len(intersection.incoming_lanes)
+    if observation == "density":
+        return tuple(lanes.capacity[lanes.indices(intersection.incoming_lanes)].tolist())
+    if observation == "movements":
+        incoming = lanes.capacity[lanes.indices(intersection.incoming_lanes)].tolist()
+        outgoing = lanes.capacity[lanes.indices(intersection.outgoing_lanes)].tolist()
+        return (*incoming, *incoming, *outgoing)
+    return ()

@@ -1,0 +1,170 @@
+"""Pretrain one network "universal" on drawn road networks; its weights may start a training.
+
+    python -m studies.pretraining OUT --networks 150 --episodes 800
+    python -m studies.pretraining OUT --resume ...
+
+Road networks are drawn by seeds from `FIRST_SEED` on. Each episode takes the next one of a random
+order, in a world drawn for it: the plain simulation, one of random vehicles and drivers, or one
+with late commands. Every so many episodes the greedy policy plays road networks that it never
+trained on, beside two rules. The table of these checks is written beside the weights.
+"""
+
+from __future__ import annotations
+
+import argparse
+import contextlib
+import time
+from collections.abc import Sequence
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ugat_marl.effects import Domain
+from ugat_marl.envs import TrafficEnv, parallel_env
+from ugat_marl.experiments import drawn_effects, effect_ranges
+from ugat_marl.files import write_whole
+from ugat_marl.policies import (
+    UNIVERSAL_NAME,
+    DQNConfig,
+    Policy,
+    Pretraining,
+    make_rule,
+    observed_options,
+    roll_out,
+)
+from ugat_marl.scenarios import NetworkRanges, Scenario, draw_scenario, read_scenario
+from ugat_marl.seeding import derive_seed, numpy_generator
+from ugat_marl.simulation import kept_warm
+
+FIRST_SEED = 100_000
+"""Seed of the first road network of the training; tables use smaller ones."""
+
+FIRST_CHECK_SEED = 90_000
+"""Seed of the first road network of the checks."""
+
+CHECKED = 8
+"""Number of road networks of a check."""
+
+RULES = ("max-pressure:20", "largest-queue:30")
+"""Rules that are played beside the policy in a check."""
+
+OPTIONS = observed_options(UNIVERSAL_NAME)
+"""Options of the environments."""
+
+SETTINGS = DQNConfig(
+    network="universal",
+    hidden=(32, 32),
+    steps=3,
+    batch_size=64,
+    replay_capacity=4_000,
+    warmup_decisions=50,
+    learning_rate=1e-3,
+)
+
+AT_A_TIME = 4
+"""Road networks that are played at the same time."""
+
+SHARES = (0.5, 0.3, 0.2)
+"""Shares of episodes in the plain simulation, with random vehicles, and with late commands."""
+
+
+@kept_warm()
+def main(arguments: Sequence[str] | None = None) -> None:
+    """Train and check."""
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser.add_argument("out", type=Path)
+    parser.add_argument("--networks", type=int, default=150)
+    parser.add_argument("--largest", type=int, default=3, help="most intersections of a network")
+    parser.add_argument("--episodes", type=int, default=560)
+    parser.add_argument("--updates", type=int, default=160, help="updates after an episode")
+    parser.add_argument("--every", type=int, default=140, help="episodes between checks")
+    parser.add_argument("--minutes", type=float, default=1e9, help="stop after so many minutes")
+    parser.add_argument("--seed", type=int, default=0)
+    given = parser.parse_args(arguments)
+    ranges = NetworkRanges(intersections=(1, given.largest))
+    networks = drawn_networks(given.out / "networks", FIRST_SEED, given.networks, ranges)
+    checked = drawn_networks(given.out / "checked", FIRST_CHECK_SEED, CHECKED, ranges)
+    bars = {rule: played(checked, rule) for rule in RULES}
+    best = np.min(list(bars.values()), axis=0)
+    lines = ["| episodes | minutes | ATT, s | over the better rule |", "|---:|---:|---:|---:|"]
+    for rule, att_s in bars.items():
+        lines.append(f"| `{rule}` | | {att_s.mean():.1f} | {np.mean(att_s / best):.3f} |")
+    print("\n".join(lines), flush=True)
+    pretraining = Pretraining(SETTINGS, given.seed)
+    begin = time.monotonic()
+    while pretraining.episodes < given.episodes:
+        play(pretraining, networks, given)
+        episode, minutes = pretraining.episodes, (time.monotonic() - begin) / 60
+        ends = episode >= given.episodes or minutes > given.minutes
+        if episode % given.every < AT_A_TIME or ends:
+            att_s = played(checked, pretraining)
+            lines.append(
+                f"| {episode} | {minutes:.0f} | {att_s.mean():.1f} | {np.mean(att_s / best):.3f} |"
+            )
+            print(lines[-1], (att_s / best).round(2), flush=True)
+            origin = f"{episode} episodes on {given.networks} networks, seed {given.seed}"
+            pretraining.start(origin).save(given.out / "start.pt")
+            write_whole(given.out / "checks.md", "\n".join(lines) + "\n")
+        if ends:
+            break
+
+
+def drawn_networks(
+    folder: Path, first_seed: int, count: int, ranges: NetworkRanges
+) -> list[Scenario]:
+    """Return drawn road networks; those that a folder holds already are read."""
+    for seed in range(first_seed, first_seed + count):
+        if not (folder / f"d{seed}").exists():
+            draw_scenario(folder / f"d{seed}", seed, ranges)
+    return [read_scenario(str(folder / f"d{first_seed + k}")) for k in range(count)]
+
+
+def play(pretraining: Pretraining, networks: Sequence[Scenario], given: argparse.Namespace) -> None:
+    """Play the next episodes, each in a world drawn for it, and update."""
+    first = pretraining.episodes
+    progress = first / given.episodes
+    rate = float(np.interp(progress, (0.4, 1), (1, 0.1)))
+    pretraining.set_learning_rate(SETTINGS.learning_rate * rate)
+    with contextlib.ExitStack() as stack:
+        envs: dict[str, TrafficEnv] = {}
+        for episode in range(first, first + AT_A_TIME):
+            order = numpy_generator(given.seed, "order", episode // len(networks))
+            place = int(order.permutation(len(networks))[episode % len(networks)])
+            domain = drawn_domain(networks[place], derive_seed(given.seed, "domain", episode))
+            env = parallel_env(networks[place], domain, **OPTIONS)
+            envs[networks[place].id] = stack.enter_context(contextlib.closing(env))
+        epsilon = float(np.interp(first, (0, 40, 0.5 * given.episodes), (1.0, 0.1, 0.05)))
+        pretraining.play(envs, AT_A_TIME * given.updates, epsilon)
+
+
+def drawn_domain(scenario: Scenario, seed: int) -> Domain:
+    """Draw the world of an episode."""
+    generator = numpy_generator(seed, "pretraining")
+    kind = generator.choice(3, p=SHARES)
+    if kind == 0:
+        return "sim"
+    if kind == 1:
+        return drawn_effects(effect_ranges(scenario), seed)
+    decisions = int(generator.integers(1, 4))
+    return f"execution_delay={decisions * scenario.control.decision_interval_s:g}"
+
+
+def played(scenarios: Sequence[Scenario], policy: str | Pretraining) -> NDArray[np.float64]:
+    """Return the ATT of a rule, or of the network so far, on each road network, in s."""
+    att_s: list[float] = []
+    for scenario in scenarios:
+        options = OPTIONS if isinstance(policy, Pretraining) else {"observation": "movements"}
+        with contextlib.closing(parallel_env(scenario, "sim", **options)) as env:
+            acting: Policy
+            if isinstance(policy, Pretraining):
+                acting = policy.policy(env)
+            else:
+                acting = make_rule(policy, env)
+            roll_out(env, acting, 1)
+            att_s.append(env.scores().att_s)
+    return np.array(att_s)
+
+
+if __name__ == "__main__":
+    main()
