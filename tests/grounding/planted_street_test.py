@@ -94,6 +94,7 @@ class Idle:
 @pytest.fixture(scope="module")
 def trained(tmp_path_factory: pytest.TempPathFactory) -> RunState[Any]:
     config = UgatConfig(
+        grounding="phase",
         pretrain_episodes=0,
         iterations=1,
         grounded_episodes=1,

@@ -21,6 +21,7 @@ from ugat_marl.errors import CheckpointError, OptionError, UnknownNameError
 from ugat_marl.experiments import transfer
 from ugat_marl.experiments.training import simulated_worlds
 from ugat_marl.grounding import (
+    ChangePenalty,
     GateConfig,
     GroundedEnv,
     PhaseTransform,
@@ -118,6 +119,25 @@ def test_what_the_infos_say_is_what_was_done(env: TrafficEnv) -> None:
     """Delays that were drawn for a green that goes on had no effect, and are not told."""
     told, lanes = play(RandomDelays(env, MOST_S), 4)
     assert lanes == replayed(env, 4, told) != replayed(env, 4, [{}] * len(told))
+
+
+def test_a_change_costs_its_price_and_nothing_else_does(env: TrafficEnv) -> None:
+    def paid(world: Any) -> tuple[list[float], list[bool]]:
+        world.reset(seed=3)
+        rewards: list[float] = []
+        changes: list[bool] = []
+        decision = 0
+        while world.agents:
+            before = dict(zip(env.agents, env.phases, strict=True))
+            _, reward, _, _, infos = world.step(phases_of(env.agents, decision))
+            rewards += reward.values()
+            changes += [infos[a]["executed_action"] != before[a] for a in reward]
+            decision += 1
+        return rewards, changes
+
+    (plain, changes), (charged, _) = paid(env), paid(ChangePenalty(env, 7.0))
+    assert {True, False} == set(changes)
+    assert charged == [reward - 7.0 * change for reward, change in zip(plain, changes, strict=True)]
 
 
 def test_traffic_is_delayed_in_some_episodes_more_often_than_in_others(env: TrafficEnv) -> None:
@@ -269,7 +289,8 @@ def few_rules(monkeypatch: pytest.MonkeyPatch) -> None:
 def test_the_kind_of_grounding_decides_what_is_made(env: TrafficEnv) -> None:
     with pytest.raises(UnknownNameError, match=r"grounding 'time'\. Did you mean 'timed'"):
         UgatConfig(grounding="time")  # pyright: ignore[reportArgumentType]
-    phase, timely = UgatConfig(), UgatConfig(grounding="timed", timed=TimedConfig(most_s=7))
+    phase, timely = UgatConfig("phase"), UgatConfig("timed", timed=TimedConfig(most_s=7))
+    assert UgatConfig().grounding == "street"
     assert (phase.grounding, phase.most_delay_s, timely.most_delay_s) == ("phase", 0, 7)
     assert isinstance(phase.transform(env.layouts, 0), PhaseTransform)
     made = timely.transform(env.layouts, 0)

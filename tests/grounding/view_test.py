@@ -329,7 +329,9 @@ def test_a_run_finds_the_neighbours_by_itself(
         raise ResetResult(state.transform)
 
     monkeypatch.setattr(Ugat, "train", begun)
-    config = TransferConfig("grid2x2-v1", ugat=UgatConfig(inputs=InputsConfig(history=2, hops=1)))
+    config = TransferConfig(
+        "grid2x2-v1", ugat=UgatConfig("phase", inputs=InputsConfig(history=2, hops=1))
+    )
     with pytest.raises(ResetResult) as told:
         transfer(config, tmp_path / "run")
     (made,) = told.value.args

@@ -51,5 +51,6 @@ from .worlds import RollOutSettings as RollOutSettings
 from .worlds import SimulatedWorld as SimulatedWorld
 from .worlds import World as World
 from .worlds import roll_outs as roll_outs
+from .wrappers import ChangePenalty as ChangePenalty
 from .wrappers import GroundedEnv as GroundedEnv
 from .wrappers import RandomDelays as RandomDelays

@@ -26,6 +26,9 @@ class Savable(Protocol):
 
 Saved = TypeVar("Saved", bound=Savable)
 
+_POLICIES = ("direct", "best")
+"""Policies of a state; each has a file in a checkpoint."""
+
 
 @dataclass
 class RunState(Generic[Saved]):
@@ -35,6 +38,7 @@ class RunState(Generic[Saved]):
         learner: Learner of the policy.
         transform: What is fitted: f, h and gate, or a street.
         direct: Policy after plain training, for direct transfer.
+        best: Best policy so far in the fitted street; None where policies are not compared.
         simulated: Logs of D_sim.
         real: Logs of D_real.
         pretrained: Number of episodes of plain training so far.
@@ -44,10 +48,15 @@ class RunState(Generic[Saved]):
     learner: Learner
     transform: Saved
     direct: Policy | None = None
+    best: Policy | None = None
     simulated: list[TransitionLog] = field(default_factory=list)
     real: list[TransitionLog] = field(default_factory=list)
     pretrained: int = 0
     iteration: int = 0
+
+    def policy(self) -> Policy:
+        """Return the result so far: the best policy, or that of the learner."""
+        return self.best or self.learner.policy()
 
     def save(self, run: Run) -> None:
         """Write a checkpoint into the run's folder.
@@ -59,8 +68,9 @@ class RunState(Generic[Saved]):
         def write(folder: Path) -> None:
             self.learner.save(folder / "learner.pt")
             self.transform.save(folder / "grounding.pt")
-            if self.direct is not None:
-                _save_policy(self.direct, folder / "direct.pt")
+            for name in _POLICIES:
+                if (policy := getattr(self, name)) is not None:
+                    _save_policy(policy, folder / f"{name}.pt")
             for name, logs in (("sim", self.simulated), ("real", self.real)):
                 for number, log in enumerate(logs):
                     log.write(folder / f"{name}-{number:03}.parquet")
@@ -77,7 +87,7 @@ class RunState(Generic[Saved]):
 
         Args:
             run: Folder of the run.
-            load_policy: Reads direct transfer.
+            load_policy: Reads direct transfer and the best policy.
             prepare: Called after the transform is restored and before the learner is, which it may
                 replace by one that fits.
 
@@ -92,8 +102,9 @@ class RunState(Generic[Saved]):
             self.transform.load(folder / "grounding.pt")
             prepare(self)
             self.learner.load(folder / "learner.pt")
-            if (folder / "direct.pt").exists():
-                self.direct = load_policy(folder / "direct.pt")
+            for name in _POLICIES:
+                if (folder / f"{name}.pt").exists():
+                    setattr(self, name, load_policy(folder / f"{name}.pt"))
             self.simulated = _read_logs(folder, "sim")
             self.real = _read_logs(folder, "real")
 

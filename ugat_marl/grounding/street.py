@@ -18,6 +18,7 @@ part explains is left to f and h on top of it (`residual`).
 
 from __future__ import annotations
 
+import contextlib
 import copy
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
@@ -26,6 +27,7 @@ from typing import Any
 
 import numpy as np
 import torch
+from numpy.typing import NDArray
 from pettingzoo.utils import BaseParallelWrapper
 from torch import Tensor
 
@@ -67,6 +69,8 @@ class StreetConfig:
         simulations: N, worlds that are simulated for the first posterior.
         further: Worlds that each further iteration adds, half of them drawn from the posterior.
         simulated_s: Length of an episode in such a world, in s.
+        judged: Worlds of the fitted street in which policies are compared after each iteration; the
+            best one is kept. 0 keeps the last one.
         without: Effects left out of the library.
         channel: Numbers of the fit of the command channel.
         eyes: Numbers of the fit of the detectors.
@@ -77,6 +81,7 @@ class StreetConfig:
     simulations: int = 160
     further: int = 40
     simulated_s: float = 1800.0
+    judged: int = 4
     without: tuple[str, ...] = ()
     channel: ChannelConfig = field(default_factory=ChannelConfig)
     eyes: EyesConfig = field(default_factory=EyesConfig)
@@ -92,6 +97,8 @@ class StreetConfig:
             raise OptionError(f"simulations = {self.simulations}: must be at least 20")
         if self.further < 0:
             raise OptionError(f"further = {self.further}: must not be negative")
+        if self.judged < 0:
+            raise OptionError(f"judged = {self.judged}: must not be negative")
         if self.simulated_s <= 0:
             raise OptionError(f"simulated_s = {self.simulated_s}: must be above 0")
 
@@ -268,9 +275,20 @@ class Simulation:
         domain = _joined(self.sim, world.effects)
         return parallel_env(self.scenario, domain, **given)
 
+    def shown(self, commands: int) -> int:
+        """Return how many own commands agents see, where a street asks for some.
+
+        Agents that see commands in any case see no other number of them: their policies go on.
+        """
+        return int(self.options.get("commands", 0)) or commands
+
     def plain(self, commands: int) -> TrafficEnv:
-        """Return the unchanged simulation, in which agents see so many own commands."""
-        return self.env(StreetWorld(), commands=commands)
+        """Return the unchanged simulation, in which agents see their own commands.
+
+        Args:
+            commands: Number of commands, for agents that see none otherwise.
+        """
+        return self.env(StreetWorld(), commands=self.shown(commands))
 
     def play(self, world: StreetWorld, policy: Policy, seed: int, stop: Stop) -> TransitionLog:
         """Run one episode in a world and record it."""
@@ -286,6 +304,31 @@ class Simulation:
             return played.log
         finally:
             env.close()
+
+    def att_s(self, world: StreetWorld, policy: Policy, seed: int, stop: Stop) -> float:
+        """Run one episode in a world; return the average travel time in s."""
+        with contextlib.closing(self.env(world, **policy.env_options)) as env:
+            acting, check = copy.deepcopy(policy), stop_callback(stop)
+            persistently(lambda: roll_out(env, acting, seed, on_step=check))
+            return env.scores().att_s
+
+    def compare(
+        self,
+        worlds: Sequence[StreetWorld],
+        policies: Sequence[Policy],
+        seeds: Sequence[int],
+        on_done: Callable[[], object],
+    ) -> NDArray[np.float64]:
+        """Run each policy in each world with the world's seed.
+
+        Returns:
+            Average travel times in s, ``(policies, worlds)``.
+        """
+        stop = Stop()
+        pairs = list(zip(worlds, seeds, strict=True))
+        parts = [(world, policy, seed, stop) for policy in policies for world, seed in pairs]
+        times_s = in_order(self.workers, self.att_s, parts, stop, lambda _: on_done())
+        return np.array(times_s).reshape(len(policies), len(worlds))
 
     def logs(
         self,
@@ -457,11 +500,12 @@ def street_env(street: FittedStreet, simulation: Simulation, commands: int) -> D
     Args:
         street: The fitted street.
         simulation: The simulation.
-        commands: Number of own commands that agents see.
+        commands: Number of own commands that agents see, if they see none otherwise.
     """
+    shown = simulation.shown(commands)
     return DrawnEnv(
         simulation.plain(commands),
-        lambda seed: simulation.env(street.world(seed), commands=commands),
+        lambda seed: simulation.env(street.world(seed), commands=shown),
     )
 
 

@@ -9,13 +9,14 @@
      5      roll pi out in worlds of the street; fit f to D_real, h to these roll-outs (`residual`)
      6      for e = 1, ..., E episodes: draw a world of the street, update pi in it; where f is
             trusted, ground its actions
+     7      keep the better of pi and the policy kept so far, in the same worlds of the street
 
 Line 5 is an option. Where commands are late, a grounded action would be late as well, and none is
 grounded.
 
-If commands are late or lost, the policy needs to see its own last commands, which the pre-trained
-one does not. If detectors are at fault, the numbers that it learnt to read mean something else. A
-new policy then begins in the fitted street, with M episodes more.
+If commands are late or lost, the policy needs to see its own last commands. If detectors are at
+fault, the numbers that it learnt to read mean something else. A policy that did not see commands,
+or that learnt other numbers, begins anew in the fitted street, with M episodes more.
 """
 
 from __future__ import annotations
@@ -124,7 +125,7 @@ class StreetTraining(Algorithm):
             before = state.transform.view
             street = self._fit(state, policy)  # line 4
             episodes = self.config.grounded_episodes
-            if state.transform.view != before:
+            if self._begins_anew(before, state.transform.view):
                 self.renew(state)
                 episodes += self.config.pretrain_episodes
             numbers = street.as_dict()
@@ -139,19 +140,47 @@ class StreetTraining(Algorithm):
             if residual is not None and residual.acts:
                 gate = residual.end_iteration().as_dict()
                 numbers |= {f"residual/gate/{name}": value for name, value in gate.items()}
+            numbers |= self._keep_better(state, street)  # line 7
             if self.probe is not None:
-                numbers |= self.probe(state.learner.policy())
+                numbers |= self.probe(state.policy())
             self.run.log("iteration", state.iteration + 1, numbers)
             state.iteration += 1
             state.save(self.run)
-        return state.learner.policy()
+        return state.policy()
+
+    def _keep_better(self, state: RunState[StreetFit], street: FittedStreet) -> dict[str, float]:
+        """Compare the new policy with the kept one in worlds of the street; keep the better.
+
+        Returns:
+            Average travel times in s, for the metrics.
+        """
+        count = self.config.street.judged
+        if count == 0:
+            return {}
+        new, kept = state.learner.policy(), state.best or state.direct
+        assert kept is not None  # plain training comes first
+        seeds = [derive_seed(self.seed, "judged", state.iteration, k) for k in range(count)]
+        worlds = [street.world(seed) for seed in seeds]
+        with self.run.reporter.task(f"comparing, {iteration_name(state)}", 2 * count) as advance:
+            times_s = self.simulation.compare(worlds, [kept, new], seeds, advance).mean(1)
+        state.best = new if times_s[1] < times_s[0] else kept
+        self.run.reporter.say(
+            f"{iteration_name(state)}: {times_s[1]:.1f} s in the fitted street, the policy before "
+            f"{times_s[0]:.1f} s: {'the new one' if state.best is new else 'that one'} is kept"
+        )
+        return {"judged/before": float(times_s[0]), "judged/after": float(times_s[1])}
 
     def renew(self, state: RunState[StreetFit]) -> None:
         """Replace the learner by a new one, if policies see something else in the street."""
-        commands, faulty = state.transform.view
-        if commands or faulty:
+        commands, _ = state.transform.view
+        if self._begins_anew((0, False), state.transform.view):
             with contextlib.closing(self.simulation.plain(commands)) as env:
                 state.learner = self.make(env, self.seed)
+
+    def _begins_anew(self, before: tuple[int, bool], now: tuple[int, bool]) -> bool:
+        """Return True if a policy of the view `before` is of no use with the view `now`."""
+        shown = self.simulation.shown
+        return (shown(before[0]), before[1]) != (shown(now[0]), now[1])
 
     def _roll_out(self, state: RunState[StreetFit], policy: Policy) -> None:
         """Roll the policy out on the street (line 3)."""

@@ -301,17 +301,18 @@ class RecordedWorld:
         provenance = log.provenance
         for fact, given, wanted in (
             ("agents", list(provenance.layouts), list(env.recorded_layouts)),
+            ("observation", provenance.observation, env.options.observation),
             *(
                 (f"sizes at {agent}", provenance.layouts.get(agent), layout)
                 for agent, layout in env.recorded_layouts.items()
             ),
-            ("observation", provenance.observation, env.options.observation),
             ("decision interval", provenance.decision_interval_s, env.decision_interval_s),
         ):
             if given != wanted:
                 raise LogError(
-                    f"the real log's {fact} are {given}, the simulation's {wanted}; record it on "
-                    f"{env.scenario.id!r} with the same options"
+                    f"{fact} of the real log: {given}, of the simulation: {wanted}; record it on "
+                    f"{env.scenario.id!r} with the same options, or train with those of the log "
+                    "(--observation count --learner dqn, for example)"
                 )
         stack = Stack(env.recorded_layouts)
         split(stack_log(log, stack), held_out_every, stack)  # raises now instead of after hours

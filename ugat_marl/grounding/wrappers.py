@@ -199,3 +199,30 @@ class RandomDelays(BaseParallelWrapper[str, Any, Any]):
             begins = infos[agent]["executed_action"] != before[agent]
             told[agent] = {**infos[agent], "delay_s": delays[agent] * begins}
         return observations, rewards, terminations, truncations, told
+
+
+class ChangePenalty(BaseParallelWrapper[str, Any, Any]):
+    """Lowers an agent's reward whenever its intersection changes the phase.
+
+    It is a control that needs no data: somebody guesses that changes cost more on the street.
+
+    Args:
+        env: A `TrafficEnv`, wrapped or not.
+        cost: Amount taken from the reward for a change, in the unit of the reward.
+    """
+
+    def __init__(self, env: AnyParallelEnv, cost: float) -> None:
+        super().__init__(env)
+        self._cost = cost
+
+    def step(self, actions: dict[str, Any]) -> StepResult:
+        """Execute the actions, and take the cost of changes from the rewards."""
+        agents = list(self.env.agents)
+        base: Any = self.env.unwrapped
+        before = dict(zip(agents, base.phases, strict=True)) if agents else {}
+        observations, rewards, terminations, truncations, infos = self.env.step(actions)
+        paid = {
+            agent: reward - self._cost * (infos[agent]["executed_action"] != before[agent])
+            for agent, reward in rewards.items()
+        }
+        return observations, paid, terminations, truncations, infos
