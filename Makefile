@@ -37,9 +37,9 @@ help:
 
 demo: environment
 	rm -rf runs/demo
-	OMP_NUM_THREADS=1 $(BIN)/ugat-marl train grid2x2-v1 --real V4 --grounding timed --out runs/demo \
-		--pretrain-episodes 20 --iterations 3 --grounded-episodes 6 --sim-rollouts 2 --real-rollouts 2 \
-		--evaluation-seeds 5 --tuning-seeds 1 $(ARGS)
+	OMP_NUM_THREADS=1 $(BIN)/ugat-marl train grid2x2-v1 --real V4 --out runs/demo --duration-s 1800 \
+		--pretrain-episodes 4 --iterations 1 --grounded-episodes 8 --street.simulations 40 \
+		--street.simulated-s 900 --evaluation-seeds 3 --tuning-seeds 1 $(ARGS)
 
 test: environment-dev
 	UGAT_MARL_TEST_INSTALLED=1 OMP_NUM_THREADS=1 $(BIN)/python -m pytest -q -n $(JOBS) --dist worksteal $(TESTS) $(ARGS)

@@ -92,9 +92,9 @@ max-pressure:10 max-pressure-loss:20 green-wave programme random
 """
 
 TRAINING = """
---real V4 --seed 3 --duration-s 900 --pretrain-episodes 4 --iterations 2 --grounded-episodes 2
---sim-rollouts 2 --real-rollouts 2 --evaluation-seeds 2 --tuning-seeds 1 --fit.epochs 20
---least-accuracy None
+--learner dqn --real V4 --seed 3 --duration-s 900 --pretrain-episodes 4 --iterations 2
+--grounded-episodes 2 --sim-rollouts 2 --real-rollouts 2 --evaluation-seeds 2 --tuning-seeds 1
+--fit.epochs 20 --least-accuracy None
 """
 
 UNEXAMINED = """

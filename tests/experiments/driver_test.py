@@ -47,7 +47,7 @@ from ugat_marl.simulation import kept_warm
 from ugat_marl.simulation.host import _WarmParent
 
 needs_forks = pytest.mark.skipif(not jobs_fork_on("cpu"), reason="jobs are not forked here")
-QUICK = LearnerSpec(dqn=DQNConfig(warmup_decisions=5, epsilon_decay_decisions=50))
+QUICK = LearnerSpec(DQN_NAME, dqn=DQNConfig(warmup_decisions=5, epsilon_decay_decisions=50))
 PLAIN = Job(
     Setting("direct transfer", "direct", learner=QUICK),
     "single-v1",
@@ -59,6 +59,7 @@ PLAIN = Job(
     evaluation_seeds=evaluation_seeds(2),
 )
 UGAT = UgatConfig(
+    grounding="phase",
     pretrain_episodes=4,
     iterations=1,
     grounded_episodes=2,

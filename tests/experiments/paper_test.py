@@ -32,8 +32,10 @@ def row(name: str, config: PaperConfig = SHORT, table: str = "main") -> Setting:
 def test_main_has_the_controls_an_honest_table_needs() -> None:
     names = [setting.name for setting in SHORT.settings("main")]
     assert names == [
-        "direct transfer", "UGAT", "UGAT, timed", "UGAT, timed: rewards matched", "more plain sim",
-        "domain randomisation", "random delay", *(f"constant delay {s} s" for s in (1, 2, 3, 4, 5)),
+        "direct transfer", "UGAT", "UGAT, timed", "fitted street", "UGAT, timed: rewards matched",
+        "more plain sim",
+        "domain randomisation", "random delay", "penalty on changes",
+        *(f"constant delay {s} s" for s in (1, 2, 3, 4, 5)),
         "fine-tuned on the same data", "trained in real", "best rule, tuned there",
     ]  # fmt: skip
 

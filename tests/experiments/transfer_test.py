@@ -218,7 +218,8 @@ def test_timed_grounding_learns_from_a_log_of_fixed_time(crossings: bool, tmp_pa
     path = tmp_path / "fixed.parquet"
     call = ["rollout", "single-v1", "--domain", "V4", "--policy", "fixed-time:30", "--out"]
     call += [str(path), "--epsilon", "0", "--episodes", "2", "--duration-s", "300"]
-    assert main([*call, *(["--crossings"] if crossings else [])]) == 0
+    call += ["--observation", "count", "--crossings" if crossings else "--no-crossings"]
+    assert main(call) == 0
     log = TransitionLog.read(path)
     rows, layout = log.transitions("signal_0"), log.provenance.layouts["signal_0"]
     assert rows.served_features.shape == (60, layout.features if crossings else 0)

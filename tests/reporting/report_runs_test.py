@@ -38,7 +38,7 @@ from ugat_marl.experiments import (
     transfer,
 )
 from ugat_marl.experiments.scores import Result
-from ugat_marl.grounding import FitConfig, GateConfig, UgatConfig
+from ugat_marl.grounding import FitConfig, GateConfig, StreetConfig, UgatConfig
 from ugat_marl.reporting import RunRecord, read_records, runs_page, style, write_pictures
 from ugat_marl.reporting import formats as words
 from ugat_marl.reporting.charts import radar_picture
@@ -109,7 +109,7 @@ def queues() -> pl.DataFrame:
 
 def make_run(directory: Path, *, seed: int = 0, real: str = "V4", **changes: Any) -> Path:
     """A folder such as a run leaves; `changes` are of the configuration."""
-    ugat = UgatConfig(pretrain_episodes=14, iterations=2, grounded_episodes=5)
+    ugat = UgatConfig("phase", pretrain_episodes=14, iterations=2, grounded_episodes=5)
     config = TransferConfig("grid2x2-v1", real, seed=seed, ugat=ugat, **changes)
     directory.mkdir(parents=True)
     checkpoint = directory / "trainings" / "ugat" / "checkpoint"
@@ -724,9 +724,18 @@ def test_the_page_is_drawn_in_light_and_dark(dark: bool, run: Path, tmp_path: Pa
 
 
 @pytest.mark.slow
-def test_a_run_leaves_all_that_its_page_wants(tmp_path: Path) -> None:
-    ugat = UgatConfig(pretrain_episodes=1, iterations=1, grounded_episodes=1, sim_rollouts=1,
-                      real_rollouts=1, fit=FitConfig(epochs=1))  # fmt: skip
+@pytest.mark.parametrize("grounding", ["phase", "street"])
+def test_a_run_leaves_all_that_its_page_wants(grounding: Any, tmp_path: Path) -> None:
+    ugat = UgatConfig(
+        grounding,
+        pretrain_episodes=1,
+        iterations=1,
+        grounded_episodes=1,
+        sim_rollouts=1,
+        real_rollouts=1,
+        fit=FitConfig(epochs=1),
+        street=StreetConfig(simulations=20, simulated_s=60.0, judged=1),
+    )
     config = TransferConfig("grid2x2-v1", duration_s=100, evaluation_seeds=2, tuning_seeds=1,
                             control=False, ugat=ugat)  # fmt: skip
     found = transfer(config, tmp_path / "run")

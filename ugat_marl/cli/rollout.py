@@ -66,10 +66,11 @@ class Rollout:
         seed: Root of the episodes' seeds.
         epsilon: Chance of a random phase. The log then also holds actions that the policy would not
             take.
-        observation: Observation to record: count, queue, pressure, waiting, density, movements.
+        observation: Observation to record: movements, count, queue, pressure, waiting, density. The
+            learner universal reads movements.
         neighbours: Distance in roads up to which other intersections are observed too.
         duration_s: Length of an episode in s; default: the scenario's own.
-        crossings: Also record when vehicles cross the stop lines, for timed grounding.
+        crossings: Also record when vehicles cross the stop lines, which groundings of greens read.
         workers: Simulations at a time.
         ray: Record on Ray instead.
         video: Video to write: .mp4 (needs ffmpeg: pip install 'ugat-marl[video]'), .webp or .gif
@@ -87,10 +88,10 @@ class Rollout:
     episodes: int = 3
     seed: int = 0
     epsilon: float = 0.3
-    observation: str = "count"
+    observation: str = "movements"
     neighbours: int = 0
     duration_s: float | None = None
-    crossings: bool = False
+    crossings: bool = True
     workers: Workers = None
     ray: RayAddress = None
     video: Annotated[

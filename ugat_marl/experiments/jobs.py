@@ -38,7 +38,14 @@ from ugat_marl.experiments.settings import DIRECT, Setting
 from ugat_marl.experiments.training import Effort, simulated_worlds, train_grounded, train_through
 from ugat_marl.experiments.tuning import TUNED_RULES, VERSION, tuned_rules
 from ugat_marl.files import write_whole
-from ugat_marl.grounding import Probe, RandomDelays, RecordedWorld, SimulatedWorld, World
+from ugat_marl.grounding import (
+    ChangePenalty,
+    Probe,
+    RandomDelays,
+    RecordedWorld,
+    SimulatedWorld,
+    World,
+)
 from ugat_marl.parallel import Workers, in_this_process
 from ugat_marl.policies import STANDARD_RULES, Policy, PolicyFactory
 from ugat_marl.progress import Bars, Reporter
@@ -438,7 +445,7 @@ def _grounded(
             workers=workers,
         )
     assert state.direct is not None  # plain training comes first
-    policies = {ugat.pretrain_episodes: state.direct, job.episodes: state.learner.policy()}
+    policies = {ugat.pretrain_episodes: state.direct, job.episodes: state.policy()}
     for mark in job.rows:
         _save(policies[mark], folder / (POLICY if mark == job.episodes else DIRECT_POLICY))
         yield mark, policies[mark]
@@ -508,7 +515,9 @@ def _world(job: Job) -> AnyParallelEnv:
     if setting.recipe == "randomised":
         return randomised_env(scenario, options, job.sim)
     env = parallel_env(scenario, setting.world or job.target or job.sim, **options)
-    return RandomDelays(env, setting.most_delay_s) if setting.recipe == "delays" else env
+    if setting.recipe == "delays":
+        return RandomDelays(env, setting.most_delay_s)
+    return ChangePenalty(env, setting.change_cost) if setting.recipe == "penalty" else env
 
 
 def perform_described(folder: Path) -> int:

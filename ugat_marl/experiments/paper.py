@@ -22,12 +22,14 @@ from ugat_marl.experiments.settings import (
     FINE_TUNED,
     GROUNDED_NAME,
     ORACLE,
+    PENALTY,
     RANDOM_DELAY,
     RANDOMISED,
     RULE,
     SEEING_ORACLE,
     SEEN_COMMANDS,
     STREET,
+    UNTRAINED,
     LearnerSpec,
     Setting,
 )
@@ -44,7 +46,12 @@ from ugat_marl.grounding import (
     UgatConfig,
 )
 from ugat_marl.parallel import Workers
-from ugat_marl.policies import DQN_NAME, DQNConfig, require_device_name
+from ugat_marl.policies import (
+    UNIVERSAL_NAME,
+    DQNConfig,
+    observed_options,
+    require_device_name,
+)
 from ugat_marl.progress import Reporter
 
 SEVERAL = 5
@@ -59,7 +66,7 @@ def settings_of(
     table: str,
     ugat: UgatConfig,
     sim: str,
-    groundings: Sequence[str] = ("phase", "timed"),
+    groundings: Sequence[str] = (),
     constants: Sequence[int] = (1, 2, 3, 4, 5),
     learner: LearnerSpec | None = None,
 ) -> list[Setting]:
@@ -69,18 +76,19 @@ def settings_of(
         table: One of `TABLES`.
         ugat: Settings that the rows share.
         sim: The simulation.
-        groundings: Kinds of grounding to try: "phase", "timed", "street".
+        groundings: Kinds of grounding to try: "phase", "timed", "street"; empty for all that the
+            table can have. "alpha" and "uncertainty" need a gate, which "street" has not.
         constants: Constant delays in s that "main" sweeps.
         learner: The learner of all rows; None for DQN with its default settings.
 
     Raises:
         OptionError: A grounding, delay or table does not exist.
     """
+    gated = table in ("alpha", "uncertainty")
+    groundings = groundings or [g for g in GROUNDED_NAME if g != "street" or not gated]
     for grounding in groundings:
         if grounding not in GROUNDED_NAME:
             raise OptionError(f"grounding {grounding!r}: allowed are {', '.join(GROUNDED_NAME)}")
-    if not groundings:
-        raise OptionError("groundings is empty; name phase, timed, or both")
     if wrong := [seconds for seconds in constants if seconds < 1]:
         raise OptionError(f"constants holds {wrong[0]}: delays are whole seconds, at least 1")
     # Phase grounding is the paper's: it uses f and h from the start, however accurate they are.
@@ -90,7 +98,9 @@ def settings_of(
     direct, rule = Setting(DIRECT, "direct"), Setting(RULE, "rule")
     if table == "main":
         rows = [direct, *_grounded(bases), *_controls(ugat, sim, constants)]
-        if "street" in bases:
+        if learner is not None and learner.dqn.start is not None:
+            rows.append(Setting(UNTRAINED, "untrained"))
+        if "street" in bases and not observed_options((learner or LearnerSpec()).name):
             rows.append(Setting(SEEING_ORACLE, "scratch", commands=SEEN_COMMANDS))
         rows.append(rule)
     elif table == "ablation":
@@ -153,6 +163,7 @@ def _controls(ugat: UgatConfig, sim: str, constants: Sequence[int]) -> list[Sett
         Setting(CONTROL, "further", sim),
         Setting(RANDOMISED, "randomised"),
         Setting(RANDOM_DELAY, "delays", sim),
+        Setting(PENALTY, "penalty", sim),
         *(Setting(constant_name(s), "further", late_in(sim, s)) for s in constants),
         Setting(FINE_TUNED, "further", episodes=seen),
         Setting(ORACLE, "scratch"),
@@ -278,22 +289,22 @@ class PaperConfig:
         grounded_episodes: Episodes of grounded training per iteration.
         sim_rollouts: Episodes added to D_sim per iteration.
         real_rollouts: Episodes added to D_real per iteration.
-        groundings: Kinds of grounding: phase, timed, street.
+        groundings: Kinds of grounding: phase, timed, street; default: all that the table can have.
         constants: Constant delays in s that "main" sweeps.
         rows: Names of the rows to train; direct transfer is always trained. Default: all rows.
         evaluation_seeds: Number of evaluation episodes of each policy in each domain.
         rule_budget: Most episodes to tune one rule in one domain.
-        observation: Kind of observation.
+        observation: Kind of observation; default: the one that the learner needs, or count.
         reward: Kind of reward.
         neighbours: Agents also see the intersections up to so many roads away.
         duration_s: Length of an episode in s; default: the scenario's own.
-        learner: Learner of all rows: dqn, the suite's own, or a baseline
+        learner: Learner of all rows: universal or dqn, the suite's own, or a baseline
             (docs/how-to/learners.md).
         learner_settings: Settings of a baseline as NAME=VALUE, such as learning_rate=0.001; commas
             separate the parts of a tuple.
-        device: Device for dqn's updates and the fits: cpu, cuda, or cuda:N; all trainings share
-            it.
-        dqn: Settings of dqn.
+        device: Device for the learner's updates and the fits: cpu, cuda, or cuda:N; all trainings
+            share it.
+        dqn: Settings of the learners universal and dqn.
         inputs: Inputs of f and h beside the intersection's own state and action.
         fit: Settings of the fit of f and h; a row may replace some.
         gate: Settings of the gate and its threshold; a row may replace some.
@@ -306,21 +317,21 @@ class PaperConfig:
     sim: str = "sim"
     seeds: int = 5
     first_seed: int = 0
-    episodes: int = 60
-    iterations: int = 4
+    episodes: int = 20
+    iterations: int = 2
     grounded_episodes: int = 10
     sim_rollouts: int = 3
-    real_rollouts: int = 3
-    groundings: tuple[str, ...] = ("phase", "timed")
+    real_rollouts: int = 2
+    groundings: tuple[str, ...] = ()
     constants: tuple[int, ...] = (1, 2, 3, 4, 5)
     rows: tuple[str, ...] = ()
     evaluation_seeds: int = 5
     rule_budget: int = BUDGET
-    observation: str = "count"
+    observation: str | None = None
     reward: str = "total-queue"
     neighbours: int = 0
     duration_s: float | None = None
-    learner: str = DQN_NAME
+    learner: str = UNIVERSAL_NAME
     learner_settings: tuple[str, ...] = ()
     device: str = "cpu"
     dqn: DQNConfig = field(default_factory=DQNConfig)
@@ -434,7 +445,7 @@ def compare(
         loaded.hash,
         domain_label(config.sim),
         tuple(trials),
-        {} if config.learner == DQN_NAME else {"learner": config.learner},
+        {"learner": config.learner},
         constants=tuple(row.name for row in rows if row.name in late),
         grounded=tuple(row.name for row in rows if row.recipe == "grounded"),
     )
@@ -505,7 +516,7 @@ class Planner:
             episodes=self._episodes(row),
             start=None if base is None else f"{base.name}/{LEARNER}",
             options={
-                "observation": config.observation,
+                **config.spec.env_options(config.observation),
                 "reward": config.reward,
                 "neighbours": config.neighbours,
                 "duration_s": config.duration_s,
@@ -521,4 +532,5 @@ class Planner:
         config = self._config
         if row.episodes is not None:
             return config.episodes + row.episodes
-        return {"direct": config.episodes, "rule": 0}.get(row.recipe, config.all_episodes)
+        fixed = {"direct": config.episodes, "rule": 0, "untrained": 0}
+        return fixed.get(row.recipe, config.all_episodes)

@@ -3,18 +3,21 @@
 from __future__ import annotations
 
 from dataclasses import asdict, dataclass, field
-from typing import Any, Literal
+from typing import Any, Literal, get_args
 
 from ugat_marl.errors import OptionError, UnknownNameError
 from ugat_marl.grounding import NEGATIVE_CONTROLS, NegativeControl, UgatConfig
 from ugat_marl.policies import (
-    DQN_NAME,
+    SUITE_LEARNERS,
+    UNIVERSAL_NAME,
     DQNConfig,
     LearnerFactory,
     baseline_settings,
     learner_factory,
     learner_library,
+    observed_options,
     require_known_learner,
+    suite_config,
 )
 
 DIRECT, UGAT, TIMED = "direct transfer", "UGAT", "UGAT, timed"
@@ -22,12 +25,14 @@ CONTROL = "more plain sim"
 CORRECTED = "corrected sim"
 RANDOMISED = "domain randomisation"
 RANDOM_DELAY = "random delay"
+PENALTY = "penalty on changes"
 FINE_TUNED = "fine-tuned on the same data"
 ORACLE = "trained in real"
 SEEING_ORACLE = "trained in real, sees its commands"
 RULE = "best rule, tuned there"
 
 STREET = "fitted street"
+UNTRAINED = "pretrained, not trained here"
 
 GROUNDED_NAME = {"phase": UGAT, "timed": TIMED, "street": STREET}
 """Name of the row of each kind of grounding."""
@@ -38,10 +43,21 @@ SEEN_COMMANDS = 4
 MOST_DELAY_S = 5
 """Longest of the random delays of the recipe "delays", in s."""
 
-Recipe = Literal["direct", "grounded", "further", "scratch", "randomised", "delays", "rule"]
-RECIPES: tuple[Recipe, ...] = (
-    "direct", "grounded", "further", "scratch", "randomised", "delays", "rule",
-)  # fmt: skip
+CHANGE_COST = 5.0
+"""Cost of a change of phase of the recipe "penalty", in halting vehicles."""
+
+Recipe = Literal[
+    "direct",
+    "grounded",
+    "further",
+    "scratch",
+    "randomised",
+    "delays",
+    "penalty",
+    "untrained",
+    "rule",
+]
+RECIPES: tuple[Recipe, ...] = get_args(Recipe)
 
 
 @dataclass(frozen=True)
@@ -49,12 +65,12 @@ class LearnerSpec:
     """The algorithm that learns, with its settings.
 
     Attributes:
-        name: "dqn", the suite's own, or the name of a baseline.
+        name: "universal" or "dqn", the suite's own, or the name of a baseline.
         settings: Settings of a baseline as ``NAME=VALUE``.
-        dqn: Settings of "dqn".
+        dqn: Settings of the suite's own learners that differ from the defaults.
     """
 
-    name: str = DQN_NAME
+    name: str = UNIVERSAL_NAME
     settings: tuple[str, ...] = ()
     dqn: DQNConfig = field(default_factory=DQNConfig)
 
@@ -65,7 +81,7 @@ class LearnerSpec:
         """Return a factory of fresh learners.
 
         Args:
-            device: Device for the updates of "dqn"; baselines stay on the CPU.
+            device: Device for the updates of the suite's own; baselines stay on the CPU.
 
         Raises:
             UnknownNameError: A setting does not exist.
@@ -74,6 +90,17 @@ class LearnerSpec:
         """
         return learner_factory(self.name, self.settings, self.dqn, device)
 
+    def env_options(self, observation: str | None) -> dict[str, Any]:
+        """Return the options of environments about what agents see.
+
+        Args:
+            observation: Kind of observation; None for the one that the learner needs, or `count`.
+        """
+        needed = observed_options(self.name)
+        return {"observation": "count", **needed} | (
+            {} if observation is None else {"observation": observation}
+        )
+
     @property
     def identity(self) -> dict[str, Any]:
         """Name and settings of the learner, and the library of a baseline.
@@ -81,8 +108,8 @@ class LearnerSpec:
         Raises:
             OptionError: The learner's library is not installed.
         """
-        if self.name == DQN_NAME:
-            return {"name": self.name, "settings": asdict(self.dqn)}
+        if self.name in SUITE_LEARNERS:
+            return {"name": self.name, "settings": asdict(suite_config(self.name, self.dqn))}
         settings = baseline_settings(self.name, self.settings)
         return {"name": self.name, "settings": settings, "library": learner_library(self.name)}
 
@@ -96,7 +123,9 @@ class Setting:
         recipe: "direct" (plain training in the simulation), "grounded" (UGAT), "further" (direct
             transfer trained further in `world`), "scratch" (all episodes in `world`), "randomised"
             (all episodes in worlds drawn at random), "delays" (direct transfer trained further in
-            `world` while greens begin late by random times), "rule" (the best rule, no training).
+            `world` while greens begin late by random times), "penalty" (the same while changes of
+            phase cost reward), "untrained" (what the learner begins
+            with), "rule" (the best rule, no training).
         world: Domain to train in; None for the job's real domain, or for the simulation if the job
             has no real domain.
         learner: The algorithm that learns.
@@ -105,6 +134,7 @@ class Setting:
             "shuffled" permutes the outcomes in D_real, "noise" replaces f by noise.
         episodes: Training episodes after those of direct transfer; None for as many as UGAT has.
         most_delay_s: Longest delay of "delays", in s.
+        change_cost: Cost of a change of "penalty", in the unit of the reward.
         commands: Number of own commands that agents see in training without grounding; a fitted
             street decides it by itself.
         rules: Rules among which "rule" chooses; empty for all.
@@ -118,6 +148,7 @@ class Setting:
     placebo: NegativeControl = "none"
     episodes: int | None = None
     most_delay_s: int = MOST_DELAY_S
+    change_cost: float = CHANGE_COST
     commands: int = 0
     rules: tuple[str, ...] = ()
 
@@ -141,7 +172,7 @@ class Setting:
     @property
     def begins_with_direct(self) -> bool:
         """True if training starts from direct transfer."""
-        return self.recipe in ("grounded", "further", "delays")
+        return self.recipe in ("grounded", "further", "delays", "penalty")
 
     @property
     def matches(self) -> bool:
@@ -166,6 +197,8 @@ class Setting:
             parts["placebo"] = self.placebo
         if self.recipe == "delays":
             parts["most_delay_s"] = self.most_delay_s
+        if self.recipe == "penalty":
+            parts["change_cost"] = self.change_cost
         if self.commands:
             parts["commands"] = self.commands
         return parts

@@ -66,6 +66,7 @@ from ugat_marl.parallel import Workers
 from ugat_marl.policies import (
     DQN_NAME,
     STANDARD_RULES,
+    UNIVERSAL_NAME,
     DQNConfig,
     require_device_name,
     require_known_learner,
@@ -94,7 +95,8 @@ class TransferConfig:
             settings of the algorithm but the numbers of episodes.
         real_log: Transition log that replaces the roll-outs in the real domain.
         seed: Root of every random choice in training.
-        observation: Kind of observation: count, queue, pressure, waiting, density, movements.
+        observation: Kind of observation: count, queue, pressure, waiting, density, movements;
+            default: movements for the learner universal, which needs it, and count for others.
         reward: Kind of reward: total-queue, queue, pressure, waiting.
         neighbours: Agents also see the intersections up to so many roads away.
         duration_s: Length of an episode in s; default: the scenario's own.
@@ -118,12 +120,13 @@ class TransferConfig:
         placebo: A negative control; grounding must win nothing with it. "same-world" records D_real
             in the simulation, "shuffled" permutes the outcomes in D_real, "noise" replaces f by
             noise.
-        learner: The learner: dqn, the suite's own, or a baseline (docs/how-to/learners.md).
+        learner: The learner: universal or dqn, the suite's own, or a baseline
+            (docs/how-to/learners.md); default: universal, and dqn with the preset "paper".
         learner_settings: Settings of a baseline as NAME=VALUE, such as learning_rate=0.001; commas
             separate the parts of a tuple.
-        device: Device for dqn's updates and the fits of f and h: cpu, cuda, or cuda:N.
+        device: Device for the learner's updates and the fits of f and h: cpu, cuda, or cuda:N.
         ugat: Settings of the algorithm.
-        dqn: Settings of dqn.
+        dqn: Settings of the learners universal and dqn.
     """
 
     scenario: Annotated[Positional[str], arg(metavar="SCENARIO")]
@@ -132,7 +135,7 @@ class TransferConfig:
     preset: Literal["paper"] | None = None
     real_log: Path | None = None
     seed: int = 0
-    observation: str = "count"
+    observation: str | None = None
     reward: str = "total-queue"
     neighbours: int = 0
     duration_s: float | None = None
@@ -147,7 +150,7 @@ class TransferConfig:
     fine_tuned: bool = False
     oracle: bool = False
     placebo: NegativeControl = "none"
-    learner: str = DQN_NAME
+    learner: str = ""
     learner_settings: tuple[str, ...] = ()
     device: str = "cpu"
     ugat: Annotated[UgatConfig, arg(name="")] = field(default_factory=UgatConfig)
@@ -157,6 +160,9 @@ class TransferConfig:
         if self.preset is not None:
             object.__setattr__(self, "ugat", as_published(self.ugat))
             object.__setattr__(self, "reward", _published_reward(self.reward))
+        if not self.learner:
+            usual = UNIVERSAL_NAME if self.preset is None else DQN_NAME
+            object.__setattr__(self, "learner", usual)
         for name in ("evaluation_seeds", "tuning_seeds"):
             if getattr(self, name) < 1:
                 raise OptionError(f"{name} = {getattr(self, name)}: must be at least 1")
@@ -224,7 +230,7 @@ class TransferConfig:
     def env_options(self) -> dict[str, Any]:
         """Options of every environment of the experiment."""
         return {
-            "observation": self.observation,
+            **self.spec.env_options(self.observation),
             "reward": self.reward,
             "neighbours": self.neighbours,
             "duration_s": self.duration_s,
@@ -402,7 +408,7 @@ def _notes(config: TransferConfig, rules: Mapping[str, str]) -> dict[str, str]:
         **{f"best rule in {domain}": rule for domain, rule in rules.items()},
         "rules searched": searched,
         "training seed": str(config.seed),
-        **({} if config.learner == DQN_NAME else {"learner": config.learner}),
+        "learner": config.learner,
         **({} if config.corrected is None else {CORRECTED: domain_label(config.corrected)}),
     }
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
-from typing import Literal
+from typing import Any, Literal
 
 from ugat_marl.data import AgentLayout
 from ugat_marl.errors import OptionError, UnknownNameError
@@ -27,9 +27,9 @@ class UgatConfig:
     """Settings of the algorithm.
 
     Attributes:
-        grounding: Kind of the grounded action: "phase" is another phase, as in the paper; "timed"
-            is the policy's own phase with a green that begins later; "street" leaves actions alone
-            and trains in worlds fitted to the street.
+        grounding: Kind of the grounding: "street" leaves actions alone and trains in worlds fitted
+            to the street; "phase" grounds an action by another phase, as in the paper; "timed" by
+            the policy's own phase with a green that begins later.
         pretrain_episodes: M, episodes in plain sim before the first iteration.
         iterations: I, repetitions of rolling out, fitting and grounded training.
         grounded_episodes: E, episodes of training in the grounded sim per iteration.
@@ -49,12 +49,12 @@ class UgatConfig:
         street: Settings of the fit, with "street".
     """
 
-    grounding: Literal["phase", "timed", "street"] = "phase"
-    pretrain_episodes: int = 60
-    iterations: int = 4
+    grounding: Literal["phase", "timed", "street"] = "street"
+    pretrain_episodes: int = 20
+    iterations: int = 2
     grounded_episodes: int = 10
     sim_rollouts: int = 3
-    real_rollouts: int = 3
+    real_rollouts: int = 2
     rollout_epsilon: float = 0.3
     least_accuracy: float | None = 0.0
     inputs: InputsConfig = field(default_factory=InputsConfig)
@@ -164,10 +164,14 @@ class UgatConfig:
                 raise OptionError(f"{name} = {value}: must be from 0 to 1")
 
 
-COUNTS = (
-    "pretrain_episodes", "iterations", "grounded_episodes", "sim_rollouts", "real_rollouts",
-)  # fmt: skip
-"""Settings that Algorithm 1 leaves open: numbers of episodes and iterations."""
+COUNTS: Mapping[str, int] = {
+    "pretrain_episodes": 60,
+    "iterations": 4,
+    "grounded_episodes": 10,
+    "sim_rollouts": 3,
+    "real_rollouts": 3,
+}
+"""Settings that Algorithm 1 leaves open: numbers of episodes and iterations, for `as_published`."""
 
 PUBLISHED_EPOCHS = 300
 """Epochs of the fits in the paper."""
@@ -176,12 +180,19 @@ PUBLISHED_EPOCHS = 300
 def as_published(config: UgatConfig) -> UgatConfig:
     """Return Algorithm 1 of the paper without departures, with these numbers of episodes.
 
-    Every departure, its reason and what it changes: docs/explanation/departures.md.
+    Every departure, its reason and what it changes: docs/explanation/departures.md. Numbers of
+    episodes that are left at their defaults become those of `COUNTS`: a learner that begins with
+    nothing needs more of them.
 
     Raises:
         OptionError: Another setting than a number of episodes was changed.
     """
-    counts = {name: getattr(config, name) for name in COUNTS}
+    usual = UgatConfig()
+    given: dict[str, Any] = {name: getattr(config, name) for name in COUNTS}
+    counts: dict[str, Any] = {
+        name: COUNTS[name] if value == getattr(usual, name) else value
+        for name, value in given.items()
+    }
     published = UgatConfig(
         **counts,
         grounding="phase",
@@ -195,9 +206,9 @@ def as_published(config: UgatConfig) -> UgatConfig:
             kl_weight=1.0,
             off_data_weight=0.0,
         ),
-        gate=GateConfig(scope="pooled", window_epochs=config.grounded_episodes),
+        gate=GateConfig(scope="pooled", window_epochs=counts["grounded_episodes"]),
     )
-    if config not in (UgatConfig(**counts), published):
+    if config not in (UgatConfig(**given), published):
         raise OptionError(
             'the preset "paper" decides all settings of the algorithm but the numbers of episodes '
             f"({', '.join(COUNTS)}); leave the others out, or leave out the preset"
