@@ -21,8 +21,9 @@ class Export:
     The files are described in docs/how-to/export.md.
 
     Examples:
-        ugat-marl export runs/demo/policies/ugat.pt --out ugat.onnx --scenario grid2x2-v1
-        ugat-marl export runs/demo/policies/ugat.pt --out ugat.npz
+        ugat-marl export runs/demo/policies/fitted-street.pt
+        --out policy.onnx --scenario grid2x2-v1
+        ugat-marl export runs/demo/policies/fitted-street.pt --out policy.npz
 
     Attributes:
         policy: File of a trained policy.

@@ -55,7 +55,7 @@ class Rollout:
         ugat-marl rollout single-v1 --domain V4 --policy largest-queue:20 --out v4.parquet
         ugat-marl rollout grid4x4-v1 --domain V4 --policy max-pressure:20 --video out.mp4
         ugat-marl rollout grid2x2-v1 --domain V4 --policy runs/first/policies/direct-transfer.pt
-        --beside runs/first/policies/ugat.pt --video before-after.gif
+        --beside runs/first/policies/fitted-street.pt --video before-after.gif
 
     Attributes:
         scenario: Id of a shipped scenario, directory, .sumocfg or resco:<map>.
