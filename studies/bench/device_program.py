@@ -60,7 +60,7 @@ class Updates:
         """Return wall ms of one update, including the copy of weights to the acting networks."""
         began = time.perf_counter()
         for _ in range(self._updates):
-            self._learner._update(self._generator)
+            self._learner.update(self._generator)
             self._learner._acting.network(self._learner.updates)
         return 1e3 * (time.perf_counter() - began) / self._updates
 

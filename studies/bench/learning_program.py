@@ -174,7 +174,7 @@ def update_costs(request: Mapping[str, Any], spaces: list[tuple[int, int]]) -> d
         for learner, own in zip(learners, seconds, strict=True):
             began = time.perf_counter()
             for _ in range(request["updates"]):
-                learner._update(generator)
+                learner.update(generator)
             own.append((time.perf_counter() - began) / request["updates"])
     return {"update_one_s": seconds[0], "update_all_s": seconds[1]}
 
