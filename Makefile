@@ -38,7 +38,7 @@ help:
 demo: environment
 	rm -rf runs/demo
 	OMP_NUM_THREADS=1 $(BIN)/ugat-marl train grid2x2-v1 --real V4 --out runs/demo --duration-s 1800 \
-		--pretrain-episodes 4 --iterations 1 --grounded-episodes 8 --street.simulations 40 \
+		--pretrain-episodes 12 --iterations 1 --grounded-episodes 10 --street.simulations 40 \
 		--street.simulated-s 900 --evaluation-seeds 3 --tuning-seeds 1 $(ARGS)
 
 test: environment-dev
