@@ -37,9 +37,8 @@ help:
 
 demo: environment
 	rm -rf runs/demo
-	OMP_NUM_THREADS=1 $(BIN)/ugat-marl train grid2x2-v1 --real V4 --out runs/demo --duration-s 1800 \
-		--pretrain-episodes 12 --iterations 1 --grounded-episodes 10 --street.simulations 40 \
-		--street.simulated-s 900 --evaluation-seeds 3 --tuning-seeds 1 $(ARGS)
+	OMP_NUM_THREADS=1 $(BIN)/ugat-marl train single-v1 --real V4 --out runs/demo --duration-s 1800 \
+		--street.simulations 80 --street.further 20 --evaluation-seeds 3 --tuning-seeds 1 $(ARGS)
 
 test: environment-dev
 	UGAT_MARL_TEST_INSTALLED=1 OMP_NUM_THREADS=1 $(BIN)/python -m pytest -q -n $(JOBS) --dist worksteal $(TESTS) $(ARGS)

@@ -30,7 +30,7 @@ class Evaluate:
 
     Examples:
         ugat-marl evaluate single-v1 --policies largest-queue:20 max-pressure programme
-        ugat-marl evaluate grid2x2-v1 --policies runs/demo/policies/fitted-street.pt
+        ugat-marl evaluate single-v1 --policies runs/demo/policies/fitted-street.pt
         --domains sim V4
         ugat-marl evaluate single-v1 --domains all --seeds 1 --duration-s 900
 

@@ -22,7 +22,7 @@ class Export:
 
     Examples:
         ugat-marl export runs/demo/policies/fitted-street.pt
-        --out policy.onnx --scenario grid2x2-v1
+        --out policy.onnx --scenario single-v1
         ugat-marl export runs/demo/policies/fitted-street.pt --out policy.npz
 
     Attributes:

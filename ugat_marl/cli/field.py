@@ -41,7 +41,7 @@ class Field:
 
     Examples:
         ugat-marl field single-v1 --policy largest-queue:20 --start --domain V4
-        ugat-marl field grid2x2-v1 --policy runs/demo/policies/fitted-street.pt
+        ugat-marl field single-v1 --policy runs/demo/policies/fitted-street.pt
         --port 8813 --log field.jsonl
 
     Attributes:
