@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import subprocess
 import xml.etree.ElementTree as ET
 from dataclasses import replace
 from pathlib import Path
@@ -11,6 +10,7 @@ import numpy as np
 import pytest
 
 import ugat_marl
+from tests.crossroads import build_crossroads
 from ugat_marl.__main__ import main
 from ugat_marl.effects import load_scenario, scenario_in_domain
 from ugat_marl.errors import OptionError, ScenarioError
@@ -19,11 +19,8 @@ from ugat_marl.field import Site
 from ugat_marl.files import Document
 from ugat_marl.grounding import UgatConfig
 from ugat_marl.policies import make_rule
-from ugat_marl.scenarios import NO_UPSTREAM_LANES, Network, Scenario, sumo_program, survey
+from ugat_marl.scenarios import NO_UPSTREAM_LANES, Network, Scenario, survey
 from ugat_marl.scenarios.junctions import Upstream, behind_of
-
-NODES = {"M": (0, 0), "N": (0, 200), "S": (0, -200), "W": (-200, 0), "w": (-11, 0), "E": (200, 0)}
-ROADS = ("Ww", "wM", "ME", "NM", "MS", "SM", "MN")
 
 
 @pytest.fixture(scope="module")
@@ -33,20 +30,7 @@ def split(tmp_path_factory: pytest.TempPathFactory) -> Scenario:
 
 
 def crossroads(folder: Path, before_m: int) -> Scenario:
-    places = {**NODES, "w": (-before_m, 0)}
-    nodes = "".join(
-        f'<node id="{name}" x="{x}" y="{y}" type="{"traffic_light" if name == "M" else "priority"}"'
-        "/>"
-        for name, (x, y) in places.items()
-    )
-    edges = "".join(f'<edge id="{r}" from="{r[0]}" to="{r[1]}" speed="13"/>' for r in ROADS)
-    (folder / "n.nod.xml").write_text(f"<nodes>{nodes}</nodes>")
-    (folder / "n.edg.xml").write_text(f"<edges>{edges}</edges>")
-    subprocess.run(
-        [str(sumo_program("netconvert")), "-n", "n.nod.xml", "-e", "n.edg.xml", "-o", "n.net.xml",
-         "--no-turnarounds"],
-        cwd=folder, check=True, capture_output=True,
-    )  # fmt: skip
+    build_crossroads(folder, before_m)
     cars = "".join(
         f'<vehicle id="{i}" depart="{2 * i}"><route edges="Ww wM ME"/></vehicle>' for i in range(8)
     )

@@ -2,36 +2,20 @@
 
 from __future__ import annotations
 
-import subprocess
-
 import pytest
 
 import ugat_marl
+from tests.crossroads import build_crossroads
 from ugat_marl.effects import load_scenario
 from ugat_marl.envs import Rewarder, TrafficEnv
-from ugat_marl.scenarios import Scenario, sumo_program
-
-PLACES = {"M": (0, 0), "N": (0, 200), "S": (0, -200), "W": (-200, 0), "w": (-18, 0), "E": (200, 0)}
-ROADS = ("Ww", "wM", "ME", "NM", "MS", "SM", "MN")
+from ugat_marl.scenarios import Scenario
 
 
 @pytest.fixture(scope="module")
 def short_entry(tmp_path_factory: pytest.TempPathFactory) -> Scenario:
     """A crossroads whose western road is cut 18 m before the light; 60 cars come from there."""
     folder = tmp_path_factory.mktemp("short")
-    nodes = "".join(
-        f'<node id="{name}" x="{x}" y="{y}" type="{"traffic_light" if name == "M" else "priority"}"'
-        "/>"
-        for name, (x, y) in PLACES.items()
-    )
-    edges = "".join(f'<edge id="{r}" from="{r[0]}" to="{r[1]}" speed="13"/>' for r in ROADS)
-    (folder / "n.nod.xml").write_text(f"<nodes>{nodes}</nodes>")
-    (folder / "n.edg.xml").write_text(f"<edges>{edges}</edges>")
-    subprocess.run(
-        [str(sumo_program("netconvert")), "-n", "n.nod.xml", "-e", "n.edg.xml", "-o", "n.net.xml",
-         "--no-turnarounds"],
-        cwd=folder, check=True, capture_output=True,
-    )  # fmt: skip
+    build_crossroads(folder, 18)
     cars = "".join(
         f'<vehicle id="w{i}" depart="{5 * i}"><route edges="Ww wM ME"/></vehicle>'
         f'<vehicle id="n{i}" depart="{5 * i}"><route edges="NM MS"/></vehicle>'

@@ -139,6 +139,7 @@ class _Part:
         return Split(rows - stops, stops, "blocks")
 
 
+@one_thread()
 def compare(
     transform: Transform,
     real: TransitionLog,
@@ -158,17 +159,6 @@ def compare(
     Raises:
         LogError: A log has other agents, or is too short to be split.
     """
-    with one_thread():
-        return _compare(transform, real, world, fitter, config)
-
-
-def _compare(
-    transform: Transform,
-    real: TransitionLog,
-    world: TransitionLog,
-    fitter: Fitter,
-    config: TrustConfig,
-) -> Trust:
     stack = transform.stack
     street, simulated = (
         _part(transform.lesson(data), data.weight)

@@ -1,4 +1,4 @@
-"""Pretraining: one network learns on many road networks, and its weights start every training.
+"""Pretraining: one network learns on many road networks, and its weights may start a training.
 
 Every road network has a learner with its own replay memory. All learners share their weights. A
 few road networks are played at a time, and then updates follow, each from the memory of a drawn
