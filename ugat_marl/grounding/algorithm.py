@@ -11,7 +11,7 @@ from ugat_marl.envs import AnyParallelEnv
 from ugat_marl.grounding.config import UgatConfig
 from ugat_marl.grounding.state import RunState
 from ugat_marl.grounding.worlds import World
-from ugat_marl.policies import Policy
+from ugat_marl.policies import Policy, Taught
 
 CHECKPOINT_EPISODES = 10
 """Episodes of plain training between two checkpoints."""
@@ -46,6 +46,8 @@ class Algorithm:
     def _pretrain(self, state: RunState[Any]) -> None:
         """Train in plain E_sim for M episodes; keep the policy as direct transfer (line 1)."""
         wanted = self.config.pretrain_episodes
+        if state.pretrained == 0 < wanted:
+            self._attend(state, self.env, "plain sim")
         while state.pretrained < wanted:
             episodes = min(CHECKPOINT_EPISODES, wanted - state.pretrained)
             numbers = f"{state.pretrained + 1}-{state.pretrained + episodes}"
@@ -59,6 +61,15 @@ class Algorithm:
             if self.probe is not None:
                 self.run.log("iteration", 0, self.probe(state.direct))
             state.save(self.run)
+
+    def _attend(self, state: RunState[Any], env: AnyParallelEnv, title: str) -> None:
+        """Let the learner watch the rule that is good in an environment, if it has a teacher."""
+        learner = state.learner
+        if not isinstance(learner, Taught) or not (number := learner.plays(env)):
+            return
+        with self.run.reporter.task(f"lessons, {title}", number) as advance:
+            name = learner.attend(env, self.seed, lambda rule: advance(note=rule))
+        self.run.reporter.say(f"{title}: {name} teaches")
 
     def _learn(self, state: RunState[Any], env: AnyParallelEnv, episodes: int, title: str) -> None:
         """Let the learner train in an environment; log every episode."""

@@ -7,7 +7,8 @@
      3      roll pi out in E_real, add the transitions to D_real
      4      fit the street to D_real (`street`)
      5      roll pi out in worlds of the street; fit f to D_real, h to these roll-outs (`residual`)
-     6      for e = 1, ..., E episodes: draw a world of the street, update pi in it; where f is
+     6      watch the rule that is best in worlds of the street, if the learner has a teacher;
+            for e = 1, ..., E episodes: draw a world of the street, update pi in it; where f is
             trusted, ground its actions
      7      keep the better of pi and the policy kept so far, in the same worlds of the street
 
@@ -136,6 +137,7 @@ class StreetTraining(Algorithm):
             env = street_env(street, self.simulation, street.commands)
             with contextlib.closing(env):
                 grounded = env if residual is None else residual.around(env)
+                self._attend(state, grounded, title)
                 self._learn(state, grounded, episodes, title)  # line 6
             if residual is not None and residual.acts:
                 gate = residual.end_iteration().as_dict()

@@ -46,6 +46,7 @@ from .protocols import EpisodeCallback as EpisodeCallback
 from .protocols import Learner as Learner
 from .protocols import Policy as Policy
 from .protocols import PolicyFactory as PolicyFactory
+from .protocols import Taught as Taught
 from .rollout import EpsilonGreedy as EpsilonGreedy
 from .rollout import RollOutStopped as RollOutStopped
 from .rollout import StepCallback as StepCallback

@@ -85,5 +85,20 @@ class Learner(Protocol):
         ...
 
 
+@runtime_checkable
+class Taught(Protocol):
+    """A learner that can watch a rule before it acts itself."""
+
+    def plays(self, env: AnyParallelEnv) -> int:
+        """Return the number of episodes that `attend` plays; 0 without a teacher."""
+        ...
+
+    def attend(
+        self, env: AnyParallelEnv, seed: int, on_play: Callable[[str], None] | None = None
+    ) -> str | None:
+        """Watch the rule that is good in an environment, and return its spelling."""
+        ...
+
+
 PolicyFactory = Callable[[TrafficEnv], Policy]
 """Make a policy for an environment; controllers read the network from it."""

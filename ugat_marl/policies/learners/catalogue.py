@@ -41,6 +41,7 @@ SUITE_LEARNERS: Mapping[str, DQNConfig] = {
         steps=3,
         warmup_decisions=100,
         epsilon_decay_decisions=1_200,
+        teacher="best",
     ),
 }
 """The suite's own learners: settings of DQN by name."""

@@ -23,11 +23,12 @@ from ugat_marl.envs import ActionMask, AgentSet, AnyParallelEnv
 from ugat_marl.errors import CheckpointError, EpisodeError, OptionError
 from ugat_marl.policies.devices import CPU
 from ugat_marl.policies.learners.dqn_config import CEILING_DECISIONS, DQNConfig
+from ugat_marl.policies.learners.lessons import OnPlay, find_teacher, plays
 from ugat_marl.policies.learners.replay import Replay
 from ugat_marl.policies.learners.scaling import ceilings, input_factors
 from ugat_marl.policies.learners.start import Start
 from ugat_marl.policies.network_policy import NetworkPolicy, checkpoint_header, parse_header
-from ugat_marl.policies.networks.batched import one_thread
+from ugat_marl.policies.networks.batched import one_thread, size_mask
 from ugat_marl.policies.networks.q_network import (
     bind_parameters,
     flatten_parameters,
@@ -37,11 +38,11 @@ from ugat_marl.policies.networks.q_network import (
 )
 from ugat_marl.policies.networks.structure import Structure, structure_in
 from ugat_marl.policies.networks.universal import SECONDS
-from ugat_marl.policies.protocols import EpisodeCallback
+from ugat_marl.policies.protocols import EpisodeCallback, Policy
 from ugat_marl.seeding import derive_seed, numpy_generator, torch_generator
 
 _KIND = "ugat_marl.dqn"
-_COUNTERS = ("episodes", "decisions", "updates")
+_COUNTERS = ("episodes", "decisions", "updates", "taught")
 _MOMENTS = ("step", "exp_avg", "exp_avg_sq")
 UNIVERSAL_SCALE = 0.05
 """Factor on rewards for the network "universal": 20 halting vehicles are 1."""
@@ -181,6 +182,7 @@ class DQN:
         self.episodes = 0
         self.decisions = 0
         self.updates = 0
+        self.taught = 0
         hidden, shared = self.config.hidden, self.config.shared
         weights = torch_generator(seed, "dqn", "weights")
         self.device = device
@@ -196,6 +198,7 @@ class DQN:
         scale = self.config.reward_scale or (UNIVERSAL_SCALE if self._is_universal else 1.0)
         self._scale = torch.full((len(agents), 1), scale, device=device)
         self._inputs = torch.ones(len(agents), 1, agents.widest_observation)
+        self._actions = size_mask(agents.action_counts).unsqueeze(1).to(device)
         tens = _tens_of_seconds(structure)
         self._discount = self.config.discount**tens
         self._steps = max(1, round(self.config.steps / tens))
@@ -255,12 +258,75 @@ class DQN:
                 f"the environment's agents are {AgentSet.of(env)}, this learner's {self.agents}; "
                 "make a new learner with DQN.of(env)"
             )
+        if self.config.teacher is not None and self.episodes == self.taught == 0:
+            self.attend(env, seed)
         with one_thread():
             for _ in range(episodes):
                 numbers = self._episode(env, seed)
                 if on_episode is not None:
                     on_episode(self.episodes - 1, numbers)
         return self.policy()
+
+    def attend(self, env: AnyParallelEnv, seed: int, on_play: OnPlay | None = None) -> str | None:
+        """Watch the teacher in an environment; what earlier teachers did is an example no more.
+
+        `learn` calls it before the first episode. Call it again in an environment of other
+        dynamics, where another rule may be the best one.
+
+        Args:
+            env: An environment with the agents of this learner; it is reset.
+            seed: Root of the seeds of the episodes and of the replay.
+            on_play: Called after every episode with the rule that played it, `plays` times.
+
+        Returns:
+            Spelling of the teacher; None without one.
+
+        Raises:
+            UnknownNameError: No rule has the teacher's name.
+            OptionError: The teacher reads other observations than the environment's.
+        """
+        if self.config.teacher is None:
+            return None
+        root = derive_seed(seed, "dqn", "lessons", self.taught)
+        name, teacher = find_teacher(env, self.config.teacher, root, on_play)
+        self._replay.forget_teacher()
+        for lesson in range(self.config.lessons):
+            self._watch(env, teacher, derive_seed(root, "shown", lesson))
+            if on_play is not None:
+                on_play(name)
+        sampling = torch_generator(root, "replay")
+        with one_thread():
+            for _ in range(self.config.lesson_updates):
+                self.update(sampling)
+        self.taught += 1
+        return name
+
+    def plays(self, env: AnyParallelEnv) -> int:
+        """Return the number of episodes that `attend` plays."""
+        teacher = self.config.teacher
+        return 0 if teacher is None else plays(env, teacher, self.config.lessons)
+
+    def _watch(self, env: AnyParallelEnv, teacher: Policy, seed: int) -> None:
+        """Let the teacher play an episode, and store its decisions."""
+        observations, infos = env.reset(seed=seed)
+        teacher.reset(seed)
+        now = self.agents.stack(observations)
+        while env.agents:
+            actions = teacher.act(observations, infos)
+            observations, rewards, terminated, _, infos = env.step(actions)
+            self._require_all_or_none(env)
+            then, allowed = self.agents.stack(observations), self.agents.masks(infos)
+            self._replay.add(
+                now,
+                self.agents.values(actions).astype(np.int64),
+                self._finite(self.agents.values(rewards)),
+                self.agents.values(terminated).astype(np.bool_),
+                then,
+                allowed,
+                last=not env.agents,
+                shown=True,
+            )
+            now = then
 
     def policy(self) -> NetworkPolicy:
         """Return the current greedy policy; later learning does not change it.
@@ -354,7 +420,8 @@ class DQN:
 
         The loss is Huber's of Q(s, a) - y with ``y = r + discount * Q'(s', argmax_a' Q(s', a'))``,
         where Q' is the target network and r the scaled reward. With `steps` = n, r is the
-        discounted sum over n decisions and s' the state after them.
+        discounted sum over n decisions and s' the state after them. A teacher's decisions add the
+        loss of `margin`.
 
         Args:
             generator: Source of the sample.
@@ -372,10 +439,13 @@ class DQN:
             future = torch.where(batch.terminal, nothing, future)
             reward = (batch.reward - self._centre * batch.weight) * self._scale
             wanted = reward + batch.discount * future
-        chosen = self._online(batch.observation).gather(-1, batch.action.unsqueeze(-1)).squeeze(-1)
+        values = self._online(batch.observation)
+        chosen = values.gather(-1, batch.action.unsqueeze(-1)).squeeze(-1)
         losses = nn.functional.huber_loss(
             chosen, wanted, reduction="none", delta=self.config.huber_delta
         )
+        if config.teacher is not None:
+            losses = losses + self._margin_losses(values, batch.action, chosen) * batch.shown
         # a mean over agents would make the step of each network depend on the number of agents
         losses.mean(dim=1).sum().backward()
         self._adam.step()
@@ -384,6 +454,15 @@ class DQN:
         self._target_weights.data.lerp_(self._weights.data, self.config.target_rate)
         self.updates += 1
         return float(losses.detach().mean()), float(chosen.detach().mean())
+
+    def _margin_losses(self, values: Tensor, action: Tensor, chosen: Tensor) -> Tensor:
+        """Return ``max_a (Q(s, a) + margin [a != a_t]) - Q(s, a_t)`` for teachers' actions a_t.
+
+        Hester et al. 2018, eq. 1. The shape is that of `action`, ``(agents, batch)``.
+        """
+        raised = (values + self.config.margin).masked_fill(~self._actions, -torch.inf)
+        raised = raised.scatter(-1, action.unsqueeze(-1), chosen.unsqueeze(-1))
+        return raised.amax(-1) - chosen
 
     def _require_all_or_none(self, env: AnyParallelEnv) -> None:
         if env.agents and len(env.agents) != len(self.agents):

@@ -69,6 +69,14 @@ class DQNConfig:
         ceiling: Quantile at which policies cut each number of an observation. It is measured over
             the last 1000 decisions of training. In a fuller street than in training, a policy then
             acts as in the fullest street it knows. None cuts nothing.
+        teacher: Rule that shows the learner its first episodes, such as "max-pressure:20". "best"
+            takes the best of the standard rules in the environment of the training. None for none.
+            With a teacher, exploration begins at `epsilon_end`.
+        lessons: Episodes that the teacher shows.
+        lesson_updates: Updates after them, before the learner acts.
+        margin: Q of an action that the teacher did not choose should be lower than that of its own
+            by this much, in scaled reward (Hester et al. 2018, eq. 1). It counts for decisions that
+            the teacher made, and so less and less as the memory fills.
     """
 
     hidden: tuple[int, ...] = (48, 48)
@@ -91,6 +99,10 @@ class DQNConfig:
     start: str | None = None
     steps: int = 1
     ceiling: float | None = None
+    teacher: str | None = None
+    lessons: int = 3
+    lesson_updates: int = 1_000
+    margin: float = 0.2
 
     def __post_init__(self) -> None:
         # JSON gives a list, which would differ from the tuple of a checkpoint
@@ -103,6 +115,8 @@ class DQNConfig:
             "epsilon_decay_decisions",
             "sticky_decisions",
             "steps",
+            "lessons",
+            "lesson_updates",
         ):
             self._require(name, getattr(self, name) >= 1, "at least 1")
         self._require("hidden", all(width >= 1 for width in self.hidden), "sizes of at least 1")
@@ -112,6 +126,7 @@ class DQNConfig:
         self._require("epsilon_start", 0 <= self.epsilon_start <= 1, "from 0 to 1")
         self._require("epsilon_end", 0 <= self.epsilon_end <= 1, "from 0 to 1")
         self._require("huber_delta", 0 < self.huber_delta < float("inf"), "above 0")
+        self._require("margin", 0 <= self.margin < float("inf"), "at least 0")
         scale = self.reward_scale
         self._require("reward_scale", scale is None or 0 < scale < float("inf"), "above 0, or None")
         ceiling = self.ceiling
@@ -140,5 +155,7 @@ class DQNConfig:
 
     def epsilon(self, decisions: int) -> float:
         """Return the share of exploratory decisions after `decisions` decisions."""
+        if self.teacher is not None:
+            return self.epsilon_end
         progress = min(1.0, decisions / self.epsilon_decay_decisions)
         return self.epsilon_start + progress * (self.epsilon_end - self.epsilon_start)

@@ -26,6 +26,7 @@ class Batch:
         next_allowed: Actions allowed after the last decision, ``(agents, batch, most_actions)``.
         weight: Sum of the discounts of the rewards, ``(batch,)``; 1 for one decision.
         discount: Discount of the value after the last decision, ``(batch,)``.
+        shown: True where a teacher acted, ``(batch,)``.
     """
 
     observation: Tensor
@@ -36,6 +37,7 @@ class Batch:
     next_allowed: Tensor
     weight: Tensor
     discount: Tensor
+    shown: Tensor
 
     def scaled(self, factors: Tensor) -> Batch:
         """Return the batch with observations times factors ``(agents, 1, widest_observation)``."""
@@ -74,6 +76,7 @@ class Replay:
             "next_allowed": torch.zeros(n, capacity, actions, dtype=torch.bool),
         }
         self._last = torch.zeros(1, capacity, dtype=torch.bool)
+        self._shown = torch.zeros(1, capacity, dtype=torch.bool)
 
     def __len__(self) -> int:
         return min(self.added, self.capacity)
@@ -87,6 +90,7 @@ class Replay:
         next_observation: NDArray[np.float32],
         next_allowed: ActionMask,
         last: bool = False,
+        shown: bool = False,
     ) -> None:
         """Store one decision of all agents; a full ring loses its oldest decision.
 
@@ -98,12 +102,14 @@ class Replay:
             next_observation: Observations after the action.
             next_allowed: Actions allowed after the action, ``(agents, most_actions)``.
             last: True for the last decision of an episode.
+            shown: True if a teacher acted.
         """
         at, columns = self.added % self.capacity, self._columns
         rows = (observation, action, reward, terminal, next_observation, next_allowed)
         for name, row in zip(_COLUMNS, rows, strict=True):
             columns[name][:, at] = torch.from_numpy(row)
         self._last[:, at] = last
+        self._shown[:, at] = shown
         self.added += 1
 
     def sample(
@@ -137,7 +143,12 @@ class Replay:
             next_allowed=read["next_allowed"].index_select(1, final),
             weight=powers.sum(1),
             discount=discount * powers.gather(1, done).squeeze(1),
+            shown=self._shown[0, at],
         )
+
+    def forget_teacher(self) -> None:
+        """Keep the decisions of earlier teachers as those of any policy."""
+        self._shown.zero_()
 
     def rewards(self) -> Tensor:
         """Return all stored rewards, ``(agents, len(self))``."""
@@ -172,4 +183,4 @@ class Replay:
             rows.copy_(state[name])
 
     def _fields(self) -> list[tuple[str, Tensor]]:
-        return [*self._columns.items(), ("last", self._last)]
+        return [*self._columns.items(), ("last", self._last), ("shown", self._shown)]

@@ -1,0 +1,98 @@
+"""Lessons: a rule that is good in an environment plays there, and a learner watches.
+
+A learner that begins with nothing needs many episodes to be as good as a rule. One that has watched
+the rule is as good from the first episode, and learning goes on from there.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from typing import Any
+
+import numpy as np
+
+from ugat_marl.envs import AnyParallelEnv
+from ugat_marl.errors import OptionError
+from ugat_marl.policies.protocols import Policy
+from ugat_marl.policies.rollout import roll_out
+from ugat_marl.policies.rules.catalogue import STANDARD_RULES, make_rule
+from ugat_marl.seeding import derive_seed
+
+BEST = "best"
+"""Name of the teacher that is looked for among `STANDARD_RULES`."""
+
+FINALISTS = 3
+"""Rules that play again after the first episode of all."""
+
+FINAL_EPISODES = 2
+"""Episodes that each of them plays then."""
+
+OnPlay = Callable[[str], None]
+"""Called after an episode with the rule that played it."""
+
+
+def find_teacher(
+    env: AnyParallelEnv, name: str, seed: int, on_play: OnPlay | None = None
+) -> tuple[str, Policy]:
+    """Return the rule that teaches in an environment, and its spelling.
+
+    For `BEST` all standard rules that read this environment's observations play one episode, and
+    the best of them play again. The greatest mean reward wins. All play the same seeds.
+
+    Args:
+        env: The environment; it is reset.
+        name: Spelling of a rule, or `BEST`.
+        seed: Root of the seeds of the episodes.
+        on_play: Called after every episode.
+
+    Raises:
+        UnknownNameError: No rule has this name.
+        OptionError: The rule reads other observations than the environment's.
+    """
+    if name != BEST:
+        rule = make_rule(name, env.unwrapped)
+        if not _reads(rule, env):
+            raise OptionError(
+                f"teacher {name}: it needs environments with {dict(rule.env_options)}; give one of "
+                f"{', '.join(spec for spec, _ in _candidates(env))}, or {BEST}"
+            )
+        return name, rule
+    rules = dict(_candidates(env))
+    rewards: dict[str, list[float]] = {spec: [] for spec in rules}
+    running = list(rules)
+    for first, episodes in ((0, 1), (1, FINAL_EPISODES)):
+        for spec in running:
+            for episode in range(first, first + episodes):
+                played = roll_out(env, rules[spec], derive_seed(seed, "teacher", episode))
+                rewards[spec].append(played.mean_reward)
+                if on_play is not None:
+                    on_play(spec)
+        # the sort is stable: of equal rules, the one named first stays first
+        running.sort(key=lambda spec: -float(np.mean(rewards[spec])))
+        running = running[:FINALISTS]
+    return running[0], rules[running[0]]
+
+
+def plays(env: AnyParallelEnv, name: str, shown: int) -> int:
+    """Return the number of episodes that lessons play.
+
+    Args:
+        env: The environment.
+        name: Spelling of a rule, or `BEST`.
+        shown: Episodes that the teacher shows.
+    """
+    if name != BEST:
+        return shown
+    candidates = len(_candidates(env))
+    return candidates + FINAL_EPISODES * min(FINALISTS, candidates) + shown
+
+
+def _candidates(env: AnyParallelEnv) -> Sequence[tuple[str, Policy]]:
+    rules = [(spec, make_rule(spec, env.unwrapped)) for spec in STANDARD_RULES]
+    return [(spec, rule) for spec, rule in rules if _reads(rule, env)]
+
+
+def _reads(rule: Policy, env: AnyParallelEnv) -> bool:
+    """Return True if the environment has the options that the rule relies on."""
+    given: Any = getattr(env.unwrapped, "env_options", {})
+    return all(given.get(name) == value for name, value in rule.env_options.items())
