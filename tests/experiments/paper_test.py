@@ -35,7 +35,7 @@ def test_main_has_the_controls_an_honest_table_needs() -> None:
         "direct transfer", "UGAT", "UGAT, timed", "fitted street", "UGAT, timed: rewards matched",
         "more plain sim",
         "domain randomisation", "random delay", "penalty on changes",
-        *(f"constant delay {s} s" for s in (1, 2, 3, 4, 5)),
+        *(f"constant delay {s} s" for s in (1, 2, 3, 4, 5, 6)),
         "fine-tuned on the same data", "trained in real", "best rule, tuned there",
     ]  # fmt: skip
 

@@ -47,7 +47,7 @@ from ugat_marl.grounding import (
     World,
 )
 from ugat_marl.parallel import Workers, in_this_process
-from ugat_marl.policies import STANDARD_RULES, Policy, PolicyFactory
+from ugat_marl.policies import STANDARD_RULES, Policy, PolicyFactory, Taught
 from ugat_marl.progress import Bars, Reporter
 from ugat_marl.simulation import exit_when_input_ends, kept_warm
 
@@ -398,6 +398,8 @@ def _plain(
             learner.load(progress)
         elif before is not None:
             learner.load(before)
+            if isinstance(learner, Taught):
+                learner.attend(env, job.seed)  # this world may have another teacher
         marks = [mark for mark in job.marks if record.missing(job, mark) or mark == job.episodes]
         if marks[0] < learner.episodes:
             raise OptionError(

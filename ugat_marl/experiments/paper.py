@@ -67,7 +67,7 @@ def settings_of(
     ugat: UgatConfig,
     sim: str,
     groundings: Sequence[str] = (),
-    constants: Sequence[int] = (1, 2, 3, 4, 5),
+    constants: Sequence[int] = (1, 2, 3, 4, 5, 6),
     learner: LearnerSpec | None = None,
 ) -> list[Setting]:
     """Return the rows of a table.
@@ -323,7 +323,7 @@ class PaperConfig:
     sim_rollouts: int = 3
     real_rollouts: int = 2
     groundings: tuple[str, ...] = ()
-    constants: tuple[int, ...] = (1, 2, 3, 4, 5)
+    constants: tuple[int, ...] = (1, 2, 3, 4, 5, 6)
     rows: tuple[str, ...] = ()
     evaluation_seeds: int = 5
     rule_budget: int = BUDGET
