@@ -128,6 +128,20 @@ def test_shortest_and_longest_greens_are_entries_of_the_table() -> None:
     assert after_one_step(channel, 2, age=9) == [0, 1, 3]  # not seen: as the oldest that was
 
 
+def test_greens_that_the_simulation_holds_itself_are_not_forbidden() -> None:
+    def held(running: int, age: int) -> Sequence[int]:
+        return [running] if age < 2 else range(PHASES)
+
+    log = log_of(mask=held)
+    assert fit_channel(log).forbids
+    assert not fit_channel(log, held_s=2 * INTERVAL_S).changes
+
+    def cyclic_and_held(running: int, age: int) -> Sequence[int]:
+        return [running] if age < 2 else [running, (running + 1) % PHASES]
+
+    assert fit_channel(log_of(mask=cyclic_and_held), held_s=2 * INTERVAL_S).forbids
+
+
 def test_the_actuator_repeats_the_street() -> None:
     channel = fit_channel(log_of(lag=2, lost=0.2))
     actuator = channel.actuator(None, TIMING, INTERVAL_S)  # type: ignore[arg-type]

@@ -24,22 +24,32 @@ Fault = Callable[[np.ndarray, np.random.Generator], np.ndarray]
 """Counts of an episode, ``(decisions, lanes)``, as faulty detectors report them."""
 
 
-def counted(decisions: int, generator: np.random.Generator) -> tuple[np.ndarray, np.ndarray]:
-    """Return counts ``(decisions + 1, lanes)`` and the phases that ran in between."""
+def counted(
+    decisions: int, generator: np.random.Generator, starts: tuple[float, ...] = (4.0, 4.0, 4.0)
+) -> tuple[np.ndarray, np.ndarray]:
+    """Return counts ``(decisions + 1, lanes)`` and the phases that ran in between.
+
+    `starts` is what a lane serves in each decision of its green.
+    """
     counts = np.zeros((decisions + 1, LANES))
     phases = (np.arange(decisions) // 3) % PHASES
     for t, phase in enumerate(phases):
-        served = np.where(GREEN[:, phase], 4.0, 0.0)
+        served = np.where(GREEN[:, phase], starts[t % len(starts)], 0.0)
         arrivals = generator.poisson(1.7, LANES)
         counts[t + 1] = np.minimum(np.maximum(counts[t] - served, 0.0) + arrivals, 30.0)
     return counts, phases
 
 
-def log_of(fault: Fault | None = None, episodes: int = 4, seed: int = 0) -> TransitionLog:
+def log_of(
+    fault: Fault | None = None,
+    episodes: int = 4,
+    seed: int = 0,
+    starts: tuple[float, ...] = (4.0, 4.0, 4.0),
+) -> TransitionLog:
     generator = np.random.default_rng(seed)
     recorder = TransitionRecorder(Provenance("by hand", "", "street", (), 10.0, "count", LAYOUTS))
     for episode in range(episodes):
-        counts, phases = counted(300, generator)
+        counts, phases = counted(300, generator, starts)
         shown = counts if fault is None else fault(counts, generator)
         before = 0
         for t, phase in enumerate(phases):
@@ -106,6 +116,12 @@ def test_late_counts_are_found_with_their_lag(lag: int) -> None:
     assert eyes.lag == lag
     (part,) = eyes.parts(0, VIEW.lanes, 10.0)
     assert str(part) == f"observation_delay={10 * lag}"
+
+
+def test_queues_that_start_late_are_not_late_counts() -> None:
+    """Slow drivers: nobody leaves in the first decision of a green, but none in red either."""
+    late_starts = log_of(starts=(0.0, 6.0, 6.0))
+    assert fit_eyes(late_starts, PERFECT, VIEW).lag == 0
 
 
 def test_lost_readings_are_told_from_queues_that_stand() -> None:

@@ -229,19 +229,24 @@ class FittedActuator(Actuator):
             mask *= allowed
 
 
-def fit_channel(log: TransitionLog, config: ChannelConfig | None = None) -> CommandChannel:
+def fit_channel(
+    log: TransitionLog, config: ChannelConfig | None = None, held_s: float = 0.0
+) -> CommandChannel:
     """Fit the channel to a log of the street.
 
     Args:
         log: Transitions with the asked and the executed phases; with masks, if there are any.
         config: Numbers of the method.
+        held_s: Time from a command to the end of the shortest green, in s. The simulation keeps a
+            phase so long by itself, and so masks that keep it forbid nothing.
 
     Raises:
         LogError: An agent has fewer than two rows.
     """
     config = config or ChannelConfig()
+    interval_s = log.provenance.decision_interval_s
     courses = [
-        _Course.of(log.transitions(agent), layout, config)
+        _Course.of(log.transitions(agent), layout, config, held_s / interval_s)
         for agent, layout in log.provenance.layouts.items()
     ]
     masked = all(course.mask is not None for course in courses)
@@ -272,6 +277,7 @@ class _Course:
         left: Decisions until the end of the episode, ``(n,)``.
         phases: Number of phases.
         ages: Number of ages of the tables.
+        held: Decisions for which the simulation keeps a phase by itself.
     """
 
     asked: NDArray[np.int64]
@@ -282,9 +288,12 @@ class _Course:
     left: NDArray[np.int64]
     phases: int
     ages: int
+    held: float
 
     @classmethod
-    def of(cls, rows: Transitions, layout: AgentLayout, config: ChannelConfig) -> _Course:
+    def of(
+        cls, rows: Transitions, layout: AgentLayout, config: ChannelConfig, held: float
+    ) -> _Course:
         """Read the rows of an agent."""
         count = len(rows)
         if count < 2:
@@ -305,7 +314,8 @@ class _Course:
             left[t] = left[t + 1] + 1 if goes_on[t] else 0
         mask = rows.mask if rows.mask.shape[1] else None
         age = np.minimum(age, config.ages - 1)
-        return cls(asked, running, age, rows.executed, mask, left, layout.phases, config.ages)
+        ages, phases = config.ages, layout.phases
+        return cls(asked, running, age, rows.executed, mask, left, phases, ages, held)
 
     def free_table(self) -> Table:
         """Return a table that permits everything."""
@@ -316,7 +326,10 @@ class _Course:
         assert self.mask is not None
         rows = np.flatnonzero(self.left >= lag)
         states = rows + lag
-        rows, states = rows[self.age[states] > 0], states[self.age[states] > 0]
+        known = self.age[states] > 0
+        alone = self.mask[rows].sum(1) == 1
+        known &= ~(alone & (self.age[states] < self.held + 1.0))  # the green was held, as in sim
+        rows, states = rows[known], states[known]
         shape = (self.ages, self.phases)
         cells = np.ravel_multi_index((self.age[states], self.running[states]), shape)
         seen = _tally(cells, shape)

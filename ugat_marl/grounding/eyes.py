@@ -20,6 +20,7 @@ from dataclasses import asdict, dataclass
 from typing import Any, ClassVar
 
 import numpy as np
+from numpy.typing import NDArray
 
 from ugat_marl.data import TransitionLog
 from ugat_marl.effects import (
@@ -219,7 +220,7 @@ def fit_eyes(
     """
     config = config or EyesConfig()
     rows, perfect = view.rows(street), view.rows(simulated)
-    lag = _lag(rows, config)
+    lag = _lag(rows, perfect, config)
     noisy, step = _fraction(rows) > config.fraction, _step(rows)
     absolute, relative = _noise(rows, perfect, config) if noisy else (0.0, 0.0)
     return Eyes(
@@ -330,15 +331,18 @@ def _step(rows: Sequence[LaneRows]) -> float:
     return step if step > 1 else 0.0
 
 
-def _lag(rows: Sequence[LaneRows], config: EyesConfig) -> int:
+def _lag(rows: Sequence[LaneRows], perfect: Sequence[LaneRows], config: EyesConfig) -> int:
     """Return the number of decisions after which counts fall with a green.
 
     For every lag, the fall of counts is regressed on the green so many decisions before; the lag
-    that explains most of it is the answer.
+    that explains most of it is the candidate. Slow drivers look alike, because their queues begin
+    to fall late in the green. But late counts also fall late in the red that follows it. So the
+    candidate is taken if counts fall about as far there as in the green that it names, measured
+    from the fall that perfect detectors show there.
     """
     gains = np.zeros(config.most_lag + 1)
     for own in rows:
-        goes_on = (np.diff(own.episode) == 0) & (np.diff(own.step) == 1)
+        goes_on = _goes_on(own)
         fall = own.before - own.after
         green = own.has.astype(float)
         known = own.before >= config.queue
@@ -349,7 +353,49 @@ def _lag(rows: Sequence[LaneRows], config: EyesConfig) -> int:
             with_green, without = fall[use & (green > 0)], fall[use & (green == 0)]
             if len(with_green) > 2 and len(without) > 2:
                 gains[lag] += (with_green.mean() - without.mean()) * np.sqrt(use.sum())
-    return int(gains.argmax()) if gains.max() > 0 else 0
+    lag = int(gains.argmax()) if gains.max() > 0 else 0
+    if not lag:
+        return 0
+    late, usual = (_fall_in_red(lanes, lag, config) for lanes in (rows, perfect))
+    long = _fall_in_green(rows, lag, config)
+    return lag if late - usual > (long - usual) / 2 else 0
+
+
+def _goes_on(own: LaneRows) -> NDArray[np.bool_]:
+    """Return whether each decision but the first follows the one before it, ``(n - 1,)``."""
+    return (np.diff(own.episode) == 0) & (np.diff(own.step) == 1)
+
+
+def _since_green(own: LaneRows) -> NDArray[np.int64]:
+    """Return the decisions since a lane had its last green; 0 in green, -1 if none is known."""
+    since = np.zeros(len(own.has), dtype=np.int64)
+    goes_on = np.concatenate([[False], _goes_on(own)])
+    for t in range(len(since)):
+        before = since[t - 1] if goes_on[t] else -1
+        since[t] = 0 if own.has[t] else before + (before >= 0)
+    return since
+
+
+def _fall_in_red(rows: Sequence[LaneRows], lag: int, config: EyesConfig) -> float:
+    """Return the mean fall of long queues in the decision of red of this number; 0 without any."""
+    falls = [
+        (own.before - own.after)[(own.before >= config.queue) & (_since_green(own) == lag)]
+        for own in rows
+    ]
+    together = np.concatenate(falls)
+    return float(together.mean()) if len(together) else 0.0
+
+
+def _fall_in_green(rows: Sequence[LaneRows], lag: int, config: EyesConfig) -> float:
+    """Return the mean fall of long queues, so many decisions after a green; 0 without any."""
+    falls: list[Floats] = []
+    for own in rows:
+        green = own.has.copy()
+        for _ in range(lag):
+            green = np.concatenate([[False], green[:-1] & _goes_on(own)])
+        falls.append((own.before - own.after)[(own.before >= config.queue) & green])
+    together = np.concatenate(falls)
+    return float(together.mean()) if len(together) else 0.0
 
 
 def _lost(rows: Sequence[LaneRows], config: EyesConfig) -> float:

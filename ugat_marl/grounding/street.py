@@ -402,7 +402,9 @@ def fit_street(
     """
     known = known or Known()
     lanes, interval_s = worlds.lanes, real.provenance.decision_interval_s
-    channel = fit_channel(real, config.channel) if "channel" in config.parts else None
+    timing = simulation.scenario.timing
+    held_s = timing.clearance_s + timing.min_green_s
+    channel = fit_channel(real, config.channel, held_s) if "channel" in config.parts else None
     street = FittedStreet(lanes, interval_s, channel)
     if "eyes" in config.parts:
         seeds = [derive_seed(seed, "street", "baseline", k) for k in range(BASELINE_EPISODES)]
