@@ -8,7 +8,7 @@ those of the simulation keep, a detector is at fault. Each fault is estimated fr
 - zone: no count is ever above n, although counts above n are common in the simulation;
 - noise: counts fall in red, as far and as often as those of the simulation do with the same noise;
 - coarse counts: all counts are multiples of a number;
-- lag: counts fall so many decisions after the green, and not with it;
+- lag: counts go on falling so many decisions into the red;
 - dropout: a count stays the same while a long queue is served.
 """
 
@@ -332,33 +332,19 @@ def _step(rows: Sequence[LaneRows]) -> float:
 
 
 def _lag(rows: Sequence[LaneRows], perfect: Sequence[LaneRows], config: EyesConfig) -> int:
-    """Return the number of decisions after which counts fall with a green.
+    """Return the number of decisions by which counts are late.
 
-    For every lag, the fall of counts is regressed on the green so many decisions before; the lag
-    that explains most of it is the candidate. Slow drivers look alike, because their queues begin
-    to fall late in the green. But late counts also fall late in the red that follows it. So the
-    candidate is taken if counts fall about as far there as in the green that it names, measured
+    Late counts go on falling in the red after a green, for as many decisions as they are late.
+    Slow drivers do not: their queues begin to fall late in the green, and stand in the red. A
+    decision of red counts as late if counts fall there at least half as far as in green, measured
     from the fall that perfect detectors show there.
     """
-    gains = np.zeros(config.most_lag + 1)
-    for own in rows:
-        goes_on = _goes_on(own)
-        fall = own.before - own.after
-        green = own.has.astype(float)
-        known = own.before >= config.queue
-        for lag in range(len(gains)):
-            if lag:
-                green = np.concatenate([[np.nan], np.where(goes_on, green[:-1], np.nan)])
-            use = known & ~np.isnan(green)
-            with_green, without = fall[use & (green > 0)], fall[use & (green == 0)]
-            if len(with_green) > 2 and len(without) > 2:
-                gains[lag] += (with_green.mean() - without.mean()) * np.sqrt(use.sum())
-    lag = int(gains.argmax()) if gains.max() > 0 else 0
-    if not lag:
-        return 0
-    late, usual = (_fall_in_red(lanes, lag, config) for lanes in (rows, perfect))
-    long = _fall_in_green(rows, lag, config)
-    return lag if late - usual > (long - usual) / 2 else 0
+    greens = [_fall_in_green(rows, lag, config) for lag in range(config.most_lag + 1)]
+    for lag in range(1, config.most_lag + 1):
+        late, usual = (_fall_in_red(lanes, lag, config) for lanes in (rows, perfect))
+        if late - usual <= max(0.0, (max(greens) - usual) / 2):
+            return lag - 1
+    return config.most_lag
 
 
 def _goes_on(own: LaneRows) -> NDArray[np.bool_]:
