@@ -62,14 +62,19 @@ class Algorithm:
                 self.run.log("iteration", 0, self.probe(state.direct))
             state.save(self.run)
 
-    def _attend(self, state: RunState[Any], env: AnyParallelEnv, title: str) -> None:
-        """Let the learner watch the rule that is good in an environment, if it has a teacher."""
+    def _attend(self, state: RunState[Any], env: AnyParallelEnv, title: str) -> Policy | None:
+        """Let the learner watch the rule that is good in an environment, if it has a teacher.
+
+        Returns:
+            The policy after the lessons; None without a teacher.
+        """
         learner = state.learner
         if not isinstance(learner, Taught) or not (number := learner.plays(env)):
-            return
+            return None
         with self.run.reporter.task(f"lessons, {title}", number) as advance:
             name = learner.attend(env, self.seed, lambda rule: advance(note=rule))
         self.run.reporter.say(f"{title}: {name} teaches")
+        return state.learner.policy()
 
     def _learn(self, state: RunState[Any], env: AnyParallelEnv, episodes: int, title: str) -> None:
         """Let the learner train in an environment; log every episode."""

@@ -10,7 +10,8 @@
      6      watch the rule that is best in worlds of the street, if the learner has a teacher;
             for e = 1, ..., E episodes: draw a world of the street, update pi in it; where f is
             trusted, ground its actions
-     7      keep the better of pi and the policy kept so far, in the same worlds of the street
+     7      keep the best of pi, pi after the lessons, and the policy kept so far, in the same
+            worlds of the street
 
 Line 5 is an option. Where commands are late, a grounded action would be late as well, and none is
 grounded.
@@ -137,12 +138,12 @@ class StreetTraining(Algorithm):
             env = street_env(street, self.simulation, street.commands)
             with contextlib.closing(env):
                 grounded = env if residual is None else residual.around(env)
-                self._attend(state, grounded, title)
+                taught = self._attend(state, grounded, title)
                 self._learn(state, grounded, episodes, title)  # line 6
             if residual is not None and residual.acts:
                 gate = residual.end_iteration().as_dict()
                 numbers |= {f"residual/gate/{name}": value for name, value in gate.items()}
-            numbers |= self._keep_better(state, street)  # line 7
+            numbers |= self._keep_better(state, street, taught)  # line 7
             if self.probe is not None:
                 numbers |= self.probe(state.policy())
             self.run.log("iteration", state.iteration + 1, numbers)
@@ -150,8 +151,15 @@ class StreetTraining(Algorithm):
             state.save(self.run)
         return state.policy()
 
-    def _keep_better(self, state: RunState[StreetFit], street: FittedStreet) -> dict[str, float]:
-        """Compare the new policy with the kept one in worlds of the street; keep the better.
+    def _keep_better(
+        self, state: RunState[StreetFit], street: FittedStreet, taught: Policy | None
+    ) -> dict[str, float]:
+        """Compare the new policies with the kept one in worlds of the street; keep the best.
+
+        Args:
+            state: The state, with the learner after its training.
+            street: The fitted street.
+            taught: Policy after the lessons; None if there were none.
 
         Returns:
             Average travel times in s, for the metrics.
@@ -159,18 +167,23 @@ class StreetTraining(Algorithm):
         count = self.config.street.judged
         if count == 0:
             return {}
-        new, kept = state.learner.policy(), state.best or state.direct
+        kept = state.best or state.direct
         assert kept is not None  # plain training comes first
+        known = {"before": kept, "after the lessons": taught, "after": state.learner.policy()}
+        policies = {name: policy for name, policy in known.items() if policy is not None}
         seeds = [derive_seed(self.seed, "judged", state.iteration, k) for k in range(count)]
         worlds = [street.world(seed) for seed in seeds]
-        with self.run.reporter.task(f"comparing, {iteration_name(state)}", 2 * count) as advance:
-            times_s = self.simulation.compare(worlds, [kept, new], seeds, advance).mean(1)
-        state.best = new if times_s[1] < times_s[0] else kept
+        title = f"comparing, {iteration_name(state)}"
+        with self.run.reporter.task(title, len(policies) * count) as advance:
+            compared = self.simulation.compare(worlds, [*policies.values()], seeds, advance)
+        times_s = dict(zip(policies, compared.mean(1).tolist(), strict=True))
+        best = min(times_s, key=lambda name: times_s[name])  # of equal ones that before
+        state.best = policies[best]
+        told = ", ".join(f"{name} {time_s:.1f} s" for name, time_s in times_s.items())
         self.run.reporter.say(
-            f"{iteration_name(state)}: {times_s[1]:.1f} s in the fitted street, the policy before "
-            f"{times_s[0]:.1f} s: {'the new one' if state.best is new else 'that one'} is kept"
+            f"{iteration_name(state)}: in the fitted street the policy {told}; that {best} is kept"
         )
-        return {"judged/before": float(times_s[0]), "judged/after": float(times_s[1])}
+        return {f"judged/{name.replace(' ', '_')}": time_s for name, time_s in times_s.items()}
 
     def renew(self, state: RunState[StreetFit]) -> None:
         """Replace the learner by a new one, if policies see something else in the street."""
