@@ -90,8 +90,10 @@ def test_a_short_zone_is_found_by_what_is_never_counted() -> None:
     def short(counts: np.ndarray, _: np.random.Generator) -> np.ndarray:
         return np.minimum(counts, 3.0)
 
-    low_m, high_m = found(short).zone_m
+    eyes = found(short)
+    low_m, high_m = eyes.zone_m
     assert low_m < 3 * 7.5 < high_m < 40.0
+    assert eyes.lag == 0
 
 
 def test_noise_is_found_with_its_size() -> None:

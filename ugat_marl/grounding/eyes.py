@@ -15,6 +15,7 @@ those of the simulation keep, a detector is at fault. Each fault is estimated fr
 from __future__ import annotations
 
 import itertools
+import math
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass
 from typing import Any, ClassVar
@@ -62,7 +63,8 @@ class EyesConfig:
         absolute: Standard deviations of the absolute error that are tried, in vehicles.
         relative: Standard deviations of the relative error that are tried.
         long_queue: Vehicles on a lane that is served without pause.
-        least_served: Fewest decisions with a long queue from which lost readings are estimated.
+        least_served: Fewest decisions with a long queue from which lost readings, or late counts,
+            are estimated.
         least_stays: Fewest of them in which the count stayed.
         least_lost: Smallest share of lost readings that counts as found.
     """
@@ -340,9 +342,10 @@ def _lag(rows: Sequence[LaneRows], perfect: Sequence[LaneRows], config: EyesConf
     from the fall that perfect detectors show there.
     """
     greens = [_fall_in_green(rows, lag, config) for lag in range(config.most_lag + 1)]
+    most = max((fall for fall in greens if not math.isnan(fall)), default=0.0)
     for lag in range(1, config.most_lag + 1):
         late, usual = (_fall_in_red(lanes, lag, config) for lanes in (rows, perfect))
-        if late - usual <= max(0.0, (max(greens) - usual) / 2):
+        if not late - usual > max(0.0, (most - usual) / 2):  # also if one is not known
             return lag - 1
     return config.most_lag
 
@@ -363,25 +366,31 @@ def _since_green(own: LaneRows) -> NDArray[np.int64]:
 
 
 def _fall_in_red(rows: Sequence[LaneRows], lag: int, config: EyesConfig) -> float:
-    """Return the mean fall of long queues in the decision of red of this number; 0 without any."""
+    """Return the mean fall of long queues in the decision of red of this number.
+
+    It is NaN with fewer than `least_served` of them, as where zones are too short for queues.
+    """
     falls = [
         (own.before - own.after)[(own.before >= config.queue) & (_since_green(own) == lag)]
         for own in rows
     ]
-    together = np.concatenate(falls)
-    return float(together.mean()) if len(together) else 0.0
+    return _mean_of_many(falls, config)
 
 
 def _fall_in_green(rows: Sequence[LaneRows], lag: int, config: EyesConfig) -> float:
-    """Return the mean fall of long queues, so many decisions after a green; 0 without any."""
+    """Return the mean fall of long queues, so many decisions after a green; NaN without many."""
     falls: list[Floats] = []
     for own in rows:
         green = own.has.copy()
         for _ in range(lag):
             green = np.concatenate([[False], green[:-1] & _goes_on(own)])
         falls.append((own.before - own.after)[(own.before >= config.queue) & green])
-    together = np.concatenate(falls)
-    return float(together.mean()) if len(together) else 0.0
+    return _mean_of_many(falls, config)
+
+
+def _mean_of_many(parts: Sequence[Floats], config: EyesConfig) -> float:
+    together = np.concatenate(parts)
+    return float(together.mean()) if len(together) >= config.least_served else math.nan
 
 
 def _lost(rows: Sequence[LaneRows], config: EyesConfig) -> float:
