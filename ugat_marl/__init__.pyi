@@ -4,5 +4,8 @@ from .envs import TrafficEnv as TrafficEnv
 from .envs import env as env
 from .envs import parallel_env as parallel_env
 from .envs import vector_env as vector_env
+from .experiments.functions import Training as Training
+from .experiments.functions import evaluate as evaluate
+from .experiments.functions import train as train
 
 __version__: str

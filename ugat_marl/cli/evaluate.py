@@ -37,7 +37,8 @@ class Evaluate:
     Attributes:
         scenario: Id of a shipped scenario, directory, .sumocfg or resco:<map>.
         policies: Rules (such as fixed-time:30, actuated:40, largest-queue:20, max-pressure:10,
-            programme; docs/reference/rules.md has them all) and files of trained policies.
+            programme; docs/reference/rules.md has them all), files of trained policies, and your
+            own policies as my_module:my_policy.
         domains: Domains; gaps are differences from the first. "all" is sim and every named domain.
             "observation", "action", "transition" or "reward" is every domain of this gap; see
             ugat-marl domains.

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import re
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated
@@ -12,9 +11,8 @@ from tyro.conf import arg
 
 from ugat_marl.cli.arguments import RayAddress, workers_of
 from ugat_marl.data import METRICS_FILE, Metrics
-from ugat_marl.effects import domain_label
 from ugat_marl.errors import OptionError
-from ugat_marl.experiments import TransferConfig, transfer
+from ugat_marl.experiments import TransferConfig, run_folder, transfer
 from ugat_marl.progress import Bars
 from ugat_marl.reporting import calibration_picture, transfer_picture, transfer_table
 
@@ -28,6 +26,7 @@ class Train:
         ugat-marl train resco:cologne3 --real V3 --seed 1 --out runs/cologne3
         ugat-marl train path/to/my.sumocfg --real startup_delay=0.8+acceleration=1.2
         ugat-marl train single-v1 --real none --real-log measured.parquet
+        ugat-marl train single-v1 --real V4 --learner my_algo:MyLearner
         ugat-marl train grid4x4-v1 --real V4 --ray auto
 
     Attributes:
@@ -47,8 +46,7 @@ class Train:
         config = self.config
         if self.out == Path():
             raise OptionError("--out is empty; give the name of a folder")
-        name = "-".join(re.sub(r"[^\w=+.]+", "-", part).strip("-.") for part in _names(config))
-        directory = self.out or Path("runs") / f"{name}-s{config.seed}"
+        directory = self.out or run_folder(config)
         with workers_of(None, self.ray) as workers:
             table = transfer(
                 config, directory, resume=self.resume, reporter=Bars(console), workers=workers
@@ -58,16 +56,15 @@ class Train:
         transfer_picture(table, metrics, picture)
         calibration_picture(metrics, directory / "calibration.png")
         console.print(transfer_table(table))
-        console.print(
-            f"run: {directory}\ntable: {directory / 'table.json'}\npicture: {picture}\n"
-            f"policies: {directory / 'policies'}\n"
-            f"curves: tensorboard --logdir {directory}",
-            soft_wrap=True,
-        )
+        places = {
+            "run": directory,
+            "table": directory / "table.json",
+            "picture": picture,
+            "policies": directory / "policies",
+            "curves": f"tensorboard --logdir {directory}",
+        }
+        if not (directory / "policies").exists():  # of a learner that cannot be kept
+            del places["policies"]
+        for name, place in places.items():
+            console.print(f"{name}: {place}", soft_wrap=True, markup=False)
         return 0
-
-
-def _names(config: TransferConfig) -> tuple[str, str]:
-    """Return scenario and real domain; a path gives its last part."""
-    scenario, real = config.scenario, domain_label(config.real)
-    return Path(scenario).name.removesuffix(".sumocfg"), Path(real).name

@@ -119,6 +119,10 @@ class Run:
             current.rename(old)
         fresh.rename(current)
         shutil.rmtree(old, ignore_errors=True)
+        self.write_metrics()
+
+    def write_metrics(self) -> None:
+        """Write all metrics so far."""
         self.metrics.write(self.directory / METRICS_FILE)
         if self._board is not None:
             self._board.flush()

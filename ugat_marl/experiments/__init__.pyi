@@ -13,6 +13,9 @@ from .evaluation import best_rules as best_rules
 from .evaluation import evaluate as evaluate
 from .evaluation import policy_factory as policy_factory
 from .evaluation import rule_factory as rule_factory
+from .functions import Training as Training
+from .functions import run_folder as run_folder
+from .functions import train as train
 from .gap_costs import domains_by_gap as domains_by_gap
 from .gap_costs import gap_matrix as gap_matrix
 from .jobs import EVALUATION_SEED as EVALUATION_SEED

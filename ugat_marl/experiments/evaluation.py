@@ -2,10 +2,13 @@
 
 from __future__ import annotations
 
+import copy
 import math
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
@@ -22,12 +25,17 @@ from ugat_marl.parallel import (
     persistently,
 )
 from ugat_marl.policies import (
+    RULES,
     STANDARD_RULES,
     NetworkPolicy,
+    OwnLearnerFactory,
     Policy,
     PolicyFactory,
     StepCallback,
+    is_own,
+    load_own,
     make_rule,
+    own_policy,
     parse_rule,
     roll_out,
     stop_callback,
@@ -211,13 +219,13 @@ class RuleFactory:
 
 @dataclass(frozen=True)
 class FixedPolicy:
-    """Maker that always returns the same, stateless policy."""
+    """Maker that returns copies of one policy."""
 
     policy: Policy
 
     def __call__(self, env: TrafficEnv) -> Policy:
-        """Return the policy."""
-        return self.policy
+        """Return a copy of the policy, because several episodes run at a time."""
+        return copy.deepcopy(self.policy)
 
 
 @dataclass(frozen=True)
@@ -251,24 +259,59 @@ def rule_factory(spec: str) -> PolicyFactory:
 
 
 def fixed_policy(policy: Policy) -> PolicyFactory:
-    """Return a factory that always gives the same, stateless policy."""
+    """Return a factory that gives copies of one policy."""
     return FixedPolicy(policy)
 
 
 def policy_factory(spec: str) -> PolicyFactory:
-    """Return a factory for a rule, or for the file of a trained policy, as a user names it.
+    """Return a factory for a rule, the file of a trained policy, or a policy in a user's module.
+
+    Args:
+        spec: Spelling of a rule, a file, ``module:name`` of a policy or of what makes one, or
+            ``module:name@file`` of a learner with the file of its state.
 
     Raises:
         UnknownNameError: The name is neither a file nor a rule.
+        OptionError: The module or the name in it is missing.
         CheckpointError: The file is not a policy. The factory raises it for a policy of another
             scenario.
     """
+    name, at, file = spec.partition("@")
+    if is_own(name) and name.partition(":")[0] not in RULES:
+        if at:
+            return OwnLearnerPolicy(name, Path(file))
+        return OwnPolicyFactory(load_own(name, "policy"), name)
     path = Path(spec)
     if path.is_dir():
         raise CheckpointError(f"{path} is a folder; name the .pt file of a policy in it")
     if path.suffix != ".pt" and not path.is_file():
         return rule_factory(spec)
     return TrainedPolicy(NetworkPolicy.load(path), str(path))
+
+
+@dataclass(frozen=True)
+class OwnPolicyFactory:
+    """Maker of a policy that a user gives."""
+
+    given: Any
+    name: str
+
+    def __call__(self, env: TrafficEnv) -> Policy:
+        """Return the policy for an environment."""
+        return copy.deepcopy(own_policy(self.given, self.name, env))
+
+
+@dataclass(frozen=True)
+class OwnLearnerPolicy:
+    """Maker of the policy of a user's learner, restored from a file."""
+
+    name: str
+    path: Path
+
+    def __call__(self, env: TrafficEnv) -> Policy:
+        """Return the policy for an environment."""
+        make_env = partial(parallel_env, env.scenario)
+        return OwnLearnerFactory(self.name).read_policy(make_env, self.path)
 
 
 def _pairs(

@@ -45,6 +45,7 @@ from ugat_marl.grounding import (
     RecordedWorld,
     SimulatedWorld,
     World,
+    is_kept,
 )
 from ugat_marl.parallel import Workers, in_this_process
 from ugat_marl.policies import STANDARD_RULES, Policy, PolicyFactory, Taught
@@ -411,7 +412,8 @@ def _plain(
             record.add(effort)
             if job.every:
                 record.write(folder)
-            learner.save(progress)
+            if is_kept(learner):
+                learner.save(progress)
 
         left = max(0, job.episodes - learner.episodes)
         with reporter.task(f"training: {job.setting.name}", left) as advance:
@@ -503,8 +505,8 @@ def _start(job: Job, folder: Path) -> Path | None:
 
 
 def _save(policy: Any, path: Path) -> None:
-    """Save a policy if it has a method `save`."""
-    if hasattr(policy, "save"):
+    """Save a policy if it has a method `save` and can be restored."""
+    if hasattr(policy, "save") and is_kept(policy):
         policy.save(path)
 
 

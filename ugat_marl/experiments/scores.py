@@ -16,6 +16,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+import polars as pl
 from numpy.typing import NDArray
 
 from ugat_marl.data import MEASURES, Scores
@@ -131,6 +132,42 @@ class Evaluation:
                 for r in self.results
             ],
         }
+
+    def frame(self) -> pl.DataFrame:
+        """Return one row per policy and domain: means over the seeds, with intervals.
+
+        Returns:
+            Columns ``policy``, ``domain``, ``episodes``, ``att_s`` (average travel time in s),
+            ``low_s`` and ``high_s`` (its interval, 95 %), ``gap_s`` (minus that in the first
+            domain, s) and ``regret_s`` (minus that of the best policy in this domain, s).
+        """
+        rows: list[dict[str, Any]] = []
+        for domain in self.domains:
+            for policy in self.policies:
+                att = self.estimate(policy, domain, "att_s")
+                rows.append(
+                    {
+                        "policy": policy,
+                        "domain": domain,
+                        "episodes": len(self.values(policy, domain, "att_s")),
+                        "att_s": att.mean,
+                        "low_s": att.low,
+                        "high_s": att.high,
+                        "gap_s": self.gap(policy, domain, "att_s").mean,
+                        "regret_s": self.regret(policy, domain).mean,
+                    }
+                )
+        return pl.DataFrame(rows)
+
+    def episodes_frame(self) -> pl.DataFrame:
+        """Return one row per episode: policy, domain, seed, and a column for every measure."""
+        rows = [
+            {"policy": r.policy, "domain": r.domain, "seed": r.seed}
+            | {name: value for name, value in asdict(r.scores).items() if name != "hidden"}
+            | dict(r.scores.hidden)
+            for r in self.results
+        ]
+        return pl.DataFrame(rows, infer_schema_length=None)
 
     def write(self, path: Path) -> None:
         """Write `as_dict` as JSON, whole or not at all; nan becomes null."""

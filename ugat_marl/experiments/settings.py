@@ -13,8 +13,11 @@ from ugat_marl.policies import (
     DQNConfig,
     LearnerFactory,
     baseline_settings,
+    is_own,
+    is_savable,
     learner_factory,
     learner_library,
+    load_own,
     observed_options,
     require_known_learner,
     suite_config,
@@ -65,8 +68,9 @@ class LearnerSpec:
     """The algorithm that learns, with its settings.
 
     Attributes:
-        name: "universal" or "dqn", the suite's own, or the name of a baseline.
-        settings: Settings of a baseline as ``NAME=VALUE``.
+        name: "universal" or "dqn", the suite's own, the name of a baseline, or ``module:name`` of a
+            user's learner.
+        settings: Settings of a baseline or of a user's learner as ``NAME=VALUE``.
         dqn: Settings of the suite's own learners that differ from the defaults.
     """
 
@@ -102,6 +106,11 @@ class LearnerSpec:
         )
 
     @property
+    def savable(self) -> bool:
+        """True if other trainings can start from what the learner has learnt."""
+        return not is_own(self.name) or is_savable(load_own(self.name, "learner"))
+
+    @property
     def identity(self) -> dict[str, Any]:
         """Name and settings of the learner, and the library of a baseline.
 
@@ -110,6 +119,8 @@ class LearnerSpec:
         """
         if self.name in SUITE_LEARNERS:
             return {"name": self.name, "settings": asdict(suite_config(self.name, self.dqn))}
+        if is_own(self.name):
+            return {"name": self.name, "settings": list(self.settings)}
         settings = baseline_settings(self.name, self.settings)
         return {"name": self.name, "settings": settings, "library": learner_library(self.name)}
 

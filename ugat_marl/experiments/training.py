@@ -39,7 +39,13 @@ from ugat_marl.grounding import (
     street_prior,
 )
 from ugat_marl.parallel import Workers
-from ugat_marl.policies import EpisodeCallback, Learner, LearnerFactory, NetworkPolicy, Policy
+from ugat_marl.policies import (
+    EpisodeCallback,
+    Learner,
+    LearnerFactory,
+    NetworkPolicy,
+    Policy,
+)
 from ugat_marl.scenarios import Scenario, green_begins_at_once
 
 
@@ -144,10 +150,18 @@ def train_grounded(
     if start is not None:
         state.learner.load(start)
         state.direct, state.pretrained = state.learner.policy(), ugat.pretrain_episodes
-    state.restore(run, NetworkPolicy.load, renew)
+    state.restore(run, _policy_reader(make, env), renew)
     with contextlib.closing(sim), contextlib.closing(real):
         algorithm.train(state)
     return state
+
+
+def _policy_reader(make: LearnerFactory, env: TrafficEnv) -> Callable[[Path], Policy]:
+    """Return the function that reads the policies of a learner from a checkpoint."""
+    read = getattr(make, "read_policy", None)  # makers of users' learners have it
+    return (
+        NetworkPolicy.load if read is None else partial(read, partial(parallel_env, env.scenario))
+    )
 
 
 def _keep(_state: RunState[Any]) -> None:

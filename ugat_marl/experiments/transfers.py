@@ -31,6 +31,7 @@ from ugat_marl.experiments.jobs import (
     DIRECT_POLICY,
     POLICY,
     RULE_FILE,
+    SCORES,
     Job,
     Record,
     evaluation_seeds,
@@ -68,6 +69,8 @@ from ugat_marl.policies import (
     STANDARD_RULES,
     UNIVERSAL_NAME,
     DQNConfig,
+    check_own_learner,
+    is_own,
     require_device_name,
     require_known_learner,
 )
@@ -120,10 +123,11 @@ class TransferConfig:
         placebo: A negative control; grounding must win nothing with it. "same-world" records D_real
             in the simulation, "shuffled" permutes the outcomes in D_real, "noise" replaces f by
             noise.
-        learner: The learner: universal or dqn, the suite's own, or a baseline
-            (docs/how-to/learners.md); default: universal, and dqn with the preset "paper".
-        learner_settings: Settings of a baseline as NAME=VALUE, such as learning_rate=0.001; commas
-            separate the parts of a tuple.
+        learner: The learner: universal or dqn, the suite's own, a baseline, or your own as
+            my_module:MyLearner (docs/how-to/learners.md); default: universal, and dqn with the
+            preset "paper".
+        learner_settings: Settings of a baseline or of your own learner as NAME=VALUE, such as
+            learning_rate=0.001; commas separate the parts of a tuple.
         device: Device for the learner's updates and the fits of f and h: cpu, cuda, or cuda:N.
         ugat: Settings of the algorithm.
         dqn: Settings of the learners universal and dqn.
@@ -193,6 +197,17 @@ class TransferConfig:
             raise OptionError('the placebo "same-world" takes the place of a real_log; give one')
         if self.random_delay_s is not None and self.random_delay_s < 1:
             raise OptionError(f"random_delay_s = {self.random_delay_s}: must be at least 1")
+        continues = {
+            "further": bool(self.further),
+            "random_delay_s": self.random_delay_s is not None,
+            "fine_tuned": self.fine_tuned,
+        }
+        for name, asked in continues.items():
+            if asked and not self.spec.savable:
+                raise OptionError(
+                    f"{name} starts from the learner of direct transfer, and {self.learner!r} "
+                    "cannot be kept: give its class the methods save(path) and load(path)"
+                )
         for name in ("fine_tuned", "oracle"):
             if getattr(self, name) and len(self.domains) < 2:
                 raise OptionError(f"{name} needs a real domain to train in, not {self.real!r}")
@@ -292,7 +307,7 @@ def transfer(
         identity = _identity(config, scenario, env)
     plan = planned_jobs(config)
     folder = directory / TRAININGS
-    begun = any(folder.glob(f"*/{CHECKPOINT_FOLDER}"))
+    begun = any(path for name in (CHECKPOINT_FOLDER, SCORES) for path in folder.glob(f"*/{name}"))
     if begun and not resume:
         raise OptionError(
             f"{directory} holds a run already; use --resume to go on with it, or another --out"
@@ -307,9 +322,9 @@ def planned_jobs(config: TransferConfig) -> list[Job]:
     """Return the jobs of a run: UGAT with its plain training, the other settings, and the rules.
 
     Settings that begin with direct transfer start from the learner that the first job keeps after
-    plain training.
+    plain training. Where a learner cannot be kept, the control trains all its episodes itself.
     """
-    ugat = _grounded_job(config)
+    ugat, kept = _grounded_job(config), config.spec.savable
     real, common = ugat.target, replace(ugat, real_log=None, probe_domains=(), target=None)
     others = [
         replace(
@@ -319,7 +334,7 @@ def planned_jobs(config: TransferConfig) -> list[Job]:
             episodes=config.episodes
             if setting.episodes is None
             else config.ugat.pretrain_episodes + setting.episodes,
-            start=f"{ugat.name}/{DIRECT_LEARNER}" if setting.begins_with_direct else None,
+            start=f"{ugat.name}/{DIRECT_LEARNER}" if setting.begins_with_direct and kept else None,
         )
         for setting in config.settings
     ]
@@ -381,6 +396,8 @@ def _write_results(
     trained = {name: row for name, row in rows.items() if row[0].seed is not None}
     for file, (job, mark, _) in zip(file_names(trained), trained.values(), strict=True):
         policy = folder / job.name / (POLICY if mark == job.episodes else DIRECT_POLICY)
+        if not policy.exists():  # of a learner that cannot be kept
+            continue
         write_whole(directory / "policies" / f"{file}.pt", policy.read_bytes())
     write_whole(directory / METRICS_FILE, (folder / plan[0].name / METRICS_FILE).read_bytes())
     write_queues(
@@ -422,7 +439,12 @@ def _check(config: TransferConfig, scenario: Scenario, env: TrafficEnv, reporter
         env: The simulation.
         reporter: Receives a note if the real log is from another domain.
     """
-    config.spec.factory(config.device)
+    make = config.spec.factory(config.device)
+    if is_own(config.learner) and not check_own_learner(make, env, config.seed).savable:
+        reporter.say(
+            f"note: {config.learner} has no save(path) and load(path): an interrupted training "
+            "begins anew with --resume, and no policies are written"
+        )
     for world in worlds_of(_grounded_job(config), env, None):
         world.close()
     if config.real_log is not None:

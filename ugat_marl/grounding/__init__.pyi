@@ -27,6 +27,7 @@ from .residual import ResidualConfig as ResidualConfig
 from .stacked import Stack as Stack
 from .stacked import stack_log as stack_log
 from .state import RunState as RunState
+from .state import is_kept as is_kept
 from .street import PARTS as PARTS
 from .street import DrawnEnv as DrawnEnv
 from .street import FittedStreet as FittedStreet

@@ -9,7 +9,7 @@ from typing import Any
 from ugat_marl.data import Run
 from ugat_marl.envs import AnyParallelEnv
 from ugat_marl.grounding.config import UgatConfig
-from ugat_marl.grounding.state import RunState
+from ugat_marl.grounding.state import RunState, is_kept
 from ugat_marl.grounding.worlds import World
 from ugat_marl.policies import Policy, Taught
 
@@ -57,7 +57,8 @@ class Algorithm:
                 state.save(self.run)
         if state.direct is None:
             state.direct = state.learner.policy()
-            state.learner.save(self.run.directory / DIRECT_LEARNER)
+            if is_kept(state.learner):
+                state.learner.save(self.run.directory / DIRECT_LEARNER)
             if self.probe is not None:
                 self.run.log("iteration", 0, self.probe(state.direct))
             state.save(self.run)

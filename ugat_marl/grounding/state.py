@@ -26,6 +26,12 @@ class Savable(Protocol):
 
 Saved = TypeVar("Saved", bound=Savable)
 
+
+def is_kept(learner_or_policy: Any) -> bool:
+    """Return True if a learner or policy can be saved; those of users may lack the methods."""
+    return getattr(learner_or_policy, "savable", True)
+
+
 _POLICIES = ("direct", "best")
 """Policies of a state; each has a file in a checkpoint."""
 
@@ -59,11 +65,14 @@ class RunState(Generic[Saved]):
         return self.best or self.learner.policy()
 
     def save(self, run: Run) -> None:
-        """Write a checkpoint into the run's folder.
+        """Write a checkpoint into the run's folder; without a learner to keep, only the metrics.
 
         Raises:
             OptionError: The learner's policy has no method to save it.
         """
+        if not is_kept(self.learner):
+            run.write_metrics()
+            return
 
         def write(folder: Path) -> None:
             self.learner.save(folder / "learner.pt")

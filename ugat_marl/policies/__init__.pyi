@@ -42,6 +42,14 @@ from .networks.batched import one_thread as one_thread
 from .networks.batched import size_mask as size_mask
 from .networks.q_network import flatten_parameters as flatten_parameters
 from .networks.q_network import parameters_for_unscaled as parameters_for_unscaled
+from .own import OwnLearnerFactory as OwnLearnerFactory
+from .own import OwnPolicy as OwnPolicy
+from .own import check_own_learner as check_own_learner
+from .own import is_own as is_own
+from .own import is_savable as is_savable
+from .own import load_own as load_own
+from .own import own_name as own_name
+from .own import own_policy as own_policy
 from .protocols import EpisodeCallback as EpisodeCallback
 from .protocols import Learner as Learner
 from .protocols import Policy as Policy

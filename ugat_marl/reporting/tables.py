@@ -55,7 +55,7 @@ def measures_table(evaluation: Evaluation) -> RenderableType:
             pad_edge=False,
             padding=(0, 1, 0, 0),
         )
-        table.add_column("policy", max_width=18, overflow="fold")
+        table.add_column("policy", max_width=20, overflow="fold")
         headings = ("ATT s", "through.", "reward", "queue", "delay", "delay s", "regret s")
         for heading in headings:
             table.add_column(heading, justify="right", no_wrap=True)

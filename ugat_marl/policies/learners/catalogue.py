@@ -1,4 +1,4 @@
-"""Every learner by name: the suite's own two, and those in the files of baselines/.
+"""Every learner by name: the suite's own two, those in the files of baselines/, and a user's.
 
 "dqn" learns a network for each intersection. "universal" is the same algorithm with one network for
 all, whose weights belong to none.
@@ -7,6 +7,8 @@ A new learner needs a file in baselines/ and a row in `BASELINES`. The file hold
 follows the protocol `Learner` and is made as ``Learner(env, config, seed)``, and a dataclass of its
 settings. Its policies are of class `NetworkPolicy`, which all commands read. A file of baselines/
 is loaded at its first use.
+
+A user's learner has the name ``module:name`` and needs no row here (`policies.own`).
 """
 
 from __future__ import annotations
@@ -25,6 +27,7 @@ from ugat_marl.data import installed_version
 from ugat_marl.envs import AnyParallelEnv
 from ugat_marl.errors import OptionError, UnknownNameError
 from ugat_marl.policies.learners.dqn_config import DQNConfig
+from ugat_marl.policies.own import OwnLearnerFactory, is_own, load_own, own_learner_options
 from ugat_marl.policies.protocols import Learner
 
 LearnerFactory = Callable[[AnyParallelEnv, int], Learner]
@@ -124,8 +127,9 @@ def learner_factory(
     """Return the maker of the named learner; its library is imported now.
 
     Args:
-        name: One of `SUITE_LEARNERS` or of `BASELINES`.
-        settings: Settings of a baseline, as ``NAME=VALUE``; commas separate the parts of a tuple.
+        name: One of `SUITE_LEARNERS` or of `BASELINES`, or ``module:name`` of a user's learner.
+        settings: Settings of a baseline or of a user's learner, as ``NAME=VALUE``; commas separate
+            the parts of a tuple.
         dqn: Settings of the suite's own learners that differ from the defaults; None for none.
         device: Device of the updates of the suite's own learners (`devices.device_of`); baselines
             stay on the CPU.
@@ -139,6 +143,8 @@ def learner_factory(
 
     require_known_learner(name)
     place = device_of(device)
+    if is_own(name):
+        return OwnLearnerFactory(name, settings)
     if name in SUITE_LEARNERS:
         if settings:
             raise OptionError(f"learner settings {' '.join(settings)}: those of {name} are --dqn.*")
@@ -167,7 +173,7 @@ def suite_config(name: str, given: DQNConfig | None = None) -> DQNConfig:
 
 def observed_options(name: str) -> dict[str, Any]:
     """Return the options of the environment that a learner needs; empty if any will do."""
-    return dict(OBSERVED.get(name, {}))
+    return own_learner_options(name) if is_own(name) else dict(OBSERVED.get(name, {}))
 
 
 def baseline_settings(name: str, given: Sequence[str] = ()) -> dict[str, Any]:
@@ -195,9 +201,13 @@ def require_known_learner(name: str) -> None:
 
     Raises:
         UnknownNameError: It is neither one of `SUITE_LEARNERS` nor of `BASELINES`.
+        OptionError: A user's learner cannot be found.
     """
-    if name not in SUITE_LEARNERS and name not in BASELINES:
-        raise UnknownNameError("learner", name, (*SUITE_LEARNERS, *BASELINES))
+    if is_own(name):
+        load_own(name, "learner")
+    elif name not in SUITE_LEARNERS and name not in BASELINES:
+        hint = "An algorithm of your own: --learner my_module:MyLearner."
+        raise UnknownNameError("learner", name, (*SUITE_LEARNERS, *BASELINES), hint)
 
 
 def learner_library(name: str) -> str:

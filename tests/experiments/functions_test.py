@@ -1,0 +1,77 @@
+"""The functions of scripts: names of policies, folders of runs, tables of evaluations."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import pytest
+
+import ugat_marl
+from ugat_marl.data import Scores
+from ugat_marl.errors import OptionError, UnknownNameError
+from ugat_marl.experiments import Evaluation, TransferConfig, run_folder
+from ugat_marl.experiments.scores import Result as Episode
+
+
+def scored(att_s: float) -> Scores:
+    return Scores(att_s, 2, 3, 4, 5, 6, 7, 8, 9, 10)
+
+
+TABLE = Evaluation(
+    "two",
+    "",
+    (
+        Episode("a", "sim", 1, scored(10)),
+        Episode("a", "sim", 2, scored(20)),
+        Episode("a", "V4", 1, scored(30)),
+        Episode("a", "V4", 2, scored(60)),
+        Episode("b", "sim", 1, scored(12)),
+        Episode("b", "sim", 2, scored(12)),
+        Episode("b", "V4", 1, scored(40)),
+        Episode("b", "V4", 2, scored(40)),
+    ),
+    {},
+)
+
+
+def test_the_frame_of_an_evaluation_has_gaps_and_regrets() -> None:
+    frame = TABLE.frame()
+    rows = {(row["policy"], row["domain"]): row for row in frame.to_dicts()}
+    assert rows["a", "sim"]["att_s"] == 15 and rows["a", "sim"]["gap_s"] == 0
+    assert rows["a", "V4"]["gap_s"] == 30 and rows["b", "V4"]["gap_s"] == 28
+    assert rows["a", "V4"]["regret_s"] == 5 and rows["b", "V4"]["regret_s"] == 0
+    assert rows["a", "sim"]["low_s"] < 15 < rows["a", "sim"]["high_s"]
+    assert frame["episodes"].to_list() == [2] * 4
+    each = TABLE.episodes_frame()
+    assert each.height == 8 and each["att_s"].to_list()[:3] == [10, 20, 30]
+
+
+@pytest.mark.parametrize(
+    ("scenario", "real", "folder"),
+    [
+        ("single-v1", "V4", "single-v1-V4-s3"),
+        ("/some/where/town.sumocfg", "reach=100+rain=1", "town-reach=100+rain=1-s3"),
+        ("resco:cologne3", "found/corrected", "resco-cologne3-corrected-s3"),
+    ],
+)  # fmt: skip
+def test_a_run_has_a_folder_of_its_own(scenario: str, real: str, folder: str) -> None:
+    assert run_folder(TransferConfig(scenario, real=real, seed=3)) == Path("runs", folder)
+
+
+def test_wrong_calls_are_refused() -> None:
+    for policies in (["random", "random"], []):
+        with pytest.raises(OptionError, match="policies"):
+            ugat_marl.evaluate("single-v1", policies, ["sim"])
+    with pytest.raises(OptionError, match="at least one"):
+        ugat_marl.evaluate("single-v1", ["random"], [])
+    with pytest.raises(UnknownNameError, match="largest-queue"):
+        ugat_marl.evaluate("single-v1", "largst-queue", ["sim"])
+    with pytest.raises(UnknownNameError, match="universal"):
+        ugat_marl.train("single-v1", learner="univrsal")
+
+
+def test_what_the_package_offers_is_listed() -> None:
+    offered = {"train", "evaluate", "parallel_env", "env", "vector_env", "load_scenario"}
+    assert offered <= set(dir(ugat_marl))
+    for name in dir(ugat_marl):
+        assert getattr(ugat_marl, name).__doc__

@@ -1,0 +1,354 @@
+"""Learners and policies of users: what they need, what is said when it is missing."""
+
+from __future__ import annotations
+
+import importlib
+import json
+import re
+import sys
+from pathlib import Path
+from typing import Any
+
+import polars as pl
+import pytest
+
+import ugat_marl
+from tests.interrupts import KillAfter
+from tests.runs import search_few_rules
+from ugat_marl.__main__ import main
+from ugat_marl.data import Metrics
+from ugat_marl.errors import ActionError, CheckpointError, OptionError, UnknownNameError
+from ugat_marl.experiments import policy_factory
+from ugat_marl.policies import (
+    OwnLearnerFactory,
+    check_own_learner,
+    load_own,
+    own_name,
+    own_policy,
+)
+from ugat_marl.testing import ToyTraffic
+
+ALGORITHM = '''
+class Cycle:
+    """Counts its episodes, and holds each phase for as many decisions."""
+
+    def __init__(self, env, seed, first: int = 1):
+        self.env, self.hold = env, first
+
+    def learn(self, env, episodes):
+        for _ in range(episodes):
+            observations, infos = env.reset()
+            while env.agents:
+                actions = {agent: env.action_space(agent).sample() for agent in env.agents}
+                observations, rewards, *_ = env.step(actions)
+            self.hold += 1
+
+    def policy(self):
+        return Holding(self.hold)
+
+
+class Holding:
+    def __init__(self, hold):
+        self.hold, self.decision = hold, 0
+
+    def reset(self):
+        self.decision = 0
+
+    def act(self, observations):
+        self.decision += 1
+        return {agent: (self.decision // self.hold) % 2 for agent in observations}
+
+
+class Kept(Cycle):
+    def save(self, path):
+        path.write_text(str(self.hold))
+
+    def load(self, path):
+        self.hold = int(path.read_text())
+
+
+def first_phase(observations, infos):
+    return dict.fromkeys(observations, 0)
+
+
+def cycling(env):
+    return Holding(2)
+
+
+holding = Holding(3)
+'''
+SHORT = ("--duration-s", "100", "--evaluation-seeds", "1", "--tuning-seeds", "1")
+FEW = ("--pretrain-episodes", "2", "--iterations", "1", "--grounded-episodes", "1")
+
+
+@pytest.fixture
+def algorithm(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Any:
+    """A module of a user in the working folder."""
+    (tmp_path / "my_algo.py").write_text(ALGORITHM)
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.syspath_prepend(str(tmp_path))
+    monkeypatch.delitem(sys.modules, "my_algo", raising=False)
+    return importlib.import_module("my_algo")
+
+
+def trained(folder: Path, learner: str, *words: str) -> int:
+    """The exit code of a small training by the command line."""
+    call = ["train", "single-v1", "--grounding", "phase", "--learner", learner]
+    return main([*call, *SHORT, *FEW, "--out", str(folder), *words])
+
+
+@pytest.mark.usefixtures("algorithm")
+def test_a_learner_with_two_methods_is_trained_and_judged_in_every_row(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    search_few_rules(monkeypatch, "programme")
+    assert trained(tmp_path / "run", "my_algo:Cycle") == 0
+    out = capsys.readouterr().out
+    assert "my_algo:Cycle has no save(path) and load(path)" in out
+    table = json.loads((tmp_path / "run" / "table.json").read_text())
+    names = [row["policy"] for row in table["summary"] if row["domain"] == "V4"]
+    assert names[:3] == ["direct transfer", "UGAT", "more plain sim"]
+    rows = Metrics.read(tmp_path / "run" / "metrics.parquet").rows
+    assert sorted(step for _, step, name, _ in rows if name == "return") == [0, 1, 2]
+    assert not list((tmp_path / "run" / "policies").glob("*"))
+
+
+@pytest.mark.usefixtures("algorithm")
+def test_a_learner_that_can_be_saved_resumes_to_the_numbers_of_an_unbroken_run(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    search_few_rules(monkeypatch, "programme")
+    common: dict[str, Any] = {
+        "learner": "my_algo:Kept", "learner_settings": ["first=2"], "grounding": "phase",
+        "pretrain_episodes": 2, "iterations": 2, "grounded_episodes": 1, "duration_s": 100.0,
+        "evaluation_seeds": 1,
+    }  # fmt: skip
+    whole = ugat_marl.train("single-v1", out=tmp_path / "whole", **common)
+    stop = KillAfter("grounded, iteration 2", 0)
+    with pytest.raises(KeyboardInterrupt):
+        ugat_marl.train("single-v1", out=tmp_path / "cut", reporter=stop, **common)
+    again = ugat_marl.train("single-v1", out=tmp_path / "cut", resume=True, **common)
+    assert again.table.equals(whole.table)
+    assert set(again.policies) == {"direct-transfer", "ugat", "more-plain-sim"}
+    direct = again.policies["direct-transfer"]
+    played = ugat_marl.evaluate(
+        "single-v1", f"my_algo:Kept@{direct}", ["sim"], seeds=1, duration_s=100.0
+    )
+    expected = whole.table.filter(pl.col("policy") == "direct transfer", pl.col("domain") == "sim")
+    assert played["att_s"].item() == expected["att_s"].item()
+
+
+def test_a_learner_of_a_notebook_is_given_as_an_object(
+    tmp_path: Path, algorithm: Any, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    search_few_rules(monkeypatch, "programme")
+    run = ugat_marl.train(
+        "single-v1",
+        learner=lambda env, seed: algorithm.Cycle(env, seed, first=4),
+        grounding="phase",
+        pretrain_episodes=1,
+        iterations=0,
+        control=False,
+        evaluation_seeds=1,
+        duration_s=100.0,
+        out=tmp_path / "run",
+    )
+    table = run.table
+    assert table.columns[:4] == ["policy", "domain", "episodes", "att_s"]
+    assert set(table["domain"]) == {"sim", "V4"}
+    assert str(run.folder) in repr(run)
+
+
+def test_policies_of_every_form_are_evaluated(algorithm: Any) -> None:
+    table = ugat_marl.evaluate(
+        "single-v1",
+        {
+            "object": algorithm.Holding(3),
+            "same": "my_algo:holding",
+            "function": algorithm.first_phase,
+            "maker": algorithm.cycling,
+            "rule": "fixed-time:30",
+        },
+        ["sim", "V4"],
+        seeds=2,
+        duration_s=200.0,
+    )
+    att = {(row["policy"], row["domain"]): row["att_s"] for row in table.to_dicts()}
+    assert len(att) == 10 and table["episodes"].to_list() == [2] * 10
+    assert att["object", "sim"] == att["same", "sim"]
+    assert att["object", "sim"] != att["maker", "sim"]
+    best = min(value for (_, domain), value in att.items() if domain == "V4")
+    for row in table.to_dicts():
+        if row["domain"] == "V4":
+            assert row["regret_s"] == pytest.approx(row["att_s"] - best)
+            assert row["gap_s"] == pytest.approx(row["att_s"] - att[row["policy"], "sim"])
+    each = ugat_marl.evaluate(
+        "single-v1", algorithm.holding, ["sim"], seeds=[7], duration_s=200.0, each_episode=True
+    )
+    assert each.select("policy", "seed").rows() == [("Holding", 7)]
+
+
+def test_a_policy_of_the_command_line(
+    algorithm: Any, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    del algorithm
+    monkeypatch.setenv("COLUMNS", "200")
+    words = ["--policies", "my_algo:first_phase", "fixed-time:30", "--domains", "sim"]
+    assert main(["evaluate", "single-v1", *words, "--seeds", "1", "--duration-s", "100"]) == 0
+    assert "my_algo:first_phase" in capsys.readouterr().out
+
+
+class NoPolicy:
+    def learn(self, env: Any, episodes: int) -> None:
+        """Learn nothing."""
+
+
+class NeedsMore(NoPolicy):
+    def learn(self, env: Any, episodes: int, buffer: Any) -> None:  # pyright: ignore[reportIncompatibleMethodOverride]
+        """Ask for more than is given."""
+
+    def policy(self) -> Any:
+        return lambda observations: dict.fromkeys(observations, 0)
+
+
+class Lazy(NoPolicy):
+    def policy(self) -> Any:
+        return lambda observations: dict.fromkeys(observations, 0)
+
+
+class Wild(Lazy):
+    def policy(self) -> Any:
+        return lambda observations: dict.fromkeys(observations, 99)
+
+
+class Mute(Lazy):
+    def policy(self) -> Any:
+        return lambda observations: None
+
+
+class Unready(Lazy):
+    def policy(self) -> Any:
+        raise RuntimeError("no network yet")
+
+
+class Bare(Lazy):
+    def policy(self) -> Any:
+        return 3
+
+
+@pytest.mark.parametrize(
+    ("learner", "error", "says"),
+    [
+        (NoPolicy, OptionError, "no method policy()"),
+        (NeedsMore, OptionError, "called as learn(env, episodes)"),
+        (Wild, ActionError, "99"),
+        (Mute, OptionError, "returned a NoneType"),
+        (Unready, OptionError, "no network yet"),
+        (Bare, OptionError, "a int has no act"),
+        (Lazy(), OptionError, "give its class"),
+        (3, OptionError, "is a int"),
+    ],
+)
+def test_what_a_learner_lacks_is_said_before_the_first_episode(
+    learner: Any, error: type[Exception], says: str, tmp_path: Path
+) -> None:
+    with pytest.raises(error, match=re.escape(says)):
+        ugat_marl.train(
+            "single-v1", learner=learner, grounding="phase", duration_s=100.0, out=tmp_path / "run"
+        )
+    assert not (tmp_path / "run").exists()
+
+
+def test_a_learner_that_plays_too_little_is_refused() -> None:
+    learner = check_own_learner(OwnLearnerFactory(own_name(Lazy)), ToyTraffic(), 0)
+    with pytest.raises(OptionError, match=r"learn\(env, 2\) played 0 whole episodes"):
+        learner.learn(ToyTraffic(), 2, 0)
+
+
+def test_later_learning_does_not_change_a_policy(algorithm: Any) -> None:
+    env = ToyTraffic()
+    learner = OwnLearnerFactory(own_name(algorithm.Kept))(env, 0)
+    before = learner.policy()
+    learner.learn(env, 3, 0)
+    observations, infos = env.reset(seed=0)
+    for policy, changes_at in ((before, 1), (learner.policy(), 4)):
+        policy.reset(0)
+        shown = [set(policy.act(observations, infos).values()) for _ in range(5)]
+        assert shown.index({1}) + 1 == changes_at
+
+
+def test_a_training_with_the_same_seed_is_the_same(algorithm: Any) -> None:
+    del algorithm
+    seen: list[list[float]] = []
+    for _ in range(2):
+        learner = OwnLearnerFactory("my_algo:Cycle")(ToyTraffic(), 0)
+        seeds: list[float] = []
+        env = ToyTraffic()
+        reset = env.reset
+
+        def noted(
+            seed: int | None = None,
+            options: Any = None,
+            reset: Any = reset,
+            seeds: Any = seeds,
+        ) -> Any:
+            seeds.append(float(seed or -1))
+            return reset(seed=seed, options=options)
+
+        env.reset = noted
+        learner.learn(env, 2, 5)
+        learner.learn(env, 1, 5)
+        seen.append(seeds)
+    assert seen[0] == seen[1]
+    assert len(set(seen[0])) == 3 and -1.0 not in seen[0]
+
+
+@pytest.mark.usefixtures("algorithm")
+@pytest.mark.parametrize(
+    ("name", "error", "says"),
+    [
+        ("my_aglo:Cycle", OptionError, "no module 'my_aglo'"),
+        ("my_algo:Cylce", UnknownNameError, "'Cycle'"),
+        ("my_algo.py:Cylce", UnknownNameError, "'Cycle'"),
+    ],
+)
+def test_a_name_that_leads_nowhere_is_refused(name: str, error: type[Exception], says: str) -> None:
+    with pytest.raises(error, match=says):
+        load_own(name, "learner")
+
+
+@pytest.mark.usefixtures("algorithm")
+def test_settings_have_the_type_of_the_argument() -> None:
+    learner: Any = OwnLearnerFactory("my_algo:Cycle", ["first=6"])(ToyTraffic(), 0)
+    assert learner.policy()._given.hold == 6
+    with pytest.raises(OptionError, match="integer"):
+        OwnLearnerFactory("my_algo:Cycle", ["first=many"])
+    with pytest.raises(UnknownNameError, match="first"):
+        OwnLearnerFactory("my_algo:Cycle", ["frist=2"])
+
+
+@pytest.mark.usefixtures("algorithm")
+def test_options_that_continue_a_learner_need_one_that_can_be_kept(
+    capsys: pytest.CaptureFixture[str], tmp_path: Path
+) -> None:
+    assert trained(tmp_path / "run", "my_algo:Cycle", "--fine-tuned") == 2
+    assert "fine_tuned starts from the learner of direct transfer" in capsys.readouterr().err
+
+
+@pytest.mark.usefixtures("algorithm")
+def test_a_file_of_something_else_is_refused(tmp_path: Path) -> None:
+    (tmp_path / "other.pt").write_bytes(b"nothing")
+    make = policy_factory("my_algo:Kept@other.pt")
+    with pytest.raises(CheckpointError, match=r"other\.pt: not the state of a learner"):
+        make(ugat_marl.parallel_env("single-v1"))
+
+
+def test_a_class_of_policies_is_made(algorithm: Any) -> None:
+    class Own(algorithm.Holding):
+        def __init__(self, env: Any) -> None:
+            super().__init__(len(env.possible_agents))
+
+    policy = own_policy(Own, "own", ToyTraffic())
+    policy.reset(3)
+    observations, infos = ToyTraffic().reset(seed=0)
+    assert set(policy.act(observations, infos)) == set(observations)

@@ -1,0 +1,231 @@
+"""Functions of scripts and notebooks: train across a gap, and evaluate policies.
+
+They do what the commands ``train`` and ``evaluate`` do, and take objects of Python where a command
+takes names.
+"""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, Literal
+
+import polars as pl
+
+from ugat_marl.effects import Domain, domain_label, load_scenario
+from ugat_marl.errors import OptionError
+from ugat_marl.experiments import evaluation
+from ugat_marl.experiments.evaluation import OwnPolicyFactory, policy_factory
+from ugat_marl.experiments.jobs import EVALUATION_SEED
+from ugat_marl.experiments.scores import Evaluation
+from ugat_marl.experiments.transfers import TransferConfig, transfer
+from ugat_marl.grounding import UgatConfig
+from ugat_marl.parallel import Workers
+from ugat_marl.policies import DQNConfig, PolicyFactory, own_name
+from ugat_marl.progress import Reporter, usual
+from ugat_marl.scenarios import Scenario
+
+
+@dataclass(frozen=True)
+class Training:
+    """Result of `train`.
+
+    Attributes:
+        folder: Folder of the run, for ``ugat-marl report`` and ``resume``.
+        evaluation: Every episode of the evaluation.
+    """
+
+    folder: Path
+    evaluation: Evaluation
+
+    @property
+    def table(self) -> pl.DataFrame:
+        """One row per policy and domain (`Evaluation.frame`)."""
+        return self.evaluation.frame()
+
+    @property
+    def policies(self) -> dict[str, Path]:
+        """Files of the trained policies, by the name of the file without suffix."""
+        return {path.stem: path for path in sorted((self.folder / "policies").glob("*.pt"))}
+
+    def __repr__(self) -> str:
+        """Return the folder and the table."""
+        return f"Training in {self.folder}\n{self.table}"
+
+
+def train(
+    scenario: str | Path,
+    *,
+    real: str = "V4",
+    sim: str = "sim",
+    learner: str | type[Any] | Any = "",
+    learner_settings: Sequence[str] = (),
+    grounding: Literal["street", "timed", "phase"] = "street",
+    pretrain_episodes: int = UgatConfig.pretrain_episodes,
+    iterations: int = UgatConfig.iterations,
+    grounded_episodes: int = UgatConfig.grounded_episodes,
+    real_rollouts: int = UgatConfig.real_rollouts,
+    observation: str | None = None,
+    reward: str = "total-queue",
+    control: bool = True,
+    evaluation_seeds: int = 5,
+    duration_s: float | None = None,
+    seed: int = 0,
+    preset: Literal["paper"] | None = None,
+    real_log: str | Path | None = None,
+    ugat: UgatConfig | None = None,
+    dqn: DQNConfig | None = None,
+    out: str | Path | None = None,
+    resume: bool = False,
+    workers: Workers = None,
+    reporter: Reporter | None = None,
+) -> Training:
+    """Train policies in a simulation for a domain that differs, and judge them in both.
+
+    Args:
+        scenario: Id of a shipped scenario, directory, .sumocfg or resco:<map>.
+        real: The real domain, such as "V4" or "startup_delay=1+deceleration=2".
+        sim: The domain to train in.
+        learner: Name of a learner, ``module:name``, or a class with ``learn(env, episodes)`` and
+            ``policy()``, or a function of ``env`` and ``seed`` that makes such an object.
+        learner_settings: Settings of the learner as ``NAME=VALUE``.
+        grounding: "street", "timed" or "phase".
+        pretrain_episodes: Episodes of plain training; the policy after them is direct transfer.
+        iterations: Number of times to roll out, fit and train.
+        grounded_episodes: Episodes of training in each iteration.
+        real_rollouts: Episodes recorded in the real domain in each iteration.
+        observation: Kind of observation; None for the one that the learner needs, or "count".
+        reward: Kind of reward.
+        control: Also train direct transfer for as many further episodes in plain sim.
+        evaluation_seeds: Number of evaluation episodes of each policy in each domain.
+        duration_s: Length of an episode in s; None for the scenario's own.
+        seed: Root of every random choice.
+        preset: "paper" for Algorithm 1 as published.
+        real_log: Transition log in place of roll-outs in the real domain.
+        ugat: All settings of the algorithm, in place of the numbers above.
+        dqn: Settings of the learners universal and dqn.
+        out: Folder of the run; None for runs/SCENARIO-REAL-sSEED.
+        resume: Continue the run in that folder.
+        workers: Simulations at a time, or an executor; None for one per core.
+        reporter: Shows progress; None for the one of the program.
+
+    Returns:
+        The table and the folder of the run.
+
+    Raises:
+        UgatMarlError: An option, the scenario or the learner is at fault; the message names it.
+    """
+    settings = ugat or UgatConfig(
+        grounding=grounding,
+        pretrain_episodes=pretrain_episodes,
+        iterations=iterations,
+        grounded_episodes=grounded_episodes,
+        real_rollouts=real_rollouts,
+    )
+    config = TransferConfig(
+        str(scenario),
+        real=real,
+        sim=sim,
+        preset=preset,
+        real_log=None if real_log is None else Path(real_log),
+        seed=seed,
+        observation=observation,
+        reward=reward,
+        duration_s=duration_s,
+        evaluation_seeds=evaluation_seeds,
+        control=control,
+        learner=learner if isinstance(learner, str) else own_name(learner),
+        learner_settings=tuple(learner_settings),
+        ugat=settings,
+        dqn=dqn or DQNConfig(),
+    )
+    folder = Path(out) if out is not None else run_folder(config)
+    table = transfer(config, folder, resume=resume, reporter=reporter or usual(), workers=workers)
+    return Training(folder, table)
+
+
+def evaluate(
+    scenario: str | Path | Scenario,
+    policies: Any = ("programme", "largest-queue:20", "max-pressure:10", "random"),
+    domains: Sequence[Domain] = ("sim", "V1", "V2", "V3", "V4"),
+    *,
+    seeds: int | Sequence[int] = 5,
+    duration_s: float | None = None,
+    each_episode: bool = False,
+    workers: Workers = None,
+    reporter: Reporter | None = None,
+) -> pl.DataFrame:
+    """Play policies in domains with several seeds, and return their scores.
+
+    Args:
+        scenario: Id of a shipped scenario, directory, .sumocfg, resco:<map>, or a loaded scenario.
+        policies: A policy, a sequence of them, or a dictionary from names to policies. Each is the
+            spelling of a rule, the file of a trained policy, ``module:name``, an object with
+            ``act(observations, infos)``, a function of the same arguments, or a class or a function
+            of ``env`` that makes one.
+        domains: Domains; gaps are differences from the first.
+        seeds: Number of episodes of each policy in each domain, or the seeds themselves.
+        duration_s: Length of an episode in s; None for the scenario's own.
+        each_episode: Return one row per episode with all measures.
+        workers: Simulations at a time, or an executor; None for one per core.
+        reporter: Shows progress; None for the one of the program.
+
+    Returns:
+        One row per policy and domain (`Evaluation.frame`), or per episode.
+
+    Raises:
+        UgatMarlError: A name or an option is at fault; the message names it.
+    """
+    numbers = range(EVALUATION_SEED, EVALUATION_SEED + seeds) if isinstance(seeds, int) else seeds
+    if not numbers or not domains:
+        raise OptionError("seeds and domains need at least one each")
+    played = evaluation.evaluate(
+        load_scenario(scenario),
+        _factories(policies),
+        domains,
+        numbers,
+        duration_s=duration_s,
+        workers=workers,
+        reporter=reporter or usual(),
+    )
+    return played.episodes_frame() if each_episode else played.frame()
+
+
+def run_folder(config: TransferConfig) -> Path:
+    """Return the folder of a run that has been given none: runs/SCENARIO-REAL-sSEED."""
+    scenario, real = config.scenario, domain_label(config.real)
+    parts = (Path(scenario).name.removesuffix(".sumocfg"), Path(real).name)
+    name = "-".join(re.sub(r"[^\w=+.]+", "-", part).strip("-.") for part in parts)
+    return Path("runs") / f"{name}-s{config.seed}"
+
+
+def _factories(policies: Any) -> Mapping[str, PolicyFactory]:
+    """Return makers of policies by name."""
+    if isinstance(policies, Mapping):
+        return {str(name): _factory(given, str(name)) for name, given in policies.items()}
+    several = policies if isinstance(policies, list | tuple) else [policies]
+    named = [(_name(given), given) for given in several]
+    if len(dict(named)) < len(named):
+        raise OptionError(
+            f"policies holds a name twice: {', '.join(name for name, _ in named)}; give a "
+            "dictionary from names to policies"
+        )
+    if not named:
+        raise OptionError("policies needs at least one")
+    return {name: _factory(given, name) for name, given in named}
+
+
+def _factory(given: Any, name: str) -> PolicyFactory:
+    return policy_factory(str(given)) if _is_name(given) else OwnPolicyFactory(given, name)
+
+
+def _name(given: Any) -> str:
+    if _is_name(given):
+        return str(given)
+    return str(getattr(given, "__name__", type(given).__name__))
+
+
+def _is_name(given: Any) -> bool:
+    return isinstance(given, str | Path)

@@ -1,0 +1,529 @@
+"""Learners and policies of users, adapted to the protocols of the suite.
+
+A learner of a user needs ``learn(env, episodes)`` and ``policy()``. A policy needs
+``act(observations, infos)``, or is a function of the same arguments; ``infos`` may be left out.
+Both are named as ``module:name``, as in an entry point of Python, and the module is looked for in
+the working folder, too.
+
+With ``save(path)`` and ``load(path)`` a learner can also be resumed, and trainings can start from
+what it has learnt.
+"""
+
+from __future__ import annotations
+
+import ast
+import contextlib
+import copy
+import importlib
+import inspect
+import io
+import json
+import re
+import sys
+import tempfile
+import warnings
+import zipfile
+from collections.abc import Callable, Mapping, Sequence
+from pathlib import Path
+from typing import Any, get_type_hints
+
+from pettingzoo.utils import BaseParallelWrapper
+from pydantic import TypeAdapter, ValidationError
+
+from ugat_marl.envs import (
+    Actions,
+    AnyParallelEnv,
+    Infos,
+    Observations,
+    ResetResult,
+    StepResult,
+    checked_phases,
+)
+from ugat_marl.errors import CheckpointError, OptionError, UgatMarlError, UnknownNameError
+from ugat_marl.files import write_whole
+from ugat_marl.policies.protocols import EpisodeCallback, Policy
+from ugat_marl.seeding import derive_seed
+
+NEEDED = {"learn": ("env", "episodes"), "policy": ()}
+"""Methods that a learner must have, and their arguments."""
+
+_NAME = re.compile(r"[\w./\\-]+:[A-Za-z_][\w.<>]*")
+_STATE, _COUNTERS = "learner.pt", "counters.json"
+
+_given: dict[str, Any] = {}
+"""Objects that were given in Python, by the name under which settings hold them."""
+
+
+def is_own(name: str) -> bool:
+    """Return True if a name has the form ``module:name``."""
+    return _NAME.fullmatch(name) is not None
+
+
+def own_name(given: Any) -> str:
+    """Return the name ``module:name`` of an object, under which `load_own` finds it here."""
+    kind = given if hasattr(given, "__qualname__") else type(given)
+    name = f"{kind.__module__}:{kind.__qualname__}"
+    _given[name] = given
+    return name
+
+
+def load_own(name: str, what: str) -> Any:
+    """Return the object that a user names.
+
+    Args:
+        name: ``module:name``; the module may also be a path that ends in .py.
+        what: Kind of thing for messages, such as "learner".
+
+    Raises:
+        OptionError: The module or the object is missing.
+    """
+    if name in _given:
+        return _given[name]
+    place, _, path = name.partition(":")
+    file = Path(place) if place.endswith(".py") else None
+    folder = str(Path.cwd() if file is None else file.resolve().parent)
+    if folder not in sys.path:
+        sys.path.insert(0, folder)
+    module_name = place if file is None else file.stem
+    try:
+        found: Any = importlib.import_module(module_name)
+    except ModuleNotFoundError as error:
+        if error.name != module_name.partition(".")[0]:
+            raise OptionError(
+                f"{what} {name!r}: the module needs {error.name}, which is not installed"
+            ) from None
+        raise OptionError(
+            f"{what} {name!r}: there is no module {module_name!r} in {folder} or among the "
+            "installed packages; write the name of a file without .py, a colon, and the name in it"
+        ) from None
+    for part in path.split("."):
+        if not hasattr(found, part):
+            names = [key for key, value in vars(found).items() if callable(value)]
+            raise UnknownNameError(f"{what} in {module_name}", part, names)
+        found = getattr(found, part)
+    return found
+
+
+class OwnPolicy:
+    """A policy of a user, as a `Policy`.
+
+    Args:
+        given: Object with ``act``, or a function of the observations and, if it takes them, the
+            infos.
+        name: Name for messages.
+        env_options: Options of the environment that the policy was made for.
+        state: Content of the file that `save` writes; None if the learner cannot be saved.
+        shared: Objects that copies of the policy share, such as the environment of its training.
+
+    Raises:
+        OptionError: `given` can neither act nor be called.
+    """
+
+    def __init__(
+        self,
+        given: Any,
+        name: str,
+        env_options: Mapping[str, Any],
+        state: bytes | None = None,
+        shared: Sequence[Any] = (),
+    ) -> None:
+        act = getattr(given, "act", given)
+        if not callable(act):
+            raise OptionError(
+                f"policy {name!r}: a {type(given).__name__} has no act(observations, infos) and "
+                "cannot be called; give it that method, or give a function"
+            )
+        self.env_options: Mapping[str, Any] = {
+            **env_options,
+            **getattr(given, "env_options", {}),
+        }
+        self._given, self._name, self._state, self._shared = given, name, state, shared
+        self._sees_infos = _takes(act, 2)
+
+    @property
+    def savable(self) -> bool:
+        """True if `save` writes a file from which the learner can be restored."""
+        return self._state is not None
+
+    def reset(self, seed: int) -> None:
+        """Tell the user's policy that an episode begins, if it has a method ``reset``."""
+        reset = getattr(self._given, "reset", None)
+        if reset is not None:
+            reset(*[seed] if _takes(reset, 1) else [])
+
+    def act(self, observations: Observations, infos: Infos) -> Actions:
+        """Return the actions of the user's policy as whole numbers.
+
+        Raises:
+            OptionError: It returned no mapping from agents to numbers.
+        """
+        act = getattr(self._given, "act", self._given)
+        chosen = act(observations, infos) if self._sees_infos else act(observations)
+        try:
+            return {agent: int(action) for agent, action in chosen.items()}
+        except (AttributeError, TypeError, ValueError):
+            raise OptionError(
+                f"policy {self._name!r} returned a {type(chosen).__name__}; it must return a "
+                "dictionary from every agent to the number of a phase"
+            ) from None
+
+    def save(self, path: Path) -> None:
+        """Write the state of the learner that made the policy, whole or not at all."""
+        assert self._state is not None, "ask savable first"
+        write_whole(path, self._state)
+
+    def __deepcopy__(self, memo: dict[int, Any]) -> OwnPolicy:
+        """Copy the user's policy, but not the environments that it may hold."""
+        given = _copied(self._given, self._shared, self._name, memo)
+        return OwnPolicy(given, self._name, self.env_options, self._state, self._shared)
+
+
+def own_policy(given: Any, name: str, env: AnyParallelEnv) -> Policy:
+    """Return the policy that a user gives for an environment.
+
+    Args:
+        given: An object or a function as for `OwnPolicy`, or what makes one: a class, or a function
+            whose first argument is called ``env``.
+        name: Name for messages.
+        env: The environment.
+    """
+    if inspect.isclass(given):
+        given = given(*[env] if _takes(given, 1) else [])
+    elif inspect.isroutine(given) and _first_argument(given) == "env":
+        given = given(env)
+    return OwnPolicy(given, name, {})
+
+
+class OwnLearner:
+    """A learner of a user, as a `Learner`.
+
+    Every episode is seeded by its number, so that a training can be repeated.
+
+    Args:
+        given: The user's learner.
+        name: Name for messages.
+        env: Environment with the agents of the learner.
+    """
+
+    def __init__(self, given: Any, name: str, env: AnyParallelEnv) -> None:
+        self.episodes = 0
+        self._given, self._name = given, name
+        self._env_options = dict(getattr(env.unwrapped, "env_options", {}))
+        self._shared: list[Any] = [env, env.unwrapped]
+        self._seed, self._on_episode = 0, None
+
+    @property
+    def savable(self) -> bool:
+        """True if the user's learner has ``save`` and ``load``."""
+        return is_savable(self._given)
+
+    def learn(
+        self,
+        env: AnyParallelEnv,
+        episodes: int,
+        seed: int,
+        on_episode: EpisodeCallback | None = None,
+    ) -> OwnPolicy:
+        """Let the user's learner train for `episodes` more episodes.
+
+        Raises:
+            OptionError: It played fewer episodes.
+        """
+        if episodes > 0:
+            counted = CountedEnv(env, self.episodes, seed, on_episode)
+            self._shared = [counted, env, env.unwrapped]
+            self._given.learn(counted, episodes)
+            played, self.episodes = counted.episodes - self.episodes, counted.episodes
+            if played < episodes:
+                raise OptionError(
+                    f"learner {self._name!r}: learn(env, {episodes}) played {played} whole "
+                    f"episodes; it has to play {episodes}, each from env.reset() until env.agents "
+                    "is empty"
+                )
+            if played > episodes:
+                warnings.warn(
+                    f"learner {self._name!r}: learn(env, {episodes}) played {played} episodes; "
+                    "rows of a table are comparable if all play what they are asked",
+                    stacklevel=2,
+                )
+        return self.policy()
+
+    def policy(self) -> OwnPolicy:
+        """Return a copy of the user's current policy."""
+        given = _copied(self._given.policy(), self._shared, self._name, {})
+        state = self._packed() if self.savable else None
+        return OwnPolicy(given, self._name, self._env_options, state, self._shared)
+
+    def save(self, path: Path) -> None:
+        """Write what the user's ``save`` writes, and the number of episodes, as one file."""
+        write_whole(path, self._packed())
+
+    def load(self, path: Path) -> None:
+        """Restore the state from a file of `save`.
+
+        Raises:
+            CheckpointError: The file is missing, damaged, or the user's ``load`` refuses it.
+        """
+        self.episodes = int(_counters(path)["episodes"])
+        with tempfile.TemporaryDirectory() as folder:
+            try:
+                with zipfile.ZipFile(path) as packed:
+                    packed.extractall(folder)
+                self._given.load(Path(folder, _STATE))
+            except Exception as error:
+                raise CheckpointError(
+                    f"{path}: the learner {self._name!r} cannot load it "
+                    f"({type(error).__name__}: {error})"
+                ) from error
+
+    def _packed(self) -> bytes:
+        """Return the files that the user's ``save`` writes, and the counters, as a zip file."""
+        memory = io.BytesIO()
+        with tempfile.TemporaryDirectory() as folder, zipfile.ZipFile(memory, "w") as packed:
+            self._given.save(Path(folder, _STATE))
+            for file in sorted(Path(folder).rglob("*")):
+                packed.write(file, file.relative_to(folder))
+            counters = {"episodes": self.episodes, "env_options": self._env_options}
+            packed.writestr(_COUNTERS, json.dumps(counters))
+        return memory.getvalue()
+
+
+class CountedEnv(BaseParallelWrapper[str, Any, Any]):
+    """Environment that counts the whole episodes of a learner and seeds them by their number.
+
+    Attributes:
+        episodes: Number of whole episodes so far, those of earlier calls included.
+
+    Args:
+        env: The environment.
+        episodes: Number of episodes in earlier calls.
+        seed: Root of the seeds of all episodes.
+        on_episode: Called after each episode with its number and ``return`` (sum of the rewards,
+            mean over agents).
+    """
+
+    def __init__(
+        self, env: AnyParallelEnv, episodes: int, seed: int, on_episode: EpisodeCallback | None
+    ) -> None:
+        super().__init__(env)
+        self.episodes = episodes
+        self._root, self._on_episode, self._return = seed, on_episode, 0.0
+
+    def reset(self, seed: int | None = None, options: dict[str, Any] | None = None) -> ResetResult:
+        """Start the next episode; its number decides the seed unless one is given."""
+        if seed is None:
+            seed = derive_seed(self._root, "learner", "episode", self.episodes)
+        self._return = 0.0
+        return self.env.reset(seed=seed, options=options)
+
+    def step(self, actions: dict[str, Any]) -> StepResult:
+        """Execute the actions; count the episode if it ends."""
+        running = bool(self.env.agents)
+        result = self.env.step(actions)
+        if running and result[1]:
+            self._return += sum(map(float, result[1].values())) / len(result[1])
+        if running and not self.env.agents:
+            self.episodes += 1
+            if self._on_episode is not None:
+                self._on_episode(self.episodes - 1, {"return": self._return})
+        return result
+
+    def close(self) -> None:
+        """Leave the environment open, because a learner may close what it was given."""
+
+
+class OwnLearnerFactory:
+    """Maker of the learner that a user names.
+
+    The user's class or function gets the environment and the seed if it has arguments of the names
+    ``env`` and ``seed``. Settings are further keywords.
+
+    Attributes:
+        name: ``module:name`` of the class or function.
+
+    Args:
+        name: The same.
+        settings: ``NAME=VALUE``, converted to the annotated type of the argument.
+
+    Raises:
+        OptionError: It does not exist, makes no learners, or a value is impossible.
+        UnknownNameError: It has no argument of that name.
+    """
+
+    def __init__(self, name: str, settings: Sequence[str] = ()) -> None:
+        self.name, self._make = name, load_own(name, "learner")
+        if inspect.isclass(self._make):
+            _require_methods(self._make, name)
+        elif hasattr(self._make, "learn"):
+            raise OptionError(
+                f"learner {name!r} is one learner already; give its class or a function that "
+                "makes it, because every row of the table trains a new one"
+            )
+        elif not callable(self._make):
+            raise OptionError(
+                f"learner {name!r} is a {type(self._make).__name__}; give a class with "
+                "learn(env, episodes) and policy(), or a function that makes such an object"
+            )
+        self._settings = _converted(self._make, settings, name)
+
+    def __call__(self, env: AnyParallelEnv, seed: int) -> OwnLearner:
+        """Make a learner for the agents of an environment."""
+        given = self._make(**self._settings, **_offered(self._make, {"env": env, "seed": seed}))
+        _require_methods(given, self.name)
+        return OwnLearner(given, self.name, env)
+
+    def read_policy(self, make_env: Callable[..., AnyParallelEnv], path: Path) -> OwnPolicy:
+        """Return the policy of a file that `OwnPolicy.save` or `OwnLearner.save` wrote.
+
+        Args:
+            make_env: Makes an environment of the scenario with given options.
+            path: The file.
+
+        Raises:
+            CheckpointError: The file cannot be read, or is of another learner.
+        """
+        with contextlib.closing(make_env(**_counters(path)["env_options"])) as env:
+            learner = self(env, 0)
+            learner.load(path)
+            return learner.policy()
+
+
+def own_learner_options(name: str) -> dict[str, Any]:
+    """Return the options of the environment that a user's learner asks for (``env_options``)."""
+    return dict(getattr(load_own(name, "learner"), "env_options", {}))
+
+
+def is_savable(given: Any) -> bool:
+    """Return True if a learner or its class has ``save(path)`` and ``load(path)``."""
+    return all(callable(getattr(given, method, None)) for method in ("save", "load"))
+
+
+def check_own_learner(
+    make: Callable[[AnyParallelEnv, int], Any], env: AnyParallelEnv, seed: int
+) -> Any:
+    """Make a learner and let it act once, so that what it lacks is said before any training.
+
+    Args:
+        make: Maker of the learner.
+        env: The environment; it is reset.
+        seed: Seed of the learner and of the episode.
+
+    Returns:
+        The learner.
+
+    Raises:
+        OptionError: It cannot be made, has no policy before its training, or the policy fails.
+        ActionError: Its policy chooses a phase that does not exist.
+    """
+    name = getattr(make, "name", "")
+    try:
+        learner = make(env, seed)
+        policy = learner.policy()
+        observations, infos = env.reset(seed=seed)
+        policy.reset(seed)
+        actions = policy.act(observations, infos)
+    except UgatMarlError:
+        raise
+    except Exception as error:
+        raise OptionError(
+            f"learner {name!r} failed before its training ({type(error).__name__}: {error}); "
+            "policy() is asked before the first learn(), too, and has to act in the environment"
+        ) from error
+    spaces: Any = env.unwrapped
+    checked_phases(actions, env.agents, spaces.action_spaces)
+    return learner
+
+
+def _counters(path: Path) -> dict[str, Any]:
+    """Return the counters in a file of `OwnLearner.save`."""
+    try:
+        with zipfile.ZipFile(path) as packed:
+            counters = json.loads(packed.read(_COUNTERS))
+            return {
+                "episodes": int(counters["episodes"]),
+                "env_options": dict(counters["env_options"]),
+            }
+    except (OSError, KeyError, ValueError, TypeError, zipfile.BadZipFile) as error:
+        raise CheckpointError(f"{path}: not the state of a learner of a user ({error})") from None
+
+
+def _require_methods(given: Any, name: str) -> None:
+    """Refuse a learner that lacks a method, or whose method takes other arguments."""
+    for method, arguments in NEEDED.items():
+        own = getattr(given, method, None)
+        wanted = f"{method}({', '.join(arguments)})"
+        if not callable(own):
+            raise OptionError(
+                f"learner {name!r} has no method {wanted}; a learner needs "
+                "learn(env, episodes) and policy()"
+            )
+        self_argument = 1 if inspect.isclass(given) and inspect.isfunction(own) else 0
+        if not _takes(own, len(arguments) + self_argument):
+            raise OptionError(
+                f"learner {name!r}: its method {method}{inspect.signature(own)} is called as "
+                f"{wanted}; give further arguments defaults"
+            )
+
+
+def _takes(function: Callable[..., Any], number: int) -> bool:
+    """Return True if a function can be called with so many positional arguments."""
+    try:
+        inspect.signature(function).bind(*range(number))
+    except TypeError:
+        return False
+    except ValueError:  # a function in C without a signature
+        return True
+    return True
+
+
+def _first_argument(function: Callable[..., Any]) -> str:
+    return next(iter(inspect.signature(function).parameters), "")
+
+
+def _offered(make: Callable[..., Any], values: Mapping[str, Any]) -> dict[str, Any]:
+    """Return those of the values that a class or function has arguments for."""
+    return {name: values[name] for name in inspect.signature(make).parameters if name in values}
+
+
+def _converted(make: Callable[..., Any], settings: Sequence[str], name: str) -> dict[str, Any]:
+    """Return the settings of a user's learner in the types of its arguments."""
+    parameters = inspect.signature(make).parameters
+    names = [key for key in parameters if key not in ("env", "seed")]
+    hints: dict[str, Any] = {}
+    if settings:
+        hints = get_type_hints(make.__init__ if inspect.isclass(make) else make)
+    values: dict[str, Any] = {}
+    for setting in settings:
+        key, equals, text = setting.partition("=")
+        if not equals or not text:
+            raise OptionError(f"learner setting {setting!r}: must be NAME=VALUE")
+        if key not in names:
+            raise UnknownNameError(f"setting of {name}", key, names)
+        values[key] = _plain_value(text)
+        if key in hints:
+            whole = text.split(",") if "tuple" in str(hints[key]) else text
+            try:
+                values[key] = TypeAdapter(hints[key]).validate_python(whole)
+            except ValidationError as error:
+                reason = error.errors()[0]["msg"]
+                raise OptionError(f"learner setting {setting!r}: {reason}") from None
+    return values
+
+
+def _plain_value(text: str) -> Any:
+    """Return a number, a tuple or another literal of Python; other words stay text."""
+    try:
+        return ast.literal_eval(text)
+    except (ValueError, SyntaxError):
+        return text
+
+
+def _copied(given: Any, shared: Sequence[Any], name: str, memo: dict[int, Any]) -> Any:
+    """Return a deep copy of a user's policy in which the shared objects stay the same."""
+    try:
+        return copy.deepcopy(given, {**memo, **{id(item): item for item in shared}})
+    except Exception as error:
+        raise OptionError(
+            f"policy of {name!r} cannot be copied ({type(error).__name__}: {error}); let policy() "
+            "return an object that holds only what it needs to act"
+        ) from error
