@@ -67,12 +67,18 @@ SHORT: dict[str, tuple[str, ...]] = {
 }
 """Short names of commands, and the words that replace them."""
 
+GROUPS: dict[str, str] = {
+    "scenario": "make, check, draw and list scenarios: new, check, draw, list",
+    "paper": "the tables of the paper: main, ablation, alpha, uncertainty, gap",
+}
+"""Purpose of the commands of two words, by their first."""
 
 LINE = CommandLine(
     program="ugat-marl",
     purpose="Traffic signals across the gap between simulation and street.",
     commands=COMMANDS,
     short=SHORT,
+    groups=GROUPS,
     examples=(
         "ugat-marl scenario list",
         "ugat-marl evaluate single-v1 --domains sim V4 --seeds 2",

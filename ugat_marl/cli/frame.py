@@ -4,23 +4,23 @@ from __future__ import annotations
 
 import contextlib
 import importlib
-import inspect
 import io
 import os
 import re
 import sys
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, field, fields, is_dataclass
-from typing import Any, get_type_hints
+from dataclasses import dataclass, field
+from typing import Any
 
 from rich.console import Console
 
+from ugat_marl.cli.help import HELP, HELP_ALL, described, options_of, print_help
 from ugat_marl.errors import UgatMarlError, UnknownNameError, nearest
 from ugat_marl.progress import Bars, showing
 
 USAGE_ERROR = 2
 INTERRUPTED = 130
-HELP = ("-h", "--help")
+COMPLETION = "completion"
 
 
 def run_command(command: Any, console: Console) -> int:
@@ -37,6 +37,7 @@ class CommandLine:
         purpose: First line of the program's help.
         commands: Name of each command to its place, ``"module:Dataclass"``, and one line of help.
         short: Short names of commands, and the words that replace them.
+        groups: Purpose of commands of two words, by their first word.
         examples: Command lines for a first try.
         perform: Function that runs a command's dataclass and returns the exit code.
     """
@@ -45,6 +46,7 @@ class CommandLine:
     purpose: str
     commands: Mapping[str, tuple[str, str]]
     short: Mapping[str, tuple[str, ...]] = field(default_factory=dict)
+    groups: Mapping[str, str] = field(default_factory=dict)
     examples: tuple[str, ...] = ()
     perform: Callable[[Any, Console], int] = run_command
 
@@ -87,6 +89,8 @@ def _dispatch(line: CommandLine, words: list[str], console: Console) -> int:
 
         console.print(f"ugat-marl {__version__}")
         return 0
+    if words[0] == COMPLETION:
+        return _print_completion(line, words[1:])
     words = [*line.short.get(words[0], (words[0],)), *words[1:]]
     name, rest = words[0], words[1:]
     if members := {key.split()[1] for key in line.commands if key.startswith(f"{name} ")}:
@@ -97,7 +101,7 @@ def _dispatch(line: CommandLine, words: list[str], console: Console) -> int:
             raise UnknownNameError(name, rest[0], members)
         name, rest = f"{name} {rest[0]}", rest[1:]
     if name not in line.commands:
-        names = {*(key.split()[0] for key in line.commands), *line.short}
+        names = {*(key.split()[0] for key in line.commands), *line.short, COMPLETION}
         raise UnknownNameError("command", name, names, f"{line.program} --help explains them.")
     return line.perform(_parse(line, name, rest), console)
 
@@ -108,14 +112,17 @@ def _parse(line: CommandLine, name: str, words: list[str]) -> Any:
 
     module, _, attribute = line.commands[name][0].partition(":")
     command_type = getattr(importlib.import_module(module), attribute)
+    program = f"{line.program} {name}"
+    if any(word in (*HELP, HELP_ALL) for word in words):
+        print_help(command_type, program, words)
     messages = io.StringIO()
     try:
         with contextlib.redirect_stderr(messages):
             command, unknown = tyro.cli(
                 command_type,
                 args=_with_address(words),
-                prog=f"{line.program} {name}",
-                description=_description(command_type),
+                prog=program,
+                description=described(command_type),
                 return_unknown_args=True,
             )
     except SystemExit as end:
@@ -126,7 +133,7 @@ def _parse(line: CommandLine, name: str, words: list[str]) -> Any:
     if unknown:
         first = unknown[0].partition("=")[0]
         if first.startswith("-"):
-            guess = nearest(first, sorted(_options(command_type)))
+            guess = nearest(first, sorted(options_of(command_type)))
             hint = f"Did you mean {guess!r}?" if guess else ""
             raise UgatMarlError(
                 f"unknown option {first!r} of {name}. {hint} See {line.program} {name} --help"
@@ -145,28 +152,6 @@ def _with_address(words: list[str]) -> list[str]:
     return complete
 
 
-def _description(command_type: Any) -> str:
-    """Return the docstring with its examples, without its list of attributes."""
-    return (inspect.getdoc(command_type) or "").partition("\nAttributes:")[0].strip()
-
-
-def _options(command_type: Any, prefix: str = "") -> set[str]:
-    """Return the long options of a command, nested settings included."""
-    options: set[str] = set()
-    hints = get_type_hints(command_type, include_extras=True)
-    for option in fields(command_type):
-        hint = hints[option.name]
-        inner = getattr(hint, "__origin__", hint)
-        if isinstance(inner, type) and is_dataclass(inner):
-            flat = any(
-                getattr(extra, "name", None) == "" for extra in getattr(hint, "__metadata__", ())
-            )
-            options |= _options(inner, prefix if flat else f"{prefix}{option.name}.")
-        else:
-            options.add(f"--{prefix}{option.name}".replace("_", "-"))
-    return options
-
-
 def _one_line(box: str) -> str:
     """Return the message in the box that tyro draws, as one line."""
     lines = [re.sub(r"[│╭╮╰╯]", " ", line).strip() for line in box.splitlines()]
@@ -177,14 +162,29 @@ def _one_line(box: str) -> str:
     return " ".join(words.split()).rstrip(".")
 
 
+def _print_completion(line: CommandLine, words: list[str]) -> int:
+    """Print the script that completes words in a shell."""
+    from ugat_marl.cli.completion import SHELLS, completion_script
+
+    if len(words) != 1 or words[0] in HELP:
+        print(f"usage: {line.program} {COMPLETION} {{{','.join(SHELLS)}}}\n")
+        for shell, load in SHELLS.items():
+            print(f"  {shell:<5} {load.format(program=line.program)}")
+        return 0 if words and words[0] in HELP else USAGE_ERROR
+    print(completion_script(line.program, line.commands, words[0]), end="")
+    return 0
+
+
 def _print_help(line: CommandLine, console: Console, prefix: str = "") -> None:
     console.print(f"{line.purpose}\n")
     console.print(f"usage: {line.program} {prefix}COMMAND [options]\n", markup=False)
-    listed = {
-        name.removeprefix(prefix): text
-        for name, (_, text) in line.commands.items()
-        if name.startswith(prefix)
-    }
+    listed: dict[str, str] = {}
+    for name, (_, text) in line.commands.items():
+        if name.startswith(prefix):
+            first, _, second = name.removeprefix(prefix).partition(" ")
+            listed[first] = line.groups.get(first, text) if second else text
+    if not prefix:
+        listed[COMPLETION] = "print a script for tab completion in bash, zsh or fish"
     width = max(map(len, listed))
     for name, text in listed.items():
         console.print(f"  {name:<{width}}  {text}")

@@ -55,6 +55,23 @@ class _Paper:
     ray: RayAddress = None
 
     table: ClassVar[str]
+    FIRST: ClassVar[tuple[str, ...]] = (
+        "scenario",
+        "domains",
+        "seeds",
+        "episodes",
+        "iterations",
+        "grounded-episodes",
+        "groundings",
+        "rows",
+        "learner",
+        "evaluation-seeds",
+        "rule-budget",
+        "out",
+        "runs",
+        "jobs",
+    )
+    """Options of the first screen of the help."""
 
     def run(self, console: Console) -> int:
         """Train and evaluate; print the table and write it as Markdown, CSV and PNG."""
@@ -83,10 +100,9 @@ class _Paper:
 class Main(_Paper):
     """Compare UGAT with direct transfer and with all controls.
 
-    The controls are: more training in plain sim, domain randomisation, random and constant delays
-    of greens, fine-tuning on as much real data, training in the real domain, and the best rule,
-    tuned there. Finished trainings are kept in --runs, and all tables use them again. A killed run
-    continues where it stopped.
+    docs/how-to/paper-tables.md explains the controls and the other rows.
+
+    All tables share the trainings in --runs. A killed run continues.
 
     Examples:
         ugat-marl paper main

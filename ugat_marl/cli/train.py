@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, ClassVar
 
 from rich.console import Console
 from tyro.conf import arg
@@ -35,6 +35,23 @@ class Train:
         resume: Continue the run in that folder.
         ray: Play roll-outs and search for the best rule on Ray; learning stays on this machine.
     """
+
+    FIRST: ClassVar[tuple[str, ...]] = (
+        "real",
+        "learner",
+        "preset",
+        "grounding",
+        "pretrain-episodes",
+        "iterations",
+        "grounded-episodes",
+        "real-log",
+        "corrected",
+        "evaluation-seeds",
+        "seed",
+        "out",
+        "resume",
+    )
+    """Options of the first screen of the help."""
 
     config: Annotated[TransferConfig, arg(name="")]
     out: Path | None = None
