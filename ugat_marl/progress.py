@@ -5,20 +5,22 @@ from __future__ import annotations
 import contextlib
 import os
 import time
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator, Mapping
+from dataclasses import dataclass
 from pathlib import Path
-from typing import IO, Any, Protocol
+from typing import IO, Any, Literal, Protocol
 
-from rich.console import Console
+from rich.console import Console, Group
+from rich.live import Live
 from rich.progress import (
     BarColumn,
     MofNCompleteColumn,
     Progress,
+    TaskProgressColumn,
     TextColumn,
     TimeElapsedColumn,
     TimeRemainingColumn,
 )
-from rich.table import Column
 
 Advance = Callable[..., None]
 """Called as ``advance()`` or ``advance(note="...")`` when a unit of work is done."""
@@ -30,11 +32,57 @@ _PATIENCE_S = 1.0
 """Seconds of reading a file after which a bar appears."""
 
 
+Loudness = Literal["quiet", "usual", "verbose"]
+"""How much a program says: results only, progress as well, or everything that is measured."""
+
+_loudness: list[Loudness] = ["usual"]
+
+
+@contextlib.contextmanager
+def loudness(level: Loudness) -> Iterator[None]:
+    """Let all `Bars` that are made inside the block say as much as the level asks for."""
+    _loudness.append(level)
+    try:
+        yield
+    finally:
+        _loudness.pop()
+
+
+@dataclass(frozen=True)
+class Share:
+    """Part of a long work that tasks of one kind do.
+
+    Attributes:
+        units: Expected number of units of these tasks together.
+        weight: Cost of a unit, in the same measure for all shares, such as episodes.
+    """
+
+    units: int
+    weight: float = 1.0
+
+
 class Reporter(Protocol):
-    """Shows tasks of known length."""
+    """Shows tasks of known length.
+
+    Attributes:
+        verbose: True if everything that is measured is to be shown.
+    """
+
+    verbose: bool
 
     def task(self, name: str, total: int) -> contextlib.AbstractContextManager[Advance]:
         """Show a task; the value of the context advances it by one."""
+        ...
+
+    def whole(
+        self, name: str, shares: Mapping[str, Share]
+    ) -> contextlib.AbstractContextManager[None]:
+        """Show how far the tasks inside the block are all together.
+
+        Args:
+            name: Name of the whole.
+            shares: Expected work of tasks, by the beginning of their names.
+        """
         ...
 
     def say(self, text: str) -> None:
@@ -45,11 +93,19 @@ class Reporter(Protocol):
 class Silent:
     """Reporter that shows nothing."""
 
+    verbose = False
+
     @contextlib.contextmanager
     def task(self, name: str, total: int) -> Iterator[Advance]:
         """Do nothing."""
         del name, total
         yield lambda note="": None
+
+    @contextlib.contextmanager
+    def whole(self, name: str, shares: Mapping[str, Share]) -> Iterator[None]:
+        """Do nothing."""
+        del name, shares
+        yield
 
     def say(self, text: str) -> None:
         """Do nothing."""
@@ -59,7 +115,7 @@ class Bars:
     """Reporter with progress bars and the time left.
 
     Without a terminal, as in a log, a bar is printed when its task ends and at most once a minute
-    before.
+    before. Nothing is cut: a note that does not fit beside the bar is left out.
 
     Args:
         console: The console to write to.
@@ -67,41 +123,114 @@ class Bars:
 
     def __init__(self, console: Console) -> None:
         self._console = console
+        self._quiet = _loudness[-1] == "quiet"
+        self.verbose = _loudness[-1] == "verbose"
+        self._whole: _Whole | None = None
 
     @contextlib.contextmanager
     def task(self, name: str, total: int) -> Iterator[Advance]:
         """Show a bar that leaves one line behind when the task is done."""
-        columns = (
-            TextColumn("{task.description:<26.26}"),
-            BarColumn(bar_width=18),
-            MofNCompleteColumn(),
-            TimeElapsedColumn(),
-            TextColumn("left"),
-            TimeRemainingColumn(compact=True),
-            TextColumn("[dim]{task.fields[note]}", table_column=self._rest()),
-        )
-        with Progress(*columns, console=self._console) as progress:
-            bar = progress.add_task(name, total=total, note="")
-            printed = time.monotonic()
+        if self._quiet:
+            yield lambda note="": None
+            return
+        progress = _bars(self._console)
+        bar = progress.add_task(name, total=total, note="")
+        printed, left = time.monotonic(), total
+        room = self._console.width - _TAKEN - max(len(name), _NAME_WIDTH)
+        whole = self._whole
 
-            def advance(note: str = "") -> None:
-                nonlocal printed
-                fields: dict[str, Any] = {"note": note} if note else {}
-                progress.update(bar, advance=1, **fields)
-                if not self._console.is_terminal and time.monotonic() - printed >= _QUIET_S:
-                    printed = time.monotonic()
+        def advance(note: str = "") -> None:
+            nonlocal printed, left
+            fields: dict[str, Any] = {"note": note if len(note) <= room else ""} if note else {}
+            progress.update(bar, advance=1, **fields)
+            left -= 1
+            if whole is not None and left >= 0:
+                whole.advance(name, 1)
+            if not self._console.is_terminal and time.monotonic() - printed >= _QUIET_S:
+                printed = time.monotonic()
+                for bars in (progress, *([whole.progress] if whole else [])):
+                    self._console.print(bars.make_tasks_table(bars.tasks))
+
+        with contextlib.nullcontext() if whole is not None else progress:
+            if whole is not None:
+                whole.step = progress
+            try:
+                yield advance
+                progress.update(bar, completed=total)  # the work may end early by its own rule
+                if whole is not None:
+                    whole.advance(name, max(left, 0))
                     self._console.print(progress.make_tasks_table(progress.tasks))
+            finally:
+                if whole is not None:
+                    whole.step = None
 
-            yield advance
-            progress.update(bar, completed=total)  # the work may end early by its own rule
-
-    def _rest(self) -> Column:
-        """Return the column of the note, as wide as the other columns leave space."""
-        return Column(no_wrap=True, overflow="ellipsis", max_width=max(self._console.width - 74, 6))
+    @contextlib.contextmanager
+    def whole(self, name: str, shares: Mapping[str, Share]) -> Iterator[None]:
+        """Show a bar for everything, above the bar of the task at hand."""
+        if self._quiet:
+            yield
+            return
+        self._whole = whole = _Whole(name, shares, self._console)
+        live = contextlib.nullcontext()
+        if self._console.is_terminal:
+            live = Live(
+                get_renderable=whole.drawn, console=self._console, transient=True, screen=False
+            )
+        try:
+            with live:
+                yield
+        finally:
+            self._whole = None
 
     def say(self, text: str) -> None:
         """Write a line."""
-        self._console.print(text, highlight=False, markup=False)
+        if not self._quiet:
+            self._console.print(text, highlight=False, markup=False)
+
+
+class _Whole:
+    """Bar of everything, in units of weight, and the bar of the task at hand."""
+
+    def __init__(self, name: str, shares: Mapping[str, Share], console: Console) -> None:
+        self._shares = shares
+        self._left = {name: float(share.units) for name, share in shares.items()}
+        self.progress = _bars(console, counted=False)
+        self.step: Progress | None = None
+        total = sum(share.units * share.weight for share in shares.values())
+        self._bar = self.progress.add_task(name, total=max(total, 1e-9), note="")
+
+    def advance(self, name: str, units: int) -> None:
+        """Count units of a task; more of them than expected count nothing."""
+        for kind, share in self._shares.items():
+            if name.startswith(kind):
+                counted = min(units, self._left[kind])
+                self._left[kind] -= counted
+                self.progress.update(self._bar, advance=counted * share.weight)
+                return
+
+    def drawn(self) -> Group:
+        """Return both bars."""
+        return Group(*(bars for bars in (self.progress, self.step) if bars is not None))
+
+
+_NAME_WIDTH = 30
+_TAKEN = 42
+"""Characters beside the name and the note: bar, numbers, times and the spaces between them."""
+
+
+def _bars(console: Console, counted: bool = True) -> Progress:
+    """Return a set of bars in the form that all of them have."""
+    return Progress(
+        TextColumn(f"{{task.description:<{_NAME_WIDTH}}}"),
+        BarColumn(bar_width=10),
+        MofNCompleteColumn() if counted else TaskProgressColumn(),
+        TimeElapsedColumn(),
+        TextColumn("left"),
+        TimeRemainingColumn(compact=True),
+        TextColumn("[dim]{task.fields[note]}"),
+        console=console,
+        auto_refresh=console.is_terminal,
+    )
 
 
 _shown: list[Reporter] = [Silent()]

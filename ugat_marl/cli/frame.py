@@ -16,11 +16,13 @@ from rich.console import Console
 
 from ugat_marl.cli.help import HELP, HELP_ALL, described, options_of, print_help
 from ugat_marl.errors import UgatMarlError, UnknownNameError, nearest
-from ugat_marl.progress import Bars, showing
+from ugat_marl.progress import Bars, Loudness, loudness, showing
 
 USAGE_ERROR = 2
 INTERRUPTED = 130
 COMPLETION = "completion"
+LOUDNESS: dict[str, Loudness] = {"--quiet": "quiet", "--verbose": "verbose"}
+"""Options of every command."""
 
 
 def run_command(command: Any, console: Console) -> int:
@@ -63,9 +65,10 @@ def run(line: CommandLine, arguments: Sequence[str]) -> int:
         fault), 130 (interrupted).
     """
     console = Console(highlight=False)
+    arguments, level = _without_loudness(arguments)
     progress = console if console.is_terminal else Console(stderr=True, highlight=False)
     try:
-        with showing(Bars(progress)):
+        with loudness(level), showing(Bars(progress)):
             return _dispatch(line, list(arguments), console)
     except UgatMarlError as error:
         print(f"{line.program}: error: {' '.join(str(error).split())}", file=sys.stderr)
@@ -77,6 +80,13 @@ def run(line: CommandLine, arguments: Sequence[str]) -> int:
     except BrokenPipeError:  # else the interpreter writes to the closed pipe at its end
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
         return USAGE_ERROR
+
+
+def _without_loudness(words: Sequence[str]) -> tuple[list[str], Loudness]:
+    """Return the words without --quiet and --verbose, and how much they ask to be said."""
+    asked = [word for word in words if word in LOUDNESS]
+    rest = [word for word in words if word not in LOUDNESS]
+    return rest, LOUDNESS[asked[-1]] if asked else "usual"
 
 
 def _dispatch(line: CommandLine, words: list[str], console: Console) -> int:
@@ -191,6 +201,7 @@ def _print_help(line: CommandLine, console: Console, prefix: str = "") -> None:
     console.print(
         f"\n{line.program} {prefix}COMMAND --help shows options and examples of a command."
     )
+    console.print("With every command: --quiet (results only), --verbose (all that is measured).")
     if not prefix and line.short:
         short = ", ".join(f"{name} = {' '.join(words)}" for name, words in line.short.items())
         console.print(f"Short: {short}.")

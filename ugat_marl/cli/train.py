@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import shlex
+import sys
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, ClassVar
@@ -64,10 +66,15 @@ class Train:
         if self.out == Path():
             raise OptionError("--out is empty; give the name of a folder")
         directory = self.out or run_folder(config)
-        with workers_of(None, self.ray) as workers:
-            table = transfer(
-                config, directory, resume=self.resume, reporter=Bars(console), workers=workers
-            )
+        try:
+            with workers_of(None, self.ray) as workers:
+                table = transfer(
+                    config, directory, resume=self.resume, reporter=Bars(console), workers=workers
+                )
+        except KeyboardInterrupt:
+            raise KeyboardInterrupt(
+                f"run: {directory}; go on with: {self._call(directory)}"
+            ) from None
         picture = directory / "gap.png"
         metrics = Metrics.read(directory / METRICS_FILE)
         transfer_picture(table, metrics, picture)
@@ -85,3 +92,13 @@ class Train:
         for name, place in places.items():
             console.print(f"{name}: {place}", soft_wrap=True, markup=False)
         return 0
+
+    def _call(self, directory: Path) -> str:
+        """Return the command line that continues the run."""
+        program, *words = sys.argv
+        given = [word for word in words if word != "--resume"]
+        if Path(program).name not in ("ugat-marl", "__main__.py") or given[:1] != ["train"]:
+            given = ["train", self.config.scenario, "..."]  # called by another program
+        if self.out is None:
+            given += ["--out", str(directory)]
+        return shlex.join(["ugat-marl", *given, "--resume"]).replace("'...'", "...")

@@ -7,6 +7,7 @@ the rows of the work it repeats and ends with the same file as an unbroken run.
 
 from __future__ import annotations
 
+import fnmatch
 import importlib.metadata
 import importlib.util
 import json
@@ -27,6 +28,22 @@ CHECKPOINT_FOLDER = "checkpoint"
 METRICS_FILE = "metrics.parquet"
 SETTINGS_FILE = "settings.json"
 IDENTITY_FILE = "run.json"
+MAIN_CURVES = (
+    "episode/return",
+    "episode/loss",
+    "iteration/att_s/*",
+    "iteration/judged/before",
+    "iteration/judged/after",
+    "iteration/forward/error",
+    "iteration/forward/no_change",
+    "iteration/inverse/accuracy",
+    "iteration/inverse/majority",
+    "iteration/calibration/auroc",
+    "iteration/gate/acceptance",
+    "iteration/gate/alpha",
+    "iteration/lost_time/best_s",
+)
+"""Curves that TensorBoard shows; the metrics of a run and --verbose have all."""
 _VERSIONS = ("ugat-marl", "eclipse-sumo", "libsumo", "numpy", "torch")
 _SCHEMA = {"stage": pl.String, "step": pl.Int64, "name": pl.String, "value": pl.Float64}
 
@@ -151,11 +168,14 @@ class Run:
         return state
 
     def log(self, stage: str, step: int, numbers: Mapping[str, float]) -> None:
-        """Add numbers to the metrics and, if finite, to TensorBoard."""
+        """Add numbers to the metrics and, if finite, to TensorBoard.
+
+        TensorBoard receives the `MAIN_CURVES`, and all numbers if the reporter is verbose.
+        """
         self.metrics.add(stage, step, numbers)
         board = self._tensorboard(step)
         for name, value in numbers.items():
-            if math.isfinite(value):
+            if math.isfinite(value) and (self.reporter.verbose or _is_main(stage, name)):
                 board.add_scalar(f"{stage}/{name}", value, step)
 
     def close(self) -> None:
@@ -173,6 +193,11 @@ class Run:
             again = step if folder.exists() else None  # hides rows that a killed run logged later
             self._board = SummaryWriter(str(folder), purge_step=again)
         return self._board
+
+
+def _is_main(stage: str, name: str) -> bool:
+    """Return True if a number is one of the `MAIN_CURVES`."""
+    return any(fnmatch.fnmatchcase(f"{stage}/{name}", curve) for curve in MAIN_CURVES)
 
 
 def write_settings(directory: Path, settings: Mapping[str, Any]) -> None:

@@ -39,6 +39,7 @@ from ugat_marl.experiments.jobs import (
     file_names,
     worlds_of,
 )
+from ugat_marl.experiments.plans import described_plan, work_of
 from ugat_marl.experiments.queues import QUEUES, write_queues
 from ugat_marl.experiments.scores import Evaluation, Result
 from ugat_marl.experiments.settings import (
@@ -314,7 +315,11 @@ def transfer(
         )
     write_identity(directory, identity, begun=begun)
     write_settings(directory, asdict(config))
-    records = perform_here(plan, folder, reporter, workers)
+    episode_s = config.duration_s or scenario.settings.duration_s
+    for line in described_plan(plan, directory, folder, episode_s):
+        reporter.say(line)
+    with reporter.whole("whole run", work_of(plan, folder, episode_s)):
+        records = perform_here(plan, folder, reporter, workers)
     return _write_results(config, scenario, directory, plan, records)
 
 

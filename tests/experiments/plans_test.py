@@ -1,0 +1,102 @@
+"""The plan of a run: what it says, and how much work it expects."""
+
+from __future__ import annotations
+
+import sys
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from tests.runs import SMALL, play_nothing
+from ugat_marl.__main__ import main
+from ugat_marl.data import Run
+from ugat_marl.experiments import transfer
+from ugat_marl.experiments.plans import described_plan, work_of
+from ugat_marl.experiments.transfers import TRAININGS, planned_jobs
+from ugat_marl.grounding import StreetConfig, UgatConfig
+from ugat_marl.progress import Silent
+
+
+def test_the_work_of_a_run_is_counted_by_hand(tmp_path: Path) -> None:
+    config = replace(SMALL, control=True, evaluation_seeds=3, tuning_seeds=2)
+    work = work_of(planned_jobs(config), tmp_path, 100.0)
+    # direct, UGAT, the control and two rules, in two domains, with three seeds
+    assert work["evaluating"].units == 5 * 2 * 3
+    assert work["plain sim"].units == 2 and work["grounded"].units == 2 * 2
+    assert work["training"].units == 3, "half of what it shares with direct transfer"
+    assert work["best rule"].units == 2 * (14 + 7)
+    assert (work["roll-outs"].units, work["roll-outs"].weight) == (4, 2.0)
+    assert work["fitting"].units == 3 * 2 * 2
+
+
+def test_a_fitted_street_simulates_shorter_worlds(tmp_path: Path) -> None:
+    ugat = UgatConfig(iterations=2, street=StreetConfig(simulations=50, further=10, judged=3))
+    config = replace(SMALL, ugat=ugat)
+    work = work_of(planned_jobs(config), tmp_path, 7200.0)
+    assert (work["fitting"].units, work["fitting"].weight) == (60, 0.25)
+    assert work["comparing"].units == 2 * 3 * 2
+
+
+def test_what_is_done_is_neither_planned_nor_counted(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    play_nothing(monkeypatch)
+    transfer(SMALL, tmp_path)
+    plan = planned_jobs(replace(SMALL, oracle=True))
+    work = work_of(plan, tmp_path / TRAININGS, 100.0)
+    assert set(work) == {"evaluating", "training"}
+    lines = described_plan(plan, tmp_path, tmp_path / TRAININGS, 100.0)
+    assert lines[0] == f"run: {tmp_path}"
+    assert "done before: 3 of 4" in lines[1]
+    assert [line for line in lines if "trained in real: 6 episodes" in line]
+
+
+def test_tensorboard_has_the_curves_that_matter(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    class Board:
+        def __init__(self) -> None:
+            self.names: list[str] = []
+
+        def add_scalar(self, name: str, _value: float, _step: int) -> None:
+            self.names.append(name)
+
+        def close(self) -> None:
+            pass
+
+    class Verbose(Silent):
+        verbose = True
+
+    numbers = {"att_s/V4": 1.0, "forward/error": 2.0, "forward/error/A1": 3.0, "other": 4.0}
+    for reporter, expected in ((Silent(), 2), (Verbose(), 4)):
+        board: Any = Board()
+        monkeypatch.setattr(Run, "_tensorboard", lambda *_, board=board: board)
+        run = Run(tmp_path / str(expected), {}, reporter)
+        run.log("iteration", 1, numbers)
+        run.close()
+        assert len(board.names) == expected
+        assert len(run.metrics.rows) == 4
+
+
+def test_an_interrupted_training_says_how_to_go_on(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    def interrupted(*_: Any, **__: Any) -> None:
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr("ugat_marl.cli.train.transfer", interrupted)
+    words = ["train", "single-v1", "--real", "startup_delay=1+headway=2", "--iterations", "1"]
+    monkeypatch.setattr(sys, "argv", ["/bin/ugat-marl", *words])
+    assert main(words) == 130
+    folder = "runs/single-v1-startup_delay=1+headway=2-s0"
+    err = capsys.readouterr().err
+    assert f"run: {folder}" in err
+    assert err.endswith(f"go on with: ugat-marl {' '.join(words)} --out {folder} --resume\n")
+    words += ["--out", str(tmp_path / "my run"), "--resume"]
+    monkeypatch.setattr(sys, "argv", ["/bin/ugat-marl", *words])
+    assert main(words) == 130
+    err = capsys.readouterr().err
+    assert err.count("--out") == 1 and err.count("--resume") == 1
+    assert f"'{tmp_path}/my run'" in err

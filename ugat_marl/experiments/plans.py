@@ -1,0 +1,111 @@
+"""Plan of a run in words, and its expected work for the overall bar."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from pathlib import Path
+
+from ugat_marl.experiments.jobs import Job, Record
+from ugat_marl.experiments.tuning import TUNED_RULES
+from ugat_marl.grounding import UgatConfig
+from ugat_marl.policies import STANDARD_RULES
+from ugat_marl.progress import Share
+
+EPOCH = 0.05
+"""Rough cost of an epoch of the fits of f and h, in episodes."""
+
+
+def described_plan(
+    plan: Sequence[Job], directory: Path, folder: Path, episode_s: float
+) -> list[str]:
+    """Return the folder and the plan of a run, as lines.
+
+    Args:
+        plan: Jobs of the run.
+        directory: Folder of the run.
+        folder: Folder that holds the jobs' folders.
+        episode_s: Length of an episode, in s.
+    """
+    todo = [job for job in plan if not Record.read(folder / job.name).is_whole(job)]
+    lines = [f"run: {directory}"]
+    if len(todo) < len(plan):
+        lines.append(f"done before: {len(plan) - len(todo)} of {len(plan)} parts")
+    for number, job in enumerate(todo, 1):
+        setting, evaluated = job.setting, len(job.domains) * len(job.evaluation_seeds)
+        if setting.recipe == "rule":
+            does = f"search for the best rule in {job.target or job.sim}"
+        elif setting.ugat is not None:
+            does = (
+                f"{setting.name}: {setting.ugat.pretrain_episodes} episodes in {job.sim}, then "
+                f"{setting.ugat.iterations} times {setting.ugat.grounded_episodes} for {job.target}"
+            )
+        else:
+            does = f"{setting.name}: {job.episodes} episodes"
+        lines.append(f"  {number}. {does}; {evaluated * len(job.rows)} to judge it")
+    total = sum(share.units * share.weight for share in work_of(todo, folder, episode_s).values())
+    lines.append(f"  in all about {total:.0f} episodes; the bar says how long they take")
+    return lines
+
+
+def work_of(plan: Sequence[Job], folder: Path, episode_s: float) -> dict[str, Share]:
+    """Return the expected work of the unfinished jobs, by the beginnings of the names of tasks.
+
+    The unit is an episode. Jobs that are half done count as a whole.
+
+    Args:
+        plan: Jobs of the run.
+        folder: Folder that holds the jobs' folders.
+        episode_s: Length of an episode, in s.
+    """
+    units: dict[str, float] = {}
+    weights: dict[str, float] = {}
+
+    def add(name: str, count: float, weight: float = 1.0) -> None:
+        units[name] = units.get(name, 0) + count
+        weights[name] = weight
+
+    for job in plan:
+        record = Record.read(folder / job.name)
+        if record.is_whole(job):
+            continue
+        for mark in job.marks:
+            add("evaluating", sum(map(len, record.missing(job, mark).values())))
+        if job.setting.recipe == "rule":
+            add("tuning" if job.rule_budget else "best rule", _rule_episodes(job))
+        elif (ugat := job.setting.ugat) is None:
+            add("training", job.episodes if job.start is None else job.episodes // 2)
+        else:
+            for name, (count, weight) in _grounded_work(ugat, episode_s).items():
+                add(name, count, weight)
+    return {name: Share(round(count), weights[name]) for name, count in units.items()}
+
+
+def _rule_episodes(job: Job) -> int:
+    """Return the number of episodes of the search for the best rule."""
+    if job.rule_budget is not None:
+        return job.rule_budget * len(job.setting.rules or TUNED_RULES)
+    left, episodes = len(job.setting.rules or STANDARD_RULES), 0
+    for _ in range(job.tuning_seeds):
+        episodes += left
+        left = max(2, math.ceil(left / 2))
+    return episodes
+
+
+def _grounded_work(ugat: UgatConfig, episode_s: float) -> dict[str, tuple[float, float]]:
+    """Return number and weight of the units of a grounded training's tasks."""
+    times, street = ugat.iterations, ugat.street
+    work: dict[str, tuple[float, float]] = {"plain sim": (ugat.pretrain_episodes, 1.0)}
+    if ugat.grounding == "street":
+        worlds = street.simulations + max(0, times - 1) * street.further
+        short = min(1.0, street.simulated_s / episode_s)
+        work["roll-outs"] = (times, ugat.real_rollouts)
+        work["fitting"] = (worlds if times else 0, short)
+        work["fitted street"] = (times * ugat.grounded_episodes, 1.0)
+        work["comparing"] = (2 * street.judged * times, 1.0)
+        return work
+    rollouts = ugat.sim_rollouts + ugat.real_rollouts
+    work["roll-outs"] = (2 * times, rollouts / 2)
+    work["fitting"] = (3 * ugat.fit.epochs * times, EPOCH)
+    work["grounded"] = (times * ugat.grounded_episodes, 1.0)
+    return work
