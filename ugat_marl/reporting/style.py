@@ -104,11 +104,15 @@ def styled(salt: str = "ugat") -> Iterator[None]:
 
 
 def curve_style(number: int) -> dict[str, Any]:
-    """Return colour, dashes and marker of a curve as arguments of matplotlib."""
+    """Return colour, dashes and marker of a curve as arguments of matplotlib.
+
+    Curves beyond the last colour have the same colours again, with other dashes and markers.
+    """
+    again = number // len(CURVES)
     return {
         "color": LIGHT[CURVES[number % len(CURVES)]],
-        "linestyle": DASHES[number % len(DASHES)],
-        "marker": MARKERS[number % len(MARKERS)],
+        "linestyle": DASHES[(number + again) % len(DASHES)],
+        "marker": MARKERS[(number + 2 * again) % len(MARKERS)],
     }
 
 

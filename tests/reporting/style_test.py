@@ -1,0 +1,83 @@
+"""Curves that every eye can tell apart."""
+
+from __future__ import annotations
+
+import itertools
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+
+from ugat_marl.reporting.style import CURVES, DARK, LIGHT, curve_style
+
+# Machado, Oliveira, Fernandes 2009, severity 1: linear RGB as a colour-blind eye sees it.
+EYES = {
+    "all cones": np.eye(3),
+    "deuteranopia": np.array(
+        [
+            [0.367322, 0.860646, -0.227968],
+            [0.280085, 0.672501, 0.047413],
+            [-0.011820, 0.042940, 0.968881],
+        ]
+    ),
+    "protanopia": np.array(
+        [
+            [0.152286, 1.052583, -0.204868],
+            [0.114503, 0.786281, 0.099216],
+            [-0.003882, -0.048116, 1.051998],
+        ]
+    ),
+}
+TO_XYZ = np.array(
+    [
+        [0.4124564, 0.3575761, 0.1804375],
+        [0.2126729, 0.7151522, 0.0721750],
+        [0.0193339, 0.1191920, 0.9503041],
+    ]
+)
+WHITE = np.array([0.95047, 1.0, 1.08883])
+LEAST = 12.0
+"""Smallest CIE76 difference of two curves; 2.3 is just noticeable side by side."""
+
+
+def linear(colour: str) -> NDArray[np.float64]:
+    """Linear RGB of a colour in hexadecimal sRGB (IEC 61966-2-1)."""
+    values = np.array([int(colour[place : place + 2], 16) for place in (1, 3, 5)]) / 255
+    return np.where(values <= 0.04045, values / 12.92, ((values + 0.055) / 1.055) ** 2.4)
+
+
+def lab(rgb: NDArray[np.float64]) -> NDArray[np.float64]:
+    """CIELAB of linear RGB."""
+    x = TO_XYZ @ np.clip(rgb, 0, 1) / WHITE
+    f = np.where(x > 216 / 24389, np.cbrt(x), (24389 / 27 * x + 16) / 116)
+    return np.array([116 * f[1] - 16, 500 * (f[0] - f[1]), 200 * (f[1] - f[2])])
+
+
+def difference(one: str, other: str, eye: str) -> float:
+    """CIE76 difference of two colours for an eye."""
+    seen = [lab(EYES[eye] @ linear(colour)) for colour in (one, other)]
+    return float(np.linalg.norm(seen[0] - seen[1]))
+
+
+def test_the_measure_is_the_one_of_the_book() -> None:
+    assert difference("#ffffff", "#000000", "all cones") == pytest.approx(100, abs=0.01)
+    assert lab(linear("#ff0000")) == pytest.approx([53.24, 80.09, 67.20], abs=0.02)
+    # Red and green of equal lightness, which a deuteranope confuses.
+    assert difference("#c04000", "#707000", "all cones") > 50
+    assert difference("#c04000", "#707000", "deuteranopia") < 20
+
+
+@pytest.mark.parametrize("eye", EYES)
+@pytest.mark.parametrize("palette", [LIGHT, DARK], ids=["light", "dark"])
+def test_colours_of_curves_differ_for_every_eye(palette: dict[str, str], eye: str) -> None:
+    for one, other in itertools.combinations(CURVES, 2):
+        assert difference(palette[one], palette[other], eye) > LEAST, (one, other)
+    for one in CURVES:
+        assert difference(palette[one], palette["paper"], eye) > 25
+
+
+def test_curves_differ_without_colour_too() -> None:
+    styles = [curve_style(number) for number in range(12)]
+    for one, other in itertools.combinations(styles, 2):
+        assert (one["marker"], one["linestyle"]) != (other["marker"], other["linestyle"])
+        assert one["color"] != other["color"] or one["linestyle"] != other["linestyle"]
