@@ -6,7 +6,10 @@ as one line and ends with exit code 2.
 
 from __future__ import annotations
 
+import contextlib
 import difflib
+import importlib.metadata
+import re
 from collections.abc import Iterable
 
 LISTED = 32
@@ -101,6 +104,22 @@ class BlindTestError(UgatMarlError):
 
 class CheckpointError(UgatMarlError):
     """A checkpoint cannot be read, holds impossible numbers, or belongs to something else."""
+
+
+def install_command(extra: str) -> str:
+    """Return the command that installs what an extra of the package brings.
+
+    It names the libraries themselves, because the package may have been installed from a file that
+    no index knows.
+    """
+    needed: list[str] = []
+    with contextlib.suppress(importlib.metadata.PackageNotFoundError):
+        for requirement in importlib.metadata.requires("ugat-marl") or ():
+            library, _, condition = requirement.partition(";")
+            if re.search(rf"extra == ['\"]{re.escape(extra)}['\"]", condition):
+                needed.append(f"'{library.strip()}'")
+    libraries = " ".join(needed) or f"'.[{extra}]'"
+    return f"pip install {libraries}"
 
 
 def nearest(name: str, allowed: Iterable[str]) -> str | None:

@@ -27,7 +27,7 @@ from concurrent.futures.process import BrokenProcessPool
 from pathlib import Path
 from typing import Any, TypeVar
 
-from ugat_marl.errors import OptionError, SimulatorCrashed
+from ugat_marl.errors import OptionError, SimulatorCrashed, install_command
 
 Workers = int | Executor | None
 """Number of parts at a time, None for the number of usable cores, or an executor."""
@@ -215,7 +215,7 @@ class RayExecutor(Executor):
             import ray  # pyright: ignore[reportMissingImports]
         except ImportError:
             raise OptionError(
-                "--ray needs Ray, which is not installed: pip install 'ugat-marl[ray]'"
+                f"--ray needs Ray, which is not installed: {install_command('ray')}"
             ) from None
         self._ray: Any = ray
         self._owns = not ray.is_initialized()

@@ -14,7 +14,7 @@ from studies.bench.fresh_process import in_fresh_process
 from studies.bench.report import Report, Spread, Target, require_positive
 from studies.bench.sumo_rl import PETTINGZOO, SUMO_RL, SumoRl, install_sumo_rl
 from ugat_marl.effects import load_scenario
-from ugat_marl.errors import MeasurementError
+from ugat_marl.errors import MeasurementError, install_command
 from ugat_marl.progress import Advance, Reporter, Silent
 
 _FOLDER = Path(__file__).parent
@@ -329,7 +329,7 @@ def find_scenario(name: str, sumo_rl: SumoRl | None) -> tuple[str | Path, str | 
         if found:
             return found[0], None
     return "grid4x4-v1", (
-        f"{name} is not installed (pip install 'ugat-marl[resco]'): grid4x4-v1 was measured instead"
+        f"{name} is not installed ({install_command('resco')}): grid4x4-v1 was measured instead"
     )
 
 

@@ -13,7 +13,7 @@ from typing import Any
 from studies.bench.fresh_process import in_fresh_process
 from studies.bench.memory import growth_of
 from studies.bench.report import Report, Spread, Target, require_positive
-from ugat_marl.errors import MeasurementError, OptionError
+from ugat_marl.errors import MeasurementError, OptionError, install_command
 from ugat_marl.policies import learner_is_installed, require_known_learner
 from ugat_marl.progress import Reporter, Silent
 
@@ -132,7 +132,7 @@ class ScaleBench:
         notes = [_METHOD]
         for part in self.parts:
             if part == "ray" and find_spec("ray") is None:
-                notes.append("Ray is not installed (pip install 'ugat-marl[ray]'): not measured.")
+                notes.append(f"Ray is not installed ({install_command('ray')}): not measured.")
                 continue
             if part == "learner" and not learner_is_installed(self.learner):
                 notes.append(f"The library of {self.learner} is not installed: not measured.")

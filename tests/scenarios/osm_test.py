@@ -299,7 +299,7 @@ def test_without_pyosmium_the_way_out_is_named(
     monkeypatch.setitem(sys.modules, "osmium", None)
     (tmp_path / "town.osm.pbf").write_bytes(as_pbf(TOWN, dense=True))
     assert made(tmp_path / "a", tmp_path / "town.osm.pbf") == 2
-    assert "needs pyosmium; run pip install 'ugat-marl[osm]'" in capsys.readouterr().err
+    assert "needs pyosmium; run pip install 'osmium>=4'" in capsys.readouterr().err
     assert made(tmp_path / "b", TOWN) == 0
 
 

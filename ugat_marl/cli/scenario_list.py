@@ -9,7 +9,7 @@ from rich.console import Console
 from rich.table import Table
 
 from ugat_marl.effects import DOMAIN_ALIASES, PAPER_WORLDS, load_scenario
-from ugat_marl.errors import ScenarioError
+from ugat_marl.errors import ScenarioError, install_command
 from ugat_marl.scenarios import Network, check_demand, resco_maps, shipped_scenarios
 
 
@@ -33,7 +33,7 @@ class ScenarioList:
             table.add_row(name, *_facts(name))
         console.print(table)
         if not maps:
-            console.print("RESCO networks: pip install 'ugat-marl[resco]'", markup=False)
+            console.print(f"RESCO networks: {install_command('resco')}", markup=False)
         aliases = {setting: alias for alias, setting in DOMAIN_ALIASES.items()}
         for setting, effects in PAPER_WORLDS.items():
             values = ", ".join(map(str, effects))

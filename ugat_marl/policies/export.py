@@ -31,7 +31,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ugat_marl.envs import Actions, AgentSet, AnyParallelEnv, Infos, Observations
-from ugat_marl.errors import CheckpointError, OptionError
+from ugat_marl.errors import CheckpointError, OptionError, install_command
 from ugat_marl.files import require_writable, write_whole
 from ugat_marl.policies.portable import (
     PORTABLE,
@@ -279,7 +279,7 @@ def _onnx(policy: NetworkPolicy) -> bytes:
         onnx: Any = importlib.import_module("onnx")
     except ModuleNotFoundError:
         raise OptionError(
-            "writing .onnx needs the package onnx; run pip install 'ugat-marl[onnx]', or export "
+            f"writing .onnx needs the package onnx; run {install_command('onnx')}, or export "
             "to .npz or .ts"
         ) from None
     network, agents, rows = portable_network(policy), policy.agents, len(policy.agents)

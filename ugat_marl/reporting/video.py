@@ -16,7 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ugat_marl.envs import NetworkRenderer, TrafficEnv
-from ugat_marl.errors import OptionError, OutputError
+from ugat_marl.errors import OptionError, OutputError, install_command
 from ugat_marl.files import replacing
 from ugat_marl.policies import Policy, RollOutStopped, roll_out
 from ugat_marl.simulation import (
@@ -207,9 +207,10 @@ def require_video(path: Path) -> None:
         known = ", ".join([*_FFMPEG, *_PILLOW])
         raise OptionError(f"{path}: a video's name ends in one of {known}, not {ending!r}")
     if ending in _FFMPEG and _ffmpeg() is None:
+        other = path.with_suffix(".gif").name
         raise OptionError(
-            f"{path}: {ending} needs ffmpeg, which is not here; pip install 'ugat-marl[video]' "
-            f"brings it, or write {path.with_suffix('.gif').name}, which needs nothing"
+            f"{path}: {ending} needs ffmpeg, which is not here; {install_command('video')} brings "
+            f"it, or write {other}, which needs nothing"
         )
 
 

@@ -18,7 +18,7 @@ from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
-from ugat_marl.errors import ScenarioError, UnknownNameError
+from ugat_marl.errors import ScenarioError, UnknownNameError, install_command
 from ugat_marl.files import Document, Draft, child_texts, parse_xml, read_bytes, write_whole
 from ugat_marl.scenarios.settings import (
     ControlSettings,
@@ -280,7 +280,7 @@ def _resco_configuration(name: str) -> Path:
     if not maps:
         raise ScenarioError(
             f"resco:{name} needs the RESCO networks of the sumo-rl wheel; "
-            "install them with: pip install 'ugat-marl[resco]'"
+            f"install them with: {install_command('resco')}"
         )
     if name not in maps:
         raise UnknownNameError("RESCO map", name, maps)

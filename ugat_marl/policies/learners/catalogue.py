@@ -25,7 +25,7 @@ from pydantic import TypeAdapter, ValidationError
 
 from ugat_marl.data import installed_version
 from ugat_marl.envs import AnyParallelEnv
-from ugat_marl.errors import OptionError, UnknownNameError
+from ugat_marl.errors import OptionError, UnknownNameError, install_command
 from ugat_marl.policies.learners.dqn_config import DQNConfig
 from ugat_marl.policies.own import OwnLearnerFactory, is_own, load_own, own_learner_options
 from ugat_marl.policies.protocols import Learner
@@ -255,7 +255,7 @@ def load_baseline(name: str) -> ModuleType:
             raise
         raise OptionError(
             f"learner {name!r} needs {missing}, which is not installed; run "
-            f"pip install 'ugat-marl[{baseline.extra}]', or in a checkout "
+            f"{install_command(baseline.extra)}, or in a checkout "
             f"pip install -c constraints-baselines.txt -e '.[{baseline.extra}]'"
         ) from None
     return module

@@ -16,7 +16,7 @@ from pathlib import Path
 from typing import Any, NamedTuple
 from xml.sax.saxutils import quoteattr
 
-from ugat_marl.errors import OptionError, ScenarioError
+from ugat_marl.errors import OptionError, ScenarioError, install_command
 from ugat_marl.files import Tag, parse_xml, read_bytes, scratch, write_whole
 from ugat_marl.progress import Reporter
 from ugat_marl.scenarios.importers.long_files import scan
@@ -256,7 +256,7 @@ def unpack(path: Path, out: Path, reporter: Reporter) -> None:
         osmium: Any = importlib.import_module("osmium")
     except ImportError:
         raise ScenarioError(
-            f"{path}: reading .osm.pbf needs pyosmium; run pip install 'ugat-marl[osm]', or give "
+            f"{path}: reading .osm.pbf needs pyosmium; run {install_command('osm')}, or give "
             "the extract as .osm or .osm.gz"
         ) from None
     try:

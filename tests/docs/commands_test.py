@@ -1,0 +1,158 @@
+"""Every command in the pages, in the help and in messages is one that the command line takes."""
+
+from __future__ import annotations
+
+import importlib
+import inspect
+import re
+import shlex
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from ugat_marl.__main__ import COMMANDS, LINE, main
+from ugat_marl.cli import frame
+from ugat_marl.errors import install_command
+from ugat_marl.experiments.jobs import file_name
+from ugat_marl.experiments.settings import CONTROL, CORRECTED, DIRECT, STREET, TIMED, UGAT
+
+ROOT = Path(__file__).resolve().parents[2]
+PAGES = [
+    *(ROOT / name for name in ("README.md", "scenarios/README.md", "baselines/README.md")),
+    *sorted((ROOT / "docs").rglob("*.md")),
+]
+WRITTEN = {file_name(name) for name in (CONTROL, CORRECTED, DIRECT, STREET, TIMED, UGAT)}
+"""Names of the policies that a run writes, without suffix."""
+
+ALGORITHM = """
+class MyLearner:
+    def learn(self, env, episodes): ...
+    def policy(self): ...
+
+def my_policy(observations): ...
+"""
+
+
+def whole_lines(text: str) -> list[str]:
+    """Lines of a shell block; lines that end in a backslash are joined with the next."""
+    return text.replace("\\\n", " ").splitlines()
+
+
+def in_pages() -> list[Any]:
+    """Every command in a shell block of a page."""
+    found: list[Any] = []
+    for page in PAGES:
+        blocks = re.findall(r"^```(?:sh|bash)\n(.*?)^```", page.read_text(), flags=re.M | re.S)
+        lines = [line.strip() for block in blocks for line in whole_lines(block)]
+        found += [
+            pytest.param(line, id=f"{page.relative_to(ROOT)}: {line[:60]}")
+            for line in lines
+            if line.startswith("ugat-marl ") and "$" not in line  # a loop of the shell
+        ]
+    return found
+
+
+def in_help() -> list[Any]:
+    """Every example in the help of a command, and the first tries."""
+    found = [pytest.param(line, id=f"help: {line[:60]}") for line in LINE.examples]
+    for place, _ in COMMANDS.values():
+        module, _, attribute = place.partition(":")
+        text = inspect.getdoc(getattr(importlib.import_module(module), attribute)) or ""
+        examples = text.partition("Examples:\n")[2].partition("Attributes:")[0]
+        joined = re.sub(r"\n +(?!ugat-marl)(?=\S)", " ", examples)
+        found += [
+            pytest.param(line.strip(), id=f"help: {line.strip()[:60]}")
+            for line in joined.splitlines()
+            if line.strip().startswith("ugat-marl ")
+        ]
+    return found
+
+
+def words_of(command: str) -> list[str]:
+    """The words after the program's name, without comments and redirections."""
+    words = shlex.split(command, comments=True)[1:]
+    for stop in (">", "|", "&&", "&"):
+        if stop in words:
+            words = words[: words.index(stop)]
+    return words
+
+
+@pytest.fixture
+def folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    """A working folder with the user's module that the pages speak of."""
+    (tmp_path / "my_algo.py").write_text(ALGORITHM)
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.syspath_prepend(str(tmp_path))
+    return tmp_path
+
+
+COMMAND_LINES = [*in_pages(), *in_help()]
+
+
+def test_commands_are_found() -> None:
+    assert len(in_pages()) > 60 and len(in_help()) > 40
+
+
+@pytest.mark.usefixtures("folder")
+@pytest.mark.parametrize("command", COMMAND_LINES)
+def test_a_documented_command_is_understood(
+    command: str, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    taken: list[Any] = []
+
+    def kept(_line: Any, name: str, words: list[str]) -> Any:
+        parsed = parse(LINE, name, words)
+        taken.append(parsed)
+        return type("Nothing", (), {"run": lambda *_: 0})()
+
+    parse = frame._parse
+    monkeypatch.setattr(frame, "_parse", kept)
+    try:
+        code = main(words_of(command))
+    except SystemExit as end:  # help
+        code = end.code
+    assert code == 0, capsys.readouterr().err
+
+
+@pytest.mark.parametrize("command", COMMAND_LINES)
+def test_a_documented_policy_is_one_that_a_run_writes(command: str) -> None:
+    for name in re.findall(r"runs/[\w.-]+/policies/([\w.-]+)\.pt", command):
+        assert name in WRITTEN
+
+
+CHEAP = ("scenario list", "domains", "evaluate")
+
+
+@pytest.mark.usefixtures("folder")
+@pytest.mark.parametrize(
+    "command",
+    [
+        case
+        for case in COMMAND_LINES
+        if str(case.values[0]).removeprefix("ugat-marl ").startswith(CHEAP)
+        and not re.search(r"\.pt|my[-_]|resco:|--domains all|>", str(case.values[0]))
+    ],
+)
+def test_a_cheap_command_runs(command: str, capsys: pytest.CaptureFixture[str]) -> None:
+    words = words_of(command)
+    if words[0] == "evaluate":
+        words += ["--seeds", "1", "--duration-s", "100"]
+    assert main(words) == 0, capsys.readouterr().err
+    assert capsys.readouterr().out.strip()
+
+
+def test_messages_name_commands_that_exist() -> None:
+    verbs = {name.split()[0] for name in COMMANDS} | {*LINE.short, "completion", "COMMAND"}
+    named: set[str] = set()
+    for path in (ROOT / "ugat_marl").rglob("*.py"):
+        text = path.read_text(encoding="utf-8")
+        named |= set(re.findall(r"`+ugat-marl ([a-z][\w-]*)", text))
+        assert "ugat-marl[" not in text, f"{path}: no index has the package"
+    assert named and named <= verbs
+
+
+def test_an_extra_is_installed_by_its_libraries() -> None:
+    assert install_command("ray") == "pip install 'ray>=2.40'"
+    assert install_command("sb3").count("'") == 4
+    assert install_command("no such extra") == "pip install '.[no such extra]'"
