@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterator
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Any
 
 from rich.console import Console
 from tyro.conf import Positional, arg
@@ -73,7 +73,7 @@ class Rollout:
         crossings: Also record when vehicles cross the stop lines, which groundings of greens read.
         workers: Simulations at a time.
         ray: Record on Ray instead.
-        video: Video to write: .mp4 (needs ffmpeg: pip install 'ugat-marl[video]'), .webp or .gif
+        video: Video to write: .mp4 (needs ffmpeg: pip install imageio-ffmpeg), .webp or .gif
             (need nothing). It shows a separate episode without random phases.
         beside: A second policy, filmed beside the first with the same seed.
         film: Part of the episode to film.
@@ -162,7 +162,7 @@ class Rollout:
     def _filmed(self, scenario: Scenario, spec: str, name: str) -> Film:
         probe = parallel_env(scenario, self.domain, duration_s=self.duration_s)
         policy = policy_factory(spec)(probe)
-        options = {"duration_s": self.duration_s, **policy.env_options}
+        options: dict[str, Any] = {"duration_s": self.duration_s, **policy.env_options}
         env = parallel_env(scenario, self.domain, **options)
         seed = derive_seed(self.seed, "rollout", 0)
         try:

@@ -6,6 +6,7 @@ from .agents import agent_groups as agent_groups
 from .commands import AGE_SCALE_S as AGE_SCALE_S
 from .commands import CommandMemory as CommandMemory
 from .commands import memory_size as memory_size
+from .description import Description as Description
 from .objectives import OBJECTIVE_MEASURES as OBJECTIVE_MEASURES
 from .observations import COUNT_SCALE as COUNT_SCALE
 from .observations import OBSERVATION_UNITS as OBSERVATION_UNITS
@@ -13,7 +14,9 @@ from .observations import WAITING_SCALE_S as WAITING_SCALE_S
 from .observations import Observer as Observer
 from .options import EnvOptions as EnvOptions
 from .rendering import NetworkRenderer as NetworkRenderer
+from .rewards import IntersectionView as IntersectionView
 from .rewards import Rewarder as Rewarder
+from .single import SingleEnv as SingleEnv
 from .traffic_env import TrafficEnv as TrafficEnv
 from .traffic_env import env as env
 from .traffic_env import parallel_env as parallel_env

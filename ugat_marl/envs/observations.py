@@ -7,9 +7,9 @@ last commands with the age of its green (`CommandMemory`); it is empty by defaul
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import replace
-from typing import Literal, get_args
+from typing import Any, Literal, get_args
 
 import numpy as np
 from gymnasium.spaces import Box
@@ -17,11 +17,15 @@ from numpy.typing import NDArray
 
 from ugat_marl.data import AgentLayout
 from ugat_marl.envs.commands import CommandMemory, memory_size
+from ugat_marl.envs.rewards import IntersectionView, intersection_views
 from ugat_marl.errors import OptionError, UnknownNameError
-from ugat_marl.scenarios import Network, group_names, member_names, within_hops
+from ugat_marl.scenarios import Intersection, Network, group_names, member_names, within_hops
 from ugat_marl.simulation import Snapshot
 
 ObservationName = Literal["count", "queue", "pressure", "waiting", "density", "movements"]
+
+ObservationFunction = Callable[[IntersectionView], Any]
+"""Function from the view of an intersection to its features, a row of numbers."""
 
 COUNT_SCALE = 40.0
 """Number of vehicles for a count of 1; so many fit on a lane of 300 m."""
@@ -47,7 +51,8 @@ class Observer:
 
     Args:
         network: The network.
-        name: One of `ObservationName`; ``"count"`` is the observation of the UGAT paper.
+        observation: One of `ObservationName`, or a function of an `IntersectionView` that returns
+            the features of an intersection. ``"count"`` is the observation of the UGAT paper.
         neighbours: Distance in roads up to which features and phases of others are included.
         commands: Number of own last commands that are included, with the age of the green.
 
@@ -58,17 +63,28 @@ class Observer:
             numbers of lanes and phases, so their spaces are equal under every observation, and
             the names of agents do not depend on the observation.
         agents: Name ``<group>_<n>`` of each intersection.
+        commands: Number of own last commands that are included.
+        near: For each intersection the positions of the others that are included.
+        feature_names: For each intersection lane and meaning of its features.
     """
 
     def __init__(
-        self, network: Network, name: str = "count", neighbours: int = 0, commands: int = 0
+        self,
+        network: Network,
+        observation: str | ObservationFunction = "count",
+        neighbours: int = 0,
+        commands: int = 0,
     ) -> None:
-        if name not in get_args(ObservationName):
-            raise UnknownNameError("observation", str(name), get_args(ObservationName))
+        name = observation if isinstance(observation, str) else "function"
+        self._function = None if isinstance(observation, str) else observation
+        if self._function is None and name not in get_args(ObservationName):
+            raise UnknownNameError(
+                "observation", name, get_args(ObservationName), "A function works as well."
+            )
         if neighbours < 0:
             raise OptionError(f"neighbours = {neighbours}: must be 0 or a number of roads")
         self.name = name
-        self._commands = commands
+        self.commands = commands
         self._lanes = network.lane_table()
         items = network.intersections
         self._incoming = np.concatenate(
@@ -76,9 +92,17 @@ class Observer:
         )
         self._downstream = _downstream_matrix(network) if name == "pressure" else None
         self._gather, sizes = _gather(network, name)
+        if self._function is not None:
+            self._views = intersection_views(network)
+            idle = Snapshot.idle(len(self._lanes.ids))
+            sizes = [len(self._features(view)) for view in self._views(idle)]
         self._sizes = sizes
         self._phases = [len(intersection.phases) for intersection in items]
-        self._near = _within(network, neighbours)
+        self.near = _within(network, neighbours)
+        self.feature_names = [
+            _feature_names(item, name, size)
+            for item, size in zip(network.intersections, sizes, strict=True)
+        ]
         self.layouts = [
             AgentLayout(
                 features=size,
@@ -86,16 +110,18 @@ class Observer:
                 context=sum(sizes[j] + self._phases[j] for j in near)
                 + memory_size(phases, commands),
             )
-            for size, phases, near in zip(sizes, self._phases, self._near, strict=True)
+            for size, phases, near in zip(sizes, self._phases, self.near, strict=True)
         ]
         sizes_of = [(len(i.incoming_lanes), len(i.outgoing_lanes), len(i.phases)) for i in items]
         kinds = [
-            (sizes_of[index], *(sizes_of[j] for j in near)) for index, near in enumerate(self._near)
+            (sizes_of[index], *(sizes_of[j] for j in near)) for index, near in enumerate(self.near)
         ]
         self.groups = group_names(kinds)
         self.agents = member_names(self.groups)
-        low = -1.0 if name == "pressure" else 0.0
-        spaces = {members[0]: self._space(members[0], low) for members in self.groups.values()}
+        low, high = {"pressure": (-1.0, 1.0), "function": (-np.inf, np.inf)}.get(name, (0.0, 1.0))
+        spaces = {
+            members[0]: self._space(members[0], low, high) for members in self.groups.values()
+        }
         first = {place: members[0] for members in self.groups.values() for place in members}
         self.spaces = [spaces[first[index]] for index in range(len(items))]
         self._place()
@@ -103,19 +129,24 @@ class Observer:
     @property
     def needs_waiting(self) -> bool:
         """True if snapshots must hold waiting times."""
-        return self.name == "waiting"
+        return self.name == "waiting" or self._function is not None
+
+    @property
+    def needs_upstream(self) -> bool:
+        """True if snapshots must hold the vehicles that queue upstream of lanes."""
+        return self._function is not None
 
     @property
     def recorded(self) -> list[AgentLayout]:
         """Layouts of the vectors without the memory of commands, as logs record them."""
         return [
-            replace(layout, context=layout.context - memory_size(layout.phases, self._commands))
+            replace(layout, context=layout.context - memory_size(layout.phases, self.commands))
             for layout in self.layouts
         ]
 
     def memory(self, interval_s: float) -> CommandMemory | None:
         """Return an empty memory of commands for `observe`; None if none are included."""
-        return CommandMemory(self._phases, self._commands, interval_s) if self._commands else None
+        return CommandMemory(self._phases, self.commands, interval_s) if self.commands else None
 
     def observe(
         self, snapshot: Snapshot, phases: Sequence[int], memory: CommandMemory | None = None
@@ -159,16 +190,18 @@ class Observer:
         )
         self._context: NDArray[np.int64] | None = None
         self._parts = slices
-        if any(self._near):
+        if any(self.near):
             places = np.arange(self._length)
             seen = [
                 np.concatenate([places[slices[j]] for j in (index, *near)])
-                for index, near in enumerate(self._near)
+                for index, near in enumerate(self.near)
             ]
             self._context = np.concatenate(seen)
             self._parts = _slices([len(part) for part in seen])
 
     def _flat(self, snapshot: Snapshot) -> NDArray[np.float64]:
+        if self._function is not None:
+            return np.concatenate([self._features(view) for view in self._views(snapshot)])
         capacity = self._lanes.capacity
         if self.name == "count":
             values = snapshot.vehicles[self._incoming] / COUNT_SCALE
@@ -187,14 +220,39 @@ class Observer:
             values = both[self._gather]
         return np.minimum(values, 1.0)
 
-    def _space(self, index: int, low: float) -> Box:
-        parts: list[NDArray[np.float32]] = []
-        for j in (index, *self._near[index]):
-            parts.append(np.full(self._sizes[j], low, dtype=np.float32))
-            parts.append(np.zeros(self._phases[j], dtype=np.float32))
-        parts.append(np.zeros(memory_size(self._phases[index], self._commands), dtype=np.float32))
-        lows = np.concatenate(parts)
-        return Box(lows, np.ones_like(lows), dtype=np.float32)
+    def _features(self, view: IntersectionView) -> NDArray[np.float64]:
+        """Return the features that the user's function makes of an intersection."""
+        assert self._function is not None
+        values = np.asarray(self._function(view), dtype=np.float64)
+        if values.ndim != 1 or not np.isfinite(values).all():
+            raise OptionError(
+                f"observation: the function returned an array of shape {values.shape}"
+                f"{'' if np.isfinite(values).all() else ' that is not finite'}; it must return one "
+                "row of finite numbers, always as many for an intersection"
+            )
+        return values
+
+    def _space(self, index: int, low: float, high: float) -> Box:
+        lows: list[NDArray[np.float32]] = []
+        highs: list[NDArray[np.float32]] = []
+        for j in (index, *self.near[index]):
+            lows += [np.full(self._sizes[j], low), np.zeros(self._phases[j])]
+            highs += [np.full(self._sizes[j], high), np.ones(self._phases[j])]
+        memory = memory_size(self._phases[index], self.commands)
+        least = np.concatenate([*lows, np.zeros(memory)]).astype(np.float32)
+        most = np.concatenate([*highs, np.ones(memory)]).astype(np.float32)
+        return Box(least, most, dtype=np.float32)
+
+
+def _feature_names(item: Intersection, name: str, size: int) -> list[tuple[str, str]]:
+    """Return lane and meaning of each feature of an intersection."""
+    if name == "function":
+        return [("", f"number {place} of the function") for place in range(size)]
+    if name != "movements":
+        return [(lane, name) for lane in item.incoming_lanes]
+    halting = [(lane, "halting vehicles") for lane in item.incoming_lanes]
+    incoming = [(lane, "vehicles, incoming") for lane in item.incoming_lanes]
+    return halting + incoming + [(lane, "vehicles, outgoing") for lane in item.outgoing_lanes]
 
 
 def joint_space(spaces: Sequence[Box]) -> Box:

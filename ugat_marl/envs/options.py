@@ -2,14 +2,60 @@
 
 from __future__ import annotations
 
+import inspect
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, fields
-from typing import Any, Literal, get_args
+from typing import Any, Literal, TypedDict, TypeVar, get_args
 
 from ugat_marl.effects import ControllerPart
 from ugat_marl.errors import OptionError, UnknownNameError
 
+Function = TypeVar("Function", bound=Callable[..., Any])
+
 RenderMode = Literal["human", "rgb_array"]
+
+
+class EnvKeywords(TypedDict, total=False):
+    """Keywords of `parallel_env`, `env` and `vector_env`: the fields of `EnvOptions`."""
+
+    observation: str | Callable[[Any], Any]
+    reward: str | Callable[[Any, Any], float]
+    neighbours: int
+    commands: int
+    signals: str
+    duration_s: float | None
+    simulator: str
+    fitted: tuple[ControllerPart, ...]
+    crossings: bool
+    render_mode: str | None
+
+
+def with_env_keywords(function: Function) -> Function:
+    """Show the fields of `EnvOptions` as keywords in the help of a function.
+
+    The function takes them as ``**options``, so that an unknown one is refused by `EnvOptions.of`
+    with the nearest name.
+    """
+    signature = inspect.signature(function)
+    given = [p for p in signature.parameters.values() if p.kind is not p.VAR_KEYWORD]
+    taken = {parameter.name for parameter in given}
+    keywords = [
+        inspect.Parameter(
+            option.name,
+            inspect.Parameter.KEYWORD_ONLY,
+            default=option.default,
+            annotation=option.type,
+        )
+        for option in fields(EnvOptions)
+        if option.name not in taken
+    ]
+    shown: Any = function
+    shown.__signature__ = signature.replace(parameters=[*given, *keywords])
+    about = inspect.getdoc(EnvOptions) or ""
+    listed = about.partition("Attributes:\n")[2]
+    indented = "\n".join(f"    {line}".rstrip() for line in listed.splitlines())
+    shown.__doc__ = f"{inspect.getdoc(function)}\n\nKeywords:\n{indented.rstrip()}\n"
+    return function
 
 
 @dataclass(frozen=True)
@@ -17,7 +63,8 @@ class EnvOptions:
     """Options of an environment.
 
     Attributes:
-        observation: Name of the observation; see `ugat_marl.envs.observations.OBSERVATION_UNITS`.
+        observation: Name of the observation (`ugat_marl.envs.observations.OBSERVATION_UNITS`), or a
+            function of an `IntersectionView` that returns a row of features.
         reward: ``"total-queue"``, ``"queue"``, ``"pressure"``, ``"waiting"`` or a function of two
             `IntersectionView`.
         neighbours: Distance in roads up to which agents see features and phases of others.
@@ -35,7 +82,7 @@ class EnvOptions:
         render_mode: None, ``"rgb_array"`` (a picture from `render`) or ``"human"`` (sumo-gui).
     """
 
-    observation: str = "count"
+    observation: str | Callable[[Any], Any] = "count"
     reward: str | Callable[[Any, Any], float] = "total-queue"
     neighbours: int = 0
     commands: int = 0

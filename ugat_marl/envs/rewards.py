@@ -44,6 +44,31 @@ RewardFunction = Callable[[IntersectionView, IntersectionView], float]
 """Function from the views before and after a decision interval to a reward."""
 
 
+def intersection_views(network: Network) -> Callable[[Snapshot], list[IntersectionView]]:
+    """Return a function from a snapshot to the views of all intersections, in their order."""
+    lanes = network.lane_table()
+    places = [
+        (lanes.indices(item.incoming_lanes), lanes.indices(item.outgoing_lanes))
+        for item in network.intersections
+    ]
+
+    def views(snapshot: Snapshot) -> list[IntersectionView]:
+        return [
+            IntersectionView(
+                snapshot.time_s,
+                snapshot.vehicles[incoming],
+                snapshot.halting[incoming],
+                snapshot.mean_speed_mps[incoming],
+                snapshot.waiting_s[incoming],
+                snapshot.vehicles[outgoing],
+                snapshot.queued_upstream[incoming],
+            )
+            for incoming, outgoing in places
+        ]
+
+    return views
+
+
 class Rewarder:
     """Computes the rewards of all intersections at once.
 
@@ -73,6 +98,7 @@ class Rewarder:
         self._outgoing = [
             lanes.indices(intersection.outgoing_lanes) for intersection in network.intersections
         ]
+        self._views = intersection_views(network)
         self._sum_in = _Sums(self._incoming)
         self._sum_out = _Sums(self._outgoing)
 
@@ -98,22 +124,8 @@ class Rewarder:
         if self._reward == "waiting":
             return (self._sum_in(before.waiting_s) - self._sum_in(after.waiting_s)).tolist()
         assert callable(self._reward)
-        return [
-            float(self._reward(self._view(before, index), self._view(after, index)))
-            for index in range(len(self._incoming))
-        ]
-
-    def _view(self, snapshot: Snapshot, index: int) -> IntersectionView:
-        incoming = self._incoming[index]
-        return IntersectionView(
-            snapshot.time_s,
-            snapshot.vehicles[incoming],
-            snapshot.halting[incoming],
-            snapshot.mean_speed_mps[incoming],
-            snapshot.waiting_s[incoming],
-            snapshot.vehicles[self._outgoing[index]],
-            snapshot.queued_upstream[incoming],
-        )
+        views = zip(self._views(before), self._views(after), strict=True)
+        return [float(self._reward(then, now)) for then, now in views]
 
 
 class _Sums:

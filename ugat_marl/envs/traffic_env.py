@@ -5,7 +5,7 @@ from __future__ import annotations
 import warnings
 from collections.abc import Mapping
 from pathlib import Path
-from typing import Any
+from typing import Any, Unpack
 
 import numpy as np
 from gymnasium.spaces import Box, Discrete
@@ -26,9 +26,10 @@ from ugat_marl.effects import (
 )
 from ugat_marl.envs.actions import checked_delays, checked_phases
 from ugat_marl.envs.actuators import Actuators
+from ugat_marl.envs.description import Description, describe
 from ugat_marl.envs.objectives import Objectives
 from ugat_marl.envs.observations import Observer, joint_space
-from ugat_marl.envs.options import EnvOptions
+from ugat_marl.envs.options import EnvKeywords, EnvOptions, with_env_keywords
 from ugat_marl.envs.rendering import NetworkRenderer
 from ugat_marl.envs.rewards import Rewarder
 from ugat_marl.envs.sensors import Sensors
@@ -96,6 +97,7 @@ class TrafficEnv(ParallelEnv[str, Any, Any]):
         self._withheld = withheld(self.network, served)
         self._objectives = Objectives.of(effects, self.scenario)
         self._name_agents()
+        self._states = [signals.initial_state(self._timing) for _ in self.possible_agents]
         self._state_space = joint_space(list(self.observation_spaces.values()))
         self._simulator: Simulator | None = None
         self._directory = OwnDirectory()
@@ -139,6 +141,10 @@ class TrafficEnv(ParallelEnv[str, Any, Any]):
     def phases(self) -> list[int]:
         """Phase of each intersection that is green or about to be, in the order of the agents."""
         return [state.phase for state in self._states]
+
+    def describe(self) -> Description:
+        """Return tables of the observed numbers and of the phases; ``print`` shows them whole."""
+        return describe(self.network, self._observer, self.possible_agents)
 
     # --- episode ------------------------------------------------------------------------------
 
@@ -247,7 +253,7 @@ class TrafficEnv(ParallelEnv[str, Any, Any]):
 
     def state(self) -> NDArray[np.float32]:
         """Return all observations, one after the other; also after the last step."""
-        if not hasattr(self, "_states"):
+        if not hasattr(self, "_seen"):
             raise EpisodeError("state() has no meaning before the first reset()")
         return np.concatenate(self._observer.observe(self._seen, self.phases, self._memory))
 
@@ -269,6 +275,12 @@ class TrafficEnv(ParallelEnv[str, Any, Any]):
 
         Return None in render mode "human", in which SUMO draws its own window, and without one.
         """
+        if self.render_mode is None:
+            warnings.warn(
+                "render() draws nothing without a render mode; make the environment with "
+                'render_mode="rgb_array" (a picture) or render_mode="human" (sumo-gui)',
+                stacklevel=2,
+            )
         if self.render_mode != "rgb_array":
             return None
         if self._renderer is None:
@@ -313,6 +325,7 @@ class TrafficEnv(ParallelEnv[str, Any, Any]):
     def _start(self, seed: int) -> None:
         if self._simulator is None:
             self._simulator = simulator_of(self.options.simulator)
+        needs_upstream = self._rewarder.needs_upstream or self._observer.needs_upstream
         launch = launch_of(
             with_late_green_programmes(self.scenario),
             seed,
@@ -324,7 +337,7 @@ class TrafficEnv(ParallelEnv[str, Any, Any]):
             zone_m=self._sensors.zone_m if self._sensors else 0.0,
             persons=self._objectives.persons if self._objectives else None,
             behind=self._lanes.behind,
-            turns=self._lanes.turns if self._rewarder.needs_upstream else (),
+            turns=self._lanes.turns if needs_upstream else (),
         )
         self.agents = []
         for part in (self._sensors, self._actuators):
@@ -393,8 +406,9 @@ class TrafficEnv(ParallelEnv[str, Any, Any]):
         self._scores = self._objectives.judged(scores, trips) if self._objectives else scores
 
 
+@with_env_keywords
 def parallel_env(
-    scenario: str | Path | Scenario, domain: Domain = "sim", **options: Any
+    scenario: str | Path | Scenario, domain: Domain = "sim", **options: Unpack[EnvKeywords]
 ) -> TrafficEnv:
     """Make an environment as a PettingZoo `ParallelEnv`.
 
@@ -403,7 +417,7 @@ def parallel_env(
             or a loaded scenario.
         domain: ``"sim"``, ``"V1"``..``"V4"`` or an alias, ``"effect=value+..."``, the path of
             another scenario on the same network, or a list of effects.
-        **options: See `EnvOptions`.
+        **options: The keywords below.
 
     Raises:
         UnknownNameError: No such scenario, domain or option.
@@ -412,7 +426,10 @@ def parallel_env(
     return TrafficEnv(load_scenario(scenario), domain, EnvOptions.of(options))
 
 
-def env(scenario: str | Path | Scenario, domain: Domain = "sim", **options: Any) -> Any:
+@with_env_keywords
+def env(
+    scenario: str | Path | Scenario, domain: Domain = "sim", **options: Unpack[EnvKeywords]
+) -> Any:
     """Make an environment as a PettingZoo `AECEnv`; the arguments are those of `parallel_env`."""
     from pettingzoo.utils import parallel_to_aec
 

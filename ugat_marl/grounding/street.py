@@ -513,7 +513,7 @@ def street_env(street: FittedStreet, simulation: Simulation, commands: int) -> D
 
 def street_prior(env: TrafficEnv, config: StreetConfig) -> Worlds:
     """Return the prior of the worlds of an environment's network."""
-    view = LaneView.of(env.network, env.options.observation)
+    view = LaneView.of(env.network, str(env.options.observation))
     everything = tuple(item.name for item in LIBRARY)
     left_out = config.without if "effects" in config.parts else everything
     return Worlds.of(view.lanes, left_out, "service" in config.parts)

@@ -88,7 +88,9 @@ def roll_out(
     return Episode(steps, total / max(steps, 1), recording.log() if recording else None)
 
 
-def observer_of(env: AnyParallelEnv, name: str | None = None, neighbours: int = 0) -> Observer:
+def observer_of(
+    env: AnyParallelEnv, name: str | Callable[[Any], Any] | None = None, neighbours: int = 0
+) -> Observer:
     """Make an observer of the environment's network.
 
     Args:
@@ -167,7 +169,10 @@ def provenance_of(env: AnyParallelEnv, observer: Observer, *seeds: int) -> Prove
         observation=observer.name,
         layouts=dict(zip(observer.agents, observer.layouts, strict=True)),
         versions={name: installed_version(name) or "not installed" for name in SIMULATING},
-        units={"observation": OBSERVATION_UNITS[observer.name], "reward": str(base.options.reward)},
+        units={
+            "observation": OBSERVATION_UNITS.get(observer.name, "as the function returns them"),
+            "reward": str(base.options.reward),
+        },
     )
 
 

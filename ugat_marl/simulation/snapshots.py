@@ -48,6 +48,12 @@ class Snapshot:
     near: NDArray[np.float64] = field(default_factory=lambda: np.empty(0))
     queued_upstream: NDArray[np.float64] = field(default_factory=lambda: np.empty(0))
 
+    @classmethod
+    def idle(cls, lanes: int) -> Snapshot:
+        """Return the snapshot of a network without vehicles; lanes have a mean speed of 1 m/s."""
+        zeros = np.zeros(lanes)
+        return cls(0.0, zeros, zeros, np.ones(lanes), zeros, 0, 0, queued_upstream=zeros)
+
     def less(self, left: NDArray[np.float64]) -> Snapshot:
         """Return this snapshot without the vehicles that have `left`, ``(lanes,)``."""
         halting = np.maximum(self.halting - left, 0.0)

@@ -8,7 +8,7 @@ import warnings
 from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, Literal, get_args
+from typing import Any, Literal, Unpack, get_args
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -16,6 +16,7 @@ from numpy.typing import ArrayLike, NDArray
 from ugat_marl.data import Scores
 from ugat_marl.effects import Domain, load_scenario
 from ugat_marl.envs.agents import AgentSet
+from ugat_marl.envs.options import EnvKeywords, with_env_keywords
 from ugat_marl.envs.traffic_env import parallel_env
 from ugat_marl.envs.types import AnyParallelEnv
 from ugat_marl.envs.vector.arrays import Arrays
@@ -360,6 +361,7 @@ def _said(answers: Iterable[Answer]) -> Iterator[str]:
         yield from answer.warnings
 
 
+@with_env_keywords
 def vector_env(
     scenario: str | Path | Scenario,
     n: int,
@@ -367,7 +369,7 @@ def vector_env(
     *,
     autoreset: Autoreset = "same-step",
     wrap: Wraps = None,
-    **options: Any,
+    **options: Unpack[EnvKeywords],
 ) -> VectorEnv:
     """Make simulations in worker processes, stepped together, with arrays in shared memory.
 
@@ -383,7 +385,7 @@ def vector_env(
         autoreset: Mode for the end of an episode, see `Autoreset`.
         wrap: Wrapper of each environment: an importable function, its ``"module:name"``, such as
             ``"ugat_marl.envs.wrappers:agent_indicator"``, or a list of them.
-        **options: Options of `EnvOptions`, except ``simulator`` and ``render_mode``.
+        **options: The keywords below, except ``simulator`` and ``render_mode``.
 
     Raises:
         UnknownNameError: A scenario, domain, option or mode does not exist.

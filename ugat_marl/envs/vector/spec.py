@@ -40,26 +40,30 @@ class Spec:
         scenario: Folder of the scenario.
         applied: Effects in the scenario; some of them are in no file.
         options: Options of `EnvOptions`.
-        reward: ``"module:name"`` of a reward function; None for a named reward.
+        functions: Option to ``"module:name"``, for a reward or an observation that is a function.
         wraps: ``"module:name"`` of each wrapper.
     """
 
     scenario: str
     applied: Sequence[str]
     options: Mapping[str, Any]
-    reward: str | None
+    functions: Mapping[str, str]
     wraps: Sequence[str]
 
     @classmethod
     def of(cls, scenario: Scenario, options: Mapping[str, Any], wraps: Wraps) -> Spec:
         """Return the specification of an environment; its scenario still has to be written."""
         plain = dict(options)
-        reward = plain.pop("reward") if callable(plain.get("reward")) else None
+        functions = {
+            name: spelling(name, plain.pop(name))
+            for name in ("reward", "observation")
+            if callable(plain.get(name))
+        }
         return cls(
             "",
             scenario.applied,
             plain,
-            None if reward is None else spelling("reward", reward),
+            functions,
             [spelling("wrap", each) for each in listed(wraps)],
         )
 
@@ -70,8 +74,7 @@ class Spec:
     def environment(self, domain: Any) -> AnyParallelEnv:
         """Make the environment in a domain of `sent`, with the simulator in this process."""
         options = dict(self.options)
-        if self.reward is not None:
-            options["reward"] = imported(self.reward)
+        options |= {name: imported(text) for name, text in self.functions.items()}
         options["simulator"] = "inprocess"
         scenario = replace(load_scenario(self.scenario), applied=tuple(self.applied))
         env: AnyParallelEnv = parallel_env(scenario, received(domain), **options)

@@ -1,0 +1,169 @@
+"""What tells a newcomer about an environment: its description, its keywords, its errors."""
+
+from __future__ import annotations
+
+import inspect
+from dataclasses import fields
+from typing import Any
+
+import gymnasium
+import numpy as np
+import polars as pl
+import pytest
+from gymnasium.utils.env_checker import check_env
+from numpy.typing import NDArray
+
+import ugat_marl
+from ugat_marl.envs import EnvOptions, IntersectionView, SingleEnv
+from ugat_marl.envs.options import EnvKeywords
+from ugat_marl.envs.single import SINGLE, register
+from ugat_marl.errors import CheckpointError, OptionError, UnknownNameError
+from ugat_marl.policies import DQN, DQNConfig
+
+
+def two(view: IntersectionView) -> NDArray[np.float64]:
+    """All vehicles on the incoming lanes, and the longest queue in tens."""
+    return np.array([view.vehicles.sum(), 10 * view.halting.max()])
+
+
+@pytest.mark.parametrize(
+    "options",
+    [
+        {},
+        {"observation": "movements", "commands": 2},
+        {"neighbours": 1, "observation": "pressure"},
+        {"observation": two, "neighbours": 1, "commands": 1},
+    ],
+)
+def test_every_number_of_an_observation_is_described(options: dict[str, Any]) -> None:
+    env = ugat_marl.parallel_env("mixed-v1", **options)
+    table = env.describe().observation
+    for agent in env.possible_agents:
+        rows = table.filter(pl.col("agent") == agent)
+        assert rows["entry"].to_list() == list(range(env.observation_space(agent).shape[0]))
+
+
+def test_lanes_stand_where_their_numbers_are() -> None:
+    env = ugat_marl.parallel_env("mixed-v1", observation="movements")
+    described = env.describe()
+    env.reset(seed=1)
+    for _ in range(20):
+        seen, *_ = env.step(dict.fromkeys(env.agents, 0))
+    lanes = env.network.lane_table()
+    counts = {"halting vehicles": env.snapshot.halting, "vehicles, incoming": env.snapshot.vehicles}
+    compared = 0
+    for row in described.observation.to_dicts():
+        if row["shows"] in counts:
+            (place,) = lanes.indices([row["name"]])
+            expected = counts[row["shows"]][place] / lanes.capacity[place]
+            assert seen[row["agent"]][row["entry"]] == pytest.approx(min(expected, 1.0), abs=1e-6)
+            compared += expected > 0
+    assert compared > 20
+    env.close()
+
+
+def test_phases_are_described_by_their_movements() -> None:
+    env = ugat_marl.parallel_env("single-v1")
+    phases = env.describe().phases
+    (light,) = env.network.intersections
+    for phase, state in enumerate(light.phases):
+        rows = phases.filter(pl.col("phase") == phase)
+        green = {link.from_lane for link in light.links if state[link.index] in "Gg"}
+        assert set(" ".join(rows["lanes"]).split()) == green
+        protected = rows.filter(pl.col("right_of_way") == "protected")
+        assert (protected.height > 0) == ("G" in state)
+    assert set(phases["turn"]) <= {"left", "through", "right", "turn-around"}
+    text = str(env.describe())
+    assert "…" not in text and light.phases and light.incoming_lanes[-1] in text
+
+
+def test_a_function_is_an_observation() -> None:
+    env = ugat_marl.parallel_env("grid2x2-v1", observation=two)
+    seen, _ = env.reset(seed=1)
+    lanes = env.network.lane_table()
+    for _ in range(8):
+        for agent, vector in seen.items():
+            assert env.observation_space(agent).contains(vector)
+            item = env.network.intersection(env.intersection_of[agent])
+            incoming = lanes.indices(item.incoming_lanes)
+            assert vector[0] == env.snapshot.vehicles[incoming].sum()
+            assert vector[1] == 10 * env.snapshot.halting[incoming].max()
+            assert vector[2 + env.phases[env.possible_agents.index(agent)]] == 1
+        seen, *_ = env.step(dict.fromkeys(env.agents, 1))
+    env.close()
+
+
+def test_workers_of_a_vector_import_the_function() -> None:
+    vector = ugat_marl.vector_env("single-v1", 2, observation=two, duration_s=100.0)
+    first = vector.reset(seed=3).observations[0, 0]
+    vector.close()
+    env = ugat_marl.parallel_env("single-v1", observation=two, duration_s=100.0)
+    observations, _ = env.reset(seed=3)
+    assert np.array_equal(first, *observations.values())
+    env.close()
+
+
+@pytest.mark.parametrize(
+    ("function", "says"),
+    [
+        (lambda view: view.vehicles.reshape(1, -1), "shape (1,"),
+        (lambda view: [float("nan")], "not finite"),
+    ],
+)
+def test_a_function_that_returns_no_row_is_refused(function: Any, says: str) -> None:
+    with pytest.raises(OptionError, match=says.replace("(", r"\(")):
+        ugat_marl.parallel_env("single-v1", observation=function)
+
+
+def test_a_policy_of_a_function_is_not_written(tmp_path: Any) -> None:
+    env = ugat_marl.parallel_env("single-v1", observation=two)
+    policy = DQN.of(env, DQNConfig(), 0).policy()
+    with pytest.raises(CheckpointError):
+        policy.save(tmp_path / "policy.pt")
+
+
+def test_keywords_are_shown_with_their_defaults_and_documented() -> None:
+    options = {option.name: option for option in fields(EnvOptions)}
+    assert set(EnvKeywords.__annotations__) == set(options)
+    for function in (ugat_marl.parallel_env, ugat_marl.env, ugat_marl.vector_env):
+        parameters = inspect.signature(function).parameters
+        assert not [p for p in parameters.values() if p.kind is p.VAR_KEYWORD]
+        for name, option in options.items():
+            assert parameters[name].default == option.default
+            assert f"    {name}: " in (function.__doc__ or "")
+    with pytest.raises(UnknownNameError, match="'observation'"):
+        ugat_marl.parallel_env("single-v1", obsrevation="count")
+
+
+def test_one_light_is_an_environment_of_gymnasium() -> None:
+    register()
+    for name in SINGLE:
+        env = gymnasium.make(f"ugat_marl/{name}", domain="V4", duration_s=100.0)
+        check_env(env.unwrapped, skip_render_check=True)
+        env.reset(seed=4)
+        same = ugat_marl.parallel_env(name, "V4", duration_s=100.0)
+        same.reset(seed=4)
+        (agent,) = same.possible_agents
+        over = False
+        while not over:
+            seen, reward, ended, over, info = env.step(1)
+            others, rewards, *_ = same.step({agent: 1})
+            assert np.array_equal(seen, others[agent]) and reward == rewards[agent]
+            assert not ended and info["action_mask"].shape == (env.action_space.n,)  # pyright: ignore[reportAttributeAccessIssue]
+        env.close()
+        same.close()
+    with pytest.raises(OptionError, match=r"has 4 intersections.*parallel_env"):
+        SingleEnv("grid2x2-v1")
+
+
+def test_render_without_a_mode_warns() -> None:
+    with pytest.warns(UserWarning, match='render_mode="rgb_array"'):
+        assert ugat_marl.parallel_env("single-v1").render() is None
+
+
+def test_phases_are_known_before_the_first_reset() -> None:
+    env = ugat_marl.parallel_env("mixed-v1")
+    before = env.phases
+    env.reset(seed=1)
+    assert before == env.phases and len(before) == len(env.possible_agents)
+    env.close()
