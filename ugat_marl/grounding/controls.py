@@ -66,6 +66,10 @@ class ShuffledWorld:
         log = self._world.collect(policy, iteration, seed)
         return None if log is None else shuffled(log, derive_seed(seed, "shuffled", iteration))
 
+    def replay(self) -> Policy | None:
+        """Return the other world's policy."""
+        return self._world.replay()
+
     def stop(self) -> None:
         """Stop the roll-outs of the other world."""
         self._world.stop()

@@ -214,11 +214,15 @@ class StreetTraining(Algorithm):
         jams = Oversaturation.of(self.view, self.view.rows(real), agents)
         for line in jams.describe():
             self.run.reporter.say(f"{iteration_name(state)}: {line}")
+        simulation, acting = self.simulation, policy
+        if (replay := self.real.replay()) is not None:
+            # a log of someone else's commands tells of the street only beside worlds that got them
+            simulation, acting = replace(simulation, epsilon=0.0), replay
         with self.run.reporter.task(f"fitting, {iteration_name(state)}", number) as advance:
             street, state.transform.known = fit_street(
                 real,
-                self.simulation,
-                policy,
+                simulation,
+                acting,
                 state.transform.worlds,
                 self.view,
                 config,

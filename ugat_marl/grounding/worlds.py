@@ -11,7 +11,14 @@ from typing import Any, Protocol
 
 from ugat_marl.data import Scores, TransitionLog
 from ugat_marl.effects import Domain
-from ugat_marl.envs import AnyParallelEnv, TrafficEnv, parallel_env
+from ugat_marl.envs import (
+    Actions,
+    AnyParallelEnv,
+    Infos,
+    Observations,
+    TrafficEnv,
+    parallel_env,
+)
 from ugat_marl.errors import LogError
 from ugat_marl.grounding.fitting import FitConfig, split
 from ugat_marl.grounding.stacked import Stack, stack_log
@@ -38,6 +45,10 @@ class World(Protocol):
 
     def collect(self, policy: Policy, iteration: int, seed: int) -> TransitionLog | None:
         """Return the transitions this iteration adds; None if there are no more."""
+        ...
+
+    def replay(self) -> Policy | None:
+        """Return a policy that repeats the transitions' commands; None if `collect`'s one acted."""
         ...
 
     def stop(self) -> None:
@@ -145,6 +156,10 @@ class SimulatedWorld:
         logs = in_order(workers, alone.play, given, self._stop, lambda _: on_done())
         self._stop = Stop()  # the old one was set at the end
         return logs
+
+    def replay(self) -> Policy | None:
+        """Return None: the policy that is given to `collect` acts."""
+        return None
 
     def stop(self) -> None:
         """Stop the running roll-outs."""
@@ -282,6 +297,38 @@ def roll_outs(
     return TransitionLog.concatenate(list(logs)), tuple(scores)
 
 
+class Replay:
+    """Policy that repeats the commands of a log, decision by decision.
+
+    Each episode repeats one of the log's. After its last decision, the last command stays.
+
+    Args:
+        log: The transitions.
+    """
+
+    def __init__(self, log: TransitionLog) -> None:
+        self.env_options: Mapping[str, Any] = {"observation": log.provenance.observation}
+        rows = {agent: log.transitions(agent) for agent in log.agents}
+        self._commands = [
+            {agent: own.action[own.episode == episode] for agent, own in rows.items()}
+            for episode in sorted(set(log.frame["episode"]))
+        ]
+        self._episode, self._step = 0, 0
+
+    def reset(self, seed: int) -> None:
+        """Begin an episode of the log; `seed` chooses it."""
+        self._episode, self._step = seed % len(self._commands), 0
+
+    def act(self, observations: Observations, infos: Infos) -> Actions:
+        """Return the commands of the next decision of the log."""
+        del infos
+        commands = self._commands[self._episode]
+        step, self._step = self._step, self._step + 1
+        return {
+            name: int(commands[name][min(step, len(commands[name]) - 1)]) for name in observations
+        }
+
+
 class RecordedWorld:
     """World that consists of a recorded log; nothing is simulated.
 
@@ -322,6 +369,10 @@ class RecordedWorld:
         """Return the whole log at the first iteration, nothing afterwards."""
         del policy, seed
         return self._log if iteration == 0 else None
+
+    def replay(self) -> Policy | None:
+        """Return a policy that repeats the log: whoever made it, other worlds get its commands."""
+        return Replay(self._log)
 
     def stop(self) -> None:
         """Do nothing; `collect` returns at once."""
