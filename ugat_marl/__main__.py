@@ -25,6 +25,10 @@ COMMANDS: dict[str, tuple[str, str]] = {
         "ugat_marl.cli.import_atspm:ImportAtspm",
         "convert a log of signal controllers to measured data",
     ),
+    "import-log": (
+        "ugat_marl.cli.import_log:ImportLog",
+        "convert measured data to a log of transitions",
+    ),
     "policy-gap": (
         "ugat_marl.cli.policy_gap:PolicyGap",
         "compare policies before and after a diagnosis",

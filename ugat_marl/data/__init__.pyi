@@ -3,6 +3,7 @@ from .checkpoints import read_checkpoint as read_checkpoint
 from .checkpoints import write_checkpoint as write_checkpoint
 from .measured.atspm import import_atspm as import_atspm
 from .measured.coverage import is_actuated as is_actuated
+from .measured.lanes import traffic_of_lanes as traffic_of_lanes
 from .measured.passages import passages_as_written as passages_as_written
 from .measured.reading import read_measured as read_measured
 from .measured.values import Finding as Finding

@@ -22,7 +22,7 @@ from numpy.typing import NDArray
 from ugat_marl.errors import LogError
 from ugat_marl.files import replacing
 
-FORMAT = 1
+FORMAT = 2
 METADATA_KEY = "ugat_marl.data.transitions"
 SOURCES = ("simulated", "measured")
 
@@ -102,6 +102,8 @@ class Provenance:
         source: "simulated" or "measured".
         versions: Package to version, for packages that can change the numbers.
         units: Column to unit.
+        deviation: Incoming lane to the standard deviation of its vehicles, where they are
+            estimated; empty if they were counted.
     """
 
     scenario: str
@@ -114,6 +116,7 @@ class Provenance:
     source: str = "simulated"
     versions: Mapping[str, str] = field(default_factory=dict)
     units: Mapping[str, str] = field(default_factory=dict)
+    deviation: Mapping[str, float] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
         if self.source not in SOURCES:

@@ -12,6 +12,7 @@ paper. The modules, from data to the algorithm:
 - `trust`, `residual`: where f is better than a fitted street; f and h on top of one.
 - `wrappers`: the grounded environment; greens with random delays.
 - `worlds`, `controls`: sources of D_sim and D_real; negative controls.
+- `detected`, `measured_log`: vehicles on lanes from detections; measured data as a log.
 - `oversaturation`: decisions of a log at which lanes are full.
 - `channel`, `eyes`, `summaries`, `regression`, `posterior`: commands, detectors and worlds of a
   street, fitted from its log; `street` puts them together and draws the world of each episode.

@@ -10,6 +10,7 @@ from .controls import NegativeControl as NegativeControl
 from .controls import ShuffledWorld as ShuffledWorld
 from .controls import answer_with_noise as answer_with_noise
 from .delays import MATCHED_REWARDS as MATCHED_REWARDS
+from .detected import DetectionConfig as DetectionConfig
 from .eyes import Eyes as Eyes
 from .eyes import fit_eyes as fit_eyes
 from .fitting import FitConfig as FitConfig
@@ -17,6 +18,9 @@ from .fitting import Fitter as Fitter
 from .gate import GateConfig as GateConfig
 from .inverse import InverseConfig as InverseConfig
 from .inverse import InverseModel as InverseModel
+from .measured_log import MeasuredLog as MeasuredLog
+from .measured_log import MeasuredSource as MeasuredSource
+from .measured_log import log_of_measured as log_of_measured
 from .phase import PhaseTransform as PhaseTransform
 from .phase import fit_inverse as fit_inverse
 from .phase import inverse_accuracy as inverse_accuracy

@@ -13,7 +13,7 @@ little its draws follow the network.
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any, ClassVar
 
 import numpy as np
@@ -234,6 +234,7 @@ class Posterior:
             simulated: At least ten simulated worlds.
             street: Statistics of the street's log.
         """
+        simulated = [replace(item, summary=item.summary.where(street.usable)) for item in simulated]
         number, lanes = len(simulated), len(worlds.lanes)
         unknown = np.isnan(street.network)  # a statistic that the street's log does not have
         network = np.stack([item.summary.network for item in simulated])

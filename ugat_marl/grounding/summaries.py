@@ -28,6 +28,10 @@ CLOSE = 1e-4
 FULL = 0.9
 """Share of the vehicles that fit on a lane from which it is full. At 0.8 long queues that still
 move are taken for full; at 1.0 trucks and gaps keep a jam from being seen."""
+MOST_DEVIATION = 1.5
+"""Standard deviation of the vehicles on a lane, in vehicles, above which only the service of its
+greens is used: the fall of a queue by two or three vehicles would be lost in it. At 3.0 lanes are
+used whose queue is guessed; at 0.7 a lane is left out for a few queues beyond its detector."""
 LEAST_ROWS = 3
 """Fewest decisions whose mean is used."""
 COUNTED = ("count", "density", "movements", "queue")
@@ -47,6 +51,8 @@ NAMES = (
     "most",
 )
 """Names of the statistics of a lane."""
+OF_COUNTS = np.array([not name.startswith("left") for name in NAMES])
+"""True for statistics that need the vehicles on a lane; the others need those that left it."""
 
 
 @dataclass(frozen=True)
@@ -56,15 +62,24 @@ class Summary:
     Attributes:
         values: ``(lanes, len(NAMES))``, vehicles; NaN where too few decisions are of the kind.
         rows: Decisions behind each value, ``(lanes, len(NAMES))``.
+        usable: True for values that may be used, bool ``(lanes, len(NAMES))``; None for all.
     """
 
     values: Floats
     rows: Floats
+    usable: NDArray[np.bool_] | None = None
 
     @classmethod
     def of(cls, values: Floats, rows: Floats) -> Summary:
         """Return a summary in which values of too few decisions are NaN."""
         return cls(np.where(rows < LEAST_ROWS, np.nan, values), rows)
+
+    def where(self, usable: NDArray[np.bool_] | None) -> Summary:
+        """Return the summary without values that may not be used; None leaves it as it is."""
+        if usable is None:
+            return self
+        values, rows = np.where(usable, self.values, np.nan), np.where(usable, self.rows, 0.0)
+        return Summary(values, rows, usable)
 
     @property
     def network(self) -> Floats:
@@ -183,9 +198,14 @@ class LaneView:
     def summary(self, log: TransitionLog) -> Summary:
         """Return the statistics of a log."""
         parts = [_statistics(row) for row in self.rows(log)]
-        return Summary(
+        summary = Summary(
             np.stack([values for values, _ in parts]), np.stack([number for _, number in parts])
         )
+        deviation = log.provenance.deviation
+        if not deviation:
+            return summary
+        unsure = np.array([deviation.get(lane, 0.0) > MOST_DEVIATION for lane in self.lanes])
+        return summary.where(~(unsure[:, None] & OF_COUNTS))
 
     def _rows_of(self, place: int, rows: Transitions, layout: AgentLayout) -> Iterator[LaneRows]:
         """Return the decisions of the lanes of an intersection."""

@@ -19,7 +19,12 @@ from pathlib import Path
 import numpy as np
 import polars as pl
 
-from ugat_marl.data import MeasuredData, passages_as_written, split_periods
+from ugat_marl.data import (
+    MeasuredData,
+    passages_as_written,
+    split_periods,
+    traffic_of_lanes,
+)
 from ugat_marl.effects import (
     Domain,
     Effect,
@@ -39,7 +44,7 @@ from ugat_marl.experiments.recording.controller import (
     switch_document,
     switches,
 )
-from ugat_marl.experiments.recording.tracks import per_lane, tracks
+from ugat_marl.experiments.recording.tracks import tracks
 from ugat_marl.policies import PolicyFactory
 from ugat_marl.progress import Advance, Reporter, Silent
 from ugat_marl.scenarios import (
@@ -260,7 +265,8 @@ def _day(street: _Street, index: int, split: Split, stop: threading.Event) -> _D
     period = _logged(apply_detector_effects(period, street.effects, street.detectors, owner))
     lanes = None
     if vehicles is not None and street.lanes:
-        lanes = per_lane(vehicles, street.detectors, period)
+        named = {detector.lane for detector in street.detectors}
+        lanes = traffic_of_lanes(vehicles, sorted(named), period)
     return _Day(period, lanes, vehicles if street.trajectories else None)
 
 

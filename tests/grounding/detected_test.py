@@ -1,0 +1,169 @@
+"""Vehicles on a lane from its detectors, against hand counts and planted queues."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+import pytest
+
+from ugat_marl.grounding.detected import DetectionConfig, LaneCourse, LaneEstimate, greens_of
+from ugat_marl.scenarios import Detector, Lane, Passages, Period
+
+LANE = Lane("W_0", "W", 300.0, 10.0, ((0.0, 0.0), (300.0, 0.0)))
+ADVANCE = Detector("advance", "W_0", 250.0, 0.0, "advance")
+STOP = Detector("stop", "W_0", 297.5, 0.0, "stop")
+ENTRY = Detector("entry", "W_0", 10.0, 0.0, "exit")
+
+
+def crossed(times_s: Sequence[float], speed_mps: float | Sequence[float] = 10.0) -> Passages:
+    """Cars of 5 m whose fronts reach a point at some times."""
+    on_s = np.array(times_s, dtype=np.float64)
+    speed = np.broadcast_to(np.array(speed_mps, dtype=np.float64), on_s.shape)
+    return Passages(on_s, on_s + 5.0 / speed, speed, np.full(len(on_s), 5.0))
+
+
+def course(passages: dict[str, Passages], end_s: float = 600.0, lane: Lane = LANE) -> LaneCourse:
+    detectors = [d for d in (ADVANCE, STOP, ENTRY) if d.id in passages]
+    period = Period("day", 0.0, end_s, "fit", {}, passages)
+    (found,) = LaneEstimate([period], {lane.id: lane}, detectors).incoming(lane.id)
+    return found
+
+
+def free(starts_s: Sequence[float]) -> dict[str, Passages]:
+    """Cars that enter the lane at some times and drive on at 10 m/s."""
+    starts = np.array(starts_s)
+    return {"advance": crossed(list(starts + 25.0)), "stop": crossed(list(starts + 29.75))}
+
+
+def test_free_vehicles_are_on_the_lane_from_its_begin_to_its_end() -> None:
+    found = course(free([10, 20, 50]))
+    assert found.come_s == pytest.approx([10, 20, 50])
+    assert found.leave_s == pytest.approx([40, 50, 80])
+    times = np.array([9.0, 11.0, 21.0, 45.0, 55.0, 90.0])
+    assert found.vehicles(times).tolist() == [0, 1, 2, 1, 1, 0]
+    assert found.unmatched == 0 and found.jams == ()
+    assert found.blind_s == pytest.approx(25.0)
+
+
+def test_who_leaves_early_counts_for_longer() -> None:
+    # Two cars leave 2.5 s and 7.5 s after the decision: 1 to 10 s see 8 and 3 of them.
+    found = course(free([12.5, 17.5]))
+    assert found.mean_left(np.array([40.0]), 10.0) == pytest.approx([(8 + 3) / 10])
+
+
+def test_a_queue_that_ends_before_the_advance_detector_is_exact() -> None:
+    came = {"advance": crossed([35, 38, 41]), "stop": crossed([60, 62.5, 65], [3, 5, 7])}
+    found = course(came)
+    assert found.come_s == pytest.approx([10, 13, 16])
+    assert found.vehicles(np.array([59.0, 61.5, 64.0, 66.0])).tolist() == [3, 2, 1, 0]
+    # all of them stand before the green of 58 s; 2 s later the first one has started
+    standing = found.halting(np.array([50.0, 58.5]), [(58.0, 90.0)], DetectionConfig())
+    assert standing.tolist() == [3, 2]
+
+
+def test_vehicles_of_a_jam_are_spread_between_the_free_ones_around_it() -> None:
+    # Four slow cars over the advance detector; one was free before, one after.
+    advance = crossed([25, 40, 60, 62, 64, 85], [10, 1, 2, 2, 2, 10])
+    stop = crossed([29.75, 58, 64, 67, 70, 89.75], [10, 2, 4, 5, 5, 10])
+    found = course({"advance": advance, "stop": stop})
+    (jam,) = found.jams
+    assert (jam.count, jam.open) == (3, False)
+    # The first slow one came on time: at 15 s. The others came between it and the one of 60 s.
+    assert found.come_s == pytest.approx([0, 15, 26.25, 37.0, 39.0, 60])
+    # The last two would have come later than they can have: 25 s before 62 and 64 s.
+    share = (30.0 - 15.0) / (60.0 - 15.0)
+    expected = 3 * share * (1 - share)
+    assert found.deviation(np.array([30.0])) == pytest.approx([np.sqrt(expected)], rel=1e-3)
+
+
+def test_exit_detectors_say_when_the_vehicles_of_a_jam_came() -> None:
+    advance = crossed([25, 40, 60, 62, 64, 85], [10, 1, 2, 2, 2, 10])
+    stop = crossed([29.75, 58, 64, 67, 70, 89.75], [10, 2, 4, 5, 5, 10])
+    entries = crossed([1, 16, 20, 22, 24, 61])
+    found = course({"advance": advance, "stop": stop, "entry": entries})
+    even = course({"advance": advance, "stop": stop})
+    truth = np.array([20.0, 22.0, 24.0])
+    errors = [np.abs(one.come_s[2:5] - truth).max() for one in (found, even)]
+    assert errors[0] < 5.0 < errors[1]
+
+
+def test_a_jam_that_never_ends_grows_at_the_rate_of_free_times() -> None:
+    # A car every 5 s comes; from 100 s on the light serves one in 10 s, and the queue grows.
+    generator = np.random.default_rng(0)
+    errors: list[float] = []
+    for _ in range(40):
+        starts = np.sort(generator.uniform(0.0, 600.0, generator.poisson(120)))
+        first = starts < 100.0
+        slow = 130.0 + 10.0 * np.arange(40)
+        advance = crossed(
+            [*(starts[first] + 25.0), *slow], [10.0] * int(first.sum()) + [2.0] * len(slow)
+        )
+        stop = crossed(
+            [*(starts[first] + 29.75), *(slow + 35.0)], [10.0] * int(first.sum()) + [4.0] * 40
+        )
+        found = course({"advance": advance, "stop": stop})
+        assert found.jams[-1].open
+        (deviation,) = found.deviation(np.array([400.0]))
+        true = min((starts < 400.0).sum() - (found.leave_s <= 400.0).sum(), LANE.capacity)
+        errors.append((found.vehicles(np.array([400.0]))[0] - true) / deviation)
+    assert np.abs(errors).mean() < 1.5
+    assert found.rate_error == pytest.approx(1 / np.sqrt(first.sum()), rel=0.2)
+
+
+def test_a_lane_never_holds_more_than_fit_on_it() -> None:
+    slow = 130.0 + 10.0 * np.arange(45)
+    head = 25.0 + 2.0 * np.arange(40)
+    advance = crossed([*head, *slow], [10.0] * 40 + [2.0] * 45)
+    stop = crossed([*(head + 4.75), *(slow + 35.0)], [10.0] * 40 + [4.0] * 45)
+    found = course({"advance": advance, "stop": stop})
+    held = found.vehicles(np.arange(0.0, 600.0, 5.0))
+    assert held.max() <= LANE.capacity
+    assert held[-1] > 0.8 * LANE.capacity
+
+
+def test_a_missed_vehicle_and_a_change_of_lanes_do_not_shift_the_others() -> None:
+    starts = [10.0, 20, 50, 90, 130, 170]
+    there = free(starts)
+    missed = there["advance"].at(np.array([0, 1, 3, 4, 5]))
+    found = course({"advance": missed, "stop": there["stop"]})
+    assert found.unmatched == 1
+    assert found.leave_s == pytest.approx(np.array(starts) + 30.0)
+    kept = np.array([0, 1, 3, 4, 5])
+    assert found.come_s[kept] == pytest.approx(np.array(starts)[kept])
+    gone = there["stop"].at(np.array([0, 1, 2, 4, 5]))
+    found = course({"advance": there["advance"], "stop": gone})
+    assert found.unmatched == 1
+    # The one that changed lanes behind the advance detector left the lane there.
+    assert found.vehicles(np.array([100.0, 119.0, 140.0])).tolist() == [1, 0, 1]
+
+
+def test_without_an_advance_detector_vehicles_are_known_when_they_leave() -> None:
+    found = course({"stop": crossed([29.75, 80, 82.5, 85, 119.75], [10, 2, 4, 5, 10])})
+    assert found.come_s[[0, 4]] == pytest.approx([0, 90])
+    assert found.vehicles(np.array([79.0]))[0] >= 2  # it waits on the detector; others are guessed
+    assert found.deviation(np.array([75.0]))[0] > 0.4
+
+
+def test_a_vehicle_on_the_lane_at_the_end_has_not_left() -> None:
+    there = free([10.0, 570.0])
+    stop = there["stop"].at(np.array([0]))
+    found = course({"advance": there["advance"], "stop": stop})
+    assert found.leave_s.tolist() == [pytest.approx(40.0), np.inf]
+    assert found.vehicles(np.array([590.0]))[0] == 1
+
+
+def test_late_stamps_are_put_right() -> None:
+    late = {name: crossed(list(p.on_s + 2.0)) for name, p in free([10, 20]).items()}
+    period = Period("day", 0.0, 600.0, "fit", {}, late)
+    config = DetectionConfig(latency_s=2.0)
+    (found,) = LaneEstimate([period], {"W_0": LANE}, [ADVANCE, STOP], config).incoming("W_0")
+    assert found.leave_s == pytest.approx([40, 50])
+
+
+def test_greens_of_a_lane_join_what_goes_on() -> None:
+    signals = {"C": ((0.0, "Gr"), (10.0, "gG"), (20.0, "yr"), (23.0, "rG"), (40.0, "Gr"))}
+    period = Period("day", 0.0, 60.0, "fit", signals, {})
+    assert greens_of(period, "C", [0]) == [(0.0, 20.0), (40.0, 60.0)]
+    assert greens_of(period, "C", [1]) == [(10.0, 20.0), (23.0, 40.0)]
+    assert greens_of(period, "D", [0]) == []

@@ -1,0 +1,214 @@
+"""Measured data as a transition log, against the log of the simulation that was measured."""
+
+from __future__ import annotations
+
+import contextlib
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from ugat_marl.__main__ import main
+from ugat_marl.data import MeasuredData, TransitionLog, write_measured
+from ugat_marl.effects import load_scenario
+from ugat_marl.envs import parallel_env
+from ugat_marl.errors import MeasuredDataError, OptionError
+from ugat_marl.experiments import policy_factory, record
+from ugat_marl.grounding import DetectionConfig, LaneView, RecordedWorld, log_of_measured
+from ugat_marl.grounding.measured_log import phases_shown
+from ugat_marl.grounding.summaries import NAMES, OF_COUNTS
+from ugat_marl.grounding.worlds import Replay
+from ugat_marl.policies import observer_of, roll_out
+from ugat_marl.scenarios import Network, Scenario
+from ugat_marl.seeding import derive_seed
+
+POLICY = "fixed-time:20"
+STEP = DetectionConfig(latency_s=-1.0)
+"""Recordings are early by a simulation step."""
+
+
+@pytest.fixture(scope="module")
+def crossing(data: Path) -> Scenario:
+    return load_scenario(data / "crossing")
+
+
+@pytest.fixture(scope="module")
+def measured(crossing: Scenario) -> MeasuredData:
+    return record(
+        crossing, "sim", policy_factory(POLICY), periods=1, workers=1, same_demand=True,
+        lanes=True, trajectories=True,
+    )  # fmt: skip
+
+
+@pytest.fixture(scope="module")
+def truth(crossing: Scenario) -> TransitionLog:
+    """What the simulation itself saw in the recorded episode."""
+    make = policy_factory(POLICY)
+    policy = make(parallel_env(crossing))
+    env = parallel_env(crossing, crossings=True, reward="queue", **policy.env_options)
+    with contextlib.closing(env):
+        seed = derive_seed(0, "record", 0, "simulation")
+        log = roll_out(env, policy, seed, record=observer_of(env, "count")).log
+    assert log is not None
+    return log
+
+
+def imported(
+    measured: MeasuredData, scenario: Scenario, observation: str = "count", **more: Any
+) -> TransitionLog:
+    options: dict[str, Any] = {"source": "detections", "config": STEP, **more}
+    network = Network.read(scenario)
+    return log_of_measured(measured, scenario, network, "street", observation, **options).log
+
+
+def test_the_log_is_that_of_the_simulation(
+    crossing: Scenario, measured: MeasuredData, truth: TransitionLog
+) -> None:
+    log = imported(measured, crossing)
+    (agent,) = log.agents
+    found, true = log.transitions(agent), truth.transitions(agent)
+    rows = len(found)
+    assert 10 <= rows < len(true)  # the last cars were not seen by a detector
+    assert found.executed.tolist() == true.executed[:rows].tolist()
+    assert found.action.tolist() == true.executed[:rows].tolist()
+    assert found.observation[:, 2:].tolist() == true.observation[:rows, 2:].tolist()
+    counts, others = 40 * found.observation[:, :2], 40 * true.observation[:rows, :2]
+    assert others.max() >= 3
+    assert np.abs(counts - others).mean() < 0.3
+    left, gone = (40 * r.observation[:, :2] - 40 * r.served_features for r in (found, true))
+    assert np.abs(left - gone[:rows]).mean() < 0.06 < gone.mean()
+    assert np.abs(found.reward - true.reward[:rows]).mean() < 0.5
+    assert log.provenance.source == "measured" and log.provenance.domain == "street"
+    assert set(log.provenance.deviation) == {"S_C_0", "W_C_0"}
+
+
+@pytest.mark.parametrize("kind", ["lanes", "trajectories"])
+def test_a_table_of_lanes_or_trajectories_takes_the_place_of_the_estimate(
+    crossing: Scenario, measured: MeasuredData, truth: TransitionLog, kind: str
+) -> None:
+    given = replace(
+        measured, **{"lanes": None, "trajectories": None, kind: getattr(measured, kind)}
+    )
+    # Positions are recorded a step early, too.
+    table = getattr(given, kind).with_columns(time_s=getattr(given, kind)["time_s"] + 1.0)
+    log = imported(replace(given, **{kind: table}), crossing, source="best")
+    found, true = log.transitions(log.agents[0]), truth.transitions(truth.agents[0])
+    assert len(found) == len(true)
+    assert found.observation[1:].tolist() == true.observation[1:].tolist()
+    assert found.reward.tolist() == true.reward.tolist()
+    assert not log.provenance.deviation
+
+
+def test_a_learner_and_a_fit_take_the_log(crossing: Scenario, measured: MeasuredData) -> None:
+    log = imported(measured, crossing, "movements")
+    env = parallel_env(crossing, observation="movements")
+    world = RecordedWorld(log, env)
+    assert world.collect(Replay(log), 0, 0) is log
+    summary = LaneView.of(Network.read(crossing), "movements").summary(log)
+    assert np.isfinite(summary.values[:, NAMES.index("mean")]).all()
+
+
+def test_a_replay_repeats_the_commands_of_the_street(
+    crossing: Scenario, measured: MeasuredData
+) -> None:
+    log = imported(measured, crossing)
+    replay = RecordedWorld(log, parallel_env(crossing, observation="count")).replay()
+    assert replay is not None
+    with contextlib.closing(parallel_env(crossing, **replay.env_options)) as env:
+        again = roll_out(env, replay, 3, record=observer_of(env)).log
+    assert again is not None
+    wanted = log.transitions(log.agents[0]).executed
+    found = again.transitions(again.agents[0]).executed
+    assert found[: len(wanted)].tolist() == wanted.tolist()
+    assert set(found[len(wanted) :]) == {wanted[-1]}
+
+
+def test_of_a_lane_with_a_guessed_queue_only_the_service_is_used(
+    crossing: Scenario, measured: MeasuredData
+) -> None:
+    view = LaneView.of(Network.read(crossing), "count")
+    log = imported(measured, crossing)
+    plain = TransitionLog(replace(log.provenance, deviation={}), log.frame)
+    unsure = TransitionLog(replace(log.provenance, deviation={"S_C_0": 5.0}), log.frame)
+    whole, part = view.summary(plain), view.summary(unsure)
+    lane = view.lanes.index("S_C_0")
+    assert np.isnan(part.values[lane, OF_COUNTS]).all()
+    other = 1 - lane
+    assert np.array_equal(part.values[other], whole.values[other], equal_nan=True)
+    assert np.array_equal(
+        part.values[lane, ~OF_COUNTS], whole.values[lane, ~OF_COUNTS], equal_nan=True
+    )
+    assert part.network[NAMES.index("mean")] == whole.values[other, NAMES.index("mean")]
+    assert part.usable is not None and whole.usable is None
+    # A simulated world is compared by the same numbers.
+    assert np.array_equal(whole.where(part.usable).network, part.network, equal_nan=True)
+
+
+def test_clearances_lead_to_the_next_phase(crossing: Scenario) -> None:
+    light = Network.read(crossing).intersections[0]
+    assert light.phases == ("Gr", "rG")
+    shown = ((0.0, "Gr"), (20.0, "yr"), (23.0, "rr"), (25.0, "rG"), (45.0, "ry"))
+    phases, strange = phases_shown(shown, light, 50.0, 5.0)
+    assert phases.tolist() == [0, 1, 1, 1, 1]
+    assert strange == 0.0
+
+
+def test_greens_of_no_phase_are_the_most_similar_one_and_said(crossing: Scenario) -> None:
+    light = Network.read(crossing).intersections[0]
+    phases, strange = phases_shown(((0.0, "Gr"), (20.0, "GG"), (30.0, "rG")), light, 40.0, 5.0)
+    assert phases.tolist() == [0, 0, 1]
+    assert strange == pytest.approx(0.25)
+    with pytest.raises(MeasuredDataError, match="'C' never shows a phase of the scenario"):
+        phases_shown(((0.0, "rr"),), light, 40.0, 5.0)
+
+
+def test_what_the_data_cannot_tell_is_an_error(crossing: Scenario, measured: MeasuredData) -> None:
+    period = measured.periods[0]
+
+    def without(kind: str) -> MeasuredData:
+        kept = tuple(d for d in measured.detectors if d.kind != kind)
+        return replace(measured, detectors=kept)
+
+    def changed(**more: Any) -> MeasuredData:
+        return replace(measured, periods=(replace(period, **more),))
+
+    with pytest.raises(OptionError, match="waiting"):
+        imported(measured, crossing, "waiting")
+    for data, observation, words in (
+        (changed(passages={}), "count", "counts only: when single vehicles leave"),
+        (without("stop"), "count", r"no stop detector on 2 lanes \('S_C_0', 'W_C_0'\)"),
+        (without("exit"), "movements", "no exit detector on 2 lanes .* --observation count"),
+        (changed(signals={}), "count", "nothing of traffic light 'C' in period 'day1'"),
+        (changed(end_s=20.0), "count", "fewer than two decisions of 10 s"),
+    ):
+        with pytest.raises(MeasuredDataError, match=words):
+            imported(data, crossing, observation)
+    assert len(imported(without("exit"), crossing, "count")) > 0
+
+
+def test_without_advance_detectors_it_says_so(crossing: Scenario, measured: MeasuredData) -> None:
+    kept = tuple(d for d in measured.detectors if d.kind != "advance")
+    network = Network.read(crossing)
+    found = log_of_measured(
+        replace(measured, detectors=kept), crossing, network, "street", "count", "detections"
+    )
+    assert any("no advance detector" in line for line in found.findings)
+    assert any("taken for the commands" in line for line in found.findings)
+
+
+def test_the_command_writes_a_log_that_can_be_read(
+    tmp_path: Path, data: Path, measured: MeasuredData, capsys: pytest.CaptureFixture[str]
+) -> None:
+    write_measured(replace(measured, lanes=None, trajectories=None), tmp_path / "main-street")
+    out = tmp_path / "street.parquet"
+    call = ["import-log", str(data / "crossing"), str(tmp_path / "main-street")]
+    assert main([*call, "--out", str(out), "--latency-s", "-1"]) == 0
+    said = capsys.readouterr().out
+    assert "vehicles on a lane are estimated" in said and "transitions of 1 periods" in said
+    log = TransitionLog.read(out)
+    assert log.provenance.domain == "main-street"
+    assert log.provenance.observation == "movements"
+    assert main([*call, "--out", str(out), "--observation", "waiting"]) == 2
+    assert "which detectors do not see" in capsys.readouterr().err

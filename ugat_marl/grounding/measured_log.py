@@ -1,0 +1,442 @@
+"""Measured data of a street as a transition log, from which grounding learns.
+
+The signals give the phases, the detectors the vehicles on each lane and the service of greens
+(`detected`). A table of lanes or trajectories, from cameras or radar, takes the place of the
+estimate where there is one. What nothing measured is not in the log: masks, delays of greens, and
+commands that were not obeyed.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from typing import Literal
+
+import numpy as np
+import polars as pl
+from numpy.typing import NDArray
+
+from ugat_marl.data import (
+    MeasuredData,
+    Provenance,
+    TransitionLog,
+    TransitionRecorder,
+    installed_version,
+    traffic_of_lanes,
+)
+from ugat_marl.envs import OBSERVATION_UNITS, Observer, Rewarder
+from ugat_marl.errors import MeasuredDataError, OptionError
+from ugat_marl.grounding.detected import (
+    DetectionConfig,
+    LaneCourse,
+    LaneDetectors,
+    LaneEstimate,
+    greens_of,
+)
+from ugat_marl.scenarios import GREEN, YELLOW, Intersection, Network, Period, Scenario, SignalLog
+from ugat_marl.simulation import Snapshot
+
+Floats = NDArray[np.float64]
+
+MeasuredSource = Literal["best", "detections"]
+"""Where vehicles on lanes come from: a table of lanes or trajectories if there is one, or always
+the detections."""
+
+WITH_OUTGOING = ("movements", "pressure")
+"""Observations that read the lanes that lead away, too."""
+REWARD = "queue"
+"""Reward of the log. Vehicles outside of the measured lanes are unknown, so not `total-queue`."""
+
+
+@dataclass(frozen=True)
+class MeasuredLog:
+    """A transition log of measured data, and what is known of its errors.
+
+    Attributes:
+        log: The log; its episodes are the periods. Its provenance has the standard deviation of
+            the vehicles on each lane, root mean square over the decisions, if they are estimated.
+        findings: What the log does not know, a sentence each.
+    """
+
+    log: TransitionLog
+    findings: tuple[str, ...]
+
+
+@dataclass(frozen=True, eq=False)
+class _LaneSeries:
+    """Traffic of a lane at the decisions of a period; arrays ``(decisions + 1,)``.
+
+    Attributes:
+        vehicles: Vehicles on the lane.
+        halting: Vehicles that stand.
+        mean_left: Vehicles that left after a decision, averaged over the interval.
+        deviation: Standard deviation of `vehicles`.
+    """
+
+    vehicles: Floats
+    halting: Floats
+    mean_left: Floats
+    deviation: Floats
+
+
+def log_of_measured(
+    measured: MeasuredData,
+    scenario: Scenario,
+    network: Network,
+    place: str,
+    observation: str = "movements",
+    source: MeasuredSource = "best",
+    config: DetectionConfig | None = None,
+) -> MeasuredLog:
+    """Return the transitions of measured data.
+
+    Args:
+        measured: Measured data with signals, and with single detections or trajectories.
+        scenario: Scenario with the decision interval and the timing of the signals.
+        network: Network of the scenario.
+        place: Name of the street, for the provenance.
+        observation: Observation to record; `waiting` cannot be known.
+        source: Where vehicles on lanes come from.
+        config: Numbers of the estimate.
+
+    Raises:
+        MeasuredDataError: Signals or detectors are missing, or no phase of the scenario was shown.
+        OptionError: The observation cannot be known from measured data.
+    """
+    if observation == "waiting":
+        raise OptionError(
+            "observation 'waiting' sums up how long each vehicle stands, which detectors do not "
+            f"see; use one of {', '.join(name for name in OBSERVATION_UNITS if name != 'waiting')}"
+        )
+    street = _Street(measured, scenario, network, observation, source, config or DetectionConfig())
+    street.require_detectors()
+    return street.log(place)
+
+
+@dataclass(frozen=True)
+class _Street:
+    """Measured data with all that is needed to read them as decisions."""
+
+    measured: MeasuredData
+    scenario: Scenario
+    network: Network
+    observation: str
+    source: MeasuredSource
+    config: DetectionConfig
+
+    @property
+    def interval_s(self) -> float:
+        return self.scenario.control.decision_interval_s
+
+    @property
+    def table(self) -> pl.DataFrame | None:
+        """Vehicles per lane and second, from the table of lanes or from trajectories."""
+        if self.source == "detections":
+            return None
+        if self.measured.lanes is not None:
+            return self.measured.lanes
+        if self.measured.trajectories is None:
+            return None
+        lanes = self.network.lane_table().ids
+        parts = [
+            traffic_of_lanes(
+                self.measured.trajectories.filter(pl.col("period_id") == period.id), lanes, period
+            )
+            for period in self.measured.periods
+        ]
+        return pl.concat(parts)
+
+    def require_detectors(self) -> None:
+        """Refuse data in which a lane of the observation was not seen."""
+        if not self.measured.has_events:
+            raise MeasuredDataError(
+                "counts only: when single vehicles leave a lane stays unknown, so there is no log "
+                "of transitions; add detections (on and off of every vehicle)"
+            )
+        incoming = [x for item in self.network.intersections for x in item.incoming_lanes]
+        seen = {lane: LaneDetectors.of(self.measured.detectors, lane) for lane in self._lanes}
+        blind = [lane for lane in incoming if seen[lane].stop is None]
+        if blind:
+            raise MeasuredDataError(
+                f"detectors.csv: no stop detector on {_names(blind)}, of {len(incoming)} incoming "
+                "lanes: when vehicles leave there stays unknown; add one, or leave the traffic "
+                "light out of the scenario"
+            )
+        ends = [lane for lane in self._lanes if lane not in incoming and seen[lane].exit is None]
+        if ends and self.observation in WITH_OUTGOING:
+            raise MeasuredDataError(
+                f"detectors.csv: no exit detector on {_names(ends)}, which the observation "
+                f"{self.observation!r} reads; add one, or choose --observation count"
+            )
+
+    def log(self, place: str) -> MeasuredLog:
+        """Return the log, and what it does not know."""
+        courses = self._courses()
+        table, observer = self.table, Observer(self.network, self.observation)
+        recorder = TransitionRecorder(self._provenance(observer, place))
+        variances: dict[str, list[Floats]] = {}
+        unlike: dict[str, list[float]] = {}
+        for episode, period in enumerate(self.measured.periods):
+            blind_s = (
+                0.0 if table is not None else max(c[episode].blind_s for c in courses.values())
+            )
+            last = int((period.end_s - blind_s - period.begin_s) / self.interval_s + 1e-9)
+            if last < 2:
+                raise MeasuredDataError(
+                    f"periods.csv: period {period.id!r} has fewer than two decisions of "
+                    f"{self.interval_s:g} s; join periods, or leave it out"
+                )
+            times_s = period.begin_s + self.interval_s * np.arange(last + 1, dtype=np.float64)
+            phases: list[NDArray[np.int64]] = []
+            for item in self.network.intersections:
+                shown, strange = self._phases(item, period, times_s)
+                phases.append(shown)
+                unlike.setdefault(item.id, []).append(strange)
+            rows = table.filter(pl.col("period_id") == period.id) if table is not None else None
+            lanes = [
+                self._series(lane, courses.get(lane), episode, times_s, rows)
+                for lane in self._lanes
+            ]
+            for lane, one in zip(self._lanes, lanes, strict=True):
+                variances.setdefault(lane, []).append(one.deviation**2)
+            self._record(recorder, observer, episode, times_s, np.stack(phases, 1), lanes)
+        incoming = [x for item in self.network.intersections for x in item.incoming_lanes]
+        deviation = {x: float(np.sqrt(np.concatenate(variances[x]).mean())) for x in incoming}
+        findings = self._findings(courses, deviation, unlike, table is not None)
+        log = recorder.log()
+        if table is None:
+            log = TransitionLog(replace(log.provenance, deviation=deviation), log.frame)
+        return MeasuredLog(log, findings)
+
+    @property
+    def _lanes(self) -> tuple[str, ...]:
+        return self.network.lane_table().ids
+
+    def _courses(self) -> dict[str, list[LaneCourse]]:
+        """Return the courses of all lanes with detectors."""
+        estimate = LaneEstimate(
+            self.measured.periods, self.network.lanes, self.measured.detectors, self.config
+        )
+        courses: dict[str, list[LaneCourse]] = {}
+        for lane in self._lanes:
+            own = LaneDetectors.of(self.measured.detectors, lane)
+            if own.stop is not None:
+                courses[lane] = estimate.incoming(lane)
+            elif own.exit is not None:
+                courses[lane] = estimate.outgoing(lane)
+        return courses
+
+    def _series(
+        self,
+        lane: str,
+        courses: list[LaneCourse] | None,
+        episode: int,
+        times_s: Floats,
+        table: pl.DataFrame | None,
+    ) -> _LaneSeries:
+        """Return the traffic of a lane at some times."""
+        none = np.zeros(len(times_s))
+        if courses is None:  # leads away, and the observation does not read it
+            return _LaneSeries(none, none, none, none)
+        course, period = courses[episode], self.measured.periods[episode]
+        left = course.mean_left(times_s, self.interval_s)
+        seen = table.filter(pl.col("lane_id") == lane).sort("time_s") if table is not None else None
+        if seen is not None and not seen.is_empty():
+            at = seen["time_s"].to_numpy()
+            rows = np.clip(np.searchsorted(at, times_s + 1e-6, side="right") - 1, 0, None)
+            vehicles, halting = (seen[x].to_numpy()[rows] for x in ("vehicles", "halting"))
+            return _LaneSeries(vehicles, halting, left, none)
+        vehicles, deviation = course.vehicles(times_s), course.deviation(times_s)
+        light = next(
+            (item for item in self.network.intersections if lane in item.incoming_lanes), None
+        )
+        if light is None:
+            return _LaneSeries(vehicles, none, left, deviation)
+        links = sorted({link.index for link in light.links if link.from_lane == lane})
+        greens = greens_of(period, light.id, links)
+        halting = course.halting(times_s, greens, self.config)
+        return _LaneSeries(vehicles, halting, left, deviation)
+
+    def _phases(
+        self, item: Intersection, period: Period, times_s: Floats
+    ) -> tuple[NDArray[np.int64], float]:
+        """Return the phase that is green or about to be at each time, and the share of others.
+
+        A change at the very moment of a decision is its result, so the state before it counts.
+        """
+        shown = period.signals.get(item.id)
+        if not shown:
+            raise MeasuredDataError(
+                f"signals: nothing of traffic light {item.id!r} in period {period.id!r}; without "
+                "its phases there is no log of transitions: add them, or leave the period out"
+            )
+        phases, strange = phases_shown(shown, item, period.end_s, self.scenario.timing.min_green_s)
+        since = np.array([begin for begin, _ in shown])
+        at = np.searchsorted(since, times_s - 1e-6, side="right") - 1
+        return phases[np.clip(at, 0, None)], strange
+
+    def _record(
+        self,
+        recorder: TransitionRecorder,
+        observer: Observer,
+        episode: int,
+        times_s: Floats,
+        phases: NDArray[np.int64],
+        lanes: Sequence[_LaneSeries],
+    ) -> None:
+        """Add the decisions of a period."""
+        vehicles, halting, left = (
+            np.stack([getattr(one, name) for one in lanes], 1)
+            for name in ("vehicles", "halting", "mean_left")
+        )
+        nothing = np.zeros(len(lanes))
+        snapshots = [
+            Snapshot(float(time), vehicles[k], halting[k], nothing, np.empty(0), 0, 0)
+            for k, time in enumerate(times_s)
+        ]
+        rewarder = Rewarder(self.network, REWARD)
+
+        def seen(snapshot: Snapshot, row: int) -> dict[str, NDArray[np.float32]]:
+            shown = observer.observe(snapshot, phases[row].tolist())
+            return dict(zip(observer.agents, shown, strict=True))
+
+        for step, (before, after) in enumerate(zip(snapshots, snapshots[1:], strict=False)):
+            ran = dict(zip(observer.agents, phases[step + 1].tolist(), strict=True))
+            rewards = rewarder.rewards(before, after)
+            served = seen(before.less(np.minimum(left[step], before.vehicles)), step)
+            recorder.record(
+                episode,
+                step,
+                seen(before, step),
+                ran,
+                ran,
+                dict(zip(observer.agents, rewards, strict=True)),
+                seen(after, step + 1),
+                served={
+                    agent: served[agent][: layout.features]
+                    for agent, layout in zip(observer.agents, observer.layouts, strict=True)
+                },
+            )
+
+    def _provenance(self, observer: Observer, place: str) -> Provenance:
+        return Provenance(
+            scenario=self.scenario.id,
+            scenario_hash="",
+            domain=place,
+            seeds=(),
+            decision_interval_s=self.interval_s,
+            observation=observer.name,
+            layouts=dict(zip(observer.agents, observer.layouts, strict=True)),
+            source="measured",
+            versions={"ugat-marl": installed_version("ugat-marl") or "not installed"},
+            units={"observation": OBSERVATION_UNITS[observer.name], "reward": REWARD},
+        )
+
+    def _findings(
+        self,
+        courses: dict[str, list[LaneCourse]],
+        deviation: dict[str, float],
+        unlike: dict[str, list[float]],
+        counted: bool,
+    ) -> tuple[str, ...]:
+        """Return what the log does not know, most important first."""
+        found: list[str] = []
+        if not counted:
+            worst = max(deviation, key=lambda lane: deviation[lane])
+            found.append(
+                f"vehicles on a lane are estimated to {np.median(list(deviation.values())):.1f} "
+                f"(median of {len(deviation)} lanes) to {deviation[worst]:.1f} vehicles ({worst}), "
+                "standard deviation; how many of them stand follows from the greens"
+            )
+            stuck = [
+                lane for lane in deviation if any(j.long for c in courses[lane] for j in c.jams)
+            ]
+            if stuck:
+                found.append(
+                    f"{_names(stuck)}: a queue stood on the first detector to the end of a period, "
+                    "so how fast it grew stays unknown; the rate of free times is taken"
+                )
+            late = sum(c.unmatched for lane in deviation for c in courses[lane])
+            total = sum(len(c.leave_s) for lane in deviation for c in courses[lane])
+            if late:
+                found.append(
+                    f"{100 * late / total:.0f} % of the vehicles were seen by one detector of "
+                    "their lane only: they changed lanes, or a detector missed them"
+                )
+            alone = [
+                x for x in deviation if LaneDetectors.of(self.measured.detectors, x).advance is None
+            ]
+            if alone:
+                found.append(
+                    f"{_names(alone)}: no advance detector, so vehicles that wait are known only "
+                    "when they leave"
+                )
+            blind_s = max(one.blind_s for own in courses.values() for one in own)
+            found.append(
+                f"the last {blind_s:.0f} s of each period are left out: vehicles that came then "
+                "had not reached a detector"
+            )
+        strange = {light: max(shares) for light, shares in unlike.items() if max(shares) > 0.005}
+        if strange:
+            light = max(strange, key=lambda x: strange[x])
+            found.append(
+                f"{_names(list(strange), 'traffic light')}: greens of no phase of the scenario for "
+                f"up to {100 * strange[light]:.0f} % of the time; the most similar phase is taken"
+            )
+        found.append(
+            "the phases that ran are taken for the commands: late, lost or refused commands, masks "
+            "and delays of greens are not in the data"
+        )
+        return tuple(found)
+
+
+def phases_shown(
+    shown: SignalLog, item: Intersection, end_s: float, min_green_s: float
+) -> tuple[NDArray[np.int64], float]:
+    """Return the phase that each state of a traffic light shows or leads to.
+
+    A state with the greens of a phase shows it. Another one that has no yellow and lasts for a
+    minimum green shows the phase with the most similar greens. The rest are clearances, which lead
+    to the next phase.
+
+    Args:
+        shown: States of the light.
+        item: Its intersection.
+        end_s: End of the last state.
+        min_green_s: Minimum green.
+
+    Returns:
+        Index of a phase for each state, and the share of time with greens of no phase.
+
+    Raises:
+        MeasuredDataError: No state has green on a link of any phase.
+    """
+    links = sorted({link.index for link in item.links})
+    greens = [frozenset(i for i in links if phase[i] in GREEN) for phase in item.phases]
+    times = np.array([begin for begin, _ in shown] + [max(end_s, shown[-1][0])])
+    lengths = np.diff(times)
+    phases = np.full(len(shown), -1, dtype=np.int64)
+    strange = 0.0
+    for k, (_, state) in enumerate(shown):
+        lit = frozenset(i for i in links if state[i] in GREEN)
+        if lit in greens:
+            phases[k] = greens.index(lit)
+        elif lit and lengths[k] >= max(min_green_s, 1.0) and not set(state) & YELLOW:
+            alike = [len(lit & own) / len(lit | own) for own in greens]
+            if max(alike) > 0:
+                phases[k] = int(np.argmax(alike))
+                strange += float(lengths[k])
+    known = np.flatnonzero(phases >= 0)
+    if not len(known):
+        raise MeasuredDataError(
+            f"signals: traffic light {item.id!r} never shows a phase of the scenario "
+            f"({', '.join(item.phases[:3])}, ...); give it the phases of the street in "
+            "scenario.toml (intersections.<light>.phases)"
+        )
+    after = np.searchsorted(known, np.arange(len(shown)))
+    return phases[known[np.minimum(after, len(known) - 1)]], strange / max(float(lengths.sum()), 1)
+
+
+def _names(names: Sequence[str], title: str = "lane") -> str:
+    shown = ", ".join(map(repr, names[:4])) + (", ..." if len(names) > 4 else "")
+    return f"{len(names)} {title}{'s' if len(names) != 1 else ''} ({shown})"
