@@ -65,6 +65,7 @@ class DetectionConfig:
         speed_spread: Standard deviation of free speeds, as a share of their median.
         fastest: Fastest ride between two detectors, as a share of the speed limit.
         unmatched: Cost of a passage without a partner, in standard deviations of a free ride.
+        missed: Share of the vehicles of a road that its detectors may miss or count twice.
         longest_s: Longest ride between two detectors of a lane, in s.
     """
 
@@ -82,6 +83,7 @@ class DetectionConfig:
     speed_spread: float = 0.1
     fastest: float = 1.3
     unmatched: float = 3.0
+    missed: float = 0.05
     longest_s: float = 900.0
 
 
@@ -94,12 +96,17 @@ class Jam:
         end_s: The same for the first free vehicle after it; the end of the period without one.
         count: Vehicles of the jam, without those in `beyond`.
         open: True if it did not end within the period.
+        error: Relative error of the rate at which vehicles come in an open jam.
+        share: Share of a Poisson variance that the number of these vehicles has. Below 1, exit
+            detectors counted the vehicles of the road, and only their lane is unsure.
     """
 
     begin_s: float
     end_s: float
     count: int
     open: bool = False
+    error: float = 0.0
+    share: float = 1.0
 
     @property
     def long(self) -> bool:
@@ -119,7 +126,6 @@ class LaneCourse:
         jams: Spans with a queue on the reference detector.
         free_mps: Median free speed.
         capacity: Vehicles that fit on the lane.
-        rate_error: Relative error of the rate at which vehicles come in open jams.
         unmatched: Passages of one detector without a partner at the other one.
         blind_s: Time from the lane's begin to the reference detector. Who came later than this
             before the end of the period was not seen.
@@ -132,7 +138,6 @@ class LaneCourse:
     jams: tuple[Jam, ...]
     free_mps: float
     capacity: float
-    rate_error: float = 0.0
     unmatched: int = 0
     blind_s: float = 0.0
 
@@ -161,7 +166,7 @@ class LaneCourse:
             share = np.clip((times_s - jam.begin_s) / max(jam.end_s - jam.begin_s, 1e-9), 0.0, 1.0)
             if jam.open:
                 came = jam.count * share
-                spread = came + (came * self.rate_error) ** 2
+                spread = jam.share * came + (came * jam.error) ** 2
                 variance += np.minimum(spread, self.capacity**2 / 12.0)
             else:
                 variance += jam.count * share * (1.0 - share)
@@ -336,6 +341,21 @@ class _Clock:
         return np.where(reads > self.reads[-1], np.inf, times)
 
 
+@dataclass(frozen=True)
+class _Rest:
+    """Vehicles that came on a road and were seen on none of its lanes, as one lane's share.
+
+    Attributes:
+        clock: Clock that reads the vehicles of the lane.
+        unsure: Share of a Poisson variance of their number: they may be on another jammed lane.
+        error: Relative error of their number.
+    """
+
+    clock: _Clock
+    unsure: float
+    error: float
+
+
 @dataclass(frozen=True, eq=False)
 class _Seen:
     """Passages of a lane's reference detector, as if the lane had no queue.
@@ -379,8 +399,24 @@ class _Seen:
             count -= end - begin
         return _Rate(float(max(count, 0)), max(span, 0.0))
 
-    def spread(self, period: Period, rate: _Rate) -> tuple[Floats, Floats, tuple[Jam, ...]]:
+    def open_since(self, period: Period) -> float:
+        """Return the begin of a long jam that does not end within the period; infinite without."""
+        jams = self.jams()
+        if jams and jams[-1][1] == len(self.come_s):
+            first, last = self._ends(*jams[-1], period)
+            if last - first > LONG_S:
+                return first
+        return math.inf
+
+    def spread(
+        self, period: Period, rate: _Rate, rest: _Rest | None = None
+    ) -> tuple[Floats, Floats, tuple[Jam, ...]]:
         """Spread the vehicles of each jam between the free vehicles around it.
+
+        Args:
+            period: Period of the passages.
+            rate: Rate of free times, for a jam that does not end.
+            rest: Vehicles that came on the road meanwhile, if exit detectors counted them.
 
         Returns:
             Times at which the vehicles came, ``(n,)``. Times of further vehicles that came but were
@@ -393,11 +429,16 @@ class _Seen:
             first, last = self.clock.read(first_s), self.clock.read(last_s)
             steps = np.arange(1, end - begin + 1)
             open_end = end == len(come)
-            if open_end and rate.value > 0:
-                pace = rate.above((end - begin) / max(float(last - first), 1e-9))
-                number = int(pace * float(last - first))
-                reads = first + np.arange(1, max(number, end - begin) + 1) / pace
-                times = self.clock.when(reads)
+            error, share = rate.error, 1.0
+            if open_end and (rest is not None or rate.value > 0):
+                if rest is not None:
+                    error, share, clock = rest.error, rest.unsure, rest.clock
+                    first, last, pace = rest.clock.read(first_s), rest.clock.reads[-1], 1.0
+                else:
+                    clock = self.clock
+                    pace = rate.above((end - begin) / max(float(last - first), 1e-9))
+                number = max(int(pace * float(last - first)), end - begin)
+                times = clock.when(first + np.arange(1, number + 1) / pace)
                 beyond = times[end - begin :]
                 beyond = beyond[beyond < period.end_s]
                 even = times[: end - begin]
@@ -405,7 +446,7 @@ class _Seen:
                 even = self.clock.when(first + steps / (end - begin + 1) * (last - first))
             come[begin:end] = np.minimum(even, come[begin:end])
             count = end - begin + len(beyond) * open_end
-            found.append(Jam(first_s, last_s, count, open_end))
+            found.append(Jam(first_s, last_s, count, open_end, error, share))
         return come, beyond, tuple(found)
 
     def _ends(self, begin: int, end: int, period: Period) -> tuple[float, float]:
@@ -434,14 +475,59 @@ class LaneEstimate:
     def incoming(self, name: str) -> list[LaneCourse]:
         """Return the courses of a lane that ends at a light and has a stop detector, by period."""
         lane, own = self.lanes[name], LaneDetectors.of(self.detectors, name)
-        assert own.stop is not None
+        seen, rate = self._all_seen(lane)
+        return [
+            self._course(
+                period, lane, own, one.spread(period, rate, self._rest(place, lane, one)), one
+            )
+            for place, (period, one) in enumerate(zip(self.periods, seen, strict=True))
+        ]
+
+    def _all_seen(self, lane: Lane) -> tuple[list[_Seen], _Rate]:
+        """Return what the first detector of a lane saw, by period, and the rate of free times."""
+        own = LaneDetectors.of(self.detectors, lane.id)
         seen = [self._seen(period, lane, own) for period in self.periods]
         rates = [one.rate(period) for one, period in zip(seen, self.periods, strict=True)]
-        rate = _Rate(sum(one.count for one in rates), sum(one.span for one in rates))
-        return [
-            self._course(period, lane, own, one, rate)
-            for period, one in zip(self.periods, seen, strict=True)
-        ]
+        return seen, _Rate(sum(one.count for one in rates), sum(one.span for one in rates))
+
+    def _rest(self, place: int, lane: Lane, own: _Seen) -> _Rest | None:
+        """Return the vehicles of a lane's open jam, from what came on its road.
+
+        A vehicle that came on the road and is not seen on a lane without an open jam came on one
+        with. Two such lanes share them as they share those that leave.
+        """
+        period = self.periods[place]
+        entries = self._entries(period, lane)
+        if entries is None or math.isinf(own.open_since(period)):
+            return None
+        known: list[Floats] = []
+        since: list[float] = []
+        flows: list[float] = []
+        mine = 0
+        for name, other in self.lanes.items():
+            if other.edge != lane.edge:
+                continue
+            if LaneDetectors.of(self.detectors, name).stop is None:
+                return None  # who leaves by that lane is not seen
+            seen, rate = self._all_seen(other)
+            one, jammed_s = seen[place], seen[place].open_since(period)
+            come, _, _ = one.spread(period, rate)
+            known.append(come[come <= jammed_s])
+            if not math.isinf(jammed_s):
+                since.append(jammed_s)
+                flows.append(float((one.come_s > jammed_s).sum()) / (period.end_s - jammed_s))
+                mine = len(since) - 1 if name == lane.id else mine
+        begin = min(since)
+        ticks = _unseen(entries, np.concatenate(known), begin)
+        ticks = ticks[ticks > begin]
+        jammed = ticks[:, None] >= np.array(since)[None, :]
+        flow = jammed * np.array(flows)
+        weights = flow[:, mine] / np.maximum(flow.sum(1), 1e-9)
+        at_s = np.concatenate([[begin], ticks, [period.end_s]])
+        reads = np.concatenate([[0.0], weights.cumsum(), [weights.sum()]])
+        clock = _Clock(at_s, reads + 1e-6 * (at_s - begin))
+        unsure = 1.0 - float(weights.sum()) / max(float((weights > 0).sum()), 1.0)
+        return _Rest(clock, unsure, self.config.missed)
 
     def _seen(self, period: Period, lane: Lane, own: LaneDetectors) -> _Seen:
         reference = own.advance or own.stop
@@ -456,10 +542,15 @@ class LaneEstimate:
         return _Seen(first, come, pace, self._free(first, free_mps), upstream_m, free_mps, clock)
 
     def _course(
-        self, period: Period, lane: Lane, own: LaneDetectors, seen: _Seen, rate: _Rate
+        self,
+        period: Period,
+        lane: Lane,
+        own: LaneDetectors,
+        spread: tuple[Floats, Floats, tuple[Jam, ...]],
+        seen: _Seen,
     ) -> LaneCourse:
         """Join what the reference and the stop detector saw."""
-        come, beyond, jams = seen.spread(period, rate)
+        come, beyond, jams = spread
         stops = seen.crossings if own.advance is None else self._crossings(period, own.stop)
         assert own.stop is not None
         pace, ahead_m = seen.pace_mps, lane.length_m + max(lane.room_m - lane.length_m, 0.0)
@@ -495,8 +586,7 @@ class LaneEstimate:
         come, leave, arrive, sigma = (x[there] for x in (come, leave, arrive, sigma))
         blind_s = seen.upstream_m / seen.free_mps
         return LaneCourse(
-            come, leave, arrive, sigma, jams, seen.free_mps, lane.capacity, rate.error, unmatched,
-            blind_s,
+            come, leave, arrive, sigma, jams, seen.free_mps, lane.capacity, unmatched, blind_s
         )  # fmt: skip
 
     def outgoing(self, name: str) -> list[LaneCourse]:
@@ -562,6 +652,17 @@ class LaneEstimate:
         beyond_m = stop.position_m + stop.length_m + stops.length_m - length_m
         speed = np.maximum(stops.speed_mps, self.config.least_mps)
         return np.maximum(stops.off_s - beyond_m / speed, stops.on_s)
+
+
+def _unseen(entries: Floats, known: Floats, begin_s: float) -> Floats:
+    """Return the times from `begin_s` on at which more vehicles came than are known, sorted."""
+    entries, known = entries[entries >= begin_s], known[known >= begin_s]
+    times = np.concatenate([entries, known])
+    steps = np.concatenate([np.ones(len(entries)), -np.ones(len(known))])
+    order = np.lexsort((steps, times))  # a known vehicle takes its own entry away
+    surplus = steps[order].cumsum()
+    most = np.maximum.accumulate(np.maximum(surplus, 0.0))
+    return times[order][np.diff(most, prepend=0.0) > 0]
 
 
 def greens_of(period: Period, tls: str, links: Sequence[int]) -> list[tuple[float, float]]:
