@@ -5,6 +5,7 @@ from __future__ import annotations
 import tempfile
 from collections.abc import Callable
 from dataclasses import replace
+from datetime import datetime, timedelta
 from pathlib import Path
 
 import numpy as np
@@ -506,3 +507,89 @@ def test_columns_that_nobody_reads_are_said(reread: Callable[..., MeasuredData])
     read = reread({"detections.csv": replaced("speed_mps", "speed_ms")})
     assert "'speed_ms' is not read; if it means 'speed_mps', rename it" in texts(read)
     assert "no speeds" in texts(read)
+
+
+def in_local_time(zone: str = "") -> dict[str, Change]:
+    """Turn the files of a recording to local times; the scenario's clock is 0 at 07:00."""
+    offset = "-06:00" if zone else ""
+
+    def stamp(day: str, seconds: str) -> str:
+        at = datetime(2024, 3, 5 + int(day[-1]), 7) + timedelta(seconds=float(seconds))
+        return at.isoformat(timespec="milliseconds") + offset
+
+    def periods(text: str) -> str:
+        head, *rows = text.split()
+        ends = [f"2024-03-{5 + i:02d}T07:00:00,{zone}" for i in range(len(rows))]
+        return (
+            "\n".join([f"{head},zero,time_zone", *map(",".join, zip(rows, ends, strict=True))])
+            + "\n"
+        )
+
+    def table(text: str) -> str:
+        head, *rows = text.split()
+        cells = [row.split(",") for row in rows]
+        at = head.split(",").index("time_s")
+        for row in cells:
+            row[at] = stamp(row[0], row[at])
+        return "\n".join([head.replace("time_s", "time"), *map(",".join, cells)]) + "\n"
+
+    return {"periods.csv": periods, "signals.csv": table, "detections.csv": table}
+
+
+@pytest.mark.parametrize("zone", ["", "America/Chicago"])
+def test_local_times_become_seconds_of_the_scenario(
+    zone: str, reread: Callable[..., MeasuredData]
+) -> None:
+    assert reread(in_local_time(zone)).hash == recording().hash
+
+
+def test_local_counts_become_seconds(reread: Callable[..., MeasuredData], tmp_path: Path) -> None:
+    counts = pl.DataFrame(
+        {"period_id": ["day0"], "begin_s": [0.0], "end_s": [60.0], "detector_id": ["s"],
+         "count": [7]}
+    )  # fmt: skip
+    given = replace(recording(), counts=counts)
+    local = (
+        "period_id,begin,end,detector_id,count\nday0,2024-03-05 07:00:00,2024-03-05 07:01:00,s,7\n"
+    )
+    changes = {**in_local_time(), "counts.csv": lambda _: local}
+    read = reread(changes, given)
+    assert read.counts is not None
+    assert read.counts.row(0) == ("day0", 0.0, 60.0, "s", 7.0)
+
+
+@pytest.mark.parametrize(
+    ("name", "change", "words"),
+    [
+        ("periods.csv", None, "periods.csv does not say when the scenario's clock is"),
+        (
+            "detections.csv",
+            lambda text: in_local_time()["detections.csv"](text).replace("T07:00", " soon", 1),
+            r"detections.csv, line \d+: time is '2024-03-05 soon.*; write it as 2024-03-05",
+        ),
+        (
+            "periods.csv",
+            lambda text: in_local_time("Chicago")["periods.csv"](text),
+            "unknown time_zone 'Chicago'",
+        ),
+        (
+            "periods.csv",
+            lambda text: in_local_time()["periods.csv"](text).replace("2024-03-06T07:00:00", ""),
+            "line 3: period_id 'day1' has no zero, though others have",
+        ),
+        (
+            "detections.csv",
+            lambda text: in_local_time("America/Chicago")["detections.csv"](text),
+            "time has the time zone UTC; write the street's own in periods.csv, as time_zone",
+        ),
+    ],
+)
+def test_wrong_local_times_are_named(
+    name: str, change: Change | None, words: str, reread: Callable[..., MeasuredData]
+) -> None:
+    changes = in_local_time()
+    del changes[name]
+    if change is not None:
+        changes[name] = change
+    with pytest.raises(MeasuredDataError, match=words):
+        reread(changes)

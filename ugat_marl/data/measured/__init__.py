@@ -4,6 +4,7 @@
 - `tables`: the files and their columns, checked while they are read.
 - `reading`: reader of a directory, which returns `values.MeasuredData`.
 - `passages`: passages of vehicles from on and off events.
+- `local_time`: local times as seconds of the scenario's clock.
 - `lanes`: traffic of lanes from positions of single vehicles.
 - `coverage`: findings on missing data.
 - `writing`: writer of a directory.

@@ -17,6 +17,7 @@ import polars as pl
 
 from ugat_marl.data.measured.atspm_mapping import AtspmMapping, Device, Span, read_mapping
 from ugat_marl.data.measured.coverage import coverage
+from ugat_marl.data.measured.local_time import local_times
 from ugat_marl.data.measured.passages import passages_of
 from ugat_marl.data.measured.reading import detectors_of, periods_of, signals_of
 from ugat_marl.data.measured.tables import (
@@ -25,7 +26,6 @@ from ugat_marl.data.measured.tables import (
     ROW,
     frame_of,
     in_order,
-    place,
     read_raw,
     refuse_set_back,
     to_numbers,
@@ -75,13 +75,9 @@ _NAMES = {
     "eventparam": "parameter",
     "eventparameter": "parameter",
 }
-_FORMATS = (
-    "%Y-%m-%d %H:%M:%S%.f",
-    "%Y-%m-%dT%H:%M:%S%.f",
-    "%m/%d/%Y %H:%M:%S%.f",
-    "%m/%d/%Y %I:%M:%S%.f %p",
-)
 
+ZONE = "the mapping, as time_zone"
+"""Place at which the street's time zone is given, for messages."""
 LOOK_BACK_S = 3600.0
 """Time before a period from which events are read, to know the signal state at its begin."""
 
@@ -462,7 +458,7 @@ def read_log(path: Path, time_zone: str, findings: list[Finding]) -> pl.DataFram
     frame = pl.DataFrame(
         [
             pl.int_range(start, raw.height + start, dtype=pl.Int64, eager=True).alias(ROW),
-            _times(path, raw["time"], time_zone, start),
+            local_times(path, raw["time"].alias("TimeStamp"), time_zone, start, ZONE).alias("time"),
             to_texts(path, raw["device"]),
             to_numbers(path, raw["event"]),
             to_numbers(path, raw["parameter"]),
@@ -477,39 +473,3 @@ def read_log(path: Path, time_zone: str, findings: list[Finding]) -> pl.DataFram
         pl.col("event").cast(pl.Int64, strict=False),
         pl.col("parameter").cast(pl.Int64, strict=False),
     ).drop_nulls()
-
-
-def _times(path: Path, cells: pl.Series, time_zone: str, start: int) -> pl.Series:
-    """Return local times without a time zone."""
-    if isinstance(cells.dtype, pl.String):
-        cells = _parsed(path, cells.str.strip_chars(), start)
-    if not isinstance(cells.dtype, pl.Datetime):
-        raise MeasuredDataError(
-            f"{path}: TimeStamp has the type {cells.dtype}; it holds dates with times"
-        )
-    if cells.dtype.time_zone is not None:
-        if not time_zone:
-            raise MeasuredDataError(
-                f"{path}: TimeStamp has the time zone {cells.dtype.time_zone}; write the street's "
-                'own in the mapping, as in time_zone = "America/Denver"'
-            )
-        cells = cells.dt.convert_time_zone(time_zone).dt.replace_time_zone(None)
-    return cells.cast(pl.Datetime("us"))
-
-
-def _parsed(path: Path, cells: pl.Series, start: int) -> pl.Series:
-    if cells.str.contains(r"(Z|[+-]\d\d:?\d\d)$").any():
-        zoned = cells.str.replace(" ", "T", literal=True).str.to_datetime(
-            "%+", strict=False, time_unit="us", time_zone="UTC"
-        )
-        parsed = [zoned]
-    else:
-        parsed = [cells.str.to_datetime(x, strict=False, time_unit="us") for x in _FORMATS]
-    best = min(parsed, key=lambda times: times.null_count())
-    if best.null_count():
-        at = int(best.is_null().arg_true()[0])
-        raise MeasuredDataError(
-            f"{place(path, at + start)}: TimeStamp is {str(cells[at])[:40]!r}; write it as "
-            "2024-03-05 07:00:00.1"
-        )
-    return best

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import tomllib
-import zoneinfo
 from collections.abc import Collection, Mapping, Sequence
 from datetime import datetime
 from pathlib import Path
@@ -12,6 +11,7 @@ from typing import Annotated, Any
 import pydantic
 from pydantic import Field
 
+from ugat_marl.data.measured.local_time import require_time_zone
 from ugat_marl.errors import MeasuredDataError
 from ugat_marl.scenarios import DetectorKind, Split
 
@@ -155,10 +155,7 @@ def read_mapping(
             f"{path}: give zero (the local times at which the scenario's clock is 0), or "
             "[[periods]] with a zero each, and not both"
         )
-    if mapping.time_zone and mapping.time_zone not in zoneinfo.available_timezones():
-        raise MeasuredDataError(
-            f"{path}: unknown time_zone {mapping.time_zone!r}; write it as in 'America/Denver'"
-        )
+    require_time_zone(mapping.time_zone, str(path))
     if any(span.zero.tzinfo for span in mapping.spans()):
         raise MeasuredDataError(f"{path}: zero has a time zone; write local time without one")
     _check_devices(path, mapping.devices, widths, driven)

@@ -13,6 +13,7 @@ import polars as pl
 
 from ugat_marl.data.measured import tables
 from ugat_marl.data.measured.coverage import coverage
+from ugat_marl.data.measured.local_time import LocalClock, local_times, require_time_zone
 from ugat_marl.data.measured.passages import passages_of
 from ugat_marl.data.measured.tables import (
     PERIOD,
@@ -81,12 +82,15 @@ def read_measured(directory: Path, scenario: Scenario, network: Network) -> Meas
     if paths["signals"] is None and not counts_only:
         raise _missing(directory, tables.SIGNALS)
 
+    clock: LocalClock | None = None
+
     def rows(table: Table) -> tuple[Path, pl.DataFrame]:
         path = paths[table.stem]
         assert path is not None
-        return path, read_table(path, table, findings)
+        return path, read_table(path, table, findings, clock)
 
-    periods = periods_of(*rows(tables.PERIODS), scenario)
+    listed = rows(tables.PERIODS)
+    periods, clock = periods_of(*listed, scenario), _clock(*listed)
     detectors = detectors_of(*rows(tables.DETECTORS), network)
     signals: tuple[dict[str, SignalLog], ...] = tuple({} for _ in periods)
     if paths["signals"] is not None:
@@ -121,6 +125,30 @@ def read_measured(directory: Path, scenario: Scenario, network: Network) -> Meas
     )
     findings += coverage(measured, scenario, network)
     return replace(measured, findings=tuple(findings))
+
+
+def _clock(path: Path, frame: pl.DataFrame) -> LocalClock | None:
+    """Return the local times at which the scenario's clock is 0; None if they are not given."""
+    if frame["zero"].null_count() == frame.height:
+        return None
+    for name in ("zero", "time_zone"):
+        if 0 < frame[name].null_count() < frame.height:
+            refuse(
+                path,
+                frame.filter(pl.col(name).is_null()),
+                "period_id",
+                f"has no {name}, though others have",
+                "write it for every period",
+            )
+    zones = frame["time_zone"].drop_nulls().unique().to_list()
+    if len(zones) > 1:
+        raise MeasuredDataError(
+            f"{path}: two time zones, {zones[0]!r} and {zones[1]!r}; write that of the street"
+        )
+    zone = zones[0] if zones else ""
+    require_time_zone(zone, str(path))
+    zeros = local_times(path, frame["zero"], zone, 2, "the column time_zone")
+    return LocalClock(dict(zip(frame["period_id"], zeros, strict=True)), zone)
 
 
 def _missing(directory: Path, table: Table) -> MeasuredDataError:

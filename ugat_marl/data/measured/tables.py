@@ -16,6 +16,7 @@ import numpy as np
 import polars as pl
 from numpy.typing import NDArray
 
+from ugat_marl.data.measured.local_time import LocalClock
 from ugat_marl.data.measured.values import Finding
 from ugat_marl.errors import MeasuredDataError, nearest
 from ugat_marl.scenarios import Period
@@ -33,6 +34,9 @@ MOST_OUTSIDE = 0.5
 """Largest share of a period's rows that may lie outside of the period."""
 EPOCH = 1e8
 """Times above this are dates, not seconds of a scenario."""
+
+TIMES = ("time_s", "begin_s", "end_s")
+"""Columns whose times may be local: without ``_s`` in the name they hold dates."""
 
 PERIOD = "period"
 """Column with the index of the row's period."""
@@ -78,7 +82,7 @@ class Table:
 PERIODS = Table(
     "periods",
     {"period_id": "text", "begin_s": "number", "end_s": "number"},
-    {"split": "text"},
+    {"split": "text", "zero": "text", "time_zone": "text"},
     (".csv",),
 )
 DETECTORS = Table(
@@ -139,13 +143,17 @@ COUNTS = Table(
 TABLES = (PERIODS, DETECTORS, SIGNALS, DETECTIONS, LANES, TRAJECTORIES, COUNTS)
 
 
-def read_table(path: Path, table: Table, findings: list[Finding]) -> pl.DataFrame:
+def read_table(
+    path: Path, table: Table, findings: list[Finding], clock: LocalClock | None = None
+) -> pl.DataFrame:
     """Read the columns of `table` from a file, numbers as Float64, and add `ROW`.
 
     Args:
         path: The file.
         table: Expected columns.
         findings: Findings; unknown columns are added to them.
+        clock: Clock for columns of local times: ``time`` in place of ``time_s``, ``begin`` and
+            ``end`` in place of ``begin_s`` and ``end_s``. None if periods.csv has no ``zero``.
 
     Returns:
         One row per row of the file, in its order. Missing optional columns are null.
@@ -156,6 +164,7 @@ def read_table(path: Path, table: Table, findings: list[Finding]) -> pl.DataFram
     """
     raw = read_raw(path, findings)
     wanted = {**table.columns, **table.optional}
+    raw = _in_seconds(path, table, raw, clock)
     _check_columns(path, table, raw.columns, findings)
     start = 1 if path.suffix == ".parquet" else 2  # line 1 of a CSV file is its header
     columns = [pl.int_range(start, raw.height + start, dtype=pl.Int64, eager=True).alias(ROW)]
@@ -176,6 +185,30 @@ def read_table(path: Path, table: Table, findings: list[Finding]) -> pl.DataFram
     return pl.DataFrame(columns)
 
 
+def _in_seconds(
+    path: Path, table: Table, raw: pl.DataFrame, clock: LocalClock | None
+) -> pl.DataFrame:
+    """Replace columns of local times by seconds of the scenario's clock."""
+    local = {
+        name.removesuffix("_s"): name
+        for name in table.columns
+        if name in TIMES and name not in raw.columns and name.removesuffix("_s") in raw.columns
+    }
+    if not local or table.stem == "periods":
+        return raw
+    if clock is None:
+        raise MeasuredDataError(
+            f"{path}: {next(iter(local))} holds local times, and periods.csv does not say when the "
+            "scenario's clock is 0; add the column zero there, such as 2024-03-05T07:00:00"
+        )
+    if "period_id" not in raw.columns:
+        return raw  # refused as a missing column
+    start = 1 if path.suffix == ".parquet" else 2
+    periods = to_texts(path, raw["period_id"])
+    seconds = [clock.seconds(path, raw[name], periods, start) for name in local]
+    return raw.drop(*local).with_columns(seconds)
+
+
 def read_raw(path: Path, findings: list[Finding]) -> pl.DataFrame:
     """Read all columns of a CSV or Parquet file; columns of a CSV file are text.
 
@@ -186,8 +219,10 @@ def read_raw(path: Path, findings: list[Finding]) -> pl.DataFrame:
 
 
 def frame_of(table: Table, rows: Sequence[tuple[object, ...]]) -> pl.DataFrame:
-    """Return rows as a frame with the columns of a table."""
+    """Return rows as a frame with the columns of a table; the last ones may be missing."""
     kinds = {**table.columns, **table.optional}
+    if rows and len(rows[0]) < len(kinds):
+        rows = [(*row, *[None] * (len(kinds) - len(row))) for row in rows]
     schema = {
         name: pl.Float64() if kind == "number" else pl.String() for name, kind in kinds.items()
     }

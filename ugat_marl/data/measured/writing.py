@@ -137,7 +137,8 @@ def _detectors(measured: MeasuredData) -> pl.DataFrame:
 
 
 def _periods(periods: Sequence[Period]) -> pl.DataFrame:
-    return frame_of(PERIODS, [(p.id, p.begin_s, p.end_s, p.split) for p in periods])
+    rows = [(p.id, p.begin_s, p.end_s, p.split) for p in periods]
+    return frame_of(PERIODS, rows).drop("zero", "time_zone")  # all times are written in seconds
 
 
 def _signals(periods: Sequence[Period]) -> pl.DataFrame:

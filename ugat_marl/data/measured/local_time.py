@@ -1,0 +1,115 @@
+"""Local times of a street, with or without a time zone, as seconds of a scenario's clock."""
+
+from __future__ import annotations
+
+import zoneinfo
+from collections.abc import Mapping
+from dataclasses import dataclass
+from datetime import datetime
+from pathlib import Path
+
+import polars as pl
+
+from ugat_marl.errors import MeasuredDataError
+
+_FORMATS = (
+    "%Y-%m-%d %H:%M:%S%.f",
+    "%Y-%m-%dT%H:%M:%S%.f",
+    "%m/%d/%Y %H:%M:%S%.f",
+    "%m/%d/%Y %I:%M:%S%.f %p",
+)
+
+
+@dataclass(frozen=True)
+class LocalClock:
+    """Local times at which the scenario's clock is 0.
+
+    Attributes:
+        zeros: Period to its local time.
+        time_zone: Time zone of the street; "" if the times have none.
+    """
+
+    zeros: Mapping[str, datetime]
+    time_zone: str = ""
+
+    def seconds(self, path: Path, cells: pl.Series, periods: pl.Series, start: int) -> pl.Series:
+        """Return times as seconds of the scenario's clock, named as `cells` with ``_s``.
+
+        Args:
+            path: File of the times.
+            cells: Times.
+            periods: Period of each; a time of an unknown period becomes 0.
+            start: Number of the first row, for messages.
+
+        Raises:
+            MeasuredDataError: A time cannot be read.
+        """
+        local = local_times(path, cells, self.time_zone, start, "periods.csv, as time_zone")
+        zero = periods.replace_strict(self.zeros, default=None, return_dtype=pl.Datetime("us"))
+        # a time of an unknown period is left out later, with its row
+        seconds = ((local - zero).dt.total_microseconds() / 1e6).fill_null(0.0)
+        return seconds.set(local.is_null(), None).alias(f"{cells.name}_s")
+
+
+def require_time_zone(name: str, where: str) -> None:
+    """Refuse a time zone that does not exist.
+
+    Raises:
+        MeasuredDataError: There is no such zone.
+    """
+    if name and name not in zoneinfo.available_timezones():
+        raise MeasuredDataError(
+            f"{where}: unknown time_zone {name!r}; write one such as America/Denver"
+        )
+
+
+def local_times(
+    path: Path, cells: pl.Series, time_zone: str, start: int, mapping: str
+) -> pl.Series:
+    """Return local times without a time zone, in microseconds; empty cells stay empty.
+
+    Args:
+        path: File of the times.
+        cells: Texts or datetimes; their name is that of the column.
+        time_zone: Time zone of the street; required if the times have one.
+        start: Number of the first row, for messages.
+        mapping: Place at which the time zone can be given, for messages.
+
+    Raises:
+        MeasuredDataError: The times have an unknown form, or a time zone without `time_zone`.
+    """
+    if isinstance(cells.dtype, pl.String):
+        cells = _parsed(path, cells.str.strip_chars(), start)
+    if not isinstance(cells.dtype, pl.Datetime):
+        raise MeasuredDataError(
+            f"{path}: {cells.name} has the type {cells.dtype}; it holds dates with times"
+        )
+    if cells.dtype.time_zone is not None:
+        if not time_zone:
+            raise MeasuredDataError(
+                f"{path}: {cells.name} has the time zone {cells.dtype.time_zone}; write the "
+                f"street's own in {mapping}, such as America/Denver"
+            )
+        cells = cells.dt.convert_time_zone(time_zone).dt.replace_time_zone(None)
+    return cells.cast(pl.Datetime("us"))
+
+
+def _parsed(path: Path, cells: pl.Series, start: int) -> pl.Series:
+    empty = cells.is_null() | (cells == "")
+    if cells.str.contains(r"(Z|[+-]\d\d:?\d\d)$").any():
+        zoned = cells.str.replace(" ", "T", literal=True).str.to_datetime(
+            "%+", strict=False, time_unit="us", time_zone="UTC"
+        )
+        parsed = [zoned]
+    else:
+        parsed = [cells.str.to_datetime(x, strict=False, time_unit="us") for x in _FORMATS]
+    best = min(parsed, key=lambda times: times.null_count())
+    wrong = best.is_null() & ~empty.fill_null(True)
+    if wrong.any():
+        at = int(wrong.arg_true()[0])
+        unit = "row" if path.suffix == ".parquet" else "line"
+        raise MeasuredDataError(
+            f"{path}, {unit} {at + start}: {cells.name} is {str(cells[at])[:40]!r}; write it as "
+            "2024-03-05 07:00:00.1"
+        )
+    return best
