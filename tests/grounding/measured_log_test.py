@@ -16,7 +16,13 @@ from ugat_marl.effects import load_scenario
 from ugat_marl.envs import parallel_env
 from ugat_marl.errors import MeasuredDataError, OptionError
 from ugat_marl.experiments import policy_factory, record
-from ugat_marl.grounding import DetectionConfig, LaneView, RecordedWorld, log_of_measured
+from ugat_marl.grounding import (
+    DetectionConfig,
+    LaneView,
+    RecordedWorld,
+    StreetConfig,
+    log_of_measured,
+)
 from ugat_marl.grounding.measured_log import phases_shown
 from ugat_marl.grounding.summaries import NAMES, OF_COUNTS
 from ugat_marl.grounding.worlds import Replay
@@ -144,6 +150,15 @@ def test_of_a_lane_with_a_guessed_queue_only_the_service_is_used(
     assert part.usable is not None and whole.usable is None
     # A simulated world is compared by the same numbers.
     assert np.array_equal(whole.where(part.usable).network, part.network, equal_nan=True)
+
+
+def test_estimated_vehicles_are_no_readings_of_detectors(
+    crossing: Scenario, measured: MeasuredData, truth: TransitionLog
+) -> None:
+    assert StreetConfig().of_log(truth) == StreetConfig()
+    assert StreetConfig().of_log(imported(measured, crossing)).parts == (
+        "channel", "service", "effects"
+    )  # fmt: skip
 
 
 def test_clearances_lead_to_the_next_phase(crossing: Scenario) -> None:

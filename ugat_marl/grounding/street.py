@@ -102,6 +102,12 @@ class StreetConfig:
         if self.simulated_s <= 0:
             raise OptionError(f"simulated_s = {self.simulated_s}: must be above 0")
 
+    def of_log(self, real: TransitionLog) -> StreetConfig:
+        """Return the settings for a log; estimated vehicles are no readings of detectors."""
+        if not real.provenance.deviation:
+            return self
+        return replace(self, parts=tuple(part for part in self.parts if part != "eyes"))
+
     @property
     def simulates(self) -> bool:
         """True if worlds are simulated."""

@@ -207,9 +207,9 @@ class StreetTraining(Algorithm):
 
     def _fit(self, state: RunState[StreetFit], policy: Policy) -> FittedStreet:
         """Fit the street to D_real, and say what was found (line 4)."""
-        config, known = self.config.street, state.transform.known
+        real, known = TransitionLog.concatenate(state.real), state.transform.known
+        config = self.config.street.of_log(real)
         number = episodes_of_fit(config, known)
-        real = TransitionLog.concatenate(state.real)
         agents = list(real.provenance.layouts)
         jams = Oversaturation.of(self.view, self.view.rows(real), agents)
         for line in jams.describe():
