@@ -1,4 +1,4 @@
-"""How well do detectors show the street's queues, and what does a fitted street learn from them?
+"""Queues of a street as its detectors show them, and what a fitted street learns from them.
 
     python -m studies.detector_logs single-v1 grid2x2-v1 arterial1x5-v1 --domain V4
     python -m studies.detector_logs single-v1 --domain V4 --simulations 160
@@ -42,23 +42,19 @@ SURE = 1.5
 
 @dataclass(frozen=True)
 class LaneErrors:
-    """Errors of the vehicles and of the service of some lanes.
+    """Errors of the vehicles on some lanes.
 
     Attributes:
         lanes: Number of lanes.
         vehicles: Mean number of vehicles on them.
         error: Root mean square error of the vehicles.
         said: Root mean square of the deviations that the log states.
-        served: Root mean square error of the mean number that left in a decision.
-        left: Mean of that number.
     """
 
     lanes: int
     vehicles: float
     error: float
     said: float
-    served: float
-    left: float
 
 
 def record_street(
@@ -101,8 +97,6 @@ def errors(scenario: Scenario, lanes: TransitionLog, detectors: TransitionLog) -
             true.before[there],
             found.before - true.before[there],
             np.full(len(found.before), deviation[lane]),
-            found.left - true.left[there],
-            true.left[there],
         )
         groups[deviation[lane] > SURE].append(parts)
     return [_summed(group) for group in groups]
@@ -110,16 +104,13 @@ def errors(scenario: Scenario, lanes: TransitionLog, detectors: TransitionLog) -
 
 def _summed(group: Sequence[tuple[Floats, ...]]) -> LaneErrors:
     if not group:
-        return LaneErrors(0, *[float("nan")] * 5)
-    vehicles, error, said, served, left = (np.concatenate(x) for x in zip(*group, strict=True))
+        return LaneErrors(0, *[float("nan")] * 3)
+    vehicles, error, said = (np.concatenate(x) for x in zip(*group, strict=True))
 
     def size(values: Floats) -> float:
         return float(np.sqrt((values**2).mean()))
 
-    return LaneErrors(
-        len(group), float(vehicles.mean()), size(error), size(said), size(served),
-        float(left.mean()),
-    )  # fmt: skip
+    return LaneErrors(len(group), float(vehicles.mean()), size(error), size(said))
 
 
 def fits(
@@ -157,15 +148,15 @@ def main() -> None:
     parser.add_argument("--duration-s", type=float)
     parser.add_argument("--simulations", type=int, default=0, help="worlds for a fit; 0 for none")
     given = parser.parse_args()
-    print("| network | queues | lanes | vehicles | error | said | left | error |")
-    print("|---|---|---:|---:|---:|---:|---:|---:|")
+    print("| network | queues | lanes | vehicles | error | said |")
+    print("|---|---|---:|---:|---:|---:|")
     for name in given.scenarios:
         scenario = load_scenario(name)
         logs = record_street(scenario, given.domain, given.policy, given.periods, given.duration_s)
         for kind, row in zip(("known", "guessed"), errors(scenario, *logs), strict=True):
             print(
                 f"| {name} | {kind} | {row.lanes} | {row.vehicles:.1f} | {row.error:.2f} | "
-                f"{row.said:.2f} | {row.left:.2f} | {row.served:.2f} |"
+                f"{row.said:.2f} |"
             )
         if given.simulations:
             found = fits(scenario, *logs, given.simulations)

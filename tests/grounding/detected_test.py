@@ -170,8 +170,10 @@ def test_a_missed_vehicle_and_a_change_of_lanes_do_not_shift_the_others() -> Non
     gone = there["stop"].at(np.array([0, 1, 2, 4, 5]))
     found = course({"advance": there["advance"], "stop": gone})
     assert found.unmatched == 1
-    # The one that changed lanes behind the advance detector left the lane there.
-    assert found.vehicles(np.array([100.0, 119.0, 140.0])).tolist() == [1, 0, 1]
+    # The one that changed lanes behind the advance detector did so before the next one came by:
+    # between 115.5 s, where it left the detector, and 155.25 s.
+    assert found.vehicles(np.array([100.0, 134.0, 137.0])).tolist() == [1, 2, 1]
+    assert found.deviation(np.array([125.0]))[0] == pytest.approx(0.5, abs=0.1)
 
 
 def test_without_an_advance_detector_vehicles_are_known_when_they_leave() -> None:

@@ -16,7 +16,11 @@ def test_a_queue_that_detectors_see_is_close(data: Path) -> None:
     known, guessed = errors(scenario, *logs)
     assert (known.lanes, guessed.lanes) == (2, 0)
     assert known.vehicles > 1.0
-    assert known.error < 0.5 and known.served < 0.1 < known.left
+    assert known.error < 0.2
+    # Detectors of other days are far off.
+    _, other = record_street(scenario, "sim", "fixed-time:10", 1)
+    assert errors(scenario, logs[0], other)[0].error > 0.4
+    assert 0.0 < known.said < 1.0
     assert np.isnan(guessed.error)
 
 

@@ -129,6 +129,8 @@ class LaneCourse:
         unmatched: Passages of one detector without a partner at the other one.
         blind_s: Time from the lane's begin to the reference detector. Who came later than this
             before the end of the period was not seen.
+        merging_s: Spans in which a vehicle that changed lanes behind the reference detector may
+            have waited for a gap beside it, ``(spans, 2)``. Half of them is taken as its stay.
     """
 
     come_s: Floats
@@ -140,6 +142,7 @@ class LaneCourse:
     capacity: float
     unmatched: int = 0
     blind_s: float = 0.0
+    merging_s: Floats = field(default_factory=lambda: np.empty((0, 2)))
 
     def vehicles(self, times_s: Floats) -> Floats:
         """Return the vehicles on the lane at each time, ``(times,)``."""
@@ -175,7 +178,9 @@ class LaneCourse:
             near = np.abs(times_s - come) < 4.0 * sigma
             chance = norm.cdf((times_s[near] - come) / sigma)
             variance[near] += chance * (1.0 - chance)
-        return np.sqrt(variance)
+        begin_s, end_s = self.merging_s.T
+        variance += 0.25 * (_passed(begin_s, times_s) - _passed(end_s, times_s))
+        return np.sqrt(np.maximum(variance, 0.0))
 
     def halting(
         self, times_s: Floats, greens: Sequence[tuple[float, float]], config: DetectionConfig
@@ -557,7 +562,7 @@ class LaneEstimate:
         sigma = np.where(seen.free, self.config.speed_spread * seen.upstream_m / pace, 0.0)
         arrive = come + ahead_m / pace
         leave = self._left(stops, own.stop, lane.length_m)
-        unmatched = 0
+        unmatched, merging_s = 0, np.empty((0, 2))
         if own.advance is not None:
             way_m = own.stop.position_m - own.advance.position_m
             fastest_s = way_m / (self.config.fastest * lane.speed_mps)
@@ -573,7 +578,14 @@ class LaneEstimate:
             come = np.concatenate([come[of_first], leave[lone] - ride_s])
             arrive = np.concatenate([arrive[of_first], leave[lone]])
             sigma = np.concatenate([sigma[of_first], half])
-            gone = (leave[pairs[:, 1]], np.full(len(stays), np.inf), seen.crossings.off_s[changed])
+            # One that changed lanes was gone when the next vehicle behind it reached the stop line.
+            off_s = seen.crossings.off_s[changed]
+            behind = pairs[np.searchsorted(pairs[:, 0], changed), 1]
+            gone_s = np.maximum(off_s, leave[behind] - ride_s)
+            merging_s = np.stack([off_s, gone_s], 1)
+            merging_s = merging_s[np.isfinite(merging_s).all(1)]
+            waited_s = np.where(np.isfinite(gone_s), 0.5 * (off_s + gone_s), off_s)
+            gone = (leave[pairs[:, 1]], np.full(len(stays), np.inf), waited_s)
             leave = np.concatenate([*gone, leave[lone]])
         come = np.concatenate([come, beyond])
         arrive = np.concatenate([arrive, beyond + ahead_m / seen.free_mps])
@@ -586,7 +598,8 @@ class LaneEstimate:
         come, leave, arrive, sigma = (x[there] for x in (come, leave, arrive, sigma))
         blind_s = seen.upstream_m / seen.free_mps
         return LaneCourse(
-            come, leave, arrive, sigma, jams, seen.free_mps, lane.capacity, unmatched, blind_s
+            come, leave, arrive, sigma, jams, seen.free_mps, lane.capacity, unmatched, blind_s,
+            merging_s,
         )  # fmt: skip
 
     def outgoing(self, name: str) -> list[LaneCourse]:
