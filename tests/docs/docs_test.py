@@ -24,6 +24,7 @@ from ugat_marl.effects import (
     effect_from_record,
     effects_on_controllers,
     known_effects,
+    measurement_effects,
 )
 from ugat_marl.effects.actuators import PHASE_ORDERS
 from ugat_marl.envs import OBJECTIVE_MEASURES
@@ -120,8 +121,9 @@ def test_every_uncertainty_is_documented() -> None:
 def test_every_effect_is_documented_with_its_fields_and_ranges() -> None:
     page = (Path(__file__).parents[2] / "docs" / "reference" / "effects.md").read_text()
     rows = dict(re.findall(r"^\| `(\w+)` \| ([^|]+) \|", page, flags=re.MULTILINE))
-    assert list(rows) == list(known_effects())
-    for name, kind in known_effects().items():
+    kinds = {**known_effects(), **measurement_effects()}
+    assert list(rows) == list(kinds)
+    for name, kind in kinds.items():
         cell = rows[name]
         assert re.findall(r"`(\w+)`", cell) == [item.name for item in fields(kind)], name
         for parameter in kind.ranges.values():

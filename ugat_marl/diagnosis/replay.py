@@ -44,6 +44,7 @@ from ugat_marl.effects import (
     Effect,
     depart_s,
     detector_effects,
+    installed_detectors,
     late_greens,
     shift_parking,
     sort_departures,
@@ -102,6 +103,7 @@ class Replay:
         owner: Traffic light by detector.
         thresholds: Numbers of the method.
         answering: True if the signals followed the traffic; days then get the measured arrivals.
+        detection: Errors of measurement of the detectors that saw the arrivals.
     """
 
     answering = False
@@ -115,6 +117,7 @@ class Replay:
         thresholds: DayThresholds,
         *,
         answering: bool = False,
+        detection: Sequence[Effect] = (),
     ) -> None:
         self._given = scenario, network, detectors, owner, thresholds
         self.answering = answering
@@ -123,7 +126,8 @@ class Replay:
         self._detectors = tuple(detectors)
         self._owner = dict(owner)
         self._thresholds = thresholds
-        layout = DetectorLayout.of(network, detectors)
+        self._detection = tuple(detection)
+        layout = DetectorLayout.of(network, installed_detectors(self._detection, detectors))
         self._arrivals = Arrivals(layout, network, thresholds) if answering else None
         self._own = detector_effects(scenario)
         self._days: OrderedDict[int, Scenario] = OrderedDict()
@@ -131,7 +135,14 @@ class Replay:
 
     def __reduce__(self) -> tuple[functools.partial[Replay], tuple[Any, ...]]:
         """Pickle the arguments only, without the days in memory."""
-        return functools.partial(Replay, answering=self.answering), self._given
+        return (
+            functools.partial(Replay, answering=self.answering, detection=self._detection),
+            self._given,
+        )
+
+    def detecting(self, errors: Sequence[Effect]) -> Replay:
+        """Return a simulator of the same days that knows errors of measurement."""
+        return Replay(*self._given, answering=self.answering, detection=errors)
 
     def simulate(self, effects: Sequence[Effect], period: Period, seed: int) -> Day:
         """Simulate one day.
@@ -155,7 +166,7 @@ class Replay:
         scenario = shift_parking(scenario, derive_seed(seed, "parking"))
         with tempfile.TemporaryDirectory(prefix="ugat_marl-") as name:
             directory = Path(name)
-            done = persistently(lambda: self._run(scenario, period, seed, directory))
+            done = persistently(lambda: self._run(scenario, effects, period, seed, directory))
         seen = done.period
         for effect in (*self._own, *effects):
             seen = effect.observe(seen, self._detectors, self._owner)
@@ -186,14 +197,22 @@ class Replay:
                     self._days.popitem(last=False)
             return day
 
-    def _run(self, scenario: Scenario, period: Period, seed: int, directory: Path) -> Day:
+    def _run(
+        self,
+        scenario: Scenario,
+        effects: Sequence[Effect],
+        period: Period,
+        seed: int,
+        directory: Path,
+    ) -> Day:
         settings = scenario.settings
         step = settings.step_length_s
         begin = max(settings.begin_s, period.begin_s - self._thresholds.warm_up_s)
         begin = settings.begin_s + step * round((begin - settings.begin_s) / step)
         loops = directory / "loops.xml"
+        true = installed_detectors((*self._own, *effects), self._detectors)
         signals = replay_document(scenario, period, begin)
-        detectors = detectors_document(self._detectors, dict(self._network.lanes), loops)
+        detectors = detectors_document(true, self._network.lanes, loops)
         scenario = replace(
             scenario,
             additional=(*scenario.additional, signals, detectors),
@@ -211,7 +230,7 @@ class Replay:
             kind = SimulatorCrashed if done.returncode < 0 else SimulatorError
             raise kind(f"SUMO failed in a replay of period {period.id!r}: {said}")
         trips = read_trips(directory / "trips.xml")
-        seen = read_passages(loops, self._detectors, period.begin_s, period.end_s)
+        seen = read_passages(loops, true, period.begin_s, period.end_s)
         travel = float(np.mean(trips.travel_time_s)) if len(trips.travel_time_s) else np.nan
         return Day(replace(period, passages=seen), travel)
 

@@ -20,6 +20,16 @@ from .controllers import Stage as Stage
 from .demand import DemandLevel as DemandLevel
 from .demand import DemandSurge as DemandSurge
 from .demand import DemandTiming as DemandTiming
+from .detection import DetectorExtension as DetectorExtension
+from .detection import DetectorOffset as DetectorOffset
+from .detection import DetectorPulse as DetectorPulse
+from .detection import DetectorSpeeds as DetectorSpeeds
+from .detection import DetectorSplash as DetectorSplash
+from .detection import DetectorZone as DetectorZone
+from .detection import Overlap as Overlap
+from .detection import detectors_at as detectors_at
+from .detection import group_name as group_name
+from .detection import next_detectors as next_detectors
 from .detectors import ClockDrift as ClockDrift
 from .detectors import DetectorEffect as DetectorEffect
 from .detectors import Dropout as Dropout
@@ -29,6 +39,7 @@ from .detectors import Swapped as Swapped
 from .detectors import Undercount as Undercount
 from .detectors import apply_detector_effects as apply_detector_effects
 from .detectors import detector_lights as detector_lights
+from .detectors import installed_detectors as installed_detectors
 from .documents import depart_s as depart_s
 from .documents import edit_scenario as edit_scenario
 from .documents import seconds_text as seconds_text
@@ -80,6 +91,7 @@ from .table import effect_from_record as effect_from_record
 from .table import effects_on_controllers as effects_on_controllers
 from .table import known_effects as known_effects
 from .table import load_scenario as load_scenario
+from .table import measurement_effects as measurement_effects
 from .turning import Turning as Turning
 from .vehicles import NO_SOFTER as NO_SOFTER
 from .vehicles import Acceleration as Acceleration

@@ -16,7 +16,10 @@ from ugat_marl.scenarios import Detector, Period, Scenario
 EVERYWHERE = "*"
 """Place of an effect that means all places."""
 
-TextKind = Literal["lane", "edge", "traffic light", "detector", "model", "phase order", "objective"]
+TextKind = Literal[
+    "lane", "edge", "traffic light", "detector", "detectors", "model", "phase order", "objective",
+    "point of a passage", "report of close vehicles",
+]  # fmt: skip
 
 _FORBIDDEN = frozenset(" \t\n\r|\\'\";,<>&")
 """Characters that ids in SUMO cannot have; a comma ends a value in the text form."""
@@ -92,6 +95,8 @@ class Effect(ControllerPart):
         attribute: Attribute of vehicle types with the effect's number, or "".
         examined: Strengths that a diagnosis tries on a whole network; None if it tries none.
         on_detectors: True if it changes the reports of detectors, but no traffic.
+        on_installation: True if it changes where or what detectors record. Unlike other effects on
+            detectors it needs a new simulation.
         on_departures: True if it changes only which vehicles depart, and when.
 
     Raises:
@@ -104,6 +109,7 @@ class Effect(ControllerPart):
     attribute: ClassVar[str] = ""
     examined: ClassVar[ExaminedStrengths | None] = None
     on_detectors: ClassVar[bool] = False
+    on_installation: ClassVar[bool] = False
     on_departures: ClassVar[bool] = False
 
     def __post_init__(self) -> None:
@@ -141,6 +147,21 @@ class Effect(ControllerPart):
         """
         del detectors, owner
         return period
+
+    def installed(self, detectors: Sequence[Detector]) -> tuple[Detector, ...]:
+        """Return the detectors as they really are on the street.
+
+        Args:
+            detectors: The detectors as they are stated.
+
+        Raises:
+            UnknownNameError: The detector does not exist.
+        """
+        return tuple(detectors)
+
+    def in_words(self) -> str:
+        """Return the effect as part of a sentence; its text form unless it has better words."""
+        return str(self)
 
     def cost(self) -> Cost | None:
         """Make the cost by which controllers are judged; None without a cost."""

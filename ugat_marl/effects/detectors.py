@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
+from collections.abc import Set as AbstractSet
 from dataclasses import dataclass, replace
 from typing import ClassVar
 
@@ -92,7 +93,7 @@ class Undercount(DetectorEffect):
             ]
             return passages.at(np.array(kept, dtype=np.bool_))
 
-        return _edited(period, _named(self, self.place, detectors), thinned)
+        return edited(period, _named(self, self.place, detectors), thinned)
 
 
 @dataclass(frozen=True)
@@ -112,7 +113,7 @@ class SignalClock(DetectorEffect):
         """Shift all times of the detectors."""
         del detectors
         shift = self.seconds
-        return _edited(period, _at(self.place, period, owner), lambda _, p: _moved(p, shift, shift))
+        return edited(period, _at(self.place, period, owner), lambda _, p: _moved(p, shift, shift))
 
 
 @dataclass(frozen=True)
@@ -140,7 +141,7 @@ class ClockDrift(DetectorEffect):
             on, off = passages.on_s - period.begin_s, passages.off_s - period.begin_s
             return _moved(passages, rate * on, rate * off)
 
-        return _edited(period, _at(self.place, period, owner), drifted)
+        return edited(period, _at(self.place, period, owner), drifted)
 
 
 @dataclass(frozen=True)
@@ -173,7 +174,7 @@ class Stuck(DetectorEffect):
             times = np.where(np.isnan(parts[0]), parts[1], parts[0])
             return Passages(*parts).at(np.argsort(times, kind="stable"))
 
-        return _edited(period, names, held)
+        return edited(period, names, held)
 
 
 @dataclass(frozen=True)
@@ -195,7 +196,7 @@ class Dropout(DetectorEffect):
             del name
             return passages.at(~_within(passages, self.begin_s, self.end_s))
 
-        return _edited(period, _named(self, self.detector, detectors), silent)
+        return edited(period, _named(self, self.detector, detectors), silent)
 
 
 @dataclass(frozen=True)
@@ -233,6 +234,16 @@ def apply_detector_effects(
     return period
 
 
+def installed_detectors(
+    effects: Sequence[Effect], detectors: Sequence[Detector]
+) -> tuple[Detector, ...]:
+    """Return the detectors as they really are, with all effects on their places and zones."""
+    true = tuple(detectors)
+    for effect in effects:
+        true = effect.installed(true)
+    return true
+
+
 def _named(effect: Effect, place: str, detectors: Sequence[Detector]) -> set[str]:
     known = {detector.id for detector in detectors}
     if place == EVERYWHERE:
@@ -247,7 +258,9 @@ def _at(place: str, period: Period, owner: Owner) -> set[str]:
     return {x for x in period.passages if place in (EVERYWHERE, owner.get(x))}
 
 
-def _edited(period: Period, names: set[str], change: Callable[[str, Passages], Passages]) -> Period:
+def edited(
+    period: Period, names: AbstractSet[str], change: Callable[[str, Passages], Passages]
+) -> Period:
     """Return the period with other passages at some detectors; empty detectors are left out."""
     passages = dict(period.passages)
     for name in sorted(names):

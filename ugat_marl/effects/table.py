@@ -11,6 +11,14 @@ from typing import Any
 from ugat_marl.effects.actuators import ACTING
 from ugat_marl.effects.base import Effect
 from ugat_marl.effects.demand import DemandLevel, DemandSurge, DemandTiming
+from ugat_marl.effects.detection import (
+    DetectorExtension,
+    DetectorOffset,
+    DetectorPulse,
+    DetectorSpeeds,
+    DetectorSplash,
+    DetectorZone,
+)
 from ugat_marl.effects.detectors import (
     ClockDrift,
     Dropout,
@@ -59,6 +67,13 @@ _MEASURABLE: dict[str, type[Effect]] = {
 }  # fmt: skip
 
 
+_OF_MEASUREMENT: dict[str, type[Effect]] = {
+    kind.name: kind
+    for kind in (
+        DetectorExtension, DetectorOffset, DetectorZone, DetectorSpeeds, DetectorPulse,
+        DetectorSplash,
+    )
+}  # fmt: skip
 _ON_CONTROLLERS: dict[str, type[Effect]] = {
     kind.name: kind for kind in (*OBSERVATION_EFFECTS, *ACTING, *JUDGING, LaneService)
 }
@@ -66,13 +81,20 @@ _OTHERS: dict[str, type[Effect]] = {
     kind.name: kind for kind in (Incident, QueueModel, BlockerPatience, Reach)
 }
 
-EFFECTS: dict[str, type[Effect]] = {**_MEASURABLE, **_ON_CONTROLLERS, **_OTHERS}
+EFFECTS: dict[str, type[Effect]] = {
+    **_MEASURABLE, **_OF_MEASUREMENT, **_ON_CONTROLLERS, **_OTHERS
+}  # fmt: skip
 """Effects by name."""
 
 
 def known_effects() -> Mapping[str, type[Effect]]:
     """Return the effects that a diagnosis can find, by name: traffic, signals, detectors."""
     return dict(_MEASURABLE)
+
+
+def measurement_effects() -> Mapping[str, type[Effect]]:
+    """Return the errors of measurement by name; a diagnosis fits them before other effects."""
+    return dict(_OF_MEASUREMENT)
 
 
 def effects_on_controllers() -> Mapping[str, type[Effect]]:
@@ -163,7 +185,7 @@ def detector_effects(scenario: Scenario) -> tuple[Effect, ...]:
     return tuple(
         effect_from_text(text)  # undoes str(effect)
         for name, text in zip(names, scenario.applied, strict=True)
-        if name in _MEASURABLE and _MEASURABLE[name].on_detectors
+        if name in EFFECTS and EFFECTS[name].on_detectors
     )
 
 

@@ -44,11 +44,13 @@ from .network import Lane as Lane
 from .network import Network as Network
 from .network import signal_widths as signal_widths
 from .network import within_hops as within_hops
+from .periods import SPEED_POINTS as SPEED_POINTS
 from .periods import Detector as Detector
 from .periods import DetectorKind as DetectorKind
 from .periods import Passages as Passages
 from .periods import Period as Period
 from .periods import SignalLog as SignalLog
+from .periods import SpeedPoint as SpeedPoint
 from .periods import Split as Split
 from .periods import deciding_letter as deciding_letter
 from .phases import conflicting_greens as conflicting_greens

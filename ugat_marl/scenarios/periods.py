@@ -10,7 +10,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 DetectorKind = Literal["advance", "stop", "exit"]
-
+SpeedPoint = Literal["front", "rear", "mean"]
+"""Point of a passage at which a detector measures the speed: when the front reaches the zone, when
+the rear leaves it, or the mean of both."""
+SPEED_POINTS: tuple[SpeedPoint, ...] = ("front", "rear", "mean")
 
 Split = Literal["fit", "heldout"]
 
@@ -30,6 +33,8 @@ class Detector:
         length_m: Length of the zone; 0 for a point.
         kind: ``advance`` upstream of a stop line, ``stop`` at the stop line, ``exit`` downstream of
             the intersection.
+        speed_at: Point of the passage at which speeds are measured; None if it is not stated.
+            Detectors of a simulation then measure when the rear leaves.
     """
 
     id: str
@@ -37,6 +42,7 @@ class Detector:
     position_m: float
     length_m: float
     kind: DetectorKind
+    speed_at: SpeedPoint | None = None
 
 
 @dataclass(frozen=True, eq=False)

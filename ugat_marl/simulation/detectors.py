@@ -5,7 +5,7 @@ from __future__ import annotations
 import re
 import xml.etree.ElementTree as ET
 from collections import defaultdict
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 
 import numpy as np
@@ -13,7 +13,15 @@ from numpy.typing import NDArray
 
 from ugat_marl.errors import SimulatorError
 from ugat_marl.files import xml_bytes
-from ugat_marl.scenarios import Detector, DetectorKind, Document, Lane, Network, Passages
+from ugat_marl.scenarios import (
+    Detector,
+    DetectorKind,
+    Document,
+    Lane,
+    Network,
+    Passages,
+    SpeedPoint,
+)
 
 STOP_SETBACK_M = 2.5
 """Distance of stop detectors upstream of the stop line. The first vehicle of a queue stands on the
@@ -46,7 +54,7 @@ def standard_detectors(network: Network) -> tuple[Detector, ...]:
 
 
 def detectors_document(
-    detectors: Sequence[Detector], lanes: dict[str, Lane] | None, file: Path
+    detectors: Sequence[Detector], lanes: Mapping[str, Lane] | None, file: Path
 ) -> Document:
     """Return an additional file with the loops of the detectors, which write to `file`.
 
@@ -54,12 +62,15 @@ def detectors_document(
 
     Args:
         detectors: Detectors to simulate.
-        lanes: Lanes by id, used to keep the end of a zone on its lane; or None.
+        lanes: Lanes by id, used to keep zones on their lanes; or None.
         file: Absolute path of SUMO's output.
     """
     root = ET.Element("additional")
     for detector in detectors:
-        ends = {detector.id: detector.position_m}
+        begin = detector.position_m
+        if lanes is not None:
+            begin = min(begin, lanes[detector.lane].length_m - 0.1)
+        ends = {detector.id: begin}
         if detector.length_m > 0:
             end = detector.position_m + detector.length_m
             if lanes is not None:
@@ -99,7 +110,9 @@ def read_passages(
     for detector in detectors:
         first = detector.id.encode()
         last = (detector.id + _END).encode() if detector.length_m > 0 else first
-        passages = _clipped(_passages(rows[first], rows[last]), begin_s, end_s)
+        passages = _clipped(
+            _passages(rows[first], rows[last], detector.speed_at or "rear"), begin_s, end_s
+        )
         if len(passages):
             by_detector[detector.id] = passages
     return by_detector
@@ -108,8 +121,12 @@ def read_passages(
 def _passages(
     front: list[tuple[float, bool, bytes, float, float]],
     rear: list[tuple[float, bool, bytes, float, float]],
+    speed_at: SpeedPoint,
 ) -> Passages:
-    """Pair the entry of each vehicle at the upstream end with its exit at the downstream end."""
+    """Pair the entry of each vehicle at the upstream end with its exit at the downstream end.
+
+    The speed of a vehicle without an entry is that of its rear, whatever `speed_at` says.
+    """
     left: dict[bytes, tuple[float, float]] = {
         vehicle: (time, speed) for time, enters, vehicle, speed, _ in rear if not enters
     }
@@ -117,7 +134,8 @@ def _passages(
     for time, enters, vehicle, speed, length in front:
         if enters:
             off, speed_off = left.pop(vehicle, (np.inf, speed))
-            rows.append((time, off, speed_off, length))
+            seen = {"front": speed, "rear": speed_off, "mean": 0.5 * (speed + speed_off)}[speed_at]
+            rows.append((time, off, seen, length))
     # A vehicle inserted on the loop, or one that changed lanes onto it, leaves without entering.
     rows += [(-np.inf, time, speed, np.nan) for time, speed in left.values()]
     if not rows:

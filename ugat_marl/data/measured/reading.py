@@ -30,6 +30,7 @@ from ugat_marl.data.measured.values import Finding, MeasuredData, split_periods
 from ugat_marl.errors import MeasuredDataError, nearest
 from ugat_marl.scenarios import (
     SIGNAL_LETTERS,
+    SPEED_POINTS,
     Detector,
     DetectorKind,
     Network,
@@ -339,7 +340,7 @@ def detectors_of(path: Path, frame: pl.DataFrame, network: Network) -> tuple[Det
 
     Raises:
         MeasuredDataError: There is no detector. Or a detector occurs twice, is on an unknown lane,
-            reaches beyond its lane, or has an unknown kind.
+            reaches beyond its lane, or has an unknown kind or point of speed measurement.
     """
     if frame.is_empty():
         raise MeasuredDataError(f"{path}: no detectors; write one row per detection zone")
@@ -357,6 +358,13 @@ def detectors_of(path: Path, frame: pl.DataFrame, network: Network) -> tuple[Det
         "kind",
         "is unknown",
         f"write one of {', '.join(kinds)}",
+    )
+    refuse(
+        path,
+        frame.filter(pl.col("speed_at").is_not_null() & ~pl.col("speed_at").is_in(SPEED_POINTS)),
+        "speed_at",
+        "is unknown",
+        f"write one of {', '.join(SPEED_POINTS)}, or leave it empty where it is not known",
     )
     detectors: list[Detector] = []
     for row in frame.iter_rows(named=True):
@@ -379,7 +387,9 @@ def detectors_of(path: Path, frame: pl.DataFrame, network: Network) -> tuple[Det
                 f"{where} ends {begin + length:g} m along lane {lane.id!r}, which ends at "
                 f"{lane.length_m:g} m; its length_m is at most {lane.length_m - begin:g}"
             )
-        detectors.append(Detector(row["detector_id"], lane.id, begin, length, row["kind"]))
+        detectors.append(
+            Detector(row["detector_id"], lane.id, begin, length, row["kind"], row["speed_at"])
+        )
     return tuple(detectors)
 
 

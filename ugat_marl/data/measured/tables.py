@@ -94,7 +94,7 @@ DETECTORS = Table(
         "length_m": "number",
         "kind": "text",
     },
-    {},
+    {"speed_at": "text"},
     (".csv",),
 )
 SIGNALS = Table(

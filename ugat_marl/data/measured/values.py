@@ -86,7 +86,8 @@ class MeasuredData:
                 float(detector.length_m),
                 detector.kind,
             )
-            digest.update(repr(zone).encode())
+            stated = () if detector.speed_at is None else (detector.speed_at,)
+            digest.update(repr((*zone, *stated)).encode())
         for period in self.periods:
             head = (period.id, float(period.begin_s), float(period.end_s), period.split)
             digest.update(repr(head).encode())

@@ -33,6 +33,7 @@ from ugat_marl.effects import (
     detector_effects,
     detector_lights,
     domain_path,
+    installed_detectors,
     parse_domain,
     scenario_in_domain,
     shift_parking,
@@ -50,6 +51,7 @@ from ugat_marl.progress import Advance, Reporter, Silent
 from ugat_marl.scenarios import (
     Detector,
     Document,
+    Lane,
     Network,
     Passages,
     Period,
@@ -75,7 +77,9 @@ class _Street:
     Attributes:
         base: The scenario without the effects.
         effects: Effects of the domain.
-        detectors: Detection zones.
+        detectors: Detection zones as they are stated.
+        installed: The same zones as they really are.
+        lanes_by_id: Lanes of the network.
         programmes: Signals of the traffic lights that follow a fixed programme, by id.
         watched: Ids of the traffic lights whose programme depends on the traffic.
         policy: Maker of the controller.
@@ -89,6 +93,8 @@ class _Street:
     base: Scenario
     effects: tuple[Effect, ...]
     detectors: tuple[Detector, ...]
+    installed: tuple[Detector, ...]
+    lanes_by_id: Mapping[str, Lane]
     programmes: Mapping[str, SignalLog]
     watched: tuple[str, ...]
     policy: PolicyFactory
@@ -172,6 +178,8 @@ def record(
         demand_as_vehicles(base),
         effects,
         detectors,
+        installed_detectors(effects, detectors),
+        network.lanes,
         fixed,
         watched,
         policy,
@@ -248,7 +256,7 @@ def _day(street: _Street, index: int, split: Split, stop: threading.Event) -> _D
         commanded = play(
             watched, street.policy, derive_seed(street.seed, "record", index, "simulation"), stop
         )
-        passages = read_passages(directory / "loops.xml", street.detectors, begin, end)
+        passages = read_passages(directory / "loops.xml", street.installed, begin, end)
         shown = switches(directory / "signals.xml", end) if street.watched else {}
         vehicles = None
         if street.lanes or street.trajectories:
@@ -289,7 +297,7 @@ def _renamed(scenario: Scenario, seed: int) -> Scenario:
 
 def _with_outputs(scenario: Scenario, street: _Street, directory: Path) -> Scenario:
     """Return the scenario with detectors, and with the other outputs that a recording needs."""
-    extra = [detectors_document(street.detectors, None, directory / "loops.xml")]
+    extra = [detectors_document(street.installed, street.lanes_by_id, directory / "loops.xml")]
     if street.watched:
         extra.append(switch_document(street.watched, directory / "signals.xml"))
     settings = scenario.settings

@@ -1,0 +1,319 @@
+"""Errors of measurement: where detectors really lie, and what they report of each vehicle.
+
+They are properties of the detectors and say nothing about drivers. A diagnosis fits them before it
+looks for effects on traffic (`ugat_marl.diagnosis.measurement`).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
+from typing import ClassVar, Literal
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ugat_marl.effects.base import (
+    EVERYWHERE,
+    NumberParameter,
+    Owner,
+    TextParameter,
+    hashed_uniform,
+)
+from ugat_marl.effects.detectors import DetectorEffect, edited
+from ugat_marl.errors import UnknownNameError
+from ugat_marl.scenarios import (
+    SPEED_POINTS,
+    Detector,
+    Passages,
+    Period,
+    SpeedPoint,
+    edge_of_lane,
+)
+
+_PLACE = TextParameter("detectors", everywhere=True)
+
+Overlap = Literal["split", "merged"]
+"""Report of vehicles that follow so closely that the detector never goes off between them:
+``split`` ends the first at the arrival of the second, ``merged`` reports one long passage."""
+
+
+def detectors_at(place: str, detectors: Sequence[Detector], effect: str = "") -> frozenset[str]:
+    """Return the ids of the detectors at a place.
+
+    Args:
+        place: ``*`` for all, the id of a detector, a kind such as ``advance``, or ``<kind>@<edge>``
+            for those of a kind on an edge.
+        detectors: All detectors.
+        effect: Name of the effect for the error.
+
+    Raises:
+        UnknownNameError: No detector is at the place.
+    """
+    groups: dict[str, set[str]] = {}
+    for detector in detectors:
+        kind, edge = detector.kind, edge_of_lane(detector.lane)
+        for group in (EVERYWHERE, kind, group_name(kind, edge)):
+            groups.setdefault(group, set()).add(detector.id)
+    for detector in detectors:
+        groups[detector.id] = {detector.id}  # an id comes before a kind of the same name
+    if place not in groups:
+        raise UnknownNameError("detectors", place, groups, f"Effect {effect!r} names them.")
+    return frozenset(groups[place])
+
+
+def _more(metres: float) -> str:
+    return "longer" if metres > 0 else "shorter"
+
+
+def group_name(kind: str, edge: str) -> str:
+    """Return the place of all detectors of a kind on an edge."""
+    return f"{kind}@{edge}"
+
+
+@dataclass(frozen=True)
+class _OfDetectors(DetectorEffect):
+    """Base of effects on a group of detectors, see `detectors_at`."""
+
+    place: str
+
+    def _changed(
+        self, detectors: Sequence[Detector], change: Callable[[Detector], Detector]
+    ) -> tuple[Detector, ...]:
+        names = detectors_at(self.place, detectors, self.name)
+        return tuple(change(one) if one.id in names else one for one in detectors)
+
+    def _edited(
+        self,
+        period: Period,
+        detectors: Sequence[Detector],
+        change: Callable[[str, Passages], Passages],
+    ) -> Period:
+        return edited(period, detectors_at(self.place, detectors, self.name), change)
+
+
+@dataclass(frozen=True)
+class DetectorOffset(_OfDetectors):
+    """Detectors lie so many m farther downstream than stated; negative means upstream."""
+
+    name: ClassVar[str] = "detector_offset"
+    on_installation: ClassVar[bool] = True
+    ranges: ClassVar[dict[str, NumberParameter]] = {"metres": NumberParameter("m", -60.0, 60.0)}
+    texts: ClassVar[dict[str, TextParameter]] = {"place": _PLACE}
+    metres: float
+
+    def in_words(self) -> str:
+        """Return the error as a predicate of its detectors."""
+        where = "upstream" if self.metres < 0 else "downstream"
+        return f"lie {abs(self.metres):.3g} m farther {where} than stated"
+
+    def installed(self, detectors: Sequence[Detector]) -> tuple[Detector, ...]:
+        """Move the zones along their lanes, but not beyond the start of the lane."""
+        return self._changed(
+            detectors, lambda one: replace(one, position_m=max(one.position_m + self.metres, 0.0))
+        )
+
+    def observe(self, period: Period, detectors: Sequence[Detector], owner: Owner) -> Period:
+        """Check the place; the passages are recorded at the true position already."""
+        del owner
+        detectors_at(self.place, detectors, self.name)
+        return period
+
+
+@dataclass(frozen=True)
+class DetectorZone(_OfDetectors):
+    """Zones of detectors are so many m longer than stated, at their downstream end."""
+
+    name: ClassVar[str] = "detector_zone"
+    on_installation: ClassVar[bool] = True
+    ranges: ClassVar[dict[str, NumberParameter]] = {"metres": NumberParameter("m", -30.0, 30.0)}
+    texts: ClassVar[dict[str, TextParameter]] = {"place": _PLACE}
+    metres: float
+
+    def in_words(self) -> str:
+        """Return the error as a predicate of its detectors."""
+        return f"have zones {abs(self.metres):.3g} m {_more(self.metres)} than stated"
+
+    def installed(self, detectors: Sequence[Detector]) -> tuple[Detector, ...]:
+        """Change the lengths of the zones, at least to 0."""
+        return self._changed(
+            detectors, lambda one: replace(one, length_m=max(one.length_m + self.metres, 0.0))
+        )
+
+    def observe(self, period: Period, detectors: Sequence[Detector], owner: Owner) -> Period:
+        """Check the place; the passages are recorded over the true zone already."""
+        del owner
+        detectors_at(self.place, detectors, self.name)
+        return period
+
+
+@dataclass(frozen=True)
+class DetectorSpeeds(_OfDetectors):
+    """Detectors measure speeds at another point of the passage than stated."""
+
+    name: ClassVar[str] = "detector_speeds"
+    on_installation: ClassVar[bool] = True
+    texts: ClassVar[dict[str, TextParameter]] = {
+        "place": _PLACE,
+        "point": TextParameter("point of a passage", allowed=SPEED_POINTS),
+    }
+    point: SpeedPoint
+
+    def in_words(self) -> str:
+        """Return the error as a predicate of its detectors."""
+        where = {"front": "when the front arrives", "rear": "when the rear leaves"}
+        return f"measure speeds {where.get(self.point, 'in the mean of front and rear')}"
+
+    def installed(self, detectors: Sequence[Detector]) -> tuple[Detector, ...]:
+        """Set the point at which speeds are measured."""
+        return self._changed(detectors, lambda one: replace(one, speed_at=self.point))
+
+    def observe(self, period: Period, detectors: Sequence[Detector], owner: Owner) -> Period:
+        """Check the place; the speeds are recorded at the true point already."""
+        del owner
+        detectors_at(self.place, detectors, self.name)
+        return period
+
+
+@dataclass(frozen=True)
+class DetectorExtension(_OfDetectors):
+    """Detectors stay on for so many s after the rear has left.
+
+    A negative number is a delay: detectors go on only when a vehicle has been there for so long.
+    A vehicle that leaves earlier is not reported.
+
+    Controllers and detector units can do both. NTCIP 1202, objects 2.3.2.6 (vehicleDetectorExtend,
+    up to 25.5 s) and 2.3.2.5 (vehicleDetectorDelay).
+    """
+
+    name: ClassVar[str] = "detector_extension"
+    ranges: ClassVar[dict[str, NumberParameter]] = {"seconds": NumberParameter("s", -5.0, 10.0)}
+    texts: ClassVar[dict[str, TextParameter]] = {
+        "place": _PLACE,
+        "overlap": TextParameter("report of close vehicles", allowed=("split", "merged")),
+    }
+    seconds: float
+    overlap: Overlap
+
+    def in_words(self) -> str:
+        """Return the error as a predicate of its detectors."""
+        if self.seconds < 0:
+            return f"go on {-self.seconds:.3g} s after a vehicle arrives"
+        return f"stay on {self.seconds:.3g} s after a vehicle has left"
+
+    def observe(self, period: Period, detectors: Sequence[Detector], owner: Owner) -> Period:
+        """Move the ends, or for a delay the begins, of all passages."""
+        del owner
+
+        def extended(name: str, passages: Passages) -> Passages:
+            del name
+            if self.seconds < 0:
+                late = replace(passages, on_s=passages.on_s - self.seconds)
+                return late.at(~(late.on_s >= late.off_s))
+            longer = replace(passages, off_s=passages.off_s + self.seconds)
+            return _merged(longer) if self.overlap == "merged" else longer
+
+        return self._edited(period, detectors, extended)
+
+
+def _merged(passages: Passages) -> Passages:
+    """Return passages in which each group without an off in between is one passage.
+
+    It has the speed and the length of its first vehicle.
+    """
+    if not len(passages):
+        return passages
+    on = np.where(np.isnan(passages.on_s), -np.inf, passages.on_s)
+    off = np.where(np.isnan(passages.off_s), np.inf, passages.off_s)
+    latest = np.maximum.accumulate(off)
+    first = np.append(True, on[1:] > latest[:-1])
+    last = np.append(first[1:], True)
+    ends = latest[last]
+    return replace(passages.at(first), off_s=np.where(np.isfinite(ends), ends, np.nan))
+
+
+@dataclass(frozen=True)
+class DetectorPulse(_OfDetectors):
+    """Detectors report a pulse of so many s per vehicle, not its presence."""
+
+    name: ClassVar[str] = "detector_pulse"
+    ranges: ClassVar[dict[str, NumberParameter]] = {"seconds": NumberParameter("s", 0.01, 2.0)}
+    texts: ClassVar[dict[str, TextParameter]] = {"place": _PLACE}
+    seconds: float
+
+    def in_words(self) -> str:
+        """Return the error as a predicate of its detectors."""
+        return f"report pulses of {self.seconds:.3g} s instead of presence"
+
+    def observe(self, period: Period, detectors: Sequence[Detector], owner: Owner) -> Period:
+        """End all passages after the pulse; a vehicle that came before the period has none."""
+        del owner
+
+        def pulsed(name: str, passages: Passages) -> Passages:
+            del name
+            known = passages.at(np.isfinite(passages.on_s))
+            return replace(known, off_s=known.on_s + self.seconds)
+
+        return self._edited(period, detectors, pulsed)
+
+
+@dataclass(frozen=True)
+class DetectorSplash(_OfDetectors):
+    """Detectors also report this share of the vehicles over those of the next lanes."""
+
+    name: ClassVar[str] = "detector_splash"
+    ranges: ClassVar[dict[str, NumberParameter]] = {"share": NumberParameter("", 0.0, 1.0)}
+    texts: ClassVar[dict[str, TextParameter]] = {"place": _PLACE}
+    share: float
+
+    def in_words(self) -> str:
+        """Return the error as a predicate of its detectors."""
+        return f"also report {100 * self.share:.3g} % of the vehicles on the next lanes"
+
+    def observe(self, period: Period, detectors: Sequence[Detector], owner: Owner) -> Period:
+        """Add passages of the next lanes, chosen by a hash of the detector, number and time."""
+        del owner
+        beside = next_detectors(detectors)
+
+        def splashed(name: str, passages: Passages) -> Passages:
+            parts = [passages]
+            for other in beside.get(name, ()):
+                seen = period.passages.get(other, Passages.none())
+                parts.append(seen.at(self._chosen(name, other, seen)))
+            return joined(parts)
+
+        return self._edited(period, detectors, splashed)
+
+    def _chosen(self, name: str, other: str, seen: Passages) -> NDArray[np.bool_]:
+        times = np.where(np.isnan(seen.on_s), seen.off_s, seen.on_s)
+        return np.array(
+            [
+                hashed_uniform("splash", name, other, str(n), f"{time:.3f}") < self.share
+                for n, time in enumerate(times.tolist())
+            ],
+            dtype=np.bool_,
+        )
+
+
+def next_detectors(detectors: Sequence[Detector]) -> dict[str, tuple[str, ...]]:
+    """Return the detectors of the same kind on the lanes beside, by detector."""
+    by_place: dict[tuple[str, str], list[str]] = {}
+    for detector in detectors:
+        by_place.setdefault((detector.lane, detector.kind), []).append(detector.id)
+    beside: dict[str, tuple[str, ...]] = {}
+    for detector in detectors:
+        edge, _, number = detector.lane.rpartition("_")
+        lanes = (f"{edge}_{int(number) + step}" for step in (-1, 1))
+        others = [name for lane in lanes for name in by_place.get((lane, detector.kind), ())[:1]]
+        beside[detector.id] = tuple(others)
+    return beside
+
+
+def joined(parts: Sequence[Passages]) -> Passages:
+    """Return several passages as one, sorted by time."""
+    columns = [
+        np.concatenate([getattr(part, key) for part in parts])
+        for key in ("on_s", "off_s", "speed_mps", "length_m")
+    ]
+    times = np.where(np.isnan(columns[0]), columns[1], columns[0])
+    return Passages(*columns).at(np.argsort(times, kind="stable"))
