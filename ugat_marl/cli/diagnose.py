@@ -21,7 +21,7 @@ from ugat_marl.diagnosis import (
     default_cache,
     diagnose,
 )
-from ugat_marl.effects import known_effects, load_scenario
+from ugat_marl.effects import known_effects, load_scenario, measurement_effects
 from ugat_marl.errors import OptionError, OutputError
 from ugat_marl.files import require_writable
 from ugat_marl.progress import Bars
@@ -172,4 +172,4 @@ def _say_what_cannot_be_seen(measured: MeasuredData, console: Console) -> None:
 
 def _in_the_model(effect: NamedEffect) -> bool:
     """Return true if an effect changes the traffic, not only the detections."""
-    return not known_effects()[effect.name].on_detectors
+    return not {**known_effects(), **measurement_effects()}[effect.name].on_detectors

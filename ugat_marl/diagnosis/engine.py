@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import copy
 import functools
 import hashlib
 import io
@@ -11,7 +12,7 @@ import time
 import zipfile
 import zlib
 from collections import OrderedDict
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from concurrent.futures import Executor, ThreadPoolExecutor
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -22,6 +23,7 @@ from numpy.typing import NDArray
 
 from ugat_marl.data import installed_version
 from ugat_marl.diagnosis.features import FEATURES, DetectorLayout, Greens, Tally, tally
+from ugat_marl.diagnosis.measurement import Sightings
 from ugat_marl.diagnosis.replay import Day, Due, Replay, Unmeasured, corrected
 from ugat_marl.diagnosis.thresholds import Thresholds
 from ugat_marl.effects import Effect
@@ -182,6 +184,48 @@ class Engine:
         self._edges = sorted({edge for _, edge, _ in layout.places})
         self._signals = [_signals_hash(period, replay.answering) for period in periods]
         self._known_by: Callable[[], None] | None = None
+        self._detection: tuple[Effect, ...] = ()
+
+    def detecting(self, errors: Sequence[Effect]) -> Engine:
+        """Return a simulator of the same days, seen by detectors with errors of measurement.
+
+        Args:
+            errors: Errors of measurement, which then belong to every model.
+        """
+        if not errors:
+            return self
+        other = copy.copy(self)
+        other.__dict__.pop("usual", None)
+        other._detection = tuple(errors)
+        other._replay = self._replay.detecting(errors)
+        return other
+
+    def sightings(self, numbers: Sequence[int], advance: Callable[[], None]) -> list[Sightings]:
+        """Return what single vehicles did at the detectors on days of the scenario as it is.
+
+        Args:
+            numbers: Numbers of the days.
+            advance: Function to call after each day.
+
+        Raises:
+            OutOfTime: The budget is spent and a day is not in the cache.
+        """
+
+        def one(number: int) -> Sightings:
+            key = self._key((), number) + "-vehicles"
+            arrays = self._stored(key)
+            if arrays is None:
+                period = self._unmeasured.kept_from(self._day((), number).period)
+                greens = self._greens[number % len(self.periods)]
+                seen = Sightings.of(self.layout, period, greens, self._thresholds)
+                self._store(key, seen.arrays())
+            else:
+                seen = Sightings.from_arrays(arrays)
+            advance()
+            return seen
+
+        (days,) = self._together(one, [numbers])
+        return days
 
     @property
     def known(self) -> int:
@@ -267,7 +311,7 @@ class Engine:
         """
 
         def one(number: int) -> Replicate:
-            day = self._one(tuple(effects), number)
+            day = self._one((*self._detection, *effects), number)
             if advance is not None:
                 advance()
             return day
@@ -294,7 +338,7 @@ class Engine:
 
         def one(day: tuple[Sequence[Effect], int]) -> None:
             with contextlib.suppress(SimulatorError, OptionError, ScenarioError):
-                self._one(tuple(day[0]), day[1])
+                self._one((*self._detection, *day[0]), day[1])
 
         days = [[(effects, number) for number in numbers] for effects, numbers in models]
         self._together(one, days, advance)
@@ -369,8 +413,8 @@ class Engine:
 
     def _day(self, effects: tuple[Effect, ...], number: int) -> Day:
         """Return a day as the detectors saw it; faults of detectors need no new simulation."""
-        faults = tuple(effect for effect in effects if effect.on_detectors)
-        physics = tuple(effect for effect in effects if not effect.on_detectors)
+        faults = tuple(effect for effect in effects if _after_simulation(effect))
+        physics = tuple(effect for effect in effects if not _after_simulation(effect))
         key = self._key(physics, number)
         day = self._days.get(key)
         if day is None:
@@ -402,28 +446,22 @@ class Engine:
         return hashlib.sha256(text.encode()).hexdigest()
 
     def _remembered(self, key: str) -> Replicate | None:
-        if self._cache is None:
+        stored = self._stored(key)
+        if stored is None:
             return None
         try:
-            with np.load(self._cache / key[:2] / f"{key}.npz", allow_pickle=False) as stored:
-                counted = Tally(
-                    stored["sums"].astype(np.float64), stored["bins"].astype(np.float64)
+            counted = Tally(stored["sums"].astype(np.float64), stored["bins"].astype(np.float64))
+            due = None
+            if "asked" in stored:
+                asked, given = (
+                    dict(zip(self._edges, stored[name], strict=True)) for name in ("asked", "given")
                 )
-                due = None
-                if "asked" in stored:
-                    asked, given = (
-                        dict(zip(self._edges, stored[name], strict=True))
-                        for name in ("asked", "given")
-                    )
-                    due = Due(asked, given)
-                return self._with_due(counted, float(stored["travel_time_s"]), due)
-        except (OSError, EOFError, ValueError, KeyError, zipfile.BadZipFile, zlib.error):
-            return None  # absent or damaged: simulated again
+                due = Due(asked, given)
+            return self._with_due(counted, float(stored["travel_time_s"]), due)
+        except (ValueError, KeyError):
+            return None  # damaged: simulated again
 
     def _remember(self, key: str, day: Replicate) -> None:
-        if self._cache is None:
-            return
-        content = io.BytesIO()
         counted = day.counted or day.tally
         arrays: dict[str, Any] = {
             "sums": counted.sums,
@@ -433,8 +471,28 @@ class Engine:
         if day.due is not None:
             for name, of_edge in (("asked", day.due.asked), ("given", day.due.given)):
                 arrays[name] = np.stack([of_edge[edge] for edge in self._edges])
-        np.savez_compressed(content, **arrays)
-        write_whole(self._cache / key[:2] / f"{key}.npz", content.getvalue())
+        self._store(key, arrays)
+
+    def _stored(self, key: str) -> dict[str, Any] | None:
+        """Return the arrays under a key of the cache; None if absent or damaged."""
+        if self._cache is None:
+            return None
+        try:
+            with np.load(self._cache / key[:2] / f"{key}.npz", allow_pickle=False) as stored:
+                return {name: stored[name] for name in stored.files}
+        except (OSError, EOFError, ValueError, KeyError, zipfile.BadZipFile, zlib.error):
+            return None
+
+    def _store(self, key: str, arrays: Mapping[str, Any]) -> None:
+        if self._cache is not None:
+            content = io.BytesIO()
+            np.savez_compressed(content, **arrays)
+            write_whole(self._cache / key[:2] / f"{key}.npz", content.getvalue())
+
+
+def _after_simulation(effect: Effect) -> bool:
+    """Return True if the effect can be applied to a day that was simulated without it."""
+    return effect.on_detectors and not effect.on_installation
 
 
 def default_cache() -> Path:

@@ -8,7 +8,14 @@ from typing import Any
 
 import numpy as np
 
-from ugat_marl.effects import EVERYWHERE, PAPER_WORLDS, Effect, ExaminedStrengths, known_effects
+from ugat_marl.effects import (
+    EVERYWHERE,
+    PAPER_WORLDS,
+    Effect,
+    ExaminedStrengths,
+    known_effects,
+    measurement_effects,
+)
 from ugat_marl.errors import OptionError, UnknownNameError
 from ugat_marl.scenarios import Scenario
 
@@ -112,8 +119,8 @@ def library(without: Collection[str] = ()) -> frozenset[str]:
     """
     names = frozenset(GLOBAL) | LOCAL | {"driver_model"}
     for name in without:
-        if name not in known_effects():
-            raise UnknownNameError("effect of the library", name, known_effects())
+        if name not in (known := {**known_effects(), **measurement_effects()}):
+            raise UnknownNameError("effect of the library", name, known)
     return names - frozenset(without)
 
 

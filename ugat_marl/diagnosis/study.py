@@ -24,6 +24,7 @@ from ugat_marl.diagnosis.features import (
 )
 from ugat_marl.diagnosis.fit import Fitter
 from ugat_marl.diagnosis.hypotheses import Hypothesis, global_hypotheses, library
+from ugat_marl.diagnosis.measurement import DetectorError, Measurement, Sightings, together
 from ugat_marl.diagnosis.places import PlaceFinder, Routes
 from ugat_marl.diagnosis.records import Fitted, Tested
 from ugat_marl.diagnosis.replay import Replay
@@ -101,6 +102,7 @@ class Study:
         other_days: Simulator of days that keep the model's own arrivals; None if the signals did
             not follow the traffic, since `engine` does the same then.
         ruled_out: Names of the effects that the data cannot show.
+        detection: Errors of measurement, which all simulated days have.
     """
 
     scenario: Scenario
@@ -117,6 +119,7 @@ class Study:
     heldout: tuple[Tally, ...]
     other_days: Engine | None = None
     ruled_out: frozenset[str] = field(default=frozenset())
+    detection: tuple[DetectorError, ...] = ()
     _doubts: dict[tuple[Effect, ...], Mapping[str, Array]] = field(default_factory=dict, init=False)
 
     @property
@@ -183,6 +186,33 @@ class Study:
     def speeds(self) -> bool:
         """True if speeds were measured."""
         return self.measured.has_speeds
+
+    def detectors_as_they_are(self, reporter: Reporter) -> Study:
+        """Find errors of measurement from what detectors say of single vehicles.
+
+        All days of the returned study are seen by detectors with these errors. See `measurement`.
+
+        Raises:
+            OutOfTime: The budget does not suffice for the days to compare with.
+        """
+        thresholds = self.config.thresholds
+        if not self.measured.has_events or not thresholds.measurement_days:
+            return self
+        numbers = range(min(thresholds.measurement_days, self.effort.base))
+        with reporter.task("the detectors", len(numbers)) as advance:
+            simulated = together(self.engine.sightings(numbers, advance))
+        seen = [
+            Sightings.of(self.layout, period, self.layout.greens(period), thresholds)
+            for period in self.measured.of("fit")
+        ]
+        measurement = Measurement(self.layout.detectors, together(seen), simulated, thresholds)
+        errors = measurement.errors(self.config.leave_out)
+        if not errors:
+            return self
+        effects = tuple(error.effect for error in errors)
+        other = None if self.other_days is None else self.other_days.detecting(effects)
+        engine = self.engine.detecting(effects)
+        return replace(self, engine=engine, other_days=other, detection=errors)
 
     def base(self, reporter: Reporter) -> Tested:
         """Simulate the scenario as it is, and test if it could have made the data.

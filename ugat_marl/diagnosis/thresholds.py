@@ -224,6 +224,92 @@ class Thresholds(DayThresholds):
     model's own arrivals to the measured ones. Set on cases without effects, with two seeds that no
     blind test uses. Halved: too many such cases are contradicted."""
 
+    # --- measurement: the detectors as they are -----------------------------------------------
+
+    measurement_days: int = 8
+    """Simulated days with which the reports of single vehicles are compared. By hand: thousands of
+    vehicles. Halved: errors of detectors are known 1.4 times less exactly."""
+    least_sightings: int = 15
+    """Vehicles below which a group of detectors is not judged by itself. By hand. Halved: medians
+    of a few vehicles are compared."""
+    touching_s: float = 0.02
+    """Time between two passages below which the detector did not go off between them, s: above the
+    rounding of logs to 10 ms. Halved: no change for logs in ms."""
+    longest_alone_s: float = 8.0
+    """Longest time of a moving vehicle over a zone, s. By hand: long zones and long extensions.
+    Halved: extensions of 4 s and more are not seen."""
+    crawling_mps: float = 1.5
+    """Speed from which a queued vehicle moves over the stop detector without a stop, m/s. By hand.
+    Halved: vehicles that stand on the detector count as moving."""
+    least_braking_mps: float = 3.0
+    """Speed from which a vehicle that brakes for a red still moves over the zone, m/s. By hand.
+    Halved: vehicles that come to rest on the detector count."""
+    least_travel_s: float = 0.5
+    """Least time of a vehicle between advance and stop detector, s. By hand. Halved: no change."""
+    longest_travel_s: float = 12.0
+    """Longest such time, s. By hand: 100 m at 30 km/h. Halved: advance detectors far upstream are
+    not judged."""
+    steady_share: float = 0.15
+    """Change of a speed between the two detectors, as a share of the limit, beyond which a vehicle
+    did not drive steadily. By hand. Halved: fewer vehicles, each more exact."""
+    twin_s: float = 0.15
+    """Difference of two passages on adjacent lanes below which they are twins, s. By hand. Halved:
+    detectors with unlike response times do not show splash."""
+    inexact: float = 0.01
+    """Share by which kinematics of simulated and real vehicles may differ. By hand. Halved: errors
+    of detectors by small differences of driving are named."""
+    bent: float = 0.5
+    """The same for vehicles that accelerate, as a share of their difference from steady ones. By
+    hand: drivers may accelerate half or one and a half times as hard. Halved: slow drivers look
+    like speeds measured elsewhere."""
+    unlike: float = 0.015
+    """The same for queues and vehicles that brake, added to both. By hand. Halved: as above."""
+    sure_of_a_point: float = 9.0
+    """Difference in cost from which speeds are not taken for those of the rear. By hand: three
+    deviations. Halved: slow drivers look like speeds measured elsewhere."""
+    price_of_an_error: float = 8.0
+    """Price of an error of a group of detectors, in squared deviations. By hand. Halved: approaches
+    are judged apart from each other by chance."""
+    merged_share: float = 0.3
+    """Share of the expected passages without a gap below which close vehicles are reported as one.
+    By hand. Halved: more such reports count as split."""
+    speed_doubt: float = 0.15
+    """Standard deviation of the speed of lone vehicles if speeds are not measured, as a share. By
+    hand: limits are driven at 85 to 115 %. Halved: slow drivers look like long extensions."""
+    queue_doubt: float = 0.5
+    """The same for vehicles in a queue, or behind a stop line. By hand: slow drivers need half as
+    much time again. Halved: as above."""
+    pace_doubt: float = 0.04
+    """Share by which a distance may differ if speeds come from times over zones. By hand. Halved:
+    drivers who brake early look like detectors elsewhere."""
+    usual_extension_s: float = 1.0
+    """Prior standard deviation of an extension, s. NTCIP 1202 allows 0 to 25.5 s, and most are
+    within 2 s. Halved: extensions of 3 s are drawn towards 0 where data are few."""
+    usual_zone_m: float = 3.0
+    """Prior standard deviation of the length of a zone, m: half of a usual loop of 6 ft by 20 ft,
+    FHWA Traffic Detector Handbook (2006). Halved: long zones are drawn towards what is stated."""
+    usual_offset_m: float = 15.0
+    """Prior standard deviation of the position of an advance detector, m. By hand: setbacks are
+    read off plans, and sometimes given to another point. Halved: large errors are drawn to 0."""
+    named_deviations: float = 4.0
+    """Standard errors beyond which an error of detectors is named. By hand: many groups are judged.
+    Halved: one group in twenty is blamed by chance."""
+    least_extension_s: float = 0.15
+    """Extension below which it does not matter, s: above the response time of loop detectors.
+    Halved: response times are named."""
+    least_zone_m: float = 1.0
+    """Error of a zone's length below which it does not matter, m. By hand: the field of a loop
+    reaches beyond its edge by as much. Halved: such fields are named."""
+    least_offset_m: float = 3.0
+    """Error of a position below which it does not matter, m. By hand: setbacks are read off plans.
+    Halved: errors are named that hardly change any statistic."""
+    least_splash: float = 0.02
+    """Share of vehicles reported by the next lane too from which it matters. By hand. Halved:
+    chance is named more often."""
+    pulse_share: float = 0.9
+    """Share of passages with nearly the same time from which a detector reports pulses. By hand.
+    Halved: dense traffic at one speed looks like pulses."""
+
     # --- locate and propose -------------------------------------------------------------------
 
     heavy_tail: float = 6.0

@@ -10,6 +10,7 @@ from scipy import stats
 
 from ugat_marl.diagnosis.features import FEATURES, DetectorLayout
 from ugat_marl.diagnosis.hypotheses import WINDOW, Hypothesis, Members
+from ugat_marl.diagnosis.measurement import DetectorError
 from ugat_marl.diagnosis.places import one_behind_the_other
 from ugat_marl.diagnosis.records import (
     Conclusion,
@@ -81,7 +82,10 @@ def conclude(
 
 
 def unchallenged(
-    located: Located, ruled_out: Collection[str], timing: Sequence[Effect]
+    located: Located,
+    ruled_out: Collection[str],
+    timing: Sequence[Effect],
+    detection: Sequence[DetectorError] = (),
 ) -> Conclusion:
     """Conclude that the scenario as it is could have made the data.
 
@@ -89,15 +93,17 @@ def unchallenged(
         located: Comparison of the scenario as it is with the data.
         ruled_out: Names of effects that the data cannot show.
         timing: Effects that are read off the signal log.
+        detection: Errors of measurement.
     """
     blind = f"; {len(ruled_out)} effects could not be examined" if ruled_out else ""
     sentence = f"Nothing in the data contradicts the scenario as it is{blind}."
-    if timing:
-        named = " and ".join(map(str, timing))
-        sentence = f"The signal log has {named}; with that, nothing contradicts the scenario."
+    if timing or detection:
+        known = [f"the signal log has {' and '.join(map(str, timing))}"] if timing else []
+        known += [describe_errors(detection)] if detection else []
+        sentence = f"{capitalised('; '.join(known))}; with that, nothing contradicts the scenario."
     if not located.complete:
         sentence += " The budget ended before single effects were looked for."
-    verdict = "explained" if timing else "no_discrepancy"
+    verdict = "explained" if timing or detection else "no_discrepancy"
     return Conclusion(verdict, located.base, (), sentence, None)
 
 
@@ -250,6 +256,24 @@ def describe_effect(hypothesis: Hypothesis, values: tuple[float, ...]) -> str:
         if present and name not in ("factor", "share"):
             text += f" (scenario: {present:.3g})"
     return text
+
+
+def describe_errors(errors: Sequence[DetectorError]) -> str:
+    """Describe errors of measurement as a part of a sentence, such as ``all detectors ...``."""
+    return listed([describe_error(error.effect) for error in errors])
+
+
+def describe_error(error: Effect) -> str:
+    """Describe one error of measurement, with the detectors it is about."""
+    values = error.record()
+    kind, _, edge = str(values["place"]).partition("@")
+    noun = {"*": "all detectors"}.get(kind, f"{kind} detectors")
+    return f"{noun}{f' of approach {edge}' if edge else ''} {error.in_words()}"
+
+
+def capitalised(text: str) -> str:
+    """Return a text that begins with a capital letter."""
+    return text[:1].upper() + text[1:]
 
 
 def place_and_window(

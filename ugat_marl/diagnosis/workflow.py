@@ -38,7 +38,14 @@ from ugat_marl.diagnosis.records import (
     Verified,
 )
 from ugat_marl.diagnosis.study import IN_THE_LOG, DiagnosisConfig, Study, timing_effects
-from ugat_marl.diagnosis.verdict import conclude, effect_record, unchallenged, unverified
+from ugat_marl.diagnosis.verdict import (
+    capitalised,
+    conclude,
+    describe_errors,
+    effect_record,
+    unchallenged,
+    unverified,
+)
 from ugat_marl.diagnosis.verify import tables_of, verify_model
 from ugat_marl.effects import Effect, apply_effects
 from ugat_marl.progress import Reporter, Silent
@@ -79,8 +86,10 @@ def diagnose(
         reporter.say(f"note: {finding.text}")
     read = timing_effects(scenario, study.network, measured, config.thresholds)
     timing = tuple(effect for effect in read if effect.name not in config.leave_out)
-    named = timing
+    named: tuple[Effect, ...] = ()
     try:
+        study = study.detectors_as_they_are(reporter)
+        named = tuple(error.effect for error in study.detection)
         base = study.base(reporter)
     except OutOfTime:
         diagnosis = _nothing_simulated(study, timing)
@@ -90,6 +99,7 @@ def diagnose(
     place = directory / CORRECTED
     if (place / "scenario.toml").is_file():  # written by an earlier diagnosis
         shutil.rmtree(place)
+    named = (*timing, *named)
     if named:
         apply_effects(scenario, named).write(place)
         diagnosis = replace(diagnosis, corrected=CORRECTED)
@@ -111,12 +121,22 @@ def _compared(
     located = locate_gap(study, base, selector)
     if located.base.residual.p > study.config.alpha:
         verified = verify_model(study, located.base, located.base)
-        conclusion = unchallenged(located, study.ruled_out, timing)
+        conclusion = unchallenged(located, study.ruled_out, timing, study.detection)
         return _record(study, timing, located, None, verified, conclusion), ()
     selected = selector.select(located)
+
+    def told(conclusion: Conclusion) -> Conclusion:
+        """Say first what is wrong with the detectors."""
+        if not study.detection or conclusion.verdict == "no_discrepancy":
+            return conclusion
+        errors = capitalised(describe_errors(study.detection))
+        return replace(conclusion, sentence=f"{errors}. {conclusion.sentence}")
+
     try:
         verified = verify_model(study, located.base, selected.best)
-        conclusion = conclude(located, selected, selector, verified, study.config, study.layout)
+        conclusion = told(
+            conclude(located, selected, selector, verified, study.config, study.layout)
+        )
         if conclusion.verdict == "no_discrepancy":
             verified = Verified(verified.before, verified.before, None)
             conclusion = _beside_the_log(study, located, conclusion, timing)
@@ -124,6 +144,7 @@ def _compared(
     except OutOfTime:
         selected = replace(selected, complete=False)
         verified, conclusion = unverified(located, selected)
+        conclusion = told(conclusion)
         diagnosis = _record(study, timing, located, selected, verified, conclusion, tables=False)
     return diagnosis, () if conclusion.verdict == "unknown" else conclusion.best.model.effects
 
@@ -131,10 +152,10 @@ def _compared(
 def _beside_the_log(
     study: Study, located: Located, conclusion: Conclusion, timing: tuple[Effect, ...]
 ) -> Conclusion:
-    """Add the effects read off the signal log to a conclusion that names no effects."""
-    if not timing:
+    """Add effects that need no search to a conclusion that names no effects."""
+    if not timing and not study.detection:
         return conclusion
-    alone = unchallenged(located, study.ruled_out, timing)
+    alone = unchallenged(located, study.ruled_out, timing, study.detection)
     sentence = f"{alone.sentence} {conclusion.sentence}"
     return replace(conclusion, verdict=alone.verdict, sentence=sentence)
 
@@ -229,7 +250,13 @@ def _begun(
         versions=installed_versions("ugat-marl", "eclipse-sumo"),
         verdict=verdict,
         sentence=sentence,
-        effects=tuple(_from_the_log(effect) for effect in timing),
+        effects=(
+            *(_without_search(effect, "signal log") for effect in timing),
+            *(
+                _without_search(error.effect, "detections of single vehicles", error.margin or 0.0)
+                for error in study.detection
+            ),
+        ),
         where=(),
         left=(),
         alternatives=(),
@@ -272,16 +299,17 @@ def _named(best: Tested, selected: Selected, half_interval: float) -> tuple[Name
     return tuple(effects)
 
 
-def _from_the_log(effect: Effect) -> NamedEffect:
-    """Return the record of an effect read off the signal log; its intervals have no width."""
+def _without_search(effect: Effect, source: str, margin: float = 0.0) -> NamedEffect:
+    """Return the record of an effect read off the data; `margin` is half its 95 % interval."""
     values = effect.record()
     name = str(values.pop("name"))
-    numbers = {key: float(value) for key, value in values.items()}
+    texts = [str(values[key]) for key in effect.texts]
+    numbers = {key: (float(values[key]), limits.unit) for key, limits in effect.ranges.items()}
     parameters = {
-        key: Parameter(value, value, value, effect.ranges[key].unit)
-        for key, value in numbers.items()
+        key: Parameter(value, value - margin, value + margin, unit)
+        for key, (value, unit) in numbers.items()
     }
-    return NamedEffect(name, None, None, parameters, LogGrounds("signal log"))
+    return NamedEffect(name, ">".join(texts) or None, None, parameters, LogGrounds(source))
 
 
 def _with_grounds(effect: EffectRecord, grounds: SearchGrounds) -> NamedEffect:

@@ -1,0 +1,190 @@
+"""Errors of measurement, from equations solved by hand and from vehicles that were made up."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+import pytest
+
+from ugat_marl.diagnosis.features import DetectorLayout, Greens, IncomingLane
+from ugat_marl.diagnosis.measurement import (
+    ALONE,
+    Equation,
+    Measurement,
+    Sightings,
+    by_place,
+    solved,
+    together,
+)
+from ugat_marl.diagnosis.thresholds import Thresholds
+from ugat_marl.scenarios import Detector, Passages, Period
+
+THRESHOLDS = Thresholds()
+CAR_M, GAP_M = 5.0, 50.0
+"""Length of every vehicle, and stated distance of the detectors."""
+DETECTORS = (
+    Detector("far", "in_0", 100.0, 0.0, "advance"),
+    Detector("far left", "in_1", 100.0, 0.0, "advance"),
+    Detector("line", "in_0", 150.0, 0.0, "stop"),
+    Detector("line left", "in_1", 150.0, 0.0, "stop"),
+)
+LANES = tuple(
+    IncomingLane(
+        f"in_{n}", "in", 0, (n,), 14.0, {"advance": (f"far{name}",), "stop": (f"line{name}",)}
+    )
+    for n, name in enumerate(("", " left"))
+)
+LAYOUT = DetectorLayout(("A",), LANES, (), DETECTORS, {})
+GREEN = Greens(
+    np.array([0.0]), np.array([3600.0]), np.array([3603.0]), np.array([3604.0]), np.array([True])
+)
+
+
+def crossings(times: np.ndarray, speeds: np.ndarray, extension_s: float = 0.0) -> Passages:
+    return Passages(times, times + CAR_M / speeds + extension_s, speeds, np.full(len(times), CAR_M))
+
+
+def day(
+    seed: int,
+    *,
+    extension_s: float = 0.0,
+    distance_m: float = GAP_M,
+    zone_m: float = 0.0,
+    twins: float = 0.0,
+    speeds: bool = True,
+) -> Sightings:
+    """One period of steady vehicles that drive by themselves."""
+    generator = np.random.default_rng(seed)
+    passages: dict[str, Passages] = {}
+    for name in ("", " left"):
+        times = 10.0 + np.cumsum(generator.uniform(12.0, 20.0, 150))
+        pace = generator.uniform(8.0, 15.0, 150)
+        more = extension_s + zone_m / pace
+        for place, at in ((f"far{name}", times), (f"line{name}", times + distance_m / pace)):
+            seen = crossings(at, pace)
+            passages[place] = Passages(seen.on_s, seen.off_s + more, pace, seen.length_m)
+    chosen = generator.random(150) < twins
+    whole = passages["far"]
+    splash = [
+        np.concatenate([getattr(passages["far left"], key), getattr(whole, key)[chosen]])
+        for key in ("on_s", "off_s", "speed_mps", "length_m")
+    ]
+    order = np.argsort(splash[0])
+    passages["far left"] = Passages(*splash).at(order)
+    if not speeds:
+        none = np.full(len(whole), np.nan)
+        passages = {
+            name: Passages(x.on_s, x.off_s, none[: len(x)], none[: len(x)])
+            for name, x in passages.items()
+            if name != "far left"
+        }
+    period = Period("day", 0.0, 3600.0, "fit", {}, passages)
+    return Sightings.of(LAYOUT, period, [GREEN, GREEN], THRESHOLDS)
+
+
+def named(measured: Sightings, simulated: Sightings) -> list[str]:
+    errors = Measurement(DETECTORS, measured, simulated, THRESHOLDS).errors()
+    return [str(error.effect) for error in errors]
+
+
+def test_a_line_through_two_regimes_gives_extension_and_zone() -> None:
+    # y = 0.5 v / reach + 2 / reach for reach 5 m at 5 and 15 m/s
+    rows = [Equation(0.5 * v / 5 + 2 / 5, (v / 5, 1 / 5), 0.0, 1e-3) for v in (5.0, 15.0)]
+    solution = solved(rows, 1.0, (1.0, 3.0), 8.0)
+    assert [x.value for x in solution.estimates] == pytest.approx([0.5, 2.0], rel=1e-3)
+    # (a / sd)^2 of the prior, and two parameters
+    assert solution.cost == pytest.approx(0.5**2 + (2 / 3) ** 2 + 16, rel=1e-3)
+
+
+def test_parameters_that_are_not_needed_are_nothing() -> None:
+    rows = [Equation(0.5 * v / 5, (v / 5, 1 / 5), 0.0, 1e-3) for v in (5.0, 15.0)]
+    first, second = solved(rows, 1.0, (1.0, 3.0), 8.0).estimates
+    assert (round(first.value, 3), second.value, second.error) == (0.5, 0.0, 0.0)
+    assert solved([Equation(0.01, (1.0,), 0.0, 0.01)], 1.0, (1.0,), 8.0).cost == pytest.approx(1)
+
+
+def test_bends_are_taken_off_in_the_direction_of_the_point() -> None:
+    rows = [Equation(-0.2, (1.0,), 0.2, 0.01)]
+    assert [solved(rows, x, (1.0,), 8.0).cost for x in (1.0, 0.0, -1.0)] == pytest.approx(
+        [8 + 0.4**2, 8 + 0.2**2, 0.0], abs=0.1
+    )
+
+
+def test_the_fewest_numbers_that_suffice_are_taken() -> None:
+    def rows(value: float) -> list[Equation]:
+        return [Equation(value, (1.0,), 0.0, 0.01)]
+
+    def places(**of: float) -> dict[str, float]:
+        groups = {tuple(name.split("_")): rows(value) for name, value in of.items()}
+        found, _ = by_place(groups, 0.0, (1.0,), 8.0)  # pyright: ignore[reportArgumentType]
+        return {place: round(x.estimates[0].value, 2) for place, x in found.items()}
+
+    assert places(stop_a=1.0, stop_b=1.0, exit_a=1.0) == {"*": 1.0}
+    assert places(stop_a=1.0, stop_b=1.0, exit_a=0.0) == {"stop": 1.0, "exit": 0.0}
+    assert places(stop_a=1.0, stop_b=0.0) == {"stop@a": 1.0, "stop@b": 0.0}
+    assert places(stop_a=0.0, stop_b=0.01) == {"*": 0.0}
+
+
+@pytest.mark.parametrize(
+    ("hidden", "place", "value"),
+    [
+        ({"extension_s": 1.0}, "detector_extension=*", 1.0),
+        ({"zone_m": 3.0}, "detector_zone=*", 3.0),
+        ({"distance_m": GAP_M + 18.0}, "detector_offset=advance", -18.0),
+        ({"distance_m": GAP_M - 10.0}, "detector_offset=advance", 10.0),
+        ({"twins": 0.1}, "detector_splash=advance", 0.1),
+    ],
+)
+def test_what_is_wrong_is_named_and_nothing_else(
+    hidden: dict[str, Any], place: str, value: float
+) -> None:
+    usual = together([day(seed) for seed in range(3)])
+    (only,) = named(together([day(seed, **hidden) for seed in (7, 8)]), usual)
+    assert only.startswith(f"{place},")
+    # of lone vehicles half have a splash, since the other lane reports none of theirs
+    share = 0.5 if "twins" in hidden else 1.0
+    assert float(only.split(",")[1]) == pytest.approx(share * value, rel=0.3 if share < 1 else 0.03)
+
+
+def test_nothing_is_named_where_nothing_is_wrong() -> None:
+    usual = together([day(seed) for seed in range(3)])
+    assert named(together([day(seed) for seed in (7, 8)]), usual) == []
+
+
+def test_slower_drivers_are_no_error_of_detectors() -> None:
+    usual = together([day(seed) for seed in range(3)])
+    slow = day(9)
+    slow.passages[:, 3] *= 0.8
+    slow.passages[:, 2] /= 0.8
+    slow.pairs[:, 1] /= 0.8
+    slow.pairs[:, 2] *= 0.8
+    assert named(slow, usual) == []
+
+
+def test_extensions_are_seen_without_speeds() -> None:
+    usual = together([day(seed, speeds=False) for seed in range(3)])
+    found = named(day(7, extension_s=1.0, speeds=False), usual)
+    (only,) = found
+    assert only.startswith("detector_extension=*,")
+    assert float(only.split(",")[1]) == pytest.approx(1.0, abs=0.03)
+    assert named(day(7, speeds=False), usual) == []
+
+
+def test_pulses_are_seen() -> None:
+    usual = together([day(seed) for seed in range(3)])
+    pulses = day(7)
+    pulses.passages[:, 2] = 0.1
+    assert named(pulses, usual)[:2] == [
+        "detector_pulse=advance@in,0.1",
+        "detector_pulse=stop@in,0.1",
+    ]
+
+
+def test_sightings_are_stored_and_read() -> None:
+    one = day(1)
+    again = Sightings.from_arrays(one.arrays())
+    for key, values in one.arrays().items():
+        np.testing.assert_array_equal(again.arrays()[key], values)
+    assert (one.passages[:, 1] == ALONE).all()
+    assert len((one + again).pairs) == 2 * len(one.pairs) > 0

@@ -1,0 +1,66 @@
+"""Errors of measurement of every kind are read off, and drivers are not taken for them."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import pytest
+
+from ugat_marl.diagnosis import DiagnosisConfig, Study
+from ugat_marl.diagnosis.thresholds import Effort
+from ugat_marl.progress import Silent
+
+pytestmark = pytest.mark.slow
+
+FAMILIES = {
+    "extension": ("detector_extension=*,1,split", "detector_extension=*", 1.0),
+    "delay": ("detector_extension=*,-0.2,split", "detector_extension=*", -0.2),
+    "upstream": ("detector_offset=advance,-12", "detector_offset=advance", -12.0),
+    "zone": ("detector_zone=*,4", "detector_zone=*", 4.0),
+    "front": ("detector_speeds=*,front", "detector_speeds=*,front", None),
+    "pulse": ("detector_pulse=*,0.15", "detector_pulse=", 0.15),
+}
+DRIVERS = ("acceleration=1.2", "headway=1.5", "desired_speed=0.8", "heavy_share=0.2")
+
+
+def read_off(street, domain: str) -> list[str]:
+    measured = street.measure(domain, periods=3)
+    effort = Effort(base=32, bank=2, fit=5, test=16)
+    config = DiagnosisConfig(effort=effort, cache=street.cache, budget_s=3600.0)
+    study = Study.of(street.scenario, measured, config).detectors_as_they_are(Silent())
+    return [str(error.effect) for error in study.detection]
+
+
+@pytest.mark.parametrize("family", FAMILIES)
+def test_an_error_of_measurement_is_read_off(street, family: str) -> None:
+    domain, text, value = FAMILIES[family]
+    found = read_off(street, domain)
+    assert found, "nothing was found"
+    assert all(one.startswith(text) for one in found), found
+    if value is not None:
+        numbers = [float(one.split(",")[1]) for one in found]
+        assert numbers == pytest.approx([value] * len(found), rel=0.1)
+
+
+@pytest.mark.parametrize("domain", ["sim", *DRIVERS])
+def test_drivers_are_no_error_of_measurement(street, domain: str) -> None:
+    assert read_off(street, domain) == []
+
+
+def test_drivers_are_found_behind_an_error_of_measurement(street, tmp_path: Path) -> None:
+    domain = "headway=1.4+detector_extension=*,1,split"
+    found = street.diagnose(street.measure(domain), tmp_path)
+    assert [effect["name"] for effect in found["effects"]] == ["headway", "detector_extension"]
+    headway, extension = (effect["parameters"]["seconds"] for effect in found["effects"])
+    assert headway["value"] == pytest.approx(1.4, rel=0.05)
+    assert extension["value"] == pytest.approx(1.0, abs=0.05)
+    assert extension["low"] < extension["value"] < extension["high"]
+    assert found["sentence"].startswith("All detectors stay on 1 s")
+    assert found["verdict"] == "explained", found["sentence"]
+
+
+def test_an_error_of_measurement_alone_leaves_the_traffic_as_it_is(street, tmp_path: Path) -> None:
+    found = street.diagnose(street.measure("detector_offset=advance,-12"), tmp_path)
+    assert [effect["name"] for effect in found["effects"]] == ["detector_offset"]
+    assert found["verdict"] == "explained", found["sentence"]
+    assert "lie 1" in found["sentence"]
