@@ -107,7 +107,7 @@ turning lane_closure parking local_speed clock_drift stuck dropout swapped
 WORDS = frozenset({"sentence", "findings", "next_measurement", "ruled_out", "untried", "left_out"})
 """Keys of a diagnosis whose values are sentences."""
 OF_THE_RUN = frozenset(
-    {"hashes", "versions", "budget_s", "policy_gap", "schema", "scenario", "corrected"}
+    {"hashes", "versions", "budget_h", "budget_s", "policy_gap", "schema", "scenario", "corrected"}
 )
 """Keys of a diagnosis about the run, not about its result."""
 

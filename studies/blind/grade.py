@@ -28,7 +28,13 @@ from ugat_marl.errors import BlindTestError
 from ugat_marl.files import write_whole
 
 Verdict = Literal[
-    "no_discrepancy", "explained", "not_identifiable", "partially_explained", "unknown", "failed"
+    "no_discrepancy",
+    "explained",
+    "not_identifiable",
+    "partially_explained",
+    "provisional",
+    "unknown",
+    "failed",
 ]
 Outcome = Literal["right", "missed", "wrong", "abstained", "failed"]
 

@@ -210,6 +210,7 @@ def _taken_for(grade: Grade) -> str:
         "explained": names or "explained by nothing",
         "partially_explained": f"partly {names}" if names else "partly something",
         "not_identifiable": f"one of several, {names} among them" if names else "one of several",
+        "provisional": "unfinished",
         "unknown": "unknown",
         "failed": "failed",
     }

@@ -72,7 +72,7 @@ def judge_visibility(
                 scenario = load_scenario(label.scenario)
                 data = directory / label.case / "measured"
                 measured = read_measured(data, scenario, Network.read(scenario))
-                config = DiagnosisConfig(budget_s=math.inf, seed=seed)
+                config = DiagnosisConfig(budget_h=math.inf, seed=seed)
                 found[label.case] = deviations_of(Study.of(scenario, measured, config), effects)
             write_whole(path, json.dumps(found, indent=1, allow_nan=False) + "\n")
             advance(note=label.case)

@@ -276,7 +276,7 @@ def test_the_steps_in_the_manual_run_one_by_one(
         ('"single-v1"', repr(str(street.scenario))),
         ('"measured"', repr(str(street.measured))),
         ('"by-hand"', repr(str(tmp_path / "by-hand"))),
-        ("budget_s=900", "effort=FEW, leave_out=LEFT_OUT, cache=CACHE"),
+        ("budget_h=900", "effort=FEW, leave_out=LEFT_OUT, cache=CACHE"),
     ):
         assert text.count(old) == 1
         text = text.replace(old, new)
@@ -354,8 +354,8 @@ def test_a_budget_too_small_for_anything_says_so(
     assert main(fresh.arguments(tmp_path / "out", "--budget-s", "0.01")) == 0
     text = " ".join(capsys.readouterr().out.split())
     diagnosed = json.loads((tmp_path / "out" / "diagnosis.json").read_text())
-    assert (diagnosed["verdict"], diagnosed["complete"]) == ("unknown", False)
-    assert "Partial result: the budget of 0.01 s ended" in text
+    assert (diagnosed["verdict"], diagnosed["complete"]) == ("provisional", False)
+    assert "Partial result: the budget of 1500 simulated hours or 0.01 s ended" in text
     assert "held-out periods" not in text
     assert "Partial result" in (tmp_path / "out" / "report.html").read_text()
 
@@ -380,7 +380,7 @@ def test_a_budget_that_ends_in_the_search_gives_a_partial_result(
     text = " ".join(capsys.readouterr().out.split())
     diagnosed = json.loads((tmp_path / "out" / "diagnosis.json").read_text())
     assert diagnosed["complete"] is False
-    assert "Partial result: the budget of 18 s ended" in text
+    assert "Partial result: the budget of 1500 simulated hours or 18 s ended" in text
     assert "Partial result" in (tmp_path / "out" / "report.html").read_text()
 
 

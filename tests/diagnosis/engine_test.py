@@ -13,7 +13,7 @@ import pytest
 
 from ugat_marl.diagnosis import Tally, default_cache
 from ugat_marl.diagnosis import engine as module
-from ugat_marl.diagnosis.engine import Engine, OutOfTime, Replicate
+from ugat_marl.diagnosis.engine import Budget, Engine, OutOfTime, Replicate
 from ugat_marl.diagnosis.features import BIN_FEATURES, FEATURES, DetectorLayout
 from ugat_marl.diagnosis.replay import Day, Replay, Unmeasured
 from ugat_marl.diagnosis.thresholds import Thresholds
@@ -74,7 +74,7 @@ def an_engine(
     *,
     seed: int = 3,
     periods: Sequence[Period] = PERIODS,
-    deadline: float | None = None,
+    budget: Budget | None = None,
     base_days: int = 0,
     thresholds: Thresholds = THRESHOLDS,
 ) -> tuple[Engine, Streets]:
@@ -87,7 +87,7 @@ def an_engine(
         seed,
         thresholds,
         cache=cache,
-        deadline=deadline,
+        budget=budget,
         workers=3,
         base_days=base_days,
     )
@@ -277,11 +277,31 @@ def test_another_version_of_the_features_forgets(
     assert len(streets.calls) == 1
 
 
+def test_a_budget_counts_simulated_hours_and_no_stored_days(
+    scenario: Scenario, layout: DetectorLayout, tmp_path: Path
+) -> None:
+    period = an_engine(scenario, layout, tmp_path / "other")[0].periods[0]
+    hours = (period.end_s - period.begin_s) / 3600.0
+    budget = Budget(1.5 * hours)  # a day that has begun is finished
+    short, streets = an_engine(scenario, layout, tmp_path, budget=budget)
+    short.replicates((), range(2))
+    assert (budget.days, budget.spent_h) == (2, pytest.approx(2 * hours))
+    with pytest.raises(OutOfTime, match="budget"):
+        short.replicates((), [2])
+    again = Budget(0.5 * hours)
+    later, _ = an_engine(scenario, layout, tmp_path, budget=again)
+    later.replicates((), range(3))
+    assert again.days == 1
+    assert len(streets.calls) == 2
+
+
 def test_when_time_is_up_only_what_is_remembered_is_given(
     scenario: Scenario, layout: DetectorLayout, tmp_path: Path
 ) -> None:
     known = an_engine(scenario, layout, tmp_path)[0].replicates((), range(2))
-    late, streets = an_engine(scenario, layout, tmp_path, deadline=time.monotonic() - 1)
+    late, streets = an_engine(
+        scenario, layout, tmp_path, budget=Budget(deadline=time.monotonic() - 1)
+    )
     assert same(late.replicates((), [1])[0], known[1])
     with pytest.raises(OutOfTime, match="budget"):
         late.replicates((), range(3))
@@ -419,7 +439,9 @@ def test_no_day_is_prepared_when_time_is_up(
     scenario: Scenario, layout: DetectorLayout, tmp_path: Path
 ) -> None:
     an_engine(scenario, layout, tmp_path)[0].replicates((), range(2))
-    late, streets = an_engine(scenario, layout, tmp_path, deadline=time.monotonic() - 1)
+    late, streets = an_engine(
+        scenario, layout, tmp_path, budget=Budget(deadline=time.monotonic() - 1)
+    )
     late.prepare([((), [0, 1])])
     with pytest.raises(OutOfTime, match="budget"):
         late.prepare([((), [0, 1]), (HEADWAY, [0])])

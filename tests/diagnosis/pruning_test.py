@@ -170,3 +170,30 @@ def test_progress_is_told_of_every_smaller_set() -> None:
     fitter = cast(Fitter, cast(object, ledger))
     pruned(best, best, fitter, lambda model: model, ledger.test, 0.05, Heard())
     assert sorted(notes) == ["demand_level", "headway"]
+
+
+def test_an_effect_whose_interval_holds_the_usual_value_is_never_named() -> None:
+    both = ("headway", "demand_level")
+    ledger = Ledger(
+        {both: 1000.0, ("headway",): 1400.0, ("demand_level",): 9000.0},
+        {both: 0.9, ("headway",): 1e-9, ("demand_level",): 0.0},
+    )
+    # the set suffices and its parts do not, but 0.95 +- 0.08 may be the usual 1
+    assert ledger.left(HEADWAY, DEMAND, errors=0.04) == (HEADWAY,)
+    assert ledger.left(HEADWAY, DEMAND, errors=0.02) == (HEADWAY, DEMAND)
+
+
+def test_the_least_certain_effect_goes_first_and_the_rest_is_judged_anew() -> None:
+    every = ("headway", "demand_level", "desired_speed")
+    costs: dict[tuple[str, ...], float]
+    costs = {every: 1000.0, every[:2]: 9000.0, every[1:]: 9000.0, every[::2]: 9000.0}
+    costs |= {("headway",): 99000.0, ("desired_speed",): 99000.0}
+    ledger = Ledger(costs, {**dict.fromkeys(costs, 1e-9), every: 0.6})
+    # headway 0.5, demand 0.05 and speed 0.2 away from usual: 0.11 doubts the last two of them
+    assert ledger.left(HEADWAY, DEMAND, SPEED, errors=0.11) == (HEADWAY, SPEED)
+    assert set(ledger.tested) == {every[::2]}
+
+
+def test_if_every_effect_may_be_absent_none_is_named() -> None:
+    ledger = Ledger({("headway",): 1000.0}, {("headway",): 0.9})
+    assert ledger.left(HEADWAY, errors=0.4) == ()

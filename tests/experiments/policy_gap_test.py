@@ -79,10 +79,11 @@ def diagnosed(directory: Path, corrected: str | None = "V4", **changes: Any) -> 
     )  # fmt: skip
     none = ("best", "heldout", "evidence", "courtesy", "travel_time", "next_measurement")
     record = {
-        "schema": "ugat-marl/diagnosis/2",
+        "schema": "ugat-marl/diagnosis/3",
         "scenario": SCENARIO.id,
         "seed": 0,
         "alpha": 0.05,
+        "budget_h": None,
         "budget_s": 600.0,
         "verdict": "explained" if corrected else "unknown",
         "sentence": "It is so.",

@@ -29,7 +29,10 @@ from ugat_marl.scenarios import Network
 
 LANES = ("S_C_0", "W_C_0", "C_N_0", "C_E_0")
 NASTY = "</style><script>alert(1)</script>\"'><img src=x onerror=alert(2)>&amp;"
-VERDICTS = ("no_discrepancy", "explained", "not_identifiable", "partially_explained", "unknown")
+VERDICTS = (
+    "no_discrepancy", "explained", "not_identifiable", "partially_explained", "provisional",
+    "unknown",
+)  # fmt: skip
 
 
 def parameter(value: float, low: Any = None, high: Any = None, unit: str = "s") -> dict[str, Any]:
@@ -61,8 +64,8 @@ def content_of(verdict: str = "explained", *, complete: bool = True, **more: Any
     named = verdict in ("explained", "not_identifiable", "partially_explained")
     evidence = {"distance": 118.2, "runner_up_is_worse_by": 4021.0}
     record: dict[str, Any] = {
-        "schema": "ugat-marl/diagnosis/2", "scenario": "crossing-v1", "seed": 0, "alpha": 0.05,
-        "budget_s": 600.0, "left_out": [], "ruled_out": ["speed_spread"],
+        "schema": "ugat-marl/diagnosis/3", "scenario": "crossing-v1", "seed": 0, "alpha": 0.05,
+        "budget_h": None, "budget_s": 600.0, "left_out": [], "ruled_out": ["speed_spread"],
         "findings": ["detections.csv: no speeds"], "verified_on_fitted_periods": False,
         "periods": {"fit": ["day1", "day2"], "heldout": ["day3"]}, "policy_gap": None,
         "hashes": {"scenario": "a" * 64, "measured": "b" * 64},
@@ -212,7 +215,7 @@ def test_the_page_does_not_contradict_its_sentence(network: Network) -> None:
     found = Page(diagnosis_page(diagnosis_of("unknown", effects=logged), network)).text
     assert "signal log" in found
     assert "No effect is named" not in found
-    assert "stands in the log of the signals" in found
+    assert "read off the signals and detections" in found
 
 
 def test_a_result_without_any_simulation_has_a_page(network: Network) -> None:

@@ -45,21 +45,24 @@ class Diagnose:
             (docs/reference/measured-data.md). Nothing is written to it.
         out: Directory for diagnosis.json, report.html and the corrected scenario. An earlier
             diagnosis in it is replaced.
-        budget_s: Time in s after which no further simulation begins. The result is then marked as
-            partial; the same command continues from there.
+        budget_h: Simulated hours after which no further simulation begins; stored days are free.
+            The result is then provisional; the same command continues from there.
+        budget_s: Time in s after which no further simulation begins either.
         alpha: Chance of naming an effect if there is none.
         seed: Root of the simulated days; the same data and seed give the same diagnosis.
         leave_out: Names of effects (docs/reference/effects.md) that are not examined.
         cache: Folder of stored simulations.
         workers: Simulations at a time.
         ray: Simulate on Ray instead.
+        correct_partially: Write the corrected scenario also if its effects explain only a part.
         report: Write the page report.html.
     """
 
     scenario: Annotated[Positional[str], arg(metavar="SCENARIO")]
     measured: Annotated[Positional[Path], arg(metavar="MEASURED")]
     out: Path
-    budget_s: float = 600.0
+    budget_h: float = 1500.0
+    budget_s: Annotated[float | None, arg(help_behavior_hint="(default: no limit)")] = None
     alpha: float = 0.05
     seed: int = 0
     leave_out: Annotated[
@@ -70,6 +73,7 @@ class Diagnose:
     ] = None
     workers: Workers = None
     ray: RayAddress = None
+    correct_partially: bool = False
     report: bool = True
 
     def run(self, console: Console) -> int:
@@ -98,11 +102,13 @@ class Diagnose:
         if self.workers is not None and self.workers < 1:
             raise OptionError(f"workers = {self.workers} must be at least 1")
         return DiagnosisConfig(
+            budget_h=self.budget_h,
             budget_s=self.budget_s,
             alpha=self.alpha,
             seed=self.seed,
             leave_out=self.leave_out,
             cache=self.cache,
+            correct_partially=self.correct_partially,
         )
 
     def _check_out(self) -> None:
@@ -128,7 +134,9 @@ class Diagnose:
     def _commands(self, diagnosis: Diagnosis) -> list[str]:
         """Return the command line of this diagnosis and the next one."""
         given = ["ugat-marl", "diagnose", self.scenario, str(self.measured), "--out", str(self.out)]
-        given += ["--budget-s", f"{self.budget_s:g}", "--alpha", f"{self.alpha:g}"]
+        given += ["--budget-h", f"{self.budget_h:g}", "--alpha", f"{self.alpha:g}"]
+        given += [] if self.budget_s is None else ["--budget-s", f"{self.budget_s:g}"]
+        given += ["--correct-partially"] if self.correct_partially else []
         given += ["--seed", str(self.seed)]
         if self.leave_out:
             given += ["--leave-out", *self.leave_out]

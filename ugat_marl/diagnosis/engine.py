@@ -1,4 +1,4 @@
-"""Tallies of simulated days: computed in parallel, cached on disk, within a budget of time."""
+"""Tallies of simulated days: computed in parallel, cached on disk, within a budget."""
 
 from __future__ import annotations
 
@@ -8,6 +8,8 @@ import functools
 import hashlib
 import io
 import itertools
+import math
+import threading
 import time
 import zipfile
 import zlib
@@ -103,7 +105,42 @@ Done = TypeVar("Done")
 
 
 class OutOfTime(UgatMarlError):
-    """The budget of time is spent; the diagnosis ends with the results so far."""
+    """The budget is spent; the diagnosis ends with the results so far."""
+
+
+class Budget:
+    """Work that a diagnosis may do: simulated hours, and wall time if that is limited too.
+
+    Days from the cache are no work.
+
+    Args:
+        hours: Simulated hours after which new simulations are refused.
+        deadline: ``time.monotonic()`` after which they are refused; None for no limit.
+
+    Attributes:
+        spent_h: Simulated hours so far.
+        days: Simulated days so far.
+    """
+
+    def __init__(self, hours: float = math.inf, deadline: float | None = None) -> None:
+        self._hours = hours
+        self._deadline = deadline
+        self._lock = threading.Lock()
+        self.spent_h = 0.0
+        self.days = 0
+
+    def spend(self, period: Period) -> None:
+        """Spend the hours of a period.
+
+        Raises:
+            OutOfTime: The budget is spent.
+        """
+        with self._lock:
+            late = self._deadline is not None and time.monotonic() > self._deadline
+            if late or self.spent_h >= self._hours:
+                raise OutOfTime("the budget is spent")
+            self.spent_h += (period.end_s - period.begin_s) / 3600.0
+            self.days += 1
 
 
 @dataclass(frozen=True, eq=False)
@@ -135,7 +172,7 @@ class Engine:
         seed: Root seed of the days.
         thresholds: Numbers of the method.
         cache: Folder of the cached tallies; None for no cache on disk.
-        deadline: ``time.monotonic()`` after which new simulations are refused; None for no limit.
+        budget: Work that may be done; None for no limit.
         workers: Simulations at a time, None for one per core; or an executor that simulates days.
         base_days: Number of days of the scenario as it is that decide which days are ordinary; 0 if
             all days are.
@@ -151,15 +188,14 @@ class Engine:
         thresholds: Thresholds,
         *,
         cache: Path | None = None,
-        deadline: float | None = None,
+        budget: Budget | None = None,
         workers: Workers = None,
         base_days: int = 0,
     ) -> None:
         self._base_days = base_days
         self.layout = layout
         self.periods = tuple(periods)
-        self.simulated = 0
-        self.deadline = deadline
+        self._budget = budget or Budget()
         self._replay = replay
         self._seed = seed
         self._thresholds = thresholds
@@ -226,6 +262,11 @@ class Engine:
 
         (days,) = self._together(one, [numbers])
         return days
+
+    @property
+    def simulated(self) -> int:
+        """Number of days that were simulated, without days from the cache."""
+        return self._budget.days
 
     @property
     def known(self) -> int:
@@ -306,7 +347,7 @@ class Engine:
             advance: Function to call after each day.
 
         Raises:
-            OutOfTime: The deadline has passed and a day is not in the cache.
+            OutOfTime: The budget is spent and a day is not in the cache.
             SimulatorError: SUMO refused the model.
         """
 
@@ -333,7 +374,7 @@ class Engine:
             advance: Function to call after each model.
 
         Raises:
-            OutOfTime: The deadline has passed.
+            OutOfTime: The budget is spent.
         """
 
         def one(day: tuple[Sequence[Effect], int]) -> None:
@@ -418,12 +459,10 @@ class Engine:
         key = self._key(physics, number)
         day = self._days.get(key)
         if day is None:
-            if self.deadline is not None and time.monotonic() > self.deadline:
-                raise OutOfTime("the budget of time is spent")
             period = self.periods[number % len(self.periods)]
+            self._budget.spend(period)
             seed = derive_seed(self._seed, "replicate", number)
             day = self._simulated(physics, period, seed)
-            self.simulated += 1
             self._days[key] = day
             while len(self._days) > _KEPT_DAYS:
                 try:

@@ -34,11 +34,16 @@ FILE = "diagnosis.json"
 """Name of the file that a diagnosis writes into its directory."""
 CORRECTED = "corrected"
 """Name of the folder of the corrected scenario, beside that file."""
-SCHEMA = "ugat-marl/diagnosis/2"
+SCHEMA = "ugat-marl/diagnosis/3"
 """Form of the file; it rises whenever the form changes."""
 
 Verdict = Literal[
-    "no_discrepancy", "explained", "not_identifiable", "partially_explained", "unknown"
+    "no_discrepancy",
+    "explained",
+    "not_identifiable",
+    "partially_explained",
+    "provisional",
+    "unknown",
 ]
 
 
@@ -217,7 +222,7 @@ class Conclusion:
     """A verdict with its grounds.
 
     Attributes:
-        verdict: One of the five values of `Verdict`.
+        verdict: One of the values of `Verdict`.
         best: The model that the verdict is about; the scenario as it is if nothing is found.
         indistinct: Other models that fit equally well.
         sentence: The verdict as a sentence.
@@ -562,7 +567,8 @@ class Diagnosis:
         scenario: Id of the scenario.
         seed: Root seed of the simulated days.
         alpha: Level of the tests.
-        budget_s: Wall time after which no simulation was begun, s.
+        budget_h: Simulated hours after which no simulation was begun.
+        budget_s: Wall time after which no simulation was begun, s; None if it was not limited.
         left_out: Names of effects that the user excluded.
         ruled_out: Names of effects that the data cannot show.
         findings: Remarks from the check of the data.
@@ -570,7 +576,7 @@ class Diagnosis:
         verified_on_fitted_periods: True if no period was held out.
         hashes: SHA-256 of the scenario and of the data.
         versions: Versions of the software.
-        verdict: One of the five values of `Verdict`.
+        verdict: One of the values of `Verdict`.
         sentence: The verdict as a sentence.
         effects: The named effects.
         where: Places where the scenario as it is disagrees with the fitted periods.
@@ -592,11 +598,12 @@ class Diagnosis:
 
     __pydantic_config__ = ConfigDict(extra="forbid")
 
-    schema: Literal["ugat-marl/diagnosis/2"]
+    schema: Literal["ugat-marl/diagnosis/3"]
     scenario: str
     seed: int
     alpha: float
-    budget_s: float
+    budget_h: float | None
+    budget_s: float | None
     left_out: tuple[str, ...]
     ruled_out: tuple[str, ...]
     findings: tuple[str, ...]
@@ -622,6 +629,13 @@ class Diagnosis:
     untried: tuple[str, ...]
     corrected: str | None
     policy_gap: dict[str, PolicyGap] | None = None
+
+    @property
+    def budget_in_words(self) -> str:
+        """The budget with its unit: simulated hours, seconds, or both."""
+        hours = "" if self.budget_h is None else f"{self.budget_h:g} simulated hours"
+        seconds = "" if self.budget_s is None else f"{self.budget_s:g} s"
+        return " or ".join(filter(None, (hours, seconds))) or "no limit"
 
     def to_json(self) -> dict[str, Any]:
         """Return plain values for JSON: numbers with nine digits, None for NaN and infinity."""

@@ -144,8 +144,11 @@ class Selector:
         return [day.tally for day in days.values()]
 
     def _untested(self, model: Fitted, base: Tested) -> Tested:
-        """Return a model with the test of the scenario as it is; there was no time for its own."""
-        return Tested(model, base.residual, 0.0 * model.values, {})
+        """Return a model with the test of the scenario as it is, for there was no time for its own.
+
+        Its errors are not known.
+        """
+        return Tested(model, base.residual, np.full(len(model.values), np.nan), {})
 
     def _round(self, start: Tested, number: int) -> Tested | None:
         """Add, change or remove effects; return None if no change is worth its price."""
@@ -381,9 +384,30 @@ def pruned(
             break
         best = tested
     something = merged((), best.model.members)
-    if len(something) == len(best.model.members):
-        return best
-    return test(fitter.simulate(something)) if something else base
+    if len(something) < len(best.model.members):
+        best = test(fitter.simulate(something)) if something else base
+    return _sure(best, base, fitter, test)
+
+
+def _sure(best: Tested, base: Tested, fitter: Fitter, test: Callable[[Fitted], Tested]) -> Tested:
+    """Drop effects whose intervals hold their usual values, the least certain one first."""
+    thresholds = fitter.thresholds
+    while doubtful := _doubtful(best, thresholds.half_interval):
+        least = min(doubtful, key=lambda place: _deviations(best, place))
+        members = each_left_out(best.model.members)[least]
+        if not members:
+            return base
+        best = test(fitter.refine(fitter.simulate(members), thresholds.steps_without))
+    return best
+
+
+def _deviations(tested: Tested, place: int) -> float:
+    """Return how many standard errors the member at `place` is away from its usual values."""
+    members = tested.model.members
+    first = sum(len(values) for _, values in members[:place])
+    hypothesis, values = members[place]
+    errors = np.maximum(tested.errors[first : first + len(values)], 1e-12)
+    return float((np.abs(np.subtract(values, hypothesis.nominal or 0.0)) / errors).max())
 
 
 def _doubtful(tested: Tested, half_interval: float) -> list[int]:

@@ -1,4 +1,4 @@
-"""Inputs of one diagnosis: the scenario, the data, the simulated days and the budget of time."""
+"""Inputs of one diagnosis: the scenario, the data, the simulated days and the budget."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from pathlib import Path
 import numpy as np
 
 from ugat_marl.data import Finding, MeasuredData, is_actuated
-from ugat_marl.diagnosis.engine import Engine, default_cache
+from ugat_marl.diagnosis.engine import Budget, Engine, default_cache
 from ugat_marl.diagnosis.features import (
     DetectorLayout,
     Tally,
@@ -53,28 +53,35 @@ class DiagnosisConfig:
     """Options of a diagnosis.
 
     Attributes:
-        budget_s: Wall time after which no further simulation is begun, s.
+        budget_h: Simulated hours after which no further simulation is begun. Days from the cache
+            do not count.
+        budget_s: Wall time after which no further simulation is begun either, s; None for no limit.
         alpha: Level of the tests: chance of naming an effect where there is none.
         seed: Root seed of the simulated days.
         leave_out: Names of effects that are not examined.
         cache: Folder of the remembered days; None for the user's cache folder.
         workers: Simulations at a time, None for one per core; or an executor.
         effort: Numbers of simulated days; None for those that suit the size of the network.
+        correct_partially: Write ``corrected`` also for a verdict of `partially_explained`.
         thresholds: Numbers of the method.
     """
 
-    budget_s: float = 600.0
+    budget_h: float = 1500.0
+    budget_s: float | None = None
     alpha: float = 0.05
     seed: int = 0
     leave_out: tuple[str, ...] = ()
     cache: Path | None = None
     workers: Workers = None
     effort: Effort | None = None
+    correct_partially: bool = False
     thresholds: Thresholds = field(default_factory=Thresholds)
 
     def __post_init__(self) -> None:
-        if not self.budget_s > 0:
-            raise OptionError(f"budget_s = {self.budget_s:g} must be above 0")
+        for name in ("budget_h", "budget_s"):
+            budget = getattr(self, name)
+            if budget is not None and not budget > 0:
+                raise OptionError(f"{name} = {budget:g} must be above 0")
         if not 0 < self.alpha < 0.5:
             raise OptionError(f"alpha = {self.alpha:g} must be between 0 and 0.5")
         if self.seed < 0:
@@ -149,6 +156,9 @@ class Study:
         answering = any(is_actuated(measured.periods, tls) for tls in lights)
         effort = config.effort or effort_for(len(lights))
 
+        deadline = None if config.budget_s is None else time.monotonic() + config.budget_s
+        budget = Budget(config.budget_h, deadline)
+
         def simulating(answering: bool, base_days: int) -> Engine:
             return Engine(
                 scenario,
@@ -158,7 +168,7 @@ class Study:
                 config.seed,
                 thresholds,
                 cache=config.cache or default_cache(),
-                deadline=time.monotonic() + config.budget_s,
+                budget=budget,
                 workers=config.workers,
                 base_days=base_days,
             )

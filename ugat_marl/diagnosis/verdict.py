@@ -1,4 +1,4 @@
-"""Verdict of a diagnosis: one of five, with a sentence and the next useful measurement."""
+"""Verdict of a diagnosis: one of six, with a sentence and the next useful measurement."""
 
 from __future__ import annotations
 
@@ -29,6 +29,9 @@ NOUNS = {"swapped": "swapped detectors", "stuck": "a stuck detector"}
 """Nouns for effects whose names are no nouns, for sentences."""
 
 
+UNEXPLAINED = "Simulation and measurement disagree, and no effect of the library explains it"
+
+
 def conclude(
     located: Located,
     selection: Selected,
@@ -57,8 +60,10 @@ def conclude(
             f"periods do not: together nothing unusual (p = {chance:.2g})."
         )
         return Conclusion("no_discrepancy", base, (), sentence, "more periods")
+    if not selection.complete:
+        return unverified(selection, verification)
     if not best.model.members:
-        sentence = _unexplained(selection) + "; the first places below say where to look."
+        sentence = f"{UNEXPLAINED}; the first places below say where to look."
         return Conclusion("unknown", best, (), sentence, _look_at(selection))
     names = describe_members(best.model.members)
     shrink = verification.shrink if verification.shrink is not None else 0.0
@@ -68,17 +73,16 @@ def conclude(
             f"The fitted periods hint at {names}, but the held-out periods do not confirm it."
         )
         return Conclusion("unknown", best, (), sentence, "more periods")
-    if chance_only and selection.complete:
+    if chance_only:
         return _sufficient(selection, selector, config, layout)
     if shrink >= thresholds.part:
         verb = "explains" if len(best.model.members) == 1 else "explain"
-        sentence = f"{names[:1].upper()}{names[1:]} {verb} {100 * shrink:.0f} % of the gap; " + (
+        sentence = (
+            f"{capitalised(names)} {verb} {100 * shrink:.0f} % of the gap; "
             "something else remains that the library does not have."
-            if selection.complete
-            else "the budget ended before the rest was examined."
         )
         return Conclusion("partially_explained", best, (), sentence, _look_at(selection))
-    return Conclusion("unknown", best, (), _unexplained(selection) + ".", _look_at(selection))
+    return Conclusion("unknown", best, (), f"{UNEXPLAINED}.", _look_at(selection))
 
 
 def unchallenged(
@@ -107,17 +111,26 @@ def unchallenged(
     return Conclusion(verdict, located.base, (), sentence, None)
 
 
-def unverified(located: Located, selected: Selected) -> tuple[Verified, Conclusion]:
-    """Conclude if the budget ended before the model was verified."""
-    residual = located.base.residual
+def unverified(selected: Selected, verified: Verified | None = None) -> Conclusion:
+    """Conclude if the budget ended before the search did.
+
+    Args:
+        selected: The search so far.
+        verified: Tests on the held-out periods; None if there was no budget for them.
+    """
     members = selected.best.model.members
-    nearest = f" The nearest so far is {describe_members(members)}." if members else ""
+    if members:
+        shrink = None if verified is None else verified.shrink
+        gone = "" if shrink is None else f", which takes off {100 * shrink:.0f} % of the gap"
+        named = f"{describe_members(members)}{gone}"
+        nearest = f"The nearest explanation so far, not verified, is {named}."
+    else:
+        nearest = "No effect that was tried so far explains it."
     sentence = (
-        "Simulation and measurement disagree; the budget ended before an explanation was verified."
+        "Simulation and measurement disagree; the budget ended before the search did. "
         f"{nearest} Run the same command again to go on."
     )
-    conclusion = Conclusion("unknown", selected.best, (), sentence, None)
-    return Verified(residual, residual, None), conclusion
+    return Conclusion("provisional", selected.best, (), sentence, None)
 
 
 def _sufficient(
@@ -153,16 +166,6 @@ def _sufficient(
     them = "it" if len(best.model.members) == 1 else "them"
     sentence = f"The street has {names}; with {them}, what is left is no more than chance."
     return Conclusion("explained", best, (), sentence, None)
-
-
-def _unexplained(selection: Selected) -> str:
-    """Return the sentence that no effect explains the data; it depends on the end of the search."""
-    if selection.complete:
-        return "Simulation and measurement disagree, and no effect of the library explains it"
-    return (
-        "Simulation and measurement disagree; the budget ended before all effects were examined, "
-        "and none so far explains it"
-    )
 
 
 def combined(one: float, other: float) -> float:
@@ -209,13 +212,8 @@ def _kinds(members: Members) -> set[str]:
     return {hypothesis.name for hypothesis, _ in members}
 
 
-def _look_at(selection: Selected) -> str | None:
-    """Suggest a measurement where most is left; None if the search ended early.
-
-    A longer search may still explain the data then.
-    """
-    if not selection.complete:
-        return None
+def _look_at(selection: Selected) -> str:
+    """Suggest a measurement where most is left."""
     z = selection.best.model.distance.z["network"][0]
     strongest = [FEATURES[int(i)][:2] for i in np.argsort(-np.abs(z))[:3] if z[int(i)]]
     told = ", ".join(f"{statistic(name)} ({regime})" for name, regime in strongest)

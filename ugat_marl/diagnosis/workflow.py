@@ -11,6 +11,8 @@ from collections.abc import Collection
 from dataclasses import replace
 from pathlib import Path
 
+import numpy as np
+
 from ugat_marl.data import MeasuredData, installed_versions
 from ugat_marl.diagnosis.engine import OutOfTime
 from ugat_marl.diagnosis.locate import disagreements, locate_gap
@@ -143,10 +145,14 @@ def _compared(
         diagnosis = _record(study, timing, located, selected, verified, conclusion)
     except OutOfTime:
         selected = replace(selected, complete=False)
-        verified, conclusion = unverified(located, selected)
+        verified = verify_model(study, located.base, located.base)
+        conclusion = unverified(selected)
         conclusion = told(conclusion)
         diagnosis = _record(study, timing, located, selected, verified, conclusion, tables=False)
-    return diagnosis, () if conclusion.verdict == "unknown" else conclusion.best.model.effects
+    kept = conclusion.verdict != "unknown"
+    if conclusion.verdict == "partially_explained":
+        kept = study.config.correct_partially
+    return diagnosis, conclusion.best.model.effects if kept else ()
 
 
 def _beside_the_log(
@@ -206,11 +212,11 @@ def _record(
 def _nothing_simulated(study: Study, timing: tuple[Effect, ...]) -> Diagnosis:
     """Make the record for a budget that ended before the scenario as it is was simulated."""
     sentence = (
-        f"The budget of {study.config.budget_s:g} s ended after {study.engine.known} of "
-        f"{study.effort.base} simulated days of the scenario as it is, before anything could be "
-        "compared. Run the same command again to go on, or give a larger budget."
+        f"The budget ended after {study.engine.known} of {study.effort.base} simulated days of the "
+        "scenario as it is, before anything could be compared. Run the same command again to go "
+        "on, or give a larger budget."
     )
-    return _begun(study, timing, "unknown", sentence, ())
+    return _begun(study, timing, "provisional", sentence, ())
 
 
 def _begun(
@@ -237,6 +243,7 @@ def _begun(
         scenario=study.scenario.id,
         seed=study.config.seed,
         alpha=study.config.alpha,
+        budget_h=study.config.budget_h,
         budget_s=study.config.budget_s,
         left_out=tuple(sorted(study.config.leave_out)),
         ruled_out=tuple(sorted(study.ruled_out)),
@@ -291,9 +298,9 @@ def _named(best: Tested, selected: Selected, half_interval: float) -> tuple[Name
     effects: list[NamedEffect] = []
     place = 0
     for hypothesis, values in best.model.members:
-        margins = tuple(
-            half_interval * float(error) for error in best.errors[place : place + len(values)]
-        )
+        errors = best.errors[place : place + len(values)]
+        known = bool(np.isfinite(errors).all())
+        margins = tuple(half_interval * float(error) for error in errors) if known else None
         place += len(values)
         effects.append(_with_grounds(effect_record(hypothesis, values, margins), grounds))
     return tuple(effects)

@@ -40,7 +40,7 @@ _STRIPS = 8
 _COMMANDS = re.compile(r"<h2>Run it again</h2>\s*<pre><code>(.*?)</code></pre>", re.DOTALL)
 _BADGES: dict[Verdict, str] = {
     "no_discrepancy": "good", "explained": "good", "not_identifiable": "mixed",
-    "partially_explained": "mixed", "unknown": "bad",
+    "partially_explained": "mixed", "provisional": "mixed", "unknown": "bad",
 }  # fmt: skip
 _CRITERIA: tuple[tuple[str, Callable[[CriteriaRow], str]], ...] = (
     ("counts with GEH below 5 (usual: 85 %)", lambda row: share(row.geh_below_5)),
@@ -335,7 +335,7 @@ def _provenance(diagnosis: Diagnosis) -> list[tuple[str, str]]:
         ("schema", diagnosis.schema),
         ("seed", str(diagnosis.seed)),
         ("level of the tests", number(diagnosis.alpha)),
-        ("budget", f"{number(diagnosis.budget_s)} s"),
+        ("budget", diagnosis.budget_in_words),
         *((f"version of {name}", str(text)) for name, text in diagnosis.versions.items()),
         *((f"SHA-256 of the {name}", text) for name, text in diagnosis.hashes.items()),
     ]
@@ -343,8 +343,9 @@ def _provenance(diagnosis: Diagnosis) -> list[tuple[str, str]]:
 
 def _usual_commands(diagnosis: Diagnosis) -> list[str]:
     """Return the commands with words in capitals for the paths, which no record holds."""
-    options = f"--budget-s {diagnosis.budget_s:g} --alpha {diagnosis.alpha:g}"
-    options += f" --seed {diagnosis.seed}"
+    options = f"--alpha {diagnosis.alpha:g} --seed {diagnosis.seed}"
+    for option, value in (("h", diagnosis.budget_h), ("s", diagnosis.budget_s)):
+        options = options if value is None else f"--budget-{option} {value:g} {options}"
     if diagnosis.left_out:
         options += " --leave-out " + " ".join(diagnosis.left_out)
     lines = [f"ugat-marl diagnose {diagnosis.scenario} MEASURED --out DIR {options}"]

@@ -16,6 +16,7 @@ VERDICTS: dict[Verdict, str] = {
     "explained": "explained",
     "not_identifiable": "not identifiable",
     "partially_explained": "partially explained",
+    "provisional": "provisional",
     "unknown": "unknown",
 }
 
@@ -28,6 +29,8 @@ MEANINGS: dict[Verdict, str] = {
     "one listed here; which one is true takes another measurement.",
     "partially_explained": "These effects take off most of the gap, and yet they are not the whole "
     "explanation. What is missing may bend their values.",
+    "provisional": "The search has not ended. What is listed here comes nearest so far and is not "
+    "verified.",
     "unknown": "Simulation and measurement disagree, and nothing in the library accounts for it. "
     "Any name would be a guess.",
 }
@@ -39,7 +42,7 @@ def meaning(diagnosis: Diagnosis) -> str:
         return ""
     text = MEANINGS[diagnosis.verdict]
     if diagnosis.verdict == "unknown" and diagnosis.effects:
-        text += " What is listed here stands in the log of the signals."
+        text += " What is listed here is read off the signals and detections themselves."
     return text
 
 
@@ -104,7 +107,7 @@ def partial(diagnosis: Diagnosis) -> str | None:
     more = f", … ({len(untried)} in all)" if len(untried) > UNTRIED else ""
     left = f" Not examined yet: {joined(untried[:UNTRIED])}{more}." if untried else ""
     return (
-        f"Partial result: the budget of {number(diagnosis.budget_s)} s ended before the search "
+        f"Partial result: the budget of {diagnosis.budget_in_words} ended before the search "
         f"did.{left} The same command goes on where this one stopped."
     )
 

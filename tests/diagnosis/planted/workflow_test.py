@@ -44,7 +44,7 @@ def test_the_same_inputs_give_the_same_file(street, measured: MeasuredData, tmp_
 def test_the_answer_is_the_file(street, measured: MeasuredData, tmp_path: Path) -> None:
     found = run(street, measured, tmp_path)
     assert json.loads((tmp_path / "diagnosis.json").read_text()) == found
-    assert found["schema"] == "ugat-marl/diagnosis/2"
+    assert found["schema"] == "ugat-marl/diagnosis/3"
     assert found["hashes"] == {"scenario": street.scenario.hash, "measured": measured.hash}
     assert found["periods"] == {"fit": ["day1", "day2", "day3"], "heldout": ["day4", "day5"]}
     assert not found["verified_on_fitted_periods"]
@@ -68,7 +68,7 @@ def test_a_budget_that_is_too_small_for_anything_says_so(
     street, measured: MeasuredData, tmp_path: Path
 ) -> None:
     found = run(street, measured, tmp_path, budget_s=1e-6, cache=tmp_path / "days", seed=1)
-    assert found["verdict"] == "unknown"
+    assert found["verdict"] == "provisional"
     assert not found["complete"]
     assert found["effects"] == []
     assert found["corrected"] is None
@@ -90,13 +90,14 @@ def test_when_the_budget_ends_half_way_the_answer_says_so(
 
     monkeypatch.setattr(Engine, "replicates", short)
     found = run(street, measured, tmp_path)
-    assert found["verdict"] == "unknown"
+    assert found["verdict"] == "provisional"
     assert found["effects"] == []
     assert not found["complete"]
     assert found["where"], "what is known is said"
     assert found["untried"] == ["dropout", "swapped"], "and what is not"
     monkeypatch.undo()
     whole_search = run(street, measured, tmp_path)
+    assert whole_search["heldout"]["before"] == found["heldout"]["before"]
     assert whole_search["verdict"] == "explained"
     assert whole_search["untried"] == []
 
