@@ -15,7 +15,7 @@ from ugat_marl.diagnosis import DiagnosisConfig, Study, Tally
 from ugat_marl.diagnosis.engine import Engine
 from ugat_marl.diagnosis.features import BIN_FEATURES, FEATURES, INDEX
 from ugat_marl.diagnosis.statistics import Pools
-from ugat_marl.diagnosis.study import effort_for, heard
+from ugat_marl.diagnosis.study import day_to_day_variation, effort_for, heard
 from ugat_marl.diagnosis.thresholds import Effort, Thresholds
 from ugat_marl.effects import Effect, Headway
 from ugat_marl.scenarios import Detector, Passages, Period
@@ -143,3 +143,35 @@ def test_what_measured_arrivals_leave_open_is_a_matter_of_the_model() -> None:
 
 def test_where_signals_answered_nobody_nothing_is_left_open() -> None:
     assert study(Days({False: 8.0}), None).doubt() is None
+
+
+def counts(generator: np.random.Generator, mean: float, share: float, days: int) -> np.ndarray:
+    level = generator.gamma(share**-2.0, share**2.0, days) if share else np.ones(days)
+    return generator.poisson(mean * level)[None].astype(np.float64)
+
+
+def test_demand_that_varies_from_day_to_day_is_told_from_chance() -> None:
+    generator = np.random.default_rng(4)
+
+    def estimates(share: float, days: int) -> np.ndarray:
+        draws = (counts(generator, 1500.0, share, days) for _ in range(200))
+        return np.array([day_to_day_variation(draw, Thresholds()) for draw in draws])
+
+    assert (estimates(0.0, 5) == 0.0).mean() > 0.85
+    assert estimates(0.0, 60).max() < 0.03
+    for share in (0.05, 0.1):
+        assert estimates(share, 60).mean() == pytest.approx(share, rel=0.1)
+        assert estimates(share, 5).mean() == pytest.approx(share, rel=0.3)
+    assert (estimates(0.1, 5) == 0.0).mean() < 0.1
+
+
+def test_a_day_alone_and_a_street_without_vehicles_do_not_vary() -> None:
+    assert day_to_day_variation(np.array([[90.0]]), Thresholds()) == 0.0
+    assert day_to_day_variation(np.zeros((2, 5)), Thresholds()) == 0.0
+    assert day_to_day_variation(np.empty((0, 5)), Thresholds()) == 0.0
+
+
+def test_of_several_places_the_busiest_one_counts() -> None:
+    steady, varied = np.full(5, 900.0), np.array([50.0, 100.0, 150.0, 200.0, 250.0])
+    assert day_to_day_variation(np.array([varied, steady]), Thresholds()) == 0.0
+    assert day_to_day_variation(np.array([varied * 9, steady]), Thresholds()) > 0.2

@@ -36,6 +36,7 @@ class Record:
         periods: Number of days. The last 40 % are held out: a diagnosis is judged on them.
         seed: Root of the seeds of all days.
         duration_s: Length of a day in s.
+        day_to_day: Standard deviation of the whole demand of a day, as a share of its mean.
         same_demand: Use the scenario's own vehicles on every day, instead of drawing each day anew.
         detector_length_m: Length of the detection zones in m; 0 for points.
         speeds: Measure speeds and lengths at the detectors.
@@ -51,6 +52,7 @@ class Record:
     periods: int = 5
     seed: int = 0
     duration_s: LengthS = None
+    day_to_day: float = 0.0
     same_demand: bool = False
     detector_length_m: float = 0.0
     speeds: bool = True
@@ -75,6 +77,7 @@ class Record:
             seed=self.seed,
             duration_s=self.duration_s,
             same_demand=self.same_demand,
+            day_to_day=self.day_to_day,
             detector_length_m=self.detector_length_m,
             speeds=self.speeds,
             lanes=self.lanes,

@@ -216,6 +216,7 @@ class Engine:
             thresholds.of_a_day(),
         )
         head += (self._unmeasured,) if self._unmeasured else ()
+        head += (replay.day_to_day,) if replay.day_to_day else ()
         self._root = hashlib.sha256(repr(head).encode()).hexdigest()
         self._edges = sorted({edge for _, edge, _ in layout.places})
         self._signals = [_signals_hash(period, replay.answering) for period in periods]

@@ -104,9 +104,11 @@ class Replay:
         thresholds: Numbers of the method.
         answering: True if the signals followed the traffic; days then get the measured arrivals.
         detection: Errors of measurement of the detectors that saw the arrivals.
+        day_to_day: Variation of the demand from day to day, see `draw_day`.
     """
 
     answering = False
+    day_to_day = 0.0
 
     def __init__(
         self,
@@ -118,6 +120,7 @@ class Replay:
         *,
         answering: bool = False,
         detection: Sequence[Effect] = (),
+        day_to_day: float = 0.0,
     ) -> None:
         self._given = scenario, network, detectors, owner, thresholds
         self.answering = answering
@@ -127,6 +130,7 @@ class Replay:
         self._owner = dict(owner)
         self._thresholds = thresholds
         self._detection = tuple(detection)
+        self.day_to_day = day_to_day
         layout = DetectorLayout.of(network, installed_detectors(self._detection, detectors))
         self._arrivals = Arrivals(layout, network, thresholds) if answering else None
         self._own = detector_effects(scenario)
@@ -136,13 +140,20 @@ class Replay:
     def __reduce__(self) -> tuple[functools.partial[Replay], tuple[Any, ...]]:
         """Pickle the arguments only, without the days in memory."""
         return (
-            functools.partial(Replay, answering=self.answering, detection=self._detection),
+            functools.partial(
+                Replay,
+                answering=self.answering,
+                detection=self._detection,
+                day_to_day=self.day_to_day,
+            ),
             self._given,
         )
 
     def detecting(self, errors: Sequence[Effect]) -> Replay:
         """Return a simulator of the same days that knows errors of measurement."""
-        return Replay(*self._given, answering=self.answering, detection=errors)
+        return Replay(
+            *self._given, answering=self.answering, detection=errors, day_to_day=self.day_to_day
+        )
 
     def simulate(self, effects: Sequence[Effect], period: Period, seed: int) -> Day:
         """Simulate one day.
@@ -192,7 +203,7 @@ class Replay:
         with self._lock:
             day = self._days.get(seed)
             if day is None:
-                day = self._days[seed] = draw_day(self._scenario, seed)
+                day = self._days[seed] = draw_day(self._scenario, seed, self.day_to_day)
                 if len(self._days) > _DAYS:
                     self._days.popitem(last=False)
             return day

@@ -12,14 +12,17 @@ from dataclasses import dataclass, field, replace
 from pathlib import Path
 
 import numpy as np
+from scipy import stats
 
 from ugat_marl.data import Finding, MeasuredData, is_actuated
 from ugat_marl.diagnosis.engine import Budget, Engine, default_cache
 from ugat_marl.diagnosis.features import (
+    BIN_FEATURES,
     DetectorLayout,
     Tally,
     bins_together,
     counts_tally,
+    tally,
     without_gaps,
 )
 from ugat_marl.diagnosis.fit import Fitter
@@ -159,11 +162,29 @@ class Study:
         deadline = None if config.budget_s is None else time.monotonic() + config.budget_s
         budget = Budget(config.budget_h, deadline)
 
+        fit = _tallies(layout, measured, periods, thresholds)
+        heldout = _tallies(layout, measured, measured.of("heldout"), thresholds)
+        variation = _variation(layout, measured, (*fit, *heldout), thresholds)
+        if variation:
+            text = (
+                f"demand differs from day to day by about {100 * variation:.0f} %, on top of "
+                "chance; so do the simulated days"
+            )
+            measured = replace(measured, findings=(*measured.findings, Finding(text)))
+
         def simulating(answering: bool, base_days: int) -> Engine:
             return Engine(
                 scenario,
                 layout,
-                Replay(scenario, network, detectors, layout.owner, thresholds, answering=answering),
+                Replay(
+                    scenario,
+                    network,
+                    detectors,
+                    layout.owner,
+                    thresholds,
+                    answering=answering,
+                    day_to_day=variation,
+                ),
                 [*periods, *measured.of("heldout")],
                 config.seed,
                 thresholds,
@@ -186,8 +207,8 @@ class Study:
             allowed,
             tuple(global_hypotheses(scenario, allowed)),
             effort,
-            _tallies(layout, engine, measured, periods, thresholds),
-            _tallies(layout, engine, measured, measured.of("heldout") or periods, thresholds),
+            fit,
+            heldout or fit,
             simulating(False, 0) if answering else None,
             ruled_out,
         )
@@ -388,17 +409,73 @@ def heard(measured: MeasuredData) -> tuple[Detector, ...]:
 
 def _tallies(
     layout: DetectorLayout,
-    engine: Engine,
     measured: MeasuredData,
     periods: Sequence[Period],
     thresholds: Thresholds,
 ) -> tuple[Tally, ...]:
     if measured.has_events or measured.counts is None:
-        return tuple(engine.measured(periods))
+        return tuple(tally(layout, period, layout.greens(period), thresholds) for period in periods)
     whole = without_gaps(measured.counts, measured.periods, thresholds)
     return tuple(
         counts_tally(layout, period, measured.counts, whole, thresholds) for period in periods
     )
+
+
+# --- variation from day to day --------------------------------------------------------------------
+
+
+def day_to_day_variation(counts: Array, thresholds: Thresholds) -> float:
+    """Estimate how much demand varies from day to day, on top of the chance of single vehicles.
+
+    The mean square of a day's counts around their mean has the expectation ``m + (s m)^2``, for a
+    mean m and a variation s. No variation at all, as in a simulation, and a variation with a
+    half-normal distribution are equally likely before. The likelier of the two is taken; if it is
+    the second one, its posterior root mean square.
+
+    Args:
+        counts: Vehicles per day at places that no vehicle passes twice, ``(places, days)``. The
+            busiest one is used: others see many of the same vehicles.
+        thresholds: Numbers of the method.
+
+    Returns:
+        Standard deviation as a share of the mean, rounded to `Thresholds.grain_of_variation`.
+    """
+    days = counts[int(np.argmax(counts.sum(axis=1)))] if len(counts) else np.empty(0)
+    if len(days) < 2 or not days.mean():
+        return 0.0
+    freedom = len(days) - 1
+    squares = max(float(((days - days.mean()) ** 2).sum()), 1e-6)  # counts may be equal
+    shares = np.arange(0.0, 1.0, 0.002)
+    scale = days.mean() + (shares * days.mean()) ** 2
+    logs = stats.chi2.logpdf(squares / scale, freedom) - np.log(scale)
+    prior = np.exp(-0.5 * (shares / thresholds.usual_variation) ** 2)
+    prior[0] = prior[1:].sum()
+    posterior = prior * np.exp(logs - logs.max())
+    if posterior[0] > posterior[1:].sum():
+        return 0.0
+    posterior[0] = 0.0
+    posterior /= posterior.sum()
+    found = math.sqrt(float((posterior * shares**2).sum()))
+    grain = thresholds.grain_of_variation
+    return round(grain * round(found / grain), 6)
+
+
+def _variation(
+    layout: DetectorLayout, measured: MeasuredData, days: Sequence[Tally], thresholds: Thresholds
+) -> float:
+    """Estimate the variation from day to day; 0 if the periods are not the same time of days."""
+    if len({(period.begin_s, period.end_s) for period in measured.periods}) > 1:
+        return 0.0
+    owners = np.array([lane.intersection for lane in layout.lanes])
+    rows: list[Array] = []
+    for number in range(len(layout.intersections)):
+        lanes = np.flatnonzero(owners == number)
+        by_kind = [
+            np.array([day.bins[kind, lanes].sum() for day in days])
+            for kind in (BIN_FEATURES.index("count_stop"), BIN_FEATURES.index("count_advance"))
+        ]
+        rows.append(max(by_kind, key=lambda counts: float(counts.sum())))
+    return day_to_day_variation(np.array(rows), thresholds)
 
 
 # --- measured edges without demand ----------------------------------------------------------------

@@ -169,6 +169,15 @@ class Thresholds(DayThresholds):
     """Largest share of such days that is left out of a model. By hand: five measured days probably
     have none. Halved: a model that locks up now and then keeps these days and their noise."""
 
+    # --- study: variation from day to day -----------------------------------------------------
+
+    usual_variation: float = 0.07
+    """Scale of the variation of demand from day to day where there is one, as a share. Streets have
+    5 to 10 %. Halved: few days with a strong variation seem less noisy than they are."""
+    grain_of_variation: float = 0.02
+    """Grain of the estimated variation. By hand: data with equal estimates share simulated days,
+    and a variation below 1 % is none. Halved: hardly any days are shared."""
+
     # --- statistics: noise --------------------------------------------------------------------
 
     least_observations: float = 3.0

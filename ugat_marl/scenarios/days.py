@@ -54,7 +54,7 @@ class _Vehicles:
     speeds: NDArray[np.float64]
 
 
-def draw_day(scenario: Scenario, seed: int) -> Scenario:
+def draw_day(scenario: Scenario, seed: int, day_to_day: float = 0.0) -> Scenario:
     """Draw another day: a Poisson number of copies of every vehicle, departures jittered.
 
     The same seed gives the same vehicles, names and speedFactors. Effects applied afterwards do not
@@ -63,6 +63,8 @@ def draw_day(scenario: Scenario, seed: int) -> Scenario:
     Args:
         scenario: Any scenario; `demand_as_vehicles` turns its trips and flows into vehicles.
         seed: Number of the day, a non-negative integer.
+        day_to_day: Standard deviation of the whole demand of a day, as a share of its mean. It
+            comes on top of the Poisson numbers; 0 for none.
     """
     scenario = demand_as_vehicles(scenario)
     vehicles = _vehicles(tuple(document.read() for document in scenario.routes))
@@ -70,7 +72,11 @@ def draw_day(scenario: Scenario, seed: int) -> Scenario:
     begin = scenario.settings.begin_s
     end = begin + scenario.settings.duration_s
     count = len(vehicles.names)
-    copies = generator.poisson(1.0, count)
+    level = 1.0
+    if day_to_day:  # a stream of its own, so that days without variation stay what they are
+        shape = day_to_day**-2.0
+        level = float(numpy_generator(seed, "level of the day").gamma(shape, 1.0 / shape))
+    copies = generator.poisson(level, count)
     most = 8
     shifts = generator.uniform(-JITTER_S, JITTER_S, (most, count))
     draws = generator.standard_normal((most, count))

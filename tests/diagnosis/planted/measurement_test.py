@@ -16,7 +16,7 @@ FAMILIES = {
     "extension": ("detector_extension=*,1,split", "detector_extension=*", 1.0),
     "delay": ("detector_extension=*,-0.2,split", "detector_extension=*", -0.2),
     "upstream": ("detector_offset=advance,-12", "detector_offset=advance", -12.0),
-    "zone": ("detector_zone=*,4", "detector_zone=*", 4.0),
+    "zone": ("detector_zone=stop,2", "detector_zone=stop", 2.0),
     "front": ("detector_speeds=*,front", "detector_speeds=*,front", None),
     "pulse": ("detector_pulse=*,0.15", "detector_pulse=", 0.15),
 }

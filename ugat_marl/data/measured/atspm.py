@@ -194,6 +194,7 @@ def _zones(table: AtspmMapping) -> pl.DataFrame:
             detector.position_m,
             detector.length_m,
             detector.kind,
+            None,  # controllers log no speeds
         )
         for device in table.devices
         for detector in device.detectors

@@ -85,6 +85,7 @@ class _Street:
         policy: Maker of the controller.
         seed: Root of the seeds of all days.
         same_demand: True if every day has the scenario's own vehicles.
+        day_to_day: Variation of the demand from day to day, see `draw_day`.
         speeds: True if the detectors measure speeds and lengths.
         lanes: True to keep data per lane and second.
         trajectories: True to keep the positions of all vehicles.
@@ -100,6 +101,7 @@ class _Street:
     policy: PolicyFactory
     seed: int
     same_demand: bool
+    day_to_day: float
     speeds: bool
     lanes: bool
     trajectories: bool
@@ -124,6 +126,7 @@ def record(
     seed: int = 0,
     duration_s: float | None = None,
     same_demand: bool = False,
+    day_to_day: float = 0.0,
     detector_length_m: float = 0.0,
     speeds: bool = True,
     lanes: bool = False,
@@ -141,6 +144,7 @@ def record(
         seed: Root of the seeds of all days.
         duration_s: Length of a day in s; None for the scenario's own.
         same_demand: True to use the scenario's own vehicles every day, False to draw new ones.
+        day_to_day: Standard deviation of the whole demand of a day, as a share of its mean.
         detector_length_m: Length of the detection zones in m; 0 for points.
         speeds: True if the detectors measure speeds and lengths.
         lanes: True to keep vehicles, halting vehicles and mean speed per lane and second.
@@ -160,6 +164,8 @@ def record(
         raise OptionError(
             f"detector_length_m = {detector_length_m:g} and seed = {seed} must be 0 or more"
         )
+    if not 0 <= day_to_day < 1:
+        raise OptionError(f"day_to_day = {day_to_day:g} must be from 0 to below 1")
     if duration_s is not None:
         scenario = scenario.with_duration(duration_s)
     base, effects = _world(demand_as_vehicles(scenario), domain)
@@ -185,6 +191,7 @@ def record(
         policy,
         seed,
         same_demand,
+        day_to_day,
         speeds,
         lanes,
         trajectories,
@@ -243,7 +250,9 @@ def _day(street: _Street, index: int, split: Split, stop: threading.Event) -> _D
     """Record one day, from its vehicles to the measured data."""
     scenario = street.base
     if not street.same_demand:
-        scenario = draw_day(scenario, derive_seed(street.seed, "record", index, "demand"))
+        scenario = draw_day(
+            scenario, derive_seed(street.seed, "record", index, "demand"), street.day_to_day
+        )
         scenario = _renamed(scenario, derive_seed(street.seed, "record", index, "names"))
     scenario = apply_effects(scenario, street.effects)
     if not street.same_demand:
