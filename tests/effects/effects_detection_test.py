@@ -109,6 +109,15 @@ def test_an_extension_merges_vehicles_that_follow_closely() -> None:
     assert times(whole, "far") == [(10, 30)]
 
 
+def test_an_extension_is_taken_off_again() -> None:
+    day = period(far=passages([10, 20, NAN], [11, NAN, 3.0]))
+    longer = DetectorExtension("far", 1.5, "split")
+    again = longer.undone(longer.observe(day, DETECTORS, {}), DETECTORS)
+    assert np.allclose(np.array(times(again, "far")), np.array(times(day, "far")), equal_nan=True)
+    short = period(far=passages([10], [10.5]))
+    assert times(longer.undone(short, DETECTORS), "far") == [(10, 10)]
+
+
 def test_a_delay_moves_begins_and_hides_short_passages() -> None:
     day = period(far=passages([10, 20], [10.4, 23]))
     after = DetectorExtension("far", -0.5, "split").observe(day, DETECTORS, {})

@@ -10,8 +10,9 @@ content of ``diagnosis.json``.
     records     the records of the stages, and the form of ``diagnosis.json``
     features    measured lanes, and the features of one period there
     statistics  statistics of several periods, their noise, distances, whitening
+    measurement errors of the detectors, read off single vehicles before all else
     replay      one simulated day under the measured signals, with measured arrivals
-    engine      simulated days in parallel, with a cache, within a budget of time
+    engine      simulated days in parallel, with a cache, within a budget
     locate      test of the scenario as it is, and the places that contradict it
     hypotheses  the library of effects, and sets of them
     places      effects proposed at places, in windows and of detectors
@@ -20,7 +21,7 @@ content of ``diagnosis.json``.
     residual    the test of the difference that a model leaves
     select      the search, round by round
     verify      both models on held-out periods, side by side; the usual criteria
-    verdict     one of five verdicts, in words
+    verdict     one of six verdicts, in words
 """
 
 import lazy_loader

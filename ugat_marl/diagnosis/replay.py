@@ -173,7 +173,10 @@ class Replay:
         if self._arrivals is not None:
             others = [effect for effect in effects if not effect.on_departures]
             drivers = scenario if len(others) == len(effects) else _with(day, others)
-            scenario, due = self._arrivals.given(scenario, drivers, period)
+            came = period
+            for error in self._detection:
+                came = error.undone(came, self._detectors)
+            scenario, due = self._arrivals.given(scenario, drivers, came)
         scenario = shift_parking(scenario, derive_seed(seed, "parking"))
         with tempfile.TemporaryDirectory(prefix="ugat_marl-") as name:
             directory = Path(name)

@@ -159,6 +159,16 @@ class Effect(ControllerPart):
         """
         return tuple(detectors)
 
+    def undone(self, period: Period, detectors: Sequence[Detector]) -> Period:
+        """Return a measured period without the effect, as far as the reports allow.
+
+        Args:
+            period: Measured passages; it does not change itself.
+            detectors: All detectors.
+        """
+        del detectors
+        return period
+
     def in_words(self) -> str:
         """Return the effect as part of a sentence; its text form unless it has better words."""
         return str(self)

@@ -215,6 +215,16 @@ class DetectorExtension(_OfDetectors):
 
         return self._edited(period, detectors, extended)
 
+    def undone(self, period: Period, detectors: Sequence[Detector]) -> Period:
+        """Take the extension off the ends; a delay and merged vehicles stay as they are."""
+
+        def shorter(name: str, passages: Passages) -> Passages:
+            del name
+            ends = passages.off_s - max(self.seconds, 0.0)
+            return replace(passages, off_s=np.where(ends < passages.on_s, passages.on_s, ends))
+
+        return self._edited(period, detectors, shorter)
+
 
 def _merged(passages: Passages) -> Passages:
     """Return passages in which each group without an off in between is one passage.

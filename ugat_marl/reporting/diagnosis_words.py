@@ -54,7 +54,9 @@ def effect_name(effect: EffectRecord) -> str:
 def place(effect: EffectRecord) -> str:
     """Return the place of an effect."""
     where = effect.place
-    return "everywhere" if where in (None, "*", "") else where.replace(">", " → ")
+    if where in (None, "*", ""):
+        return "everywhere"
+    return " → ".join("everywhere" if part == "*" else part for part in where.split(">"))
 
 
 def window(span: tuple[float, float] | None) -> str:
