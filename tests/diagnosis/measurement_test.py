@@ -188,3 +188,16 @@ def test_sightings_are_stored_and_read() -> None:
         np.testing.assert_array_equal(again.arrays()[key], values)
     assert (one.passages[:, 1] == ALONE).all()
     assert len((one + again).pairs) == 2 * len(one.pairs) > 0
+
+
+@pytest.mark.parametrize(("grain_s", "seen"), [(0.1, True), (1.0, False)])
+def test_coarse_clocks(grain_s: float, seen: bool) -> None:
+    usual = together([day(seed) for seed in range(3)])
+
+    def rounded(sightings: Sightings) -> Sightings:
+        sightings.passages[:, 2] = grain_s * np.round(sightings.passages[:, 2] / grain_s)
+        return sightings
+
+    assert named(rounded(day(7)), usual) == []
+    found = named(rounded(day(7, extension_s=1.0)), usual)
+    assert [text.startswith("detector_extension=*") for text in found] == ([True] if seen else [])

@@ -340,6 +340,15 @@ def _median(values: Array) -> Estimate:
     return Estimate(middle, 1.2533 * max(spread, 1e-3) / float(np.sqrt(len(values))))
 
 
+def _grain_s(times: Array) -> float:
+    """Return the grain of a clock that stamps in tenths of seconds or coarser, s; 0 if finer."""
+    for grain in (1.0, 0.5, 0.2, 0.1):
+        steps = times / grain
+        if len(times) and bool((np.abs(steps - np.round(steps)) < 0.01).all()):
+            return grain
+    return 0.0
+
+
 @dataclass(frozen=True)
 class Equation:
     """One linear equation ``value = coefficients . parameters + bend * rear`` with its error.
@@ -477,6 +486,7 @@ class Measurement:
         self._measured = measured
         self._simulated = simulated
         self._thresholds = thresholds
+        self._grain_s = _grain_s(measured.passages[:, 2])
         self._groups: dict[Group, list[int]] = {}
         for index, detector in enumerate(detectors):
             group = (detector.kind, edge_of_lane(detector.lane))
@@ -489,6 +499,8 @@ class Measurement:
             left_out: Names of effects that are not examined.
         """
         limit = self._thresholds
+        if self._grain_s > limit.coarsest_clock_s:
+            return ()
         pulses = self._pulses()
         found = [
             DetectorError(DetectorPulse(place, round(seconds, 2)))
@@ -525,7 +537,10 @@ class Measurement:
                 float(np.mean(np.abs(x[:, 2] - np.median(x[:, 2])) < self._thresholds.touching_s))
                 for x in (data, model)
             ]
-            if alike[0] > self._thresholds.pulse_share > 2.0 * alike[1]:
+            # Times in tenths of seconds are alike too, but not far from those of simulated days.
+            apart = abs(float(np.median(data[:, 2]) - np.median(model[:, 2])))
+            same = alike[0] > self._thresholds.pulse_share > 2.0 * alike[1]
+            if same and apart > self._thresholds.least_extension_s:
                 pulses[group_name(*group)] = float(np.median(data[:, 2]))
         return pulses
 
@@ -607,8 +622,9 @@ class Measurement:
         bend = usual.value / steady - 1.0
         doubt = limit.inexact * found.value + limit.bent * abs(bend)
         doubt += 0.0 if seen[0, 1] == ALONE else limit.unlike
-        error = float(np.sqrt(found.error**2 + usual.error**2 + doubt**2)) / steady
         pace = float(np.median(seen[:, 3] / seen[:, 4]))
+        doubt += 0.5 * self._grain_s * pace
+        error = float(np.sqrt(found.error**2 + usual.error**2 + doubt**2)) / steady
         coefficients = (pace / steady, 1.0 / float(np.median(seen[:, 4])) / steady)
         return Equation(found.value / steady - 1.0, coefficients, bend, error)
 
@@ -621,7 +637,8 @@ class Measurement:
         share = limit.speed_doubt if steadily else limit.queue_doubt
         # The same drivers pass all groups of a kind, so more groups are not more exact.
         alike = sum(kind == other for other, _ in self._groups) * (1 if steadily else regimes)
-        error = float(np.hypot(found.error, share * usual.value * np.sqrt(alike)))
+        doubt = share * usual.value * np.sqrt(alike) + 0.5 * self._grain_s
+        error = float(np.hypot(found.error, doubt))
         slowness = usual.value / float(np.median(known[:, 4]))
         return Equation(found.value - usual.value, (1.0, slowness), 0.0, error)
 

@@ -315,6 +315,10 @@ class Thresholds(DayThresholds):
     least_splash: float = 0.02
     """Share of vehicles reported by the next lane too from which it matters. By hand. Halved:
     chance is named more often."""
+    coarsest_clock_s: float = 0.2
+    """Grain of the stamps of detections above which errors of detectors are not examined, s. By
+    hand: vehicles are over a zone for less than half a second. Halved: logs in fifths of seconds
+    are not examined."""
     pulse_share: float = 0.9
     """Share of passages with nearly the same time from which a detector reports pulses. By hand.
     Halved: dense traffic at one speed looks like pulses."""
