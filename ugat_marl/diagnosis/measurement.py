@@ -620,7 +620,10 @@ class Measurement:
         limit = self._thresholds
         found, usual = (_median(x[:, 2] * x[:, 3] / x[:, 4]) for x in (seen, known))
         bend = usual.value / steady - 1.0
-        doubt = limit.inexact * found.value + limit.bent * abs(bend)
+        # The same drivers pass all groups of a kind, so more groups are not more exact.
+        kind = self._detectors[int(seen[0, 0])].kind
+        alike = sum(kind == other for other, _ in self._groups)
+        doubt = limit.inexact * found.value + limit.bent * abs(bend) * np.sqrt(alike)
         doubt += 0.0 if seen[0, 1] == ALONE else limit.unlike
         pace = float(np.median(seen[:, 3] / seen[:, 4]))
         doubt += 0.5 * self._grain_s * pace

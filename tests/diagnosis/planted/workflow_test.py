@@ -195,3 +195,29 @@ def test_data_without_a_period_to_fit_are_refused(
 def test_impossible_settings_are_refused(wrong: dict[str, Any], error: type[Exception]) -> None:
     with pytest.raises(error):
         DiagnosisConfig(**wrong)
+
+
+def test_a_search_without_time_for_a_test_keeps_its_nearest_explanation(
+    street, measured: MeasuredData, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    from ugat_marl.diagnosis.engine import Engine
+
+    whole = Engine.replicates
+
+    def short(self: Engine, effects: Any, numbers: Any, *rest: Any) -> Any:
+        if effects and len(numbers) > FEW.fit:
+            raise OutOfTime("the budget is spent")
+        return whole(self, effects, numbers, *rest)
+
+    monkeypatch.setattr(Engine, "replicates", short)
+    found = run(street, measured, tmp_path)
+    assert (found["verdict"], found["complete"]) == ("provisional", False)
+    (effect,) = found["effects"]
+    assert (effect["name"], effect["place"]) == ("undercount", "stop:S_C_0")
+    assert effect["parameters"]["share"]["low"] is None, "an interval needs a test"
+    assert "not verified" in found["sentence"]
+    assert (tmp_path / found["corrected"] / "scenario.toml").is_file()
+    monkeypatch.undo()
+    whole_search = run(street, measured, tmp_path)
+    assert whole_search["verdict"] == "explained"
+    assert whole_search["heldout"]["before"] == found["heldout"]["before"]
