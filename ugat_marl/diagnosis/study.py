@@ -91,6 +91,11 @@ class DiagnosisConfig:
             raise OptionError(f"seed = {self.seed} must not be negative")
         library(self.leave_out)
 
+    def budget(self) -> Budget:
+        """Return the budget of a diagnosis that begins now."""
+        deadline = None if self.budget_s is None else time.monotonic() + self.budget_s
+        return Budget(self.budget_h, deadline)
+
 
 @dataclass(frozen=True, eq=False)
 class Study:
@@ -113,6 +118,7 @@ class Study:
             not follow the traffic, since `engine` does the same then.
         ruled_out: Names of the effects that the data cannot show.
         detection: Errors of measurement, which all simulated days have.
+        day_to_day: Variation of demand from day to day, which they have too, as a share.
     """
 
     scenario: Scenario
@@ -130,6 +136,7 @@ class Study:
     other_days: Engine | None = None
     ruled_out: frozenset[str] = field(default=frozenset())
     detection: tuple[DetectorError, ...] = ()
+    day_to_day: float = 0.0
     _doubts: dict[tuple[Effect, ...], Mapping[str, Array]] = field(default_factory=dict, init=False)
 
     @property
@@ -158,19 +165,11 @@ class Study:
         lights = layout.intersections
         answering = any(is_actuated(measured.periods, tls) for tls in lights)
         effort = config.effort or effort_for(len(lights))
-
-        deadline = None if config.budget_s is None else time.monotonic() + config.budget_s
-        budget = Budget(config.budget_h, deadline)
-
+        budget = config.budget()
         fit = _tallies(layout, measured, periods, thresholds)
         heldout = _tallies(layout, measured, measured.of("heldout"), thresholds)
         variation = _variation(layout, measured, (*fit, *heldout), thresholds)
-        if variation:
-            text = (
-                f"demand differs from day to day by about {100 * variation:.0f} %, on top of "
-                "chance; so do the simulated days"
-            )
-            measured = replace(measured, findings=(*measured.findings, Finding(text)))
+        measured = replace(measured, findings=(*measured.findings, *_of_variation(variation)))
 
         def simulating(answering: bool, base_days: int) -> Engine:
             return Engine(
@@ -211,6 +210,7 @@ class Study:
             heldout or fit,
             simulating(False, 0) if answering else None,
             ruled_out,
+            day_to_day=variation,
         )
 
     @property
@@ -476,6 +476,17 @@ def _variation(
         ]
         rows.append(max(by_kind, key=lambda counts: float(counts.sum())))
     return day_to_day_variation(np.array(rows), thresholds)
+
+
+def _of_variation(variation: float) -> tuple[Finding, ...]:
+    """Return a finding on the variation from day to day; none without one."""
+    if not variation:
+        return ()
+    share = f"{100 * variation:.0f} %"
+    text = (
+        f"demand differs from day to day by about {share}, on top of chance; so do simulated days"
+    )
+    return (Finding(text),)
 
 
 # --- measured edges without demand ----------------------------------------------------------------
