@@ -171,14 +171,13 @@ def test_extensions_are_seen_without_speeds() -> None:
     assert named(day(7, speeds=False), usual) == []
 
 
-def test_pulses_are_seen() -> None:
+@pytest.mark.parametrize("seconds", [0.1, 1.0])
+def test_pulses_are_seen(seconds: float) -> None:
     usual = together([day(seed) for seed in range(3)])
     pulses = day(7)
-    pulses.passages[:, 2] = 0.1
-    assert named(pulses, usual)[:2] == [
-        "detector_pulse=advance@in,0.1",
-        "detector_pulse=stop@in,0.1",
-    ]
+    pulses.passages[:, 2] = seconds
+    kinds = [f"detector_pulse={kind}@in,{seconds:g}" for kind in ("advance", "stop")]
+    assert named(pulses, usual) == kinds
 
 
 def test_sightings_are_stored_and_read() -> None:

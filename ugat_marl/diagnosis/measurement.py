@@ -341,10 +341,15 @@ def _median(values: Array) -> Estimate:
 
 
 def _grain_s(times: Array) -> float:
-    """Return the grain of a clock that stamps in tenths of seconds or coarser, s; 0 if finer."""
+    """Return the grain of a clock that stamps in tenths of seconds or coarser, s; 0 if finer.
+
+    Equal times are pulses, which say nothing about the clock.
+    """
+    if not len(times) or np.ptp(times) < 0.05:
+        return 0.0
     for grain in (1.0, 0.5, 0.2, 0.1):
         steps = times / grain
-        if len(times) and bool((np.abs(steps - np.round(steps)) < 0.01).all()):
+        if bool((np.abs(steps - np.round(steps)) < 0.01).all()):
             return grain
     return 0.0
 
