@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -181,12 +182,12 @@ class Watched(Replay):
         )
         self.parked: list[list[float]] = []
 
-    def _run(self, scenario: Scenario, period: Period, seed: int, directory: Path) -> Day:
+    def _run(self, scenario: Scenario, *rest: Any) -> Day:
         vehicles = (x for item in scenario.routes for x in item.parse().iter("vehicle"))
         self.parked.append(
             [float(x.get("depart", "")) for x in vehicles if x.get("id", "").startswith("parking.")]
         )
-        return super()._run(scenario, period, seed, directory)
+        return super()._run(scenario, *rest)
 
 
 def test_vehicles_park_at_other_times_on_other_days(scenario: Scenario) -> None:
