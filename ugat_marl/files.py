@@ -17,7 +17,7 @@ import tempfile
 import weakref
 import xml.etree.ElementTree as ET
 import zlib
-from collections.abc import Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, BinaryIO, NamedTuple
@@ -30,6 +30,9 @@ _PIECE = 1 << 20
 _KEPT = 8 << 20
 """Bytes of an edited document above which it is kept in a file instead of in memory."""
 _INDENT = "    "
+_DEEPEST = 64
+"""Most elements inside each other. Files of SUMO and OpenStreetMap have fewer than ten. Deeper ones
+exhaust the stack of whatever walks through them."""
 _END = "\0"
 """Mark after each child of an element during writing. XML cannot contain this character."""
 
@@ -128,11 +131,13 @@ class Tag(NamedTuple):
         name: Tag of the element.
         attributes: Its attributes.
         line: Its line in the document, from 1.
+        parent: Tag of the element around it; empty for the root.
     """
 
     name: str
     attributes: dict[str, str]
     line: int
+    parent: str = ""
 
 
 def chunks_of(path: Path, reporter: Reporter | None = None) -> Iterator[bytes]:
@@ -171,11 +176,19 @@ def scan_xml(pieces: Iterable[bytes], name: str) -> Iterator[Tag]:
     """
     parser = _refusing_parser(name)
     tags: list[Tag] = []
+    around = [""]
 
     def start(tag: str, attributes: dict[str, str]) -> None:
-        tags.append(Tag(tag, attributes, parser.CurrentLineNumber))
+        tags.append(Tag(tag, attributes, parser.CurrentLineNumber, around[-1]))
+        around.append(tag)
+        if len(around) > _DEEPEST:
+            _refuse_depth(parser, name)
+
+    def end(tag: str) -> None:
+        del tag, around[-1]
 
     parser.StartElementHandler = start
+    parser.EndElementHandler = end
     for piece in pieces:
         _parse(parser, piece, False, name)
         yield from tags
@@ -232,13 +245,38 @@ def parts_of_xml(pieces: Iterable[bytes], name: str) -> Iterator[ET.Element]:
 
 
 def _building_parser(name: str) -> tuple[expat.XMLParserType, ET.TreeBuilder]:
-    builder = ET.TreeBuilder()
+    builder = _BoundedBuilder()
     parser = _refusing_parser(name)
+    builder.too_deep = lambda: _refuse_depth(parser, name)
     parser.buffer_text = True
     parser.StartElementHandler = builder.start
     parser.EndElementHandler = builder.end
     parser.CharacterDataHandler = builder.data
     return parser, builder
+
+
+class _BoundedBuilder(ET.TreeBuilder):
+    """Builder of a tree that is not deeper than `_DEEPEST`."""
+
+    too_deep: Callable[[], None]
+    _depth = 0
+
+    def start(self, tag: str, attrs: dict[str, str], /) -> ET.Element:
+        self._depth += 1
+        if self._depth > _DEEPEST:
+            self.too_deep()
+        return super().start(tag, attrs)
+
+    def end(self, tag: str, /) -> ET.Element:
+        self._depth -= 1
+        return super().end(tag)
+
+
+def _refuse_depth(parser: expat.XMLParserType, name: str) -> None:
+    raise ScenarioError(
+        f"{name}, line {parser.CurrentLineNumber}: more than {_DEEPEST} elements inside each "
+        "other, which no file of a scenario needs"
+    )
 
 
 def _refusing_parser(name: str) -> expat.XMLParserType:

@@ -206,14 +206,6 @@ def test_a_state_of_the_wrong_length_is_sumo_s_error(
         simulator.advance(10, {"C": [(10.0, "G")]})
 
 
-def test_an_option_sumo_does_not_know(
-    simulator: LibsumoSimulator, crossing: Crossing, tmp_path: Path
-) -> None:
-    directory = crossing(toml=lambda text: text + '[sumo]\nlateral-revolution = "0.8"\n')
-    with pytest.raises(SimulatorError, match=r"SUMO did not start: .*command ?line"):
-        started(simulator, directory, tmp_path)
-
-
 # --- the signals SUMO really shows
 
 

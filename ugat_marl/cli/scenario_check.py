@@ -29,6 +29,7 @@ from ugat_marl.experiments import (
 )
 from ugat_marl.progress import Bars, Silent
 from ugat_marl.scenarios import SHORT_LANE_M, IntersectionFacts, Survey, survey
+from ugat_marl.simulation import confinement_missing
 from ugat_marl.testing import (
     CheckResult,
     check_determinism,
@@ -108,6 +109,12 @@ class ScenarioCheck:
             print(text)
         else:
             show(console, facts, runs, rows, wrong)
+            if reason := confinement_missing():
+                console.print(
+                    f"note: simulations are not confined, because {reason}; see SECURITY.md before "
+                    "you run files of others",
+                    soft_wrap=True,
+                )
         return 1 if wrong else 0
 
     def _kit(self, console: Console) -> int:

@@ -63,7 +63,6 @@ from ugat_marl.scenarios import (
     demand_as_vehicles,
     draw_day,
     late_green_log,
-    sumo_program,
 )
 from ugat_marl.seeding import derive_seed
 from ugat_marl.simulation import (
@@ -234,9 +233,9 @@ class Replay:
         )
         launch = launch_of(scenario, seed, directory, ())
         launch.write()
-        command = [str(sumo_program("sumo")), *launch.arguments, "--end", repr(period.end_s)]
         # The files are those of the scenario. Reading the schemas takes longer than a short day.
-        command += ["--xml-validation", "never", "--xml-validation.routes", "never"]
+        unchecked = ("--xml-validation", "never", "--xml-validation.routes", "never")
+        command = launch.command("--end", repr(period.end_s), *unchecked)
         done = subprocess.run(command, capture_output=True, text=True, check=False)
         if done.returncode:
             said = one_line_message(done.stderr) or f"exit code {done.returncode}"

@@ -12,7 +12,7 @@ from ugat_marl.experiments.evaluation import evaluate, rule_factory
 from ugat_marl.experiments.transfer_headroom import HeadroomRow
 from ugat_marl.files import chunks_of, scan_xml
 from ugat_marl.progress import Reporter
-from ugat_marl.scenarios import Scenario, Survey, departures, run_program, sumo_program
+from ugat_marl.scenarios import Scenario, Survey, departures, run_program
 from ugat_marl.simulation import launch_of
 
 TRIPS = "trips.xml"
@@ -89,7 +89,7 @@ def left_outside(scenario: Scenario, seed: int) -> Counter[str]:
         launch = launch_of(scenario, seed, directory, ())
         launch.write()
         end_s = scenario.settings.begin_s + scenario.settings.duration_s
-        run_program("sumo", [str(sumo_program("sumo")), *launch.arguments, "--end", repr(end_s)])
+        run_program("sumo", launch.command("--end", repr(end_s)))
         waiting = {
             element.attributes.get("id", "")
             for element in scan_xml(chunks_of(directory / TRIPS), "SUMO's report")

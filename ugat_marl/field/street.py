@@ -28,7 +28,7 @@ from traci.exceptions import FatalTraCIError, TraCIException
 
 from ugat_marl.effects import late_greens
 from ugat_marl.errors import OptionError, SimulatorError
-from ugat_marl.scenarios import Scenario, sumo_program
+from ugat_marl.scenarios import Scenario
 from ugat_marl.simulation import Trips, launch_of, read_trips
 
 CountSource = Literal["lanes", "areas"]
@@ -246,7 +246,7 @@ class StartedSumo:
         launch.write()
         self._trips = place / Path(_value_of("--tripinfo-output", launch.arguments)).name
         self.process: subprocess.Popen[bytes] = subprocess.Popen(
-            [str(sumo_program("sumo")), *launch.arguments, "--remote-port", str(self.port)],
+            launch.command(port=self.port),
             stdin=subprocess.DEVNULL,
             stdout=subprocess.DEVNULL,
             stderr=subprocess.DEVNULL,

@@ -19,11 +19,11 @@ from pathlib import Path
 from typing import Any
 
 from ugat_marl.errors import ScenarioError, UnknownNameError, install_command
-from ugat_marl.files import Document, Draft, child_texts, parse_xml, read_bytes, write_whole
+from ugat_marl.files import Document, parse_xml, read_bytes, write_whole
+from ugat_marl.scenarios.admission import OPTIONS, admitted
 from ugat_marl.scenarios.settings import (
     ControlSettings,
     ScenarioFile,
-    may_be_given,
     parse_time,
     validate_settings,
 )
@@ -41,6 +41,7 @@ class Scenario:
         additional: SUMO's additional files.
         settings: All settings of ``scenario.toml``.
         applied: Descriptions of the effects that made this scenario out of another one.
+        outputs: Folders into which measurements of the suite let SUMO write. No file can name one.
     """
 
     id: str
@@ -49,6 +50,7 @@ class Scenario:
     additional: tuple[Document, ...]
     settings: ScenarioFile
     applied: tuple[str, ...] = field(default=())
+    outputs: tuple[str, ...] = field(default=(), compare=False)
 
     @property
     def control(self) -> ControlSettings:
@@ -181,13 +183,13 @@ def _load_directory(directory: Path) -> Scenario:
         path = directory / name
         if not path.is_file():
             raise ScenarioError(f"{file}: {key} names {name!r}, but {path} does not exist")
-        return Document(path.name, path)
+        return admitted(Document(path.name, path))
 
     return Scenario(
         id=directory.resolve().name,
         network=document(settings.network, "network"),
         routes=tuple(document(name, "routes") for name in settings.routes),
-        additional=tuple(_quiet(document(name, "additional")) for name in settings.additional),
+        additional=tuple(document(name, "additional") for name in settings.additional),
         settings=settings,
     )
 
@@ -219,7 +221,7 @@ def _load_sumocfg(path: Path, scenario_id: str) -> Scenario:
                 raise ScenarioError(
                     f"{path}: <{key}> names {name!r}, but {path.parent / name} does not exist"
                 )
-        return tuple(Document(Path(name).name, path.parent / name) for name in names)
+        return tuple(admitted(Document(Path(name).name, path.parent / name)) for name in names)
 
     def seconds(key: str, default: str) -> float:
         text = value(key, default)
@@ -246,12 +248,12 @@ def _load_sumocfg(path: Path, scenario_id: str) -> Scenario:
                 element.tag: element.get("value", element.get("v", ""))
                 for section in (*root.iter("processing"), *root.iter("routing"))
                 for element in section
-                if may_be_given(element.tag)
+                if element.tag in OPTIONS
             },
         },
         str(path),
     )
-    return Scenario(scenario_id, network, routes, tuple(map(_quiet, additional)), settings)
+    return Scenario(scenario_id, network, routes, additional, settings)
 
 
 def _names(text: str, directory: Path) -> list[str]:
@@ -285,21 +287,6 @@ def _resco_configuration(name: str) -> Path:
     if name not in maps:
         raise UnknownNameError("RESCO map", name, maps)
     return maps[name]
-
-
-def _quiet(document: Document) -> Document:
-    """Return the document with its outputs discarded; SUMO would write them beside user files."""
-    if not any("file" in tag.attributes for tag in document.scan()):
-        return document
-    draft = None
-    for part in document.parts():
-        for element in part.iter():
-            if "file" in element.attrib:
-                element.set("file", "NUL")
-        draft = draft or Draft(document.name.removesuffix(".gz"), part)
-        draft.add(*child_texts(part))
-    assert draft is not None
-    return draft.document()
 
 
 def _quoted(value: Any) -> str:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import re
 from collections.abc import Mapping
 from typing import Annotated, Any, Literal
 
@@ -10,6 +9,7 @@ import pydantic
 from pydantic import Field
 
 from ugat_marl.errors import ScenarioError, nearest
+from ugat_marl.scenarios.admission import OPTIONS, option_fault
 
 PhaseSource = Literal["programme", "conflict-free", "permitted"] | tuple[str, ...]
 """Source of an intersection's green phases.
@@ -19,14 +19,6 @@ PhaseSource = Literal["programme", "conflict-free", "permitted"] | tuple[str, ..
 - ``permitted``: the same, with left turns that give way to opposite traffic.
 - A list: SUMO states.
 """
-
-_SET_BY_THE_SUITE = frozenset(
-    {
-        "begin", "end", "step-length", "seed", "random", "no-warnings", "suppress-warnings",
-        "time-to-teleport",
-    }
-)  # fmt: skip
-_INPUT_AND_OUTPUT = frozenset({"output", "file", "files", "port", "script", "log", "gui"})
 
 _STRICT = pydantic.ConfigDict(extra="forbid", frozen=True, allow_inf_nan=False)
 
@@ -92,11 +84,15 @@ def validate_settings(raw: Mapping[str, Any], source: str) -> ScenarioFile:
     except pydantic.ValidationError as error:
         explained = dict.fromkeys(_explain(problem) for problem in error.errors())
         raise ScenarioError(f"{source}: {'; '.join(explained)}") from None
-    for option in settings.sumo:
-        if not may_be_given(option):
+    for option, value in settings.sumo.items():
+        if option not in OPTIONS:
+            guess = nearest(option, OPTIONS)
             raise ScenarioError(
-                f"{source}: sumo.{option} is set by the suite and cannot be given; leave it out"
+                f"{source}: sumo.{option} is set by the suite or names files, and cannot be given; "
+                f"leave it out{f', or did you mean {guess!r}?' if guess else ''}"
             )
+        if fault := option_fault(option, value):
+            raise ScenarioError(f"{source}: sumo.{option} = {value!r} {fault}")
     control = settings.control
     step = settings.step_length_s
     for key, value in (
@@ -122,12 +118,6 @@ def validate_settings(raw: Mapping[str, Any], source: str) -> ScenarioFile:
             f"({control.decision_interval_s:g} s)"
         )
     return settings
-
-
-def may_be_given(option: str) -> bool:
-    """Return True if a scenario may set this option of SUMO; the suite sets the other options."""
-    words = set(re.split("[-.]", option))
-    return option not in _SET_BY_THE_SUITE and not words & _INPUT_AND_OUTPUT
 
 
 def parse_time(text: str) -> float:

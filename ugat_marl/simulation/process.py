@@ -159,10 +159,12 @@ def _answer(simulator: Simulator, question: dict[str, Any]) -> Message:
     request = question["what"]
     if request == "start":
         fields: dict[str, Any] = dict(question["launch"])
-        for name in ("arguments", "lanes"):
+        for name in ("arguments", "lanes", "reads", "outputs"):
             fields[name] = tuple(fields[name])
         fields["behind"] = UpstreamLanes(*fields["behind"])
-        return _message(simulator.start(Launch(**fields)))
+        launch = Launch(**fields)
+        launch.confine()
+        return _message(simulator.start(launch))
     if request == "advance":
         return _message(simulator.advance(question["seconds"], question["plans"]))
     if request == "vehicles":

@@ -28,7 +28,9 @@ from ugat_marl.scenarios import (
     Turns,
     UpstreamLanes,
     edge_of_lane,
+    sumo_program,
 )
+from ugat_marl.simulation.confinement import confine, confined_command
 from ugat_marl.simulation.host import one_line_message
 from ugat_marl.simulation.mesoscopic import MesoscopicLanes, refuse_in_queues
 from ugat_marl.simulation.snapshots import HALTING_MPS, Snapshot, Trips
@@ -62,6 +64,8 @@ class Launch:
         behind: Upstream lanes and roads, as in `ugat_marl.scenarios.lanes.LaneTable`.
         turns: Ways across the agents' lights, to measure queues upstream of `lanes`; empty to leave
             them out.
+        reads: Files of the scenario that SUMO reads where they lie.
+        outputs: Folders, besides its own, into which SUMO writes.
     """
 
     arguments: tuple[str, ...]
@@ -76,6 +80,8 @@ class Launch:
     persons: tuple[tuple[str, float], ...] = ()
     behind: UpstreamLanes = NO_UPSTREAM_LANES
     turns: Turns = ()
+    reads: tuple[str, ...] = ()
+    outputs: tuple[str, ...] = ()
 
     @property
     def segment_m(self) -> float:
@@ -89,6 +95,34 @@ class Launch:
         Path(self.directory).mkdir(mode=0o700, exist_ok=True)
         for name, content in self.files:
             write_whole(Path(self.directory) / name, content)
+
+    def command(self, *options: str, port: int | None = None) -> list[str]:
+        """Return a command line for the program ``sumo``, confined as in `confine`.
+
+        Args:
+            options: Further options of SUMO.
+            port: TCP port on which SUMO listens, or None.
+        """
+        ports = [] if port is None else [port]
+        further = [] if port is None else ["--remote-port", str(port)]
+        return confined_command(
+            [str(sumo_program("sumo")), *self.arguments, *options, *further],
+            self.reads,
+            self._writable,
+            ports,
+        )
+
+    def confine(self) -> None:
+        """Confine this thread to the files of this simulation, where the system can do that.
+
+        A simulation with a window stays free, because it needs the display.
+        """
+        if not self.gui:
+            confine(self.reads, self._writable)
+
+    @property
+    def _writable(self) -> tuple[str, ...]:
+        return (self.directory, *self.outputs)
 
     def as_dict(self) -> dict[str, Any]:
         """Return the fields for JSON. The files are left out because `write` has stored them."""
@@ -181,9 +215,11 @@ def launch_of(
     }
     arguments: list[str] = []
     written: dict[str, bytes] = {}
+    reads: list[str] = []
     for option, documents in files.items():
         if documents:
             paths = [_on_disk(document, directory, written) for document in documents]
+            reads += paths
             arguments += [option, ",".join(paths)]
     for option, value in settings.sumo.items():
         arguments += [f"--{option}", value]
@@ -217,6 +253,8 @@ def launch_of(
         tuple((persons or {}).items()),
         behind,
         turns,
+        tuple(reads),
+        scenario.outputs,
     )
 
 

@@ -66,6 +66,8 @@ def _abandoned(parent: int, user: int) -> bool:
 class _Life:
     """Watch that ends a worker with the user's process and removes its folder.
 
+    Its thread begins before the worker is confined, so that it may remove the folder.
+
     Args:
         parent: Number of the process that started this one.
         user: Number of the user's process.
@@ -76,18 +78,21 @@ class _Life:
         self._parent = parent
         self._user = user
         self._directory = directory
+        self._over = threading.Event()
         threading.Thread(target=self._watch, daemon=True).start()
 
     def leave(self) -> NoReturn:
         """Remove the folder and exit."""
+        self._over.set()
+        while True:
+            time.sleep(LOOK_EVERY_S)
+
+    def _watch(self) -> None:
+        while not self._over.wait(LOOK_EVERY_S) and not _abandoned(self._parent, self._user):
+            pass
         if self._directory is not None:
             shutil.rmtree(self._directory, ignore_errors=True)
         os._exit(0)  # no destructors: libsumo's may take long on a large network
-
-    def _watch(self) -> None:
-        while not _abandoned(self._parent, self._user):
-            time.sleep(LOOK_EVERY_S)
-        self.leave()
 
 
 def _work(

@@ -30,7 +30,8 @@ from ugat_marl.envs.types import AnyParallelEnv
 from ugat_marl.envs.vector.arrays import Arrays, Shape
 from ugat_marl.envs.vector.spec import Spec, agents_of
 from ugat_marl.errors import EpisodeError, ScenarioError
-from ugat_marl.simulation import Message
+from ugat_marl.scenarios import Scenario
+from ugat_marl.simulation import Message, confine
 
 _KEPT = 64
 """Number of environments that the parent keeps; the least recently used one is dropped."""
@@ -127,6 +128,7 @@ class _EpisodeServer:
                 f"first one of this vector_env: {agents}, not {header['agents']}"
             )
         self._running = self._env
+        self._confine()
         self._agents = AgentSet.of(self._env)
         self._arrays = Arrays.over(self._memory, Shape(**header["shape"]))
         observations, infos = self._env.reset(seed=header["seed"])
@@ -136,6 +138,18 @@ class _EpisodeServer:
         (history,) = question.arrays
         for row in history.astype(np.int64):
             self._step(row)
+
+    def _confine(self) -> None:
+        """Confine this process to the files of its scenario, unless it runs functions of the user.
+
+        A user's reward or wrapper may well write files of its own.
+        """
+        spec = self._order["spec"]
+        if spec["reward"] is None and not spec["wraps"]:
+            base: Any = self._running.unwrapped
+            scenario: Scenario = base.scenario
+            files = [str(each.path) for each in scenario.documents if each.path is not None]
+            confine([self._order["folder"], *files], [self._order["directory"]])
 
     def _step(self, actions: NDArray[np.int64]) -> None:
         observations, rewards, _, _, infos = self._running.step(self._agents.actions(actions))

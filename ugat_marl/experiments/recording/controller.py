@@ -17,7 +17,7 @@ from ugat_marl.envs import EnvOptions, TrafficEnv, parallel_env
 from ugat_marl.errors import SimulatorError
 from ugat_marl.files import parse_xml, xml_bytes
 from ugat_marl.policies import PolicyFactory, roll_out, stop_callback
-from ugat_marl.scenarios import Document, Network, Scenario, SignalLog, signals, sumo_program
+from ugat_marl.scenarios import Document, Network, Scenario, SignalLog, signals
 from ugat_marl.simulation import launch_of
 
 _STATE = re.compile(r'<tlsState time="([\d.]+)" id="([^"]*)" [^>]*?state="([^"]*)"')
@@ -96,10 +96,12 @@ def own_programmes(
     with tempfile.TemporaryDirectory(prefix="ugat_marl-") as name:
         directory = Path(name)
         watching = switch_document(fixed, directory / "signals.xml")
-        empty = replace(scenario, routes=(), additional=(*scenario.additional, watching))
+        empty = replace(
+            scenario, routes=(), additional=(*scenario.additional, watching), outputs=(name,)
+        )
         launch = launch_of(empty, 0, directory / "sumo", ())
         launch.write()
-        command = [str(sumo_program("sumo")), *launch.arguments, "--end", repr(begin + end)]
+        command = launch.command("--end", repr(begin + end))
         done = subprocess.run(command, capture_output=True, text=True, check=False)
         if done.returncode:
             said = " ".join(done.stderr.split())

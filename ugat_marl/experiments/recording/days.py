@@ -317,7 +317,12 @@ def _with_outputs(scenario: Scenario, street: _Street, directory: Path) -> Scena
             "fcd-output.attributes": "id,lane,pos,speed",
         }
         settings = settings.model_copy(update={"sumo": {**settings.sumo, **output}})
-    return replace(scenario, additional=(*scenario.additional, *extra), settings=settings)
+    return replace(
+        scenario,
+        additional=(*scenario.additional, *extra),
+        settings=settings,
+        outputs=(str(directory),),
+    )
 
 
 def _logged(period: Period) -> Period:

@@ -1,0 +1,227 @@
+"""Scenarios of a stranger: none may read or write a file outside, with the list or without it.
+
+Each case puts one hostile thing into a harmless scenario. It names `{out}`, a file of the user that
+must keep its content, or `{secret}`, one whose content must not come out. Without the list of
+`ugat_marl.scenarios.admission` the kernel alone has to hold.
+"""
+
+from __future__ import annotations
+
+import shutil
+from collections.abc import Callable, Iterator
+from pathlib import Path
+
+import pytest
+
+from ugat_marl.envs import parallel_env
+from ugat_marl.errors import UgatMarlError
+from ugat_marl.files import Document
+from ugat_marl.scenarios import read_scenario, scenario, settings
+from ugat_marl.simulation.confinement import confinement_missing
+
+Crossing = Callable[..., Path]
+
+KEPT = "what the user wrote"
+SECRET = "SECRET-OF-THE-USER"
+
+OPTIONS = [
+    "netstate-dump", "summary", "summary-output", "l", "log", "message-log", "error-log",
+    "save-configuration", "C", "save-template", "save-schema", "save-state.prefix",
+    "save-state.files", "c", "configuration-file", "tripinfo", "tripinfo-output", "fcd-output",
+    "full-output", "queue-output", "vtk-output", "amitran-output", "emission-output",
+    "lanechange-output", "stop-output", "collision-output", "edgedata-output", "lanedata-output",
+    "statistic-output", "deadlock-output", "link-output", "bt-output", "battery-output",
+    "vehroute-output", "vehroutes", "personinfo-output", "person-summary-output",
+    "device.rerouting.output", "device.ssm.file", "device.toc.file",
+    "device.taxi.dispatch-algorithm.output", "phemlight-path", "weight-files", "load-state",
+    "output-prefix",
+]  # fmt: skip
+
+ADDITIONAL = {
+    "timedEvent": '<timedEvent type="SaveTLSStates" source="C" dest="{out}"/>',
+    "calibrator": '<calibrator id="c" edge="W_C" pos="0" output="{out}" freq="10"/>',
+    "include": '<include href="{secret}"/>',
+    "induction loop": '<inductionLoop id="d" lane="W_C_0" pos="5" period="10" file="{out}"/>',
+    "e1Detector": '<e1Detector id="d" lane="W_C_0" pos="5" freq="10" file="{out}"/>',
+    "instant": '<instantInductionLoop id="d" lane="W_C_0" pos="5" file="{out}"/>',
+    "area": '<laneAreaDetector id="d" lane="W_C_0" pos="5" length="9" freq="9" file="{out}"/>',
+    "edgeData": '<edgeData id="d" file="{out}"/>',
+    "laneData": '<laneData id="d" file="{out}"/>',
+    "edges file": '<edgeData id="d" file="NUL" edgesFile="{secret}"/>',
+    "routeProbe": '<routeProbe id="d" edge="W_C" freq="10" file="{out}"/>',
+    "vTypeProbe": '<vTypeProbe id="d" freq="10" file="{out}"/>',
+    "rerouter": '<rerouter id="d" edges="W_C" file="{secret}"/>',
+    "sign": '<variableSpeedSign id="d" lanes="W_C_0" file="{secret}"/>',
+    "calibrator file": '<calibrator id="c" edge="W_C" pos="0" file="{secret}"/>',
+    "ssm": '<vType id="t"><param key="has.ssm.device" value="true"/>'
+    '<param key="device.ssm.file" value="{out}"/></vType>',
+    "actuated": '<tlLogic id="C" type="actuated" programID="x" offset="0"><param key="file" '
+    'value="{out}"/><phase duration="9" state="rG"/><phase duration="9" state="Gr"/></tlLogic>',
+}
+ROUTES = {
+    "ssm of a type": '<vType id="t"><param key="has.ssm.device" value="true"/>'
+    '<param key="device.ssm.file" value="{out}"/></vType>',
+    "ssm of a vehicle": '<vehicle id="s" depart="0" route="east">'
+    '<param key="has.ssm.device" value="true"/>'
+    '<param key="device.ssm.file" value="{out}"/></vehicle>',
+    "toc": '<vType id="t"><param key="has.toc.device" value="true"/>'
+    '<param key="device.toc.file" value="{out}"/></vType>',
+    "include": '<include href="{secret}"/>',
+}
+CASES = [
+    *[("option", name) for name in OPTIONS],
+    *[("additional", name) for name in ADDITIONAL],
+    *[("routes", name) for name in ROUTES],
+    *[("network", name) for name in ("induction loop", "edgeData", "timedEvent", "include")],
+]
+
+
+@pytest.fixture
+def around(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Path]:
+    """The user's folder: the current one, with a file to keep and a secret."""
+    folder = tmp_path / "user"
+    folder.mkdir()
+    (folder / "kept.txt").write_text(KEPT)
+    (folder / "secret.xml").write_text(f"<{SECRET} {SECRET}='1'/>")
+    monkeypatch.chdir(folder)
+    yield folder
+    assert {path.name for path in folder.iterdir()} == {"kept.txt", "secret.xml"}
+    assert (folder / "kept.txt").read_text() == KEPT
+
+
+def hostile(crossing: Crossing, kind: str, name: str, user: Path) -> Path:
+    """Return a scenario, as a SUMO configuration, with one hostile thing."""
+    names = {"out": user / "kept.txt", "secret": user / "secret.xml"}
+    vehicle = '<vehicle id="a" depart="0" route="east"/>'
+    routes = ROUTES[name].format(**names) if kind == "routes" else ""
+    directory = crossing(vehicles=f"{routes}{vehicle}")
+    processing = extra = ""
+    if kind == "option":
+        reads = name in ("c", "configuration-file", "weight-files", "load-state", "phemlight-path")
+        processing = f'<{name} value="{names["secret" if reads else "out"]}"/>'
+        if name == "device.ssm.file":
+            processing += '<device.ssm.probability value="1"/>'
+    if kind == "additional":
+        extra = '<additional-files value="extra.add.xml"/>'
+        text = ADDITIONAL[name].format(**names)
+        (directory / "extra.add.xml").write_text(f"<additional>{text}</additional>")
+    if kind == "network":
+        network = directory / "network.net.xml"
+        text = ADDITIONAL[name].format(**names)
+        network.write_text(network.read_text().replace("</net>", f"{text}</net>"))
+    path = directory / "x.sumocfg"
+    path.write_text(
+        '<configuration><input><net-file value="network.net.xml"/>'
+        f'<route-files value="demand.rou.xml"/>{extra}</input>'
+        '<time><begin value="0"/><end value="60"/></time>'
+        f"<processing>{processing}</processing></configuration>"
+    )
+    return path
+
+
+def play(path: Path) -> str:
+    """Simulate a scenario for a minute; return the error, or nothing."""
+    try:
+        env = parallel_env(read_scenario(path))
+    except UgatMarlError as error:
+        return str(error)
+    try:
+        env.reset(seed=0)
+        while env.agents:
+            env.step(dict.fromkeys(env.agents, 0))
+    except UgatMarlError as error:
+        return str(error)
+    finally:
+        env.close()
+    return ""
+
+
+@pytest.mark.parametrize(("kind", "name"), CASES)
+def test_a_hostile_scenario_is_refused_or_harmless(
+    kind: str, name: str, crossing: Crossing, around: Path
+) -> None:
+    path = hostile(crossing, kind, name, around)
+    said = play(path)
+    assert SECRET not in said
+    assert "\n" not in said
+
+
+@pytest.mark.skipif(
+    bool(confinement_missing()), reason=f"only the list protects here: {confinement_missing()}"
+)
+@pytest.mark.parametrize(("kind", "name"), CASES)
+def test_the_kernel_alone_holds(
+    kind: str, name: str, crossing: Crossing, around: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    class All(frozenset[str]):
+        def __contains__(self, item: object) -> bool:
+            return True
+
+    def unchecked(document: Document) -> Document:
+        return document
+
+    def no_fault(option: str, value: str) -> str:
+        del option, value
+        return ""
+
+    monkeypatch.setattr(scenario, "admitted", unchecked)
+    monkeypatch.setattr(scenario, "OPTIONS", All())
+    monkeypatch.setattr(settings, "OPTIONS", All())
+    monkeypatch.setattr(settings, "option_fault", no_fault)
+    path = hostile(crossing, kind, name, around)
+    assert SECRET not in play(path)
+
+
+def test_the_bait_works(crossing: Crossing, around: Path, tmp_path: Path) -> None:
+    """Without list and kernel a hostile scenario overwrites the file: the tests can fail."""
+    from ugat_marl.scenarios import Scenario
+    from ugat_marl.simulation import LibsumoSimulator, launch_of
+
+    path = hostile(crossing, "additional", "e1Detector", around)
+    honest = read_scenario(path)
+    raw = Document("extra.add.xml", path.parent / "extra.add.xml")
+    opened = Scenario("x", honest.network, honest.routes, (raw,), honest.settings)
+    simulator = LibsumoSimulator()
+    simulator.start(launch_of(opened, 0, tmp_path / "run", ()))
+    simulator.advance(20.0, {})
+    simulator.close()
+    shutil.rmtree(tmp_path / "run")
+    assert (around / "kept.txt").read_text() != KEPT
+    (around / "kept.txt").write_text(KEPT)
+
+
+@pytest.mark.parametrize(
+    ("option", "value", "fault"),
+    [
+        ("ignore-route-errors", "--summary=x", "neither true nor false"),
+        ("scale", "1e9", "between 0 and 100"),
+        ("scale", "nan", "not a number"),
+        ("scale", "1_0", "not a number"),
+        ("scale", "\u0661", "not a number"),
+        ("routing-algorithm", "/etc/passwd", "not a plain word"),
+        ("max-depart-delay", "soon", "not a number"),
+    ],
+)
+def test_values_of_options(option: str, value: str, fault: str) -> None:
+    raw = {"network": "n", "routes": ["r"], "sumo": {option: value}}
+    with pytest.raises(UgatMarlError, match=fault):
+        settings.validate_settings(raw, "here")
+
+
+def test_a_pile_of_elements_is_refused(crossing: Crossing) -> None:
+    directory = crossing()
+    routes = directory / "demand.rou.xml"
+    deep = "<person>" * 12000 + "</person>" * 12000
+    routes.write_text(f"<routes>{deep}</routes>")
+    with pytest.raises(UgatMarlError, match="line 1: more than 64 elements inside each other"):
+        read_scenario(directory)
+
+
+def test_a_request_outside_every_table_is_refused(crossing: Crossing) -> None:
+    directory = crossing()
+    network = directory / "network.net.xml"
+    network.write_text(
+        network.read_text().replace('<request index="0"', '<request index="400000000"')
+    )
+    with pytest.raises(UgatMarlError, match="line .*400000000.* is not a number from 0 to 4095"):
+        read_scenario(directory)
