@@ -44,6 +44,12 @@ LENGTH = struct.Struct("<I")
 PATIENCE_S = 10.0
 """Seconds that a process has to end after a request; then it is killed."""
 
+DEADLINE_S = 900.0
+"""Seconds within which a process has to answer; then it counts as dead. Loading a city takes
+minutes, so half of it would kill honest simulations on slow machines."""
+DEADLINE_VARIABLE = "UGAT_MARL_DEADLINE_S"
+"""Environment variable that replaces `DEADLINE_S`."""
+
 _CAN_FORK = hasattr(os, "fork") and hasattr(socket, "send_fds")
 _PROGRAM = "ugat_marl.simulation.worker"
 
@@ -99,9 +105,12 @@ class Host:
         service: ``"module:Class"`` of the `Service`.
         start_method: ``"forkserver"`` (the default where processes can fork) or ``"spawn"``.
         defaults: Environment variables of the processes, unless the user has set them.
+        deadline_s: Seconds within which a process has to answer; None for the variable
+            ``UGAT_MARL_DEADLINE_S``, or `DEADLINE_S`.
 
     Raises:
-        OptionError: The method is unknown, or this system does not have it.
+        OptionError: The method is unknown, this system does not have it, or the deadline is not a
+            number of seconds.
     """
 
     def __init__(
@@ -109,6 +118,7 @@ class Host:
         service: str,
         start_method: StartMethod | None = None,
         defaults: Mapping[str, str] | None = None,
+        deadline_s: float | None = None,
     ) -> None:
         method = start_method or ("forkserver" if _CAN_FORK else "spawn")
         if method not in ("forkserver", "spawn"):
@@ -118,6 +128,9 @@ class Host:
         self._service = service
         self._method: StartMethod = method
         self._defaults = dict(defaults or {})
+        self._deadline_s = _usual_deadline_s() if deadline_s is None else deadline_s
+        if not 0 < self._deadline_s < float("inf"):
+            raise OptionError(f"deadline_s = {deadline_s}: give seconds above 0")
         self._parent: _WarmParent | None = None
 
     def start(self, order: Order, descriptors: Sequence[int] = ()) -> Worker:
@@ -131,10 +144,10 @@ class Host:
             SimulatorCrashed: No process can be started.
         """
         if self._method == "spawn":
-            return Worker.spawn(self._service, order, self._defaults)
+            return Worker.spawn(self._service, order, self._defaults, self._deadline_s)
         for _ in range(2):
             parent = self.warm()
-            worker = parent.fork(order, descriptors)
+            worker = parent.fork(order, descriptors, self._deadline_s)
             if worker is not None:
                 return worker
             parent.end()
@@ -168,6 +181,7 @@ class Worker:
         channel: The connection to the worker.
         said: File with everything the worker prints.
         pid: Process number of the worker.
+        deadline_s: Seconds within which the worker has to answer.
         process: The process, if it is a child of this one.
     """
 
@@ -176,17 +190,22 @@ class Worker:
         channel: Channel,
         said: IO[bytes],
         pid: int,
+        deadline_s: float,
         process: subprocess.Popen[bytes] | None = None,
     ) -> None:
         self._channel = channel
         self._said = said
         self._pid = pid
+        self._deadline_s = deadline_s
+        self._late = False
         self._process = process
         self._owner = os.getpid()
         self._ended = False
 
     @classmethod
-    def spawn(cls, service: str, order: Order, defaults: Mapping[str, str]) -> Worker:
+    def spawn(
+        cls, service: str, order: Order, defaults: Mapping[str, str], deadline_s: float
+    ) -> Worker:
         """Start a new interpreter; messages use its standard input and output."""
         said = tempfile.TemporaryFile()  # noqa: SIM115 - stays open as long as the worker
         process: subprocess.Popen[bytes] = subprocess.Popen(
@@ -200,7 +219,7 @@ class Worker:
         assert process.stdin is not None
         assert process.stdout is not None
         channel = Channel(process.stdout, process.stdin, process.stdin.close)
-        return cls(channel, said, process.pid, process)
+        return cls(channel, said, process.pid, deadline_s, process)
 
     @property
     def running(self) -> bool:
@@ -211,10 +230,13 @@ class Worker:
         """Send a question; `answer` waits for its answer.
 
         Raises:
-            ChannelClosed: The process died, see `obituary`.
+            ChannelClosed: The process died or does not read, see `obituary`.
         """
         try:
             self._channel.send(Message({"what": request, **arguments}, list(arrays)))
+        except TimeoutError:
+            self._kill_late()
+            raise ChannelClosed from None
         except OSError:
             raise ChannelClosed from None
         except BaseException:  # Ctrl-C in the middle of a message
@@ -222,15 +244,25 @@ class Worker:
             raise
 
     def answer(self) -> Message:
-        """Wait for the answer to a question.
+        """Wait for the answer to a question, until the deadline.
 
         Raises:
-            ChannelClosed: The process died, see `obituary`.
+            ChannelClosed: The process died or did not answer in time, see `obituary`.
             UgatMarlError: The service raised this error; the process has been ended.
             WorkerError: The service raised another exception; the process has been ended.
         """
         try:
+            # Sockets keep the deadline themselves; a spawned worker has pipes.
+            if (
+                self._process is not None
+                and os.name != "nt"
+                and not self.has_answered(self._deadline_s)
+            ):
+                raise TimeoutError
             reply = self._channel.receive()
+        except TimeoutError:
+            self._kill_late()
+            raise ChannelClosed from None
         except (ChannelClosed, OSError):
             raise ChannelClosed from None
         except BaseException:  # Ctrl-C here: the next question would get the answer to this one
@@ -248,6 +280,12 @@ class Worker:
         Not on Windows.
         """
         return self._channel.is_readable(patience_s)
+
+    def _kill_late(self) -> None:
+        """Kill a process that is past its deadline; it may be stopped and would not end itself."""
+        self._late = True
+        with contextlib.suppress(ProcessLookupError):
+            os.kill(self._pid, signal.SIGTERM if os.name == "nt" else signal.SIGKILL)
 
     def end(self, patience_s: float = PATIENCE_S) -> None:
         """Close the connection and wait until the process exits. A second call does nothing.
@@ -284,6 +322,12 @@ class Worker:
                 status = f" with status {self._process.wait(timeout=PATIENCE_S)}"
         words = self._words()
         self.end()
+        if self._late:
+            return (
+                f"the simulator process {self._pid} did not answer {doing!r} within "
+                f"{self._deadline_s:g} s and was killed (stopped, or too little for this network: "
+                f"set {DEADLINE_VARIABLE}). reset() starts this environment afresh"
+            )
         said = f"it said: {words}" if words else "it said nothing (killed, or out of memory?)"
         return (
             f"the simulator process {self._pid} died{status} during {doing!r}; {said}. "
@@ -387,12 +431,14 @@ class _WarmParent:
             with self._lock, contextlib.suppress(OSError):
                 self._socket.sendall(b"f" + _framed(message))
 
-    def fork(self, order: Order, descriptors: Sequence[int]) -> Worker | None:
-        """Return a fresh worker, or None if the parent has ended."""
+    def fork(self, order: Order, descriptors: Sequence[int], deadline_s: float) -> Worker | None:
+        """Return a fresh worker, or None if the parent has ended or does not answer in time."""
         mine, its = socket.socketpair()
+        mine.settimeout(deadline_s)
         said = tempfile.TemporaryFile()  # noqa: SIM115 - stays open as long as the worker
         pid = b""
         with its, self._lock:
+            self._socket.settimeout(deadline_s)
             try:
                 socket.send_fds(self._socket, [b"f"], [its.fileno(), said.fileno(), *descriptors])
                 self._socket.sendall(_framed({"what": "fork", "order": order}))
@@ -413,7 +459,8 @@ class _WarmParent:
                 mine.shutdown(socket.SHUT_WR)
             mine.close()
 
-        return Worker(Channel(reader, writer, hang_up), said, int.from_bytes(pid, "little"))
+        number = int.from_bytes(pid, "little")
+        return Worker(Channel(reader, writer, hang_up), said, number, deadline_s)
 
     def end(self) -> None:
         """End the process; its workers continue. A second call does nothing."""
@@ -432,6 +479,16 @@ class _WarmParent:
                 self._process.wait()
             if self._current.get(self._service) is self:
                 del self._current[self._service]
+
+
+def _usual_deadline_s() -> float:
+    text = os.environ.get(DEADLINE_VARIABLE, "")
+    if not text:
+        return DEADLINE_S
+    try:
+        return float(text)
+    except ValueError:
+        raise OptionError(f"{DEADLINE_VARIABLE} = {text!r}: give a number of seconds") from None
 
 
 def one_line_message(text: str) -> str:

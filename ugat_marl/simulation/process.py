@@ -36,13 +36,17 @@ class ProcessSimulator:
 
     Args:
         start_method: ``"forkserver"`` (the default where processes can fork) or ``"spawn"``.
+        deadline_s: Seconds within which SUMO has to answer, as in `Host`; then its process counts
+            as dead.
 
     Raises:
         OptionError: The method is unknown, or this system does not have it.
     """
 
-    def __init__(self, start_method: StartMethod | None = None) -> None:
-        self._host = Host(SERVICE, start_method)
+    def __init__(
+        self, start_method: StartMethod | None = None, deadline_s: float | None = None
+    ) -> None:
+        self._host = Host(SERVICE, start_method, deadline_s=deadline_s)
         self._worker: Worker | None = None
 
     def start(self, launch: Launch) -> Snapshot:

@@ -1,0 +1,72 @@
+"""Processes that are stopped: nothing waits for them without end, and numbers stay the same."""
+
+from __future__ import annotations
+
+import os
+import signal
+import time
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from ugat_marl.envs import vector_env
+from ugat_marl.errors import OptionError, SimulatorCrashed
+from ugat_marl.scenarios import read_scenario
+from ugat_marl.simulation import Host, ProcessSimulator, launch_of
+from ugat_marl.simulation.host import DEADLINE_VARIABLE, StartMethod
+
+Crossing = Callable[..., Path]
+
+
+@pytest.mark.parametrize("method", ["forkserver", "spawn"])
+def test_a_stopped_simulation_counts_as_dead(
+    method: StartMethod, crossing: Crossing, tmp_path: Path
+) -> None:
+    simulator = ProcessSimulator(method, deadline_s=4.0)
+    launch = launch_of(read_scenario(crossing()), 0, tmp_path / "run", ())
+    first = simulator.start(launch)
+    worker = simulator._worker
+    assert worker is not None
+    os.kill(worker._pid, signal.SIGSTOP)
+    begun = time.monotonic()
+    with pytest.raises(SimulatorCrashed, match=r"did not answer 'advance' within 4 s and was"):
+        simulator.advance(10.0, {})
+    assert time.monotonic() - begun < 12.0
+    until = time.monotonic() + 5
+    while Path(f"/proc/{worker._pid}/environ").exists() and time.monotonic() < until:
+        time.sleep(0.05)
+    assert not Path(f"/proc/{worker._pid}/environ").exists()
+    again = simulator.start(launch)
+    np.testing.assert_array_equal(again.vehicles, first.vehicles)
+    simulator.close()
+
+
+def test_a_stopped_worker_of_a_vector_is_replaced_with_the_same_numbers(
+    crossing: Crossing, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setenv(DEADLINE_VARIABLE, "4")
+
+    def play(stopped_at: int | None) -> list[float]:
+        env = vector_env(crossing(), 2)
+        rewards: list[float] = []
+        env.reset(seed=3)
+        for decision in range(6):
+            if decision == stopped_at:
+                worker = env._environments[1]._worker
+                assert worker is not None
+                os.kill(worker._pid, signal.SIGSTOP)
+            transition = env.step(np.full((2, 1), decision % 2))
+            rewards += transition.rewards.ravel().tolist()
+        env.close()
+        return rewards
+
+    assert play(2) == play(None)
+
+
+@pytest.mark.parametrize("text", ["soon", "0", "-1", "nan", "inf"])
+def test_impossible_deadlines(text: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv(DEADLINE_VARIABLE, text)
+    with pytest.raises(OptionError, match="give "):
+        Host("any:Service")
