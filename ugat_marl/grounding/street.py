@@ -277,7 +277,7 @@ class Simulation:
     def env(self, world: StreetWorld, **options: Any) -> TrafficEnv:
         """Return an environment of a world."""
         fitted = (*self.options.get("fitted", ()), *world.parts)
-        given = {**self.options, **options, "fitted": fitted}
+        given: dict[str, Any] = {**self.options, **options, "fitted": fitted}
         domain = _joined(self.sim, world.effects)
         return parallel_env(self.scenario, domain, **given)
 
