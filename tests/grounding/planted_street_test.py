@@ -68,6 +68,9 @@ class ByHand:
                 running, counts = executed, then
         return recorder.log()
 
+    def replay(self) -> None:
+        """Return None: the policy acts."""
+
     def stop(self) -> None:
         """Do nothing."""
 

@@ -67,6 +67,10 @@ class Counting:
         self.done.append(f"collect {policy} {iteration} {seed}")
         return LOG if iteration < 2 else None
 
+    def replay(self) -> Policy | None:
+        self.done.append("replay")
+        return None
+
     def stop(self) -> None:
         self.done.append("stop")
 
@@ -83,6 +87,7 @@ def test_a_shuffled_world_asks_the_other_one() -> None:
     assert not first.frame.equals(LOG.frame) and not first.frame.equals(second.frame)
     assert first.frame.select(pl.col("reward").sum()).item() == 2 * sum(range(ROWS))
     assert made.collect(nobody, 2, 5) is None
+    assert made.replay() is None
     made.stop()
     made.close()
-    assert world.done == [*(f"collect nobody {i} 5" for i in range(3)), "stop", "close"]
+    assert world.done == [*(f"collect nobody {i} 5" for i in range(3)), "replay", "stop", "close"]
