@@ -159,8 +159,12 @@ class Diagnose:
             lines.append(f"corrected: {self.out / CORRECTED}")
         if following := self._next(diagnosis):
             lines.append(f"use it:    {following[0]}")
-        elif diagnosis.effects:
+        elif diagnosis.effects and not any(map(_in_the_model, diagnosis.effects)):
             lines.append("The effects are faults of detectors; the simulation stays as it is.")
+        elif diagnosis.verdict == "partially_explained":
+            lines.append(
+                "Nothing is corrected by a part; --correct-partially writes it all the same."
+            )
         console.print("\n" + "\n".join(lines), soft_wrap=True, markup=False)
 
 
