@@ -62,7 +62,9 @@ class Diagnose:
     measured: Annotated[Positional[Path], arg(metavar="MEASURED")]
     out: Path
     budget_h: float = 1500.0
-    budget_s: Annotated[float | None, arg(help_behavior_hint="(default: no limit)")] = None
+    budget_s: Annotated[
+        float | None, arg(metavar="FLOAT", help_behavior_hint="(default: no limit)")
+    ] = None
     alpha: float = 0.05
     seed: int = 0
     leave_out: Annotated[
