@@ -18,7 +18,13 @@ from pettingzoo import ParallelEnv
 from pettingzoo.test import parallel_api_test
 
 import ugat_marl
-from ugat_marl.envs import agent_indicator, appended_mask, masked_observation, pad_spaces
+from ugat_marl.envs import (
+    agent_indicator,
+    appended_mask,
+    legal_actions,
+    masked_observation,
+    pad_spaces,
+)
 from ugat_marl.envs.wrappers import frame_stack, shared_observation
 from ugat_marl.errors import ActionError, EpisodeError, OptionError
 from ugat_marl.policies import DQN
@@ -196,6 +202,34 @@ def test_masked_observations_in_closed_form() -> None:
     assert env.observation_spaces["a_1"] == env.observation_spaces["b_2"]
     free, _ = masked_observation(Steep(masks=False)).reset()
     assert free["b_2"]["action_mask"].tolist() == [1, 1, 1, 1]
+
+
+def test_masked_observations_have_the_key_of_the_library() -> None:
+    env = masked_observation(Steep(), key="observation")
+    observations, _ = env.reset()
+    assert set(observations["a_1"]) == {"observation", "action_mask"}
+    assert env.observation_space("a_1").contains(observations["a_1"])
+    with pytest.raises(OptionError, match="key = 'action_mask'"):
+        masked_observation(Steep(), key="action_mask")
+
+
+def test_forbidden_actions_become_permitted_ones() -> None:
+    steep = Steep()
+    env = legal_actions(pad_spaces(steep))
+    _, infos = env.reset()
+    assert infos["a_1"]["action_replaced"] == 0
+    # a_1 may choose 1 of its two actions, and b_2 the actions 0 and 3
+    for asked, executed in (
+        ({"a_1": 1, "b_2": 3}, {"a_1": 1, "b_2": 3}),
+        ({"a_1": 0, "b_2": 1}, {"a_1": 1, "b_2": 3}),
+        ({"a_1": 3, "b_2": 2}, {"a_1": 1, "b_2": 0}),
+    ):
+        *_, infos = env.step(asked)
+        assert steep.told[-1] == executed
+        for agent in asked:
+            assert infos[agent]["action_replaced"] == int(asked[agent] != executed[agent])
+    with pytest.raises(ActionError):
+        env.step({"a_1": 9, "b_2": 0})
 
 
 @pytest.mark.parametrize("wrapper", SINGLE)

@@ -352,3 +352,9 @@ def test_a_class_of_policies_is_made(algorithm: Any) -> None:
     policy.reset(3)
     observations, infos = ToyTraffic().reset(seed=0)
     assert set(policy.act(observations, infos)) == set(observations)
+
+
+@pytest.mark.usefixtures("algorithm")
+def test_tables_need_a_learner_that_can_be_kept(capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(["paper", "main", "--learner", "my_algo:Cycle"]) == 2
+    assert "rows of a table start from what direct transfer has learnt" in capsys.readouterr().err

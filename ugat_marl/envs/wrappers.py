@@ -65,12 +65,34 @@ def frame_stack(env: AnyParallelEnv, k: int) -> Wrapper:
     return _FrameStack(env, k)
 
 
-def masked_observation(env: AnyParallelEnv) -> Wrapper:
-    """Give observations as ``{"observations": vector, "action_mask": int8 (actions,)}``.
+def masked_observation(env: AnyParallelEnv, key: str = "observations") -> Wrapper:
+    """Give observations as ``{key: vector, "action_mask": int8 (actions,)}``.
 
-    RLlib needs this form. The mask is a copy of that of the infos, or all ones without one.
+    The mask is a copy of that of the infos, or all ones without one.
+
+    Args:
+        env: The environment.
+        key: Name of the vector: "observations", as RLlib needs it, or "observation", the form of
+            PettingZoo's classic environments, which tianshou and others read.
+
+    Raises:
+        OptionError: The key is that of the mask.
     """
-    return _MaskedObservation(env)
+    if key == "action_mask":
+        raise OptionError(
+            f"key = {key!r}: the mask has this name; take another, such as observation"
+        )
+    return _MaskedObservation(env, key)
+
+
+def legal_actions(env: AnyParallelEnv) -> Wrapper:
+    """Execute a permitted action in place of one that the mask forbids, padding included.
+
+    It is for libraries that ignore masks. Forbidden action a becomes number ``a % n`` of the n
+    permitted ones, and the info's ``action_replaced`` is 1. The library learns from the action that
+    it chose, so masks serve better where a library knows them. Put it outside `pad_spaces`.
+    """
+    return _LegalActions(env)
 
 
 def appended_mask(env: AnyParallelEnv) -> Wrapper:
@@ -137,7 +159,8 @@ class Wrapper(BaseParallelWrapper[str, Any, Any]):
             ActionError: The wrapped environment or `pad_spaces` refuses an action.
         """
         self._check(actions)
-        observations, rewards, terminations, truncations, infos = self.env.step(actions)
+        executed = self._translated(actions)
+        observations, rewards, terminations, truncations, infos = self.env.step(executed)
         told = self._told(infos)
         return self._seen(observations, told), rewards, terminations, truncations, told
 
@@ -146,6 +169,10 @@ class Wrapper(BaseParallelWrapper[str, Any, Any]):
 
     def _check(self, actions: Mapping[str, Any]) -> None:
         """Refuse actions before anything happens."""
+
+    def _translated(self, actions: dict[str, Any]) -> dict[str, Any]:
+        """Return the actions for the wrapped environment."""
+        return actions
 
     def _told(self, infos: Infos) -> Infos:
         """Return the infos for the learner."""
@@ -304,19 +331,53 @@ class _AppendedMask(_Masking):
         }
 
 
-class _MaskedObservation(_Masking):
+class _LegalActions(_Masking):
     def __init__(self, env: AnyParallelEnv) -> None:
         super().__init__(env)
+        self._masks: dict[str, NDArray[np.int8]] = {}
+        self._replaced: set[str] = set()
+
+    def _begin(self) -> None:
+        self._replaced = set()
+
+    def _translated(self, actions: dict[str, Any]) -> dict[str, Any]:
+        self._replaced = set()
+        executed = dict(actions)
+        for agent, action in actions.items():
+            mask = self._masks.get(agent)
+            if mask is None or not 0 <= int(action) < len(mask) or mask[int(action)]:
+                continue  # permitted, or refused by the environment itself
+            permitted = np.flatnonzero(mask)
+            executed[agent] = int(permitted[int(action) % len(permitted)])
+            self._replaced.add(agent)
+        return executed
+
+    def _told(self, infos: Infos) -> Infos:
+        self._masks = {agent: self._mask(agent, infos) for agent in self.env.agents}
+        told = dict(infos)
+        for agent in self._sizes:
+            if agent in infos:
+                told[agent] = {**infos[agent], "action_replaced": int(agent in self._replaced)}
+        return told
+
+    def _seen(self, observations: Vectors, infos: Infos) -> dict[str, Any]:
+        return dict(observations)
+
+
+class _MaskedObservation(_Masking):
+    def __init__(self, env: AnyParallelEnv, key: str) -> None:
+        super().__init__(env)
+        self._key = key
         sizes = self._sizes
         masks = {size: spaces.Box(0, 1, (size,), np.int8) for size in sizes.values()}
         self.observation_spaces = {
-            agent: spaces.Dict({"observations": box, "action_mask": masks[sizes[agent]]})
+            agent: spaces.Dict({key: box, "action_mask": masks[sizes[agent]]})
             for agent, box in self.observation_spaces.items()
         }
 
     def _seen(self, observations: Vectors, infos: Infos) -> dict[str, Any]:
         return {
-            agent: {"observations": vector, "action_mask": self._mask(agent, infos)}
+            agent: {self._key: vector, "action_mask": self._mask(agent, infos)}
             for agent, vector in observations.items()
         }
 

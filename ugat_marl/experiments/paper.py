@@ -357,7 +357,12 @@ class PaperConfig:
             raise OptionError(f"domain {self.sim!r} is the simulation itself; name real ones")
         if self.timed.match:
             raise OptionError("rewards are matched in a row of its own; leave timed.match out")
-        _ = self.ugat, self.spec  # both check their options when they are made
+        _ = self.ugat  # it checks its options when it is made
+        if not self.spec.savable:
+            raise OptionError(
+                f"learner {self.learner!r}: rows of a table start from what direct transfer has "
+                "learnt; give its class the methods save(path) and load(path)"
+            )
 
     @property
     def ugat(self) -> UgatConfig:
