@@ -16,6 +16,7 @@ import contextlib
 import time
 from collections.abc import Sequence
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -154,7 +155,8 @@ def played(scenarios: Sequence[Scenario], policy: str | Pretraining) -> NDArray[
     """Return the ATT of a rule, or of the network so far, on each road network, in s."""
     att_s: list[float] = []
     for scenario in scenarios:
-        options = OPTIONS if isinstance(policy, Pretraining) else {"observation": "movements"}
+        plain: dict[str, Any] = {"observation": "movements"}
+        options = OPTIONS if isinstance(policy, Pretraining) else plain
         with contextlib.closing(parallel_env(scenario, "sim", **options)) as env:
             acting: Policy
             if isinstance(policy, Pretraining):

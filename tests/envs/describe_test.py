@@ -46,7 +46,7 @@ def test_every_number_of_an_observation_is_described(options: dict[str, Any]) ->
 def test_lanes_stand_where_their_numbers_are() -> None:
     env = ugat_marl.parallel_env("mixed-v1", observation="movements")
     described = env.describe()
-    env.reset(seed=1)
+    seen, _ = env.reset(seed=1)
     for _ in range(20):
         seen, *_ = env.step(dict.fromkeys(env.agents, 0))
     lanes = env.network.lane_table()
@@ -99,7 +99,8 @@ def test_workers_of_a_vector_import_the_function() -> None:
     vector.close()
     env = ugat_marl.parallel_env("single-v1", observation=two, duration_s=100.0)
     observations, _ = env.reset(seed=3)
-    assert np.array_equal(first, *observations.values())
+    (second,) = observations.values()
+    assert np.array_equal(first, second)
     env.close()
 
 
@@ -131,8 +132,9 @@ def test_keywords_are_shown_with_their_defaults_and_documented() -> None:
         for name, option in options.items():
             assert parameters[name].default == option.default
             assert f"    {name}: " in (function.__doc__ or "")
+    wrong: dict[str, Any] = {"obsrevation": "count"}
     with pytest.raises(UnknownNameError, match="'observation'"):
-        ugat_marl.parallel_env("single-v1", obsrevation="count")
+        ugat_marl.parallel_env("single-v1", **wrong)
 
 
 def test_one_light_is_an_environment_of_gymnasium() -> None:

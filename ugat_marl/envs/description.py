@@ -65,18 +65,18 @@ def describe(network: Network, observer: Observer, agents: Sequence[str]) -> Des
             ]
         if observer.commands:
             entries.append((agent, "age", "", "age of the green / 60 s"))
-        rows += [
+        rows.extend(
             {"agent": agent, "entry": number, "of": of, "part": part, "name": name, "shows": shows}
             for number, (of, part, name, shows) in enumerate(entries)
-        ]
-    phases = [
+        )
+    movements: list[dict[str, object]] = [
         {"agent": agent, "intersection": item.id, "phase": phase, **movement}
         for agent, item in zip(agents, network.intersections, strict=True)
         for phase in range(len(item.phases))
         for movement in _movements(item, phase)
     ]
     unit = OBSERVATION_UNITS.get(observer.name, "as the function returns them")
-    return Description(pl.DataFrame(rows), pl.DataFrame(phases), unit)
+    return Description(pl.DataFrame(rows), pl.DataFrame(movements), unit)
 
 
 def _own_entries(

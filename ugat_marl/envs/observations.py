@@ -233,8 +233,8 @@ class Observer:
         return values
 
     def _space(self, index: int, low: float, high: float) -> Box:
-        lows: list[NDArray[np.float32]] = []
-        highs: list[NDArray[np.float32]] = []
+        lows: list[NDArray[np.float64]] = []
+        highs: list[NDArray[np.float64]] = []
         for j in (index, *self.near[index]):
             lows += [np.full(self._sizes[j], low), np.zeros(self._phases[j])]
             highs += [np.full(self._sizes[j], high), np.ones(self._phases[j])]

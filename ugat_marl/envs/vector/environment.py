@@ -403,6 +403,7 @@ def vector_env(
     plain: AnyParallelEnv = parallel_env(loaded, domain_of(0, 0), **options)
     for each in listed(wrap):
         plain = imported(spelling("wrap", each))(plain)
-    shared = Shared(loaded, options, wrap, AgentSet.of(plain), n)
+    given: dict[str, Any] = {**options}
+    shared = Shared(loaded, given, wrap, AgentSet.of(plain), n)
     environments = [RemoteEnv(shared, index, shared.arrays.part(index)) for index in range(n)]
     return VectorEnv(environments, shared.arrays, plain, domain_of, autoreset, shared)

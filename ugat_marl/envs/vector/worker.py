@@ -145,7 +145,7 @@ class _EpisodeServer:
         A user's reward or wrapper may well write files of its own.
         """
         spec = self._order["spec"]
-        if spec["reward"] is None and not spec["wraps"]:
+        if not spec["functions"] and not spec["wraps"]:
             base: Any = self._running.unwrapped
             scenario: Scenario = base.scenario
             files = [str(each.path) for each in scenario.documents if each.path is not None]
