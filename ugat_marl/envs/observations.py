@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 
 from ugat_marl.data import AgentLayout
 from ugat_marl.envs.commands import CommandMemory, memory_size
-from ugat_marl.envs.rewards import IntersectionView, intersection_views
+from ugat_marl.envs.rewards import IntersectionView, IntersectionViews
 from ugat_marl.errors import OptionError, UnknownNameError
 from ugat_marl.scenarios import Intersection, Network, group_names, member_names, within_hops
 from ugat_marl.simulation import Snapshot
@@ -93,7 +93,7 @@ class Observer:
         self._downstream = _downstream_matrix(network) if name == "pressure" else None
         self._gather, sizes = _gather(network, name)
         if self._function is not None:
-            self._views = intersection_views(network)
+            self._views = IntersectionViews(network)
             idle = Snapshot.idle(len(self._lanes.ids))
             sizes = [len(self._features(view)) for view in self._views(idle)]
         self._sizes = sizes

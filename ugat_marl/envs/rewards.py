@@ -44,15 +44,22 @@ RewardFunction = Callable[[IntersectionView, IntersectionView], float]
 """Function from the views before and after a decision interval to a reward."""
 
 
-def intersection_views(network: Network) -> Callable[[Snapshot], list[IntersectionView]]:
-    """Return a function from a snapshot to the views of all intersections, in their order."""
-    lanes = network.lane_table()
-    places = [
-        (lanes.indices(item.incoming_lanes), lanes.indices(item.outgoing_lanes))
-        for item in network.intersections
-    ]
+class IntersectionViews:
+    """Division of snapshots into the views of all intersections, in the network's order.
 
-    def views(snapshot: Snapshot) -> list[IntersectionView]:
+    Args:
+        network: The network.
+    """
+
+    def __init__(self, network: Network) -> None:
+        lanes = network.lane_table()
+        self._places = [
+            (lanes.indices(item.incoming_lanes), lanes.indices(item.outgoing_lanes))
+            for item in network.intersections
+        ]
+
+    def __call__(self, snapshot: Snapshot) -> list[IntersectionView]:
+        """Return the views of a snapshot."""
         return [
             IntersectionView(
                 snapshot.time_s,
@@ -63,10 +70,8 @@ def intersection_views(network: Network) -> Callable[[Snapshot], list[Intersecti
                 snapshot.vehicles[outgoing],
                 snapshot.queued_upstream[incoming],
             )
-            for incoming, outgoing in places
+            for incoming, outgoing in self._places
         ]
-
-    return views
 
 
 class Rewarder:
@@ -98,7 +103,7 @@ class Rewarder:
         self._outgoing = [
             lanes.indices(intersection.outgoing_lanes) for intersection in network.intersections
         ]
-        self._views = intersection_views(network)
+        self._views = IntersectionViews(network)
         self._sum_in = _Sums(self._incoming)
         self._sum_out = _Sums(self._outgoing)
 
