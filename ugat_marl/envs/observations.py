@@ -75,8 +75,8 @@ class Observer:
         neighbours: int = 0,
         commands: int = 0,
     ) -> None:
-        name = observation if isinstance(observation, str) else "function"
-        self._function = None if isinstance(observation, str) else observation
+        name = "function" if callable(observation) else str(observation)
+        self._function = observation if callable(observation) else None
         if self._function is None and name not in get_args(ObservationName):
             raise UnknownNameError(
                 "observation", name, get_args(ObservationName), "A function works as well."
