@@ -10,6 +10,7 @@ import polars as pl
 import pytest
 
 from ugat_marl.data import AgentLayout, Provenance, TransitionLog, TransitionRecorder
+from ugat_marl.data.row_hashes import write_hashed
 from ugat_marl.data.transitions import METADATA_KEY
 from ugat_marl.errors import LogError
 
@@ -136,8 +137,21 @@ def test_missing_file_foreign_parquet_and_no_parquet(tmp_path: Path) -> None:
 )
 def test_broken_provenance_is_refused(tmp_path: Path, text: str) -> None:
     path = tmp_path / "log.parquet"
-    recorded().frame.write_parquet(path, metadata={METADATA_KEY: text})
-    with pytest.raises(LogError, match=r"log\.parquet: "):
+    write_hashed(recorded().frame, path, {METADATA_KEY: text})
+    with pytest.raises(LogError, match=r"log\.parquet: provenance"):
+        TransitionLog.read(path)
+
+
+def test_a_log_without_hashes_or_with_other_rows_is_refused(tmp_path: Path) -> None:
+    path = tmp_path / "log.parquet"
+    recorded().write(path)
+    frame, metadata = pl.read_parquet(path), pl.read_parquet_metadata(path)
+    frame.write_parquet(path, metadata={METADATA_KEY: metadata[METADATA_KEY]})
+    with pytest.raises(LogError, match="has no hashes of its rows"):
+        TransitionLog.read(path)
+    own = {key: text for key, text in metadata.items() if key.startswith("ugat_marl")}
+    frame.with_columns(pl.col("reward") + 1).write_parquet(path, metadata=own)
+    with pytest.raises(LogError, match=r"damaged, row group 0 \(rows 0 to \d+\) is not what was"):
         TransitionLog.read(path)
 
 

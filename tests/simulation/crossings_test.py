@@ -13,6 +13,7 @@ import pytest
 
 from ugat_marl import parallel_env
 from ugat_marl.data import AgentLayout, Provenance, TransitionLog, TransitionRecorder
+from ugat_marl.data.row_hashes import write_hashed
 from ugat_marl.effects import load_scenario
 from ugat_marl.errors import LogError
 from ugat_marl.grounding import Stack, stack_log
@@ -326,7 +327,7 @@ def test_logs_written_without_the_columns_are_still_read(tmp_path: Path) -> None
     log = recorded()
     old = log.frame.drop("delay_s", "served_features")
     metadata = {"ugat_marl.data.transitions": log.provenance.to_json()}
-    old.write_parquet(tmp_path / "old.parquet", metadata=metadata)
+    write_hashed(old, tmp_path / "old.parquet", metadata)
     again = TransitionLog.read(tmp_path / "old.parquet")
     for agent, layout in LAYOUTS.items():
         rows, whole = again.transitions(agent), log.transitions(agent)

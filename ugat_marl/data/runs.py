@@ -20,6 +20,7 @@ from typing import IO, Any
 
 import polars as pl
 
+from ugat_marl.data.row_hashes import damage, write_hashed
 from ugat_marl.errors import CheckpointError, OptionError
 from ugat_marl.files import replacing, require_writable, write_whole
 from ugat_marl.progress import Reporter
@@ -66,7 +67,7 @@ class Metrics:
         """Write all rows as Parquet, whole or not at all."""
         frame = pl.DataFrame(self.rows, schema=_SCHEMA, orient="row")
         with replacing(path) as temporary:
-            frame.write_parquet(temporary)
+            write_hashed(frame, temporary)
 
     @classmethod
     def read(cls, path: Path) -> Metrics:
@@ -76,7 +77,7 @@ class Metrics:
             CheckpointError: The file is missing, cut short or of another form.
         """
         try:
-            frame = pl.read_parquet(path)
+            frame, metadata = pl.read_parquet(path), pl.read_parquet_metadata(path)
         except (OSError, pl.exceptions.PolarsError, pl.exceptions.PanicException) as error:
             reason = str(error).splitlines()[0]
             raise CheckpointError(
@@ -85,6 +86,10 @@ class Metrics:
             ) from None
         if frame.schema != pl.Schema(_SCHEMA):
             raise CheckpointError(f"{path}: not the metrics of a run")
+        if wrong := damage(frame, metadata):
+            raise CheckpointError(
+                f"{path}: damaged, {wrong}; remove the run folder and start again"
+            )
         return cls(frame.rows())
 
 

@@ -19,6 +19,7 @@ import numpy as np
 import polars as pl
 from numpy.typing import NDArray
 
+from ugat_marl.data.row_hashes import damage, is_hashed, write_hashed
 from ugat_marl.errors import LogError
 from ugat_marl.files import replacing
 
@@ -285,7 +286,7 @@ class TransitionLog:
     def write(self, path: Path) -> None:
         """Write the log as Parquet. An existing file is replaced whole or stays unchanged."""
         with replacing(path) as temporary:
-            self.frame.write_parquet(temporary, metadata={METADATA_KEY: self.provenance.to_json()})
+            write_hashed(self.frame, temporary, {METADATA_KEY: self.provenance.to_json()})
 
     @classmethod
     def read(cls, path: Path | str) -> TransitionLog:
@@ -301,6 +302,13 @@ class TransitionLog:
                 f"{path}: a Parquet file, but not a transition log: its metadata lacks "
                 f"{METADATA_KEY!r}; write logs with TransitionLog.write"
             )
+        if not is_hashed(metadata):
+            raise LogError(
+                f"{path}: has no hashes of its rows, so damage could not be seen; write logs with "
+                "TransitionLog.write"
+            )
+        if wrong := damage(frame, metadata, (METADATA_KEY,)):
+            raise LogError(f"{path}: damaged, {wrong}; record or copy it again")
         try:
             return cls(Provenance.from_json(metadata[METADATA_KEY]), frame)
         except LogError as error:

@@ -14,6 +14,7 @@ import numpy as np
 import polars as pl
 from numpy.typing import NDArray
 
+from ugat_marl.data import damage, write_hashed
 from ugat_marl.envs import AnyParallelEnv
 from ugat_marl.errors import CheckpointError
 from ugat_marl.files import replacing
@@ -109,7 +110,7 @@ class QueueRecord:
                 mean = (pl.col("queue") * pl.col("looks")).sum() / pl.col("looks").sum()
                 frame = both.agg(mean, pl.col("looks").sum())
         with replacing(path) as temporary:
-            frame.write_parquet(temporary)
+            write_hashed(frame.sort(_PLACE), temporary)
 
 
 def write_queues(path: Path, sources: Mapping[str, tuple[Path, str]]) -> None:
@@ -126,7 +127,7 @@ def write_queues(path: Path, sources: Mapping[str, tuple[Path, str]]) -> None:
             rows = read_queues(source).filter(policy=name_there)
             frames.append(rows.with_columns(policy=pl.lit(name)))
     with replacing(path) as temporary:
-        pl.concat(frames).write_parquet(temporary)
+        write_hashed(pl.concat(frames).sort(_PLACE), temporary)
 
 
 def read_queues(path: Path) -> pl.DataFrame:
@@ -136,10 +137,12 @@ def read_queues(path: Path) -> pl.DataFrame:
         CheckpointError: The file is missing, cut short or of another form.
     """
     try:
-        frame = pl.read_parquet(path)
+        frame, metadata = pl.read_parquet(path), pl.read_parquet_metadata(path)
     except (OSError, pl.exceptions.PolarsError, pl.exceptions.PanicException) as error:
         reason = str(error).splitlines()[0]
         raise CheckpointError(f"{path}: cannot be read ({reason})") from None
     if frame.schema != pl.Schema(_SCHEMA):
         raise CheckpointError(f"{path}: not the queues of a run")
+    if wrong := damage(frame, metadata):
+        raise CheckpointError(f"{path}: damaged, {wrong}")
     return frame

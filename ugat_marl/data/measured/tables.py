@@ -18,6 +18,7 @@ from numpy.typing import NDArray
 
 from ugat_marl.data.measured.local_time import LocalClock
 from ugat_marl.data.measured.values import Finding
+from ugat_marl.data.row_hashes import damage
 from ugat_marl.errors import MeasuredDataError, nearest
 from ugat_marl.scenarios import Period
 
@@ -286,11 +287,15 @@ def _read_parquet(path: Path) -> pl.DataFrame:
         )
     try:
         with _quietly():
-            return pl.read_parquet(io.BytesIO(content))
+            frame = pl.read_parquet(io.BytesIO(content))
+            metadata = pl.read_parquet_metadata(io.BytesIO(content))
     except (pl.exceptions.PolarsError, pl.exceptions.PanicException, OSError, ValueError) as error:
         raise MeasuredDataError(
             f"{path}: damaged Parquet file ({_first_line(error)}); copy or export it again"
         ) from None
+    if wrong := damage(frame, metadata):  # tables of others carry no hashes
+        raise MeasuredDataError(f"{path}: damaged, {wrong}; copy or export it again")
+    return frame
 
 
 @contextlib.contextmanager

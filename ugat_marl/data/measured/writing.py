@@ -25,6 +25,7 @@ from ugat_marl.data.measured.tables import (
     frame_of,
 )
 from ugat_marl.data.measured.values import MeasuredData
+from ugat_marl.data.row_hashes import write_hashed
 from ugat_marl.errors import OutputError
 from ugat_marl.scenarios import Passages, Period
 
@@ -128,7 +129,7 @@ def _write(frame: pl.DataFrame, path: Path) -> None:
     if path.suffix == ".csv":
         frame.write_csv(path)
     else:
-        frame.write_parquet(path)
+        write_hashed(frame, path)
 
 
 def _detectors(measured: MeasuredData) -> pl.DataFrame:
