@@ -5,6 +5,7 @@ from __future__ import annotations
 import contextlib
 import gzip
 import os
+import random
 import signal
 import stat
 import subprocess
@@ -15,6 +16,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+from ugat_marl import files
 from ugat_marl.errors import ScenarioError
 from ugat_marl.files import parse_xml, read_bytes, replacing, write_whole, xml_bytes
 
@@ -213,3 +215,18 @@ def test_an_unknown_encoding_is_named() -> None:
         parse_xml(b'<?xml version="1.0" encoding="klingon"?><r/>', "here")
     with pytest.raises(ScenarioError, match="here: "):
         parse_xml("<r>ü</r>".encode("latin-1"), "here")
+
+
+def test_an_archive_made_to_fill_memory_is_refused(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(files, "_UNPACKED", 1 << 20)
+    bomb = tmp_path / "net.xml.gz"
+    bomb.write_bytes(gzip.compress(b"<a>" + b" " * (4 << 20) + b"</a>"))
+    with pytest.raises(ScenarioError, match="unpack to more than 100 times as many"):
+        files.read_bytes(bomb)
+    with pytest.raises(ScenarioError, match="unpack to more than 100 times as many"):
+        list(files.chunks_of(bomb))
+    honest = b"".join(b"<b id='%d'/>" % random.Random(i).getrandbits(64) for i in range(90000))
+    bomb.write_bytes(gzip.compress(honest))
+    assert files.read_bytes(bomb) == honest == b"".join(files.chunks_of(bomb))

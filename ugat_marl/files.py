@@ -30,6 +30,10 @@ _PIECE = 1 << 20
 _KEPT = 8 << 20
 """Bytes of an edited document above which it is kept in a file instead of in memory."""
 _INDENT = "    "
+_UNPACKED = 256 << 20
+"""Unpacked bytes from which the ratio of an archive counts."""
+_MOST_RATIO = 100
+"""Largest ratio of unpacked to packed bytes; XML packs to a tenth or a thirtieth."""
 _DEEPEST = 64
 """Most elements inside each other. Files of SUMO and OpenStreetMap have fewer than ten. Deeper ones
 exhaust the stack of whatever walks through them."""
@@ -117,11 +121,25 @@ def read_bytes(path: Path) -> bytes:
     try:
         if not data:
             raise EOFError("it is empty")
-        return gzip.decompress(data)
+        with gzip.GzipFile(fileobj=io.BytesIO(data)) as file:
+            return b"".join(_bounded(iter(lambda: file.read(_PIECE), b""), path, len(data)))
     except (OSError, EOFError, zlib.error) as error:
         raise ScenarioError(
             f"{path}: not a whole gzip archive ({error}); it may have been cut short"
         ) from None
+
+
+def _bounded(pieces: Iterator[bytes], path: Path, packed: int) -> Iterator[bytes]:
+    """Yield the pieces of an archive; refuse one made to fill memory or disk."""
+    total = 0
+    for piece in pieces:
+        total += len(piece)
+        if total > max(_UNPACKED, _MOST_RATIO * packed):
+            raise ScenarioError(
+                f"{path}: {packed} bytes unpack to more than {_MOST_RATIO} times as many, which no "
+                "network or demand does; unpack it yourself if you trust it"
+            )
+        yield piece
 
 
 class Tag(NamedTuple):
@@ -153,6 +171,8 @@ def chunks_of(path: Path, reporter: Reporter | None = None) -> Iterator[bytes]:
     try:
         with path.open("rb") as raw, gzip.open(raw) if path.suffix == ".gz" else raw as file:
             pieces = iter(lambda: file.read(_PIECE), b"")
+            if path.suffix == ".gz":
+                pieces = _bounded(pieces, path, path.stat().st_size)
             yield from watched(pieces, raw, reporter or Silent())
     except FileNotFoundError:
         raise ScenarioError(f"{path}: no such file") from None

@@ -7,6 +7,7 @@ must keep its content, or `{secret}`, one whose content must not come out. Witho
 
 from __future__ import annotations
 
+import re
 import shutil
 from collections.abc import Callable, Iterator
 from pathlib import Path
@@ -214,6 +215,21 @@ def test_a_pile_of_elements_is_refused(crossing: Crossing) -> None:
     deep = "<person>" * 12000 + "</person>" * 12000
     routes.write_text(f"<routes>{deep}</routes>")
     with pytest.raises(UgatMarlError, match="line 1: more than 64 elements inside each other"):
+        read_scenario(directory)
+
+
+@pytest.mark.parametrize("attribute", ["length", "speed"])
+@pytest.mark.parametrize("text", ["-5", "0", "inf", "nan", "1_000", "\u0661", "", "1e999"])
+def test_lanes_that_no_vehicle_can_use_are_refused(
+    attribute: str, text: str, crossing: Crossing
+) -> None:
+    directory = crossing()
+    network = directory / "network.net.xml"
+    before = network.read_text()
+    after = re.sub(rf'(<lane [^>]*{attribute}=")[^"]*', rf"\g<1>{text}", before, count=1)
+    assert after != before
+    network.write_text(after)
+    with pytest.raises(UgatMarlError, match=rf"line \d+: lane '.*' has {attribute} = .* above 0"):
         read_scenario(directory)
 
 

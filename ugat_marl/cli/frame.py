@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import errno
 import importlib
 import io
 import os
@@ -23,6 +24,14 @@ INTERRUPTED = 130
 COMPLETION = "completion"
 LOUDNESS: dict[str, Loudness] = {"--quiet": "quiet", "--verbose": "verbose"}
 """Options of every command."""
+_WAYS_OUT = {
+    errno.ENOSPC: "; make room, or name another folder (TMPDIR for temporary files)",
+    errno.EDQUOT: "; make room, or name another folder (TMPDIR for temporary files)",
+    errno.EMFILE: "; raise the limit (ulimit -n), or use fewer workers or environments",
+    errno.ENFILE: "; close other programs, or use fewer workers or environments",
+    errno.ENAMETOOLONG: "; give a shorter name",
+}
+"""Number of an error of the operating system to its remedy."""
 
 
 def run_command(command: Any, console: Console) -> int:
@@ -79,6 +88,26 @@ def run(line: CommandLine, arguments: Sequence[str]) -> int:
         return INTERRUPTED
     except BrokenPipeError:  # else the interpreter writes to the closed pipe at its end
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+        return USAGE_ERROR
+    except OSError as error:  # a full disk, too few descriptors, a name that is too long
+        place = f"{str(error.filename)[:200]}: " if error.filename is not None else ""
+        said = error.strerror or str(error) or type(error).__name__
+        way_out = _WAYS_OUT.get(error.errno or 0, "")
+        print(f"{line.program}: error: {place}{said}{way_out}", file=sys.stderr)
+        return USAGE_ERROR
+    except RecursionError:
+        print(
+            f"{line.program}: error: a file is nested too deeply to be read; no file of the suite "
+            "nests that deep",
+            file=sys.stderr,
+        )
+        return USAGE_ERROR
+    except MemoryError:
+        print(
+            f"{line.program}: error: out of memory; use a smaller file, fewer workers, or a larger "
+            "machine",
+            file=sys.stderr,
+        )
         return USAGE_ERROR
 
 

@@ -250,6 +250,8 @@ _OPEN_KEYS = _words(
 _TO_FILES = re.compile(r"file|output|dest|path|prefix|dump|log", re.IGNORECASE)
 _SCHEMA = re.compile(r"(https?://sumo[\w.-]*/xsd/)?[\w-]+\.xsd", re.ASCII)
 
+_DECIMAL = re.compile(r"[-+]?(\d+\.?\d*|\.\d+)([eE][-+]?\d+)?", re.ASCII)
+
 _MOST_LINKS = 4096
 """Upper bound of the index of a <request>, a place in tables of this size. SUMO stops at 256."""
 
@@ -352,7 +354,25 @@ def _request_fault(tag: Tag) -> str:
     return f"<request index={index[:20]!r}> is not a number from 0 to {_MOST_LINKS - 1}"
 
 
+def _lane_fault(tag: Tag) -> str:
+    for attribute in ("length", "speed"):
+        text = tag.attributes.get(attribute)
+        if text is not None and not _is_positive(text):
+            lane = tag.attributes.get("id", "")
+            return (
+                f"lane {lane!r} has {attribute} = {text[:40]!r}, which is not a finite number "
+                "above 0; build the network again with netconvert"
+            )
+    return ""
+
+
+def _is_positive(text: str) -> bool:
+    """Return True for a number above 0 as SUMO writes it, in ASCII digits without underscores."""
+    return bool(_DECIMAL.fullmatch(text)) and 0 < float(text) < math.inf
+
+
 _CHECKS: Mapping[str, Callable[[Tag], str]] = {
+    "lane": _lane_fault,
     "param": _parameter_fault,
     "request": _request_fault,
 }

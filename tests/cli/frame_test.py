@@ -1,0 +1,39 @@
+"""The one guard of the command line: an error of the system is one line with a way out."""
+
+from __future__ import annotations
+
+import errno
+import os
+from typing import Any
+
+import pytest
+from rich.console import Console
+
+from ugat_marl.cli import CommandLine, frame, run
+
+
+@pytest.mark.parametrize(
+    ("error", "said"),
+    [
+        (OSError(errno.ENOSPC, os.strerror(errno.ENOSPC), "/full/a"), "/full/a: No space left on"),
+        (OSError(errno.EMFILE, os.strerror(errno.EMFILE)), "Too many open files; raise the limit"),
+        (OSError(errno.ENAMETOOLONG, "File name too long", "x" * 999), "long; give a shorter name"),
+        (OSError("odd"), "error: odd"),
+        (RecursionError(), "nested too deeply"),
+        (MemoryError(), "out of memory"),
+    ],
+)
+def test_errors_of_the_system_are_one_line(
+    error: BaseException, said: str, capsys: pytest.CaptureFixture[str], monkeypatch: Any
+) -> None:
+    def fail(line: CommandLine, words: list[str], console: Console) -> int:
+        raise error
+
+    monkeypatch.setattr(frame, "_dispatch", fail)
+    assert run(CommandLine("prog", "", {}), []) == 2
+    out, err = capsys.readouterr()
+    assert out == ""
+    assert err.startswith("prog: error: ")
+    assert err.count("\n") == 1
+    assert said in err
+    assert len(err) < 400
