@@ -17,7 +17,7 @@ from tests.runs import SMALL, checkpoint_of, numbers, play_nothing, weights
 from ugat_marl.__main__ import main
 from ugat_marl.data import TransitionLog
 from ugat_marl.errors import CheckpointError, OptionError, UnknownNameError
-from ugat_marl.experiments import Evaluation, transfer
+from ugat_marl.experiments import Evaluation, transfer, transfers
 from ugat_marl.experiments.jobs import file_names
 from ugat_marl.experiments.randomised import RandomisedEnv
 from ugat_marl.grounding import RandomDelays, TimedConfig, UgatConfig
@@ -135,6 +135,28 @@ def test_controls_can_be_added_to_a_run_and_change_nothing_else(tmp_path: Path) 
     for name in policies:
         one, two = (weights(tmp_path / run, name) for run in ("run", "at once"))
         assert np.array_equal(one, two), name
+
+
+def test_the_folder_is_locked_until_the_table_is_written(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """A second run begins while the first one, already trained and judged, writes its table."""
+    refused: list[str] = []
+
+    def write(*_: Any) -> str:
+        with pytest.raises(OptionError, match="another process is training in this folder") as told:
+            transfer(SMALL, tmp_path / "run", resume=True)
+        refused.append(str(told.value))
+        return "table"
+
+    def perform(*_: Any) -> list[Any]:
+        return []
+
+    monkeypatch.setattr(transfers, "perform_here", perform)
+    monkeypatch.setattr(transfers, "_write_results", write)
+    for _ in range(2):  # the first one has freed the folder
+        transfer(SMALL, tmp_path / "run", resume=True)
+    assert len(refused) == 2
 
 
 def test_domain_randomisation_resumes(tmp_path: Path) -> None:

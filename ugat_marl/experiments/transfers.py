@@ -20,6 +20,7 @@ from ugat_marl.data import (
     METRICS_FILE,
     TransitionLog,
     installed_versions,
+    lock_folder,
     write_identity,
     write_settings,
 )
@@ -55,7 +56,7 @@ from ugat_marl.experiments.settings import (
     Setting,
 )
 from ugat_marl.experiments.tuning import LEAST_BUDGET, TUNED_RULES
-from ugat_marl.files import write_whole
+from ugat_marl.files import require_writable, write_whole
 from ugat_marl.grounding import (
     DIRECT_LEARNER,
     MATCHED_REWARDS,
@@ -308,19 +309,23 @@ def transfer(
         identity = _identity(config, scenario, env)
     plan = planned_jobs(config)
     folder = directory / TRAININGS
-    begun = any(path for name in (CHECKPOINT_FOLDER, SCORES) for path in folder.glob(f"*/{name}"))
-    if begun and not resume:
-        raise OptionError(
-            f"{directory} holds a run already; use --resume to go on with it, or another --out"
-        )
-    write_identity(directory, identity, begun=begun)
-    write_settings(directory, asdict(config))
-    episode_s = config.duration_s or scenario.settings.duration_s
-    for line in described_plan(plan, directory, folder, episode_s):
-        reporter.say(line)
-    with reporter.whole("whole run", work_of(plan, folder, episode_s)):
-        records = perform_here(plan, folder, reporter, workers)
-    return _write_results(config, scenario, directory, plan, records)
+    require_writable(directory / "table.json")
+    # Until the table is written: a second run that begins while this one is judged would lose.
+    with contextlib.closing(lock_folder(directory)):
+        names = (CHECKPOINT_FOLDER, SCORES)
+        begun = any(path for name in names for path in folder.glob(f"*/{name}"))
+        if begun and not resume:
+            raise OptionError(
+                f"{directory} holds a run already; use --resume to go on with it, or another --out"
+            )
+        write_identity(directory, identity, begun=begun)
+        write_settings(directory, asdict(config))
+        episode_s = config.duration_s or scenario.settings.duration_s
+        for line in described_plan(plan, directory, folder, episode_s):
+            reporter.say(line)
+        with reporter.whole("whole run", work_of(plan, folder, episode_s)):
+            records = perform_here(plan, folder, reporter, workers)
+        return _write_results(config, scenario, directory, plan, records)
 
 
 def planned_jobs(config: TransferConfig) -> list[Job]:
