@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
@@ -65,3 +66,23 @@ def test_what_is_not_finite_is_not_written(tmp_path: Path) -> None:
     with pytest.raises(CheckpointError, match=r"nested\.weights"):
         write_checkpoint(path, "toy", bad)
     assert path.read_bytes() == before
+
+
+@pytest.mark.filterwarnings("ignore")  # torch will drop quantised tensors
+@pytest.mark.parametrize(
+    "make",
+    [
+        lambda: torch.zeros(1).expand(10**13),
+        lambda: torch.zeros(2, device="meta"),
+        lambda: torch.quantize_per_tensor(torch.ones(2), 0.1, 0, torch.qint8),
+        lambda: torch.eye(2).to_sparse(),
+    ],
+    ids=["stride 0", "meta", "quantised", "sparse"],
+)
+def test_tensors_that_are_not_plain_are_refused(
+    make: Callable[[], torch.Tensor], tmp_path: Path
+) -> None:
+    path = tmp_path / "a.pt"
+    torch.save({"kind": "x", "net": {"weight": make()}}, path)
+    with pytest.raises(CheckpointError, match=r"net\.weight is no plain tensor|not a readable"):
+        read_checkpoint(path, "x")

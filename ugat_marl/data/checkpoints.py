@@ -59,6 +59,12 @@ def read_checkpoint(path: Path, kind: str) -> dict[str, Any]:
         raise CheckpointError(
             f"{path}: holds {kind_read!r}, expected {kind!r}; give the right file"
         )
+    for name, tensor in _tensors("", content):
+        if not _is_plain(tensor):
+            raise CheckpointError(
+                f"{path}: {name} is no plain tensor of its size ({tensor.layout}, "
+                f"{tensor.dtype}, {tensor.device}); save it with write_checkpoint"
+            )
     require_finite(content, str(path), "cannot be used: take an earlier checkpoint or train again")
     return content
 
@@ -113,6 +119,17 @@ def checked_tensors(
                 f"{tuple(tensor.shape)}; use the settings it was saved with"
             )
     return {name: read[name] for name in expected}
+
+
+def _is_plain(tensor: torch.Tensor) -> bool:
+    """Return True for a dense tensor in memory that holds all of its elements.
+
+    A stride of 0 lets a few bytes stand for more elements than any memory holds; quantised and meta
+    tensors have no values to check.
+    """
+    if tensor.layout != torch.strided or tensor.is_quantized or tensor.is_meta:
+        return False
+    return tensor.numel() * tensor.element_size() <= tensor.untyped_storage().nbytes()
 
 
 def _tensors(prefix: str, content: Mapping[str, Any]) -> Iterator[tuple[str, torch.Tensor]]:
