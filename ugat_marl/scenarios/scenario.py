@@ -145,7 +145,7 @@ def read_scenario(name: str | Path) -> Scenario:
     path = Path(text).expanduser()
     if path.suffix == ".sumocfg" or path.name.endswith(".sumocfg.xml"):
         return _load_sumocfg(path, path.name.split(".")[0])
-    if (path / "scenario.toml").is_file():
+    if _is_file(path / "scenario.toml"):
         return _load_directory(path)
     if path.name == "scenario.toml" and path.is_file():
         return _load_directory(path.parent)
@@ -181,7 +181,7 @@ def _load_directory(directory: Path) -> Scenario:
 
     def document(name: str, key: str) -> Document:
         path = directory / name
-        if not path.is_file():
+        if not _is_file(path):
             raise ScenarioError(f"{file}: {key} names {name!r}, but {path} does not exist")
         return admitted(Document(path.name, path))
 
@@ -217,7 +217,7 @@ def _load_sumocfg(path: Path, scenario_id: str) -> Scenario:
         if kind and not names:
             raise ScenarioError(f"{path}: no <{key} value=...>; a scenario needs {kind}")
         for name in names:
-            if not (path.parent / name).is_file():
+            if not _is_file(path.parent / name):
                 raise ScenarioError(
                     f"{path}: <{key}> names {name!r}, but {path.parent / name} does not exist"
                 )
@@ -256,13 +256,19 @@ def _load_sumocfg(path: Path, scenario_id: str) -> Scenario:
     return Scenario(scenario_id, network, routes, additional, settings)
 
 
+def _is_file(path: Path) -> bool:
+    """Return True for a file; a name that is too long or impossible is none."""
+    try:
+        return path.is_file()
+    except (OSError, ValueError):
+        return False
+
+
 def _names(text: str, directory: Path) -> list[str]:
     """Return file names; SUMO separates them by commas or blanks."""
     names = [name.strip() for name in text.split(",") if name.strip()]
     return [
-        part
-        for name in names
-        for part in ([name] if (directory / name).is_file() else name.split())
+        part for name in names for part in ([name] if _is_file(directory / name) else name.split())
     ]
 
 
