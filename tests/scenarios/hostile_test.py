@@ -10,11 +10,12 @@ from __future__ import annotations
 import re
 import shutil
 from collections.abc import Callable, Iterator
+from dataclasses import replace
 from pathlib import Path
 
 import pytest
 
-from ugat_marl.envs import parallel_env
+from ugat_marl.envs import parallel_env, vector_env
 from ugat_marl.errors import UgatMarlError
 from ugat_marl.files import Document
 from ugat_marl.scenarios import read_scenario, scenario, settings
@@ -171,6 +172,21 @@ def test_the_kernel_alone_holds(
     monkeypatch.setattr(settings, "option_fault", no_fault)
     path = hostile(crossing, kind, name, around)
     assert SECRET not in play(path)
+
+
+@pytest.mark.skipif(bool(confinement_missing()), reason="only the list protects here")
+def test_the_kernel_holds_the_workers_of_a_vector(crossing: Crossing, around: Path) -> None:
+    path = hostile(crossing, "additional", "edgeData", around)
+    honest = read_scenario(path)
+    raw = honest.additional[0].edited((path.parent / "extra.add.xml").read_bytes())
+    opened = replace(honest, additional=(raw,))
+    with vector_env(opened, 1) as env:
+        step = env.reset(seed=0)  # the worker reads the scenario again, and discards the output
+        assert step.observations.shape[0] == 1
+        worker = env._environments[0]._worker
+        assert worker is not None
+        status = Path(f"/proc/{worker._pid}/status").read_text()
+        assert "NoNewPrivs:\t1" in status  # set with the rules of the kernel, and never before
 
 
 def test_the_bait_works(crossing: Crossing, around: Path, tmp_path: Path) -> None:

@@ -142,7 +142,7 @@ class _EpisodeServer:
     def _confine(self) -> None:
         """Confine this process to the files of its scenario, unless it runs functions of the user.
 
-        A user's reward or wrapper may well write files of its own.
+        A user's reward, observation or wrapper may well write files of its own.
         """
         spec = self._order["spec"]
         if not spec["functions"] and not spec["wraps"]:
