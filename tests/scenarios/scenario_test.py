@@ -344,7 +344,7 @@ def test_without_the_wheel_the_error_says_how_to_install(monkeypatch: pytest.Mon
     monkeypatch.setattr(
         importlib.util, "find_spec", lambda name, *a: None if name == "sumo_rl" else find(name, *a)
     )
-    with pytest.raises(ScenarioError, match=r"pip install 'ugat-marl\[resco\]'"):
+    with pytest.raises(ScenarioError, match=r"pip install 'sumo-rl\b"):
         read_scenario("resco:cologne3")
 
 
