@@ -33,7 +33,14 @@ COMMANDS: dict[str, tuple[str, str]] = {
         "studies.bench.device:DeviceBench",
         "find the size from which on a GPU learns faster",
     ),
-    "all": ("studies.bench.everything:AllBench", "measure all but strength, scale and device"),
+    "field-log": (
+        "studies.bench.field_log:FieldLogBench",
+        "measure the log of the field loop over a year",
+    ),
+    "all": (
+        "studies.bench.everything:AllBench",
+        "measure all but strength, scale, device, field-log",
+    ),
 }
 
 

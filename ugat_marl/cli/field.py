@@ -86,6 +86,8 @@ class Field:
         log = None if self.log is None else DecisionLog(self.log)
         att = ""
         with contextlib.ExitStack() as stack:
+            if log is not None:
+                stack.callback(log.close)
             sumo = StartedSumo(scenario, self.seed, self.port) if self.start else None
             if sumo is not None:
                 stack.enter_context(sumo)
@@ -101,8 +103,9 @@ class Field:
                 street.close()
                 att = f"; ATT {sumo.trips().travel_time_s.mean():.1f} s"
         console.print(f"{_told(summary, len(site.lights))}{att}", soft_wrap=True)
-        if self.log is not None:
-            console.print(f"log: {self.log}", soft_wrap=True)
+        if log is not None:
+            lost = f" ({log.lost} decisions lost while it could not be written)" if log.lost else ""
+            console.print(f"log: {self.log}{lost}", soft_wrap=True)
         return 0
 
 

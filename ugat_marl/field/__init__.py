@@ -5,7 +5,8 @@
 - `watchdog`: checks of the counts.
 - `safety`: signal machines, the fixed-time plan, and the trust in the policy.
 - `answering`: calls of the policy with a deadline.
-- `loop`: the loop, its log and its summary.
+- `decisions`: decisions and their log.
+- `loop`: the loop and its summary.
 """
 
 import lazy_loader

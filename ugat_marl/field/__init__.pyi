@@ -1,5 +1,5 @@
-from .loop import Decision as Decision
-from .loop import DecisionLog as DecisionLog
+from .decisions import Decision as Decision
+from .decisions import DecisionLog as DecisionLog
 from .loop import FieldLoop as FieldLoop
 from .loop import LoopSummary as LoopSummary
 from .site import Site as Site

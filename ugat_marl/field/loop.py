@@ -7,107 +7,26 @@ lights follow the fixed-time plan. Every answer goes through the signal machines
 
 from __future__ import annotations
 
-import contextlib
-import json
 import time
 from collections import Counter
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
-from pathlib import Path
-from typing import Any, Literal
+from typing import Any
 
 import numpy as np
 
 from ugat_marl.envs import checked_phases
 from ugat_marl.errors import OptionError
 from ugat_marl.field.answering import Answering, Late, NoAnswer
+from ugat_marl.field.decisions import Decision, DecisionLog
 from ugat_marl.field.safety import Light, Trust, fixed_time, merged
 from ugat_marl.field.site import Site
 from ugat_marl.field.street import LaneCount, Street
 from ugat_marl.field.watchdog import TrustLimits, Watchdog
-from ugat_marl.files import require_writable, write_whole
 from ugat_marl.policies import Policy
 from ugat_marl.scenarios import GREEN, Segment
 
 _WARM_UP_S = 30.0
-_WRITE_EVERY_S = 1.0
-
-Source = Literal["policy", "fallback", "both"]
-
-
-@dataclass(frozen=True)
-class Decision:
-    """One decision for all lights.
-
-    Attributes:
-        time_s: Time of the decision on the street's clock, s.
-        phases: Traffic light to the phase asked for.
-        fallback: Traffic light that follows the fixed-time plan to the reason.
-        read_ms: Time spent on reading and checking the counts, ms.
-        latency_ms: Time from the start of reading until every light had its plan, ms.
-    """
-
-    time_s: float
-    phases: Mapping[str, int]
-    fallback: Mapping[str, str]
-    read_ms: float
-    latency_ms: float
-
-    @property
-    def source(self) -> Source:
-        """Source of the decision: the policy, the fixed-time plan, or both."""
-        if not self.fallback:
-            return "policy"
-        return "fallback" if len(self.fallback) == len(self.phases) else "both"
-
-    def line(self) -> str:
-        """Return the decision as a line of JSON."""
-        return json.dumps(
-            {
-                "time_s": self.time_s,
-                "source": self.source,
-                "reasons": dict(self.fallback),
-                "phases": dict(self.phases),
-                "read_ms": round(self.read_ms, 3),
-                "latency_ms": round(self.latency_ms, 3),
-            }
-        )
-
-
-class DecisionLog:
-    """File with one line of JSON per decision, whole at any moment.
-
-    At most once a second the whole file is written beside its place and renamed. A killed loop
-    therefore loses only the lines of its last second. Lines that the file already holds are kept.
-    If the file cannot be written for a while, the lights go on, and the next decision tries again.
-
-    Args:
-        path: The file.
-
-    Raises:
-        OutputError: The file cannot be written.
-        OptionError: The file does not end with a whole line.
-    """
-
-    def __init__(self, path: Path) -> None:
-        require_writable(path)
-        self.path = path
-        self._content = path.read_bytes() if path.exists() else b""
-        if self._content and not self._content.endswith(b"\n"):
-            raise OptionError(f"{path}: does not end with a whole line; give the log another name")
-        self._written = time.monotonic()
-
-    def add(self, decision: Decision) -> None:
-        """Add the line of a decision; write the file if the last write is a second old."""
-        self._content += decision.line().encode() + b"\n"
-        if time.monotonic() - self._written >= _WRITE_EVERY_S:
-            with contextlib.suppress(OSError):  # a full disk does not stop the lights
-                self.write()
-
-    def write(self) -> None:
-        """Write all lines to the file."""
-        write_whole(self.path, self._content)
-        self._written = time.monotonic()
 
 
 @dataclass
@@ -196,6 +115,7 @@ class FieldLoop:
 
         Raises:
             SimulatorError: The connection to the street is lost; no light can be set any more.
+            OutputError: The log cannot be written at the end.
         """
         until = self._street.now_s() + seconds - 1e-6
         try:
@@ -206,7 +126,7 @@ class FieldLoop:
                     on_decision(decision)
         finally:
             if self._log is not None:
-                self._log.write()
+                self._log.close()
         return self.summary
 
     def decide(self) -> tuple[Decision, dict[str, list[Segment]]]:

@@ -1,0 +1,244 @@
+"""Decisions of the field loop, and the log that they are written to."""
+
+from __future__ import annotations
+
+import contextlib
+import errno
+import importlib.util
+import json
+import os
+import re
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Literal
+
+from ugat_marl.errors import OptionError, OutputError
+from ugat_marl.files import require_writable
+
+_SEGMENT_BYTES = 1 << 20
+"""Size from which a segment is closed, bytes. A larger one delays one decision in a day for longer.
+A smaller one waits more often for the disk."""
+_MOST_WAITING = 100_000
+"""Most decisions that wait in memory for a disk that is full: 11 days of one in 10 s."""
+_AT_ONCE = 64
+"""Most waiting decisions that one decision writes, so that none takes long after a full disk."""
+
+Source = Literal["policy", "fallback", "both"]
+
+
+@dataclass(frozen=True)
+class Decision:
+    """One decision for all lights.
+
+    Attributes:
+        time_s: Time of the decision on the street's clock, s.
+        phases: Traffic light to the phase asked for.
+        fallback: Traffic light that follows the fixed-time plan to the reason.
+        read_ms: Time spent on reading and checking the counts, ms.
+        latency_ms: Time from the start of reading until every light had its plan, ms.
+    """
+
+    time_s: float
+    phases: Mapping[str, int]
+    fallback: Mapping[str, str]
+    read_ms: float
+    latency_ms: float
+
+    @property
+    def source(self) -> Source:
+        """Source of the decision: the policy, the fixed-time plan, or both."""
+        if not self.fallback:
+            return "policy"
+        return "fallback" if len(self.fallback) == len(self.phases) else "both"
+
+    def line(self) -> str:
+        """Return the decision as a line of JSON."""
+        return json.dumps(
+            {
+                "time_s": self.time_s,
+                "source": self.source,
+                "reasons": dict(self.fallback),
+                "phases": dict(self.phases),
+                "read_ms": round(self.read_ms, 3),
+                "latency_ms": round(self.latency_ms, 3),
+            }
+        )
+
+
+class DecisionLog:
+    """File with one line of JSON per decision; the time to add a line does not grow with the file.
+
+    Each line is written at once to a segment beside the file, ``NAME.OFFSET.part``. OFFSET is the
+    place of the segment in the file, in bytes. A full segment is added to the file and removed; so
+    is the last one in `close`. A killed loop leaves its segment, and the next log of that name adds
+    it first. A killed loop therefore loses at most the line that it was writing. Lines that the
+    file already holds are kept.
+
+    If the disk is full for a while, the lights go on, and the next decisions try again.
+
+    Args:
+        path: The file. It is locked until `close`.
+
+    Attributes:
+        lost: Number of decisions that were dropped because the disk was full for too long.
+
+    Raises:
+        OutputError: The file cannot be written.
+        OptionError: Another loop writes to the file, or the file does not end with a whole line.
+    """
+
+    def __init__(self, path: Path) -> None:
+        require_writable(path)
+        self.path = path
+        self.lost = 0
+        self._waiting: list[bytes] = []
+        self._file = self._segment = -1  # descriptors; -1 while there is none
+        self._part = path
+        self._size = 0
+        try:
+            self._open_file()
+            self._require_whole()
+            self._merge()
+        except BlockingIOError:
+            self._release()
+            raise OptionError(
+                f"{path}: another loop writes to this log; give this one another name"
+            ) from None
+        except OSError as error:
+            self._release()
+            raise OutputError(
+                f"{path}: cannot be written ({error.strerror}); give another place"
+            ) from None
+        except OptionError:
+            self._release()
+            raise
+
+    def add(self, decision: Decision) -> None:
+        """Write the line of a decision; keep it for the next call if the disk is full."""
+        self._waiting.append(decision.line().encode() + b"\n")
+        if len(self._waiting) > _MOST_WAITING:
+            del self._waiting[0]
+            self.lost += 1
+        with contextlib.suppress(OSError):  # a full disk does not stop the lights
+            self._write()
+
+    def close(self) -> None:
+        """Write what is left, add the last segment to the file and release the file.
+
+        Raises:
+            OutputError: The disk is full, or the folder is gone.
+        """
+        try:
+            while self._waiting:
+                self._write()
+            if self._segment >= 0:
+                self._rotate()
+        except OSError as error:
+            raise OutputError(
+                f"{self.path}: cannot be completed ({error.strerror}); make room and begin a loop "
+                f"with this log again, which adds the lines in {self.path.name}.*.part"
+            ) from None
+        finally:
+            self._release()
+
+    def _write(self) -> None:
+        """Write some of the waiting lines to the segment."""
+        if self._segment < 0 or os.fstat(self._segment).st_nlink == 0:  # nobody can see it any more
+            self._begin()
+        lines = b"".join(self._waiting[:_AT_ONCE])
+        # A write that fails in its middle is repeated at the same place.
+        _write_at(self._segment, lines, self._size)
+        self._size, self._waiting = self._size + len(lines), self._waiting[_AT_ONCE:]
+        if self._size >= _SEGMENT_BYTES:
+            self._rotate()
+
+    def _begin(self) -> None:
+        """Begin a segment behind the file and the segments that are still to be added to it."""
+        self.path.parent.mkdir(parents=True, exist_ok=True)
+        if self._file < 0 or os.fstat(self._file).st_nlink == 0:
+            self._release()
+            self._open_file()
+        end = os.fstat(self._file).st_size + sum(part.stat().st_size for _, part in self._parts())
+        self._part = self.path.with_name(f"{self.path.name}.{end:015d}.part")
+        self._segment = os.open(self._part, os.O_RDWR | os.O_CREAT | os.O_TRUNC, 0o666)
+        self._size = 0
+
+    def _rotate(self) -> None:
+        """Close the segment and add it to the file."""
+        segment, self._segment = self._segment, -1
+        try:
+            os.ftruncate(segment, self._size)
+        finally:
+            os.close(segment)
+        self._merge()
+
+    def _merge(self) -> None:
+        """Add all segments to the file. A merge that was killed at any point is completed."""
+        for offset, part in self._parts():
+            lines = _whole_lines(part)
+            size = os.fstat(self._file).st_size
+            try:
+                _write_at(self._file, lines[self._overlap(offset, lines) :], size)
+            except OSError:
+                os.ftruncate(self._file, size)
+                raise
+            os.fsync(self._file)  # before the only other copy goes
+            part.unlink()
+
+    def _overlap(self, offset: int, lines: bytes) -> int:
+        """Return the number of bytes at the begin of a segment that the file ends with."""
+        length = os.fstat(self._file).st_size - offset
+        if 0 < length <= len(lines) and os.pread(self._file, length, offset) == lines[:length]:
+            return length
+        return 0
+
+    def _parts(self) -> list[tuple[int, Path]]:
+        """Return the segments with their places in the file, in order."""
+        names = re.compile(re.escape(self.path.name) + r"\.(\d{15})\.part")
+        matches = ((names.fullmatch(part.name), part) for part in self.path.parent.iterdir())
+        return sorted((int(match[1]), part) for match, part in matches if match)
+
+    def _open_file(self) -> None:
+        self._file = os.open(self.path, os.O_RDWR | os.O_CREAT, 0o666)
+        if importlib.util.find_spec("fcntl") is not None:  # not on Windows
+            import fcntl
+
+            try:
+                fcntl.flock(self._file, fcntl.LOCK_EX | fcntl.LOCK_NB)
+            except BlockingIOError:
+                self._release()
+                raise
+
+    def _require_whole(self) -> None:
+        """Refuse a file whose last line has no end, unless a merge that was killed left it so."""
+        size = os.fstat(self._file).st_size
+        if size == 0 or os.pread(self._file, 1, size - 1) == b"\n":
+            return
+        if not any(self._overlap(offset, _whole_lines(part)) for offset, part in self._parts()[:1]):
+            raise OptionError(
+                f"{self.path}: does not end with a whole line; give the log another name"
+            )
+
+    def _release(self) -> None:
+        for descriptor in (self._segment, self._file):
+            if descriptor >= 0:
+                os.close(descriptor)
+        self._segment = self._file = -1
+
+
+def _whole_lines(part: Path) -> bytes:
+    """Return a segment without a last line that was not written to its end."""
+    content = part.read_bytes()
+    return content[: content.rfind(b"\n") + 1]
+
+
+def _write_at(descriptor: int, content: bytes, offset: int) -> None:
+    """Write all of `content` at a place of a file.
+
+    Raises:
+        OSError: The disk is full; a part may have been written.
+    """
+    written = os.pwrite(descriptor, content, offset) if content else 0
+    if written < len(content):
+        raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
