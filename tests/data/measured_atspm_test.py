@@ -366,6 +366,11 @@ def test_a_recording_that_became_a_log_is_the_same_recording(
         ("position_m = 487", "position_m = 4870", "goes from 0 to 490 m"),
         ('kind = "stop"', 'kind = "presence"', r"detectors.0.kind: Input should be 'advance'"),
         ("position_m = 487", "", r"position_m: Field required"),
+        ("position_m = 487", "position_m = true", r"detectors.0.position_m: Input should be a val"),
+        ("position_m = 487", 'position_m = "487"', r"detectors.0.position_m: Input should be a v"),
+        ("channel = 5", "channel = true", r"detectors.0.channel: Input should be a valid integer"),
+        ("4 = [1]", "4 = [true]", r"phases.4.green.0: Input should be a valid integer"),
+        ("4 = [1]", "0_4 = [1]", r"'0_4' is no number; write plain digits"),
         ("zero =", "zeros =", "zeros: Extra inputs are not permitted"),
         ("zero = [2024-03-05T07:00:00]", "", "give zero .* or .*periods"),
         ("07:00:00]", "07:00:00Z]", "write local time without one"),
@@ -397,6 +402,13 @@ def test_a_wrong_log_is_refused(imported: Import, tmp_path: Path) -> None:
         imported(log(LOG).with_columns(pl.lit(1.5).alias("TimeStamp")))
     with pytest.raises(MeasuredDataError, match=r"line 2: event is 'green'"):
         imported(log(LOG).with_columns(pl.lit("green").alias("EventId")), csv=True)
+    for cell in ("1_0", "١٢", "true"):
+        with pytest.raises(MeasuredDataError, match=f"line 2: event is '{cell}'; write a number"):
+            imported(log(LOG).with_columns(pl.lit(cell).alias("EventId")), csv=True)
+    with pytest.raises(MeasuredDataError, match=r"line 2: event '81\.5' is not a whole number"):
+        imported(log(LOG).with_columns(pl.lit(81.5).alias("EventId")), csv=True)
+    with pytest.raises(MeasuredDataError, match="'event' has the type Boolean"):
+        imported(log(LOG).with_columns(pl.lit(True).alias("EventId")))
     whole = (tmp_path / "events.parquet").read_bytes()
     (tmp_path / "events.parquet").write_bytes(whole[:100])
     scenario = read_scenario(Path(__file__).parents[1] / "fixtures" / "crossing")

@@ -86,6 +86,14 @@ def test_a_scenario_is_a_value(crossing: Crossing) -> None:
 # --- the hash ------------------------------------------------------------------------------------
 
 
+@pytest.mark.parametrize("wrong", ["true", '"200"', '"1_000"'])
+def test_what_only_python_takes_for_a_number_is_refused(crossing: Crossing, wrong: str) -> None:
+    with pytest.raises(ScenarioError, match=r"scenario\.toml: .*duration_s"):
+        read_scenario(
+            crossing(toml=lambda text: text.replace("duration_s = 200", f"duration_s = {wrong}"))
+        )
+
+
 def test_the_hash_knows_every_byte_and_setting(crossing: Crossing) -> None:
     hashes = {
         read_scenario(directory).hash

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import math
+import re
 from collections.abc import Mapping
 from typing import Annotated, Any, Literal
 
@@ -20,6 +22,11 @@ PhaseSource = Literal["programme", "conflict-free", "permitted"] | tuple[str, ..
 - A list: SUMO states.
 """
 
+Real = Annotated[float, pydantic.Strict()]
+"""A number of a file. Without this, ``true`` would be 1, and a text of digits a number."""
+
+_DECIMAL = re.compile(r"[+-]?([0-9]+\.?[0-9]*|\.[0-9]+)([eE][+-]?[0-9]+)?")
+
 _STRICT = pydantic.ConfigDict(extra="forbid", frozen=True, allow_inf_nan=False)
 
 
@@ -28,14 +35,14 @@ class ControlSettings(pydantic.BaseModel):
 
     model_config = _STRICT
 
-    decision_interval_s: Annotated[float, Field(gt=0, le=600)] = 10.0
-    yellow_s: Annotated[float, Field(ge=0, le=60)] = 3.0
-    all_red_s: Annotated[float, Field(ge=0, le=60)] = 2.0
-    min_green_s: Annotated[float, Field(ge=0, le=600)] = 5.0
+    decision_interval_s: Annotated[Real, Field(gt=0, le=600)] = 10.0
+    yellow_s: Annotated[Real, Field(ge=0, le=60)] = 3.0
+    all_red_s: Annotated[Real, Field(ge=0, le=60)] = 2.0
+    min_green_s: Annotated[Real, Field(ge=0, le=600)] = 5.0
     phases: PhaseSource = "programme"
-    late_green_s: Annotated[float, Field(ge=0, le=60, exclude_if=lambda value: value == 0)] = 0.0
+    late_green_s: Annotated[Real, Field(ge=0, le=60, exclude_if=lambda value: value == 0)] = 0.0
     """Seconds by which every green is shown late; agents do not see this delay."""
-    reach_m: Annotated[float, Field(ge=0, le=2000, exclude_if=lambda value: value == 0)] = 0.0
+    reach_m: Annotated[Real, Field(ge=0, le=2000, exclude_if=lambda value: value == 0)] = 0.0
     """Distance upstream of a stop line, m, within which vehicles count beyond short lanes too."""
 
 
@@ -46,7 +53,7 @@ class IntersectionSettings(pydantic.BaseModel):
 
     phases: PhaseSource | None = None
     late_green_s: Annotated[
-        float | None, Field(ge=0, le=60, exclude_if=lambda value: value is None)
+        Real | None, Field(ge=0, le=60, exclude_if=lambda value: value is None)
     ] = None
 
 
@@ -59,9 +66,9 @@ class ScenarioFile(pydantic.BaseModel):
     network: str
     routes: Annotated[tuple[str, ...], Field(min_length=1)]
     additional: tuple[str, ...] = ()
-    begin_s: Annotated[float, Field(ge=0)] = 0.0
-    duration_s: Annotated[float, Field(gt=0, le=1e7)] = 3600.0
-    step_length_s: Annotated[float, Field(ge=0.001, le=10)] = 1.0
+    begin_s: Annotated[Real, Field(ge=0)] = 0.0
+    duration_s: Annotated[Real, Field(gt=0, le=1e7)] = 3600.0
+    step_length_s: Annotated[Real, Field(ge=0.001, le=10)] = 1.0
     control: ControlSettings = ControlSettings()
     intersections: dict[str, IntersectionSettings] = {}
     effects: tuple[dict[str, Any], ...] = ()
@@ -118,6 +125,20 @@ def validate_settings(raw: Mapping[str, Any], source: str) -> ScenarioFile:
             f"({control.decision_interval_s:g} s)"
         )
     return settings
+
+
+def parse_decimal(text: str) -> float:
+    """Return the number in a text of a file, as every other program would read it.
+
+    Python itself also reads ``1_000``, digits of other scripts, ``nan`` and ``inf``.
+
+    Raises:
+        ValueError: Not a number in plain digits, or one too large.
+    """
+    value = float(text) if _DECIMAL.fullmatch(text.strip()) else math.nan
+    if not math.isfinite(value):
+        raise ValueError(text)
+    return value
 
 
 def parse_time(text: str) -> float:

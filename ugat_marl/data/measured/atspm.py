@@ -27,6 +27,7 @@ from ugat_marl.data.measured.tables import (
     frame_of,
     in_order,
     read_raw,
+    refuse,
     refuse_set_back,
     to_numbers,
     to_texts,
@@ -469,6 +470,14 @@ def read_log(path: Path, time_zone: str, findings: list[Finding]) -> pl.DataFram
     if whole.height < frame.height:
         findings.append(
             Finding(f"{path.name}: {frame.height - whole.height} rows with empty cells left out")
+        )
+    for column in ("event", "parameter"):
+        refuse(
+            path,
+            whole.filter(pl.col(column) % 1 != 0),
+            column,
+            "is not a whole number",
+            "export the log again, or leave the row out",
         )
     return whole.with_columns(
         pl.col("event").cast(pl.Int64, strict=False),

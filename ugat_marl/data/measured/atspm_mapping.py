@@ -13,10 +13,10 @@ from pydantic import Field
 
 from ugat_marl.data.measured.local_time import require_time_zone
 from ugat_marl.errors import MeasuredDataError
-from ugat_marl.scenarios import DetectorKind, Split
+from ugat_marl.scenarios import DetectorKind, Real, Split
 
 _STRICT = pydantic.ConfigDict(extra="forbid", frozen=True, allow_inf_nan=False)
-Index = Annotated[int, Field(ge=0)]
+Index = Annotated[int, pydantic.Strict(), Field(ge=0)]
 Text = Annotated[str, Field(min_length=1)]
 
 
@@ -25,6 +25,15 @@ def _name(value: Any) -> Any:
     return str(value) if isinstance(value, int) and not isinstance(value, bool) else value
 
 
+def _digits(value: Any) -> Any:
+    """Refuse a key such as ``1_0``, which Python would read as 10."""
+    if isinstance(value, str) and not (value.isascii() and value.isdecimal()):
+        raise ValueError(f"{value[:40]!r} is no number; write plain digits")
+    return value
+
+
+Number = Annotated[int, pydantic.BeforeValidator(_digits)]
+"""Number of a phase, overlap or link that is the key of a table."""
 Name = Annotated[Text, pydantic.BeforeValidator(_name)]
 
 
@@ -60,11 +69,11 @@ class Channel(pydantic.BaseModel):
 
     channel: Index
     lane: Text
-    position_m: float
-    length_m: float = 0.0
+    position_m: Real
+    length_m: Real = 0.0
     kind: DetectorKind
     id: Name = ""
-    latency_s: float = 0.0
+    latency_s: Real = 0.0
     """Delay of the detector's time stamps, s; it is subtracted from them."""
 
 
@@ -75,9 +84,9 @@ class Device(pydantic.BaseModel):
 
     id: Name
     tls: Text
-    phases: dict[int, LinksOf] = {}
-    overlaps: dict[int, LinksOf] = {}
-    constant: dict[int, Annotated[str, Field(pattern="^[rugGyYoOs]$")]] = {}
+    phases: dict[Number, LinksOf] = {}
+    overlaps: dict[Number, LinksOf] = {}
+    constant: dict[Number, Annotated[str, Field(pattern="^[rugGyYoOs]$")]] = {}
     detectors: tuple[Channel, ...] = ()
 
 
@@ -88,8 +97,8 @@ class Span(pydantic.BaseModel):
 
     id: Name = ""
     zero: datetime
-    begin_s: float | None = None
-    end_s: float | None = None
+    begin_s: Real | None = None
+    end_s: Real | None = None
     split: Split | None = None
 
 
@@ -100,8 +109,8 @@ class AtspmMapping(pydantic.BaseModel):
 
     time_zone: str = ""
     zero: tuple[datetime, ...] = ()
-    begin_s: float | None = None
-    end_s: float | None = None
+    begin_s: Real | None = None
+    end_s: Real | None = None
     periods: tuple[Span, ...] = ()
     devices: Annotated[tuple[Device, ...], Field(min_length=1)]
 

@@ -31,6 +31,7 @@ from ugat_marl.scenarios.importers.turning_shares import (
     write_drives,
 )
 from ugat_marl.scenarios.programs import run_program, sumo_program, tool
+from ugat_marl.scenarios.settings import parse_decimal
 from ugat_marl.seeding import numpy_generator
 
 _CANDIDATES_VPH = 400.0
@@ -128,7 +129,7 @@ def _whole(reader: csv.DictReader[str], path: Path) -> Iterator[dict[str, str]]:
 
 def _number(text: str | None, key: str, where: str) -> float:
     try:
-        value = float(text or "")
+        value = parse_decimal(text or "")
     except ValueError:
         value = math.nan
     if not (math.isfinite(value) and value >= 0):
