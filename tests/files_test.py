@@ -17,7 +17,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from ugat_marl import files
-from ugat_marl.errors import ScenarioError
+from ugat_marl.errors import LogError, MeasuredDataError, ScenarioError
 from ugat_marl.files import parse_xml, read_bytes, replacing, write_whole, xml_bytes
 
 
@@ -230,3 +230,45 @@ def test_an_archive_made_to_fill_memory_is_refused(
     honest = b"".join(b"<b id='%d'/>" % random.Random(i).getrandbits(64) for i in range(90000))
     bomb.write_bytes(gzip.compress(honest))
     assert files.read_bytes(bomb) == honest == b"".join(files.chunks_of(bomb))
+
+
+TEXTS = {
+    "deep.json": ("[" * 100_000, "more than 64 tables or lists inside each other"),
+    "deeper.json": ("[" * 65 + "]" * 65, "more than 64 tables or lists inside each other"),
+    "deep.toml": ("a = " + "[" * 100_000, "more than 64 tables or lists inside each other"),
+    "deeper.toml": ("a = " + "[" * 65 + "]" * 65, "more than 64 tables or lists"),
+    "long.json": ("1" * 5000, "not valid JSON: Exceeds the limit"),
+    "long.toml": ("a = " + "1" * 5000, "not valid TOML: Exceeds the limit"),
+    "cut.json": ('{"a": [1,', r"not valid JSON: .*line 1.*cut short"),
+    "cut.toml": ("a = [1,", "not valid TOML: .*cut short"),
+    "latin.json": (b'"\xe9"', "not UTF-8"),
+    "latin.toml": (b"a = '\xe9'", "not UTF-8"),
+    "large.json": (b" " * (2 << 20), "has more than 1 MiB"),
+    "large.toml": (b" " * (2 << 20), "has more than 1 MiB"),
+}
+
+
+@pytest.mark.parametrize("name", TEXTS)
+def test_json_and_toml_made_to_harm_are_refused_in_one_line(
+    name: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(files, "_LONGEST", 1 << 20)
+    content, says = TEXTS[name]
+    path = tmp_path / name
+    path.write_bytes(content.encode() if isinstance(content, str) else content)
+    read = files.read_json if path.suffix == ".json" else files.read_toml
+    with pytest.raises(MeasuredDataError, match=rf"^{path}: {says}") as refused:
+        read(path, MeasuredDataError)
+    assert "\n" not in str(refused.value)
+
+
+def test_json_and_toml_as_deep_as_allowed_are_read(tmp_path: Path) -> None:
+    deep = "[" * 64 + "]" * 64
+    (tmp_path / "a.json").write_text(deep)
+    (tmp_path / "a.toml").write_text(f"a = {deep[1:-1]}")
+    assert str(files.read_json(tmp_path / "a.json", LogError)) == deep
+    assert str(files.read_toml(tmp_path / "a.toml", LogError)["a"]) == deep[1:-1]
+    with pytest.raises(LogError, match=r"none\.json: cannot be read \(No such file"):
+        files.read_json(tmp_path / "none.json", LogError)
+    with pytest.raises(LogError, match="^provenance: more than 64 tables"):
+        files.parse_json("[" * 65 + "]" * 65, "provenance", LogError)

@@ -1,4 +1,4 @@
-"""Files that are whole or absent, and safe reading of XML.
+"""Files that are whole or absent, and safe reading of XML, JSON and TOML.
 
 The suite writes files with `replacing` or `write_whole`: a killed run leaves the old file or the
 new one, never half of either. It reads XML with one parser, which refuses entities and document
@@ -10,10 +10,12 @@ from __future__ import annotations
 import contextlib
 import gzip
 import io
+import json
 import os
 import secrets
 import shutil
 import tempfile
+import tomllib
 import weakref
 import xml.etree.ElementTree as ET
 import zlib
@@ -23,7 +25,7 @@ from pathlib import Path
 from typing import Any, BinaryIO, NamedTuple
 from xml.parsers import expat
 
-from ugat_marl.errors import OutputError, ScenarioError
+from ugat_marl.errors import OutputError, ScenarioError, UgatMarlError
 from ugat_marl.progress import Reporter, Silent, usual, watched
 
 _PIECE = 1 << 20
@@ -37,6 +39,8 @@ _MOST_RATIO = 100
 _DEEPEST = 64
 """Most elements inside each other. Files of SUMO and OpenStreetMap have fewer than ten. Deeper ones
 exhaust the stack of whatever walks through them."""
+_LONGEST = 64 << 20
+"""Most bytes of a JSON or TOML file; those of the suite have less than a hundredth of it."""
 _END = "\0"
 """Mark after each child of an element during writing. XML cannot contain this character."""
 
@@ -140,6 +144,92 @@ def _bounded(pieces: Iterator[bytes], path: Path, packed: int) -> Iterator[bytes
                 "network or demand does; unpack it yourself if you trust it"
             )
         yield piece
+
+
+def read_toml(path: Path, fault: type[UgatMarlError]) -> dict[str, Any]:
+    """Return the content of a TOML file that others may have written.
+
+    Args:
+        path: The file.
+        fault: Kind of the error to raise.
+
+    Raises:
+        UgatMarlError: As `fault`. The file is missing, too long, no TOML in UTF-8 or nested too
+            deeply.
+    """
+    return _read_text(path, fault, tomllib.loads, "TOML")
+
+
+def read_json(path: Path, fault: type[UgatMarlError]) -> Any:
+    """Return the content of a JSON file that others may have written.
+
+    Args:
+        path: The file.
+        fault: Kind of the error to raise.
+
+    Raises:
+        UgatMarlError: As for `read_toml`, with JSON.
+    """
+    return _read_text(path, fault, json.loads, "JSON")
+
+
+def parse_json(text: str, name: str, fault: type[UgatMarlError]) -> Any:
+    """Return the content of a JSON text that others may have written.
+
+    Args:
+        text: The text.
+        name: Name of the text in errors, usually its path.
+        fault: Kind of the error to raise.
+
+    Raises:
+        UgatMarlError: As `fault`. The text is no JSON, or nested too deeply.
+    """
+    return _parsed(text, name, fault, json.loads, "JSON")
+
+
+def _read_text(
+    path: Path, fault: type[UgatMarlError], parse: Callable[[str], Any], kind: str
+) -> Any:
+    try:
+        if path.stat().st_size > _LONGEST:
+            raise fault(
+                f"{path}: has more than {_LONGEST >> 20} MiB, which no such file needs; is it "
+                "another file?"
+            )
+        text = path.read_text(encoding="utf-8")
+    except UnicodeDecodeError as error:
+        raise fault(f"{path}: not UTF-8 ({error.reason}); save it as UTF-8") from None
+    except OSError as error:
+        raise fault(f"{path}: cannot be read ({error.strerror})") from None
+    return _parsed(text, str(path), fault, parse, kind)
+
+
+def _parsed(
+    text: str, name: str, fault: type[UgatMarlError], parse: Callable[[str], Any], kind: str
+) -> Any:
+    too_deep = fault(
+        f"{name}: more than {_DEEPEST} tables or lists inside each other, which no such file needs"
+    )
+    try:
+        content = parse(text)
+    except RecursionError:
+        raise too_deep from None
+    except ValueError as error:  # also a number of more digits than Python reads
+        raise fault(
+            f"{name}: not valid {kind}: {error}; the file may have been cut short"
+        ) from None
+    level = [content]
+    for _ in range(_DEEPEST):
+        level = [part for value in level for part in _parts_of(value)]
+        if not level:
+            return content
+    raise too_deep
+
+
+def _parts_of(value: Any) -> Iterable[Any]:
+    if isinstance(value, dict):
+        return value.values()
+    return value if isinstance(value, list) else ()
 
 
 class Tag(NamedTuple):

@@ -267,7 +267,7 @@ CASES = [
     ),
     # scenario.toml
     Case("no TOML", content(TOML, "network = [\n"), (r"scenario\.toml: not valid TOML",)),
-    Case("bytes that are no text", content(TOML, b"\xff\xfe"), ("scenario.toml: cannot be",)),
+    Case("bytes that are no text", content(TOML, b"\xff\xfe"), (r"scenario\.toml: not UTF-8",)),
     Case("no key network", content(TOML, 'routes = ["a"]'), ("key 'network' is missing",)),
     Case("no key routes", content(TOML, 'network = "a"'), ("key 'routes' is missing",)),
     Case(

@@ -21,7 +21,7 @@ from numpy.typing import NDArray
 
 from ugat_marl.data.row_hashes import damage, is_hashed, write_hashed
 from ugat_marl.errors import LogError
-from ugat_marl.files import replacing
+from ugat_marl.files import parse_json, replacing
 
 FORMAT = 2
 METADATA_KEY = "ugat_marl.data.transitions"
@@ -142,7 +142,7 @@ class Provenance:
                 of the wrong type.
         """
         try:
-            content = json.loads(text)
+            content = parse_json(text, "provenance", LogError)
             if content.pop("format") != FORMAT:
                 raise LogError(f"provenance has another format; this version reads {FORMAT}")
             layouts = {name: AgentLayout(**part) for name, part in content.pop("layouts").items()}

@@ -22,7 +22,7 @@ from numpy.typing import NDArray
 from ugat_marl.data import MEASURES, Scores
 from ugat_marl.errors import CheckpointError
 from ugat_marl.experiments.statistics import Interval
-from ugat_marl.files import write_whole
+from ugat_marl.files import read_json, write_whole
 
 
 @dataclass(frozen=True)
@@ -182,17 +182,11 @@ class Evaluation:
             CheckpointError: The file is missing, cut short or of another form.
         """
         try:
-            content = json.loads(path.read_text(encoding="utf-8"))
+            content = read_json(path, CheckpointError)
             results = _whole(tuple(result_of(row) for row in content["episodes"]))
             notes = {str(key): str(text) for key, text in content["notes"].items()}
             return cls(str(content["scenario"]), str(content["scenario_hash"]), results, notes)
-        except OSError as error:
-            raise CheckpointError(f"{path}: cannot be read ({error.strerror})") from None
-        except json.JSONDecodeError as error:
-            raise CheckpointError(
-                f"{path}: no JSON at line {error.lineno} ({error.msg}); it may have been cut short"
-            ) from None
-        except (ValueError, TypeError, KeyError, AttributeError, RecursionError) as error:
+        except (ValueError, TypeError, KeyError, AttributeError) as error:
             raise CheckpointError(
                 f"{path}: not the table of a run ({error!r}); it may have been cut short"
             ) from None

@@ -12,14 +12,13 @@ import hashlib
 import importlib.util
 import json
 import re
-import tomllib
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
 from ugat_marl.errors import ScenarioError, UnknownNameError, install_command
-from ugat_marl.files import Document, parse_xml, read_bytes, write_whole
+from ugat_marl.files import Document, parse_xml, read_bytes, read_toml, write_whole
 from ugat_marl.scenarios.admission import OPTIONS, admitted
 from ugat_marl.scenarios.settings import (
     ControlSettings,
@@ -171,13 +170,7 @@ def shipped_scenarios() -> Iterator[tuple[str, Path]]:
 
 def _load_directory(directory: Path) -> Scenario:
     file = directory / "scenario.toml"
-    try:
-        raw = tomllib.loads(file.read_text(encoding="utf-8"))
-    except tomllib.TOMLDecodeError as error:
-        raise ScenarioError(f"{file}: not valid TOML: {error}") from None
-    except (OSError, UnicodeDecodeError) as error:
-        raise ScenarioError(f"{file}: cannot be read: {error}") from None
-    settings = validate_settings(raw, str(file))
+    settings = validate_settings(read_toml(file, ScenarioError), str(file))
 
     def document(name: str, key: str) -> Document:
         path = directory / name

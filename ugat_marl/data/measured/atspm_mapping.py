@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import tomllib
 from collections.abc import Collection, Mapping, Sequence
 from datetime import datetime
 from pathlib import Path
@@ -13,6 +12,7 @@ from pydantic import Field
 
 from ugat_marl.data.measured.local_time import require_time_zone
 from ugat_marl.errors import MeasuredDataError
+from ugat_marl.files import read_toml
 from ugat_marl.scenarios import DetectorKind, Real, Split
 
 _STRICT = pydantic.ConfigDict(extra="forbid", frozen=True, allow_inf_nan=False)
@@ -146,14 +146,7 @@ def read_mapping(
             Or a traffic light is unknown or mapped twice, or links are not mapped or unknown.
     """
     try:
-        raw = tomllib.loads(path.read_text(encoding="utf-8"))
-        mapping = AtspmMapping.model_validate(raw)
-    except OSError as error:
-        raise MeasuredDataError(f"{path}: cannot be read ({error.strerror})") from None
-    except UnicodeDecodeError as error:
-        raise MeasuredDataError(f"{path}: not UTF-8 ({error.reason}); save it as UTF-8") from None
-    except tomllib.TOMLDecodeError as error:
-        raise MeasuredDataError(f"{path}: not valid TOML: {error}") from None
+        mapping = AtspmMapping.model_validate(read_toml(path, MeasuredDataError))
     except pydantic.ValidationError as error:
         said = [f"{'.'.join(map(str, e['loc']))}: {e['msg']}" for e in error.errors()[:4]]
         raise MeasuredDataError(
