@@ -234,7 +234,7 @@ CASES = [
     Case(
         "a number that is none",
         replaced(NETWORK, 'length="490.00"', 'length="long"', 1),
-        (r"network\.net\.xml: ", "'long'", "build the network again with netconvert"),
+        (r"network\.net\.xml, line 13: ", "'long'", "build the network again with netconvert"),
     ),
     Case(
         "a connection over a lane that is not there",
