@@ -37,7 +37,7 @@ CITY = """
 <!-- comments are dropped -->
 <vehicle id="v1" depart="triggered" type="mix" route="either"/>
 <vehicle id="v2" depart="0:00:10" type="mix" route="east" speedFactor="1.2"><stop lane="C_E_0"
-    endPos="50" duration="5"/><param key="k" value="v">some <b>text</b> here</param></vehicle>
+    endPos="50" duration="5"/><param key="k" value="v">some <param key="i"/> text</param></vehicle>
 <flow id="f1" begin="20" end="180" vehsPerHour="400" type="car" route="north"/>
 <trip id="t1" depart="30" from="W_C" to="C_E"/>
 <flow id="f2" begin="40" number="30" period="exp(0.25)" from="W_C" to="C_E"/>

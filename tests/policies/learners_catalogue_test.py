@@ -93,7 +93,7 @@ def test_settings_are_of_their_type() -> None:
         ("plain", ["rate=fast"], OptionError, "rate=fast"),
         ("plain", ["sizes=1,x"], OptionError, "sizes=1,x"),
         ("second", ["kind=three"], UnknownNameError, "kind"),  # its name has said it
-        ("needy", [], OptionError, "no_such_library.*ugat-marl.needs"),
+        ("needy", [], OptionError, "no_such_library.*\\[needs"),
         ("gone", [], OptionError, "gone.py"),
         ("broken", [], ValueError, "its own"),
         ("dqn", ["hidden=3"], OptionError, "--dqn"),

@@ -91,7 +91,7 @@ def test_endings_and_ffmpeg(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> 
     with pytest.raises(OptionError, match=r"ends in one of \.mp4.*not '\.avi'"):
         require_video(tmp_path / "a.avi")
     monkeypatch.setattr(filming, "_ffmpeg", lambda: None)
-    with pytest.raises(OptionError, match=r"ugat-marl\[video\].*out\.gif"):
+    with pytest.raises(OptionError, match=r"pip install .imageio-ffmpeg.*out\.gif"):
         require_video(tmp_path / "out.mp4")
     require_video(tmp_path / "out.gif")
 
