@@ -24,7 +24,11 @@ from .measured_log import log_of_measured as log_of_measured
 from .phase import PhaseTransform as PhaseTransform
 from .phase import fit_inverse as fit_inverse
 from .phase import inverse_accuracy as inverse_accuracy
+from .posterior import FittedService as FittedService
 from .posterior import Posterior as Posterior
+from .posterior import Simulated as Simulated
+from .posterior import Values as Values
+from .posterior import Worlds as Worlds
 from .reports import FitReport as FitReport
 from .residual import Residual as Residual
 from .residual import ResidualConfig as ResidualConfig
@@ -37,6 +41,7 @@ from .street import DrawnEnv as DrawnEnv
 from .street import FittedStreet as FittedStreet
 from .street import Simulation as Simulation
 from .street import StreetConfig as StreetConfig
+from .street import StreetWorld as StreetWorld
 from .street import fit_street as fit_street
 from .street import street_env as street_env
 from .street import street_prior as street_prior

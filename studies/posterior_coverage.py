@@ -1,0 +1,246 @@
+"""Coverage of the posterior over worlds, in simulated streets whose values are hidden from it.
+
+    python -m studies.posterior_coverage single-v1 mixed-v1 --streets 60 --jobs 2
+
+Worlds are simulated once for each network, as a training does. Then streets are drawn and
+simulated, and the posterior is asked for the values of each. Half of the streets come from the
+prior of the worlds. The other half come from another distribution, so that the prior is wrong
+about them: each effect is there with a chance of a half, alone, and a third of the lanes loses
+green at its beginning.
+
+A value is covered if the 90 % interval of its draws holds it. A value at the end of its range is
+covered by an interval that ends there.
+"""
+
+from __future__ import annotations
+
+import argparse
+import contextlib
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+from rich.console import Console
+from scipy.stats import binomtest
+
+from ugat_marl import parallel_env
+from ugat_marl.data import TransitionLog
+from ugat_marl.effects import load_scenario
+from ugat_marl.experiments import policy_factory
+from ugat_marl.grounding import (
+    FittedService,
+    LaneView,
+    Posterior,
+    Simulated,
+    Simulation,
+    StreetConfig,
+    StreetWorld,
+    Values,
+    Worlds,
+    street_prior,
+)
+from ugat_marl.progress import Bars
+from ugat_marl.seeding import derive_seed, numpy_generator
+
+Floats = NDArray[np.float64]
+
+KINDS = ("prior", "other")
+"""Distributions from which streets are drawn."""
+
+INTERVAL = (0.05, 0.95)
+EPSILON = 0.1
+"""Chance of a random phase in all roll-outs."""
+
+
+@dataclass(frozen=True)
+class Asked:
+    """A hidden value and the posterior's answer.
+
+    Attributes:
+        kind: One of `KINDS`.
+        name: Name of the effect, or of the kind of service.
+        truth: The hidden value, in the effect's unit.
+        low: Lower end of the 90 % interval.
+        middle: Median.
+        high: Upper end of the interval.
+        blind: Median of the prior.
+        width: Width of the prior's 90 % interval.
+    """
+
+    kind: str
+    name: str
+    truth: float
+    low: float
+    middle: float
+    high: float
+    blind: float
+    width: float
+
+    @property
+    def covered(self) -> bool:
+        """True if the interval holds the value."""
+        return self.low - 1e-9 <= self.truth <= self.high + 1e-9
+
+
+def draw_other(worlds: Worlds, seed: int) -> Values:
+    """Draw a street from a distribution that is not the prior.
+
+    Args:
+        worlds: The prior; its ranges are kept.
+        seed: Seed of the street.
+    """
+    generator = numpy_generator(seed, "posterior coverage", "other")
+    effects = np.array(
+        [
+            generator.uniform(x.low, x.high) if generator.random() < 0.5 else x.nominal
+            for x in worlds.library
+        ]
+    )
+    service_s = np.zeros((len(worlds.lanes), 2))
+    late = generator.random(len(worlds.lanes)) < 1 / 3
+    service_s[late, 0] = generator.uniform(1.0, 6.0, int(late.sum()))
+    return worlds.clipped(Values(effects, service_s))
+
+
+def streets_of(worlds: Worlds, number: int, seed: int) -> list[tuple[str, Values]]:
+    """Return the streets, by turns from either distribution."""
+    drawn: list[tuple[str, Values]] = []
+    for k in range(number):
+        one, kind = derive_seed(seed, "street", k), KINDS[k % 2]
+        drawn.append((kind, worlds.draw(one) if kind == "prior" else draw_other(worlds, one)))
+    return drawn
+
+
+def answers(
+    posterior: Posterior, kind: str, truth: Values, prior: tuple[Floats, Floats]
+) -> list[Asked]:
+    """Return the posterior's answers for a street.
+
+    Args:
+        posterior: The posterior for the log of the street.
+        kind: Distribution of the street.
+        truth: Its values.
+        prior: Draws of the prior: effects ``(n, effects)``, and the lanes' mean service ``(n, 2)``.
+    """
+    effects, service_s = posterior.sample(400)
+    names = [item.name for item in posterior.worlds.library]
+    columns = [
+        (names[i], truth.effects[i], effects[:, i], prior[0][:, i]) for i in range(len(names))
+    ]
+    for j, name in enumerate(("green unused at first, s", "green unused later, s")):
+        mean_s = truth.service_s[:, j].mean()
+        columns.append((f"mean {name}", mean_s, service_s[:, :, j].mean(1), prior[1][:, j]))
+        for lane in range(len(posterior.worlds.lanes)):
+            value = truth.service_s[lane, j]
+            columns.append((f"lanes: {name}", value, service_s[:, lane, j], prior[1][:, j]))
+    asked: list[Asked] = []
+    for name, value, sample, blind in columns:
+        low, middle, high = (float(q) for q in np.quantile(sample, (INTERVAL[0], 0.5, INTERVAL[1])))
+        least, usual, most = np.quantile(blind, (INTERVAL[0], 0.5, INTERVAL[1]))
+        width = float(most - least)
+        asked.append(Asked(kind, name, float(value), low, middle, high, float(usual), width))
+    return asked
+
+
+def study(
+    name: str, number: int, simulations: int, policy: str, seed: int, jobs: int | None
+) -> list[Asked]:
+    """Simulate worlds and streets of a network; return all answers.
+
+    Args:
+        name: The scenario.
+        number: Number of streets.
+        simulations: Number of worlds for the posterior.
+        policy: Rule that acts in worlds and streets.
+        seed: Root of all random choices.
+        jobs: Simulations at a time.
+    """
+    scenario = load_scenario(name)
+    with contextlib.closing(parallel_env(scenario, observation="movements")) as env:
+        worlds = street_prior(env, StreetConfig(parts=("service", "effects")))
+        view, acting = LaneView.of(env.network, "movements"), policy_factory(policy)(env)
+    simulation = Simulation(scenario, "sim", {"observation": "movements"}, EPSILON, jobs)
+    streets = streets_of(worlds, number, seed)
+    values = [worlds.draw(derive_seed(seed, "world", k)) for k in range(simulations)]
+    values += [value for _, value in streets for _ in range(2)]  # two episodes of each street
+    drawn = [
+        StreetWorld(worlds.effects(v), (FittedService(worlds.lanes, v.service_s),)) for v in values
+    ]
+    seeds = [derive_seed(seed, "episode", k) for k in range(len(drawn))]
+    with Bars(Console(stderr=True)).task(name, len(drawn)) as advance:
+        logs = simulation.logs(drawn, acting, seeds, 1800.0, advance)
+    known = [
+        Simulated(value, view.summary(log))
+        for value, log in zip(values[:simulations], logs[:simulations], strict=True)
+    ]
+    several = [worlds.draw(derive_seed(seed, "blind", k)) for k in range(400)]
+    prior = (
+        np.stack([value.effects for value in several]),
+        np.stack([value.service_s.mean(0) for value in several]),
+    )
+    asked: list[Asked] = []
+    for k, (kind, truth) in enumerate(streets):
+        at = simulations + 2 * k
+        log = TransitionLog.concatenate(logs[at : at + 2])
+        posterior = Posterior.fit(worlds, known, view.summary(log))
+        asked += answers(posterior, kind, truth, prior)
+    return asked
+
+
+def table(asked: Sequence[Asked]) -> str:
+    """Return coverage, width and error by value, as Markdown; the worst coverage first."""
+    groups: dict[tuple[str, str], list[Asked]] = {}
+    for one in asked:
+        groups.setdefault((one.kind, one.name), []).append(one)
+    for kind in KINDS:
+        groups[kind, "all effects"] = [
+            one for one in asked if one.kind == kind and "green" not in one.name
+        ]
+    lines = [
+        "| streets from | value | cases | covered by 90 % | 95 % interval of that | "
+        "width, share of the prior's | error, share of the prior's |",
+        "|---|---|---:|---:|---:|---:|---:|",
+    ]
+
+    def rate(group: Sequence[Asked]) -> float:
+        return float(np.mean([one.covered for one in group]))
+
+    for (kind, name), group in sorted(groups.items(), key=lambda item: rate(item[1])):
+        hits = sum(one.covered for one in group)
+        ends = binomtest(hits, len(group)).proportion_ci(method="wilson")
+        width = np.mean([(one.high - one.low) / one.width for one in group])
+        error = _size([one.middle - one.truth for one in group])
+        blind = _size([one.blind - one.truth for one in group])
+        told = f"{error / blind:.2f}" if blind else "–"
+        lines.append(
+            f"| {kind} | {name} | {len(group)} | {rate(group):.2f} | "
+            f"{ends.low:.2f}–{ends.high:.2f} | {width:.2f} | {told} |"
+        )
+    return "\n".join(lines)
+
+
+def _size(errors: Sequence[float]) -> float:
+    return float(np.sqrt(np.mean(np.square(errors))))
+
+
+def main() -> None:
+    """Simulate, ask, and print a table for each network."""
+    summary = (__doc__ or "").splitlines()[0]
+    parser = argparse.ArgumentParser(
+        prog="python -m studies.posterior_coverage", description=summary
+    )
+    parser.add_argument("scenarios", nargs="+")
+    parser.add_argument("--streets", type=int, default=60)
+    parser.add_argument("--simulations", type=int, default=160)
+    parser.add_argument("--policy", default="max-pressure:10")
+    parser.add_argument("--seed", type=int, default=0)
+    parser.add_argument("--jobs", type=int)
+    given = parser.parse_args()
+    for name in given.scenarios:
+        asked = study(name, given.streets, given.simulations, given.policy, given.seed, given.jobs)
+        print(f"## {name}\n\n{table(asked)}\n", flush=True)
+
+
+if __name__ == "__main__":
+    main()
