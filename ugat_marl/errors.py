@@ -8,7 +8,6 @@ from __future__ import annotations
 
 import contextlib
 import difflib
-import importlib.metadata
 import re
 from collections.abc import Iterable
 
@@ -112,9 +111,11 @@ def install_command(extra: str) -> str:
     It names the libraries themselves, because the package may have been installed from a file that
     no index knows.
     """
+    from importlib import metadata
+
     needed: list[str] = []
-    with contextlib.suppress(importlib.metadata.PackageNotFoundError):
-        for requirement in importlib.metadata.requires("ugat-marl") or ():
+    with contextlib.suppress(metadata.PackageNotFoundError):
+        for requirement in metadata.requires("ugat-marl") or ():
             library, _, condition = requirement.partition(";")
             if re.search(rf"extra == ['\"]{re.escape(extra)}['\"]", condition):
                 needed.append(f"'{library.strip()}'")

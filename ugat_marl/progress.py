@@ -8,19 +8,11 @@ import time
 from collections.abc import Callable, Iterable, Iterator, Mapping
 from dataclasses import dataclass
 from pathlib import Path
-from typing import IO, Any, Literal, Protocol
+from typing import IO, TYPE_CHECKING, Any, Literal, Protocol
 
-from rich.console import Console, Group
-from rich.live import Live
-from rich.progress import (
-    BarColumn,
-    MofNCompleteColumn,
-    Progress,
-    TaskProgressColumn,
-    TextColumn,
-    TimeElapsedColumn,
-    TimeRemainingColumn,
-)
+if TYPE_CHECKING:
+    from rich.console import Console, Group
+    from rich.progress import Progress
 
 Advance = Callable[..., None]
 """Called as ``advance()`` or ``advance(note="...")`` when a unit of work is done."""
@@ -173,6 +165,8 @@ class Bars:
         self._whole = whole = _Whole(name, shares, self._console)
         live = contextlib.nullcontext()
         if self._console.is_terminal:
+            from rich.live import Live
+
             live = Live(
                 get_renderable=whole.drawn, console=self._console, transient=True, screen=False
             )
@@ -210,6 +204,8 @@ class _Whole:
 
     def drawn(self) -> Group:
         """Return both bars."""
+        from rich.console import Group
+
         return Group(*(bars for bars in (self.progress, self.step) if bars is not None))
 
 
@@ -220,6 +216,17 @@ _TAKEN = 42
 
 def _bars(console: Console, counted: bool = True) -> Progress:
     """Return a set of bars in the form that all of them have."""
+    # here and not above: simulations and environments load this module, and show no bars
+    from rich.progress import (
+        BarColumn,
+        MofNCompleteColumn,
+        Progress,
+        TaskProgressColumn,
+        TextColumn,
+        TimeElapsedColumn,
+        TimeRemainingColumn,
+    )
+
     return Progress(
         TextColumn(f"{{task.description:<{_NAME_WIDTH}}}"),
         BarColumn(bar_width=10),

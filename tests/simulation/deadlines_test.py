@@ -46,7 +46,7 @@ def test_a_stopped_simulation_counts_as_dead(
 def test_a_stopped_worker_of_a_vector_is_replaced_with_the_same_numbers(
     crossing: Crossing, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setenv(DEADLINE_VARIABLE, "4")
+    monkeypatch.setenv(DEADLINE_VARIABLE, "8")  # the warm parent starts within it as well
 
     def play(stopped_at: int | None) -> list[float]:
         env = vector_env(crossing(), 2)

@@ -19,7 +19,9 @@ def test_table_by_hand() -> None:
     lines = table(asked).splitlines()
     assert "| prior | headway | 2 | 0.50 | 0.09–0.91 | 0.50 | 0.63 |" in lines
     assert "| other | headway | 1 | 1.00 | 0.21–1.00 | 0.50 | – |" in lines
-    assert lines.index("| prior | headway | 2 | 0.50 | 0.09–0.91 | 0.50 | 0.63 |") < 4  # worst first
+    assert (
+        lines.index("| prior | headway | 2 | 0.50 | 0.09–0.91 | 0.50 | 0.63 |") < 4
+    )  # worst first
 
 
 def test_half_of_the_streets_are_not_of_the_prior() -> None:

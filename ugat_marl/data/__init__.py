@@ -1,6 +1,7 @@
 """Data: values that are recorded and kept in files. Nothing here computes statistics over runs.
 
 - `transitions`: the log of transitions of roll-outs, one row per episode, step and agent.
+- `layouts`: layout of observations.
 - `measured`: measured data of a street, their readers (CSV, Parquet, ATSPM) and their writer.
 - `runs`: the folder of a training run.
 - `checkpoints`: dictionaries of tensors.

@@ -1,6 +1,7 @@
 from .checkpoints import checked_tensors as checked_tensors
 from .checkpoints import read_checkpoint as read_checkpoint
 from .checkpoints import write_checkpoint as write_checkpoint
+from .layouts import AgentLayout as AgentLayout
 from .measured.atspm import import_atspm as import_atspm
 from .measured.coverage import is_actuated as is_actuated
 from .measured.lanes import traffic_of_lanes as traffic_of_lanes
@@ -29,7 +30,6 @@ from .scores import MEASURES as MEASURES
 from .scores import MORE_IS_BETTER as MORE_IS_BETTER
 from .scores import EpisodeRecorder as EpisodeRecorder
 from .scores import Scores as Scores
-from .transitions import AgentLayout as AgentLayout
 from .transitions import Provenance as Provenance
 from .transitions import TransitionLog as TransitionLog
 from .transitions import TransitionRecorder as TransitionRecorder

@@ -19,6 +19,7 @@ import numpy as np
 import polars as pl
 from numpy.typing import NDArray
 
+from ugat_marl.data.layouts import AgentLayout
 from ugat_marl.data.row_hashes import damage, is_hashed, write_hashed
 from ugat_marl.errors import LogError
 from ugat_marl.files import parse_json, replacing
@@ -60,31 +61,6 @@ OPTIONAL: Mapping[str, pl.Expr] = {
 """Columns that may be missing, with their default."""
 VECTORS = ("observation", "next_observation")
 CHOICES = ("action", "executed")
-
-
-@dataclass(frozen=True)
-class AgentLayout:
-    """Layout of an agent's observation vector: features | phase one-hot | context.
-
-    Attributes:
-        features: Count of traffic numbers of the intersection itself. The forward model predicts
-            them and the inverse model compares them.
-        phases: Number of green phases, the size of the action space and of the one-hot part.
-        context: Count of numbers about the neighbours; may be 0.
-    """
-
-    features: int
-    phases: int
-    context: int = 0
-
-    def __post_init__(self) -> None:
-        if self.features < 1 or self.phases < 1 or self.context < 0:
-            raise LogError(f"{self}: needs features >= 1, phases >= 1 and context >= 0")
-
-    @property
-    def size(self) -> int:
-        """Length of the observation vector."""
-        return self.features + self.phases + self.context
 
 
 @dataclass(frozen=True)

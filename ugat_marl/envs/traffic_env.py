@@ -5,7 +5,7 @@ from __future__ import annotations
 import warnings
 from collections.abc import Mapping
 from pathlib import Path
-from typing import Any, Unpack
+from typing import TYPE_CHECKING, Any, Unpack
 
 import numpy as np
 from gymnasium.spaces import Box, Discrete
@@ -26,7 +26,6 @@ from ugat_marl.effects import (
 )
 from ugat_marl.envs.actions import checked_delays, checked_phases
 from ugat_marl.envs.actuators import Actuators
-from ugat_marl.envs.description import Description, describe
 from ugat_marl.envs.objectives import Objectives
 from ugat_marl.envs.observations import Observer, joint_space
 from ugat_marl.envs.options import EnvKeywords, EnvOptions, with_env_keywords
@@ -37,6 +36,9 @@ from ugat_marl.errors import EpisodeError, OptionError
 from ugat_marl.files import OwnDirectory
 from ugat_marl.scenarios import Network, Scenario, check_demand, signals
 from ugat_marl.simulation import Simulator, Snapshot, launch_of, simulator_of
+
+if TYPE_CHECKING:
+    from ugat_marl.envs.description import Description
 
 
 class TrafficEnv(ParallelEnv[str, Any, Any]):
@@ -144,6 +146,8 @@ class TrafficEnv(ParallelEnv[str, Any, Any]):
 
     def describe(self) -> Description:
         """Return tables of the observed numbers and of the phases; ``print`` shows them whole."""
+        from ugat_marl.envs.description import describe  # loads polars, which no episode needs
+
         return describe(self.network, self._observer, self.possible_agents)
 
     # --- episode ------------------------------------------------------------------------------

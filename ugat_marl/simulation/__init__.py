@@ -3,6 +3,7 @@
 Only this room imports libsumo. A simulator advances by some seconds under planned signal states and
 returns a `Snapshot`. At the end of an episode it returns `Trips`.
 
+- `launch`: what SUMO is told at the start; the interface of all simulators.
 - `simulator`: SUMO in this process.
 - `mesoscopic`: lane measurements in SUMO's mesoscopic model.
 - `process`: SUMO in a separate process.

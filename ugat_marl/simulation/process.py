@@ -16,13 +16,7 @@ from ugat_marl.errors import SimulatorCrashed, SimulatorError
 from ugat_marl.scenarios import UpstreamLanes
 from ugat_marl.simulation.channel import ChannelClosed, Message
 from ugat_marl.simulation.host import Host, StartMethod, Worker
-from ugat_marl.simulation.simulator import (
-    Launch,
-    LibsumoSimulator,
-    SignalPlans,
-    Simulator,
-    VehiclePositions,
-)
+from ugat_marl.simulation.launch import Launch, SignalPlans, Simulator, VehiclePositions
 from ugat_marl.simulation.snapshots import Snapshot, Trips
 
 SERVICE = "ugat_marl.simulation.process:Simulations"
@@ -117,6 +111,8 @@ class ProcessSimulator:
 def simulator_of(option: str) -> Simulator:
     """Return the simulator for an option of `EnvOptions`: inprocess, spawn or another name."""
     if option == "inprocess":
+        from ugat_marl.simulation.simulator import LibsumoSimulator  # loads libsumo
+
         return LibsumoSimulator()
     return ProcessSimulator("spawn" if option == "spawn" else None)
 
@@ -139,17 +135,25 @@ def _snapshot(reply: Message) -> Snapshot:
 
 
 class Simulations:
-    """Service that runs one simulator in each worker."""
+    """Service that runs one simulator in each worker.
+
+    Making it loads libsumo: once, in the warm parent, for all workers.
+    """
+
+    def __init__(self) -> None:
+        from ugat_marl.simulation.simulator import LibsumoSimulator
+
+        self._simulator: Callable[[], Simulator] = LibsumoSimulator
 
     def prepare(self, order: dict[str, Any]) -> None:
-        """Do nothing: SUMO is loaded with this module."""
+        """Do nothing: SUMO is loaded already."""
 
     def open(
         self, order: dict[str, Any], descriptors: Sequence[int]
     ) -> Callable[[Message], Message]:
         """Return a function that answers questions to a fresh simulator."""
         del order, descriptors
-        simulator = LibsumoSimulator()
+        simulator = self._simulator()
         return lambda question: _answer(simulator, question.header)
 
     def told(self, order: dict[str, Any]) -> None:

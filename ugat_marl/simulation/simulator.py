@@ -9,267 +9,27 @@ from __future__ import annotations
 
 import os
 from collections import defaultdict
-from collections.abc import Callable, Mapping, Sequence
-from dataclasses import asdict, dataclass, replace
+from collections.abc import Callable, Sequence
+from dataclasses import replace
 from pathlib import Path
-from typing import Any, Protocol
 
 import libsumo
 import numpy as np
 from numpy.typing import NDArray
 
 from ugat_marl.errors import SimulatorBusy, SimulatorError
-from ugat_marl.files import write_whole
 from ugat_marl.scenarios import (
-    NO_UPSTREAM_LANES,
-    Document,
-    Scenario,
-    Segment,
-    Turns,
     UpstreamLanes,
     edge_of_lane,
-    sumo_program,
 )
-from ugat_marl.simulation.confinement import confine, confined_command
 from ugat_marl.simulation.host import one_line_message
-from ugat_marl.simulation.mesoscopic import MesoscopicLanes, refuse_in_queues
+from ugat_marl.simulation.launch import ERRORS, TRIPS, Launch, SignalPlans, VehiclePositions
+from ugat_marl.simulation.mesoscopic import MesoscopicLanes
 from ugat_marl.simulation.snapshots import HALTING_MPS, Snapshot, Trips
-from ugat_marl.simulation.trips import measuring_options, read_trips
+from ugat_marl.simulation.trips import read_trips
 from ugat_marl.simulation.upstream import UpstreamQueues
 
-SignalPlans = Mapping[str, Sequence[Segment]]
-"""Traffic light to its states for the coming seconds. Lights left out continue as before."""
-
 _Floats = NDArray[np.float64]
-_TRIPS, _ERRORS = "trips.xml", "errors.log"
-
-
-@dataclass(frozen=True)
-class Launch:
-    """Options of one simulation, as plain values that can be sent to a process.
-
-    Attributes:
-        arguments: Options of SUMO, without the name of the program.
-        directory: Folder for this simulation's own files. The runner of the simulation may remove
-            it afterwards.
-        begin_s: Start of the simulation on the scenario's clock.
-        lanes: Lanes to measure.
-        waiting: True to measure waiting times as well.
-        crossings: True to look every second for vehicles that left a lane's road.
-        gui: True to open a window.
-        files: Names and content of the scenario's edited files.
-        zone_m: Length of a zone at the end of each lane that is measured separately; 0 for none.
-        persons: Vehicle types with the persons in each vehicle. If given, the hidden measures of
-            `Trips` (CO2, persons, dangers) are taken.
-        behind: Upstream lanes and roads, as in `ugat_marl.scenarios.lanes.LaneTable`.
-        turns: Ways across the agents' lights, to measure queues upstream of `lanes`; empty to leave
-            them out.
-        reads: Files of the scenario that SUMO reads where they lie.
-        outputs: Folders, besides its own, into which SUMO writes.
-    """
-
-    arguments: tuple[str, ...]
-    directory: str
-    begin_s: float
-    lanes: tuple[str, ...]
-    waiting: bool = False
-    crossings: bool = False
-    gui: bool = False
-    files: tuple[tuple[str, bytes], ...] = ()
-    zone_m: float = 0.0
-    persons: tuple[tuple[str, float], ...] = ()
-    behind: UpstreamLanes = NO_UPSTREAM_LANES
-    turns: Turns = ()
-    reads: tuple[str, ...] = ()
-    outputs: tuple[str, ...] = ()
-
-    @property
-    def segment_m(self) -> float:
-        """Length of a segment of the mesoscopic model, m; 0 with car following."""
-        if "--mesosim" not in self.arguments:
-            return 0.0
-        return float(self.arguments[self.arguments.index("--meso-edgelength") + 1])
-
-    def write(self) -> None:
-        """Create the folder and write the files into it."""
-        Path(self.directory).mkdir(mode=0o700, exist_ok=True)
-        for name, content in self.files:
-            write_whole(Path(self.directory) / name, content)
-
-    def command(self, *options: str, port: int | None = None) -> list[str]:
-        """Return a command line for the program ``sumo``, confined as in `confine`.
-
-        Args:
-            options: Further options of SUMO.
-            port: TCP port on which SUMO listens, or None.
-        """
-        ports = [] if port is None else [port]
-        further = [] if port is None else ["--remote-port", str(port)]
-        return confined_command(
-            [str(sumo_program("sumo")), *self.arguments, *options, *further],
-            self.reads,
-            self._writable,
-            ports,
-        )
-
-    def confine(self) -> None:
-        """Confine this thread to the files of this simulation, where the system can do that.
-
-        A simulation with a window stays free, because it needs the display.
-        """
-        if not self.gui:
-            confine(self.reads, self._writable)
-
-    @property
-    def _writable(self) -> tuple[str, ...]:
-        return (self.directory, *self.outputs)
-
-    def as_dict(self) -> dict[str, Any]:
-        """Return the fields for JSON. The files are left out because `write` has stored them."""
-        return {**asdict(replace(self, files=())), "files": ()}
-
-
-@dataclass(frozen=True)
-class VehiclePositions:
-    """Positions of the vehicles, for drawing.
-
-    Attributes:
-        position: Coordinates of the front bumpers, m, ``(vehicles, 2)``.
-        angle_deg: Headings, 0 is north, clockwise, ``(vehicles,)``.
-        length_m: Lengths, ``(vehicles,)``.
-        speed_mps: Speeds, ``(vehicles,)``.
-    """
-
-    position: NDArray[np.float64]
-    angle_deg: NDArray[np.float64]
-    length_m: NDArray[np.float64]
-    speed_mps: NDArray[np.float64]
-
-
-class Simulator(Protocol):
-    """One simulation at a time; start, advance repeatedly, finish."""
-
-    def start(self, launch: Launch) -> Snapshot:
-        """Start a simulation; end a running one first."""
-        ...
-
-    def advance(self, seconds: float, plans: SignalPlans) -> Snapshot:
-        """Simulate `seconds` under the given signals."""
-        ...
-
-    def vehicles(self) -> VehiclePositions:
-        """Return the positions of all vehicles now."""
-        ...
-
-    def signals(self) -> dict[str, str]:
-        """Return the state of every traffic light now, uncontrolled ones included."""
-        ...
-
-    def finish(self) -> Trips:
-        """End the simulation; return the trips of every vehicle due."""
-        ...
-
-    def close(self) -> None:
-        """End the simulation, if there is one. A second call does nothing."""
-        ...
-
-
-def launch_of(
-    scenario: Scenario,
-    seed: int,
-    directory: Path,
-    lanes: Sequence[str],
-    *,
-    waiting: bool = False,
-    crossings: bool = False,
-    gui: bool = False,
-    zone_m: float = 0.0,
-    persons: Mapping[str, float] | None = None,
-    behind: UpstreamLanes = NO_UPSTREAM_LANES,
-    turns: Turns = (),
-) -> Launch:
-    """Collect SUMO's options and the files it needs; write nothing.
-
-    Args:
-        scenario: The scenario to simulate.
-        seed: SUMO's seed; its lowest 31 bits are used.
-        directory: Folder for this simulation alone. It is created when the simulation starts.
-        lanes: Lanes to measure.
-        waiting: True to measure waiting times.
-        crossings: True to look every second for vehicles that left a lane's road.
-        gui: True to open a window.
-        zone_m: Length of a zone at the end of each lane that is measured separately; 0 for none.
-        persons: Vehicle type to the persons in each vehicle, "" for all other types. If given, the
-            hidden measures of `Trips` (CO2, persons, dangers) are taken.
-        behind: Upstream lanes and roads, as in `ugat_marl.scenarios.lanes.LaneTable`.
-        turns: Ways across the agents' lights, to measure queues upstream of `lanes`; empty to leave
-            them out.
-    """
-    settings = scenario.settings
-    if "mesosim" in settings.sumo:
-        refuse_in_queues(scenario.id, crossings=crossings, zone=bool(zone_m), gui=gui)
-    files = {
-        "--net-file": [scenario.network],
-        "--route-files": list(scenario.routes),
-        "--additional-files": list(scenario.additional),
-    }
-    arguments: list[str] = []
-    written: dict[str, bytes] = {}
-    reads: list[str] = []
-    for option, documents in files.items():
-        if documents:
-            paths = [_on_disk(document, directory, written) for document in documents]
-            reads += paths
-            arguments += [option, ",".join(paths)]
-    for option, value in settings.sumo.items():
-        arguments += [f"--{option}", value]
-    arguments += [
-        "--begin", repr(settings.begin_s),
-        "--step-length", repr(settings.step_length_s),
-        "--seed", str(seed & 0x7FFFFFFF),
-        "--time-to-teleport", "-1",
-        "--tripinfo-output", str(directory / _TRIPS),
-        "--tripinfo-output.write-unfinished", "true",
-        "--tripinfo-output.write-undeparted", "true",
-        "--error-log", str(directory / _ERRORS),
-        "--no-step-log", "true",
-        "--duration-log.disable", "true",
-        "--no-warnings", "true",
-    ]  # fmt: skip
-    if persons is not None:
-        arguments += measuring_options(directory)
-    if gui:
-        arguments += ["--start", "true", "--quit-on-end", "true"]
-    return Launch(
-        tuple(arguments),
-        str(directory),
-        settings.begin_s,
-        tuple(lanes),
-        waiting,
-        crossings,
-        gui,
-        tuple(written.items()),
-        zone_m,
-        tuple((persons or {}).items()),
-        behind,
-        turns,
-        tuple(reads),
-        scenario.outputs,
-    )
-
-
-def _on_disk(document: Document, directory: Path, written: dict[str, bytes]) -> str:
-    """Return a path SUMO can open.
-
-    Edited documents and paths with a comma get an entry in `written`: SUMO ends a name at a comma.
-    """
-    if document.path is not None and "," not in str(document.path.resolve()):
-        return str(document.path.resolve())
-    name = document.name.removesuffix(".gz").replace(",", "_")
-    while name in written:
-        name = f"_{name}"
-    written[name] = document.read()
-    return str(directory / name)
 
 
 class LibsumoSimulator:
@@ -382,7 +142,7 @@ class LibsumoSimulator:
         assert self._launch is not None, "finish before start"
         directory, persons = Path(self._launch.directory), dict(self._launch.persons)
         self.close()
-        return read_trips(directory / _TRIPS, persons)
+        return read_trips(directory / TRIPS, persons)
 
     def close(self) -> None:
         """End the simulation of this object, if there is one."""
@@ -519,7 +279,7 @@ def _add_those_behind(
 
 def _errors_of(directory: Path) -> str:
     """Return SUMO's error log as one line."""
-    path = directory / _ERRORS
+    path = directory / ERRORS
     return one_line_message(path.read_text(errors="replace")) if path.exists() else ""
 
 
