@@ -19,7 +19,7 @@ from ugat_marl.envs import parallel_env, vector_env
 from ugat_marl.errors import UgatMarlError
 from ugat_marl.files import Document
 from ugat_marl.scenarios import read_scenario, scenario, settings
-from ugat_marl.simulation.confinement import confinement_missing
+from ugat_marl.scenarios.confinement import confinement_missing
 
 Crossing = Callable[..., Path]
 

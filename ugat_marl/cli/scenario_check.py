@@ -28,8 +28,13 @@ from ugat_marl.experiments import (
     problems,
 )
 from ugat_marl.progress import Bars, Silent
-from ugat_marl.scenarios import SHORT_LANE_M, IntersectionFacts, Survey, survey
-from ugat_marl.simulation import confinement_missing
+from ugat_marl.scenarios import (
+    SHORT_LANE_M,
+    IntersectionFacts,
+    Survey,
+    confinement_missing,
+    survey,
+)
 from ugat_marl.testing import (
     CheckResult,
     check_determinism,

@@ -1,5 +1,8 @@
 from . import signals as signals
 from .capacity import degrees_of_saturation as degrees_of_saturation
+from .confinement import confine as confine
+from .confinement import confined_command as confined_command
+from .confinement import confinement_missing as confinement_missing
 from .days import draw_day as draw_day
 from .demand import Demand as Demand
 from .demand import check_demand as check_demand

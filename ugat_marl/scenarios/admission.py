@@ -4,7 +4,7 @@ A scenario may come from a stranger, and SUMO's files can name other files to re
 only listed options, elements and attributes are passed on, and none of them names a file. Outputs
 are discarded, because many honest scenarios have some. Everything else is refused by name.
 
-`ugat_marl.simulation.confinement` holds beneath this list, as a rule of the operating system.
+`ugat_marl.scenarios.confinement` holds beneath this list, as a rule of the operating system.
 """
 
 from __future__ import annotations

@@ -10,6 +10,7 @@ from collections.abc import Sequence
 from pathlib import Path
 
 from ugat_marl.errors import ScenarioError
+from ugat_marl.scenarios.confinement import confined_command
 
 _MOST_WORDS = 60
 """Most words quoted from a program's error; netconvert can print pages."""
@@ -26,7 +27,8 @@ def netconvert(arguments: Sequence[str], output: Path) -> str:
     """Make a network with netconvert, and remove the comment with date and paths.
 
     Args:
-        arguments: Options of netconvert without the output.
+        arguments: Options of netconvert without the output. The files they name lie in the folder
+            of the output.
         output: The ``.net.xml`` to write.
 
     Returns:
@@ -35,9 +37,7 @@ def netconvert(arguments: Sequence[str], output: Path) -> str:
     Raises:
         ScenarioError: netconvert refused; the message quotes it.
     """
-    said = run_program(
-        "netconvert", [str(sumo_program("netconvert")), *arguments, "-o", str(output)]
-    )
+    said = convert("netconvert", [*arguments, "-o", str(output)], output.parent)
     if not output.exists():
         raise ScenarioError(f"netconvert: wrote no network: {_short(said)}")
     text = output.read_text(encoding="utf-8")
@@ -46,18 +46,31 @@ def netconvert(arguments: Sequence[str], output: Path) -> str:
     return said if "Warning" in said else ""
 
 
-def tool(script: str, arguments: Sequence[str]) -> None:
-    """Run one of SUMO's tools written in Python.
+def convert(name: str, arguments: Sequence[str], folder: Path, reads: Sequence[Path] = ()) -> str:
+    """Run one of SUMO's converters, confined to a folder where the system can do that.
+
+    What it is given may come from a stranger, and its formats can name further files.
 
     Args:
-        script: Name of the tool, such as ``routeSampler.py``.
-        arguments: Options of the tool.
+        name: A program such as ``netconvert``, or a tool in Python such as ``routeSampler.py``.
+        arguments: Options of the converter.
+        folder: Folder in which it reads and writes; an absolute path.
+        reads: Further files that it reads.
+
+    Returns:
+        Its standard error.
 
     Raises:
-        ScenarioError: The tool failed; the message quotes it.
+        ScenarioError: The converter failed; the message quotes it.
     """
-    path = sumo_program("netconvert").parent.parent / "tools" / script
-    run_program(script, [sys.executable, str(path), *arguments])
+    if name.endswith(".py"):
+        path = sumo_program("netconvert").parent.parent / "tools" / name
+        command = [sys.executable, str(path), *arguments]
+    else:
+        command = [str(sumo_program(name)), *arguments]
+    return run_program(
+        name, confined_command(command, [str(path) for path in reads], [str(folder)])
+    )
 
 
 def run_program(name: str, command: Sequence[str]) -> str:

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import functools
-import subprocess
 import tempfile
 from collections.abc import Iterator
 from dataclasses import replace
@@ -12,7 +11,7 @@ from pathlib import Path
 from ugat_marl.errors import ScenarioError
 from ugat_marl.files import Tag, replacing
 from ugat_marl.progress import Reporter
-from ugat_marl.scenarios.programs import sumo_program
+from ugat_marl.scenarios.programs import convert
 from ugat_marl.scenarios.scenario import Document, Scenario
 from ugat_marl.scenarios.settings import parse_time
 
@@ -115,13 +114,15 @@ def _routed_by_duarouter(scenario: Scenario) -> Document:
     with tempfile.TemporaryDirectory(prefix="ugat_marl-") as name:
         directory = Path(name)
         out = directory / "routed.rou.xml"
+        reads: list[Path] = []
 
         def files(documents: tuple[Document, ...]) -> str:
-            return ",".join(str(_for_sumo(document, directory)) for document in documents)
+            paths = [_for_sumo(document, directory) for document in documents]
+            reads.extend(paths)
+            return ",".join(map(str, paths))
 
         settings = scenario.settings
-        command = [
-            str(sumo_program("duarouter")),
+        arguments = [
             "--net-file", files((scenario.network,)),
             "--route-files", files(scenario.routes),
             "--output-file", str(out),
@@ -133,13 +134,16 @@ def _routed_by_duarouter(scenario: Scenario) -> Document:
             "--seed", "1",
         ]  # fmt: skip
         if scenario.additional:
-            command += ["--additional-files", files(scenario.additional)]
-        done = subprocess.run(command, capture_output=True, text=True, check=False)
-        if done.returncode or not out.exists():
-            said = " ".join(done.stderr.split()) or "no reason given"
+            arguments += ["--additional-files", files(scenario.additional)]
+        try:
+            convert("duarouter", arguments, directory, reads)
+            if not out.exists():
+                raise ScenarioError("duarouter: wrote no routes")
+        except ScenarioError as error:
             raise ScenarioError(
-                f"scenario {scenario.id!r}: its trips or flows cannot be turned into routes: {said}"
-            )
+                f"scenario {scenario.id!r}: its trips or flows cannot be turned into routes: "
+                f"{error}"
+            ) from None
         return Document("routed.rou.xml", None, out.read_bytes())
 
 

@@ -9,7 +9,6 @@ returns a `Snapshot`. At the end of an episode it returns `Trips`.
 - `process`: SUMO in a separate process.
 - `host`: start and end of processes, for `process` and for vectors of environments.
 - `worker`: the program of these processes.
-- `confinement`: what the process of a simulation may read and write.
 - `channel`: messages to and from a worker.
 - `snapshots`, `trips`, `detectors`: measurements.
 """

@@ -1,8 +1,6 @@
 from .channel import Channel as Channel
 from .channel import ChannelClosed as ChannelClosed
 from .channel import Message as Message
-from .confinement import confine as confine
-from .confinement import confinement_missing as confinement_missing
 from .detectors import detectors_document as detectors_document
 from .detectors import read_passages as read_passages
 from .detectors import standard_detectors as standard_detectors

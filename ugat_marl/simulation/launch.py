@@ -21,9 +21,10 @@ from ugat_marl.scenarios import (
     Segment,
     Turns,
     UpstreamLanes,
+    confine,
+    confined_command,
     sumo_program,
 )
-from ugat_marl.simulation.confinement import confine, confined_command
 from ugat_marl.simulation.mesoscopic import refuse_in_queues
 from ugat_marl.simulation.snapshots import Snapshot, Trips
 from ugat_marl.simulation.trips import measuring_options

@@ -30,8 +30,8 @@ from ugat_marl.envs.types import AnyParallelEnv
 from ugat_marl.envs.vector.arrays import Arrays, Shape
 from ugat_marl.envs.vector.spec import Spec, agents_of
 from ugat_marl.errors import EpisodeError, ScenarioError
-from ugat_marl.scenarios import Scenario
-from ugat_marl.simulation import Message, confine
+from ugat_marl.scenarios import Scenario, confine
+from ugat_marl.simulation import Message
 
 _KEPT = 64
 """Number of environments that the parent keeps; the least recently used one is dropped."""

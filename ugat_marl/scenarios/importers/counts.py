@@ -30,7 +30,7 @@ from ugat_marl.scenarios.importers.turning_shares import (
     walked,
     write_drives,
 )
-from ugat_marl.scenarios.programs import run_program, sumo_program, tool
+from ugat_marl.scenarios.programs import convert
 from ugat_marl.scenarios.settings import parse_decimal
 from ugat_marl.seeding import numpy_generator
 
@@ -162,10 +162,11 @@ def from_counts(path: Path, begin_s: float, length_s: float, seed: int) -> Vehic
             options = _counts_for_sumo(rows, work)
             out = work / "sampled.rou.xml"
             begin, end = min(row.begin_s for row in rows), max(row.end_s for row in rows)
-            tool(
+            convert(
                 "routeSampler.py",
                 ["-r", str(work / "candidates.rou.xml"), *options, "-o", str(out),
                  "--begin", str(begin), "--end", str(end), "--seed", str(seed & 0x7FFFFFFF)],
+                work,
             )  # fmt: skip
             sampled = list(_sampled(out))
         if not sampled:
@@ -302,11 +303,12 @@ def _route(trips: bytes, network: Path, out: Path, seed: int) -> None:
         work = Path(name)
         write_whole(work / "trips.xml", trips)
         (work / "network.net.xml").write_bytes(read_bytes(network))
-        run_program(
+        convert(
             "duarouter",
-            [str(sumo_program("duarouter")), "--net-file", str(work / "network.net.xml"),
+            ["--net-file", str(work / "network.net.xml"),
              "--route-files", str(work / "trips.xml"), "--output-file", str(work / "out.rou.xml"),
              "--no-step-log", "true", "--seed", str(seed & 0x7FFFFFFF)],
+            work,
         )  # fmt: skip
         root = parse_xml(read_bytes(work / "out.rou.xml"), "duarouter")
         write_whole(out, xml_bytes(root))

@@ -2,9 +2,9 @@
 
 A scenario's files may name other files. `ugat_marl.scenarios.admission` lists what they may say;
 beneath that list the kernel holds the process of a simulation to the scenario's own files, SUMO's
-data and the folder of the simulation.
+data and the folder of the simulation. It holds SUMO's converters to their folder in the same way.
 
-The file is a program too, for simulations by the program ``sumo``: it confines itself and becomes
+The file is a program too, for ``sumo``, ``netconvert`` and the like: it confines itself and becomes
 the other program. It therefore imports nothing of the package.
 
 The numbers are those of ``linux/landlock.h``.
