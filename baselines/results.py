@@ -20,6 +20,7 @@ import tyro
 from rich.console import Console
 from tyro.conf import arg
 
+from ugat_marl.data import write_csv
 from ugat_marl.effects import load_scenario
 from ugat_marl.errors import OptionError, UgatMarlError
 from ugat_marl.experiments import CurvesConfig, file_stem, learn_curves, machine_facts
@@ -62,7 +63,7 @@ class Results:
             failures |= found.failures
             if found.curves and found.best:
                 write_whole(page, curves_page(found, self.config, machine_facts()) + "\n")
-                write_whole(page.with_suffix(".csv"), curves_as_csv(found.curves))
+                write_csv(page.with_suffix(".csv"), curves_as_csv(found.curves))
                 console.print(f"page: {page}, each evaluation: {page.with_suffix('.csv')}")
         for name, reason in failures.items():
             console.print(f"{name}: {reason}", markup=False, soft_wrap=True)

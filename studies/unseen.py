@@ -23,6 +23,7 @@ import numpy as np
 from rich.console import Console
 
 from studies.osm_extracts import make_all
+from ugat_marl.data import write_csv
 from ugat_marl.experiments import DIRECT, RULE, STREET, Comparison, PaperConfig, compare
 from ugat_marl.files import write_whole
 from ugat_marl.grounding import StreetConfig
@@ -118,7 +119,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
             "main", str(scenario), config, given.out / "runs", given.jobs, Bars(console)
         )
         folder = given.out / scenario.name
-        write_whole(folder / "seeds.csv", seeds_csv(table))
+        write_csv(folder / "seeds.csv", seeds_csv(table))
         outcomes += outcomes_of(scenario.name, table)
         write_whole(given.out / "summary.md", summary(outcomes))
     console.print(summary(outcomes))

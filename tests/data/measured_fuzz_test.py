@@ -10,7 +10,13 @@ import pytest
 from hypothesis import HealthCheck, event, given, settings
 from hypothesis import strategies as st
 
-from ugat_marl.data import MeasuredData, read_measured, split_periods, write_measured
+from ugat_marl.data import (
+    CSV_HASHES,
+    MeasuredData,
+    read_measured,
+    split_periods,
+    write_measured,
+)
 from ugat_marl.errors import UgatMarlError
 from ugat_marl.scenarios import Detector, Network, Passages, Period, Scenario, read_scenario
 
@@ -71,17 +77,19 @@ def damage(draw: st.DrawFn, content: bytes) -> bytes:
     return bytes(changed)
 
 
-@pytest.mark.parametrize("csv", [False, True])
-@settings(max_examples=200, suppress_health_check=[HealthCheck.function_scoped_fixture])
+@pytest.mark.parametrize("form", ["parquet", "csv", "csv by hand"])
+@settings(max_examples=150, suppress_health_check=[HealthCheck.function_scoped_fixture])
 @given(data=st.data())
 def test_damaged_files_never_end_in_a_traceback(
-    csv: bool, tmp_path: Path, data: st.DataObject
+    form: str, tmp_path: Path, data: st.DataObject
 ) -> None:
     scenario = read_scenario(Path(__file__).parents[1] / "fixtures" / "crossing")
     network = Network.read(scenario)
     whole = tmp_path / "whole"
     if not whole.exists():
-        write_measured(recording(), whole, csv=csv)
+        write_measured(recording(), whole, csv=form != "parquet")
+        if form == "csv by hand":
+            (whole / CSV_HASHES).unlink()
     broken = tmp_path / "broken"
     shutil.rmtree(broken, ignore_errors=True)
     shutil.copytree(whole, broken)

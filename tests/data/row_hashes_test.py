@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import datetime
+import json
+import re
 from pathlib import Path
 
 import numpy as np
@@ -10,7 +12,15 @@ import polars as pl
 import pytest
 
 from ugat_marl.data import row_hashes
-from ugat_marl.data.row_hashes import HASH_KEYS, damage, write_hashed
+from ugat_marl.data.row_hashes import (
+    CSV_HASHES,
+    HASH_KEYS,
+    csv_damage,
+    csv_texts,
+    damage,
+    write_csv,
+    write_hashed,
+)
 from ugat_marl.data.runs import Metrics
 from ugat_marl.errors import CheckpointError
 
@@ -90,3 +100,90 @@ def test_a_damaged_table_is_one_line(tmp_path: Path) -> None:
     frame.with_columns(pl.Series(frame.columns[-1], [2.0])).write_parquet(path, metadata=kept)
     with pytest.raises(CheckpointError, match=r"damaged, row group 0 \(rows 0 to 0\) is not"):
         Metrics.read(path)
+
+
+def csv_of(tmp_path: Path, rows: int) -> Path:
+    path = tmp_path / "a.csv"
+    lines = "".join(f"n{row},{row / 4}\n" for row in range(rows))
+    write_csv(path, f"name,value\n{lines}")
+    return path
+
+
+def csv_fault(path: Path) -> str:
+    return csv_damage(path, csv_texts(path.read_bytes()))
+
+
+@pytest.mark.parametrize("rows", [0, 1, 40, 5000])
+def test_a_csv_table_stays_plain_and_whole(rows: int, tmp_path: Path) -> None:
+    path = csv_of(tmp_path, rows)
+    assert csv_fault(path) == ""
+    assert path.read_text().splitlines()[0] == "name,value"
+    assert len(path.read_text().splitlines()) == rows + 1
+    # Another program may end lines in another way and put quotes around cells.
+    path.write_bytes(path.read_bytes().replace(b"\n", b"\r\n").replace(b"name", b'"name"'))
+    assert csv_fault(path) == ""
+
+
+def test_flipped_bits_of_a_csv_table_are_seen(tmp_path: Path) -> None:
+    path = csv_of(tmp_path, 30)
+    content = path.read_bytes()
+    before = csv_texts(content)
+    other = 0
+    for place in np.random.default_rng(2).integers(0, 8 * len(content), 300).tolist():
+        flipped = bytearray(content)
+        flipped[place // 8] ^= 1 << place % 8
+        path.write_bytes(flipped)
+        try:
+            frame = csv_texts(bytes(flipped))
+            wrong = csv_damage(path, frame)
+        except pl.exceptions.PolarsError:
+            continue
+        other += not wrong and not frame.equals(before)
+    assert other == 0
+
+
+def test_flipped_bits_of_the_hashes_of_csv_are_seen_or_harmless(tmp_path: Path) -> None:
+    path = csv_of(tmp_path, 3)
+    file = tmp_path / CSV_HASHES
+    content = file.read_bytes()
+    stored = json.loads(content)
+    for place in np.random.default_rng(3).integers(0, 8 * len(content), 300).tolist():
+        flipped = bytearray(content)
+        flipped[place // 8] ^= 1 << place % 8
+        file.write_bytes(flipped)
+        if "the hashes beside it are" not in csv_fault(path):
+            assert json.loads(flipped) == stored  # white space
+
+
+@pytest.mark.parametrize(
+    ("rows", "says"), [(30, r"^line 12 is not"), (5000, r"^lines 12 to 16 are not")]
+)
+def test_the_damaged_line_of_a_csv_table_is_named(rows: int, says: str, tmp_path: Path) -> None:
+    path = csv_of(tmp_path, rows)
+    path.write_text(path.read_text().replace("n10,2.5\n", "n10,2.9\n"))
+    assert re.match(says, csv_fault(path))
+    assert "remove row-hashes.json if you changed it yourself" in csv_fault(path)
+
+
+def test_a_csv_table_that_lost_or_won_rows_is_damaged(tmp_path: Path) -> None:
+    path = csv_of(tmp_path, 30)
+    whole = path.read_text()
+    path.write_text(whole.replace("n10,2.5\n", ""))
+    assert csv_fault(path).startswith("line 12 is not what was written")
+    path.write_text(whole + "n30,1\n")
+    assert csv_fault(path).startswith("it has 31 rows, and had 30")
+    path.write_text(whole.replace("value", "valve"))
+    assert csv_fault(path).startswith("its columns are not those")
+
+
+def test_tables_by_hand_have_no_hashes(tmp_path: Path) -> None:
+    csv_of(tmp_path, 3)
+    by_hand = tmp_path / "b.csv"
+    by_hand.write_text("name\nx\n")
+    assert csv_fault(by_hand) == ""
+    write_csv(by_hand, "name\ny\n")
+    by_hand.write_text("name\nx\n")
+    assert csv_fault(by_hand).startswith("line 2")
+    assert csv_fault(tmp_path / "a.csv") == ""
+    (tmp_path / CSV_HASHES).unlink()
+    assert csv_fault(by_hand) == ""

@@ -226,7 +226,7 @@ def test_a_table_from_the_command_line(
     assert max(map(len, tables.splitlines())) <= 80
     folder = tmp_path / "results" / "single-v1" / "gap"
     assert {path.name for path in folder.iterdir()} == {
-        "table.md", "table.csv", "seeds.csv", "radar.png", "gaps.png",
+        "table.md", "table.csv", "seeds.csv", "row-hashes.json", "radar.png", "gaps.png",
     }  # fmt: skip
     before = (folder / "table.csv").read_bytes()
     trained = sorted(path for path in (tmp_path / "runs").iterdir() if path.is_dir())

@@ -270,9 +270,8 @@ def test_the_command_writes_a_directory(
     call = ["record", str(data / "crossing"), "--periods", "2", "--no-speeds", "--out", str(out)]
     assert main(call) == 0
     assert "over 6 detectors in 2 period(s)" in capsys.readouterr().out
-    assert {"periods.csv", "detectors.csv", "signals.parquet", "detections.parquet"} == {
-        path.name for path in out.iterdir()
-    }
+    tables = {"periods.csv", "detectors.csv", "signals.parquet", "detections.parquet"}
+    assert {path.name for path in out.iterdir()} == {*tables, "row-hashes.json"}
 
 
 def test_a_foreign_directory_is_refused_before_anything_is_measured(

@@ -10,6 +10,7 @@ from rich.console import Console
 from tyro.conf import arg
 
 from ugat_marl.cli.arguments import RayAddress, workers_of
+from ugat_marl.data import write_csv
 from ugat_marl.errors import OptionError
 from ugat_marl.experiments import (
     DIRECT,
@@ -165,8 +166,8 @@ class Gap(_Paper):
 def _write(comparison: Comparison, title: str, folder: Path) -> None:
     page = comparison_page(comparison, DIRECT, title, machine_facts())
     write_whole(folder / "table.md", page + "\n")
-    write_whole(folder / "table.csv", comparison_csv(comparison))
-    write_whole(folder / "seeds.csv", seeds_csv(comparison))
+    write_csv(folder / "table.csv", comparison_csv(comparison))
+    write_csv(folder / "seeds.csv", seeds_csv(comparison))
     grounded = [*GROUNDED_NAME.values(), matched_name("timed")]
     drawn = [DIRECT, *(name for name in grounded if name in comparison.settings)]
     comparison_radar(comparison, drawn, folder / "radar.png")

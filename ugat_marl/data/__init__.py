@@ -5,6 +5,7 @@
 - `measured`: measured data of a street, their readers (CSV, Parquet, ATSPM) and their writer.
 - `runs`: the folder of a training run.
 - `checkpoints`: dictionaries of tensors.
+- `row_hashes`: hashes of the rows of tables, which tell damaged ones.
 - `scores`: the measures of an episode.
 """
 

@@ -12,7 +12,11 @@ from .measured.values import MeasuredData as MeasuredData
 from .measured.values import split_periods as split_periods
 from .measured.writing import require_replaceable as require_replaceable
 from .measured.writing import write_measured as write_measured
+from .row_hashes import CSV_HASHES as CSV_HASHES
+from .row_hashes import csv_damage as csv_damage
+from .row_hashes import csv_texts as csv_texts
 from .row_hashes import damage as damage
+from .row_hashes import write_csv as write_csv
 from .row_hashes import write_hashed as write_hashed
 from .runs import CHECKPOINT_FOLDER as CHECKPOINT_FOLDER
 from .runs import IDENTITY_FILE as IDENTITY_FILE

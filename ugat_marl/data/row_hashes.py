@@ -1,24 +1,38 @@
-"""Hashes of the rows of a Parquet file, because Parquet itself reads flipped bits as other numbers.
+"""Hashes of the rows of tables, because a flipped bit often reads as another number.
 
-A file of `write_hashed` carries one hash per row group, over the values and not over the bytes of
-the file, so that it does not depend on compression or on the version of a library. The hashes are
-there twice: one flipped bit in their name would otherwise hide them.
+A Parquet file of `write_hashed` carries one hash per row group, over the values and not over the
+bytes of the file, so that it does not depend on compression or on the version of a library. The
+hashes are there twice: one flipped bit in their name would otherwise hide them.
+
+CSV has no place for hashes that other programs would not read as a row. Those of `write_csv_hashes`
+stand in a file beside the tables. A table that is not listed there, such as one made by hand, has
+none.
 """
 
 from __future__ import annotations
 
 import hashlib
+import io
 import json
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterable, Iterator, Mapping
 from pathlib import Path
+from typing import Any
 
 import polars as pl
+
+from ugat_marl.errors import CheckpointError
+from ugat_marl.files import parse_json, read_json, write_whole
 
 HASH_KEYS = ("ugat_marl.row_hashes", "ugat_marl.row_hashes.copy")
 """Keys of the hashes in the metadata of the file."""
 
+CSV_HASHES = "row-hashes.json"
+"""Name of the file with the hashes of the CSV tables in its folder."""
+
 _GROUP_ROWS = 65536
 """Rows of a row group. Half as many name the damage more closely and make the file longer."""
+_MOST_CSV_GROUPS = 1024
+"""Most hashes of a CSV table. Twice as many name the damage more closely and double their file."""
 
 
 def write_hashed(
@@ -33,11 +47,119 @@ def write_hashed(
     """
     own = dict(metadata or {})
     text = json.dumps(
-        {"rows": frame.height, "head": _head(frame, own), "groups": [*_groups(frame)]}
+        {"rows": frame.height, "head": _head(frame, own), "groups": [*_groups(frame, _GROUP_ROWS)]}
     )
     frame.write_parquet(
         path, metadata={**own, **dict.fromkeys(HASH_KEYS, text)}, row_group_size=_GROUP_ROWS
     )
+
+
+def write_csv_hashes(directory: Path, names: Iterable[str]) -> None:
+    """Write the hashes of the rows of CSV files, which are there already, into `CSV_HASHES`.
+
+    Args:
+        directory: Folder of the files.
+        names: Names of the files; those of other files stay in the list.
+    """
+    tables = _known_csv_hashes(directory)
+    for name in names:
+        frame = csv_texts((directory / name).read_bytes())
+        rows = _rows_of_csv_group(frame.height)
+        tables[name] = {
+            "rows": frame.height, "head": _head(frame, {}), "groups": [*_groups(frame, rows)],
+        }  # fmt: skip
+    _store_csv_hashes(directory, tables)
+
+
+def write_csv(path: Path, text: str) -> None:
+    """Write a CSV table, whole or not at all, and the hashes of its rows beside it.
+
+    A run that is killed between the two leaves a table without hashes.
+    """
+    tables = _known_csv_hashes(path.parent)
+    if tables.pop(path.name, None) is not None:
+        _store_csv_hashes(path.parent, tables)
+    write_whole(path, text)
+    write_csv_hashes(path.parent, [path.name])
+
+
+def csv_texts(content: bytes) -> pl.DataFrame:
+    """Return the cells of a CSV file as text.
+
+    Raises:
+        polars.exceptions.PolarsError: The content is no table.
+    """
+    return pl.read_csv(io.BytesIO(content), infer_schema=False)
+
+
+def csv_damage(path: Path, frame: pl.DataFrame) -> str:
+    """Return what is damaged in a CSV table that was read; empty if it is whole or has no hashes.
+
+    Args:
+        path: The file.
+        frame: Its cells, from `csv_texts`.
+
+    Returns:
+        The damage as words that follow the name of the file, with the way out.
+    """
+    if not (path.parent / CSV_HASHES).exists():
+        return ""
+    try:
+        tables = _csv_hashes(path.parent / CSV_HASHES)
+    except CheckpointError as error:
+        return f"or the hashes beside it are ({error}); copy both again, or remove {CSV_HASHES}"
+    if path.name not in tables:
+        return ""
+    stored = tables[path.name]
+    way_out = f"copy it again, or remove {CSV_HASHES} if you changed it yourself"
+    if stored["head"] != _head(frame, {}):
+        return f"its columns are not those that were written; {way_out}"
+    rows = _rows_of_csv_group(stored["rows"])
+    now = [*_groups(frame, rows)]
+    for number, was in enumerate(stored["groups"]):
+        if now[number : number + 1] != [was]:
+            first = number * rows + 2  # line 1 is the header
+            last = min(first + rows - 1, stored["rows"] + 1)
+            lines = f"line {first} is" if first == last else f"lines {first} to {last} are"
+            return f"{lines} not what was written; {way_out}"
+    if frame.height != stored["rows"]:
+        return f"it has {frame.height} rows, and had {stored['rows']} when written; {way_out}"
+    return ""
+
+
+def _known_csv_hashes(directory: Path) -> dict[str, Any]:
+    file = directory / CSV_HASHES
+    try:
+        return _csv_hashes(file) if file.exists() else {}
+    except CheckpointError:  # damaged; the tables written next have hashes again
+        return {}
+
+
+def _store_csv_hashes(directory: Path, tables: Mapping[str, Any]) -> None:
+    content = {"tables": tables, "hash": _hash(tables)}
+    write_whole(directory / CSV_HASHES, json.dumps(content, indent=1, sort_keys=True) + "\n")
+
+
+def _csv_hashes(file: Path) -> dict[str, Any]:
+    content = read_json(file, CheckpointError)
+    try:
+        tables = content["tables"]
+        whole = content["hash"] == _hash(tables)
+    except (KeyError, TypeError):
+        whole, tables = False, {}
+    if not whole:
+        raise CheckpointError(f"{file}: not what was written")
+    return tables
+
+
+def _rows_of_csv_group(rows: int) -> int:
+    """Return the rows per hash: one in a short table, so that a damaged line is named."""
+    return -(-rows // _MOST_CSV_GROUPS) or 1
+
+
+def _hash(content: Any) -> str:
+    text = json.dumps(content, sort_keys=True)
+    return hashlib.blake2b(text.encode(), digest_size=16).hexdigest()
 
 
 def damage(frame: pl.DataFrame, metadata: Mapping[str, str], own: tuple[str, ...] = ()) -> str:
@@ -56,9 +178,9 @@ def damage(frame: pl.DataFrame, metadata: Mapping[str, str], own: tuple[str, ...
         return ""
     texts = [metadata.get(key) for key in HASH_KEYS]
     try:
-        stored = json.loads(texts[0] or "")
+        stored = parse_json(texts[0] or "", "hashes", CheckpointError)
         rows, head, groups = stored["rows"], stored["head"], stored["groups"]
-    except (ValueError, KeyError, TypeError):
+    except (CheckpointError, KeyError, TypeError):
         return "its hashes are damaged"
     if texts[0] != texts[1]:
         return "its hashes are damaged"
@@ -66,7 +188,7 @@ def damage(frame: pl.DataFrame, metadata: Mapping[str, str], own: tuple[str, ...
         return f"it has {frame.height} rows, and had {rows} when it was written"
     if head != _head(frame, {key: metadata[key] for key in own if key in metadata}):
         return "its columns or its metadata are not those that were written"
-    for number, (was, now) in enumerate(zip(groups, _groups(frame), strict=False)):
+    for number, (was, now) in enumerate(zip(groups, _groups(frame, _GROUP_ROWS), strict=False)):
         if was != now:
             first, last = number * _GROUP_ROWS, min((number + 1) * _GROUP_ROWS, rows) - 1
             return f"row group {number} (rows {first} to {last}) is not what was written"
@@ -80,15 +202,14 @@ def is_hashed(metadata: Mapping[str, str]) -> bool:
 
 def _head(frame: pl.DataFrame, metadata: Mapping[str, str]) -> str:
     names = [[name, str(kind)] for name, kind in frame.schema.items()]
-    text = json.dumps([names, sorted(metadata.items())])
-    return hashlib.blake2b(text.encode(), digest_size=16).hexdigest()
+    return _hash([names, sorted(metadata.items())])
 
 
-def _groups(frame: pl.DataFrame) -> Iterator[str]:
-    """Yield the hash of each row group."""
-    for start in range(0, frame.height, _GROUP_ROWS):
+def _groups(frame: pl.DataFrame, rows: int) -> Iterator[str]:
+    """Yield the hash of each group of so many rows."""
+    for start in range(0, frame.height, rows):
         digest = hashlib.blake2b(digest_size=16)
-        for column in frame.slice(start, _GROUP_ROWS):
+        for column in frame.slice(start, rows):
             for piece in _bytes(column):
                 digest.update(len(piece).to_bytes(8, "little"))
                 digest.update(piece)

@@ -10,7 +10,6 @@ from __future__ import annotations
 
 import contextlib
 import csv
-import json
 import math
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
@@ -19,9 +18,17 @@ from typing import Any, TypeVar
 
 import polars as pl
 
-from ugat_marl.data import CHECKPOINT_FOLDER, METRICS_FILE, SETTINGS_FILE, Metrics
-from ugat_marl.errors import OptionError, UgatMarlError
+from ugat_marl.data import (
+    CHECKPOINT_FOLDER,
+    METRICS_FILE,
+    SETTINGS_FILE,
+    Metrics,
+    csv_damage,
+    csv_texts,
+)
+from ugat_marl.errors import CheckpointError, OptionError, UgatMarlError
 from ugat_marl.experiments import QUEUES, TRAININGS, Evaluation, read_queues, result_of
+from ugat_marl.files import read_json
 from ugat_marl.reporting.formats import commands_in
 
 RUN, JOB, TABLE, SCORES = "run.json", "job.json", "table.json", "scores.json"
@@ -170,7 +177,7 @@ class _Reader:
             if path.stat().st_size > _LONGEST:
                 raise ValueError(f"it has more than {_LONGEST // 1_000_000} MB")
             return parse(path)
-        except (UgatMarlError, OSError, ValueError, TypeError, KeyError, RecursionError) as error:
+        except (UgatMarlError, OSError, ValueError, TypeError, KeyError) as error:
             reason = " ".join(str(error).replace(f"{path}: ", "").split())
             self.missing.append(f"{name} cannot be used ({reason[:160]}): {without}")
             return None
@@ -235,7 +242,7 @@ def _names(folders: Sequence[Path]) -> list[str]:
 
 
 def _object(path: Path) -> dict[str, Any]:
-    content = json.loads(path.read_text(encoding="utf-8", errors="replace"))
+    content = read_json(path, CheckpointError)
     if not isinstance(content, dict):
         raise ValueError("not a JSON object")
     return content
@@ -280,7 +287,7 @@ def _run(directory: Path, name: str) -> RunRecord:
 def _hashes(directory: Path, kept: Mapping[str, Any]) -> Any:
     try:
         identity = _object(directory / RUN)
-    except (OSError, ValueError, RecursionError):
+    except (CheckpointError, ValueError):
         identity = kept
     return identity.get("scenario_hash") or identity.get("worlds")
 
@@ -346,6 +353,12 @@ def _table(directory: Path, name: str) -> TableRecord:
 
 
 def _csv(path: Path) -> list[dict[str, Any]]:
+    try:
+        wrong = csv_damage(path, csv_texts(path.read_bytes()))
+    except pl.exceptions.PolarsError as error:
+        raise ValueError(f"not a table: {error}") from None
+    if wrong:
+        raise ValueError(f"damaged, {wrong}")
     with path.open(newline="", encoding="utf-8", errors="replace") as file:
         rows = [row for row in csv.DictReader(file) if row.get("setting") and row.get("domain")]
     if not rows:

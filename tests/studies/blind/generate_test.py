@@ -60,6 +60,7 @@ def test_cases_are_sealed(test_folder: tuple[Path, Blueprint]) -> None:
         names = {path.name for path in folder.rglob("*")}
         assert names == {
             "measured", "periods.csv", "detectors.csv", "signals.parquet", "detections.parquet",
+            "row-hashes.json",
         }  # fmt: skip
     plan = (directory / "plan.json").read_text()
     given = json.loads(plan)["cases"][0]

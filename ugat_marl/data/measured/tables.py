@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 
 from ugat_marl.data.measured.local_time import LocalClock
 from ugat_marl.data.measured.values import Finding
-from ugat_marl.data.row_hashes import damage
+from ugat_marl.data.row_hashes import csv_damage, csv_texts, damage
 from ugat_marl.errors import MeasuredDataError, nearest
 from ugat_marl.scenarios import Period
 
@@ -348,11 +348,13 @@ def _read_csv(path: Path, findings: list[Finding]) -> pl.DataFrame:
             Finding(f"{path.name}: the last line has no end; the file may have been cut short")
         )
     try:
-        frame = pl.read_csv(io.BytesIO(content), infer_schema=False)
+        frame = csv_texts(content)
     except (pl.exceptions.PolarsError, pl.exceptions.PanicException, OSError, ValueError) as error:
         raise MeasuredDataError(
             f"{path}: not a table ({_first_line(error)}); every line needs the columns of line 1"
         ) from None
+    if wrong := csv_damage(path, frame):  # tables of others carry no hashes
+        raise MeasuredDataError(f"{path}: damaged, {wrong}")
     return frame.rename({name: name.strip() for name in frame.columns}, strict=False)
 
 

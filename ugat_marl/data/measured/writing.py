@@ -25,7 +25,7 @@ from ugat_marl.data.measured.tables import (
     frame_of,
 )
 from ugat_marl.data.measured.values import MeasuredData
-from ugat_marl.data.row_hashes import write_hashed
+from ugat_marl.data.row_hashes import CSV_HASHES, write_csv_hashes, write_hashed
 from ugat_marl.errors import OutputError
 from ugat_marl.scenarios import Passages, Period
 
@@ -69,6 +69,7 @@ def write_measured(measured: MeasuredData, directory: Path, *, csv: bool = False
             _write(table, temporary / f"trajectories{suffix}")
         if measured.counts is not None:
             _write(_ordered(measured.counts, COUNTS), temporary / "counts.csv")
+        write_csv_hashes(temporary, sorted(path.name for path in temporary.glob("*.csv")))
         _put(temporary, directory)
     except OSError as error:
         raise OutputError(
@@ -89,7 +90,7 @@ def require_replaceable(directory: Path) -> None:
         return
     if not directory.is_dir():
         raise OutputError(f"{directory}: is a file; give the name of a directory")
-    known = {name for table in TABLES for name in table.names()}
+    known = {name for table in TABLES for name in table.names()} | {CSV_HASHES}
     try:
         there = {path.name for path in directory.iterdir()}
     except OSError as error:
