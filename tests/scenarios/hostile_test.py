@@ -257,3 +257,36 @@ def test_a_request_outside_every_table_is_refused(crossing: Crossing) -> None:
     )
     with pytest.raises(UgatMarlError, match="line .*400000000.* is not a number from 0 to 4095"):
         read_scenario(directory)
+
+
+@pytest.mark.parametrize("text", ["1_000", "\u0661", "nan", "inf", "1e999"])
+@pytest.mark.parametrize("element", ["vehicle", "flow", "phase"])
+def test_numbers_that_people_and_programs_read_differently_are_refused(
+    element: str, text: str, crossing: Crossing
+) -> None:
+    elements = {
+        "vehicle": f'<vehicle id="a" depart="{text}" route="east"/>',
+        "flow": f'<flow id="a" begin="0" end="60" number="{text}" route="east"/>',
+        "phase": '<vehicle id="a" depart="0" route="east"/>',
+    }
+    directory = crossing(vehicles=elements[element])
+    if element == "phase":
+        network = directory / "network.net.xml"
+        network.write_text(network.read_text().replace('duration="10"', f'duration="{text}"'))
+    with pytest.raises(UgatMarlError, match=rf"line \d+: <{element} \w+=.*in plain digits"):
+        read_scenario(directory)
+
+
+@pytest.mark.parametrize(
+    ("text", "wrong"),
+    [("1_0", "1_0"), ("\u0661", "\u0661"), ("nan:0:0", "nan"), ("0:1_0:0", "1_0"), ("", "")],
+)
+def test_times_are_plain_digits(text: str, wrong: str) -> None:
+    with pytest.raises(ValueError, match=rf"^{wrong}$"):
+        settings.parse_time(text)
+
+
+def test_times_with_and_without_colons() -> None:
+    assert settings.parse_time("1:02:03.5") == 3723.5
+    assert settings.parse_time("1:00:00:01") == 86401.0
+    assert settings.parse_time("12.25") == 12.25

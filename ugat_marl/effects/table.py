@@ -51,7 +51,7 @@ from ugat_marl.effects.vehicles import (
     YellowRunning,
 )
 from ugat_marl.errors import OptionError, UnknownNameError
-from ugat_marl.scenarios import Scenario, read_scenario
+from ugat_marl.scenarios import Scenario, parse_decimal, read_scenario
 
 _MEASURABLE: dict[str, type[Effect]] = {
     kind.name: kind
@@ -151,7 +151,7 @@ def effect_from_text(text: str) -> Effect:
     given: dict[str, Any] = {}
     for parameter, part in zip(parameters, parts, strict=True):
         try:
-            given[parameter] = part if parameter in kind.texts else float(part)
+            given[parameter] = part if parameter in kind.texts else parse_decimal(part)
         except ValueError:
             raise OptionError(f"effect {name!r}: {part!r} is not a number") from None
     return kind(**given)

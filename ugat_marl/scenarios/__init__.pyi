@@ -69,6 +69,7 @@ from .scenario import read_scenario as read_scenario
 from .scenario import resco_maps as resco_maps
 from .scenario import shipped_scenarios as shipped_scenarios
 from .settings import Real as Real
+from .settings import parse_decimal as parse_decimal
 from .settings import parse_time as parse_time
 from .settings import validate_settings as validate_settings
 from .signals import GREEN as GREEN

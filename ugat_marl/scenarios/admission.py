@@ -250,7 +250,19 @@ _OPEN_KEYS = _words(
 _TO_FILES = re.compile(r"file|output|dest|path|prefix|dump|log", re.IGNORECASE)
 _SCHEMA = re.compile(r"(https?://sumo[\w.-]*/xsd/)?[\w-]+\.xsd", re.ASCII)
 
-_DECIMAL = re.compile(r"[-+]?(\d+\.?\d*|\.\d+)([eE][-+]?\d+)?", re.ASCII)
+DECIMAL = re.compile(r"[-+]?(\d+\.?\d*|\.\d+)([eE][-+]?\d+)?", re.ASCII)
+"""A number in plain digits. Python itself also reads ``1_000``, other scripts, ``nan``, ``inf``."""
+_NUMERIC = _words(
+    """
+    accel actionStepLength angle apparentDecel arrivalPos arrivalPosLat arrivalSpeed begin
+    boardingDuration containerNumber containersPerHour decel depart departPos departPosLat
+    departSpeed desiredMaxSpeed duration emergencyDecel end endPos fromLane height impatience index
+    length linkIndex linkIndex2 loadingDuration mass maxDur maxSpeed maxSpeedLat minDur minGap
+    minGapLat number numLanes offset period personNumber personsPerHour pos posLat priority
+    probability sigma speed speedDev speedFactor startPos tau toLane until vehsPerHour width x y z
+    """
+)
+"""Attributes whose value is a number, or sometimes a word."""
 
 _MOST_LINKS = 4096
 """Upper bound of the index of a <request>, a place in tables of this size. SUMO stops at 256."""
@@ -331,7 +343,14 @@ def _fault(tag: Tag) -> str:
                 "leave it out"
             )
     check = _CHECKS.get(name)
-    return check(tag) if check is not None else ""
+    return (check(tag) if check is not None else "") or _number_fault(tag)
+
+
+def _number_fault(tag: Tag) -> str:
+    for attribute, value in tag.attributes.items():
+        if attribute in _NUMERIC and _is_odd_number(value):
+            return f"<{tag.name} {attribute}={value[:40]!r}> is not a finite number in plain digits"
+    return ""
 
 
 def _parameter_fault(tag: Tag) -> str:
@@ -366,9 +385,17 @@ def _lane_fault(tag: Tag) -> str:
     return ""
 
 
+def _is_odd_number(text: str) -> bool:
+    """Return True if Python reads a number where SUMO and a person may read another or none."""
+    try:
+        return not (math.isfinite(float(text)) and DECIMAL.fullmatch(text.strip()))
+    except ValueError:  # a word, such as "max", or a time with colons
+        return False
+
+
 def _is_positive(text: str) -> bool:
     """Return True for a number above 0 as SUMO writes it, in ASCII digits without underscores."""
-    return bool(_DECIMAL.fullmatch(text)) and 0 < float(text) < math.inf
+    return bool(DECIMAL.fullmatch(text)) and 0 < float(text) < math.inf
 
 
 _CHECKS: Mapping[str, Callable[[Tag], str]] = {

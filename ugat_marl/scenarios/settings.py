@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-import re
 from collections.abc import Mapping
 from typing import Annotated, Any, Literal
 
@@ -11,7 +10,7 @@ import pydantic
 from pydantic import Field
 
 from ugat_marl.errors import ScenarioError, nearest
-from ugat_marl.scenarios.admission import OPTIONS, option_fault
+from ugat_marl.scenarios.admission import DECIMAL, OPTIONS, option_fault
 
 PhaseSource = Literal["programme", "conflict-free", "permitted"] | tuple[str, ...]
 """Source of an intersection's green phases.
@@ -25,7 +24,6 @@ PhaseSource = Literal["programme", "conflict-free", "permitted"] | tuple[str, ..
 Real = Annotated[float, pydantic.Strict()]
 """A number of a file. Without this, ``true`` would be 1, and a text of digits a number."""
 
-_DECIMAL = re.compile(r"[+-]?([0-9]+\.?[0-9]*|\.[0-9]+)([eE][+-]?[0-9]+)?")
 
 _STRICT = pydantic.ConfigDict(extra="forbid", frozen=True, allow_inf_nan=False)
 
@@ -135,7 +133,7 @@ def parse_decimal(text: str) -> float:
     Raises:
         ValueError: Not a number in plain digits, or one too large.
     """
-    value = float(text) if _DECIMAL.fullmatch(text.strip()) else math.nan
+    value = float(text) if DECIMAL.fullmatch(text.strip()) else math.nan
     if not math.isfinite(value):
         raise ValueError(text)
     return value
@@ -147,7 +145,7 @@ def parse_time(text: str) -> float:
     Raises:
         ValueError: Not a time.
     """
-    parts = [float(part) for part in text.split(":")]
+    parts = [parse_decimal(part) for part in text.split(":")]
     if len(parts) not in (1, 3, 4):
         raise ValueError(text)
     seconds = 0.0

@@ -24,6 +24,7 @@ from ugat_marl.policies.rules.phase_scores import (
 )
 from ugat_marl.policies.rules.sotl import SelfOrganising
 from ugat_marl.policies.rules.webster import Webster
+from ugat_marl.scenarios import parse_decimal
 
 
 @dataclass(frozen=True)
@@ -161,7 +162,7 @@ def parse_rule(spec: str) -> tuple[str, tuple[float, ...]]:
     values = [parameter.default for parameter in parameters]
     for place, text in enumerate(texts):
         try:
-            values[place] = float(text)
+            values[place] = parse_decimal(text)
         except ValueError:
             values[place] = math.nan
         if not 0 < values[place] < math.inf:

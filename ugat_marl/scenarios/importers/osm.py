@@ -25,6 +25,7 @@ from ugat_marl.scenarios.importers.osm_crossings import crossings_for, has_light
 from ugat_marl.scenarios.junctions import crossings_of, foes_of, links_of
 from ugat_marl.scenarios.phases import are_foes
 from ugat_marl.scenarios.programs import netconvert, sumo_program
+from ugat_marl.scenarios.settings import parse_decimal
 
 _ENDINGS = (".osm", ".osm.xml", ".osm.gz", ".osm.xml.gz", ".pbf")
 _FOR_CARS = frozenset(
@@ -350,7 +351,7 @@ def place_of(node: Tag, path: Path) -> tuple[float, float]:
         ScenarioError: The node has no valid coordinates; the message names the line.
     """
     try:
-        longitude, latitude = (float(node.attributes[key]) for key in ("lon", "lat"))
+        longitude, latitude = (parse_decimal(node.attributes[key]) for key in ("lon", "lat"))
     except (KeyError, ValueError):
         longitude = latitude = math.nan
     if not (abs(longitude) <= 180 and abs(latitude) <= 90):
