@@ -237,9 +237,9 @@ TEXTS = {
     "deeper.json": ("[" * 65 + "]" * 65, "more than 64 tables or lists inside each other"),
     "deep.toml": ("a = " + "[" * 100_000, "more than 64 tables or lists inside each other"),
     "deeper.toml": ("a = " + "[" * 65 + "]" * 65, "more than 64 tables or lists"),
-    "long.json": ("1" * 5000, "not valid JSON: Exceeds the limit"),
-    "long.toml": ("a = " + "1" * 5000, "not valid TOML: Exceeds the limit"),
-    "cut.json": ('{"a": [1,', r"not valid JSON: .*line 1.*cut short"),
+    "long.json": ("1" * 5000, "a number is far too long"),
+    "long.toml": ("a = " + "1" * 5000, "a number is far too long"),
+    "cut.json": ('{"a": [1,', r"not valid JSON \(.*cut short"),
     "cut.toml": ("a = [1,", "not valid TOML: .*cut short"),
     "latin.json": (b'"\xe9"', "not UTF-8"),
     "latin.toml": (b"a = '\xe9'", "not UTF-8"),
@@ -257,7 +257,7 @@ def test_json_and_toml_made_to_harm_are_refused_in_one_line(
     path = tmp_path / name
     path.write_bytes(content.encode() if isinstance(content, str) else content)
     read = files.read_json if path.suffix == ".json" else files.read_toml
-    with pytest.raises(MeasuredDataError, match=rf"^{path}: {says}") as refused:
+    with pytest.raises(MeasuredDataError, match=rf"^{path}.*: {says}") as refused:
         read(path, MeasuredDataError)
     assert "\n" not in str(refused.value)
 

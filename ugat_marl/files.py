@@ -41,6 +41,9 @@ _DEEPEST = 64
 exhaust the stack of whatever walks through them."""
 _LONGEST = 64 << 20
 """Most bytes of a JSON or TOML file; those of the suite have less than a hundredth of it."""
+_LARGEST = 1 << 256
+"""Largest integer of a JSON or TOML file. One beyond 2^1024 is no float; the state of a random
+generator has 128 bits."""
 _END = "\0"
 """Mark after each child of an element during writing. XML cannot contain this character."""
 
@@ -210,17 +213,27 @@ def _parsed(
     too_deep = fault(
         f"{name}: more than {_DEEPEST} tables or lists inside each other, which no such file needs"
     )
+    too_long = fault(f"{name}: a number is far too long, which no such file needs")
     try:
         content = parse(text)
     except RecursionError:
         raise too_deep from None
-    except ValueError as error:  # also a number of more digits than Python reads
+    except json.JSONDecodeError as error:
+        raise fault(
+            f"{name}, line {error.lineno}: not valid {kind} ({error.msg}); the file may have been "
+            "cut short"
+        ) from None
+    except tomllib.TOMLDecodeError as error:
         raise fault(
             f"{name}: not valid {kind}: {error}; the file may have been cut short"
         ) from None
+    except ValueError:  # more digits than Python reads
+        raise too_long from None
     level = [content]
     for _ in range(_DEEPEST):
         level = [part for value in level for part in _parts_of(value)]
+        if any(isinstance(value, int) and abs(value) > _LARGEST for value in level):
+            raise too_long
         if not level:
             return content
     raise too_deep

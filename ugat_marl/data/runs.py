@@ -22,7 +22,7 @@ import polars as pl
 
 from ugat_marl.data.row_hashes import damage, write_hashed
 from ugat_marl.errors import CheckpointError, OptionError
-from ugat_marl.files import replacing, require_writable, write_whole
+from ugat_marl.files import read_json, replacing, require_writable, write_whole
 from ugat_marl.progress import Reporter
 
 CHECKPOINT_FOLDER = "checkpoint"
@@ -163,11 +163,11 @@ class Run:
         """
         folder = self.directory / CHECKPOINT_FOLDER
         try:
-            state: dict[str, Any] = json.loads((folder / "state.json").read_text())
-        except (OSError, ValueError) as error:
-            raise CheckpointError(
-                f"{folder}: cannot be read ({error}); remove {self.directory} and start again"
-            ) from None
+            state = read_json(folder / "state.json", CheckpointError)
+            if not isinstance(state, dict):
+                raise CheckpointError(f"{folder / 'state.json'}: not an object of JSON")
+        except CheckpointError as error:
+            raise CheckpointError(f"{error}; remove {self.directory} and start again") from None
         read(folder)
         self.metrics = Metrics.read(folder / METRICS_FILE)
         return state
@@ -256,9 +256,11 @@ def lock_folder(directory: Path) -> IO[str]:
 
 def _refuse_other(file: Path, identity: Mapping[str, Any]) -> None:
     try:
-        held: dict[str, Any] = json.loads(file.read_text())
-    except (OSError, ValueError) as error:
-        raise CheckpointError(f"{file}: cannot be read ({error}); use another --out") from None
+        held = read_json(file, CheckpointError)
+        if not isinstance(held, dict):
+            raise CheckpointError(f"{file}: not an object of JSON")
+    except CheckpointError as error:
+        raise CheckpointError(f"{error}; use another --out") from None
     different = [key for key in {*held, *identity} if held.get(key) != identity.get(key)]
     if different:
         key = sorted(different)[0]

@@ -28,7 +28,8 @@ from ugat_marl.diagnosis.features import Tally
 from ugat_marl.diagnosis.hypotheses import Members, effects_of
 from ugat_marl.diagnosis.statistics import Array, Distance, Reference
 from ugat_marl.effects import Effect
-from ugat_marl.files import write_whole
+from ugat_marl.errors import OptionError
+from ugat_marl.files import read_json, write_whole
 
 FILE = "diagnosis.json"
 """Name of the file that a diagnosis writes into its directory."""
@@ -660,10 +661,10 @@ class Diagnosis:
         """Read the file in a directory.
 
         Raises:
-            OSError: There is no such file.
+            OptionError: There is no such file, or it is no JSON.
             ValueError: The file is no diagnosis of this version.
         """
-        return cls.from_json(json.loads((directory / FILE).read_text(encoding="utf-8")))
+        return cls.from_json(read_json(directory / FILE, OptionError))
 
 
 @cache

@@ -348,7 +348,7 @@ def _known_gap(directory: Path, diagnosis: Diagnosis) -> dict[str, PolicyGap] | 
     """
     try:
         earlier = Diagnosis.read(directory)
-    except (OSError, ValueError):
+    except ValueError:
         return None  # no file, or no diagnosis of this version
     same = (earlier.hashes, earlier.versions) == (diagnosis.hashes, diagnosis.versions)
     return earlier.policy_gap if same and _values(earlier) == _values(diagnosis) else None

@@ -24,7 +24,7 @@ from rich.console import Console
 from ugat_marl.data import Run, Scores, TransitionLog, installed_versions, remove_temporaries
 from ugat_marl.effects import load_scenario, scenario_in_domain
 from ugat_marl.envs import AnyParallelEnv, TrafficEnv, parallel_env
-from ugat_marl.errors import OptionError, UgatMarlError
+from ugat_marl.errors import CheckpointError, OptionError, UgatMarlError
 from ugat_marl.experiments.evaluation import (
     TUNING_SEED,
     best_rules,
@@ -37,7 +37,7 @@ from ugat_marl.experiments.randomised import randomised_env
 from ugat_marl.experiments.settings import DIRECT, Setting
 from ugat_marl.experiments.training import Effort, simulated_worlds, train_grounded, train_through
 from ugat_marl.experiments.tuning import TUNED_RULES, VERSION, tuned_rules
-from ugat_marl.files import write_whole
+from ugat_marl.files import read_json, write_whole
 from ugat_marl.grounding import (
     ChangePenalty,
     Probe,
@@ -256,13 +256,13 @@ class Record:
     def read(cls, folder: Path) -> Record:
         """Read a record that `write` wrote; an empty record if the file is missing or broken."""
         try:
-            content = json.loads((folder / SCORES).read_text(encoding="utf-8"))
+            content = read_json(folder / SCORES, CheckpointError)
             scores: dict[tuple[int, str, int], Scores] = {}
             for row in content["episodes"]:
                 key = int(row.pop("trained")), str(row.pop("domain")), int(row.pop("seed"))
                 scores[key] = Scores(**row)
             return cls(scores, **content["training"])
-        except (OSError, ValueError, TypeError, KeyError, AttributeError):
+        except (CheckpointError, ValueError, TypeError, KeyError, AttributeError):
             return cls()
 
     def write(self, folder: Path) -> None:
@@ -528,7 +528,8 @@ def perform_described(folder: Path) -> int:
     """Perform the job that a folder describes; return the exit code and print what went wrong."""
     remove_temporaries(folder)
     try:
-        job = TypeAdapter(Job).validate_json((folder / JOB).read_bytes())
+        described = read_json(folder / JOB, CheckpointError)
+        job = TypeAdapter(Job).validate_json(json.dumps(described))
         perform(job, folder, Bars(Console(width=100)))
     except UgatMarlError as error:
         print(" ".join(str(error).split()), file=sys.stderr)

@@ -7,7 +7,6 @@ diagnosis did not use. Only a real domain that is itself a simulation allows thi
 
 from __future__ import annotations
 
-import json
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
@@ -125,10 +124,10 @@ def read_diagnosis(directory: Path, scenario: Scenario) -> tuple[Diagnosis, Scen
     file = directory / FILE
     try:
         diagnosis = Diagnosis.read(directory)
-    except (OSError, UnicodeDecodeError, json.JSONDecodeError) as error:
+    except OptionError as error:
         raise OptionError(
-            f"{file}: cannot be read ({error}); name the directory of a diagnosis, "
-            "`ugat-marl diagnose SCENARIO MEASURED --out DIR`"
+            f"{error}; name the directory of a diagnosis, `ugat-marl diagnose SCENARIO MEASURED "
+            "--out DIR`"
         ) from None
     except ValueError:  # readable, but with other keys or types
         raise OptionError(f"{file}: not a diagnosis of this version; diagnose again") from None

@@ -19,10 +19,10 @@ from typing import Any
 
 from ugat_marl.data import installed_version
 from ugat_marl.effects import Domain, domain_label, scenario_in_domain
-from ugat_marl.errors import OptionError, UnknownNameError
+from ugat_marl.errors import CheckpointError, OptionError, UnknownNameError
 from ugat_marl.experiments.evaluation import TUNING_SEED, best_rules, race
 from ugat_marl.experiments.scores import Trial, Tuned
-from ugat_marl.files import user_cache, write_whole
+from ugat_marl.files import read_json, user_cache, write_whole
 from ugat_marl.parallel import Workers
 from ugat_marl.policies import RULE_NAMES, RULES, format_rule
 from ugat_marl.progress import Reporter
@@ -208,9 +208,9 @@ def _place(
 def _recall(place: Path, specs: Sequence[str]) -> tuple[Trial, ...] | None:
     """Return the result in a file; None if the file is missing or holds other settings."""
     try:
-        rows: Any = json.loads(place.read_text(encoding="utf-8"))
+        rows: Any = read_json(place, CheckpointError)
         trials = tuple(Trial(str(r["spec"]), float(r["att_s"]), int(r["episodes"])) for r in rows)
-    except (OSError, ValueError, KeyError, TypeError):
+    except (CheckpointError, ValueError, KeyError, TypeError):
         return None
     whole = sorted(trial.spec for trial in trials) == sorted(specs)
     return trials if whole and all(math.isfinite(trial.att_s) for trial in trials) else None

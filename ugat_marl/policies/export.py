@@ -32,7 +32,7 @@ from numpy.typing import NDArray
 
 from ugat_marl.envs import Actions, AgentSet, AnyParallelEnv, Infos, Observations
 from ugat_marl.errors import CheckpointError, OptionError, install_command
-from ugat_marl.files import require_writable, write_whole
+from ugat_marl.files import read_json, require_writable, write_whole
 from ugat_marl.policies.portable import (
     PORTABLE,
     Layer,
@@ -156,7 +156,7 @@ class NumpyPolicy:
                 together.
         """
         try:
-            about = json.loads(path.with_suffix(".json").read_text(encoding="utf-8"))
+            about = read_json(path.with_suffix(".json"), CheckpointError)
             model = path.read_bytes()
             if about["kind"] != _KIND or about["sha256"] != hashlib.sha256(model).hexdigest():
                 raise ValueError("the JSON file beside it belongs to another model")
@@ -164,7 +164,7 @@ class NumpyPolicy:
                 network = PORTABLE[about["network"]]({name: arrays[name] for name in arrays.files})
             sizes = (tuple(about[key]) for key in ("agents", "observation_sizes", "action_counts"))
             return cls(AgentSet(*sizes), network, about["env_options"])
-        except _UNREADABLE as error:
+        except (CheckpointError, *_UNREADABLE) as error:
             raise CheckpointError(
                 f"{path}: not a whole exported policy ({error}); export it again"
             ) from None

@@ -5,7 +5,7 @@ from __future__ import annotations
 import json
 from collections.abc import Mapping
 from pathlib import Path
-from typing import Any, cast
+from typing import Any
 
 import numpy as np
 import torch
@@ -15,6 +15,7 @@ from torch import Tensor, nn
 from ugat_marl.data import read_checkpoint, write_checkpoint
 from ugat_marl.envs import Actions, AgentSet, Infos, Observations
 from ugat_marl.errors import CheckpointError
+from ugat_marl.files import parse_json
 from ugat_marl.policies.devices import CPU
 from ugat_marl.policies.networks.q_network import Held, greedy_actions, q_network
 from ugat_marl.policies.networks.structure import Structure, structure_in
@@ -174,7 +175,12 @@ def parse_header(
     hidden = tuple(int(width) for width in content["hidden"])
     if {len(agents)} != {len(each) for each in sizes} or min(*sizes[0], *sizes[1], *hidden) < 1:
         raise ValueError("its agents or the sizes of its layers are no network's")
-    options = cast(dict[str, Any], json.loads(content["env_options"]))
+    try:
+        options = parse_json(content["env_options"], "env_options", CheckpointError)
+    except CheckpointError as error:  # the caller knows the file
+        raise ValueError(str(error)) from None
+    if not isinstance(options, dict):
+        raise TypeError(f"env_options = {options!r} is not an object")
     shared = content["shared"]
     if not isinstance(shared, bool):
         raise TypeError(f"shared = {shared!r} is not a bool")

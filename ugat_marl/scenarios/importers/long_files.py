@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import Any, cast
 
 from ugat_marl.errors import ScenarioError
-from ugat_marl.files import Tag, chunks_of, read_bytes, scan_xml
+from ugat_marl.files import Tag, chunks_of, parse_json, read_bytes, scan_xml
 from ugat_marl.progress import Reporter
 
 _MOST = 32 << 20
@@ -94,20 +94,13 @@ def read_json(path: Path) -> tuple[Any, str]:
     """Return the content of a JSON file, and its text.
 
     Raises:
-        ScenarioError: The file is not JSON.
+        ScenarioError: As for `ugat_marl.files.read_json`.
     """
     try:
-        text = read_bytes(path).decode()
-        return json.loads(text), text
+        text = read_bytes(path).decode("utf-8-sig")
     except UnicodeDecodeError as error:
         raise ScenarioError(f"{path}: is not UTF-8: {error}") from None
-    except json.JSONDecodeError as error:
-        raise ScenarioError(
-            f"{path}, line {error.lineno}: not valid JSON ({error.msg}); the file may have been "
-            "cut short"
-        ) from None
-    except (RecursionError, ValueError) as error:
-        raise _strange(str(path), error) from None
+    return parse_json(text, str(path), ScenarioError), text
 
 
 def _strange(where: str, error: Exception) -> ScenarioError:
