@@ -15,6 +15,7 @@ from ugat_marl.envs import vector_env
 from ugat_marl.errors import OptionError, SimulatorCrashed
 from ugat_marl.scenarios import read_scenario
 from ugat_marl.simulation import Host, ProcessSimulator, launch_of
+from ugat_marl.simulation.channel import ChannelClosed
 from ugat_marl.simulation.host import DEADLINE_VARIABLE, StartMethod
 
 Crossing = Callable[..., Path]
@@ -63,6 +64,43 @@ def test_a_stopped_worker_of_a_vector_is_replaced_with_the_same_numbers(
         return rewards
 
     assert play(2) == play(None)
+
+
+LARGE = """
+import numpy as np
+from ugat_marl.simulation.channel import Message
+
+class Large:
+    def prepare(self, order): pass
+    def open(self, order, descriptors):
+        return lambda question: Message({}, [np.ones(question.header["count"])])
+"""
+
+
+@pytest.mark.parametrize("method", ["forkserver", "spawn"])
+@pytest.mark.parametrize("amid", ["the question", "the answer"])
+def test_a_worker_that_stops_in_the_middle_of_a_message_counts_as_dead(
+    method: StartMethod, amid: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    (tmp_path / "large_service.py").write_text(LARGE)
+    monkeypatch.syspath_prepend(tmp_path)
+    host = Host("large_service:Large", method, deadline_s=3.0)
+    worker = host.start({})
+    worker.ask("once", count=2)
+    np.testing.assert_array_equal(worker.answer().arrays[0], [1.0, 1.0])
+    large = np.ones(2_000_000)  # 16 MB, far more than a connection holds
+    if amid == "the answer":
+        worker.ask("large", count=len(large))
+        assert worker.has_answered(30.0)
+    os.kill(worker._pid, signal.SIGSTOP)
+    begun = time.monotonic()
+    with pytest.raises(ChannelClosed):
+        if amid == "the question":
+            worker.ask("large", [large], count=1)
+        worker.answer()
+    assert 2.5 < time.monotonic() - begun < 10.0
+    assert "did not answer 'large' within 3 s and was killed" in worker.obituary("large")
+    host.close()
 
 
 @pytest.mark.parametrize("text", ["soon", "0", "-1", "nan", "inf"])

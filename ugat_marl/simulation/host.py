@@ -208,18 +208,21 @@ class Worker:
     ) -> Worker:
         """Start a new interpreter; messages use its standard input and output."""
         said = tempfile.TemporaryFile()  # noqa: SIM115 - stays open as long as the worker
-        process: subprocess.Popen[bytes] = subprocess.Popen(
-            _command("spawned", service, str(os.getpid()), json.dumps(order)),
-            stdin=subprocess.PIPE,
-            stdout=subprocess.PIPE,
-            stderr=said,
-            env=_environment(defaults),
-            start_new_session=True,  # so Ctrl-C reaches only the user's process, which ends this
-        )
-        assert process.stdin is not None
-        assert process.stdout is not None
-        channel = Channel(process.stdout, process.stdin, process.stdin.close)
-        return cls(channel, said, process.pid, deadline_s, process)
+        command = _command("spawned", service, str(os.getpid()), json.dumps(order))
+        # A session of its own, so that Ctrl-C reaches only the user's process, which ends this one.
+        options: dict[str, Any] = {"env": _environment(defaults), "start_new_session": True}
+        if os.name == "nt":  # pipes, and no deadline
+            process = subprocess.Popen(
+                command, stdin=subprocess.PIPE, stdout=subprocess.PIPE, stderr=said, **options
+            )
+            assert process.stdin is not None
+            assert process.stdout is not None
+            channel = Channel(process.stdout, process.stdin, process.stdin.close)
+            return cls(channel, said, process.pid, deadline_s, process)
+        mine, its = socket.socketpair()
+        with its:
+            process = subprocess.Popen(command, stdin=its, stdout=its, stderr=said, **options)
+        return cls(_channel_of(mine, deadline_s), said, process.pid, deadline_s, process)
 
     @property
     def running(self) -> bool:
@@ -252,13 +255,6 @@ class Worker:
             WorkerError: The service raised another exception; the process has been ended.
         """
         try:
-            # Sockets keep the deadline themselves; a spawned worker has pipes.
-            if (
-                self._process is not None
-                and os.name != "nt"
-                and not self.has_answered(self._deadline_s)
-            ):
-                raise TimeoutError
             reply = self._channel.receive()
         except TimeoutError:
             self._kill_late()
@@ -434,7 +430,6 @@ class _WarmParent:
     def fork(self, order: Order, descriptors: Sequence[int], deadline_s: float) -> Worker | None:
         """Return a fresh worker, or None if the parent has ended or does not answer in time."""
         mine, its = socket.socketpair()
-        mine.settimeout(deadline_s)
         said = tempfile.TemporaryFile()  # noqa: SIM115 - stays open as long as the worker
         pid = b""
         with its, self._lock:
@@ -452,15 +447,8 @@ class _WarmParent:
             mine.close()
             said.close()
             return None
-        reader, writer = mine.makefile("rb"), mine.makefile("wb")
-
-        def hang_up() -> None:
-            with contextlib.suppress(OSError):
-                mine.shutdown(socket.SHUT_WR)
-            mine.close()
-
         number = int.from_bytes(pid, "little")
-        return Worker(Channel(reader, writer, hang_up), said, number, deadline_s)
+        return Worker(_channel_of(mine, deadline_s), said, number, deadline_s)
 
     def end(self) -> None:
         """End the process; its workers continue. A second call does nothing."""
@@ -479,6 +467,21 @@ class _WarmParent:
                 self._process.wait()
             if self._current.get(self._service) is self:
                 del self._current[self._service]
+
+
+def _channel_of(mine: socket.socket, deadline_s: float) -> Channel:
+    """Return the user's end of a connection, which waits `deadline_s` for each part of a message.
+
+    Parts count, not whole messages: a process that stops in the middle of one is noticed too.
+    """
+    mine.settimeout(deadline_s)
+
+    def hang_up() -> None:
+        with contextlib.suppress(OSError):
+            mine.shutdown(socket.SHUT_WR)
+        mine.close()
+
+    return Channel(mine.makefile("rb"), mine.makefile("wb"), hang_up)
 
 
 def _usual_deadline_s() -> float:
