@@ -12,7 +12,7 @@ from hypothesis.stateful import initialize, invariant, rule, run_state_machine_a
 from tests.scenarios import signals_test
 from ugat_marl.effects import load_scenario
 from ugat_marl.errors import OptionError
-from ugat_marl.field.safety import Light, Trust, fixed_time, merged
+from ugat_marl.field.safety import Light, Trust, fixed_time
 from ugat_marl.scenarios import GREEN, Network, Segment, SignalTiming
 
 LINKS = signals_test.LINKS
@@ -161,16 +161,3 @@ def test_the_plan_serves_every_link_of_every_light() -> None:
         assert green == servable
         assert all(actions[item.id] == asked[0][item.id] for actions in asked[:3])
         assert asked[3][item.id] != asked[0][item.id]
-
-
-def test_plans_of_lights_are_merged_by_hand() -> None:
-    plans = {
-        "A": [(3.0, "y"), (7.0, "G")],
-        "B": [(10.0, "r")],
-        "C": [(3.0, "g"), (2.0, "y"), (5.0, "r")],
-    }
-    assert merged(plans) == [
-        (3.0, {"A": "y", "B": "r", "C": "g"}),
-        (2.0, {"A": "G", "C": "y"}),
-        (5.0, {"C": "r"}),
-    ]

@@ -7,6 +7,7 @@ lights follow the fixed-time plan. Every answer goes through the signal machines
 
 from __future__ import annotations
 
+import functools
 import time
 from collections import Counter
 from collections.abc import Callable, Mapping
@@ -16,10 +17,10 @@ from typing import Any
 import numpy as np
 
 from ugat_marl.envs import checked_phases
-from ugat_marl.errors import OptionError
 from ugat_marl.field.answering import Answering, Late, NoAnswer
 from ugat_marl.field.decisions import Decision, DecisionLog
-from ugat_marl.field.safety import Light, Trust, fixed_time, merged
+from ugat_marl.field.lights import Lights
+from ugat_marl.field.safety import Trust, fixed_time
 from ugat_marl.field.site import Site
 from ugat_marl.field.street import LaneCount, Street
 from ugat_marl.field.watchdog import TrustLimits, Watchdog
@@ -74,6 +75,10 @@ class FieldLoop:
         limits: Limits of trust; None for the default values.
         log: Log of the decisions; None for no log.
 
+    Attributes:
+        summary: Counts of all decisions.
+        driven_s: Time of all decisions on the street's clock, s.
+
     Raises:
         OptionError: The street lacks a light, or a light shows a state that it cannot have.
     """
@@ -86,48 +91,64 @@ class FieldLoop:
         limits: TrustLimits | None = None,
         log: DecisionLog | None = None,
     ) -> None:
-        self._site, self._street, self._log = site, street, log
+        self._site, self._policy, self._log = site, policy, log
         self._limits = limits = limits or TrustLimits()
-        shown = street.shown()
-        if lacking := [light for light in site.lights if light not in shown]:
-            raise OptionError(f"the street has no traffic light {lacking[0]!r}; it has {[*shown]}")
-        self.lights = {
-            intersection.id: Light(intersection.phases, site.timing, shown[intersection.id])
-            for intersection in site.network.intersections
-        }
-        self._memory = site.observer.memory(site.decision_interval_s)
-        if self._memory is not None:
-            self._memory.reset([light.phase for light in self.lights.values()])
-        self._watchdog = Watchdog(site.capacity, site.halting, limits)
-        self._held: frozenset[str] = frozenset()
-        self._trust = Trust(site.lights, limits.return_after)
         interval, clearance = site.decision_interval_s, site.timing.clearance_s
         self._plan = fixed_time(site.network, interval, clearance, limits.green_s)
         self.summary = LoopSummary()
+        self.driven_s = 0.0
         self._answer = _answer_of(policy, site)
         self._asked = Answering()
-        self._warm_up(policy)
+        self._begin(street, Lights(site, street, limits))
+
+    def take_over(self, street: Street) -> None:
+        """Go on with a street that came back, from what its lights show now.
+
+        Raises:
+            SimulatorError: The street shows none of the lights.
+            OptionError: A light shows a state that it cannot have.
+        """
+        self._begin(street, Lights(self._site, street, self._limits, all_seen=False))
+
+    def _begin(self, street: Street, lights: Lights) -> None:
+        self._street, self._lights = street, lights
+        self._memory = self._site.observer.memory(self._site.decision_interval_s)
+        if self._memory is not None:
+            self._memory.reset([light.phase for light in lights.machines.values()])
+        self._watchdog = Watchdog(self._site.capacity, self._site.halting, self._limits)
+        self._held: frozenset[str] = frozenset()
+        self._trust = Trust(self._site.lights, self._limits.return_after)
+        self._warm_up(self._policy)
 
     def run(
         self, seconds: float, on_decision: Callable[[Decision], None] | None = None
     ) -> LoopSummary:
-        """Drive the street for `seconds`, rounded up to whole decisions.
+        """Drive the street for `seconds`, rounded up to whole decisions, and close the log.
 
         Raises:
             SimulatorError: The connection to the street is lost; no light can be set any more.
             OutputError: The log cannot be written at the end.
         """
-        until = self._street.now_s() + seconds - 1e-6
         try:
-            while self._street.now_s() < until:
-                decision, plans = self.decide()
-                self._act(decision, plans)
-                if on_decision is not None:
-                    on_decision(decision)
+            self.drive(seconds, on_decision)
         finally:
             if self._log is not None:
                 self._log.close()
         return self.summary
+
+    def drive(self, seconds: float, on_decision: Callable[[Decision], None] | None = None) -> None:
+        """Drive the street for `seconds`, rounded up to whole decisions.
+
+        Raises:
+            SimulatorError: The connection to the street is lost; no light can be set any more.
+        """
+        until = self._street.now_s() + seconds - 1e-6
+        while (now := self._street.now_s()) < until:
+            decision, plans = self.decide()
+            self._lights.act(plans, functools.partial(self._record, decision, plans))
+            self.driven_s += self._street.now_s() - now
+            if on_decision is not None:
+                on_decision(decision)
 
     def decide(self) -> tuple[Decision, dict[str, list[Segment]]]:
         """Read the counts, check them and decide; no light is set yet.
@@ -137,40 +158,34 @@ class FieldLoop:
         """
         begun = time.perf_counter()
         now = float(self._street.now_s())
+        disobeying = self._lights.faults()
         counts, faults = self._look(now)
+        faults |= disobeying
         read_ms = _ms_since(begun)
         requested: list[int] = []
-        if len(faults) < len(self.lights):
+        lights = self._lights.machines
+        if len(faults) < len(lights):
             requested, wrong = self._ask(counts, now, begun)
             if wrong:
-                faults = dict.fromkeys(self.lights, wrong) | faults
+                faults = dict.fromkeys(lights, wrong) | faults
         fallback = self._trust.judge(faults)
         phases = self._plan.act({}, {})
-        for light, phase in zip(self.lights, requested, strict=False):
+        for light, phase in zip(lights, requested, strict=False):
             if light not in fallback:
                 phases[light] = phase
-        interval = self._site.decision_interval_s
-        plans = {name: light.advance(phases[name], interval) for name, light in self.lights.items()}
+        plans = self._lights.plan(phases)
         if self._memory is not None:
-            asked = [phases[name] for name in self.lights]
-            self._memory.add(asked, [light.phase for light in self.lights.values()])
+            asked = [phases[name] for name in lights]
+            self._memory.add(asked, [light.phase for light in lights.values()])
         decision = Decision(now, phases, fallback, read_ms, _ms_since(begun))
         return decision, plans
 
-    def _act(self, decision: Decision, plans: Mapping[str, list[Segment]]) -> None:
-        """Show the plans. Each state gets its full time, even if the street is late."""
-        for index, (duration, states) in enumerate(merged(plans)):
-            self._street.show(states)
-            until = self._street.now_s() + duration
-            if index == 0:  # after the first states are set, so that lights do not wait for a disk
-                self._record(decision)
-                self._held = _without_green(self._site, plans)
-            self._street.wait(until)
-
-    def _record(self, decision: Decision) -> None:
+    def _record(self, decision: Decision, plans: Mapping[str, list[Segment]]) -> None:
+        """Count and log a decision, after its first states are set: no light waits for a disk."""
         self.summary.add(decision)
         if self._log is not None:
             self._log.add(decision)
+        self._held = _without_green(self._site, plans)
 
     def close(self) -> None:
         """Let the policy's thread end; the lights keep their states."""
@@ -186,9 +201,9 @@ class FieldLoop:
             wrong = self._watchdog.faults(counts, now, self._held)
         except (Exception, SystemExit) as error:  # noqa: BLE001 - whatever a detector's driver raises
             reason = f"missing: no counts at all, {type(error).__name__}: {error}"
-            return {}, dict.fromkeys(self.lights, reason)
+            return {}, dict.fromkeys(self._lights.machines, reason)
         faults: dict[str, str] = {}
-        for name, light in self.lights.items():
+        for name, light in self._lights.machines.items():
             reasons = [wrong[lane] for lane in self._site.sees[name] if lane in wrong]
             if reasons:
                 faults[name] = reasons[0] + (f" (+{len(reasons) - 1})" if reasons[1:] else "")
@@ -204,7 +219,7 @@ class FieldLoop:
         `begun` is the start of the decision by `time.perf_counter`, s.
         """
         limits = self._limits
-        phases = [light.phase for light in self.lights.values()]
+        phases = [light.phase for light in self._lights.machines.values()]
         observations = self._site.observe(counts, now, phases, self._memory)
         within_ms = limits.answer_ms - limits.reserve_ms
         left_ms = within_ms - _ms_since(begun)
@@ -221,7 +236,7 @@ class FieldLoop:
 
     def _infos(self) -> dict[str, dict[str, Any]]:
         interval = self._site.decision_interval_s
-        lights = zip(self._site.observer.agents, self.lights.values(), strict=True)
+        lights = zip(self._site.observer.agents, self._lights.machines.values(), strict=True)
         return {
             agent: {"action_mask": light.free(interval), "executed_action": light.phase}
             for agent, light in lights
@@ -230,7 +245,7 @@ class FieldLoop:
     def _warm_up(self, policy: Policy) -> None:
         """Ask the policy once before the first decision: a network's first answer takes longest."""
         try:
-            now, phases = self._street.now_s(), [0] * len(self.lights)
+            now, phases = self._street.now_s(), [0] * len(self._lights.machines)
             nothing = self._site.observe({}, now, phases, self._memory)
             for function, arguments in (
                 (policy.reset, (0,)),
@@ -256,7 +271,7 @@ def _without_green(site: Site, plans: Mapping[str, list[Segment]]) -> frozenset[
     """Return the lanes in front of lights that have no green in these plans."""
     held: set[str] = set()
     for intersection in site.network.intersections:
-        states = [state for _, state in plans[intersection.id]]
+        states = [state for _, state in plans.get(intersection.id, ())]
         green = {
             link.from_lane
             for link in intersection.links

@@ -146,21 +146,3 @@ def fixed_time(
         clearance_s,
     )
     return FixedTime(streets, green_s)
-
-
-def merged(plans: Mapping[str, Sequence[Segment]]) -> list[tuple[float, dict[str, str]]]:
-    """Merge the plans of all lights into common pieces of time.
-
-    Returns:
-        For each piece its duration in s, and the state of each light that changes at its start.
-    """
-    changes: dict[float, dict[str, str]] = {}
-    end = 0.0
-    for light, segments in plans.items():
-        offset = 0.0
-        for duration, state in segments:
-            changes.setdefault(round(offset, 6), {})[light] = state
-            offset += duration
-        end = max(end, offset)
-    times = [*sorted(changes), round(end, 6)]
-    return [(until - since, changes[since]) for since, until in zip(times, times[1:], strict=False)]

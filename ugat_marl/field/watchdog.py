@@ -31,6 +31,9 @@ class TrustLimits:
             because motorcycles need less room than the vehicles that define the capacity.
         return_after: Number of good decisions in a row before the policy drives a light again.
         green_s: Time of a phase of the fixed-time plan, s, its clearance included.
+        obey_s: Time, s, for which a light may go on with its earlier state after a command. Then it
+            is at fault, and is taken over from what it shows.
+        look_every_s: Longest time between two looks at what lights show, s.
     """
 
     answer_ms: float = 50.0
@@ -41,12 +44,16 @@ class TrustLimits:
     over_capacity: float = 2.0
     return_after: int = 3
     green_s: float = 30.0
+    obey_s: float = 2.0
+    look_every_s: float = 1.0
 
     def __post_init__(self) -> None:
         for field in fields(self):
             value, endless = getattr(self, field.name), field.name in _MAY_BE_ENDLESS
             if not (value >= 0 and (endless or value < math.inf)):
                 raise OptionError(f"{field.name} = {value}: must be a number, 0 or more")
+        if self.look_every_s == 0:
+            raise OptionError("look_every_s = 0: lights cannot be looked at without a pause")
         if self.reserve_ms >= self.answer_ms:
             raise OptionError(
                 f"reserve_ms = {self.reserve_ms:g} leaves the policy nothing of the "
