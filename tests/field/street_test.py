@@ -3,12 +3,10 @@
 from __future__ import annotations
 
 import json
-import os
 import re
 import signal
 import socket
 import subprocess
-import sys
 import time
 from collections.abc import Callable, Iterator, Mapping
 from itertools import pairwise
@@ -23,11 +21,12 @@ from ugat_marl.effects import load_scenario, scenario_in_domain
 from ugat_marl.envs import parallel_env
 from ugat_marl.errors import OptionError, SimulatorError
 from ugat_marl.policies import DQN, UNIVERSAL_NAME, make_rule, observed_options, suite_config
-from ugat_marl.scenarios import GREEN
+from ugat_marl.scenarios import GREEN, sumo_program
+from ugat_marl.simulation import Trips, launch_of, read_trips
 
 pytest.importorskip("traci")
 
-from ugat_marl.field import FieldLoop, Site, StartedSumo, TraciStreet
+from ugat_marl.field import FieldLoop, SimulatedStreet, Site, TraciStreet, TrustLimits
 
 
 class Watched(TraciStreet):
@@ -60,16 +59,42 @@ class Remembering:
         return self.policy.act(observations, infos)
 
 
+class SumoServer:
+    """``sumo --remote-port`` with a scenario, as somebody else may have started it."""
+
+    def __init__(self, scenario: Any, directory: Path, port: int | None = None) -> None:
+        if port is None:
+            with socket.socket() as probe:
+                probe.bind(("localhost", 0))
+                port = int(probe.getsockname()[1])
+        self.port, self._directory = port, directory
+        launch = launch_of(scenario, 3, directory, ())
+        launch.write()
+        self.process = subprocess.Popen(
+            [str(sumo_program("sumo")), *launch.arguments, "--remote-port", str(port)],
+            stdin=subprocess.DEVNULL,
+            stdout=subprocess.DEVNULL,
+            stderr=subprocess.DEVNULL,
+        )
+
+    def trips(self) -> Trips:
+        self.process.wait(20)
+        return read_trips(self._directory / "trips.xml")
+
+    def end(self) -> None:
+        self.process.kill()
+        self.process.wait()
+
+
 @pytest.fixture
-def running() -> Iterator[Callable[..., tuple[StartedSumo, Watched]]]:
+def running(tmp_path: Path) -> Iterator[Callable[..., tuple[SumoServer, Watched]]]:
     """Starts SUMO with a scenario and connects to it."""
     ends: list[Callable[[], None]] = []
 
-    def run(scenario: Any, site: Site, **options: Any) -> tuple[StartedSumo, Watched]:
-        sumo = StartedSumo(scenario, seed=3)
-        sumo.__enter__()
-        ends.append(lambda: sumo.__exit__(None, None, None))
-        street = Watched(tuple(site.capacity), sumo.port, process=sumo.process, **options)
+    def run(scenario: Any, site: Site, **options: Any) -> tuple[SumoServer, Watched]:
+        sumo = SumoServer(scenario, tmp_path / f"sumo{len(ends)}")
+        ends.append(sumo.end)
+        street = Watched(tuple(site.capacity), sumo.port, **options)
         ends.append(street.close)
         return sumo, street
 
@@ -189,7 +214,7 @@ def test_a_street_that_goes_away_is_told(running: Callable[..., Any]) -> None:
 
     def end(decision: Any) -> None:
         if decision.time_s >= 20:
-            sumo.process.kill()
+            sumo.end()
 
     with pytest.raises(SimulatorError, match="Connection closed by SUMO"):
         loop.run(100.0, end)
@@ -200,38 +225,50 @@ def test_a_street_that_goes_away_is_told(running: Callable[..., Any]) -> None:
 def test_late_greens_are_refused() -> None:
     scenario = scenario_in_domain(load_scenario("single-v1"), "late_green=*,1")
     with pytest.raises(OptionError, match="late"):
-        StartedSumo(scenario, seed=0)
+        SimulatedStreet(scenario, 0, ())
 
 
-@pytest.mark.skipif(sys.platform != "linux", reason="only Linux ends children with their parent")
-def test_sumo_does_not_outlive_the_process_that_started_it(
-    python: list[str], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+def test_the_own_sumo_of_a_demonstration_is_the_same_street(
+    running: Callable[..., Any],
 ) -> None:
-    monkeypatch.setenv("TMPDIR", str(tmp_path))  # nobody is left to clear away
-    code = (
-        "import time\n"
-        "from ugat_marl.effects import load_scenario\n"
-        "from ugat_marl.field.street import StartedSumo\n"
-        "with StartedSumo(load_scenario('single-v1'), 0) as sumo:\n"
-        "    print(sumo.process.pid, flush=True)\n"
-        "    time.sleep(60)\n"
-    )
-    with subprocess.Popen([*python, "-c", code], stdout=subprocess.PIPE, text=True) as parent:
-        assert parent.stdout is not None
-        child = int(parent.stdout.readline())
-        os.kill(child, 0)
-        parent.send_signal(signal.SIGKILL)
-        until = time.monotonic() + 10
-        while _alive(child) and time.monotonic() < until:
-            time.sleep(0.05)
-        assert not _alive(child)
+    scenario = scenario_in_domain(load_scenario("single-v1"), "V4")
+    policy = make_rule("largest-queue:10", parallel_env(scenario))
+    site = Site.of(scenario, policy.env_options)
+    sumo, over_traci = running(scenario, site)
+    seen: list[list[Any]] = []
+    trips: list[Trips] = []
+    with SimulatedStreet(scenario, 3, tuple(site.capacity)) as own:
+        for street in (own, over_traci):
+            made: list[Any] = []
+            FieldLoop(site, policy, street, TrustLimits(answer_ms=5000)).run(240.0, made.append)
+            seen.append([(d.time_s, d.phases, d.fallback) for d in made])
+        trips.append(own.trips())
+    over_traci.close()
+    trips.append(sumo.trips())
+    assert seen[0] == seen[1]
+    assert trips[0].entered.sum() > 50
+    assert np.sort(trips[0].travel_time_s).tolist() == np.sort(trips[1].travel_time_s).tolist()
 
 
-def _alive(pid: int) -> bool:
-    try:
-        return Path(f"/proc/{pid}/stat").read_text().rpartition(")")[2].split()[0] != "Z"
-    except FileNotFoundError:
-        return False
+@pytest.mark.skipif(not Path("/proc/net/tcp").exists(), reason="reads /proc")
+def test_a_demonstration_opens_no_port() -> None:
+    scenario = load_scenario("single-v1")
+
+    def listening() -> set[str]:
+        rows = Path("/proc/net/tcp").read_text().splitlines()[1:]
+        return {row.split()[9] for row in rows if row.split()[3] == "0A"}
+
+    with SimulatedStreet(scenario, 0, ()) as street:
+        street.wait(street.now_s() + 5.0)
+        descriptors = [
+            str(entry.readlink())
+            for pid in ("self", str(street._simulator._worker._pid))  # type: ignore[union-attr]
+            for entry in Path(f"/proc/{pid}/fd").iterdir()
+            if entry.is_symlink()
+        ]
+        sockets = {name[len("socket:[") : -1] for name in descriptors if name.startswith("socket")}
+        assert sockets
+        assert not sockets & listening()
 
 
 def test_the_command_drives_and_sums_up(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
@@ -245,14 +282,24 @@ def test_the_command_drives_and_sums_up(tmp_path: Path, capsys: pytest.CaptureFi
     assert len(log.read_text().splitlines()) == 6
 
 
-def test_an_interrupted_command_leaves_its_log_and_nothing_else(
-    python: list[str], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+@pytest.mark.parametrize(
+    ("number", "code", "says"),
+    [(signal.SIGINT, 130, "interrupted"), (signal.SIGTERM, 143, "terminated")],
+)
+def test_a_stopped_command_leaves_its_log_and_nothing_else(
+    number: int,
+    code: int,
+    says: str,
+    python: list[str],
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     monkeypatch.setenv("TMPDIR", str(tmp_path))
     log = tmp_path / "field.jsonl"
+    health = tmp_path / "health.json"
     call = ["-m", "ugat_marl", "field", "single-v1", "--policy", "fixed-time:30", "--start"]
     with subprocess.Popen(
-        [*python, *call, "--seconds", "1e7", "--log", str(log)],
+        [*python, *call, "--seconds", "inf", "--log", str(log), "--health", str(health)],
         stdout=subprocess.DEVNULL,
         stderr=subprocess.PIPE,
         text=True,
@@ -262,14 +309,17 @@ def test_an_interrupted_command_leaves_its_log_and_nothing_else(
             time.monotonic() < until
         ):
             time.sleep(0.05)
-        command.send_signal(signal.SIGINT)
+        command.send_signal(number)
         _, said = command.communicate(timeout=30)
-    assert command.returncode == 130, said
-    assert said.strip().splitlines()[-1] == "ugat-marl: interrupted"
+    assert command.returncode == code, said
+    assert said.strip().splitlines()[-1] == f"ugat-marl: {says}"
     rows = [json.loads(line) for line in log.read_text().splitlines()]
     assert rows
     assert [row["time_s"] for row in rows] == [10.0 * n for n in range(len(rows))]
-    assert [entry.name for entry in tmp_path.iterdir()] == ["field.jsonl"]
+    told = json.loads(health.read_text())
+    assert (told["state"], told["times_gone"]) == ("ended", 0)
+    assert told["decisions"] == len(rows)
+    assert sorted(entry.name for entry in tmp_path.iterdir()) == ["field.jsonl", "health.json"]
 
 
 @pytest.mark.parametrize(
@@ -277,6 +327,10 @@ def test_an_interrupted_command_leaves_its_log_and_nothing_else(
     [
         (["--policy", "random"], "--port is missing"),
         (["--policy", "random", "--start", "--host", "far"], "--host far"),
+        (["--policy", "random", "--start", "--port", "8813"], "opens no port"),
+        (["--policy", "random", "--start", "--look-for-s", "9"], "opens no port"),
+        (["--policy", "random", "--port", "1", "--look-for-s", "-1"], "--look-for-s"),
+        (["--policy", "random", "--port", "1", "--sumo-answer-s", "inf"], "--sumo-answer-s"),
         (["--policy", "random", "--start", "--seconds", "0"], "above 0"),
         (["--policy", "programme", "--start"], "programme"),
         (["--policy", "longest-waiting", "--start"], "waiting times"),

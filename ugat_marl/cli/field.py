@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import contextlib
+import math
+from collections.abc import Callable
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Annotated
@@ -18,16 +20,20 @@ from ugat_marl.experiments import policy_factory
 from ugat_marl.field import (
     CountSource,
     DecisionLog,
-    FieldLoop,
+    FieldService,
+    Health,
     LoopSummary,
+    SimulatedStreet,
     Site,
-    StartedSumo,
+    Street,
     TraciStreet,
     TrustLimits,
 )
-from ugat_marl.progress import Bars
+from ugat_marl.files import require_writable
+from ugat_marl.policies import Policy
+from ugat_marl.progress import Bars, Silent
 
-Port = Annotated[int | None, arg(metavar="INT", help_behavior_hint="(with --start: a free one)")]
+Port = Annotated[int | None, arg(metavar="INT", help_behavior_hint="(or --start)")]
 Log = Annotated[Path | None, arg(metavar="FILE", help_behavior_hint="(default: nowhere)")]
 
 
@@ -36,8 +42,8 @@ class Field:
     """Drive the lights of a SUMO that runs elsewhere, as if it were the street.
 
     Counts are read once per decision. Minimum green and clearance are always
-    kept. If counts are stale, missing or absurd, or the policy fails, the lights
-    follow a fixed-time plan (docs/how-to/field.md).
+    kept. If counts are stale, missing or absurd, the policy fails, or a light
+    does not obey, lights follow a fixed-time plan (docs/how-to/field.md).
 
     Examples:
         ugat-marl field single-v1 --policy largest-queue:20 --start --domain V4
@@ -49,13 +55,16 @@ class Field:
         policy: A rule or the file of a trained policy.
         port: Port of SUMO (its --remote-port).
         host: The machine on which SUMO runs.
-        start: Start a SUMO with the scenario, for a demonstration.
+        start: Run a SUMO with the scenario, without a port, for a demonstration.
         domain: Domain of the SUMO that --start runs.
         seed: Seed of the SUMO that --start runs.
-        seconds: Time to drive, s.
+        seconds: Time to drive, s; inf for ever.
         detectors: Count on whole lanes, or on SUMO's lane-area detectors.
+        sumo_answer_s: Time within which SUMO has to answer, s; else it counts as gone.
+        look_for_s: Time to look for a SUMO that is gone, s; inf for ever.
         log: File of JSON lines, one for each decision; new lines are appended.
-        limits: Limits beyond which counts and policy are not trusted.
+        health: JSON file with the state of the loop, written after each decision.
+        limits: Limits beyond which counts, policy and lights are not trusted.
     """
 
     scenario: Annotated[Positional[str], arg(metavar="SCENARIO")]
@@ -67,46 +76,117 @@ class Field:
     seed: int = 0
     seconds: LengthS = None
     detectors: CountSource = "lanes"
+    sumo_answer_s: float = 60.0
+    look_for_s: float = 0.0
     log: Log = None
+    health: Log = None
     limits: TrustLimits = field(default_factory=TrustLimits)
 
     def run(self, console: Console) -> int:
         """Drive the lights and print a summary."""
-        if self.port is None and not self.start:
-            raise OptionError("--port is missing: where SUMO listens; or let --start run one")
-        if self.start and self.host != "localhost":
-            raise OptionError(f"--start runs SUMO here, and not at --host {self.host}")
-        if self.seed < 0 or (self.seconds is not None and not self.seconds > 0):
-            raise OptionError("--seed must not be negative, and --seconds must be above 0")
+        self._check()
         scenario = scenario_in_domain(load_scenario(self.scenario), self.domain)
         policy = policy_factory(self.policy)(parallel_env(scenario))
         site = Site.of(scenario, policy.env_options)
         seconds = self.seconds or scenario.settings.duration_s
-        decisions = -int(-seconds // site.decision_interval_s)
-        log = None if self.log is None else DecisionLog(self.log)
-        att = ""
+        if self.health is not None:
+            require_writable(self.health)
         with contextlib.ExitStack() as stack:
+            log = None if self.log is None else DecisionLog(self.log)
             if log is not None:
                 stack.callback(log.close)
-            sumo = StartedSumo(scenario, self.seed, self.port) if self.start else None
-            if sumo is not None:
-                stack.enter_context(sumo)
-            port, process = (sumo.port, sumo.process) if sumo else (self.port or 0, None)
-            lanes = tuple(site.capacity)
-            street = TraciStreet(lanes, port, self.host, detectors=self.detectors, process=process)
-            stack.callback(street.close)
-            loop = FieldLoop(site, policy, street, self.limits, log)
-            stack.callback(loop.close)
-            with Bars(console).task(f"{self.policy} at {self.host}:{port}", decisions) as advance:
-                summary = loop.run(seconds, lambda decision: advance(note=decision.source))
-            if sumo is not None:
-                street.close()
-                att = f"; ATT {sumo.trips().travel_time_s.mean():.1f} s"
+            console.print(self._reach(), soft_wrap=True)
+            if self.start:
+                street = SimulatedStreet(scenario, self.seed, tuple(site.capacity))
+                stack.enter_context(street)
+                summary = self._driven(site, policy, lambda: street, seconds, log, console)
+                att = f"; ATT {street.trips().travel_time_s.mean():.1f} s"
+            else:
+                connect = stack.enter_context(_Connections(self, tuple(site.capacity)))
+                summary = self._driven(site, policy, connect, seconds, log, console)
+                att = ""
         console.print(f"{_told(summary, len(site.lights))}{att}", soft_wrap=True)
         if log is not None:
             lost = f" ({log.lost} decisions lost while it could not be written)" if log.lost else ""
             console.print(f"log: {self.log}{lost}", soft_wrap=True)
         return 0
+
+    def _check(self) -> None:
+        if self.port is None and not self.start:
+            raise OptionError("--port is missing: where SUMO listens; or let --start run one")
+        if self.start and self.host != "localhost":
+            raise OptionError(f"--start runs SUMO here, and not at --host {self.host}")
+        if self.start and (self.port is not None or self.look_for_s or self.detectors != "lanes"):
+            raise OptionError(
+                "--start runs a SUMO of its own that opens no port, ends with the loop and counts "
+                "on whole lanes; leave --port, --look-for-s and --detectors out"
+            )
+        if self.seed < 0 or (self.seconds is not None and not self.seconds > 0):
+            raise OptionError("--seed must not be negative, and --seconds must be above 0")
+        if not (self.look_for_s >= 0 and 0 < self.sumo_answer_s < math.inf):
+            raise OptionError("--look-for-s must be 0 or more, and --sumo-answer-s above 0")
+
+    def _reach(self) -> str:
+        """Return what the loop reaches and writes, for whoever guards this machine."""
+        reached = "no port" if self.start else f"{self.host}:{self.port} (SUMO, without a password)"
+        files = [str(file) for file in (self.log, self.health) if file is not None]
+        return f"opens no port; reaches {reached}; writes {' and '.join(files) or 'no file'}"
+
+    def _driven(
+        self,
+        site: Site,
+        policy: Policy,
+        connect: Callable[[], Street],
+        seconds: float,
+        log: DecisionLog | None,
+        console: Console,
+    ) -> LoopSummary:
+        endless = math.isinf(seconds)
+        decisions = 1 if endless else -int(-seconds // site.decision_interval_s)
+        reporter = Bars(console)
+        service = FieldService(
+            site,
+            policy,
+            connect,
+            self.limits,
+            log,
+            health=Health(self.health),
+            look_for_s=self.look_for_s,
+            say=reporter.say,
+        )
+        where = "a SUMO of its own" if self.start else f"{self.host}:{self.port}"
+        bars = Silent() if endless else reporter
+        with bars.task(f"{self.policy} at {where}", decisions) as advance:
+            return service.run(seconds, lambda decision: advance(note=decision.source))
+
+
+class _Connections:
+    """Maker of connections to SUMO; each one closes the one before."""
+
+    def __init__(self, command: Field, lanes: tuple[str, ...]) -> None:
+        self._command, self._lanes = command, lanes
+        self._street: TraciStreet | None = None
+
+    def __call__(self) -> TraciStreet:
+        self.close()
+        self._street = TraciStreet(
+            self._lanes,
+            self._command.port or 0,
+            self._command.host,
+            detectors=self._command.detectors,
+            answer_s=self._command.sumo_answer_s,
+        )
+        return self._street
+
+    def close(self) -> None:
+        if self._street is not None:
+            self._street.close()
+
+    def __enter__(self) -> _Connections:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self.close()
 
 
 def _told(summary: LoopSummary, lights: int) -> str:

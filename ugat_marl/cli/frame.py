@@ -8,8 +8,10 @@ import importlib
 import io
 import os
 import re
+import signal
 import sys
-from collections.abc import Callable, Mapping, Sequence
+import threading
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any
 
@@ -21,6 +23,7 @@ from ugat_marl.progress import Bars, Loudness, loudness, showing
 
 USAGE_ERROR = 2
 INTERRUPTED = 130
+TERMINATED = 143
 COMPLETION = "completion"
 LOUDNESS: dict[str, Loudness] = {"--quiet": "quiet", "--verbose": "verbose"}
 """Options of every command."""
@@ -32,6 +35,10 @@ _WAYS_OUT = {
     errno.ENAMETOOLONG: "; give a shorter name",
 }
 """Number of an error of the operating system to its remedy."""
+
+
+class Terminated(KeyboardInterrupt):
+    """The program got SIGTERM; it ends in order, as after Ctrl-C."""
 
 
 def run_command(command: Any, console: Console) -> int:
@@ -71,21 +78,22 @@ def run(line: CommandLine, arguments: Sequence[str]) -> int:
 
     Returns:
         The exit code: 0, 1 (a check or target failed), 2 (wrong call or input; one line names the
-        fault), 130 (interrupted).
+        fault), 130 (interrupted), 143 (terminated).
     """
     console = Console(highlight=False)
     arguments, level = _without_loudness(arguments)
     progress = console if console.is_terminal else Console(stderr=True, highlight=False)
     try:
-        with loudness(level), showing(Bars(progress)):
+        with _ended_in_order(), loudness(level), showing(Bars(progress)):
             return _dispatch(line, list(arguments), console)
     except UgatMarlError as error:
         print(f"{line.program}: error: {' '.join(str(error).split())}", file=sys.stderr)
         return USAGE_ERROR
     except KeyboardInterrupt as interrupt:
-        parts = [f"{line.program}: interrupted", *map(str, interrupt.args)]
-        print("; ".join(parts), file=sys.stderr)
-        return INTERRUPTED
+        terminated = isinstance(interrupt, Terminated)
+        ended = f"{line.program}: {'terminated' if terminated else 'interrupted'}"
+        print("; ".join([ended, *map(str, interrupt.args)]), file=sys.stderr)
+        return TERMINATED if terminated else INTERRUPTED
     except BrokenPipeError:  # else the interpreter writes to the closed pipe at its end
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
         return USAGE_ERROR
@@ -109,6 +117,25 @@ def run(line: CommandLine, arguments: Sequence[str]) -> int:
             file=sys.stderr,
         )
         return USAGE_ERROR
+
+
+@contextlib.contextmanager
+def _ended_in_order() -> Iterator[None]:
+    """Turn the first SIGTERM into an exception, so that files and folders are left in order."""
+
+    def end(number: int, frame: object) -> None:
+        signal.signal(signal.SIGTERM, signal.SIG_IGN)  # the end must not be interrupted in turn
+        raise Terminated
+
+    main_thread = threading.current_thread() is threading.main_thread()
+    if not main_thread or signal.getsignal(signal.SIGTERM) is not signal.SIG_DFL:
+        yield
+        return
+    signal.signal(signal.SIGTERM, end)
+    try:
+        yield
+    finally:
+        signal.signal(signal.SIGTERM, signal.SIG_DFL)
 
 
 def _without_loudness(words: Sequence[str]) -> tuple[list[str], Loudness]:

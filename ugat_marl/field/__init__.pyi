@@ -1,11 +1,13 @@
 from .decisions import Decision as Decision
 from .decisions import DecisionLog as DecisionLog
+from .health import Health as Health
 from .loop import FieldLoop as FieldLoop
 from .loop import LoopSummary as LoopSummary
+from .service import FieldService as FieldService
 from .site import Site as Site
 from .street import CountSource as CountSource
 from .street import LaneCount as LaneCount
-from .street import StartedSumo as StartedSumo
+from .street import SimulatedStreet as SimulatedStreet
 from .street import Street as Street
 from .street import TraciStreet as TraciStreet
 from .watchdog import TrustLimits as TrustLimits

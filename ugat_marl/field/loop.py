@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import functools
 import time
+from array import array
 from collections import Counter
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
@@ -42,7 +43,7 @@ class LoopSummary:
     """
 
     decisions: int = 0
-    latencies_ms: list[float] = field(default_factory=list)
+    latencies_ms: array[float] = field(default_factory=lambda: array("d"))
     light_decisions: int = 0
     reasons: Counter[str] = field(default_factory=Counter)
 

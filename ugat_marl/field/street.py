@@ -1,24 +1,16 @@
 """Interface of a street: counts with their time, lights to set, a clock.
 
-`TraciStreet` uses a running SUMO as the street. `StartedSumo` starts such a SUMO. A real street is
-a class with the five methods of `Street`; docs/how-to/field.md shows one.
+`TraciStreet` uses a SUMO that runs elsewhere as the street, `SimulatedStreet` one of its own. A
+real street is a class with the five methods of `Street`; docs/how-to/field.md shows one.
 """
 
 from __future__ import annotations
 
 import contextlib
-import ctypes
 import math
-import os
-import signal
-import socket
-import subprocess
-import sys
-import tempfile
 import time
 from collections import defaultdict
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from pathlib import Path
 from types import TracebackType
 from typing import Any, Literal, NamedTuple, Protocol
 
@@ -28,16 +20,14 @@ from traci.exceptions import FatalTraCIError, TraCIException
 
 from ugat_marl.effects import late_greens
 from ugat_marl.errors import OptionError, SimulatorError
+from ugat_marl.files import OwnDirectory
 from ugat_marl.scenarios import Scenario
-from ugat_marl.simulation import Trips, launch_of, read_trips
+from ugat_marl.simulation import ProcessSimulator, Trips, launch_of
 
 CountSource = Literal["lanes", "areas"]
 """Source of SUMO's counts: whole lanes, or its lane-area detectors."""
 
 _RETRY_S = 0.05
-
-_PATIENCE_S = 10.0
-_DIE_WITH_PARENT = 1  # PR_SET_PDEATHSIG of <linux/prctl.h>
 
 
 class LaneCount(NamedTuple):
@@ -90,8 +80,8 @@ class TraciStreet:
         host: The machine it runs on.
         detectors: Whether to count on whole lanes, as the environments do, or on the simulation's
             lane-area detectors (E2), several on a lane added up; lanes without one are not counted.
-        process: SUMO's process, if it is a child of this one, so that its end is noticed.
-        patience_s: How long to wait for SUMO to listen.
+        patience_s: Time for which to wait for SUMO to listen, s.
+        answer_s: Time within which SUMO has to answer, s; then the street counts as gone.
 
     Raises:
         SimulatorError: No SUMO listens, or it runs another network.
@@ -104,11 +94,13 @@ class TraciStreet:
         host: str = "localhost",
         *,
         detectors: CountSource = "lanes",
-        process: subprocess.Popen[bytes] | None = None,
         patience_s: float = 10.0,
+        answer_s: float = 60.0,
     ) -> None:
         self._where = f"{host}:{port}"
-        self._connection = _connected(port, host, process, patience_s)
+        self._connection = _connected(port, host, patience_s)
+        self._connection._socket.settimeout(answer_s)
+        self._answer_s = answer_s
         self._time_s, self._amid = 0.0, False
         try:
             self._subscribe(lanes, detectors)
@@ -185,15 +177,16 @@ class TraciStreet:
             self._amid = False
         except (TraCIException, FatalTraCIError, OSError) as error:
             self.close()
-            raise SimulatorError(f"{action} ({self._where}): {error}") from None
+            raise SimulatorError(
+                f"{action} ({self._where}): {error} (or there was no answer for "
+                f"{self._answer_s:g} s)"
+            ) from None
 
 
 _COUNTED = (tc.LAST_STEP_VEHICLE_NUMBER, tc.LAST_STEP_VEHICLE_HALTING_NUMBER)
 
 
-def _connected(
-    port: int, host: str, process: subprocess.Popen[bytes] | None, patience_s: float
-) -> Any:
+def _connected(port: int, host: str, patience_s: float) -> Any:
     """Return a connection that is not in traci's pool, because the pool belongs to the user."""
     connect: Callable[..., Any] = traci.connect
     until = time.monotonic() + patience_s
@@ -201,68 +194,43 @@ def _connected(
         try:
             return connect(port, 0, host)
         except (TraCIException, FatalTraCIError, OSError) as error:
-            ended = process is not None and process.poll() is not None
-            if ended or time.monotonic() > until:
-                why = "it has ended" if ended else f"nobody listened for {patience_s:g} s"
+            if time.monotonic() > until:
                 raise SimulatorError(
-                    f"no connection to SUMO at {host}:{port}, {why} ({error}); start it with "
-                    f"--remote-port {port}, or let --start do so"
+                    f"no connection to SUMO at {host}:{port}, nobody listened for {patience_s:g} s "
+                    f"({error}); start it with --remote-port {port}, or use --start"
                 ) from None
             time.sleep(_RETRY_S)
 
 
-class StartedSumo:
-    """Scenario in a ``sumo --remote-port`` that runs as long as the ``with`` block.
+class SimulatedStreet:
+    """Scenario in a SUMO of its own, as the street, for as long as the ``with`` block.
 
-    SUMO ends when its one client closes the connection. Under Linux it also ends when this process
-    dies.
+    SUMO runs in a confined process (`ugat_marl.simulation.ProcessSimulator`) and opens no port.
 
     Args:
         scenario: The scenario, in its domain.
         seed: SUMO's seed.
-        port: Port to listen on; None for a free one.
-
-    Attributes:
-        port: Port on which SUMO listens.
-        process: SUMO's process.
+        lanes: Lanes to count on.
 
     Raises:
         OptionError: The scenario's lights turn green late, which SUMO does not do by itself.
     """
 
-    def __init__(self, scenario: Scenario, seed: int, port: int | None = None) -> None:
+    def __init__(self, scenario: Scenario, seed: int, lanes: Sequence[str]) -> None:
         if late := late_greens(scenario):
             raise OptionError(
                 f"scenario {scenario.id!r}: traffic light {next(iter(late))!r} turns green late, "
                 "which only the environments do; start SUMO in another domain"
             )
-        self.port = port or _free_port()
-        self._scenario, self._seed = scenario, seed
+        self._scenario, self._seed, self._lanes = scenario, seed, tuple(lanes)
 
-    def __enter__(self) -> StartedSumo:
-        self._directory = tempfile.TemporaryDirectory(prefix="ugat_marl-field-")
-        place = Path(self._directory.name)
-        launch = launch_of(self._scenario, self._seed, place, ())
-        launch.write()
-        self._trips = place / Path(_value_of("--tripinfo-output", launch.arguments)).name
-        self.process: subprocess.Popen[bytes] = subprocess.Popen(
-            launch.command(port=self.port),
-            stdin=subprocess.DEVNULL,
-            stdout=subprocess.DEVNULL,
-            stderr=subprocess.DEVNULL,
-            start_new_session=True,  # Ctrl-C reaches only this process, which then ends SUMO
-            preexec_fn=_tied_to(os.getpid()) if sys.platform == "linux" else None,
-        )
+    def __enter__(self) -> SimulatedStreet:
+        self._directory = OwnDirectory()
+        launch = launch_of(self._scenario, self._seed, self._directory.fresh(), self._lanes)
+        self._simulator = ProcessSimulator()
+        self._asked: dict[str, str] = {}
+        self._snapshot = self._simulator.start(launch)
         return self
-
-    def trips(self) -> Trips:
-        """Return the trips of every vehicle due; the client must have closed the connection.
-
-        Raises:
-            SimulatorError: SUMO has not written the trips.
-        """
-        self._wait()
-        return read_trips(self._trips)
 
     def __exit__(
         self,
@@ -270,35 +238,35 @@ class StartedSumo:
         error: BaseException | None,
         trace: TracebackType | None,
     ) -> None:
-        self.process.kill()  # its files are deleted below, so it need not write them
-        self._wait()
-        self._directory.cleanup()
+        self._simulator.close()
+        self._directory.remove()
 
-    def _wait(self) -> None:
-        try:
-            self.process.wait(_PATIENCE_S)
-        except subprocess.TimeoutExpired:
-            self.process.kill()
-            self.process.wait()
+    def now_s(self) -> float:
+        """Return the simulation's time, s."""
+        return self._snapshot.time_s
 
+    def shown(self) -> dict[str, str]:
+        """Return traffic light to its state; SUMO's lights show at once what they are asked for."""
+        return self._simulator.signals() | self._asked
 
-def _value_of(option: str, arguments: tuple[str, ...]) -> str:
-    return arguments[arguments.index(option) + 1]
+    def read(self) -> dict[str, LaneCount]:
+        """Return the counts at the end of the last step."""
+        seen = self._snapshot
+        rows = zip(self._lanes, seen.vehicles.tolist(), seen.halting.tolist(), strict=True)
+        return {lane: LaneCount(seen.time_s, *row) for lane, *row in rows}
 
+    def show(self, states: Mapping[str, str]) -> None:
+        """Set the lights from the begin of the next step."""
+        self._asked |= states
 
-def _free_port() -> int:
-    with socket.socket() as probe:
-        probe.bind(("localhost", 0))
-        return int(probe.getsockname()[1])
+    def wait(self, until_s: float) -> None:
+        """Simulate until `until_s`."""
+        seconds = until_s - self.now_s()
+        if seconds > 0:
+            plans = {light: [(seconds, state)] for light, state in self._asked.items()}
+            self._snapshot = self._simulator.advance(seconds, plans)
+            self._asked = {}
 
-
-def _tied_to(parent: int) -> Callable[[], None]:
-    """Return a function to run in the child process: the child is killed when `parent` dies."""
-    prctl: Any = ctypes.CDLL(None).prctl  # loaded here, since little is allowed after the fork
-
-    def tie() -> None:
-        prctl(_DIE_WITH_PARENT, int(signal.SIGKILL))
-        if os.getppid() != parent:
-            os._exit(1)
-
-    return tie
+    def trips(self) -> Trips:
+        """End the simulation; return the trips of every vehicle due."""
+        return self._simulator.finish()

@@ -1,8 +1,9 @@
-"""Confinement of a process by Linux (Landlock): what SUMO may read and write, and to which ports.
+"""Confinement of a process by Linux (Landlock): what SUMO may read and write.
 
 A scenario's files may name other files. `ugat_marl.scenarios.admission` lists what they may say;
 beneath that list the kernel holds the process of a simulation to the scenario's own files, SUMO's
 data and the folder of the simulation. It holds SUMO's converters to their folder in the same way.
+None of them opens or reaches a TCP port.
 
 The file is a program too, for ``sumo``, ``netconvert`` and the like: it confines itself and becomes
 the other program. It therefore imports nothing of the package.
@@ -25,7 +26,7 @@ from typing import Any
 
 _CREATE_RULESET, _ADD_RULE, _RESTRICT_SELF = 444, 445, 446
 _VERSION = 1
-_PATH_BENEATH, _NET_PORT = 1, 2
+_PATH_BENEATH = 1
 _NO_NEW_PRIVILEGES = 38
 
 _EXECUTE, _WRITE_FILE, _READ_FILE, _READ_DIR = (1 << bit for bit in range(4))
@@ -55,7 +56,6 @@ def confinement_missing() -> str:
 def confine(
     reads: Iterable[str],
     writes: Iterable[str],
-    ports: Iterable[int] = (),
     programs: Iterable[str] | None = None,
 ) -> str:
     """Confine the calling thread, and what it starts, for the rest of its life.
@@ -65,7 +65,6 @@ def confine(
     Args:
         reads: Files and folders to read, besides Python and SUMO themselves.
         writes: Folders to read and write.
-        ports: TCP ports to listen on; no other port can be opened or reached.
         programs: Folders of Python, its packages and SUMO; None for those of this process.
 
     Returns:
@@ -94,9 +93,6 @@ def confine(
         _allow(ruleset, ("/dev/null",), _READ_FILE | _WRITE_FILE)
         _allow(ruleset, reads, reading)
         _allow(ruleset, writes, on_files & ~_EXECUTE)
-        if version >= 4:
-            for port in ports:
-                _checked(_ADD_RULE, ruleset, _NET_PORT, struct.pack("=QQ", _BIND_TCP, port), 0)
         libc = _libc()
         if libc.prctl(_NO_NEW_PRIVILEGES, 1, 0, 0, 0):
             raise OSError(ctypes.get_errno(), "prctl")
@@ -107,7 +103,7 @@ def confine(
 
 
 def confined_command(
-    command: Sequence[str], reads: Sequence[str], writes: Sequence[str], ports: Sequence[int] = ()
+    command: Sequence[str], reads: Sequence[str], writes: Sequence[str]
 ) -> list[str]:
     """Return a command line that runs `command` confined; the command itself where that is missing.
 
@@ -115,12 +111,11 @@ def confined_command(
         command: A program and its options.
         reads: Files and folders to read.
         writes: Folders to read and write.
-        ports: TCP ports to listen on.
     """
     if confinement_missing():
         return [*command]
     # Without site, which takes most of its start, Python does not know its packages.
-    rules = json.dumps([[*reads], [*writes], [*ports], _programs()])
+    rules = json.dumps([[*reads], [*writes], _programs()])
     return [sys.executable, "-I", "-S", __file__, rules, *command]
 
 

@@ -88,21 +88,14 @@ class Launch:
         for name, content in self.files:
             write_whole(Path(self.directory) / name, content)
 
-    def command(self, *options: str, port: int | None = None) -> list[str]:
+    def command(self, *options: str) -> list[str]:
         """Return a command line for the program ``sumo``, confined as in `confine`.
 
         Args:
             options: Further options of SUMO.
-            port: TCP port on which SUMO listens, or None.
         """
-        ports = [] if port is None else [port]
-        further = [] if port is None else ["--remote-port", str(port)]
-        return confined_command(
-            [str(sumo_program("sumo")), *self.arguments, *options, *further],
-            self.reads,
-            self._writable,
-            ports,
-        )
+        command = [str(sumo_program("sumo")), *self.arguments, *options]
+        return confined_command(command, self.reads, self._writable)
 
     def confine(self) -> None:
         """Confine this thread to the files of this simulation, where the system can do that.
