@@ -209,11 +209,15 @@ class Worker:
         """Start a new interpreter; messages use its standard input and output."""
         said = tempfile.TemporaryFile()  # noqa: SIM115 - stays open as long as the worker
         command = _command("spawned", service, str(os.getpid()), json.dumps(order))
-        # A session of its own, so that Ctrl-C reaches only the user's process, which ends this one.
-        options: dict[str, Any] = {"env": _environment(defaults), "start_new_session": True}
+        variables = _environment(defaults)
+        process: subprocess.Popen[bytes]
         if os.name == "nt":  # pipes, and no deadline
             process = subprocess.Popen(
-                command, stdin=subprocess.PIPE, stdout=subprocess.PIPE, stderr=said, **options
+                command,
+                stdin=subprocess.PIPE,
+                stdout=subprocess.PIPE,
+                stderr=said,
+                env=variables,
             )
             assert process.stdin is not None
             assert process.stdout is not None
@@ -221,7 +225,14 @@ class Worker:
             return cls(channel, said, process.pid, deadline_s, process)
         mine, its = socket.socketpair()
         with its:
-            process = subprocess.Popen(command, stdin=its, stdout=its, stderr=said, **options)
+            process = subprocess.Popen(
+                command,
+                stdin=its.fileno(),
+                stdout=its.fileno(),
+                stderr=said,
+                env=variables,
+                start_new_session=True,  # so Ctrl-C reaches only the user's process
+            )
         return cls(_channel_of(mine, deadline_s), said, process.pid, deadline_s, process)
 
     @property
