@@ -34,7 +34,7 @@ from ugat_marl.experiments.evaluation import (
 )
 from ugat_marl.experiments.queues import QUEUES, QueueRecord
 from ugat_marl.experiments.randomised import randomised_env
-from ugat_marl.experiments.settings import DIRECT, Setting
+from ugat_marl.experiments.settings import DIRECT, Setting, file_hash
 from ugat_marl.experiments.training import Effort, simulated_worlds, train_grounded, train_through
 from ugat_marl.experiments.tuning import TUNED_RULES, VERSION, tuned_rules
 from ugat_marl.files import read_json, write_whole
@@ -224,11 +224,6 @@ def file_names(names: Iterable[str]) -> list[str]:
         candidates = [stem, *(f"{stem}-{k}" for k in range(2, len(files) + 2))]
         files.append(next(file for file in candidates if file not in files))
     return files
-
-
-def file_hash(path: Path) -> str:
-    """Return the SHA-256 of a file's content, so that the file may be moved."""
-    return hashlib.sha256(path.read_bytes()).hexdigest()
 
 
 @functools.cache

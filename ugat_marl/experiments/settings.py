@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import hashlib
 from dataclasses import asdict, dataclass, field
+from pathlib import Path
 from typing import Any, Literal, get_args
 
 from ugat_marl.errors import OptionError, UnknownNameError
@@ -48,6 +50,19 @@ MOST_DELAY_S = 5
 
 CHANGE_COST = 5.0
 """Cost of a change of phase of the recipe "penalty", in halting vehicles."""
+
+
+def file_hash(path: Path) -> str:
+    """Return the SHA-256 of a file's content, so that the file may be moved.
+
+    Raises:
+        OptionError: The file cannot be read.
+    """
+    try:
+        return hashlib.sha256(path.read_bytes()).hexdigest()
+    except OSError as error:
+        raise OptionError(f"{path}: {error.strerror}; name a file that can be read") from None
+
 
 Recipe = Literal[
     "direct",
@@ -115,10 +130,14 @@ class LearnerSpec:
         """Name and settings of the learner, and the library of a baseline.
 
         Raises:
-            OptionError: The learner's library is not installed.
+            OptionError: The learner's library is not installed, or the file of weights to begin
+                with cannot be read.
         """
         if self.name in SUITE_LEARNERS:
-            return {"name": self.name, "settings": asdict(suite_config(self.name, self.dqn))}
+            settings = asdict(suite_config(self.name, self.dqn))
+            if self.dqn.start is not None:
+                settings["start"] = file_hash(Path(self.dqn.start))
+            return {"name": self.name, "settings": settings}
         if is_own(self.name):
             return {"name": self.name, "settings": list(self.settings)}
         settings = baseline_settings(self.name, self.settings)

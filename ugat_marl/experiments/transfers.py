@@ -36,7 +36,6 @@ from ugat_marl.experiments.jobs import (
     Job,
     Record,
     evaluation_seeds,
-    file_hash,
     file_names,
     worlds_of,
 )
@@ -54,6 +53,7 @@ from ugat_marl.experiments.settings import (
     RULE,
     LearnerSpec,
     Setting,
+    file_hash,
 )
 from ugat_marl.experiments.tuning import LEAST_BUDGET, TUNED_RULES
 from ugat_marl.files import require_writable, write_whole

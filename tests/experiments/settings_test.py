@@ -1,0 +1,28 @@
+"""Identity of a learner: what decides its policy, and nothing else."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import pytest
+
+from ugat_marl.errors import OptionError
+from ugat_marl.experiments.settings import LearnerSpec
+from ugat_marl.policies import DQNConfig
+
+
+def test_weights_to_begin_with_count_by_their_content(tmp_path: Path) -> None:
+    def identity(name: str, content: bytes) -> object:
+        path = tmp_path / name
+        path.write_bytes(content)
+        start = DQNConfig(network="universal", hidden=(48, 48), start=str(path))
+        return LearnerSpec("universal", (), start).identity
+
+    assert identity("a.pt", b"one") == identity("moved.pt", b"one")
+    assert identity("a.pt", b"one") != identity("a.pt", b"other")
+
+
+def test_missing_weights_are_one_line() -> None:
+    spec = LearnerSpec("universal", (), DQNConfig(network="universal", start="no.pt"))
+    with pytest.raises(OptionError, match=r"no\.pt: No such file"):
+        _ = spec.identity
