@@ -10,6 +10,8 @@ green at its beginning.
 
 A value is covered if the 90 % interval of its draws holds it. A value at the end of its range is
 covered by an interval that ends there.
+
+The statistics of all episodes are kept in the folder ``--out`` and read again by the same command.
 """
 
 from __future__ import annotations
@@ -18,6 +20,7 @@ import argparse
 import contextlib
 from collections.abc import Sequence
 from dataclasses import dataclass
+from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
@@ -28,6 +31,7 @@ from ugat_marl import parallel_env
 from ugat_marl.data import TransitionLog
 from ugat_marl.effects import load_scenario
 from ugat_marl.experiments import policy_factory
+from ugat_marl.files import replacing
 from ugat_marl.grounding import (
     FittedService,
     LaneView,
@@ -40,6 +44,8 @@ from ugat_marl.grounding import (
     Worlds,
     street_prior,
 )
+from ugat_marl.grounding.summaries import Summary
+from ugat_marl.policies import Policy
 from ugat_marl.progress import Bars
 from ugat_marl.seeding import derive_seed, numpy_generator
 
@@ -143,49 +149,86 @@ def answers(
     return asked
 
 
-def study(
-    name: str, number: int, simulations: int, policy: str, seed: int, jobs: int | None
-) -> list[Asked]:
+def study(network: Network, number: int, simulations: int, seed: int, kept: Path) -> list[Asked]:
     """Simulate worlds and streets of a network; return all answers.
 
     Args:
-        name: The scenario.
+        network: The network, and who acts on it.
         number: Number of streets.
         simulations: Number of worlds for the posterior.
-        policy: Rule that acts in worlds and streets.
         seed: Root of all random choices.
-        jobs: Simulations at a time.
+        kept: File of the statistics of all episodes; they are read if it exists.
     """
-    scenario = load_scenario(name)
-    with contextlib.closing(parallel_env(scenario, observation="movements")) as env:
-        worlds = street_prior(env, StreetConfig(parts=("service", "effects")))
-        view, acting = LaneView.of(env.network, "movements"), policy_factory(policy)(env)
-    simulation = Simulation(scenario, "sim", {"observation": "movements"}, EPSILON, jobs)
+    worlds = network.worlds
     streets = streets_of(worlds, number, seed)
     values = [worlds.draw(derive_seed(seed, "world", k)) for k in range(simulations)]
-    values += [value for _, value in streets for _ in range(2)]  # two episodes of each street
-    drawn = [
-        StreetWorld(worlds.effects(v), (FittedService(worlds.lanes, v.service_s),)) for v in values
-    ]
-    seeds = [derive_seed(seed, "episode", k) for k in range(len(drawn))]
-    with Bars(Console(stderr=True)).task(name, len(drawn)) as advance:
-        logs = simulation.logs(drawn, acting, seeds, 1800.0, advance)
-    known = [
-        Simulated(value, view.summary(log))
-        for value, log in zip(values[:simulations], logs[:simulations], strict=True)
-    ]
+    if not kept.exists():
+        of_streets = [value for _, value in streets for _ in range(2)]  # two episodes of each
+        logs = network.play([*values, *of_streets], seed)
+        pairs = range(simulations, len(logs), 2)
+        logs = [*logs[:simulations], *(TransitionLog.concatenate(logs[k : k + 2]) for k in pairs)]
+        summaries = [network.view.summary(log) for log in logs]
+        every = np.ones_like(summaries[0].rows, dtype=np.bool_)
+        stacked = {
+            "values": np.stack([x.values for x in summaries]),
+            "rows": np.stack([x.rows for x in summaries]),
+            "usable": np.stack([every if x.usable is None else x.usable for x in summaries]),
+        }
+        with replacing(kept) as part, part.open("wb") as file:
+            np.savez(file, **stacked)
+    with np.load(kept, allow_pickle=False) as file:
+        columns = [file[name] for name in ("values", "rows", "usable")]
+    summaries = [Summary(*one) for one in zip(*columns, strict=True)]
+    known = [Simulated(v, x) for v, x in zip(values, summaries[:simulations], strict=True)]
     several = [worlds.draw(derive_seed(seed, "blind", k)) for k in range(400)]
     prior = (
         np.stack([value.effects for value in several]),
         np.stack([value.service_s.mean(0) for value in several]),
     )
     asked: list[Asked] = []
-    for k, (kind, truth) in enumerate(streets):
-        at = simulations + 2 * k
-        log = TransitionLog.concatenate(logs[at : at + 2])
-        posterior = Posterior.fit(worlds, known, view.summary(log))
-        asked += answers(posterior, kind, truth, prior)
+    for (kind, truth), summary in zip(streets, summaries[simulations:], strict=True):
+        asked += answers(Posterior.fit(worlds, known, summary), kind, truth, prior)
     return asked
+
+
+@dataclass(frozen=True)
+class Network:
+    """A network, its prior, and who acts on it.
+
+    Attributes:
+        name: The scenario.
+        worlds: Prior of the worlds.
+        view: Lanes of the network.
+        acting: Policy that acts in worlds and streets.
+        simulation: The simulation.
+    """
+
+    name: str
+    worlds: Worlds
+    view: LaneView
+    acting: Policy
+    simulation: Simulation
+
+    @classmethod
+    def of(cls, name: str, policy: str, jobs: int | None) -> Network:
+        """Return a scenario on which a rule acts, with so many simulations at a time."""
+        scenario = load_scenario(name)
+        with contextlib.closing(parallel_env(scenario, observation="movements")) as env:
+            worlds = street_prior(env, StreetConfig(parts=("service", "effects")))
+            view, acting = LaneView.of(env.network, "movements"), policy_factory(policy)(env)
+        simulation = Simulation(scenario, "sim", {"observation": "movements"}, EPSILON, jobs)
+        return cls(name, worlds, view, acting, simulation)
+
+    def play(self, values: Sequence[Values], seed: int) -> list[TransitionLog]:
+        """Return the log of half an hour in each world."""
+        lanes = self.worlds.lanes
+        drawn = [
+            StreetWorld(self.worlds.effects(v), (FittedService(lanes, v.service_s),))
+            for v in values
+        ]
+        seeds = [derive_seed(seed, "episode", k) for k in range(len(drawn))]
+        with Bars(Console(stderr=True)).task(self.name, len(drawn)) as advance:
+            return self.simulation.logs(drawn, self.acting, seeds, 1800.0, advance)
 
 
 def table(asked: Sequence[Asked]) -> str:
@@ -236,9 +279,14 @@ def main() -> None:
     parser.add_argument("--policy", default="max-pressure:10")
     parser.add_argument("--seed", type=int, default=0)
     parser.add_argument("--jobs", type=int)
+    parser.add_argument("--out", type=Path, default=Path("runs/posterior-coverage"))
     given = parser.parse_args()
     for name in given.scenarios:
-        asked = study(name, given.streets, given.simulations, given.policy, given.seed, given.jobs)
+        stem = f"{name}-{given.policy.replace(':', '-')}-s{given.seed}"
+        kept = given.out / f"{stem}-{given.simulations}-{given.streets}.npz"
+        kept.parent.mkdir(parents=True, exist_ok=True)
+        network = Network.of(name, given.policy, given.jobs)
+        asked = study(network, given.streets, given.simulations, given.seed, kept)
         print(f"## {name}\n\n{table(asked)}\n", flush=True)
 
 

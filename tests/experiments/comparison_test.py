@@ -104,7 +104,7 @@ def test_bars_are_told_apart_within_the_picture(shared: str, tmp_path: Path) -> 
     rows += [replace(row, domain="sim") for row in rows]
     found = Comparison("toy", "0" * 8, "sim", tuple(rows), {})
     path = tmp_path / "gaps.png"
-    gap_picture(found, path)
+    gap_picture(found.rows(), path)
     pixels = matplotlib.image.imread(path)[-130:, :, :3]
     edges = np.concatenate((pixels[:, :3], pixels[:, -3:]), axis=1)
     assert pixels.min() < 0.5 and edges.min() == 1.0  # a legend, and none of it cut off

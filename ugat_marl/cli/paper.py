@@ -14,13 +14,11 @@ from ugat_marl.data import write_csv
 from ugat_marl.errors import OptionError
 from ugat_marl.experiments import (
     DIRECT,
-    GROUNDED_NAME,
     Comparison,
     PaperConfig,
     compare,
     file_stem,
     machine_facts,
-    matched_name,
 )
 from ugat_marl.files import require_writable, write_whole
 from ugat_marl.policies import device_of
@@ -28,8 +26,7 @@ from ugat_marl.progress import Bars
 from ugat_marl.reporting import (
     comparison_csv,
     comparison_page,
-    comparison_radar,
-    gap_picture,
+    draw_table,
     seeds_csv,
     terminal_tables,
 )
@@ -168,7 +165,4 @@ def _write(comparison: Comparison, title: str, folder: Path) -> None:
     write_whole(folder / "table.md", page + "\n")
     write_csv(folder / "table.csv", comparison_csv(comparison))
     write_csv(folder / "seeds.csv", seeds_csv(comparison))
-    grounded = [*GROUNDED_NAME.values(), matched_name("timed")]
-    drawn = [DIRECT, *(name for name in grounded if name in comparison.settings)]
-    comparison_radar(comparison, drawn, folder / "radar.png")
-    gap_picture(comparison, folder / "gaps.png")
+    draw_table(comparison.rows(), comparison.sim, folder)

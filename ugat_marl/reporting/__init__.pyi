@@ -1,9 +1,10 @@
 from .charts import calibration_picture as calibration_picture
-from .charts import comparison_radar as comparison_radar
+from .charts import draw_table as draw_table
 from .charts import gap_picture as gap_picture
 from .charts import transfer_picture as transfer_picture
 from .comparison_tables import comparison_csv as comparison_csv
 from .comparison_tables import comparison_page as comparison_page
+from .comparison_tables import read_rows as read_rows
 from .comparison_tables import seeds_csv as seeds_csv
 from .comparison_tables import terminal_tables as terminal_tables
 from .diagnosis_page import commands_on_page as commands_on_page

@@ -11,7 +11,14 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ugat_marl.data import Metrics
-from ugat_marl.experiments import Comparison, Evaluation, Interval, means_by_step, means_by_stretch
+from ugat_marl.experiments import (
+    DIRECT,
+    GROUNDED_NAME,
+    Evaluation,
+    matched_name,
+    means_by_step,
+    means_by_stretch,
+)
 from ugat_marl.reporting.figures import (
     TOP,
     WIDTH,
@@ -231,9 +238,12 @@ def scores_picture(
 
 def _draw_estimates(
     axes: Any, labels: Sequence[str], series: Mapping[str, Sequence[Estimated]], unit: str,
-    *, named: bool = True,
+    letters: int = 26,
 ) -> None:  # fmt: skip
-    """Draw a row for every label, and in each row a dot with an interval for every series."""
+    """Draw a row for every label, and in each row a dot with an interval for every series.
+
+    Labels have no more than `letters` letters; with 0 they are left out.
+    """
     from matplotlib.ticker import FuncFormatter, MaxNLocator
 
     for number, (group, estimates) in enumerate(series.items()):
@@ -247,7 +257,7 @@ def _draw_estimates(
             (dot,) = axes.plot(mean, place + shift, **style, markersize=8, zorder=3)
             add_tip(dot, f"{label}, {group}: {tick_text(mean)} {unit}")
     axes.set_ylim(len(labels) - 0.5, -0.5)
-    texts = [printable(shortened(label, 26)) for label in labels] if named else [""] * len(labels)
+    texts = [printable(shortened(label, letters)) if letters else "" for label in labels]
     axes.set_yticks(range(len(labels)), texts, color=LIGHT["ink"])
     axes.grid(visible=False, axis="y")
     axes.xaxis.set_major_locator(MaxNLocator(5))
@@ -309,41 +319,69 @@ def _draw_policies(axes: Any, evaluation: Evaluation) -> None:
     axes.set_title(title, color=LIGHT["soft"], x=-178 / _points_wide(axes))
 
 
+def draw_table(rows: Sequence[Mapping[str, Any]], sim: str, folder: Path) -> None:
+    """Draw a table of the paper: ``gaps.png``, and ``radar.png`` with direct transfer and UGAT.
+
+    Args:
+        rows: Rows of the table, as of `Comparison.rows` or `read_rows`.
+        sim: The simulation.
+        folder: Folder for the pictures.
+    """
+    settings = _settings_and_targets(rows)[0]
+    grounded = [*GROUNDED_NAME.values(), matched_name("timed")]
+    drawn = [DIRECT, *(name for name in grounded if name in settings)]
+    comparison_radar(rows, drawn, sim, folder / "radar.png")
+    gap_picture(rows, folder / "gaps.png")
+
+
 @styled()
-def gap_picture(comparison: Comparison, path: Path) -> None:
+def gap_picture(rows: Sequence[Mapping[str, Any]], path: Path) -> None:
     """Draw the gaps of ATT and throughput with intervals over training seeds, as PNG.
 
     Args:
-        comparison: The comparison.
+        rows: Rows of a table, as of `Comparison.rows` or `read_rows`.
         path: File to write.
     """
-    below = legend_height(comparison.targets, 2 * WIDTH)
-    row = max(24.0, 11.0 * len(comparison.targets) + 6)
-    height = TOP + 8 + row * len(comparison.settings) + 48 + below
-    title = f"{comparison.scenario}: real domain minus simulation"
+    settings, targets = _settings_and_targets(rows)
+    below = legend_height(targets, 2 * WIDTH)
+    row_height = max(24.0, 11.0 * len(targets) + 6)
+    height = TOP + 8 + row_height * len(settings) + 48 + below
+    title = f"{rows[0]['scenario']}: real domain minus simulation"
     picture = new_picture("gaps", title, height, 2 * WIDTH)
+    by_cell = {(row["setting"], row["domain"]): row for row in rows}
     for place, (measure, label, unit) in enumerate(
         (
             ("att_s", "Δ of ATT, s; shorter is better", "s"),
             ("throughput", "Δ of throughput, veh; more is better", "veh"),
         )
     ):
-        side = (190.0, 375.0) if place == 0 else (2 * WIDTH - 355, 16.0)
+        side = (242.0, 352.0) if place == 0 else (2 * WIDTH - 335, 16.0)
         axes = add_axes(picture, side[0], TOP + 8, side[1], 48 + below)
+        names = [f"{measure}_gap{end}" for end in ("", "_low", "_high")]
         series = {
             target: [
-                _of(Interval.of(comparison.gaps(s, target, measure)))
-                if comparison.has(s, target)
-                else (math.nan, math.nan, math.nan)
-                for s in comparison.settings
+                (cell[0], cell[1], cell[2])
+                for setting in settings
+                for cell in [_numbers(by_cell.get((setting, target), {}), names)]
             ]
-            for target in comparison.targets
+            for target in targets
         }
-        _draw_estimates(axes, comparison.settings, series, unit, named=place == 0)
+        _draw_estimates(axes, settings, series, unit, letters=0 if place else 34)
         axes.axvline(0, color=LIGHT["soft"], linewidth=1)
         axes.set_xlabel(label, loc="right")
-    add_legend(picture, comparison.targets, lines=False)
+    add_legend(picture, targets, lines=False)
     write_png(picture, path)
+
+
+def _settings_and_targets(rows: Sequence[Mapping[str, Any]]) -> tuple[list[str], list[str]]:
+    """Return the settings and the domains of a table, in their order."""
+    settings, targets = (dict.fromkeys(row[key] for row in rows) for key in ("setting", "domain"))
+    return list(settings), list(targets)
+
+
+def _numbers(row: Mapping[str, Any], names: Sequence[str]) -> tuple[float, ...]:
+    """Return numbers of a row; nan for those it lacks."""
+    return tuple(float(row.get(name, math.nan)) for name in names)
 
 
 def _of(interval: Any) -> Estimated:
@@ -376,37 +414,36 @@ def radar_picture(
 
 
 @styled()
-def comparison_radar(comparison: Comparison, settings: Sequence[str], path: Path) -> None:
+def comparison_radar(
+    rows: Sequence[Mapping[str, Any]], settings: Sequence[str], sim: str, path: Path
+) -> None:
     """Draw the paper's five measures in sim and in each real domain, as PNG.
 
     Args:
-        comparison: The comparison.
+        rows: Rows of a table, as of `Comparison.rows` or `read_rows`.
         settings: Settings to draw. The first one is drawn in the simulation, too.
+        sim: The simulation.
         path: File to write.
     """
-    columns = min(len(comparison.targets), 2)
-    rows = math.ceil(len(comparison.targets) / columns)
-    legend = [f"{settings[0]} in {comparison.sim}", *(f"{s} in the real domain" for s in settings)]
+    targets = _settings_and_targets(rows)[1]
+    columns = min(len(targets), 2)
+    lines = math.ceil(len(targets) / columns)
+    legend = [f"{settings[0]} in {sim}", *(f"{s} in the real domain" for s in settings)]
     wide, high = 440.0, 310.0
     width = max(wide * columns, 560.0)
     below = legend_height(legend, width) + 12
-    title = "simulation against real domain; the rim is the best"
-    picture = new_picture(
-        "radar", f"{comparison.scenario}: {title}", TOP + high * rows + below, width
-    )
-    for place, target in enumerate(comparison.targets):
+    title = f"{rows[0]['scenario']}: simulation against real domain; the rim is the best"
+    picture = new_picture("radar", title, TOP + high * lines + below, width)
+    by_cell = {(row["setting"], row["domain"]): row for row in rows}
+    for place, target in enumerate(targets):
         left, top = wide * (place % columns), TOP + high * (place // columns)
         axes = add_axes(
             picture, left + 125, top + 70, width - left - wide + 125,
-            below + high * (rows - 1 - place // columns) + 50, projection="polar",
+            below + high * (lines - 1 - place // columns) + 50, projection="polar",
         )  # fmt: skip
-        lines = [(settings[0], comparison.sim), *((s, target) for s in settings)]
-        table = [
-            [float(comparison.values(s, target, m, domain).mean()) for m in MEASURES]
-            if comparison.has(s, target)
-            else [math.nan] * len(MEASURES)
-            for s, domain in lines
-        ]
+        cells = [by_cell.get((setting, target), {}) for setting in settings]
+        in_sim = [f"{measure}_sim" for measure in MEASURES]
+        table = [_numbers(cells[0], in_sim), *(_numbers(cell, MEASURES) for cell in cells)]
         _draw_radar(axes, table)
         axes.set_title(printable(target), x=-0.6, y=1.24, fontweight="bold")
     add_legend(picture, legend)
