@@ -6,7 +6,14 @@ import numpy as np
 import pytest
 
 from ugat_marl.errors import CheckpointError, UnknownNameError
-from ugat_marl.grounding.posterior import FittedService, Posterior, Simulated, Values, Worlds
+from ugat_marl.grounding.posterior import (
+    FittedService,
+    Posterior,
+    Simulated,
+    Values,
+    Worlds,
+    at_least_0,
+)
 from ugat_marl.grounding.summaries import NAMES, Summary
 
 LANES = tuple(f"lane_{k}" for k in range(8))
@@ -95,3 +102,19 @@ def test_a_posterior_survives_its_checkpoint_and_refuses_another_network() -> No
     assert np.array_equal(again.draw(4).effects, posterior.draw(4).effects)
     with pytest.raises(CheckpointError, match="another network"):
         Posterior.from_state(Worlds.of(LANES[:3]), posterior.state_dict())
+
+
+def test_values_at_least_0_by_hand() -> None:
+    given = np.array([[3.0, -1.0, 1.0], [-1.0, -2.0, 2.0], [1.0, 0.0, 0.0]])
+    # Means 1, -1, 1: of the first column 2.5 and 0.5 are left, of the second nothing.
+    expected = np.array([[2.5, 0.0, 1.0], [0.0, 0.0, 2.0], [0.5, 0.0, 0.0]])
+    np.testing.assert_allclose(at_least_0(given), expected)
+    many = np.random.default_rng(0).normal(0.3, 1.0, (50, 20))
+    np.testing.assert_allclose(at_least_0(many).mean(0), np.maximum(many.mean(0), 0.0), atol=1e-12)
+
+
+def test_a_street_without_unused_green_is_given_none_on_average() -> None:
+    """Noise of single lanes cancels: set to 0 one by one, it would add a third of its size."""
+    truth = Values(np.array([x.nominal for x in WORLDS.library]), np.zeros((len(LANES), 2)))
+    sample_s = Posterior.fit(WORLDS, SIMULATED, summary(truth, 5)).sample(400)[1]
+    assert np.quantile(sample_s[:, :, 0].mean(1), 0.05) == 0.0

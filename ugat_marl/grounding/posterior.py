@@ -282,10 +282,9 @@ class Posterior:
     def drawn(self, generator: np.random.Generator) -> Values:
         """Draw the values of a world with a generator."""
         row = int(generator.choice(len(self.chances), p=self.chances))
-        values = Values(
-            self.effects + self.effect_errors[row], self.service_s + self.service_errors_s[row]
-        )
-        return self.worlds.clipped(Values(values.effects, values.service_s * self.worlds.service))
+        effects = self.effects + self.effect_errors[row]
+        service_s = at_least_0(self.service_s + self.service_errors_s[row])
+        return self.worlds.clipped(Values(effects, service_s * self.worlds.service))
 
     def sample(self, number: int, seed: int = 0) -> tuple[Floats, Floats]:
         """Return effects ``(number, effects)`` and service ``(number, lanes, 2)`` of draws."""
@@ -327,6 +326,26 @@ class Posterior:
 
 
 _NUMBERS = ("effects", "service_s", "effect_errors", "service_errors_s", "chances")
+
+
+def at_least_0(service_s: Floats) -> Floats:
+    """Return the values nearest to the given ones that are not negative and have the same means.
+
+    Values that are only set to 0 where they are negative would have a higher mean: a street whose
+    lanes use all of their greens would be given red in each. The answer is the projection on a
+    simplex (Held, Wolfe and Crowder 1974): ``max(value - shift, 0)`` with one shift per column. All
+    of a column with a mean below 0 is 0.
+
+    Args:
+        service_s: ``(lanes, columns)``.
+    """
+    lanes = len(service_s)
+    total = np.maximum(service_s.sum(0), 0.0)
+    ordered = -np.sort(-service_s, axis=0)
+    shifts = (np.cumsum(ordered, axis=0) - total) / np.arange(1, lanes + 1)[:, None]
+    positive = (ordered > shifts).sum(0)
+    shift = shifts[np.maximum(positive, 1) - 1, np.arange(service_s.shape[1])]
+    return np.maximum(service_s - shift, 0.0) * (total > 0)
 
 
 def _mean(rows: Floats) -> Floats:
