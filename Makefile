@@ -1,6 +1,6 @@
 # Everything needs only Python 3.11 or newer (and make): the first call sets up .venv by itself.
 #
-#   make demo       trains a policy across the gap on a shipped network and prints the table
+#   make demo       trains a policy across the gap on a shipped network; table, page, film
 #   make test       builds the wheel, installs it into .venv and tests it
 #   make test-all   the same, and small versions of the paper's tables (an hour)
 #   make check      format, lint, types, architecture, words, tests
@@ -38,7 +38,11 @@ help:
 demo: environment
 	rm -rf runs/demo
 	OMP_NUM_THREADS=1 $(BIN)/ugat-marl train single-v1 --real V4 --out runs/demo --duration-s 1800 \
-		--street.simulations 80 --street.further 20 --evaluation-seeds 3 --tuning-seeds 1 $(ARGS)
+		--iterations 1 --street.simulations 80 --tuning-seeds 1 $(ARGS)
+	OMP_NUM_THREADS=1 $(BIN)/ugat-marl report runs/demo
+	OMP_NUM_THREADS=1 $(BIN)/ugat-marl rollout single-v1 --domain V4 --policy runs/demo/policies/direct-transfer.pt \
+		--beside runs/demo/policies/fitted-street.pt --video runs/demo/before-after.gif \
+		--film.from-s 1500 --film.length-s 60 --film.size 400
 
 test: environment-dev
 	UGAT_MARL_TEST_INSTALLED=1 OMP_NUM_THREADS=1 $(BIN)/python -m pytest -q -n $(JOBS) --dist worksteal $(TESTS) $(ARGS)

@@ -9,12 +9,13 @@ from pathlib import Path
 from typing import Annotated, ClassVar
 
 from rich.console import Console
+from rich.text import Text
 from tyro.conf import arg
 
 from ugat_marl.cli.arguments import RayAddress, workers_of
 from ugat_marl.data import METRICS_FILE, Metrics
 from ugat_marl.errors import OptionError
-from ugat_marl.experiments import TransferConfig, run_folder, transfer
+from ugat_marl.experiments import TransferConfig, outcome_of, run_folder, transfer
 from ugat_marl.progress import Bars
 from ugat_marl.reporting import calibration_picture, transfer_picture, transfer_table
 
@@ -80,6 +81,8 @@ class Train:
         transfer_picture(table, metrics, picture)
         calibration_picture(metrics, directory / "calibration.png")
         console.print(transfer_table(table))
+        if outcome := outcome_of(table):
+            console.print(Text(f"{outcome.sentence()}\n", "bold"))
         places = {
             "run": directory,
             "table": directory / "table.json",

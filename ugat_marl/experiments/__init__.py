@@ -11,6 +11,7 @@ interrupted ones. `train`, the tables of the UGAT paper, the learning curves of 
   scores and intervals.
 - `tuning`, `transfer_headroom`, `scenario_check`: the tuning of rules, and the check of scenarios
   with them.
+- `sim_check`, `transfer_outcome`: is a policy trained; what did grounding change?
 - `recording`: measured data of a domain.
 - `training_curves`: means of what trainings log.
 - `queues`: halting vehicles per intersection and minute.

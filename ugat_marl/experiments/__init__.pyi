@@ -73,6 +73,8 @@ from .training_curves import means_by_stretch as means_by_stretch
 from .transfer_headroom import HOLDS_S as HOLDS_S
 from .transfer_headroom import HeadroomRow as HeadroomRow
 from .transfer_headroom import measure_headroom as measure_headroom
+from .transfer_outcome import TransferOutcome as TransferOutcome
+from .transfer_outcome import outcome_of as outcome_of
 from .transfers import TRAININGS as TRAININGS
 from .transfers import TransferConfig as TransferConfig
 from .transfers import transfer as transfer

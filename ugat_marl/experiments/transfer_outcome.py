@@ -1,0 +1,80 @@
+"""Outcome of a transfer in one sentence: what grounding changed in the real domain, how surely."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+from ugat_marl.experiments.scores import Evaluation
+from ugat_marl.experiments.settings import DIRECT, GROUNDED_NAME
+from ugat_marl.experiments.statistics import PairedTest
+
+LEVEL = 0.05
+"""Level below which a difference is called shown."""
+
+
+@dataclass(frozen=True)
+class TransferOutcome:
+    """The grounded policy of a run beside direct transfer, in the real domain.
+
+    Attributes:
+        real: Name of the real domain.
+        policy: Name of the grounded policy.
+        att_s: Its mean ATT, s.
+        test: Its ATT minus that of direct transfer in episodes with the same vehicles, s.
+        rule: Name of the best rule there; "" if none was sought.
+        rule_s: Mean ATT of that rule, s; nan without one.
+    """
+
+    real: str
+    policy: str
+    att_s: float
+    test: PairedTest
+    rule: str
+    rule_s: float
+
+    @property
+    def shown(self) -> bool:
+        """True if chance between episodes does not explain the difference."""
+        return self.test.p < LEVEL
+
+    def sentence(self) -> str:
+        """Return the outcome in words."""
+        change, n = self.test.difference, self.test.count
+        begin = f"In {self.real} vehicles need {self.att_s:.3g} s with {self.policy}"
+        less = change.mean < 0
+        ends = sorted((abs(change.low), abs(change.high))) if self.shown else (0.0, 0.0)
+        if self.shown:
+            text = (
+                f"{begin}, {abs(change.mean):.3g} s {'less' if less else 'more'} than with direct "
+                f"transfer (95 % interval {ends[0]:.2g} to {ends[1]:.2g} s, p = {self.test.p:.1g}, "
+                f"{n} episodes with the same vehicles)"
+            )
+        elif math.isfinite(change.low):
+            text = (
+                f"{begin}; no difference from direct transfer is shown ({change.low:+.2g} to "
+                f"{change.high:+.2g} s, {n} episodes with the same vehicles)"
+            )
+        else:
+            text = f"{begin}, {change.mean:+.3g} s against direct transfer in a single episode"
+        if self.rule:
+            text += f"; the best rule there, {self.rule}, needs {self.rule_s:.3g} s"
+        return f"{text}."
+
+
+def outcome_of(evaluation: Evaluation) -> TransferOutcome | None:
+    """Compare the grounded policy of a run with direct transfer in the real domain.
+
+    Returns:
+        None if the run has no grounded policy, no direct transfer or no real domain.
+    """
+    grounded = [name for name in evaluation.policies if name in GROUNDED_NAME.values()]
+    if DIRECT not in evaluation.policies or not grounded or len(evaluation.domains) < 2:
+        return None
+    real, policy = evaluation.domains[1], grounded[0]
+    own, direct = (evaluation.values(name, real, "att_s") for name in (policy, DIRECT))
+    rule = evaluation.notes.get(f"best rule in {real}", "")
+    rule_s = evaluation.estimate(f"rule {rule}", real, "att_s").mean if rule else math.nan
+    return TransferOutcome(
+        real, policy, float(own.mean()), PairedTest.of(own, direct), rule, rule_s
+    )
