@@ -443,7 +443,7 @@ def comparison_radar(
         )  # fmt: skip
         cells = [by_cell.get((setting, target), {}) for setting in settings]
         in_sim = [f"{measure}_sim" for measure in MEASURES]
-        table = [_numbers(cells[0], in_sim), *(_numbers(cell, MEASURES) for cell in cells)]
+        table = [_numbers(cells[0], in_sim), *(_numbers(cell, list(MEASURES)) for cell in cells)]
         _draw_radar(axes, table)
         axes.set_title(printable(target), x=-0.6, y=1.24, fontweight="bold")
     add_legend(picture, legend)
