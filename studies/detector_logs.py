@@ -12,7 +12,7 @@ from __future__ import annotations
 
 import argparse
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
@@ -22,7 +22,6 @@ from ugat_marl.data import MeasuredData, TransitionLog
 from ugat_marl.effects import load_scenario
 from ugat_marl.experiments import policy_factory, record
 from ugat_marl.grounding import (
-    DetectionConfig,
     LaneView,
     Posterior,
     RecordedWorld,
@@ -72,18 +71,13 @@ def record_street(
     measured = record(
         scenario, domain, policy_factory(policy), periods=periods, duration_s=duration_s, lanes=True
     )
-    step_s = scenario.settings.step_length_s
-    assert measured.lanes is not None
-    # SUMO stamps positions and detections one step early against its signals.
-    lanes = measured.lanes.with_columns(time_s=measured.lanes["time_s"] + step_s)
-    measured = replace(measured, lanes=lanes)
     return _log(measured, scenario, domain, "best"), _log(measured, scenario, domain, "detections")
 
 
 def _log(measured: MeasuredData, scenario: Scenario, domain: str, source: str) -> TransitionLog:
-    network, config = Network.read(scenario), DetectionConfig(-scenario.settings.step_length_s)
+    network = Network.read(scenario)
     assert source in ("best", "detections")
-    return log_of_measured(measured, scenario, network, domain, "movements", source, config).log
+    return log_of_measured(measured, scenario, network, domain, "movements", source).log
 
 
 def errors(scenario: Scenario, lanes: TransitionLog, detectors: TransitionLog) -> list[LaneErrors]:

@@ -126,8 +126,8 @@ def texts(measured: MeasuredData) -> str:
 def test_a_log_counted_by_hand(imported: Import, csv: bool) -> None:
     read = imported(csv=csv)
     assert read.detectors == (
-        Detector("7:5", "S_C_0", 487.0, 0.0, "stop"),
-        Detector("advance west", "W_C_0", 440.0, 2.0, "advance"),
+        Detector("7:5", "S_C_0", 487.0, 0.0, "stop", clock="signals"),
+        Detector("advance west", "W_C_0", 440.0, 2.0, "advance", clock="signals"),
     )
     period = read.periods[0]
     assert (period.id, period.begin_s, period.end_s) == ("2024-03-05T0700", 0.0, 200.0)
@@ -137,6 +137,14 @@ def test_a_log_counted_by_hand(imported: Import, csv: bool) -> None:
     np.testing.assert_array_equal(stop.off_s, [35.9, 51.7])
     assert np.isnan(stop.speed_mps).all()
     np.testing.assert_array_equal(period.passages["advance west"].off_s, [33.4])
+
+
+def test_links_on_which_vehicles_may_go_on_red(imported: Import) -> None:
+    read = imported(mapping=MAPPING.replace('tls = "C"', 'tls = "C"\non_red = [1]'))
+    shown = tuple((since, state[0] + state[1].replace("r", "s")) for since, state in SIGNALS)
+    assert read.periods[0].signals == {"C": shown}
+    with pytest.raises(MeasuredDataError, match="link 2 does not exist"):
+        imported(mapping=MAPPING.replace('tls = "C"', 'tls = "C"\non_red = [2]'))
 
 
 def test_what_was_shown_before_the_log_begins_follows_from_its_first_events(
@@ -325,8 +333,8 @@ def test_a_recording_that_became_a_log_is_the_same_recording(
 
     channels = {"7:5": 5, "advance west": 6}
     detectors = (
-        Detector("7:5", "S_C_0", 487.0, 0.0, "stop"),
-        Detector("advance west", "W_C_0", 440.0, 2.0, "advance"),
+        Detector("7:5", "S_C_0", 487.0, 0.0, "stop", clock="signals"),
+        Detector("advance west", "W_C_0", 440.0, 2.0, "advance", clock="signals"),
     )
     days = tuple(
         Period(

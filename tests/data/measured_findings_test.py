@@ -28,10 +28,10 @@ from ugat_marl.scenarios import Detector, Network, Passages, Period, Scenario, r
 
 END = 7200.0
 DETECTORS = (
-    Detector("a", "S_C_0", 440.0, 0.0, "advance"),
-    Detector("s", "S_C_0", 487.0, 0.0, "stop"),
-    Detector("w", "W_C_0", 487.0, 0.0, "stop"),
-    Detector("x", "C_N_0", 5.0, 0.0, "exit"),
+    Detector("a", "S_C_0", 440.0, 0.0, "advance", clock="signals"),
+    Detector("s", "S_C_0", 487.0, 0.0, "stop", clock="signals"),
+    Detector("w", "W_C_0", 487.0, 0.0, "stop", clock="signals"),
+    Detector("x", "C_N_0", 5.0, 0.0, "exit", clock="signals"),
 )
 Rows = Callable[[pl.DataFrame], pl.DataFrame]
 

@@ -36,10 +36,10 @@ from ugat_marl.scenarios import (
 Change = Callable[[str], str]
 
 DETECTORS = (
-    Detector("a", "S_C_0", 40.0, 2.0, "advance"),
-    Detector("s", "S_C_0", 90.0, 0.0, "stop"),
-    Detector("w", "W_C_0", 90.0, 0.0, "stop"),
-    Detector("x", "C_N_0", 5.0, 0.0, "exit"),
+    Detector("a", "S_C_0", 40.0, 2.0, "advance", clock="signals"),
+    Detector("s", "S_C_0", 90.0, 0.0, "stop", clock="signals"),
+    Detector("w", "W_C_0", 90.0, 0.0, "stop", clock="signals"),
+    Detector("x", "C_N_0", 5.0, 0.0, "exit", clock="signals"),
 )
 SIGNALS = {"C": tuple((20.0 * i, ("Gr", "rG")[i % 2]) for i in range(10))}
 

@@ -86,7 +86,7 @@ def test_loops_report_the_speed_at_a_point(tmp_path: Path, point: str, speed: fl
     file.write_text(row.format("1.00", "enter", "4.00") + row.format("2.00", "leave", "8.00"))
     detector = Detector("a", "in_0", 5.0, 0.0, "stop")
     effect = DetectorSpeeds("a", point)  # pyright: ignore[reportArgumentType]
-    seen = read_passages(file, effect.installed([detector]), 0.0, 10.0)["a"]
+    seen = read_passages(file, effect.installed([detector]), 0.0, 10.0, 1.0)["a"]
     assert seen.speed_mps.tolist() == [speed]
 
 

@@ -66,10 +66,32 @@ def test_loops_count_the_cars_that_passed(by_hand: MeasuredData) -> None:
 
 def test_passages_have_times_speeds_and_lengths(by_hand: MeasuredData) -> None:
     seen = by_hand.periods[0].passages["advance:S_C_0"]
-    assert seen.on_s[0] == pytest.approx((440.0 - 5.1) / 10, abs=0.2)
+    # The car departs in the first step and is on the road, 5.1 m of it, at the end of the step.
+    assert seen.on_s[0] == pytest.approx(1 + (440.0 - 5.1) / 10, abs=0.02)
     assert (seen.off_s - seen.on_s)[0] == pytest.approx(5.0 / 10, abs=0.05)
     assert seen.speed_mps[0] == pytest.approx(10.0)
     assert (seen.length_m == 5.0).all()
+
+
+def test_the_first_of_a_queue_starts_when_its_light_turns_green(by_hand: MeasuredData) -> None:
+    """A car of 5 m stands at 489 m from 52 s on; its light is green from 60 s on."""
+    assert by_hand.trajectories is not None
+    assert by_hand.periods[0].signals["C"][3] == (60.0, "rG")
+    car = by_hand.trajectories.filter(pl.col("vehicle_id") == "east.0").sort("time_s")
+    stood = car.filter(pl.col("speed_mps") == 0.0)
+    assert stood["time_s"].to_list() == [52.0 + i for i in range(9)]
+    assert stood["position_m"].unique().to_list() == [489.0]
+    moving = car.filter(pl.col("time_s").is_between(61.0, 63.0))
+    assert moving["speed_mps"].to_list() == [2.5, 5.0, 7.5]  # 2.5 m/s² from 60 s on
+    # The rear is at 484 m and leaves the loop at 487.5 m: 2.5 m until 61 s, then 1 m at 5 m/s.
+    assert by_hand.periods[0].passages["stop:W_C_0"].off_s[0] == pytest.approx(61.2, abs=0.005)
+
+
+def test_the_clock_of_the_detectors_is_written(by_hand: MeasuredData, tmp_path: Path) -> None:
+    assert {detector.clock for detector in by_hand.detectors} == {"signals"}
+    directory = write_measured(by_hand, tmp_path / "measured")
+    table = pl.read_csv(directory / "detectors.csv")
+    assert table.columns[-1] == "clock" and set(table["clock"]) == {"signals"}
 
 
 def test_the_plan_of_the_controller_is_logged(by_hand: MeasuredData) -> None:

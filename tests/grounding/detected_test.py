@@ -12,9 +12,9 @@ from ugat_marl.grounding.detected import DetectionConfig, LaneCourse, LaneEstima
 from ugat_marl.scenarios import Detector, Lane, Passages, Period
 
 LANE = Lane("W_0", "W", 300.0, 10.0, ((0.0, 0.0), (300.0, 0.0)))
-ADVANCE = Detector("advance", "W_0", 250.0, 0.0, "advance")
-STOP = Detector("stop", "W_0", 297.5, 0.0, "stop")
-ENTRY = Detector("entry", "W_0", 10.0, 0.0, "exit")
+ADVANCE = Detector("advance", "W_0", 250.0, 0.0, "advance", clock="signals")
+STOP = Detector("stop", "W_0", 297.5, 0.0, "stop", clock="signals")
+ENTRY = Detector("entry", "W_0", 10.0, 0.0, "exit", clock="signals")
 
 
 def crossed(times_s: Sequence[float], speed_mps: float | Sequence[float] = 10.0) -> Passages:
@@ -197,6 +197,14 @@ def test_late_stamps_are_put_right() -> None:
     config = DetectionConfig(latency_s=2.0)
     (found,) = LaneEstimate([period], {"W_0": LANE}, [ADVANCE, STOP], config).incoming("W_0")
     assert found.leave_s == pytest.approx([40, 50])
+
+
+def test_stamps_of_sumos_output_are_a_step_early() -> None:
+    zones = [replace(one, clock="sumo") for one in (ADVANCE, STOP)]
+    period = Period("day", 0.0, 600.0, "fit", {}, free([10, 20]))
+    estimate = LaneEstimate([period], {"W_0": LANE}, zones, step_s=0.5)
+    (found,) = estimate.incoming("W_0")
+    assert found.leave_s == pytest.approx([40.5, 50.5])
 
 
 def test_greens_of_a_lane_join_what_goes_on() -> None:

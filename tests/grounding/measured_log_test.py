@@ -17,7 +17,6 @@ from ugat_marl.envs import parallel_env
 from ugat_marl.errors import MeasuredDataError, OptionError
 from ugat_marl.experiments import policy_factory, record
 from ugat_marl.grounding import (
-    DetectionConfig,
     LaneView,
     RecordedWorld,
     StreetConfig,
@@ -31,8 +30,6 @@ from ugat_marl.scenarios import Network, Scenario
 from ugat_marl.seeding import derive_seed
 
 POLICY = "fixed-time:20"
-STEP = DetectionConfig(latency_s=-1.0)
-"""Recordings are early by a simulation step."""
 
 
 @pytest.fixture(scope="module")
@@ -64,7 +61,7 @@ def truth(crossing: Scenario) -> TransitionLog:
 def imported(
     measured: MeasuredData, scenario: Scenario, observation: str = "count", **more: Any
 ) -> TransitionLog:
-    options: dict[str, Any] = {"source": "detections", "config": STEP, **more}
+    options: dict[str, Any] = {"source": "detections", **more}
     network = Network.read(scenario)
     return log_of_measured(measured, scenario, network, "street", observation, **options).log
 
@@ -97,9 +94,7 @@ def test_a_table_of_lanes_or_trajectories_takes_the_place_of_the_estimate(
     given = replace(
         measured, **{"lanes": None, "trajectories": None, kind: getattr(measured, kind)}
     )
-    # Positions are recorded a step early, too.
-    table = getattr(given, kind).with_columns(time_s=getattr(given, kind)["time_s"] + 1.0)
-    log = imported(replace(given, **{kind: table}), crossing, source="best")
+    log = imported(given, crossing, source="best")
     found, true = log.transitions(log.agents[0]), truth.transitions(truth.agents[0])
     assert len(found) == len(true)
     assert found.observation[1:].tolist() == true.observation[1:].tolist()
@@ -219,7 +214,7 @@ def test_the_command_writes_a_log_that_can_be_read(
     write_measured(replace(measured, lanes=None, trajectories=None), tmp_path / "main-street")
     out = tmp_path / "street.parquet"
     call = ["import-log", str(data / "crossing"), str(tmp_path / "main-street")]
-    assert main([*call, "--out", str(out), "--latency-s", "-1"]) == 0
+    assert main([*call, "--out", str(out)]) == 0
     said = capsys.readouterr().out
     assert "vehicles on a lane are estimated" in said and "transitions of 1 periods" in said
     log = TransitionLog.read(out)

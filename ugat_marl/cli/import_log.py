@@ -36,8 +36,7 @@ class ImportLog:
             universal reads movements.
         vehicles: Source of the vehicles on lanes: best (a table of lanes or trajectories if there
             is one, else detections) or detections.
-        latency_s: Delay of the detectors' stamps behind those of the signals, in s. Recordings of
-            SUMO (ugat-marl record) are early by one simulation step: -1.
+        latency_s: Constant delay of the detectors' stamps, in s; it is taken off them.
     """
 
     scenario: Annotated[Positional[str], arg(metavar="SCENARIO")]

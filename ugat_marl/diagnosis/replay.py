@@ -66,6 +66,7 @@ from ugat_marl.scenarios import (
 )
 from ugat_marl.seeding import derive_seed
 from ugat_marl.simulation import (
+    delayed,
     detectors_document,
     launch_of,
     one_line_message,
@@ -175,7 +176,7 @@ class Replay:
             came = period
             for error in self._detection:
                 came = error.undone(came, self._detectors)
-            scenario, due = self._arrivals.given(scenario, drivers, came)
+            scenario, due = self._arrivals.given(scenario, drivers, self._as_sumo_stamps(came))
         scenario = shift_parking(scenario, derive_seed(seed, "parking"))
         with tempfile.TemporaryDirectory(prefix="ugat_marl-") as name:
             directory = Path(name)
@@ -210,6 +211,15 @@ class Replay:
                     self._days.popitem(last=False)
             return day
 
+    def _as_sumo_stamps(self, period: Period) -> Period:
+        """Return a period with the stamps that SUMO, which lets vehicles depart, would give."""
+        step = self._scenario.settings.step_length_s
+        early = {d.id: (1 - d.steps_early) * step for d in self._detectors}
+        passages = {
+            name: delayed(seen, -early.get(name, 0.0)) for name, seen in period.passages.items()
+        }
+        return replace(period, passages=passages)
+
     def _run(
         self,
         scenario: Scenario,
@@ -243,7 +253,7 @@ class Replay:
             kind = SimulatorCrashed if done.returncode < 0 else SimulatorError
             raise kind(f"SUMO failed in a replay of period {period.id!r}: {said}")
         trips = read_trips(directory / "trips.xml")
-        seen = read_passages(loops, true, period.begin_s, period.end_s)
+        seen = read_passages(loops, true, period.begin_s, period.end_s, step)
         travel = float(np.mean(trips.travel_time_s)) if len(trips.travel_time_s) else np.nan
         return Day(replace(period, passages=seen), travel)
 

@@ -44,8 +44,7 @@ class DetectionConfig:
     """Numbers of the estimate.
 
     Attributes:
-        latency_s: Delay of the detectors' stamps behind those of the signals, in s; it is taken off
-            them. Recordings of SUMO are early by one simulation step.
+        latency_s: Delay of the detectors' stamps behind their clock, in s; it is taken off them.
         vehicle_m: Length of a vehicle whose length was not measured, in m.
         space_m: Length of a queued vehicle with its gap, in m.
         jam: Share of the free speed below which a vehicle at a detector is in a jam.
@@ -263,8 +262,10 @@ class _Crossings:
     length_m: Floats
 
     @classmethod
-    def of(cls, passages: Passages | None, zone_m: float, config: DetectionConfig) -> _Crossings:
-        """Fill in unknown times, speeds and lengths."""
+    def of(
+        cls, passages: Passages | None, zone_m: float, later_s: float, config: DetectionConfig
+    ) -> _Crossings:
+        """Fill in unknown times, speeds and lengths, and add `later_s` to the times."""
         if passages is None:
             return cls(*(np.empty(0) for _ in range(4)))
         length_m = np.where(np.isnan(passages.length_m), config.vehicle_m, passages.length_m)
@@ -277,7 +278,7 @@ class _Crossings:
                       passages.on_s)  # fmt: skip
         off = np.where(np.isnan(passages.off_s), np.inf, passages.off_s)
         order = np.argsort(on, kind="stable")
-        on, off = on - config.latency_s, off - config.latency_s
+        on, off = on + later_s, off + later_s
         return cls(on[order], off[order], speed[order], length_m[order])
 
     def __len__(self) -> int:
@@ -470,12 +471,15 @@ class LaneEstimate:
         lanes: Lanes of the network, by id.
         detectors: All detectors.
         config: Numbers of the estimate.
+        step_s: Length of a simulation step, in s. Detectors with the clock of SUMO's output are
+            ahead of the signals by it (`Detector.clock`), and it is added to their stamps.
     """
 
     periods: Sequence[Period]
     lanes: Mapping[str, Lane]
     detectors: Sequence[Detector]
     config: DetectionConfig = field(default_factory=DetectionConfig)
+    step_s: float = 1.0
 
     def incoming(self, name: str) -> list[LaneCourse]:
         """Return the courses of a lane that ends at a light and has a stop detector, by period."""
@@ -621,7 +625,8 @@ class LaneEstimate:
     def _crossings(self, period: Period, detector: Detector | None) -> _Crossings:
         assert detector is not None
         passages = period.passages.get(detector.id)
-        return _Crossings.of(passages, detector.length_m, self.config)
+        later_s = detector.steps_early * self.step_s - self.config.latency_s
+        return _Crossings.of(passages, detector.length_m, later_s, self.config)
 
     def _free_speed(self, seen: _Crossings, limit_mps: float) -> float:
         """Return the median speed of vehicles far from others; the limit without enough of them."""

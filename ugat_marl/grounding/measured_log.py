@@ -215,7 +215,11 @@ class _Street:
     def _courses(self) -> dict[str, list[LaneCourse]]:
         """Return the courses of all lanes with detectors."""
         estimate = LaneEstimate(
-            self.measured.periods, self.network.lanes, self.measured.detectors, self.config
+            self.measured.periods,
+            self.network.lanes,
+            self.measured.detectors,
+            self.config,
+            self.scenario.settings.step_length_s,
         )
         courses: dict[str, list[LaneCourse]] = {}
         for lane in self._lanes:

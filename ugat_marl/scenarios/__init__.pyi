@@ -47,8 +47,10 @@ from .network import Lane as Lane
 from .network import Network as Network
 from .network import signal_widths as signal_widths
 from .network import within_hops as within_hops
+from .periods import DETECTOR_CLOCKS as DETECTOR_CLOCKS
 from .periods import SPEED_POINTS as SPEED_POINTS
 from .periods import Detector as Detector
+from .periods import DetectorClock as DetectorClock
 from .periods import DetectorKind as DetectorKind
 from .periods import Passages as Passages
 from .periods import Period as Period

@@ -14,6 +14,10 @@ SpeedPoint = Literal["front", "rear", "mean"]
 """Point of a passage at which a detector measures the speed: when the front reaches the zone, when
 the rear leaves it, or the mean of both."""
 SPEED_POINTS: tuple[SpeedPoint, ...] = ("front", "rear", "mean")
+DetectorClock = Literal["signals", "sumo"]
+"""Clock that stamps a detector's events: that of the signals, or that of SUMO's output. In SUMO the
+positions at time t already follow the signals of t, so its stamps are one step early."""
+DETECTOR_CLOCKS: tuple[DetectorClock, ...] = ("signals", "sumo")
 
 Split = Literal["fit", "heldout"]
 
@@ -35,6 +39,7 @@ class Detector:
             the intersection.
         speed_at: Point of the passage at which speeds are measured; None if it is not stated.
             Detectors of a simulation then measure when the rear leaves.
+        clock: Clock that stamps the events; None if it is not stated, which counts as ``sumo``.
     """
 
     id: str
@@ -43,6 +48,12 @@ class Detector:
     length_m: float
     kind: DetectorKind
     speed_at: SpeedPoint | None = None
+    clock: DetectorClock | None = None
+
+    @property
+    def steps_early(self) -> int:
+        """Simulation steps by which the stamps are ahead of the clock of the signals: 0 or 1."""
+        return 0 if self.clock == "signals" else 1
 
 
 @dataclass(frozen=True, eq=False)

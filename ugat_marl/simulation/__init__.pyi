@@ -1,6 +1,7 @@
 from .channel import Channel as Channel
 from .channel import ChannelClosed as ChannelClosed
 from .channel import Message as Message
+from .detectors import delayed as delayed
 from .detectors import detectors_document as detectors_document
 from .detectors import read_passages as read_passages
 from .detectors import standard_detectors as standard_detectors

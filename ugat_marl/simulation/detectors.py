@@ -6,6 +6,7 @@ import re
 import xml.etree.ElementTree as ET
 from collections import defaultdict
 from collections.abc import Mapping, Sequence
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -86,15 +87,18 @@ def detectors_document(
 
 
 def read_passages(
-    file: Path, detectors: Sequence[Detector], begin_s: float, end_s: float
+    file: Path, detectors: Sequence[Detector], begin_s: float, end_s: float, step_s: float
 ) -> dict[str, Passages]:
     """Read the passages over detectors between two times; detectors without passages are left out.
+
+    Times are those of each detector's own clock, see `Detector.clock`.
 
     Args:
         file: SUMO's output.
         detectors: The detectors of `detectors_document`.
         begin_s: Begin, on the scenario's clock.
         end_s: End, on the scenario's clock.
+        step_s: Length of a simulation step, s.
 
     Raises:
         SimulatorError: SUMO did not write the file.
@@ -110,9 +114,8 @@ def read_passages(
     for detector in detectors:
         first = detector.id.encode()
         last = (detector.id + _END).encode() if detector.length_m > 0 else first
-        passages = _clipped(
-            _passages(rows[first], rows[last], detector.speed_at or "rear"), begin_s, end_s
-        )
+        passages = _passages(rows[first], rows[last], detector.speed_at or "rear")
+        passages = _clipped(delayed(passages, (1 - detector.steps_early) * step_s), begin_s, end_s)
         if len(passages):
             by_detector[detector.id] = passages
     return by_detector
@@ -142,6 +145,16 @@ def _passages(
         return Passages.none()
     table = np.array(sorted(rows, key=lambda row: min(row[0], row[1])), dtype=np.float64)
     return Passages(table[:, 0], table[:, 1], table[:, 2], table[:, 3])
+
+
+def delayed(passages: Passages, delay_s: float) -> Passages:
+    """Return the passages with later stamps.
+
+    Args:
+        passages: Passages over a detector.
+        delay_s: Time that is added to all stamps, s; negative for earlier ones.
+    """
+    return replace(passages, on_s=passages.on_s + delay_s, off_s=passages.off_s + delay_s)
 
 
 def _clipped(passages: Passages, begin_s: float, end_s: float) -> Passages:

@@ -196,6 +196,7 @@ def _zones(table: AtspmMapping) -> pl.DataFrame:
             detector.length_m,
             detector.kind,
             None,  # controllers log no speeds
+            "signals",
         )
         for device in table.devices
         for detector in device.detectors
@@ -410,6 +411,8 @@ def _states(
             )
             for link, link_sources in enumerate(links)
         ]
+        for link in device.on_red:
+            letters[link] = letters[link].replace("r", "s")
         return "".join(letters)
 
     log = [(period.begin_s, state())]

@@ -78,7 +78,17 @@ class Channel(pydantic.BaseModel):
 
 
 class Device(pydantic.BaseModel):
-    """Controller and its traffic light in the network."""
+    """Controller and its traffic light in the network.
+
+    Attributes:
+        id: Id in the log.
+        tls: Traffic light.
+        phases: Phase to its links.
+        overlaps: Overlap to its links.
+        constant: Link that always shows the same letter, to the letter.
+        on_red: Links on which vehicles may go on red after a stop (``s`` in place of ``r``).
+        detectors: Channels with detectors.
+    """
 
     model_config = _STRICT
 
@@ -87,6 +97,7 @@ class Device(pydantic.BaseModel):
     phases: dict[Number, LinksOf] = {}
     overlaps: dict[Number, LinksOf] = {}
     constant: dict[Number, Annotated[str, Field(pattern="^[rugGyYoOs]$")]] = {}
+    on_red: tuple[Index, ...] = ()
     detectors: tuple[Channel, ...] = ()
 
 
@@ -185,7 +196,8 @@ def _check_devices(
         for links in (*device.phases.values(), *device.overlaps.values()):
             mapped |= {*links.green, *links.permissive, *links.flashing}
         width = widths[device.tls]
-        if unknown := sorted(link for link in mapped if not 0 <= link < width):
+        named = mapped | set(device.on_red)
+        if unknown := sorted(link for link in named if not 0 <= link < width):
             raise MeasuredDataError(
                 f"{where}: link {unknown[0]} does not exist; {device.tls!r} has the links 0 to "
                 f"{width - 1}"

@@ -94,6 +94,7 @@ def coverage(measured: MeasuredData, scenario: Scenario, network: Network) -> li
         *_of_periods(measured),
         *_of_signals(measured, scenario, network),
         *_of_kinds(measured, network),
+        *_of_clocks(measured),
         *_of_places(measured.detectors, network),
         *_of_silence(measured),
         *_of_agreement(measured, network),
@@ -241,6 +242,16 @@ def _of_speeds(measured: MeasuredData) -> Iterator[Finding]:
         yield Finding(
             "detections: all times are whole seconds; effects of less than a second are hard to "
             "see (controllers log tenths)"
+        )
+
+
+def _of_clocks(measured: MeasuredData) -> Iterator[Finding]:
+    silent = [detector.id for detector in measured.detectors if detector.clock is None]
+    if silent and measured.has_events:
+        yield Finding(
+            f"detectors.csv: no clock stated for {_list('detector', silent)}; the stamps are taken "
+            "for those of SUMO's output, one simulation step ahead of the signals. For a street, "
+            "add the column clock with signals in every row"
         )
 
 

@@ -29,6 +29,7 @@ from ugat_marl.data.measured.tables import (
 from ugat_marl.data.measured.values import Finding, MeasuredData, split_periods
 from ugat_marl.errors import MeasuredDataError, nearest
 from ugat_marl.scenarios import (
+    DETECTOR_CLOCKS,
     SIGNAL_LETTERS,
     SPEED_POINTS,
     Detector,
@@ -340,7 +341,7 @@ def detectors_of(path: Path, frame: pl.DataFrame, network: Network) -> tuple[Det
 
     Raises:
         MeasuredDataError: There is no detector. Or a detector occurs twice, is on an unknown lane,
-            reaches beyond its lane, or has an unknown kind or point of speed measurement.
+            reaches beyond its lane, or has an unknown kind, point of speed measurement or clock.
     """
     if frame.is_empty():
         raise MeasuredDataError(f"{path}: no detectors; write one row per detection zone")
@@ -359,13 +360,14 @@ def detectors_of(path: Path, frame: pl.DataFrame, network: Network) -> tuple[Det
         "is unknown",
         f"write one of {', '.join(kinds)}",
     )
-    refuse(
-        path,
-        frame.filter(pl.col("speed_at").is_not_null() & ~pl.col("speed_at").is_in(SPEED_POINTS)),
-        "speed_at",
-        "is unknown",
-        f"write one of {', '.join(SPEED_POINTS)}, or leave it empty where it is not known",
-    )
+    for column, allowed in (("speed_at", SPEED_POINTS), ("clock", DETECTOR_CLOCKS)):
+        refuse(
+            path,
+            frame.filter(pl.col(column).is_not_null() & ~pl.col(column).is_in(allowed)),
+            column,
+            "is unknown",
+            f"write one of {', '.join(allowed)}, or leave it empty where it is not known",
+        )
     detectors: list[Detector] = []
     for row in frame.iter_rows(named=True):
         lane = network.lanes.get(row["lane_id"])
@@ -388,7 +390,15 @@ def detectors_of(path: Path, frame: pl.DataFrame, network: Network) -> tuple[Det
                 f"{lane.length_m:g} m; its length_m is at most {lane.length_m - begin:g}"
             )
         detectors.append(
-            Detector(row["detector_id"], lane.id, begin, length, row["kind"], row["speed_at"])
+            Detector(
+                row["detector_id"],
+                lane.id,
+                begin,
+                length,
+                row["kind"],
+                row["speed_at"],
+                row["clock"],
+            )
         )
     return tuple(detectors)
 

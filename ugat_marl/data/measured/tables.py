@@ -95,7 +95,7 @@ DETECTORS = Table(
         "length_m": "number",
         "kind": "text",
     },
-    {"speed_at": "text"},
+    {"speed_at": "text", "clock": "text"},
     (".csv",),
 )
 SIGNALS = Table(

@@ -86,7 +86,7 @@ class MeasuredData:
                 float(detector.length_m),
                 detector.kind,
             )
-            stated = () if detector.speed_at is None else (detector.speed_at,)
+            stated = [name for name in (detector.speed_at, detector.clock) if name is not None]
             digest.update(repr((*zone, *stated)).encode())
         for period in self.periods:
             head = (period.id, float(period.begin_s), float(period.end_s), period.split)

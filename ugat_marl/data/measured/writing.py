@@ -135,10 +135,11 @@ def _write(frame: pl.DataFrame, path: Path) -> None:
 
 def _detectors(measured: MeasuredData) -> pl.DataFrame:
     rows = [
-        (d.id, d.lane, d.position_m, d.length_m, d.kind, d.speed_at) for d in measured.detectors
+        (d.id, d.lane, d.position_m, d.length_m, d.kind, d.speed_at, d.clock)
+        for d in measured.detectors
     ]
     frame = frame_of(DETECTORS, rows)
-    return frame if frame["speed_at"].count() else frame.drop("speed_at")
+    return frame.drop(name for name in DETECTORS.optional if not frame[name].count())
 
 
 def _periods(periods: Sequence[Period]) -> pl.DataFrame:

@@ -218,11 +218,13 @@ def _world(scenario: Scenario, domain: Domain) -> tuple[Scenario, tuple[Effect, 
 
 
 def _zone(detector: Detector, length_m: float) -> Detector:
-    """Return a detection zone that ends at the detector's point; it begins at 0 m or later."""
+    """Return a detection zone that ends at the detector's point; it begins at 0 m or later.
+
+    Like a street's controller, it stamps vehicles by the clock of the signals.
+    """
     begin = max(detector.position_m - length_m, 0.0)
-    return replace(
-        detector, position_m=round(begin, 2), length_m=round(detector.position_m - begin, 2)
-    )
+    length = round(detector.position_m - begin, 2)
+    return replace(detector, position_m=round(begin, 2), length_m=length, clock="signals")
 
 
 def _all_days(street: _Street, periods: int, workers: int, advance: Advance) -> list[_Day]:
@@ -265,11 +267,12 @@ def _day(street: _Street, index: int, split: Split, stop: threading.Event) -> _D
         commanded = play(
             watched, street.policy, derive_seed(street.seed, "record", index, "simulation"), stop
         )
-        passages = read_passages(directory / "loops.xml", street.installed, begin, end)
+        step = scenario.settings.step_length_s
+        passages = read_passages(directory / "loops.xml", street.installed, begin, end, step)
         shown = switches(directory / "signals.xml", end) if street.watched else {}
         vehicles = None
         if street.lanes or street.trajectories:
-            vehicles = tracks(directory / "vehicles.xml", f"day{index + 1}", begin, end)
+            vehicles = tracks(directory / "vehicles.xml", f"day{index + 1}", end, step)
     period = Period(
         f"day{index + 1}",
         begin,
