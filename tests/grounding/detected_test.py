@@ -8,7 +8,13 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from ugat_marl.grounding.detected import DetectionConfig, LaneCourse, LaneEstimate, greens_of
+from ugat_marl.grounding.detected import (
+    DetectionConfig,
+    LaneCourse,
+    LaneEstimate,
+    greens_of,
+    staircase,
+)
 from ugat_marl.scenarios import Detector, Lane, Passages, Period
 
 LANE = Lane("W_0", "W", 300.0, 10.0, ((0.0, 0.0), (300.0, 0.0)))
@@ -70,12 +76,25 @@ def test_vehicles_of_a_jam_are_spread_between_the_free_ones_around_it() -> None:
     found = course({"advance": advance, "stop": stop})
     (jam,) = found.jams
     assert (jam.count, jam.open) == (3, False)
-    # The first slow one came on time: at 15 s. The others came between it and the one of 60 s.
-    assert found.come_s == pytest.approx([0, 15, 26.25, 37.0, 39.0, 60])
-    # The last two would have come later than they can have: 25 s before 62 and 64 s.
-    share = (30.0 - 15.0) / (60.0 - 15.0)
-    expected = 3 * share * (1 - share)
-    assert found.deviation(np.array([30.0])) == pytest.approx([np.sqrt(expected)], rel=1e-3)
+    # The first slow one came on time: at 15 s. The others came between it and the one of 60 s, and
+    # 25 s before they were seen at 60, 62 and 64 s: by rejection, from a million triples.
+    drawn = np.sort(15.0 + 45.0 * np.random.default_rng(1).random((1_000_000, 3)), axis=1)
+    drawn = drawn[(drawn <= [35.0, 37.0, 39.0]).all(1)]
+    assert found.come_s == pytest.approx([0, 15, *drawn.mean(0), 60], abs=0.05)
+    expected = (drawn <= 30.0).sum(1).std()
+    assert found.deviation(np.array([30.0])) == pytest.approx([expected], rel=0.01)
+
+
+def test_without_latest_times_a_jam_is_spread_evenly() -> None:
+    mean, grid, variance = staircase(np.ones(4))
+    assert mean == pytest.approx([0.2, 0.4, 0.6, 0.8], abs=1e-4)
+    assert variance == pytest.approx(4 * grid * (1 - grid), abs=1e-9)
+
+
+def test_a_jam_of_very_many_vehicles_has_times() -> None:
+    mean, _, variance = staircase(np.full(300, 1e-6))
+    assert np.isfinite(mean).all() and np.isfinite(variance).all()
+    assert (np.diff(mean) > 0).all()
 
 
 def test_exit_detectors_say_when_the_vehicles_of_a_jam_came() -> None:
@@ -180,7 +199,8 @@ def test_without_an_advance_detector_vehicles_are_known_when_they_leave() -> Non
     found = course({"stop": crossed([29.75, 80, 82.5, 85, 119.75], [10, 2, 4, 5, 10])})
     assert found.come_s[[0, 4]] == pytest.approx([0, 90])
     assert found.vehicles(np.array([79.0]))[0] >= 2  # it waits on the detector; others are guessed
-    assert found.deviation(np.array([75.0]))[0] > 0.4
+    assert found.deviation(np.array([52.0]))[0] > 0.4
+    assert found.deviation(np.array([75.0]))[0] == 0.0  # the lane takes 29.75 s without a queue
 
 
 def test_a_vehicle_on_the_lane_at_the_end_has_not_left() -> None:

@@ -7,8 +7,10 @@ A lane holds at time t the vehicles that came by then and have not left,
 A stop detector gives `leave` of every vehicle. The lane's reference detector, `advance` if there is
 one and else `stop`, gives `come`: a vehicle that drives freely came on the lane a free ride before.
 Where a queue stands on the reference detector, vehicles pass it late. The n vehicles of such a jam
-came between the last free one before it and the first free one after it; their times are spread
-over this span, evenly or, with exit detectors at the lane's begin, as vehicles came on the road.
+came between the last free one before it and the first free one after it, in order, and each of them
+at least a free ride before it passed the detector. Their times are those of a Poisson process under
+these conditions (`staircase`), by the seconds or, with exit detectors at the lane's begin, by the
+vehicles that came on the road.
 The break between a jam and free traffic is a gap in the flow (Liu, Wu, Ma, Hu 2009, "Real-time
 queue length estimation for congested signalized intersections"). In a jam that does not end within
 the period nobody was seen to come. There vehicles come at the rate of free times, as far as the
@@ -27,6 +29,9 @@ from dataclasses import dataclass, field
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.integrate import trapezoid
+from scipy.linalg import toeplitz
+from scipy.special import gammaln
 from scipy.stats import norm
 
 from ugat_marl.scenarios import GREEN, Detector, Lane, Passages, Period, deciding_letter
@@ -35,6 +40,11 @@ Floats = NDArray[np.float64]
 
 FAR = 8.0
 """Standard deviations from which the normal distribution has no mass left to divide by."""
+GRID = 129
+"""Times at which the distribution of the vehicles of a jam is computed."""
+STAIRS = 0.1
+"""Least distance of the latest times of two vehicles of a jam, in mean distances. A span may begin
+late, by the error of a free ride, and would then leave no time for them."""
 LONG_S = 300.0
 """Length from which an open jam is no queue of the last cycle."""
 
@@ -98,6 +108,8 @@ class Jam:
         error: Relative error of the rate at which vehicles come in an open jam.
         share: Share of a Poisson variance that the number of these vehicles has. Below 1, exit
             detectors counted the vehicles of the road, and only their lane is unsure.
+        at_s: Times of `variance`, ``(times,)``; without `variance` if the jam is open.
+        variance: Variance of the vehicles of a closed jam that came by then, ``(times,)``.
     """
 
     begin_s: float
@@ -106,6 +118,8 @@ class Jam:
     open: bool = False
     error: float = 0.0
     share: float = 1.0
+    at_s: Floats = field(default_factory=lambda: np.empty(0))
+    variance: Floats = field(default_factory=lambda: np.empty(0))
 
     @property
     def long(self) -> bool:
@@ -159,19 +173,20 @@ class LaneCourse:
     def deviation(self, times_s: Floats) -> Floats:
         """Return the standard deviation of `vehicles`, ``(times,)``.
 
-        Of the n vehicles of a jam, Binomial(n, u) came in the share u of its span. In an open jam
-        the number that came is that of a Poisson process of unsure rate, within what the lane
-        holds. A free vehicle came at its time with an error of `sigma_s`.
+        The vehicles of a jam came as in `staircase`. In an open jam the number that came is that of
+        a Poisson process of unsure rate, within what the lane holds. A free vehicle came at its
+        time with an error of `sigma_s`.
         """
         variance = np.zeros(len(times_s))
         for jam in self.jams:
-            share = np.clip((times_s - jam.begin_s) / max(jam.end_s - jam.begin_s, 1e-9), 0.0, 1.0)
             if jam.open:
+                share = (times_s - jam.begin_s) / max(jam.end_s - jam.begin_s, 1e-9)
+                share = np.clip(share, 0.0, 1.0)
                 came = jam.count * share
                 spread = jam.share * came + (came * jam.error) ** 2
                 variance += np.minimum(spread, self.capacity**2 / 12.0)
             else:
-                variance += jam.count * share * (1.0 - share)
+                variance += np.interp(times_s, jam.at_s, jam.variance, 0.0, 0.0)
         free = self.sigma_s > 0
         for come, sigma in zip(self.come_s[free], self.sigma_s[free], strict=True):
             near = np.abs(times_s - come) < 4.0 * sigma
@@ -433,7 +448,7 @@ class _Seen:
         for begin, end in self.jams():
             first_s, last_s = self._ends(begin, end, period)
             first, last = self.clock.read(first_s), self.clock.read(last_s)
-            steps = np.arange(1, end - begin + 1)
+            at_s, variance = np.empty(0), np.empty(0)
             open_end = end == len(come)
             error, share = rate.error, 1.0
             if open_end and (rest is not None or rate.value > 0):
@@ -449,10 +464,16 @@ class _Seen:
                 beyond = beyond[beyond < period.end_s]
                 even = times[: end - begin]
             else:
-                even = self.clock.when(first + steps / (end - begin + 1) * (last - first))
+                span = max(float(last - first), 1e-9)
+                latest = (self.clock.read(come[begin:end]) - first) / span
+                mean, at, variance = staircase(latest)
+                even, at_s = (
+                    self.clock.when(first + mean * span),
+                    self.clock.when(first + at * span),
+                )
             come[begin:end] = np.minimum(even, come[begin:end])
             count = end - begin + len(beyond) * open_end
-            found.append(Jam(first_s, last_s, count, open_end, error, share))
+            found.append(Jam(first_s, last_s, count, open_end, error, share, at_s, variance))
         return come, beyond, tuple(found)
 
     def _ends(self, begin: int, end: int, period: Period) -> tuple[float, float]:
@@ -460,6 +481,52 @@ class _Seen:
         first = float(self.come_s[begin - 1]) if begin else period.begin_s
         last = float(self.come_s[end]) if end < len(self.come_s) else period.end_s
         return first, max(last, first)
+
+
+def staircase(latest: Floats) -> tuple[Floats, Floats, Floats]:
+    """Return when vehicles of a Poisson process came, given the latest time for each.
+
+    The i-th of n vehicles came by ``latest[i]``, so that N(t), uniform order statistics without
+    this condition, is at least the number of those that are due:
+
+        P(N(0) = 0, N(1) = n; N(t) >= #{i : latest[i] <= t} for all t).
+
+    The distribution is found on a grid of times, forward and backward.
+
+    Args:
+        latest: Latest times, ascending, as shares of the span; those above 1 are no condition.
+
+    Returns:
+        Mean time of each vehicle, ``(n,)``; the grid, from 0 to 1, ``(times,)``; and the variance
+        of N on it, ``(times,)``.
+    """
+    n = len(latest)
+    latest = np.clip(latest, STAIRS * np.arange(1, n + 1) / (n + 1), 1.0)
+    grid = np.unique(np.concatenate([np.linspace(0.0, 1.0, GRID), latest]))
+    due = np.searchsorted(latest, grid[:-1], side="right")
+    more = np.arange(n + 1)
+    factorial = gammaln(more + 1.0)
+    kernels: list[Floats] = []
+    for step in np.diff(grid):
+        weights = np.exp(more * np.log(n * step) - factorial)
+        kernels.append(toeplitz(weights, np.zeros(n + 1)))
+    forward = np.zeros((len(grid), n + 1))
+    backward = np.zeros((len(grid), n + 1))
+    forward[0, 0] = backward[-1, n] = 1.0
+    allowed = more[None, :] >= np.append(due, n)[:, None]
+    for k, kernel in enumerate(kernels):
+        ahead = (kernel @ forward[k]) * allowed[k + 1]
+        forward[k + 1] = ahead / ahead.sum()
+    for k in range(len(kernels) - 1, -1, -1):
+        back = (kernels[k].T @ backward[k + 1]) * allowed[k]
+        backward[k] = back / back.sum()
+    chance = forward * backward
+    chance /= chance.sum(1, keepdims=True)
+    count = chance @ more
+    variance = chance @ more**2 - count**2
+    # E t_i is the integral of P(N(t) < i), here by the trapezoidal rule
+    mean = trapezoid(chance.cumsum(1)[:, :-1], grid, axis=0)
+    return mean, grid, np.maximum(variance, 0.0)
 
 
 @dataclass(frozen=True)
