@@ -2,8 +2,11 @@
 
 from __future__ import annotations
 
+import contextlib
+import errno
 from collections.abc import Callable
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -86,3 +89,39 @@ def test_tensors_that_are_not_plain_are_refused(
     torch.save({"kind": "x", "net": {"weight": make()}}, path)
     with pytest.raises(CheckpointError, match=r"net\.weight is no plain tensor|not a readable"):
         read_checkpoint(path, "x")
+
+
+def test_the_same_content_is_the_same_file_wherever_it_lies(tmp_path: Path) -> None:
+    for name in ("a.pt", "other.pt"):
+        write_checkpoint(tmp_path / name, "toy", CONTENT)
+    assert (tmp_path / "a.pt").read_bytes() == (tmp_path / "other.pt").read_bytes()
+
+
+def test_a_full_disk_is_an_error_of_the_system(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    class Full:
+        """A disk that is full at first, or after some of the content."""
+
+        def __init__(self, left: int) -> None:
+            self.left = left
+
+        def write(self, content: bytes) -> int:
+            self.left -= len(content)
+            if self.left < 0:
+                raise OSError(errno.ENOSPC, "No space left on device")
+            return len(content)
+
+        def flush(self) -> None:
+            pass
+
+    for left in (0, 500):
+
+        def open_on_it(_: Path, mode: str, left: int = left) -> Any:
+            assert mode == "wb"
+            return contextlib.nullcontext(Full(left))
+
+        monkeypatch.setattr(Path, "open", open_on_it)
+        with pytest.raises(OSError, match="No space left"):
+            write_checkpoint(tmp_path / "a.pt", "toy", CONTENT)
+    assert list(tmp_path.iterdir()) == []

@@ -100,7 +100,7 @@ def test_alpha_can_start_at_what_the_first_fit_expects(tmp_path: Path) -> None:
     assert rows["gate/acceptance"] < 1.0
 
 
-def test_resuming_gives_the_numbers_of_an_unbroken_run(unbroken: Path, tmp_path: Path) -> None:
+def test_a_resumed_run_is_an_unbroken_one_byte_for_byte(unbroken: Path, tmp_path: Path) -> None:
     """One run is interrupted at four moments, and taken up again after each."""
     folder = tmp_path / "run"
     for moment in (
@@ -110,11 +110,19 @@ def test_resuming_gives_the_numbers_of_an_unbroken_run(unbroken: Path, tmp_path:
         with pytest.raises(KeyboardInterrupt):
             transfer(LONG, folder, resume=folder.exists(), reporter=KillAt(moment))
     transfer(LONG, folder, resume=True)
-    one, two = (pl.read_parquet(path / "metrics.parquet") for path in (folder, unbroken))
-    assert one.equals(two)
-    for name in ("direct-transfer", "ugat"):
-        assert np.array_equal(weights(folder, name), weights(unbroken, name))
-    assert (folder / "table.json").read_text() == (unbroken / "table.json").read_text()
+    one, two = contents(folder), contents(unbroken)
+    assert [name for name in one.keys() | two.keys() if one.get(name) != two.get(name)] == []
+    assert {"table.json", "metrics.parquet", "queues.parquet", "policies/ugat.pt"} <= one.keys()
+    assert any(name.endswith("checkpoint/learner.pt") for name in one)
+
+
+def contents(run: Path) -> dict[str, bytes]:
+    """The bytes of every file of a run, without curves of TensorBoard, which hold the time."""
+    return {
+        str(path.relative_to(run)): path.read_bytes()
+        for path in run.rglob("*")
+        if path.is_file() and not path.name.startswith("events.out.tfevents")
+    }
 
 
 def short_of(method: MethodName) -> TransferConfig:

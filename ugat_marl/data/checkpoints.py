@@ -30,10 +30,17 @@ def write_checkpoint(path: Path, kind: str, content: Mapping[str, Any]) -> None:
 
     Raises:
         CheckpointError: A number in `content` is not finite. The file at `path` stays unchanged.
+        OSError: The disk is full.
     """
     require_finite(content, str(path), "was not written over")
-    with replacing(path) as temporary:
-        torch.save({"kind": kind, **content}, temporary)
+    # torch writes the name of a path into the archive, which then differs from run to run.
+    with replacing(path) as temporary, temporary.open("wb") as file:
+        try:
+            torch.save({"kind": kind, **content}, file)
+        except RuntimeError as error:  # torch's own, in place of that of a full disk
+            if isinstance(error.__context__, OSError):
+                raise error.__context__ from None
+            raise
 
 
 def read_checkpoint(path: Path, kind: str) -> dict[str, Any]:
