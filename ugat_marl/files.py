@@ -8,6 +8,7 @@ types.
 from __future__ import annotations
 
 import contextlib
+import errno
 import gzip
 import io
 import json
@@ -44,6 +45,7 @@ _LONGEST = 64 << 20
 _LARGEST = 1 << 256
 """Largest integer of a JSON or TOML file. One beyond 2^1024 is no float; the state of a random
 generator has 128 bits."""
+_NO_ROOM = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG)
 _END = "\0"
 """Mark after each child of an element during writing. XML cannot contain this character."""
 
@@ -61,6 +63,10 @@ def replacing(path: Path) -> Iterator[Path]:
         os.umask(umask)
         temporary.chmod(0o666 & ~umask)
         temporary.replace(path)
+    except OSError as error:
+        if error.filename is None and error.errno in _NO_ROOM:  # of a write, which has no name
+            error.filename = str(path)
+        raise
     finally:
         temporary.unlink(missing_ok=True)
 

@@ -27,6 +27,8 @@ TERMINATED = 143
 COMPLETION = "completion"
 LOUDNESS: dict[str, Loudness] = {"--quiet": "quiet", "--verbose": "verbose"}
 """Options of every command."""
+_LONGEST_MESSAGE = 1500
+"""Most characters of an error: about twenty lines of a terminal."""
 _WAYS_OUT = {
     errno.ENOSPC: "; make room, or name another folder (TMPDIR for temporary files)",
     errno.EDQUOT: "; make room, or name another folder (TMPDIR for temporary files)",
@@ -87,7 +89,7 @@ def run(line: CommandLine, arguments: Sequence[str]) -> int:
         with _ended_in_order(), loudness(level), showing(Bars(progress)):
             return _dispatch(line, list(arguments), console)
     except UgatMarlError as error:
-        print(f"{line.program}: error: {' '.join(str(error).split())}", file=sys.stderr)
+        print(f"{line.program}: error: {_in_one_line(str(error))}", file=sys.stderr)
         return USAGE_ERROR
     except KeyboardInterrupt as interrupt:
         terminated = isinstance(interrupt, Terminated)
@@ -136,6 +138,14 @@ def _ended_in_order() -> Iterator[None]:
         yield
     finally:
         signal.signal(signal.SIGTERM, signal.SIG_DFL)
+
+
+def _in_one_line(text: str) -> str:
+    """Return a message as one line, without the middle of one that quotes a whole file."""
+    words = " ".join(text.split())
+    if len(words) <= _LONGEST_MESSAGE:
+        return words
+    return f"{words[: 2 * _LONGEST_MESSAGE // 3]} ... {words[-_LONGEST_MESSAGE // 3 :]}"
 
 
 def _without_loudness(words: Sequence[str]) -> tuple[list[str], Loudness]:

@@ -56,6 +56,9 @@ JOB, SCORES, POLICY, DIRECT_POLICY, LEARNER, RULE_FILE = (
     "job.json", "scores.json", "policy.pt", "direct-policy.pt", "learner.pt", "rule.txt",
 )  # fmt: skip
 
+_MOST_NAME_BYTES = 200
+"""Most bytes of a name made of domains; file systems take 255, and many effects are more."""
+
 EVALUATION_SEED = 1000
 """First seed of the reported episodes; training and the search for rules use other seeds."""
 
@@ -177,9 +180,9 @@ class Job:
             setting.world or "",
             self.target or "",
         )
-        parts = [*place, self._seed_word, self.digest]
-        words = (re.sub(r"[^\w=+.]+", "-", part).strip("-.") for part in parts)
-        return "-".join(part for part in words if part)
+        words = (re.sub(r"[^\w=+.]+", "-", part).strip("-.") for part in place)
+        named = _cut("-".join(word for word in words if word)).rstrip("-.")
+        return "-".join(filter(None, (named, self._seed_word, self.digest)))
 
     @property
     def short(self) -> str:
@@ -213,7 +216,12 @@ def file_stem(scenario: str) -> str:
 
 def file_name(name: str) -> str:
     """Return the name of a policy in the form of a file's name."""
-    return re.sub(r"[^a-z0-9.]+", "-", name.lower()).strip("-")
+    return _cut(re.sub(r"[^a-z0-9.]+", "-", name.lower())).strip("-")
+
+
+def _cut(name: str) -> str:
+    """Return the begin of a name that file systems take, with room for a digest and an ending."""
+    return name.encode()[:_MOST_NAME_BYTES].decode(errors="ignore")
 
 
 def file_names(names: Iterable[str]) -> list[str]:
