@@ -19,6 +19,7 @@ import tempfile
 import tomllib
 import weakref
 import xml.etree.ElementTree as ET
+import zipfile
 import zlib
 from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass, field
@@ -153,6 +154,17 @@ def _bounded(pieces: Iterator[bytes], path: Path, packed: int) -> Iterator[bytes
                 "network or demand does; unpack it yourself if you trust it"
             )
         yield piece
+
+
+def require_stored(archive: zipfile.ZipFile) -> None:
+    """Refuse an archive with packed entries: those of the suite have none, and a bomb needs them.
+
+    Raises:
+        ValueError: An entry is packed.
+    """
+    for entry in archive.infolist():
+        if entry.compress_type != zipfile.ZIP_STORED or entry.file_size > entry.compress_size:
+            raise ValueError(f"{entry.filename} is packed, which the suite never does")
 
 
 def read_toml(path: Path, fault: type[UgatMarlError]) -> dict[str, Any]:

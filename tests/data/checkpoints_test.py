@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import errno
+import zipfile
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -125,3 +126,17 @@ def test_a_full_disk_is_an_error_of_the_system(
         with pytest.raises(OSError, match="No space left"):
             write_checkpoint(tmp_path / "a.pt", "toy", CONTENT)
     assert list(tmp_path.iterdir()) == []
+
+
+def test_a_packed_archive_is_refused_before_it_is_unpacked(tmp_path: Path) -> None:
+    """A megabyte could unpack to a gigabyte; the suite packs no checkpoint."""
+    write_checkpoint(tmp_path / "a.pt", "toy", {"a": torch.zeros(10**6)})
+    with (
+        zipfile.ZipFile(tmp_path / "a.pt") as plain,
+        zipfile.ZipFile(tmp_path / "b.pt", "w", zipfile.ZIP_DEFLATED) as packed,
+    ):
+        for entry in plain.infolist():
+            packed.writestr(entry.filename, plain.read(entry))
+    assert (tmp_path / "b.pt").stat().st_size < 10**5
+    with pytest.raises(CheckpointError, match="is packed, which the suite never does"):
+        read_checkpoint(tmp_path / "b.pt", "toy")

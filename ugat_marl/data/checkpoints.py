@@ -11,7 +11,7 @@ from typing import Any
 import torch
 
 from ugat_marl.errors import CheckpointError
-from ugat_marl.files import replacing
+from ugat_marl.files import replacing, require_stored
 
 _UNREADABLE = (
     OSError, EOFError, RuntimeError, ValueError, LookupError, TypeError, AttributeError,
@@ -77,12 +77,13 @@ def read_checkpoint(path: Path, kind: str) -> dict[str, Any]:
 
 
 def _require_sums(path: Path) -> None:
-    """Refuse an archive with a wrong check sum, such as after a flipped bit; torch does not check.
+    """Refuse an archive that is packed or has a wrong check sum; torch checks neither.
 
     Raises:
-        ValueError: A check sum is wrong.
+        ValueError: An entry is packed, or a check sum is wrong, such as after a flipped bit.
     """
     with zipfile.ZipFile(path) as archive:
+        require_stored(archive)
         damaged = archive.testzip()
     if damaged is not None:
         raise ValueError(f"check sum of {damaged} is wrong")

@@ -32,7 +32,7 @@ from numpy.typing import NDArray
 
 from ugat_marl.envs import Actions, AgentSet, AnyParallelEnv, Infos, Observations
 from ugat_marl.errors import CheckpointError, OptionError, install_command
-from ugat_marl.files import read_json, require_writable, write_whole
+from ugat_marl.files import read_json, require_stored, require_writable, write_whole
 from ugat_marl.policies.portable import (
     PORTABLE,
     Layer,
@@ -160,6 +160,8 @@ class NumpyPolicy:
             model = path.read_bytes()
             if about["kind"] != _KIND or about["sha256"] != hashlib.sha256(model).hexdigest():
                 raise ValueError("the JSON file beside it belongs to another model")
+            with zipfile.ZipFile(io.BytesIO(model)) as archive:
+                require_stored(archive)
             with np.load(io.BytesIO(model), allow_pickle=False) as arrays:
                 network = PORTABLE[about["network"]]({name: arrays[name] for name in arrays.files})
             sizes = (tuple(about[key]) for key in ("agents", "observation_sizes", "action_counts"))

@@ -40,7 +40,7 @@ from ugat_marl.envs import (
     checked_phases,
 )
 from ugat_marl.errors import CheckpointError, OptionError, UgatMarlError, UnknownNameError
-from ugat_marl.files import parse_json, write_whole
+from ugat_marl.files import parse_json, require_stored, write_whole
 from ugat_marl.policies.protocols import EpisodeCallback, Policy
 from ugat_marl.seeding import derive_seed
 
@@ -438,6 +438,7 @@ def _counters(path: Path) -> dict[str, Any]:
     """Return the counters in a file of `OwnLearner.save`."""
     try:
         with zipfile.ZipFile(path) as packed:
+            require_stored(packed)
             text = packed.read(_COUNTERS).decode("utf-8")
             counters = parse_json(text, f"{path}, {_COUNTERS}", CheckpointError)
             return {
