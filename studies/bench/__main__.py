@@ -37,9 +37,13 @@ COMMANDS: dict[str, tuple[str, str]] = {
         "studies.bench.field_log:FieldLogBench",
         "measure the log of the field loop over a year",
     ),
+    "field-soak": (
+        "studies.bench.soak:FieldSoakBench",
+        "drive lights for hours while something fails every ten minutes",
+    ),
     "all": (
         "studies.bench.everything:AllBench",
-        "measure all but strength, scale, device, field-log",
+        "measure all but strength, scale, device and the field loop",
     ),
 }
 
