@@ -5,6 +5,7 @@ It reads the network and the timing by itself and shares no code with what it ju
 
 from __future__ import annotations
 
+import functools
 import tomllib
 import xml.etree.ElementTree as ET
 from collections import Counter
@@ -82,7 +83,7 @@ class Observer:
         for light, crossing in self._rules.crossing.items():
             state = shown[light]
             before = self._before.get(light, state)
-            wrong = [*self._conflicts(state, crossing)]
+            wrong = ["greens that cross"] if _crosses(state, crossing) else []
             if state != before:
                 for link, (was, now) in enumerate(zip(before, state, strict=True)):
                     if _kind(was) != _kind(now):
@@ -98,11 +99,6 @@ class Observer:
         self.broken.update(found)
         self.unsafe += bool(found)
         self.seconds += 1
-
-    def _conflicts(self, state: str, crossing: frozenset[tuple[int, int]]) -> list[str]:
-        if any(state[one] == state[other] == "G" for one, other in crossing):
-            return ["greens that cross"]
-        return []
 
     def _change(self, light: str, link: int, kinds: tuple[str, str], state: str) -> list[str]:
         """Return the rules that a link breaks by its change to another kind of letter."""
@@ -129,6 +125,11 @@ class Observer:
             if last and self.seconds - 1 - max(last) < self._rules.all_red_s:
                 wrong.append("short clearance")
         return wrong
+
+
+@functools.lru_cache(maxsize=4096)
+def _crosses(state: str, crossing: frozenset[tuple[int, int]]) -> bool:
+    return any(state[one] == state[other] == "G" for one, other in crossing)
 
 
 def _kind(letter: str) -> str:
