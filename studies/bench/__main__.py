@@ -41,9 +41,13 @@ COMMANDS: dict[str, tuple[str, str]] = {
         "studies.bench.soak:FieldSoakBench",
         "drive lights for hours while something fails every ten minutes",
     ),
+    "training-faults": (
+        "studies.bench.training_faults:TrainingFaultsBench",
+        "disturb short trainings, resume them, compare all numbers",
+    ),
     "all": (
         "studies.bench.everything:AllBench",
-        "measure all but strength, scale, device and the field loop",
+        "measure all but strength, scale, device, field-* and training-faults",
     ),
 }
 

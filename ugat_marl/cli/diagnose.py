@@ -92,8 +92,8 @@ class Diagnose:
             with workers_of(self.workers, self.ray) as workers:
                 config = replace(config, workers=workers)
                 diagnosis = diagnose(scenario, measured, self.out, config, Bars(console))
-        except KeyboardInterrupt:
-            raise KeyboardInterrupt("the same command goes on where it stopped") from None
+        except KeyboardInterrupt as interrupt:
+            raise type(interrupt)("the same command goes on where it stopped") from None
         console.print(diagnosis_summary(diagnosis))
         if self.report:
             write_diagnosis_page(diagnosis, network, self.out / REPORT, self._commands(diagnosis))

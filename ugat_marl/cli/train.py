@@ -72,8 +72,8 @@ class Train:
                 table = transfer(
                     config, directory, resume=self.resume, reporter=Bars(console), workers=workers
                 )
-        except KeyboardInterrupt:
-            raise KeyboardInterrupt(
+        except KeyboardInterrupt as interrupt:
+            raise type(interrupt)(
                 f"run: {directory}; go on with: {self._call(directory)}"
             ) from None
         picture = directory / "gap.png"

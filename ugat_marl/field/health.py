@@ -10,8 +10,6 @@ from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any, Literal
 
-from ugat_marl.files import write_whole
-
 State = Literal["looking", "driving", "ended"]
 """State of the loop: it looks for its street, it drives the lights, or it has ended."""
 
@@ -40,8 +38,11 @@ class Health:
         if self._path is not None:
             now = datetime.now(UTC).isoformat(timespec="milliseconds")
             content = {"state": state, "written_at": now, "pid": os.getpid(), **facts}
+            # One name, not a new one each time: what a killed loop leaves is used up by the next.
+            temporary = self._path.with_name(f".{self._path.name}.tmp")
             with contextlib.suppress(OSError):
-                write_whole(self._path, json.dumps(content, indent=1) + "\n")
+                temporary.write_text(json.dumps(content, indent=1) + "\n")
+                temporary.replace(self._path)
         lines = [f"STATUS={state}", "STOPPING=1" if state == "ended" else "WATCHDOG=1"]
         if state == "driving" and not self._ready:
             lines.insert(0, "READY=1")
