@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import errno
 import os
+import signal
+import time
 from typing import Any
 
 import pytest
@@ -37,3 +39,26 @@ def test_errors_of_the_system_are_one_line(
     assert err.count("\n") == 1
     assert said in err
     assert len(err) < 400
+
+
+def test_a_terminated_command_ends_in_order(
+    capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    cleared: list[str] = []
+
+    def work(line: CommandLine, words: list[str], console: Console) -> int:
+        try:
+            os.kill(os.getpid(), signal.SIGTERM)
+            time.sleep(10)
+        except KeyboardInterrupt as interrupt:
+            cleared.append("folder")
+            os.kill(os.getpid(), signal.SIGTERM)  # impatient, and in vain
+            raise type(interrupt)("go on with: prog") from None
+        return 0
+
+    monkeypatch.setattr(frame, "_dispatch", work)
+    before = signal.getsignal(signal.SIGTERM)
+    assert run(CommandLine("prog", "", {}), []) == 143
+    assert capsys.readouterr().err == "prog: terminated; go on with: prog\n"
+    assert cleared == ["folder"]
+    assert signal.getsignal(signal.SIGTERM) == before

@@ -126,7 +126,7 @@ def test_two_hours_with_faults_have_no_unsafe_second() -> None:
 
 @pytest.mark.skipif(sys.platform != "linux", reason="limits other processes' files")
 def test_a_loop_that_does_not_look_at_lights_is_caught() -> None:
-    report = FieldSoakBench(hours=2, scenario="single-v1", subject="blind").run()
+    report = FieldSoakBench(hours=1, scenario="single-v1", subject="blind").run()
     unsafe, left = report.targets
     assert unsafe.measured > 0
     assert left.met
