@@ -94,7 +94,7 @@ def _counts(tallies: Sequence[Tally]) -> NDArray[np.float64]:
 
 # --- simulated days -------------------------------------------------------------------------------
 
-VERSION = 4
+VERSION = 5
 """Version of features and replays; tallies cached under another version are not used."""
 
 _KEPT_DAYS = 40
@@ -490,7 +490,11 @@ class Engine:
         if stored is None:
             return None
         try:
-            counted = Tally(stored["sums"].astype(np.float64), stored["bins"].astype(np.float64))
+            counted = Tally(
+                stored["sums"].astype(np.float64),
+                stored["bins"].astype(np.float64),
+                journeys=stored["journeys"],
+            )
             due = None
             if "asked" in stored:
                 asked, given = (
@@ -507,6 +511,7 @@ class Engine:
             "sums": counted.sums,
             "bins": counted.bins.astype(np.float32),
             "travel_time_s": np.float64(day.travel_time_s),
+            "journeys": counted.journeys,
         }
         if day.due is not None:
             for name, of_edge in (("asked", day.due.asked), ("given", day.due.given)):

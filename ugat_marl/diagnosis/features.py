@@ -17,6 +17,7 @@ import numpy as np
 import polars as pl
 from numpy.typing import NDArray
 
+from ugat_marl.diagnosis.journeys import JOURNEYS, Crossings, journey_sums, matched
 from ugat_marl.diagnosis.thresholds import DayThresholds
 from ugat_marl.errors import MeasuredDataError
 from ugat_marl.scenarios import (
@@ -159,6 +160,23 @@ class DetectorLayout:
             rows |= dict.fromkeys(names[:1], ("count_exit", len(self.lanes) + index))
         return rows
 
+    @functools.cached_property
+    def approaches(self) -> tuple[tuple[int, ...], ...]:
+        """Indices of the lanes of each edge that have an advance and a stop detector."""
+        by_edge: dict[str, list[int]] = {}
+        for index, lane in enumerate(self.lanes):
+            if "advance" in lane.detectors and "stop" in lane.detectors:
+                by_edge.setdefault(lane.edge, []).append(index)
+        return tuple(map(tuple, by_edge.values()))
+
+    def ride_s(self, lane: int) -> float:
+        """Return the time from the advance to the stop detector of a lane at its limit, s."""
+        of_lane = self.lanes[lane]
+        zones = {detector.id: detector for detector in self.detectors}
+        begin, end = (zones[of_lane.detectors[kind][0]] for kind in ("advance", "stop"))
+        metres = end.position_m + end.length_m - begin.position_m
+        return max(metres, 0.0) / of_lane.speed_mps
+
     def greens(self, period: Period) -> tuple[Greens, ...]:
         """Return the greens of every lane that begin and end inside the period."""
         greens_of_lanes: list[Greens] = []
@@ -291,12 +309,15 @@ class Tally:
         bins: Counts and occupied seconds in time, ``(bin features, places, bins)``.
         days: Number of periods that were added up.
         known: Number of periods in which each bin was counted, shape of `bins`; None if all were.
+        journeys: Sums and numbers of observations of `JOURNEYS`, ``(measures, places, 2)``. No
+            distance contains them. None without single vehicles.
     """
 
     sums: Array
     bins: Array
     days: int = 1
     known: Array | None = None
+    journeys: Array | None = None
 
     @property
     def counted(self) -> Array:
@@ -323,11 +344,13 @@ class Tally:
     def __add__(self, other: Tally) -> Tally:
         bins = min(self.bins.shape[-1], other.bins.shape[-1])
         every = self.known is None and other.known is None
+        known = self.journeys is not None and other.journeys is not None
         return Tally(
             self.sums + other.sums,
             self.bins[..., :bins] + other.bins[..., :bins],
             self.days + other.days,
             None if every else self.counted[..., :bins] + other.counted[..., :bins],
+            self.journeys + other.journeys if known else None,
         )
 
 
@@ -377,7 +400,7 @@ def tally(
         counter.place = len(layout.lanes) + index
         exits[index] = counter.volume("count_exit", 2, _merged(period, names))
     _conserved(counter, layout, advances, stops, exits)
-    return Tally(counter.sums, counter.bins)
+    return Tally(counter.sums, counter.bins, journeys=_journeys(layout, period, greens, thresholds))
 
 
 @dataclass
@@ -615,6 +638,33 @@ def _conserved(
         if incoming and outgoing:
             counter.place = incoming[0]
             counter.ratio("kept_to_exit", exits[outgoing].sum(), stops[incoming].sum())
+
+
+def _journeys(
+    layout: DetectorLayout, period: Period, greens: Sequence[Greens], thresholds: DayThresholds
+) -> Array:
+    """Return sums of `JOURNEYS` at all places; nothing at lanes without both detectors."""
+    sums = np.zeros((len(JOURNEYS), len(layout.lanes) + len(layout.exits), 2))
+    for lanes in layout.approaches:
+        came: list[Array] = []
+        crossed: list[Crossings] = []
+        for lane in (layout.lanes[index] for index in lanes):
+            advance, stop = _passages(period, lane, "advance"), _passages(period, lane, "stop")
+            assert advance is not None and stop is not None
+            came.append(np.sort(advance.on_s[np.isfinite(advance.on_s)]))
+            starts = greens[lanes[len(came) - 1]].start_s
+            crossed.append(
+                Crossings.of(
+                    stop, starts, lane.speed_mps, thresholds.free, thresholds.settled_green_s
+                )
+            )
+        rides = [layout.ride_s(index) for index in lanes]
+        pairs, _ = matched(
+            came, crossed, [ride / thresholds.fastest for ride in rides], thresholds.slack_s
+        )
+        for index, of_lane, ride in zip(lanes, pairs, rides, strict=True):
+            sums[:, index] = journey_sums(of_lane, ride, greens[index].start_s)
+    return sums
 
 
 # --- counts alone ---------------------------------------------------------------------------------

@@ -39,6 +39,7 @@ from ugat_marl.diagnosis.features import (
     Tally,
     bins_of,
 )
+from ugat_marl.diagnosis.journeys import Crossings, matched
 from ugat_marl.diagnosis.thresholds import DayThresholds
 from ugat_marl.effects import (
     Effect,
@@ -695,9 +696,7 @@ def by_lane_left(
 ) -> list[Array]:
     """Return the arrival times of vehicles, by the lane on which they leave the approach.
 
-    Some vehicles change lanes between the detectors. A vehicle at a stop detector is matched to the
-    earliest arrival on its lane that has not left yet. If there is none, it is matched to the
-    earliest such arrival on the other lanes.
+    Some vehicles change lanes between the detectors; see `matched`.
 
     Args:
         came: Times at the advance detectors in order, per lane, s.
@@ -707,17 +706,12 @@ def by_lane_left(
     Returns:
         Times per lane, s. Vehicles that never left stay on the lane of their arrival.
     """
-    waiting = [deque(times.tolist()) for times in came]
-    matched: list[list[float]] = [[] for _ in came]
-    events = sorted((time, lane) for lane, times in enumerate(crossed) for time in times.tolist())
-    for time, lane in events:
-        latest = time - travel_s[lane]
-        source = waiting[lane]
-        if not source or source[0] > latest:
-            source = min(waiting, key=lambda queue: queue[0] if queue else np.inf)
-        if source and source[0] <= latest:
-            matched[lane].append(source.popleft())
-    return [np.array(sorted([*times, *left])) for times, left in zip(matched, waiting, strict=True)]
+    vehicles = [Crossings(times, np.zeros(len(times), np.bool_)) for times in crossed]
+    pairs, waiting = matched(came, vehicles, travel_s)
+    return [
+        np.array(sorted([*(arrival for arrival, _ in of_lane), *left]))
+        for of_lane, left in zip(pairs, waiting, strict=True)
+    ]
 
 
 def missed(times: Array, crossed: Array, period: Period, thresholds: DayThresholds) -> Array:

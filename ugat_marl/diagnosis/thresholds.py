@@ -150,6 +150,13 @@ class DayThresholds:
     """Multiple of the speed limit that no vehicle exceeds between two detectors. By hand. Halved:
     vehicles are matched to others that arrived before them."""
 
+    # --- journeys: travel times and queues that no fit uses -----------------------------------
+
+    slack_s: float = 8.0
+    """Time by which a vehicle that crosses the stop line freely may have been slower than at the
+    speed limit since the advance detector, s. By hand. Halved: vehicles that met the end of a
+    queue have no travel time."""
+
     def of_a_day(self) -> tuple[tuple[str, object], ...]:
         """Return the names and values of these numbers alone, for the key of cached days."""
         return tuple((item.name, getattr(self, item.name)) for item in fields(DayThresholds))
@@ -640,6 +647,21 @@ class Thresholds(DayThresholds):
     confirmed: float = 10.0
     """Distance by which effects must improve the held-out periods. By hand, below `price`. Halved:
     chance confirms more often."""
+
+    # --- gate of the corrected scenario -------------------------------------------------------
+
+    gate_draws: int = 200
+    """Data sets drawn for the error of the gain in held-out travel times and queues. Halved: this
+    error is known to 7 instead of 5 %."""
+    gate_deviations: float = 1.645
+    """Standard errors by which that gain must be above 0: the normal quantile of 0.95, so one in
+    twenty corrections without use passes. Halved: one in five."""
+    least_journeys: float = 20.0
+    """Vehicles below which the data hold no travel times of an approach, or none at all. By hand.
+    Halved: means of ten vehicles are told."""
+    least_gaps: float = 10.0
+    """Gaps of queued vehicles below which an approach has no capacity. By hand. Halved: capacities
+    of single queues are told."""
 
     # --- signal log and usual criteria --------------------------------------------------------
 

@@ -1,0 +1,92 @@
+"""Travel times and queues between detectors, counted by hand."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from ugat_marl.diagnosis.features import DetectorLayout, Greens, IncomingLane, tally
+from ugat_marl.diagnosis.journeys import Crossings, journey_sums, matched
+from ugat_marl.diagnosis.thresholds import Thresholds
+from ugat_marl.scenarios import Detector, Passages, Period
+
+DETECTORS = (
+    Detector("far", "in_0", 100.0, 0.0, "advance"),
+    Detector("line", "in_0", 128.0, 0.0, "stop"),
+)
+LANE = IncomingLane("in_0", "in", 0, (0,), 14.0, {"advance": ("far",), "stop": ("line",)})
+LAYOUT = DetectorLayout(("A",), (LANE,), (), DETECTORS, {})
+GREENS = Greens(
+    np.array([30.0, 90.0]),
+    np.array([50.0, 110.0]),
+    np.array([53.0, 113.0]),
+    np.array([90.0, 120.0]),
+    np.array([True, True]),
+)
+
+
+def crossings(*times: float, free: tuple[float, ...] = ()) -> Crossings:
+    return Crossings(np.array(times), np.isin(times, free))
+
+
+def passages(times: list[float], speeds: list[float]) -> Passages:
+    on = np.array(times)
+    return Passages(on, on + 0.5, np.array(speeds), np.full(len(on), 5.0))
+
+
+def test_first_come_first_served() -> None:
+    pairs, waiting = matched([np.array([0.0, 4.0, 8.0])], [crossings(31.0, 33.0)], [2.0])
+    assert pairs == [[(0.0, 31.0), (4.0, 33.0)]]
+    assert list(waiting[0]) == [8.0]
+
+
+def test_a_vehicle_may_change_lanes_between_the_detectors() -> None:
+    came = [np.array([0.0]), np.array([1.0, 2.0])]
+    pairs, _ = matched(came, [crossings(31.0, 33.0), crossings(32.0)], [2.0, 2.0])
+    assert pairs == [[(0.0, 31.0), (2.0, 33.0)], [(1.0, 32.0)]]
+
+
+def test_a_missed_vehicle_does_not_shift_the_vehicles_after_the_next_free_one() -> None:
+    # The stop detector missed the vehicle of 10 s; everyone drives freely and needs 2 s.
+    came = [np.array([10.0, 20.0, 40.0, 60.0])]
+    shifted, _ = matched(came, [crossings(22.0, 42.0, 62.0)], [2.0], 8.0)
+    assert shifted == [[(10.0, 22.0), (20.0, 42.0), (40.0, 62.0)]]
+    pairs, _ = matched(came, [crossings(22.0, 42.0, 62.0, free=(22.0,))], [2.0], 8.0)
+    assert pairs == [[(20.0, 22.0), (40.0, 42.0), (60.0, 62.0)]]
+
+
+def test_a_free_vehicle_that_nobody_saw_come_has_no_travel_time() -> None:
+    pairs, _ = matched([np.array([0.0, 90.0])], [crossings(60.0, free=(60.0,))], [2.0], 8.0)
+    assert pairs == [[]]
+
+
+def test_the_free_ones_are_quick_apart_and_not_at_the_begin_of_green() -> None:
+    stop = passages([31.0, 38.0, 40.0, 47.0], [14.0, 14.0, 14.0, 3.0])
+    seen = Crossings.of(stop, np.array([30.0]), 14.0, 0.85, 5.0)
+    assert seen.time_s.tolist() == [31.5, 38.5, 40.5, 47.5]
+    assert seen.free.tolist() == [False, True, False, False]
+
+
+def test_sums_of_one_lane() -> None:
+    # Due at 12, 14 and 40 s; green begins at 30 and 50 s. Two wait for the first, none for the
+    # second.
+    pairs = [(10.0, 31.0), (12.0, 33.0), (38.0, 40.5)]
+    sums = journey_sums(pairs, 2.0, np.array([30.0, 50.0]))
+    assert sums.tolist() == [[21.0 + 21.0 + 2.5, 3.0], [2.0, 2.0]]
+    assert journey_sums([], 2.0, np.array([30.0])).tolist() == [[0.0, 0.0], [0.0, 1.0]]
+
+
+def test_the_tally_of_a_period_has_them_beside_the_features() -> None:
+    seen = {
+        "far": passages([10.0, 20.0, 70.0], [14.0, 14.0, 14.0]),
+        "line": passages([31.0, 33.0, 91.0], [3.0, 5.0, 3.0]),
+    }
+    period = Period("day", 0.0, 120.0, "fit", {}, seen)
+    day = tally(LAYOUT, period, [GREENS], Thresholds())
+    assert day.journeys is not None
+    times, queues = day.journeys[:, 0]
+    assert times.tolist() == [pytest.approx(21.5 + 13.5 + 21.5), 3.0]
+    assert queues.tolist() == [3.0, 2.0]
+    both = day + day
+    assert both.journeys is not None
+    assert both.journeys[0, 0].tolist() == [pytest.approx(113.0), 6.0]
