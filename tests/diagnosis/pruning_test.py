@@ -10,12 +10,13 @@ from typing import Any, cast
 import numpy as np
 import pytest
 
-from ugat_marl.diagnosis import Hypothesis, records
+from ugat_marl.diagnosis import Hypothesis, global_hypotheses, records
 from ugat_marl.diagnosis.fit import Fitter
-from ugat_marl.diagnosis.hypotheses import Members
+from ugat_marl.diagnosis.hypotheses import Members, library
 from ugat_marl.diagnosis.records import Fitted
-from ugat_marl.diagnosis.select import pruned
+from ugat_marl.diagnosis.select import Selector, doubtful, pruned
 from ugat_marl.diagnosis.thresholds import Thresholds
+from ugat_marl.effects import known_effects, load_scenario
 from ugat_marl.progress import Advance, Silent
 
 THRESHOLDS = Thresholds()
@@ -197,3 +198,47 @@ def test_the_least_certain_effect_goes_first_and_the_rest_is_judged_anew() -> No
 def test_if_every_effect_may_be_absent_none_is_named() -> None:
     ledger = Ledger({("headway",): 1000.0}, {("headway",): 0.9})
     assert ledger.left(HEADWAY, errors=0.4) == ()
+
+
+LOCAL = (
+    Hypothesis("demand_surge", (("edge", "a"), ("begin_s", 0.0), ("end_s", 9.0)), ("factor",),
+               ((1.5,),), (1.0,), 0.1),
+    Hypothesis("turning", (("from_edge", "a"), ("to_edge", "b")), ("share",), ((0.2,),), (0.0,)),
+    Hypothesis("parking", (("lane", "a_0"), ("dwell_s", 40.0)), ("per_hour",), ((9.0,),), (0.0,)),
+    Hypothesis("local_speed", (("edge", "a"),), ("factor",), ((0.8,),), (1.0,), 0.02),
+)  # fmt: skip
+EVERY = (*global_hypotheses(load_scenario("single-v1"), library()), *LOCAL)
+
+
+@pytest.mark.parametrize("hypothesis", [x for x in EVERY if x.free], ids=lambda x: x.name)
+def test_of_every_effect_the_interval_decides(hypothesis: Hypothesis) -> None:
+    assert hypothesis.nominal is not None
+    (usual,), (strong, *_) = hypothesis.nominal, hypothesis.levels[0]
+    blank = cast(Any, None)
+    for share, named in ((2.1, True), (1.9, False)):
+        error = abs(strong - usual) / share
+        model = Fitted(((hypothesis, (strong,)),), {}, blank, blank, 0.0)
+        tested = records.Tested(model, blank, np.array([error]), {})
+        assert (doubtful(tested, THRESHOLDS.half_interval) == []) == named
+
+
+def test_every_effect_with_a_number_has_a_usual_value() -> None:
+    # Without one, nothing could show that its interval holds it.
+    without = {x.name for x in EVERY if x.nominal is None}
+    assert all(not known_effects()[name].ranges for name in without), without
+
+
+def test_when_the_budget_ends_no_doubtful_effect_is_named_either() -> None:
+    both = ("headway", "demand_level")
+    costs = {both: 900.0, ("headway",): 1000.0, ("demand_level",): 950.0}
+    ledger = Ledger(costs, {(): 0.0, **dict.fromkeys(costs, 0.0)})
+    best = ledger.with_chance(ledger.simulate((HEADWAY, DEMAND), 16), 0.04)
+    assert doubtful(best, THRESHOLDS.half_interval) == [1], "0.95 +- 0.08 may be the usual 1"
+    base = ledger.with_chance(replace(best.model, members=(), cost=2000.0), 0.0)
+    selector: Any = object.__new__(Selector)
+    selector._thresholds = THRESHOLDS
+    alone = [ledger.simulate((member,), 16) for member in (HEADWAY, DEMAND)]
+    selector._seen = {str(number): model for number, model in enumerate([best.model, *alone])}
+    assert selector._without_doubtful(best, base).model.members == (HEADWAY,)
+    selector._seen = {"both": best.model}
+    assert selector._without_doubtful(best, base) is base

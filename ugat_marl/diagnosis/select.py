@@ -112,6 +112,8 @@ class Selector:
             cheapest = min(self._seen.values(), key=cost_of, default=best.model)
             if cheapest.cost < best.model.cost:
                 best = self._untested(cheapest, base)
+            elif doubtful(best, self._thresholds.half_interval):
+                best = self._without_doubtful(best, base)
         rivals = tuple(sorted(self._seen.values(), key=cost_of))
         return Selected(best, rivals, complete, located.examined | self.examined)
 
@@ -149,6 +151,18 @@ class Selector:
         Its errors are not known.
         """
         return Tested(model, base.residual, np.full(len(model.values), np.nan), {})
+
+    def _without_doubtful(self, best: Tested, base: Tested) -> Tested:
+        """Return the best model that was simulated with none but the certain effects of another."""
+        unsure = doubtful(best, self._thresholds.half_interval)
+        members = best.model.members
+        certain = {h.key for place, (h, _) in enumerate(members) if place not in unsure}
+        parts = [
+            model
+            for model in self._seen.values()
+            if model.members and {hypothesis.key for hypothesis, _ in model.members} <= certain
+        ]
+        return self._untested(min(parts, key=cost_of), base) if parts else base
 
     def _round(self, start: Tested, number: int) -> Tested | None:
         """Add, change or remove effects; return None if no change is worth its price."""
@@ -370,16 +384,16 @@ def pruned(
                     )
                 )
                 advance(note=names_of(part))
-        doubtful = [fewer[place] for place in _doubtful(best, fitter.thresholds.half_interval)]
+        unsure = [fewer[place] for place in doubtful(best, fitter.thresholds.half_interval)]
         least = min(fewer, key=cost_of)
         if least.cost - settled(best.model).cost > fitter.thresholds.negligible:
-            if not doubtful:
+            if not unsure:
                 break
-            least = min(doubtful, key=cost_of)
+            least = min(unsure, key=cost_of)
         tested = test(least)
         enough = tested.residual.p > alpha
         # If no set suffices anyway, an effect that may be absent is not named either.
-        vain = least in doubtful and best.residual.p <= alpha
+        vain = least in unsure and best.residual.p <= alpha
         if least.cost > best.model.cost and not enough and not vain:
             break
         best = tested
@@ -392,8 +406,8 @@ def pruned(
 def _sure(best: Tested, base: Tested, fitter: Fitter, test: Callable[[Fitted], Tested]) -> Tested:
     """Drop effects whose intervals hold their usual values, the least certain one first."""
     thresholds = fitter.thresholds
-    while doubtful := _doubtful(best, thresholds.half_interval):
-        least = min(doubtful, key=lambda place: _deviations(best, place))
+    while unsure := doubtful(best, thresholds.half_interval):
+        least = min(unsure, key=lambda place: _deviations(best, place))
         members = each_left_out(best.model.members)[least]
         if not members:
             return base
@@ -410,9 +424,9 @@ def _deviations(tested: Tested, place: int) -> float:
     return float((np.abs(np.subtract(values, hypothesis.nominal or 0.0)) / errors).max())
 
 
-def _doubtful(tested: Tested, half_interval: float) -> list[int]:
+def doubtful(tested: Tested, half_interval: float) -> list[int]:
     """Return indices of effects whose intervals hold the nominal values: they may be absent."""
-    doubtful: list[int] = []
+    places: list[int] = []
     first = 0
     for place, (hypothesis, values) in enumerate(tested.model.members):
         errors = tested.errors[first : first + len(values)]
@@ -420,5 +434,5 @@ def _doubtful(tested: Tested, half_interval: float) -> list[int]:
         if values and hypothesis.nominal is not None:
             away = np.abs(np.subtract(values, hypothesis.nominal))
             if (away <= half_interval * errors).all():
-                doubtful.append(place)
-    return doubtful
+                places.append(place)
+    return places
