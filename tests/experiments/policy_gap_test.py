@@ -75,11 +75,14 @@ def diagnosed(directory: Path, corrected: str | None = "V4", **changes: Any) -> 
     """Write a diagnosis as `diagnose` does, with nothing in it but verdict and correction."""
     nothing: tuple[str, ...] = (
         "left_out", "ruled_out", "findings", "effects", "where", "left", "alternatives",
-        "statistics", "lanes", "untried",
+        "statistics", "lanes", "untried", "approaches",
     )  # fmt: skip
-    none = ("best", "heldout", "evidence", "courtesy", "travel_time", "next_measurement")
+    none = (
+        "best", "heldout", "evidence", "courtesy", "travel_time", "next_measurement", "gate",
+        "not_corrected",
+    )  # fmt: skip
     record = {
-        "schema": "ugat-marl/diagnosis/3",
+        "schema": "ugat-marl/diagnosis/4",
         "scenario": SCENARIO.id,
         "seed": 0,
         "alpha": 0.05,

@@ -64,7 +64,7 @@ def content_of(verdict: str = "explained", *, complete: bool = True, **more: Any
     named = verdict in ("explained", "not_identifiable", "partially_explained")
     evidence = {"distance": 118.2, "runner_up_is_worse_by": 4021.0}
     record: dict[str, Any] = {
-        "schema": "ugat-marl/diagnosis/3", "scenario": "crossing-v1", "seed": 0, "alpha": 0.05,
+        "schema": "ugat-marl/diagnosis/4", "scenario": "crossing-v1", "seed": 0, "alpha": 0.05,
         "budget_h": None, "budget_s": 600.0, "left_out": [], "ruled_out": ["speed_spread"],
         "findings": ["detections.csv: no speeds"], "verified_on_fitted_periods": False,
         "periods": {"fit": ["day1", "day2"], "heldout": ["day3"]}, "policy_gap": None,
@@ -117,6 +117,20 @@ def content_of(verdict: str = "explained", *, complete: bool = True, **more: Any
             "measured": {"saturation_headway_s": 2.25},
         },
         "travel_time": {"before_s": 102.5, "after_s": 133.6},
+        "approaches": [
+            {
+                "tls": "C", "approach": edge,
+                "capacity": {"measured": 1410.0, "before": 1790.0, "after": None},
+                "queue": {"measured": 5.2 + n, "before": 3.1, "after": 5.0},
+                "delay": {"measured": 31.5 + n, "before": 20.0, "after": 30.5},
+            }
+            for n, edge in enumerate(("S_C", "W_C"))
+        ],
+        "gate": None if same else {
+            "measure": "travel time and queue", "error_before": 0.482, "error_after": 0.051,
+            "noise": 0.02, "better": True,
+        },
+        "not_corrected": None,
     }  # fmt: skip
     if not complete:
         record |= {"statistics": [], "lanes": [], "courtesy": None, "travel_time": None}

@@ -54,7 +54,8 @@ class Diagnose:
         cache: Folder of stored simulations.
         workers: Simulations at a time.
         ray: Simulate on Ray instead.
-        correct_partially: Write the corrected scenario also if its effects explain only a part.
+        correct_anyway: Write the corrected scenario also if its effects explain only a part, or do
+            not bring held-out travel times and queues nearer.
         report: Write the page report.html.
     """
 
@@ -75,7 +76,7 @@ class Diagnose:
     ] = None
     workers: Workers = None
     ray: RayAddress = None
-    correct_partially: bool = False
+    correct_anyway: bool = False
     report: bool = True
 
     def run(self, console: Console) -> int:
@@ -110,7 +111,7 @@ class Diagnose:
             seed=self.seed,
             leave_out=self.leave_out,
             cache=self.cache,
-            correct_partially=self.correct_partially,
+            correct_anyway=self.correct_anyway,
         )
 
     def _check_out(self) -> None:
@@ -138,7 +139,7 @@ class Diagnose:
         given = ["ugat-marl", "diagnose", self.scenario, str(self.measured), "--out", str(self.out)]
         given += ["--budget-h", f"{self.budget_h:g}", "--alpha", f"{self.alpha:g}"]
         given += [] if self.budget_s is None else ["--budget-s", f"{self.budget_s:g}"]
-        given += ["--correct-partially"] if self.correct_partially else []
+        given += ["--correct-anyway"] if self.correct_anyway else []
         given += ["--seed", str(self.seed)]
         if self.leave_out:
             given += ["--leave-out", *self.leave_out]
@@ -163,10 +164,8 @@ class Diagnose:
             lines.append(f"use it:    {following[0]}")
         elif diagnosis.effects and not any(map(_in_the_model, diagnosis.effects)):
             lines.append("The effects are faults of detectors; the simulation stays as it is.")
-        elif diagnosis.verdict == "partially_explained":
-            lines.append(
-                "Nothing is corrected by a part; --correct-partially writes it all the same."
-            )
+        if diagnosis.not_corrected is not None:
+            lines.append(f"{diagnosis.not_corrected} --correct-anyway does it all the same.")
         console.print("\n" + "\n".join(lines), soft_wrap=True, markup=False)
 
 

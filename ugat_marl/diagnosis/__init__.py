@@ -9,6 +9,7 @@ content of ``diagnosis.json``.
     thresholds  every number of the method, with its unit and its reason
     records     the records of the stages, and the form of ``diagnosis.json``
     features    measured lanes, and the features of one period there
+    journeys    travel times and queues between detectors, which no fit uses
     statistics  statistics of several periods, their noise, distances, whitening
     measurement errors of the detectors, read off single vehicles before all else
     replay      one simulated day under the measured signals, with measured arrivals
@@ -21,6 +22,7 @@ content of ``diagnosis.json``.
     residual    the test of the difference that a model leaves
     select      the search, round by round
     verify      both models on held-out periods, side by side; the usual criteria
+    traffic     both models in terms of traffic; the gate of the corrected scenario
     verdict     one of six verdicts, in words
 """
 

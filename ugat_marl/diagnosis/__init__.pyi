@@ -8,6 +8,7 @@ from .locate import locate_gap as locate_gap
 from .places import Routes as Routes
 from .records import CORRECTED as CORRECTED
 from .records import FILE as FILE
+from .records import ApproachRow as ApproachRow
 from .records import Conclusion as Conclusion
 from .records import CriteriaRow as CriteriaRow
 from .records import Diagnosis as Diagnosis
@@ -27,8 +28,10 @@ from .records import Parameter as Parameter
 from .records import PolicyGap as PolicyGap
 from .records import SearchGrounds as SearchGrounds
 from .records import Selected as Selected
+from .records import Sides as Sides
 from .records import Splits as Splits
 from .records import StatisticRow as StatisticRow
+from .records import TrafficGate as TrafficGate
 from .records import TravelTimeEstimate as TravelTimeEstimate
 from .records import TravelTimes as TravelTimes
 from .records import Verdict as Verdict

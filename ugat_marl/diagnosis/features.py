@@ -344,13 +344,13 @@ class Tally:
     def __add__(self, other: Tally) -> Tally:
         bins = min(self.bins.shape[-1], other.bins.shape[-1])
         every = self.known is None and other.known is None
-        known = self.journeys is not None and other.journeys is not None
+        mine, others = self.journeys, other.journeys
         return Tally(
             self.sums + other.sums,
             self.bins[..., :bins] + other.bins[..., :bins],
             self.days + other.days,
             None if every else self.counted[..., :bins] + other.counted[..., :bins],
-            self.journeys + other.journeys if known else None,
+            None if mine is None or others is None else mine + others,
         )
 
 

@@ -35,7 +35,7 @@ FILE = "diagnosis.json"
 """Name of the file that a diagnosis writes into its directory."""
 CORRECTED = "corrected"
 """Name of the folder of the corrected scenario, beside that file."""
-SCHEMA = "ugat-marl/diagnosis/3"
+SCHEMA = "ugat-marl/diagnosis/4"
 """Form of the file; it rises whenever the form changes."""
 
 Verdict = Literal[
@@ -494,6 +494,59 @@ class TravelTimes:
 
 
 @dataclass(frozen=True)
+class Sides:
+    """A number of traffic on the held-out periods; None where too few vehicles tell.
+
+    Attributes:
+        measured: The data.
+        before: The scenario as it is.
+        after: The corrected model.
+    """
+
+    measured: float | None
+    before: float | None
+    after: float | None
+
+
+@dataclass(frozen=True)
+class ApproachRow:
+    """Capacity, queue and delay of one approach on the held-out periods.
+
+    Attributes:
+        tls: SUMO id of the traffic light.
+        approach: SUMO id of the edge.
+        capacity: Saturation flow, vehicles per hour of green and lane.
+        queue: Vehicles held back between the detectors when green begins, all lanes together.
+        delay: Time between the detectors beyond that at the speed limit, s per vehicle.
+    """
+
+    tls: str
+    approach: str
+    capacity: Sides
+    queue: Sides
+    delay: Sides
+
+
+@dataclass(frozen=True)
+class TrafficGate:
+    """Judgement of a correction by measures that no fit uses, on the held-out periods.
+
+    Attributes:
+        measure: The measures: ``travel time and queue``, or else ``service counts``.
+        error_before: Sum of the relative errors of the scenario as it is.
+        error_after: Sum of the relative errors of the corrected model.
+        noise: Standard error of their difference.
+        better: True if the correction lowers the error by more than this noise.
+    """
+
+    measure: str
+    error_before: float
+    error_after: float
+    noise: float
+    better: bool
+
+
+@dataclass(frozen=True)
 class Tables:
     """Both models side by side.
 
@@ -502,12 +555,14 @@ class Tables:
         lanes: Rows for the lanes with detectors.
         courtesy: Usual criteria of traffic engineers.
         travel_time: Mean simulated travel times.
+        approaches: Rows for the approaches, in terms of traffic.
     """
 
     statistics: tuple[StatisticRow, ...] = ()
     lanes: tuple[LaneRow, ...] = ()
     courtesy: EngineeringCriteria | None = None
     travel_time: TravelTimes | None = None
+    approaches: tuple[ApproachRow, ...] = ()
 
 
 @dataclass(frozen=True)
@@ -590,16 +645,21 @@ class Diagnosis:
         lanes: Lanes with detectors, before and after.
         courtesy: Usual criteria of traffic engineers, before and after.
         travel_time: Mean simulated travel times, before and after.
+        approaches: Capacity, queue and delay of each approach, before and after.
+        gate: Judgement of the correction by measures that no fit uses; None if there is nothing to
+            judge, or nothing to judge by.
         next_measurement: A measurement that would separate the rivals, or show the missing effect.
         complete: True if the diagnosis ended by itself, False if the budget ended it.
         untried: Names of effects that were not examined for lack of time.
         corrected: Name of the folder of the corrected scenario; None if nothing is corrected.
+        not_corrected: Reason why effects of the search are in no corrected scenario; None without
+            one.
         policy_gap: Travel times by policy; None until `ugat-marl policy-gap` has measured them.
     """
 
     __pydantic_config__ = ConfigDict(extra="forbid")
 
-    schema: Literal["ugat-marl/diagnosis/3"]
+    schema: Literal["ugat-marl/diagnosis/4"]
     scenario: str
     seed: int
     alpha: float
@@ -625,10 +685,13 @@ class Diagnosis:
     lanes: tuple[LaneRow, ...]
     courtesy: EngineeringCriteria | None
     travel_time: TravelTimes | None
+    approaches: tuple[ApproachRow, ...]
+    gate: TrafficGate | None
     next_measurement: str | None
     complete: bool
     untried: tuple[str, ...]
     corrected: str | None
+    not_corrected: str | None
     policy_gap: dict[str, PolicyGap] | None = None
 
     @property

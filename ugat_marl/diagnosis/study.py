@@ -65,7 +65,8 @@ class DiagnosisConfig:
         cache: Folder of the remembered days; None for the user's cache folder.
         workers: Simulations at a time, None for one per core; or an executor.
         effort: Numbers of simulated days; None for those that suit the size of the network.
-        correct_partially: Write ``corrected`` also for a verdict of `partially_explained`.
+        correct_anyway: Write ``corrected`` also if its effects explain only a part, or bring
+            held-out traffic no nearer.
         thresholds: Numbers of the method.
     """
 
@@ -77,7 +78,7 @@ class DiagnosisConfig:
     cache: Path | None = None
     workers: Workers = None
     effort: Effort | None = None
-    correct_partially: bool = False
+    correct_anyway: bool = False
     thresholds: Thresholds = field(default_factory=Thresholds)
 
     def __post_init__(self) -> None:

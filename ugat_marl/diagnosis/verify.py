@@ -24,6 +24,7 @@ from ugat_marl.diagnosis.records import (
     StatisticRow,
     Tables,
     Tested,
+    TrafficGate,
     TravelTimes,
     Verified,
 )
@@ -31,6 +32,7 @@ from ugat_marl.diagnosis.residual import Null
 from ugat_marl.diagnosis.statistics import Array, sum_of
 from ugat_marl.diagnosis.study import Study
 from ugat_marl.diagnosis.thresholds import Thresholds
+from ugat_marl.diagnosis.traffic import approach_table, gate_of
 from ugat_marl.effects import Effect
 
 
@@ -65,7 +67,27 @@ def tables_of(study: Study, base: Tested, best: Tested) -> Tables:
         lanes_table(study, base, best),
         courtesy(study, base, best),
         travel_times(study, best),
+        approach_table(
+            study.layout,
+            study.heldout,
+            _same_days(base, best),
+            best.model.tallies,
+            study.config.thresholds,
+        ),
     )
+
+
+def judged(study: Study, base: Tested, best: Tested) -> TrafficGate | None:
+    """Judge the correction by held-out measures that no fit uses; None if it changes no traffic."""
+    if all(effect.on_detectors for effect in best.model.effects):
+        return None
+    days = _same_days(base, best)
+    return gate_of(study.heldout, days, best.model.tallies, study.config.thresholds)
+
+
+def _same_days(base: Tested, best: Tested) -> list[Tally]:
+    """Return those days of the scenario as it is that the corrected model has too."""
+    return [base.model.days[number] for number in best.model.days]
 
 
 def statistics_table(study: Study, base: Tested, best: Tested) -> tuple[StatisticRow, ...]:

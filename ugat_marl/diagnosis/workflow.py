@@ -36,6 +36,7 @@ from ugat_marl.diagnosis.records import (
     Splits,
     Tables,
     Tested,
+    TrafficGate,
     Verdict,
     Verified,
 )
@@ -48,7 +49,7 @@ from ugat_marl.diagnosis.verdict import (
     unchallenged,
     unverified,
 )
-from ugat_marl.diagnosis.verify import tables_of, verify_model
+from ugat_marl.diagnosis.verify import judged, tables_of, verify_model
 from ugat_marl.effects import Effect, apply_effects
 from ugat_marl.progress import Reporter, Silent
 from ugat_marl.scenarios import Scenario
@@ -149,10 +150,26 @@ def _compared(
         conclusion = unverified(selected)
         conclusion = told(conclusion)
         diagnosis = _record(study, timing, located, selected, verified, conclusion, tables=False)
-    kept = conclusion.verdict != "unknown"
+    if conclusion.verdict == "unknown" or not conclusion.best.model.members:
+        return diagnosis, ()
+    gate = judged(study, located.base, conclusion.best)
+    reason = None if study.config.correct_anyway else _reason_against(conclusion, gate)
+    diagnosis = replace(diagnosis, gate=gate, not_corrected=reason)
+    return diagnosis, () if reason else conclusion.best.model.effects
+
+
+def _reason_against(conclusion: Conclusion, gate: TrafficGate | None) -> str | None:
+    """Return why the effects of a conclusion are not put into the scenario; None if they are."""
     if conclusion.verdict == "partially_explained":
-        kept = study.config.correct_partially
-    return diagnosis, conclusion.best.model.effects if kept else ()
+        return "The effects named explain only a part, so the scenario is not corrected by them."
+    if gate is None or gate.better:
+        return None
+    return (
+        f"The effects named do not bring {gate.measure} nearer to the held-out periods: the sum of "
+        f"relative errors is {100 * gate.error_before:.1f} % before and "
+        f"{100 * gate.error_after:.1f} % after (standard error of the difference: "
+        f"{100 * gate.noise:.1f} %). So the scenario is not corrected by them."
+    )
 
 
 def _beside_the_log(
@@ -205,6 +222,7 @@ def _record(
         lanes=sides.lanes,
         courtesy=sides.courtesy,
         travel_time=sides.travel_time,
+        approaches=sides.approaches,
         next_measurement=conclusion.next_measurement,
     )
 
@@ -274,10 +292,13 @@ def _begun(
         lanes=(),
         courtesy=None,
         travel_time=None,
+        approaches=(),
+        gate=None,
         next_measurement=None,
         complete=examined is None,
         untried=tuple(sorted(left)),
         corrected=None,
+        not_corrected=None,
     )
 
 

@@ -87,6 +87,8 @@ def diagnosis_page(diagnosis: Diagnosis, network: Network, commands: Sequence[st
         judged="fitted" if diagnosis.verified_on_fitted_periods else "held-out",
         heldout=None if heldout is None else _heldout(heldout),
         expected=number(None if heldout is None else heldout.expected),
+        traffic=_traffic(diagnosis),
+        gate=words.gate_line(diagnosis),
         maps=_maps(page, diagnosis, network),
         map_key=[(f"d{place}", text) for place, (_, text) in enumerate(DISAGREEMENT)],
         statistics=_statistics(page, diagnosis),
@@ -142,6 +144,14 @@ def _heldout(heldout: HeldOut) -> list[tuple[str, str]]:
     if corrected:
         boxes.append((chance(heldout.p_after), "p after"))
     return boxes
+
+
+def _traffic(diagnosis: Diagnosis) -> Grid | None:
+    """Return a table of capacity, queue and delay by approach; None without travel times."""
+    corrected = diagnosis.best is not None
+    rows = words.traffic_rows(diagnosis.approaches, corrected=corrected)
+    columns = ("measured", "before", "after")
+    return Grid(("approach", "", *columns), rows, columns) if rows else None
 
 
 def _model(diagnosis: Diagnosis) -> str:

@@ -32,6 +32,10 @@ def diagnosis_summary(diagnosis: Diagnosis) -> RenderableType:
         blocks.append(_where(diagnosis))
     if diagnosis.heldout is not None:
         blocks.append(_heldout(diagnosis.heldout, fitted=diagnosis.verified_on_fitted_periods))
+    if diagnosis.approaches:
+        blocks.append(_traffic(diagnosis))
+    if (text := words.gate_line(diagnosis)) is not None:
+        blocks.append(Text(text))
     if (text := words.geh_line(diagnosis)) is not None:
         blocks.append(Text(text))
     return Group(*blocks)
@@ -79,6 +83,19 @@ def _where(diagnosis: Diagnosis) -> Table:
                 (words.disagreement_place(disagreement), observed, size, signed(disagreement.z)),
             )
         )
+    return table
+
+
+def _traffic(diagnosis: Diagnosis) -> Table:
+    """Return capacity, queue and delay of the approach whose delay differs most."""
+    corrected = diagnosis.best is not None
+    approach = words.slowest(diagnosis)
+    table = _table(f"approach {approach[0].approach}")
+    table.add_column("", overflow="fold")
+    for heading in ("measured", "before", "after"):
+        table.add_column(heading, justify="right")
+    for _, name, *values in words.traffic_rows(approach, corrected=corrected):
+        table.add_row(*map(Text, (name, *values)))
     return table
 
 

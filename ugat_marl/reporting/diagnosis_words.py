@@ -3,9 +3,18 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable
+from collections.abc import Callable, Iterable
 
-from ugat_marl.diagnosis import Diagnosis, Disagreement, EffectRecord, Parameter, Verdict, clock
+from ugat_marl.diagnosis import (
+    ApproachRow,
+    Diagnosis,
+    Disagreement,
+    EffectRecord,
+    Parameter,
+    Sides,
+    Verdict,
+    clock,
+)
 from ugat_marl.reporting.formats import number, share
 
 UNTRIED = 8
@@ -111,6 +120,59 @@ def partial(diagnosis: Diagnosis) -> str | None:
     return (
         f"Partial result: the budget of {diagnosis.budget_in_words} ended before the search "
         f"did.{left} The same command goes on where this one stopped."
+    )
+
+
+TRAFFIC: tuple[tuple[str, Callable[[ApproachRow], Sides]], ...] = (
+    ("capacity, veh/h per lane in green", lambda row: row.capacity),
+    ("queue when green begins, vehicles", lambda row: row.queue),
+    ("delay between the detectors, s", lambda row: row.delay),
+)
+"""Numbers of traffic of an approach, and how to find them in its row."""
+
+
+def traffic_rows(
+    rows: Iterable[ApproachRow], *, corrected: bool
+) -> list[tuple[str, str, str, str, str]]:
+    """Return approach, name, measured and simulated values of each number of traffic.
+
+    Args:
+        rows: Rows of the approaches.
+        corrected: True if the corrected model is told too.
+    """
+    return [
+        (
+            row.approach,
+            name,
+            number(sides.measured),
+            number(sides.before),
+            number(sides.after) if corrected else "",
+        )
+        for row in rows
+        for name, value in TRAFFIC
+        if (sides := value(row)).measured is not None
+    ]
+
+
+def slowest(diagnosis: Diagnosis) -> list[ApproachRow]:
+    """Return the approach whose measured delay differs most from the scenario as it is."""
+
+    def apart(row: ApproachRow) -> float:
+        return abs((row.delay.measured or 0.0) - (row.delay.before or 0.0))
+
+    return sorted(diagnosis.approaches, key=apart)[-1:]
+
+
+def gate_line(diagnosis: Diagnosis) -> str | None:
+    """Return a sentence on the gate of the corrected scenario; None without one."""
+    gate = diagnosis.gate
+    if gate is None:
+        return None
+    nearer = "come nearer" if gate.better else "do not come nearer"
+    before, after = share(gate.error_before), share(gate.error_after)
+    return (
+        f"By the effects named, simulated {gate.measure} {nearer} to the data, which no fit used: "
+        f"sum of relative errors {before} before, {after} after."
     )
 
 

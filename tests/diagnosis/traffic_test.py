@@ -1,0 +1,115 @@
+"""The gate of the corrected scenario, and verdicts in terms of traffic."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from types import SimpleNamespace
+from typing import Any
+
+import numpy as np
+import pytest
+
+from ugat_marl.diagnosis.features import BIN_FEATURES, FEATURES, INDEX, Tally
+from ugat_marl.diagnosis.thresholds import Thresholds
+from ugat_marl.diagnosis.traffic import approach_table, gate_of
+from ugat_marl.diagnosis.workflow import _reason_against as reason_against
+
+THRESHOLDS = Thresholds()
+LAYOUT: Any = SimpleNamespace(
+    intersections=("A",),
+    lanes=(SimpleNamespace(edge="in", intersection=0), SimpleNamespace(edge="in", intersection=0)),
+    approaches=((0, 1),),
+    ride_s=lambda lane: 3.0,
+)
+
+
+def days(
+    seed: int, count: int, travel_s: float, queue: float, gap_s: float = 2.0, served: float = 20.0
+) -> list[Tally]:
+    """Days of two lanes with 50 vehicles and 20 greens each."""
+    generator = np.random.default_rng(seed)
+    made: list[Tally] = []
+    for _ in range(count):
+        sums = np.zeros((len(FEATURES), 2, 2))
+        sums[INDEX["gap6-8"]] = (40 * gap_s, 40)
+        bins = np.zeros((len(BIN_FEATURES), 2, 4))
+        bins[BIN_FEATURES.index("count_stop")] = generator.poisson(served, (2, 4))
+        times = 50 * generator.normal(travel_s, 0.5, 2)
+        held = 20 * generator.normal(queue, 0.2, 2)
+        journeys = np.stack([[times, [50, 50]], [held, [20, 20]]]).transpose(0, 2, 1)
+        made.append(Tally(sums, bins, journeys=journeys))
+    return made
+
+
+def without_journeys(tallies: Sequence[Tally]) -> list[Tally]:
+    return [Tally(day.sums, day.bins) for day in tallies]
+
+
+def test_a_correction_that_brings_travel_times_nearer_passes() -> None:
+    gate = gate_of(days(1, 2, 25, 5), days(2, 16, 20, 4), days(3, 16, 25, 5), THRESHOLDS)
+    assert gate is not None and gate.better
+    assert gate.measure == "travel time and queue"
+    # |25 - 20| / 25 + |5 - 4| / 5
+    assert gate.error_before == pytest.approx(0.4, abs=0.06)
+    assert gate.error_after < 0.08
+    assert 0.0 < gate.noise < 0.1
+
+
+def test_a_correction_that_makes_waiting_worse_is_refused() -> None:
+    gate = gate_of(days(1, 2, 20, 4), days(2, 16, 20, 4), days(3, 16, 22, 5), THRESHOLDS)
+    assert gate is not None and not gate.better
+    assert gate.error_after > gate.error_before
+
+
+def test_a_correction_without_use_passes_as_often_as_is_said() -> None:
+    gates = [
+        gate_of(days(s, 2, 20, 4), days(s + 1000, 16, 20, 4), days(s + 2000, 16, 20, 4), THRESHOLDS)
+        for s in range(60)
+    ]
+    passed = sum(gate is not None and gate.better for gate in gates)
+    assert passed <= 8, "one in twenty, and chance"
+
+
+def test_without_travel_times_counts_decide() -> None:
+    street, sim, repaired = days(1, 2, 20, 4, served=30), days(2, 16, 20, 4), days(2, 16, 20, 4)
+    gate = gate_of(*map(without_journeys, (street, sim, repaired)), THRESHOLDS)
+    assert gate is not None and gate.measure == "service counts"
+    assert not gate.better
+    right = days(3, 16, 20, 4, served=30)
+    gate = gate_of(*map(without_journeys, (street, sim, right)), THRESHOLDS)
+    assert gate is not None and gate.better
+
+
+def test_without_anything_to_judge_by_there_is_no_gate() -> None:
+    empty = [Tally(np.zeros((len(FEATURES), 0, 2)), np.zeros((len(BIN_FEATURES), 0, 4)))]
+    assert gate_of(empty, empty * 3, empty * 3, THRESHOLDS) is None
+
+
+def test_an_approach_in_terms_of_traffic() -> None:
+    street, sim = days(1, 2, 25, 5, gap_s=2.4), days(2, 16, 20, 4, gap_s=2.0)
+    (row,) = approach_table(LAYOUT, street, sim, days(3, 16, 25, 5, gap_s=2.5), THRESHOLDS)
+    assert (row.tls, row.approach) == ("A", "in")
+    assert row.capacity.measured == pytest.approx(1500.0)
+    assert (row.capacity.before, row.capacity.after) == pytest.approx((1800.0, 1440.0))
+    assert row.queue.measured == pytest.approx(10.0, abs=0.6), "both lanes together"
+    assert row.delay.measured == pytest.approx(22.0, abs=1.0), "3 s are the free ride"
+    assert row.delay.before == pytest.approx(17.0, abs=0.5)
+    assert approach_table(LAYOUT, without_journeys(street), sim, sim, THRESHOLDS) == ()
+
+
+@pytest.mark.parametrize(
+    ("verdict", "better", "refused"),
+    [
+        ("explained", True, ""),
+        ("explained", False, "travel time and queue"),
+        ("provisional", False, "travel time and queue"),
+        ("partially_explained", True, "only a part"),
+    ],
+)
+def test_why_a_scenario_is_not_corrected(verdict: str, better: bool, refused: str) -> None:
+    after = days(3, 16, 25, 5) if better else days(3, 16, 20, 4)
+    gate = gate_of(days(1, 2, 25, 5), days(2, 16, 20, 4), after, THRESHOLDS)
+    conclusion: Any = SimpleNamespace(verdict=verdict)
+    reason = reason_against(conclusion, gate)
+    assert (reason is not None) == bool(refused)
+    assert refused in (reason or "")

@@ -1,0 +1,156 @@
+"""Both models in terms of traffic: capacity, queue and delay per approach, on held-out periods.
+
+Travel times and queues between detectors are in no distance. So they also decide if a correction
+makes the simulation a better picture of the street: the gate of the corrected scenario.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+
+from ugat_marl.diagnosis.features import BIN_FEATURES, INDEX, DetectorLayout, Tally
+from ugat_marl.diagnosis.records import ApproachRow, Sides, TrafficGate
+from ugat_marl.diagnosis.statistics import Array, sum_of
+from ugat_marl.diagnosis.thresholds import Thresholds
+
+_STEADY = [INDEX[name] for name in ("gap4-5", "gap6-8", "gap9+")]
+"""Gaps of queued vehicles from the fourth on: those of saturation flow."""
+_SERVED = [BIN_FEATURES.index(name) for name in ("count_stop", "count_exit")]
+_SEED = 11
+"""Seed of the drawn data sets; fixed, so that the same days give the same gate."""
+
+
+def approach_table(
+    layout: DetectorLayout,
+    measured: Sequence[Tally],
+    before: Sequence[Tally],
+    after: Sequence[Tally],
+    thresholds: Thresholds,
+) -> tuple[ApproachRow, ...]:
+    """Compare capacity, queue and delay of every approach with both detectors.
+
+    Args:
+        layout: Lanes and detectors.
+        measured: Tallies of the held-out periods.
+        before: Tallies of days of the scenario as it is.
+        after: Tallies of days of the corrected model.
+        thresholds: Numbers of the method.
+    """
+    sides = [sum_of(days) for days in (measured, before, after)]
+    if any(side.journeys is None for side in sides):
+        return ()
+    rows: list[ApproachRow] = []
+    for lanes in layout.approaches:
+        first = layout.lanes[lanes[0]]
+        values = [_of_approach(layout, side, lanes, thresholds) for side in sides]
+        if values[0][2] is not None:
+            capacity, queue, delay = (Sides(*column) for column in zip(*values, strict=True))
+            tls = layout.intersections[first.intersection]
+            rows.append(ApproachRow(tls, first.edge, capacity, queue, delay))
+    return tuple(rows)
+
+
+def _of_approach(
+    layout: DetectorLayout, tally: Tally, lanes: Sequence[int], thresholds: Thresholds
+) -> tuple[float | None, float | None, float | None]:
+    """Return capacity in veh/h of green and lane, vehicles held back, delay in s per vehicle.
+
+    Capacity = 3600 / mean gap of queued vehicles. The queue is the sum of the lanes' means per
+    green. Delay = time between the detectors minus that at the speed limit.
+    """
+    assert tally.journeys is not None
+    places = list(lanes)
+    total, count = tally.sums[_STEADY][:, places].sum(axis=(0, 1))
+    capacity = 3600.0 * count / total if count >= thresholds.least_gaps else None
+    times, queues = tally.journeys[:, places]
+    known = times[:, 1].sum()
+    if known < thresholds.least_journeys:
+        return capacity, None, None
+    rides = sum(
+        layout.ride_s(lane) * number for lane, number in zip(lanes, times[:, 1], strict=True)
+    )
+    queue = sum(held / greens for held, greens in queues if greens)
+    return capacity, float(queue), float((times[:, 0].sum() - rides) / known)
+
+
+def gate_of(
+    measured: Sequence[Tally],
+    before: Sequence[Tally],
+    after: Sequence[Tally],
+    thresholds: Thresholds,
+) -> TrafficGate | None:
+    """Judge a correction by measures that no fit uses.
+
+    The error of a model is the sum over the measures of ``Σ w |measured - simulated| / Σ w
+    measured``, with the numbers of observations w of the lanes. Data sets are drawn around the
+    measured values, with the noise of the model's own days, and days of both models are drawn anew,
+    to know the error of the gain.
+
+    Args:
+        measured: Tallies of the held-out periods.
+        before: Tallies of days of the scenario as it is.
+        after: Tallies of days of the corrected model.
+        thresholds: Numbers of the method.
+
+    Returns:
+        None if the data hold nothing to judge by.
+    """
+    for measure, sums in (("travel time and queue", _journeys), ("service counts", _served)):
+        sides = [sums(days) for days in (measured, before, after)]
+        if all(side is not None and side.shape[-2] for side in sides):
+            real, old, new = (side for side in sides if side is not None)
+            if real[..., 1].sum() >= thresholds.least_journeys:
+                return _gate(measure, real, old, new, thresholds)
+    return None
+
+
+def _gate(measure: str, real: Array, old: Array, new: Array, thresholds: Thresholds) -> TrafficGate:
+    """Judge by sums of days ``(days, measures, places, 2)`` of the data and of both models.
+
+    Both models have the same days.
+    """
+    street, simulated, repaired = (_ratio(side.sum(axis=0)) for side in (real, old, new))
+    weight = real.sum(axis=0)[..., 1]
+    used = np.isfinite(street) & np.isfinite(simulated) & np.isfinite(repaired)
+    weight = np.where(used, weight, 0.0)
+
+    def error(model: Array, data: Array) -> float:
+        apart = np.where(used, np.abs(data - model), 0.0) * weight
+        size = (np.where(used, np.abs(street), 0.0) * weight).sum(axis=-1)
+        return float((apart.sum(axis=-1)[size > 0] / size[size > 0]).sum())
+
+    generator = np.random.default_rng(_SEED)
+    gains: list[float] = []
+    for _ in range(thresholds.gate_draws):
+        days = generator.choice(len(new), len(real))
+        drawn = street + np.nan_to_num(_ratio(new[days].sum(axis=0)) - repaired)
+        again = generator.choice(len(new), len(new))  # the same days of both models
+        models = (np.nan_to_num(_ratio(side[again].sum(axis=0))) for side in (old, new))
+        first, last = (error(model, drawn) for model in models)
+        gains.append(first - last)
+    first, last, noise = error(simulated, street), error(repaired, street), float(np.std(gains))
+    better = first - last > thresholds.gate_deviations * noise
+    return TrafficGate(measure, first, last, noise, better)
+
+
+def _ratio(sums: Array) -> Array:
+    """Return sums over numbers of observations; NaN without observations."""
+    return np.where(sums[..., 1] > 0, sums[..., 0] / np.maximum(sums[..., 1], 1e-9), np.nan)
+
+
+def _journeys(days: Sequence[Tally]) -> Array | None:
+    """Return the sums of `JOURNEYS` of each day, ``(days, measures, places, 2)``."""
+    known = [day.journeys for day in days if day.journeys is not None]
+    return np.stack(known) if len(known) == len(days) else None
+
+
+def _served(days: Sequence[Tally]) -> Array | None:
+    """Return vehicles per bin of time at stop and exit detectors, ``(days, 1, places, 2)``."""
+    shortest = min(day.bins.shape[-1] for day in days)
+    sums = [
+        np.stack([x[_SERVED, :, :shortest].ravel() for x in (day.bins, day.counted)], axis=-1)
+        for day in days
+    ]
+    return np.stack(sums)[:, None]
