@@ -9,7 +9,7 @@ from pathlib import Path
 import pytest
 
 from ugat_marl.diagnosis import Hypothesis, free_values, global_hypotheses, ordered
-from ugat_marl.diagnosis.hypotheses import LOCAL, library, settings_as_members
+from ugat_marl.diagnosis.hypotheses import LOCAL, cautious_drivers, library
 from ugat_marl.effects import PAPER_WORLDS, known_effects, load_scenario, parse_domain
 from ugat_marl.errors import OptionError, UnknownNameError
 from ugat_marl.scenarios import Scenario
@@ -153,15 +153,22 @@ def test_trucks_keep_their_own_acceleration() -> None:
     assert names.index("heavy_share") > names.index("acceleration")
 
 
-def test_the_settings_of_the_paper_are_starting_points(single: Scenario) -> None:
-    found = settings_as_members(global_hypotheses(single, library()))
-    assert len(found) == len(PAPER_WORLDS)
-    for members, effects in zip(found, PAPER_WORLDS.values(), strict=True):
-        values = {hypothesis.name: value for hypothesis, value in members}
-        for effect in effects:
-            if effect.name in values:
-                assert hypothesis_value(effect) == values[effect.name]
-    assert settings_as_members([]) == []
+def test_cautious_drivers_are_starting_points(single: Scenario) -> None:
+    mild, strong = cautious_drivers(global_hypotheses(single, library()))
+    assert [(h.name, value) for h, value in mild] == [
+        ("acceleration", (1.6,)), ("deceleration", (3.2,)), ("startup_delay", (0.3,)),
+    ]  # fmt: skip
+    assert [value for _, value in strong] == [(0.8,), (2.0,), (1.2,)]
+    assert cautious_drivers([]) == []
+
+
+def test_no_world_of_the_paper_is_a_starting_point(single: Scenario) -> None:
+    # A search that begins at the worlds it is tried on would find them for a wrong reason.
+    hypotheses = global_hypotheses(single, library())
+    worlds = {(e.name, hypothesis_value(e)) for world in PAPER_WORLDS.values() for e in world}
+    starts = {(h.name, value) for start in cautious_drivers(hypotheses) for h, value in start}
+    starts |= {(h.name, level) for h in hypotheses for level in h.levels}
+    assert worlds & starts == set()
 
 
 def hypothesis_value(effect: object) -> tuple[float, ...]:

@@ -10,7 +10,6 @@ import numpy as np
 
 from ugat_marl.effects import (
     EVERYWHERE,
-    PAPER_WORLDS,
     Effect,
     ExaminedStrengths,
     known_effects,
@@ -107,6 +106,9 @@ LOCAL = frozenset(
 )  # fmt: skip
 """Effects that need a place, and some a window: see `places`."""
 
+CAUTION = ("acceleration", "deceleration", "startup_delay")
+"""Properties of drivers that change together, for `cautious_drivers`."""
+
 MODELS = ("IDM", "EIDM", "W99")
 """Driver models that are examined."""
 
@@ -167,24 +169,30 @@ def global_hypotheses(scenario: Scenario, allowed: Collection[str]) -> list[Hypo
     return hypotheses
 
 
-def settings_as_members(
-    hypotheses: Sequence[Hypothesis],
-) -> list[tuple[tuple[Hypothesis, tuple[float, ...]], ...]]:
-    """Return the settings of the paper (loads, rain, snow) as starting points of a fit.
+def cautious_drivers(hypotheses: Sequence[Hypothesis]) -> list[Members]:
+    """Return sets of several properties of drivers as starting points of a fit.
 
-    They change several properties of drivers at once, and single effects do not lead there.
+    In bad weather drivers start later, and speed up and brake more gently, all at once. Single
+    effects do not lead there. The strengths are those at which the library examines each effect
+    alone: the mildest together, and the strongest together.
+
+    Args:
+        hypotheses: Hypotheses about the whole network.
     """
     known = {hypothesis.name: hypothesis for hypothesis in hypotheses}
-    settings: list[tuple[tuple[Hypothesis, tuple[float, ...]], ...]] = []
-    for effects in PAPER_WORLDS.values():
-        members = [
-            (known[effect.name], free_values(effect, known[effect.name]))
-            for effect in effects
-            if effect.name in known
-        ]
-        if len(members) > 1:
-            settings.append(tuple(members))
-    return settings
+    if not all(name in known for name in CAUTION):
+        return []
+
+    def together(strongest: bool) -> Members:
+        members: list[tuple[Hypothesis, tuple[float, ...]]] = []
+        for hypothesis in (known[name] for name in CAUTION):
+            (usual,) = hypothesis.nominal or (0.0,)
+            levels = [level for level in hypothesis.levels if level not in hypothesis.extreme]
+            levels.sort(key=lambda level: abs(level[0] - usual))
+            members.append((hypothesis, levels[-1 if strongest else 0]))
+        return tuple(members)
+
+    return [together(strongest=False), together(strongest=True)]
 
 
 def ordered(effects: Sequence[Effect]) -> tuple[Effect, ...]:

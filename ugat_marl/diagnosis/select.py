@@ -16,11 +16,11 @@ from ugat_marl.diagnosis.hypotheses import (
     Members,
     a_few,
     both_ways,
+    cautious_drivers,
     each_left_out,
     effects_of,
     merged,
     names_of,
-    settings_as_members,
 )
 from ugat_marl.diagnosis.places import PlaceFinder
 from ugat_marl.diagnosis.propose import Direction, between, promising, propose, squared_gap
@@ -182,7 +182,7 @@ class Selector:
         if number == 0:
             chosen += self._nearest()
             chosen += (
-                settings_as_members(self._library) if gap > self._thresholds.huge * chance else []
+                cautious_drivers(self._library) if gap > self._thresholds.huge * chance else []
             )
         best = self._fitted(start, chosen, f"round {number + 1}: candidates")
         if best is None and not near:  # simulations did not confirm the prediction of the library

@@ -619,7 +619,7 @@ class Thresholds(DayThresholds):
     Halved: more candidates are fitted."""
     huge: float = 20.0
     """Distance per statistic beyond which several effects at once are likely from the start. By
-    hand. Halved: the paper's settings are tried more often."""
+    hand. Halved: cautious drivers are tried more often."""
     plain: float = 100.0
     """Factor below the level of the tests from which a small p value alone justifies a test of a
     model that gains less than its price. By hand. Halved: more such models are tested."""

@@ -111,7 +111,7 @@ class EmergencyDeceleration(VehicleEffect):
     name: ClassVar[str] = "emergency_deceleration"
     attribute: ClassVar[str] = "emergencyDecel"
     ranges: ClassVar[dict[str, NumberParameter]] = {"mps2": NumberParameter("m/s^2", 0.1, 20.0)}
-    examined: ClassVar[ExaminedStrengths] = ExaminedStrengths((3.0, 6.0), 9.0, 0.5)
+    examined: ClassVar[ExaminedStrengths] = ExaminedStrengths((3.0, 5.0), 9.0, 0.5)
     mps2: float
 
 
