@@ -2,8 +2,11 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Sequence
 from dataclasses import dataclass, field
+from pathlib import Path
+from types import SimpleNamespace
 from typing import Any, cast
 
 import numpy as np
@@ -12,6 +15,7 @@ import pytest
 
 from ugat_marl.data import MeasuredData
 from ugat_marl.diagnosis import DiagnosisConfig, Study, Tally
+from ugat_marl.diagnosis import study as module
 from ugat_marl.diagnosis.engine import Engine
 from ugat_marl.diagnosis.features import BIN_FEATURES, FEATURES, INDEX
 from ugat_marl.diagnosis.statistics import Pools
@@ -175,3 +179,22 @@ def test_of_several_places_the_busiest_one_counts() -> None:
     steady, varied = np.full(5, 900.0), np.array([50.0, 100.0, 150.0, 200.0, 250.0])
     assert day_to_day_variation(np.array([varied, steady]), Thresholds()) == 0.0
     assert day_to_day_variation(np.array([varied * 9, steady]), Thresholds()) > 0.2
+
+
+def test_every_task_of_a_diagnosis_is_part_of_the_whole() -> None:
+    rooms = Path(module.__file__).parent
+    source = "".join((rooms / name).read_text() for name in ("study.py", "select.py"))
+    shown = re.findall(r"task\(\s*f?\"([^\"]+)\"", source)
+    shown += re.findall(r"f\"(round [^\"]+)\"", source)
+    assert len(set(shown)) >= 8
+    study: Any = object.__new__(Study)
+    given = {
+        "effort": Effort(), "config": DiagnosisConfig(), "hypotheses": (), "other_days": None,
+        "layout": SimpleNamespace(lanes=()),
+    }  # fmt: skip
+    for name, value in given.items():
+        object.__setattr__(study, name, value)
+    for title in shown:
+        for number in ("1", "2"):
+            name = title.replace("{number + 1}", number).replace("{what}", "library")
+            assert any(name.startswith(share) for share in study.work()), name

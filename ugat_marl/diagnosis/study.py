@@ -32,13 +32,13 @@ from ugat_marl.diagnosis.places import PlaceFinder, Routes
 from ugat_marl.diagnosis.records import Fitted, Tested
 from ugat_marl.diagnosis.replay import Replay
 from ugat_marl.diagnosis.residual import Directed, Directions, Null
-from ugat_marl.diagnosis.select import Selector
+from ugat_marl.diagnosis.select import MOVES_OF_A_VALUE, Selector
 from ugat_marl.diagnosis.statistics import Array, Distance, Pools, Reference, change_between, sum_of
 from ugat_marl.diagnosis.thresholds import EFFORTS, LEAST_EFFORT, Effort, Thresholds
 from ugat_marl.effects import Effect, effect_from_record
 from ugat_marl.errors import MeasuredDataError, OptionError
 from ugat_marl.parallel import Workers
-from ugat_marl.progress import Reporter
+from ugat_marl.progress import Reporter, Share
 from ugat_marl.scenarios import (
     GREEN,
     Detector,
@@ -218,6 +218,30 @@ class Study:
     def speeds(self) -> bool:
         """True if speeds were measured."""
         return self.measured.has_speeds
+
+    def work(self) -> dict[str, Share]:
+        """Return the work of the tasks of a whole diagnosis, weighed in simulated days.
+
+        The length of a search is not known before. It is expected to end in its second round; a
+        search that ends sooner leaves the rest of the bar.
+        """
+        effort, limits = self.effort, self.config.thresholds
+        moves = limits.steps * (1 + limits.candidates_fitted)
+        strengths = sum(len(hypothesis.levels) for hypothesis in self.hypotheses)
+        lanes = min(len(self.layout.lanes), limits.most_lanes)
+        test = limits.settling_days + effort.test + MOVES_OF_A_VALUE * effort.fit
+        return {
+            "the detectors": Share(limits.measurement_days),
+            "the scenario as it is": Share(effort.base),
+            "the same with": Share(limits.doubt_days if self.other_days is not None else 0),
+            "round 1: library": Share(strengths, effort.bank),
+            "round 1: places": Share(lanes, effort.bank),
+            "round 1: candidates": Share(2 * sum(limits.candidates), effort.fit),
+            "fitting": Share(2 * limits.candidates_fitted, moves * effort.fit),
+            "is what is left chance": Share(2 * test),
+            "round 2": Share(2 * len(self.hypotheses), effort.bank),
+            "without single": Share(2, limits.steps_without * effort.fit + limits.settling_days),
+        }
 
     def detectors_as_they_are(self, reporter: Reporter) -> Study:
         """Find errors of measurement from what detectors say of single vehicles.

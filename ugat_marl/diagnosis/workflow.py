@@ -89,16 +89,8 @@ def diagnose(
         reporter.say(f"note: {finding.text}")
     read = timing_effects(scenario, study.network, measured, config.thresholds)
     timing = tuple(effect for effect in read if effect.name not in config.leave_out)
-    named: tuple[Effect, ...] = ()
-    try:
-        study = study.detectors_as_they_are(reporter)
-        named = tuple(error.effect for error in study.detection)
-        base = study.base(reporter)
-    except OutOfTime:
-        diagnosis = _nothing_simulated(study, timing)
-    else:
-        diagnosis, searched = _compared(study, base, timing, reporter)
-        named += searched
+    with reporter.whole("diagnosis", study.work()):
+        diagnosis, named = _diagnosed(study, timing, reporter)
     place = directory / CORRECTED
     if (place / "scenario.toml").is_file():  # written by an earlier diagnosis
         shutil.rmtree(place)
@@ -110,6 +102,21 @@ def diagnose(
     written = replace(written, policy_gap=_known_gap(directory, written))
     written.write(directory)
     return written
+
+
+def _diagnosed(
+    study: Study, timing: tuple[Effect, ...], reporter: Reporter
+) -> tuple[Diagnosis, tuple[Effect, ...]]:
+    """Run all stages, and return the record and the effects beside those of the signal log."""
+    errors: tuple[Effect, ...] = ()
+    try:
+        study = study.detectors_as_they_are(reporter)
+        errors = tuple(error.effect for error in study.detection)
+        base = study.base(reporter)
+    except OutOfTime:
+        return _nothing_simulated(study, timing), errors
+    diagnosis, searched = _compared(study, base, timing, reporter)
+    return diagnosis, (*errors, *searched)
 
 
 def _compared(
