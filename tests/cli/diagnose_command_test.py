@@ -22,7 +22,7 @@ import pytest
 from ugat_marl.__main__ import main
 from ugat_marl.cli import diagnose as command
 from ugat_marl.data import CSV_HASHES, write_measured
-from ugat_marl.diagnosis import DiagnosisConfig
+from ugat_marl.diagnosis import DiagnosisConfig, Pattern
 from ugat_marl.diagnosis.thresholds import Effort
 from ugat_marl.effects import known_effects, load_scenario
 from ugat_marl.experiments import policy_factory, record
@@ -202,9 +202,11 @@ def test_nothing_is_named_that_the_library_lacks(
 KEYS = re.compile(r"^\| `([\w.\[\]<>-]+)` \| [a-z ,]+ \|", flags=re.MULTILINE)
 LIKE_ANOTHER = ("left", "alternatives[].effects", "best.effects")
 """Lists of what is described elsewhere on the page."""
-SOMETIMES = {"effects[].evidence.source", "policy_gap", "gate"} | {
-    f"alternatives[].{key}" for key in ("effects", "distance", "cost")
-}
+SOMETIMES = (
+    {"effects[].evidence.source", "policy_gap", "gate"}
+    | {f"patterns[].{field}" for field in Pattern.__dataclass_fields__}
+    | {f"alternatives[].{key}" for key in ("effects", "distance", "cost")}
+)
 
 
 def keys_of(value: Any, path: str = "") -> set[str]:
@@ -237,7 +239,7 @@ def test_the_manual_lists_exactly_the_keys_there_are(found: tuple[Path, str, str
     assert diagnosed["schema"] in page
     listed = KEYS.findall(page.partition("## diagnosis.json")[2])
     assert len(listed) == len(set(listed))
-    there = keys_of(diagnosed | {"policy_gap": GAP}) - {"alternatives"}
+    there = keys_of(diagnosed | {"policy_gap": GAP}) - {"alternatives", "patterns"}
     assert there - set(listed) == set()
     assert set(listed) - there - SOMETIMES == set()
 

@@ -131,6 +131,14 @@ def content_of(verdict: str = "explained", *, complete: bool = True, **more: Any
             "noise": 0.02, "better": True,
         },
         "not_corrected": None,
+        "patterns": [] if same else [
+            {
+                "quantity": "discharge", "place": "S_C", "movement": "s", "detectors": None,
+                "vehicles": [3.0, None], "green_s": None, "window": [600.0, 1200.0],
+                "long_vehicles": False, "change": -0.14, "error": 0.01, "heldout_change": -0.13,
+                "p": 1e-9,
+            }
+        ],
     }  # fmt: skip
     if not complete:
         record |= {"statistics": [], "lanes": [], "courtesy": None, "travel_time": None}
@@ -412,3 +420,29 @@ def test_the_page_is_drawn_in_a_browser(dark: bool, network: Network, tmp_path: 
     assert pixels.shape[:2] == (1600, 1280)
     assert pixels.std() > 0.05
     assert (pixels[:, :, :3].mean() < 0.5) == dark
+
+
+def test_the_verdict_is_told_in_terms_of_traffic(network: Network) -> None:
+    diagnosis = diagnosis_of()
+    page = diagnosis_page(diagnosis, network)
+    assert "In terms of traffic" in page
+    for text in ("capacity, veh/h per lane in green", "1 410", "1 790"):
+        assert text in page.replace("\u00a0", " "), text
+    assert "travel time and queue come nearer" in page
+    assert "48 % before, 5 % after" in page
+    shown = printed(diagnosis)
+    assert "approach W_C" in shown, "its delay differs most"
+    assert "delay between the detectors, s" in shown
+
+
+def test_why_nothing_is_corrected_is_said_first(network: Network) -> None:
+    reason = "The effects named do not bring travel time and queue nearer."
+    page = diagnosis_page(diagnosis_of(corrected=None, not_corrected=reason), network)
+    assert page.index(reason) < page.index("<main>")
+
+
+def test_patterns_are_told_in_sentences(network: Network) -> None:
+    page = diagnosis_page(diagnosis_of("unknown"), network)
+    assert "Patterns in what is left" in page
+    assert "the through lanes of S_C discharge 14 % less from vehicle 3 of the queue on" in page
+    assert "Patterns in what is left" not in diagnosis_page(diagnosis_of("no_discrepancy"), network)

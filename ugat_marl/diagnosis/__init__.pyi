@@ -25,6 +25,7 @@ from .records import LogGrounds as LogGrounds
 from .records import MeasuredHeadway as MeasuredHeadway
 from .records import NamedEffect as NamedEffect
 from .records import Parameter as Parameter
+from .records import Pattern as Pattern
 from .records import PolicyGap as PolicyGap
 from .records import SearchGrounds as SearchGrounds
 from .records import Selected as Selected
@@ -48,6 +49,7 @@ from .thresholds import Effort as Effort
 from .thresholds import Thresholds as Thresholds
 from .verdict import clock as clock
 from .verdict import conclude as conclude
+from .verdict import describe_pattern as describe_pattern
 from .verdict import statistic as statistic
 from .verify import verify_model as verify_model
 from .workflow import diagnose as diagnose

@@ -248,18 +248,43 @@ class Engine:
             OutOfTime: The budget is spent and a day is not in the cache.
         """
 
-        def one(number: int) -> Sightings:
-            key = self._key((), number) + "-vehicles"
+        def reduce(period: Period, greens: Sequence[Greens]) -> dict[str, Any]:
+            return Sightings.of(self.layout, period, greens, self._thresholds).arrays()
+
+        days = self.reduced((), numbers, "vehicles", reduce, advance)
+        return [Sightings.from_arrays(arrays) for arrays in days]
+
+    def reduced(
+        self,
+        effects: Sequence[Effect],
+        numbers: Sequence[int],
+        name: str,
+        reduce: Callable[[Period, Sequence[Greens]], dict[str, Any]],
+        advance: Callable[[], None],
+    ) -> list[dict[str, Any]]:
+        """Return what a function makes of single vehicles on days of a model; it is cached.
+
+        Args:
+            effects: Effects of the model.
+            numbers: Numbers of the days.
+            name: Name of the function's result, for the cache.
+            reduce: Function of a period and the greens of every lane; it returns arrays by name.
+            advance: Function to call after each day.
+
+        Raises:
+            OutOfTime: The budget is spent and a day is not in the cache.
+        """
+        every = (*self._detection, *effects)
+
+        def one(number: int) -> dict[str, Any]:
+            key = f"{self._key(every, number)}-{name}"
             arrays = self._stored(key)
             if arrays is None:
-                period = self._unmeasured.kept_from(self._day((), number).period)
-                greens = self._greens[number % len(self.periods)]
-                seen = Sightings.of(self.layout, period, greens, self._thresholds)
-                self._store(key, seen.arrays())
-            else:
-                seen = Sightings.from_arrays(arrays)
+                period = self._unmeasured.kept_from(self._day(every, number).period)
+                arrays = reduce(period, self._greens[number % len(self.periods)])
+                self._store(key, arrays)
             advance()
-            return seen
+            return arrays
 
         (days,) = self._together(one, [numbers])
         return days

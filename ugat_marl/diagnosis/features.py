@@ -51,6 +51,7 @@ class IncomingLane:
         speed_mps: Speed limit, m/s.
         detectors: Ids of the detectors on it, by kind.
         following: Ids of the edges that it leads to.
+        directions: SUMO's letters of its movements in lower case: s straight, l left, r right.
     """
 
     id: str
@@ -60,6 +61,7 @@ class IncomingLane:
     speed_mps: float
     detectors: Mapping[DetectorKind, tuple[str, ...]]
     following: frozenset[str] = frozenset()
+    directions: frozenset[str] = frozenset()
 
 
 @dataclass(frozen=True)
@@ -127,6 +129,7 @@ class DetectorLayout:
                         network.lanes[lane].speed_mps,
                         kinds,
                         _following(intersection, lane),
+                        _directions(intersection, lane),
                     )
                 )
                 owner |= {name: intersection.id for names in kinds.values() for name in names}
@@ -192,6 +195,11 @@ def _links(intersection: Intersection, lane: str) -> tuple[int, ...]:
 
 def _following(intersection: Intersection, lane: str) -> frozenset[str]:
     return frozenset(link.to_edge for link in intersection.links if link.from_lane == lane)
+
+
+def _directions(intersection: Intersection, lane: str) -> frozenset[str]:
+    letters = {x.direction.lower() for x in intersection.links if x.from_lane == lane}
+    return frozenset(letters - {"t"})
 
 
 def _greens(log: SignalLog, links: tuple[int, ...], period: Period) -> Greens:
@@ -449,36 +457,67 @@ def _merged(period: Period, names: Sequence[str]) -> Passages:
     return recorded[0] if recorded else Passages.none()
 
 
+@dataclass(frozen=True, eq=False)
+class Discharge:
+    """Vehicles that cross a stop line in their green, in order; all arrays ``(vehicles,)``.
+
+    Attributes:
+        stop: Their passages over the stop detector.
+        number: Place in their green, 0 for the first.
+        start_s: Begin of their green, s.
+        gap_s: Time since the vehicle before, or since green began for the first, s.
+        alive: True for those of the queue at the begin of green, before its first long gap.
+        protected: The same, where green gives right of way.
+    """
+
+    stop: Passages
+    number: NDArray[np.int64]
+    start_s: Array
+    gap_s: Array
+    alive: NDArray[np.bool_]
+    protected: NDArray[np.bool_]
+
+    @classmethod
+    def of(cls, stop: Passages, greens: Greens, thresholds: DayThresholds) -> Discharge | None:
+        """Find these vehicles; None without any."""
+        order = np.argsort(stop.off_s, kind="stable")  # crossings in time, by the vehicle's rear
+        stop = stop.at(order[np.isfinite(stop.off_s[order])])
+        if not len(stop) or not len(greens.start_s):
+            return None
+        crossed = stop.off_s
+        cycle = np.searchsorted(greens.start_s, crossed, "right") - 1
+        inside = (cycle >= 0) & (crossed <= greens.red_s[np.maximum(cycle, 0)])
+        stop, crossed, cycle = stop.at(inside), crossed[inside], cycle[inside]
+        if not len(stop):
+            return None
+        first = np.searchsorted(cycle, cycle, "left")
+        number = np.arange(len(cycle)) - first
+        start = greens.start_s[cycle]
+        came = np.where(np.isfinite(stop.on_s), stop.on_s, -np.inf)
+        queue = came[first] < start
+        # the gap of the first queued vehicle runs from the start of green
+        before = np.where(number == 0, start, np.roll(crossed, 1))
+        gap = crossed - before
+        broken = np.cumsum(
+            gap > np.where(number == 0, thresholds.first_gap_s, thresholds.queue_break_s)
+        )
+        # vehicles before the first long gap of their green
+        alive = queue & (broken - broken[first] + (gap[first] > thresholds.first_gap_s) == 0)
+        return cls(stop, number, start, gap, alive, alive & greens.protected[cycle])
+
+
 def _discharge(counter: _Counter, stop: Passages, greens: Greens) -> None:
     """Add gaps, speeds and times over the detector of vehicles queued at the start of green."""
-    order = np.argsort(stop.off_s, kind="stable")  # crossings in time, by the vehicle's rear
-    stop = stop.at(order[np.isfinite(stop.off_s[order])])
     cycles = float(len(greens.start_s))
     counter.ratio("queued", 0.0, cycles)
     counter.ratio("discharged", 0.0, cycles)
-    if not len(stop) or not cycles:
+    thresholds = counter.thresholds
+    found = Discharge.of(stop, greens, thresholds)
+    if found is None:
         return
-    thresholds, crossed = counter.thresholds, stop.off_s
-    cycle = np.searchsorted(greens.start_s, crossed, "right") - 1
-    inside = (cycle >= 0) & (crossed <= greens.red_s[np.maximum(cycle, 0)])
-    stop, crossed, cycle = stop.at(inside), crossed[inside], cycle[inside]
-    if not len(stop):
-        return
-    first = np.searchsorted(cycle, cycle, "left")
-    number = np.arange(len(cycle)) - first
-    start = greens.start_s[cycle]
-    came = np.where(np.isfinite(stop.on_s), stop.on_s, -np.inf)
-    queue = came[first] < start
-    # the gap of the first queued vehicle runs from the start of green
-    before = np.where(number == 0, start, np.roll(crossed, 1))
-    gap = crossed - before
-    broken = np.cumsum(
-        gap > np.where(number == 0, thresholds.first_gap_s, thresholds.queue_break_s)
-    )
-    # vehicles before the first long gap of their green
-    alive = queue & (broken - broken[first] + (gap[first] > thresholds.first_gap_s) == 0)
-    protected = alive & greens.protected[cycle]
-    counter.add("gap_permitted", gap[alive & ~greens.protected[cycle] & (number >= 1)])
+    stop, number, start, gap = found.stop, found.number, found.start_s, found.gap_s
+    alive, protected = found.alive, found.protected
+    counter.add("gap_permitted", gap[alive & ~protected & (number >= 1)])
     lost = gap[protected & (number == 0)]
     counter.add("lost", lost)
     # trend = mean of lost * t, with t from -1 at the begin of the period to 1 at its end
@@ -540,6 +579,18 @@ def _lengths(counter: _Counter, passages: Passages) -> None:
     counter.add("long_vehicles", _share(length, counter.thresholds.long_vehicle_m))
 
 
+def free_vehicles(
+    advance: Passages, greens: Greens, thresholds: DayThresholds
+) -> NDArray[np.bool_]:
+    """Mark vehicles over an advance detector that drive freely towards a settled green."""
+    on = advance.on_s
+    cycle = np.searchsorted(greens.start_s, on, "right") - 1
+    inside = np.maximum(cycle, 0)
+    green = (cycle >= 0) & (on < greens.end_s[inside])
+    apart = np.append(np.inf, np.diff(on)) > thresholds.free_gap_s
+    return green & apart & (on - greens.start_s[inside] > thresholds.settled_green_s)
+
+
 def _approach(counter: _Counter, advance: Passages, greens: Greens, limit_mps: float) -> None:
     """Add gaps and speeds of moving platoons, free vehicles, and vehicles that approach red."""
     thresholds = counter.thresholds
@@ -564,14 +615,12 @@ def _approach(counter: _Counter, advance: Passages, greens: Greens, limit_mps: f
         return
     cycle = np.searchsorted(greens.start_s, on, "right") - 1
     inside = np.maximum(cycle, 0)
-    green = (cycle >= 0) & (on < greens.end_s[inside])
     red = (
         (cycle >= 0)
         & (on > greens.red_s[inside])
         & (on < greens.next_s[inside] - thresholds.before_green_s)
     )
-    after_s = on - greens.start_s[inside]
-    free = green & (gap > thresholds.free_gap_s) & (after_s > thresholds.settled_green_s)
+    free = free_vehicles(advance, greens, thresholds)
     counter.add("free_speed", speed[free])
     counter.add("free_speed_spread", np.abs(speed[free] - limit_mps))
     counter.add("free_fast", _share(speed[free], thresholds.fast_share * limit_mps))

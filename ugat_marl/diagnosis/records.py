@@ -547,6 +547,40 @@ class TrafficGate:
 
 
 @dataclass(frozen=True)
+class Pattern:
+    """A set of vehicles for which the model is wrong by the same share, see `patterns`.
+
+    Attributes:
+        quantity: ``discharge``, ``free speed`` or ``count``.
+        place: SUMO id of an edge or a lane; None for all.
+        movement: ``s`` straight, ``l`` left, ``r`` right: lanes of this movement alone; ``lane`` if
+            `place` is a lane; None for all lanes.
+        detectors: Kind of detectors that differ; None for all.
+        vehicles: First and last position in the queue; None for no limit.
+        green_s: Least and largest age of green, s; None for no limit.
+        window: Begin and end on the scenario's clock, s; None for all of the time.
+        long_vehicles: True if only long vehicles differ.
+        change: Measured over simulated, minus 1.
+        error: Standard error of `change`.
+        heldout_change: The same on the held-out periods; None without any.
+        p: Chance of such a pattern under the model.
+    """
+
+    quantity: str
+    place: str | None
+    movement: str | None
+    detectors: str | None
+    vehicles: tuple[float | None, float | None] | None
+    green_s: tuple[float | None, float | None] | None
+    window: tuple[float, float] | None
+    long_vehicles: bool
+    change: float
+    error: float
+    heldout_change: float | None
+    p: float
+
+
+@dataclass(frozen=True)
 class Tables:
     """Both models side by side.
 
@@ -648,6 +682,7 @@ class Diagnosis:
         approaches: Capacity, queue and delay of each approach, before and after.
         gate: Judgement of the correction by measures that no fit uses; None if there is nothing to
             judge, or nothing to judge by.
+        patterns: Patterns in what is left where the effects do not explain the data.
         next_measurement: A measurement that would separate the rivals, or show the missing effect.
         complete: True if the diagnosis ended by itself, False if the budget ended it.
         untried: Names of effects that were not examined for lack of time.
@@ -687,6 +722,7 @@ class Diagnosis:
     travel_time: TravelTimes | None
     approaches: tuple[ApproachRow, ...]
     gate: TrafficGate | None
+    patterns: tuple[Pattern, ...]
     next_measurement: str | None
     complete: bool
     untried: tuple[str, ...]

@@ -19,6 +19,7 @@ from ugat_marl.diagnosis.engine import Budget, Engine, default_cache
 from ugat_marl.diagnosis.features import (
     BIN_FEATURES,
     DetectorLayout,
+    Greens,
     Tally,
     bins_together,
     counts_tally,
@@ -28,8 +29,9 @@ from ugat_marl.diagnosis.features import (
 from ugat_marl.diagnosis.fit import Fitter
 from ugat_marl.diagnosis.hypotheses import Hypothesis, global_hypotheses, library
 from ugat_marl.diagnosis.measurement import DetectorError, Measurement, Sightings, together
+from ugat_marl.diagnosis.patterns import QUANTITIES, cells_of, patterns
 from ugat_marl.diagnosis.places import PlaceFinder, Routes
-from ugat_marl.diagnosis.records import Fitted, Tested
+from ugat_marl.diagnosis.records import Fitted, Pattern, Tested
 from ugat_marl.diagnosis.replay import Replay
 from ugat_marl.diagnosis.residual import Directed, Directions, Null
 from ugat_marl.diagnosis.select import MOVES_OF_A_VALUE, Selector
@@ -240,6 +242,7 @@ class Study:
             "fitting": Share(2 * limits.candidates_fitted, moves * effort.fit),
             "is what is left chance": Share(2 * test),
             "round 2": Share(2 * len(self.hypotheses), effort.bank),
+            "patterns": Share(limits.pattern_days),
             "without single": Share(2, limits.steps_without * effort.fit + limits.settling_days),
         }
 
@@ -297,6 +300,37 @@ class Study:
         model = Fitted((), known, reference, distance, distance.total)
         residual = self.null(tallies, len(self.fit)).test(self.fit)
         return Tested(model, residual, np.empty(0), {})
+
+    def left_over(self, model: Tested, reporter: Reporter) -> tuple[Pattern, ...]:
+        """Find patterns in what a model leaves; none if single vehicles were not detected.
+
+        Raises:
+            OutOfTime: The budget does not suffice for days of the model to compare with.
+        """
+        fit, heldout = self.measured.of("fit"), self.measured.of("heldout")
+        spans = {(period.begin_s, period.end_s) for period in (*fit, *heldout)}
+        if not self.measured.has_events or len(spans) > 1:
+            return ()
+        thresholds, effects = self.config.thresholds, model.model.effects
+
+        def cells(period: Period, greens: Sequence[Greens]) -> dict[str, Array]:
+            return cells_of(self.layout, period, greens, thresholds)
+
+        numbers = self.engine.first(thresholds.pattern_days)
+        with reporter.task("patterns in what is left", len(numbers)) as advance:
+            simulated = self.engine.reduced(effects, numbers, "cells", cells, advance)
+        # Under signals that follow the traffic, simulated counts are the measured ones.
+        quantities = QUANTITIES if self.other_days is None else QUANTITIES[:-1]
+        return patterns(
+            self.layout,
+            [cells(period, self.layout.greens(period)) for period in fit],
+            [cells(period, self.layout.greens(period)) for period in heldout],
+            simulated,
+            quantities,
+            spans.pop(),
+            thresholds,
+            self.config.alpha,
+        )
 
     def null(
         self,

@@ -648,6 +648,32 @@ class Thresholds(DayThresholds):
     """Distance by which effects must improve the held-out periods. By hand, below `price`. Halved:
     chance confirms more often."""
 
+    # --- patterns in what is left -------------------------------------------------------------
+
+    pattern_bin_s: float = 300.0
+    """Bins of time of the cells, s. By hand; patterns may fill several. Halved: windows are found
+    more exactly, and slower."""
+    pattern_days: int = 24
+    """Simulated days with which single vehicles are compared. By hand. Halved: the chance of a
+    pattern is known 1.4 times less exactly."""
+    pattern_draws: int = 20
+    """Data sets drawn from each half of these days. By hand. Halved: as above."""
+    price_of_a_limit: float = 10.0
+    """Squared deviations that each limit of a pattern must explain: by place, kind, position, age,
+    time or length. By hand. Halved: patterns are narrower than what they show."""
+    least_simulated: float = 5.0
+    """Simulated vehicles below which a cell is not compared. By hand. Halved: means of a few
+    vehicles are compared."""
+    least_relative_spread: float = 0.02
+    """Least standard deviation of single vehicles in a cell, as a share of the mean. By hand.
+    Halved: cells that hardly vary weigh up to four times as much."""
+    least_share: float = 0.03
+    """Share below which a pattern does not matter. By hand. Halved: differences are told that no
+    plan would change for."""
+    most_patterns: int = 3
+    """Largest number of patterns that are told. By hand: a page has room for more than a reader has
+    patience. Halved: one."""
+
     # --- gate of the corrected scenario -------------------------------------------------------
 
     gate_draws: int = 200

@@ -18,6 +18,7 @@ from ugat_marl.diagnosis.records import (
     Fitted,
     Located,
     Parameter,
+    Pattern,
     Selected,
     Verified,
 )
@@ -311,6 +312,56 @@ def effect_record(
         if not isinstance(value, str) and name not in WINDOW:
             parameters[name] = Parameter(value, None, None, ranges[name].unit)
     return EffectRecord(hypothesis.name, place, window, parameters)
+
+
+# --- patterns -------------------------------------------------------------------------------------
+
+_MOVEMENTS = {"s": "through lanes", "l": "left-turn lanes", "r": "right-turn lanes"}
+
+
+def describe_pattern(pattern: Pattern) -> str:
+    """Describe a pattern in what is left as one sentence, without its full stop."""
+    where, one = _whereabouts(pattern)
+    percent = f"{100 * abs(pattern.change):.0f} %"
+    more = pattern.change > 0
+    if pattern.quantity == "count":
+        kind = f"{pattern.detectors} detectors" if pattern.detectors else "the detectors"
+        said = f"{kind} of {where} count {percent} {'more' if more else 'fewer'} vehicles"
+    elif pattern.quantity == "free speed":
+        who = "long vehicles" if pattern.long_vehicles else "free vehicles"
+        said = f"{who} on {where} drive {percent} {'faster' if more else 'slower'}"
+    else:
+        who = f"long vehicles on {where} discharge"
+        who = who if pattern.long_vehicles else f"{where} {'discharges' if one else 'discharge'}"
+        said = f"{who} {percent} {'more' if more else 'less'}"
+    when = ""
+    if pattern.window is not None:
+        when = f"from {clock(pattern.window[0])} to {clock(pattern.window[1])}, "
+    return capitalised(when + said + _from_to(pattern))
+
+
+def _whereabouts(pattern: Pattern) -> tuple[str, bool]:
+    """Return the place of a pattern in words, and True if it is a single thing."""
+    if pattern.movement == "lane":
+        return f"lane {pattern.place}", True
+    if pattern.movement is None:
+        return (f"approach {pattern.place}", True) if pattern.place else ("all lanes", False)
+    lanes = f"the {_MOVEMENTS.get(pattern.movement, 'lanes')}"
+    return (f"{lanes} of {pattern.place}" if pattern.place else lanes), False
+
+
+def _from_to(pattern: Pattern) -> str:
+    """Return the limits of a pattern in the queue and in green as phrases."""
+    phrases: list[str] = []
+    if pattern.vehicles is not None:
+        first, last = pattern.vehicles
+        phrases += [f" from vehicle {first:.0f} of the queue on"] if first is not None else []
+        phrases += [f" up to vehicle {last:.0f} of the queue"] if last is not None else []
+    if pattern.green_s is not None:
+        first, last = pattern.green_s
+        phrases += [f" after {first:.0f} s of green"] if first is not None else []
+        phrases += [f" in the first {last:.0f} s of green"] if last is not None else []
+    return "".join(phrases)
 
 
 # --- words ----------------------------------------------------------------------------------------

@@ -45,6 +45,7 @@ from ugat_marl.diagnosis.verdict import (
     capitalised,
     conclude,
     describe_errors,
+    describe_pattern,
     effect_record,
     unchallenged,
     unverified,
@@ -157,12 +158,33 @@ def _compared(
         conclusion = unverified(selected)
         conclusion = told(conclusion)
         diagnosis = _record(study, timing, located, selected, verified, conclusion, tables=False)
+    diagnosis = _with_patterns(study, diagnosis, located.base, conclusion, reporter)
     if conclusion.verdict == "unknown" or not conclusion.best.model.members:
         return diagnosis, ()
     gate = judged(study, located.base, conclusion.best)
     reason = None if study.config.correct_anyway else _reason_against(conclusion, gate)
     diagnosis = replace(diagnosis, gate=gate, not_corrected=reason)
     return diagnosis, () if reason else conclusion.best.model.effects
+
+
+def _with_patterns(
+    study: Study, diagnosis: Diagnosis, base: Tested, conclusion: Conclusion, reporter: Reporter
+) -> Diagnosis:
+    """Add patterns in what is left, if the search has ended and does not explain the data.
+
+    An effect that is not named explains nothing, so then all of the difference is left.
+    """
+    if conclusion.verdict not in ("unknown", "partially_explained"):
+        return diagnosis
+    model = conclusion.best if conclusion.verdict == "partially_explained" else base
+    try:
+        patterns = study.left_over(model, reporter)
+    except OutOfTime:
+        return diagnosis
+    if not patterns:
+        return diagnosis
+    told = f"What is left shows most in this: {describe_pattern(patterns[0])}."
+    return replace(diagnosis, patterns=patterns, sentence=f"{diagnosis.sentence} {told}")
 
 
 def _reason_against(conclusion: Conclusion, gate: TrafficGate | None) -> str | None:
@@ -301,6 +323,7 @@ def _begun(
         travel_time=None,
         approaches=(),
         gate=None,
+        patterns=(),
         next_measurement=None,
         complete=examined is None,
         untried=tuple(sorted(left)),

@@ -20,6 +20,7 @@ from ugat_marl.diagnosis import (
     StatisticRow,
     TravelTimeEstimate,
     Verdict,
+    describe_pattern,
     statistic,
 )
 from ugat_marl.files import write_whole
@@ -93,6 +94,7 @@ def diagnosis_page(diagnosis: Diagnosis, network: Network, commands: Sequence[st
         map_key=[(f"d{place}", text) for place, (_, text) in enumerate(DISAGREEMENT)],
         statistics=_statistics(page, diagnosis),
         where=_where(diagnosis),
+        patterns=_patterns(diagnosis),
         ranking=_ranking(diagnosis),
         courtesy=_courtesy(diagnosis),
         geh=words.geh_line(diagnosis),
@@ -246,6 +248,21 @@ def _disagreements(disagreements: Sequence[Disagreement]) -> Grid:
         for disagreement in disagreements
     ]
     return Grid(("place", "regime", "statistic", "size", "z", "window"), rows, ("size", "z"))
+
+
+def _patterns(diagnosis: Diagnosis) -> Grid | None:
+    """Return a table of the patterns in what is left; None without any."""
+    rows = [
+        (
+            describe_pattern(pattern),
+            f"{signed(100 * pattern.change)} % ± {number(100 * pattern.error, 2)}",
+            "–" if (again := pattern.heldout_change) is None else f"{signed(100 * again)} %",
+            chance(pattern.p),
+        )
+        for pattern in diagnosis.patterns
+    ]
+    headings = ("pattern", "change", "held-out", "p")
+    return Grid(headings, rows, headings[1:]) if rows else None
 
 
 def _ranking(diagnosis: Diagnosis) -> list[dict[str, Any]]:
