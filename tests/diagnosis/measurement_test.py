@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -10,6 +11,9 @@ import pytest
 from ugat_marl.diagnosis.features import DetectorLayout, Greens, IncomingLane
 from ugat_marl.diagnosis.measurement import (
     ALONE,
+    FOURTH,
+    SECOND,
+    THIRD,
     Equation,
     Measurement,
     Sightings,
@@ -200,3 +204,43 @@ def test_coarse_clocks(grain_s: float, seen: bool) -> None:
     assert named(rounded(day(7)), usual) == []
     found = named(rounded(day(7, extension_s=1.0)), usual)
     assert [text.startswith("detector_extension=*") for text in found] == ([True] if seen else [])
+
+
+def accelerating(seed: int, ratio: float) -> Sightings:
+    """One period in which G of queued vehicles at the stop detectors is `ratio`."""
+    generator, one = np.random.default_rng(seed), day(seed)
+    rows = [
+        (index, regime, ratio * generator.normal(1.0, 0.01), CAR_M, CAR_M)
+        for index, detector in enumerate(DETECTORS)
+        for regime in (SECOND, THIRD, FOURTH)
+        for _ in range(60)
+        if detector.kind == "stop"
+    ]
+    return replace(one, passages=np.concatenate([one.passages, np.array(rows)]))
+
+
+@pytest.mark.parametrize(
+    ("stated", "measured", "told"),
+    [
+        ("front", 0.8, None),
+        ("front", 1.2, ("front", "rear")),
+        ("rear", 1.25, ("rear", "front")),
+        ("rear", 0.8, None),
+        ("mean", 1.2, None),
+        (None, 1.2, None),
+    ],
+)
+def test_a_stated_point_of_speed_measurement_is_contradicted(
+    stated: Any, measured: float, told: tuple[str, str] | None
+) -> None:
+    # Simulated days measure where it is stated: G is 0.8 there, so it is 1.2 at the other end.
+    detectors = [replace(detector, speed_at=stated) for detector in DETECTORS]
+    usual = together([accelerating(seed, 0.8) for seed in range(3)])
+    seen = Measurement(detectors, accelerating(7, measured), usual, THRESHOLDS)
+    assert seen.contradicted_point() == told
+
+
+def test_a_point_that_only_some_detectors_state_is_not_contradicted() -> None:
+    some = [replace(DETECTORS[0], speed_at="front"), *DETECTORS[1:]]
+    usual = together([accelerating(seed, 0.8) for seed in range(3)])
+    assert Measurement(some, accelerating(7, 1.2), usual, THRESHOLDS).contradicted_point() is None

@@ -556,6 +556,24 @@ class Measurement:
 
         The point is None if it is stated, cannot be told, or is the one of simulated days.
         """
+        stated = any(detector.speed_at is not None for detector in self._detectors)
+        point, best = self._point(pulses, "rear", fixed=stated)
+        zones = {place: solution.estimates for place, solution in best.items()}
+        return (None if point == "rear" else point), zones
+
+    def _point(
+        self, pulses: Collection[str], usual: SpeedPoint, *, fixed: bool = False
+    ) -> tuple[SpeedPoint, dict[str, Solution]]:
+        """Return the point of speed measurement for which vehicles that accelerate speak.
+
+        Args:
+            pulses: Places that are left out.
+            usual: Point of simulated days; another one needs `Thresholds.sure_of_a_point`.
+            fixed: True to take `usual` as it is.
+
+        Returns:
+            The point, and extensions and zones by place.
+        """
         limit = self._thresholds
         steady = self._steady()
         equations = {
@@ -565,17 +583,31 @@ class Measurement:
         }
         equations = {group: rows for group, rows in equations.items() if rows}
         prior = (limit.usual_extension_s, limit.usual_zone_m)
-        weights: dict[SpeedPoint, float] = {"rear": 1.0, "front": -1.0, "mean": 0.0}
         best, least = by_place(equations, 1.0, prior, limit.price_of_an_error)
-        point: SpeedPoint = "rear"
-        if all(detector.speed_at is None for detector in self._detectors):
-            usual = least
-            for name, weight in weights.items():
-                places, cost = by_place(equations, weight, prior, limit.price_of_an_error)
-                if cost < min(least, usual - limit.sure_of_a_point):
-                    point, best, least = name, places, cost
-        zones = {place: solution.estimates for place, solution in best.items()}
-        return (None if point == "rear" else point), zones
+        point, first = usual, least
+        # Bends are those of the point of simulated days, and opposite at the other end.
+        others: dict[SpeedPoint, float] = {
+            "front" if usual == "rear" else "rear": -1.0,
+            "mean": 0.0,
+        }
+        for name, weight in [] if fixed else others.items():
+            places, cost = by_place(equations, weight, prior, limit.price_of_an_error)
+            if cost < min(least, first - limit.sure_of_a_point):
+                point, best, least = name, places, cost
+        return point, best
+
+    def contradicted_point(self) -> tuple[SpeedPoint, SpeedPoint] | None:
+        """Return the stated point of speed measurement, and the one for which vehicles speak.
+
+        None if they agree, if not all detectors state the same end of a passage, or if nothing is
+        stated. The mean of both ends says nothing about either.
+        """
+        points = {detector.speed_at for detector in self._detectors}
+        stated = points.pop() if len(points) == 1 else None
+        if stated in (None, "mean") or self._grain_s > self._thresholds.coarsest_clock_s:
+            return None
+        seen, _ = self._point(self._pulses(), stated)
+        return None if seen == stated else (stated, seen)
 
     def _steady(self) -> float:
         """Return the ratio G of steady vehicles on simulated days.

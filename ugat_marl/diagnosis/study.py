@@ -48,6 +48,7 @@ from ugat_marl.scenarios import (
     Period,
     Scenario,
     SignalLog,
+    SpeedPoint,
     driven_routes,
     edge_of_lane,
 )
@@ -266,6 +267,11 @@ class Study:
         ]
         measurement = Measurement(self.layout.detectors, together(seen), simulated, thresholds)
         errors = measurement.errors(self.config.leave_out)
+        if (points := measurement.contradicted_point()) is not None:
+            finding = _of_speed_points(*points)
+            reporter.say(f"note: {finding.text}")
+            measured = replace(self.measured, findings=(*self.measured.findings, finding))
+            self = replace(self, measured=measured)
         if not errors:
             return self
         effects = tuple(error.effect for error in errors)
@@ -546,6 +552,15 @@ def _of_variation(variation: float) -> tuple[Finding, ...]:
         f"demand differs from day to day by about {share}, on top of chance; so do simulated days"
     )
     return (Finding(text),)
+
+
+def _of_speed_points(stated: SpeedPoint, seen: SpeedPoint) -> Finding:
+    """Return a finding on a stated point of speed measurement that vehicles contradict."""
+    text = (
+        f"detectors.csv: speed_at = {stated}, but the vehicles that accelerate speak for {seen}; "
+        f"the stated point was used, so check it, or leave the column empty"
+    )
+    return Finding(text)
 
 
 # --- measured edges without demand ----------------------------------------------------------------

@@ -8,6 +8,8 @@ import pytest
 
 from ugat_marl.diagnosis import DiagnosisConfig, Study
 from ugat_marl.diagnosis.thresholds import Effort
+from ugat_marl.effects import load_scenario
+from ugat_marl.experiments import policy_factory, record
 from ugat_marl.progress import Silent
 
 pytestmark = pytest.mark.slow
@@ -45,6 +47,20 @@ def test_an_error_of_measurement_is_read_off(street, family: str) -> None:
 @pytest.mark.parametrize("domain", ["sim", *DRIVERS])
 def test_drivers_are_no_error_of_measurement(street, domain: str) -> None:
     assert read_off(street, domain) == []
+
+
+def test_splash_is_read_off_where_lanes_lie_side_by_side(street) -> None:
+    scenario = load_scenario("single-v1")
+    policy = policy_factory("fixed-time:30")
+    domain = "detector_splash=stop,0.15"
+    measured = record(scenario, domain, policy, periods=3, seed=5, duration_s=900.0)
+    config = DiagnosisConfig(cache=street.cache, budget_s=3600.0)
+    study = Study.of(scenario, measured, config).detectors_as_they_are(Silent())
+    (found,) = (str(error.effect) for error in study.detection)
+    name, _, values = found.partition("=")
+    place, share = values.split(",")
+    assert (name, place) == ("detector_splash", "stop")
+    assert float(share) == pytest.approx(0.15, abs=0.05)
 
 
 def test_drivers_are_found_behind_an_error_of_measurement(street, tmp_path: Path) -> None:
