@@ -370,6 +370,10 @@ WRONG: dict[str, tuple[dict[str, Change], str]] = {
         {"detectors.csv": added("a,S_C_0,10,0,stop")},
         r"line 2.*'a' occurs twice .and 1 row more.",
     ),
+    "a name no effect can have": (
+        {"detectors.csv": added('"a,b",S_C_0,10,0,stop,signals')},
+        r"line 6: detector_id 'a,b' has characters that no effect .*leave out commas",
+    ),
     "detector beyond the lane": ({"detectors.csv": replaced("90.0", "900")}, r"position_m 900"),
     "zone beyond the lane": ({"detectors.csv": replaced("40.0,2.0", "40,460")}, r"at most"),
     "unknown kind": ({"detectors.csv": replaced("advance", "advanced")}, r"advance, stop, exit"),

@@ -201,6 +201,16 @@ def test_impossible_places_and_windows(text: str, message: str) -> None:
         parse_domain(text)
 
 
+def test_detectors_may_have_names_with_spaces() -> None:
+    """Tables of a street have such names, and an effect that a diagnosis tries must take them."""
+    (effect,) = parse_domain("undercount=stop north,0.2")
+    assert str(effect) == "undercount=stop north,0.2"
+    (moved,) = parse_domain("detector_offset=stop north,3")
+    assert parse_domain(str(moved)) == (moved,)
+    with pytest.raises(OptionError, match="is not the name of a detector"):
+        Undercount(" a", 0.2)
+
+
 @pytest.mark.parametrize("value", [1, None, "", "a,b", "<x>"])
 def test_what_is_no_place(value: Any) -> None:
     with pytest.raises(OptionError, match="is not the name of a traffic light"):

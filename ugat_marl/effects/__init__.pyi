@@ -10,6 +10,7 @@ from .base import ExaminedStrengths as ExaminedStrengths
 from .base import NumberParameter as NumberParameter
 from .base import TextParameter as TextParameter
 from .base import hashed_uniform as hashed_uniform
+from .base import is_detector_name as is_detector_name
 from .controllers import Actuator as Actuator
 from .controllers import Commands as Commands
 from .controllers import ControllerPart as ControllerPart

@@ -25,6 +25,11 @@ _FORBIDDEN = frozenset(" \t\n\r|\\'\";,<>&")
 """Characters that ids in SUMO cannot have; a comma ends a value in the text form."""
 
 
+def is_detector_name(text: str) -> bool:
+    """Return True for names that an effect can give a detector: ids in SUMO, and spaces inside."""
+    return bool(text) and text == text.strip() and not set(text) & (_FORBIDDEN - {" "})
+
+
 Owner = Mapping[str, str]
 """Detector to the traffic light whose controller records it."""
 
@@ -205,7 +210,12 @@ class Effect(ControllerPart):
 
     def _name(self, field: str, value: object) -> str:
         text = self.texts[field]
-        if not isinstance(value, str) or not value or set(value) & _FORBIDDEN:
+        named = isinstance(value, str) and (
+            is_detector_name(value)
+            if text.kind in ("detector", "detectors")
+            else bool(value) and not set(value) & _FORBIDDEN
+        )
+        if not isinstance(value, str) or not named:
             raise OptionError(
                 f"effect {self.name!r}: {field} = {value!r} is not the name of a {text.kind}"
             )

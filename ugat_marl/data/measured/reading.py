@@ -27,6 +27,7 @@ from ugat_marl.data.measured.tables import (
     with_period,
 )
 from ugat_marl.data.measured.values import Finding, MeasuredData, split_periods
+from ugat_marl.effects import is_detector_name
 from ugat_marl.errors import MeasuredDataError, nearest
 from ugat_marl.scenarios import (
     DETECTOR_CLOCKS,
@@ -351,6 +352,14 @@ def detectors_of(path: Path, frame: pl.DataFrame, network: Network) -> tuple[Det
         "detector_id",
         "occurs twice",
         "give each detector a name of its own",
+    )
+    names = pl.col("detector_id").map_elements(is_detector_name, return_dtype=pl.Boolean)
+    refuse(
+        path,
+        frame.filter(~names),
+        "detector_id",
+        "has characters that no effect on a detector can name",
+        "leave out commas, quotes, tabs and | \\ ; < > &, and spaces at the ends",
     )
     kinds = get_args(DetectorKind)
     refuse(
