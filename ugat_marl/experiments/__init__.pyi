@@ -61,6 +61,7 @@ from .settings import UGAT as UGAT
 from .settings import UNTRAINED as UNTRAINED
 from .settings import LearnerSpec as LearnerSpec
 from .settings import Setting as Setting
+from .settings import is_grounded as is_grounded
 from .sim_check import SimCheck as SimCheck
 from .sim_check import check_run as check_run
 from .sim_check import check_table as check_table

@@ -42,6 +42,12 @@ UNTRAINED = "pretrained, not trained here"
 GROUNDED_NAME = {"phase": UGAT, "timed": TIMED, "street": STREET}
 """Name of the row of each kind of grounding."""
 
+
+def is_grounded(name: str) -> bool:
+    """Return True for the name of a row of a grounding, such as "UGAT, timed: rewards matched"."""
+    return name.partition(":")[0] in GROUNDED_NAME.values()
+
+
 SEEN_COMMANDS = 4
 """Number of own commands that the agents of `SEEING_ORACLE` see."""
 

@@ -24,6 +24,7 @@ from .measured_log import log_of_measured as log_of_measured
 from .phase import PhaseTransform as PhaseTransform
 from .phase import fit_inverse as fit_inverse
 from .phase import inverse_accuracy as inverse_accuracy
+from .posterior import LIBRARY as LIBRARY
 from .posterior import FittedService as FittedService
 from .posterior import Posterior as Posterior
 from .posterior import Simulated as Simulated

@@ -180,13 +180,18 @@ class FittedStreet:
             )
         return lines
 
-    def as_dict(self) -> dict[str, float]:
-        """Return flat numbers for the metrics of a run."""
+    def as_dict(self, lanes_of: Mapping[str, Sequence[int]]) -> dict[str, float]:
+        """Return flat numbers for the metrics of a run.
+
+        Args:
+            lanes_of: Agent to the positions of its lanes (`LaneView.lanes_of`).
+        """
         numbers: dict[str, float] = {"street/commands": float(self.commands)}
         if self.channel is not None:
             weights = self.channel.network
             numbers |= {f"channel/lag_{k}": float(w) for k, w in enumerate(weights[:-1]) if w > 0}
             numbers["channel/lost"] = self.channel.lost
+            numbers["channel/forbids"] = float(self.channel.forbids)
         if self.eyes is not None:
             numbers |= {
                 "eyes/dead": float(self.eyes.dead.sum()),
@@ -195,6 +200,7 @@ class FittedStreet:
                 "eyes/relative": self.eyes.relative,
                 "eyes/lag": float(self.eyes.lag),
                 "eyes/lost": self.eyes.lost,
+                "eyes/step": self.eyes.step,
             }
         if self.posterior is not None:
             effects, service_s = self.posterior.sample(200)
@@ -206,6 +212,12 @@ class FittedStreet:
             for lane, (begin_s, each_s) in zip(self.lanes, service_s.mean(0), strict=True):
                 numbers[f"service/begin_s/{lane}"] = float(begin_s)
                 numbers[f"service/each_s/{lane}"] = float(each_s)
+            for agent, places in lanes_of.items():
+                unused_s = service_s[:, list(places)].mean(1)
+                quantiles = np.quantile(unused_s, (0.05, 0.5, 0.95), axis=0)
+                for end, row in zip(("_low", "", "_high"), quantiles, strict=True):
+                    numbers[f"unused/begin_s{end}/{agent}"] = float(row[0])
+                    numbers[f"unused/each_s{end}/{agent}"] = float(row[1])
         return numbers
 
     def save(self, path: Path, simulated: Sequence[Simulated] = ()) -> None:

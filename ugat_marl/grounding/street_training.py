@@ -130,7 +130,8 @@ class StreetTraining(Algorithm):
             if self._begins_anew(before, state.transform.view):
                 self.renew(state)
                 episodes += self.config.pretrain_episodes
-            numbers = street.as_dict()
+            agents = list(state.real[0].provenance.layouts)
+            numbers = street.as_dict(self.view.lanes_of(agents))
             residual = state.transform.residual
             if residual is not None:
                 numbers |= self._fit_residual(state, policy, street, residual)  # line 5

@@ -171,6 +171,16 @@ class LaneView:
         onward = _onward(network, lanes)
         return cls(tuple(lanes), tuple(green), tuple(scale), tuple(first), np.array(holds), onward)
 
+    def lanes_of(self, agents: Sequence[str]) -> dict[str, range]:
+        """Return the positions of the lanes of each agent.
+
+        Args:
+            agents: All agents, in the order of the network.
+        """
+        ends = np.cumsum([len(scale) for scale in self.scale]).tolist()
+        begins = [0, *ends[:-1]]
+        return {a: range(*ends_of) for a, *ends_of in zip(agents, begins, ends, strict=True)}
+
     def rows(self, log: TransitionLog) -> list[LaneRows]:
         """Return the decisions of every lane, in the order of `lanes`."""
         rows = [

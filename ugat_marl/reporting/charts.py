@@ -15,6 +15,7 @@ from ugat_marl.experiments import (
     DIRECT,
     GROUNDED_NAME,
     Evaluation,
+    is_grounded,
     matched_name,
     means_by_step,
     means_by_stretch,
@@ -453,11 +454,11 @@ def comparison_radar(
 def radar_lines(evaluation: Evaluation, real: str) -> dict[str, list[float]]:
     """Return the lines of a radar: direct transfer in the simulation, then policies in `real`.
 
-    These policies are direct transfer, those of UGAT and the best rule, five at most.
+    These policies are direct transfer, grounded ones and the best rule, five at most.
     """
     sim, policies = evaluation.domains[0], evaluation.policies
     rule = f"rule {evaluation.notes.get(f'best rule in {real}')}"
-    shown = [policies[0], *(p for p in policies if p.startswith("UGAT") and p != policies[0])]
+    shown = [policies[0], *(p for p in policies if is_grounded(p) and p != policies[0])]
     shown += [p for p in policies if p == rule and p not in shown]
 
     def means(policy: str, domain: str) -> list[float]:

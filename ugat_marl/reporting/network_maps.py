@@ -48,7 +48,7 @@ _CELL = 17.0
 @styled()
 def node_map(
     name: str, title: str, network: Network, values: Mapping[str, tuple[float, str]],
-    ends: tuple[float, float], unit: str,
+    ends: tuple[float, float], unit: str, intervals: Mapping[str, str] | None = None,
 ) -> NamedFigure:  # fmt: skip
     """Draw the network with its intersections coloured by a number.
 
@@ -59,6 +59,7 @@ def node_map(
         values: Intersection to its number and to the text in its circle; nan gets no colour.
         ends: Lower and upper end of the scale of colours.
         unit: Unit of the number.
+        intervals: Intersection to the interval of its number, for the tip of its circle.
     """
     centres = {
         intersection.id: intersection.position
@@ -75,7 +76,8 @@ def node_map(
             x, y, "o", markersize=2 * radius, markerfacecolor=LIGHT[colour],
             markeredgecolor=LIGHT["soft"], markeredgewidth=1.2, zorder=3,
         )  # fmt: skip
-        add_tip(disc, f"{tls}: {text or 'no value'} {unit}")
+        interval = f" ({intervals[tls]})" if intervals and tls in intervals else ""
+        add_tip(disc, f"{tls}: {text or 'no value'}{interval} {unit}")
         if radius >= 11:
             axes.annotate(
                 text or "–", (x, y), ha="center", va="center_baseline", fontweight="bold", zorder=4,

@@ -6,28 +6,25 @@ each missing part in its place.
 
 from __future__ import annotations
 
-import functools
 import math
 import re
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
 from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any
 
 from ugat_marl.data import MEASURES
-from ugat_marl.effects import load_scenario, scenario_in_domain
-from ugat_marl.envs import OBJECTIVE_MEASURES, Observer
-from ugat_marl.errors import UgatMarlError
-from ugat_marl.experiments import Estimate, Evaluation, check_run
+from ugat_marl.envs import OBJECTIVE_MEASURES
+from ugat_marl.experiments import Estimate, Evaluation, check_run, is_grounded, outcome_of
 from ugat_marl.reporting import charts
 from ugat_marl.reporting.figures import NamedFigure, printable
 from ugat_marl.reporting.formats import number, share, signed
 from ugat_marl.reporting.network_maps import minutes_picture, node_map
 from ugat_marl.reporting.page import Figure, Grid, Page, render
+from ugat_marl.reporting.places import Places, places_of
 from ugat_marl.reporting.run_groups import groups, seeds_of_one
 from ugat_marl.reporting.run_records import RunRecord, TableRecord, as_number
-from ugat_marl.scenarios import Network
+from ugat_marl.reporting.street_found import found_on_street
 
 Commands = Mapping[Path, Sequence[str]]
 """Folder of a training to the commands that repeat the training."""
@@ -42,7 +39,7 @@ _OPEN = 4
 """Largest number of sections that are shown unfolded."""
 _WORST = 10
 """Number of intersections in the table of the longest queues."""
-_RADARS = ("direct transfer", "UGAT", "trained in real", "best rule")
+_RADARS = ("direct transfer", "UGAT", "fitted street", "trained in real", "best rule")
 _RADAR = "Every axis is scaled by its best value, at the rim; the middle is worst."
 _STRETCH = "Mean of a stretch of episodes, with its 95 % interval over "
 
@@ -186,7 +183,7 @@ def _overview_row(record: RunRecord) -> list[str]:
     policy = record.setting if record.job else record.grounding
     if evaluation is not None and evaluation.policies:
         shown = _main_policies(evaluation)
-        policy = next((name for name in shown if name.startswith("UGAT")), shown[0])
+        policy = next(filter(is_grounded, shown), shown[0])
         sim, real = evaluation.domains[0], evaluation.domains[-1]
         cells["sim"] = _with_interval(evaluation.estimate(policy, sim, "att_s"))
         if real != sim:
@@ -312,6 +309,7 @@ def _training(page: Page, record: RunRecord, commands: Commands) -> dict[str, An
         "boxes": _boxes(record),
         "scores": _scores(page, record, evaluation) if evaluation is not None and judged else None,
         "curves": page.figures((learning, f"{_STRETCH}its episodes."), (travel, once)),
+        "street": found_on_street(page, record, places),
         "gate": _gate(page, record, places),
         "queues": _worst(page, record, places if isinstance(places, Places) else None),
         "commands": commands.get(record.directory, ()),
@@ -330,22 +328,23 @@ def _boxes(record: RunRecord) -> list[tuple[str, str]]:
     for name in _main_policies(evaluation):
         text = number(evaluation.estimate(name, real, "att_s").mean)
         boxes.append((f"{text} s", f"{name} in {real}"))
-    ugat = next((name for name in evaluation.policies if name.startswith("UGAT")), None)
-    if ugat is not None:
-        start, now = (evaluation.gap(p, real, "att_s").mean for p in (direct, ugat))
+    grounded = next(filter(is_grounded, evaluation.policies), None)
+    if grounded is not None:
+        start, now = (evaluation.gap(p, real, "att_s").mean for p in (direct, grounded))
         if start > 0 and math.isfinite(now):
-            boxes.append((share(1 - now / start), "of the gap Δ is gone with UGAT"))
-        boxes.append((f"{number(evaluation.regret(ugat, real).mean)} s", "regret of UGAT"))
+            boxes.append((share(1 - now / start), f"of the gap Δ is gone with {grounded}"))
+        regret_s = number(evaluation.regret(grounded, real).mean)
+        boxes.append((f"{regret_s} s", f"regret of {grounded}"))
     return boxes
 
 
 def _main_policies(evaluation: Evaluation) -> list[str]:
-    """Return those of direct transfer, UGAT and the best rule that were evaluated."""
+    """Return those of direct transfer, grounded ones and the best rule that were evaluated."""
     rule = f"rule {evaluation.notes.get(f'best rule in {evaluation.domains[-1]}')}"
     return [
         name
         for place, name in enumerate(evaluation.policies)
-        if place == 0 or name.startswith("UGAT") or name == rule
+        if place == 0 or is_grounded(name) or name == rule
     ]
 
 
@@ -380,9 +379,10 @@ def _scores(page: Page, record: RunRecord, evaluation: Evaluation) -> dict[str, 
         _file_name(record.name, "travel-times"),
     )
     caption = "Mean over the episodes with its 95 % interval."
-    check = check_run(evaluation)
+    check, outcome = check_run(evaluation), outcome_of(evaluation)
     return {
         "sim": first,
+        "outcome": None if outcome is None else outcome.sentence(),
         "trained": None if check is None else check.sentence("--pretrain-episodes"),
         "episodes": len({result.seed for result in evaluation.results}),
         "table": Grid(headings, rows, headings[1:]),
@@ -484,7 +484,7 @@ def _worst(page: Page, record: RunRecord, places: Places | None) -> dict[str, An
     if record.queues is None or record.evaluation is None:
         return None
     domain, known = record.evaluation.domains[-1], record.evaluation.policies
-    policies = [p for p in known if p.startswith("UGAT")]
+    policies = [p for p in known if is_grounded(p)]
     policies = [*policies, *(p for p in known[:1] if p not in policies)]
     by_policy: dict[str, dict[str, list[float]]] = {}
     for policy, where, _, tls, queue, _ in record.queues.sort("minute").rows():
@@ -564,52 +564,3 @@ def _with_half(estimate: Estimate) -> str:
 def _ends(low: float, high: float) -> str:
     """Return an interval with spaces at which no browser breaks the line."""
     return f"({number(low)}\u00a0to\u00a0{number(high)})"
-
-
-# --- where the agents are -------------------------------------------------------------------------
-
-
-@dataclass(frozen=True)
-class Places:
-    """A network and the traffic lights of its agents.
-
-    Attributes:
-        network: The network.
-        intersection_of: Agent to SUMO's id of its traffic light.
-        note: Remark on the map for the reader; "" for none.
-    """
-
-    network: Network
-    intersection_of: Mapping[str, str]
-    note: str
-
-
-def places_of(record: RunRecord) -> Places | str:
-    """Return the places of a training's agents, or the reason why they are not known."""
-    if not record.scenario:
-        return "no map: the scenario is not on record"
-    options: Any = record.settings.get("options") if record.job else record.settings
-    options = options if isinstance(options, Mapping) else {}
-    try:
-        # A job records the hash of the scenario itself. A training records the hash of the scenario
-        # with the training's own duration.
-        duration_s = None if record.job else options.get("duration_s")
-        network, own_hash = _network(record.scenario, record.sim, duration_s)
-        neighbours = int(options.get("neighbours") or 0)
-        agents = Observer(network, str(options.get("observation") or "count"), neighbours).agents
-    except (UgatMarlError, OSError, ValueError, TypeError) as error:
-        reason = " ".join(str(error).split())
-        return f"no map: scenario {record.scenario!r} cannot be read here ({reason[:200]})"
-    tls = [each.id for each in network.intersections]
-    recorded = record.hashes.get("sim") or record.hashes.get(record.sim)
-    changed = recorded not in (None, own_hash)
-    note = "The scenario has changed since; the map shows it as it is now." if changed else ""
-    return Places(network, dict(zip(agents, tls, strict=True)), note)
-
-
-@functools.lru_cache(maxsize=8)
-def _network(scenario: str, sim: str, duration_s: float | None) -> tuple[Network, str]:
-    derived = scenario_in_domain(load_scenario(scenario), sim)
-    if duration_s is not None:
-        derived = derived.with_duration(duration_s)
-    return Network.read(derived), derived.hash
