@@ -224,7 +224,6 @@ def test_other_vehicles_for_a_configuration(files: Path, tmp_path: Path) -> None
     [
         ([], "one source of roads, not 0"),
         (["--grid", "2x2", "--arterial", "3", "--vph", "100"], "one source of roads, not 2"),
-        (["--grid", "2x2"], "one source of vehicles, not 0"),
         (["--grid", "2x2", "--vph", "100", "--routes", "x.rou.xml"], "vehicles, not 2"),
         (["--grid", "2by2", "--vph", "100"], "as in 4x4"),
         (["--grid", "0x2", "--vph", "100"], "as in 4x4"),

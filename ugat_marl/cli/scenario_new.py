@@ -3,17 +3,21 @@
 from __future__ import annotations
 
 import shlex
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import MISSING, dataclass, fields
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
+from rich import box
 from rich.console import Console
+from rich.table import Table
 from tyro.conf import Positional, arg
 
 from ugat_marl.errors import OptionError
 from ugat_marl.progress import Bars
+from ugat_marl.reporting import draw_network
 from ugat_marl.scenarios import (
+    CountFit,
     RoadSource,
     VehicleSource,
     arterial_roads,
@@ -26,11 +30,14 @@ from ugat_marl.scenarios import (
     from_sumo,
     from_turning_shares,
     grid_roads,
+    make_draft,
     make_scenario,
 )
 
 ROADS = ("grid", "arterial", "osm", "sumo", "cityflow", "draw")
 DEMANDS = ("routes", "vph", "counts", "od")
+MOST_COUNTS = 8
+"""Largest number of counts that are shown; the file has them all."""
 _OWN = Annotated[float | None, arg(metavar="FLOAT", help_behavior_hint="(default: the source's)")]
 
 
@@ -42,7 +49,9 @@ def _none(metavar: str) -> Any:
 class ScenarioNew:
     """Make a scenario directory: roads with demand, ready for all other commands.
 
-    Name one source of roads and one of vehicles. --draw stands for both.
+    Name one source of roads and one of vehicles. --draw stands for both. Without vehicles the
+    folder gets the roads, drawings of the lights, and counts.csv: a row for every turn at a light,
+    with its streets, to fill in and give back with --counts.
 
     Examples:
         ugat-marl scenario new my-grid --grid 4x4 --vph 400
@@ -50,6 +59,8 @@ class ScenarioNew:
         ugat-marl scenario new my-city --sumo city.net.xml --routes cars.rou.xml
         ugat-marl scenario new my-city --sumo city.sumocfg
         ugat-marl scenario new my-city --osm city.osm.pbf --vph 300
+        ugat-marl scenario new my-city --osm city.osm.pbf
+        ugat-marl scenario new my-city --osm city.osm.pbf --counts my-city/counts.csv
         ugat-marl scenario new my-city --cityflow roadnet.json flow.json
 
     Attributes:
@@ -67,7 +78,8 @@ class ScenarioNew:
         routes: Route files for the network.
         vph: Vehicles an hour at every road into the network.
         turns: Shares of left turns, straight on and right turns, for --vph.
-        counts: CSV file of counts: edge,count or from,to,count; also begin_s,end_s.
+        counts: CSV file of counts: edge,count or from,to,count; also begin_s,end_s. Rows with a
+            blank count are left out.
         od: CSV file of origins and destinations: from,to,count; also begin_s,end_s.
         seed: Seed of the vehicles of --vph, --counts and --od.
         spacing_m: Distance between intersections of a grid or arterial, m.
@@ -106,6 +118,8 @@ class ScenarioNew:
     def run(self, console: Console) -> int:
         """Make the scenario and print its facts."""
         roads, vehicles = self._sources()
+        if vehicles is None and not self._brings_vehicles():
+            return self._draft(roads, console)
         made = make_scenario(
             self.name,
             roads,
@@ -124,10 +138,34 @@ class ScenarioNew:
             markup=False,
             soft_wrap=True,
         )
+        if made.fits:
+            console.print(_fit_table(made.fits))
         for note in made.notes:
             console.print(f"note: {note}", markup=False, soft_wrap=True)
         where = shlex.quote(str(self.name))
         console.print(f"next: ugat-marl scenario check {where}", markup=False, soft_wrap=True)
+        return 0
+
+    def _draft(self, roads: RoadSource, console: Console) -> int:
+        """Make a folder with roads, drawn lights and a sheet of counts."""
+        reporter = Bars(console)
+        draft = make_draft(
+            self.name,
+            roads,
+            settings=self._settings(),
+            command=self._command(),
+            draw=lambda scenario, out: draw_network(scenario, out, reporter),
+            reporter=reporter,
+        )
+        sheet = shlex.quote(str(draft.sheet))
+        for text in (
+            f"{self.name}: roads with {len(draft.network.intersections)} intersections, no "
+            "vehicles yet",
+            *(f"note: {note}" for note in draft.notes),
+            f"fill in: {sheet}, {draft.turns} turns; {self.name}/pictures shows the lights",
+            f"next: {self._command()} --counts {sheet} (or --vph N, --routes FILE, --od FILE)",
+        ):
+            console.print(text, markup=False, soft_wrap=True)
         return 0
 
     def _sources(self) -> tuple[RoadSource, VehicleSource | None]:
@@ -171,10 +209,14 @@ class ScenarioNew:
     def _demands(self) -> list[str]:
         return [name for name in DEMANDS if getattr(self, name) not in (None, ())]
 
+    def _brings_vehicles(self) -> bool:
+        """Return True if the source of roads has vehicles of its own."""
+        configured = self.sumo is not None and ".sumocfg" in self.sumo.name
+        return bool(self.draw is not None or self.cityflow or configured)
+
     def _vehicles(self) -> VehicleSource | None:
         given = self._demands()
-        comes_along = self.cityflow or (self.sumo is not None and ".sumocfg" in self.sumo.name)
-        if len(given) > 1 or (not given and not comes_along):
+        if len(given) > 1:
             raise OptionError(
                 f"scenario new needs one source of vehicles, not {len(given)}: "
                 f"give one of {_listed(DEMANDS)}"
@@ -206,6 +248,28 @@ class ScenarioNew:
                 values = value if isinstance(value, tuple) else () if value is True else (value,)
                 words += [_option(name), *map(str, values)]
         return shlex.join(words)
+
+
+def _fit_table(fits: Sequence[CountFit]) -> Table:
+    """Return the counts that are met worst, with their GEH."""
+    worst = sorted(fits, key=lambda fit: -fit.geh)[:MOST_COUNTS]
+    table = Table(
+        title=f"Counts and vehicles, the {len(worst)} largest GEH of {len(fits)}",
+        box=box.SIMPLE_HEAD,
+        pad_edge=False,
+        title_justify="left",
+    )
+    for name in ("light", "from", "turn", "to", "counted", "driven", "GEH"):
+        right = name in ("counted", "driven", "GEH")
+        table.add_column(name, justify="right" if right else "left", overflow="fold")
+    for fit in worst:
+        turn = fit.turn
+        start = f"{turn.street or fit.roads[0]}, {turn.approach}" if turn else fit.roads[0]
+        goal = (turn.to_street if turn else "") or (fit.roads[-1] if len(fit.roads) > 1 else "")
+        cells = (f"{fit.counted:g}", f"{fit.driven}", f"{fit.geh:.1f}")
+        light, way = (turn.light, turn.turn) if turn else ("", "")
+        table.add_row(light, start, way, goal, *cells)
+    return table
 
 
 def _option(name: str) -> str:

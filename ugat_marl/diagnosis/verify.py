@@ -34,6 +34,7 @@ from ugat_marl.diagnosis.study import Study
 from ugat_marl.diagnosis.thresholds import Thresholds
 from ugat_marl.diagnosis.traffic import approach_table, gate_of
 from ugat_marl.effects import Effect
+from ugat_marl.scenarios import geh_of
 
 
 def verify_model(study: Study, base: Tested, best: Tested) -> Verified:
@@ -222,15 +223,14 @@ def hourly(tally: Tally) -> Array:
 
 
 def geh(measured: Array, simulated: Array) -> Array:
-    """Return ``GEH = sqrt(2 (m - c)^2 / (m + c))`` of hourly counts, without empty pairs.
+    """Return the GEH of hourly counts, without empty pairs.
 
     Args:
-        measured: Counts c, vehicles per hour.
-        simulated: Counts m, vehicles per hour.
+        measured: Counts, vehicles per hour.
+        simulated: Counts, vehicles per hour.
     """
     some = measured + simulated > 1.0
-    m, c = simulated[some], measured[some]
-    return np.sqrt(2 * (m - c) ** 2 / (m + c))
+    return geh_of(measured[some], simulated[some])
 
 
 def fhwa(

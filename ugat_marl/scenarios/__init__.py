@@ -5,6 +5,7 @@ hashes it. It also derives the static network. Nothing here runs a simulation of
 
 - `scenario`, `settings`: the directory and its ``scenario.toml``.
 - `network`, `lanes`, `junctions`, `phases`, `naming`: the static network.
+- `street_names`: names of streets, approaches, turns and intersections.
 - `signals`: signal timing as pure functions.
 - `demand`, `routes`, `days`: checks of route files, routes of vehicles, other days of a demand.
 - `periods`: detectors, and the recordings of detectors and signals.

@@ -7,8 +7,12 @@ from .days import draw_day as draw_day
 from .demand import Demand as Demand
 from .demand import check_demand as check_demand
 from .importers.cityflow import from_cityflow as from_cityflow
+from .importers.count_sheet import FIT_SHEET as FIT_SHEET
+from .importers.count_sheet import CountFit as CountFit
+from .importers.counts import GOOD_GEH as GOOD_GEH
 from .importers.counts import from_counts as from_counts
 from .importers.counts import from_od as from_od
+from .importers.counts import geh_of as geh_of
 from .importers.drawn import DrawnNetwork as DrawnNetwork
 from .importers.drawn import NetworkRanges as NetworkRanges
 from .importers.drawn import draw_network as draw_network
@@ -16,6 +20,7 @@ from .importers.drawn import draw_scenario as draw_scenario
 from .importers.drawn import drawn_sources as drawn_sources
 from .importers.making import RoadSource as RoadSource
 from .importers.making import VehicleSource as VehicleSource
+from .importers.making import make_draft as make_draft
 from .importers.making import make_scenario as make_scenario
 from .importers.osm import from_osm as from_osm
 from .importers.plan import Road as Road
@@ -85,3 +90,7 @@ from .signals import Withheld as Withheld
 from .signals import green_begins_at_once as green_begins_at_once
 from .signals import late_green_log as late_green_log
 from .signals import with_late_green as with_late_green
+from .street_names import NamedTurn as NamedTurn
+from .street_names import approach_directions as approach_directions
+from .street_names import intersection_name as intersection_name
+from .street_names import named_turns as named_turns

@@ -101,11 +101,13 @@ class Network:
         lanes: Lanes outside of junctions by id.
         intersections: Traffic lights with at least two green phases, in the order of their ids.
         uncontrolled: Traffic lights with fewer than two green phases; they run their own programme.
+        streets: Road (SUMO's edge) to the name of its street; roads without a name are left out.
     """
 
     lanes: Mapping[str, Lane]
     intersections: tuple[Intersection, ...]
     uncontrolled: tuple[str, ...]
+    streets: Mapping[str, str] = field(default_factory=dict[str, str])
 
     @classmethod
     def read(cls, scenario: Scenario) -> Network:
@@ -133,7 +135,7 @@ class Network:
     @classmethod
     def _of(cls, root: ET.Element, scenario: Scenario) -> Network:
         document = scenario.network
-        lanes = _lanes(root)
+        lanes = lanes_of(root)
         links = links_of(root)
         programmes = _programmes(root, scenario)
         if unknown := sorted(set(scenario.settings.intersections) - set(links)):
@@ -182,7 +184,9 @@ class Network:
         agents = {intersection.id for intersection in agents_found}
         pruned = tuple(_with_neighbours(light, agents) for light in agents_found)
         reach_m = scenario.control.reach_m
-        return cls(_with_room(lanes, root, agents, reach_m), pruned, tuple(uncontrolled))
+        return cls(
+            _with_room(lanes, root, agents, reach_m), pruned, tuple(uncontrolled), streets_of(root)
+        )
 
     def intersection(self, tls: str) -> Intersection:
         """Return the intersection with this SUMO id."""
@@ -331,7 +335,8 @@ def _check_lanes(
                 )
 
 
-def _lanes(root: ET.Element) -> dict[str, Lane]:
+def lanes_of(root: ET.Element) -> dict[str, Lane]:
+    """Return the lanes outside of junctions by id."""
     lanes: dict[str, Lane] = {}
     for edge in root.iter("edge"):
         if edge.get("function") in ("internal", "crossing", "walkingarea"):
@@ -346,6 +351,17 @@ def _lanes(root: ET.Element) -> dict[str, Lane]:
                 _shape(lane.get("shape", "")),
             )
     return lanes
+
+
+def _streets(root: ET.Element) -> dict[str, str]:
+    names = {edge.get("id", ""): edge.get("name", "") for edge in root.iter("edge")}
+    return {edge: name for edge, name in names.items() if name}
+
+
+def streets_of(root: ET.Element) -> dict[str, str]:
+    """Return road (SUMO's edge) to the name of its street, without roads that have no name."""
+    names = {edge.get("id", ""): edge.get("name", "") for edge in root.iter("edge")}
+    return {edge: name for edge, name in names.items() if name}
 
 
 def _with_room(

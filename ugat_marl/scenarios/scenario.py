@@ -28,6 +28,9 @@ from ugat_marl.scenarios.settings import (
 )
 from ugat_marl.scenarios.signals import SignalTiming
 
+COUNT_SHEET = "counts.csv"
+"""Name of the sheet of turning counts in the folder of a scenario."""
+
 
 @dataclass(frozen=True)
 class Scenario:
@@ -151,6 +154,11 @@ def read_scenario(name: str | Path) -> Scenario:
     shipped = dict(shipped_scenarios())
     if text in shipped:
         return _load_directory(shipped[text])
+    if text and (path / COUNT_SHEET).is_file():
+        raise ScenarioError(
+            f"{path}: has roads and no vehicles yet; fill in {path / COUNT_SHEET}, and make it "
+            "again with --counts, as its README.md says"
+        )
     if text and path.is_dir():
         raise ScenarioError(f"{path}: a directory without scenario.toml is not a scenario")
     raise UnknownNameError(

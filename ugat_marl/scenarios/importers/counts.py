@@ -16,10 +16,17 @@ from itertools import chain, pairwise
 from pathlib import Path
 
 import numpy as np
+from numpy.typing import NDArray
 
-from ugat_marl.errors import ScenarioError
-from ugat_marl.files import parse_xml, read_bytes, write_whole, xml_bytes
+from ugat_marl.errors import ScenarioError, nearest
+from ugat_marl.files import chunks_of, parse_xml, read_bytes, write_whole, xml_bytes
 from ugat_marl.progress import Reporter
+from ugat_marl.scenarios.importers.count_sheet import (
+    FIT_SHEET,
+    CountFit,
+    NamedNetwork,
+    write_fit,
+)
 from ugat_marl.scenarios.importers.long_files import lines
 from ugat_marl.scenarios.importers.making import ROUTES, VehicleFiles, VehicleSource
 from ugat_marl.scenarios.importers.streets import Streets
@@ -31,12 +38,15 @@ from ugat_marl.scenarios.importers.turning_shares import (
     write_drives,
 )
 from ugat_marl.scenarios.programs import convert
+from ugat_marl.scenarios.scenario import COUNT_SHEET
 from ugat_marl.scenarios.settings import parse_decimal
 from ugat_marl.seeding import numpy_generator
 
 _CANDIDATES_VPH = 400.0
 """Random candidate routes drawn at each entry; routeSampler chooses among them."""
-_GOOD_GEH = 5.0
+GOOD_GEH = 5.0
+"""GEH below which a count is met (UK TAG unit M3.1)."""
+_ASK_FOR_SHEET = "scenario new without vehicles writes a sheet with all turns at lights"
 _MOST_ROWS = 1_000_000
 """Most rows of a table: about a thousand roads, ten days, intervals of 15 minutes."""
 
@@ -66,6 +76,7 @@ def read_rows(
     """Read a CSV file with the column ``count`` and either ``edge`` or ``from`` and ``to``.
 
     The columns ``begin_s`` and ``end_s`` are optional. Without them a row covers the whole episode.
+    A row whose count is blank is left out: nothing was counted there.
 
     Args:
         path: The file.
@@ -92,6 +103,8 @@ def read_rows(
     total = 0.0
     for values in _whole(reader, path):
         where = f"{path}, line {reader.line_num}"
+        if values["count"] is not None and not values["count"].strip():
+            continue
         roads = tuple(
             (values[key] or "").strip() for key in (("from", "to") if turns else ("edge",))
         )
@@ -116,7 +129,7 @@ def read_rows(
                 + "; keep those of the episode, or sum them up"
             )
     if not total:
-        raise ScenarioError(f"{path}: no row counts a vehicle")
+        raise ScenarioError(f"{path}: no row counts a vehicle; fill in the column count")
     return rows_read
 
 
@@ -152,7 +165,8 @@ def from_counts(path: Path, begin_s: float, length_s: float, seed: int) -> Vehic
 
     def vehicles(folder: Path, network: Path, reporter: Reporter) -> VehicleFiles:
         rows = read_rows(path, begin_s, begin_s + length_s, reporter, pairs=False)
-        streets = Streets.of(parse_xml(read_bytes(network), str(network)))
+        root = parse_xml(read_bytes(network), str(network))
+        streets = Streets.of(root)
         _require_roads(rows, streets, path, network)
         with tempfile.TemporaryDirectory(prefix="ugat_marl-") as name:
             work = Path(name)
@@ -172,7 +186,11 @@ def from_counts(path: Path, begin_s: float, length_s: float, seed: int) -> Vehic
         if not sampled:
             raise ScenarioError(f"{path}: SUMO's routeSampler found no vehicle for these counts")
         write_drives(folder / ROUTES, sorted(sampled, key=lambda d: (d.depart_s, d.id)))
-        return VehicleFiles((ROUTES,), (_fit(rows, sampled, path),))
+        names = NamedNetwork(root)
+        fits = _fits(rows, sampled, names)
+        write_fit(folder / FIT_SHEET, fits, names)
+        write_whole(folder / COUNT_SHEET, b"".join(chunks_of(path)))
+        return VehicleFiles((ROUTES,), (_summary(fits, path),), fits=fits)
 
     return vehicles
 
@@ -181,8 +199,10 @@ def _require_roads(rows: Iterable[Row], streets: Streets, path: Path, network: P
     for row in rows:
         for road in row.roads:
             if road not in streets.start:
+                guess = nearest(road, streets.start)
+                hint = f"did you mean {guess!r}?" if guess else _ASK_FOR_SHEET
                 raise ScenarioError(
-                    f"{path}, line {row.line}: {road!r} is not a road for cars of {network}"
+                    f"{path}, line {row.line}: {road!r} is not a road for cars of {network}; {hint}"
                 )
 
 
@@ -229,21 +249,48 @@ def _sampled(path: Path) -> Iterator[Drive]:
             yield Drive(f"{edges[0]}_{number}", float(element.get("depart", "0")), edges)
 
 
-def _fit(rows: Sequence[Row], drives: Sequence[Drive], path: Path) -> str:
-    """Return a sentence with the number of counts that are met.
-
-    A count C is met by M vehicles per hour if GEH = sqrt(2 (M - C)^2 / (M + C)) is below 5.
-    """
-    good = 0
+def _fits(
+    rows: Sequence[Row], drives: Sequence[Drive], names: NamedNetwork
+) -> tuple[CountFit, ...]:
     passed = _passages(drives)
+    fits: list[CountFit] = []
     for row in rows:
         departs = passed.get(row.roads, [])
-        made = bisect_left(departs, row.end_s) - bisect_left(departs, row.begin_s)
+        driven = bisect_left(departs, row.end_s) - bisect_left(departs, row.begin_s)
         hours = (row.end_s - row.begin_s) / 3600
-        wanted, got = row.count / hours, made / hours
-        geh = math.sqrt(2 * (got - wanted) ** 2 / (got + wanted)) if got + wanted else 0.0
-        good += geh < _GOOD_GEH
-    return f"{good} of {len(rows)} counts of {path.name} are met within a GEH of {_GOOD_GEH:g}"
+        turn = names.turn(row.roads) if len(row.roads) > 1 else None
+        fits.append(
+            CountFit(
+                names.intersection(turn.light) if turn else "",
+                turn, row.roads, row.begin_s, row.end_s, row.count, driven,
+                float(geh_of(np.array(row.count / hours), np.array(driven / hours))),
+            )
+        )  # fmt: skip
+    return tuple(fits)
+
+
+def geh_of(
+    counted_vph: NDArray[np.float64], driven_vph: NDArray[np.float64]
+) -> NDArray[np.float64]:
+    """Return ``GEH = sqrt(2 (m - c)^2 / (m + c))`` of hourly flows; 0 where both are 0.
+
+    Args:
+        counted_vph: Flows c that were counted, vehicles per hour.
+        driven_vph: Flows m of the model, vehicles per hour, of the same shape.
+
+    Source:
+        UK Department for Transport, Transport Analysis Guidance, unit M3.1.
+    """
+    total = counted_vph + driven_vph
+    return np.sqrt(2 * (driven_vph - counted_vph) ** 2 / np.where(total > 0, total, 1.0))
+
+
+def _summary(fits: Sequence[CountFit], path: Path) -> str:
+    good = sum(fit.geh < GOOD_GEH for fit in fits)
+    return (
+        f"{good} of {len(fits)} counts of {path.name} are met within a GEH of {GOOD_GEH:g}; "
+        f"{FIT_SHEET} has them one by one"
+    )
 
 
 def _passages(drives: Sequence[Drive]) -> dict[tuple[str, ...], list[float]]:

@@ -3,11 +3,12 @@
 from __future__ import annotations
 
 import contextlib
+import shlex
 import shutil
 import signal
 import tempfile
 import threading
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -15,12 +16,24 @@ from typing import Any
 from ugat_marl.errors import OutputError, ScenarioError
 from ugat_marl.files import write_whole
 from ugat_marl.progress import Reporter
+from ugat_marl.scenarios.admission import admitted
 from ugat_marl.scenarios.demand import Demand, check_demand
+from ugat_marl.scenarios.importers.count_sheet import CountFit, is_filled, write_template
 from ugat_marl.scenarios.network import Network
 from ugat_marl.scenarios.phases import suited
-from ugat_marl.scenarios.scenario import Scenario, read_scenario, scenario_toml, shipped_scenarios
+from ugat_marl.scenarios.scenario import (
+    COUNT_SHEET,
+    Document,
+    Scenario,
+    read_scenario,
+    scenario_toml,
+    shipped_scenarios,
+)
+from ugat_marl.scenarios.settings import validate_settings
 
 NETWORK, ROUTES = "network.net.xml", "demand.rou.xml"
+PICTURES = "pictures"
+"""Folder with drawings of the lights, in a folder without vehicles."""
 
 
 @dataclass(frozen=True)
@@ -62,11 +75,13 @@ class VehicleFiles:
         routes: Names of route files in the folder, or absolute paths of files outside.
         notes: Notes for the user.
         copied: Copy in the folder to its original file.
+        fits: Counts and the vehicles found for them, if the source has counts.
     """
 
     routes: tuple[str, ...]
     notes: tuple[str, ...] = ()
     copied: Mapping[str, Path] = field(default_factory=dict[str, Path])
+    fits: tuple[CountFit, ...] = ()
 
 
 VehicleSource = Callable[[Path, Path, Reporter], VehicleFiles]
@@ -82,11 +97,30 @@ class Made:
         network: Its network.
         demand: Counts of its vehicles.
         notes: Notes for the user.
+        fits: Counts and the vehicles found for them, if the source has counts.
     """
 
     scenario: Scenario
     network: Network
     demand: Demand
+    notes: tuple[str, ...]
+    fits: tuple[CountFit, ...]
+
+
+@dataclass(frozen=True)
+class Draft:
+    """A folder with roads and lights that has no vehicles yet.
+
+    Attributes:
+        network: Its network.
+        sheet: Sheet of counts to fill in.
+        turns: Number of rows of the sheet.
+        notes: Notes for the user.
+    """
+
+    network: Network
+    sheet: Path
+    turns: int
     notes: tuple[str, ...]
 
 
@@ -118,26 +152,69 @@ def make_scenario(
     with new_folder(target, force=force) as folder:
         draft = roads(folder, reporter)
         copied = dict(draft.copied)
-        with _errors_about(copied, folder):
+        with _errors_about(copied, folder, draft.network):
             fleet = VehicleFiles(draft.routes)
             if vehicles:
                 fleet = vehicles(folder, folder / draft.network, reporter)
                 copied |= fleet.copied
-            notes = _write_settings(folder, draft, fleet, settings)
+            content, notes = _settings(folder, draft, fleet.routes, settings)
+            notes += fleet.notes
+            write_whole(folder / "scenario.toml", scenario_toml(content))
             scenario = read_scenario(folder)
             network = Network.read(scenario)
             demand = check_demand(scenario, network, reporter)
-        made = Made(scenario, network, demand, notes)
+        made = Made(scenario, network, demand, notes, fleet.fits)
         write_whole(folder / "README.md", _readme(made, draft, command))
-    return Made(read_scenario(target), network, demand, made.notes)
+    return Made(read_scenario(target), network, demand, made.notes, made.fits)
 
 
-def _write_settings(
-    folder: Path, draft: RoadFiles, fleet: VehicleFiles, settings: Mapping[str, Any]
-) -> tuple[str, ...]:
-    """Write ``scenario.toml`` and return all notes."""
+def make_draft(
+    target: Path,
+    roads: RoadSource,
+    *,
+    settings: Mapping[str, Any],
+    command: str,
+    draw: Callable[[Scenario, Path], object],
+    reporter: Reporter,
+) -> Draft:
+    """Make a folder with roads, drawn lights and a sheet of turning counts, whole or not at all.
+
+    The folder becomes a scenario by `make_scenario` with the counts that were filled in.
+
+    Args:
+        target: The folder to make.
+        roads: Source of the roads.
+        settings: Values for ``scenario.toml``; they override those of the source.
+        command: Command that makes the folder again, for the README.
+        draw: Function that draws the lights of a scenario, which has no vehicles, into a folder.
+        reporter: Shows progress.
+
+    Raises:
+        OutputError: The folder exists, or cannot be written.
+        ScenarioError: The network cannot be controlled.
+    """
+    with new_folder(target, force=False) as folder:
+        source = roads(folder, reporter)
+        with _errors_about(source.copied, folder, source.network):
+            content, notes = _settings(folder, source, ("none",), settings)
+            document = admitted(Document(NETWORK, folder / source.network))
+            scenario = Scenario(
+                target.name, document, (), (), validate_settings(content, str(target))
+            )
+            network = Network.read(scenario)
+            turns = write_template(folder / COUNT_SHEET, document.parse())
+            draw(scenario, folder / PICTURES)
+        lines = _draft_readme(target, source, command, network, notes)
+        write_whole(folder / "README.md", "\n".join(lines) + "\n")
+    return Draft(network, target / COUNT_SHEET, turns, notes)
+
+
+def _settings(
+    folder: Path, draft: RoadFiles, routes: Sequence[str], settings: Mapping[str, Any]
+) -> tuple[dict[str, Any], tuple[str, ...]]:
+    """Return the content of ``scenario.toml`` and the notes on the roads."""
     table = dict(draft.settings)
-    notes = (*draft.notes, *fleet.notes)
+    notes = draft.notes
     if draft.derive and "phases" not in settings.get("control", {}):
         kinds, more = suited(folder / draft.network)
         notes += tuple(more)
@@ -146,26 +223,27 @@ def _write_settings(
     content: dict[str, Any] = {
         "description": draft.description,
         "network": draft.network,
-        "routes": list(fleet.routes),
+        "routes": list(routes),
         "additional": list(draft.additional),
         **table,
         **{key: value for key, value in settings.items() if key != "control"},
         "control": control,
     }
     content = {key: value for key, value in content.items() if value not in ([], {})}
-    write_whole(folder / "scenario.toml", scenario_toml(content))
-    return notes
+    return content, notes
 
 
 @contextlib.contextmanager
-def _errors_about(copied: Mapping[str, Path], folder: Path) -> Iterator[None]:
-    """Make errors name the user's files instead of the copies, which are removed on errors."""
+def _errors_about(copied: Mapping[str, Path], folder: Path, network: str) -> Iterator[None]:
+    """Make errors name the user's files instead of those in the folder, which is removed then."""
     try:
         yield
     except ScenarioError as error:
         text = str(error)
         for name, source in copied.items():
             text = text.replace(str(folder / name), str(source))
+        if not Path(network).is_absolute():
+            text = text.replace(str(folder / network), "this network")
         raise ScenarioError(text) from None
 
 
@@ -200,6 +278,35 @@ def _readme(made: Made, draft: RoadFiles, command: str) -> str:
     return "\n".join(lines) + "\n"
 
 
+def _draft_readme(
+    target: Path, source: RoadFiles, command: str, network: Network, notes: Sequence[str]
+) -> list[str]:
+    others = len(network.uncontrolled)
+    more = f" and {others} more that are no agents" if others else ""
+    return [
+        f"# {target.name}",
+        "",
+        f"{source.description}: roads and lights, no vehicles yet.",
+        "",
+        f"- **Intersections:** {len(network.intersections)}{more}; `{PICTURES}/` shows them",
+        f"- **Vehicles:** fill in the column `count` of `{COUNT_SHEET}`, a row for every turn at a "
+        "light. A row that stays blank was not counted. For quarters of an hour, copy the rows and "
+        "give each its `begin_s` and `end_s`. Then add the counts to the command below:",
+        f"  `{command} --counts {shlex.quote(str(target / COUNT_SHEET))}`",
+        "",
+        "## Origin",
+        "",
+        source.origin,
+        "",
+        "Made with",
+        "",
+        "```sh",
+        command,
+        "```",
+        *(["", "## Notes", "", *(f"- {note}" for note in notes)] if notes else []),
+    ]
+
+
 @contextlib.contextmanager
 def new_folder(target: Path, *, force: bool) -> Iterator[Path]:
     """Yield an empty folder beside `target` that becomes `target` if the block ends normally.
@@ -225,12 +332,15 @@ def new_folder(target: Path, *, force: bool) -> Iterator[Path]:
             made.mkdir()
             yield made
             require_free(target, force=force)  # it may have appeared meanwhile
+            _require_counts_kept(made, target)
             _put(made, target, folder / "before")
     except ScenarioError as error:
         # Files are checked in the temporary folder, but errors should name the final one.
         if str(made) not in str(error):
             raise
         raise ScenarioError(str(error).replace(str(made), str(target))) from None
+    except OutputError:  # an OSError as well, with a message of its own
+        raise
     except OSError as error:
         where = str(error.filename2 or error.filename or made).replace(str(made), str(target))
         raise OutputError(
@@ -256,6 +366,15 @@ def _stopped_in_order() -> Iterator[None]:
         yield
     finally:
         signal.signal(signal.SIGTERM, signal.SIG_DFL)
+
+
+def _require_counts_kept(made: Path, target: Path) -> None:
+    """Refuse to lose a sheet that was filled in, even with --force."""
+    old, new = target / COUNT_SHEET, made / COUNT_SHEET
+    if not old.is_file() or (new.is_file() and (target / "scenario.toml").is_file()):
+        return
+    if is_filled(old) and not (new.is_file() and new.read_bytes() == old.read_bytes()):
+        raise OutputError(f"{old} would be lost; give it with --counts, or move it away first")
 
 
 def _put(made: Path, target: Path, before: Path) -> None:
@@ -290,6 +409,14 @@ def require_free(target: Path, *, force: bool) -> None:
     if occupied:
         raise OutputError(f"{target} exists and is not a folder; choose another name")
     if not target.is_dir() or not any(target.iterdir()):
+        return
+    if (target / COUNT_SHEET).is_file() and not (target / "scenario.toml").exists():
+        known = {COUNT_SHEET, NETWORK, PICTURES, "README.md"}
+        if others := sorted({path.name for path in target.iterdir()} - known):
+            raise OutputError(
+                f"{target / others[0]} was not made with the sheet of counts, and would be lost; "
+                "move it away first"
+            )
         return
     if not (target / "scenario.toml").is_file():
         raise OutputError(f"{target} exists and is not a scenario; choose another name")

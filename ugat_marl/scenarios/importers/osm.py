@@ -117,6 +117,7 @@ def from_osm(path: Path, *, guess: bool) -> RoadSource:
             settings={"control": {"phases": "conflict-free"}},
             derive=True,
             notes=tuple(notes),
+            copied={NETWORK: path},
         )
 
     return roads

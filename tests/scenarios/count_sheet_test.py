@@ -1,0 +1,260 @@
+"""Sheets of turning counts: names against the map, counts that come back, nothing that is lost."""
+
+from __future__ import annotations
+
+import csv
+import math
+import shutil
+from collections import Counter
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from ugat_marl.__main__ import main
+from ugat_marl.files import parse_xml
+from ugat_marl.scenarios import (
+    Lane,
+    Link,
+    approach_directions,
+    geh_of,
+    intersection_name,
+    read_scenario,
+)
+from ugat_marl.scenarios.importers.count_sheet import write_template
+from ugat_marl.scenarios.street_names import heading_rad
+
+TOWN = Path(__file__).parents[1] / "fixtures" / "town.osm"
+COUNTS = {"left": 40, "through": 200, "right": 60}
+
+
+def made(target: Path, *words: str | Path) -> int:
+    return main(["scenario", "new", str(target), "--osm", str(TOWN), *map(str, words)])
+
+
+def rows_of(path: Path) -> list[dict[str, str]]:
+    with path.open(encoding="utf-8-sig", newline="") as file:
+        return list(csv.DictReader(file))
+
+
+def fill_in(path: Path, **changes: str) -> None:
+    """Write the count of each turn, or of `changes`, as a spreadsheet of a German would."""
+    rows = rows_of(path)
+    for row in rows:
+        row["count"] = changes.get(row["turn"], str(COUNTS[row["turn"]]))
+    with path.open("w", encoding="utf-8", newline="") as file:
+        writer = csv.DictWriter(file, list(rows[0]), delimiter=";")
+        writer.writeheader()
+        writer.writerows(rows)
+
+
+@pytest.fixture(scope="module")
+def original(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    target = tmp_path_factory.mktemp("sheet") / "town"
+    assert made(target) == 0
+    return target
+
+
+@pytest.fixture
+def draft(original: Path, tmp_path: Path) -> Path:
+    return shutil.copytree(original, tmp_path / "town")
+
+
+def test_a_sheet_names_every_turn_as_on_the_map(draft: Path) -> None:
+    rows = rows_of(draft / "counts.csv")
+    assert len(rows) == 2 * 4 * 3  # two crossroads; the light at a crossing has no turns
+    assert all(row["count"] == row["begin_s"] == row["end_s"] == "" for row in rows)
+    names = {
+        (row["light"], row["street"], row["approach"], row["turn"]): row["to_street"]
+        for row in rows
+    }
+    assert len(names) == len(rows)
+    # Long Road runs from west to east and Cross Street from south to north, by their coordinates.
+    assert names["cluster_2_5", "Long Road", "eastbound", "left"] == "Cross Street"
+    assert names["cluster_2_5", "Cross Street", "southbound", "left"] == "Long Road"
+    assert names["9", "Upper Street", "westbound", "through"] == "Upper Street"
+    ways = {(row["approach"], row["turn"]): row for row in rows if row["light"] == "cluster_2_5"}
+    assert ways["eastbound", "left"]["from"] == "1000#0"  # the carriageway to the east
+    assert ways["eastbound", "left"]["to"] == ways["northbound", "through"]["to"] == "1002#2"
+    assert ways["westbound", "right"]["to"] == "1002#2"
+    assert {row["intersection"] for row in rows} == {
+        "Long Road / Cross Street", "Cross Street / Upper Street",
+    }  # fmt: skip
+
+
+def test_the_lights_are_drawn(original: Path) -> None:
+    assert {path.name for path in (original / "pictures").iterdir()} == {
+        f"{name}.{end}" for name in ("network", "9", "cluster_2_5") for end in ("png", "svg")
+    }
+    text = (original / "README.md").read_text()
+    assert "no vehicles yet" in text
+    assert f"--counts {original}/counts.csv" in text
+
+
+def test_counts_come_back_with_their_geh(draft: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    fill_in(draft / "counts.csv", right="0")
+    filled = (draft / "counts.csv").read_bytes()
+    assert made(draft, "--counts", draft / "counts.csv") == 0
+    assert "24 of 24 counts of counts.csv are met" in capsys.readouterr().out
+    passed: Counter[tuple[str, str]] = Counter()
+    for route in read_scenario(draft).routes[0].parse().iter("route"):
+        edges = route.get("edges", "").split()
+        passed.update(zip(edges, edges[1:], strict=False))
+    fits = rows_of(draft / "counts-fit.csv")
+    assert len(fits) == 24
+    for fit in fits:
+        c, m = float(fit["counted"]), float(fit["driven"])
+        assert c == {"left": 40, "through": 200, "right": 0}[fit["turn"]]
+        assert m == passed[fit["from"], fit["to"]]
+        wanted = math.sqrt(2 * (m - c) ** 2 / (m + c)) if m + c else 0.0
+        assert float(fit["geh"]) == pytest.approx(wanted, abs=0.005)
+    assert (draft / "counts.csv").read_bytes() == filled
+
+
+def test_counts_that_cannot_all_be_met_come_first(
+    draft: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """What leaves the lower crossroads to the north has to arrive at the upper one."""
+    monkeypatch.setenv("COLUMNS", "100")
+    rows = rows_of(draft / "counts.csv")
+    wanted = {("1002#0", "1002#2"): 900, ("1002#3", "1002#4"): 100}
+    text = "from,to,count\n" + "".join(
+        f"{row['from']},{row['to']},{wanted.get((row['from'], row['to']), '')}\n" for row in rows
+    )
+    text += "1002#3,-1003#0,0\n1002#3,1003#1,0\n1002#2,1002#3,100\n"
+    (draft / "counts.csv").write_text(text)
+    assert made(draft, "--counts", draft / "counts.csv") == 0
+    out = capsys.readouterr().out
+    shown = [line for line in out.splitlines() if "Cross Street, northbound" in line]
+    assert "900" in shown[0] and "through" in shown[0]
+    assert "4 of 5 counts" in out or "3 of 5 counts" in out
+
+
+def test_blank_rows_are_not_counted(draft: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    sheet = draft / "counts.csv"
+    assert made(draft, "--counts", sheet) == 2
+    assert "no row counts a vehicle; fill in the column count" in capsys.readouterr().err
+    fill_in(sheet, left="", right=" ")
+    assert made(draft, "--counts", sheet) == 0
+    assert len(rows_of(draft / "counts-fit.csv")) == 8
+
+
+def test_filled_sheets_are_never_lost(draft: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    fill_in(draft / "counts.csv")
+    before = (draft / "counts.csv").read_bytes()
+    for words in ((), ("--vph", "300"), ("--vph", "300", "--force")):
+        assert made(draft, *words) == 2
+        assert f"{draft / 'counts.csv'} would be lost" in capsys.readouterr().err
+        assert (draft / "counts.csv").read_bytes() == before
+    (draft / "survey.xlsx").write_text("other work")
+    assert made(draft, "--counts", draft / "counts.csv") == 2
+    assert "survey.xlsx was not made with the sheet of counts" in capsys.readouterr().err
+    (draft / "survey.xlsx").unlink()
+    assert made(draft, "--counts", draft / "counts.csv") == 0
+    assert made(draft, "--vph", "300", "--force") == 2
+    assert "would be lost" in capsys.readouterr().err
+
+
+def test_a_folder_without_vehicles_says_what_is_missing(
+    draft: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert main(["scenario", "check", str(draft)]) == 2
+    assert f"no vehicles yet; fill in {draft / 'counts.csv'}" in capsys.readouterr().err
+
+
+def test_errors_name_files_that_exist(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    (tmp_path / "c.csv").write_text("edge,count\n1002#00,1\n")
+    assert made(tmp_path / "a", "--counts", tmp_path / "c.csv") == 2
+    text = capsys.readouterr().err
+    assert f"'1002#00' is not a road for cars of {TOWN}; did you mean '1002#0'?" in text
+    words = ["--grid", "1x1", "--counts", str(tmp_path / "c.csv")]
+    assert main(["scenario", "new", str(tmp_path / "a"), *words]) == 2
+    assert "not a road for cars of this network; scenario new without" in capsys.readouterr().err
+    assert not (tmp_path / "a").exists()
+
+
+def test_a_grid_has_a_sheet_too(tmp_path: Path) -> None:
+    assert main(["scenario", "new", str(tmp_path / "g"), "--grid", "1x1"]) == 0
+    rows = rows_of(tmp_path / "g" / "counts.csv")
+    ways = {(row["approach"], row["turn"]): row["to"] for row in rows}
+    assert ways["eastbound", "through"] == "A1_east1"
+    assert ways["southbound", "left"] == "A1_east1"
+    assert {row["street"] for row in rows} == {""}
+
+
+def test_names_that_a_spreadsheet_would_run_are_texts(tmp_path: Path) -> None:
+    text = TOWN.read_text().replace("Long Road", '=HYPERLINK("http://x")'.replace('"', "&quot;"))
+    (tmp_path / "t.osm").write_text(text)
+    assert main(["scenario", "new", str(tmp_path / "a"), "--osm", str(tmp_path / "t.osm")]) == 0
+    rows = rows_of(tmp_path / "a" / "counts.csv")
+    streets = {row[key] for row in rows for key in ("street", "to_street", "intersection")}
+    assert any("=HYPERLINK" in street for street in streets)
+    assert not any(street.startswith("=") for street in streets)
+
+
+# --- directions ----------------------------------------------------------------------------------
+
+
+def arms(*degrees: float) -> tuple[list[Link], dict[str, Lane]]:
+    """Roads that end at the origin, by the compass direction of travel."""
+    lanes = {
+        f"e{n}_0": Lane(
+            f"e{n}_0", f"e{n}", 100, 10,
+            ((-100 * math.sin(math.radians(d)), -100 * math.cos(math.radians(d))), (0.0, 0.0)),
+        )
+        for n, d in enumerate(degrees)
+    }  # fmt: skip
+    return [Link(n, f"e{n}_0", "out_0", "s") for n in range(len(degrees))], lanes
+
+
+@pytest.mark.parametrize(
+    ("degrees", "names"),
+    [
+        ((0, 90, 180, 270), ("northbound", "eastbound", "southbound", "westbound")),
+        ((30, 120, 210, 300), ("northbound", "eastbound", "southbound", "westbound")),
+        ((350, 170, 80), ("northbound", "southbound", "eastbound")),
+        ((0, 40, 180), ("northbound", "eastbound", "southbound")),  # no name twice
+        (
+            (0, 90, 180, 270, 45),
+            ("northbound", "eastbound", "southbound", "westbound", "northeastbound"),
+        ),
+        (tuple(range(0, 360, 36)), None),
+    ],
+)
+def test_approaches_are_named_together(degrees: tuple[float, ...], names: object) -> None:
+    links, lanes = arms(*degrees)
+    found = tuple(approach_directions(links, lanes).values())
+    if names is None:  # more roads than names
+        assert len(found) == 10 and len(set(found)) == 8
+    else:
+        assert found == names
+
+
+def test_the_last_metres_of_a_road_count() -> None:
+    assert heading_rad(((0, 0), (100, 0), (100, 29), (101, 40))) == pytest.approx(0, abs=0.05)
+    assert math.degrees(heading_rad(((0, 0), (5, 0)))) == pytest.approx(90)
+
+
+def test_an_intersection_is_named_by_its_streets() -> None:
+    links = [Link(0, "a_0", "b_0", "s"), Link(1, "c_0", "b_0", "r")]
+    assert intersection_name(links, {"a": "Mill Lane", "b": "High Street"}) == (
+        "High Street / Mill Lane"
+    )
+    assert intersection_name(links, {}) == ""
+
+
+def test_geh_is_that_of_the_handbook() -> None:
+    """TAG unit M3.1: GEH = sqrt((m - c)^2 / ((m + c) / 2))."""
+    c, m = np.array([1000.0, 0.0, 50.0]), np.array([1100.0, 0.0, 50.0])
+    assert geh_of(c, m) == pytest.approx([math.sqrt(100**2 / 1050), 0.0, 0.0])
+
+
+def test_a_light_without_turns_needs_no_row(tmp_path: Path) -> None:
+    root = parse_xml(
+        b'<net><edge id="a" from="x" to="y"><lane id="a_0" length="9" speed="9" '
+        b'shape="0,0 0,9"/></edge><edge id="b" from="y" to="z"><lane id="b_0" length="9" '
+        b'speed="9" shape="0,9 0,18"/></edge>'
+        b'<connection from="a" to="b" fromLane="0" toLane="0" tl="y" linkIndex="0" dir="s"/></net>',
+        "net",
+    )
+    assert write_template(tmp_path / "t.csv", root) == 0

@@ -1,0 +1,147 @@
+"""Names that people use: streets, directions of approaches, turns and intersections.
+
+A direction is that of travel, as on sheets of counts and in signal plans: a northbound approach
+comes from the south. The y axis of a network points north.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from scipy import optimize
+
+from ugat_marl.scenarios.junctions import Link
+from ugat_marl.scenarios.network import Lane
+
+MAIN_DIRECTIONS = ("northbound", "eastbound", "southbound", "westbound")
+ALL_DIRECTIONS = (
+    "northbound", "northeastbound", "eastbound", "southeastbound",
+    "southbound", "southwestbound", "westbound", "northwestbound",
+)  # fmt: skip
+TURN_NAMES = {"l": "left", "L": "left", "s": "through", "r": "right", "R": "right",
+              "t": "u-turn", "T": "u-turn"}  # fmt: skip
+"""SUMO's letter of a direction to the name of the turn."""
+_TURN_ORDER = ("left", "through", "right", "u-turn")
+_HEADING_M = 30.0
+"""Length of road before the stop line whose direction counts, m; less is a kerb, more a bend."""
+_MOST_STREETS = 3
+
+
+@dataclass(frozen=True)
+class NamedTurn:
+    """One way across an intersection, from road to road, with its names.
+
+    Attributes:
+        light: SUMO id of the traffic light.
+        street: Street it comes from; empty if the network has no name for it.
+        approach: Direction of travel, such as ``northbound``.
+        turn: ``left``, ``through``, ``right`` or ``u-turn``.
+        to_street: Street it leads to; empty if the network has no name for it.
+        from_edge: SUMO id of the road it comes from.
+        to_edge: SUMO id of the road it leads to.
+    """
+
+    light: str
+    street: str
+    approach: str
+    turn: str
+    to_street: str
+    from_edge: str
+    to_edge: str
+
+
+def named_turns(
+    light: str, links: Sequence[Link], lanes: Mapping[str, Lane], streets: Mapping[str, str]
+) -> tuple[NamedTurn, ...]:
+    """Return the turns of a traffic light, clockwise by approach, and from left to right.
+
+    Args:
+        light: SUMO id of the traffic light.
+        links: Its links for vehicles.
+        lanes: Lanes of the network.
+        streets: Road (SUMO's edge) to the name of its street.
+    """
+    approaches = approach_directions(links, lanes)
+    turns = {
+        (link.from_edge, link.to_edge): NamedTurn(
+            light,
+            streets.get(link.from_edge, ""),
+            approaches[link.from_edge],
+            TURN_NAMES.get(link.direction, "through"),
+            streets.get(link.to_edge, ""),
+            link.from_edge,
+            link.to_edge,
+        )
+        for link in links
+    }
+    return tuple(
+        sorted(
+            turns.values(),
+            key=lambda turn: (
+                ALL_DIRECTIONS.index(turn.approach),
+                turn.from_edge,
+                _TURN_ORDER.index(turn.turn),
+                turn.to_edge,
+            ),
+        )
+    )
+
+
+def approach_directions(links: Iterable[Link], lanes: Mapping[str, Lane]) -> dict[str, str]:
+    """Return the direction of travel of each road that leads to a traffic light.
+
+    Up to eight roads get different names, chosen together so that the squared angles between name
+    and road are least: up to four roads the four main directions, else all eight.
+
+    Args:
+        links: Links for vehicles of the traffic light.
+        lanes: Lanes of the network.
+    """
+    first_lane = {link.from_edge: link.from_lane for link in links}
+    headings = [heading_rad(lanes[lane].shape) for lane in first_lane.values()]
+    names = MAIN_DIRECTIONS if len(headings) <= len(MAIN_DIRECTIONS) else ALL_DIRECTIONS
+    places = [2 * math.pi * place / len(names) for place in range(len(names))]
+    costs = np.array([[_between(heading, place) ** 2 for place in places] for heading in headings])
+    if len(headings) > len(names):
+        chosen = costs.argmin(axis=1)
+    else:
+        _, chosen = optimize.linear_sum_assignment(costs)
+    return {edge: names[place] for edge, place in zip(first_lane, chosen, strict=True)}
+
+
+def heading_rad(shape: Sequence[tuple[float, float]]) -> float:
+    """Return the direction of the last metres of a line, clockwise from north, rad."""
+    end, start, left_m = shape[-1], shape[-1], _HEADING_M
+    for before, after in zip(reversed(shape[:-1]), reversed(shape[1:]), strict=True):
+        start = before
+        left_m -= math.dist(before, after)
+        if left_m <= 0:
+            break
+    return math.atan2(end[0] - start[0], end[1] - start[1])
+
+
+def _between(a_rad: float, b_rad: float) -> float:
+    """Return the angle between two directions, 0 to pi."""
+    return abs((a_rad - b_rad + math.pi) % (2 * math.pi) - math.pi)
+
+
+def intersection_name(links: Iterable[Link], streets: Mapping[str, str]) -> str:
+    """Return the streets that meet at a traffic light, as in ``Long Road / Cross Street``.
+
+    Args:
+        links: Links for vehicles of the traffic light.
+        streets: Road (SUMO's edge) to the name of its street.
+
+    Returns:
+        At most three names, those of the most links first; empty if no street has a name.
+    """
+    counts: dict[str, int] = {}
+    for link in links:
+        for edge in (link.from_edge, link.to_edge):
+            if name := streets.get(edge):
+                counts[name] = counts.get(name, 0) + 1
+    busiest = sorted(counts, key=lambda name: (-counts[name], name))
+    return " / ".join(busiest[:_MOST_STREETS])
