@@ -11,14 +11,18 @@ import pytest
 from rich.console import Console, RenderableType
 
 from ugat_marl.data import Metrics, Scores
+from ugat_marl.effects import load_scenario
 from ugat_marl.experiments import Evaluation
 from ugat_marl.experiments.evaluation import Result
 from ugat_marl.reporting import (
     calibration_picture,
     measures_table,
+    service_tables,
     transfer_picture,
     transfer_table,
 )
+from ugat_marl.reporting.service_tables import service_grid
+from ugat_marl.scenarios import Network, named_approaches
 
 BASE = Scores(0.0, 90.0, 500.0, -3.0, 3.0, 0.4, 50.0, 520.0, 515.0, 0.0)
 ATT = {
@@ -100,3 +104,34 @@ def test_the_calibration_is_drawn_if_there_was_an_iteration(tmp_path: Path) -> N
         metrics.add("iteration", iteration, numbers)
         assert calibration_picture(metrics, path)
         assert matplotlib.image.imread(path).std() > 0.05
+
+
+def test_levels_of_service_of_policies_and_approaches(found: Evaluation) -> None:
+    """Two approaches: 100 vehicles lose 20 s in every episode, 300 lose 60 s or, in V4, 100 s."""
+    network = Network.read(load_scenario("grid2x2-v1"))
+    results = tuple(
+        replace(
+            result,
+            scores=replace(
+                result.scores,
+                approaches={
+                    "A1_A2": (100.0, 20.0),
+                    "A1_B1": (300.0, 60.0 if result.domain == "sim" else 100.0),
+                },
+            ),
+        )
+        for result in found.results
+    )  # fmt: skip
+    (tables,) = service_tables(replace(found, results=results), network)
+    text = " ".join(printed(tables).split())
+    assert "direct transfer 50.0 D 80.0 E worst approach 60.0 E 100 F" in text
+    assert "The same by approach, in V4" in text
+    rows = [line.split() for line in printed(tables).splitlines() if "A1_" in line]
+    assert [row[2:4] for row in rows] == [["A1_B1", "300"], ["A1_A2", "100"]]  # the worst first
+    assert [row[0] for row in rows] == ["B1", "A2"]
+    assert [row[1] for row in rows] == ["eastbound", "northbound"]
+    assert service_tables(found, network) == []  # nothing was measured
+    grid = service_grid(replace(found, results=results), ["UGAT"], named_approaches(network))
+    assert grid is not None
+    assert grid.rows[0] == ["B1", "eastbound", "A1_B1", "100 F"]
+    assert service_grid(found, ["UGAT"], {}) is None

@@ -17,8 +17,13 @@ from ugat_marl.errors import OptionError, ScenarioError
 from ugat_marl.experiments import domains_by_gap, evaluate, policy_factory
 from ugat_marl.files import require_writable
 from ugat_marl.progress import Bars
-from ugat_marl.reporting import gap_matrix_table, measures_table, objective_tables
-from ugat_marl.scenarios import Scenario
+from ugat_marl.reporting import (
+    gap_matrix_table,
+    measures_table,
+    objective_tables,
+    service_tables,
+)
+from ugat_marl.scenarios import Network, Scenario
 
 MOST_IN_DETAIL = 8
 """Most domains in the detailed table; more are shown as a matrix of controllers and gaps."""
@@ -84,12 +89,15 @@ class Evaluate:
                 duration_s=self.duration_s,
                 workers=workers,
                 reporter=Bars(console),
+                approaches=True,
             )
         if len(domains) > MOST_IN_DETAIL and domains_by_gap(evaluation):
             console.print(gap_matrix_table(evaluation))
         else:
             console.print(measures_table(evaluation))
         for table in objective_tables(evaluation):
+            console.print(table)
+        for table in service_tables(evaluation, Network.read(scenario)):
             console.print(table)
         if self.out is not None:
             evaluation.write(self.out)

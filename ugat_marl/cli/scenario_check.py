@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Annotated, Any
 
@@ -28,11 +28,15 @@ from ugat_marl.experiments import (
     problems,
 )
 from ugat_marl.progress import Bars, Silent
+from ugat_marl.reporting import approach_table
 from ugat_marl.scenarios import (
     SHORT_LANE_M,
     IntersectionFacts,
+    NamedApproach,
+    Network,
     Survey,
     confinement_missing,
+    named_approaches,
     survey,
 )
 from ugat_marl.testing import (
@@ -113,7 +117,7 @@ class ScenarioCheck:
             )
             print(text)
         else:
-            show(console, facts, runs, rows, wrong)
+            show(console, facts, runs, rows, wrong, named_approaches(Network.read(scenario)))
             if reason := confinement_missing():
                 console.print(
                     f"note: simulations are not confined, because {reason}; see SECURITY.md before "
@@ -150,6 +154,7 @@ def show(
     runs: Sequence[RuleEpisode],
     rows: Sequence[HeadroomRow] | None,
     wrong: Sequence[str],
+    names: Mapping[str, NamedApproach],
 ) -> None:
     """Print everything as tables that fit 80 columns."""
 
@@ -181,6 +186,8 @@ def show(
         )
     if runs:
         console.print(_runs(runs))
+        delays = {run.rule: run.approaches for run in runs}
+        console.print(approach_table("Control delay and level of service (HCM)", delays, names))
     if rows is None:
         say("headroom: not measured; --headroom 1 measures it with one seed")
     else:

@@ -7,6 +7,7 @@
 - `checkpoints`: dictionaries of tensors.
 - `row_hashes`: hashes of the rows of tables, which tell damaged ones.
 - `scores`: the measures of an episode.
+- `level_of_service`: the levels A to F of traffic engineers.
 """
 
 import lazy_loader

@@ -2,6 +2,9 @@ from .checkpoints import checked_tensors as checked_tensors
 from .checkpoints import read_checkpoint as read_checkpoint
 from .checkpoints import write_checkpoint as write_checkpoint
 from .layouts import AgentLayout as AgentLayout
+from .level_of_service import LEVELS_S as LEVELS_S
+from .level_of_service import level_of_service as level_of_service
+from .level_of_service import mean_delay_s as mean_delay_s
 from .measured.atspm import import_atspm as import_atspm
 from .measured.coverage import is_actuated as is_actuated
 from .measured.lanes import traffic_of_lanes as traffic_of_lanes

@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ugat_marl.scenarios import LaneTable
-from ugat_marl.simulation import Snapshot, Trips
+from ugat_marl.simulation import ApproachDelays, Snapshot, Trips
 
 
 @dataclass(frozen=True)
@@ -32,6 +32,8 @@ class Scores:
         departed: Number of vehicles that entered the network.
         backlog: Number of vehicles due that never entered the network.
         hidden: Measures of a domain with an objective; see `ugat_marl.envs.OBJECTIVE_MEASURES`.
+        approaches: Approach (SUMO's edge at a light) to the number of vehicles that passed and
+            their mean control delay in s; empty if it was not measured.
     """
 
     att_s: float
@@ -45,6 +47,7 @@ class Scores:
     departed: float
     backlog: float
     hidden: Mapping[str, float] = field(default_factory=dict[str, float])
+    approaches: ApproachDelays = field(default_factory=dict[str, tuple[float, float]])
 
 
 MEASURES: dict[str, str] = {

@@ -5,7 +5,7 @@ from __future__ import annotations
 import copy
 import math
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -42,7 +42,7 @@ from ugat_marl.policies import (
 )
 from ugat_marl.progress import Reporter, Silent
 from ugat_marl.scenarios import Scenario
-from ugat_marl.simulation import kept_warm
+from ugat_marl.simulation import ApproachDelays, kept_warm, measured_approaches
 
 Watch = Callable[[str, str, TrafficEnv], StepCallback]
 """Maker of a callback from the name of the policy, the name of the domain and the environment. The
@@ -59,6 +59,7 @@ class _Task:
     world: TrafficEnv
     seeds: tuple[int, ...]
     watch: Watch | None
+    approaches: bool
 
 
 @kept_warm()
@@ -74,6 +75,7 @@ def evaluate(
     title: str = "evaluating",
     notes: Mapping[str, str] | None = None,
     watch: Watch | None = None,
+    approaches: bool = False,
 ) -> Evaluation:
     """Play every policy in every domain with every seed, spread over the cores.
 
@@ -88,6 +90,7 @@ def evaluate(
         title: Title of the progress bar.
         notes: Further facts, kept with the result.
         watch: Makes callbacks that observe the environments; needs workers in this process.
+        approaches: True to measure the control delay on every approach (`Scores.approaches`).
     """
     names = [domain_label(domain) for domain in domains]
     if twice := sorted({name for name in names if names.count(name) > 1}):
@@ -101,7 +104,7 @@ def evaluate(
     episodes = len(seeds) * len(policies) * len(domains)
     per_task = max(1, episodes // (4 * parts_at_a_time(workers)))
     tasks = [
-        _Task(name, make, world, tuple(seeds[start : start + per_task]), watch)
+        _Task(name, make, world, tuple(seeds[start : start + per_task]), watch, approaches)
         for world in worlds
         for name, make in policies.items()
         for start in range(0, len(seeds), per_task)
@@ -323,7 +326,21 @@ def _pairs(
 def _play(task: _Task, stop: Stop) -> list[Result]:
     policy = task.make(task.world)
     # The scenario's files hold the effects of the domain already.
-    env = parallel_env(task.world.scenario, **policy.env_options)
+    scenario = task.world.scenario
+    if not task.approaches:
+        return _episodes(task, parallel_env(scenario, **policy.env_options), policy, stop)
+    with measured_approaches(scenario, task.world.network) as (measured, read):
+        env = parallel_env(measured, **policy.env_options)
+        return _episodes(task, env, policy, stop, read)
+
+
+def _episodes(
+    task: _Task,
+    env: TrafficEnv,
+    policy: Policy,
+    stop: Stop,
+    read: Callable[[], ApproachDelays] = dict,
+) -> list[Result]:
     results: list[Result] = []
     check = stop_callback(stop)
     look = task.watch(task.name, task.world.domain, env) if task.watch is not None else check
@@ -335,7 +352,8 @@ def _play(task: _Task, stop: Stop) -> list[Result]:
     try:
         for seed in task.seeds:
             persistently(lambda seed=seed: roll_out(env, policy, seed, on_step=on_step))
-            results.append(Result(task.name, task.world.domain, seed, env.scores()))
+            scores = replace(env.scores(), approaches=read())
+            results.append(Result(task.name, task.world.domain, seed, scores))
     finally:
         env.close()
     return results

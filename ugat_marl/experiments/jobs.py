@@ -263,6 +263,7 @@ class Record:
             scores: dict[tuple[int, str, int], Scores] = {}
             for row in content["episodes"]:
                 key = int(row.pop("trained")), str(row.pop("domain")), int(row.pop("seed"))
+                row["approaches"] = {k: tuple(v) for k, v in row.get("approaches", {}).items()}
                 scores[key] = Scores(**row)
             return cls(scores, **content["training"])
         except (CheckpointError, ValueError, TypeError, KeyError, AttributeError):
@@ -355,6 +356,7 @@ def _judge(
             reporter=reporter,
             title=f"evaluating in {domain}",
             watch=queues.watch,
+            approaches=True,
         )
         record.scores |= {(mark, domain, r.seed): r.scores for r in played.results}
         if mark in job.rows:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import tempfile
 from collections import Counter
 from collections.abc import Mapping, Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, field
 from pathlib import Path
 
 from ugat_marl.experiments.evaluation import evaluate, rule_factory
@@ -37,6 +37,7 @@ class RuleEpisode:
         departed: Number of vehicles that entered the network.
         arrived: Number of vehicles that arrived.
         backlog: Number of vehicles that wait outside at the end.
+        approaches: Approach to the number of vehicles that passed and their mean control delay, s.
     """
 
     rule: str
@@ -45,12 +46,15 @@ class RuleEpisode:
     departed: int
     arrived: int
     backlog: int
+    approaches: Mapping[str, tuple[float, float]] = field(
+        default_factory=dict[str, tuple[float, float]]
+    )
 
 
 def play_check_rules(
     scenario: Scenario, seed: int, workers: int | None, reporter: Reporter
 ) -> tuple[RuleEpisode, ...]:
-    """Play one episode under each of `RULES`."""
+    """Play one episode under each of `RULES`, and measure the delay on every approach."""
     evaluation = evaluate(
         scenario,
         {name: rule_factory(name) for name in RULES},
@@ -59,6 +63,7 @@ def play_check_rules(
         workers=workers,
         reporter=reporter,
         title="an episode for each rule",
+        approaches=True,
     )
 
     def value(rule: str, measure: str) -> float:
@@ -67,7 +72,10 @@ def play_check_rules(
     measures = ("due", "departed", "throughput", "backlog")
     return tuple(
         RuleEpisode(
-            rule, round(value(rule, "att_s"), 1), *(int(value(rule, name)) for name in measures)
+            rule,
+            round(value(rule, "att_s"), 1),
+            *(int(value(rule, name)) for name in measures),
+            evaluation.approaches(rule, "sim"),
         )
         for rule in RULES
     )

@@ -10,6 +10,7 @@ from __future__ import annotations
 
 import json
 import math
+from collections import defaultdict
 from collections.abc import Mapping
 from dataclasses import asdict, dataclass, fields
 from pathlib import Path
@@ -19,10 +20,13 @@ import numpy as np
 import polars as pl
 from numpy.typing import NDArray
 
-from ugat_marl.data import MEASURES, Scores
+from ugat_marl.data import MEASURES, Scores, mean_delay_s
 from ugat_marl.errors import CheckpointError
 from ugat_marl.experiments.statistics import Interval
 from ugat_marl.files import read_json, write_whole
+
+_MAPPINGS = ("hidden", "approaches")
+"""Fields of `Scores` that are no single number."""
 
 
 @dataclass(frozen=True)
@@ -96,6 +100,21 @@ class Evaluation:
         real = self.values(policy, domain, measure)
         return Estimate.of(real - self.values(policy, self.domains[0], measure))
 
+    def approaches(self, policy: str, domain: str) -> dict[str, tuple[float, float]]:
+        """Return, for each approach, vehicles per episode and mean control delay in s.
+
+        The delay is the mean over all vehicles of all episodes. Empty if it was not measured.
+        """
+        played = [r.scores for r in self.results if r.policy == policy and r.domain == domain]
+        pairs: dict[str, list[tuple[float, float]]] = defaultdict(list)
+        for scores in played:
+            for road, pair in scores.approaches.items():
+                pairs[road].append(pair)
+        return {
+            road: (sum(count for count, _ in own) / len(played), mean_delay_s(own))
+            for road, own in pairs.items()
+        }
+
     def regret(self, policy: str, domain: str) -> Estimate:
         """Return the ATT of a policy minus that of the best policy there, in s, paired by seed."""
         best = min(self.policies, key=lambda name: self.estimate(name, domain, "att_s").mean)
@@ -163,7 +182,7 @@ class Evaluation:
         """Return one row per episode: policy, domain, seed, and a column for every measure."""
         rows = [
             {"policy": r.policy, "domain": r.domain, "seed": r.seed}
-            | {name: value for name, value in asdict(r.scores).items() if name != "hidden"}
+            | {name: value for name, value in asdict(r.scores).items() if name not in _MAPPINGS}
             | dict(r.scores.hidden)
             for r in self.results
         ]
@@ -237,10 +256,14 @@ def result_of(row: Mapping[str, Any]) -> Result:
     numbers = {
         measure.name: _number(row.get(measure.name))
         for measure in fields(Scores)
-        if measure.name != "hidden"
+        if measure.name not in _MAPPINGS
+    }
+    approaches = {
+        str(road): (_number(pair[0]), _number(pair[1]))
+        for road, pair in (row.get("approaches") or {}).items()
     }
     hidden = {str(name): _number(value) for name, value in (row.get("hidden") or {}).items()}
-    scores = Scores(**numbers, hidden=hidden)
+    scores = Scores(**numbers, hidden=hidden, approaches=approaches)
     return Result(str(row["policy"]), str(row["domain"]), int(row["seed"]), scores)
 
 

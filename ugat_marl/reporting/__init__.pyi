@@ -22,6 +22,8 @@ from .phase_diagrams import draw_network as draw_network
 from .run_records import RunRecord as RunRecord
 from .run_records import TableRecord as TableRecord
 from .run_records import read_records as read_records
+from .service_tables import approach_table as approach_table
+from .service_tables import service_tables as service_tables
 from .tables import measures_table as measures_table
 from .tables import policy_gap_table as policy_gap_table
 from .tables import transfer_table as transfer_table

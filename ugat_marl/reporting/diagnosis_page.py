@@ -97,7 +97,7 @@ def diagnosis_page(diagnosis: Diagnosis, network: Network, commands: Sequence[st
         patterns=_patterns(diagnosis),
         ranking=_ranking(diagnosis),
         courtesy=_courtesy(diagnosis),
-        geh=words.geh_line(diagnosis),
+        criteria=words.criteria_line(diagnosis),
         policy_gap=_policy_gap(diagnosis),
         data=_data(diagnosis),
         commands=commands or _usual_commands(diagnosis),

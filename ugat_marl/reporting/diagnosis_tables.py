@@ -20,6 +20,8 @@ _SHOWN = 3
 def diagnosis_summary(diagnosis: Diagnosis) -> RenderableType:
     """Return verdict, effects, strongest disagreements and the numbers of the held-out periods."""
     blocks: list[RenderableType] = []
+    if (text := words.criteria_line(diagnosis)) is not None:
+        blocks.append(Text(text))
     if (text := words.partial(diagnosis)) is not None:
         blocks.append(Text(text, style="bold yellow"))
     verdict = words.VERDICTS[diagnosis.verdict]
@@ -35,8 +37,6 @@ def diagnosis_summary(diagnosis: Diagnosis) -> RenderableType:
     if diagnosis.approaches:
         blocks.append(_traffic(diagnosis))
     if (text := words.gate_line(diagnosis)) is not None:
-        blocks.append(Text(text))
-    if (text := words.geh_line(diagnosis)) is not None:
         blocks.append(Text(text))
     return Group(*blocks)
 

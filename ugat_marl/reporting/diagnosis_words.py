@@ -7,6 +7,7 @@ from collections.abc import Callable, Iterable
 
 from ugat_marl.diagnosis import (
     ApproachRow,
+    CriteriaRow,
     Diagnosis,
     Disagreement,
     EffectRecord,
@@ -15,7 +16,7 @@ from ugat_marl.diagnosis import (
     Verdict,
     clock,
 )
-from ugat_marl.reporting.formats import number, share
+from ugat_marl.reporting.formats import chance, number, share
 
 UNTRIED = 8
 """Most effects that are named as not examined; of more, the text gives their number."""
@@ -176,16 +177,51 @@ def gate_line(diagnosis: Diagnosis) -> str | None:
     )
 
 
-def geh_line(diagnosis: Diagnosis) -> str | None:
-    """Return a sentence on GEH, the usual criterion for counts; None without counts."""
-    criteria = diagnosis.courtesy
+def criteria_line(diagnosis: Diagnosis) -> str | None:
+    """Return the usual criteria for the model as it is, beside our own; None without counts."""
+    criteria, heldout = diagnosis.courtesy, diagnosis.heldout
     if criteria is None or criteria.before.geh_below_5 is None:
         return None
-    before, after = criteria.before.geh_below_5, criteria.after.geh_below_5
-    text = f"GEH < 5 (usual: on 85 % of counts): {share(before)} before, {share(after)} after"
-    if diagnosis.verdict != "no_discrepancy" and before >= 0.85:
-        return f"{text}. It passes without any correction: it does not see this gap."
-    return f"{text}."
+    texts = [f"As it is: {_usual(criteria.before)}"]
+    if heldout is not None:
+        texts[0] += f"; our test {_ours(heldout.p_before)}"
+        if heldout.shrink is not None:
+            texts.append(f"Corrected: {_usual(criteria.after)}; our test {_ours(heldout.p_after)}")
+    if diagnosis.verdict != "no_discrepancy" and criteria.before.geh_below_5 >= GEH_SHARE:
+        texts.append("GEH does not see this gap")
+    return f"{'. '.join(texts)}. {STRICTER}"
+
+
+GEH_SHARE = 0.85
+"""Share of counts that should have a GEH below 5 (UK TAG unit M3.1)."""
+OUR_LEAST_P = 0.01
+"""Least chance of a difference as large as the measured one: the noise floor of a diagnosis."""
+STRICTER = (
+    "Ours is stricter. GEH and FHWA see how many vehicles pass, and drivers and signals hardly "
+    "change that; ours also sees when they pass, in queues and from the stop line on."
+)
+
+
+def _usual(row: CriteriaRow) -> str:
+    """Return GEH and the number of FHWA's four criteria that are met."""
+    below = row.geh_below_5
+    text = f"GEH < 5 on {share(below)} of counts"
+    if below is not None:
+        text += f" ({'met' if below >= GEH_SHARE else 'not met'}, usual: {share(GEH_SHARE)})"
+    limits = (
+        (row.within_2_sigma, 0.95),
+        (row.within_1_sigma, 2 / 3),
+        (row.absolute_error, 1.0),
+        (row.systematic_error, 1.0),
+    )
+    met = [value >= least for value, least in limits if value is not None]
+    if len(met) < len(limits):
+        return f"{text}, FHWA not known (it needs three measured days)"
+    return f"{text}, FHWA {sum(met)} of {len(limits)} criteria met"
+
+
+def _ours(p: float) -> str:
+    return f"{'met' if p >= OUR_LEAST_P else 'not met'}, p = {chance(p)}".replace("= <", "<")
 
 
 def joined(names: Iterable[str]) -> str:

@@ -24,7 +24,12 @@ from ugat_marl.reporting.page import Figure, Grid, Page, render
 from ugat_marl.reporting.places import Places, places_of
 from ugat_marl.reporting.run_groups import groups, seeds_of_one
 from ugat_marl.reporting.run_records import RunRecord, TableRecord, as_number
+<<<<<<< HEAD
 from ugat_marl.reporting.street_found import found_on_street
+=======
+from ugat_marl.reporting.service_tables import LEGEND, service_grid
+from ugat_marl.scenarios import Network, named_approaches
+>>>>>>> 826739f (Control delay and level of service for every approach, and the usual criteria first)
 
 Commands = Mapping[Path, Sequence[str]]
 """Folder of a training to the commands that repeat the training."""
@@ -307,7 +312,9 @@ def _training(page: Page, record: RunRecord, commands: Commands) -> dict[str, An
         "progress": _progress(record),
         "missing": record.missing,
         "boxes": _boxes(record),
-        "scores": _scores(page, record, evaluation) if evaluation is not None and judged else None,
+        "scores": _scores(page, record, evaluation, places)
+        if evaluation is not None and judged
+        else None,
         "curves": page.figures((learning, f"{_STRETCH}its episodes."), (travel, once)),
         "street": found_on_street(page, record, places),
         "gate": _gate(page, record, places),
@@ -348,8 +355,10 @@ def _main_policies(evaluation: Evaluation) -> list[str]:
     ]
 
 
-def _scores(page: Page, record: RunRecord, evaluation: Evaluation) -> dict[str, Any]:
-    """Return travel times with gap and regret, and all measures."""
+def _scores(
+    page: Page, record: RunRecord, evaluation: Evaluation, places: Places | str
+) -> dict[str, Any]:
+    """Return travel times with gap and regret, levels of service, and all measures."""
     first, *others = evaluation.domains
     headings = ["policy", f"in {first}, s"]
     for domain in others:
@@ -379,7 +388,12 @@ def _scores(page: Page, record: RunRecord, evaluation: Evaluation) -> dict[str, 
         _file_name(record.name, "travel-times"),
     )
     caption = "Mean over the episodes with its 95 % interval."
+<<<<<<< HEAD
     check, outcome = check_run(evaluation), outcome_of(evaluation)
+=======
+    names = named_approaches(places.network) if isinstance(places, Places) else {}
+    check = check_run(evaluation)
+>>>>>>> 826739f (Control delay and level of service for every approach, and the usual criteria first)
     return {
         "sim": first,
         "outcome": None if outcome is None else outcome.sentence(),
@@ -387,6 +401,9 @@ def _scores(page: Page, record: RunRecord, evaluation: Evaluation) -> dict[str, 
         "episodes": len({result.seed for result in evaluation.results}),
         "table": Grid(headings, rows, headings[1:]),
         "measures": _measures(evaluation),
+        "service": service_grid(evaluation, _main_policies(evaluation), names),
+        "real": evaluation.domains[-1],
+        "levels": LEGEND,
         "figures": page.figures((scores, caption), *((radar, _RADAR) for radar in radars)),
     }
 

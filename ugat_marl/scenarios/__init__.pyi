@@ -90,7 +90,9 @@ from .signals import Withheld as Withheld
 from .signals import green_begins_at_once as green_begins_at_once
 from .signals import late_green_log as late_green_log
 from .signals import with_late_green as with_late_green
+from .street_names import NamedApproach as NamedApproach
 from .street_names import NamedTurn as NamedTurn
 from .street_names import approach_directions as approach_directions
 from .street_names import intersection_name as intersection_name
+from .street_names import named_approaches as named_approaches
 from .street_names import named_turns as named_turns

@@ -14,7 +14,7 @@ import numpy as np
 from scipy import optimize
 
 from ugat_marl.scenarios.junctions import Link
-from ugat_marl.scenarios.network import Lane
+from ugat_marl.scenarios.network import Lane, Network
 
 MAIN_DIRECTIONS = ("northbound", "eastbound", "southbound", "westbound")
 ALL_DIRECTIONS = (
@@ -88,6 +88,42 @@ def named_turns(
             ),
         )
     )
+
+
+@dataclass(frozen=True)
+class NamedApproach:
+    """A road that leads to a traffic light, with its names.
+
+    Attributes:
+        light: SUMO id of the traffic light.
+        intersection: Streets that meet there; empty if they have no names.
+        street: Street of the road; empty if the network has no name for it.
+        direction: Direction of travel, such as ``northbound``.
+        edge: SUMO id of the road.
+    """
+
+    light: str
+    intersection: str
+    street: str
+    direction: str
+    edge: str
+
+    @property
+    def name(self) -> str:
+        """Street and direction, as in ``Long Road, eastbound``."""
+        return f"{self.street}, {self.direction}" if self.street else self.direction
+
+
+def named_approaches(network: Network) -> dict[str, NamedApproach]:
+    """Return the approaches of all agents by road, clockwise at each light."""
+    approaches: dict[str, NamedApproach] = {}
+    for light in network.intersections:
+        name = intersection_name(light.links, network.streets)
+        directions = approach_directions(light.links, network.lanes)
+        for edge in sorted(directions, key=lambda edge: ALL_DIRECTIONS.index(directions[edge])):
+            street = network.streets.get(edge, "")
+            approaches[edge] = NamedApproach(light.id, name, street, directions[edge], edge)
+    return approaches
 
 
 def approach_directions(links: Iterable[Link], lanes: Mapping[str, Lane]) -> dict[str, str]:

@@ -1,3 +1,5 @@
+from .approach_delays import ApproachDelays as ApproachDelays
+from .approach_delays import measured_approaches as measured_approaches
 from .channel import Channel as Channel
 from .channel import ChannelClosed as ChannelClosed
 from .channel import Message as Message

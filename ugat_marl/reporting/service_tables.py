@@ -1,0 +1,126 @@
+"""Tables of control delay and level of service, approach by approach."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+
+from rich import box
+from rich.console import Group, RenderableType
+from rich.table import Table
+from rich.text import Text
+
+from ugat_marl.data import level_of_service, mean_delay_s
+from ugat_marl.experiments import Evaluation
+from ugat_marl.reporting.formats import number_text
+from ugat_marl.reporting.page import Grid
+from ugat_marl.scenarios import NamedApproach, Network, named_approaches
+
+MOST_APPROACHES = 8
+"""Most approaches in a table of the terminal."""
+LEGEND = (
+    "Mean control delay in s per vehicle that passed the light, and the level of service of the "
+    "Highway Capacity Manual: A to 10 s, B to 20, C to 35, D to 55, E to 80, F above. Vehicles "
+    "that wait outside the network do not count."
+)
+
+Delays = Mapping[str, tuple[float, float]]
+"""Approach to the number of vehicles that passed and their mean control delay, s."""
+
+
+def delay_text(delay_s: float) -> str:
+    """Return a control delay in s with its level of service, as in ``38.2 D``."""
+    return f"{number_text(delay_s)} {level_of_service(delay_s)}".strip()
+
+
+def service_tables(evaluation: Evaluation, network: Network) -> list[RenderableType]:
+    """Return the level of service of each policy, and that of the worst approaches.
+
+    Args:
+        evaluation: Episodes with `Scores.approaches`; without, the list is empty.
+        network: The network.
+    """
+    names = named_approaches(network)
+    measured = {
+        (policy, domain): found
+        for domain in evaluation.domains
+        for policy in evaluation.policies
+        if (found := evaluation.approaches(policy, domain))
+    }
+    if not measured:
+        return []
+    table = _table(f"{evaluation.scenario}: control delay and level of service (HCM)")
+    table.add_column("policy", max_width=22, overflow="fold")
+    for domain in evaluation.domains:
+        table.add_column(domain, justify="right", overflow="fold")
+    for policy in evaluation.policies:
+        own = [measured.get((policy, domain), {}) for domain in evaluation.domains]
+        table.add_row(Text(policy), *(delay_text(mean_delay_s(d.values())) for d in own))
+        worst = [max(delays.items(), key=lambda item: item[1][1], default=None) for delays in own]
+        cells = ["-" if at is None else delay_text(at[1][1]) for at in worst]
+        table.add_row(*(Text(text, style="dim") for text in ("  worst approach", *cells)))
+    last = evaluation.domains[-1]
+    delays = {policy: measured.get((policy, last), {}) for policy in evaluation.policies}
+    return [Group(table, approach_table(f"The same by approach, in {last}", delays, names))]
+
+
+def approach_table(
+    title: str, delays: Mapping[str, Delays], names: Mapping[str, NamedApproach]
+) -> RenderableType:
+    """Return delay and level of service of the worst approaches under several controllers.
+
+    Args:
+        title: Title of the table.
+        delays: Delays by controller; the first one decides which approaches are the worst.
+        names: Names of the approaches.
+    """
+    roads = _worst_first(delays)
+    shown = roads[:MOST_APPROACHES]
+    more = f", the worst {len(shown)} of {len(roads)}" if len(roads) > len(shown) else ""
+    table = _table(f"{title}{more}")
+    for heading in ("light", "approach", "road"):
+        table.add_column(heading, overflow="fold", max_width=22)
+    table.add_column("veh", justify="right")
+    for name in delays:
+        table.add_column(name, justify="right", overflow="fold")
+    for road in shown:
+        named = names.get(road)
+        cells = [delay_text(own[road][1]) if road in own else "-" for own in delays.values()]
+        count = next(own[road][0] for own in delays.values() if road in own)
+        light, approach = (named.light, named.name) if named else ("", "")
+        table.add_row(Text(light), Text(approach), Text(road), f"{count:.0f}", *cells)
+    return Group(table, Text(LEGEND, style="dim"))
+
+
+def service_grid(
+    evaluation: Evaluation, policies: Sequence[str], names: Mapping[str, NamedApproach]
+) -> Grid | None:
+    """Return delay and level of service of all approaches in the last domain; None without any.
+
+    Args:
+        evaluation: The episodes.
+        policies: Policies to show.
+        names: Names of the approaches; those missing are shown by their road alone.
+    """
+    domain = evaluation.domains[-1]
+    delays = {policy: evaluation.approaches(policy, domain) for policy in policies}
+    rows: list[list[str]] = []
+    for road in _worst_first(delays):
+        named = names.get(road)
+        cells = [delay_text(own[road][1]) if road in own else "–" for own in delays.values()]
+        texts = (named.intersection or named.light, named.name) if named else ("", "")
+        rows.append([*texts, road, *cells])
+    headings = [f"{policy}, s per vehicle" for policy in delays]
+    return Grid(["intersection", "approach", "road", *headings], rows, headings) if rows else None
+
+
+def _worst_first(delays: Mapping[str, Delays]) -> list[str]:
+    roads = dict.fromkeys(road for own in delays.values() for road in own)
+    first = next(iter(delays.values()), {})
+    return sorted(roads, key=lambda road: -first.get(road, (0.0, 0.0))[1])
+
+
+def _table(title: str) -> Table:
+    return Table(
+        box=box.SIMPLE_HEAD, title=Text(title), title_justify="left", pad_edge=False,
+        padding=(0, 1, 0, 0),
+    )  # fmt: skip

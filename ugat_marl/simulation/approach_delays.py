@@ -1,0 +1,138 @@
+"""Control delay on every approach of a traffic light, measured by SUMO itself.
+
+Control delay is the time that a vehicle loses because of a light: braking, waiting, moving up and
+getting under way again. Here it is the time lost against free flow on the road that leads to the
+light and inside the junction. Where a map cuts the road at nodes from which there is one way on,
+the pieces upstream count too. Vehicles that wait outside the network are on no road and do not
+count.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import tempfile
+import xml.etree.ElementTree as ET
+from collections import defaultdict
+from collections.abc import Callable, Iterator, Mapping
+from dataclasses import replace
+from pathlib import Path
+
+from ugat_marl.errors import SimulatorError
+from ugat_marl.files import xml_bytes
+from ugat_marl.scenarios import Document, Network, Scenario, edge_of_lane
+
+ApproachDelays = Mapping[str, tuple[float, float]]
+"""Approach (SUMO's edge at a light) to the number of vehicles that passed the light in an episode,
+and their mean control delay, s."""
+
+_FILE = "approaches.xml"
+
+
+@contextlib.contextmanager
+def measured_approaches(
+    scenario: Scenario, network: Network
+) -> Iterator[tuple[Scenario, Callable[[], ApproachDelays]]]:
+    """Let simulations of a scenario measure the delay on the approaches of its agents.
+
+    The traffic is the same to the bit. Simulations must come one after the other.
+
+    Args:
+        scenario: The scenario.
+        network: Its network.
+
+    Yields:
+        The scenario to simulate, and a function that returns the delays of the simulation that has
+        ended last.
+    """
+    roads = approach_roads(scenario.network.parse(), network)
+    with tempfile.TemporaryDirectory(prefix="ugat_marl-") as name:
+        file = Path(name).resolve() / _FILE
+        root = ET.Element("additional")
+        ET.SubElement(
+            root,
+            "edgeData",
+            {"id": "approaches", "file": str(file), "withInternal": "true", "excludeEmpty": "true"},
+        )
+        extra = Document("approaches.add.xml", None, xml_bytes(root))
+        measured = replace(
+            scenario,
+            additional=(*scenario.additional, extra),
+            outputs=(*scenario.outputs, str(file.parent)),
+        )
+        yield measured, lambda: read_approach_delays(file, roads)
+
+
+def read_approach_delays(file: Path, roads: Mapping[str, frozenset[str]]) -> ApproachDelays:
+    """Read SUMO's edge data.
+
+    The delay is the time lost on the roads of an approach by all vehicles, divided by the number of
+    vehicles that passed the light. In a queue that grows, vehicles that still wait count in the
+    first and not in the second.
+
+    Args:
+        file: SUMO's output.
+        roads: Approach to the roads whose lost time counts for it, as of `approach_roads`.
+
+    Raises:
+        SimulatorError: The file is missing or incomplete.
+    """
+    lost_s: dict[str, float] = defaultdict(float)
+    left: dict[str, float] = defaultdict(float)
+    try:
+        for _, element in ET.iterparse(file):
+            if element.tag == "edge":
+                road = element.get("id", "")
+                lost_s[road] += float(element.get("timeLoss", "0"))
+                left[road] += float(element.get("left", "0"))
+            element.clear()
+    except (OSError, ET.ParseError, ValueError) as error:
+        raise SimulatorError(f"SUMO's data on roads cannot be read ({error})") from None
+    return {
+        approach: (left[approach], sum(map(lost_s.__getitem__, pieces)) / max(left[approach], 1.0))
+        for approach, pieces in roads.items()
+    }
+
+
+def approach_roads(root: ET.Element, network: Network) -> dict[str, frozenset[str]]:
+    """Return, for each approach of an agent, the roads whose lost time counts for it.
+
+    These are the approach itself, the ways across its junction, and the roads upstream of it from
+    which all ways lead to it, up to the next light.
+
+    Args:
+        root: The ``<net>``.
+        network: Its network.
+    """
+    onward: dict[str, set[str]] = defaultdict(set)
+    before: dict[str, set[str]] = defaultdict(set)
+    inside: dict[tuple[str, str], set[str]] = defaultdict(set)
+    further = {
+        f"{element.get('from')}_{element.get('fromLane')}": element.get("via", "")
+        for element in root.iter("connection")
+        if element.get("from", "").startswith(":")
+    }
+    for element in root.iter("connection"):
+        start, end = element.get("from", ":"), element.get("to", ":")
+        if start.startswith(":") or end.startswith(":") or element.get("dir") == "t":
+            continue
+        onward[start].add(end)
+        lane = element.get("via", "")
+        while lane and edge_of_lane(lane) not in inside[start, end]:
+            inside[start, end].add(edge_of_lane(lane))
+            lane = further.get(lane, "")
+        if element.get("tl") is None:
+            before[end].add(start)
+    approaches = {link.from_edge for light in network.intersections for link in light.links}
+    roads: dict[str, frozenset[str]] = {}
+    for approach in sorted(approaches):
+        pieces = {approach}.union(*(inside[approach, end] for end in onward[approach]))
+        waiting, seen = [approach], {approach}
+        while waiting:
+            here = waiting.pop()
+            for upstream in before[here] - seen - approaches:
+                if onward[upstream] == {here}:
+                    seen.add(upstream)
+                    pieces |= {upstream, *inside[upstream, here]}
+                    waiting.append(upstream)
+        roads[approach] = frozenset(pieces)
+    return roads
