@@ -37,6 +37,7 @@ COMMANDS: dict[str, tuple[str, str]] = {
         "ugat_marl.cli.diagnose:Diagnose",
         "find why a simulation and measured data disagree",
     ),
+    "plan": ("ugat_marl.cli.plan:Plan", "read and write fixed-time signal plans"),
     "export": ("ugat_marl.cli.export:Export", "write a policy as TorchScript, ONNX or matrices"),
     "scenario list": (
         "ugat_marl.cli.scenario_list:ScenarioList",

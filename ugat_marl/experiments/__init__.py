@@ -15,6 +15,7 @@ interrupted ones. `train`, the tables of the UGAT paper, the learning curves of 
 - `recording`: measured data of a domain.
 - `training_curves`: means of what trainings log.
 - `queues`: halting vehicles per intersection and minute.
+- `typical_plans`: the behaviour of a policy as a fixed-time plan.
 - `policy_gaps`: travel times before and after a diagnosis.
 - `randomised`: worlds drawn at random.
 - `machine`: facts of the machine.

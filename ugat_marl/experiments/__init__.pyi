@@ -85,3 +85,4 @@ from .tuning import TUNED_RULES as TUNED_RULES
 from .tuning import VERSION as VERSION
 from .tuning import tune as tune
 from .tuning import tuned_rules as tuned_rules
+from .typical_plans import typical_plans as typical_plans

@@ -24,12 +24,9 @@ from ugat_marl.reporting.page import Figure, Grid, Page, render
 from ugat_marl.reporting.places import Places, places_of
 from ugat_marl.reporting.run_groups import groups, seeds_of_one
 from ugat_marl.reporting.run_records import RunRecord, TableRecord, as_number
-<<<<<<< HEAD
-from ugat_marl.reporting.street_found import found_on_street
-=======
 from ugat_marl.reporting.service_tables import LEGEND, service_grid
-from ugat_marl.scenarios import Network, named_approaches
->>>>>>> 826739f (Control delay and level of service for every approach, and the usual criteria first)
+from ugat_marl.reporting.street_found import found_on_street
+from ugat_marl.scenarios import named_approaches
 
 Commands = Mapping[Path, Sequence[str]]
 """Folder of a training to the commands that repeat the training."""
@@ -388,12 +385,8 @@ def _scores(
         _file_name(record.name, "travel-times"),
     )
     caption = "Mean over the episodes with its 95 % interval."
-<<<<<<< HEAD
-    check, outcome = check_run(evaluation), outcome_of(evaluation)
-=======
     names = named_approaches(places.network) if isinstance(places, Places) else {}
-    check = check_run(evaluation)
->>>>>>> 826739f (Control delay and level of service for every approach, and the usual criteria first)
+    check, outcome = check_run(evaluation), outcome_of(evaluation)
     return {
         "sim": first,
         "outcome": None if outcome is None else outcome.sentence(),

@@ -6,6 +6,7 @@ hashes it. It also derives the static network. Nothing here runs a simulation of
 - `scenario`, `settings`: the directory and its ``scenario.toml``.
 - `network`, `lanes`, `junctions`, `phases`, `naming`: the static network.
 - `street_names`: names of streets, approaches, turns and intersections.
+- `signal_plans`: fixed-time plans in rings and barriers, and their tables.
 - `signals`: signal timing as pure functions.
 - `demand`, `routes`, `days`: checks of route files, routes of vehicles, other days of a demand.
 - `periods`: detectors, and the recordings of detectors and signals.

@@ -22,6 +22,7 @@ from .importers.making import RoadSource as RoadSource
 from .importers.making import VehicleSource as VehicleSource
 from .importers.making import make_draft as make_draft
 from .importers.making import make_scenario as make_scenario
+from .importers.making import new_folder as new_folder
 from .importers.osm import from_osm as from_osm
 from .importers.plan import Road as Road
 from .importers.plan import RoadPlan as RoadPlan
@@ -35,6 +36,8 @@ from .importers.sumo_files import from_sumo as from_sumo
 from .importers.turning_shares import from_turning_shares as from_turning_shares
 from .importers.turning_shares import poisson_arrivals as poisson_arrivals
 from .importers.turning_shares import weighted_choice as weighted_choice
+from .importers.utdf import is_utdf as is_utdf
+from .importers.utdf import read_utdf as read_utdf
 from .inspection import SHORT_LANE_M as SHORT_LANE_M
 from .inspection import IntersectionFacts as IntersectionFacts
 from .inspection import Survey as Survey
@@ -79,6 +82,13 @@ from .settings import Real as Real
 from .settings import parse_decimal as parse_decimal
 from .settings import parse_time as parse_time
 from .settings import validate_settings as validate_settings
+from .signal_plans import PlanPhase as PlanPhase
+from .signal_plans import SignalPlan as SignalPlan
+from .signal_plans import movement_codes as movement_codes
+from .signal_plans import programme_plan as programme_plan
+from .signal_plans import read_plans as read_plans
+from .signal_plans import with_plans as with_plans
+from .signal_plans import write_plans as write_plans
 from .signals import GREEN as GREEN
 from .signals import SIGNAL_LETTERS as SIGNAL_LETTERS
 from .signals import YELLOW as YELLOW

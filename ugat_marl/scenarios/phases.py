@@ -128,7 +128,7 @@ def conflict_free_phases(
             f"{source}: the network has no internal lanes, so conflicts are unknown; "
             'use phases = "programme" or list the phases'
         )
-    clash = _permitted_clash(links, rules) if permitted else partial(are_foes, foes=rules.foes)
+    clash = permitted_clash(links, rules) if permitted else partial(are_foes, foes=rules.foes)
     groups = _movements(links)
     following = {name for name in groups if name[1] == "r"}
     while True:
@@ -144,7 +144,7 @@ def conflict_free_phases(
     return tuple(dict.fromkeys(state_of(green, links, rules, width) for green in together))
 
 
-def _permitted_clash(links: Sequence[Link], rules: RightOfWay) -> Clash:
+def permitted_clash(links: Sequence[Link], rules: RightOfWay) -> Clash:
     """Return a conflict test that allows left turns that wait for opposite traffic."""
     through = [link for link in links if link.direction == "s"]
     crossing = {

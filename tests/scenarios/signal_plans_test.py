@@ -1,0 +1,296 @@
+"""Fixed-time plans: rings and barriers by hand, what SUMO shows, tables, Synchro's files."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+
+import pytest
+
+from ugat_marl.__main__ import main
+from ugat_marl.effects import load_scenario
+from ugat_marl.envs import parallel_env
+from ugat_marl.errors import ScenarioError
+from ugat_marl.experiments import rule_factory, typical_plans
+from ugat_marl.progress import Silent
+from ugat_marl.scenarios import (
+    Network,
+    PlanPhase,
+    Scenario,
+    SignalPlan,
+    movement_codes,
+    programme_plan,
+    read_plans,
+    read_scenario,
+    read_utdf,
+    with_plans,
+    write_plans,
+)
+
+LEFTS_FIRST = (  # two rings, two barriers: lefts before through, of unequal length
+    (1, 1, "EBL", 15), (1, 1, "WBT WBR", 35), (1, 2, "NBL", 15), (1, 2, "SBT SBR", 25),
+    (2, 1, "WBL", 20), (2, 1, "EBT EBR", 30), (2, 2, "SBL", 15), (2, 2, "NBT NBR", 25),
+)  # fmt: skip
+
+
+def dual_ring(offset_s: float = 0.0) -> SignalPlan:
+    phases = tuple(
+        PlanPhase(ring, barrier, tuple(codes.split()), split, 3, 2)
+        for ring, barrier, codes, split in LEFTS_FIRST
+    )
+    return SignalPlan("A1", 90, offset_s, phases)
+
+
+@pytest.fixture(scope="module")
+def single() -> Scenario:
+    return load_scenario("single-v1").with_duration(300)
+
+
+def green_at(scenario: Scenario, second: float, letters: str = "Gg") -> set[str]:
+    """Movements with these letters at a second of the cycle of the light's programme."""
+    network = Network.read(scenario)
+    (light,) = network.intersections
+    left = second % sum(seconds for seconds, _ in light.programme)
+    for seconds, state in light.programme:
+        if left < seconds:
+            codes = movement_codes(light, network)
+            return {code for link, code in codes.items() if state[link.index] in letters}
+        left -= seconds
+    raise AssertionError
+
+
+def test_rings_run_side_by_side_and_meet_at_the_barrier(single: Scenario) -> None:
+    planned = with_plans(single, [dual_ring()], "plans.csv")
+    (light,) = Network.read(planned).intersections
+    assert sum(seconds for seconds, _ in light.programme) == 90
+    assert green_at(planned, 5) == {"EBL", "WBL"}
+    assert green_at(planned, 11, "y") == {"EBL"}  # 15 s: 10 green, 3 yellow, 2 red
+    assert green_at(planned, 14) == {"WBL"}
+    assert green_at(planned, 25) == {"WBT", "WBR", "EBT", "EBR"}
+    assert green_at(planned, 46, "y") == {"WBT", "WBR", "EBT", "EBR"}
+    assert green_at(planned, 49) == set()  # both rings wait for the barrier
+    assert green_at(planned, 51) == {"NBL", "SBL"}
+    assert green_at(planned, 70) == {"SBT", "SBR", "NBT", "NBR"}
+    assert all("g" not in state for _, state in light.programme)  # nobody gives way
+
+
+def test_a_movement_of_two_phases_in_turn_stays_green(single: Scenario) -> None:
+    phases = (
+        PlanPhase(1, 1, ("EBL", "EBT", "EBR"), 25, 3, 2),
+        PlanPhase(1, 1, ("EBT", "EBR", "WBT", "WBR"), 25, 3, 2),
+        PlanPhase(1, 1, ("WBL", "WBR", "NBR"), 15, 3, 2),
+        PlanPhase(1, 1, ("NBT", "NBR", "SBT", "SBR", "NBL", "SBL"), 25, 3, 2),
+    )
+    planned = with_plans(single, [SignalPlan("A1", 90, 0, phases)], "plans.csv")
+    assert green_at(planned, 21) == {"EBT", "EBR"}
+    assert green_at(planned, 21, "y") == {"EBL"}
+    assert green_at(planned, 24) == {"EBT", "EBR"}
+    assert green_at(planned, 70, "g") == {"NBL", "SBL"}  # with the traffic opposite
+    assert green_at(planned, 70, "G") == {"NBT", "NBR", "SBT", "SBR"}
+    assert green_at(planned, 86, "y") == {"NBT", "NBL", "SBT", "SBL", "SBR", "NBR"}
+
+
+@pytest.mark.parametrize(("begin_s", "offset_s"), [(0, 0), (0, 25), (100, 40)])
+def test_sumo_shows_the_plan_at_its_offset(
+    single: Scenario, begin_s: float, offset_s: float
+) -> None:
+    settings = single.settings.model_copy(update={"begin_s": begin_s})
+    scenario = with_plans(replace(single, settings=settings), [dual_ring(offset_s)], "plans.csv")
+    network = Network.read(scenario)
+    (light,) = network.intersections
+    env = parallel_env(scenario, signals="programme")
+    env.reset(seed=1)
+    for _ in range(12):
+        env.step(dict.fromkeys(env.agents, 0))
+        time_s = env.snapshot.time_s
+        assert env._simulator is not None
+        state = env._simulator.signals()["A1"]
+        shown = {
+            c for link, c in movement_codes(light, network).items() if state[link.index] in "Gg"
+        }
+        # SUMO shows a state from the second after its begin on.
+        assert shown in (green_at(scenario, time_s - offset_s - d) for d in (0.0, 1.0))
+    env.close()
+
+
+def test_a_table_comes_back(single: Scenario, tmp_path: Path) -> None:
+    network = Network.read(single)
+    (light,) = network.intersections
+    plans = (dual_ring(12.5),)
+    write_plans(tmp_path / "p.csv", plans, network)
+    assert read_plans(tmp_path / "p.csv") == plans
+    text = (tmp_path / "p.csv").read_text(encoding="utf-8-sig").replace(",", ";")
+    (tmp_path / "q.csv").write_text(text)
+    assert read_plans(tmp_path / "q.csv") == plans
+    own = programme_plan(light, network)
+    assert own.cycle_s == sum(seconds for seconds, _ in light.programme)
+    again = with_plans(single, [own], "plans.csv")
+    assert Network.read(again).intersections[0].programme == light.programme
+
+
+HEAD = "light,cycle_s,offset_s,ring,barrier,movements,split_s,yellow_s,all_red_s\n"
+GOOD = "A1,60,0,1,1,NBT NBR SBT SBR NBL SBL,30,3,2\nA1,60,0,1,1,EBT EBR WBT WBR EBL WBL,30,3,2\n"
+
+
+@pytest.mark.parametrize(
+    ("text", "says"),
+    [
+        ("light,cycle\nA1,60\n", "line 1: the column cycle_s is missing; is it 'cycle'?"),
+        (HEAD, "no row holds a phase"),
+        (HEAD + GOOD.replace("A1,60,0,1,1,E", "A1,70,0,1,1,E"), "line 3: light 'A1' has another"),
+        (HEAD + GOOD.replace("A1,60", "A1,70"), "its splits make 60 s and its cycle_s is 70"),
+        (HEAD + GOOD.replace(",30,3,2\nA1", ",5,3,2\nA1"), "phase 1 (NBT NBR"),
+        (HEAD + GOOD.replace(",30,3,2", ",many,3,2", 1), "line 2: split_s = 'many' is not a time"),
+        (HEAD + GOOD.replace("60,0,1,1", "60,0,x,1", 1), "line 2: ring = 'x' is not a number"),
+        (HEAD + GOOD.replace("NBT NBR SBT SBR NBL SBL", ""), "line 2: movements is blank"),
+        (HEAD + GOOD.replace("NBT NBR", "NBT NXR"), "it has no movement 'NXR'; it has EBL"),
+        (HEAD + GOOD.replace("NBL SBL", ""), "NBL SBL are in no phase, and"),
+        (HEAD + GOOD.replace("NBL SBL", "NBL SBL WBT"), "are green together and cross"),
+        (HEAD + GOOD.replace("A1", "B7"), "light 'B7' is no agent of scenario"),
+        (HEAD + GOOD.replace("A1,60,0,1,1,EBT", "A1,60,0,2,1,EBT").replace("WBL,30", "WBL,20"),
+         "the rings differ before the end of barrier 1 (ring 1 30 s, ring 2 20 s)"),
+    ],
+)  # fmt: skip
+def test_plans_that_are_wrong(
+    text: str, says: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    (tmp_path / "t.csv").write_text(text)
+    words = ["plan", "single-v1", "--apply", str(tmp_path / "t.csv"), "--out", str(tmp_path / "x")]
+    assert main(words) == 2
+    err = capsys.readouterr().err
+    assert says in err
+    assert len(err.strip().splitlines()) == 1
+    assert not (tmp_path / "x").exists()
+
+
+UTDF = """[Network]
+Network Settings
+RECORDNAME,DATA
+Metric,1
+[Nodes]
+Node Data
+INTID,TYPE,X,Y,Z,DESCRIPTION
+7,0,0,0,0,"Main & First, town"
+[Lanes]
+Lane Group Data
+RECORDNAME,INTID,NBL,NBT,NBR,SBL,SBT,SBR,EBL,EBT,EBR,WBL,WBT,WBR,PED
+Lanes,7,1,2,0,1,2,0,1,2,0,1,2,0,
+Phase1,7,3,8,,7,4,,5,2,,1,6,,
+PermPhase1,7,,,,,,,2,,,,,,
+[Timeplans]
+Timing Plan Settings
+RECORDNAME,INTID,DATA
+Control Type,7,0
+Cycle Length,7,90.0
+Referenced To,7,{referenced}
+Reference Phase,7,206
+Offset,7,{offset}
+[Phases]
+Phasing Data
+RECORDNAME,INTID,D1,D2,D3,D4,D5,D6,D7,D8
+BRP,7,111,112,211,212,121,122,221,222
+MinGreen,7,4,4,4,4,4,4,4,4
+MaxGreen,7,{d1},30,10,20,10,30,10,20
+Yellow,7,3,3,3,3,3,3.5,3,3
+AllRed,7,2,2,2,2,2,1.5,2,2
+"""
+
+
+def synchro(folder: Path, **values: object) -> Path:
+    """A file as Synchro writes it: barrier 1 is 50 s, barrier 2 40 s."""
+    given: dict[str, object] = {"referenced": 3, "offset": 30, "d1": 10}
+    text = UTDF.format(**(given | values))
+    (folder / "synchro.csv").write_text(text)
+    return folder / "synchro.csv"
+
+
+def test_synchro_s_rings_and_barriers(single: Scenario, tmp_path: Path) -> None:
+    """Phases 1, 2 | 3, 4 in one ring and 5, 6 | 7, 8 in the other; BRP is barrier, ring, place."""
+    network = Network.read(single)
+    (plan,), notes = read_utdf(synchro(tmp_path), network, {})
+    assert notes == ()
+    assert (plan.light, plan.cycle_s) == ("A1", 90)
+    assert [(p.ring, p.barrier, p.split_s) for p in plan.phases] == [
+        (1, 1, 15), (1, 1, 35), (2, 1, 15), (2, 1, 35),
+        (1, 2, 15), (1, 2, 25), (2, 2, 15), (2, 2, 25),
+    ]  # fmt: skip
+    served = [set(p.movements) for p in plan.phases]
+    assert served[0] == {"WBL"}  # phase 1
+    assert served[1] == {"EBT", "EBR", "EBL"}  # phase 2, right turns with it, left permitted
+    assert served[2] == {"EBL"} and served[3] == {"WBT", "WBR"}  # phases 5 and 6
+    assert (plan.phases[3].yellow_s, plan.phases[3].all_red_s) == (3.5, 1.5)
+    # Phases 2 and 6 turn green 15 s after the begin of the cycle, which is what offset 30 is for.
+    assert plan.offset_s == 15
+    planned = with_plans(single, [plan], "synchro.csv")
+    assert green_at(planned, 25, "g") == {"EBL"}
+    assert green_at(planned, 5, "G") == {"WBL", "EBL"}
+
+
+@pytest.mark.parametrize(
+    ("referenced", "offset", "begins"),
+    [(0, 15, 0), (3, 0, 75), (1, 45, 0), (2, 48, 0), (1, 0, 45)],
+)  # phases 2 and 6 are green from 15 to 45, and red from 48 or 48.5
+def test_offsets_refer_to_parts_of_phases(
+    referenced: int, offset: float, begins: float, single: Scenario, tmp_path: Path
+) -> None:
+    file = synchro(tmp_path, referenced=referenced, offset=offset)
+    (plan,), _ = read_utdf(file, Network.read(single), {"7": "A1"})
+    assert plan.offset_s == begins
+
+
+@pytest.mark.parametrize(
+    ("values", "lights", "says"),
+    [
+        ({"d1": 12}, (), "the rings differ before the end of barrier 1 (ring 1 52 s, ring 2 50 s)"),
+        ({"d1": "ten"}, (), "maxgreen = 'ten' is not a number"),
+        ({"referenced": 4}, (), "Referenced To = 4: offsets are read that refer to"),
+        ({}, ("8=A1",), "has no plan for an intersection '8'; it has 7"),
+        ({}, ("7=B1",), "'B1' is no agent of the scenario; its agents are A1"),
+        ({}, ("7",), "--lights 7: give INTID=LIGHT"),
+    ],
+)
+def test_files_of_synchro_that_are_wrong(
+    values: dict[str, object],
+    lights: tuple[str, ...],
+    says: str,
+    tmp_path: Path,
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    file = synchro(tmp_path, **values)
+    words = ["plan", "single-v1", "--apply", str(file), "--out", str(tmp_path / "x")]
+    assert main([*words, *(["--lights", *lights] if lights else [])]) == 2
+    assert says in capsys.readouterr().err
+
+
+def test_a_plan_becomes_a_scenario(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    words = ["plan", "single-v1", "--apply", str(synchro(tmp_path)), "--out", str(tmp_path / "p")]
+    assert main(words) == 0
+    assert "single-v1 with 1 plans as programmes" in capsys.readouterr().out
+    (light,) = Network.read(read_scenario(tmp_path / "p")).intersections
+    assert sum(seconds for seconds, _ in light.programme) == 90
+    assert len(light.phases) == 8  # agents keep their phases
+    assert main(words) == 2
+    assert "--force replaces it" in capsys.readouterr().err
+
+
+def test_two_lights_need_a_word_on_which_is_which(tmp_path: Path) -> None:
+    network = Network.read(load_scenario("grid2x2-v1"))
+    with pytest.raises(ScenarioError, match=r"which intersection is which light\? Give --lights"):
+        read_utdf(synchro(tmp_path), network, {})
+
+
+def test_the_typical_plan_of_a_fixed_time_is_itself(single: Scenario) -> None:
+    """Four phases of 30 s: needs of 25/120 each, so C = 20 / (1 - 100/120) = 120 s."""
+    (plan,) = typical_plans(
+        single.with_duration(1200), rule_factory("fixed-time:30"), "sim", (1,), Silent()
+    )
+    assert (plan.cycle_s, [phase.split_s for phase in plan.phases]) == (120, [30] * 4)
+    assert {code for phase in plan.phases for code in phase.movements} == {
+        f"{way}{turn}" for way in ("NB", "EB", "SB", "WB") for turn in "LTR"
+    }
+
+
+def test_the_typical_plan_of_the_programme_is_the_programme(single: Scenario) -> None:
+    network = Network.read(single)
+    (plan,) = typical_plans(single, rule_factory("programme"), "sim", (1,), Silent())
+    assert plan == programme_plan(network.intersections[0], network)

@@ -1,0 +1,157 @@
+"""``ugat-marl plan``: fixed-time signal plans in and out."""
+
+from __future__ import annotations
+
+import shlex
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Annotated, Any
+
+from rich import box
+from rich.console import Console
+from rich.table import Table
+from rich.text import Text
+from tyro.conf import Positional, arg
+
+from ugat_marl.effects import load_scenario, scenario_in_domain
+from ugat_marl.errors import OptionError
+from ugat_marl.experiments import policy_factory, typical_plans
+from ugat_marl.files import require_writable
+from ugat_marl.progress import Bars
+from ugat_marl.scenarios import (
+    Network,
+    Scenario,
+    SignalPlan,
+    is_utdf,
+    new_folder,
+    read_plans,
+    read_utdf,
+    with_plans,
+    write_plans,
+)
+
+
+def _none(metavar: str) -> Any:
+    return arg(metavar=metavar, help_behavior_hint="(default: not used)")
+
+
+@dataclass(frozen=True)
+class Plan:
+    """Write signal plans as a table, or put a table's plans into a scenario.
+
+    The table has a row for every phase: cycle, offset, split, yellow and all-red in s, ring and
+    barrier, and the movements with green, as NBL for a left turn of northbound traffic. Without
+    --policy it holds the programmes of the network, as a template to change. With --apply, out is
+    a new scenario whose lights run the plans as their programme.
+
+    Examples:
+        ugat-marl plan single-v1 --out plans.csv
+        ugat-marl plan single-v1 --apply plans.csv --out single-planned
+        ugat-marl plan my-city --apply synchro.csv --lights 1=A1 2=B1 --out my-city-planned
+        ugat-marl plan single-v1 --policy largest-queue:20 --domain V4 --out typical.csv
+
+    Attributes:
+        scenario: Id of a shipped scenario, directory, .sumocfg or resco:<map>.
+        out: CSV file to write, or with --apply the directory of the new scenario.
+        policy: Rule, or file of a policy, whose typical behaviour becomes a plan.
+        domain: Domain in which the policy is played.
+        seeds: Number of episodes of the policy.
+        first_seed: Seed of the first episode.
+        apply: Table of plans, or combined UTDF file of Synchro.
+        lights: Lights of the intersections of a UTDF file, as INTID=LIGHT.
+        force: Replace a scenario of the name --out.
+    """
+
+    scenario: Annotated[Positional[str], arg(metavar="SCENARIO")]
+    out: Path
+    policy: Annotated[str | None, arg(metavar="POLICY", help_behavior_hint="(default: none)")] = (
+        None
+    )
+    domain: str = "sim"
+    seeds: int = 3
+    first_seed: int = 1000
+    apply: Annotated[Path | None, _none("FILE")] = None
+    lights: tuple[str, ...] = ()
+    force: bool = False
+
+    def run(self, console: Console) -> int:
+        """Write the table or the scenario, and show the plans."""
+        if self.apply is not None and self.policy is not None:
+            raise OptionError("--apply reads plans and --policy makes them; leave out one of them")
+        if self.seeds < 1 or self.first_seed < 0:
+            raise OptionError("--seeds must be at least 1, and --first-seed not negative")
+        scenario = load_scenario(self.scenario)
+        if self.apply is not None:
+            return self._put(scenario, self.apply, console)
+        require_writable(self.out)
+        plans = typical_plans(
+            scenario,
+            policy_factory(self.policy or "programme"),
+            self.domain,
+            range(self.first_seed, self.first_seed + self.seeds),
+            Bars(console),
+        )
+        network = Network.read(scenario_in_domain(scenario, self.domain))
+        write_plans(self.out, plans, network)
+        console.print(plan_table(plans))
+        out, name = shlex.quote(str(self.out)), shlex.quote(self.scenario)
+        console.print(f"plans: {out}", markup=False, soft_wrap=True)
+        console.print(
+            f"next: ugat-marl plan {name} --apply {out} --out NEW, then ugat-marl evaluate NEW "
+            "--policies programme",
+            markup=False,
+            soft_wrap=True,
+        )
+        return 0
+
+    def _put(self, scenario: Scenario, table: Path, console: Console) -> int:
+        notes: Sequence[str] = ()
+        if is_utdf(table):
+            plans, notes = read_utdf(table, Network.read(scenario), self._lights())
+        elif self.lights:
+            raise OptionError("--lights is for UTDF files; this table names the lights itself")
+        else:
+            plans = read_plans(table)
+        planned = with_plans(scenario, plans, str(table))
+        Network.read(planned)
+        with new_folder(self.out, force=self.force) as folder:
+            planned.write(folder)
+        console.print(plan_table(plans))
+        for note in notes:
+            console.print(f"note: {note}", markup=False, soft_wrap=True)
+        name = shlex.quote(str(self.out))
+        console.print(
+            f"{self.out}: {scenario.id} with {len(plans)} plans as programmes\n"
+            f"next: ugat-marl evaluate {name} --policies programme --domains sim",
+            markup=False,
+            soft_wrap=True,
+        )
+        return 0
+
+    def _lights(self) -> dict[str, str]:
+        pairs: dict[str, str] = {}
+        for text in self.lights:
+            name, equals, light = text.partition("=")
+            if not (name and equals and light):
+                raise OptionError(f"--lights {text}: give INTID=LIGHT, as in 1=A1")
+            pairs[name] = light
+        return pairs
+
+
+def plan_table(plans: Sequence[SignalPlan]) -> Table:
+    """Return the plans as a table, with the green time of each phase."""
+    table = Table(box=box.SIMPLE_HEAD, pad_edge=False, padding=(0, 1, 0, 0))
+    for heading in ("light", "cycle", "offset", "ring", "phase", "movements"):
+        table.add_column(heading, overflow="fold")
+    for heading in ("split", "green", "yellow", "all-red"):
+        table.add_column(heading, justify="right")
+    for plan in plans:
+        for number, phase in enumerate(plan.phases, 1):
+            first = (plan.light, f"{plan.cycle_s:g}", f"{plan.offset_s:g}")
+            cells = first if number == 1 else ("", "", "")
+            times = (phase.split_s, phase.green_s, phase.yellow_s, phase.all_red_s)
+            ring = f"{phase.ring}|{phase.barrier}"
+            texts = (*cells, ring, f"{number}", " ".join(phase.movements) or "-")
+            table.add_row(*map(Text, texts), *(f"{seconds:g}" for seconds in times))
+    return table

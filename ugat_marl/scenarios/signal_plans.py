@@ -1,0 +1,488 @@
+"""Fixed-time signal plans: cycle, offset, and splits in rings and barriers.
+
+A plan names movements as traffic engineers do: ``NBL`` turns left from a northbound approach. Every
+ring shows its phases one after the other. Rings run side by side, and all of them pass a barrier at
+the same time. A plan without rings is a plan with one. Within a split comes green, then yellow,
+then all-red. The cycle begins at the offset, with the first phases of the first barrier.
+"""
+
+from __future__ import annotations
+
+import csv
+import io
+import math
+import xml.etree.ElementTree as ET
+from collections import defaultdict
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass, replace
+from itertools import combinations, pairwise
+from pathlib import Path
+
+from ugat_marl.errors import ScenarioError, nearest
+from ugat_marl.files import Document, read_bytes, write_whole, xml_bytes
+from ugat_marl.scenarios.junctions import Link, foes_of, right_on_red_of, yields_of
+from ugat_marl.scenarios.network import Intersection, Network
+from ugat_marl.scenarios.phases import RightOfWay, are_foes, permitted_clash, state_of, turn_of
+from ugat_marl.scenarios.scenario import Scenario
+from ugat_marl.scenarios.settings import parse_decimal
+from ugat_marl.scenarios.signals import GREEN, YELLOW
+from ugat_marl.scenarios.street_names import (
+    ALL_DIRECTIONS,
+    TURN_NAMES,
+    approach_directions,
+    intersection_name,
+)
+
+CODES = dict(zip(ALL_DIRECTIONS, ("NB", "NE", "EB", "SE", "SB", "SW", "WB", "NW"), strict=True))
+"""Direction of travel to its code in Synchro's files."""
+_TURN_CODES = {"left": "L", "through": "T", "right": "R", "u-turn": "U"}
+COLUMNS = ("light", "intersection", "cycle_s", "offset_s", "ring", "barrier", "phase", "movements",
+           "split_s", "yellow_s", "all_red_s")  # fmt: skip
+_SAME_S = 0.05
+"""Largest difference of times that count as equal, s: tables round to tenths."""
+_MOST_S = 3600.0
+_PROGRAM = "plan"
+_NOBODY = "-"
+"""Movements of a phase in which no vehicle goes."""
+
+
+@dataclass(frozen=True)
+class PlanPhase:
+    """One phase of a plan.
+
+    Attributes:
+        ring: Number of its ring, from 1.
+        barrier: Number of its barrier group, from 1.
+        movements: Codes of the movements with green, such as ``NBT``.
+        split_s: Time of the phase, s: green, yellow and all-red.
+        yellow_s: Yellow at its end, s.
+        all_red_s: Red after the yellow, s.
+    """
+
+    ring: int
+    barrier: int
+    movements: tuple[str, ...]
+    split_s: float
+    yellow_s: float
+    all_red_s: float
+
+    @property
+    def green_s(self) -> float:
+        """Seconds of green."""
+        return self.split_s - self.yellow_s - self.all_red_s
+
+
+@dataclass(frozen=True)
+class SignalPlan:
+    """The fixed-time plan of one traffic light.
+
+    Attributes:
+        light: SUMO id of the traffic light.
+        cycle_s: Length of the cycle, s.
+        offset_s: Begin of a cycle on the scenario's clock, s.
+        phases: Phases, in the order of each ring.
+    """
+
+    light: str
+    cycle_s: float
+    offset_s: float
+    phases: tuple[PlanPhase, ...]
+
+
+def movement_codes(light: Intersection, network: Network) -> dict[Link, str]:
+    """Return the code of the movement of each link, such as ``NBL``."""
+    directions = approach_directions(light.links, network.lanes)
+    return {
+        link: CODES[directions[link.from_edge]]
+        + _TURN_CODES[TURN_NAMES.get(link.direction, "through")]
+        for link in light.links
+    }
+
+
+def check_plan(plan: SignalPlan, source: str) -> None:
+    """Refuse a plan whose times do not fit together.
+
+    Args:
+        plan: The plan.
+        source: Name of its file in errors.
+
+    Raises:
+        ScenarioError: A split is too short for its yellow and all-red, a movement is in no phase
+            with green, rings differ between two barriers, or the splits do not make the cycle.
+    """
+    where = f"{source}: light {plan.light!r}"
+    lengths: dict[int, dict[int, float]] = defaultdict(lambda: defaultdict(float))
+    for number, phase in enumerate(plan.phases, 1):
+        if phase.green_s < 1.0 - _SAME_S:
+            raise ScenarioError(
+                f"{where}: phase {number} ({' '.join(phase.movements)}) has a split of "
+                f"{phase.split_s:g} s, and yellow and all-red take "
+                f"{phase.yellow_s + phase.all_red_s:g} s of it; a second of green is the least"
+            )
+        lengths[phase.barrier][phase.ring] += phase.split_s
+    for barrier, rings in lengths.items():
+        if max(rings.values()) - min(rings.values()) > _SAME_S:
+            listed = ", ".join(f"ring {ring} {s:g} s" for ring, s in sorted(rings.items()))
+            raise ScenarioError(
+                f"{where}: the rings differ before the end of barrier {barrier} ({listed}); make "
+                "their splits equal"
+            )
+    total = sum(max(rings.values()) for rings in lengths.values())
+    if abs(total - plan.cycle_s) > _SAME_S:
+        raise ScenarioError(
+            f"{where}: its splits make {total:g} s and its cycle_s is {plan.cycle_s:g}; make them "
+            "equal"
+        )
+
+
+def plan_states(
+    plan: SignalPlan, light: Intersection, network: Network, rules: RightOfWay, source: str
+) -> tuple[tuple[float, str], ...]:
+    """Return the states of one cycle, ``(duration_s, state)``.
+
+    - A link is green if its movement is green in some ring. It stays green from one phase of a ring
+      to the next if both have it.
+    - It gives way (``g``) to other greens that go first by the junction's rules.
+    - Crossings for people on foot are green with a phase if only turning vehicles cross them.
+
+    Args:
+        plan: The plan; `check_plan` has accepted it.
+        light: Its traffic light.
+        network: The network.
+        rules: Right of way at its junctions.
+        source: Name of the plan's file in errors.
+
+    Raises:
+        ScenarioError: A movement is unknown or never green, or two greens cross.
+    """
+    codes = movement_codes(light, network)
+    _check_movements(plan, set(codes.values()), source)
+    width = max(link.index for link in (*light.links, *light.crossings)) + 1
+    width = max([width, *(len(state) for _, state in light.programme)])
+    times, shown = _times(plan)
+    states: list[tuple[float, str]] = []
+    for begin, end in pairwise(times):
+        green, yellow = _signals((begin + end) / 2, shown)
+        state = _state(green, yellow, light, codes, rules, width)
+        if pair := _crossing([link for link in light.links if codes[link] in green], light, rules):
+            raise ScenarioError(
+                f"{source}: light {plan.light!r}: {codes[pair[0]]} and {codes[pair[1]]} are green "
+                "together and cross; give them phases of their own"
+            )
+        if states and states[-1][1] == state:
+            states[-1] = (states[-1][0] + end - begin, state)
+        else:
+            states.append((end - begin, state))
+    return tuple((round(seconds, 3), state) for seconds, state in states)
+
+
+_Shown = Sequence[tuple[float, float, float, frozenset[str], frozenset[str]]]
+"""Begin, end of green, end of yellow, movements, and movements that stay green after it."""
+
+
+def phase_times(plan: SignalPlan) -> list[tuple[float, float, float]]:
+    """Return begin, end of green and end of yellow of each phase, s from the begin of the cycle."""
+    rings: dict[int, dict[int, float]] = defaultdict(lambda: defaultdict(float))
+    for phase in plan.phases:
+        rings[phase.barrier][phase.ring] += phase.split_s
+    begins = {
+        barrier: sum(max(own.values()) for other, own in rings.items() if other < barrier)
+        for barrier in rings
+    }
+    passed: dict[tuple[int, int], float] = defaultdict(float)
+    times: list[tuple[float, float, float]] = []
+    for phase in plan.phases:
+        begin = begins[phase.barrier] + passed[phase.barrier, phase.ring]
+        passed[phase.barrier, phase.ring] += phase.split_s
+        green_end = begin + phase.green_s
+        times.append((begin, green_end, green_end + phase.yellow_s))
+    return times
+
+
+def _times(plan: SignalPlan) -> tuple[list[float], _Shown]:
+    """Return the times of changes, s from the begin of the cycle, and the phases."""
+    spans = phase_times(plan)
+    shown: list[tuple[float, float, float, frozenset[str], frozenset[str]]] = []
+    times = {0.0, plan.cycle_s}
+    for ring in {phase.ring for phase in plan.phases}:
+        own = [
+            (phase, span)
+            for phase, span in zip(plan.phases, spans, strict=True)
+            if phase.ring == ring
+        ]
+        own.sort(key=lambda pair: pair[1][0])
+        for place, (phase, (begin, green_end, yellow_end)) in enumerate(own):
+            following = own[(place + 1) % len(own)][0]
+            movements = frozenset(phase.movements)
+            stays = movements & frozenset(following.movements)
+            end = begin + phase.split_s
+            shown.append((begin, green_end, yellow_end, movements, stays))
+            if stays:
+                shown.append((green_end, end, end, stays, stays))
+            times |= {begin, green_end, yellow_end, end}
+    kept: list[float] = []
+    for time in sorted(times):
+        if not kept or time - kept[-1] > 1e-6:
+            kept.append(time)
+    return kept, shown
+
+
+def _crossing(
+    going: Sequence[Link], light: Intersection, rules: RightOfWay
+) -> tuple[Link, Link] | None:
+    """Return two greens that cross, unless one is a left turn that lets opposite traffic pass.
+
+    As in `conflicting_greens`, one of them drives straight on, and merging is no crossing.
+    """
+    clash = permitted_clash(light.links, rules)
+    return next(
+        (
+            (a, b)
+            for a, b in combinations(going, 2)
+            if a.from_edge != b.from_edge
+            and a.to_edge != b.to_edge
+            and "s" in (a.direction, b.direction)
+            and clash(a, b)
+        ),
+        None,
+    )
+
+
+def _signals(time_s: float, shown: _Shown) -> tuple[set[str], set[str]]:
+    """Return the movements with green and those with yellow at a time of the cycle."""
+    green: set[str] = set()
+    yellow: set[str] = set()
+    for begin, green_end, yellow_end, movements, stays in shown:
+        if begin <= time_s < green_end:
+            green |= movements
+        elif green_end <= time_s < yellow_end:
+            yellow |= movements - stays
+    return green, yellow - green
+
+
+def _state(
+    green: set[str],
+    yellow: set[str],
+    light: Intersection,
+    codes: Mapping[Link, str],
+    rules: RightOfWay,
+    width: int,
+) -> str:
+    going = [link for link in light.links if codes[link] in green]
+    letters = {link.index for link in light.links}
+    walks = [
+        walk
+        for walk in light.crossings
+        if walk.index not in letters
+        and not yellow
+        and all(turn_of(link) != "s" for link in going if are_foes(link, walk, rules.foes))
+    ]
+    ending = [link for link in light.links if codes[link] in yellow]
+    # Who gives way goes on doing so while the others have yellow.
+    ruled = state_of([*going, *ending, *(walks if going else ())], light.links, rules, width)
+    last = {link.index for link in ending} - {link.index for link in going}
+    return "".join("y" if index in last else letter for index, letter in enumerate(ruled))
+
+
+def _check_movements(plan: SignalPlan, known: set[str], source: str) -> None:
+    where = f"{source}: light {plan.light!r}"
+    listed = {code for phase in plan.phases for code in phase.movements}
+    for code in sorted(listed - known):
+        raise ScenarioError(
+            f"{where}: it has no movement {code!r}; it has {' '.join(sorted(known))}"
+        )
+    if never := sorted(known - listed):
+        raise ScenarioError(
+            f"{where}: {' '.join(never)} {'is' if len(never) == 1 else 'are'} in no phase, and "
+            "vehicles there would wait for ever; add to a phase"
+        )
+
+
+def with_plans(scenario: Scenario, plans: Iterable[SignalPlan], source: str) -> Scenario:
+    """Return the scenario with plans as the programmes of their lights.
+
+    Args:
+        scenario: The scenario; lights without a plan keep their programme.
+        plans: The plans, one for each light.
+        source: Name of their file in errors.
+
+    Raises:
+        ScenarioError: A plan is impossible, or names a light that is no agent.
+    """
+    network = Network.read(scenario)
+    root = scenario.network.parse()
+    rules = RightOfWay(foes_of(root), yields_of(root), right_on_red_of(root))
+    lights = {light.id: light for light in network.intersections}
+    top = ET.Element("additional")
+    for plan in plans:
+        if plan.light not in lights:
+            raise ScenarioError(
+                f"{source}: light {plan.light!r} is no agent of scenario {scenario.id!r}; its "
+                f"agents are {', '.join(lights)}"
+            )
+        check_plan(plan, source)
+        logic = ET.SubElement(
+            top, "tlLogic", id=plan.light, type="static", programID=_PROGRAM,
+            offset=f"{plan.offset_s:g}",
+        )  # fmt: skip
+        for seconds, state in plan_states(plan, lights[plan.light], network, rules, source):
+            ET.SubElement(logic, "phase", duration=f"{seconds:g}", state=state)
+    name = "plans.add.xml"
+    others = tuple(document for document in scenario.additional if document.name != name)
+    return replace(scenario, additional=(*others, Document(name, None, xml_bytes(top))))
+
+
+def programme_plan(light: Intersection, network: Network, offset_s: float = 0.0) -> SignalPlan:
+    """Return the plan of a light's own programme, in one ring.
+
+    Every state with green and without yellow begins a phase. The states until the next one are its
+    yellow, as long as some light is yellow, and its all-red.
+
+    Raises:
+        ScenarioError: The light has no programme with two greens, or a phase without clearance.
+    """
+    codes = movement_codes(light, network)
+    states = list(light.programme)
+    greens = [bool(set(s) & GREEN) and not set(s) & YELLOW for _, s in states]
+    if sum(greens) < 2:
+        raise ScenarioError(
+            f"traffic light {light.id!r}: its programme has fewer than two greens; there is no plan"
+        )
+    first = greens.index(True)
+    phases: list[PlanPhase] = []
+    for place in range(len(states)):
+        seconds, state = states[(first + place) % len(states)]
+        if greens[(first + place) % len(states)]:
+            going = (code for link, code in codes.items() if state[link.index] in GREEN)
+            served = dict.fromkeys(going)
+            phases.append(PlanPhase(1, 1, tuple(served), seconds, 0.0, 0.0))
+        else:
+            last = phases[-1]
+            yellow = seconds if set(state) & YELLOW else 0.0
+            phases[-1] = replace(
+                last,
+                split_s=last.split_s + seconds,
+                yellow_s=last.yellow_s + yellow,
+                all_red_s=last.all_red_s + seconds - yellow,
+            )
+    begins_s = sum(seconds for seconds, _ in states[:first])
+    cycle_s = sum(phase.split_s for phase in phases)
+    return SignalPlan(light.id, cycle_s, (offset_s + begins_s) % cycle_s, tuple(phases))
+
+
+# --- tables ---------------------------------------------------------------------------------------
+
+
+def write_plans(path: Path, plans: Iterable[SignalPlan], network: Network) -> None:
+    """Write plans as a CSV table, a row for every phase; `read_plans` reads it."""
+    names = {
+        light.id: intersection_name(light.links, network.streets) for light in network.intersections
+    }
+    text = io.StringIO(newline="")
+    writer = csv.writer(text, lineterminator="\n")
+    writer.writerow(COLUMNS)
+    for plan in plans:
+        for number, phase in enumerate(plan.phases, 1):
+            writer.writerow(
+                (
+                    plan.light, names.get(plan.light, ""), f"{plan.cycle_s:g}",
+                    f"{plan.offset_s:g}", phase.ring, phase.barrier, number,
+                    " ".join(phase.movements) or _NOBODY, f"{phase.split_s:g}",
+                    f"{phase.yellow_s:g}", f"{phase.all_red_s:g}",
+                )
+            )  # fmt: skip
+    write_whole(path, text.getvalue().encode("utf-8-sig"))
+
+
+def read_plans(path: Path) -> tuple[SignalPlan, ...]:
+    """Read plans from a CSV table with the columns `COLUMNS`, separated by commas or semicolons.
+
+    ``intersection`` and ``phase`` are for the reader alone and may be missing, as may ``ring`` and
+    ``barrier`` (1).
+
+    Raises:
+        ScenarioError: The file is missing, a column or value is missing or impossible; the message
+            names the line. Or a plan does not fit together.
+    """
+    text = text_of_table(path)
+    reader = csv.DictReader(
+        io.StringIO(text, newline=""), delimiter=";" if ";" in text.partition("\n")[0] else ","
+    )
+    columns = [name.strip() for name in reader.fieldnames or ()]
+    reader.fieldnames = columns
+    optional = {"intersection", "phase", "ring", "barrier"}
+    if missing := [name for name in COLUMNS if name not in columns and name not in optional]:
+        guess = nearest(missing[0], columns)
+        raise ScenarioError(
+            f"{path}, line 1: the column {missing[0]} is missing"
+            + (f"; is it {guess!r}?" if guess else f"; needed are {', '.join(COLUMNS)}")
+        )
+    phases: dict[str, list[PlanPhase]] = defaultdict(list)
+    frames: dict[str, tuple[float, float]] = {}
+    try:
+        for row in reader:
+            where = f"{path}, line {reader.line_num}"
+            light = (row["light"] or "").strip()
+            frame = _seconds(row, "cycle_s", where), _seconds(row, "offset_s", where)
+            if frames.setdefault(light, frame) != frame:
+                raise ScenarioError(
+                    f"{where}: light {light!r} has another cycle_s or offset_s than in its first "
+                    "row; a light has one plan"
+                )
+            phases[light].append(_phase(row, where))
+    except csv.Error as error:
+        raise ScenarioError(f"{path}, line {reader.line_num + 1}: not CSV ({error})") from None
+    if not phases:
+        raise ScenarioError(f"{path}: no row holds a phase")
+    plans = tuple(SignalPlan(light, *frames[light], tuple(own)) for light, own in phases.items())
+    for plan in plans:
+        check_plan(plan, str(path))
+    return plans
+
+
+def text_of_table(path: Path) -> str:
+    """Return the text of a CSV file, unpacked and without a mark of its encoding.
+
+    Raises:
+        ScenarioError: It is missing, damaged or not UTF-8.
+    """
+    try:
+        return read_bytes(path).decode("utf-8-sig")
+    except UnicodeDecodeError:
+        raise ScenarioError(f"{path}: is not UTF-8; save it again as CSV in UTF-8") from None
+
+
+def _phase(row: Mapping[str, str | None], where: str) -> PlanPhase:
+    movements = tuple((row["movements"] or "").upper().replace(",", " ").split())
+    if not movements:
+        raise ScenarioError(
+            f"{where}: movements is blank; give some, as in: NBT NBR SBT SBR, or {_NOBODY} for none"
+        )
+    if movements == (_NOBODY,):
+        movements = ()
+    return PlanPhase(
+        _whole(row, "ring", where),
+        _whole(row, "barrier", where),
+        movements,
+        _seconds(row, "split_s", where),
+        _seconds(row, "yellow_s", where),
+        _seconds(row, "all_red_s", where),
+    )
+
+
+def _seconds(row: Mapping[str, str | None], key: str, where: str) -> float:
+    text = row.get(key)
+    try:
+        value = parse_decimal(text or "")
+    except ValueError:
+        value = math.nan
+    if not 0 <= value <= _MOST_S:
+        raise ScenarioError(f"{where}: {key} = {text!r} is not a time of 0 to {_MOST_S:g} s")
+    return value
+
+
+def _whole(row: Mapping[str, str | None], key: str, where: str) -> int:
+    text = (row.get(key) or "1").strip()
+    if not (text.isascii() and text.isdigit() and 1 <= int(text[:3]) <= 99 and len(text) < 3):
+        raise ScenarioError(f"{where}: {key} = {text!r} is not a number of 1 to 99")
+    return int(text)
