@@ -13,11 +13,25 @@ import pytest
 
 from ugat_marl.__main__ import main
 from ugat_marl.effects import load_scenario
-from ugat_marl.experiments import RuleEpisode, left_outside, measure_headroom, problems
+from ugat_marl.experiments import (
+    RuleEpisode,
+    best_phases,
+    left_outside,
+    measure_headroom,
+    problems,
+    remarks,
+)
 from ugat_marl.progress import Silent
 from ugat_marl.reporting import draw_network
 from ugat_marl.reporting.phase_diagrams import STYLES
-from ugat_marl.scenarios import Document, Network, Scenario, resco_maps, survey
+from ugat_marl.scenarios import (
+    Document,
+    Network,
+    Scenario,
+    degrees_of_saturation,
+    resco_maps,
+    survey,
+)
 from ugat_marl.scenarios.inspection import SATURATION_VPH
 
 
@@ -54,7 +68,14 @@ def test_traffic_is_counted_by_approach(single: Scenario) -> None:
     facts = survey(replace(single, routes=routes).with_duration(1800))
     road = next(a for a in facts.intersections[0].approaches if a.edge == lane.edge)
     assert road.vph == 720
-    assert road.flow_ratio == pytest.approx(720 / (road.lanes * SATURATION_VPH), abs=1e-3)
+    assert road.worst_vph == 1440  # all of them within a quarter of an hour
+    assert road.flow_ratio == pytest.approx(1440 / (road.lanes * SATURATION_VPH), abs=1e-3)
+    assert (road.worst_from_s, facts.busiest_s, facts.busiest, facts.last_s) == (0, 0, 360, 459)
+    assert road.first_s == pytest.approx(100 + lane.length_m / lane.speed_mps)
+    others = [a for a in facts.intersections[0].approaches if a.edge != lane.edge]
+    assert {(a.worst_vph, a.first_s) for a in others} == {(0.0, None)}
+    (text,) = [text for text in remarks(facts, ()) if "no vehicle can be there" in text]
+    assert all(a.edge in text for a in others) and lane.edge not in text
     assert road.saturation is not None
     assert road.saturation > road.flow_ratio
     assert facts.first_s == 100
@@ -62,6 +83,95 @@ def test_traffic_is_counted_by_approach(single: Scenario) -> None:
     assert facts.fill_s == pytest.approx(both, rel=0.1)
     assert facts.shortest_episode_s >= 100 + 3 * facts.fill_s
     assert sum(a.vph for a in facts.intersections[0].approaches) == 720
+
+
+def test_an_approach_that_is_full_for_a_quarter_of_an_hour_is_shown_so(single: Scenario) -> None:
+    """700 vehicles in the third quarter of an hour; the mean over the hour is a quarter of that."""
+    (item,) = Network.read(single).intersections
+    start, goal = item.links[0].from_edge, item.links[0].to_edge
+    vehicles = "".join(
+        f'<vehicle id="{i}" depart="{1800 + i * 1.2:.1f}"><route edges="{start} {goal}"/></vehicle>'
+        for i in range(700)
+    )
+    routes = (Document("r.rou.xml", None, f"<routes>{vehicles}</routes>".encode()),)
+    facts = survey(replace(single, routes=routes))
+    (road,) = [a for a in facts.intersections[0].approaches if a.edge == start]
+    assert (road.vph, road.worst_vph, road.worst_from_s) == (700, 2800, 1800)
+    assert road.saturation is not None
+    (usual,) = [a for a in survey(single).intersections[0].approaches if a.edge == start]
+    assert usual.saturation is not None  # the same share of green
+    shares = [a.flow_ratio / (a.saturation or 1.0) for a in (road, usual)]
+    assert shares[0] == pytest.approx(shares[1], rel=0.02)
+    assert (facts.busiest_s, facts.busiest) == (1800, 700)
+    assert facts.intersections[0].degrees["now"] is not None
+
+
+def test_a_better_source_of_phases_is_named() -> None:
+    """Waiting left turns block lanes that also lead straight on, so permitted ones serve more."""
+    scenario = load_scenario("mixed-v1").with_control(phases="conflict-free")
+    vehicles = scenario.routes[0].read().count(b"<vehicle ")
+    facts = survey(scenario)
+    (light,) = [light for light in facts.intersections if light.id == "S"]
+    degrees = degrees_of_saturation(scenario.with_control(phases="permitted"))
+    assert best_phases(light)[0] in ("permitted", "programme")
+    assert light.degrees["now"] == light.degrees["conflict-free"] > best_phases(light)[1]
+    assert light.degrees["permitted"] == pytest.approx(degrees["S"], rel=0.5)
+    assert problems(facts, ()) == []  # it is not full
+    full = replace(light, degrees={"now": 1.3, "conflict-free": 1.3, "permitted": 0.8})
+    (text,) = problems(replace(facts, intersections=(full,)), ())
+    assert "its demand is 130% of what its phases can serve, and 80% with" in text
+    assert 'phases = "permitted"; set it under [intersections.S]' in text
+    near = replace(light, degrees={"now": 1.3, "permitted": 1.25})
+    assert problems(replace(facts, intersections=(near,)), ()) == []
+    assert vehicles
+
+
+def test_the_worse_one_of_programme_and_rule_is_named(single: Scenario) -> None:
+    facts = survey(single)
+    runs = [
+        RuleEpisode("programme", 300, 9, 9, 9, 0),
+        RuleEpisode("largest-queue:20", 90, 9, 9, 9, 0),
+    ]
+    (text,) = [text for text in remarks(facts, runs) if "programme takes" in text]
+    assert "its timing is the worse one, and the phases suit" in text
+    runs = [
+        RuleEpisode("programme", 90, 9, 9, 9, 0),
+        RuleEpisode("largest-queue:20", 300, 9, 9, 9, 0),
+    ]
+    (text,) = [text for text in remarks(facts, runs) if "programme takes" in text]
+    assert "the rule does not suit these lights" in text
+    runs = [
+        RuleEpisode("programme", 90, 9, 9, 9, 0),
+        RuleEpisode("largest-queue:20", 80, 9, 9, 9, 0),
+    ]
+    assert not [text for text in remarks(facts, runs) if "programme takes" in text]
+
+
+def test_clearance_that_differs_from_the_file_is_told(single: Scenario) -> None:
+    same = survey(single)
+    assert not [text for text in remarks(same, ()) if "of yellow and" in text]
+    (item,) = same.intersections
+    assert (item.file_yellow_s, item.file_all_red_s) == ((3.0,), (2.0,))
+    (text,) = [
+        text
+        for text in remarks(survey(single.with_control(yellow_s=4.0)), ())
+        if "of yellow and" in text
+    ]
+    assert (
+        "the file has 3 s of yellow and 2 s of red between greens; agents' greens get 4 s" in text
+    )
+
+
+def test_phases_are_told_by_the_greens_of_the_file(single: Scenario) -> None:
+    """Listed in the other order, phase n is green 3 - n of the file."""
+    (item,) = Network.read(single).intersections
+    greens = [state for _, state in item.programme if set(state) & set("Gg") and "y" not in state]
+    greens = list(dict.fromkeys(greens))
+    facts = survey(spoilt(single, greens[::-1]))
+    numbers = [phase.green_of_file for phase in facts.intersections[0].phases]
+    assert numbers == list(range(len(greens)))[::-1]
+    other = survey(spoilt(single, [greens[0].replace("G", "r", 1), greens[1]]))
+    assert [phase.green_of_file for phase in other.intersections[0].phases] == [None, 1]
 
 
 def test_flows_are_counted_too(single: Scenario) -> None:

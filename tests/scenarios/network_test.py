@@ -7,6 +7,7 @@ import itertools
 import subprocess
 import xml.etree.ElementTree as ET
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -22,8 +23,11 @@ from ugat_marl.scenarios import (
     Scenario,
     check_demand,
     conflicting_greens,
+    read_scenario,
     shipped_scenarios,
 )
+from ugat_marl.scenarios.junctions import foes_of, yields_of
+from ugat_marl.scenarios.phases import RightOfWay
 
 SHIPPED = dict(shipped_scenarios())
 PHASES = {
@@ -416,3 +420,53 @@ def test_conflicting_greens_are_found_in_real_matrices(networks: Networks) -> No
         }
         for item in network.intersections:
             assert conflicting_greens("G" * len(item.phases[0]), item.links, foes)
+
+
+def test_protected_greens_that_cross_are_mended_by_right_of_way(
+    crossing: Callable[..., Path],
+) -> None:
+    """A programme that plain SUMO runs: both roads have G. The one that must yield gets g."""
+    folder = crossing()
+    scenario = read_scenario(folder)
+    whole = Network.read(scenario)
+    assert whole.notes == ()
+    (light,) = whole.intersections
+    every = "G" * len(light.programme[0][1])
+    text = (folder / "network.net.xml").read_text()
+    first = light.programme[0][1]
+    (folder / "network.net.xml").write_text(text.replace(f'state="{first}"', f'state="{every}"'))
+    network = Network.read(read_scenario(folder))
+    (mended,) = network.intersections
+    state = mended.programme[0][1]
+    assert sorted(state) == ["G", "g"]
+    root = read_scenario(folder).network.parse()
+    rules = RightOfWay(foes_of(root), yields_of(root))
+    yields = {link.index for link in light.links if state[link.index] == "g"}
+    a = next(link for link in light.links if link.index in yields)
+    b = next(link for link in light.links if link.index not in yields)
+    assert rules.waits(a, b) or not rules.waits(b, a)
+    (note,) = network.notes
+    assert "protected greens of its programme cross" in note
+    assert f"the links {min(yields)} have to yield and got g" in note
+    toml = (folder / "scenario.toml").read_text()
+    listed = f'phases = ["{every}", "{light.phases[1]}"]'
+    (folder / "scenario.toml").write_text(toml.replace('phases = "programme"', listed))
+    with pytest.raises(ScenarioError, match="gives protected green"):  # own lists are refused
+        Network.read(read_scenario(folder))
+
+
+def test_a_light_that_is_no_agent_has_a_reason() -> None:
+    """A T whose programme has one green, as a map may have it."""
+    scenario = load_scenario("mixed-v1").with_control(phases="programme")
+    (light,) = [item for item in Network.read(scenario).intersections if item.id == "T"]
+    text = scenario.network.read().decode()
+    for _, state in light.programme[1:]:
+        text = text.replace(f'state="{state}"', f'state="{light.programme[0][1]}"')
+    poor = replace(scenario, network=scenario.network.edited(text.encode()))
+    network = Network.read(poor)
+    assert "T" in network.uncontrolled
+    assert network.reasons["T"] == (
+        'its programme has 1 green phase; phases = "conflict-free" or "permitted" may make more'
+    )
+    derived = Network.read(poor.with_control(phases="conflict-free"))
+    assert "T" not in derived.uncontrolled

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Annotated, Any
@@ -18,18 +19,23 @@ from ugat_marl.envs import TrafficEnv, parallel_env
 from ugat_marl.errors import OptionError
 from ugat_marl.experiments import (
     HOLDS_S,
+    MUCH_LESS,
     HeadroomRow,
     RuleEpisode,
     as_json,
+    best_phases,
     is_full,
     left_outside,
     measure_headroom,
     play_check_rules,
     problems,
+    remarks,
 )
 from ugat_marl.progress import Bars, Silent
 from ugat_marl.reporting import approach_table
 from ugat_marl.scenarios import (
+    PHASE_SOURCES,
+    QUARTER_S,
     SHORT_LANE_M,
     IntersectionFacts,
     NamedApproach,
@@ -50,6 +56,7 @@ from ugat_marl.testing import (
 
 CONFORMANCE_S = 300.0
 MOST_APPROACHES = 8
+MOST_LIGHTS = 8
 
 
 @dataclass(frozen=True)
@@ -175,10 +182,21 @@ def show(
     )
     flows = f" and {facts.flows} flows" if facts.flows else ""
     say(f"demand {facts.vehicles} vehicles{flows}, the first after {facts.first_s:g} s")
-    if facts.uncontrolled:
-        say(f"no agents (fewer than two green phases): {', '.join(facts.uncontrolled)}")
+    say(
+        f"they depart until {facts.last_s:g} s, most from {facts.busiest_s:g} s on: "
+        f"{facts.busiest} within {min(QUARTER_S, facts.duration_s) / 60:g} min"
+    )
+    for tls in facts.uncontrolled[:MOST_LIGHTS]:
+        say(f"no agent: traffic light {tls!r}: {facts.reasons[tls]}")
+    if len(facts.uncontrolled) > MOST_LIGHTS:
+        say(f"no agents either: {', '.join(facts.uncontrolled[MOST_LIGHTS:])}")
     console.print(_intersections(agents))
+    for light in [light for light in agents if light.name][:MOST_LIGHTS]:
+        say(f"{light.id}: {light.name}")
+    for text in _greens_of_file(agents):
+        console.print(text, markup=False)
     console.print(_approaches(agents))
+    console.print(_phase_sources(agents))
     if short := sum(len(light.short_lanes) for light in agents):
         say(
             f"lanes at lights that are shorter than {SHORT_LANE_M:g} m: {short}. Agents see nobody "
@@ -192,6 +210,8 @@ def show(
         say("headroom: not measured; --headroom 1 measures it with one seed")
     else:
         console.print(_headroom(rows))
+    for text in remarks(facts, runs):
+        say(f"note: {text}")
     for text in wrong:
         say(f"to mend: {text}")
     if not wrong:
@@ -240,16 +260,57 @@ def _row(light: IntersectionFacts) -> tuple[str, ...]:
     return (*map(str, counts), "; ".join(f"{n} {what}" for what, n in remarks.items() if n))
 
 
+def _greens_of_file(agents: Sequence[IntersectionFacts]) -> list[str]:
+    """Return lines on which green of the file's programme each phase is."""
+    kinds: dict[tuple[int | None, ...], list[str]] = {}
+    for light in agents:
+        kinds.setdefault(tuple(phase.green_of_file for phase in light.phases), []).append(light.id)
+    parts: list[str] = []
+    for greens, names in list(kinds.items())[:MOST_LIGHTS]:
+        known = [f"{n} is green {g}" for n, g in enumerate(greens) if g is not None]
+        if greens == tuple(range(len(greens))):
+            known = ["n is green n"]
+        text = f"phase {', '.join(known)}" if known else "no phase is one of its greens"
+        if known and None in greens:
+            text += ", the others are none of its greens"
+        listed = f"{names[0]} and {len(names) - 1} more" if len(names) > 1 else names[0]
+        parts.append(f"{listed}: {text}")
+    return [f"in the file's programme, {part}" for part in parts]
+
+
+def _phase_sources(agents: Sequence[IntersectionFacts]) -> Table:
+    """Return the degree of saturation of the fullest lights with each source of phases."""
+
+    def degree(light: IntersectionFacts, source: str) -> float:
+        value = light.degrees.get(source)
+        return math.inf if value is None else value
+
+    fullest = sorted(agents, key=lambda light: -degree(light, "now"))[:MOST_LIGHTS]
+    title = "Demand as a share of capacity with other phases, busiest quarter of an hour"
+    table = _table(title, "agent", "now", *PHASE_SOURCES, "best")
+    for light in fullest:
+        cells = [
+            "-" if light.degrees.get(source) is None else f"{degree(light, source):.0%}"
+            for source in ("now", *PHASE_SOURCES)
+        ]
+        source, least = best_phases(light)
+        best = source if least < MUCH_LESS * degree(light, "now") else "as now"
+        table.add_row(light.id, *cells, best)
+    return table
+
+
 def _approaches(agents: Sequence[IntersectionFacts]) -> Table:
     all_roads = [(light.id, road) for light in agents for road in light.approaches]
     all_roads.sort(key=lambda pair: -(pair[1].saturation or pair[1].flow_ratio))
     shown = all_roads[:MOST_APPROACHES]
     title = f"Saturation by approach, the highest {len(shown)} of {len(all_roads)}"
-    table = _table(title, "agent", "road", "lanes", "veh/h", "flow ratio", "own programme")
+    headings = ("veh/h", "worst 15 min", "flow ratio", "own programme")
+    table = _table(title, "agent", "road", "lanes", *headings)
     table.columns[1].justify = "left"
     for name, road in shown:
         saturation = "no green" if road.saturation is None else f"{road.saturation:.0%}"
-        cells = (str(road.lanes), f"{road.vph:.0f}", f"{road.flow_ratio:.0%}", saturation)
+        flows = (f"{road.vph:.0f}", f"{road.worst_vph:.0f}")
+        cells = (str(road.lanes), *flows, f"{road.flow_ratio:.0%}", saturation)
         table.add_row(name, road.edge, *cells)
     return table
 

@@ -40,12 +40,15 @@ from .queues import read_queues as read_queues
 from .randomised import drawn_effects as drawn_effects
 from .randomised import effect_ranges as effect_ranges
 from .recording.days import record as record
+from .scenario_check import MUCH_LESS as MUCH_LESS
 from .scenario_check import RuleEpisode as RuleEpisode
 from .scenario_check import as_json as as_json
+from .scenario_check import best_phases as best_phases
 from .scenario_check import is_full as is_full
 from .scenario_check import left_outside as left_outside
 from .scenario_check import play_check_rules as play_check_rules
 from .scenario_check import problems as problems
+from .scenario_check import remarks as remarks
 from .scores import Estimate as Estimate
 from .scores import Evaluation as Evaluation
 from .scores import Tuned as Tuned

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import tempfile
 from collections import Counter
 from collections.abc import Mapping, Sequence
@@ -12,7 +13,13 @@ from ugat_marl.experiments.evaluation import evaluate, rule_factory
 from ugat_marl.experiments.transfer_headroom import HeadroomRow
 from ugat_marl.files import chunks_of, scan_xml
 from ugat_marl.progress import Reporter
-from ugat_marl.scenarios import Scenario, Survey, departures, run_program
+from ugat_marl.scenarios import (
+    IntersectionFacts,
+    Scenario,
+    Survey,
+    departures,
+    run_program,
+)
 from ugat_marl.simulation import launch_of
 
 TRIPS = "trips.xml"
@@ -22,6 +29,8 @@ RULES = ("programme", "largest-queue:20")
 MUCH_WORSE = 1.5
 """A rule's ATT divided by the programme's above which the phases do not suit the rule."""
 _NAMED = 5
+MUCH_LESS = 0.9
+"""A degree of saturation divided by another one below which it is worth a change of phases."""
 MOST_BACKLOG = 0.01
 """Largest share of the vehicles due that may wait outside under the better rule."""
 
@@ -69,12 +78,14 @@ def play_check_rules(
     def value(rule: str, measure: str) -> float:
         return float(evaluation.values(rule, "sim", measure)[0])
 
-    measures = ("due", "departed", "throughput", "backlog")
     return tuple(
         RuleEpisode(
             rule,
             round(value(rule, "att_s"), 1),
-            *(int(value(rule, name)) for name in measures),
+            int(value(rule, "due")),
+            int(value(rule, "departed")),
+            int(value(rule, "throughput")),
+            int(value(rule, "backlog")),
             evaluation.approaches(rule, "sim"),
         )
         for rule in RULES
@@ -134,6 +145,8 @@ def problems(
                 f"traffic light {light.id!r}: people on foot have green while vehicles that cross "
                 f"their way need not wait ({'; '.join(light.clashes)}); write g for these vehicles"
             )
+        if not light.unserved_links and (text := _other_phases(light)):
+            faults.append(text)
     if facts.duration_s < facts.shortest_episode_s:
         faults.append(
             f"an episode of {facts.duration_s:g} s is shorter than the shortest useful one "
@@ -153,6 +166,84 @@ def problems(
     return faults
 
 
+def _other_phases(light: IntersectionFacts) -> str:
+    """Return a message if the demand is too much for the phases and another source serves more."""
+    now, (source, degree) = _degree(light, "now"), best_phases(light)
+    if now <= 1.0 or degree > MUCH_LESS * now:
+        return ""
+    share = f"{now:.0%} of what its phases can serve" if now < math.inf else "not served by them"
+    return (
+        f"traffic light {light.id!r}: in the busiest quarter of an hour its demand is {share}, and "
+        f'{degree:.0%} with phases = "{source}"; set it under [intersections.{light.id}]'
+    )
+
+
+BY_PREFERENCE = ("permitted", "conflict-free", "programme")
+"""Sources of phases; of equally good ones the first is named."""
+
+
+def best_phases(light: IntersectionFacts) -> tuple[str, float]:
+    """Return the source of phases with the least degree of saturation, and this degree."""
+    sources = [source for source in BY_PREFERENCE if source in light.degrees]
+    if not sources:
+        return "now", _degree(light, "now")
+    best = min(sources, key=lambda source: _degree(light, source))
+    return best, _degree(light, best)
+
+
+def _degree(light: IntersectionFacts, source: str) -> float:
+    degree = light.degrees.get(source)
+    return math.inf if degree is None else degree
+
+
+def remarks(facts: Survey, runs: Sequence[RuleEpisode]) -> list[str]:
+    """Return what a user should know and need not repair.
+
+    Args:
+        facts: Survey of the scenario.
+        runs: Results of `play_check_rules`.
+    """
+    notes = list(facts.notes)
+    for light in facts.intersections:
+        shown = (facts.yellow_s,), (facts.all_red_s,)
+        file = (light.file_yellow_s or shown[0], light.file_all_red_s or (0.0,))
+        if light.file_yellow_s and file != shown:
+            times = ["/".join(f"{seconds:g}" for seconds in own) for own in file]
+            notes.append(
+                f"traffic light {light.id!r}: the file has {times[0]} s of yellow and {times[1]} s "
+                f"of red between greens; agents' greens get {facts.yellow_s:g} s and "
+                f"{facts.all_red_s:g} s ([control] yellow_s, all_red_s)"
+            )
+        if far := [road.edge for road in light.approaches if road.first_s is None]:
+            notes.append(
+                f"traffic light {light.id!r}: no vehicle can be there within the episode on "
+                f"{', '.join(far)}; agents never see traffic on these roads"
+            )
+    return notes + _compared(facts, runs)
+
+
+def _compared(facts: Survey, runs: Sequence[RuleEpisode]) -> list[str]:
+    """Return a remark if one of programme and rule is far behind the other."""
+    att_s = {run.rule: run.att_s for run in runs}
+    if any(rule not in att_s for rule in RULES) or _unsuited(facts, runs):
+        return []
+    programme_s, rule_s = (att_s[rule] for rule in RULES)
+    most = max((_degree(light, "now") for light in facts.intersections), default=0.0)
+    busiest = f"{most:.0%} of their capacity" if most < math.inf else "more than they can serve"
+    if programme_s > MUCH_WORSE * rule_s:
+        return [
+            f"the programme takes {programme_s:g} s where {RULES[1]} takes {rule_s:g} s: its "
+            f"timing is the worse one, and the phases suit (demand: at most {busiest})"
+        ]
+    if rule_s > MUCH_WORSE * programme_s:
+        return [
+            f"{RULES[1]} takes {rule_s:g} s where the programme takes {programme_s:g} s: the rule "
+            f"does not suit these lights (demand: at most {busiest}); try other rules and times "
+            "(ugat-marl tune)"
+        ]
+    return []
+
+
 def _unsuited(facts: Survey, runs: Sequence[RuleEpisode]) -> str:
     """Return a message if phases serve lanes in part and a rule is far behind the programme."""
     lanes = sum(len(light.partly_served) for light in facts.intersections)
@@ -165,8 +256,14 @@ def _unsuited(facts: Survey, runs: Sequence[RuleEpisode]) -> str:
     return (
         f"{RULES[1]} takes {rule_s:g} s where the programme takes {programme_s:g} s, and {lanes} "
         "lanes are served in part by some phase: whoever waits there for another phase blocks the "
-        'lane; phases = "permitted" serves whole lanes'
+        f'lane; phases = "{_whole_lanes(facts)}" serves the demand best'
     )
+
+
+def _whole_lanes(facts: Survey) -> str:
+    """Return the best source of phases of the most lights with lanes served in part."""
+    partly = [light for light in facts.intersections if light.partly_served]
+    return Counter(best_phases(light)[0] for light in partly).most_common(1)[0][0]
 
 
 def as_json(
@@ -182,4 +279,5 @@ def as_json(
     content["headroom"] = None if rows is None else [asdict(row) for row in rows]
     content["left_outside"] = dict(outside or {})
     content["problems"] = list(wrong)
+    content["remarks"] = remarks(facts, runs)
     return content

@@ -38,9 +38,12 @@ from .importers.turning_shares import poisson_arrivals as poisson_arrivals
 from .importers.turning_shares import weighted_choice as weighted_choice
 from .importers.utdf import is_utdf as is_utdf
 from .importers.utdf import read_utdf as read_utdf
+from .inspection import PHASE_SOURCES as PHASE_SOURCES
+from .inspection import QUARTER_S as QUARTER_S
 from .inspection import SHORT_LANE_M as SHORT_LANE_M
 from .inspection import IntersectionFacts as IntersectionFacts
 from .inspection import Survey as Survey
+from .inspection import green_of_file as green_of_file
 from .inspection import survey as survey
 from .junctions import Link as Link
 from .lanes import NO_UPSTREAM_LANES as NO_UPSTREAM_LANES

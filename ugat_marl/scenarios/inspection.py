@@ -2,21 +2,24 @@
 
 from __future__ import annotations
 
+import math
 import xml.etree.ElementTree as ET
 from collections import Counter, defaultdict
 from collections.abc import Container, Iterator, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from itertools import combinations
 
+from ugat_marl.errors import ScenarioError
 from ugat_marl.progress import Reporter
-from ugat_marl.scenarios.capacity import SATURATION_VPH
+from ugat_marl.scenarios.capacity import SATURATION_VPH, Flows, degrees_of_saturation
 from ugat_marl.scenarios.demand import Demand, check_demand
 from ugat_marl.scenarios.junctions import Link, foes_of, yields_of
 from ugat_marl.scenarios.network import Intersection, Network
-from ugat_marl.scenarios.phases import RightOfWay, are_foes, turn_of
+from ugat_marl.scenarios.phases import RightOfWay, are_foes, programme_phases, turn_of
 from ugat_marl.scenarios.routes import departures
 from ugat_marl.scenarios.scenario import Scenario
-from ugat_marl.scenarios.signals import GREEN
+from ugat_marl.scenarios.signals import GREEN, YELLOW
+from ugat_marl.scenarios.street_names import intersection_name
 
 SHORT_LANE_M = 50.0
 """Length below which a lane at a light shows little of a queue."""
@@ -33,12 +36,15 @@ class PhaseFacts:
         protected: Movements with protected green (``G``), as ``edge turn``.
         permitted: Movements with permitted green (``g``), which give way to others.
         crossings: Number of crossings with green.
+        green_of_file: Number of the file's programme green, from 0, that has the same links green;
+            None if there is none.
     """
 
     state: str
     protected: tuple[str, ...]
     permitted: tuple[str, ...]
     crossings: int
+    green_of_file: int | None
 
 
 @dataclass(frozen=True)
@@ -48,17 +54,24 @@ class ApproachFacts:
     Attributes:
         edge: SUMO id of the road.
         lanes: Number of its lanes at the light.
-        vph: Vehicles per hour whose routes use the road.
-        flow_ratio: `vph` divided by the flow its lanes would discharge in permanent green.
-        saturation: `vph` divided by the flow its lanes discharge under the network's own programme.
-            Above 1 the queue grows without end. None if there is no programme or no green.
+        vph: Vehicles per hour whose routes use the road, mean of the episode.
+        worst_vph: The same in the worst quarter of an hour, by free flow to the light.
+        worst_from_s: Begin of this quarter of an hour, s from the begin of the episode.
+        flow_ratio: `worst_vph` divided by the flow its lanes would discharge in permanent green.
+        saturation: `worst_vph` divided by the flow its lanes discharge under the network's own
+            programme. Above 1 the queue grows. None if there is no programme or no green.
+        first_s: Time at which the first vehicle can be there, s from the begin of the episode; None
+            if no route uses the road, or none can be there before the end.
     """
 
     edge: str
     lanes: int
     vph: float
+    worst_vph: float
+    worst_from_s: float
     flow_ratio: float
     saturation: float | None
+    first_s: float | None
 
 
 @dataclass(frozen=True)
@@ -90,6 +103,12 @@ class IntersectionFacts:
             turn``.
         uncontrolled: Number of links at its junctions without a light.
         approaches: Incoming roads with their traffic.
+        name: Streets that meet there; empty if they have no names.
+        file_yellow_s: Different times of yellow in its programme in the file, s.
+        file_all_red_s: Different times of red between two greens there, s.
+        degrees: Source of phases to the degree of saturation of the intersection with these phases,
+            in the quarter of an hour with the most traffic in the network; None if no cycle serves
+            a lane with traffic. ``now`` are its present phases.
     """
 
     id: str
@@ -113,6 +132,10 @@ class IntersectionFacts:
     clashes: tuple[str, ...]
     uncontrolled: int
     approaches: tuple[ApproachFacts, ...]
+    name: str
+    file_yellow_s: tuple[float, ...]
+    file_all_red_s: tuple[float, ...]
+    degrees: Mapping[str, float | None]
 
 
 @dataclass(frozen=True)
@@ -131,6 +154,13 @@ class Survey:
             rounded up to whole decisions.
         intersections: Facts about each agent.
         uncontrolled: Traffic lights with fewer than two green phases; they are no agents.
+        reasons: Light of `uncontrolled` to the reason why.
+        last_s: Seconds until the last vehicle of the episode departs.
+        busiest_s: Begin of the quarter of an hour with the most departures, s from the begin.
+        busiest: Number of vehicles that depart in it.
+        yellow_s: Yellow that the environment shows, s.
+        all_red_s: Red that the environment shows after it, s.
+        notes: Changes to the programmes of the file.
     """
 
     scenario: str
@@ -143,6 +173,13 @@ class Survey:
     shortest_episode_s: float
     intersections: tuple[IntersectionFacts, ...]
     uncontrolled: tuple[str, ...]
+    reasons: Mapping[str, str]
+    last_s: float
+    busiest_s: float
+    busiest: int
+    yellow_s: float
+    all_red_s: float
+    notes: tuple[str, ...]
 
 
 def survey(scenario: Scenario, reporter: Reporter | None = None) -> Survey:
@@ -165,6 +202,7 @@ def survey(scenario: Scenario, reporter: Reporter | None = None) -> Survey:
     interval = scenario.control.decision_interval_s
     shortest = traffic.first_s + FILLINGS * traffic.fill_s
     shortest = -(-shortest // interval) * interval
+    degrees = _degrees(scenario, traffic.busiest_flows_vph)
     return Survey(
         scenario.id,
         scenario.settings.duration_s,
@@ -175,11 +213,35 @@ def survey(scenario: Scenario, reporter: Reporter | None = None) -> Survey:
         round(traffic.fill_s, 1),
         shortest,
         tuple(
-            _facts(intersection, network, rules, free, traffic, short)
+            _facts(intersection, network, rules, free, traffic, short, degrees)
             for intersection in network.intersections
         ),
         network.uncontrolled,
+        network.reasons,
+        round(traffic.last_s, 2),
+        traffic.busiest_s,
+        traffic.busiest,
+        scenario.control.yellow_s,
+        scenario.control.all_red_s,
+        network.notes,
     )
+
+
+PHASE_SOURCES = ("programme", "conflict-free", "permitted")
+"""Sources of phases that are compared."""
+
+
+def _degrees(scenario: Scenario, flows_vph: Flows) -> dict[str, dict[str, float]]:
+    """Return source of phases, or ``now``, to the degree of saturation of each light."""
+    found = {"now": degrees_of_saturation(scenario, flows_vph)}
+    settings = scenario.settings.model_copy(update={"intersections": {}})
+    for source in PHASE_SOURCES:
+        other = replace(scenario, settings=settings).with_control(phases=source)
+        try:
+            found[source] = degrees_of_saturation(other, flows_vph)
+        except ScenarioError:  # no light has two such phases, or a light has too many
+            found[source] = {}
+    return found
 
 
 def _short(scenario: Scenario, network: Network) -> set[str]:
@@ -201,6 +263,7 @@ def _facts(
     free: Mapping[str, int],
     traffic: _Traffic,
     short: Container[str],
+    degrees: Mapping[str, Mapping[str, float]],
 ) -> IntersectionFacts:
     served = [
         {i for i, letter in enumerate(phase) if letter in GREEN} for phase in intersection.phases
@@ -252,7 +315,29 @@ def _facts(
         clashes=tuple(_clashes(intersection, rules)),
         uncontrolled=sum(free.get(junction, 0) for junction in junctions),
         approaches=tuple(_approaches(intersection, network, traffic)),
+        name=intersection_name(intersection.links, network.streets),
+        file_yellow_s=_times_of(intersection, yellow=True),
+        file_all_red_s=_times_of(intersection, yellow=False),
+        degrees={
+            source: _finite(lights[intersection.id])
+            for source, lights in degrees.items()
+            if intersection.id in lights
+        },
     )
+
+
+def _finite(degree: float) -> float | None:
+    return round(degree, 3) if math.isfinite(degree) else None
+
+
+def _times_of(intersection: Intersection, *, yellow: bool) -> tuple[float, ...]:
+    """Return the different times of yellow, or of red between two greens, in the programme, s."""
+    wanted = [
+        seconds
+        for seconds, state in intersection.programme
+        if (bool(set(state) & YELLOW) if yellow else not set(state) & (YELLOW | GREEN))
+    ]
+    return tuple(sorted(set(wanted)))
 
 
 def _in_part(lane: str, intersection: Intersection) -> bool:
@@ -287,7 +372,18 @@ def _phase(intersection: Intersection, state: str) -> PhaseFacts:
         )
 
     crossings = sum(state[crossing.index] in GREEN for crossing in intersection.crossings)
-    return PhaseFacts(state, movements("G"), movements("g"), crossings)
+    number = green_of_file(intersection, state)
+    return PhaseFacts(state, movements("G"), movements("g"), crossings, number)
+
+
+def green_of_file(intersection: Intersection, state: str) -> int | None:
+    """Return the number of the programme's green, from 0, with the same links green as a state."""
+
+    def going(letters: str) -> set[int]:
+        return {link.index for link in intersection.links if letters[link.index] in GREEN}
+
+    greens = programme_phases(intersection.programme)
+    return next((n for n, green in enumerate(greens) if going(green) == going(state)), None)
 
 
 def _approaches(
@@ -299,19 +395,22 @@ def _approaches(
     cycle_s = sum(seconds for seconds, _ in intersection.programme)
     approaches: list[ApproachFacts] = []
     for edge, edge_lanes in lanes.items():
-        vph = traffic.vph[edge]
+        vph, (worst_vph, worst_from_s) = traffic.vph[edge], traffic.worst(edge)
         capacity = SATURATION_VPH * len(edge_lanes)
         green = sum(_green_s(intersection, lane) for lane in edge_lanes) / len(edge_lanes)
         saturation = None
         if cycle_s:
-            saturation = vph / (capacity * green / cycle_s) if green else None
+            saturation = worst_vph / (capacity * green / cycle_s) if green else None
         approaches.append(
             ApproachFacts(
                 edge,
                 len(edge_lanes),
                 round(vph, 1),
-                round(vph / capacity, 3),
+                round(worst_vph, 1),
+                worst_from_s,
+                round(worst_vph / capacity, 3),
                 None if saturation is None else round(saturation, 3),
+                traffic.first_at_s.get(edge),
             )
         )
     return approaches
@@ -338,19 +437,66 @@ def _free_links(root: ET.Element) -> Counter[str]:
     )
 
 
-@dataclass(frozen=True)
+QUARTER_S = 900.0
+"""Quarter of an hour, s: the interval of peak flows in the Highway Capacity Manual."""
+
+
+@dataclass
 class _Traffic:
-    """Traffic from the routes.
+    """Traffic from the routes. Vehicles are taken to drive at the speed limit.
 
     Attributes:
+        duration_s: Length of the episode.
         vph: Road to the vehicles per hour whose routes use it.
+        passes: Road and quarter of an hour to the vehicles that reach its end.
+        turns: Quarter of an hour to the vehicles from road to road.
+        departing: Quarter of an hour to the vehicles that depart.
+        first_at_s: Road to the time at which the first vehicle reaches its end, s from the begin.
         first_s: Seconds until the first vehicle departs.
+        last_s: Seconds until the last vehicle departs.
         fill_s: Driving time that 95 % of the routes do not exceed at the speed limits, s.
     """
 
+    duration_s: float
     vph: Counter[str]
+    passes: dict[str, Counter[int]]
+    turns: dict[int, Counter[tuple[str, str]]]
+    departing: Counter[int]
+    first_at_s: dict[str, float]
     first_s: float
+    last_s: float
     fill_s: float
+
+    @property
+    def _interval_s(self) -> float:
+        return min(QUARTER_S, self.duration_s)
+
+    def worst(self, edge: str) -> tuple[float, float]:
+        """Return the flow in the worst quarter of an hour, vehicles per hour, and its begin, s."""
+        quarters = self.passes.get(edge)
+        if not quarters:
+            return 0.0, 0.0
+        worst = max(sorted(quarters), key=lambda quarter: quarters[quarter])
+        return quarters[worst] * 3600 / self._interval_s, worst * self._interval_s
+
+    @property
+    def busiest_s(self) -> float:
+        """Begin of the quarter of an hour with the most departures, s."""
+        if not self.departing:
+            return 0.0
+        most = max(sorted(self.departing), key=lambda quarter: self.departing[quarter])
+        return most * self._interval_s
+
+    @property
+    def busiest(self) -> int:
+        """Number of vehicles that depart in the busiest quarter of an hour."""
+        return max(self.departing.values(), default=0)
+
+    @property
+    def busiest_flows_vph(self) -> dict[tuple[str, str], float]:
+        """Vehicles per hour from road to road, in the quarter of an hour with the most of them."""
+        most = max(self.turns.values(), key=lambda turns: turns.total(), default=Counter())
+        return {turn: count * 3600 / self._interval_s for turn, count in most.items()}
 
     @classmethod
     def of(
@@ -359,17 +505,37 @@ class _Traffic:
         seconds: dict[str, float] = {}
         for lane in network.lanes.values():
             seconds[lane.edge] = lane.length_m / max(lane.speed_mps, 0.1)
-        begin = scenario.settings.begin_s
-        end = begin + scenario.settings.duration_s
+        begin, length_s = scenario.settings.begin_s, scenario.settings.duration_s
         passes: Counter[str] = Counter()
         lengths_s: list[float] = []
-        first = end
+        traffic = cls(
+            length_s, Counter(), defaultdict(Counter), defaultdict(Counter), Counter(), {},
+            length_s, 0.0, 0.0,
+        )  # fmt: skip
         for _, depart, edges in departures(scenario, routed=demand.routed, reporter=reporter):
-            if begin <= depart < end:
+            if begin <= depart < begin + length_s:
                 passes.update(edges)
+                traffic._drive(depart - begin, edges, seconds)
                 lengths_s.append(sum(seconds.get(edge, 0.0) for edge in edges))
-                first = min(first, depart)
-        hours = scenario.settings.duration_s / 3600
+        hours = length_s / 3600
         lengths_s.sort()
-        fill_s = lengths_s[int(0.95 * (len(lengths_s) - 1))] if lengths_s else 0.0
-        return cls(Counter({e: n / hours for e, n in passes.items()}), first - begin, fill_s)
+        traffic.vph = Counter({e: n / hours for e, n in passes.items()})
+        traffic.fill_s = lengths_s[int(0.95 * (len(lengths_s) - 1))] if lengths_s else 0.0
+        return traffic
+
+    def _drive(self, depart_s: float, edges: Sequence[str], seconds: Mapping[str, float]) -> None:
+        """Count a vehicle at the end of each of its roads, if it is there before the end."""
+        self.departing[int(depart_s // self._interval_s)] += 1
+        self.first_s, self.last_s = min(self.first_s, depart_s), max(self.last_s, depart_s)
+        at_s, before = depart_s, ""
+        for edge in edges:
+            at_s += seconds.get(edge, 0.0)
+            if at_s >= self.duration_s:
+                break
+            quarter = int(at_s // self._interval_s)
+            self.passes[edge][quarter] += 1
+            if at_s < self.first_at_s.get(edge, math.inf):
+                self.first_at_s[edge] = at_s
+            if before:
+                self.turns[quarter][before, edge] += 1
+            before = edge

@@ -29,6 +29,7 @@ from ugat_marl.scenarios.phases import (
     conflict_free_phases,
     conflicting_greens,
     programme_phases,
+    yielding,
 )
 from ugat_marl.scenarios.scenario import Scenario
 from ugat_marl.scenarios.signals import GREEN, SIGNAL_LETTERS, check_phases
@@ -102,12 +103,16 @@ class Network:
         intersections: Traffic lights with at least two green phases, in the order of their ids.
         uncontrolled: Traffic lights with fewer than two green phases; they run their own programme.
         streets: Road (SUMO's edge) to the name of its street; roads without a name are left out.
+        reasons: Light of `uncontrolled` to the reason why it is no agent.
+        notes: Changes to the programmes of the file, for the user.
     """
 
     lanes: Mapping[str, Lane]
     intersections: tuple[Intersection, ...]
     uncontrolled: tuple[str, ...]
     streets: Mapping[str, str] = field(default_factory=dict[str, str])
+    reasons: Mapping[str, str] = field(default_factory=dict[str, str])
+    notes: tuple[str, ...] = ()
 
     @classmethod
     def read(cls, scenario: Scenario) -> Network:
@@ -138,11 +143,7 @@ class Network:
         lanes = lanes_of(root)
         links = links_of(root)
         programmes = _programmes(root, scenario)
-        if unknown := sorted(set(scenario.settings.intersections) - set(links)):
-            raise ScenarioError(
-                f"scenario {scenario.id!r}: intersections.{unknown[0]} is not a traffic light of "
-                f"{document.source}; it has: {', '.join(sorted(links)) or 'none'}"
-            )
+        _check_settings(scenario, links)
         _check_lanes(links, lanes, document.source)
         rules = RightOfWay(foes_of(root), yields_of(root), right_on_red_of(root))
         crossings = crossings_of(root)
@@ -150,13 +151,19 @@ class Network:
         positions = _positions(root)
         agents_found: list[Intersection] = []
         uncontrolled: list[str] = []
+        reasons: dict[str, str] = {}
+        notes: list[str] = []
         for tls in sorted(links):
             light_links = tuple(sorted(links[tls], key=lambda link: (link.index, link.to_lane)))
-            programme = programmes.get(tls, ())
             walks = tuple(crossings.get(tls, ()))
-            phases = _phases_of(scenario, tls, light_links, walks, programme, rules)
-            if _choices(phases, light_links, _source_of(scenario, tls)) < 2:
+            programme, width = _programme_of(
+                scenario, tls, programmes.get(tls, ()), (*light_links, *walks), rules, notes
+            )
+            phases = _phases_of(scenario, tls, light_links, walks, programme, width, rules)
+            source = _source_of(scenario, tls)
+            if _choices(phases, light_links, source) < 2:
                 uncontrolled.append(tls)
+                reasons[tls] = _reason(source, phases, light_links, programme)
                 continue
             agents_found.append(
                 Intersection(
@@ -185,7 +192,12 @@ class Network:
         pruned = tuple(_with_neighbours(light, agents) for light in agents_found)
         reach_m = scenario.control.reach_m
         return cls(
-            _with_room(lanes, root, agents, reach_m), pruned, tuple(uncontrolled), streets_of(root)
+            _with_room(lanes, root, agents, reach_m),
+            pruned,
+            tuple(uncontrolled),
+            streets_of(root),
+            reasons,
+            tuple(notes),
         )
 
     def intersection(self, tls: str) -> Intersection:
@@ -267,13 +279,11 @@ def _phases_of(
     links: tuple[Link, ...],
     crossings: tuple[Link, ...],
     programme: tuple[tuple[float, str], ...],
+    width: int,
     rules: RightOfWay,
 ) -> tuple[str, ...]:
     source = _source_of(scenario, tls)
-    width = max(link.index for link in (*links, *crossings)) + 1
     where = f"scenario {scenario.id!r}, traffic light {tls!r}"
-    if programme:
-        width = _check_programme(programme, width, links, rules.foes, where)
     if source in ("conflict-free", "permitted"):
         phases = conflict_free_phases(
             links, rules, width, where, crossings=crossings, permitted=source == "permitted"
@@ -288,13 +298,59 @@ def _phases_of(
     return phases
 
 
-def _check_programme(
-    programme: Sequence[tuple[float, str]],
-    width: int,
+def _programme_of(
+    scenario: Scenario,
+    tls: str,
+    programme: tuple[tuple[float, str], ...],
     links: Sequence[Link],
-    foes: Mapping[str, Sequence[int]],
-    where: str,
-) -> int:
+    rules: RightOfWay,
+    notes: list[str],
+) -> tuple[tuple[tuple[float, str], ...], int]:
+    """Return the programme, mended by right of way, and the number of letters of its states.
+
+    SUMO runs a programme whose protected greens cross, and lets one vehicle wait for the other.
+    The phases of agents say so: who must yield has permitted green.
+    """
+    width = max(link.index for link in links) + 1
+    if not programme:
+        return programme, width
+    where = f"scenario {scenario.id!r}, traffic light {tls!r}"
+    width = _check_programme(programme, width, where)
+    mended = tuple((seconds, yielding(state, links, rules)) for seconds, state in programme)
+    if mended != programme:
+        changed = {
+            index
+            for (_, before), (_, after) in zip(programme, mended, strict=True)
+            for index, (a, b) in enumerate(zip(before, after, strict=True))
+            if a != b
+        }
+        notes.append(
+            f"traffic light {tls!r}: protected greens of its programme cross; the links "
+            f"{', '.join(map(str, sorted(changed)))} have to yield and got g in place of G"
+        )
+    return mended, width
+
+
+def _reason(
+    source: str | Sequence[str],
+    phases: Sequence[str],
+    links: Sequence[Link],
+    programme: Sequence[tuple[float, str]],
+) -> str:
+    """Return the reason why a light is no agent, and what would make it one."""
+    own = _choices(programme_phases(programme), links, "programme")
+    if source == "programme":
+        text = f"its programme has {own} green phase{'s' if own != 1 else ''}"
+        return f'{text}; phases = "conflict-free" or "permitted" may make more'
+    more = f'; its programme has {own}: phases = "programme" makes it an agent' if own > 1 else ""
+    if not isinstance(source, str):
+        return f"{len(phases)} phase is listed{more}"
+    made = _choices(phases, links, source)
+    text = f'phases = "{source}" makes {made or "no"} green for vehicles'
+    return f"{text}, whose ways do not cross{more}"
+
+
+def _check_programme(programme: Sequence[tuple[float, str]], width: int, where: str) -> int:
     """Refuse an impossible programme and return the number of letters of its states."""
     letters = len(programme[0][1])
     for index, (_, state) in enumerate(programme):
@@ -309,7 +365,6 @@ def _check_programme(
             raise ScenarioError(
                 f"{state_name} has unknown letters {unknown}; allowed: {sorted(SIGNAL_LETTERS)}"
             )
-        _check_greens(state, links, foes, f"{where}: state {index} of its programme")
     return letters
 
 
@@ -320,6 +375,14 @@ def _check_greens(
         raise ScenarioError(
             f"{state_name} ({state!r}) gives protected green (G) to the links {pair[0]} and "
             f"{pair[1]}, whose paths cross; write g for the one that must yield"
+        )
+
+
+def _check_settings(scenario: Scenario, links: Mapping[str, Sequence[Link]]) -> None:
+    if unknown := sorted(name for name in scenario.settings.intersections if name not in links):
+        raise ScenarioError(
+            f"scenario {scenario.id!r}: intersections.{unknown[0]} is not a traffic light of "
+            f"{scenario.network.source}; it has: {', '.join(sorted(links)) or 'none'}"
         )
 
 
@@ -351,11 +414,6 @@ def lanes_of(root: ET.Element) -> dict[str, Lane]:
                 _shape(lane.get("shape", "")),
             )
     return lanes
-
-
-def _streets(root: ET.Element) -> dict[str, str]:
-    names = {edge.get("id", ""): edge.get("name", "") for edge in root.iter("edge")}
-    return {edge: name for edge, name in names.items() if name}
 
 
 def streets_of(root: ET.Element) -> dict[str, str]:

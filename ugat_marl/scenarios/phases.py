@@ -69,6 +69,25 @@ def conflicting_greens(phase: str, links: Sequence[Link], foes: Matrix) -> tuple
     return None
 
 
+def yielding(state: str, links: Sequence[Link], rules: RightOfWay) -> str:
+    """Return a state whose protected greens do not cross: who must yield by right of way gets g.
+
+    If the junction's rules let neither of two links wait, both get g.
+    """
+    while pair := conflicting_greens(state, links, rules.foes):
+        a, b = ([link for link in links if link.index == index] for index in pair)
+        waiting = [
+            index
+            for index, own, others in ((pair[0], a, b), (pair[1], b, a))
+            if any(rules.waits(link, other) for link in own for other in others)
+        ]
+        letters = list(state)
+        for index in waiting or pair:
+            letters[index] = "g"
+        state = "".join(letters)
+    return state
+
+
 @dataclass(frozen=True)
 class RightOfWay:
     """Right of way at the junctions of a network: conflicts and priorities.

@@ -33,7 +33,9 @@ from ugat_marl.scenarios.street_names import (
     intersection_name,
 )
 
-CODES = dict(zip(ALL_DIRECTIONS, ("NB", "NE", "EB", "SE", "SB", "SW", "WB", "NW"), strict=True))
+CODES: dict[str, str] = dict(
+    zip(ALL_DIRECTIONS, ("NB", "NE", "EB", "SE", "SB", "SW", "WB", "NW"), strict=True)
+)
 """Direction of travel to its code in Synchro's files."""
 _TURN_CODES = {"left": "L", "through": "T", "right": "R", "u-turn": "U"}
 COLUMNS = ("light", "intersection", "cycle_s", "offset_s", "ring", "barrier", "phase", "movements",

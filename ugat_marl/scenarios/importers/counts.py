@@ -103,12 +103,13 @@ def read_rows(
     total = 0.0
     for values in _whole(reader, path):
         where = f"{path}, line {reader.line_num}"
-        if values["count"] is not None and not values["count"].strip():
+        counted: str | None = values["count"]
+        if counted is not None and not counted.strip():
             continue
         roads = tuple(
             (values[key] or "").strip() for key in (("from", "to") if turns else ("edge",))
         )
-        count = _number(values["count"], "count", where)
+        count = _number(counted, "count", where)
         row = Row(
             roads,
             count,

@@ -162,6 +162,7 @@ def make_scenario(
             write_whole(folder / "scenario.toml", scenario_toml(content))
             scenario = read_scenario(folder)
             network = Network.read(scenario)
+            notes += network.notes
             demand = check_demand(scenario, network, reporter)
         made = Made(scenario, network, demand, notes, fleet.fits)
         write_whole(folder / "README.md", _readme(made, draft, command))
@@ -202,6 +203,7 @@ def make_draft(
                 target.name, document, (), (), validate_settings(content, str(target))
             )
             network = Network.read(scenario)
+            notes += network.notes
             turns = write_template(folder / COUNT_SHEET, document.parse())
             draw(scenario, folder / PICTURES)
         lines = _draft_readme(target, source, command, network, notes)
