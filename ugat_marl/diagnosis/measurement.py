@@ -604,7 +604,7 @@ class Measurement:
         """
         points = {detector.speed_at for detector in self._detectors}
         stated = points.pop() if len(points) == 1 else None
-        if stated in (None, "mean") or self._grain_s > self._thresholds.coarsest_clock_s:
+        if stated is None or stated == "mean" or self._grain_s > self._thresholds.coarsest_clock_s:
             return None
         seen, _ = self._point(self._pulses(), stated)
         return None if seen == stated else (stated, seen)
