@@ -252,6 +252,8 @@ _SCHEMA = re.compile(r"(https?://sumo[\w.-]*/xsd/)?[\w-]+\.xsd", re.ASCII)
 
 DECIMAL = re.compile(r"[-+]?(\d+\.?\d*|\.\d+)([eE][-+]?\d+)?", re.ASCII)
 """A number in plain digits. Python itself also reads ``1_000``, other scripts, ``nan``, ``inf``."""
+_FINITE_DIGITS = 300
+"""A number of so many digits without an exponent is finite."""
 _NUMERIC = _words(
     """
     accel actionStepLength angle apparentDecel arrivalPos arrivalPosLat arrivalSpeed begin
@@ -347,8 +349,9 @@ def _fault(tag: Tag) -> str:
 
 
 def _number_fault(tag: Tag) -> str:
-    for attribute, value in tag.attributes.items():
-        if attribute in _NUMERIC and _is_odd_number(value):
+    for attribute in _NUMERIC.intersection(tag.attributes):
+        value = tag.attributes[attribute]
+        if _is_odd_number(value):
             return f"<{tag.name} {attribute}={value[:40]!r}> is not a finite number in plain digits"
     return ""
 
@@ -387,8 +390,11 @@ def _lane_fault(tag: Tag) -> str:
 
 def _is_odd_number(text: str) -> bool:
     """Return True if Python reads a number where SUMO and a person may read another or none."""
+    plain = DECIMAL.fullmatch(text.strip())
+    if plain and not plain[2] and len(text) < _FINITE_DIGITS:
+        return False
     try:
-        return not (math.isfinite(float(text)) and DECIMAL.fullmatch(text.strip()))
+        return not (math.isfinite(float(text)) and plain)
     except ValueError:  # a word, such as "max", or a time with colons
         return False
 
