@@ -200,7 +200,7 @@ def test_nothing_is_named_that_the_library_lacks(
 
 
 KEYS = re.compile(r"^\| `([\w.\[\]<>-]+)` \| [a-z ,]+ \|", flags=re.MULTILINE)
-LIKE_ANOTHER = ("left", "alternatives[].effects", "best.effects")
+LIKE_ANOTHER = ("left", "alternatives[].effects", "best.effects", "unnamed")
 """Lists of what is described elsewhere on the page."""
 SOMETIMES = (
     {"effects[].evidence.source", "policy_gap", "gate"}

@@ -8,7 +8,14 @@ import numpy as np
 import pytest
 
 from ugat_marl.diagnosis.features import DetectorLayout, Greens, IncomingLane
-from ugat_marl.diagnosis.patterns import AXES, QUANTITIES, cells_of, patterns, sets_of
+from ugat_marl.diagnosis.patterns import (
+    AXES,
+    QUANTITIES,
+    cells_of,
+    patterns,
+    sets_of,
+    unnamed_effects,
+)
 from ugat_marl.diagnosis.records import Pattern
 from ugat_marl.diagnosis.thresholds import Thresholds
 from ugat_marl.diagnosis.verdict import describe_pattern
@@ -188,3 +195,29 @@ def test_a_pattern_in_words() -> None:
         "The left-turn lanes discharge 18 % more up to vehicle 3 of the queue in the first 10 s of "
         "green"
     )
+
+
+def test_patterns_become_service_and_demand_without_a_name() -> None:
+    slow = Pattern("discharge", "north", "s", None, None, None, None, False, -0.2, 0.01, None, 0.0)
+    start = replace(slow, movement=None, green_s=(None, 10.0), change=-0.1)
+    more = replace(slow, quantity="count", movement=None, change=0.25)
+    surge = replace(more, place="south", window=(600.0, 1200.0), detectors="advance", change=-0.5)
+    hidden = [
+        replace(slow, window=(0.0, 600.0)),
+        replace(slow, long_vehicles=True),
+        replace(slow, quantity="free speed"),
+        replace(more, place="elsewhere"),
+        replace(more, detectors="stop"),
+    ]
+    effects = unnamed_effects(
+        [slow, start, more, surge, *hidden], LAYOUT, ("north", "south"), decision_s=10.0
+    )
+    assert list(map(str, effects)) == [
+        "demand_level=north,1.25",
+        "demand_surge=south,600,1200,0.5",
+        "lane_service=north_0,1,2",
+        "lane_service=north_1,1,2",
+        "lane_service=north_2,1,0",
+    ]
+    faster = replace(slow, place=None, movement=None, change=0.2)
+    assert unnamed_effects([faster], LAYOUT, (), 10.0) == ()

@@ -183,7 +183,9 @@ def test_of_several_places_the_busiest_one_counts() -> None:
 
 def test_every_task_of_a_diagnosis_is_part_of_the_whole() -> None:
     rooms = Path(module.__file__).parent
-    source = "".join((rooms / name).read_text() for name in ("study.py", "select.py"))
+    source = "".join(
+        (rooms / name).read_text() for name in ("study.py", "select.py", "workflow.py")
+    )
     shown = re.findall(r"task\(\s*f?\"([^\"]+)\"", source)
     shown += re.findall(r"f\"(round [^\"]+)\"", source)
     assert len(set(shown)) >= 8

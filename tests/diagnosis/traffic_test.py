@@ -3,16 +3,20 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from contextlib import nullcontext
+from dataclasses import dataclass, field
 from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
 import pytest
 
+from ugat_marl.diagnosis import workflow
 from ugat_marl.diagnosis.features import BIN_FEATURES, FEATURES, INDEX, Tally
 from ugat_marl.diagnosis.thresholds import Thresholds
 from ugat_marl.diagnosis.traffic import approach_table, gate_of
 from ugat_marl.diagnosis.workflow import _reason_against as reason_against
+from ugat_marl.effects import Effect, Headway, LaneService
 
 THRESHOLDS = Thresholds()
 LAYOUT: Any = SimpleNamespace(
@@ -113,3 +117,56 @@ def test_why_a_scenario_is_not_corrected(verdict: str, better: bool, refused: st
     reason = reason_against(conclusion, gate)
     assert (reason is not None) == bool(refused)
     assert refused in (reason or "")
+
+
+@dataclass(frozen=True)
+class Told:
+    """What a record says so far."""
+
+    patterns: tuple[str, ...] = ("a pattern",)
+    sentence: str = "Nothing explains it."
+    gate: Any = None
+    unnamed: tuple[Any, ...] = field(default=())
+
+
+@pytest.mark.parametrize(
+    ("asked", "travel_s", "corrected"), [(True, 25, True), (True, 20, False), (False, 25, False)]
+)
+def test_an_unnamed_correction_is_asked_for_and_has_to_help(
+    asked: bool, travel_s: float, corrected: bool, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    tried: list[tuple[Effect, ...]] = []
+    after = days(3, 16, travel_s, travel_s / 5)
+
+    def ordinary(effects: tuple[Effect, ...], numbers: list[int], advance: Any) -> dict[int, Any]:
+        del advance
+        tried.append(effects)
+        return {n: SimpleNamespace(tally=after[n]) for n in numbers}
+
+    service = LaneService("in_0", 0.0, 2.0)
+    monkeypatch.setattr(workflow, "unnamed_effects", lambda *given: (service,))
+    monkeypatch.setattr(workflow.Routes, "of", lambda scenario: SimpleNamespace(origins={}))
+    study: Any = SimpleNamespace(
+        config=SimpleNamespace(unnamed=asked, thresholds=THRESHOLDS),
+        scenario=SimpleNamespace(control=SimpleNamespace(decision_interval_s=10.0)),
+        engine=SimpleNamespace(first=lambda count: list(range(count)), ordinary=ordinary),
+        heldout=days(1, 2, 25, 5),
+        layout=LAYOUT,
+    )
+    base: Any = SimpleNamespace(
+        model=SimpleNamespace(days=dict(enumerate(days(2, 16, 20, 4))), effects=())
+    )
+    best: Any = SimpleNamespace(model=SimpleNamespace(effects=(Headway(1.4),)))
+    reporter: Any = SimpleNamespace(task=lambda name, total: nullcontext(lambda: None))
+    told: Any = Told()
+    for verdict, named in (("unknown", ()), ("partially_explained", (Headway(1.4),))):
+        conclusion: Any = SimpleNamespace(verdict=verdict, best=best)
+        result = workflow._unnamed(study, told, base, conclusion, reporter)
+        assert (result is not None) == corrected
+        if result is not None:
+            record, effects = result
+            assert effects == (*named, service)
+            assert record.sentence.endswith("says nothing of the cause.")
+            assert [effect.name for effect in record.unnamed] == ["lane_service"]
+            assert record.gate is not None and record.gate.better
+    assert len(tried) == (2 if asked else 0)

@@ -75,7 +75,7 @@ def diagnosed(directory: Path, corrected: str | None = "V4", **changes: Any) -> 
     """Write a diagnosis as `diagnose` does, with nothing in it but verdict and correction."""
     nothing: tuple[str, ...] = (
         "left_out", "ruled_out", "findings", "effects", "where", "left", "alternatives",
-        "statistics", "lanes", "untried", "approaches", "patterns",
+        "statistics", "lanes", "untried", "approaches", "patterns", "unnamed",
     )  # fmt: skip
     none = (
         "best", "heldout", "evidence", "courtesy", "travel_time", "next_measurement", "gate",

@@ -131,6 +131,7 @@ def content_of(verdict: str = "explained", *, complete: bool = True, **more: Any
             "noise": 0.02, "better": True,
         },
         "not_corrected": None,
+        "unnamed": [],
         "patterns": [] if same else [
             {
                 "quantity": "discharge", "place": "S_C", "movement": "s", "detectors": None,

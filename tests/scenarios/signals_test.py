@@ -21,6 +21,7 @@ from ugat_marl.scenarios import (
     green_begins_at_once,
     late_green_log,
     with_late_green,
+    withheld_log,
 )
 from ugat_marl.scenarios.signals import (
     GreenDelays,
@@ -422,3 +423,19 @@ def test_a_log_of_a_street_can_be_late() -> None:
     assert late_green_log(log, 0, 1) == log
     assert late_green_log(log[:1], 2, 1) == log[:1]
     assert late_green_log((), 2, 1) == ()
+
+
+def test_red_of_single_links_in_a_log() -> None:
+    log = [(0.0, "rr"), (10.0, "GG"), (40.0, "yy"), (43.0, "rr")]
+    red = Withheld((3.0, 0.0), (2.0, 0.0))
+    shown = withheld_log(log, red, 0.0, 1.0, 10.0, 60.0)
+    # Green of the first link begins at 13 s, and pauses in the decisions at 20 and 30 s.
+    assert shown == (
+        (0.0, "rr"), (10.0, "rG"), (13.0, "GG"), (20.0, "rG"), (22.0, "GG"), (30.0, "rG"),
+        (32.0, "GG"), (40.0, "yy"), (43.0, "rr"),
+    )  # fmt: skip
+    nothing = Withheld((0.0, 0.0), (0.0, 0.0))
+    assert withheld_log(log, nothing, 0.0, 1.0, 10.0, 60.0) == tuple(log)
+    late = withheld_log(log, nothing, 2.0, 1.0, 10.0, 60.0)
+    assert late == late_green_log(log, 2.0, 1.0)
+    assert withheld_log([], nothing, 0.0, 1.0, 10.0, 60.0) == ()

@@ -56,6 +56,8 @@ class Diagnose:
         ray: Simulate on Ray instead.
         correct_anyway: Write the corrected scenario also if its effects explain only a part, or do
             not bring held-out travel times and queues nearer.
+        unnamed: Where the named effects do not explain the data, try a correction of service and
+            demand that imitates what is left. It has no name and says nothing of the cause.
         report: Write the page report.html.
     """
 
@@ -77,6 +79,7 @@ class Diagnose:
     workers: Workers = None
     ray: RayAddress = None
     correct_anyway: bool = False
+    unnamed: bool = False
     report: bool = True
 
     def run(self, console: Console) -> int:
@@ -112,6 +115,7 @@ class Diagnose:
             leave_out=self.leave_out,
             cache=self.cache,
             correct_anyway=self.correct_anyway,
+            unnamed=self.unnamed,
         )
 
     def _check_out(self) -> None:
@@ -140,6 +144,7 @@ class Diagnose:
         given += ["--budget-h", f"{self.budget_h:g}", "--alpha", f"{self.alpha:g}"]
         given += [] if self.budget_s is None else ["--budget-s", f"{self.budget_s:g}"]
         given += ["--correct-anyway"] if self.correct_anyway else []
+        given += ["--unnamed"] if self.unnamed else []
         given += ["--seed", str(self.seed)]
         if self.leave_out:
             given += ["--leave-out", *self.leave_out]
@@ -147,7 +152,8 @@ class Diagnose:
 
     def _next(self, diagnosis: Diagnosis) -> list[str]:
         """Return the command that uses the corrected scenario; nothing if traffic is as before."""
-        if diagnosis.corrected is None or not any(map(_in_the_model, diagnosis.effects)):
+        changed = diagnosis.unnamed or any(map(_in_the_model, diagnosis.effects))
+        if diagnosis.corrected is None or not changed:
             return []
         corrected = str(self.out / CORRECTED)
         return [

@@ -18,7 +18,7 @@ from __future__ import annotations
 
 import itertools
 import math
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -28,6 +28,7 @@ from ugat_marl.diagnosis.features import DetectorLayout, Discharge, Greens, free
 from ugat_marl.diagnosis.records import Pattern
 from ugat_marl.diagnosis.residual import log_normal_tail
 from ugat_marl.diagnosis.thresholds import DayThresholds, Thresholds
+from ugat_marl.effects import DemandLevel, DemandSurge, Effect, LaneService
 from ugat_marl.scenarios import DetectorKind, Passages, Period
 
 Array = NDArray[np.float64]
@@ -43,6 +44,10 @@ POSITIONS = (2, 3, 4, 6, 9)
 """First positions in the queue of the cells: 2nd, 3rd, 4th and 5th, 6th to 8th, 9th and later."""
 AGES_S = (0.0, 10.0, 20.0, 30.0, 45.0)
 """Begins of the cells in the age of green, s."""
+MOST_LOST_S = 30.0
+"""Most seconds of a green that a lane may leave unused."""
+USUAL_GAP_S = 2.0
+"""Time that a queued vehicle takes, for patterns that end with some vehicle, s."""
 KINDS: tuple[DetectorKind, ...] = ("advance", "stop", "exit")
 AXES = ("place", "kind", "position", "age", "time", "length")
 _AGE = AXES.index("age")
@@ -490,3 +495,67 @@ def _limits(name: tuple[object, ...] | None) -> tuple[float | None, float | None
         return None
     first, last = (None if value is None else float(str(value)) for value in name)
     return first, last
+
+
+# --- unnamed correction ---------------------------------------------------------------------------
+
+
+def unnamed_effects(
+    found: Sequence[Pattern], layout: DetectorLayout, origins: Collection[str], decision_s: float
+) -> tuple[Effect, ...]:
+    """Return changes of service and demand that imitate patterns, whatever their cause.
+
+    Slower discharge becomes seconds of green that a lane does not use, in every decision or at the
+    begin of green. Counts of whole entries become demand. Patterns of some hours of the discharge,
+    of long vehicles, of single kinds of detectors behind an entry, and of speeds are left out.
+
+    Args:
+        found: Patterns, see `patterns`.
+        layout: Lanes and detectors.
+        origins: Edges on which vehicles start.
+        decision_s: Time between two decisions of a controller, s.
+    """
+    service: dict[str, tuple[float, float]] = {}
+    demand: list[Effect] = []
+    for one in found:
+        if one.quantity == "discharge" and one.window is None and not one.long_vehicles:
+            begin, each = _lost_s(one, decision_s)
+            for lane in _lanes_of(one, layout):
+                before = service.get(lane, (0.0, 0.0))
+                service[lane] = before[0] + begin, before[1] + each
+        elif one.quantity == "count" and one.place in origins and one.detectors != "stop":
+            factor = max(1.0 + one.change, 0.0)
+            demand.append(
+                DemandLevel(one.place, factor)
+                if one.window is None
+                else DemandSurge(one.place, *one.window, factor)
+            )
+    lost = [
+        LaneService(lane, min(begin, MOST_LOST_S), min(each, MOST_LOST_S))
+        for lane, (begin, each) in service.items()
+        if begin or each
+    ]
+    return (*demand, *lost)
+
+
+def _lost_s(pattern: Pattern, decision_s: float) -> tuple[float, float]:
+    """Return unused seconds at the begin of green and in each further decision."""
+    share = max(-pattern.change, 0.0)
+    _, until_s = pattern.green_s or (None, None)
+    _, until = pattern.vehicles or (None, None)
+    if until_s is None and until is not None:
+        until_s = until * USUAL_GAP_S
+    lost = (share * until_s, 0.0) if until_s is not None else (0.0, share * decision_s)
+    return round(lost[0], 1), round(lost[1], 1)
+
+
+def _lanes_of(pattern: Pattern, layout: DetectorLayout) -> list[str]:
+    """Return the incoming lanes of a pattern."""
+    sets = place_sets(layout, len(layout.lanes))
+    name = (
+        None
+        if not (pattern.place or pattern.movement)
+        else (pattern.place or "", pattern.movement or "")
+    )
+    mask = sets.masks[sets.names.index(name)]
+    return [lane.id for lane, used in zip(layout.lanes, mask, strict=True) if used]

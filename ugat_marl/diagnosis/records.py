@@ -683,6 +683,8 @@ class Diagnosis:
         gate: Judgement of the correction by measures that no fit uses; None if there is nothing to
             judge, or nothing to judge by.
         patterns: Patterns in what is left where the effects do not explain the data.
+        unnamed: Correction of service and demand that imitates these patterns, whatever their
+            cause; empty unless it was asked for and brings held-out traffic nearer.
         next_measurement: A measurement that would separate the rivals, or show the missing effect.
         complete: True if the diagnosis ended by itself, False if the budget ended it.
         untried: Names of effects that were not examined for lack of time.
@@ -723,6 +725,7 @@ class Diagnosis:
     approaches: tuple[ApproachRow, ...]
     gate: TrafficGate | None
     patterns: tuple[Pattern, ...]
+    unnamed: tuple[NamedEffect, ...]
     next_measurement: str | None
     complete: bool
     untried: tuple[str, ...]

@@ -43,12 +43,14 @@ from ugat_marl.diagnosis.journeys import Crossings, matched
 from ugat_marl.diagnosis.thresholds import DayThresholds
 from ugat_marl.effects import (
     Effect,
+    controller_effects,
     depart_s,
     detector_effects,
     installed_detectors,
     late_greens,
     shift_parking,
     sort_departures,
+    withheld,
 )
 from ugat_marl.errors import MeasuredDataError, SimulatorCrashed, SimulatorError
 from ugat_marl.files import xml_bytes
@@ -61,9 +63,11 @@ from ugat_marl.scenarios import (
     Period,
     Scenario,
     SignalLog,
+    Withheld,
     demand_as_vehicles,
     draw_day,
     late_green_log,
+    withheld_log,
 )
 from ugat_marl.seeding import derive_seed
 from ugat_marl.simulation import (
@@ -235,7 +239,9 @@ class Replay:
         begin = settings.begin_s + step * round((begin - settings.begin_s) / step)
         loops = directory / "loops.xml"
         true = installed_detectors((*self._own, *effects), self._detectors)
-        signals = replay_document(scenario, period, begin)
+        served = [effect.service() for effect in controller_effects(scenario)]
+        red = withheld(self._network, {lane: red for each in served for lane, red in each.items()})
+        signals = replay_document(scenario, period, begin, red)
         detectors = detectors_document(true, self._network.lanes, loops)
         scenario = replace(
             scenario,
@@ -274,11 +280,22 @@ def _logged(period: Period) -> Period:
     return replace(period, passages=passages)
 
 
-def replay_document(scenario: Scenario, period: Period, begin_s: float) -> Document:
+def replay_document(
+    scenario: Scenario,
+    period: Period,
+    begin_s: float,
+    red: Mapping[str, Withheld] | None = None,
+) -> Document:
     """Write a signal programme with the measured states of every measured traffic light.
 
     The warm-up before the period shows the beginning of the measured log. If the scenario's
     settings have a lost time, it follows every start of green.
+
+    Args:
+        scenario: The scenario.
+        period: The measured period.
+        begin_s: Begin of the simulation, s.
+        red: Red of single links by traffic light, in decisions of the scenario's own length.
 
     Raises:
         MeasuredDataError: A traffic light has no signals.
@@ -289,7 +306,11 @@ def replay_document(scenario: Scenario, period: Period, begin_s: float) -> Docum
     for tls, log in sorted(period.signals.items()):
         if not log:
             raise MeasuredDataError(f"period {period.id!r}: no signals of traffic light {tls!r}")
-        late = late_green_log(log, late_s.get(tls, 0.0), step)
+        if red and tls in red:
+            decision_s = scenario.control.decision_interval_s
+            late = withheld_log(log, red[tls], late_s.get(tls, 0.0), step, decision_s, period.end_s)
+        else:
+            late = late_green_log(log, late_s.get(tls, 0.0), step)
         program = ET.SubElement(
             root,
             "tlLogic",

@@ -70,6 +70,8 @@ class DiagnosisConfig:
         effort: Numbers of simulated days; None for those that suit the size of the network.
         correct_anyway: Write ``corrected`` also if its effects explain only a part, or bring
             held-out traffic no nearer.
+        unnamed: Try a correction of service and demand that has no name, where the named effects do
+            not explain the data.
         thresholds: Numbers of the method.
     """
 
@@ -82,6 +84,7 @@ class DiagnosisConfig:
     workers: Workers = None
     effort: Effort | None = None
     correct_anyway: bool = False
+    unnamed: bool = False
     thresholds: Thresholds = field(default_factory=Thresholds)
 
     def __post_init__(self) -> None:
@@ -244,6 +247,7 @@ class Study:
             "is what is left chance": Share(2 * test),
             "round 2": Share(2 * len(self.hypotheses), effort.bank),
             "patterns": Share(limits.pattern_days),
+            "unnamed": Share(limits.settling_days if self.config.unnamed else 0),
             "without single": Share(2, limits.steps_without * effort.fit + limits.settling_days),
         }
 

@@ -16,6 +16,8 @@ import numpy as np
 from ugat_marl.data import MeasuredData, installed_versions
 from ugat_marl.diagnosis.engine import OutOfTime
 from ugat_marl.diagnosis.locate import disagreements, locate_gap
+from ugat_marl.diagnosis.patterns import unnamed_effects
+from ugat_marl.diagnosis.places import Routes
 from ugat_marl.diagnosis.records import (
     CORRECTED,
     SCHEMA,
@@ -41,6 +43,7 @@ from ugat_marl.diagnosis.records import (
     Verified,
 )
 from ugat_marl.diagnosis.study import IN_THE_LOG, DiagnosisConfig, Study, timing_effects
+from ugat_marl.diagnosis.traffic import gate_of
 from ugat_marl.diagnosis.verdict import (
     capitalised,
     conclude,
@@ -159,6 +162,9 @@ def _compared(
         conclusion = told(conclusion)
         diagnosis = _record(study, timing, located, selected, verified, conclusion, tables=False)
     diagnosis = _with_patterns(study, diagnosis, located.base, conclusion, reporter)
+    unnamed = _unnamed(study, diagnosis, located.base, conclusion, reporter)
+    if unnamed is not None:
+        return unnamed
     if conclusion.verdict == "unknown" or not conclusion.best.model.members:
         return diagnosis, ()
     gate = judged(study, located.base, conclusion.best)
@@ -167,18 +173,54 @@ def _compared(
     return diagnosis, () if reason else conclusion.best.model.effects
 
 
+def _explained_by(base: Tested, conclusion: Conclusion) -> Tested:
+    """Return the model whose effects are named: an effect that is not named explains nothing."""
+    return conclusion.best if conclusion.verdict == "partially_explained" else base
+
+
+def _unnamed(
+    study: Study, diagnosis: Diagnosis, base: Tested, conclusion: Conclusion, reporter: Reporter
+) -> tuple[Diagnosis, tuple[Effect, ...]] | None:
+    """Try a correction that imitates the patterns in what is left.
+
+    Returns:
+        The record and all effects of the corrected scenario; None if it was not asked for, if no
+        pattern can be imitated, or if held-out traffic comes no nearer.
+    """
+    if not study.config.unnamed or not diagnosis.patterns:
+        return None
+    named = _explained_by(base, conclusion).model.effects
+    decision_s = study.scenario.control.decision_interval_s
+    origins = Routes.of(study.scenario).origins
+    effects = unnamed_effects(diagnosis.patterns, study.layout, origins, decision_s)
+    if not effects:
+        return None
+    numbers = study.engine.first(study.config.thresholds.settling_days)
+    try:
+        with reporter.task("unnamed correction", len(numbers)) as advance:
+            days = study.engine.ordinary((*named, *effects), numbers, advance)
+    except OutOfTime:
+        return None
+    before = [base.model.days[number] for number in days]
+    after = [day.tally for day in days.values()]
+    gate = gate_of(study.heldout, before, after, study.config.thresholds)
+    if gate is None or not gate.better:
+        return None
+    source = "imitates patterns in what is left, whatever their cause"
+    records = tuple(_without_search(effect, source) for effect in effects)
+    told = "The corrected scenario has an unnamed correction, which says nothing of the cause."
+    sentence = f"{diagnosis.sentence} {told}"
+    return replace(diagnosis, sentence=sentence, gate=gate, unnamed=records), (*named, *effects)
+
+
 def _with_patterns(
     study: Study, diagnosis: Diagnosis, base: Tested, conclusion: Conclusion, reporter: Reporter
 ) -> Diagnosis:
-    """Add patterns in what is left, if the search has ended and does not explain the data.
-
-    An effect that is not named explains nothing, so then all of the difference is left.
-    """
+    """Add patterns in what is left, if the search has ended and does not explain the data."""
     if conclusion.verdict not in ("unknown", "partially_explained"):
         return diagnosis
-    model = conclusion.best if conclusion.verdict == "partially_explained" else base
     try:
-        patterns = study.left_over(model, reporter)
+        patterns = study.left_over(_explained_by(base, conclusion), reporter)
     except OutOfTime:
         return diagnosis
     if not patterns:
@@ -324,6 +366,7 @@ def _begun(
         approaches=(),
         gate=None,
         patterns=(),
+        unnamed=(),
         next_measurement=None,
         complete=examined is None,
         untried=tuple(sorted(left)),

@@ -95,6 +95,7 @@ def diagnosis_page(diagnosis: Diagnosis, network: Network, commands: Sequence[st
         statistics=_statistics(page, diagnosis),
         where=_where(diagnosis),
         patterns=_patterns(diagnosis),
+        unnamed=_effects(diagnosis.unnamed),
         ranking=_ranking(diagnosis),
         courtesy=_courtesy(diagnosis),
         criteria=words.criteria_line(diagnosis),

@@ -103,6 +103,7 @@ from .signals import Withheld as Withheld
 from .signals import green_begins_at_once as green_begins_at_once
 from .signals import late_green_log as late_green_log
 from .signals import with_late_green as with_late_green
+from .signals import withheld_log as withheld_log
 from .street_names import NamedApproach as NamedApproach
 from .street_names import NamedTurn as NamedTurn
 from .street_names import approach_directions as approach_directions

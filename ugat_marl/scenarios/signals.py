@@ -6,6 +6,7 @@ for the minimum, and it completes each clearance that it has begun. It does not 
 
 from __future__ import annotations
 
+import bisect
 import functools
 import math
 from collections.abc import Mapping, Sequence
@@ -385,6 +386,45 @@ def late_green_log(
                 delayed.append((time, visible))
             time += seconds
     return tuple(delayed)
+
+
+def withheld_log(
+    log: Sequence[tuple[float, str]],
+    red: Withheld,
+    late_s: float,
+    step_s: float,
+    decision_s: float,
+    end_s: float,
+) -> tuple[tuple[float, str], ...]:
+    """Show red to single links in the log of a light, as `GreenDelays` does in an environment.
+
+    Args:
+        log: ``(since_s, state)`` at every change.
+        red: Red of single links.
+        late_s: Delay of each green, s.
+        step_s: Length of a simulation step, s.
+        decision_s: Time between two decisions, s; the first one is at the begin of the log.
+        end_s: End of the log, s.
+    """
+    if not log:
+        return ()
+    since = [time for time, _ in log]
+    delays = GreenDelays({"": log[0][1]}, {"": late_s}, step_s, {"": red})
+    shown: list[tuple[float, str]] = [(float(since[0]), log[0][1])]
+    time = float(since[0])
+    while time < end_s:
+        after = time + decision_s
+        first = bisect.bisect_right(since, time) - 1
+        last = bisect.bisect_left(since, after)
+        edges = [time, *since[first + 1 : last], after]
+        states = [state for _, state in log[first:last]]
+        plan = [(b - a, s) for a, b, s in zip(edges[:-1], edges[1:], states, strict=True)]
+        for seconds, state in delays.hold({"": plan})[""]:
+            if state != shown[-1][1]:
+                shown.append((time, state))
+            time += seconds
+        time = after  # sums of tenths are not exact
+    return tuple(shown)
 
 
 def check_phases(phases: Sequence[str], links: int, source: str) -> None:
