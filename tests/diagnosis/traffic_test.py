@@ -1,4 +1,4 @@
-"""The gate of the corrected scenario, and verdicts in terms of traffic."""
+"""The check before a scenario is corrected, and verdicts in terms of traffic."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ import pytest
 from ugat_marl.diagnosis import workflow
 from ugat_marl.diagnosis.features import BIN_FEATURES, FEATURES, INDEX, Tally
 from ugat_marl.diagnosis.thresholds import Thresholds
-from ugat_marl.diagnosis.traffic import approach_table, gate_of
+from ugat_marl.diagnosis.traffic import approach_table, traffic_check
 from ugat_marl.diagnosis.workflow import _reason_against as reason_against
 from ugat_marl.effects import Effect, Headway, LaneService
 
@@ -50,43 +50,45 @@ def without_journeys(tallies: Sequence[Tally]) -> list[Tally]:
 
 
 def test_a_correction_that_brings_travel_times_nearer_passes() -> None:
-    gate = gate_of(days(1, 2, 25, 5), days(2, 16, 20, 4), days(3, 16, 25, 5), THRESHOLDS)
-    assert gate is not None and gate.better
-    assert gate.measure == "travel time and queue"
+    check = traffic_check(days(1, 2, 25, 5), days(2, 16, 20, 4), days(3, 16, 25, 5), THRESHOLDS)
+    assert check is not None and check.better
+    assert check.measure == "travel time and queue"
     # |25 - 20| / 25 + |5 - 4| / 5
-    assert gate.error_before == pytest.approx(0.4, abs=0.06)
-    assert gate.error_after < 0.08
-    assert 0.0 < gate.noise < 0.1
+    assert check.error_before == pytest.approx(0.4, abs=0.06)
+    assert check.error_after < 0.08
+    assert 0.0 < check.noise < 0.1
 
 
 def test_a_correction_that_makes_waiting_worse_is_refused() -> None:
-    gate = gate_of(days(1, 2, 20, 4), days(2, 16, 20, 4), days(3, 16, 22, 5), THRESHOLDS)
-    assert gate is not None and not gate.better
-    assert gate.error_after > gate.error_before
+    check = traffic_check(days(1, 2, 20, 4), days(2, 16, 20, 4), days(3, 16, 22, 5), THRESHOLDS)
+    assert check is not None and not check.better
+    assert check.error_after > check.error_before
 
 
 def test_a_correction_without_use_passes_as_often_as_is_said() -> None:
-    gates = [
-        gate_of(days(s, 2, 20, 4), days(s + 1000, 16, 20, 4), days(s + 2000, 16, 20, 4), THRESHOLDS)
+    checks = [
+        traffic_check(
+            days(s, 2, 20, 4), days(s + 1000, 16, 20, 4), days(s + 2000, 16, 20, 4), THRESHOLDS
+        )
         for s in range(60)
     ]
-    passed = sum(gate is not None and gate.better for gate in gates)
+    passed = sum(check is not None and check.better for check in checks)
     assert passed <= 8, "one in twenty, and chance"
 
 
 def test_without_travel_times_counts_decide() -> None:
     street, sim, repaired = days(1, 2, 20, 4, served=30), days(2, 16, 20, 4), days(2, 16, 20, 4)
-    gate = gate_of(*map(without_journeys, (street, sim, repaired)), THRESHOLDS)
-    assert gate is not None and gate.measure == "service counts"
-    assert not gate.better
+    check = traffic_check(*map(without_journeys, (street, sim, repaired)), THRESHOLDS)
+    assert check is not None and check.measure == "service counts"
+    assert not check.better
     right = days(3, 16, 20, 4, served=30)
-    gate = gate_of(*map(without_journeys, (street, sim, right)), THRESHOLDS)
-    assert gate is not None and gate.better
+    check = traffic_check(*map(without_journeys, (street, sim, right)), THRESHOLDS)
+    assert check is not None and check.better
 
 
-def test_without_anything_to_judge_by_there_is_no_gate() -> None:
+def test_without_anything_to_judge_by_there_is_no_judgement() -> None:
     empty = [Tally(np.zeros((len(FEATURES), 0, 2)), np.zeros((len(BIN_FEATURES), 0, 4)))]
-    assert gate_of(empty, empty * 3, empty * 3, THRESHOLDS) is None
+    assert traffic_check(empty, empty * 3, empty * 3, THRESHOLDS) is None
 
 
 def test_an_approach_in_terms_of_traffic() -> None:
@@ -112,9 +114,9 @@ def test_an_approach_in_terms_of_traffic() -> None:
 )
 def test_why_a_scenario_is_not_corrected(verdict: str, better: bool, refused: str) -> None:
     after = days(3, 16, 25, 5) if better else days(3, 16, 20, 4)
-    gate = gate_of(days(1, 2, 25, 5), days(2, 16, 20, 4), after, THRESHOLDS)
+    check = traffic_check(days(1, 2, 25, 5), days(2, 16, 20, 4), after, THRESHOLDS)
     conclusion: Any = SimpleNamespace(verdict=verdict)
-    reason = reason_against(conclusion, gate)
+    reason = reason_against(conclusion, check)
     assert (reason is not None) == bool(refused)
     assert refused in (reason or "")
 
@@ -125,7 +127,7 @@ class Told:
 
     patterns: tuple[str, ...] = ("a pattern",)
     sentence: str = "Nothing explains it."
-    gate: Any = None
+    traffic_check: Any = None
     unnamed: tuple[Any, ...] = field(default=())
 
 
@@ -168,5 +170,5 @@ def test_an_unnamed_correction_is_asked_for_and_has_to_help(
             assert effects == (*named, service)
             assert record.sentence.endswith("says nothing of the cause.")
             assert [effect.name for effect in record.unnamed] == ["lane_service"]
-            assert record.gate is not None and record.gate.better
+            assert record.traffic_check is not None and record.traffic_check.better
     assert len(tried) == (2 if asked else 0)

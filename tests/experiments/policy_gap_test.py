@@ -78,8 +78,8 @@ def diagnosed(directory: Path, corrected: str | None = "V4", **changes: Any) -> 
         "statistics", "lanes", "untried", "approaches", "patterns", "unnamed",
     )  # fmt: skip
     none = (
-        "best", "heldout", "evidence", "courtesy", "travel_time", "next_measurement", "gate",
-        "not_corrected",
+        "best", "heldout", "evidence", "courtesy", "travel_time", "next_measurement",
+        "traffic_check", "not_corrected",
     )  # fmt: skip
     record = {
         "schema": "ugat-marl/diagnosis/4",

@@ -126,7 +126,7 @@ def content_of(verdict: str = "explained", *, complete: bool = True, **more: Any
             }
             for n, edge in enumerate(("S_C", "W_C"))
         ],
-        "gate": None if same else {
+        "traffic_check": None if same else {
             "measure": "travel time and queue", "error_before": 0.482, "error_after": 0.051,
             "noise": 0.02, "better": True,
         },

@@ -23,7 +23,7 @@ content of ``diagnosis.json``.
     select      the search, round by round
     patterns    sparse regression on what is left, where no effect explains it
     verify      both models on held-out periods, side by side; the usual criteria
-    traffic     both models in terms of traffic; the gate of the corrected scenario
+    traffic     both models in terms of traffic; the check of traffic
     verdict     one of six verdicts, in words
 """
 

@@ -32,7 +32,7 @@ from .records import Selected as Selected
 from .records import Sides as Sides
 from .records import Splits as Splits
 from .records import StatisticRow as StatisticRow
-from .records import TrafficGate as TrafficGate
+from .records import TrafficCheck as TrafficCheck
 from .records import TravelTimeEstimate as TravelTimeEstimate
 from .records import TravelTimes as TravelTimes
 from .records import Verdict as Verdict

@@ -528,7 +528,7 @@ class ApproachRow:
 
 
 @dataclass(frozen=True)
-class TrafficGate:
+class TrafficCheck:
     """Judgement of a correction by measures that no fit uses, on the held-out periods.
 
     Attributes:
@@ -680,8 +680,8 @@ class Diagnosis:
         courtesy: Usual criteria of traffic engineers, before and after.
         travel_time: Mean simulated travel times, before and after.
         approaches: Capacity, queue and delay of each approach, before and after.
-        gate: Judgement of the correction by measures that no fit uses; None if there is nothing to
-            judge, or nothing to judge by.
+        traffic_check: Judgement of the correction by measures that no fit uses; None if there is
+            nothing to judge, or nothing to judge by.
         patterns: Patterns in what is left where the effects do not explain the data.
         unnamed: Correction of service and demand that imitates these patterns, whatever their
             cause; empty unless it was asked for and brings held-out traffic nearer.
@@ -723,7 +723,7 @@ class Diagnosis:
     courtesy: EngineeringCriteria | None
     travel_time: TravelTimes | None
     approaches: tuple[ApproachRow, ...]
-    gate: TrafficGate | None
+    traffic_check: TrafficCheck | None
     patterns: tuple[Pattern, ...]
     unnamed: tuple[NamedEffect, ...]
     next_measurement: str | None

@@ -674,12 +674,12 @@ class Thresholds(DayThresholds):
     """Largest number of patterns that are told. By hand: a page has room for more than a reader has
     patience. Halved: one."""
 
-    # --- gate of the corrected scenario -------------------------------------------------------
+    # --- check of traffic before the scenario is corrected ------------------------------------
 
-    gate_draws: int = 200
+    check_draws: int = 200
     """Data sets drawn for the error of the gain in held-out travel times and queues. Halved: this
     error is known to 7 instead of 5 %."""
-    gate_deviations: float = 1.645
+    check_deviations: float = 1.645
     """Standard errors by which that gain must be above 0: the normal quantile of 0.95, so one in
     twenty corrections without use passes. Halved: one in five."""
     least_journeys: float = 20.0

@@ -1,7 +1,7 @@
 """Both models in terms of traffic: capacity, queue and delay per approach, on held-out periods.
 
 Travel times and queues between detectors are in no distance. So they also decide if a correction
-makes the simulation a better picture of the street: the gate of the corrected scenario.
+makes the simulation a better picture of the street.
 """
 
 from __future__ import annotations
@@ -11,7 +11,7 @@ from collections.abc import Sequence
 import numpy as np
 
 from ugat_marl.diagnosis.features import BIN_FEATURES, INDEX, DetectorLayout, Tally
-from ugat_marl.diagnosis.records import ApproachRow, Sides, TrafficGate
+from ugat_marl.diagnosis.records import ApproachRow, Sides, TrafficCheck
 from ugat_marl.diagnosis.statistics import Array, sum_of
 from ugat_marl.diagnosis.thresholds import Thresholds
 
@@ -19,7 +19,7 @@ _STEADY = [INDEX[name] for name in ("gap4-5", "gap6-8", "gap9+")]
 """Gaps of queued vehicles from the fourth on: those of saturation flow."""
 _SERVED = [BIN_FEATURES.index(name) for name in ("count_stop", "count_exit")]
 _SEED = 11
-"""Seed of the drawn data sets; fixed, so that the same days give the same gate."""
+"""Seed of the drawn data sets; fixed, so that the same days give the same judgement."""
 
 
 def approach_table(
@@ -75,12 +75,12 @@ def _of_approach(
     return capacity, float(queue), float((times[:, 0].sum() - rides) / known)
 
 
-def gate_of(
+def traffic_check(
     measured: Sequence[Tally],
     before: Sequence[Tally],
     after: Sequence[Tally],
     thresholds: Thresholds,
-) -> TrafficGate | None:
+) -> TrafficCheck | None:
     """Judge a correction by measures that no fit uses.
 
     The error of a model is the sum over the measures of ``Σ w |measured - simulated| / Σ w
@@ -102,11 +102,13 @@ def gate_of(
         if all(side is not None and side.shape[-2] for side in sides):
             real, old, new = (side for side in sides if side is not None)
             if real[..., 1].sum() >= thresholds.least_journeys:
-                return _gate(measure, real, old, new, thresholds)
+                return _check(measure, real, old, new, thresholds)
     return None
 
 
-def _gate(measure: str, real: Array, old: Array, new: Array, thresholds: Thresholds) -> TrafficGate:
+def _check(
+    measure: str, real: Array, old: Array, new: Array, thresholds: Thresholds
+) -> TrafficCheck:
     """Judge by sums of days ``(days, measures, places, 2)`` of the data and of both models.
 
     Both models have the same days.
@@ -123,7 +125,7 @@ def _gate(measure: str, real: Array, old: Array, new: Array, thresholds: Thresho
 
     generator = np.random.default_rng(_SEED)
     gains: list[float] = []
-    for _ in range(thresholds.gate_draws):
+    for _ in range(thresholds.check_draws):
         days = generator.choice(len(new), len(real))
         drawn = street + np.nan_to_num(_ratio(new[days].sum(axis=0)) - repaired)
         again = generator.choice(len(new), len(new))  # the same days of both models
@@ -131,8 +133,8 @@ def _gate(measure: str, real: Array, old: Array, new: Array, thresholds: Thresho
         first, last = (error(model, drawn) for model in models)
         gains.append(first - last)
     first, last, noise = error(simulated, street), error(repaired, street), float(np.std(gains))
-    better = first - last > thresholds.gate_deviations * noise
-    return TrafficGate(measure, first, last, noise, better)
+    better = first - last > thresholds.check_deviations * noise
+    return TrafficCheck(measure, first, last, noise, better)
 
 
 def _ratio(sums: Array) -> Array:

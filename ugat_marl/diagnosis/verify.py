@@ -24,7 +24,7 @@ from ugat_marl.diagnosis.records import (
     StatisticRow,
     Tables,
     Tested,
-    TrafficGate,
+    TrafficCheck,
     TravelTimes,
     Verified,
 )
@@ -32,7 +32,7 @@ from ugat_marl.diagnosis.residual import Null
 from ugat_marl.diagnosis.statistics import Array, sum_of
 from ugat_marl.diagnosis.study import Study
 from ugat_marl.diagnosis.thresholds import Thresholds
-from ugat_marl.diagnosis.traffic import approach_table, gate_of
+from ugat_marl.diagnosis.traffic import approach_table, traffic_check
 from ugat_marl.effects import Effect
 from ugat_marl.scenarios import geh_of
 
@@ -78,12 +78,12 @@ def tables_of(study: Study, base: Tested, best: Tested) -> Tables:
     )
 
 
-def judged(study: Study, base: Tested, best: Tested) -> TrafficGate | None:
+def judged(study: Study, base: Tested, best: Tested) -> TrafficCheck | None:
     """Judge the correction by held-out measures that no fit uses; None if it changes no traffic."""
     if all(effect.on_detectors for effect in best.model.effects):
         return None
     days = _same_days(base, best)
-    return gate_of(study.heldout, days, best.model.tallies, study.config.thresholds)
+    return traffic_check(study.heldout, days, best.model.tallies, study.config.thresholds)
 
 
 def _same_days(base: Tested, best: Tested) -> list[Tally]:

@@ -38,12 +38,12 @@ from ugat_marl.diagnosis.records import (
     Splits,
     Tables,
     Tested,
-    TrafficGate,
+    TrafficCheck,
     Verdict,
     Verified,
 )
 from ugat_marl.diagnosis.study import IN_THE_LOG, DiagnosisConfig, Study, timing_effects
-from ugat_marl.diagnosis.traffic import gate_of
+from ugat_marl.diagnosis.traffic import traffic_check
 from ugat_marl.diagnosis.verdict import (
     capitalised,
     conclude,
@@ -167,9 +167,9 @@ def _compared(
         return unnamed
     if conclusion.verdict == "unknown" or not conclusion.best.model.members:
         return diagnosis, ()
-    gate = judged(study, located.base, conclusion.best)
-    reason = None if study.config.correct_anyway else _reason_against(conclusion, gate)
-    diagnosis = replace(diagnosis, gate=gate, not_corrected=reason)
+    check = judged(study, located.base, conclusion.best)
+    reason = None if study.config.correct_anyway else _reason_against(conclusion, check)
+    diagnosis = replace(diagnosis, traffic_check=check, not_corrected=reason)
     return diagnosis, () if reason else conclusion.best.model.effects
 
 
@@ -203,14 +203,17 @@ def _unnamed(
         return None
     before = [base.model.days[number] for number in days]
     after = [day.tally for day in days.values()]
-    gate = gate_of(study.heldout, before, after, study.config.thresholds)
-    if gate is None or not gate.better:
+    check = traffic_check(study.heldout, before, after, study.config.thresholds)
+    if check is None or not check.better:
         return None
     source = "imitates patterns in what is left, whatever their cause"
     records = tuple(_without_search(effect, source) for effect in effects)
     told = "The corrected scenario has an unnamed correction, which says nothing of the cause."
     sentence = f"{diagnosis.sentence} {told}"
-    return replace(diagnosis, sentence=sentence, gate=gate, unnamed=records), (*named, *effects)
+    return replace(diagnosis, sentence=sentence, traffic_check=check, unnamed=records), (
+        *named,
+        *effects,
+    )
 
 
 def _with_patterns(
@@ -229,17 +232,17 @@ def _with_patterns(
     return replace(diagnosis, patterns=patterns, sentence=f"{diagnosis.sentence} {told}")
 
 
-def _reason_against(conclusion: Conclusion, gate: TrafficGate | None) -> str | None:
+def _reason_against(conclusion: Conclusion, check: TrafficCheck | None) -> str | None:
     """Return why the effects of a conclusion are not put into the scenario; None if they are."""
     if conclusion.verdict == "partially_explained":
         return "The effects named explain only a part, so the scenario is not corrected by them."
-    if gate is None or gate.better:
+    if check is None or check.better:
         return None
     return (
-        f"The effects named do not bring {gate.measure} nearer to the held-out periods: the sum of "
-        f"relative errors is {100 * gate.error_before:.1f} % before and "
-        f"{100 * gate.error_after:.1f} % after (standard error of the difference: "
-        f"{100 * gate.noise:.1f} %). So the scenario is not corrected by them."
+        f"The effects named do not bring {check.measure} nearer to the held-out periods: the sum "
+        f"of relative errors is {100 * check.error_before:.1f} % before and "
+        f"{100 * check.error_after:.1f} % after (standard error of the difference: "
+        f"{100 * check.noise:.1f} %). So the scenario is not corrected by them."
     )
 
 
@@ -364,7 +367,7 @@ def _begun(
         courtesy=None,
         travel_time=None,
         approaches=(),
-        gate=None,
+        traffic_check=None,
         patterns=(),
         unnamed=(),
         next_measurement=None,

@@ -89,7 +89,7 @@ def diagnosis_page(diagnosis: Diagnosis, network: Network, commands: Sequence[st
         heldout=None if heldout is None else _heldout(heldout),
         expected=number(None if heldout is None else heldout.expected),
         traffic=_traffic(diagnosis),
-        gate=words.gate_line(diagnosis),
+        traffic_check=words.traffic_check_line(diagnosis),
         maps=_maps(page, diagnosis, network),
         map_key=[(f"d{place}", text) for place, (_, text) in enumerate(DISAGREEMENT)],
         statistics=_statistics(page, diagnosis),

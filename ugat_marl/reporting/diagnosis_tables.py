@@ -36,7 +36,7 @@ def diagnosis_summary(diagnosis: Diagnosis) -> RenderableType:
         blocks.append(_heldout(diagnosis.heldout, fitted=diagnosis.verified_on_fitted_periods))
     if diagnosis.approaches:
         blocks.append(_traffic(diagnosis))
-    if (text := words.gate_line(diagnosis)) is not None:
+    if (text := words.traffic_check_line(diagnosis)) is not None:
         blocks.append(Text(text))
     return Group(*blocks)
 

@@ -164,15 +164,15 @@ def slowest(diagnosis: Diagnosis) -> list[ApproachRow]:
     return sorted(diagnosis.approaches, key=apart)[-1:]
 
 
-def gate_line(diagnosis: Diagnosis) -> str | None:
-    """Return a sentence on the gate of the corrected scenario; None without one."""
-    gate = diagnosis.gate
-    if gate is None:
+def traffic_check_line(diagnosis: Diagnosis) -> str | None:
+    """Return a sentence on the check of held-out traffic; None without one."""
+    check = diagnosis.traffic_check
+    if check is None:
         return None
-    nearer = "come nearer" if gate.better else "do not come nearer"
-    before, after = share(gate.error_before), share(gate.error_after)
+    nearer = "come nearer" if check.better else "do not come nearer"
+    before, after = share(check.error_before), share(check.error_after)
     return (
-        f"By the effects named, simulated {gate.measure} {nearer} to the data, which no fit used: "
+        f"By the effects named, simulated {check.measure} {nearer} to the data, which no fit used: "
         f"sum of relative errors {before} before, {after} after."
     )
 
