@@ -1,4 +1,4 @@
-"""Where the agents of a training are: its network, and the traffic light of each agent."""
+"""Places of the agents of a training: its network, and the traffic light of each agent."""
 
 from __future__ import annotations
 

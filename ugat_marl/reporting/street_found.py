@@ -1,4 +1,4 @@
-"""What a training found in the log of the street: commands, detectors, effects, unused green."""
+"""Findings of a training in the log of the street: commands, detectors, effects, unused green."""
 
 from __future__ import annotations
 
