@@ -337,13 +337,8 @@ def _splits(path: Path, frame: pl.DataFrame) -> tuple[Split, ...]:
     return splits
 
 
-def detectors_of(path: Path, frame: pl.DataFrame, network: Network) -> tuple[Detector, ...]:
-    """Return the detectors.
-
-    Raises:
-        MeasuredDataError: There is no detector. Or a detector occurs twice, is on an unknown lane,
-            reaches beyond its lane, or has an unknown kind, point of speed measurement or clock.
-    """
+def _refuse_impossible_detectors(path: Path, frame: pl.DataFrame) -> None:
+    """Refuse tables of detectors that are wrong on any network."""
     if frame.is_empty():
         raise MeasuredDataError(f"{path}: no detectors; write one row per detection zone")
     refuse(
@@ -377,6 +372,16 @@ def detectors_of(path: Path, frame: pl.DataFrame, network: Network) -> tuple[Det
             "is unknown",
             f"write one of {', '.join(allowed)}, or leave it empty where it is not known",
         )
+
+
+def detectors_of(path: Path, frame: pl.DataFrame, network: Network) -> tuple[Detector, ...]:
+    """Return the detectors.
+
+    Raises:
+        MeasuredDataError: There is no detector. Or a detector occurs twice, is on an unknown lane,
+            reaches beyond its lane, or has an unknown kind, point of speed measurement or clock.
+    """
+    _refuse_impossible_detectors(path, frame)
     detectors: list[Detector] = []
     for row in frame.iter_rows(named=True):
         lane = network.lanes.get(row["lane_id"])
