@@ -103,7 +103,7 @@ def read_rows(
     total = 0.0
     for values in _whole(reader, path):
         where = f"{path}, line {reader.line_num}"
-        counted: str | None = values["count"]
+        counted = values.get("count")
         if counted is not None and not counted.strip():
             continue
         roads = tuple(
