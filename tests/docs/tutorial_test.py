@@ -12,15 +12,34 @@ import tyro
 
 from ugat_marl.__main__ import COMMANDS
 
-PAGE = Path(__file__).parents[2] / "docs" / "tutorials" / "first-city.md"
-BLOCKS = re.findall(r"```sh\n(.*?)```", PAGE.read_text(encoding="utf-8"), flags=re.DOTALL)
-LINES = "".join(BLOCKS).replace("\\\n", " ").splitlines()
+ROOT = Path(__file__).parents[2]
+PAGES = sorted((ROOT / "docs" / "tutorials").glob("*.md"))
 
 
-def test_the_tutorial_has_commands() -> None:
-    assert len(BLOCKS) >= 4
-    assert len(LINES) >= 8
-    assert all(line.startswith("ugat-marl ") for line in LINES)
+def blocks(page: Path) -> list[str]:
+    return re.findall(r"```sh\n(.*?)```", page.read_text(encoding="utf-8"), flags=re.DOTALL)
+
+
+def lines(page: Path) -> list[str]:
+    return "".join(blocks(page)).replace("\\\n", " ").splitlines()
+
+
+LINES = [line for page in PAGES for line in lines(page)]
+
+
+@pytest.mark.parametrize("page", PAGES, ids=lambda page: page.name)
+def test_the_tutorial_has_commands(page: Path) -> None:
+    assert len(blocks(page)) >= 4
+    assert len(lines(page)) >= 8
+    assert all(line.startswith("ugat-marl ") for line in lines(page))
+
+
+def test_the_files_of_a_tutorial_are_there() -> None:
+    named = {
+        word for line in LINES for word in line.split() if word.startswith(("docs/", "tests/"))
+    }
+    assert len(named) >= 4
+    assert all((ROOT / name).exists() for name in named)
 
 
 @pytest.mark.parametrize("line", LINES)
