@@ -18,6 +18,7 @@ from ugat_marl.data.row_hashes import (
     csv_damage,
     csv_texts,
     damage,
+    read_quietly,
     write_csv,
     write_hashed,
 )
@@ -187,3 +188,21 @@ def test_tables_by_hand_have_no_hashes(tmp_path: Path) -> None:
     assert csv_fault(tmp_path / "a.csv") == ""
     (tmp_path / CSV_HASHES).unlink()
     assert csv_fault(by_hand) == ""
+
+
+def test_a_damaged_file_prints_nothing(tmp_path: Path, capfd: pytest.CaptureFixture[str]) -> None:
+    """Threads of polars would print their stack traces."""
+    path = tmp_path / "a.parquet"
+    every_kind(40).write_parquet(path)
+    content = path.read_bytes()
+    failed = 0
+    for place in np.random.default_rng(4).integers(0, 8 * len(content), 200).tolist():
+        flipped = bytearray(content)
+        flipped[place // 8] ^= 1 << place % 8
+        path.write_bytes(flipped)
+        try:
+            read_quietly(path)
+        except (pl.exceptions.PolarsError, pl.exceptions.PanicException, OSError):
+            failed += 1
+    assert failed > 10
+    assert capfd.readouterr().err == ""

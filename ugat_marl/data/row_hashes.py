@@ -11,9 +11,13 @@ none.
 
 from __future__ import annotations
 
+import contextlib
 import hashlib
 import io
 import json
+import os
+import sys
+import tempfile
 from collections.abc import Iterable, Iterator, Mapping
 from pathlib import Path
 from typing import Any
@@ -160,6 +164,41 @@ def _rows_of_csv_group(rows: int) -> int:
 def _hash(content: Any) -> str:
     text = json.dumps(content, sort_keys=True)
     return hashlib.blake2b(text.encode(), digest_size=16).hexdigest()
+
+
+def read_quietly(source: Path | io.BytesIO) -> tuple[pl.DataFrame, dict[str, str]]:
+    """Return the table and the metadata of a Parquet file; a damaged one prints nothing.
+
+    Threads of polars print their own stack traces before they raise the error in Python.
+
+    Raises:
+        polars.exceptions.PolarsError: The file is damaged; also `PanicException` and ``OSError``.
+    """
+    with _without_standard_error():
+        frame = pl.read_parquet(source)
+        if isinstance(source, io.BytesIO):
+            source.seek(0)
+        return frame, pl.read_parquet_metadata(source)
+
+
+@contextlib.contextmanager
+def _without_standard_error() -> Iterator[None]:
+    """Drop the standard error of a block if the block fails."""
+    sys.stderr.flush()
+    try:
+        kept = os.dup(2)
+    except OSError:  # no standard error at all
+        yield
+        return
+    with tempfile.TemporaryFile() as said:
+        try:
+            os.dup2(said.fileno(), 2)
+            yield
+        finally:
+            os.dup2(kept, 2)
+            os.close(kept)
+        said.seek(0)
+        os.write(2, said.read())
 
 
 def damage(frame: pl.DataFrame, metadata: Mapping[str, str], own: tuple[str, ...] = ()) -> str:

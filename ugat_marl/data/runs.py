@@ -20,7 +20,7 @@ from typing import IO, Any
 
 import polars as pl
 
-from ugat_marl.data.row_hashes import damage, write_hashed
+from ugat_marl.data.row_hashes import damage, read_quietly, write_hashed
 from ugat_marl.errors import CheckpointError, OptionError
 from ugat_marl.files import read_json, replacing, require_writable, write_whole
 from ugat_marl.progress import Reporter
@@ -77,7 +77,7 @@ class Metrics:
             CheckpointError: The file is missing, cut short or of another form.
         """
         try:
-            frame, metadata = pl.read_parquet(path), pl.read_parquet_metadata(path)
+            frame, metadata = read_quietly(path)
         except (OSError, pl.exceptions.PolarsError, pl.exceptions.PanicException) as error:
             reason = str(error).splitlines()[0]
             raise CheckpointError(

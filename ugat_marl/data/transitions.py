@@ -20,7 +20,7 @@ import polars as pl
 from numpy.typing import NDArray
 
 from ugat_marl.data.layouts import AgentLayout
-from ugat_marl.data.row_hashes import damage, is_hashed, write_hashed
+from ugat_marl.data.row_hashes import damage, is_hashed, read_quietly, write_hashed
 from ugat_marl.errors import LogError
 from ugat_marl.files import parse_json, replacing
 
@@ -445,7 +445,7 @@ def read_parquet(path: Path) -> tuple[pl.DataFrame, dict[str, str]]:
     """
     _refuse_half_file(path)
     try:
-        return pl.read_parquet(path), pl.read_parquet_metadata(path)
+        return read_quietly(path)
     except (pl.exceptions.PolarsError, pl.exceptions.PanicException, OSError) as error:
         raise LogError(
             f"{path}: damaged Parquet file ({_first_line(error)}); record or copy it again"

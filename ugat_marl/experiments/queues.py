@@ -14,7 +14,7 @@ import numpy as np
 import polars as pl
 from numpy.typing import NDArray
 
-from ugat_marl.data import damage, write_hashed
+from ugat_marl.data import damage, read_quietly, write_hashed
 from ugat_marl.envs import AnyParallelEnv
 from ugat_marl.errors import CheckpointError
 from ugat_marl.files import replacing
@@ -137,7 +137,7 @@ def read_queues(path: Path) -> pl.DataFrame:
         CheckpointError: The file is missing, cut short or of another form.
     """
     try:
-        frame, metadata = pl.read_parquet(path), pl.read_parquet_metadata(path)
+        frame, metadata = read_quietly(path)
     except (OSError, pl.exceptions.PolarsError, pl.exceptions.PanicException) as error:
         reason = str(error).splitlines()[0]
         raise CheckpointError(f"{path}: cannot be read ({reason})") from None

@@ -2,11 +2,7 @@
 
 from __future__ import annotations
 
-import contextlib
 import io
-import os
-import sys
-import tempfile
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -18,7 +14,7 @@ from numpy.typing import NDArray
 
 from ugat_marl.data.measured.local_time import LocalClock
 from ugat_marl.data.measured.values import Finding
-from ugat_marl.data.row_hashes import csv_damage, csv_texts, damage
+from ugat_marl.data.row_hashes import csv_damage, csv_texts, damage, read_quietly
 from ugat_marl.errors import MeasuredDataError, nearest
 from ugat_marl.scenarios import Period
 
@@ -286,9 +282,7 @@ def _read_parquet(path: Path) -> pl.DataFrame:
             "copy it again"
         )
     try:
-        with _quietly():
-            frame = pl.read_parquet(io.BytesIO(content))
-            metadata = pl.read_parquet_metadata(io.BytesIO(content))
+        frame, metadata = read_quietly(io.BytesIO(content))
     except (pl.exceptions.PolarsError, pl.exceptions.PanicException, OSError, ValueError) as error:
         raise MeasuredDataError(
             f"{path}: damaged Parquet file ({_first_line(error)}); copy or export it again"
@@ -296,29 +290,6 @@ def _read_parquet(path: Path) -> pl.DataFrame:
     if wrong := damage(frame, metadata):  # tables of others carry no hashes
         raise MeasuredDataError(f"{path}: damaged, {wrong}; copy or export it again")
     return frame
-
-
-@contextlib.contextmanager
-def _quietly() -> Iterator[None]:
-    """Drop the standard error of a block if the block fails.
-
-    Threads of polars print their own stack traces there before they raise the error in Python.
-    """
-    sys.stderr.flush()
-    try:
-        kept = os.dup(2)
-    except OSError:  # no standard error at all
-        yield
-        return
-    with tempfile.TemporaryFile() as said:
-        try:
-            os.dup2(said.fileno(), 2)
-            yield
-        finally:
-            os.dup2(kept, 2)
-            os.close(kept)
-        said.seek(0)
-        os.write(2, said.read())
 
 
 def _read_csv(path: Path, findings: list[Finding]) -> pl.DataFrame:
