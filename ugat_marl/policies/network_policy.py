@@ -125,7 +125,8 @@ class NetworkPolicy:
             arguments = (agents, hidden, content["parameters"], env_options, shared, structure)
             return cls(*arguments, content.get("ceiling"))
         except (KeyError, TypeError, ValueError, RuntimeError) as error:
-            raise CheckpointError(f"{path}: not a whole policy ({error}); save it again") from None
+            reason = (str(error).splitlines() or [type(error).__name__])[0]  # torch adds its stack
+            raise CheckpointError(f"{path}: not a whole policy ({reason}); save it again") from None
 
     def __reduce__(self) -> tuple[type[NetworkPolicy], tuple[Any, ...]]:
         # numpy, since torch would send tensors between processes through shared memory

@@ -16,7 +16,9 @@ from ugat_marl.files import read_toml
 from ugat_marl.scenarios import DetectorKind, Real, Split
 
 _STRICT = pydantic.ConfigDict(extra="forbid", frozen=True, allow_inf_nan=False)
-Index = Annotated[int, pydantic.Strict(), Field(ge=0)]
+_LARGEST = 2**31 - 1
+"""Largest number of a channel, phase or link; logs have columns of no more bits."""
+Index = Annotated[int, pydantic.Strict(), Field(ge=0, le=_LARGEST)]
 Text = Annotated[str, Field(min_length=1)]
 
 
@@ -32,7 +34,7 @@ def _digits(value: Any) -> Any:
     return value
 
 
-Number = Annotated[int, pydantic.BeforeValidator(_digits)]
+Number = Annotated[int, pydantic.BeforeValidator(_digits), Field(le=_LARGEST)]
 """Number of a phase, overlap or link that is the key of a table."""
 Name = Annotated[Text, pydantic.BeforeValidator(_name)]
 
