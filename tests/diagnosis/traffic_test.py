@@ -65,6 +65,13 @@ def test_a_correction_that_makes_waiting_worse_is_refused() -> None:
     assert check.error_after > check.error_before
 
 
+def test_a_correction_that_leaves_traffic_far_off_is_refused() -> None:
+    # |80 - 25| / 25 + |16 - 5| / 5: better than 400 s and 80 vehicles, and still no picture of it.
+    check = traffic_check(days(1, 2, 25, 5), days(2, 16, 400, 80), days(3, 16, 80, 16), THRESHOLDS)
+    assert check is not None and not check.better
+    assert 1.0 < check.error_after < check.error_before
+
+
 def test_a_correction_without_use_passes_as_often_as_is_said() -> None:
     checks = [
         traffic_check(

@@ -536,7 +536,7 @@ class TrafficCheck:
         error_before: Sum of the relative errors of the scenario as it is.
         error_after: Sum of the relative errors of the corrected model.
         noise: Standard error of their difference.
-        better: True if the correction lowers the error by more than this noise.
+        better: True if the correction lowers the error by more than this noise, to at most 1.
     """
 
     measure: str

@@ -682,6 +682,10 @@ class Thresholds(DayThresholds):
     check_deviations: float = 1.645
     """Standard errors by which that gain must be above 0: the normal quantile of 0.95, so one in
     twenty corrections without use passes. Halved: one in five."""
+    most_traffic_error: float = 1.0
+    """Largest sum of relative errors of travel times and queues that a correction may leave. By
+    hand: beyond it detections of model and street are not of the same vehicles. Halved: corrections
+    that take off most of a large error are refused."""
     least_journeys: float = 20.0
     """Vehicles below which the data hold no travel times of an approach, or none at all. By hand.
     Halved: means of ten vehicles are told."""

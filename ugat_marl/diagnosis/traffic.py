@@ -133,7 +133,9 @@ def _check(
         first, last = (error(model, drawn) for model in models)
         gains.append(first - last)
     first, last, noise = error(simulated, street), error(repaired, street), float(np.std(gains))
-    better = first - last > thresholds.check_deviations * noise
+    # Where even the corrected model is far off, matched vehicles are not the same ones.
+    near = last <= thresholds.most_traffic_error
+    better = near and first - last > thresholds.check_deviations * noise
     return TrafficCheck(measure, first, last, noise, better)
 
 

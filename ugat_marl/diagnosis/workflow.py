@@ -239,8 +239,8 @@ def _reason_against(conclusion: Conclusion, check: TrafficCheck | None) -> str |
     if check is None or check.better:
         return None
     return (
-        f"The effects named do not bring {check.measure} nearer to the held-out periods: the sum "
-        f"of relative errors is {100 * check.error_before:.1f} % before and "
+        f"The effects named do not bring {check.measure} nearer to the held-out periods, or leave "
+        f"them far off: the sum of relative errors is {100 * check.error_before:.1f} % before and "
         f"{100 * check.error_after:.1f} % after (standard error of the difference: "
         f"{100 * check.noise:.1f} %). So the scenario is not corrected by them."
     )
