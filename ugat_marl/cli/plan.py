@@ -47,7 +47,7 @@ class Plan:
 
     Examples:
         ugat-marl plan single-v1 --out plans.csv
-        ugat-marl plan single-v1 --apply plans.csv --out single-planned
+        ugat-marl plan single-v1 --apply plans.csv --out my-planned
         ugat-marl plan my-city --apply synchro.csv --lights 1=A1 2=B1 --out my-city-planned
         ugat-marl plan single-v1 --policy largest-queue:20 --domain V4 --out typical.csv
 
