@@ -19,15 +19,14 @@ from ugat_marl.diagnosis.patterns import (
 from ugat_marl.diagnosis.records import Pattern
 from ugat_marl.diagnosis.thresholds import Thresholds
 from ugat_marl.diagnosis.verdict import describe_pattern
-from ugat_marl.scenarios import Detector, Passages, Period
+from ugat_marl.scenarios import Detector, DetectorKind, Passages, Period
 
 THRESHOLDS = Thresholds()
 HOUR_S = 3600.0
 MOVES = {"north_0": "s", "north_1": "s", "north_2": "l", "south_0": "s"}
+KINDS: tuple[tuple[DetectorKind, float], ...] = (("advance", 50.0), ("stop", 100.0))
 DETECTORS = tuple(
-    Detector(f"{kind}:{lane}", lane, place, 0.0, kind)
-    for lane in MOVES
-    for kind, place in (("advance", 50.0), ("stop", 100.0))
+    Detector(f"{kind}:{lane}", lane, place, 0.0, kind) for lane in MOVES for kind, place in KINDS
 )
 LAYOUT = DetectorLayout(
     ("A",),

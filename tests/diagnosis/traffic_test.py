@@ -40,7 +40,8 @@ def days(
         bins[BIN_FEATURES.index("count_stop")] = generator.poisson(served, (2, 4))
         times = 50 * generator.normal(travel_s, 0.5, 2)
         held = 20 * generator.normal(queue, 0.2, 2)
-        journeys = np.stack([[times, [50, 50]], [held, [20, 20]]]).transpose(0, 2, 1)
+        vehicles, greens = np.full(2, 50.0), np.full(2, 20.0)
+        journeys = np.array([[times, vehicles], [held, greens]]).transpose(0, 2, 1)
         made.append(Tally(sums, bins, journeys=journeys))
     return made
 
@@ -85,11 +86,15 @@ def test_a_correction_without_use_passes_as_often_as_is_said() -> None:
 
 def test_without_travel_times_counts_decide() -> None:
     street, sim, repaired = days(1, 2, 20, 4, served=30), days(2, 16, 20, 4), days(2, 16, 20, 4)
-    check = traffic_check(*map(without_journeys, (street, sim, repaired)), THRESHOLDS)
+    check = traffic_check(
+        without_journeys(street), without_journeys(sim), without_journeys(repaired), THRESHOLDS
+    )
     assert check is not None and check.measure == "service counts"
     assert not check.better
     right = days(3, 16, 20, 4, served=30)
-    check = traffic_check(*map(without_journeys, (street, sim, right)), THRESHOLDS)
+    check = traffic_check(
+        without_journeys(street), without_journeys(sim), without_journeys(right), THRESHOLDS
+    )
     assert check is not None and check.better
 
 

@@ -523,7 +523,12 @@ def unnamed_effects(
             for lane in _lanes_of(one, layout):
                 before = service.get(lane, (0.0, 0.0))
                 service[lane] = before[0] + begin, before[1] + each
-        elif one.quantity == "count" and one.place in origins and one.detectors != "stop":
+        elif (
+            one.quantity == "count"
+            and one.place
+            and one.place in origins
+            and one.detectors != "stop"
+        ):
             factor = max(1.0 + one.change, 0.0)
             demand.append(
                 DemandLevel(one.place, factor)
