@@ -602,7 +602,7 @@ class Measurement:
         None if they agree, if not all detectors state the same end of a passage, or if nothing is
         stated. The mean of both ends says nothing about either.
         """
-        points = {detector.speed_at for detector in self._detectors}
+        points: set[SpeedPoint | None] = {detector.speed_at for detector in self._detectors}
         stated = points.pop() if len(points) == 1 else None
         if stated is None or stated == "mean" or self._grain_s > self._thresholds.coarsest_clock_s:
             return None
