@@ -111,12 +111,6 @@ def additional(text: str) -> Edit:
 
 
 LAUGHS = '<!DOCTYPE x [<!ENTITY a "ha"><!ENTITY b "&a;&a;&a;">]>'
-GREENS_THAT_CONFLICT = """<additional>
-    <tlLogic id="C" type="static" programID="p" offset="0">
-        <phase duration="9" state="GG"/><phase duration="9" state="rG"/>
-    </tlLogic>
-</additional>"""
-
 CASES = [
     # files
     Case("no network file", gone(NETWORK), ("scenario.toml: network names", "does not exist")),
@@ -172,24 +166,6 @@ CASES = [
             re.sub("<tlLogic.*</tlLogic>", "", (directory / NETWORK).read_text(), flags=re.S)
         ),
         ("only traffic lights with fewer than two green phases",),
-    ),
-    Case(
-        "greens that conflict",
-        replaced(NETWORK, 'state="Gr"', 'state="GG"'),
-        ("traffic light 'C'", r"\('GG'\)", "links 0 and 1", "write g for the one that must yield"),
-    ),
-    Case(
-        "greens that conflict, in an additional file",
-        additional(GREENS_THAT_CONFLICT),
-        ("traffic light 'C'", r"\('GG'\)", "write g for"),
-    ),
-    Case(
-        "greens that conflict, where the phases are listed",
-        both(
-            replaced(NETWORK, 'state="Gr"', 'state="GG"'),
-            appended('[intersections.C]\nphases = ["Gr", "rG"]\n'),
-        ),
-        ("traffic light 'C': state 0 of its programme", "write g for"),
     ),
     Case(
         "listed phases that conflict",

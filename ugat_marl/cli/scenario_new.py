@@ -49,9 +49,7 @@ def _none(metavar: str) -> Any:
 class ScenarioNew:
     """Make a scenario directory: roads with demand, ready for all other commands.
 
-    Name one source of roads and one of vehicles. --draw stands for both. Without vehicles the
-    folder gets the roads, drawings of the lights, and counts.csv: a row for every turn at a light,
-    with its streets, to fill in and give back with --counts.
+    Name a source of roads and one of vehicles; --draw stands for both.
 
     Examples:
         ugat-marl scenario new my-grid --grid 4x4 --vph 400
@@ -60,7 +58,7 @@ class ScenarioNew:
         ugat-marl scenario new my-city --sumo city.sumocfg
         ugat-marl scenario new my-city --osm city.osm.pbf --vph 300
         ugat-marl scenario new my-city --osm city.osm.pbf
-        ugat-marl scenario new my-city --osm city.osm.pbf --counts my-city/counts.csv
+        ugat-marl scenario new my-town --osm town.osm --counts my-town/counts.csv
         ugat-marl scenario new my-city --cityflow roadnet.json flow.json
 
     Attributes:
@@ -79,7 +77,8 @@ class ScenarioNew:
         vph: Vehicles an hour at every road into the network.
         turns: Shares of left turns, straight on and right turns, for --vph.
         counts: CSV file of counts: edge,count or from,to,count; also begin_s,end_s. Rows with a
-            blank count are left out.
+            blank count are left out. Without any vehicles, counts.csv is written as a sheet to fill
+            in, with a row for every turn at a light and its streets.
         od: CSV file of origins and destinations: from,to,count; also begin_s,end_s.
         seed: Seed of the vehicles of --vph, --counts and --od.
         spacing_m: Distance between intersections of a grid or arterial, m.
