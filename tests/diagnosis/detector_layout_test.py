@@ -164,11 +164,16 @@ def test_features_of_anything_are_finite(log: SignalLog, seen: dict[str, Passage
         IncomingLane("in_0", "in", 0, (0,), 14.0, {"advance": ("a",), "stop": ("s", "b")}),
         IncomingLane("in_1", "in", 0, (1,), 14.0, {}),
     )
-    layout = DetectorLayout(("C",), lanes, ((0, "out_0", ("x",)),), (), {})
+    detectors = (
+        Detector("a", "in_0", 100.0, 2.0, "advance"),
+        Detector("s", "in_0", 190.0, 8.0, "stop"),
+    )
+    layout = DetectorLayout(("C",), lanes, ((0, "out_0", ("x",)),), detectors, {})
     period = Period("day1", 0.0, 600.0, "fit", {"C": log}, seen)
     found = tally(layout, period, layout.greens(period), THRESHOLDS)
     assert np.isfinite(found.sums).all()
     assert np.isfinite(found.bins).all()
+    assert np.isfinite(found.journeys).all()
     assert (found.sums[..., 1] >= 0).all()
     assert (found.bins >= -1e-9).all()
     assert (found.sums[:, 1] == 0).all(), "a lane without detectors tells nothing"
