@@ -118,8 +118,8 @@ def test_unknown_names_get_the_nearest(domain: str, message: str) -> None:
         ("acceleration=", "effect 'acceleration': '' is not a number"),
         ("acceleration=-1", r"'acceleration': mps2 = -1.0 is outside \[0.1, 10\] m/s\^2"),
         ("startup_delay=60", r"'startup_delay': seconds = 60.0 is outside \[0, 10\] s"),
-        ("startup_delay=nan", "seconds = nan is outside"),
-        ("startup_delay=inf", "seconds = inf is outside"),
+        ("startup_delay=nan", "effect 'startup_delay': 'nan' is not a number"),
+        ("startup_delay=inf", "effect 'startup_delay': 'inf' is not a number"),
     ],
 )
 def test_impossible_values_are_named(domain: str, message: str) -> None:

@@ -145,8 +145,6 @@ def problems(
                 f"traffic light {light.id!r}: people on foot have green while vehicles that cross "
                 f"their way need not wait ({'; '.join(light.clashes)}); write g for these vehicles"
             )
-        if not light.unserved_links and (text := _other_phases(light)):
-            faults.append(text)
     if facts.duration_s < facts.shortest_episode_s:
         faults.append(
             f"an episode of {facts.duration_s:g} s is shorter than the shortest useful one "
@@ -166,16 +164,16 @@ def problems(
     return faults
 
 
-def _other_phases(light: IntersectionFacts) -> str:
+def _other_phases(light: IntersectionFacts) -> list[str]:
     """Return a message if the demand is too much for the phases and another source serves more."""
     now, (source, degree) = _degree(light, "now"), best_phases(light)
     if now <= 1.0 or degree > MUCH_LESS * now:
-        return ""
+        return []
     share = f"{now:.0%} of what its phases can serve" if now < math.inf else "not served by them"
-    return (
+    return [
         f"traffic light {light.id!r}: in the busiest quarter of an hour its demand is {share}, and "
         f'{degree:.0%} with phases = "{source}"; set it under [intersections.{light.id}]'
-    )
+    ]
 
 
 BY_PREFERENCE = ("permitted", "conflict-free", "programme")
@@ -205,6 +203,8 @@ def remarks(facts: Survey, runs: Sequence[RuleEpisode]) -> list[str]:
     """
     notes = list(facts.notes)
     for light in facts.intersections:
+        if not light.unserved_links:
+            notes += _other_phases(light)
         shown = (facts.yellow_s,), (facts.all_red_s,)
         file = (light.file_yellow_s or shown[0], light.file_all_red_s or (0.0,))
         if light.file_yellow_s and file != shown:

@@ -10,6 +10,7 @@ count.
 from __future__ import annotations
 
 import contextlib
+import math
 import tempfile
 import xml.etree.ElementTree as ET
 from collections import defaultdict
@@ -88,7 +89,11 @@ def read_approach_delays(file: Path, roads: Mapping[str, frozenset[str]]) -> App
     except (OSError, ET.ParseError, ValueError) as error:
         raise SimulatorError(f"SUMO's data on roads cannot be read ({error})") from None
     return {
-        approach: (left[approach], sum(map(lost_s.__getitem__, pieces)) / max(left[approach], 1.0))
+        # fsum: a set has another order in every process, and a plain sum another last digit
+        approach: (
+            left[approach],
+            math.fsum(map(lost_s.__getitem__, pieces)) / max(left[approach], 1.0),
+        )
         for approach, pieces in roads.items()
     }
 
