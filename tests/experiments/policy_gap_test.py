@@ -164,7 +164,7 @@ def test_what_is_no_diagnosis_of_this_scenario_is_refused(tmp_path: Path) -> Non
     with pytest.raises(ScenarioError, match="diagnose again"):
         read_diagnosis(folder, SCENARIO)
     (folder / "diagnosis.json").write_text('{"schema": ')
-    with pytest.raises(OptionError, match="cannot be read"):
+    with pytest.raises(OptionError, match="not valid JSON"):
         read_diagnosis(folder, SCENARIO)
 
 
