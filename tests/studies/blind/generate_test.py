@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import math
+import shutil
 from collections import Counter
 from collections.abc import Callable
 from dataclasses import replace
@@ -203,9 +204,9 @@ def test_buses_go_where_demand_is_written_as_flows(data: Path) -> None:
 
 @pytest.mark.usefixtures("python")
 def test_cases_are_diagnosed_once_and_a_failure_is_noted(
-    test_folder: tuple[Path, Blueprint],
+    test_folder: tuple[Path, Blueprint], tmp_path: Path
 ) -> None:
-    directory, _ = test_folder
+    directory = shutil.copytree(test_folder[0], tmp_path / "test")  # it is written to
     seen: list[str] = []
 
     def diagnose(case: Case, measured: Path, folder: Path) -> None:
