@@ -42,13 +42,12 @@ class TransferOutcome:
         """Return the outcome in words."""
         change, n = self.test.difference, self.test.count
         begin = f"In {self.real} vehicles need {self.att_s:.3g} s with {self.policy}"
-        less = change.mean < 0
-        ends = sorted((abs(change.low), abs(change.high))) if self.shown else (0.0, 0.0)
         if self.shown:
+            low, high = sorted((abs(change.low), abs(change.high)))
             text = (
-                f"{begin}, {abs(change.mean):.3g} s {'less' if less else 'more'} than with direct "
-                f"transfer (95 % interval {ends[0]:.2g} to {ends[1]:.2g} s, p = {self.test.p:.1g}, "
-                f"{n} episodes with the same vehicles)"
+                f"{begin}, {abs(change.mean):.3g} s {'less' if change.mean < 0 else 'more'} than "
+                f"with direct transfer (95 % interval {low:.2g} to {high:.2g} s, "
+                f"p = {self.test.p:.1g}, {n} episodes with the same vehicles)"
             )
         elif math.isfinite(change.low):
             text = (

@@ -358,13 +358,8 @@ def gap_picture(rows: Sequence[Mapping[str, Any]], path: Path) -> None:
     ):
         side = (242.0, 352.0) if place == 0 else (2 * WIDTH - 335, 16.0)
         axes = add_axes(picture, side[0], TOP + 8, side[1], 48 + below)
-        names = [f"{measure}_gap{end}" for end in ("", "_low", "_high")]
         series = {
-            target: [
-                (cell[0], cell[1], cell[2])
-                for setting in settings
-                for cell in [_numbers(by_cell.get((setting, target), {}), names)]
-            ]
+            target: [_estimated(by_cell.get((s, target), {}), f"{measure}_gap") for s in settings]
             for target in targets
         }
         _draw_estimates(axes, settings, series, unit, letters=0 if place else 34)
@@ -380,9 +375,10 @@ def _settings_and_targets(rows: Sequence[Mapping[str, Any]]) -> tuple[list[str],
     return list(settings), list(targets)
 
 
-def _numbers(row: Mapping[str, Any], names: Sequence[str]) -> tuple[float, ...]:
-    """Return numbers of a row; nan for those it lacks."""
-    return tuple(float(row.get(name, math.nan)) for name in names)
+def _estimated(row: Mapping[str, Any], name: str) -> Estimated:
+    """Return a number of a row with its interval; nan for what it lacks."""
+    mean, low, high = (float(row.get(f"{name}{end}", math.nan)) for end in ("", "_low", "_high"))
+    return mean, low, high
 
 
 def _of(interval: Any) -> Estimated:
@@ -443,8 +439,11 @@ def comparison_radar(
             below + high * (lines - 1 - place // columns) + 50, projection="polar",
         )  # fmt: skip
         cells = [by_cell.get((setting, target), {}) for setting in settings]
-        in_sim = [f"{measure}_sim" for measure in MEASURES]
-        table = [_numbers(cells[0], in_sim), *(_numbers(cell, list(MEASURES)) for cell in cells)]
+        drawn = [(cells[0], "_sim"), *((cell, "") for cell in cells)]
+        table = [
+            [float(cell.get(f"{measure}{end}", math.nan)) for measure in MEASURES]
+            for cell, end in drawn
+        ]
         _draw_radar(axes, table)
         axes.set_title(printable(target), x=-0.6, y=1.24, fontweight="bold")
     add_legend(picture, legend)

@@ -112,16 +112,17 @@ def _effects(record: RunRecord) -> Grid | None:
     return Grid(headings, rows, headings[2:5]) if rows else None
 
 
-def _of_agents(record: RunRecord, name: str) -> dict[str, float]:
-    return {agent: rows[-1][1] for agent, rows in record.agents(name).items()}
+def _of_agents(record: RunRecord, key: str) -> list[dict[str, float]]:
+    """Return median, lower and upper end of one kind of unused green, by agent."""
+    return [
+        {agent: rows[-1][1] for agent, rows in record.agents(f"unused/{key}{end}").items()}
+        for end in ("", "_low", "_high")
+    ]
 
 
 def _unused(record: RunRecord, places: Places | None) -> Grid | None:
     """Return the unused green of each intersection; None if it was not fitted."""
-    columns = {
-        key: [_of_agents(record, f"unused/{key}{end}") for end in ("", "_low", "_high")]
-        for key in _UNUSED
-    }
+    columns = {key: _of_agents(record, key) for key in _UNUSED}
     lights: Mapping[str, str] = {} if places is None else places.intersection_of
     rows = [
         [
@@ -141,8 +142,7 @@ def _unused(record: RunRecord, places: Places | None) -> Grid | None:
 
 def _map(record: RunRecord, places: Places, key: str) -> tuple[NamedFigure | None, str]:
     """Return a map of one kind of unused green; a single intersection needs none."""
-    ends = [_of_agents(record, f"unused/{key}{end}") for end in ("", "_low", "_high")]
-    middle, low, high = ends
+    middle, low, high = _of_agents(record, key)
     values = {
         light: (middle[agent], f"{middle[agent]:.1f}")
         for agent, light in places.intersection_of.items()

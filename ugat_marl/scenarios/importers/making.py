@@ -265,19 +265,15 @@ def _readme(made: Made, draft: RoadFiles, command: str) -> str:
         + (f" and {made.demand.flows} flows" if made.demand.flows else "")
         + f" in {settings.duration_s:g} s",
         "",
-        "## Origin",
-        "",
-        draft.origin,
-        "",
-        "Made with",
-        "",
-        "```sh",
-        command,
-        "```",
+        *_origin(draft.origin, command, made.notes),
     ]
-    if made.notes:
-        lines += ["", "## Notes", "", *(f"- {note}" for note in made.notes)]
     return "\n".join(lines) + "\n"
+
+
+def _origin(origin: str, command: str, notes: Sequence[str]) -> list[str]:
+    """Return the end of a README: where the roads are from, the command, what to know."""
+    lines = ["## Origin", "", origin, "", "Made with", "", "```sh", command, "```"]
+    return lines + (["", "## Notes", "", *(f"- {note}" for note in notes)] if notes else [])
 
 
 def _draft_readme(
@@ -296,16 +292,7 @@ def _draft_readme(
         "give each its `begin_s` and `end_s`. Then add the counts to the command below:",
         f"  `{command} --counts {shlex.quote(str(target / COUNT_SHEET))}`",
         "",
-        "## Origin",
-        "",
-        source.origin,
-        "",
-        "Made with",
-        "",
-        "```sh",
-        command,
-        "```",
-        *(["", "## Notes", "", *(f"- {note}" for note in notes)] if notes else []),
+        *_origin(source.origin, command, notes),
     ]
 
 
