@@ -8,6 +8,8 @@
 #   make bench      the figures of docs/, measured on this machine
 #   make scenarios  builds the shipped scenarios again from their sources
 #   make docs       builds the documentation site; broken links and names fail
+#   make notebooks  runs the notebooks of docs/ and keeps what they show
+#   make package    builds the wheel and the source archive, and installs them with every extra (ten minutes)
 #   make words      how docstrings open, how long lines and paragraphs of pages are
 #
 # PYTHON=... picks the interpreter, TESTS=... the tests, ARGS=... adds options to the command run.
@@ -29,7 +31,7 @@ unexport PYTHONPATH PYTHONHOME SUMO_HOME VIRTUAL_ENV
 export PYTHONSAFEPATH := 1
 export PYTHONNOUSERSITE := 1
 
-.PHONY: help demo test test-all check static format lint types architecture words docs bench scenarios oldest compat python environment environment-dev
+.PHONY: help demo test test-all check static format lint types architecture words docs package notebooks bench scenarios oldest compat python environment environment-dev environment-notebooks
 .DEFAULT_GOAL := help
 
 help:
@@ -80,6 +82,12 @@ words: python
 docs: python
 	@"$(PYTHON)" .ci/site.py
 
+notebooks: environment-notebooks
+	OMP_NUM_THREADS=1 $(BIN)/python .ci/notebooks.py
+
+package: environment-dev
+	OMP_NUM_THREADS=1 $(BIN)/python .ci/package.py $(ARGS)
+
 # The lower ends of the version ranges, in an environment of their own.
 oldest: environment-dev
 	"$(PYTHON)" -m venv $(VENV)-oldest
@@ -96,6 +104,9 @@ environment: python
 
 environment-dev: python
 	@$(ENVIRONMENT) dev osm resco
+
+environment-notebooks: python
+	@$(ENVIRONMENT) dev osm resco notebooks
 
 python:
 	@"$(PYTHON)" -c 'import sys; sys.exit(sys.version_info < (3, 11))' 2>/dev/null || { \

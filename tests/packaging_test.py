@@ -1,11 +1,14 @@
-"""What the installed wheel carries."""
+"""Contents of the wheel and the source archive, of the installed package and of the image."""
 
 from __future__ import annotations
 
 import importlib.metadata
+import re
 import subprocess
 import sys
 import sysconfig
+import tarfile
+import zipfile
 from pathlib import Path
 
 import pytest
@@ -16,39 +19,94 @@ PACKAGE = Path(ugat_marl.__file__).parent
 CHECKOUT = Path(__file__).resolve().parent.parent
 BASELINES = sorted(CHECKOUT.glob("baselines/*.py"))
 SCENARIOS = sorted(path.parent for path in CHECKOUT.glob("scenarios/*/scenario.toml"))
+SCENARIO_FILES = ("scenario.toml", "README.md", "*.xml")
+"""Names of a scenario's files that a wheel carries, as patterns."""
 
-pytestmark = pytest.mark.skipif(
+installed = pytest.mark.skipif(
     not PACKAGE.is_relative_to(sysconfig.get_paths()["purelib"]),
     reason="the package is imported from a source tree; `make test` installs the wheel",
 )
 
 
+def files_of(folder: Path) -> list[Path]:
+    return [p for p in folder.rglob("*") if p.is_file() and "__pycache__" not in p.parts]
+
+
+def carried() -> dict[str, Path]:
+    """Every file that the wheel has to carry: its name there, and its place in the checkout."""
+    package = {str(p.relative_to(CHECKOUT)): p for p in files_of(CHECKOUT / "ugat_marl")}
+    scenarios = {
+        f"ugat_marl/_scenarios/{folder.name}/{path.name}": path
+        for folder in SCENARIOS
+        for pattern in SCENARIO_FILES
+        for path in folder.glob(pattern)
+    }
+    baselines = {f"ugat_marl/_baselines/{path.name}": path for path in BASELINES}
+    return {**package, **scenarios, **baselines}
+
+
+@pytest.fixture(scope="module")
+def archives(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A folder with the wheel and the source archive of this checkout."""
+    pytest.importorskip("hatchling")
+    folder = tmp_path_factory.mktemp("dist")
+    command = [sys.executable, "-m", "hatchling", "build", "-d", str(folder)]
+    done = subprocess.run(command, cwd=CHECKOUT, capture_output=True, text=True, check=False)
+    assert done.returncode == 0, done.stderr
+    return folder
+
+
+def test_the_wheel_holds_what_the_package_reads_and_nothing_else(archives: Path) -> None:
+    with zipfile.ZipFile(next(archives.glob("*.whl"))) as wheel:
+        names = {name for name in wheel.namelist() if ".dist-info/" not in name}
+        assert names == {*carried()}
+        for name, path in carried().items():
+            assert wheel.read(name) == path.read_bytes(), name
+    kinds = {Path(name).suffix for name in names} | {Path(name).name for name in names}
+    assert {".pyi", "py.typed", ".j2", ".css", ".toml", ".xml"} <= kinds
+    assert sum(Path(name).name == "scenario.toml" for name in names) == len(SCENARIOS) >= 5
+
+
+def test_the_source_archive_builds_the_same_wheel_and_can_be_tested(archives: Path) -> None:
+    with tarfile.open(next(archives.glob("*.tar.gz"))) as source:
+        names = {name.partition("/")[2] for name in source.getnames()}
+    assert {str(path.relative_to(CHECKOUT)) for path in carried().values()} <= names
+    assert {"pyproject.toml", "README.md", "LICENSE", "CHANGELOG.md", "constraints.txt"} <= names
+    assert "tests/packaging_test.py" in names
+    assert not [name for name in names if name.startswith((".venv", ".git/", "runs/", ".cache"))]
+
+
+def test_the_image_is_made_of_what_is_there() -> None:
+    text = (CHECKOUT / "Containerfile").read_text(encoding="utf-8")
+    copied = re.findall(r"^COPY (?!--from)(\S+) ", text, flags=re.MULTILINE)
+    assert copied and all((CHECKOUT / name).exists() for name in copied)
+    versions = set(re.findall(r"^FROM \S+/python:3\.(\d+)-slim", text, flags=re.MULTILINE))
+    assert len(versions) == 1 and int(versions.pop()) >= 11
+    left_out = (CHECKOUT / ".dockerignore").read_text(encoding="utf-8").split()
+    assert not {"ugat_marl", "scenarios", "baselines", "pyproject.toml", "README.md"} & {*left_out}
+    (entry,) = re.findall(r'^ENTRYPOINT \["([\w-]+)"\]', text, flags=re.MULTILINE)
+    assert f"\n{entry} = " in (CHECKOUT / "pyproject.toml").read_text(encoding="utf-8")
+
+
+def test_the_changes_speak_of_this_version() -> None:
+    text = (CHECKOUT / "CHANGELOG.md").read_text(encoding="utf-8")
+    assert re.search(rf"^## {re.escape(ugat_marl.__version__)}\b", text, flags=re.MULTILINE)
+    cited = (CHECKOUT / "CITATION.cff").read_text(encoding="utf-8")
+    assert f"\nversion: {ugat_marl.__version__}\n" in cited
+
+
+@installed
 def test_the_version_is_the_wheels() -> None:
     assert importlib.metadata.version("ugat-marl") == ugat_marl.__version__
 
 
-def test_the_wheel_is_typed() -> None:
-    assert (PACKAGE / "py.typed").exists()
+@installed
+def test_the_installed_package_is_that_of_the_checkout() -> None:
+    for name, path in carried().items():
+        assert (PACKAGE.parent / name).read_bytes() == path.read_bytes(), name
 
 
-@pytest.mark.parametrize("source", SCENARIOS, ids=lambda path: path.name)
-def test_the_wheel_carries_what_a_scenario_needs(source: Path) -> None:
-    installed = PACKAGE / "_scenarios" / source.name
-    names = ["scenario.toml", *(path.name for path in source.glob("*.xml*"))]
-    for name in names:
-        assert (installed / name).read_bytes() == (source / name).read_bytes()
-
-
-def test_the_wheel_carries_no_build_sources() -> None:
-    carried = {path.name for path in (PACKAGE / "_scenarios").rglob("*")}
-    assert not {"source.toml", "vehicles.toml", "build.py"} & carried
-
-
-@pytest.mark.parametrize("source", BASELINES, ids=lambda path: path.name)
-def test_the_wheel_carries_the_baselines(source: Path) -> None:
-    assert (PACKAGE / "_baselines" / source.name).read_bytes() == source.read_bytes()
-
-
+@installed
 def test_other_processes_import_the_wheel_too() -> None:
     command = [sys.executable, "-c", "import ugat_marl; print(ugat_marl.__file__)"]
     printed = subprocess.run(command, cwd=CHECKOUT, capture_output=True, text=True, check=True)
