@@ -1,0 +1,76 @@
+"""The notebooks run from their first cell to their last, and their outputs are of a whole run."""
+
+from __future__ import annotations
+
+import json
+import os
+import re
+import subprocess
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+FOLDER = Path(__file__).resolve().parents[2] / "docs" / "notebooks"
+BOOKS = sorted(FOLDER.glob("*.ipynb"))
+
+BORDERS = ("shape", "┌", "│", "╞", "└")
+"""Beginnings of the lines of a table of polars, whose form is its own affair."""
+
+
+def cells(book: Path) -> list[dict[str, Any]]:
+    return json.loads(book.read_text(encoding="utf-8"))["cells"]
+
+
+def code(book: Path) -> list[dict[str, Any]]:
+    return [cell for cell in cells(book) if cell["cell_type"] == "code"]
+
+
+def test_there_are_notebooks() -> None:
+    assert {book.stem for book in BOOKS} == {"first-environment", "your-street"}
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("book", BOOKS, ids=lambda book: book.stem)
+def test_a_notebook_runs(book: Path, python: list[str], tmp_path: Path) -> None:
+    """Cells without the magic words of notebooks are one program."""
+    program = "\n".join("".join(cell["source"]) for cell in code(book))
+    assert not [line for line in program.splitlines() if line.startswith(("%", "!"))]
+    done = subprocess.run(
+        [*python, "-c", program],
+        cwd=FOLDER,
+        env={**os.environ, "MPLBACKEND": "Agg", "TMPDIR": str(tmp_path)},
+        capture_output=True,
+        text=True,
+        check=False,
+    )
+    assert done.returncode == 0, done.stderr
+    shown = "".join(
+        "".join(output["text"])
+        for cell in code(book)
+        for output in cell["outputs"]
+        if output["output_type"] == "stream" and output["name"] == "stdout"
+    )
+    said = {line for line in shown.splitlines() if not line.startswith(BORDERS)}
+    assert said and said <= set(done.stdout.splitlines())
+
+
+@pytest.mark.parametrize("book", BOOKS, ids=lambda book: book.stem)
+def test_outputs_are_of_one_whole_run(book: Path) -> None:
+    assert [cell["execution_count"] for cell in code(book)] == list(range(1, len(code(book)) + 1))
+    kinds = [output["output_type"] for cell in code(book) for output in cell["outputs"]]
+    assert kinds and "error" not in kinds
+    assert not [
+        output
+        for cell in code(book)
+        for output in cell["outputs"]
+        if output["output_type"] == "stream" and output["name"] == "stderr"
+    ]
+
+
+@pytest.mark.parametrize("book", BOOKS, ids=lambda book: book.stem)
+def test_links_of_a_notebook_lead_somewhere(book: Path) -> None:
+    texts = ["".join(cell["source"]) for cell in cells(book) if cell["cell_type"] == "markdown"]
+    targets = [target for text in texts for target in re.findall(r"\]\(([^)#]+)\)", text)]
+    assert targets
+    assert not [name for name in targets if not (book.parent / name).exists()]
