@@ -7,5 +7,6 @@ from .envs import vector_env as vector_env
 from .experiments.functions import Training as Training
 from .experiments.functions import evaluate as evaluate
 from .experiments.functions import train as train
+from .policies import load_policy as load_policy
 
 __version__: str

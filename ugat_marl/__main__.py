@@ -14,6 +14,10 @@ COMMANDS: dict[str, tuple[str, str]] = {
         "ugat_marl.cli.evaluate:Evaluate",
         "measure policies and rules in any domains",
     ),
+    "compare": (
+        "ugat_marl.cli.compare:Compare",
+        "put the row of your algorithm into a table",
+    ),
     "tune": ("ugat_marl.cli.tune:Tune", "find the best settings of each rule in a domain"),
     "rollout": ("ugat_marl.cli.rollout:Rollout", "record transitions as a Parquet log, or film"),
     "field": (
@@ -39,6 +43,15 @@ COMMANDS: dict[str, tuple[str, str]] = {
     ),
     "plan": ("ugat_marl.cli.plan:Plan", "read and write fixed-time signal plans"),
     "export": ("ugat_marl.cli.export:Export", "write a policy as TorchScript, ONNX or matrices"),
+    "policy list": ("ugat_marl.cli.policy_list:PolicyList", "list the policies that are shipped"),
+    "policy card": (
+        "ugat_marl.cli.policy_card:PolicyCardCommand",
+        "print how a shipped policy was made",
+    ),
+    "policy pack": (
+        "ugat_marl.cli.policy_pack:PolicyPack",
+        "copy trained policies with their cards",
+    ),
     "scenario list": (
         "ugat_marl.cli.scenario_list:ScenarioList",
         "list the networks and domains that have a name",
@@ -73,6 +86,7 @@ SHORT: dict[str, tuple[str, ...]] = {
 """Short names of commands, and the words that replace them."""
 
 GROUPS: dict[str, str] = {
+    "policy": "the policies that are shipped, and cards of yours: list, card, pack",
     "scenario": "make, check, draw and list scenarios: new, check, draw, list",
     "paper": "the tables of the paper: main, ablation, alpha, uncertainty, gap",
 }

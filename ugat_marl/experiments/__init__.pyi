@@ -29,6 +29,7 @@ from .learning_curves import Curves as Curves
 from .learning_curves import CurvesConfig as CurvesConfig
 from .learning_curves import learn_curves as learn_curves
 from .machine import machine_facts as machine_facts
+from .packing import pack as pack
 from .paper import PaperConfig as PaperConfig
 from .paper import compare as compare
 from .paper import matched_name as matched_name
@@ -68,6 +69,12 @@ from .settings import is_grounded as is_grounded
 from .sim_check import SimCheck as SimCheck
 from .sim_check import check_run as check_run
 from .sim_check import check_table as check_table
+from .standings import ranked as ranked
+from .standings import read_standings as read_standings
+from .standings import shipped_standings as shipped_standings
+from .standings import standings_from as standings_from
+from .standings import standings_of as standings_of
+from .standings import with_standings as with_standings
 from .statistics import Floats as Floats
 from .statistics import Interval as Interval
 from .statistics import PairedTest as PairedTest

@@ -34,6 +34,7 @@ from ugat_marl.policies import (
     StepCallback,
     is_own,
     load_own,
+    load_policy,
     make_rule,
     own_policy,
     parse_rule,
@@ -267,14 +268,15 @@ def fixed_policy(policy: Policy) -> PolicyFactory:
 
 
 def policy_factory(spec: str) -> PolicyFactory:
-    """Return a factory for a rule, the file of a trained policy, or a policy in a user's module.
+    """Return a factory for a rule, a trained policy, or a policy in a user's module.
 
     Args:
-        spec: Spelling of a rule, a file, ``module:name`` of a policy or of what makes one, or
+        spec: Spelling of a rule, a file, the id of a shipped policy such as
+            ``single-v1/fitted-street-V4-s0``, ``module:name`` of a policy or of what makes one, or
             ``module:name@file`` of a learner with the file of its state.
 
     Raises:
-        UnknownNameError: The name is neither a file nor a rule.
+        UnknownNameError: The name is neither a file nor a rule nor a shipped policy.
         OptionError: The module or the name in it is missing.
         CheckpointError: The file is not a policy. The factory raises it for a policy of another
             scenario.
@@ -287,9 +289,9 @@ def policy_factory(spec: str) -> PolicyFactory:
     path = Path(spec)
     if path.is_dir():
         raise CheckpointError(f"{path} is a folder; name the .pt file of a policy in it")
-    if path.suffix != ".pt" and not path.is_file():
+    if path.suffix != ".pt" and not path.is_file() and "/" not in spec:
         return rule_factory(spec)
-    return TrainedPolicy(NetworkPolicy.load(path), str(path))
+    return TrainedPolicy(load_policy(spec), spec)
 
 
 @dataclass(frozen=True)

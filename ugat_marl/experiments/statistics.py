@@ -68,11 +68,11 @@ class PairedTest:
         return cls(Interval.of(differences), p, better, count)
 
 
-def student_p(t: float, degrees: int) -> float:
+def student_p(t: float, degrees: float) -> float:
     """Return the two-sided p-value of Student's t.
 
     Args:
         t: The statistic.
-        degrees: Degrees of freedom, at least 1.
+        degrees: Degrees of freedom, at least 1; no whole number in Welch's test.
     """
     return float(2.0 * stdtr(degrees, -abs(t)))

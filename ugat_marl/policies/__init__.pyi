@@ -69,3 +69,8 @@ from .rules.catalogue import format_rule as format_rule
 from .rules.catalogue import make_rule as make_rule
 from .rules.catalogue import parse_rule as parse_rule
 from .rules.open_loop import FixedTime as FixedTime
+from .shipped import CardScores as CardScores
+from .shipped import PolicyCard as PolicyCard
+from .shipped import load_policy as load_policy
+from .shipped import policy_card as policy_card
+from .shipped import shipped_policies as shipped_policies

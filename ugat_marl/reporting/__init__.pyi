@@ -24,6 +24,7 @@ from .run_records import TableRecord as TableRecord
 from .run_records import read_records as read_records
 from .service_tables import approach_table as approach_table
 from .service_tables import service_tables as service_tables
+from .standings import standings_table as standings_table
 from .tables import measures_table as measures_table
 from .tables import policy_gap_table as policy_gap_table
 from .tables import transfer_table as transfer_table

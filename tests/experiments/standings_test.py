@@ -1,0 +1,116 @@
+"""Standings: tables that are read, joined and ranked, against values counted by hand."""
+
+from __future__ import annotations
+
+import math
+from pathlib import Path
+
+import numpy as np
+import polars as pl
+import pytest
+import scipy.stats
+
+from ugat_marl.__main__ import main
+from ugat_marl.errors import CheckpointError, OptionError
+from ugat_marl.experiments import ranked, read_standings, with_standings
+from ugat_marl.experiments.standings import SCHEMA
+
+HEAD = ",".join(SCHEMA)
+TABLE = f"""{HEAD}
+direct transfer,V4,0,100,60,900
+direct transfer,V4,1,120,62,890
+direct transfer,V4,2,140,64,880
+fast,V4,0,80,60,950
+fast,V4,1,81,61,951
+fast,V4,2,85,62,952
+"""
+
+
+def written(folder: Path, text: str = TABLE) -> Path:
+    file = folder / "seeds.csv"
+    file.write_text(text)
+    return file
+
+
+def row(table: pl.DataFrame, setting: str) -> dict[str, float]:
+    return ranked(table).filter(pl.col("setting") == setting).to_dicts()[0]
+
+
+def test_settings_are_ranked_with_intervals_and_regret(tmp_path: Path) -> None:
+    table = read_standings(written(tmp_path))
+    assert ranked(table)["setting"].to_list() == ["fast", "direct transfer"]
+    fast, direct = row(table, "fast"), row(table, "direct transfer")
+    assert fast["att_s"] == 82 and fast["gap_s"] == 21 and fast["regret_s"] == 0
+    assert direct["regret_s"] == 38 and direct["won_back"] == 0 and fast["won_back"] == 1
+    half = scipy.stats.t.ppf(0.975, 2) * np.std([80, 81, 85], ddof=1) / math.sqrt(3)
+    assert fast["low_s"] == pytest.approx(82 - half) and fast["high_s"] == pytest.approx(82 + half)
+    known = scipy.stats.ttest_ind([80, 81, 85], [100, 120, 140], equal_var=False)
+    assert fast["p"] == pytest.approx(known.pvalue)
+    assert direct["p"] is None
+
+
+def test_a_row_is_added_and_an_own_row_replaced(tmp_path: Path) -> None:
+    table = read_standings(written(tmp_path))
+    own = pl.DataFrame([("mine", "V4", 0, 110.0, 61.0, 900.0)], schema=SCHEMA, orient="row")
+    whole = with_standings(table, own)
+    mine = row(whole, "mine")
+    assert mine["regret_s"] == 28 and mine["low_s"] is None and mine["p"] is None
+    assert mine["won_back"] == pytest.approx(1 - 28 / 38)
+    better = own.with_columns(att_s=pl.lit(70.0))
+    again = with_standings(whole, better)
+    assert again.height == whole.height and row(again, "mine")["regret_s"] == 0
+    assert row(again, "fast")["regret_s"] == 12
+    elsewhere = own.with_columns(domain=pl.lit("V1"))
+    with pytest.raises(OptionError, match="V4"):
+        with_standings(whole, elsewhere)
+
+
+@pytest.mark.parametrize(
+    ("text", "said"),
+    [
+        (TABLE.replace("att_s_sim", "att"), "'att_s_sim'"),
+        (TABLE.replace("V4,2,140", "V4,two,140"), "row 4: training_seed = 'two'"),
+        (TABLE.replace("140", "nan"), "row 4: att_s = 'nan'"),
+        ("", "not a table"),
+    ],
+)  # fmt: skip
+def test_damaged_tables_are_refused(tmp_path: Path, text: str, said: str) -> None:
+    with pytest.raises(CheckpointError, match=said):
+        read_standings(written(tmp_path, text))
+    with pytest.raises(CheckpointError, match="No such file"):
+        read_standings(tmp_path / "missing.csv")
+
+
+def test_every_committed_table_can_be_read() -> None:
+    results = Path(__file__).resolve().parents[2] / "results"
+    tables = sorted(results.glob("*/main*/seeds.csv"))
+    assert tables
+    for path in tables:
+        table = read_standings(path)
+        assert "direct transfer" in table["setting"].to_list()
+        assert ranked(table)["regret_s"].min() == 0
+
+
+def test_rules_are_put_into_a_table(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    """Counted against `evaluate`: the same episodes, so the same travel times."""
+    out = tmp_path / "mine.csv"
+    words = ["--duration-s", "300", "--evaluation-seeds", "2", "--workers", "2"]
+    call = ["compare", "single-v1", "--name", "mine", "--policies", "largest-queue:20", "random"]
+    table = written(tmp_path)
+    assert main([*call, *words, "--table", str(table), "--out", str(out)]) == 0
+    assert "mine" in capsys.readouterr().out
+    whole = read_standings(out)
+    own = whole.filter(pl.col("setting") == "mine")
+    assert own["training_seed"].to_list() == [0, 1] and own["domain"].to_list() == ["V4", "V4"]
+    assert whole.height == 8
+    import ugat_marl
+
+    played = ugat_marl.evaluate(
+        "single-v1", ["largest-queue:20", "random"], ["sim", "V4"], seeds=2, duration_s=300
+    )
+    for domain, column in (("V4", "att_s"), ("sim", "att_s_sim")):
+        known = played.filter(pl.col("domain") == domain)["att_s"].to_numpy()
+        assert own[column].to_numpy() == pytest.approx(known, abs=1e-3)
+    for wrong in ([], ["--policies", "random", "--learner", "dqn"]):
+        assert main(["compare", "single-v1", "--name", "mine", *wrong]) == 2
+        assert "one of the two" in capsys.readouterr().err

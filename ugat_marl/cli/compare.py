@@ -1,0 +1,153 @@
+"""``ugat-marl compare``: put the row of an algorithm into a table."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Annotated, ClassVar
+
+import polars as pl
+from rich.console import Console
+from tyro.conf import Positional, arg
+
+from ugat_marl.cli.arguments import RayAddress, workers_of
+from ugat_marl.data import write_csv
+from ugat_marl.effects import domain_label, load_scenario
+from ugat_marl.errors import OptionError
+from ugat_marl.experiments import (
+    DIRECT,
+    PaperConfig,
+    compare,
+    policy_factory,
+    read_standings,
+    shipped_standings,
+    standings_from,
+    standings_of,
+    with_standings,
+)
+from ugat_marl.files import require_writable
+from ugat_marl.parallel import Workers
+from ugat_marl.progress import Bars, Reporter
+from ugat_marl.reporting import standings_table
+
+
+@dataclass(frozen=True)
+class Compare:
+    """Judge an algorithm as the published tables do, and add its row to a table.
+
+    Give either policies that are trained already, one file per training, or a learner, which is
+    trained in the simulation. docs/how-to/compare.md tells it all.
+
+    Examples:
+        ugat-marl compare single-v1 --name mine
+        --policies runs/s0/policies/fitted-street.pt runs/s1/policies/fitted-street.pt
+        ugat-marl compare single-v1 --name mine --learner my_algo:MyLearner --seeds 3
+        ugat-marl compare single-v1 --name mine --policies my_algo:my_policy
+        --table results/single-v1/main-universal/seeds.csv --out mine.csv
+
+    Attributes:
+        scenario: Id of a shipped scenario, directory, .sumocfg or resco:<map>.
+        name: Name of the row.
+        policies: Policies, one per training: files, shipped policies, my_module:my_policy, rules.
+        learner: Learner to train in the simulation instead: a baseline, or my_module:MyLearner.
+        learner_settings: Settings of the learner as NAME=VALUE.
+        seeds: Number of trainings of the learner, each with its own seed.
+        episodes: Training episodes of the learner.
+        table: Table to add the row to: a seeds.csv of ugat-marl paper, or what --out wrote before;
+            default: the shipped policies of the scenario.
+        domains: The real domains; default: those of the table, or V1 and V4.
+        evaluation_seeds: Number of episodes of each policy in each domain; tables have 5.
+        duration_s: Length of an episode in s; default: the scenario's own, as in tables.
+        out: CSV file of the table with the new row.
+        runs: Folder of the trainings of the learner; a killed call goes on there.
+        workers: Simulations or trainings at a time; default: one per core.
+        ray: Play and train on Ray instead.
+    """
+
+    scenario: Annotated[Positional[str], arg(metavar="SCENARIO")]
+    name: str
+    policies: tuple[str, ...] = ()
+    learner: str | None = None
+    learner_settings: tuple[str, ...] = ()
+    seeds: int = 3
+    episodes: int = 20
+    table: Path | None = None
+    domains: tuple[str, ...] = ()
+    evaluation_seeds: int = 5
+    duration_s: float | None = None
+    out: Path | None = None
+    runs: Path = Path("runs/compare")
+    workers: int | None = None
+    ray: RayAddress = None
+
+    FIRST: ClassVar[tuple[str, ...]] = (
+        "scenario",
+        "name",
+        "policies",
+        "learner",
+        "seeds",
+        "episodes",
+        "table",
+        "domains",
+        "evaluation-seeds",
+        "out",
+        "workers",
+    )
+    """Options of the first screen of the help."""
+
+    def run(self, console: Console) -> int:
+        """Judge, print the table, write it."""
+        if bool(self.policies) == (self.learner is not None):
+            raise OptionError("compare needs --policies or --learner, one of the two")
+        if self.evaluation_seeds < 1 or (self.workers is not None and self.workers < 1):
+            raise OptionError("--evaluation-seeds and --workers must be at least 1")
+        if self.out is not None:
+            require_writable(self.out)
+        scenario = load_scenario(self.scenario)
+        if self.table is not None:
+            table = read_standings(self.table)
+        else:
+            table = shipped_standings(scenario, self.evaluation_seeds, self.duration_s)
+        domains = self._domains(table)
+        with workers_of(self.workers, self.ray) as workers:
+            own = self._judged(domains, workers, Bars(console))
+        whole = with_standings(table, own)
+        shown = whole.filter(pl.col("domain").is_in([*map(domain_label, domains)]))
+        console.print(standings_table(scenario.id, shown, self.name))
+        if self.out is not None:
+            write_csv(self.out, whole.write_csv())
+            console.print(f"table: {self.out}", soft_wrap=True)
+        return 0
+
+    def _domains(self, table: pl.DataFrame) -> tuple[str, ...]:
+        known = table["domain"].unique(maintain_order=True).to_list()
+        return self.domains or tuple(known) or ("V1", "V4")
+
+    def _judged(
+        self, domains: tuple[str, ...], workers: Workers, reporter: Reporter
+    ) -> pl.DataFrame:
+        """Return the rows of the algorithm."""
+        if self.learner is None:
+            return standings_of(
+                self.name,
+                load_scenario(self.scenario),
+                [policy_factory(spec) for spec in self.policies],
+                domains,
+                episodes=self.evaluation_seeds,
+                duration_s=self.duration_s,
+                workers=workers,
+                reporter=reporter,
+            )
+        config = PaperConfig(
+            scenario=(self.scenario,),
+            domains=domains,
+            seeds=self.seeds,
+            episodes=self.episodes,
+            rows=(DIRECT,),
+            evaluation_seeds=self.evaluation_seeds,
+            duration_s=self.duration_s,
+            learner=self.learner,
+            learner_settings=self.learner_settings,
+        )
+        comparison = compare("main", self.scenario, config, self.runs, workers, reporter)
+        return standings_from(comparison, DIRECT, self.name)

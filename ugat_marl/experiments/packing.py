@@ -1,0 +1,121 @@
+"""Packing of trained policies with their cards, from the folders of their trainings."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import re
+from pathlib import Path
+
+import numpy as np
+from pydantic import TypeAdapter, ValidationError
+
+from ugat_marl.data import installed_versions
+from ugat_marl.effects import domain_label, load_scenario, scenario_in_domain
+from ugat_marl.errors import CheckpointError, OptionError
+from ugat_marl.experiments.jobs import DIRECT_POLICY, JOB, POLICY, Job, Record, file_name, file_stem
+from ugat_marl.experiments.statistics import Interval
+from ugat_marl.files import read_json, write_whole
+from ugat_marl.policies import CardScores, NetworkPolicy, PolicyCard
+
+_LIBRARIES = ("ugat-marl", "eclipse-sumo", "torch", "numpy")
+
+
+def pack(training: Path, folder: Path, command: str = "") -> list[PolicyCard]:
+    """Copy the policies of finished trainings to a folder, each with its card.
+
+    Args:
+        training: Folder of a run of ``train``, of the trainings of ``paper``, or of one training.
+        folder: Folder to write to: ``SCENARIO/NAME.pt`` and ``SCENARIO/NAME.json``. Policies of the
+            same name are replaced.
+        command: Command that trained them, for the cards.
+
+    Returns:
+        The cards, in the order of their folders.
+
+    Raises:
+        OptionError: There is no finished training with a policy.
+        CheckpointError: A file of a training is damaged.
+    """
+    cards: dict[str, PolicyCard] = {}
+    for place in sorted(path.parent for path in training.rglob(JOB)):
+        for card, policy in _cards(place, command):
+            cards[card.id] = card
+            write_whole(folder / f"{card.id}.pt", policy)
+            card.write(folder / f"{card.id}.json")
+    if not cards:
+        raise OptionError(
+            f"{training} holds no finished training with a policy; name the folder of a run of "
+            "`ugat-marl train`, or of the trainings of `ugat-marl paper`"
+        )
+    return list(cards.values())
+
+
+def _cards(place: Path, command: str) -> list[tuple[PolicyCard, bytes]]:
+    """Return the cards of a training that is finished, and the content of their policies."""
+    try:
+        job = TypeAdapter(Job).validate_json(json.dumps(read_json(place / JOB, CheckpointError)))
+    except ValidationError as error:
+        raise CheckpointError(
+            f"{place / JOB}: not the description of a training ({error.errors()[0]['msg']})"
+        ) from None
+    record = Record.read(place)
+    if job.seed is None or not record.is_whole(job):
+        return []
+    cards: list[tuple[PolicyCard, bytes]] = []
+    for mark, setting in job.rows.items():
+        file = place / (POLICY if mark == job.episodes else DIRECT_POLICY)
+        if file.exists():
+            NetworkPolicy.load(file)  # what cannot be loaded is not packed
+            content = file.read_bytes()
+            cards.append((_card(job, record, mark, setting, command, content), content))
+    return cards
+
+
+def _card(
+    job: Job, record: Record, mark: int, setting: str, command: str, content: bytes
+) -> PolicyCard:
+    scenario = load_scenario(job.scenario)
+    knows = job.setting.knows_target and mark == job.episodes
+    real = domain_label(job.target) if knows and job.target is not None else None
+    assert job.seed is not None
+    return PolicyCard(
+        id=f"{file_stem(job.scenario)}/{policy_name(setting, real, job.seed)}",
+        setting=setting,
+        scenario=job.scenario,
+        scenario_hashes={
+            domain_label(domain): scenario_in_domain(scenario, domain).hash
+            for domain in job.domains
+        },
+        sim=domain_label(job.sim),
+        real=real,
+        training_seed=job.seed,
+        episodes=mark,
+        learner=job.setting.learner.name,
+        command=command,
+        scores={domain_label(domain): _scores(job, record, mark, domain) for domain in job.domains},
+        first_seed=job.evaluation_seeds[0],
+        duration_s=job.duration_s,
+        versions=installed_versions(*_LIBRARIES),
+        sha256=hashlib.sha256(content).hexdigest(),
+        job=json.loads(TypeAdapter(Job).dump_json(job)),
+    )
+
+
+def policy_name(setting: str, real: str | None, seed: int) -> str:
+    """Return the name of a packed policy, such as ``fitted-street-V4-s0``."""
+    world = [] if real is None else [re.sub(r"[^\w=+.]+", "-", real).strip("-.")]
+    return "-".join([file_name(setting), *world, f"s{seed}"])
+
+
+def _scores(job: Job, record: Record, mark: int, domain: str) -> CardScores:
+    played = record.played(job, mark, domain)
+    att = Interval.of(np.array([scores.att_s for scores in played]))
+    alone = len(played) < 2  # one episode has no interval
+    return CardScores(
+        episodes=len(played),
+        att_s=round(att.mean, 3),
+        low_s=round(att.mean if alone else att.low, 3),
+        high_s=round(att.mean if alone else att.high, 3),
+        throughput=round(float(np.mean([scores.throughput for scores in played])), 3),
+    )

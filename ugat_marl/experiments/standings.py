@@ -1,0 +1,265 @@
+"""Standings: settings by domain, each from some trainings, and the row of an algorithm among them.
+
+A table of standings has one row per setting, real domain and training, as ``seeds.csv`` of `paper`
+has: ``setting``, ``domain``, ``training_seed``, ``att_s`` (mean travel time in the domain, s),
+``att_s_sim`` (in the simulation, s) and ``throughput`` (vehicles that arrived in the domain).
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import polars as pl
+
+from ugat_marl.data import csv_damage, csv_texts
+from ugat_marl.effects import Domain, domain_label
+from ugat_marl.errors import CheckpointError, OptionError
+from ugat_marl.experiments.comparison import Comparison
+from ugat_marl.experiments.evaluation import evaluate
+from ugat_marl.experiments.jobs import EVALUATION_SEED
+from ugat_marl.experiments.settings import DIRECT
+from ugat_marl.experiments.statistics import Interval, student_p
+from ugat_marl.parallel import Workers
+from ugat_marl.policies import PolicyFactory, policy_card, shipped_policies
+from ugat_marl.progress import Reporter
+from ugat_marl.scenarios import Scenario
+
+SCHEMA = pl.Schema(
+    {
+        "setting": pl.String,
+        "domain": pl.String,
+        "training_seed": pl.Int64,
+        "att_s": pl.Float64,
+        "att_s_sim": pl.Float64,
+        "throughput": pl.Float64,
+    }
+)
+"""Columns of a table of standings."""
+
+
+def read_standings(path: Path) -> pl.DataFrame:
+    """Read a table of standings, such as ``results/single-v1/main/seeds.csv``.
+
+    Raises:
+        CheckpointError: The file is missing or damaged, or a column or number is.
+    """
+    try:
+        content = path.read_bytes()
+    except OSError as error:
+        raise CheckpointError(f"{path}: {error.strerror}; name a seeds.csv of a table") from None
+    try:
+        texts = csv_texts(content)
+    except pl.exceptions.PolarsError:
+        raise CheckpointError(f"{path}: not a table of CSV; name a seeds.csv of a table") from None
+    if missing := [name for name in SCHEMA if name not in texts.columns]:
+        raise CheckpointError(
+            f"{path}: has no column {missing[0]!r}; name a seeds.csv of `ugat-marl paper`"
+        )
+    if damaged := csv_damage(path, texts):
+        raise CheckpointError(f"{path}: {damaged}")
+    rows = texts.select(pl.col(name).cast(kind, strict=False) for name, kind in SCHEMA.items())
+    for number, (row, given) in enumerate(
+        zip(rows.iter_rows(), texts.select(*SCHEMA).iter_rows(), strict=True), start=2
+    ):
+        for name, value, text in zip(SCHEMA, row, given, strict=True):
+            if value is None or (isinstance(value, float) and not math.isfinite(value)):
+                raise CheckpointError(
+                    f"{path}: row {number}: {name} = {text!r} is no {_kind(name)}"
+                )
+    return rows
+
+
+def _kind(name: str) -> str:
+    """Return what stands in a column, in words."""
+    return "whole number" if SCHEMA[name] == pl.Int64 else "number"
+
+
+def shipped_standings(
+    scenario: Scenario, episodes: int, duration_s: float | None = None
+) -> pl.DataFrame:
+    """Return the standings of the shipped policies of a scenario, from their cards.
+
+    Cards of another version of the scenario, or of other episodes, are left out.
+
+    Args:
+        scenario: The scenario.
+        episodes: Number of episodes of each policy in each domain.
+        duration_s: Length of an episode in s; None for the scenario's own.
+    """
+    rows: list[dict[str, Any]] = []
+    for name in shipped_policies():
+        if name.partition("/")[0] != scenario.id:
+            continue
+        card = policy_card(name)
+        here = card.scores.get(card.sim)
+        if here is None or card.scenario_hashes.get(card.sim) != scenario.hash:
+            continue
+        if (card.first_seed, card.duration_s) != (EVALUATION_SEED, duration_s):
+            continue
+        rows += [
+            {
+                "setting": card.setting,
+                "domain": domain,
+                "training_seed": card.training_seed,
+                "att_s": scores.att_s,
+                "att_s_sim": here.att_s,
+                "throughput": scores.throughput,
+            }
+            for domain, scores in card.scores.items()
+            if domain != card.sim and scores.episodes == here.episodes == episodes
+        ]
+    return pl.DataFrame(rows, schema=SCHEMA)
+
+
+def standings_of(
+    name: str,
+    scenario: Scenario,
+    policies: Sequence[PolicyFactory],
+    domains: Sequence[Domain],
+    *,
+    sim: Domain = "sim",
+    episodes: int = 5,
+    duration_s: float | None = None,
+    workers: Workers = None,
+    reporter: Reporter | None = None,
+) -> pl.DataFrame:
+    """Judge the policies of an algorithm as `paper` does, and return their rows.
+
+    Args:
+        name: Name of the algorithm in the table.
+        scenario: The scenario.
+        policies: One per training; the first has training seed 0.
+        domains: The real domains.
+        sim: The simulation.
+        episodes: Number of episodes of each policy in each domain.
+        duration_s: Length of an episode in s; None for the scenario's own.
+        workers: Simulations at a time, or an executor.
+        reporter: Shows progress.
+    """
+    numbered = {f"{name}, training {seed}": make for seed, make in enumerate(policies)}
+    played = evaluate(
+        scenario,
+        numbered,
+        [sim, *domains],
+        range(EVALUATION_SEED, EVALUATION_SEED + episodes),
+        duration_s=duration_s,
+        workers=workers,
+        reporter=reporter,
+    )
+
+    def mean(policy: str, domain: str, measure: str) -> float:
+        return round(float(played.values(policy, domain, measure).mean()), 3)
+
+    return pl.DataFrame(
+        [
+            {
+                "setting": name,
+                "domain": domain,
+                "training_seed": seed,
+                "att_s": mean(policy, domain, "att_s"),
+                "att_s_sim": mean(policy, domain_label(sim), "att_s"),
+                "throughput": mean(policy, domain, "throughput"),
+            }
+            for domain in map(domain_label, domains)
+            for seed, policy in enumerate(numbered)
+        ],
+        schema=SCHEMA,
+    )
+
+
+def standings_from(comparison: Comparison, setting: str, name: str) -> pl.DataFrame:
+    """Return the rows of one setting of a table of `paper`, under the name of an algorithm."""
+    rows: list[dict[str, Any]] = []
+    for target in comparison.targets:
+        columns = {
+            "att_s": comparison.values(setting, target, "att_s"),
+            "att_s_sim": comparison.values(setting, target, "att_s", comparison.sim),
+            "throughput": comparison.values(setting, target, "throughput"),
+        }
+        rows += [
+            {"setting": name, "domain": target, "training_seed": seed}
+            | {column: round(float(values[place]), 3) for column, values in columns.items()}
+            for place, seed in enumerate(comparison.training_seeds)
+        ]
+    return pl.DataFrame(rows, schema=SCHEMA)
+
+
+def with_standings(table: pl.DataFrame, own: pl.DataFrame) -> pl.DataFrame:
+    """Return a table with the rows of an algorithm; rows of the same name are replaced.
+
+    Raises:
+        OptionError: The name is that of a setting of the table which has other domains.
+    """
+    (name,) = own["setting"].unique().to_list()
+    before = table.filter(pl.col("setting") == name)
+    if lost := sorted({*before["domain"]} - {*own["domain"]}):
+        raise OptionError(
+            f"name = {name!r} is a row of the table with results in {', '.join(lost)}, which would "
+            "be lost; give another name, or these domains as well"
+        )
+    return pl.concat([table.filter(pl.col("setting") != name), own])
+
+
+def ranked(table: pl.DataFrame) -> pl.DataFrame:
+    """Return the settings of each domain by travel time, the fastest first.
+
+    Returns:
+        One row per domain and setting: ``domain``, ``setting``, ``trainings`` (number), ``att_s``,
+        ``low_s`` and ``high_s`` (95 % interval over trainings, s), ``gap_s`` (minus that in the
+        simulation, s), ``regret_s`` (minus that of the fastest setting, s), ``won_back`` (share of
+        direct transfer's regret that is gone; null without one) and ``p`` (Welch's two-sided test
+        against direct transfer; null where there is no spread to test by).
+    """
+    rows: list[dict[str, Any]] = []
+    for domain in table["domain"].unique(maintain_order=True):
+        here = table.filter(pl.col("domain") == domain)
+        values = {
+            str(setting): here.filter(pl.col("setting") == setting)
+            for setting in here["setting"].unique(maintain_order=True)
+        }
+        att = {setting: part["att_s"].to_numpy() for setting, part in values.items()}
+        best = min(float(own.mean()) for own in att.values())
+        regrets = {setting: float(own.mean()) - best for setting, own in att.items()}
+        for setting in sorted(att, key=lambda name: regrets[name]):
+            own, interval = att[setting], Interval.of(att[setting])
+            start = regrets.get(DIRECT, 0.0)
+            rows.append(
+                {
+                    "domain": domain,
+                    "setting": setting,
+                    "trainings": own.size,
+                    "att_s": interval.mean,
+                    "low_s": _or_none(interval.low),
+                    "high_s": _or_none(interval.high),
+                    "gap_s": interval.mean - float(values[setting]["att_s_sim"].to_numpy().mean()),
+                    "regret_s": regrets[setting],
+                    "won_back": 1.0 - regrets[setting] / start if start > 0 else None,
+                    "p": None if setting == DIRECT else _welch_p(own, att.get(DIRECT)),
+                }
+            )
+    return pl.DataFrame(rows, infer_schema_length=None)
+
+
+def _or_none(value: float) -> float | None:
+    return None if math.isnan(value) else value
+
+
+def _welch_p(one: Any, other: Any) -> float | None:
+    """Return the two-sided p-value of Welch's test; None if a variance is unknown or both are 0.
+
+    t = (mean1 - mean2) / √(v1 + v2) with v = s² / n, and by Welch and Satterthwaite
+    (v1 + v2)² / (v1² / (n1 - 1) + v2² / (n2 - 1)) degrees of freedom. The trainings of others share
+    no seeds with those of the table, so that no pairs can be made.
+    """
+    if other is None or one.size < 2 or other.size < 2:
+        return None
+    v1, v2 = (float(np.var(own, ddof=1)) / own.size for own in (one, other))
+    if v1 + v2 == 0:
+        return None
+    t = (float(one.mean()) - float(other.mean())) / math.sqrt(v1 + v2)
+    degrees = (v1 + v2) ** 2 / (v1**2 / (one.size - 1) + v2**2 / (other.size - 1))
+    return student_p(t, degrees)

@@ -1,0 +1,58 @@
+"""Standings as tables for the terminal."""
+
+from __future__ import annotations
+
+import polars as pl
+from rich import box
+from rich.console import Group, RenderableType
+from rich.table import Table
+from rich.text import Text
+
+from ugat_marl.experiments import ranked
+from ugat_marl.reporting.formats import chance, number_text, share_text
+
+
+def standings_table(scenario: str, table: pl.DataFrame, name: str) -> RenderableType:
+    """Return the settings of each domain, the fastest first; one of them is marked.
+
+    Args:
+        scenario: Id of the scenario.
+        table: A table of standings (`experiments.standings`).
+        name: Setting to mark.
+    """
+    rows = ranked(table)
+    blocks: list[RenderableType] = []
+    for domain in rows["domain"].unique(maintain_order=True):
+        shown = Table(
+            box=box.SIMPLE_HEAD,
+            title=Text(f"{scenario} in {domain}: average travel time, s"),
+            title_justify="left",
+            pad_edge=False,
+            padding=(0, 1, 0, 0),
+        )
+        shown.add_column("", width=1)
+        shown.add_column("setting", max_width=30, overflow="fold")
+        for heading in ("runs", "ATT (95 %)", "gap", "regret", "won back", "p"):
+            shown.add_column(heading, justify="right", no_wrap=True)
+        for row in rows.filter(pl.col("domain") == domain).iter_rows(named=True):
+            att = number_text(row["att_s"])
+            if row["low_s"] is not None and row["low_s"] < row["high_s"]:
+                att += f" ({number_text(row['low_s'])}–{number_text(row['high_s'])})"
+            shown.add_row(
+                "▶" if row["setting"] == name else "",
+                Text(row["setting"]),
+                str(row["trainings"]),
+                att,
+                number_text(row["gap_s"]),
+                number_text(row["regret_s"]),
+                "–" if row["won_back"] is None else share_text(row["won_back"]),
+                chance(row["p"]),
+            )
+        blocks.append(shown)
+    blocks.append(
+        Text(
+            "runs: trainings. gap: minus that in the simulation. regret: minus the fastest. won "
+            "back: share of direct transfer's regret. p: Welch's test against direct transfer."
+        )
+    )
+    return Group(*blocks)
