@@ -8,14 +8,17 @@ import io
 import json
 import shlex
 import shutil
+from dataclasses import replace
 from functools import cache
 from pathlib import Path
 from typing import Any
 
 import numpy as np
+import polars as pl
 
 from tests.data import measured_atspm_test as atspm
 from tests.data import measured_fuzz_test as measured
+from tests.data import measured_sums_test as measured_sums
 from tests.data import transitions_test as transitions
 from tests.fuzzing import (
     Surface,
@@ -175,6 +178,31 @@ def build_measured(folder: Path, *, csv: bool, by_hand: bool = False) -> None:
     write_measured(measured.recording(), folder / "street", csv=csv)
     if by_hand:
         (folder / "street" / CSV_HASHES).unlink()
+
+
+def build_sums(folder: Path) -> None:
+    """Write counts with occupancies and mean speeds, turning counts and travel times."""
+    shutil.copytree(CROSSING, folder / "scenario")
+    write_measured(measured_sums.sums(), folder / "street", csv=True)
+    (folder / "street" / CSV_HASHES).unlink()
+
+
+def build_tracks(folder: Path) -> None:
+    """Write trajectories and no detections."""
+    shutil.copytree(CROSSING, folder / "scenario")
+    second = np.arange(0.0, 50.0)
+    vehicles = pl.DataFrame(
+        {
+            "period_id": "p0", "vehicle_id": "v", "time_s": second, "lane_id": "S_C_0",
+            "position_m": 10.0 * second, "speed_mps": 10.0, "length_m": 4.5,
+        }
+    )  # fmt: skip
+    day = measured.recording()
+    alone = replace(day.periods[0], passages={})
+    write_measured(replace(day, periods=(alone,), trajectories=vehicles), folder / "street",
+                   csv=True)  # fmt: skip
+    (folder / "street" / "detections.csv").unlink()
+    (folder / "street" / CSV_HASHES).unlink()
 
 
 def use_measured(folder: Path) -> None:
@@ -383,6 +411,8 @@ SURFACES = (
         TEXT,
         "street/*",
     ),
+    Surface("measured sums", build_sums, use_measured, TEXT, "street/*"),
+    Surface("measured tracks", build_tracks, use_measured, TEXT, "street/*"),
     Surface("hashed CSV", lambda f: build_measured(f, csv=True), use_measured, TEXT, "street/*"),
     Surface("ATSPM log", build_atspm, use_atspm, TABLE),
     Surface("transition log", build_log, use_log, TABLE),

@@ -15,10 +15,8 @@ from ugat_marl.diagnosis.features import (
     FEATURES,
     INDEX,
     DetectorLayout,
-    bins_together,
-    counts_tally,
-    without_gaps,
 )
+from ugat_marl.diagnosis.intervals import bins_together, counts_tally, without_gaps
 from ugat_marl.diagnosis.statistics import Pools
 from ugat_marl.diagnosis.study import timing_effects
 from ugat_marl.diagnosis.thresholds import Thresholds

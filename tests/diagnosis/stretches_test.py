@@ -6,8 +6,9 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
+from ugat_marl.data import occupied_between
 from ugat_marl.diagnosis.features import BIN_FEATURES
-from ugat_marl.diagnosis.places import largest_stretches, most_unusual, occupied_between
+from ugat_marl.diagnosis.places import largest_stretches, most_unusual
 from ugat_marl.diagnosis.statistics import Distance
 from ugat_marl.diagnosis.thresholds import Thresholds
 

@@ -40,7 +40,10 @@ def test_every_column_of_every_file_is_described() -> None:
     described = re.findall(r"\| column \| unit \| meaning \|\n\|[-|]+\|\n((?:\|.*\n)+)", PAGE)
     columns = [tuple(re.findall(r"^\| `(\w+)` ", table, flags=re.MULTILINE)) for table in described]
     known = {table.stem: (*table.columns, *table.optional) for table in TABLES}
-    order = ("periods", "detectors", "signals", "detections", "counts", "lanes", "trajectories")
+    order = (
+        "periods", "detectors", "signals", "detections", "counts", "turning", "travel_times",
+        "lanes", "trajectories",
+    )  # fmt: skip
     assert columns == [known[name] for name in order]
     for table in TABLES:
         assert all(f"`{name}`" in PAGE for name in table.names())
@@ -54,6 +57,7 @@ def ruled_out(missing: str) -> set[str]:
 
 def test_what_is_ruled_out_is_what_the_code_rules_out() -> None:
     assert ruled_out(r"detections \(counts only\)") == set(coverage.COUNTABLE)
+    assert ruled_out("detections, with .*?") == set(coverage.SUMMED)
     assert ruled_out("signals") == set(coverage.NEEDS_SIGNALS)
     assert ruled_out("yellow") == set(coverage.NEEDS_YELLOW)
     assert ruled_out("`stop` detectors") == set(coverage.NEEDS_STOP)

@@ -19,7 +19,7 @@ import pytest
 from rich.console import Console
 
 from ugat_marl.diagnosis import Diagnosis, statistic
-from ugat_marl.diagnosis.features import FEATURES
+from ugat_marl.diagnosis.features import ALL_FEATURES, FEATURES
 from ugat_marl.diagnosis.verdict import STATISTICS
 from ugat_marl.effects import load_scenario
 from ugat_marl.reporting import commands_on_page, diagnosis_summary, formats, write_diagnosis_page
@@ -371,7 +371,7 @@ def test_long_names_do_not_widen_the_summary() -> None:
 
 
 def test_every_statistic_has_words() -> None:
-    assert set(STATISTICS) == {name for name, _, _ in FEATURES} | {"occupied"}
+    assert set(STATISTICS) == {name for name, _, _ in ALL_FEATURES} | {"occupied"}
     assert statistic("count_stop in time") == ("flow at stop detectors in some stretch of time")
 
 

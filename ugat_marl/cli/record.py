@@ -10,7 +10,7 @@ from rich.console import Console
 from tyro.conf import Positional, arg
 
 from ugat_marl.cli.arguments import LengthS, Workers
-from ugat_marl.data import require_replaceable, write_measured
+from ugat_marl.data import as_counts, require_replaceable, write_measured
 from ugat_marl.effects import load_scenario, scenario_in_domain
 from ugat_marl.experiments import policy_factory, record
 from ugat_marl.files import require_writable
@@ -42,6 +42,8 @@ class Record:
         speeds: Measure speeds and lengths at the detectors.
         lanes: Also record vehicles, halting and mean speed per lane and second.
         trajectories: Also record the position of every vehicle at every second.
+        counts_every_s: Write counts, occupancies and mean speeds of intervals of this length in s,
+            as detectors of cities and motorways report, in place of single detections.
         workers: Simulations at a time.
     """
 
@@ -58,6 +60,7 @@ class Record:
     speeds: bool = True
     lanes: bool = False
     trajectories: bool = False
+    counts_every_s: float | None = None
     workers: Workers = None
 
     def run(self, console: Console) -> int:
@@ -85,8 +88,10 @@ class Record:
             workers=self.workers,
             reporter=Bars(console),
         )
-        write_measured(measured, self.out)
         seen = sum(len(log) for period in measured.periods for log in period.passages.values())
+        if self.counts_every_s is not None:
+            measured = as_counts(measured, self.counts_every_s)
+        write_measured(measured, self.out)
         console.print(
             f"{seen} passages over {len(measured.detectors)} detectors in {self.periods} "
             f"period(s): {self.out}",

@@ -24,7 +24,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ugat_marl.data import installed_version
+from ugat_marl.diagnosis.between import Between
 from ugat_marl.diagnosis.features import FEATURES, DetectorLayout, Greens, Tally, tally
+from ugat_marl.diagnosis.intervals import with_intervals
 from ugat_marl.diagnosis.measurement import Sightings
 from ugat_marl.diagnosis.replay import Day, Due, Replay, Unmeasured, corrected
 from ugat_marl.diagnosis.thresholds import Thresholds
@@ -96,6 +98,9 @@ def _counts(tallies: Sequence[Tally]) -> NDArray[np.float64]:
 
 VERSION = 5
 """Version of features and replays; tallies cached under another version are not used."""
+
+_BETWEEN = "between "
+"""Begin of the names of `Tally.between` in the cache."""
 
 _KEPT_DAYS = 40
 """Largest number of simulated days that are kept in memory with their passages."""
@@ -176,6 +181,8 @@ class Engine:
         workers: Simulations at a time, None for one per core; or an executor that simulates days.
         base_days: Number of days of the scenario as it is that decide which days are ordinary; 0 if
             all days are.
+        interval_s: Length of the intervals whose features are compared, s; None for none.
+        between: Measured turning counts and travel times; None without any.
     """
 
     def __init__(
@@ -191,8 +198,12 @@ class Engine:
         budget: Budget | None = None,
         workers: Workers = None,
         base_days: int = 0,
+        interval_s: float | None = None,
+        between: Between | None = None,
     ) -> None:
         self._base_days = base_days
+        self._interval_s = interval_s
+        self._between = between
         self.layout = layout
         self.periods = tuple(periods)
         self._budget = budget or Budget()
@@ -217,6 +228,8 @@ class Engine:
         )
         head += (self._unmeasured,) if self._unmeasured else ()
         head += (replay.day_to_day,) if replay.day_to_day else ()
+        head += ("intervals", interval_s) if interval_s else ()
+        head += (between,) if between else ()
         self._root = hashlib.sha256(repr(head).encode()).hexdigest()
         self._edges = sorted({edge for _, edge, _ in layout.places})
         self._signals = [_signals_hash(period, replay.answering) for period in periods]
@@ -459,6 +472,11 @@ class Engine:
         counted = tally(
             self.layout, period, self._greens[number % len(self.periods)], self._thresholds
         )
+        if self._interval_s is not None:
+            counted = with_intervals(counted, self.layout, period, self._interval_s)
+        if self._between is not None:
+            measured = self.periods[number % len(self.periods)].id
+            counted = replace(counted, between=self._between.simulated(measured, day.between))
         # The cache holds float32, so round here: the result must not depend on the cache.
         counted = replace(counted, bins=counted.bins.astype(np.float32).astype(np.float64))
         return self._with_due(counted, day.travel_time_s, day.due)
@@ -519,6 +537,11 @@ class Engine:
                 stored["sums"].astype(np.float64),
                 stored["bins"].astype(np.float64),
                 journeys=stored["journeys"],
+                between={
+                    name.removeprefix(_BETWEEN): sums
+                    for name, sums in stored.items()
+                    if name.startswith(_BETWEEN)
+                },
             )
             due = None
             if "asked" in stored:
@@ -537,6 +560,7 @@ class Engine:
             "bins": counted.bins.astype(np.float32),
             "travel_time_s": np.float64(day.travel_time_s),
             "journeys": counted.journeys,
+            **{f"{_BETWEEN}{name}": sums for name, sums in counted.between.items()},
         }
         if day.due is not None:
             for name, of_edge in (("asked", day.due.asked), ("given", day.due.given)):

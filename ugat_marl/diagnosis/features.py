@@ -9,12 +9,10 @@ wait anywhere on the detector.
 from __future__ import annotations
 
 import functools
-import math
-from collections.abc import Collection, Mapping, Sequence
-from dataclasses import dataclass
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
 
 import numpy as np
-import polars as pl
 from numpy.typing import NDArray
 
 from ugat_marl.diagnosis.journeys import JOURNEYS, Crossings, journey_sums, matched
@@ -283,8 +281,23 @@ FEATURES: tuple[tuple[str, str, str], ...] = (
 )
 """Name, regime and unit of every feature."""
 
-INDEX = {name: index for index, (name, _, _) in enumerate(FEATURES)}
-"""Index of a feature in `FEATURES`, by name."""
+INTERVAL_FEATURES: tuple[tuple[str, str, str], ...] = tuple(
+    (f"{name}_{kind}", regime, unit)
+    for kind in ("advance", "stop", "exit")
+    for name, regime, unit in (
+        ("over", "occupancy", "s"),
+        ("mean_speed", "mean speed", "m/s"),
+        ("busy_count", "occupancy", ""),
+        ("busy_speed", "mean speed", "m/s"),
+        ("bunching", "occupancy", ""),
+    )
+)
+"""Name, regime and unit of the features of intervals, see `intervals`. They stand behind `FEATURES`
+in the tallies of counts that have occupancies or mean speeds."""
+ALL_FEATURES = (*FEATURES, *INTERVAL_FEATURES)
+
+INDEX = {name: index for index, (name, _, _) in enumerate(ALL_FEATURES)}
+"""Index of a feature in `ALL_FEATURES`, by name."""
 SPEED_FEATURES = frozenset(
     {
         "speed1", "speed2", "speed3", "speed4-5", "speed6-8", "free_speed", "free_speed_spread",
@@ -312,13 +325,16 @@ class Tally:
     """The features of one period.
 
     Attributes:
-        sums: Sums and numbers of observations, ``(features, places, 2)``. Places are the incoming
-            lanes, followed by the outgoing lanes.
+        sums: Sums and numbers of observations, ``(features, places, 2)``. Features are `FEATURES`,
+            or `ALL_FEATURES` where intervals are compared. Places are the incoming lanes, followed
+            by the outgoing lanes.
         bins: Counts and occupied seconds in time, ``(bin features, places, bins)``.
         days: Number of periods that were added up.
         known: Number of periods in which each bin was counted, shape of `bins`; None if all were.
         journeys: Sums and numbers of observations of `JOURNEYS`, ``(measures, places, 2)``. No
             distance contains them. None without single vehicles.
+        between: Turning counts and travel times between places: sums and numbers of observations,
+            ``(members, 1, 2)``, by block; see `between`.
     """
 
     sums: Array
@@ -326,6 +342,7 @@ class Tally:
     days: int = 1
     known: Array | None = None
     journeys: Array | None = None
+    between: Mapping[str, Array] = field(default_factory=dict)
 
     @property
     def counted(self) -> Array:
@@ -359,6 +376,7 @@ class Tally:
             self.days + other.days,
             None if every else self.counted[..., :bins] + other.counted[..., :bins],
             None if mine is None or others is None else mine + others,
+            {name: sums + other.between[name] for name, sums in self.between.items()},
         )
 
 
@@ -714,70 +732,3 @@ def _journeys(
         for index, of_lane, ride in zip(lanes, pairs, rides, strict=True):
             sums[:, index] = journey_sums(of_lane, ride, greens[index].start_s)
     return sums
-
-
-# --- counts alone ---------------------------------------------------------------------------------
-
-
-def bins_together(counts: pl.DataFrame | None, thresholds: DayThresholds) -> int:
-    """Return the number of bins that the longest interval of the counts covers.
-
-    Args:
-        counts: Table with ``begin_s, end_s``; None if single vehicles were detected.
-        thresholds: Numbers of the method.
-    """
-    if counts is None or counts.is_empty():
-        return 1
-    longest = float((counts["end_s"] - counts["begin_s"]).cast(pl.Float64).to_numpy().max())
-    return max(1, math.ceil(longest / thresholds.bin_s - 1e-6))
-
-
-def without_gaps(
-    counts: pl.DataFrame, periods: Sequence[Period], thresholds: DayThresholds
-) -> frozenset[str]:
-    """Find detectors that were counted in every period from begin to end."""
-    length = pl.col("end_s").cast(pl.Float64) - pl.col("begin_s").cast(pl.Float64)
-    whole = set(counts["detector_id"].to_list())
-    for period in periods:
-        of_period = counts.filter(pl.col("period_id") == period.id)
-        times = dict(of_period.group_by("detector_id").agg(length.sum()).iter_rows())
-        least = thresholds.whole * (period.end_s - period.begin_s)
-        whole = {name for name in whole if times.get(name, 0.0) >= least}
-    return frozenset(whole)
-
-
-def counts_tally(
-    layout: DetectorLayout,
-    period: Period,
-    counts: pl.DataFrame,
-    whole: Collection[str],
-    thresholds: DayThresholds,
-) -> Tally:
-    """Return a tally that holds only counts; all other features stay empty.
-
-    Args:
-        layout: Lanes and detectors.
-        period: Period to tally.
-        counts: Table with ``period_id, begin_s, end_s, detector_id, count``.
-        whole: Detectors `without_gaps`. Other detectors fill only their known bins, since the mean
-            of some hours is not the mean of the period.
-        thresholds: Numbers of the method.
-    """
-    places = len(layout.lanes) + len(layout.exits)
-    length = bins_of(period, thresholds)
-    sums = np.zeros((len(FEATURES), places, 2))
-    bins = np.zeros((len(BIN_FEATURES), places, length))
-    covered = np.zeros_like(bins)
-    edges = np.linspace(period.begin_s, period.end_s, length + 1)
-    for row in counts.filter(pl.col("period_id") == period.id).iter_rows(named=True):
-        name, place = layout.counted.get(row["detector_id"], ("", -1))
-        if place >= 0:
-            begin, end, count = float(row["begin_s"]), float(row["end_s"]), float(row["count"])
-            if row["detector_id"] in whole:
-                sums[INDEX[name], place] += (count, (end - begin) / 60.0)
-            inside = np.clip(np.minimum(edges[1:], end) - np.maximum(edges[:-1], begin), 0.0, None)
-            line = BIN_FEATURES.index(name), place
-            bins[line] += count * inside / max(end - begin, 1e-9)
-            covered[line] += inside
-    known = (covered > thresholds.whole * np.diff(edges)).astype(np.float64)
-    return Tally(sums, bins * known, known=known)

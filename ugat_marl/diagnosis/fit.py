@@ -17,7 +17,7 @@ from ugat_marl.effects import EVERYWHERE
 Change = tuple[dict[str, Array], float]
 """Change of the statistics when a free value moves, by block, and length of this move."""
 
-WIDE = ("network", "intersection")
+WIDE = ("network", "intersection", "travel time")
 """Blocks for the fit of effects on the whole network. Single lanes would add more noise than
 information."""
 

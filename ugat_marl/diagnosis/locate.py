@@ -10,7 +10,7 @@ import numpy as np
 from scipy import special, stats
 
 from ugat_marl.diagnosis.engine import OutOfTime
-from ugat_marl.diagnosis.features import BIN_FEATURES, FEATURES, DetectorLayout
+from ugat_marl.diagnosis.features import ALL_FEATURES, BIN_FEATURES, DetectorLayout
 from ugat_marl.diagnosis.records import Disagreement, Located, Tested
 from ugat_marl.diagnosis.select import Selector
 from ugat_marl.diagnosis.statistics import Array, Distance, Reference
@@ -66,7 +66,11 @@ def locate(
     """
     candidates: list[Disagreement] = []
     for name, z in distance.z.items():
-        if name != "time":
+        if name in reference.pools.between:
+            candidates += _between(
+                layout, reference, name, z[:, 0], distance.difference[name][:, 0]
+            )
+        elif name != "time":
             candidates += _statistics(
                 layout, name, z, distance.difference[name], reference.pools.thresholds
             )
@@ -110,7 +114,7 @@ def _statistics(
     rows: list[Disagreement] = []
     for member, feature in zip(*np.nonzero(z), strict=True):
         tls, approach, lane = _place(layout, pool, int(member))
-        name, regime, unit = FEATURES[int(feature)]
+        name, regime, unit = ALL_FEATURES[int(feature)]
         value = float(z[member, feature])
         size = float(difference[member, feature])
         rows.append(
@@ -127,6 +131,26 @@ def _statistics(
                 two_sided(value, thresholds.heavy_tail),
             )
         )
+    return rows
+
+
+def _between(
+    layout: DetectorLayout, reference: Reference, block: str, z: Array, difference: Array
+) -> list[Disagreement]:
+    """Return the disagreements of turning counts, or of travel times between places."""
+    owner = {edge: layout.intersections[index] for index, edge, _ in layout.places}
+    rows: list[Disagreement] = []
+    for label, value, size in zip(reference.pools.between[block], z, difference, strict=True):
+        if not value:
+            continue
+        p = two_sided(float(value), reference.pools.thresholds.heavy_tail)
+        said = f"{block} {label.edge} → {label.following}"
+        rows.append(
+            Disagreement(
+                owner.get(label.edge), label.edge, None, block, said, None, float(size),
+                label.unit, float(value), p,
+            )
+        )  # fmt: skip
     return rows
 
 

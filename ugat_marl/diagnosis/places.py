@@ -15,6 +15,8 @@ from itertools import pairwise
 import numpy as np
 from numpy.typing import NDArray
 
+from ugat_marl.data import occupied_between
+from ugat_marl.diagnosis.between import TURNING
 from ugat_marl.diagnosis.features import BIN_FEATURES, INDEX, DetectorLayout
 from ugat_marl.diagnosis.hypotheses import Hypothesis, Members, examined
 from ugat_marl.diagnosis.statistics import Distance, Reference
@@ -31,6 +33,13 @@ _FLOW = (
 """Features that change if a vehicle stands on a lane."""
 _AVOIDED = ("count_advance", "count_stop")
 """Features that show that drivers avoid a lane."""
+
+
+def _speed_row(distance: Distance) -> int:
+    """Return the feature that shows speeds: of free vehicles, or means of intervals."""
+    z = distance.z["lane"]
+    means = INDEX["mean_speed_advance"]
+    return means if means < z.shape[1] and z[:, means].any() else INDEX["free_speed"]
 
 
 class PlaceFinder:
@@ -69,6 +78,7 @@ class PlaceFinder:
         """
         hypotheses: list[Hypothesis] = []
         hypotheses += self._volume.hypotheses(distance)
+        hypotheses += turned(reference, distance)
         hypotheses += self._timing(reference, distance)
         hypotheses += self._windows(reference, distance, periods)
         hypotheses += self._places(reference, distance)
@@ -257,7 +267,7 @@ class PlaceFinder:
         hypotheses: list[Hypothesis] = []
         lanes = self._layout.lanes
         hypotheses += [_parking(lane, self._thresholds) for lane in self._disturbed(distance)]
-        speed = distance.z["lane"][: len(lanes), INDEX["free_speed"]]
+        speed = distance.z["lane"][: len(lanes), _speed_row(distance)]
         by_edge: dict[str, float] = defaultdict(float)
         for lane, value in zip(lanes, speed, strict=True):
             by_edge[lane.edge] += float(value)
@@ -302,8 +312,9 @@ class PlaceFinder:
         """Return the free speed on an edge, as a multiple of the simulated one."""
         thresholds = self._thresholds
         rows = [index for index, name in enumerate(self._edges) if name == edge]
-        mean = reference.blocks["lane"].mean[rows, INDEX["free_speed"]]
-        difference = distance.difference["lane"][rows, INDEX["free_speed"]]
+        row = _speed_row(distance)
+        mean = reference.blocks["lane"].mean[rows, row]
+        difference = distance.difference["lane"][rows, row]
         known = np.isfinite(mean) & (difference != 0) & (mean > 0)
         if not known.any():
             return thresholds.usual_speed_ratio
@@ -625,6 +636,39 @@ class Volume:
         return max(match, 0.0) ** 2 / max(float(scaled @ scaled), 1e-9)
 
 
+def turned(reference: Reference, distance: Distance) -> list[Hypothesis]:
+    """Propose turns of which turning counts hold more than the model.
+
+    A share s of the vehicles of the other turns from an edge takes the turn: with the measured
+    share m and the share k in the model, ``m = k + s (1 - k)``.
+    """
+    thresholds = reference.pools.thresholds
+    labels = reference.pools.between.get(TURNING, ())
+    if not labels:
+        return []
+    mean = reference.blocks[TURNING].mean[:, 0]
+    difference, z = (side[TURNING][:, 0] for side in (distance.difference, distance.z))
+    ranked: list[tuple[float, Hypothesis]] = []
+    for edge in dict.fromkeys(label.edge for label in labels):
+        members = [i for i, label in enumerate(labels) if label.edge == edge]
+        model, street = mean[members], mean[members] + difference[members]
+        if len(members) < 2 or not (np.isfinite(model).all() and model.sum() > 0 < street.sum()):
+            continue
+        for index, before, now in zip(
+            members, model / model.sum(), street / street.sum(), strict=True
+        ):
+            share = float((now - before) / max(1.0 - before, 1e-9))
+            if share > thresholds.least_turn and z[index] ** 2 > thresholds.suspect_change:
+                fixed = (("from_edge", edge), ("to_edge", labels[index].following))
+                level = ((min(share, thresholds.most_turning),),)
+                turn = Hypothesis(
+                    "turning", fixed, ("share",), level, (0.0,), thresholds.least_turning
+                )
+                ranked.append((float(z[index]) ** 2, turn))
+    ranked.sort(key=lambda pair: -pair[0])
+    return [turn for _, turn in ranked[: thresholds.places_of_a_kind]]
+
+
 # --- stretches of time ----------------------------------------------------------------------------
 
 _COUNTS = 3
@@ -719,20 +763,6 @@ def most_unusual(
         return None
     z, first, last, ratio = best
     return z, begin_s + thresholds.scan_s * first, begin_s + thresholds.scan_s * last, ratio
-
-
-def occupied_between(on: Array, off: Array, edges: Array) -> Array:
-    """Return occupied seconds in each interval of time, ``(edges - 1,)``.
-
-    Args:
-        on: Begins of occupation, s.
-        off: Ends of occupation, s.
-        edges: Bounds of the intervals, s.
-    """
-    filled = np.zeros(len(edges))
-    for index, edge in enumerate(edges):
-        filled[index] = np.clip(np.minimum(off, edge) - on, 0.0, None).sum()
-    return np.diff(filled)
 
 
 # --- faults of detectors --------------------------------------------------------------------------

@@ -532,7 +532,8 @@ class TrafficCheck:
     """Judgement of a correction by measures that no fit uses, on the held-out periods.
 
     Attributes:
-        measure: The measures: ``travel time and queue``, or else ``service counts``.
+        measure: The measures: ``travel time and queue``, else ``travel times of probes``, else
+            ``speed and occupancy`` of intervals, else ``service counts``.
         error_before: Sum of the relative errors of the scenario as it is.
         error_after: Sum of the relative errors of the corrected model.
         noise: Standard error of their difference.

@@ -71,10 +71,13 @@ from ugat_marl.scenarios import (
 )
 from ugat_marl.seeding import derive_seed
 from ugat_marl.simulation import (
+    Way,
     delayed,
     detectors_document,
     launch_of,
     one_line_message,
+    places_document,
+    read_between,
     read_passages,
     read_trips,
 )
@@ -91,11 +94,14 @@ class Day:
         period: The period with the passages that the detectors saw.
         travel_time_s: Mean time in the network of the vehicles due, with the wait to enter, s.
         due: Vehicles that the demand asked for; None if the day did not get measured arrivals.
+        between: Times at the first place and travel times, s, ``(vehicles, 2)``, for each of the
+            ways that are followed.
     """
 
     period: Period
     travel_time_s: float
     due: Due | None = None
+    between: tuple[Array, ...] = ()
 
 
 class Replay:
@@ -110,10 +116,12 @@ class Replay:
         answering: True if the signals followed the traffic; days then get the measured arrivals.
         detection: Errors of measurement of the detectors that saw the arrivals.
         day_to_day: Variation of the demand from day to day, see `draw_day`.
+        followed: Ways on which vehicles are followed.
     """
 
     answering = False
     day_to_day = 0.0
+    followed: tuple[Way, ...] = ()
 
     def __init__(
         self,
@@ -126,6 +134,7 @@ class Replay:
         answering: bool = False,
         detection: Sequence[Effect] = (),
         day_to_day: float = 0.0,
+        followed: Sequence[Way] = (),
     ) -> None:
         self._given = scenario, network, detectors, owner, thresholds
         self.answering = answering
@@ -136,6 +145,7 @@ class Replay:
         self._thresholds = thresholds
         self._detection = tuple(detection)
         self.day_to_day = day_to_day
+        self.followed = tuple(followed)
         layout = DetectorLayout.of(network, installed_detectors(self._detection, detectors))
         self._arrivals = Arrivals(layout, network, thresholds) if answering else None
         self._own = detector_effects(scenario)
@@ -150,6 +160,7 @@ class Replay:
                 answering=self.answering,
                 detection=self._detection,
                 day_to_day=self.day_to_day,
+                followed=self.followed,
             ),
             self._given,
         )
@@ -157,7 +168,11 @@ class Replay:
     def detecting(self, errors: Sequence[Effect]) -> Replay:
         """Return a simulator of the same days that knows errors of measurement."""
         return Replay(
-            *self._given, answering=self.answering, detection=errors, day_to_day=self.day_to_day
+            *self._given,
+            answering=self.answering,
+            detection=errors,
+            day_to_day=self.day_to_day,
+            followed=self.followed,
         )
 
     def simulate(self, effects: Sequence[Effect], period: Period, seed: int) -> Day:
@@ -189,7 +204,7 @@ class Replay:
         seen = done.period
         for effect in (*self._own, *effects):
             seen = effect.observe(seen, self._detectors, self._owner)
-        return Day(_logged(seen), done.travel_time_s, due)
+        return replace(done, period=_logged(seen), due=due)
 
     def observed(self, effects: Sequence[Effect], period: Period) -> Period:
         """Return a simulated period as detectors with faults see it, without a new simulation."""
@@ -243,9 +258,13 @@ class Replay:
         red = withheld(self._network, {lane: red for each in served for lane, red in each.items()})
         signals = replay_document(scenario, period, begin, red)
         detectors = detectors_document(true, self._network.lanes, loops)
+        more = [signals, detectors]
+        places = directory / "places.xml"
+        if self.followed:
+            more.append(places_document(self.followed, self._network.lanes, places))
         scenario = replace(
             scenario,
-            additional=(*scenario.additional, signals, detectors),
+            additional=(*scenario.additional, *more),
             settings=settings.model_copy(update={"begin_s": begin}),
         )
         launch = launch_of(scenario, seed, directory, ())
@@ -262,7 +281,10 @@ class Replay:
         trips = read_trips(directory / "trips.xml")
         seen = read_passages(loops, true, period.begin_s, period.end_s, step)
         travel = float(np.mean(trips.travel_time_s)) if len(trips.travel_time_s) else np.nan
-        return Day(replace(period, passages=seen), travel)
+        between: tuple[Array, ...] = ()
+        if self.followed:
+            between = read_between(places, self.followed, period.begin_s, period.end_s)
+        return Day(replace(period, passages=seen), travel, between=between)
 
 
 def _with(scenario: Scenario, effects: Sequence[Effect]) -> Scenario:

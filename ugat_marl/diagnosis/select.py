@@ -9,7 +9,7 @@ from dataclasses import replace
 import numpy as np
 
 from ugat_marl.diagnosis.engine import OutOfTime
-from ugat_marl.diagnosis.features import Tally
+from ugat_marl.diagnosis.features import FEATURES, Tally
 from ugat_marl.diagnosis.fit import WIDE, Fitter, cost_of, uncertainty
 from ugat_marl.diagnosis.hypotheses import (
     Hypothesis,
@@ -26,7 +26,7 @@ from ugat_marl.diagnosis.places import PlaceFinder
 from ugat_marl.diagnosis.propose import Direction, between, promising, propose, squared_gap
 from ugat_marl.diagnosis.records import Fitted, Located, Selected, Tested
 from ugat_marl.diagnosis.residual import Directions, Null
-from ugat_marl.diagnosis.statistics import Whitener
+from ugat_marl.diagnosis.statistics import Whitener, sum_of
 from ugat_marl.diagnosis.thresholds import Effort
 from ugat_marl.effects import Effect
 from ugat_marl.errors import OptionError, ScenarioError, SimulatorError
@@ -117,6 +117,11 @@ class Selector:
         rivals = tuple(sorted(self._seen.values(), key=cost_of))
         return Selected(best, rivals, complete, located.examined | self.examined)
 
+    @property
+    def held(self) -> frozenset[int]:
+        """Indices of the statistics of the network that the data hold."""
+        return frozenset(np.flatnonzero(sum_of(self._fitter.data).sums[..., 1].any(1)).tolist())
+
     def test(self, model: Fitted) -> Tested:
         """Simulate more days of a model and test the remaining difference."""
         fitter = self._fitter
@@ -176,7 +181,10 @@ class Selector:
         proposals = propose(directions, whitener, self._thresholds)
         chosen = [proposal.members for proposal in promising(proposals, self._thresholds)]
         little = gap < self._thresholds.little * chance  # the difference is then in single places
-        near = little or not proposals or proposals[0].expected > enough
+        # Sums of intervals leave few statistics of the network. Effects on the whole network
+        # imitate those at places there, so places are always examined too.
+        summed = len(self._fitter.data[0].sums) > len(FEATURES)
+        near = little or summed or not proposals or proposals[0].expected > enough
         if near:
             chosen = [*chosen[:2], *self._elsewhere(start.model, directions, number)]
         if number == 0:

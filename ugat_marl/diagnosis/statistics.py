@@ -11,12 +11,14 @@ from __future__ import annotations
 
 import functools
 from collections.abc import Collection, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 from numpy.typing import NDArray
 
+from ugat_marl.diagnosis.between import Label
 from ugat_marl.diagnosis.features import (
+    ALL_FEATURES,
     EVENT_FEATURES,
     FEATURES,
     SPEED_FEATURES,
@@ -41,14 +43,22 @@ class Pools:
         thresholds: Numbers of the method.
         together: Number of bins of time that are joined to one; leftover bins at the end are not
             used.
+        between: Members of the blocks of `Tally.between`.
     """
 
     blocks: dict[str, Array]
     thresholds: Thresholds
     together: int = 1
+    between: Mapping[str, tuple[Label, ...]] = field(default_factory=dict)
 
     @classmethod
-    def of(cls, layout: DetectorLayout, thresholds: Thresholds, together: int = 1) -> Pools:
+    def of(
+        cls,
+        layout: DetectorLayout,
+        thresholds: Thresholds,
+        together: int = 1,
+        between: Mapping[str, tuple[Label, ...]] | None = None,
+    ) -> Pools:
         """Pool the network, every intersection if there are several, every lane."""
         places = len(layout.places)
         owners = [owner for owner, _, _ in layout.places]
@@ -61,7 +71,7 @@ class Pools:
                 ]
             )
         blocks["lane"] = np.eye(places)
-        return cls(blocks, thresholds, together)
+        return cls(blocks, thresholds, together, between or {})
 
     def pool(self, tally: Tally) -> dict[str, Array]:
         """Return sums and weights ``(members, features, 2)`` of every block.
@@ -76,7 +86,7 @@ class Pools:
         bins, counted = tally.gathered(self.together)
         time = np.stack([bins, counted], axis=-1)
         pooled["time"] = time.reshape(-1, *time.shape[2:])
-        return pooled
+        return pooled | dict(tally.between)
 
 
 @dataclass(frozen=True, eq=False)
@@ -200,7 +210,8 @@ class Reference:
             used = mean > self._thresholds.least_count
         else:
             used = (weight >= self._thresholds.least_observations) & np.isfinite(mean)
-            used &= ~_constant(self._speeds)[None, :]
+            if name in self.pools.blocks:
+                used &= ~_constant(self._speeds)[None, : used.shape[1]]
         if timed:
             correlation = np.eye(sums.shape[2])
         elif prior is None:
@@ -353,12 +364,12 @@ def _controlled(
 @functools.cache
 def _grain(width: int, thresholds: Thresholds) -> Array:
     """Return the least standard deviation of a sum over a day, by feature or bin of time."""
-    if width != len(FEATURES):
+    if width not in (len(FEATURES), len(ALL_FEATURES)):
         return np.full(width, thresholds.grain)
     return np.array(
         [
             thresholds.least_events if name in EVENT_FEATURES else thresholds.grain
-            for name, _, _ in FEATURES
+            for name, _, _ in ALL_FEATURES[:width]
         ]
     )
 
@@ -366,7 +377,7 @@ def _grain(width: int, thresholds: Thresholds) -> Array:
 @functools.cache
 def _constant(speeds: bool) -> NDArray[np.bool_]:
     """Mark features that are never used: those that need speeds if no speeds were measured."""
-    return np.array([not speeds and name in SPEED_FEATURES for name, _, _ in FEATURES])
+    return np.array([not speeds and name in SPEED_FEATURES for name, _, _ in ALL_FEATURES])
 
 
 def _correlation(residual: Array, least_shrinkage: float) -> Array:

@@ -15,19 +15,23 @@ import numpy as np
 from scipy import stats
 
 from ugat_marl.data import Finding, MeasuredData, is_actuated
+from ugat_marl.diagnosis.between import Between
 from ugat_marl.diagnosis.engine import Budget, Engine, default_cache
 from ugat_marl.diagnosis.features import (
     BIN_FEATURES,
     DetectorLayout,
     Greens,
     Tally,
-    bins_together,
-    counts_tally,
     tally,
-    without_gaps,
 )
 from ugat_marl.diagnosis.fit import Fitter
 from ugat_marl.diagnosis.hypotheses import Hypothesis, global_hypotheses, library
+from ugat_marl.diagnosis.intervals import (
+    bins_together,
+    counts_tally,
+    usual_length,
+    without_gaps,
+)
 from ugat_marl.diagnosis.measurement import DetectorError, Measurement, Sightings, together
 from ugat_marl.diagnosis.patterns import QUANTITIES, cells_of, patterns
 from ugat_marl.diagnosis.places import PlaceFinder, Routes
@@ -161,22 +165,20 @@ class Study:
         """
         network, thresholds = Network.read(scenario), config.thresholds
         detectors = heard(measured)
-        noted = (*measured.findings, *unreached(scenario, measured, detectors))
-        measured = replace(measured, findings=noted)
+        measured = _noted(measured, unreached(scenario, measured, detectors))
         layout = DetectorLayout.of(network, detectors)
         ruled_out = frozenset(name for finding in measured.findings for name in finding.rules_out)
         allowed = library(config.leave_out) - ruled_out
-        periods = measured.of("fit")
-        if not periods:
-            raise MeasuredDataError("no period has the split 'fit'; there is nothing to fit")
+        periods = _fitted_periods(measured)
         lights = layout.intersections
-        answering = any(is_actuated(measured.periods, tls) for tls in lights)
+        answering = _answering(measured, lights)
         effort = config.effort or effort_for(len(lights))
         budget = config.budget()
-        fit = _tallies(layout, measured, periods, thresholds)
-        heldout = _tallies(layout, measured, measured.of("heldout"), thresholds)
+        between = Between.of(measured)
+        fit = _tallies(layout, measured, periods, thresholds, between)
+        heldout = _tallies(layout, measured, measured.of("heldout"), thresholds, between)
         variation = _variation(layout, measured, (*fit, *heldout), thresholds)
-        measured = replace(measured, findings=(*measured.findings, *_of_variation(variation)))
+        measured = _noted(measured, _of_variation(variation))
 
         def simulating(answering: bool, base_days: int) -> Engine:
             return Engine(
@@ -190,6 +192,7 @@ class Study:
                     thresholds,
                     answering=answering,
                     day_to_day=variation,
+                    followed=between.followed if between else (),
                 ),
                 [*periods, *measured.of("heldout")],
                 config.seed,
@@ -198,10 +201,11 @@ class Study:
                 budget=budget,
                 workers=config.workers,
                 base_days=base_days,
+                interval_s=None if measured.has_events else usual_length(measured.counts),
+                between=between,
             )
 
         engine = simulating(answering, effort.base)
-        together = 1 if measured.has_events else bins_together(measured.counts, thresholds)
         return cls(
             scenario,
             network,
@@ -209,7 +213,7 @@ class Study:
             config,
             layout,
             engine,
-            Pools.of(layout, thresholds, together),
+            _pools(layout, measured, between, thresholds),
             allowed,
             tuple(global_hypotheses(scenario, allowed)),
             effort,
@@ -366,7 +370,12 @@ class Study:
         counted, known = data.sums[..., 1:] > 0, data.counted >= data.days
         width = min(known.shape[-1], *(day.bins.shape[-1] for day in tallies))
         seen = [
-            Tally(day.sums * counted, day.bins[..., :width] * known[..., :width], day.days)
+            Tally(
+                day.sums * counted,
+                day.bins[..., :width] * known[..., :width],
+                day.days,
+                between=day.between,
+            )
             for day in tallies
         ]
 
@@ -452,6 +461,28 @@ class Study:
         )
 
 
+def _noted(measured: MeasuredData, findings: Sequence[Finding]) -> MeasuredData:
+    return replace(measured, findings=(*measured.findings, *findings))
+
+
+def _fitted_periods(measured: MeasuredData) -> tuple[Period, ...]:
+    if not (periods := measured.of("fit")):
+        raise MeasuredDataError("no period has the split 'fit'; there is nothing to fit")
+    return periods
+
+
+def _answering(measured: MeasuredData, lights: Sequence[str]) -> bool:
+    """Return True if signals followed traffic whose arrivals are known."""
+    return measured.has_events and any(is_actuated(measured.periods, tls) for tls in lights)
+
+
+def _pools(
+    layout: DetectorLayout, measured: MeasuredData, between: Between | None, thresholds: Thresholds
+) -> Pools:
+    together = 1 if measured.has_events else bins_together(measured.counts, thresholds)
+    return Pools.of(layout, thresholds, together, between.labels if between else None)
+
+
 def effort_for(intersections: int) -> Effort:
     """Return the numbers of days that suit the size of a network."""
     return next((effort for most, effort in EFFORTS if intersections <= most), LEAST_EFFORT)
@@ -481,13 +512,21 @@ def _tallies(
     measured: MeasuredData,
     periods: Sequence[Period],
     thresholds: Thresholds,
+    between: Between | None,
 ) -> tuple[Tally, ...]:
     if measured.has_events or measured.counts is None:
-        return tuple(tally(layout, period, layout.greens(period), thresholds) for period in periods)
-    whole = without_gaps(measured.counts, measured.periods, thresholds)
-    return tuple(
-        counts_tally(layout, period, measured.counts, whole, thresholds) for period in periods
-    )
+        days = [tally(layout, period, layout.greens(period), thresholds) for period in periods]
+    else:
+        whole = without_gaps(measured.counts, measured.periods, thresholds)
+        days = [
+            counts_tally(layout, period, measured.counts, whole, thresholds) for period in periods
+        ]
+    if between is not None:
+        days = [
+            replace(day, between=between.measured(period.id))
+            for day, period in zip(days, periods, strict=True)
+        ]
+    return tuple(days)
 
 
 # --- variation from day to day --------------------------------------------------------------------

@@ -10,7 +10,14 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from ugat_marl.diagnosis.features import BIN_FEATURES, INDEX, DetectorLayout, Tally
+from ugat_marl.diagnosis.between import TRAVEL_TIME
+from ugat_marl.diagnosis.features import (
+    ALL_FEATURES,
+    BIN_FEATURES,
+    INDEX,
+    DetectorLayout,
+    Tally,
+)
 from ugat_marl.diagnosis.records import ApproachRow, Sides, TrafficCheck
 from ugat_marl.diagnosis.statistics import Array, sum_of
 from ugat_marl.diagnosis.thresholds import Thresholds
@@ -18,6 +25,11 @@ from ugat_marl.diagnosis.thresholds import Thresholds
 _STEADY = [INDEX[name] for name in ("gap4-5", "gap6-8", "gap9+")]
 """Gaps of queued vehicles from the fourth on: those of saturation flow."""
 _SERVED = [BIN_FEATURES.index(name) for name in ("count_stop", "count_exit")]
+_PASSING = [
+    [INDEX[f"{name}_{kind}"] for kind in ("advance", "stop", "exit")]
+    for name in ("mean_speed", "over")
+]
+"""Mean speeds and occupied times per vehicle of intervals."""
 _SEED = 11
 """Seed of the drawn data sets; fixed, so that the same days give the same judgement."""
 
@@ -97,7 +109,12 @@ def traffic_check(
     Returns:
         None if the data hold nothing to judge by.
     """
-    for measure, sums in (("travel time and queue", _journeys), ("service counts", _served)):
+    for measure, sums in (
+        ("travel time and queue", _journeys),
+        ("travel times of probes", _timed),
+        ("speed and occupancy", _passing),
+        ("service counts", _served),
+    ):
         sides = [sums(days) for days in (measured, before, after)]
         if all(side is not None and side.shape[-2] for side in sides):
             real, old, new = (side for side in sides if side is not None)
@@ -148,6 +165,20 @@ def _journeys(days: Sequence[Tally]) -> Array | None:
     """Return the sums of `JOURNEYS` of each day, ``(days, measures, places, 2)``."""
     known = [day.journeys for day in days if day.journeys is not None]
     return np.stack(known) if len(known) == len(days) else None
+
+
+def _timed(days: Sequence[Tally]) -> Array | None:
+    """Return sums of travel times between places, ``(days, 1, ways, 2)``; None without any."""
+    if any(TRAVEL_TIME not in day.between for day in days):
+        return None
+    return np.stack([day.between[TRAVEL_TIME].swapaxes(0, 1) for day in days])
+
+
+def _passing(days: Sequence[Tally]) -> Array | None:
+    """Return sums of `_PASSING` of each day, ``(days, 2, kinds * places, 2)``; None without any."""
+    if any(len(day.sums) < len(ALL_FEATURES) for day in days):
+        return None
+    return np.stack([day.sums[_PASSING].reshape(len(_PASSING), -1, 2) for day in days])
 
 
 def _served(days: Sequence[Tally]) -> Array | None:

@@ -8,7 +8,7 @@ from collections.abc import Collection, Sequence
 import numpy as np
 from scipy import stats
 
-from ugat_marl.diagnosis.features import FEATURES, DetectorLayout
+from ugat_marl.diagnosis.features import ALL_FEATURES, DetectorLayout
 from ugat_marl.diagnosis.hypotheses import WINDOW, Hypothesis, Members
 from ugat_marl.diagnosis.measurement import DetectorError
 from ugat_marl.diagnosis.places import one_behind_the_other
@@ -162,7 +162,7 @@ def _sufficient(
             best,
             rivals,
             sentence,
-            _separating(best.model, rivals[0], config.thresholds.deciding_z),
+            _separating(best.model, rivals[0], selector.held, config.thresholds.deciding_z),
         )
     them = "it" if len(best.model.members) == 1 else "them"
     sentence = f"The street has {names}; with {them}, what is left is no more than chance."
@@ -216,22 +216,36 @@ def _kinds(members: Members) -> set[str]:
 def _look_at(selection: Selected) -> str:
     """Suggest a measurement where most is left."""
     z = selection.best.model.distance.z["network"][0]
-    strongest = [FEATURES[int(i)][:2] for i in np.argsort(-np.abs(z))[:3] if z[int(i)]]
+    strongest = [ALL_FEATURES[int(i)][:2] for i in np.argsort(-np.abs(z))[:3] if z[int(i)]]
     told = ", ".join(f"{statistic(name)} ({regime})" for name, regime in strongest)
     return f"trajectories or video where most is left over: {told}"
 
 
-def _separating(best: Fitted, rival: Fitted, deciding_z: float) -> str:
-    """Name the statistic in which two models differ most, and the number of periods to decide."""
+_SOURCES = {"volume": "counts", "occupancy": "occupancies", "mean speed": "mean speeds"}
+"""Data that hold the statistics of a regime; the others need detections of single vehicles."""
+
+
+def _separating(best: Fitted, rival: Fitted, held: Collection[int], deciding_z: float) -> str:
+    """Name the statistic in which two models differ most, and the number of periods to decide.
+
+    Args:
+        best: A model.
+        rival: Another model.
+        held: Indices of the statistics that the data hold.
+        deciding_z: Standardised difference that would decide.
+    """
     block, other = best.reference.blocks["network"], rival.reference.blocks["network"]
     difference = (block.mean - other.mean)[0]
     deviation = np.sqrt(block.variance[0])
     z = np.where(block.used[0], difference / deviation, 0.0)
     index = int(np.argmax(np.abs(z)))
-    name, regime, _ = FEATURES[index]
+    name, regime, _ = ALL_FEATURES[index]
     periods = int(np.ceil((deciding_z / max(abs(float(z[index])), 0.05)) ** 2))
     many = "one period" if periods == 1 else f"{periods} periods"
-    return f"{statistic(name)} ({regime}) differs most between them: about {many} would decide"
+    source = "" if index in held else f" of {_SOURCES.get(regime, 'detections of single vehicles')}"
+    return (
+        f"{statistic(name)} ({regime}) differs most between them: about {many}{source} would decide"
+    )
 
 
 def describe_members(members: Members) -> str:
@@ -414,6 +428,17 @@ STATISTICS = {
     "kept_to_stop": "vehicles at stop per vehicle at advance",
     "kept_to_exit": "vehicles at exit per vehicle at stop",
     "occupied": "occupied time of advance detector",
+    **{
+        f"{name}_{kind}": text.format(f"{kind} detectors")
+        for kind in ("advance", "stop", "exit")
+        for name, text in (
+            ("over", "occupied time per vehicle at {}"),
+            ("mean_speed", "mean speed at {}"),
+            ("busy_count", "vehicles per interval when {} are occupied"),
+            ("busy_speed", "mean speed when {} are occupied"),
+            ("bunching", "bunching of vehicles at {}"),
+        )
+    },
 }
 """Descriptions of the statistics; names of statistics in bins of time end with " in time"."""
 

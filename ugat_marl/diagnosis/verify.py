@@ -15,7 +15,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from ugat_marl.diagnosis.features import BIN_FEATURES, FEATURES, INDEX, Tally
+from ugat_marl.diagnosis.features import ALL_FEATURES, BIN_FEATURES, INDEX, Tally
 from ugat_marl.diagnosis.records import (
     CriteriaRow,
     EngineeringCriteria,
@@ -98,7 +98,8 @@ def statistics_table(study: Study, base: Tested, best: Tested) -> tuple[Statisti
     block = base.model.reference.blocks["network"]
     fitted = best.model.reference.blocks["network"]
     rows: list[StatisticRow] = []
-    for index, (name, regime, unit) in enumerate(FEATURES):
+    width = before.z["network"].shape[1]
+    for index, (name, regime, unit) in enumerate(ALL_FEATURES[:width]):
         if before.z["network"][0, index] == 0.0:
             continue
         rows.append(

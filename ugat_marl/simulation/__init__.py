@@ -10,7 +10,7 @@ returns a `Snapshot`. At the end of an episode it returns `Trips`.
 - `host`: start and end of processes, for `process` and for vectors of environments.
 - `worker`: the program of these processes.
 - `channel`: messages to and from a worker.
-- `snapshots`, `trips`, `detectors`, `approach_delays`: measurements.
+- `snapshots`, `trips`, `detectors`, `between`, `approach_delays`: measurements.
 """
 
 import lazy_loader

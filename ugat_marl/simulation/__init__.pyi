@@ -1,5 +1,9 @@
 from .approach_delays import ApproachDelays as ApproachDelays
 from .approach_delays import measured_approaches as measured_approaches
+from .between import Place as Place
+from .between import Way as Way
+from .between import places_document as places_document
+from .between import read_between as read_between
 from .channel import Channel as Channel
 from .channel import ChannelClosed as ChannelClosed
 from .channel import Message as Message

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import itertools
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Collection, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -54,6 +54,22 @@ COUNTABLE = (
     "swapped",
 )
 """Effects that counts alone can show."""
+SUMMED = (
+    "acceleration",
+    "deceleration",
+    "startup_delay",
+    "headway",
+    "min_gap",
+    "imperfection",
+    "desired_speed",
+    "heavy_share",
+    "driver_model",
+    "late_green",
+    "local_speed",
+    "lane_closure",
+    "parking",
+)
+"""Effects that occupancies, mean speeds or travel times show too, though they are sums."""
 NEEDS_SIGNALS = (
     "late_green",
     "yellow_time",
@@ -151,8 +167,14 @@ def _of_signals(measured: MeasuredData, scenario: Scenario, network: Network) ->
     if adaptive:
         yield Finding(
             f"signals: {_list('traffic light', adaptive)} with greens of many lengths, as if they "
-            "followed the traffic: simulated days get the arrivals they answered, as the advance "
-            "detectors saw them; where an approach has none, doubt the verdict unknown"
+            "followed the traffic: "
+            + (
+                "simulated days get the arrivals they answered, as the advance detectors saw them; "
+                "where an approach has none, doubt the verdict unknown"
+                if measured.has_events
+                else "without detections the arrivals they answered are not known, so simulated "
+                "queues may differ though no effect is missing; doubt every verdict"
+            )
         )
 
 
@@ -177,11 +199,7 @@ def _has_yellow(periods: Sequence[Period], tls: str) -> bool:
 
 def _of_kinds(measured: MeasuredData, network: Network) -> Iterator[Finding]:
     if not measured.has_events:
-        yield Finding(
-            "counts only, no detections of single vehicles: only "
-            f"{', '.join(COUNTABLE)} can be examined",
-            tuple(sorted(set(known_effects()) - set(COUNTABLE))),
-        )
+        yield from _of_counts(measured, network)
         return
     seen = {name for period in measured.periods for name in period.passages}
     silent = [detector.id for detector in measured.detectors if detector.id not in seen]
@@ -192,7 +210,48 @@ def _of_kinds(measured: MeasuredData, network: Network) -> Iterator[Finding]:
             + ("; they are not used, and what happens there stays unknown" if many else ""),
             ("dropout", "swapped", "undercount") if many else (),
         )
+    yield from _of_each_kind(measured, network, seen)
+    yield from _of_speeds(measured)
+
+
+def _of_counts(measured: MeasuredData, network: Network) -> Iterator[Finding]:
+    """Yield findings on data without single vehicles, and what one more kind would show."""
+    counts = measured.counts
+    columns = () if counts is None else counts.columns
+    more = {"occupancy": "occupancy", "mean speed": "mean_speed_mps"}
+    missing = [name for name, column in more.items() if column not in columns]
+    summed = len(missing) < len(more) or measured.travel_times is not None
+    shown = {*COUNTABLE, *(SUMMED if summed else ())}
+    hidden = tuple(sorted(set(known_effects()) - shown))
+    if not summed:
+        yield Finding(
+            "counts only, no detections of single vehicles: only "
+            f"{', '.join(COUNTABLE)} can be examined; with occupancy or mean_speed_mps in "
+            f"counts.csv also {', '.join(SUMMED)}",
+            hidden,
+        )
+        return
+    yield Finding(
+        "no detections of single vehicles, but sums of intervals: examined are "
+        f"{', '.join(sorted(shown))}; detections would show {', '.join(hidden)} too",
+        hidden,
+    )
+    if counts is None:
+        return
+    if missing:
+        yield Finding(
+            f"counts.csv: no {missing[0]}; several effects change one of occupancy and mean speed "
+            "alike, and both together tell them apart"
+        )
+    yield from _of_each_kind(measured, network, set(counts["detector_id"]))
+
+
+def _of_each_kind(
+    measured: MeasuredData, network: Network, seen: Collection[str]
+) -> Iterator[Finding]:
+    """Yield findings on kinds of detectors of which none is among those that saw vehicles."""
     kinds = {detector.kind for detector in measured.detectors if detector.id in seen}
+    turns = measured.turning is not None
     shared = any(
         len({link.to_edge for link in intersection.links if link.from_lane == lane}) > 1
         for intersection in network.intersections
@@ -203,8 +262,8 @@ def _of_kinds(measured: MeasuredData, network: Network) -> Iterator[Finding]:
         "advance": ("the approach to red and the reach of queues stay unseen", NEEDS_ADVANCE),
         "exit": (
             "where vehicles turn "
-            + ("on shared lanes stays unseen" if shared else "shows by lane"),
-            ("turning",) if shared else (),
+            + ("on shared lanes stays unseen" if shared and not turns else "shows by lane"),
+            ("turning",) if shared and not turns else (),
         ),
     }
     for kind, (kind_name, effects) in needs.items():
@@ -215,7 +274,6 @@ def _of_kinds(measured: MeasuredData, network: Network) -> Iterator[Finding]:
             "all detectors are of one kind: one that misses vehicles looks like less demand",
             NEEDS_TWO_KINDS,
         )
-    yield from _of_speeds(measured)
 
 
 def _of_speeds(measured: MeasuredData) -> Iterator[Finding]:

@@ -12,6 +12,7 @@ import numpy as np
 import polars as pl
 
 from ugat_marl.data.measured import tables
+from ugat_marl.data.measured.counts import counts_of, travel_times_of, turning_of
 from ugat_marl.data.measured.coverage import coverage
 from ugat_marl.data.measured.local_time import LocalClock, local_times, require_time_zone
 from ugat_marl.data.measured.passages import passages_of
@@ -26,6 +27,7 @@ from ugat_marl.data.measured.tables import (
     refuse_set_back,
     with_period,
 )
+from ugat_marl.data.measured.tracks import passages_of_tracks
 from ugat_marl.data.measured.values import Finding, MeasuredData, split_periods
 from ugat_marl.effects import is_detector_name
 from ugat_marl.errors import MeasuredDataError, nearest
@@ -74,60 +76,111 @@ def read_measured(directory: Path, scenario: Scenario, network: Network) -> Meas
             f"{directory}: no such directory; measured data are a directory with periods.csv, "
             "detectors.csv, signals and detections (docs/reference/measured-data.md)"
         )
-    findings: list[Finding] = []
-    paths = {table.stem: table.path(directory) for table in tables.TABLES}
-    for table in (tables.PERIODS, tables.DETECTORS):
-        if paths[table.stem] is None:
-            raise _missing(directory, table)
-    counts_only = paths["detections"] is None and paths["counts"] is not None
-    if paths["detections"] is None and not counts_only:
-        raise _missing(directory, tables.DETECTIONS)
-    if paths["signals"] is None and not counts_only:
-        raise _missing(directory, tables.SIGNALS)
-
-    clock: LocalClock | None = None
-
-    def rows(table: Table) -> tuple[Path, pl.DataFrame]:
-        path = paths[table.stem]
-        assert path is not None
-        return path, read_table(path, table, findings, clock)
-
-    listed = rows(tables.PERIODS)
-    periods, clock = periods_of(*listed, scenario), _clock(*listed)
-    detectors = detectors_of(*rows(tables.DETECTORS), network)
+    files = _Files(directory)
+    listed = files.rows(tables.PERIODS)
+    periods = periods_of(*listed, scenario)
+    files.clock = _clock(*listed)
+    detectors = detectors_of(*files.rows(tables.DETECTORS), network)
     signals: tuple[dict[str, SignalLog], ...] = tuple({} for _ in periods)
-    if paths["signals"] is not None:
-        signals = _signals(*rows(tables.SIGNALS), periods, scenario, network, findings)
+    if files.has(tables.SIGNALS):
+        rows = files.rows(tables.SIGNALS)
+        signals = _signals(*rows, periods, scenario, network, files.findings)
     passages: tuple[dict[str, Passages], ...] = tuple({} for _ in periods)
-    if paths["detections"] is not None:
-        path, frame = rows(tables.DETECTIONS)
-        if frame.is_empty():
-            raise MeasuredDataError(f"{path}: no detections; write one row per on and off")
-        frame = with_period(path, frame, periods, findings)
-        passages, broken = passages_of(path, frame, periods, detectors, findings)
-        _refuse_empty(
-            path, "detections", [p.id for p, x in zip(periods, passages, strict=True) if not x]
+    if files.has(tables.DETECTIONS):
+        passages, broken = _passages(
+            *files.rows(tables.DETECTIONS), periods, detectors, files.findings
         )
         detectors = tuple(detector for detector in detectors if detector.id not in broken)
+    lanes = _of_moments(files, tables.LANES, periods)
+    trajectories = _of_moments(files, tables.TRAJECTORIES, periods)
+    if trajectories is not None and files.seen_on_tracks:
+        path = files.path(tables.TRAJECTORIES)
+        passages = passages_of_tracks(path, trajectories, periods, detectors, files.findings)
     periods = tuple(
         replace(period, signals=shown, passages=seen)
         for period, shown, seen in zip(periods, signals, passages, strict=True)
     )
-
-    def extra(table: Table) -> pl.DataFrame | None:
-        return None if paths[table.stem] is None else _extra(*rows(table), table, periods, findings)
-
     measured = MeasuredData(
         detectors,
         periods,
-        extra(tables.LANES),
-        extra(tables.TRAJECTORIES),
-        None
-        if paths["counts"] is None
-        else _counts(*rows(tables.COUNTS), periods, detectors, counts_only),
+        lanes,
+        trajectories,
+        *_summed(files, periods, detectors, network),
     )
-    findings += coverage(measured, scenario, network)
-    return replace(measured, findings=tuple(findings))
+    files.findings += coverage(measured, scenario, network)
+    return replace(measured, findings=tuple(files.findings))
+
+
+class _Files:
+    """Files of a directory of measured data.
+
+    Args:
+        directory: The directory.
+
+    Attributes:
+        clock: Local times at which the scenario's clock is 0; None until they are known.
+        findings: Findings on files that were read.
+
+    Raises:
+        MeasuredDataError: A file that is needed is missing.
+    """
+
+    def __init__(self, directory: Path) -> None:
+        self._paths = {table.stem: table.path(directory) for table in tables.TABLES}
+        self.clock: LocalClock | None = None
+        self.findings: list[Finding] = []
+        needed = [tables.PERIODS, tables.DETECTORS]
+        if not self.counts_only:
+            needed += [] if self.has(tables.TRAJECTORIES) else [tables.DETECTIONS]
+            needed += [tables.SIGNALS]
+        for table in needed:
+            if not self.has(table):
+                raise _missing(directory, table)
+
+    def has(self, table: Table) -> bool:
+        """Return True if the file is there."""
+        return self._paths[table.stem] is not None
+
+    @property
+    def counts_only(self) -> bool:
+        """True if there are counts and no detections."""
+        return self.has(tables.COUNTS) and not self.has(tables.DETECTIONS)
+
+    @property
+    def seen_on_tracks(self) -> bool:
+        """True if only trajectories tell of single vehicles."""
+        return not (self.has(tables.DETECTIONS) or self.has(tables.COUNTS))
+
+    def path(self, table: Table) -> Path:
+        """Return the path of a file that is there."""
+        path = self._paths[table.stem]
+        assert path is not None
+        return path
+
+    def rows(self, table: Table) -> tuple[Path, pl.DataFrame]:
+        """Return the path and the rows of a file that is there."""
+        path = self.path(table)
+        return path, read_table(path, table, self.findings, self.clock)
+
+
+def _summed(
+    files: _Files, periods: Sequence[Period], detectors: Sequence[Detector], network: Network
+) -> tuple[pl.DataFrame | None, pl.DataFrame | None, pl.DataFrame | None]:
+    """Return counts, turning counts and travel times; None for files that are not there."""
+    counts = turning = times = None
+    if files.has(tables.COUNTS):
+        path, frame = files.rows(tables.COUNTS)
+        counts = counts_of(path, frame, periods, detectors)
+        if files.counts_only:
+            counted = set(counts["period_id"])
+            missing = [period.id for period in periods if period.id not in counted]
+            _refuse_empty(path, "counts", missing)
+    if files.has(tables.TURNING):
+        turning = turning_of(*files.rows(tables.TURNING), periods, network)
+    if files.has(tables.TRAVEL_TIMES):
+        path, frame = files.rows(tables.TRAVEL_TIMES)
+        times = travel_times_of(path, with_period(path, frame, periods, files.findings), network)
+    return counts, turning, times
 
 
 def _clock(path: Path, frame: pl.DataFrame) -> LocalClock | None:
@@ -184,68 +237,38 @@ def _signals(
     return logs
 
 
-def _extra(
-    path: Path,
-    frame: pl.DataFrame,
-    table: Table,
-    periods: tuple[Period, ...],
-    findings: list[Finding],
-) -> pl.DataFrame:
-    frame = with_period(path, frame, periods, findings)
-    for column in ("vehicles", "halting", "mean_speed_mps", "speed_mps", "position_m"):
-        if column in frame.columns:
-            refuse(
-                path, frame.filter(pl.col(column) < 0), column, "is negative", "correct the rows"
-            )
-    return frame.select(*table.columns, *table.optional)
-
-
-def _counts(
+def _passages(
     path: Path,
     frame: pl.DataFrame,
     periods: tuple[Period, ...],
     detectors: tuple[Detector, ...],
-    alone: bool,
-) -> pl.DataFrame:
-    """Return counts per detector and interval; refuse unknown detectors and wrong intervals."""
-    names = [detector.id for detector in detectors]
-    refuse(
-        path,
-        frame.filter(~pl.col("detector_id").is_in(names)),
-        "detector_id",
-        "is not listed in detectors.csv",
-        "add it there, or leave the rows out",
-    )
-    for column, values in (
-        ("begin_s", {period.id: period.begin_s for period in periods}),
-        ("end_s", {period.id: period.end_s for period in periods}),
-    ):
-        limit = pl.col("period_id").replace_strict(values, default=None, return_dtype=pl.Float64)
-        frame = frame.with_columns(limit.alias(f"period_{column}"))
-    refuse(
-        path,
-        frame.filter(pl.col("period_begin_s").is_null()),
-        "period_id",
-        "is not listed in periods.csv",
-        "add it there, or leave the rows out",
-    )
-    for bad, column, complaint in (
-        (pl.col("begin_s") < pl.col("period_begin_s"), "begin_s", "is before the period's begin"),
-        (pl.col("end_s") > pl.col("period_end_s"), "end_s", "is after the period's end"),
-        (pl.col("end_s") <= pl.col("begin_s"), "end_s", "is not after begin_s"),
-        (pl.col("count") < 0, "count", "is negative"),
-        (pl.col("count") % 1 != 0, "count", "is not a whole number"),
-        (
-            pl.struct("period_id", "begin_s", "detector_id").is_duplicated(),
-            "begin_s",
-            "is there twice for its detector",
-        ),
-    ):
-        refuse(path, frame.filter(bad), column, complaint, "correct the row")
-    if alone:
-        counted = set(frame["period_id"])
-        _refuse_empty(path, "counts", [period.id for period in periods if period.id not in counted])
-    return frame.select(*tables.COUNTS.columns)
+    findings: list[Finding],
+) -> tuple[tuple[dict[str, Passages], ...], frozenset[str]]:
+    if frame.is_empty():
+        raise MeasuredDataError(f"{path}: no detections; write one row per on and off")
+    frame = with_period(path, frame, periods, findings)
+    passages, broken = passages_of(path, frame, periods, detectors, findings)
+    empty = [p.id for p, seen in zip(periods, passages, strict=True) if not seen]
+    _refuse_empty(path, "detections", empty)
+    return passages, broken
+
+
+def _of_moments(files: _Files, table: Table, periods: tuple[Period, ...]) -> pl.DataFrame | None:
+    """Return the table of lanes or of trajectories; None without one."""
+    if not files.has(table):
+        return None
+    path, frame = files.rows(table)
+    frame = with_period(path, frame, periods, files.findings)
+    for column in (
+        "vehicles", "halting", "mean_speed_mps", "speed_mps", "position_m", "length_m",
+    ):  # fmt: skip
+        if column in frame.columns:
+            refuse(
+                path, frame.filter(pl.col(column) < 0), column, "is negative", "correct the rows"
+            )
+    lengths = ("length_m",) if "length_m" in frame.columns and frame["length_m"].count() else ()
+    optional = lengths if table is tables.TRAJECTORIES else table.optional
+    return frame.select(*table.columns, *optional)
 
 
 def _refuse_empty(path: Path, kind: str, periods: list[str]) -> None:

@@ -123,7 +123,7 @@ TRAJECTORIES = Table(
         "position_m": "number",
         "speed_mps": "number",
     },
-    {},
+    {"length_m": "number"},
 )
 COUNTS = Table(
     "counts",
@@ -134,10 +134,39 @@ COUNTS = Table(
         "detector_id": "text",
         "count": "number",
     },
+    {"occupancy": "number", "mean_speed_mps": "number"},
+    (".csv",),
+)
+TURNING = Table(
+    "turning",
+    {
+        "period_id": "text",
+        "begin_s": "number",
+        "end_s": "number",
+        "from_edge": "text",
+        "to_edge": "text",
+        "count": "number",
+    },
     {},
     (".csv",),
 )
-TABLES = (PERIODS, DETECTORS, SIGNALS, DETECTIONS, LANES, TRAJECTORIES, COUNTS)
+TRAVEL_TIMES = Table(
+    "travel_times",
+    {
+        "period_id": "text",
+        "time_s": "number",
+        "from_edge": "text",
+        "from_m": "number",
+        "to_edge": "text",
+        "to_m": "number",
+        "travel_s": "number",
+    },
+    {},
+    (".csv",),
+)
+TABLES = (
+    PERIODS, DETECTORS, SIGNALS, DETECTIONS, LANES, TRAJECTORIES, COUNTS, TURNING, TRAVEL_TIMES,
+)  # fmt: skip
 
 
 def read_table(

@@ -41,7 +41,12 @@ class MeasuredData:
         trajectories: Table of vehicles at instants, or None. Columns: ``period_id, vehicle_id,
             time_s, lane_id, position_m, speed_mps``.
         counts: Table of counts, or None. Columns: ``period_id, begin_s, end_s, detector_id,
-            count``.
+            count``, and ``occupancy`` (share of time, 0 to 1) and ``mean_speed_mps`` where they
+            were measured.
+        turning: Table of turning counts, or None. Columns: ``period_id, begin_s, end_s, from_edge,
+            to_edge, count``.
+        travel_times: Table of travel times of probes, or None. Columns: ``period_id, time_s,
+            from_edge, from_m, to_edge, to_m, travel_s``; ``time_s`` is at the first place.
         findings: Findings from the checks of the files.
     """
 
@@ -50,6 +55,8 @@ class MeasuredData:
     lanes: pl.DataFrame | None = None
     trajectories: pl.DataFrame | None = None
     counts: pl.DataFrame | None = None
+    turning: pl.DataFrame | None = None
+    travel_times: pl.DataFrame | None = None
     findings: tuple[Finding, ...] = field(default=())
 
     def of(self, split: Split) -> tuple[Period, ...]:
@@ -100,7 +107,8 @@ class MeasuredData:
                     for times in (passages.on_s, passages.off_s):
                         digest.update(_canonical(np.round(times, 3)))
                     digest.update(_canonical(passages.speed_mps) + _canonical(passages.length_m))
-        for frame in (self.lanes, self.trajectories, self.counts):
+        frames = self.lanes, self.trajectories, self.counts, self.turning, self.travel_times
+        for frame in frames:
             if frame is not None:
                 numbers = selectors.numeric().cast(pl.Float64)
                 table = frame.select(sorted(frame.columns)).with_columns(numbers)

@@ -21,6 +21,8 @@ from ugat_marl.data.measured.tables import (
     SIGNALS,
     TABLES,
     TRAJECTORIES,
+    TRAVEL_TIMES,
+    TURNING,
     Table,
     frame_of,
 )
@@ -69,6 +71,10 @@ def write_measured(measured: MeasuredData, directory: Path, *, csv: bool = False
             _write(table, temporary / f"trajectories{suffix}")
         if measured.counts is not None:
             _write(_ordered(measured.counts, COUNTS), temporary / "counts.csv")
+        if measured.turning is not None:
+            _write(_ordered(measured.turning, TURNING), temporary / "turning.csv")
+        if measured.travel_times is not None:
+            _write(_ordered(measured.travel_times, TRAVEL_TIMES), temporary / "travel_times.csv")
         write_csv_hashes(temporary, sorted(path.name for path in temporary.glob("*.csv")))
         _put(temporary, directory)
     except OSError as error:

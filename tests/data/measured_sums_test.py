@@ -1,0 +1,155 @@
+"""Sums of intervals, turning counts and travel times: read, or refused in one line."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+
+import polars as pl
+import pytest
+
+from tests.data.measured_fuzz_test import recording
+from ugat_marl.data import CSV_HASHES, MeasuredData, as_counts, read_measured, write_measured
+from ugat_marl.data.measured.coverage import COUNTABLE, SUMMED
+from ugat_marl.effects import known_effects
+from ugat_marl.errors import MeasuredDataError
+from ugat_marl.scenarios import Network, Scenario, read_scenario
+
+
+@pytest.fixture(scope="module")
+def scenario(data: Path) -> Scenario:
+    return read_scenario(data / "crossing")
+
+
+@pytest.fixture(scope="module")
+def network(scenario: Scenario) -> Network:
+    return Network.read(scenario)
+
+
+def sums() -> MeasuredData:
+    """Sums of 50 s of a recording, with a turn and a way of probes."""
+    whole = as_counts(recording(), 50.0)
+    assert whole.counts is not None
+    turns = whole.counts.filter(pl.col("detector_id") == "a").select(
+        "period_id", "begin_s", "end_s", pl.lit("S_C").alias("from_edge"),
+        pl.lit("C_N").alias("to_edge"), "count",
+    )  # fmt: skip
+    times = turns.select(
+        "period_id", pl.col("begin_s").alias("time_s"), "from_edge", pl.lit(5.0).alias("from_m"),
+        "to_edge", pl.lit(90.0).alias("to_m"), pl.lit(40.0).alias("travel_s"),
+    )  # fmt: skip
+    return replace(whole, turning=turns, travel_times=times)
+
+
+@pytest.fixture
+def written(tmp_path: Path) -> Path:
+    return write_measured(sums(), tmp_path / "street", csv=True)
+
+
+def test_what_is_written_is_what_is_read(
+    written: Path, scenario: Scenario, network: Network
+) -> None:
+    before, after = sums(), read_measured(written, scenario, network)
+    assert after.hash == before.hash
+    assert after.counts is not None and after.turning is not None
+    assert after.counts.columns[-2:] == ["occupancy", "mean_speed_mps"]
+    assert not after.has_events
+
+
+def test_counts_without_the_new_columns_keep_their_hash(
+    tmp_path: Path, scenario: Scenario, network: Network
+) -> None:
+    given = sums()
+    assert given.counts is not None
+    bare = replace(given, counts=given.counts.drop("occupancy", "mean_speed_mps"))
+    after = read_measured(write_measured(bare, tmp_path / "bare", csv=True), scenario, network)
+    assert after.counts is not None
+    assert after.counts.columns == ["period_id", "begin_s", "end_s", "detector_id", "count"]
+    assert after.hash == bare.hash
+
+
+@pytest.mark.parametrize(
+    ("file", "column", "value", "message"),
+    [
+        ("counts", "occupancy", "12.5", "occupancy '12.5' is no share of time from 0 to 1; divide"),
+        ("counts", "occupancy", "-0.1", "is no share of time"),
+        ("counts", "occupancy", "many", "occupancy is 'many'"),
+        ("counts", "mean_speed_mps", "88", "is no speed from 0 to 70 m/s; multiply miles"),
+        ("counts", "mean_speed_mps", "-1", "is no speed"),
+        ("turning", "from_edge", "S_X", "is no edge of the network; did you mean 'S_C'"),
+        ("turning", "to_edge", "C_E", "no vehicle can turn from 'S_C' to 'C_E' at a traffic light"),
+        ("turning", "from_edge", "C_N", "'C_N' leads to no traffic light"),
+        ("turning", "count", "1.5", "is not a whole number"),
+        ("turning", "period_id", "day9", "is not listed in periods.csv"),
+        ("turning", "end_s", "0", "is not after begin_s"),
+        ("travel_times", "to_edge", "X_Y", "is no edge of the network"),
+        ("travel_times", "from_m", "9000", "lies beyond its from_edge; write the distance"),
+        ("travel_times", "to_m", "-1", "lies beyond its to_edge"),
+        ("travel_times", "travel_s", "0", "is not above 0; write the time"),
+    ],
+)
+def test_impossible_rows_are_refused_with_their_place_and_the_way_out(
+    file: str, column: str, value: str, message: str, written: Path, scenario: Scenario,
+    network: Network,
+) -> None:  # fmt: skip
+    (written / CSV_HASHES).unlink()
+    path = written / f"{file}.csv"
+    frame = pl.read_csv(path, infer_schema=False).with_columns(
+        pl.when(pl.int_range(pl.len()) == 2).then(pl.lit(value)).otherwise(column).alias(column)
+    )
+    frame.write_csv(path)
+    with pytest.raises(MeasuredDataError) as refusal:
+        read_measured(written, scenario, network)
+    text = str(refusal.value)
+    assert message in text
+    assert f"{file}.csv, line 4" in text
+    assert "\n" not in text
+
+
+def test_a_turn_that_is_there_twice_is_refused(
+    tmp_path: Path, scenario: Scenario, network: Network
+) -> None:
+    given = sums()
+    assert given.turning is not None
+    twice = replace(given, turning=pl.concat([given.turning, given.turning.head(1)]))
+    with pytest.raises(MeasuredDataError, match="is there twice for its turn"):
+        read_measured(write_measured(twice, tmp_path / "twice", csv=True), scenario, network)
+
+
+def ruled_out(measured: MeasuredData) -> set[str]:
+    return {name for finding in measured.findings for name in finding.rules_out}
+
+
+@pytest.mark.parametrize("missing", ["occupancy", "mean_speed_mps"])
+def test_findings_say_what_one_more_kind_of_data_would_decide(
+    missing: str, tmp_path: Path, scenario: Scenario, network: Network
+) -> None:
+    given = replace(sums(), travel_times=None)
+    assert given.counts is not None
+
+    def read(measured: MeasuredData, name: str) -> MeasuredData:
+        written = write_measured(measured, tmp_path / name, csv=True)
+        return read_measured(written, scenario, network)
+
+    bare = replace(given, counts=given.counts.drop("occupancy", "mean_speed_mps"))
+    only = read(bare, "counts")
+    assert not ruled_out(only) & set(COUNTABLE)
+    assert set(SUMMED) <= ruled_out(only)
+    text = next(x.text for x in only.findings if x.text.startswith("counts only"))
+    assert "with occupancy or mean_speed_mps in counts.csv also" in text
+    half = read(replace(given, counts=given.counts.drop(missing)), "half")
+    word = missing.removesuffix("_mps").replace("_", " ")
+    assert any(f"counts.csv: no {word};" in x.text for x in half.findings)
+    assert "desired_speed" not in ruled_out(half)
+    assert "turning" not in ruled_out(half), "turning counts stand where exit detectors would"
+    assert set(known_effects()) - {*COUNTABLE, *SUMMED} <= ruled_out(half)
+
+
+def test_mistaken_hours_of_probes_are_seen(
+    tmp_path: Path, scenario: Scenario, network: Network
+) -> None:
+    given = sums()
+    assert given.travel_times is not None
+    late = replace(given, travel_times=given.travel_times.with_columns(pl.col("time_s") + 3600.0))
+    with pytest.raises(MeasuredDataError, match="lie outside of it"):
+        read_measured(write_measured(late, tmp_path / "late", csv=True), scenario, network)

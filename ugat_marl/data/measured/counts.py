@@ -1,0 +1,185 @@
+"""Readers of counts of detectors, turning counts and travel times of probes."""
+
+from __future__ import annotations
+
+from collections.abc import Collection, Sequence
+from pathlib import Path
+
+import polars as pl
+
+from ugat_marl.data.measured.passages import FASTEST_MPS
+from ugat_marl.data.measured.tables import COUNTS, ROW, TRAVEL_TIMES, TURNING, place, refuse
+from ugat_marl.errors import MeasuredDataError, nearest
+from ugat_marl.scenarios import Detector, Network, Period
+
+
+def counts_of(
+    path: Path, frame: pl.DataFrame, periods: Sequence[Period], detectors: Sequence[Detector]
+) -> pl.DataFrame:
+    """Return counts per detector and interval, with the optional columns that hold something.
+
+    Args:
+        path: The file.
+        frame: Its rows.
+        periods: The periods.
+        detectors: The detectors.
+
+    Raises:
+        MeasuredDataError: A detector or period is unknown, an interval or a number impossible.
+    """
+    names = [detector.id for detector in detectors]
+    refuse(
+        path,
+        frame.filter(~pl.col("detector_id").is_in(names)),
+        "detector_id",
+        "is not listed in detectors.csv",
+        "add it there, or leave the rows out",
+    )
+    frame = _checked_intervals(path, frame, periods, ("detector_id",), "its detector")
+    _refuse_units(path, frame)
+    more = [name for name in COUNTS.optional if frame[name].count()]
+    return frame.select(*COUNTS.columns, *more)
+
+
+def _checked_intervals(
+    path: Path,
+    frame: pl.DataFrame,
+    periods: Sequence[Period],
+    keys: tuple[str, ...],
+    owner: str,
+) -> pl.DataFrame:
+    """Return rows of counts; refuse unknown periods, wrong intervals and impossible numbers."""
+    for column, values in (
+        ("begin_s", {period.id: period.begin_s for period in periods}),
+        ("end_s", {period.id: period.end_s for period in periods}),
+    ):
+        limit = pl.col("period_id").replace_strict(values, default=None, return_dtype=pl.Float64)
+        frame = frame.with_columns(limit.alias(f"period_{column}"))
+    refuse(
+        path,
+        frame.filter(pl.col("period_begin_s").is_null()),
+        "period_id",
+        "is not listed in periods.csv",
+        "add it there, or leave the rows out",
+    )
+    for bad, column, complaint in (
+        (pl.col("begin_s") < pl.col("period_begin_s"), "begin_s", "is before the period's begin"),
+        (pl.col("end_s") > pl.col("period_end_s"), "end_s", "is after the period's end"),
+        (pl.col("end_s") <= pl.col("begin_s"), "end_s", "is not after begin_s"),
+        (pl.col("count") < 0, "count", "is negative"),
+        (pl.col("count") % 1 != 0, "count", "is not a whole number"),
+        (
+            pl.struct("period_id", "begin_s", *keys).is_duplicated(),
+            "begin_s",
+            f"is there twice for {owner}",
+        ),
+    ):
+        refuse(path, frame.filter(bad), column, complaint, "correct the row")
+    return frame
+
+
+def _refuse_units(path: Path, frame: pl.DataFrame) -> None:
+    """Refuse occupancies and mean speeds in other units."""
+    occupancy, speed = pl.col("occupancy"), pl.col("mean_speed_mps")
+    for bad, column, complaint, way_out in (
+        (
+            (occupancy < 0) | (occupancy > 1),
+            "occupancy",
+            "is no share of time from 0 to 1",
+            "divide percents by 100, and leave the cell empty where it was not measured",
+        ),
+        (
+            (speed < 0) | (speed > FASTEST_MPS),
+            "mean_speed_mps",
+            f"is no speed from 0 to {FASTEST_MPS:g} m/s",
+            "multiply miles per hour by 0.44704, divide km/h by 3.6, and leave the cell empty "
+            "where it was not measured",
+        ),
+    ):
+        refuse(path, frame.filter(bad), column, complaint, way_out)
+
+
+def turning_of(
+    path: Path, frame: pl.DataFrame, periods: Sequence[Period], network: Network
+) -> pl.DataFrame:
+    """Return vehicles per interval that go from one edge to the next.
+
+    Args:
+        path: The file.
+        frame: Its rows.
+        periods: The periods.
+        network: Network of the scenario.
+
+    Raises:
+        MeasuredDataError: A period is unknown, no vehicle can turn so, or an interval or a number
+            is impossible.
+    """
+    turns = {
+        (edge, link.to_edge)
+        for intersection in network.intersections
+        for link in intersection.links
+        for edge in (network.lanes[link.from_lane].edge,)
+    }
+    _refuse_edges(path, frame, ("from_edge", "to_edge"), network)
+    for row in frame.iter_rows(named=True):
+        if (row["from_edge"], row["to_edge"]) not in turns:
+            ways = sorted(to for edge, to in turns if edge == row["from_edge"])
+            leads = f"{row['from_edge']!r} leads to {', '.join(ways[:8])}" if ways else (
+                f"{row['from_edge']!r} leads to no traffic light"
+            )  # fmt: skip
+            raise MeasuredDataError(
+                f"{place(path, row[ROW])}: no vehicle can turn from {row['from_edge']!r} to "
+                f"{row['to_edge']!r} at a traffic light; {leads}"
+            )
+    frame = _checked_intervals(path, frame, periods, ("from_edge", "to_edge"), "its turn")
+    return frame.select(*TURNING.columns)
+
+
+def travel_times_of(path: Path, frame: pl.DataFrame, network: Network) -> pl.DataFrame:
+    """Return travel times of single vehicles between two places.
+
+    Args:
+        path: The file.
+        frame: Its rows, within their periods.
+        network: Network of the scenario.
+
+    Raises:
+        MeasuredDataError: An edge is unknown, a place lies beyond its edge, or a time is not above
+            0.
+    """
+    _refuse_edges(path, frame, ("from_edge", "to_edge"), network)
+    lengths = {lane.edge: lane.length_m for lane in network.lanes.values()}
+    for edge, position in (("from_edge", "from_m"), ("to_edge", "to_m")):
+        length = pl.col(edge).replace_strict(lengths, return_dtype=pl.Float64)
+        refuse(
+            path,
+            frame.filter((pl.col(position) < 0) | (pl.col(position) > length + 0.1)),
+            position,
+            f"lies beyond its {edge}",
+            "write the distance from the start of the edge, in m",
+        )
+    refuse(
+        path,
+        frame.filter(pl.col("travel_s") <= 0),
+        "travel_s",
+        "is not above 0",
+        "write the time from the first to the second place, in s",
+    )
+    return frame.select(*TRAVEL_TIMES.columns)
+
+
+def _refuse_edges(
+    path: Path, frame: pl.DataFrame, columns: Collection[str], network: Network
+) -> None:
+    edges = {lane.edge for lane in network.lanes.values()}
+    for column in columns:
+        unknown = frame.filter(~pl.col(column).is_in(list(edges)))
+        if unknown.height:
+            near = nearest(unknown[column][0], edges)
+            refuse(
+                path,
+                unknown,
+                column,
+                "is no edge of the network" + (f"; did you mean {near!r}?" if near else ""),
+                "write the id of a SUMO edge",
+            )

@@ -1,0 +1,192 @@
+"""Passages of vehicles over detectors, read off trajectories of all vehicles.
+
+Video and drones see positions, not detectors. The detectors of ``detectors.csv`` are then lines on
+the street at which the passages are read off.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+import polars as pl
+from numpy.typing import NDArray
+
+from ugat_marl.data.measured.values import Finding
+from ugat_marl.errors import MeasuredDataError
+from ugat_marl.scenarios import Detector, Passages, Period, edge_of_lane
+
+COARSEST_S = 2.0
+"""Largest usual time between two positions of a vehicle. A vehicle is over a detector for less than
+a second, so positions farther apart say little of the moment."""
+USUAL_LENGTH_M = 5.0
+"""Length of a vehicle whose length is not stated, m: that of a car in SUMO."""
+
+Array = NDArray[np.float64]
+
+
+@dataclass(frozen=True, eq=False)
+class _Track:
+    """Positions of one vehicle in order of time; all arrays ``(positions,)``.
+
+    Attributes:
+        time_s: Time, s.
+        lane: Lane of the front.
+        position_m: Position of the front on its lane, m.
+        speed_mps: Speed, m/s.
+        driven_m: Distance from the first position, m.
+        length_m: Length of the vehicle, m.
+    """
+
+    time_s: Array
+    lane: list[str]
+    position_m: Array
+    speed_mps: Array
+    driven_m: Array
+    length_m: float
+
+    @classmethod
+    def of(cls, rows: pl.DataFrame) -> _Track:
+        """Make a track from the rows of one vehicle in one period."""
+        rows = rows.sort("time_s")
+        time, position, speed = (
+            rows[name].to_numpy() for name in ("time_s", "position_m", "speed_mps")
+        )
+        lane = rows["lane_id"].to_list()
+        same = np.array([a == b for a, b in zip(lane, lane[1:], strict=False)], np.bool_)
+        # Between two lanes, and on the junction between them, only the speed tells the distance.
+        driven = 0.5 * (speed[1:] + speed[:-1]) * np.diff(time)
+        step = np.where(same, np.diff(position), driven)
+        total = np.concatenate(([0.0], np.cumsum(np.maximum(step, 0.0))))
+        known = rows["length_m"].drop_nulls() if "length_m" in rows.columns else []
+        length = float(known[0]) if len(known) else USUAL_LENGTH_M
+        return cls(time, lane, position, speed, total, length)
+
+    def stays(self) -> Iterable[tuple[str, int, int]]:
+        """Yield each lane with the first position on it and the first one behind it."""
+        begin = 0
+        for index in range(1, len(self.lane) + 1):
+            if index == len(self.lane) or self.lane[index] != self.lane[begin]:
+                yield self.lane[begin], begin, index
+                begin = index
+
+    def passage(self, detector: Detector, begin: int, end: int) -> tuple[float, ...] | None:
+        """Return on and off in s, speed in m/s and length in m; None if it does not come over.
+
+        Args:
+            detector: A detector on the lane.
+            begin: Index of the first position on the lane.
+            end: Index behind the last one.
+        """
+        start = self.driven_m[begin] - self.position_m[begin]  # distance at the start of the lane
+        first, last = begin, end - 1
+        # A vehicle that comes from another road entered the lane between two positions.
+        if begin and self._turned(begin):
+            first = begin - 1
+        if end < len(self.lane) and self._turned(end):
+            last = end
+        on = self._when(start + detector.position_m, first, last)
+        if on is None:
+            return None
+        rear = start + detector.position_m + detector.length_m + self.length_m
+        off = self._when(rear, begin, len(self.lane) - 1)
+        at = {"front": (on,), "mean": (on, off or on)}.get(
+            detector.speed_at or "rear", (off or on,)
+        )
+        speed = float(np.mean(np.interp(at, self.time_s, self.speed_mps)))
+        return on, np.nan if off is None else off, speed, self.length_m
+
+    def _turned(self, index: int) -> bool:
+        """Return True if a position is on another road than the one before."""
+        return edge_of_lane(self.lane[index]) != edge_of_lane(self.lane[index - 1])
+
+    def _when(self, distance_m: float, first: int, last: int) -> float | None:
+        """Return when the vehicle has driven a distance; None if not between two positions."""
+        driven = self.driven_m[first : last + 1]
+        index = int(np.searchsorted(driven, distance_m))
+        if index == 0 or index == len(driven):
+            return None
+        low, high = driven[index - 1], driven[index]
+        begin, end = self.time_s[first + index - 1], self.time_s[first + index]
+        return float(begin + (end - begin) * (distance_m - low) / (high - low))
+
+
+def passages_of_tracks(
+    path: Path,
+    vehicles: pl.DataFrame,
+    periods: Sequence[Period],
+    detectors: Sequence[Detector],
+    findings: list[Finding],
+) -> tuple[dict[str, Passages], ...]:
+    """Read passages over detectors off the trajectories of all vehicles.
+
+    Args:
+        path: File of the trajectories.
+        vehicles: Its rows: ``period_id, vehicle_id, time_s, lane_id, position_m, speed_mps``, and
+            perhaps ``length_m``.
+        periods: The periods.
+        detectors: The detectors.
+        findings: Findings; how the passages were made is added to them.
+
+    Returns:
+        For each period, detector to its passages.
+
+    Raises:
+        MeasuredDataError: Positions are too far apart in time, or no vehicle comes over a detector.
+    """
+    by_lane: dict[str, list[Detector]] = {}
+    for detector in detectors:
+        by_lane.setdefault(detector.lane, []).append(detector)
+    steps = (
+        vehicles.sort("time_s")
+        .select(pl.col("time_s").diff().over("period_id", "vehicle_id"))["time_s"]
+        .drop_nulls()
+    )
+    step = float(steps.median() or 0.0) if len(steps) else 0.0  # pyright: ignore[reportArgumentType]
+    if step > COARSEST_S:
+        raise MeasuredDataError(
+            f"{path}: positions every {step:g} s, and no detections; passages over detectors need "
+            f"positions at most {COARSEST_S:g} s apart. Add detections or counts, or write the "
+            "times between two places as travel_times"
+        )
+    found: list[dict[str, Passages]] = []
+    for period in periods:
+        own = vehicles.filter(pl.col("period_id") == period.id)
+        rows: dict[str, list[tuple[float, ...]]] = {}
+        for part in own.partition_by("vehicle_id", maintain_order=True):
+            _collect(_Track.of(part), by_lane, rows)
+        found.append({name: _passages(times) for name, times in rows.items()})
+    if not any(found):
+        raise MeasuredDataError(
+            f"{path}: no vehicle comes over a detector of detectors.csv; check lane_id and "
+            "position_m there"
+        )
+    has_lengths = "length_m" in vehicles.columns and vehicles["length_m"].count()
+    assumed = "" if has_lengths else f", with vehicles taken to be {USUAL_LENGTH_M:g} m long"
+    findings.append(
+        Finding(
+            f"{path.name}: no detections; passages over the detectors are read off the "
+            f"trajectories{assumed}. Trajectories of a part of the vehicles would look like less "
+            "demand"
+        )
+    )
+    return tuple(found)
+
+
+def _collect(
+    track: _Track,
+    by_lane: Mapping[str, Sequence[Detector]],
+    rows: dict[str, list[tuple[float, ...]]],
+) -> None:
+    """Add the passages of a vehicle to those of the detectors."""
+    for lane, begin, end in track.stays():
+        for detector in by_lane.get(lane, ()):
+            if (passage := track.passage(detector, begin, end)) is not None:
+                rows.setdefault(detector.id, []).append(passage)
+
+
+def _passages(rows: list[tuple[float, ...]]) -> Passages:
+    table = np.array(sorted(rows), dtype=np.float64)
+    return Passages(*np.round(table.T, 3))

@@ -1,0 +1,200 @@
+"""Counts, occupancies and mean speeds per interval, and the features of a period from them.
+
+Detectors of cities and motorways report sums of an interval of 20 s to 15 min, not single vehicles.
+The length of the interval decides what is left in them. So simulated detectors are added up over
+intervals of the same length, and both sides have these features for each kind of detector:
+
+- ``over``: occupied time per vehicle, ``Σ o / Σ n``, s;
+- ``mean_speed``: ``Σ n v / Σ n``, m/s;
+- ``busy_count``: vehicles per interval, weighted by occupied time, ``Σ n o / Σ o``: near capacity
+  where queues stand on the detector;
+- ``busy_speed``: ``Σ n o v / Σ n o``, m/s: speed in crowded intervals;
+- ``bunching``: ``Σ n^2 / Σ n``: vehicles in the interval of a vehicle.
+
+n are the vehicles of an interval, o is its occupied time, v its mean speed.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Collection, Sequence
+from dataclasses import replace
+
+import numpy as np
+import polars as pl
+from numpy.typing import NDArray
+
+from ugat_marl.data import Intervals
+from ugat_marl.diagnosis.features import (
+    ALL_FEATURES,
+    BIN_FEATURES,
+    FEATURES,
+    INDEX,
+    DetectorLayout,
+    Tally,
+    bins_of,
+)
+from ugat_marl.diagnosis.thresholds import DayThresholds
+from ugat_marl.scenarios import Passages, Period
+
+Array = NDArray[np.float64]
+
+OCCUPANCY, MEAN_SPEED = "occupancy", "mean_speed_mps"
+"""Columns of counts that hold more than vehicles."""
+
+
+def interval_sums(intervals: Intervals, length_s: float) -> dict[str, tuple[float, float]]:
+    """Return the sum and the weight of each feature of a detector.
+
+    Args:
+        intervals: Reports of the detector in a period.
+        length_s: Usual length of an interval, s; features that depend on it leave out others.
+    """
+    n, o, v = intervals.vehicles, intervals.occupied_s, intervals.speed_mps
+    usual = np.abs(intervals.end_s - intervals.begin_s - length_s) < 1e-3
+    measured = np.isfinite(o)
+    moving = np.isfinite(v) & (n > 0)
+    busy, both = measured & usual, measured & moving & usual
+    values = {
+        "over": (o[measured].sum(), n[measured].sum()),
+        "mean_speed": ((n * v)[moving].sum(), n[moving].sum()),
+        "busy_count": ((n * o)[busy].sum(), o[busy].sum()),
+        "busy_speed": ((n * o * v)[both].sum(), (n * o)[both].sum()),
+        "bunching": ((n**2)[usual].sum(), n[usual].sum()),
+    }
+    return {name: (float(total), float(weight)) for name, (total, weight) in values.items()}
+
+
+def usual_length(counts: pl.DataFrame | None) -> float | None:
+    """Return the most frequent length of an interval, s.
+
+    None if the counts have neither occupancies nor mean speeds.
+    """
+    if counts is None or not any(
+        name in counts.columns and counts[name].count() for name in (OCCUPANCY, MEAN_SPEED)
+    ):
+        return None
+    lengths = (counts["end_s"].cast(pl.Float64) - counts["begin_s"].cast(pl.Float64)).round(3)
+    return float(lengths.mode().sort()[0])
+
+
+def with_intervals(
+    counted: Tally, layout: DetectorLayout, period: Period, length_s: float
+) -> Tally:
+    """Return the tally of a period of single vehicles with the features of intervals.
+
+    Args:
+        counted: Tally of the period, with `FEATURES`.
+        layout: Lanes and detectors.
+        period: Period with passages.
+        length_s: Length of an interval, s.
+    """
+    sums = _widened(counted.sums)
+    for name, (feature, place) in layout.counted.items():
+        seen = period.passages.get(name, Passages.none())
+        _enter(sums, feature, place, Intervals.of(seen, period, length_s), length_s)
+    return replace(counted, sums=sums)
+
+
+def _widened(sums: Array) -> Array:
+    """Return sums of `FEATURES` with empty rows for the other features."""
+    wide = np.zeros((len(ALL_FEATURES), *sums.shape[1:]))
+    wide[: len(FEATURES)] = sums
+    return wide
+
+
+def _enter(sums: Array, feature: str, place: int, intervals: Intervals, length_s: float) -> None:
+    """Enter the features of one detector, whose count is called ``count_<kind>``."""
+    kind = feature.removeprefix("count_")
+    for name, values in interval_sums(intervals, length_s).items():
+        sums[INDEX[f"{name}_{kind}"], place] = values
+
+
+# --- measured counts ------------------------------------------------------------------------------
+
+
+def bins_together(counts: pl.DataFrame | None, thresholds: DayThresholds) -> int:
+    """Return the number of bins that the longest interval of the counts covers.
+
+    Args:
+        counts: Table with ``begin_s, end_s``; None if single vehicles were detected.
+        thresholds: Numbers of the method.
+    """
+    if counts is None or counts.is_empty():
+        return 1
+    longest = float((counts["end_s"] - counts["begin_s"]).cast(pl.Float64).to_numpy().max())
+    return max(1, math.ceil(longest / thresholds.bin_s - 1e-6))
+
+
+def without_gaps(
+    counts: pl.DataFrame, periods: Sequence[Period], thresholds: DayThresholds
+) -> frozenset[str]:
+    """Find detectors that were counted in every period from begin to end."""
+    length = pl.col("end_s").cast(pl.Float64) - pl.col("begin_s").cast(pl.Float64)
+    whole = set(counts["detector_id"].to_list())
+    for period in periods:
+        of_period = counts.filter(pl.col("period_id") == period.id)
+        times = dict(of_period.group_by("detector_id").agg(length.sum()).iter_rows())
+        least = thresholds.whole * (period.end_s - period.begin_s)
+        whole = {name for name in whole if times.get(name, 0.0) >= least}
+    return frozenset(whole)
+
+
+def counts_tally(
+    layout: DetectorLayout,
+    period: Period,
+    counts: pl.DataFrame,
+    whole: Collection[str],
+    thresholds: DayThresholds,
+) -> Tally:
+    """Return the tally of measured counts; features of single vehicles stay empty.
+
+    Args:
+        layout: Lanes and detectors.
+        period: Period to tally.
+        counts: Table with ``period_id, begin_s, end_s, detector_id, count``, and perhaps
+            ``occupancy, mean_speed_mps``.
+        whole: Detectors `without_gaps`. Other detectors fill only their known bins, since the mean
+            of some hours is not the mean of the period.
+        thresholds: Numbers of the method.
+    """
+    places = len(layout.lanes) + len(layout.exits)
+    bins = np.zeros((len(BIN_FEATURES), places, bins_of(period, thresholds)))
+    covered = np.zeros_like(bins)
+    edges = np.linspace(period.begin_s, period.end_s, bins.shape[-1] + 1)
+    length_s = usual_length(counts)
+    sums = np.zeros((len(FEATURES), places, 2))
+    if length_s is not None:
+        sums = _widened(sums)
+    rows = counts.filter(pl.col("period_id") == period.id)
+    for (name,), own in rows.group_by("detector_id", maintain_order=True):
+        feature, place = layout.counted.get(str(name), ("", -1))
+        if place < 0:
+            continue
+        begin, end, count = (_numbers(own, x) for x in ("begin_s", "end_s", "count"))
+        occupied_s = _numbers(own, OCCUPANCY) * (end - begin)
+        if name in whole:
+            sums[INDEX[feature], place] = count.sum(), (end - begin).sum() / 60.0
+        if name in whole and length_s is not None:
+            reports = Intervals(begin, end, count, occupied_s, _numbers(own, MEAN_SPEED))
+            _enter(sums, feature, place, reports, length_s)
+        inside = np.clip(
+            np.minimum(edges[1:], end[:, None]) - np.maximum(edges[:-1], begin[:, None]), 0.0, None
+        )
+        share = inside / np.maximum(end - begin, 1e-9)[:, None]
+        line = BIN_FEATURES.index(feature), place
+        bins[line], covered[line] = count @ share, inside.sum(axis=0)
+        if feature == "count_advance":
+            line = BIN_FEATURES.index("occupied"), place
+            measured = np.isfinite(occupied_s)
+            bins[line] = occupied_s[measured] @ share[measured]
+            covered[line] = inside[measured].sum(axis=0)
+    known = (covered > thresholds.whole * np.diff(edges)).astype(np.float64)
+    return Tally(sums, bins * known, known=known)
+
+
+def _numbers(frame: pl.DataFrame, column: str) -> Array:
+    """Return a column as numbers; NaN for empty cells, and if there is no such column."""
+    if column not in frame.columns:
+        return np.full(frame.height, np.nan)
+    return frame[column].cast(pl.Float64).fill_null(float("nan")).to_numpy()
