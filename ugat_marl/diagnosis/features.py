@@ -163,9 +163,15 @@ class DetectorLayout:
 
     @functools.cached_property
     def approaches(self) -> tuple[tuple[int, ...], ...]:
-        """Indices of the lanes of each edge that have an advance and a stop detector."""
+        """Indices of the lanes of each edge that have an advance and a stop detector.
+
+        Roads with a zone on several lanes are left out: vehicles there cannot be followed by lane.
+        """
         by_edge: dict[str, list[int]] = {}
+        wide = {edge_of_lane(detector.lane) for detector in self.detectors if detector.beside}
         for index, lane in enumerate(self.lanes):
+            if lane.edge in wide:
+                continue
             if "advance" in lane.detectors and "stop" in lane.detectors:
                 by_edge.setdefault(lane.edge, []).append(index)
         return tuple(map(tuple, by_edge.values()))

@@ -249,8 +249,12 @@ class LaneDetectors:
 
     @classmethod
     def of(cls, detectors: Sequence[Detector], lane: str) -> LaneDetectors:
-        """Choose the last stop, the first advance and the first exit detector of a lane."""
-        own = sorted((d for d in detectors if d.lane == lane), key=lambda d: d.position_m)
+        """Choose the last stop, the first advance and the first exit detector of a lane.
+
+        Zones on several lanes do not tell on which of them a vehicle was.
+        """
+        alone = [d for d in detectors if d.lanes == (lane,)]
+        own = sorted(alone, key=lambda d: d.position_m)
         kinds = {
             kind: [detector for detector in own if detector.kind == kind]
             for kind in ("stop", "advance", "exit")

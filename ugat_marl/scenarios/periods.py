@@ -28,11 +28,11 @@ SignalLog = tuple[tuple[float, str], ...]
 
 @dataclass(frozen=True)
 class Detector:
-    """A detection zone on one lane.
+    """A detection zone on one lane, or on several lanes of one road.
 
     Attributes:
         id: Name.
-        lane: SUMO id of the lane.
+        lane: SUMO id of the lane; of the first one of a zone on several lanes.
         position_m: Distance of the zone's upstream end from the lane's start.
         length_m: Length of the zone; 0 for a point.
         kind: ``advance`` upstream of a stop line, ``stop`` at the stop line, ``exit`` downstream of
@@ -40,6 +40,8 @@ class Detector:
         speed_at: Point of the passage at which speeds are measured; None if it is not stated.
             Detectors of a simulation then measure when the rear leaves.
         clock: Clock that stamps the events; None if it is not stated, which counts as ``sumo``.
+        beside: SUMO ids of the other lanes of the zone. The zone is on while a vehicle is on any
+            of its lanes, so vehicles side by side are one event.
     """
 
     id: str
@@ -49,6 +51,12 @@ class Detector:
     kind: DetectorKind
     speed_at: SpeedPoint | None = None
     clock: DetectorClock | None = None
+    beside: tuple[str, ...] = ()
+
+    @property
+    def lanes(self) -> tuple[str, ...]:
+        """SUMO ids of all lanes of the zone."""
+        return (self.lane, *self.beside)
 
     @property
     def steps_early(self) -> int:
@@ -80,6 +88,34 @@ class Passages:
         """Return passages of no vehicle."""
         empty = np.empty(0)
         return cls(empty, empty, empty, empty)
+
+    @classmethod
+    def together(cls, lanes: Sequence[Passages]) -> Passages:
+        """Return the passages over a zone on several lanes, from those over each of its lanes.
+
+        Vehicles that are on the zone at the same time are one passage: from the first front to the
+        last rear, with their mean speed, and without a length.
+        """
+        if not any(len(lane) for lane in lanes):
+            return cls.none()
+        rows = np.concatenate([[x.on_s, x.off_s, x.speed_mps, x.length_m] for x in lanes], axis=1)
+        begin = np.where(np.isfinite(rows[0]), rows[0], -np.inf)
+        end = np.where(np.isfinite(rows[1]), rows[1], np.inf)
+        order = np.argsort(begin, kind="stable")
+        begin, end, rows = begin[order], end[order], rows[:, order]
+        latest = np.maximum.accumulate(end)
+        starts = np.append(0, 1 + np.flatnonzero(begin[1:] >= latest[:-1]))
+        count = np.diff(np.append(starts, len(begin)))
+        known = np.isfinite(rows[2])
+        timed = np.add.reduceat(known.astype(np.float64), starts)
+        speed = np.add.reduceat(np.where(known, rows[2], 0.0), starts)
+        last = np.maximum.reduceat(end, starts)
+        return cls(
+            np.where(np.isfinite(begin[starts]), begin[starts], np.nan),
+            np.where(np.isfinite(last), last, np.nan),
+            np.where(timed > 0, speed / np.maximum(timed, 1.0), np.nan),
+            np.where(count == 1, rows[3][starts], np.nan),
+        )
 
     def at(self, chosen: NDArray[np.bool_] | NDArray[np.int64]) -> Passages:
         """Return the chosen passages."""

@@ -67,23 +67,29 @@ def detectors_document(
         file: Absolute path of SUMO's output.
     """
     root = ET.Element("additional")
-    for detector in detectors:
-        begin = detector.position_m
-        if lanes is not None:
-            begin = min(begin, lanes[detector.lane].length_m - 0.1)
-        ends = {detector.id: begin}
+    for detector, number, lane in _zones(detectors):
+        last_m = np.inf if lanes is None else lanes[lane].length_m - 0.1
+        name = _loop(detector, number)
+        ends = {name: min(detector.position_m, last_m)}
         if detector.length_m > 0:
-            end = detector.position_m + detector.length_m
-            if lanes is not None:
-                end = min(end, lanes[detector.lane].length_m - 0.1)
-            ends[detector.id + _END] = end
-        for name, position in ends.items():
+            ends[name + _END] = min(detector.position_m + detector.length_m, last_m)
+        for loop, position in ends.items():
             ET.SubElement(
                 root,
                 "instantInductionLoop",
-                {"id": name, "lane": detector.lane, "pos": f"{position:.3f}", "file": str(file)},
+                {"id": loop, "lane": lane, "pos": f"{position:.3f}", "file": str(file)},
             )
     return Document("loops.add.xml", None, xml_bytes(root))
+
+
+def _zones(detectors: Sequence[Detector]) -> list[tuple[Detector, int, str]]:
+    """Return every lane of every detector, with its number in the zone."""
+    return [(one, number, lane) for one in detectors for number, lane in enumerate(one.lanes)]
+
+
+def _loop(detector: Detector, number: int) -> str:
+    """Return the id of the loop on a lane of a zone."""
+    return f"{detector.id}@{number}" if number else detector.id
 
 
 def read_passages(
@@ -112,9 +118,12 @@ def read_passages(
         rows[name].append((float(time), state == b"enter", vehicle, float(speed), float(length)))
     by_detector: dict[str, Passages] = {}
     for detector in detectors:
-        first = detector.id.encode()
-        last = (detector.id + _END).encode() if detector.length_m > 0 else first
-        passages = _passages(rows[first], rows[last], detector.speed_at or "rear")
+        by_lane: list[Passages] = []
+        for number in range(len(detector.lanes)):
+            first = _loop(detector, number).encode()
+            last = first + _END.encode() if detector.length_m > 0 else first
+            by_lane.append(_passages(rows[first], rows[last], detector.speed_at or "rear"))
+        passages = by_lane[0] if len(by_lane) == 1 else Passages.together(by_lane)
         passages = _clipped(delayed(passages, (1 - detector.steps_early) * step_s), begin_s, end_s)
         if len(passages):
             by_detector[detector.id] = passages

@@ -319,14 +319,15 @@ def _of_places(detectors: Sequence[Detector], network: Network) -> Iterator[Find
     wrong = [
         detector.id
         for detector in detectors
-        if detector.lane not in (out if detector.kind == "exit" else into)
+        if not set(detector.lanes) <= (out if detector.kind == "exit" else into)
     ]
     if wrong:
         yield Finding(
             f"detectors.csv: {_list('detector', wrong)} not on a lane of that kind (advance and "
             "stop: leading to an intersection with signals, exit: leading away); not used"
         )
-    bare = sorted(into - {detector.lane for detector in detectors if detector.kind != "exit"})
+    seen = {lane for detector in detectors if detector.kind != "exit" for lane in detector.lanes}
+    bare = sorted(into - seen)
     if bare:
         yield Finding(
             f"detectors.csv: no detector on {_list('incoming lane', bare)}, of {len(into)}; "
@@ -341,7 +342,7 @@ def _of_agreement(measured: MeasuredData, network: Network) -> Iterator[Finding]
     """
     stops: dict[str, list[str]] = {}
     for detector in measured.detectors:
-        if detector.kind == "stop":
+        if detector.kind == "stop" and not detector.beside:
             stops.setdefault(detector.lane, []).append(detector.id)
     for detector in network.intersections:
         total = red = 0

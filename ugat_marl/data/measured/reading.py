@@ -37,6 +37,7 @@ from ugat_marl.scenarios import (
     SPEED_POINTS,
     Detector,
     DetectorKind,
+    Lane,
     Network,
     Passages,
     Period,
@@ -397,6 +398,26 @@ def _refuse_impossible_detectors(path: Path, frame: pl.DataFrame) -> None:
         )
 
 
+def _lanes_of(where: str, names: Sequence[str], network: Network) -> list[Lane]:
+    """Return the lanes of a zone; refuse unknown ones, and lanes of several roads."""
+    lanes: list[Lane] = []
+    for name in names:
+        lane = network.lanes.get(name)
+        if lane is None:
+            near = nearest(name, network.lanes)
+            raise MeasuredDataError(
+                f"{where} lies on lane {name!r}, which the network does not have"
+                + (f"; did you mean {near!r}?" if near else "; lanes are called <edge>_<number>")
+            )
+        lanes.append(lane)
+    if len(set(names)) < len(names) or len({lane.edge for lane in lanes}) > 1:
+        raise MeasuredDataError(
+            f"{where} lies on the lanes {', '.join(names)}; a zone on several lanes names each "
+            "lane of one road once, with spaces between"
+        )
+    return lanes
+
+
 def detectors_of(path: Path, frame: pl.DataFrame, network: Network) -> tuple[Detector, ...]:
     """Return the detectors.
 
@@ -407,14 +428,8 @@ def detectors_of(path: Path, frame: pl.DataFrame, network: Network) -> tuple[Det
     _refuse_impossible_detectors(path, frame)
     detectors: list[Detector] = []
     for row in frame.iter_rows(named=True):
-        lane = network.lanes.get(row["lane_id"])
         where = f"{place(path, row[ROW])}: detector {row['detector_id']!r}"
-        if lane is None:
-            near = nearest(row["lane_id"], network.lanes)
-            raise MeasuredDataError(
-                f"{where} lies on lane {row['lane_id']!r}, which the network does not have"
-                + (f"; did you mean {near!r}?" if near else "; lanes are called <edge>_<number>")
-            )
+        lane, *others = _lanes_of(where, row["lane_id"].split(), network)
         begin, length = row["position_m"], row["length_m"]
         if not (0 <= begin <= lane.length_m + TOLERANCE_M and length >= 0):
             raise MeasuredDataError(
@@ -435,6 +450,7 @@ def detectors_of(path: Path, frame: pl.DataFrame, network: Network) -> tuple[Det
                 row["kind"],
                 row["speed_at"],
                 row["clock"],
+                tuple(other.id for other in others),
             )
         )
     return tuple(detectors)

@@ -138,7 +138,8 @@ def passages_of_tracks(
     """
     by_lane: dict[str, list[Detector]] = {}
     for detector in detectors:
-        by_lane.setdefault(detector.lane, []).append(detector)
+        for lane in detector.lanes:
+            by_lane.setdefault(lane, []).append(detector)
     steps = (
         vehicles.sort("time_s")
         .select(pl.col("time_s").diff().over("period_id", "vehicle_id"))["time_s"]
@@ -154,10 +155,24 @@ def passages_of_tracks(
     found: list[dict[str, Passages]] = []
     for period in periods:
         own = vehicles.filter(pl.col("period_id") == period.id)
-        rows: dict[str, list[tuple[float, ...]]] = {}
+        rows: dict[tuple[str, str], list[tuple[float, ...]]] = {}
         for part in own.partition_by("vehicle_id", maintain_order=True):
             _collect(_Track.of(part), by_lane, rows)
-        found.append({name: _passages(times) for name, times in rows.items()})
+        seen = {
+            detector.id: [
+                _passages(rows[key])
+                for lane in detector.lanes
+                if (key := (detector.id, lane)) in rows
+            ]
+            for detector in detectors
+        }
+        found.append(
+            {
+                name: lanes[0] if len(lanes) == 1 else Passages.together(lanes)
+                for name, lanes in seen.items()
+                if lanes
+            }
+        )
     if not any(found):
         raise MeasuredDataError(
             f"{path}: no vehicle comes over a detector of detectors.csv; check lane_id and "
@@ -178,13 +193,13 @@ def passages_of_tracks(
 def _collect(
     track: _Track,
     by_lane: Mapping[str, Sequence[Detector]],
-    rows: dict[str, list[tuple[float, ...]]],
+    rows: dict[tuple[str, str], list[tuple[float, ...]]],
 ) -> None:
-    """Add the passages of a vehicle to those of the detectors."""
+    """Add the passages of a vehicle to those of each lane of each detector."""
     for lane, begin, end in track.stays():
         for detector in by_lane.get(lane, ()):
             if (passage := track.passage(detector, begin, end)) is not None:
-                rows.setdefault(detector.id, []).append(passage)
+                rows.setdefault((detector.id, lane), []).append(passage)
 
 
 def _passages(rows: list[tuple[float, ...]]) -> Passages:

@@ -94,7 +94,7 @@ class MeasuredData:
                 detector.kind,
             )
             stated = [name for name in (detector.speed_at, detector.clock) if name is not None]
-            digest.update(repr((*zone, *stated)).encode())
+            digest.update(repr((*zone, *stated, *detector.beside)).encode())
         for period in self.periods:
             head = (period.id, float(period.begin_s), float(period.end_s), period.split)
             digest.update(repr(head).encode())

@@ -141,7 +141,7 @@ def _write(frame: pl.DataFrame, path: Path) -> None:
 
 def _detectors(measured: MeasuredData) -> pl.DataFrame:
     rows = [
-        (d.id, d.lane, d.position_m, d.length_m, d.kind, d.speed_at, d.clock)
+        (d.id, " ".join(d.lanes), d.position_m, d.length_m, d.kind, d.speed_at, d.clock)
         for d in measured.detectors
     ]
     frame = frame_of(DETECTORS, rows)
