@@ -12,10 +12,14 @@ from ugat_marl.diagnosis.features import ALL_FEATURES, BIN_FEATURES, FEATURES, I
 from ugat_marl.diagnosis.features import tally as tally_of
 from ugat_marl.diagnosis.intervals import (
     counts_tally,
+    implausible,
     interval_sums,
+    reports_of_counts,
+    seeming_lengths,
     usual_length,
     with_intervals,
     without_gaps,
+    without_occupancies,
 )
 from ugat_marl.diagnosis.thresholds import Thresholds
 from ugat_marl.errors import OptionError
@@ -134,3 +138,61 @@ def test_counts_without_more_are_counts(layout: DetectorLayout) -> None:
 def test_an_impossible_interval_is_refused(layout: DetectorLayout, length_s: float) -> None:
     with pytest.raises(OptionError, match="must be above 0"):
         as_counts(recording(layout, 3), length_s)
+
+
+# --- detectors that are not what they seem --------------------------------------------------------
+
+
+def free_traffic(extension_s: float, longer_m: float = 0.0) -> dict[str, np.ndarray]:
+    """Sums of cars of 5 m at 8 to 15 m/s over points, and over loops that stay on."""
+    generator = np.random.default_rng(2)
+    speed = generator.uniform(8.0, 15.0, (40, 6))
+    times = (5.0 + longer_m) / speed
+
+    def reports(extra_s: float) -> Intervals:
+        begin = 60.0 * np.arange(40)
+        occupied = (times + extra_s).sum(axis=1)
+        return Intervals(begin, begin + 60.0, np.full(40, 6.0), occupied, speed.mean(axis=1))
+
+    every = (("advance", reports(extension_s)), ("stop", reports(0.0)), ("exit", reports(0.0)))
+    return seeming_lengths(every, THRESHOLDS)
+
+
+def test_free_traffic_shows_the_length_of_vehicle_and_zone() -> None:
+    for longer in (0.0, 2.0):
+        total, vehicles = free_traffic(0.0, longer)["exit"]
+        assert vehicles == 240
+        assert total / vehicles == pytest.approx(5.0 + longer, rel=0.03)
+    crowded = Intervals(
+        np.zeros(1), np.full(1, 60.0), np.full(1, 9.0), np.full(1, 30.0), np.full(1, 2.0)
+    )
+    assert seeming_lengths([("stop", crowded)], THRESHOLDS)["stop"].tolist() == [0.0, 0.0]
+
+
+def test_longer_vehicles_are_not_put_on_detectors_and_extensions_are() -> None:
+    model = free_traffic(0.0)
+    assert implausible(model, model, THRESHOLDS) == {}
+    assert implausible(free_traffic(0.0, 2.0), model, THRESHOLDS) == {}
+    found = implausible(free_traffic(0.5), model, THRESHOLDS)
+    assert set(found) == {"advance"}
+    here, there = found["advance"]
+    assert here - there == pytest.approx(0.5 * 11.5, rel=0.05)
+    assert set(implausible(free_traffic(0.0, 5.0), model, THRESHOLDS)) == set(model)
+
+
+def test_occupancies_set_aside_have_no_weight(layout: DetectorLayout) -> None:
+    counts = as_counts(recording(layout, 3), 300.0).counts
+    assert counts is not None
+    period = Period("day", 0.0, 900.0, "fit", {}, {})
+    whole = without_gaps(counts, [period], THRESHOLDS)
+    before = counts_tally(layout, period, counts, whole, THRESHOLDS)
+    after = without_occupancies(before, ("advance",))
+    changed = {
+        name
+        for name, row in INDEX.items()
+        if row < len(before.sums) and (before.sums[row] != after.sums[row]).any()
+    }
+    assert changed == {"over_advance", "busy_count_advance", "busy_speed_advance"}
+    occupied = BIN_FEATURES.index("occupied")
+    assert before.counted[occupied].any() and not after.counted[occupied].any()
+    assert {kind for kind, _ in reports_of_counts(layout, counts)} == {"advance", "stop", "exit"}

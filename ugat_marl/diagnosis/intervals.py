@@ -17,7 +17,7 @@ n are the vehicles of an interval, o is its occupied time, v its mean speed.
 from __future__ import annotations
 
 import math
-from collections.abc import Collection, Sequence
+from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
 from dataclasses import replace
 
 import numpy as np
@@ -34,7 +34,7 @@ from ugat_marl.diagnosis.features import (
     Tally,
     bins_of,
 )
-from ugat_marl.diagnosis.thresholds import DayThresholds
+from ugat_marl.diagnosis.thresholds import DayThresholds, Thresholds
 from ugat_marl.scenarios import Passages, Period
 
 Array = NDArray[np.float64]
@@ -94,6 +94,101 @@ def with_intervals(
         seen = period.passages.get(name, Passages.none())
         _enter(sums, feature, place, Intervals.of(seen, period, length_s), length_s)
     return replace(counted, sums=sums)
+
+
+# --- the detectors as they are --------------------------------------------------------------------
+
+
+def seeming_lengths(
+    reports: Iterable[tuple[str, Intervals]], thresholds: Thresholds
+) -> dict[str, Array]:
+    """Return sums from which the length of vehicles and zone follows, by kind of detector.
+
+    A vehicle of length L over a zone of length z at speed v occupies it for (L + z) / v. So in free
+    traffic ``L + z = Σ o v / Σ n``, whatever the drivers do.
+
+    Args:
+        reports: Kind of detector and reports of each detector.
+        thresholds: Numbers of the method.
+
+    Returns:
+        Kind to its sum ``Σ o v`` in m and its number of vehicles, ``(2,)``, of intervals that are
+        occupied for at most `Thresholds.free_occupancy`.
+    """
+    sums: dict[str, Array] = {}
+    for kind, one in reports:
+        n, o, v = one.vehicles, one.occupied_s, one.speed_mps
+        share = o / np.maximum(one.end_s - one.begin_s, 1e-9)
+        free = np.isfinite(v) & (n > 0) & (share <= thresholds.free_occupancy)
+        total = np.array([(o * v)[free].sum(), n[free].sum()])
+        sums[kind] = sums.get(kind, np.zeros(2)) + total
+    return sums
+
+
+def reports_of_passages(
+    layout: DetectorLayout, period: Period, length_s: float
+) -> Iterator[tuple[str, Intervals]]:
+    """Yield kind and reports of each detector over which vehicles passed."""
+    for name, (feature, _) in layout.counted.items():
+        seen = period.passages.get(name, Passages.none())
+        yield feature.removeprefix("count_"), Intervals.of(seen, period, length_s)
+
+
+def reports_of_counts(
+    layout: DetectorLayout, counts: pl.DataFrame
+) -> Iterator[tuple[str, Intervals]]:
+    """Yield kind and reports of each detector that was counted."""
+    for (name,), own in counts.group_by("detector_id", maintain_order=True):
+        feature, _ = layout.counted.get(str(name), ("", -1))
+        if feature:
+            yield feature.removeprefix("count_"), _reports(own)
+
+
+def implausible(
+    street: Mapping[str, Array], model: Mapping[str, Array], thresholds: Thresholds
+) -> dict[str, tuple[float, float]]:
+    """Find kinds of detectors whose occupancies do not fit their counts and speeds.
+
+    Vehicles may be longer than those of the model, and then they are so at every detector. So a
+    difference is put on detectors if no traffic has it, or if it is not that of the other kinds.
+
+    Args:
+        street: Sums of `seeming_lengths` of the measured periods.
+        model: The same of simulated days.
+        thresholds: Numbers of the method.
+
+    Returns:
+        Kind to its length of vehicle and zone on the street and in the model, m.
+    """
+    least = thresholds.least_sightings
+    lengths = {
+        kind: (float(sums[0] / sums[1]), float(model[kind][0] / model[kind][1]))
+        for kind, sums in street.items()
+        if sums[1] >= least and kind in model and model[kind][1] >= least
+    }
+    usual = float(np.median([here - there for here, there in lengths.values()])) if lengths else 0.0
+    if abs(usual) > thresholds.most_longer_m:
+        usual = 0.0
+    return {
+        kind: (here, there)
+        for kind, (here, there) in lengths.items()
+        if abs(here - there - usual) > thresholds.most_unlike_m
+        or abs(here - there) > thresholds.most_longer_m
+    }
+
+
+def without_occupancies(counted: Tally, kinds: Collection[str]) -> Tally:
+    """Return a tally in which some kinds of detectors measured no occupancies."""
+    sums, known = counted.sums.copy(), counted.counted.copy()
+    for kind in kinds:
+        for name in ("over", "busy_count", "busy_speed"):
+            sums[INDEX[f"{name}_{kind}"]] = 0.0
+    if "advance" in kinds:
+        known[BIN_FEATURES.index("occupied")] = 0.0
+    return replace(counted, sums=sums, bins=counted.bins * (known > 0), known=known)
+
+
+# --- features -------------------------------------------------------------------------------------
 
 
 def _widened(sums: Array) -> Array:
@@ -171,12 +266,12 @@ def counts_tally(
         feature, place = layout.counted.get(str(name), ("", -1))
         if place < 0:
             continue
-        begin, end, count = (_numbers(own, x) for x in ("begin_s", "end_s", "count"))
-        occupied_s = _numbers(own, OCCUPANCY) * (end - begin)
+        reports = _reports(own)
+        begin, end, count = reports.begin_s, reports.end_s, reports.vehicles
+        occupied_s = reports.occupied_s
         if name in whole:
             sums[INDEX[feature], place] = count.sum(), (end - begin).sum() / 60.0
         if name in whole and length_s is not None:
-            reports = Intervals(begin, end, count, occupied_s, _numbers(own, MEAN_SPEED))
             _enter(sums, feature, place, reports, length_s)
         inside = np.clip(
             np.minimum(edges[1:], end[:, None]) - np.maximum(edges[:-1], begin[:, None]), 0.0, None
@@ -191,6 +286,13 @@ def counts_tally(
             covered[line] = inside[measured].sum(axis=0)
     known = (covered > thresholds.whole * np.diff(edges)).astype(np.float64)
     return Tally(sums, bins * known, known=known)
+
+
+def _reports(rows: pl.DataFrame) -> Intervals:
+    """Return the reports of one detector in the rows of its counts."""
+    begin, end = _numbers(rows, "begin_s"), _numbers(rows, "end_s")
+    occupied_s = _numbers(rows, OCCUPANCY) * (end - begin)
+    return Intervals(begin, end, _numbers(rows, "count"), occupied_s, _numbers(rows, MEAN_SPEED))
 
 
 def _numbers(frame: pl.DataFrame, column: str) -> Array:

@@ -29,8 +29,13 @@ from ugat_marl.diagnosis.hypotheses import Hypothesis, global_hypotheses, librar
 from ugat_marl.diagnosis.intervals import (
     bins_together,
     counts_tally,
+    implausible,
+    reports_of_counts,
+    reports_of_passages,
+    seeming_lengths,
     usual_length,
     without_gaps,
+    without_occupancies,
 )
 from ugat_marl.diagnosis.measurement import DetectorError, Measurement, Sightings, together
 from ugat_marl.diagnosis.patterns import QUANTITIES, cells_of, patterns
@@ -264,8 +269,10 @@ class Study:
             OutOfTime: The budget does not suffice for the days to compare with.
         """
         thresholds = self.config.thresholds
-        if not self.measured.has_events or not thresholds.measurement_days:
+        if not thresholds.measurement_days:
             return self
+        if not self.measured.has_events:
+            return self._occupancies_as_they_are(reporter)
         numbers = range(min(thresholds.measurement_days, self.effort.base))
         with reporter.task("the detectors", len(numbers)) as advance:
             simulated = together(self.engine.sightings(numbers, advance))
@@ -286,6 +293,42 @@ class Study:
         other = None if self.other_days is None else self.other_days.detecting(effects)
         engine = self.engine.detecting(effects)
         return replace(self, engine=engine, other_days=other, detection=errors)
+
+    def _occupancies_as_they_are(self, reporter: Reporter) -> Study:
+        """Set occupancies aside that do not fit counts and speeds, see `intervals.implausible`.
+
+        Raises:
+            OutOfTime: The budget does not suffice for the days to compare with.
+        """
+        counts, thresholds = self.measured.counts, self.config.thresholds
+        length_s = usual_length(counts)
+        if counts is None or length_s is None:
+            return self
+        here = seeming_lengths(reports_of_counts(self.layout, counts), thresholds)
+        if not any(vehicles for _, vehicles in here.values()):
+            return self  # no occupancies, or no speeds
+
+        def lengths(period: Period, _: Sequence[Greens]) -> dict[str, Array]:
+            reports = reports_of_passages(self.layout, period, length_s)
+            return seeming_lengths(reports, thresholds)
+
+        numbers = range(min(thresholds.measurement_days, self.effort.base))
+        name = f"lengths up to {thresholds.free_occupancy:g}"
+        with reporter.task("the detectors", len(numbers)) as advance:
+            days = self.engine.reduced((), numbers, name, lengths, advance)
+        there = {kind: sum((day[kind] for day in days), np.zeros(2)) for kind in here}
+        wrong = implausible(here, there, thresholds)
+        if not wrong:
+            return self
+        findings = tuple(_of_length(kind, *both) for kind, both in wrong.items())
+        for finding in findings:
+            reporter.say(f"note: {finding.text}")
+        fit, heldout = (
+            tuple(without_occupancies(day, wrong) for day in days)
+            for days in (self.fit, self.heldout)
+        )
+        noted = _noted(self.measured, findings)
+        return replace(self, measured=noted, fit=fit, heldout=heldout)
 
     def base(self, reporter: Reporter) -> Tested:
         """Simulate the scenario as it is, and test if it could have made the data.
@@ -604,6 +647,15 @@ def _of_speed_points(stated: SpeedPoint, seen: SpeedPoint) -> Finding:
         f"the stated point was used, so check it, or leave the column empty"
     )
     return Finding(text)
+
+
+def _of_length(kind: str, street_m: float, model_m: float) -> Finding:
+    """Return a finding on occupancies that do not fit counts and speeds."""
+    return Finding(
+        f"counts.csv: by their occupancies, counts and speeds, vehicle and zone are together "
+        f"{street_m:.1f} m long at {kind} detectors, and {model_m:.1f} m in the simulation; check "
+        "length_m and extensions. These occupancies were not used"
+    )
 
 
 # --- measured edges without demand ----------------------------------------------------------------

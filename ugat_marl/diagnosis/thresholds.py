@@ -242,6 +242,16 @@ class Thresholds(DayThresholds):
 
     # --- measurement: the detectors as they are -----------------------------------------------
 
+    free_occupancy: float = 0.15
+    """Occupancy up to which an interval is free, so that it tells how long vehicles and zone are
+    together. By hand: no queue reaches the detector. Halved: fewer intervals."""
+    most_longer_m: float = 3.0
+    """Difference of that length from the model beyond which it is put on detectors and not on
+    vehicles, m. By hand: with a third of trucks vehicles are 3 m longer. Halved: a sixth of trucks
+    is taken for long zones."""
+    most_unlike_m: float = 1.5
+    """The same for a difference from the other kinds of detectors, m: half of a usual loop. Halved:
+    fields that reach beyond the edges of a loop count."""
     measurement_days: int = 8
     """Simulated days with which the reports of single vehicles are compared. By hand: thousands of
     vehicles. Halved: errors of detectors are known 1.4 times less exactly."""
