@@ -529,7 +529,7 @@ class ApproachRow:
 
 @dataclass(frozen=True)
 class TrafficCheck:
-    """Judgement of a correction by measures that no fit uses, on the held-out periods.
+    """Judgement of a correction on the held-out periods, if possible by measures no fit uses.
 
     Attributes:
         measure: The measures: ``travel time and queue``, else ``travel times of probes``, else

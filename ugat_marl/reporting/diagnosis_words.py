@@ -170,9 +170,11 @@ def traffic_check_line(diagnosis: Diagnosis) -> str | None:
     if check is None:
         return None
     nearer = "come nearer" if check.better else "do not come nearer"
+    unfitted = check.measure == "travel time and queue"
+    apart = "which no fit used" if unfitted else "of periods that no fit used"
     before, after = share(check.error_before), share(check.error_after)
     return (
-        f"By the effects named, simulated {check.measure} {nearer} to the data, which no fit used: "
+        f"By the effects named, simulated {check.measure} {nearer} to the data, {apart}: "
         f"sum of relative errors {before} before, {after} after."
     )
 
