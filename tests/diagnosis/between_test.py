@@ -3,18 +3,22 @@
 from __future__ import annotations
 
 import math
+from pathlib import Path
 
 import numpy as np
 import polars as pl
 import pytest
 
 from ugat_marl.data import MeasuredData
-from ugat_marl.diagnosis.between import TRAVEL_TIME, TURNING, Between
+from ugat_marl.diagnosis.between import EVERY_LANE, LANES, TRAVEL_TIME, TURNING, Between
 from ugat_marl.diagnosis.features import BIN_FEATURES, FEATURES, DetectorLayout, IncomingLane, Tally
 from ugat_marl.diagnosis.places import turned
+from ugat_marl.diagnosis.replay import Replay
 from ugat_marl.diagnosis.statistics import Pools, Reference
 from ugat_marl.diagnosis.thresholds import Thresholds
-from ugat_marl.scenarios import Period
+from ugat_marl.effects import load_scenario
+from ugat_marl.experiments import policy_factory, record
+from ugat_marl.scenarios import Network, Period, demand_as_vehicles
 from ugat_marl.simulation import Place
 
 THRESHOLDS = Thresholds()
@@ -66,10 +70,13 @@ def test_simulated_vehicles_count_where_the_street_was_counted() -> None:
     assert found is not None
     came = np.array([[10.0, 4.0], [299.0, 5.0], [300.0, 4.0], [700.0, 3.0], [900.0, 3.0]])
     seen = [came, came, np.array([[5.0, 44.0], [6.0, 46.0]]), np.empty((0, 2))]
-    one = found.simulated("one", seen)
+    one = found.simulated(PERIODS[0], seen, None)
     assert one[TURNING].tolist() == [[[3.0, 10.0]], [[2.0, 5.0]]]
     assert one[TRAVEL_TIME].tolist() == [[[90.0, 2.0]], [[0.0, 0.0]]]
-    assert found.simulated("two", seen)[TURNING].tolist() == [[[0.0, 0.0]], [[4.0, 15.0]]]
+    assert found.simulated(PERIODS[1], seen, None)[TURNING].tolist() == [
+        [[0.0, 0.0]],
+        [[4.0, 15.0]],
+    ]
 
 
 def test_without_either_kind_there_is_nothing() -> None:
@@ -104,3 +111,53 @@ def test_a_planted_turn_is_proposed_with_its_share_and_no_other() -> None:
     (found,) = turned(reference, reference.distance(other))
     assert found.fixed == (("from_edge", "a"), ("to_edge", "y"))
     assert found.levels[0][0] == pytest.approx(0.25, abs=0.05)
+
+
+# --- states of lanes ------------------------------------------------------------------------------
+
+
+def test_lanes_are_means_over_moments_and_vehicles() -> None:
+    rows = [
+        ("one", 0.0, "a_0", 2.0, 1.0, 4.0),
+        ("one", 1.0, "a_0", 4.0, 0.0, 7.0),
+        ("one", 0.0, "b_0", 0.0, 0.0, None),
+        ("one", 1.0, "b_0", 1.0, 0.0, 9.0),
+    ]
+    names = ("period_id", "time_s", "lane_id", "vehicles", "halting", "mean_speed_mps")
+    lanes = pl.DataFrame(rows, schema=names, orient="row")
+    found = Between.of(MeasuredData((), PERIODS, lanes=lanes))
+    assert found is not None and found.lanes == ("a_0", "b_0")
+    blocks = found.measured("one")
+    means = blocks[LANES][..., 0] / blocks[LANES][..., 1]
+    assert means.tolist() == [[3.0, 0.5, 36.0 / 6.0], [0.5, 0.0, 9.0]]
+    assert blocks[LANES][0, 0].tolist() == [6.0 * 450.0, 900.0], "of 900 s two were seen"
+    every = blocks[EVERY_LANE][0, :, 0] / blocks[EVERY_LANE][0, :, 1]
+    assert every.tolist() == [7.0 / 4.0, 1.0 / 4.0, 45.0 / 7.0]
+    assert not found.measured("two")[LANES].any(), "nothing is known of the other day"
+    simulated = found.simulated(PERIODS[0], [], np.array([[1800.0, 90.0, 9000.0], [0.0, 0.0, 0.0]]))
+    assert simulated[LANES].tolist() == [
+        [[1800.0, 900.0], [90.0, 900.0], [9000.0, 1800.0]],
+        [[0.0, 900.0], [0.0, 900.0], [0.0, 0.0]],
+    ]
+
+
+def test_simulated_lanes_are_those_of_positions_second_by_second(data: Path) -> None:
+    scenario = demand_as_vehicles(load_scenario(data / "crossing"))
+    network = Network.read(scenario)
+    measured = record(
+        scenario, "sim", policy_factory("fixed-time:30"), periods=1, seed=3, lanes=True,
+        same_demand=True,
+    )  # fmt: skip
+    found = Between.of(measured)
+    assert found is not None
+    (period,) = measured.periods
+    layout = DetectorLayout.of(network, measured.detectors)
+    replay = Replay(
+        scenario, network, measured.detectors, layout.owner, THRESHOLDS, watched=found.lanes
+    )
+    many = [replay.simulate((), period, seed).lane_states for seed in range(6)]
+    states = np.mean([one for one in many if one is not None], axis=0)
+    simulated = found.simulated(period, [], states)[EVERY_LANE][0]
+    street = found.measured(period.id)[EVERY_LANE][0]
+    assert simulated[0, 0] / simulated[0, 1] == pytest.approx(street[0, 0] / street[0, 1], rel=0.3)
+    assert simulated[2, 0] / simulated[2, 1] == pytest.approx(street[2, 0] / street[2, 1], rel=0.2)

@@ -1,28 +1,39 @@
-"""Turning counts and travel times of probes: vehicles that pass two places one after the other.
+"""Turning counts, travel times of probes and states of lanes: what lies between detectors.
 
 Simulated vehicles are followed over the same places. Turning counts are compared in the stretches
 of time that were counted, and as vehicles per minute. Travel times are compared as means: probes
-are a part of the vehicles, so their number says nothing.
+are a part of the vehicles, so their number says nothing. Of lanes the mean numbers of vehicles and
+of halting vehicles are compared, and the mean speed, each lane alone and all together.
 """
 
 from __future__ import annotations
 
 import math
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 import numpy as np
 import polars as pl
 from numpy.typing import NDArray
 
 from ugat_marl.data import MeasuredData
+from ugat_marl.scenarios import Period, edge_of_lane
 from ugat_marl.simulation import Place, Way
 
 Array = NDArray[np.float64]
 Span = tuple[float, float]
 
-TURNING, TRAVEL_TIME = "turning", "travel time"
+TURNING, TRAVEL_TIME, LANES, EVERY_LANE = "turning", "travel time", "lanes", "every lane"
 """Names of the blocks of statistics."""
+MEASURES: Mapping[str, tuple[tuple[str, str], ...]] = {
+    TURNING: (("vehicles that turn", "1/min"),),
+    TRAVEL_TIME: (("travel time", "s"),),
+    **dict.fromkeys(
+        (LANES, EVERY_LANE),
+        (("vehicles on lane", ""), ("halting vehicles on lane", ""), ("speed on lane", "m/s")),
+    ),
+}
+"""Names and units of the statistics of each block."""
 
 
 @dataclass(frozen=True)
@@ -30,19 +41,19 @@ class Label:
     """Meaning of a member of a block.
 
     Attributes:
-        edge: Edge at which it is reported.
-        following: Edge behind it.
-        unit: Unit of its statistic.
+        edge: Edge at which it is reported; "" for all.
+        following: Edge behind it; "" for none.
+        lane: Lane; "" for none.
     """
 
-    edge: str
-    following: str
-    unit: str
+    edge: str = ""
+    following: str = ""
+    lane: str = ""
 
 
 @dataclass(frozen=True, eq=False)
 class Between:
-    """Measured turning counts and travel times, and the places at which vehicles are followed.
+    """Measured turning counts, travel times and states of lanes.
 
     Attributes:
         turns: Pairs of edges whose turning vehicles were counted.
@@ -50,6 +61,9 @@ class Between:
         spans: For each period, begin and end of the counted intervals of each turn, s.
         counts: For each period, vehicles of each turn, ``(turns,)``.
         times: For each period, sum and number of travel times of each way, ``(ways, 2)``.
+        lanes: SUMO ids of the lanes whose state was measured.
+        states: For each period, sums and numbers of observations of the state of each lane,
+            ``(lanes, 3, 2)``.
     """
 
     turns: tuple[tuple[str, str], ...]
@@ -57,13 +71,19 @@ class Between:
     spans: Mapping[str, tuple[tuple[Span, ...], ...]]
     counts: Mapping[str, Array]
     times: Mapping[str, Array]
+    lanes: tuple[str, ...] = ()
+    states: Mapping[str, Array] = field(default_factory=dict)
 
     @classmethod
     def of(cls, measured: MeasuredData) -> Between | None:
-        """Collect the measured data; None if they hold neither kind."""
-        turning, probes = measured.turning, measured.travel_times
-        if turning is None and probes is None:
+        """Collect the measured data; None if they hold no kind."""
+        turning, probes, lanes = measured.turning, measured.travel_times, measured.lanes
+        if turning is None and probes is None and lanes is None:
             return None
+        names = () if lanes is None else tuple(sorted(set(lanes["lane_id"])))
+        states: dict[str, Array] = {}
+        if lanes is not None:
+            states = {period.id: _states(lanes, period, names) for period in measured.periods}
         turns: tuple[tuple[str, str], ...] = ()
         ways: tuple[Way, ...] = ()
         if turning is not None:
@@ -81,7 +101,7 @@ class Between:
             counts[period.id] = np.array([count for _, count in rows], np.float64)
             totals = [] if probes is None else [_time(probes.filter(own), way) for way in ways]
             times[period.id] = np.array(totals, np.float64).reshape(-1, 2)
-        return cls(turns, ways, spans, counts, times)
+        return cls(turns, ways, spans, counts, times, names, states)
 
     @property
     def followed(self) -> tuple[Way, ...]:
@@ -93,43 +113,66 @@ class Between:
     def labels(self) -> dict[str, tuple[Label, ...]]:
         """Meanings of the members of the blocks."""
         labels = {
-            TURNING: tuple(Label(a, b, "1/min") for a, b in self.turns),
-            TRAVEL_TIME: tuple(Label(a.edge, b.edge, "s") for a, b in self.ways),
+            TURNING: tuple(Label(a, b) for a, b in self.turns),
+            TRAVEL_TIME: tuple(Label(a.edge, b.edge) for a, b in self.ways),
+            LANES: tuple(Label(edge_of_lane(lane), lane=lane) for lane in self.lanes),
+            EVERY_LANE: (Label(),) if self.lanes else (),
         }
         return {name: members for name, members in labels.items() if members}
 
     def measured(self, period: str) -> dict[str, Array]:
-        """Return sums and numbers of observations of a measured period, ``(members, 1, 2)``."""
-        return self._blocks(self.counts[period], self._minutes(period), self.times[period])
+        """Return sums and numbers of observations of a measured period, by block.
 
-    def simulated(self, period: str, seen: Sequence[Array]) -> dict[str, Array]:
+        Each array is ``(members, measures, 2)``, with the measures of `MEASURES`.
+        """
+        states = self.states.get(period, np.zeros((0, 3, 2)))
+        return self._blocks(self.counts[period], self._minutes(period), self.times[period], states)
+
+    def simulated(
+        self, period: Period, seen: Sequence[Array], lanes: Array | None
+    ) -> dict[str, Array]:
         """Return the same of a simulated day.
 
         Args:
-            period: Id of the measured period whose signals the day has.
+            period: The measured period whose signals the day has.
             seen: For each of `followed`, times at the first place and travel times, s,
                 ``(vehicles, 2)``.
+            lanes: Vehicle seconds, halting seconds and driven metres of each lane, ``(lanes, 3)``;
+                None without lanes.
         """
         turned, timed = seen[: len(self.turns)], seen[len(self.turns) :]
         counts = [
             float(sum(((begin <= x[:, 0]) & (x[:, 0] < end)).sum() for begin, end in spans))
-            for x, spans in zip(turned, self.spans[period], strict=True)
+            for x, spans in zip(turned, self.spans[period.id], strict=True)
         ]
+        states = np.zeros((0, 3, 2))
+        if lanes is not None:
+            length = np.full(len(lanes), period.end_s - period.begin_s)
+            weights = np.stack([length, length, lanes[:, 0]], axis=-1)
+            states = np.stack([lanes, weights], axis=-1)
         times = np.array([(x[:, 1].sum(), len(x)) for x in timed], np.float64).reshape(-1, 2)
-        return self._blocks(np.array(counts), self._minutes(period), times)
+        return self._blocks(np.array(counts), self._minutes(period.id), times, states)
 
     def _minutes(self, period: str) -> Array:
         return np.array(
             [sum(end - begin for begin, end in spans) / 60.0 for spans in self.spans[period]]
         )
 
-    def _blocks(self, counts: Array, minutes: Array, times: Array) -> dict[str, Array]:
-        sums = {TURNING: np.stack([counts, minutes], axis=-1), TRAVEL_TIME: times}
-        return {name: values[:, None] for name, values in sums.items() if len(values)}
+    def _blocks(
+        self, counts: Array, minutes: Array, times: Array, states: Array
+    ) -> dict[str, Array]:
+        every = states.sum(axis=0, keepdims=True)
+        sums = {
+            TURNING: np.stack([counts, minutes], axis=-1)[:, None],
+            TRAVEL_TIME: times[:, None],
+            LANES: states,
+            EVERY_LANE: every if len(states) else states,
+        }
+        return {name: values for name, values in sums.items() if len(values)}
 
     def __repr__(self) -> str:
         """Return everything that simulated days depend on, for the key of the cache."""
-        return repr((self.turns, self.ways, sorted(self.spans.items())))
+        return repr((self.turns, self.ways, sorted(self.spans.items()), self.lanes))
 
 
 def _turn(turning: pl.DataFrame, turn: tuple[str, str]) -> tuple[tuple[Span, ...], float]:
@@ -149,3 +192,33 @@ def _time(probes: pl.DataFrame, way: Way) -> tuple[float, float]:
         & (pl.col("to_m") == last.position_m)
     )
     return float(own["travel_s"].sum()), float(own.height)
+
+
+def _states(lanes: pl.DataFrame, period: Period, names: Sequence[str]) -> Array:
+    """Return sums and numbers of observations of the lanes in a period, ``(lanes, 3, 2)``.
+
+    Both are scaled to a moment per second of the period, as simulated lanes have.
+    """
+    moments = lanes.filter(pl.col("period_id") == period.id)
+    speed = pl.col("mean_speed_mps") if "mean_speed_mps" in lanes.columns else pl.lit(None)
+    speed = speed.cast(pl.Float64).fill_nan(None)
+    known = pl.col("vehicles").filter(speed.is_not_null())
+    sums = moments.group_by("lane_id").agg(
+        pl.col("vehicles").sum().alias("vehicles"),
+        pl.col("halting").sum().alias("halting"),
+        (pl.col("vehicles") * speed).sum().alias("metres"),
+        pl.len().alias("moments"),
+        known.sum().alias("moving"),
+    )
+    found = {row["lane_id"]: row for row in sums.iter_rows(named=True)}
+    states = np.zeros((len(names), 3, 2))
+    for number, name in enumerate(names):
+        if (row := found.get(name)) is not None:
+            seen = float(row["moments"])
+            rows = [
+                (float(row["vehicles"]), seen),
+                (float(row["halting"]), seen),
+                (float(row["metres"]), float(row["moving"])),
+            ]
+            states[number] = np.array(rows) * (period.end_s - period.begin_s) / seen
+    return states

@@ -475,8 +475,9 @@ class Engine:
         if self._interval_s is not None:
             counted = with_intervals(counted, self.layout, period, self._interval_s)
         if self._between is not None:
-            measured = self.periods[number % len(self.periods)].id
-            counted = replace(counted, between=self._between.simulated(measured, day.between))
+            measured = self.periods[number % len(self.periods)]
+            between = self._between.simulated(measured, day.between, day.lane_states)
+            counted = replace(counted, between=between)
         # The cache holds float32, so round here: the result must not depend on the cache.
         counted = replace(counted, bins=counted.bins.astype(np.float32).astype(np.float64))
         return self._with_due(counted, day.travel_time_s, day.due)

@@ -7,6 +7,7 @@ from dataclasses import replace
 
 import numpy as np
 
+from ugat_marl.diagnosis.between import EVERY_LANE, TRAVEL_TIME
 from ugat_marl.diagnosis.engine import Engine
 from ugat_marl.diagnosis.features import Tally
 from ugat_marl.diagnosis.hypotheses import WINDOW, Hypothesis, Members, effects_of
@@ -17,7 +18,7 @@ from ugat_marl.effects import EVERYWHERE
 Change = tuple[dict[str, Array], float]
 """Change of the statistics when a free value moves, by block, and length of this move."""
 
-WIDE = ("network", "intersection", "travel time")
+WIDE = ("network", "intersection", TRAVEL_TIME, EVERY_LANE)
 """Blocks for the fit of effects on the whole network. Single lanes would add more noise than
 information."""
 

@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 from scipy import special, stats
 
+from ugat_marl.diagnosis.between import MEASURES
 from ugat_marl.diagnosis.engine import OutOfTime
 from ugat_marl.diagnosis.features import ALL_FEATURES, BIN_FEATURES, DetectorLayout
 from ugat_marl.diagnosis.records import Disagreement, Located, Tested
@@ -67,9 +68,7 @@ def locate(
     candidates: list[Disagreement] = []
     for name, z in distance.z.items():
         if name in reference.pools.between:
-            candidates += _between(
-                layout, reference, name, z[:, 0], distance.difference[name][:, 0]
-            )
+            candidates += _between(layout, reference, name, z, distance.difference[name])
         elif name != "time":
             candidates += _statistics(
                 layout, name, z, distance.difference[name], reference.pools.thresholds
@@ -137,18 +136,19 @@ def _statistics(
 def _between(
     layout: DetectorLayout, reference: Reference, block: str, z: Array, difference: Array
 ) -> list[Disagreement]:
-    """Return the disagreements of turning counts, or of travel times between places."""
+    """Return the disagreements of turning counts, travel times or states of lanes."""
     owner = {edge: layout.intersections[index] for index, edge, _ in layout.places}
     rows: list[Disagreement] = []
-    for label, value, size in zip(reference.pools.between[block], z, difference, strict=True):
-        if not value:
-            continue
-        p = two_sided(float(value), reference.pools.thresholds.heavy_tail)
-        said = f"{block} {label.edge} → {label.following}"
+    for member, feature in zip(*np.nonzero(z), strict=True):
+        label = reference.pools.between[block][int(member)]
+        name, unit = MEASURES[block][int(feature)]
+        value, size = float(z[member, feature]), float(difference[member, feature])
+        p = two_sided(value, reference.pools.thresholds.heavy_tail)
+        said = f"{name} {label.edge} → {label.following}" if label.following else name
         rows.append(
             Disagreement(
-                owner.get(label.edge), label.edge, None, block, said, None, float(size),
-                label.unit, float(value), p,
+                owner.get(label.edge), label.edge or None, label.lane or None, block, said, None,
+                size, unit, value, p,
             )
         )  # fmt: skip
     return rows

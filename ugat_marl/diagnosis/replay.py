@@ -74,10 +74,12 @@ from ugat_marl.simulation import (
     Way,
     delayed,
     detectors_document,
+    lane_states_document,
     launch_of,
     one_line_message,
     places_document,
     read_between,
+    read_lane_states,
     read_passages,
     read_trips,
 )
@@ -96,12 +98,14 @@ class Day:
         due: Vehicles that the demand asked for; None if the day did not get measured arrivals.
         between: Times at the first place and travel times, s, ``(vehicles, 2)``, for each of the
             ways that are followed.
+        lane_states: State of the watched lanes, see `read_lane_states`; None if there are none.
     """
 
     period: Period
     travel_time_s: float
     due: Due | None = None
     between: tuple[Array, ...] = ()
+    lane_states: Array | None = None
 
 
 class Replay:
@@ -117,11 +121,13 @@ class Replay:
         detection: Errors of measurement of the detectors that saw the arrivals.
         day_to_day: Variation of the demand from day to day, see `draw_day`.
         followed: Ways on which vehicles are followed.
+        watched: SUMO ids of lanes whose state is kept.
     """
 
     answering = False
     day_to_day = 0.0
     followed: tuple[Way, ...] = ()
+    watched: tuple[str, ...] = ()
 
     def __init__(
         self,
@@ -135,6 +141,7 @@ class Replay:
         detection: Sequence[Effect] = (),
         day_to_day: float = 0.0,
         followed: Sequence[Way] = (),
+        watched: Sequence[str] = (),
     ) -> None:
         self._given = scenario, network, detectors, owner, thresholds
         self.answering = answering
@@ -146,6 +153,7 @@ class Replay:
         self._detection = tuple(detection)
         self.day_to_day = day_to_day
         self.followed = tuple(followed)
+        self.watched = tuple(watched)
         layout = DetectorLayout.of(network, installed_detectors(self._detection, detectors))
         self._arrivals = Arrivals(layout, network, thresholds) if answering else None
         self._own = detector_effects(scenario)
@@ -161,6 +169,7 @@ class Replay:
                 detection=self._detection,
                 day_to_day=self.day_to_day,
                 followed=self.followed,
+                watched=self.watched,
             ),
             self._given,
         )
@@ -173,6 +182,7 @@ class Replay:
             detection=errors,
             day_to_day=self.day_to_day,
             followed=self.followed,
+            watched=self.watched,
         )
 
     def simulate(self, effects: Sequence[Effect], period: Period, seed: int) -> Day:
@@ -262,6 +272,9 @@ class Replay:
         places = directory / "places.xml"
         if self.followed:
             more.append(places_document(self.followed, self._network.lanes, places))
+        states = directory / "lanes.xml"
+        if self.watched:
+            more.append(lane_states_document(period.begin_s, period.end_s, states))
         scenario = replace(
             scenario,
             additional=(*scenario.additional, *more),
@@ -284,7 +297,8 @@ class Replay:
         between: tuple[Array, ...] = ()
         if self.followed:
             between = read_between(places, self.followed, period.begin_s, period.end_s)
-        return Day(replace(period, passages=seen), travel, between=between)
+        watched = read_lane_states(states, self.watched) if self.watched else None
+        return Day(replace(period, passages=seen), travel, between=between, lane_states=watched)
 
 
 def _with(scenario: Scenario, effects: Sequence[Effect]) -> Scenario:

@@ -16,7 +16,7 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from ugat_marl.diagnosis.between import Label
+from ugat_marl.diagnosis.between import LANES, Label
 from ugat_marl.diagnosis.features import (
     ALL_FEATURES,
     EVENT_FEATURES,
@@ -29,7 +29,7 @@ from ugat_marl.diagnosis.thresholds import Thresholds
 
 Array = NDArray[np.float64]
 
-SINGLE = ("lane", "time")
+SINGLE = ("lane", "time", LANES)
 """Blocks of single lanes and bins of time. Most differences there are chance, so differences that
 may be chance are not used when a model changes."""
 
@@ -277,7 +277,8 @@ def softened(block: str, z: Array, thresholds: Thresholds) -> Array:
 
 def _softness(block: str, thresholds: Thresholds) -> float:
     """Return the standardised difference beyond which differences in a block count less."""
-    return {"lane": thresholds.soft_lane, "time": thresholds.soft_time}.get(block, np.inf)
+    soft = {"lane": thresholds.soft_lane, LANES: thresholds.soft_lane, "time": thresholds.soft_time}
+    return soft.get(block, np.inf)
 
 
 def _stack(pools: Pools, tallies: Sequence[Tally]) -> dict[str, Array]:

@@ -175,9 +175,8 @@ class Study:
         ruled_out = frozenset(name for finding in measured.findings for name in finding.rules_out)
         allowed = library(config.leave_out) - ruled_out
         periods = _fitted_periods(measured)
-        lights = layout.intersections
-        answering = _answering(measured, lights)
-        effort = config.effort or effort_for(len(lights))
+        answering = _answering(measured, layout.intersections)
+        effort = config.effort or effort_for(len(layout.intersections))
         budget = config.budget()
         between = Between.of(measured)
         fit = _tallies(layout, measured, periods, thresholds, between)
@@ -198,6 +197,7 @@ class Study:
                     answering=answering,
                     day_to_day=variation,
                     followed=between.followed if between else (),
+                    watched=between.lanes if between else (),
                 ),
                 [*periods, *measured.of("heldout")],
                 config.seed,

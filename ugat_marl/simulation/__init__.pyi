@@ -15,6 +15,8 @@ from .host import Host as Host
 from .host import Worker as Worker
 from .host import kept_warm as kept_warm
 from .host import one_line_message as one_line_message
+from .lane_states import lane_states_document as lane_states_document
+from .lane_states import read_lane_states as read_lane_states
 from .launch import Launch as Launch
 from .launch import SignalPlans as SignalPlans
 from .launch import Simulator as Simulator

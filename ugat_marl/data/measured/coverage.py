@@ -220,7 +220,8 @@ def _of_counts(measured: MeasuredData, network: Network) -> Iterator[Finding]:
     columns = () if counts is None else counts.columns
     more = {"occupancy": "occupancy", "mean speed": "mean_speed_mps"}
     missing = [name for name, column in more.items() if column not in columns]
-    summed = len(missing) < len(more) or measured.travel_times is not None
+    others = measured.travel_times is not None or measured.lanes is not None
+    summed = len(missing) < len(more) or others
     shown = {*COUNTABLE, *(SUMMED if summed else ())}
     hidden = tuple(sorted(set(known_effects()) - shown))
     if not summed:
