@@ -172,7 +172,7 @@ def implausible(
     return {
         kind: (here, there)
         for kind, (here, there) in lengths.items()
-        if abs(here - there - usual) > thresholds.most_unlike_m
+        if min(abs(here - there - usual), abs(here - there)) > thresholds.most_unlike_m
         or abs(here - there) > thresholds.most_longer_m
     }
 
