@@ -2,8 +2,11 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from pathlib import Path
+from typing import Any
 
+import polars as pl
 import pytest
 
 import ugat_marl
@@ -75,3 +78,44 @@ def test_what_the_package_offers_is_listed() -> None:
     assert offered <= set(dir(ugat_marl))
     for name in dir(ugat_marl):
         assert getattr(ugat_marl, name).__doc__
+
+
+class Stopped(Exception):
+    """Raised by a callback, as a search does that prunes a trial."""
+
+
+def test_a_callback_gets_what_is_logged_and_may_end_the_run(tmp_path: Path) -> None:
+    options: dict[str, Any] = {
+        "learner": "ippo", "grounding": "phase", "pretrain_episodes": 2, "iterations": 1,
+        "grounded_episodes": 1, "real_rollouts": 1, "evaluation_seeds": 1, "duration_s": 100,
+        "control": False, "workers": 1, "out": tmp_path / "run",
+    }  # fmt: skip
+    heard: list[tuple[str, int, dict[str, float]]] = []
+
+    def hear(stage: str, step: int, numbers: Mapping[str, float]) -> None:
+        if stage == "iteration" and step > 0 and not any(kind == "stop" for kind, *_ in heard):
+            heard.append(("stop", step, {}))
+            raise Stopped
+        heard.append((stage, step, dict(numbers)))
+
+    with pytest.raises(Stopped):
+        ugat_marl.train("single-v1", real="V4", callback=hear, **options)
+    run = ugat_marl.train("single-v1", real="V4", callback=hear, resume=True, **options)
+    assert {stage for stage, *_ in heard} == {"episode", "iteration", "evaluation", "stop"}
+    # the episode after the last checkpoint is played, and told, twice
+    assert [step for stage, step, _ in heard if stage == "episode"] == [0, 1, 2, 2]
+    logged = {
+        (row["stage"], row["step"], row["name"]): row["value"]
+        for row in pl.read_parquet(run.folder / "metrics.parquet").to_dicts()
+    }
+    told = {
+        (stage, step, name): value
+        for stage, step, numbers in heard
+        if stage not in ("evaluation", "stop")
+        for name, value in numbers.items()
+    }
+    assert told == pytest.approx(logged, nan_ok=True)
+    stage, step, table = heard[-1]
+    assert (stage, step) == ("evaluation", 3)
+    for row in run.table.to_dicts():
+        assert table[f"{row['policy']}/{row['domain']}/att_s"] == row["att_s"]

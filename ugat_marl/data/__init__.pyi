@@ -29,6 +29,7 @@ from .runs import CHECKPOINT_FOLDER as CHECKPOINT_FOLDER
 from .runs import IDENTITY_FILE as IDENTITY_FILE
 from .runs import METRICS_FILE as METRICS_FILE
 from .runs import SETTINGS_FILE as SETTINGS_FILE
+from .runs import LogCallback as LogCallback
 from .runs import Metrics as Metrics
 from .runs import Run as Run
 from .runs import installed_version as installed_version

@@ -45,6 +45,9 @@ MAIN_CURVES = (
     "iteration/lost_time/best_s",
 )
 """Curves that TensorBoard shows; the metrics of a run and --verbose have all."""
+LogCallback = Callable[[str, int, Mapping[str, float]], None]
+"""Called as ``callback(stage, step, numbers)`` for everything that a training measures."""
+
 _VERSIONS = ("ugat-marl", "eclipse-sumo", "libsumo", "numpy", "torch")
 _SCHEMA = {"stage": pl.String, "step": pl.Int64, "name": pl.String, "value": pl.Float64}
 
@@ -100,15 +103,24 @@ class Run:
         directory: The folder.
         identity: Values that must be equal to continue: settings, scenario, seed.
         reporter: Shows progress.
+        on_log: Called with all numbers that are logged; what it raises ends the run, which can
+            be continued.
 
     Raises:
         OptionError: Another process trains in the folder.
         CheckpointError: The folder holds a checkpoint of a run with another identity.
     """
 
-    def __init__(self, directory: Path, identity: Mapping[str, Any], reporter: Reporter) -> None:
+    def __init__(
+        self,
+        directory: Path,
+        identity: Mapping[str, Any],
+        reporter: Reporter,
+        on_log: LogCallback | None = None,
+    ) -> None:
         self.directory = directory
         self.reporter = reporter
+        self._on_log = on_log
         self.metrics = Metrics()
         self._board: Any = None
         require_writable(directory / IDENTITY_FILE)
@@ -182,6 +194,8 @@ class Run:
         for name, value in numbers.items():
             if math.isfinite(value) and (self.reporter.verbose or _is_main(stage, name)):
                 board.add_scalar(f"{stage}/{name}", value, step)
+        if self._on_log is not None:
+            self._on_log(stage, step, dict(numbers))
 
     def close(self) -> None:
         """End the TensorBoard file and release the folder."""

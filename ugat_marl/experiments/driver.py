@@ -17,7 +17,7 @@ from collections.abc import Sequence
 from concurrent.futures import FIRST_COMPLETED, Future, wait
 from pathlib import Path
 
-from ugat_marl.data import lock_folder
+from ugat_marl.data import LogCallback, lock_folder
 from ugat_marl.errors import MeasurementError
 from ugat_marl.experiments.forked import ONE_CORE, jobs_fork_on, perform_forked
 from ugat_marl.experiments.jobs import Job, Record, perform
@@ -106,7 +106,11 @@ def perform_all(
 
 
 def perform_here(
-    plan: Sequence[Job], folder: Path, reporter: Reporter, workers: Workers = 1
+    plan: Sequence[Job],
+    folder: Path,
+    reporter: Reporter,
+    workers: Workers = 1,
+    on_log: LogCallback | None = None,
 ) -> list[Record]:
     """Perform jobs one after another in this process and return their records.
 
@@ -115,6 +119,7 @@ def perform_here(
         folder: Folder that holds the jobs' folders.
         reporter: Shows progress.
         workers: Simulations at a time, or an executor, see `perform`.
+        on_log: See `perform`.
 
     Raises:
         OptionError: Another process performs jobs in that folder.
@@ -125,7 +130,7 @@ def perform_here(
         for job in plan:
             place = folder / job.name
             job.write(place)
-            records.append(perform(job, place, reporter, workers))
+            records.append(perform(job, place, reporter, workers, on_log))
     return records
 
 

@@ -14,6 +14,7 @@ from typing import Any, Literal
 
 import polars as pl
 
+from ugat_marl.data import LogCallback
 from ugat_marl.effects import Domain, domain_label, load_scenario
 from ugat_marl.errors import OptionError
 from ugat_marl.experiments import evaluation
@@ -81,6 +82,7 @@ def train(
     resume: bool = False,
     workers: Workers = None,
     reporter: Reporter | None = None,
+    callback: LogCallback | None = None,
 ) -> Training:
     """Train policies in a simulation for a domain that differs, and judge them in both.
 
@@ -110,6 +112,10 @@ def train(
         resume: Continue the run in that folder.
         workers: Simulations at a time, or an executor; None for one per core.
         reporter: Shows progress; None for the one of the program.
+        callback: Called as ``callback(stage, step, numbers)`` for what the training across the gap
+            measures: stage "episode" with the number of the episode, "iteration" with that of the
+            iteration, and at the end "evaluation" with ``POLICY/DOMAIN/att_s`` in s. What it raises
+            ends the run, which can be resumed.
 
     Returns:
         The table and the folder of the run.
@@ -142,7 +148,14 @@ def train(
         dqn=dqn or DQNConfig(),
     )
     folder = Path(out) if out is not None else run_folder(config)
-    table = transfer(config, folder, resume=resume, reporter=reporter or usual(), workers=workers)
+    table = transfer(
+        config,
+        folder,
+        resume=resume,
+        reporter=reporter or usual(),
+        workers=workers,
+        on_log=callback,
+    )
     return Training(folder, table)
 
 

@@ -21,7 +21,14 @@ from typing import Any
 from pydantic import TypeAdapter
 from rich.console import Console
 
-from ugat_marl.data import Run, Scores, TransitionLog, installed_versions, remove_temporaries
+from ugat_marl.data import (
+    LogCallback,
+    Run,
+    Scores,
+    TransitionLog,
+    installed_versions,
+    remove_temporaries,
+)
 from ugat_marl.effects import load_scenario, scenario_in_domain
 from ugat_marl.envs import AnyParallelEnv, TrafficEnv, parallel_env
 from ugat_marl.errors import CheckpointError, OptionError, UgatMarlError
@@ -303,7 +310,13 @@ class Record:
 
 
 @kept_warm()
-def perform(job: Job, folder: Path, reporter: Reporter, workers: Workers = 1) -> Record:
+def perform(
+    job: Job,
+    folder: Path,
+    reporter: Reporter,
+    workers: Workers = 1,
+    on_log: LogCallback | None = None,
+) -> Record:
     """Do the missing training and evaluations of a job, and write them to its folder.
 
     Args:
@@ -312,6 +325,7 @@ def perform(job: Job, folder: Path, reporter: Reporter, workers: Workers = 1) ->
         reporter: Shows progress.
         workers: Simulations at a time, or an executor, for roll-outs, evaluations and the search
             for rules. Learning stays in this process.
+        on_log: Called with the numbers that a job of recipe "grounded" logs.
 
     Raises:
         OptionError: An evaluation is missing, and the training has already passed it.
@@ -324,7 +338,7 @@ def perform(job: Job, folder: Path, reporter: Reporter, workers: Workers = 1) ->
         _judge(job, 0, factory, record, folder, reporter, workers)
         return record
     if job.setting.ugat is not None:
-        trained = _grounded(job, folder, reporter, workers)
+        trained = _grounded(job, folder, reporter, workers, on_log)
     else:
         trained = _plain(job, folder, record, reporter)
     with contextlib.closing(trained) as policies:
@@ -430,7 +444,7 @@ def _plain(
 
 
 def _grounded(
-    job: Job, folder: Path, reporter: Reporter, workers: Workers
+    job: Job, folder: Path, reporter: Reporter, workers: Workers, on_log: LogCallback | None
 ) -> Generator[tuple[int, Policy], None, None]:
     """Train by UGAT; yield direct transfer, if plain training was part of it, and the policy."""
     ugat, make = job.setting.ugat, job.setting.learner.factory(job.device)
@@ -438,7 +452,7 @@ def _grounded(
     scenario, options = load_scenario(job.scenario), dict[str, Any](job.options)
     with (
         contextlib.closing(parallel_env(scenario, job.sim, **options)) as env,
-        contextlib.closing(Run(folder, job.identity, reporter)) as run,
+        contextlib.closing(Run(folder, job.identity, reporter, on_log)) as run,
     ):
         state = train_grounded(
             ugat,
