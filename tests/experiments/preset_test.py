@@ -7,7 +7,8 @@ from dataclasses import replace
 import pytest
 
 from ugat_marl.errors import OptionError
-from ugat_marl.experiments import TransferConfig
+from ugat_marl.experiments import PaperConfig, TransferConfig
+from ugat_marl.experiments.paper import settings_of
 from ugat_marl.grounding import GateConfig, UgatConfig, as_published
 
 
@@ -39,3 +40,31 @@ def test_the_preset_is_paid_by_the_queue_at_the_light() -> None:
     assert TransferConfig("single-v1", preset="paper", reward="queue").reward == "queue"
     with pytest.raises(OptionError, match="not 'pressure'"):
         TransferConfig("single-v1", preset="paper", reward="pressure")
+
+
+def test_the_tables_have_the_preset_too() -> None:
+    config = PaperConfig(preset="paper", episodes=7, grounded_episodes=4)
+    same = TransferConfig(
+        "single-v1",
+        preset="paper",
+        ugat=UgatConfig(
+            pretrain_episodes=7,
+            iterations=config.iterations,
+            grounded_episodes=4,
+            sim_rollouts=config.sim_rollouts,
+            real_rollouts=config.real_rollouts,
+        ),
+    )
+    assert (config.ugat, config.reward, config.learner) == (same.ugat, "queue", same.learner)
+    assert config.episodes == config.ugat.pretrain_episodes == 7
+    assert config.all_episodes == 7 + 4 * config.ugat.iterations
+    rows = settings_of("main", config.ugat, "sim", config.groundings, learner=config.spec)
+    assert [row.ugat for row in rows if row.ugat is not None] == [config.ugat]
+    assert replace(config, seeds=2).ugat == config.ugat  # applied twice it changes nothing
+    for wrong in (
+        {"groundings": ("timed",)},
+        {"reward": "pressure"},
+        {"gate": GateConfig("static")},
+    ):
+        with pytest.raises(OptionError, match="preset"):
+            PaperConfig(preset="paper", **wrong)

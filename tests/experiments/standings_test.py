@@ -11,8 +11,9 @@ import pytest
 import scipy.stats
 
 from ugat_marl.__main__ import main
-from ugat_marl.errors import CheckpointError, OptionError
-from ugat_marl.experiments import ranked, read_standings, with_standings
+from ugat_marl.cli.paper import _require_kept
+from ugat_marl.errors import CheckpointError, OptionError, OutputError
+from ugat_marl.experiments import as_standings, lost_rows, ranked, read_standings, with_standings
 from ugat_marl.experiments.standings import SCHEMA
 
 HEAD = ",".join(SCHEMA)
@@ -79,6 +80,21 @@ def test_damaged_tables_are_refused(tmp_path: Path, text: str, said: str) -> Non
         read_standings(written(tmp_path, text))
     with pytest.raises(CheckpointError, match="No such file"):
         read_standings(tmp_path / "missing.csv")
+
+
+def test_a_table_is_not_replaced_by_one_that_lacks_its_trainings(tmp_path: Path) -> None:
+    folder = tmp_path / "single-v1" / "main"
+    folder.mkdir(parents=True)
+    file = written(folder)
+    table = read_standings(file)
+    more = TABLE + "fast,V1,0,70,60,960\n"
+    _require_kept(file, more)
+    _require_kept(file, TABLE)
+    assert lost_rows(table, as_standings(more.encode(), "")).is_empty()
+    for fewer in (TABLE.replace("fast,V4,2,85,62,952\n", ""), TABLE.replace("85", "86")):
+        with pytest.raises(OutputError, match="'fast' in V4 with seed 2"):
+            _require_kept(file, fewer)
+    assert file.read_text() == TABLE
 
 
 def test_every_committed_table_can_be_read() -> None:

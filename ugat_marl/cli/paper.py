@@ -11,14 +11,17 @@ from tyro.conf import arg
 
 from ugat_marl.cli.arguments import RayAddress, workers_of
 from ugat_marl.data import write_csv
-from ugat_marl.errors import OptionError
+from ugat_marl.errors import OptionError, OutputError
 from ugat_marl.experiments import (
     DIRECT,
     Comparison,
     PaperConfig,
+    as_standings,
     compare,
     file_stem,
+    lost_rows,
     machine_facts,
+    read_standings,
 )
 from ugat_marl.files import require_writable, write_whole
 from ugat_marl.policies import device_of
@@ -31,6 +34,9 @@ from ugat_marl.reporting import (
     terminal_tables,
 )
 
+SEEDS = "seeds.csv"
+"""File of a table with a row for each training."""
+
 
 @dataclass(frozen=True)
 class _Paper:
@@ -38,7 +44,7 @@ class _Paper:
 
     Attributes:
         config: Settings of the trainings and of the evaluation.
-        out: Folder of the tables.
+        out: Folder of the tables. A table there is replaced only by one that has all its trainings.
         title: Name of the table in its heading; default: that of the command.
         runs: Folder of the trainings.
         jobs: Trainings at a time; default: one per core.
@@ -46,7 +52,7 @@ class _Paper:
     """
 
     config: Annotated[PaperConfig, arg(name="")]
-    out: Path = Path("results")
+    out: Path = Path("runs/tables")
     title: str | None = None
     runs: Path = Path("runs/paper")
     jobs: int | None = None
@@ -161,8 +167,27 @@ class Gap(_Paper):
 
 
 def _write(comparison: Comparison, title: str, folder: Path) -> None:
+    seeds = seeds_csv(comparison)
+    if (folder / SEEDS).is_file():
+        _require_kept(folder / SEEDS, seeds)
     page = comparison_page(comparison, DIRECT, title, machine_facts())
     write_whole(folder / "table.md", page + "\n")
     write_csv(folder / "table.csv", comparison_csv(comparison))
-    write_csv(folder / "seeds.csv", seeds_csv(comparison))
+    write_csv(folder / SEEDS, seeds)
     draw_table(comparison.rows(), comparison.sim, folder)
+
+
+def _require_kept(file: Path, text: str) -> None:
+    """Refuse to replace a table by one that lacks trainings of it, or has others in their place.
+
+    Raises:
+        OutputError: Trainings would be lost; nothing was written.
+    """
+    lost = lost_rows(read_standings(file), as_standings(text.encode(), "the new table"))
+    if not lost.is_empty():
+        row = lost.row(0, named=True)
+        raise OutputError(
+            f"{file.parent} holds a table of other trainings, such as {row['setting']!r} in "
+            f"{row['domain']} with seed {row['training_seed']}; give the same command with another "
+            "--out, it trains nothing again"
+        )

@@ -69,6 +69,8 @@ from .settings import is_grounded as is_grounded
 from .sim_check import SimCheck as SimCheck
 from .sim_check import check_run as check_run
 from .sim_check import check_table as check_table
+from .standings import as_standings as as_standings
+from .standings import lost_rows as lost_rows
 from .standings import ranked as ranked
 from .standings import read_standings as read_standings
 from .standings import shipped_standings as shipped_standings

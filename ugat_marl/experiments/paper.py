@@ -10,6 +10,7 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
+from typing import Any, Literal
 
 from ugat_marl.effects import domain_label, domain_path, load_scenario
 from ugat_marl.errors import OptionError, UnknownNameError
@@ -44,9 +45,12 @@ from ugat_marl.grounding import (
     StreetConfig,
     TimedConfig,
     UgatConfig,
+    as_published,
+    published_reward,
 )
 from ugat_marl.parallel import Workers
 from ugat_marl.policies import (
+    DQN_NAME,
     UNIVERSAL_NAME,
     DQNConfig,
     observed_options,
@@ -289,6 +293,8 @@ class PaperConfig:
         grounded_episodes: Episodes of grounded training per iteration.
         sim_rollouts: Episodes added to D_sim per iteration.
         real_rollouts: Episodes added to D_real per iteration.
+        preset: "paper" for Algorithm 1 exactly as published: phase grounding, the reward queue, the
+            learner dqn; only the numbers of episodes stay free.
         groundings: Kinds of grounding: phase, timed, street; default: all that the table can have.
         constants: Constant delays in s that "main" sweeps.
         rows: Names of the rows to train; direct transfer is always trained. Default: all rows.
@@ -322,6 +328,7 @@ class PaperConfig:
     grounded_episodes: int = 10
     sim_rollouts: int = 3
     real_rollouts: int = 2
+    preset: Literal["paper"] | None = None
     groundings: tuple[str, ...] = ()
     constants: tuple[int, ...] = (1, 2, 3, 4, 5, 6)
     rows: tuple[str, ...] = ()
@@ -342,6 +349,8 @@ class PaperConfig:
     street: StreetConfig = field(default_factory=StreetConfig)
 
     def __post_init__(self) -> None:
+        if self.preset is not None:
+            self._take_published()
         for name in ("seeds", "evaluation_seeds", "episodes"):
             if getattr(self, name) < 1:
                 raise OptionError(f"{name} = {getattr(self, name)}: must be at least 1")
@@ -364,10 +373,32 @@ class PaperConfig:
                 "learnt; give its class the methods save(path) and load(path)"
             )
 
+    def _take_published(self) -> None:
+        """Set what Algorithm 1 as published decides.
+
+        Raises:
+            OptionError: Another option was given for it.
+        """
+        if {*self.groundings} - {"phase"}:
+            raise OptionError(f"preset paper has phase grounding alone, not {self.groundings}")
+        published = self.ugat
+        values: dict[str, Any] = {
+            "groundings": ("phase",),
+            "reward": published_reward(self.reward),
+            "learner": DQN_NAME if self.learner == UNIVERSAL_NAME else self.learner,
+            "episodes": published.pretrain_episodes,
+            "iterations": published.iterations,
+            "grounded_episodes": published.grounded_episodes,
+            "sim_rollouts": published.sim_rollouts,
+            "real_rollouts": published.real_rollouts,
+        }
+        for name, value in values.items():
+            object.__setattr__(self, name, value)
+
     @property
     def ugat(self) -> UgatConfig:
         """Settings of the algorithm that all rows share."""
-        return UgatConfig(
+        given = UgatConfig(
             pretrain_episodes=self.episodes,
             iterations=self.iterations,
             grounded_episodes=self.grounded_episodes,
@@ -379,6 +410,7 @@ class PaperConfig:
             timed=self.timed,
             street=self.street,
         )
+        return given if self.preset is None else as_published(given)
 
     @property
     def spec(self) -> LearnerSpec:

@@ -54,23 +54,46 @@ def read_standings(path: Path) -> pl.DataFrame:
     try:
         texts = csv_texts(content)
     except pl.exceptions.PolarsError:
-        raise CheckpointError(f"{path}: not a table of CSV; name a seeds.csv of a table") from None
-    if missing := [name for name in SCHEMA if name not in texts.columns]:
-        raise CheckpointError(
-            f"{path}: has no column {missing[0]!r}; name a seeds.csv of `ugat-marl paper`"
-        )
+        texts = pl.DataFrame()  # `as_standings` refuses it
     if damaged := csv_damage(path, texts):
         raise CheckpointError(f"{path}: {damaged}")
-    rows = texts.select(pl.col(name).cast(kind, strict=False) for name, kind in SCHEMA.items())
+    return as_standings(content, str(path))
+
+
+def as_standings(content: bytes, name: str) -> pl.DataFrame:
+    """Return the table of standings in a file of CSV.
+
+    Args:
+        content: Content of the file.
+        name: Name of the file in errors.
+
+    Raises:
+        CheckpointError: It is no such table, or a number is missing.
+    """
+    try:
+        texts = csv_texts(content)
+    except pl.exceptions.PolarsError:
+        raise CheckpointError(f"{name}: not a table of CSV; name a seeds.csv of a table") from None
+    if missing := [column for column in SCHEMA if column not in texts.columns]:
+        raise CheckpointError(
+            f"{name}: has no column {missing[0]!r}; name a seeds.csv of `ugat-marl paper`"
+        )
+    texts = texts.select(*SCHEMA)
+    rows = texts.select(pl.col(column).cast(kind, strict=False) for column, kind in SCHEMA.items())
     for number, (row, given) in enumerate(
-        zip(rows.iter_rows(), texts.select(*SCHEMA).iter_rows(), strict=True), start=2
+        zip(rows.iter_rows(), texts.iter_rows(), strict=True), start=2
     ):
-        for name, value, text in zip(SCHEMA, row, given, strict=True):
+        for column, value, text in zip(SCHEMA, row, given, strict=True):
             if value is None or (isinstance(value, float) and not math.isfinite(value)):
                 raise CheckpointError(
-                    f"{path}: row {number}: {name} = {text!r} is no {_kind(name)}"
+                    f"{name}: row {number}: {column} = {text!r} is no {_kind(column)}; correct it"
                 )
     return rows
+
+
+def lost_rows(before: pl.DataFrame, after: pl.DataFrame) -> pl.DataFrame:
+    """Return the rows of a table that another one has not, with all their numbers."""
+    return before.join(after, on=list(SCHEMA), how="anti", maintain_order="left")
 
 
 def _kind(name: str) -> str:

@@ -18,6 +18,7 @@ from tyro.conf import Positional, arg
 from ugat_marl.data import (
     CHECKPOINT_FOLDER,
     METRICS_FILE,
+    LogCallback,
     TransitionLog,
     installed_versions,
     lock_folder,
@@ -59,11 +60,11 @@ from ugat_marl.experiments.tuning import LEAST_BUDGET, TUNED_RULES
 from ugat_marl.files import require_writable, write_whole
 from ugat_marl.grounding import (
     DIRECT_LEARNER,
-    MATCHED_REWARDS,
     NEGATIVE_CONTROLS,
     NegativeControl,
     UgatConfig,
     as_published,
+    published_reward,
 )
 from ugat_marl.parallel import Workers
 from ugat_marl.policies import (
@@ -165,7 +166,7 @@ class TransferConfig:
     def __post_init__(self) -> None:
         if self.preset is not None:
             object.__setattr__(self, "ugat", as_published(self.ugat))
-            object.__setattr__(self, "reward", _published_reward(self.reward))
+            object.__setattr__(self, "reward", published_reward(self.reward))
         if not self.learner:
             usual = UNIVERSAL_NAME if self.preset is None else DQN_NAME
             object.__setattr__(self, "learner", usual)
@@ -265,17 +266,6 @@ class TransferConfig:
         return self.ugat.pretrain_episodes + self.ugat.iterations * self.ugat.grounded_episodes
 
 
-def _published_reward(reward: str) -> str:
-    """Return the reward of Algorithm 1 as published, in place of the default.
-
-    Raises:
-        OptionError: Another reward was given.
-    """
-    if reward not in MATCHED_REWARDS:
-        raise OptionError(f"preset paper trains with the reward 'queue', not {reward!r}")
-    return "queue"
-
-
 @kept_warm()
 def transfer(
     config: TransferConfig,
@@ -284,6 +274,7 @@ def transfer(
     resume: bool = False,
     reporter: Reporter | None = None,
     workers: Workers = None,
+    on_log: LogCallback | None = None,
 ) -> Evaluation:
     """Perform the jobs of a run, and write its table and its results to `directory`.
 
@@ -296,6 +287,8 @@ def transfer(
         reporter: Shows progress.
         workers: Simulations at a time, or an executor, for roll-outs and the search for rules; the
             policies are evaluated on this machine.
+        on_log: Called with all numbers that the training of UGAT logs, and at the end with the
+            scores of the table.
 
     Raises:
         OptionError: The folder holds a run already, and `resume` is not set; or another process
@@ -324,8 +317,20 @@ def transfer(
         for line in described_plan(plan, directory, folder, episode_s):
             reporter.say(line)
         with reporter.whole("whole run", work_of(plan, folder, episode_s)):
-            records = perform_here(plan, folder, reporter, workers)
-        return _write_results(config, scenario, directory, plan, records)
+            records = perform_here(plan, folder, reporter, workers, on_log)
+        table = _write_results(config, scenario, directory, plan, records)
+    if on_log is not None:
+        on_log("evaluation", config.episodes, _means(table))
+    return table
+
+
+def _means(table: Evaluation) -> dict[str, float]:
+    """Return the mean travel times of a table by ``POLICY/DOMAIN/att_s``."""
+    return {
+        f"{policy}/{domain}/att_s": table.estimate(policy, domain, "att_s").mean
+        for policy in table.policies
+        for domain in table.domains
+    }
 
 
 def planned_jobs(config: TransferConfig) -> list[Job]:

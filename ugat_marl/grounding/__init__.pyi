@@ -5,6 +5,7 @@ from .channel import CommandChannel as CommandChannel
 from .channel import fit_channel as fit_channel
 from .config import UgatConfig as UgatConfig
 from .config import as_published as as_published
+from .config import published_reward as published_reward
 from .controls import NEGATIVE_CONTROLS as NEGATIVE_CONTROLS
 from .controls import NegativeControl as NegativeControl
 from .controls import ShuffledWorld as ShuffledWorld

@@ -8,6 +8,7 @@ from typing import Any, Literal
 
 from ugat_marl.data import AgentLayout
 from ugat_marl.errors import OptionError, UnknownNameError
+from ugat_marl.grounding.delays import MATCHED_REWARDS
 from ugat_marl.grounding.fitting import FitConfig
 from ugat_marl.grounding.forward import ForwardConfig
 from ugat_marl.grounding.gate import GateConfig
@@ -214,3 +215,14 @@ def as_published(config: UgatConfig) -> UgatConfig:
             f"({', '.join(COUNTS)}); leave the others out, or leave out the preset"
         )
     return published
+
+
+def published_reward(reward: str) -> str:
+    """Return the reward of Algorithm 1 as published, in place of the default.
+
+    Raises:
+        OptionError: Another reward was given.
+    """
+    if reward not in MATCHED_REWARDS:
+        raise OptionError(f"preset paper trains with the reward 'queue', not {reward!r}")
+    return "queue"
