@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import inspect
+from collections.abc import Callable
 from dataclasses import fields
+from pathlib import Path
 from typing import Any
 
 import gymnasium
@@ -19,6 +21,7 @@ from ugat_marl.envs.options import EnvKeywords
 from ugat_marl.envs.single import SINGLE, register
 from ugat_marl.errors import CheckpointError, OptionError, UnknownNameError
 from ugat_marl.policies import DQN, DQNConfig
+from ugat_marl.scenarios.phases import programme_phases
 
 
 def two(view: IntersectionView) -> NDArray[np.float64]:
@@ -75,6 +78,28 @@ def test_phases_are_described_by_their_movements() -> None:
     assert set(phases["turn"]) <= {"left", "through", "right", "turn-around"}
     text = str(env.describe())
     assert "…" not in text and light.phases and light.incoming_lanes[-1] in text
+
+
+def test_phases_say_which_green_of_the_file_they_are(crossing: Callable[..., Path]) -> None:
+    """Phases in another order than the file's."""
+    folder = crossing()
+    network = ugat_marl.parallel_env(folder).network
+    (light,) = network.intersections
+    greens = programme_phases(light.programme)
+    assert len(greens) == 2
+    file = folder / "scenario.toml"
+    phases = ", ".join(f'"{state}"' for state in reversed(greens))
+    file.write_text(file.read_text() + f"\n[intersections.{light.id}]\nphases = [{phases}]\n")
+    described = ugat_marl.parallel_env(folder).describe().phases
+    assert dict(described.select("phase", "green_of_file").unique().iter_rows()) == {0: 1, 1: 0}
+
+
+def test_phases_that_the_file_has_not_are_none_of_its_greens() -> None:
+    described = ugat_marl.parallel_env("single-v1").describe().phases
+    numbers = dict(described.select("phase", "green_of_file").unique().iter_rows())
+    # greens of the file, with its yellows left out: 0 and 1 from north and south, 2 and 3 from east
+    # and west; right turns go on in most phases, which the file lets them in none
+    assert numbers == {0: 0, 1: 2, **dict.fromkeys(range(2, 8))}
 
 
 def test_a_function_is_an_observation() -> None:

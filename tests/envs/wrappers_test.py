@@ -21,6 +21,7 @@ import ugat_marl
 from ugat_marl.envs import (
     agent_indicator,
     appended_mask,
+    intersection_names,
     legal_actions,
     masked_observation,
     pad_spaces,
@@ -419,3 +420,35 @@ def test_the_page_names_every_wrapper_and_its_example_runs() -> None:
     names: dict[str, Any] = {}
     exec(example[1], names)
     names["env"].close()
+
+
+def test_agents_are_named_by_their_lights_and_nothing_else_changes() -> None:
+    plain = ugat_marl.parallel_env("mixed-v1", duration_s=300)
+    named = intersection_names(ugat_marl.parallel_env("mixed-v1", duration_s=300))
+    light = plain.intersection_of
+    assert named.possible_agents == [light[agent] for agent in plain.possible_agents]
+    assert {*named.possible_agents} == {item.id for item in plain.network.intersections}
+    seen, infos = plain.reset(seed=3)
+    named_seen, named_infos = named.reset(seed=3)
+    for step in range(4):
+        for agent in plain.agents:
+            assert np.array_equal(seen[agent], named_seen[light[agent]])
+            assert named.observation_space(light[agent]).contains(named_seen[light[agent]])
+            mask = infos[agent]["action_mask"]
+            assert np.array_equal(mask, named_infos[light[agent]]["action_mask"])
+        actions = {agent: step % plain.action_space(agent).n for agent in plain.agents}
+        seen, rewards, _, _, infos = plain.step(actions)
+        named_seen, named_rewards, _, ends, named_infos = named.step(
+            {light[agent]: action for agent, action in actions.items()}
+        )
+        assert named_rewards == {light[agent]: value for agent, value in rewards.items()}
+        assert {*ends} == {*light.values()}
+    with pytest.raises(ActionError, match="'signala_0': the traffic lights are"):
+        named.step({"signala_0": 0})
+    groups = {group: [light[a] for a in own] for group, own in plain.agent_groups.items()}
+    assert named.agent_groups == groups
+    plain.close()
+    named.close()
+    parallel_api_test(intersection_names(ugat_marl.parallel_env("single-v1", duration_s=100)), 12)
+    with pytest.raises(OptionError, match="intersection_of"):
+        intersection_names(Steep())

@@ -124,6 +124,8 @@ class ScenarioCheck:
             )
             print(text)
         else:
+            lights = parallel_env(scenario).intersection_of
+            console.print(_named_agents(lights), markup=False, soft_wrap=True)
             show(console, facts, runs, rows, wrong, named_approaches(Network.read(scenario)))
             if reason := confinement_missing():
                 console.print(
@@ -218,6 +220,13 @@ def show(
         say("nothing to mend")
 
 
+def _named_agents(lights: Mapping[str, str]) -> str:
+    """Return which agent has which traffic light, in one line."""
+    shown = [f"{agent} is light {light}" for agent, light in [*lights.items()][:MOST_LIGHTS]]
+    more = len(lights) - len(shown)
+    return f"agents: {', '.join(shown)}{f' and {more} more' if more else ''}"
+
+
 def _table(title: str, *columns: str) -> Table:
     table = Table(title=title, box=box.SIMPLE_HEAD, pad_edge=False, title_justify="left")
     for number, column in enumerate(columns):
@@ -231,7 +240,7 @@ def _intersections(agents: Sequence[IntersectionFacts]) -> Table:
     for light in agents:
         groups.setdefault(_row(light), []).append(light.id)
     table = _table(
-        "Intersections", "agent", "lanes", "links", "movem.", "conflicts", "phases", "remarks"
+        "Intersections", "light", "lanes", "links", "movem.", "conflicts", "phases", "remarks"
     )
     table.columns[-1].justify = "left"
     for row, names in groups.items():
@@ -287,7 +296,7 @@ def _phase_sources(agents: Sequence[IntersectionFacts]) -> Table:
 
     fullest = sorted(agents, key=lambda light: -degree(light, "now"))[:MOST_LIGHTS]
     title = "Demand as a share of capacity with other phases, busiest quarter of an hour"
-    table = _table(title, "agent", "now", *PHASE_SOURCES, "best")
+    table = _table(title, "light", "now", *PHASE_SOURCES, "best")
     for light in fullest:
         cells = [
             "-" if light.degrees.get(source) is None else f"{degree(light, source):.0%}"
@@ -305,7 +314,7 @@ def _approaches(agents: Sequence[IntersectionFacts]) -> Table:
     shown = all_roads[:MOST_APPROACHES]
     title = f"Saturation by approach, the highest {len(shown)} of {len(all_roads)}"
     headings = ("veh/h", "worst 15 min", "flow ratio", "own programme")
-    table = _table(title, "agent", "road", "lanes", *headings)
+    table = _table(title, "light", "road", "lanes", *headings)
     table.columns[1].justify = "left"
     for name, road in shown:
         saturation = "no green" if road.saturation is None else f"{road.saturation:.0%}"

@@ -32,6 +32,7 @@ from .vector.environment import vector_env as vector_env
 from .wrappers import agent_indicator as agent_indicator
 from .wrappers import appended_mask as appended_mask
 from .wrappers import frame_stack as frame_stack
+from .wrappers import intersection_names as intersection_names
 from .wrappers import legal_actions as legal_actions
 from .wrappers import masked_observation as masked_observation
 from .wrappers import pad_spaces as pad_spaces

@@ -8,7 +8,7 @@ from dataclasses import dataclass
 import polars as pl
 
 from ugat_marl.envs.observations import OBSERVATION_UNITS, Observer
-from ugat_marl.scenarios import Intersection, Network
+from ugat_marl.scenarios import Intersection, Network, green_of_file
 
 TURNS = {"s": "through", "l": "left", "L": "left", "r": "right", "R": "right", "t": "turn-around"}
 """Words for SUMO's letters of directions."""
@@ -23,8 +23,9 @@ class Description:
             place in the vector), ``of`` (the agent whose intersection it shows), ``part``
             ("feature", "phase", "asked" or "age"), ``name`` (lane, or phase) and ``shows``.
         phases: One row per agent, phase and movement: ``agent``, ``intersection`` (SUMO's id),
-            ``phase`` (the action), ``from`` and ``to`` (edges), ``turn``, ``lanes`` (incoming), and
-            ``right_of_way`` ("protected", or "yields").
+            ``phase`` (the action), ``green_of_file`` (number of the green of the file's programme
+            with the same links, from 0; null if there is none), ``from`` and ``to`` (edges),
+            ``turn``, ``lanes`` (incoming), and ``right_of_way`` ("protected", or "yields").
         unit: Meaning and unit of the features.
     """
 
@@ -70,13 +71,20 @@ def describe(network: Network, observer: Observer, agents: Sequence[str]) -> Des
             for number, (of, part, name, shows) in enumerate(entries)
         )
     movements: list[dict[str, object]] = [
-        {"agent": agent, "intersection": item.id, "phase": phase, **movement}
+        {
+            "agent": agent,
+            "intersection": item.id,
+            "phase": phase,
+            "green_of_file": green_of_file(item, item.phases[phase]),
+            **movement,
+        }
         for agent, item in zip(agents, network.intersections, strict=True)
         for phase in range(len(item.phases))
         for movement in _movements(item, phase)
     ]
     unit = OBSERVATION_UNITS.get(observer.name, "as the function returns them")
-    return Description(pl.DataFrame(rows), pl.DataFrame(movements), unit)
+    phases = pl.DataFrame(movements, schema_overrides={"green_of_file": pl.Int64})
+    return Description(pl.DataFrame(rows), phases, unit)
 
 
 def _own_entries(

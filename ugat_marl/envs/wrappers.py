@@ -95,6 +95,18 @@ def legal_actions(env: AnyParallelEnv) -> Wrapper:
     return _LegalActions(env)
 
 
+def intersection_names(env: AnyParallelEnv) -> Wrapper:
+    """Name each agent by SUMO's id of its traffic light, such as ``A1`` for ``signal_0``.
+
+    It goes outside of all other wrappers but `masked_observation`. Policies and logs of the suite
+    know agents by their own names.
+
+    Raises:
+        OptionError: The environment does not say which agent has which light.
+    """
+    return _IntersectionNames(env)
+
+
 def appended_mask(env: AnyParallelEnv) -> Wrapper:
     """Append to each observation the agent's action mask, for learners without another way.
 
@@ -362,6 +374,66 @@ class _LegalActions(_Masking):
 
     def _seen(self, observations: Vectors, infos: Infos) -> dict[str, Any]:
         return dict(observations)
+
+
+class _IntersectionNames(Wrapper):
+    """Agents under the ids of their lights; spaces, vectors and numbers stay the same."""
+
+    def __init__(self, env: AnyParallelEnv) -> None:
+        super().__init__(env)
+        lights: Mapping[str, str] | None = getattr(env.unwrapped, "intersection_of", None)
+        if lights is None:
+            raise OptionError(
+                f"{type(env.unwrapped).__name__} has no intersection_of, which maps agents to "
+                "traffic lights; wrap an environment of ugat_marl"
+            )
+        self._light = dict(lights)
+        self._agent = {light: agent for agent, light in lights.items()}
+        self.observation_spaces = self._renamed(self.observation_spaces)
+        self.action_spaces = self._renamed(self.action_spaces)
+
+    @property
+    def possible_agents(self) -> list[str]:
+        """All traffic lights, in the order of the agents."""
+        return [self._light[agent] for agent in self.env.possible_agents]
+
+    @property
+    def agents(self) -> list[str]:
+        """The traffic lights of the running episode."""
+        return [self._light[agent] for agent in self.env.agents]
+
+    @property
+    def agent_groups(self) -> dict[str, list[str]]:
+        """Group to its traffic lights."""
+        groups = self.env.unwrapped.agent_groups
+        return {group: [self._light[agent] for agent in own] for group, own in groups.items()}
+
+    @property
+    def intersection_of(self) -> dict[str, str]:
+        """Every name to itself."""
+        return {light: light for light in self.possible_agents}
+
+    def reset(self, seed: int | None = None, options: dict[str, Any] | None = None) -> ResetResult:
+        """Start an episode of the wrapped environment."""
+        observations, infos = self.env.reset(seed=seed, options=options)
+        return self._renamed(observations), self._renamed(infos)
+
+    def step(self, actions: dict[str, Any]) -> StepResult:
+        """Step the wrapped environment.
+
+        Raises:
+            ActionError: A name is that of no traffic light, or the environment refuses an action.
+        """
+        if unknown := [name for name in actions if name not in self._agent]:
+            raise ActionError(
+                f"action for {unknown[0]!r}: the traffic lights are {', '.join(self._agent)}"
+            )
+        result = self.env.step({self._agent[light]: a for light, a in actions.items()})
+        observations, rewards, terminations, truncations, infos = map(self._renamed, result)
+        return observations, rewards, terminations, truncations, infos
+
+    def _renamed(self, values: Mapping[str, Any]) -> dict[str, Any]:
+        return {self._light[agent]: value for agent, value in values.items()}
 
 
 class _MaskedObservation(_Masking):

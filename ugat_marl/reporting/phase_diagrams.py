@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from ugat_marl.progress import Reporter
 from ugat_marl.reporting.figures import NamedFigure, printable, shortened
 from ugat_marl.reporting.style import LIGHT, styled
-from ugat_marl.scenarios import Intersection, Link, Network, Scenario
+from ugat_marl.scenarios import Intersection, Link, Network, Scenario, green_of_file
 
 STYLES: dict[str, tuple[str, Literal["solid", "dashed", "dotted"], str]] = {
     "G": (LIGHT["c0"], "solid", "protected green"),
@@ -147,10 +147,20 @@ def _sheet(name: str, place: _Place, scenario: str, phases: range) -> NamedFigur
             _names(axes, place)
             continue
         state = intersection.phases[phases[panel - 1]]
-        axes.set_title(f"phase {phases[panel - 1]}", size=9, weight="bold", loc="center")
+        axes.set_title(
+            _phase_title(phases[panel - 1], intersection), size=9, weight="bold", loc="center"
+        )
         _ways(axes, place, state)
     _legend(figure, intersection, height)
     return picture
+
+
+def _phase_title(phase: int, intersection: Intersection) -> str:
+    """Return the number of a phase, and which green of the file's programme it is."""
+    if not intersection.programme:
+        return f"phase {phase}"
+    green = green_of_file(intersection, intersection.phases[phase])
+    return f"phase {phase} ({'not in the file' if green is None else f'green {green} of the file'})"
 
 
 def _caption(intersection: Intersection) -> str:
