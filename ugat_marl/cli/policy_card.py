@@ -17,7 +17,7 @@ class PolicyCardCommand:
     """Print the card of a shipped policy: its training, its scores, the hashes.
 
     Examples:
-        ugat-marl policy card single-v1/fitted-street-V4-s0
+        ugat-marl policy card single-v1/direct-transfer-s0
 
     Attributes:
         policy: Id of the policy; ugat-marl policy list has them all.

@@ -272,7 +272,7 @@ def policy_factory(spec: str) -> PolicyFactory:
 
     Args:
         spec: Spelling of a rule, a file, the id of a shipped policy such as
-            ``single-v1/fitted-street-V4-s0``, ``module:name`` of a policy or of what makes one, or
+            ``single-v1/direct-transfer-s0``, ``module:name`` of a policy or of what makes one, or
             ``module:name@file`` of a learner with the file of its state.
 
     Raises:

@@ -63,7 +63,7 @@ class PolicyCard:
         scores: Scores by domain.
         first_seed: Seed of the first episode of each score; the others follow.
         duration_s: Length of these episodes in s; None for the scenario's own.
-        versions: Package to version at the training.
+        versions: Package to version in the environment that packed it.
         sha256: Hash of the file of the policy.
         job: All settings of the training, as the ``job.json`` of its folder has them.
         version: `VERSION`.
@@ -128,7 +128,7 @@ def load_policy(name: str | Path, *, folder: Path = FOLDER) -> NetworkPolicy:
     """Return a trained policy.
 
     Args:
-        name: Id of a shipped policy, such as ``"single-v1/fitted-street-V4-s0"``, or a file that a
+        name: Id of a shipped policy, such as ``"single-v1/direct-transfer-s0"``, or a file that a
             training wrote, ``policies/*.pt``.
         folder: Folder of shipped policies; the package's own by default.
 
