@@ -405,7 +405,8 @@ class _IntersectionNames(Wrapper):
     @property
     def agent_groups(self) -> dict[str, list[str]]:
         """Group to its traffic lights."""
-        groups = self.env.unwrapped.agent_groups
+        base: Any = self.env.unwrapped
+        groups: Mapping[str, list[str]] = base.agent_groups
         return {group: [self._light[agent] for agent in own] for group, own in groups.items()}
 
     @property
