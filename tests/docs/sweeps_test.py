@@ -41,6 +41,7 @@ def test_an_example_uses_the_public_functions_alone(example: Path) -> None:
 
 
 @pytest.mark.slow
+@pytest.mark.timeout(900)  # Ray starts a cluster of its own
 @pytest.mark.parametrize("example", EXAMPLES, ids=lambda path: path.stem)
 def test_an_example_runs(example: Path, python: list[str], tmp_path: Path) -> None:
     pytest.importorskip(NEEDS[example.stem])
