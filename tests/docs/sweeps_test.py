@@ -14,7 +14,7 @@ import ugat_marl
 
 FOLDER = Path(__file__).resolve().parents[2] / "docs" / "how-to"
 EXAMPLES = sorted((FOLDER / "sweeps").glob("*.py"))
-NEEDS = {"with_optuna": "optuna", "with_ray_tune": "ray.tune"}
+NEEDS = {"with_optuna": "optuna"}
 
 
 def test_every_example_is_on_the_page() -> None:
@@ -41,7 +41,7 @@ def test_an_example_uses_the_public_functions_alone(example: Path) -> None:
 
 
 @pytest.mark.slow
-@pytest.mark.timeout(900)  # Ray starts a cluster of its own
+@pytest.mark.timeout(900)  # two trainings
 @pytest.mark.parametrize("example", EXAMPLES, ids=lambda path: path.stem)
 def test_an_example_runs(example: Path, python: list[str], tmp_path: Path) -> None:
     pytest.importorskip(NEEDS[example.stem])
