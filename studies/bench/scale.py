@@ -151,8 +151,8 @@ class ScaleBench:
 
     def _workers(self, reporter: Reporter) -> list[Figure]:
         variants = {
-            name: partial(self._steps, self.scenario, n, halves=name == "halves")
-            for name, n in (("one", 1), ("together", 2), ("halves", 2))
+            name: partial(self._steps, self.scenario, n, stepping=name)
+            for name, n in (("one", 1), ("together", 2), ("halves", 2), ("ready", 2))
         }
         runs = self._rounds("workers", variants, reporter)
         one, two = runs["one"], runs["together"]
@@ -160,6 +160,7 @@ class ScaleBench:
             Figure(name, Spread.of_ratios(_speeds(runs[variant]), _speeds(one)), 1.7, 1.9, True)
             for name, variant in (
                 ("2 simulations / 1, steps per s, by halves", "halves"),
+                ("2 simulations / 1, steps per s, as they are ready", "ready"),
                 ("2 simulations / 1, steps per s, together", "together"),
             )
         ]
@@ -167,6 +168,7 @@ class ScaleBench:
             *figures,
             _told("steps per s of 1 simulation", Spread.of(_speeds(one))),
             _told("steps per s of 2 simulations, by halves", Spread.of(_speeds(runs["halves"]))),
+            _told("steps per s of 2 simulations, as ready", Spread.of(_speeds(runs["ready"]))),
             _told("steps per s of 2 simulations, together", Spread.of(_speeds(two))),
             _told("CPU of a simulation per step [ms]", _milliseconds(two, "simulation_cpu_s")),
             _told("CPU of its user per step [ms]", _milliseconds(two, "user_cpu_s")),
@@ -318,8 +320,8 @@ class ScaleBench:
                     advance()
         return runs
 
-    def _steps(self, scenario: str, n: int, *, halves: bool = False) -> Run:
-        return self._ask("steps", scenario=scenario, n=n, halves=halves, **self._lengths)
+    def _steps(self, scenario: str, n: int, *, stepping: str = "together") -> Run:
+        return self._ask("steps", scenario=scenario, n=n, stepping=stepping, **self._lengths)
 
     @property
     def _lengths(self) -> dict[str, int]:

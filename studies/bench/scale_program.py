@@ -45,8 +45,10 @@ def steps(request: Request) -> dict[str, Any]:
         computed, simulated = time.process_time(), _cpu_s(env)
         began = time.perf_counter()
         last = request["settled"] + request["decisions"]
-        if request["halves"]:
+        if request["stepping"] == "halves":
             _by_halves(env, batch, request["settled"], last)
+        elif request["stepping"] == "ready":
+            _as_they_are_ready(env, batch, request["settled"], last)
         else:
             for decision in range(request["settled"], last):
                 batch = env.step(cycle(batch.masks, decision))
@@ -73,6 +75,18 @@ def _by_halves(env: VectorEnv, batch: VectorStep, first: int, last: int) -> None
             found = half.step_wait()
             if decision < last:
                 half.step_async(cycle(found.masks, decision))
+
+
+def _as_they_are_ready(env: VectorEnv, batch: VectorStep, first: int, last: int) -> None:
+    """Step each simulation as soon as its last step is done."""
+    decisions = [first] * env.n
+    env.send(cycle(batch.masks, first))
+    while min(decisions) < last:
+        found = env.recv()
+        (number,) = found.numbers.tolist()
+        decisions[number] += 1
+        if decisions[number] < last:
+            env.send(cycle(found.masks, decisions[number]), where=[number])
 
 
 def split(request: Request) -> dict[str, Any]:

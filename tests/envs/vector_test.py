@@ -570,3 +570,142 @@ def test_the_arrays_do_not_overlap() -> None:
     two.part(1).observations[0] = 9
     assert one.observations[1, 0, 0] == 9
     assert one.observations[0].max() == 1
+
+
+# --- the first that are ready
+
+
+def one_by_one(
+    env: VectorEnv,
+    seed: int,
+    episodes: int = 1,
+    count: int = 1,
+    at: Callable[[int], None] = lambda step: None,
+) -> list[list[str]]:
+    """The same digests as `together`, with the first `count` environments that are ready."""
+    digests = [hashlib.sha256() for _ in range(env.n)]
+    found: list[list[str]] = [[] for _ in range(env.n)]
+    decisions, batch, step = [0] * env.n, env.reset(seed), 0
+    while True:
+        for row, number in enumerate(batch.numbers.tolist()):
+            digests[number].update(batch.observations[row].tobytes() + batch.masks[row].tobytes())
+        at(step)
+        step += 1
+        seeds = [episode.seed for episode in env.episodes if episode is not None]
+        numbers = batch.numbers.tolist()
+        env.send(
+            np.array(
+                [
+                    chosen(batch.masks[row], seeds[number], decisions[number])
+                    for row, number in enumerate(numbers)
+                ]
+            ),
+            where=numbers,
+        )
+        batch = env.recv(count)
+        assert len(batch.numbers) == count
+        ended = {one.environment: one for one in batch.ended}
+        for row, number in enumerate(batch.numbers.tolist()):
+            digest = digests[number]
+            digest.update(batch.rewards[row].tobytes() + batch.executed[row].tobytes())
+            decisions[number] += 1
+            assert batch.truncated[row] == (number in ended)
+            if number in ended:
+                last = ended[number]
+                digest.update(last.observations.tobytes() + last.masks.tobytes())
+                digest.update(repr(last.scores).encode())
+                found[number].append(digest.hexdigest())
+                digests[number], decisions[number] = hashlib.sha256(), 0
+        if all(len(own) >= episodes for own in found):
+            return [own[:episodes] for own in found]
+
+
+@pytest.mark.parametrize("count", [1, 2])
+def test_the_order_in_which_environments_are_ready_changes_no_episode(count: int) -> None:
+    with vector_env("grid2x2-v1", 3, ["sim", "V4", "V1"], duration_s=LENGTH_S) as env:
+        assert one_by_one(env, 4, episodes=2, count=count) == together(env, 4, episodes=2)
+
+
+def test_a_killed_simulation_is_taken_up_again_while_others_are_received() -> None:
+    killed: list[int] = []
+    with vector_env("grid2x2-v1", 2, duration_s=LENGTH_S) as env:
+        unharmed = together(env, 4, episodes=2)
+
+        def kill(step: int) -> None:
+            if step in (3, 4, 13):
+                killed.append(pids(env)[step % 2])
+                os.kill(killed[-1], signal.SIGKILL)
+
+        assert one_by_one(env, 4, episodes=2, at=kill) == unharmed
+    assert len(killed) == 3
+    assert eventually(lambda: all(map(gone, killed)))
+
+
+def test_a_slow_environment_holds_up_no_other_one() -> None:
+    with vector_env("single-v1", 3, duration_s=10_000) as env:
+        env.send(env.reset(1).masks.argmax(axis=-1))
+        os.kill(pids(env)[1], signal.SIGSTOP)
+        try:
+            first = env.recv(2)
+            assert first.numbers.tolist() == [0, 2]
+            env.send(first.masks.argmax(axis=-1), where=[0, 2])
+            assert sorted([*env.recv().numbers, *env.recv().numbers]) == [0, 2]
+        finally:
+            os.kill(pids(env)[1], signal.SIGCONT)
+        assert env.recv().numbers.tolist() == [1]
+
+
+def test_one_that_never_answers_is_replaced(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("UGAT_MARL_DEADLINE_S", "5")
+    with vector_env("single-v1", 2, duration_s=LENGTH_S) as env:
+        expected = env.step(env.reset(1).masks.argmax(axis=-1))
+        env.send(env.reset(1).masks.argmax(axis=-1))
+        stopped = pids(env)[0]
+        os.kill(stopped, signal.SIGSTOP)
+        batch = env.recv(2)
+        assert gone(stopped)
+        assert batch.numbers.tolist() == [0, 1]
+        assert batch.observations.tobytes() == expected.observations.tobytes()
+
+
+@pytest.mark.parametrize("mode", ["next-step", "disabled"])
+def test_ends_of_episodes_as_in_a_step(mode: Any, crossing: Crossing) -> None:
+    with vector_env(crossing(), 2, duration_s=20, autoreset=mode) as env:
+        actions = np.zeros((1, 1), dtype=int)
+        env.reset(3)
+        for _ in range(2):
+            env.send(actions, where=[1])
+            batch = env.recv()
+        assert batch.truncated.tolist() == [True] and batch.ended[0].environment == 1
+        if mode == "disabled":
+            with pytest.raises(EpisodeError, match="environment 1 has no episode under way"):
+                env.send(actions, where=[1])
+        else:
+            env.send(actions, where=[1])
+            batch = env.recv()
+            assert not batch.truncated.any() and not batch.rewards.any() and not batch.ended
+            assert [one.number for one in env.episodes if one is not None] == [0, 1]
+
+
+def test_wrong_calls_of_send_and_recv(crossing: Crossing) -> None:
+    with vector_env(crossing(), 2, duration_s=20) as env:
+        actions = np.zeros((2, 1), dtype=int)
+        env.reset(3)
+        with pytest.raises(EpisodeError, match=r"recv\(1\): 0 environments are in the middle"):
+            env.recv()
+        with pytest.raises(ActionError, match=r"shape \(1, 1\)"):
+            env.send(actions, where=[1])
+        with pytest.raises(ActionError, match="in environment 1 is 9"):
+            env.send(actions[:1] + 9, where=[1])
+        env.send(actions[:1], where=[1])
+        with pytest.raises(EpisodeError, match=r"recv\(2\): 1 environments"):
+            env.recv(2)
+        with pytest.raises(EpisodeError, match="environment 1 is in the middle of a step"):
+            env.step(actions)
+        env.send(actions[:1], where=[0])
+        env.recv()
+        left = next(iter(env._sent))
+        env.reset(where=[left])
+        with pytest.raises(EpisodeError, match=r"recv\(1\): 0 environments"):
+            env.recv()
+        env.step(actions)

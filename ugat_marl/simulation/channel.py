@@ -81,6 +81,10 @@ class Channel:
             offset += 8 * size
         return Message(header, arrays)
 
+    def fileno(self) -> int:
+        """Return the descriptor of the stream from the other end, for `select.poll`."""
+        return self._reader.fileno()
+
     def is_readable(self, patience_s: float) -> bool:
         """Return True if bytes, or the end of the stream, arrive within `patience_s` seconds.
 

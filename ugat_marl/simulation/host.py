@@ -16,6 +16,7 @@ import atexit
 import contextlib
 import json
 import os
+import select
 import signal
 import socket
 import struct
@@ -23,6 +24,7 @@ import subprocess
 import sys
 import tempfile
 import threading
+import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import IO, Any, ClassVar, Literal, Protocol
@@ -43,6 +45,9 @@ LENGTH = struct.Struct("<I")
 
 PATIENCE_S = 10.0
 """Seconds that a process has to end after a request; then it is killed."""
+
+_END_S = 0.05
+"""Seconds between two looks for the end of a process that was killed."""
 
 DEADLINE_S = 900.0
 """Seconds within which a process has to answer; then it counts as dead. Loading a city takes
@@ -198,6 +203,7 @@ class Worker:
         self._pid = pid
         self._deadline_s = deadline_s
         self._late = False
+        self._asked_s = time.monotonic()
         self._process = process
         self._owner = os.getpid()
         self._ended = False
@@ -246,6 +252,7 @@ class Worker:
         Raises:
             ChannelClosed: The process died or does not read, see `obituary`.
         """
+        self._asked_s = time.monotonic()
         try:
             self._channel.send(Message({"what": request, **arguments}, list(arrays)))
         except TimeoutError:
@@ -287,6 +294,29 @@ class Worker:
         Not on Windows.
         """
         return self._channel.is_readable(patience_s)
+
+    @staticmethod
+    def first_answered(workers: Sequence[Worker]) -> list[int]:
+        """Wait until a worker has answered or died; return the places of all that have.
+
+        Workers past their deadline are killed. Not on Windows.
+
+        Args:
+            workers: At least one worker; each was asked a question.
+        """
+        descriptors = select.poll()
+        places: dict[int, int] = {}
+        for place, worker in enumerate(workers):
+            number = worker._channel.fileno()
+            descriptors.register(number, select.POLLIN)
+            places[number] = place
+        while True:
+            left_s = [one._asked_s + one._deadline_s - time.monotonic() for one in workers]
+            if ready := descriptors.poll(1000 * max(min(left_s), _END_S)):
+                return sorted(places[number] for number, _ in ready)
+            for worker, left in zip(workers, left_s, strict=True):
+                if left <= 0:
+                    worker._kill_late()
 
     def _kill_late(self) -> None:
         """Kill a process that is past its deadline; it may be stopped and would not end itself."""

@@ -32,6 +32,7 @@ from ugat_marl.envs.vector.spec import (
 )
 from ugat_marl.errors import ActionError, EpisodeError, OptionError, UgatMarlError, UnknownNameError
 from ugat_marl.scenarios import Scenario
+from ugat_marl.simulation import Worker
 
 Autoreset = Literal["same-step", "next-step", "disabled"]
 """Gymnasium's modes for the end of an episode.
@@ -62,9 +63,28 @@ class Ended:
     scores: Scores | None
 
 
+@dataclass
+class _Sent:
+    """A step that was begun by `VectorEnv.send` and not handed back yet.
+
+    Attributes:
+        arrived: True if its result is complete.
+        truncated: True if it ended an episode.
+        ended: This episode.
+        rewards: Its last rewards, while the arrays hold the first step of the next episode.
+        executed: Its last phases, likewise.
+    """
+
+    arrived: bool = False
+    truncated: bool = False
+    ended: Ended | None = None
+    rewards: NDArray[np.float64] | None = None
+    executed: NDArray[np.int64] | None = None
+
+
 @dataclass(frozen=True)
 class VectorStep:
-    """Result of a reset or step of all environments; its arrays are copies.
+    """Result of a reset or step of environments; its arrays are copies.
 
     Agents are in the order of `VectorEnv.agents`. Observations are padded with zeros at the end;
     masks are 0 for phases that an agent does not have.
@@ -76,6 +96,8 @@ class VectorStep:
         executed: int64 ``(environments, agents)``; the phases that were shown.
         truncated: bool ``(environments,)``; true where an episode has ended.
         ended: Ended episodes of this step.
+        numbers: int64 ``(environments,)``; the number of each environment in the vector, in rising
+            order. All of them, except after `VectorEnv.recv`.
     """
 
     observations: NDArray[np.float32]
@@ -84,6 +106,7 @@ class VectorStep:
     executed: NDArray[np.int64]
     truncated: NDArray[np.bool_]
     ended: tuple[Ended, ...]
+    numbers: NDArray[np.int64]
 
 
 class VectorEnv:
@@ -133,6 +156,7 @@ class VectorEnv:
         self._counts = np.array(self.agent_set.action_counts)
         self._begun: list[int] = []
         self._stepped: list[int] = []
+        self._sent: dict[int, _Sent] = {}
 
     @property
     def episodes(self) -> tuple[Episode | None, ...]:
@@ -182,6 +206,7 @@ class VectorEnv:
         seeds = self._seeds(seed, chosen)
         for index in chosen:
             self._environments[index].close()
+            self._sent.pop(index, None)
         self._stepped = []
         self._begin(chosen, seeds)
         self._memory.rewards[chosen] = 0.0
@@ -204,18 +229,8 @@ class VectorEnv:
 
     def step_async(self, actions: ArrayLike) -> None:
         """Begin a step, which `step_wait` ends; the caller may work in between."""
-        requested = self._checked(actions)
-        idle = [env.over and not env.pending for env in self._environments]
-        anew = self.autoreset == "next-step" and self._environments[0].episode is not None
-        for env, over in zip(self._environments, idle, strict=True):
-            if not (anew and over):
-                env.require_running()
-        self._begun = [index for index, over in enumerate(idle) if over]
-        self._stepped = [index for index, over in enumerate(idle) if not over]
-        for index in self._stepped:
-            self._environments[index].act(requested[index].copy())
-        for index in self._begun:
-            self._environments[index].begin(None, self._domains)
+        everyone = list(range(self.n))
+        self._stepped, self._begun = self._ask(everyone, self._checked(actions, everyone))
 
     def step_wait(self) -> VectorStep:
         """Wait for the step that `step_async` began.
@@ -239,6 +254,56 @@ class VectorEnv:
             self._begin(over, dict.fromkeys(over))
             memory.rewards[over], memory.executed[over] = rewards, executed
         return self._batch(truncated, ended)
+
+    def send(self, actions: ArrayLike, where: ArrayLike | None = None) -> None:
+        """Begin a step of some environments; `recv` hands back those that are ready first.
+
+        Args:
+            actions: Integers ``(environments, agents)``, one row for each environment of `where`.
+            where: Numbers of the environments, or a mask of them; all if None.
+
+        Raises:
+            ActionError: The shape is wrong, or an agent does not have the phase; nothing was
+                simulated.
+            EpisodeError: An environment has no running episode, or is in the middle of a step.
+        """
+        chosen = self._chosen(where)
+        stepped, begun = self._ask(chosen, self._checked(actions, chosen))
+        self._sent |= {index: _Sent() for index in [*stepped, *begun]}
+
+    def recv(self, count: int = 1) -> VectorStep:
+        """Wait until `count` environments are ready; return their steps.
+
+        An environment whose episode ends in mode ``"same-step"`` is ready when its next one has
+        begun; the others do not wait for it. If more environments are ready, those come first that
+        were ready first. The order in which environments become ready depends on the machine.
+
+        Args:
+            count: Number of environments, at most as many as were sent and not received.
+
+        Raises:
+            EpisodeError: So many steps are not under way.
+            SimulatorError: SUMO failed in one environment, which has no episode now. The steps of
+                the others can still be received.
+        """
+        if not 1 <= count <= len(self._sent):
+            raise EpisodeError(
+                f"recv({count}): {len(self._sent)} environments are in the middle of a step; "
+                "send() begins one"
+            )
+        texts: list[str] = []
+        while len(ready := [index for index, step in self._sent.items() if step.arrived]) < count:
+            waiting = [index for index in self._sent if index not in ready]
+            workers = [self._environments[index].worker for index in waiting]
+            for place in Worker.first_answered(workers):
+                texts += self._receive(waiting[place])
+        for text in dict.fromkeys(texts):
+            warnings.warn(text, stacklevel=2)
+        numbers = sorted(ready[:count])
+        steps = [self._sent.pop(index) for index in numbers]
+        truncated = np.array([step.truncated for step in steps])
+        ended = tuple(step.ended for step in steps if step.ended is not None)
+        return self._batch(truncated, ended, numbers)
 
     def close(self) -> None:
         """End all simulations and processes and remove their files; a second call does nothing."""
@@ -267,6 +332,44 @@ class VectorEnv:
         if self._arrays is None:
             raise EpisodeError("this vector_env is closed; make another one")
         return self._arrays
+
+    def _ask(self, chosen: list[int], requested: NDArray[np.int64]) -> tuple[list[int], list[int]]:
+        """Begin a step; return the environments that make it, and those that begin an episode."""
+        anew = self.autoreset == "next-step"
+        idle: dict[int, bool] = {}
+        for index in chosen:
+            env = self._environments[index]
+            idle[index] = env.over and not env.pending
+            if not (anew and idle[index] and env.episode is not None):
+                env.require_running()
+            if index in self._sent:
+                raise EpisodeError(f"the step of environment {index} waits; call recv() first")
+        stepped = [index for index in chosen if not idle[index]]
+        begun = [index for index in chosen if idle[index]]
+        for index, actions in zip(chosen, requested, strict=True):
+            if not idle[index]:
+                self._environments[index].act(actions.copy())
+        for index in begun:
+            self._environments[index].begin(None, self._domains)
+        return stepped, begun
+
+    def _receive(self, index: int) -> Sequence[str]:
+        """Take the answer of an environment whose step was sent; return its warnings."""
+        step, memory = self._sent.pop(index), self._memory
+        answer = self._environments[index].answer_or_replace()
+        if answer is not None:  # else it died, and another process repeats its episode
+            step.arrived = True
+            if answer.over:
+                step.truncated, step.ended = True, self._ended(index, answer)
+            if answer.over and self.autoreset == "same-step":
+                step.arrived = False
+                step.rewards = memory.rewards[index].copy()
+                step.executed = memory.executed[index].copy()
+                self._environments[index].begin(None, self._domains)
+            elif step.rewards is not None:
+                memory.rewards[index], memory.executed[index] = step.rewards, step.executed
+        self._sent[index] = step
+        return () if answer is None else answer.warnings
 
     def _chosen(self, where: ArrayLike | None) -> list[int]:
         numbers = np.arange(self.n)
@@ -300,9 +403,9 @@ class VectorEnv:
             )
         return {index: listed[index] for index in chosen}
 
-    def _checked(self, actions: ArrayLike) -> NDArray[np.int64]:
+    def _checked(self, actions: ArrayLike, chosen: list[int]) -> NDArray[np.int64]:
         phases = np.asarray(actions)
-        wanted = (self.n, len(self.agents))
+        wanted = (len(chosen), len(self.agents))
         if phases.shape != wanted or not np.issubdtype(phases.dtype, np.integer):
             raise ActionError(
                 f"actions are {phases.dtype} of shape {phases.shape}; allowed: integers of shape "
@@ -312,7 +415,7 @@ class VectorEnv:
         if wrong.any():
             row, column = (int(places[0]) for places in np.nonzero(wrong))
             raise ActionError(
-                f"action of agent {self.agents[column]!r} in environment {row} is "
+                f"action of agent {self.agents[column]!r} in environment {chosen[row]} is "
                 f"{phases[row, column]}; allowed: the integers 0 to {self._counts[column] - 1}, "
                 "its green phases; the others are padding, and 0 in the mask"
             )
@@ -344,15 +447,22 @@ class VectorEnv:
         seen, masks = memory.observations[index].copy(), memory.masks[index].copy()
         return Ended(index, episode, seen, masks, answer.scores)
 
-    def _batch(self, truncated: NDArray[np.bool_], ended: tuple[Ended, ...]) -> VectorStep:
+    def _batch(
+        self,
+        truncated: NDArray[np.bool_],
+        ended: tuple[Ended, ...],
+        numbers: Sequence[int] | None = None,
+    ) -> VectorStep:
         memory = self._memory
+        rows = np.arange(self.n) if numbers is None else np.array(numbers, dtype=np.int64)
         return VectorStep(
-            memory.observations.copy(),
-            memory.masks.copy(),
-            memory.rewards.copy(),
-            memory.executed.copy(),
+            memory.observations[rows],
+            memory.masks[rows],
+            memory.rewards[rows],
+            memory.executed[rows],
             truncated,
             ended,
+            rows,
         )
 
 

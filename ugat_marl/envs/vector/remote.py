@@ -190,6 +190,12 @@ class RemoteEnv:
         with contextlib.suppress(ChannelClosed):  # `answer` replaces a dead process
             self._worker.ask("step")
 
+    @property
+    def worker(self) -> Worker:
+        """The process of the running episode."""
+        assert self._worker is not None
+        return self._worker
+
     def answer(self) -> Answer:
         """Wait for the answer; a process that died is replaced.
 
@@ -198,16 +204,26 @@ class RemoteEnv:
             SimulatorCrashed: Several processes in a row died.
             WorkerError: The reward or a wrapper raised an error.
         """
-        while True:
-            assert self._worker is not None
-            try:
-                reply = self._worker.answer().header
-                break
-            except ChannelClosed:
-                self._replace()
-            except BaseException:  # an error of the episode, or Ctrl-C: the process has ended
-                self.close()
-                raise
+        while (answer := self.answer_or_replace()) is None:
+            pass
+        return answer
+
+    def answer_or_replace(self) -> Answer | None:
+        """Wait for the answer; None if the process died, another one repeats its episode then.
+
+        Raises:
+            SimulatorError: SUMO failed; the message contains its output.
+            SimulatorCrashed: Several processes in a row died.
+            WorkerError: The reward or a wrapper raised an error.
+        """
+        try:
+            reply = self.worker.answer().header
+        except ChannelClosed:
+            self._replace()
+            return None
+        except BaseException:  # an error of the episode, or Ctrl-C: the process has ended
+            self.close()
+            raise
         self._deaths = 0
         self.pending = False
         self.over = reply["over"]
@@ -230,7 +246,8 @@ class RemoteEnv:
         """
         if self.pending:
             raise EpisodeError(
-                f"environment {self.index} is in the middle of a step; call step_wait() first"
+                f"environment {self.index} is in the middle of a step; call step_wait() or "
+                "recv() first"
             )
         if self.over:
             raise EpisodeError(
