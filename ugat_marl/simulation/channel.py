@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import contextlib
 import json
+import math
 import os
 import select
 import struct
@@ -75,7 +76,7 @@ class Channel:
         arrays: list[NDArray[np.float64]] = []
         offset = 0
         for shape in header.pop("shapes"):
-            size = int(np.prod(shape))
+            size = math.prod(shape)
             array = np.frombuffer(body, dtype="<f8", count=size, offset=offset).reshape(shape)
             arrays.append(array)
             offset += 8 * size

@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 
 from ugat_marl.errors import SimulatorCrashed, SimulatorError
-from ugat_marl.scenarios import UpstreamLanes
+from ugat_marl.scenarios import Segment, UpstreamLanes
 from ugat_marl.simulation.channel import ChannelClosed, Message
 from ugat_marl.simulation.host import Host, StartMethod, Worker
 from ugat_marl.simulation.launch import Launch, SignalPlans, Simulator, VehiclePositions
@@ -42,6 +42,7 @@ class ProcessSimulator:
     ) -> None:
         self._host = Host(SERVICE, start_method, deadline_s=deadline_s)
         self._worker: Worker | None = None
+        self._shown: dict[str, str] = {}
 
     def start(self, launch: Launch) -> Snapshot:
         """Start a simulation in a fresh process; end a running one first.
@@ -51,6 +52,7 @@ class ProcessSimulator:
             SimulatorCrashed: The process died.
         """
         self._end_worker()
+        self._shown = {}
         # Tell the worker the folder before it exists, so that the worker removes it in any case.
         self._worker = self._host.start({"directory": launch.directory})
         launch.write()
@@ -63,7 +65,12 @@ class ProcessSimulator:
             SimulatorError: SUMO failed; its own words are in the message.
             SimulatorCrashed: The process died.
         """
-        return _snapshot(self._ask("advance", seconds=seconds, plans=plans))
+        changes: dict[str, Sequence[Segment]] = {}  # most lights go on with what they show
+        for light, plan in plans.items():
+            if any(state != self._shown.get(light) for _, state in plan):
+                changes[light] = plan
+                self._shown[light] = plan[-1][1]
+        return _snapshot(self._ask("advance", seconds=seconds, plans=changes))
 
     def vehicles(self) -> VehiclePositions:
         """Return the positions of all vehicles now."""

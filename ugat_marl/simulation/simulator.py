@@ -44,6 +44,7 @@ class LibsumoSimulator:
         self._shown: dict[str, str] = {}
         self._time_s = 0.0
         self._limits = np.empty(0)
+        self._has_behind = False
         self._mesoscopic: MesoscopicLanes | None = None
         self._upstream: UpstreamQueues | None = None
         self._on: dict[str, tuple[int, str]] = {}
@@ -78,6 +79,8 @@ class LibsumoSimulator:
         self._shown, self._on = {}, {}
         self._time_s = launch.begin_s
         self._limits = np.array([libsumo.lane.getMaxSpeed(lane) for lane in launch.lanes])
+        lanes, roads = launch.behind
+        self._has_behind = any(lanes) or any(roads)
         self._mesoscopic = None
         if launch.segment_m:
             self._mesoscopic = MesoscopicLanes(libsumo, launch.lanes, launch.segment_m)
@@ -192,7 +195,8 @@ class LibsumoSimulator:
         halting = measure(api.getLastStepHaltingNumber, none)
         speed_mps = measure(api.getLastStepMeanSpeed, self._limits)
         waiting_s = measure(api.getWaitingTime, none) if self._launch.waiting else np.empty(0)
-        _add_those_behind(self._launch.behind, (vehicles, halting, speed_mps, waiting_s))
+        if self._has_behind:
+            _add_those_behind(self._launch.behind, (vehicles, halting, speed_mps, waiting_s))
         return Snapshot(
             time_s=self._time_s,
             vehicles=vehicles,
