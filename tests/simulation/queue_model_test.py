@@ -56,6 +56,9 @@ class FakeApi:
     def getRoute(self, name: str) -> tuple[str, ...]:
         return self.routes[name]
 
+    def getRouteID(self, name: str) -> str:
+        return " ".join(self.routes[name])
+
     def getRouteIndex(self, name: str) -> int:
         return 0
 

@@ -47,7 +47,7 @@ class _Road:
         lanes: Indices of its lanes.
         towards: Following edge to the indices of the lanes that lead there.
         segment_s: Driving time through a segment at the speed limit.
-        last_m: A segment that begins after this position is the last one.
+        last_m: A segment that begins after this position is the last one; -1 if there is only one.
         stays: Vehicles on the edge at the last measurement.
     """
 
@@ -74,8 +74,8 @@ class MesoscopicLanes:
     vehicles move upstream of the line as have left since the first one was last held up.
 
     Calls to SUMO take most of the time. A vehicle is therefore asked only for values that may have
-    changed: its route when it enters an edge, its queue when it enters a segment, and nothing
-    while it waits in the last segment.
+    changed: the name of its route when it enters an edge, its queue when it enters a segment, and
+    nothing while it waits in the last segment. The edges of a route are asked for once.
 
     Args:
         api: The module `libsumo`, with a running simulation.
@@ -96,7 +96,10 @@ class MesoscopicLanes:
             for following in {edge_of_lane(link[0]) for link in api.lane.getLinks(lane)}:
                 road.towards[following].append(place)
             road.segment_s = length / segments / api.lane.getMaxSpeed(lane)
-            road.last_m = length * (1 - 1.5 / segments)
+            road.last_m = length * (1 - 1.5 / segments) if segments > 1 else -1.0
+        self._routes: dict[
+            str, Sequence[str]
+        ] = {}  # a vehicle that changes its route, its name too
         self._measured_s = -math.inf
         self._left = [0] * self._count  # since the first vehicle of the lane was last held up
 
@@ -112,12 +115,16 @@ class MesoscopicLanes:
         position_m, waiting_s, speed_mps = api.getLanePosition, api.getWaitingTime, api.getSpeed
         passed_s = time_s - self._measured_s
         for road in self._roads.values():
+            names, before = names_on(road.edge), road.stays
+            if not names and not before:
+                continue
             segment_s, last_m = road.segment_s, road.last_m
             entered_s = time_s - min(passed_s, segment_s) / 2
-            before, road.stays = road.stays, {}
+            stays: dict[str, _Stay] = {}
+            road.stays = stays
             waiting: dict[int, list[float]] = {}
             first: dict[int, str] = {}
-            for name in names_on(road.edge):
+            for name in names:
                 stay = before.get(name)
                 if stay is None:
                     stay = self._entered(name, road, entered_s)
@@ -125,7 +132,7 @@ class MesoscopicLanes:
                 elif stay.position_m <= last_m and (at_m := position_m(name)) != stay.position_m:
                     stay.position_m, stay.since_s = at_m, entered_s
                     stay.lane = self._lane(name, road, stay, vehicles)
-                road.stays[name] = stay
+                stays[name] = stay
                 lane = stay.lane
                 vehicles[lane] += 1.0
                 first[lane] = name  # SUMO lists queues from their ends
@@ -139,7 +146,7 @@ class MesoscopicLanes:
                 if speed == 0:  # SUMO gives speed 0 to vehicles it holds up
                     waits[lane] += waiting_s(name)
             for name, stay in before.items():
-                self._left[stay.lane] += name not in road.stays
+                self._left[stay.lane] += name not in stays
             for lane, waited_s in waiting.items():
                 if waiting_s(first[lane]) > 0:
                     self._left[lane] = 0
@@ -155,11 +162,15 @@ class MesoscopicLanes:
         return measured
 
     def _entered(self, name: str, road: _Road, entered_s: float) -> _Stay:
-        route = self._api.vehicle.getRoute(name)
+        number = self._api.vehicle.getRouteID(name)
+        route = self._routes.get(number)
+        if route is None:
+            route = self._routes[number] = self._api.vehicle.getRoute(name)
         place = self._api.vehicle.getRouteIndex(name) + 1
         following = route[place] if place < len(route) else ""
         lanes = road.towards.get(following) or road.lanes
-        return _Stay(self._api.vehicle.getLanePosition(name), entered_s, lanes, -1)
+        position_m = self._api.vehicle.getLanePosition(name) if road.last_m >= 0 else 0.0
+        return _Stay(position_m, entered_s, lanes, -1)
 
     def _lane(self, name: str, road: _Road, stay: _Stay, vehicles: Sequence[float]) -> int:
         """Return the lane on which a vehicle counts, given the vehicles counted so far."""
