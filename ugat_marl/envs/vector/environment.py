@@ -71,15 +71,13 @@ class _Sent:
         arrived: True if its result is complete.
         truncated: True if it ended an episode.
         ended: This episode.
-        rewards: Its last rewards, while the arrays hold the first step of the next episode.
-        executed: Its last phases, likewise.
+        last: Its last rewards and phases, while the arrays hold those of the next episode.
     """
 
     arrived: bool = False
     truncated: bool = False
     ended: Ended | None = None
-    rewards: NDArray[np.float64] | None = None
-    executed: NDArray[np.int64] | None = None
+    last: tuple[NDArray[np.float64], NDArray[np.int64]] | None = None
 
 
 @dataclass(frozen=True)
@@ -363,11 +361,10 @@ class VectorEnv:
                 step.truncated, step.ended = True, self._ended(index, answer)
             if answer.over and self.autoreset == "same-step":
                 step.arrived = False
-                step.rewards = memory.rewards[index].copy()
-                step.executed = memory.executed[index].copy()
+                step.last = memory.rewards[index].copy(), memory.executed[index].copy()
                 self._environments[index].begin(None, self._domains)
-            elif step.rewards is not None:
-                memory.rewards[index], memory.executed[index] = step.rewards, step.executed
+            elif step.last is not None:
+                memory.rewards[index], memory.executed[index] = step.last
         self._sent[index] = step
         return () if answer is None else answer.warnings
 
