@@ -74,8 +74,9 @@ class MesoscopicLanes:
     vehicles move upstream of the line as have left since the first one was last held up.
 
     Calls to SUMO take most of the time. A vehicle is therefore asked only for values that may have
-    changed: the name of its route when it enters an edge, its queue when it enters a segment, and
-    nothing while it waits in the last segment. The edges of a route are asked for once.
+    changed: the name of its route when it enters an edge on which lanes differ, its queue when it
+    enters a segment, and nothing while it waits in the last segment. The edges of a route are asked
+    for once.
 
     Args:
         api: The module `libsumo`, with a running simulation.
@@ -97,9 +98,7 @@ class MesoscopicLanes:
                 road.towards[following].append(place)
             road.segment_s = length / segments / api.lane.getMaxSpeed(lane)
             road.last_m = length * (1 - 1.5 / segments) if segments > 1 else -1.0
-        self._routes: dict[
-            str, Sequence[str]
-        ] = {}  # a vehicle that changes its route, its name too
+        self._routes: dict[str, Sequence[str]] = {}  # a vehicle's new route has a new name
         self._measured_s = -math.inf
         self._left = [0] * self._count  # since the first vehicle of the lane was last held up
 
@@ -162,15 +161,23 @@ class MesoscopicLanes:
         return measured
 
     def _entered(self, name: str, road: _Road, entered_s: float) -> _Stay:
-        number = self._api.vehicle.getRouteID(name)
+        lanes = road.lanes
+        if road.towards and len(lanes) > 1:
+            lanes = road.towards.get(self._following(name, road.edge)) or lanes
+        position_m = self._api.vehicle.getLanePosition(name) if road.last_m >= 0 else 0.0
+        return _Stay(position_m, entered_s, lanes, -1)
+
+    def _following(self, name: str, edge: str) -> str:
+        """Return the edge behind `edge` on a vehicle's route; empty if it ends there."""
+        number: str = self._api.vehicle.getRouteID(name)
         route = self._routes.get(number)
         if route is None:
             route = self._routes[number] = self._api.vehicle.getRoute(name)
-        place = self._api.vehicle.getRouteIndex(name) + 1
-        following = route[place] if place < len(route) else ""
-        lanes = road.towards.get(following) or road.lanes
-        position_m = self._api.vehicle.getLanePosition(name) if road.last_m >= 0 else 0.0
-        return _Stay(position_m, entered_s, lanes, -1)
+        if route.count(edge) == 1:
+            place = route.index(edge) + 1
+        else:  # a route that comes back
+            place = self._api.vehicle.getRouteIndex(name) + 1
+        return route[place] if place < len(route) else ""
 
     def _lane(self, name: str, road: _Road, stay: _Stay, vehicles: Sequence[float]) -> int:
         """Return the lane on which a vehicle counts, given the vehicles counted so far."""
