@@ -241,9 +241,22 @@ def with_late_green(
     Returns:
         The new memory, and the segments shown. Their total duration is that of `segments`.
     """
+    late = late_s if isinstance(late_s, float | int) else tuple(late_s)
+    after, shown = _late_course(tuple(segments), late, step_s, before)
+    return after, list(shown)
+
+
+@functools.lru_cache(maxsize=65536)
+def _late_course(
+    segments: tuple[Segment, ...],
+    late_s: float | tuple[float, ...],
+    step_s: float,
+    before: LateGreenMemory,
+) -> tuple[LateGreenMemory, tuple[Segment, ...]]:
+    """Compute `with_late_green`. The cache helps because plans and memories recur."""
     shown: list[Segment] = []
     state = before
-    late = [late_s] * len(state.commanded) if isinstance(late_s, float | int) else late_s
+    late = (late_s,) * len(state.commanded) if isinstance(late_s, float | int) else late_s
     for duration, commanded in segments:
         state = _commanded(state, commanded, late, step_s)
         left = duration
@@ -258,7 +271,7 @@ def with_late_green(
             waiting = tuple(max(wait - part, 0.0) for wait in state.waiting_s)
             state = LateGreenMemory(commanded, visible, waiting, state.owed_s)
             left -= part
-    return state, shown
+    return state, tuple(shown)
 
 
 class Withheld(NamedTuple):
