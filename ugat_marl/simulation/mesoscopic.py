@@ -173,11 +173,10 @@ class MesoscopicLanes:
         route = self._routes.get(number)
         if route is None:
             route = self._routes[number] = self._api.vehicle.getRoute(name)
-        if route.count(edge) == 1:
-            place = route.index(edge) + 1
-        else:  # a route that comes back
-            place = self._api.vehicle.getRouteIndex(name) + 1
-        return route[place] if place < len(route) else ""
+        place: int = route.index(edge)
+        if route.count(edge) > 1:  # a route that comes back
+            place = self._api.vehicle.getRouteIndex(name)
+        return "" if place + 1 == len(route) else route[place + 1]
 
     def _lane(self, name: str, road: _Road, stay: _Stay, vehicles: Sequence[float]) -> int:
         """Return the lane on which a vehicle counts, given the vehicles counted so far."""
