@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -13,6 +14,8 @@ from ugat_marl.diagnosis.engine import Engine, Replicate, Usual
 from ugat_marl.diagnosis.features import BIN_FEATURES, FEATURES
 from ugat_marl.diagnosis.fit import Fitter, uncertainty
 from ugat_marl.diagnosis.hypotheses import Members
+from ugat_marl.diagnosis.propose import Direction
+from ugat_marl.diagnosis.records import Fitted
 from ugat_marl.diagnosis.statistics import Pools
 from ugat_marl.diagnosis.thresholds import Thresholds
 from ugat_marl.effects import Effect
@@ -98,6 +101,50 @@ def test_a_planted_value_is_found_from_afar() -> None:
 def test_two_values_are_fitted_at_once() -> None:
     fitter = a_fitter({"headway": 1.43, "min_gap": 3.3}, street=8)
     best = fitter.refine(fitter.simulate(start((HEADWAY, 1.2), (GAP, 4.0))))
+    assert best.values == pytest.approx([1.43, 3.3], abs=0.2)
+
+
+def directions(fitter: Fitter, *members: tuple[Hypothesis, float]) -> list[Direction]:
+    """Changes of the statistics by single effects at one strength, as a search knows them."""
+    plain = fitter.simulate(())
+    return [
+        Direction(hypothesis, (value,), *fitter.difference(plain, member), hypothesis.nominal)
+        for hypothesis, value in members
+        for member in [start((hypothesis, value))]
+    ]
+
+
+def test_known_directions_save_simulations() -> None:
+    slow, quick = World(), World()
+    members = start((HEADWAY, 1.2), (GAP, 4.0))
+    truth = {"headway": 1.43, "min_gap": 3.3}
+    known = directions(a_fitter(truth, street=8), (HEADWAY, 1.5), (GAP, 3.5))
+    found: list[Fitted] = []
+    for world, given in ((slow, ()), (quick, known)):
+        fitter = a_fitter(truth, street=8, world=world)
+        begun = fitter.simulate(members)
+        world.asked.clear()
+        found.append(fitter.refine(begun, directions=given))
+    assert found[1].values == pytest.approx(found[0].values, abs=0.05)
+    assert len(set(quick.asked)) < 0.6 * len(set(slow.asked))
+
+
+def test_misleading_directions_are_given_up() -> None:
+    fitter = a_fitter({"headway": 1.43}, street=7)
+    true = directions(fitter, (HEADWAY, 1.5))[0]
+    opposite = {name: -values for name, values in true.difference.items()}
+    wrong = replace(true, difference=opposite)
+    best = fitter.refine(fitter.simulate(start((HEADWAY, 1.9))), directions=[wrong])
+    assert best.values[0] == pytest.approx(1.43, abs=0.06)
+
+
+def test_steps_correct_slopes() -> None:
+    fitter = a_fitter({"headway": 1.43, "min_gap": 3.3}, street=8)
+    known = directions(fitter, (HEADWAY, 1.5), (GAP, 3.5))
+    twice = [
+        replace(one, difference={k: 2 * v for k, v in one.difference.items()}) for one in known
+    ]
+    best = fitter.refine(fitter.simulate(start((HEADWAY, 1.2), (GAP, 4.0))), 6, twice)
     assert best.values == pytest.approx([1.43, 3.3], abs=0.2)
 
 

@@ -242,3 +242,21 @@ def test_when_the_budget_ends_no_doubtful_effect_is_named_either() -> None:
     assert selector._without_doubtful(best, base).model.members == (HEADWAY,)
     selector._seen = {"both": best.model}
     assert selector._without_doubtful(best, base) is base
+
+
+@pytest.mark.parametrize(("errors", "tried"), [(0.05, True), (0.005, False)])
+def test_sets_without_an_effect_beyond_doubt_are_not_tried(
+    errors: float, tried: bool, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    costs = {("headway",): 5e3, ("desired_speed",): 5e3, ("headway", "desired_speed"): 0.0}
+    ledger = Ledger(costs, dict.fromkeys(costs, 0.5))
+    asked: list[tuple[str, ...]] = []
+    simulate = ledger.simulate
+
+    def watched(members: Members, days: int | None = None) -> Fitted:
+        asked.append(names(members))
+        return simulate(members, days)
+
+    monkeypatch.setattr(ledger, "simulate", watched)
+    assert names(ledger.left(HEADWAY, SPEED, errors=errors)) == ("headway", "desired_speed")
+    assert (("headway",) in asked) == tried

@@ -11,9 +11,13 @@ from ugat_marl.diagnosis.between import EVERY_LANE, TRAVEL_TIME
 from ugat_marl.diagnosis.engine import Engine
 from ugat_marl.diagnosis.features import Tally
 from ugat_marl.diagnosis.hypotheses import WINDOW, Hypothesis, Members, effects_of
+from ugat_marl.diagnosis.propose import Direction
 from ugat_marl.diagnosis.records import Fitted
 from ugat_marl.diagnosis.statistics import Array, Pools, Reference, Whitener, change_between, shrunk
 from ugat_marl.effects import EVERYWHERE
+
+Slope = dict[str, Array]
+"""Change of the statistics by block, for a move of a free value by 1."""
 
 Change = tuple[dict[str, Array], float]
 """Change of the statistics when a free value moves, by block, and length of this move."""
@@ -82,40 +86,98 @@ class Fitter:
         known = {number: day.tally for number, day in simulated.items()}
         return Fitted(members, known, reference, distance, cost)
 
-    def refine(self, start: Fitted, rounds: int | None = None) -> Fitted:
-        """Take Gauss-Newton steps from a simulated model, with finite differences.
+    def refine(
+        self, start: Fitted, rounds: int | None = None, directions: Sequence[Direction] = ()
+    ) -> Fitted:
+        """Take Gauss-Newton steps from a simulated model.
+
+        The first slopes are those between simulated strengths of `directions`, where these cover
+        every free value, and each step corrects them (Broyden 1965). Both cost no simulation. If
+        they lead nowhere, or cover not every value, slopes are finite differences.
 
         Args:
             start: The model to start from.
             rounds: Largest number of steps; None for `Thresholds.steps`.
+            directions: Changes of the statistics by single effects.
         """
-        best = start
-        jacobian: Array | None = None
-        for number in range(self.thresholds.steps if rounds is None else rounds):
-            if not len(best.values):
-                break
-            whitener = self.whitener(best)
-            if jacobian is None or number == 2:
-                jacobian = self.jacobian(best, whitener)
-            step = _solve(jacobian, whitener.measured, self.thresholds.ridge)
-            moved = self._moved(best, step)
-            if moved == best.members:
-                break
-            after = self.simulate(moved)
-            if after.cost >= best.cost:
-                moved = self._moved(best, self.thresholds.shorter_step * step)
-                if moved == best.members:
+        best, left = start, self.thresholds.steps if rounds is None else rounds
+        slopes = self._known_slopes(start, directions)
+        exact = False
+        while left and len(best.values):
+            if slopes is None:
+                slopes, exact = self._slopes(best), True
+            after = self._after_step(best, slopes)
+            if after is None:
+                if exact:
                     break
-                after = self.simulate(moved)
-                if after.cost >= best.cost:
-                    if number:
-                        break
-                    jacobian = None
-                    continue
-            gain, best = best.cost - after.cost, after
-            if gain < self.thresholds.least_gain and number:
+                slopes = None
+                continue
+            left -= 1
+            gain, slopes = best.cost - after.cost, self._corrected(slopes, best, after)
+            best, exact = after, False
+            if gain < self.thresholds.least_gain:
                 break
         return best
+
+    def _after_step(self, model: Fitted, slopes: Sequence[Slope]) -> Fitted | None:
+        """Return the model after a step, or a shorter one; None if neither costs less."""
+        whitener = self.whitener(model)
+        jacobian = np.stack([whitener(slope) for slope in slopes])
+        step = _solve(jacobian, whitener.measured, self.thresholds.ridge)
+        for share in (1.0, self.thresholds.shorter_step):
+            moved = self._moved(model, share * step)
+            if moved == model.members:
+                return None
+            after = self.simulate(moved)
+            if after.cost < model.cost:
+                return after
+        return None
+
+    def _known_slopes(self, model: Fitted, directions: Sequence[Direction]) -> list[Slope] | None:
+        """Return slopes of all free values from simulated strengths; None if one is not known."""
+        slopes: list[Slope] = []
+        for hypothesis, values in model.members:
+            near = [
+                direction
+                for direction in directions
+                if direction.hypothesis.key == hypothesis.key
+                and len(direction.level) == len(values) == 1
+                and direction.origin not in (None, direction.level)
+            ]
+            if hypothesis.step or not near:
+                return None
+            nearest = min(near, key=lambda one: abs(one.level[0] - values[0]))
+            assert nearest.origin is not None
+            length = nearest.level[0] - nearest.origin[0]
+            change = shrunk(nearest.difference, nearest.variance, self.thresholds)
+            slopes.append({name: values / length for name, values in change.items()})
+        return slopes or None
+
+    def _slopes(self, model: Fitted) -> list[Slope]:
+        """Return slopes of all free values from finite differences."""
+        return [
+            {name: values / delta for name, values in change.items()}
+            for change, delta in self.changes(model)
+        ]
+
+    def _corrected(self, slopes: Sequence[Slope], before: Fitted, after: Fitted) -> list[Slope]:
+        """Return slopes after a step: with it, they give the change that was simulated."""
+        shared = [number for number in before.days if number in after.days]
+        change, _ = change_between(
+            self.pools, [after.days[n] for n in shared], [before.days[n] for n in shared]
+        )
+        move = np.subtract(after.values, before.values)
+        least = [hypothesis.least for hypothesis, values in before.members for _ in values]
+        weight = move / np.square(np.maximum(least, 1e-6))
+        weight /= float(move @ weight)
+        left = {
+            name: values - sum(x * slope[name] for x, slope in zip(move, slopes, strict=True))
+            for name, values in change.items()
+        }
+        return [
+            {name: slope[name] + share * left[name] for name in slope}
+            for share, slope in zip(weight, slopes, strict=True)
+        ]
 
     def settled(self, model: Fitted, errors: Array) -> Fitted:
         """Take a last step with more days, since the search stops at a small gain.
@@ -134,9 +196,9 @@ class Fitter:
         moved = self.simulate(self._moved(precise, step), self.thresholds.settling_days)
         return moved if moved.cost < precise.cost else precise
 
-    def fitted(self, start: Fitted) -> Fitted:
-        """Fit the free values, and the windows of effects that have one."""
-        best = self.refine(start)
+    def fitted(self, start: Fitted, directions: Sequence[Direction] = ()) -> Fitted:
+        """Fit the free values, and the windows of effects that have one; see `refine`."""
+        best = self.refine(start, directions=directions)
         if any(set(WINDOW) <= dict(h.fixed).keys() for h, _ in best.members):
             moved = self._windows(best)
             best = self.refine(moved, 1) if moved is not best else best

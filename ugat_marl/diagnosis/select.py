@@ -78,6 +78,7 @@ class Selector:
         self._seen: dict[str, Fitted] = {}
         self._of_library: tuple[Direction, ...] = ()
         self._places: tuple[Direction, ...] = ()
+        self._of_round: dict[int, list[Direction]] = {}
         self.examined: set[str] = set()
 
     def looked_closer(self, base: Tested) -> Tested:
@@ -192,16 +193,19 @@ class Selector:
             chosen += (
                 cautious_drivers(self._library) if gap > self._thresholds.huge * chance else []
             )
-        best = self._fitted(start, chosen, f"round {number + 1}: candidates")
+        best = self._fitted(start, chosen, number, "candidates")
         if best is None and not near:  # simulations did not confirm the prediction of the library
             chosen = self._elsewhere(start.model, directions, number)
-            best = self._fitted(start, chosen, f"round {number + 1}: places")
+            best = self._fitted(start, chosen, number, "places")
         return best
 
-    def _fitted(self, start: Tested, chosen: Sequence[Members], title: str) -> Tested | None:
+    def _fitted(
+        self, start: Tested, chosen: Sequence[Members], number: int, what: str
+    ) -> Tested | None:
         """Return the best set of effects on top of a model; None if none is worth its price."""
+        title = f"round {number + 1}: {what}"
         tried = self._tried(start.model, list(dict.fromkeys(chosen)), title)
-        best = self._refined(tried, self._thresholds.candidates_fitted, start.model.cost)
+        best = self._refined(tried, start.model.cost, self._of_round.get(number, ()))
         if best is None:
             return None
         gain = start.model.cost - best.cost
@@ -301,6 +305,7 @@ class Selector:
                     self._reporter.say(f"note: {hypothesis.name} left out: {error}")
                 continue
             directions.append(Direction(hypothesis, level, difference, variance, origin))
+        self._of_round.setdefault(number, []).extend(directions)
         return directions
 
     def _tried(self, model: Fitted, chosen: Sequence[Members], title: str) -> list[Fitted]:
@@ -317,22 +322,24 @@ class Selector:
                 advance(note=names_of(members))
         return models_tried
 
-    def _refined(self, models: Sequence[Fitted], count: int, gap: float) -> Fitted | None:
+    def _refined(
+        self, models: Sequence[Fitted], gap: float, directions: Sequence[Direction]
+    ) -> Fitted | None:
         """Fit the most promising models and the best single effect; return the best of them.
 
         Args:
             models: Simulated models.
-            count: Number of models to fit.
             gap: Cost of the model before.
+            directions: Changes by single effects on top of the model before.
         """
-        ranked = sorted(models, key=cost_of)
+        ranked, count = sorted(models, key=cost_of), self._thresholds.candidates_fitted
         simple = [model for model in ranked[count:] if len(model.members) == 1]
         ranked = ranked[:count] + simple[:1]
         best: Fitted | None = None
         with self._reporter.task("fitting", len(ranked)) as advance:
             for model in ranked:
                 if best is None or gap - model.cost > self._thresholds.hopeful * (gap - best.cost):
-                    fitted = self._kept(self._fitter.fitted(model))
+                    fitted = self._kept(self._fitter.fitted(model, directions))
                     best = fitted if best is None or fitted.cost < best.cost else best
                 advance(note=names_of(model.members))
         return best
@@ -381,19 +388,19 @@ def pruned(
     if members and len(members) < len(best.model.members):
         best = test(fitter.refine(fitter.simulate(members), fitter.thresholds.steps_without))
     while len(best.model.members) > 1:
-        fewer: list[Fitted] = []
-        with reporter.task("without single effects", len(best.model.members)) as advance:
-            for part in each_left_out(best.model.members):
-                fewer.append(
-                    kept(
-                        settled(
-                            fitter.refine(fitter.simulate(part), fitter.thresholds.steps_without)
-                        )
-                    )
-                )
+        fewer: dict[int, Fitted] = {}
+        parts = each_left_out(best.model.members)
+        places = [place for place in range(len(parts)) if not _beyond_doubt(best, place, fitter)]
+        if not places:
+            break
+        with reporter.task("without single effects", len(places)) as advance:
+            for place in places:
+                part = parts[place]
+                without = fitter.refine(fitter.simulate(part), fitter.thresholds.steps_without)
+                fewer[place] = kept(settled(without))
                 advance(note=names_of(part))
         unsure = [fewer[place] for place in doubtful(best, fitter.thresholds.half_interval)]
-        least = min(fewer, key=cost_of)
+        least = min(fewer.values(), key=cost_of)
         if least.cost - settled(best.model).cost > fitter.thresholds.negligible:
             if not unsure:
                 break
@@ -421,6 +428,20 @@ def _sure(best: Tested, base: Tested, fitter: Fitter, test: Callable[[Fitted], T
             return base
         best = test(fitter.refine(fitter.simulate(members), thresholds.steps_without))
     return best
+
+
+def _beyond_doubt(tested: Tested, place: int, fitter: Fitter) -> bool:
+    """Return True if the data fit so much worse without the member at `place` that none need try.
+
+    The errors of the values are those of all values together, so they hold what other effects could
+    do in its place.
+    """
+    members = tested.model.members
+    first = sum(len(values) for _, values in members[:place])
+    hypothesis, values = members[place]
+    errors = tested.errors[first : first + len(values)]
+    known = bool(values) and hypothesis.nominal is not None and bool((errors > 0.0).all())
+    return known and _deviations(tested, place) > fitter.thresholds.beyond_doubt
 
 
 def _deviations(tested: Tested, place: int) -> float:

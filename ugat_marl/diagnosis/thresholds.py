@@ -637,6 +637,11 @@ class Thresholds(DayThresholds):
     """Largest extra cost of a smaller set of effects that is tested instead of a larger one. By
     hand: the test decides, this only saves time. Halved: superfluous effects stay more often."""
 
+    beyond_doubt: float = 15.0
+    """Standard errors from its usual values beyond which no set without an effect is tried: the
+    data would fit worse by the square, which is more than `negligible`. By hand, to save time.
+    Halved: a set that is nearly as good, and smaller, is missed."""
+
     # --- verdict ------------------------------------------------------------------------------
 
     indistinct: float = 25.0
