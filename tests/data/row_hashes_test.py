@@ -12,6 +12,7 @@ import polars as pl
 import pytest
 
 from ugat_marl.data import row_hashes
+from ugat_marl.data.measured.tables import read_raw
 from ugat_marl.data.row_hashes import (
     CSV_HASHES,
     HASH_KEYS,
@@ -23,7 +24,8 @@ from ugat_marl.data.row_hashes import (
     write_hashed,
 )
 from ugat_marl.data.runs import Metrics
-from ugat_marl.errors import CheckpointError
+from ugat_marl.data.transitions import read_parquet
+from ugat_marl.errors import CheckpointError, LogError, MeasuredDataError
 
 
 def every_kind(rows: int) -> pl.DataFrame:
@@ -112,6 +114,23 @@ def csv_of(tmp_path: Path, rows: int) -> Path:
 
 def csv_fault(path: Path) -> str:
     return csv_damage(path, csv_texts(path.read_bytes()))
+
+
+def test_a_small_file_of_very_many_rows_is_refused(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(row_hashes, "_FEW_ROWS", 1000)
+    packed, honest = tmp_path / "packed.parquet", tmp_path / "honest.parquet"
+    pl.DataFrame({"a": np.zeros(500_000)}).write_parquet(packed)
+    pl.DataFrame({"a": np.random.default_rng(1).random(5000)}).write_parquet(honest)
+    says = r"500000 rows in \d+ bytes"
+    with pytest.raises(pl.exceptions.ComputeError, match=says):
+        read_quietly(packed)
+    with pytest.raises(MeasuredDataError, match=rf"packed\.parquet: .*{says}"):
+        read_raw(packed, [])
+    with pytest.raises(LogError, match=rf"packed\.parquet: .*{says}"):
+        read_parquet(packed)
+    assert read_quietly(honest)[0].height == 5000
 
 
 @pytest.mark.parametrize("rows", [0, 1, 40, 5000])

@@ -35,6 +35,8 @@ CSV_HASHES = "row-hashes.json"
 
 _GROUP_ROWS = 65536
 """Rows of a row group. Half as many name the damage more closely and make the file longer."""
+_FEW_ROWS = 1_000_000
+"""Rows that are read whatever the size of their file. Ten times as many fill 1 GB of a wide log."""
 _MOST_CSV_GROUPS = 1024
 """Most hashes of a CSV table. Twice as many name the damage more closely and double their file."""
 
@@ -172,13 +174,32 @@ def read_quietly(source: Path | io.BytesIO) -> tuple[pl.DataFrame, dict[str, str
     Threads of polars print their own stack traces before they raise the error in Python.
 
     Raises:
-        polars.exceptions.PolarsError: The file is damaged; also `PanicException` and ``OSError``.
+        polars.exceptions.PolarsError: The file is damaged, or has more rows than bytes; also
+            `PanicException` and ``OSError``.
     """
     with _without_standard_error():
-        frame = pl.read_parquet(source)
-        if isinstance(source, io.BytesIO):
-            source.seek(0)
-        return frame, pl.read_parquet_metadata(source)
+        _refuse_repeated_rows(source)
+        frame = pl.read_parquet(_again(source))
+        return frame, pl.read_parquet_metadata(_again(source))
+
+
+def _refuse_repeated_rows(source: Path | io.BytesIO) -> None:
+    """Refuse a small file of very many equal rows, which would fill the memory.
+
+    Only the footer is read. Equal rows take next to no space, and rows of a street differ at least
+    in their times.
+    """
+    size = source.stat().st_size if isinstance(source, Path) else len(source.getbuffer())
+    rows = pl.scan_parquet(_again(source)).select(pl.len()).collect().item()
+    if rows > max(_FEW_ROWS, size):
+        raise pl.exceptions.ComputeError(f"{rows} rows in {size} bytes")
+
+
+def _again(source: Path | io.BytesIO) -> Path | io.BytesIO:
+    """Return the source, at its begin if it is a stream."""
+    if isinstance(source, io.BytesIO):
+        source.seek(0)
+    return source
 
 
 @contextlib.contextmanager
