@@ -9,7 +9,7 @@ from pathlib import Path
 import pytest
 
 from ugat_marl.diagnosis import Hypothesis, free_values, global_hypotheses, ordered
-from ugat_marl.diagnosis.hypotheses import LOCAL, cautious_drivers, library
+from ugat_marl.diagnosis.hypotheses import LOCAL, a_few, cautious_drivers, library
 from ugat_marl.effects import PAPER_WORLDS, known_effects, load_scenario, parse_domain
 from ugat_marl.errors import OptionError, UnknownNameError
 from ugat_marl.scenarios import Scenario
@@ -180,3 +180,11 @@ def test_a_field_that_an_effect_does_not_have_is_refused() -> None:
     item = Hypothesis("headway", (), ("metres",), ((1.5,),), (1.0,))
     with pytest.raises(OptionError, match="headway"):
         free_values(parse_domain("headway=1.4")[0], item)
+
+
+def test_an_emergency_deceleration_is_tried_near_the_usual_one(single: Scenario) -> None:
+    known = by_name(single)
+    gentle = ((known["deceleration"], (1.5,)), (known["acceleration"], (0.5,)))
+    alone = a_few(known["emergency_deceleration"])
+    assert a_few(known["emergency_deceleration"], gentle) == (*alone, (pytest.approx(1.95),))
+    assert a_few(known["headway"], gentle) == a_few(known["headway"])

@@ -10,6 +10,7 @@ import numpy as np
 
 from ugat_marl.effects import (
     EVERYWHERE,
+    NO_SOFTER,
     Effect,
     ExaminedStrengths,
     known_effects,
@@ -105,6 +106,10 @@ LOCAL = frozenset(
     }
 )  # fmt: skip
 """Effects that need a place, and some a window: see `places`."""
+
+NEAR_ITS_BOUND = 1.3
+"""Emergency deceleration that is tried, as a multiple of the model's usual one. By hand. Halved: no
+emergency deceleration is so small."""
 
 CAUTION = ("acceleration", "deceleration", "startup_delay")
 """Properties of drivers that change together, for `cautious_drivers`."""
@@ -273,14 +278,24 @@ def both_ways(
     return [change for change in changes if change[1] != values]
 
 
-def a_few(hypothesis: Hypothesis) -> tuple[tuple[float, ...], ...]:
-    """Return one strength on each side of nominal, enough for rounds after the first."""
+def a_few(hypothesis: Hypothesis, members: Members = ()) -> tuple[tuple[float, ...], ...]:
+    """Return one strength on each side of nominal, enough for rounds after the first.
+
+    An emergency deceleration changes little until it comes near the usual one. Where the model has
+    a usual one, a strength near it is added.
+
+    Args:
+        hypothesis: The hypothesis.
+        members: Members of the model.
+    """
     levels, nominal = hypothesis.levels, hypothesis.nominal
     if nominal is None or len(levels) < 2:
         return levels
     low = [level for level in levels if level < nominal]
     high = [level for level in levels if level > nominal]
-    return tuple(side[len(side) // 2] for side in (low, high) if side)
+    few = tuple(side[len(side) // 2] for side in (low, high) if side)
+    bound = [values for other, values in members if other.name == NO_SOFTER.get(hypothesis.name)]
+    return few + tuple((NEAR_ITS_BOUND * value,) for (value,) in bound)
 
 
 def effects_of(members: Members) -> tuple[Effect, ...]:

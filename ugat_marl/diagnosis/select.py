@@ -283,7 +283,7 @@ class Selector:
         jobs: list[tuple[Hypothesis, tuple[float, ...], tuple[float, ...] | None]] = []
         for hypothesis in dict.fromkeys(hypotheses):
             if hypothesis.key not in present:
-                levels = hypothesis.levels if number == 0 else a_few(hypothesis)
+                levels = hypothesis.levels if number == 0 else a_few(hypothesis, model.members)
                 jobs += [(hypothesis, level, hypothesis.nominal) for level in levels]
         if what == "library":
             for hypothesis, values in model.members:
