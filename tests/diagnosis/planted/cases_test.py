@@ -33,7 +33,7 @@ class Case:
 
 CASES = {
     "vehicles": Case("headway=1.4", "headway", None, {"seconds": 1.4}, error=0.05),
-    "fleet": Case("heavy_share=0.15", "heavy_share", None, {"share": 0.15}, error=0.2),
+    "fleet": Case("heavy_share=0.25", "heavy_share", None, {"share": 0.25}, error=0.2),
     "signals": Case("late_green=*,2", "late_green", "*", {"seconds": 2.0}, error=0.1),
     "detectors": Case(
         "undercount=stop:S_C_0,0.25", "undercount", "stop:S_C_0", {"share": 0.25}, error=0.2
