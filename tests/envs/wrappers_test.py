@@ -414,7 +414,8 @@ def test_the_page_names_every_wrapper_and_its_example_runs() -> None:
         encoding="utf-8"
     )
     named = set(re.findall(r"^\| `(\w+)\(env", page, flags=re.MULTILINE))
-    assert named == {*SINGLE, "appended_mask", "legal_actions", "masked_observation"}
+    others = {"appended_mask", "legal_actions", "masked_observation", "intersection_names"}
+    assert named == {*SINGLE, *others}
     example = re.search(r"```python\n(.*?)```", page, flags=re.DOTALL)
     assert example is not None
     names: dict[str, Any] = {}
