@@ -6,7 +6,6 @@ import json
 from dataclasses import asdict, dataclass
 from typing import Annotated
 
-from rich import box
 from rich.console import Console
 from rich.table import Table
 from rich.text import Text
@@ -14,6 +13,7 @@ from tyro.conf import Positional, arg
 
 from ugat_marl.effects import DOMAIN_ALIASES, GAP_KINDS, NAMED_DOMAINS, NamedDomain
 from ugat_marl.errors import UnknownNameError
+from ugat_marl.reporting import titled_table
 
 _TITLES = {
     "observation": "observation gap: controllers see something else",
@@ -69,10 +69,7 @@ class Domains:
 
 
 def _table(title: str, domains: list[NamedDomain]) -> Table:
-    table = Table(
-        box=box.SIMPLE_HEAD, title=Text(title), title_justify="left", pad_edge=False,
-        padding=(0, 1, 0, 0),
-    )  # fmt: skip
+    table = titled_table(title)
     table.add_column("domain", no_wrap=True)
     table.add_column("effects", overflow="fold")
     table.add_column("Sim2Signal", max_width=21, overflow="fold")

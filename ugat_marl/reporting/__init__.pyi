@@ -29,6 +29,7 @@ from .tables import measures_table as measures_table
 from .tables import policy_gap_table as policy_gap_table
 from .tables import transfer_table as transfer_table
 from .tables import tuning_table as tuning_table
+from .terminal import titled_table as titled_table
 from .training_page import runs_page as runs_page
 from .training_page import write_pictures as write_pictures
 from .video import Film as Film

@@ -10,9 +10,7 @@ from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any
 
-from rich import box
 from rich.console import Group, RenderableType
-from rich.table import Table
 from rich.text import Text
 
 from ugat_marl.data import MEASURES
@@ -32,6 +30,7 @@ from ugat_marl.reporting.formats import (
     percent_text,
     share_text,
 )
+from ugat_marl.reporting.terminal import titled_table
 
 CERTAIN = 0.05
 """Level of the paired tests in the paragraph that says what the table means."""
@@ -44,13 +43,7 @@ def terminal_tables(comparison: Comparison, direct: str) -> RenderableType:
     """Return ATT, change of the gap, regret and the share won back, in 80 columns."""
     blocks: list[RenderableType] = []
     for title, cell in _headlines(comparison, direct):
-        table = Table(
-            box=box.SIMPLE_HEAD,
-            title=Text(f"{comparison.scenario}: {title}"),
-            title_justify="left",
-            pad_edge=False,
-            padding=(0, 1, 0, 0),
-        )
+        table = titled_table(f"{comparison.scenario}: {title}")
         table.add_column("policy", max_width=28, overflow="fold")
         for target in comparison.targets:
             table.add_column(target, justify="right", no_wrap=True)

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 
-from rich import box
 from rich.console import Group, RenderableType
 from rich.table import Table
 from rich.text import Text
@@ -12,6 +11,7 @@ from rich.text import Text
 from ugat_marl.diagnosis import Diagnosis, HeldOut, NamedEffect, statistic
 from ugat_marl.reporting import diagnosis_words as words
 from ugat_marl.reporting.formats import chance, number, share, signed
+from ugat_marl.reporting.terminal import titled_table
 
 _SHOWN = 3
 """Number of disagreements in the table."""
@@ -41,18 +41,8 @@ def diagnosis_summary(diagnosis: Diagnosis) -> RenderableType:
     return Group(*blocks)
 
 
-def _table(title: str) -> Table:
-    return Table(
-        box=box.SIMPLE_HEAD,
-        title=Text(title),
-        title_justify="left",
-        pad_edge=False,
-        padding=(0, 1, 0, 0),
-    )
-
-
 def _effects(effects: Sequence[NamedEffect]) -> Table:
-    table = _table("effects (value with 95 % interval)")
+    table = titled_table("effects (value with 95 % interval)")
     table.add_column("effect", overflow="fold", max_width=20)
     table.add_column("where", overflow="fold", max_width=22)
     timed = any(effect.window for effect in effects)
@@ -67,7 +57,7 @@ def _effects(effects: Sequence[NamedEffect]) -> Table:
 
 
 def _where(diagnosis: Diagnosis) -> Table:
-    table = _table("strongest disagreements (measured minus simulated)")
+    table = titled_table("strongest disagreements (measured minus simulated)")
     table.add_column("where", overflow="fold", max_width=18)
     table.add_column("what", overflow="fold", max_width=36)
     table.add_column("size", justify="right", no_wrap=True)
@@ -90,7 +80,7 @@ def _traffic(diagnosis: Diagnosis) -> Table:
     """Return capacity, queue and delay of the approach whose delay differs most."""
     corrected = diagnosis.best is not None
     approach = words.slowest(diagnosis)
-    table = _table(f"approach {approach[0].approach}")
+    table = titled_table(f"approach {approach[0].approach}")
     table.add_column("", overflow="fold")
     for heading in ("measured", "before", "after"):
         table.add_column(heading, justify="right")
@@ -103,7 +93,7 @@ def _heldout(heldout: HeldOut, *, fitted: bool) -> RenderableType:
     """Return the numbers of the held-out periods; `fitted` says that none was held out."""
     where = "fitted periods" if fitted else "held-out periods"
     lines: list[RenderableType] = [Text(f"distance of the data from the simulation, {where}")]
-    table = _table("")
+    table = titled_table("")
     table.title = None
     for heading in ("before", "after", "floor", "shrink", "p before", "p after"):
         table.add_column(heading, justify="right")

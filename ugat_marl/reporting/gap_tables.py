@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 
-from rich import box
 from rich.console import Group, RenderableType
 from rich.table import Table
 from rich.text import Text
@@ -12,13 +11,14 @@ from rich.text import Text
 from ugat_marl.envs import OBJECTIVE_MEASURES
 from ugat_marl.experiments import Evaluation, domains_by_gap, gap_matrix
 from ugat_marl.reporting.formats import number_text
+from ugat_marl.reporting.terminal import titled_table
 
 
 def gap_matrix_table(evaluation: Evaluation) -> RenderableType:
     """Return the cost of each gap for each controller, then travel times by domain."""
     gaps = domains_by_gap(evaluation)
     first = evaluation.domains[0]
-    table = _table(f"{evaluation.scenario}: what each gap costs each controller")
+    table = titled_table(f"{evaluation.scenario}: what each gap costs each controller")
     table.add_column("policy", max_width=16, overflow="fold")
     table.add_column(f"{first}\nATT s", justify="right")
     for gap, domains in gaps.items():
@@ -50,7 +50,7 @@ def objective_tables(evaluation: Evaluation) -> list[RenderableType]:
     domains = [domain for domain in evaluation.domains if domain in told]
     if not domains:
         return []
-    table = _table(f"{evaluation.scenario}: cost of what is wanted, hidden from training")
+    table = titled_table(f"{evaluation.scenario}: cost of what is wanted, hidden from training")
     table.add_column("policy", max_width=22, overflow="fold")
     for domain in domains:
         table.add_column(domain.removeprefix("want-"), justify="right", overflow="fold")
@@ -87,7 +87,7 @@ def _measured(evaluation: Evaluation, domains: Sequence[str]) -> list[Table]:
         alike.setdefault(tuple(values), []).append(domain)
     tables: list[Table] = []
     for values, same in alike.items():
-        table = _table(f"measured in {', '.join(same)}")
+        table = titled_table(f"measured in {', '.join(same)}")
         table.add_column("policy", max_width=22, overflow="fold")
         for heading in _SHORT.values():
             table.add_column(heading, justify="right")
@@ -99,7 +99,7 @@ def _measured(evaluation: Evaluation, domains: Sequence[str]) -> list[Table]:
 
 
 def _by_domain(evaluation: Evaluation) -> RenderableType:
-    table = _table("average travel time in s, domain by domain")
+    table = titled_table("average travel time in s, domain by domain")
     table.add_column("domain", max_width=22, overflow="fold")
     for policy in evaluation.policies:
         table.add_column(policy, justify="right", overflow="fold")
@@ -109,10 +109,3 @@ def _by_domain(evaluation: Evaluation) -> RenderableType:
         )
         table.add_row(Text(domain), *map(number_text, values))
     return table
-
-
-def _table(title: str) -> Table:
-    return Table(
-        box=box.SIMPLE_HEAD, title=Text(title), title_justify="left", pad_edge=False,
-        padding=(0, 1, 0, 0),
-    )  # fmt: skip

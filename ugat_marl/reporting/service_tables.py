@@ -4,15 +4,14 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 
-from rich import box
 from rich.console import Group, RenderableType
-from rich.table import Table
 from rich.text import Text
 
 from ugat_marl.data import level_of_service, mean_delay_s
 from ugat_marl.experiments import Evaluation
 from ugat_marl.reporting.formats import number_text
 from ugat_marl.reporting.page import Grid
+from ugat_marl.reporting.terminal import titled_table
 from ugat_marl.scenarios import NamedApproach, Network, named_approaches
 
 MOST_APPROACHES = 8
@@ -48,7 +47,7 @@ def service_tables(evaluation: Evaluation, network: Network) -> list[RenderableT
     }
     if not measured:
         return []
-    table = _table(f"{evaluation.scenario}: control delay and level of service (HCM)")
+    table = titled_table(f"{evaluation.scenario}: control delay and level of service (HCM)")
     table.add_column("policy", max_width=22, overflow="fold")
     for domain in evaluation.domains:
         table.add_column(domain, justify="right", overflow="fold")
@@ -76,7 +75,7 @@ def approach_table(
     roads = _worst_first(delays)
     shown = roads[:MOST_APPROACHES]
     more = f", the worst {len(shown)} of {len(roads)}" if len(roads) > len(shown) else ""
-    table = _table(f"{title}{more}")
+    table = titled_table(f"{title}{more}")
     for heading in ("light", "approach", "road"):
         table.add_column(heading, overflow="fold", max_width=22)
     table.add_column("veh", justify="right")
@@ -117,10 +116,3 @@ def _worst_first(delays: Mapping[str, Delays]) -> list[str]:
     roads = dict.fromkeys(road for own in delays.values() for road in own)
     first = next(iter(delays.values()), {})
     return sorted(roads, key=lambda road: -first.get(road, (0.0, 0.0))[1])
-
-
-def _table(title: str) -> Table:
-    return Table(
-        box=box.SIMPLE_HEAD, title=Text(title), title_justify="left", pad_edge=False,
-        padding=(0, 1, 0, 0),
-    )  # fmt: skip

@@ -3,13 +3,12 @@
 from __future__ import annotations
 
 import polars as pl
-from rich import box
 from rich.console import Group, RenderableType
-from rich.table import Table
 from rich.text import Text
 
 from ugat_marl.experiments import ranked
 from ugat_marl.reporting.formats import chance, number_text, share_text
+from ugat_marl.reporting.terminal import titled_table
 
 
 def standings_table(scenario: str, table: pl.DataFrame, name: str) -> RenderableType:
@@ -23,13 +22,7 @@ def standings_table(scenario: str, table: pl.DataFrame, name: str) -> Renderable
     rows = ranked(table)
     blocks: list[RenderableType] = []
     for domain in rows["domain"].unique(maintain_order=True):
-        shown = Table(
-            box=box.SIMPLE_HEAD,
-            title=Text(f"{scenario} in {domain}: average travel time, s"),
-            title_justify="left",
-            pad_edge=False,
-            padding=(0, 1, 0, 0),
-        )
+        shown = titled_table(f"{scenario} in {domain}: average travel time, s")
         shown.add_column("", width=1)
         shown.add_column("setting", max_width=30, overflow="fold")
         for heading in ("runs", "ATT (95 %)", "gap", "regret", "won back", "p"):

@@ -14,6 +14,7 @@ from ugat_marl.data import MEASURES
 from ugat_marl.diagnosis import PolicyGap, TravelTimeEstimate
 from ugat_marl.experiments import Estimate, Evaluation, Tuned, check_run
 from ugat_marl.reporting.formats import number_text
+from ugat_marl.reporting.terminal import titled_table
 
 
 def transfer_table(evaluation: Evaluation) -> RenderableType:
@@ -48,13 +49,7 @@ def measures_table(evaluation: Evaluation) -> RenderableType:
     """Return a block per domain: measures, intervals, and gaps against the first domain."""
     blocks: list[RenderableType] = []
     for domain in evaluation.domains:
-        table = Table(
-            box=box.SIMPLE_HEAD,
-            title=Text(f"{evaluation.scenario} in {domain}"),
-            title_justify="left",
-            pad_edge=False,
-            padding=(0, 1, 0, 0),
-        )
+        table = titled_table(f"{evaluation.scenario} in {domain}")
         table.add_column("policy", max_width=20, overflow="fold")
         headings = ("ATT s", "through.", "reward", "queue", "delay", "delay s", "regret s")
         for heading in headings:
