@@ -12,13 +12,11 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from ugat_marl.errors import SimulatorError
 from ugat_marl.files import xml_bytes
 from ugat_marl.scenarios import Document, Lane
+from ugat_marl.simulation.detectors import LANE_END_M, add_loop, events_in
 
 _EVENT = re.compile(rb'id="place(\d+):[^"]*" time="([\d.]+)" state="[^"]*" vehID="([^"]*)"')
-_EDGE_M = 0.1
-"""Least distance of a loop from both ends of its lane, m."""
 
 
 @dataclass(frozen=True)
@@ -44,17 +42,8 @@ def places_document(ways: Sequence[Way], lanes: Mapping[str, Lane], file: Path) 
     for number, place in enumerate(_places(ways)):
         for lane in lanes.values():
             if lane.edge == place.edge:
-                position = max(min(place.position_m, lane.length_m - _EDGE_M), _EDGE_M)
-                ET.SubElement(
-                    root,
-                    "instantInductionLoop",
-                    {
-                        "id": f"place{number}:{lane.id}",
-                        "lane": lane.id,
-                        "pos": f"{position:.3f}",
-                        "file": str(file),
-                    },
-                )
+                position = max(min(place.position_m, lane.length_m - LANE_END_M), LANE_END_M)
+                add_loop(root, f"place{number}:{lane.id}", lane.id, position, file)
     return Document("places.add.xml", None, xml_bytes(root))
 
 
@@ -75,10 +64,7 @@ def read_between(
     Raises:
         SimulatorError: SUMO did not write the file.
     """
-    try:
-        content = file.read_bytes()
-    except OSError as error:
-        raise SimulatorError(f"SUMO's places cannot be read ({error.strerror})") from None
+    content = events_in(file, "places")
     places = _places(ways)
     seen: list[dict[bytes, list[float]]] = [defaultdict(list) for _ in places]
     for number, time, vehicle in _EVENT.findall(content):

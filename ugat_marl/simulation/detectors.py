@@ -31,6 +31,8 @@ shift the times by seconds."""
 ADVANCE_SETBACK_M = 50.0
 EXIT_DISTANCE_M = 10.0
 
+LANE_END_M = 0.1
+"""Least distance of a loop from an end of its lane, m."""
 _EVENT = re.compile(
     rb'id="([^"]*)" time="([\d.]+)" state="(enter|leave)" vehID="([^"]*)" '
     rb'speed="([-\d.]+)" length="([\d.]+)"'
@@ -68,18 +70,36 @@ def detectors_document(
     """
     root = ET.Element("additional")
     for detector, number, lane in _zones(detectors):
-        last_m = np.inf if lanes is None else lanes[lane].length_m - 0.1
+        last_m = np.inf if lanes is None else lanes[lane].length_m - LANE_END_M
         name = _loop(detector, number)
         ends = {name: min(detector.position_m, last_m)}
         if detector.length_m > 0:
             ends[name + _END] = min(detector.position_m + detector.length_m, last_m)
         for loop, position in ends.items():
-            ET.SubElement(
-                root,
-                "instantInductionLoop",
-                {"id": loop, "lane": lane, "pos": f"{position:.3f}", "file": str(file)},
-            )
+            add_loop(root, loop, lane, position, file)
     return Document("loops.add.xml", None, xml_bytes(root))
+
+
+def add_loop(root: ET.Element, name: str, lane: str, position_m: float, file: Path) -> None:
+    """Add a loop on a lane that writes each event to `file`."""
+    place = {"id": name, "lane": lane, "pos": f"{position_m:.3f}", "file": str(file)}
+    ET.SubElement(root, "instantInductionLoop", place)
+
+
+def events_in(file: Path, what: str) -> bytes:
+    """Return what the loops of a simulation wrote.
+
+    Args:
+        file: SUMO's output.
+        what: What the loops stand for, in the message.
+
+    Raises:
+        SimulatorError: SUMO did not write the file.
+    """
+    try:
+        return file.read_bytes()
+    except OSError as error:
+        raise SimulatorError(f"SUMO's {what} cannot be read ({error.strerror})") from None
 
 
 def _zones(detectors: Sequence[Detector]) -> list[tuple[Detector, int, str]]:
@@ -109,10 +129,7 @@ def read_passages(
     Raises:
         SimulatorError: SUMO did not write the file.
     """
-    try:
-        content = file.read_bytes()
-    except OSError as error:
-        raise SimulatorError(f"SUMO's detections cannot be read ({error.strerror})") from None
+    content = events_in(file, "detections")
     rows: dict[bytes, list[tuple[float, bool, bytes, float, float]]] = defaultdict(list)
     for name, time, state, vehicle, speed, length in _EVENT.findall(content):
         rows[name].append((float(time), state == b"enter", vehicle, float(speed), float(length)))
