@@ -73,16 +73,6 @@ SIGNALS = (
 )
 
 
-@pytest.fixture(scope="module")
-def scenario(data: Path) -> Scenario:
-    return read_scenario(data / "crossing")
-
-
-@pytest.fixture(scope="module")
-def network(scenario: Scenario) -> Network:
-    return Network.read(scenario)
-
-
 def log(
     events: list[tuple[float, int, int]], device: object = 7, zero: dt.datetime = ZERO
 ) -> pl.DataFrame:

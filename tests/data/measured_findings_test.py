@@ -41,11 +41,6 @@ def scenario(data: Path) -> Scenario:
     return read_scenario(data / "crossing").with_duration(END)
 
 
-@pytest.fixture(scope="module")
-def network(scenario: Scenario) -> Network:
-    return Network.read(scenario)
-
-
 def vehicles(seed: int, every: float = 20.0) -> Passages:
     """A vehicle about every 20 s, each on the detector for a second."""
     rng = np.random.default_rng(seed)

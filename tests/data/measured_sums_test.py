@@ -13,17 +13,7 @@ from ugat_marl.data import CSV_HASHES, MeasuredData, as_counts, read_measured, w
 from ugat_marl.data.measured.coverage import COUNTABLE, SUMMED
 from ugat_marl.effects import known_effects
 from ugat_marl.errors import MeasuredDataError
-from ugat_marl.scenarios import Network, Scenario, read_scenario
-
-
-@pytest.fixture(scope="module")
-def scenario(data: Path) -> Scenario:
-    return read_scenario(data / "crossing")
-
-
-@pytest.fixture(scope="module")
-def network(scenario: Scenario) -> Network:
-    return Network.read(scenario)
+from ugat_marl.scenarios import Network, Scenario
 
 
 def sums() -> MeasuredData:
