@@ -29,6 +29,7 @@ from ugat_marl.files import require_writable
 from ugat_marl.parallel import Workers
 from ugat_marl.progress import Bars, Reporter
 from ugat_marl.reporting import standings_table
+from ugat_marl.scenarios import Scenario
 
 
 @dataclass(frozen=True)
@@ -110,7 +111,7 @@ class Compare:
             table = shipped_standings(scenario, self.evaluation_seeds, self.duration_s)
         domains = self._domains(table)
         with workers_of(self.workers, self.ray) as workers:
-            own = self._judged(domains, workers, Bars(console))
+            own = self._judged(scenario, domains, workers, Bars(console))
         whole = with_standings(table, own)
         shown = whole.filter(pl.col("domain").is_in([*map(domain_label, domains)]))
         console.print(standings_table(scenario.id, shown, self.name))
@@ -124,13 +125,17 @@ class Compare:
         return self.domains or tuple(known) or ("V1", "V4")
 
     def _judged(
-        self, domains: tuple[str, ...], workers: Workers, reporter: Reporter
+        self,
+        scenario: Scenario,
+        domains: tuple[str, ...],
+        workers: Workers,
+        reporter: Reporter,
     ) -> pl.DataFrame:
         """Return the rows of the algorithm."""
         if self.learner is None:
             return standings_of(
                 self.name,
-                load_scenario(self.scenario),
+                scenario,
                 [policy_factory(spec) for spec in self.policies],
                 domains,
                 episodes=self.evaluation_seeds,

@@ -39,7 +39,6 @@ from ugat_marl.scenarios import (
     SHORT_LANE_M,
     IntersectionFacts,
     NamedApproach,
-    Network,
     Survey,
     confinement_missing,
     named_approaches,
@@ -124,9 +123,9 @@ class ScenarioCheck:
             )
             print(text)
         else:
-            lights = parallel_env(scenario).intersection_of
-            console.print(_named_agents(lights), markup=False, soft_wrap=True)
-            show(console, facts, runs, rows, wrong, named_approaches(Network.read(scenario)))
+            env = parallel_env(scenario)
+            console.print(_named_agents(env.intersection_of), markup=False, soft_wrap=True)
+            show(console, facts, runs, rows, wrong, named_approaches(env.network))
             if reason := confinement_missing():
                 console.print(
                     f"note: simulations are not confined, because {reason}; see SECURITY.md before "

@@ -51,13 +51,10 @@ def read_standings(path: Path) -> pl.DataFrame:
         content = path.read_bytes()
     except OSError as error:
         raise CheckpointError(f"{path}: {error.strerror}; name a seeds.csv of a table") from None
-    try:
-        texts = csv_texts(content)
-    except pl.exceptions.PolarsError:
-        texts = pl.DataFrame()  # `as_standings` refuses it
-    if damaged := csv_damage(path, texts):
+    texts = _texts(content)
+    if damaged := csv_damage(path, pl.DataFrame() if texts is None else texts):
         raise CheckpointError(f"{path}: {damaged}")
-    return as_standings(content, str(path))
+    return _standings_in(texts, str(path))
 
 
 def as_standings(content: bytes, name: str) -> pl.DataFrame:
@@ -70,10 +67,21 @@ def as_standings(content: bytes, name: str) -> pl.DataFrame:
     Raises:
         CheckpointError: It is no such table, or a number is missing.
     """
+    return _standings_in(_texts(content), name)
+
+
+def _texts(content: bytes) -> pl.DataFrame | None:
+    """Return the cells of a file of CSV as texts; None if it is none."""
     try:
-        texts = csv_texts(content)
+        return csv_texts(content)
     except pl.exceptions.PolarsError:
-        raise CheckpointError(f"{name}: not a table of CSV; name a seeds.csv of a table") from None
+        return None
+
+
+def _standings_in(texts: pl.DataFrame | None, name: str) -> pl.DataFrame:
+    """Return the table of standings in cells; see `as_standings`."""
+    if texts is None:
+        raise CheckpointError(f"{name}: not a table of CSV; name a seeds.csv of a table")
     if missing := [column for column in SCHEMA if column not in texts.columns]:
         raise CheckpointError(
             f"{name}: has no column {missing[0]!r}; name a seeds.csv of `ugat-marl paper`"
