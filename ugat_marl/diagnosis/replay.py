@@ -162,28 +162,22 @@ class Replay:
 
     def __reduce__(self) -> tuple[functools.partial[Replay], tuple[Any, ...]]:
         """Pickle the arguments only, without the days in memory."""
-        return (
-            functools.partial(
-                Replay,
-                answering=self.answering,
-                detection=self._detection,
-                day_to_day=self.day_to_day,
-                followed=self.followed,
-                watched=self.watched,
-            ),
-            self._given,
-        )
+        make = functools.partial(Replay, detection=self._detection, **self._options)
+        return make, self._given
 
     def detecting(self, errors: Sequence[Effect]) -> Replay:
         """Return a simulator of the same days that knows errors of measurement."""
-        return Replay(
-            *self._given,
-            answering=self.answering,
-            detection=errors,
-            day_to_day=self.day_to_day,
-            followed=self.followed,
-            watched=self.watched,
-        )
+        return Replay(*self._given, detection=errors, **self._options)
+
+    @property
+    def _options(self) -> dict[str, Any]:
+        """Options of every simulator of the same days."""
+        return {
+            "answering": self.answering,
+            "day_to_day": self.day_to_day,
+            "followed": self.followed,
+            "watched": self.watched,
+        }
 
     def simulate(self, effects: Sequence[Effect], period: Period, seed: int) -> Day:
         """Simulate one day.
