@@ -16,9 +16,6 @@ from ugat_marl.diagnosis.records import Fitted
 from ugat_marl.diagnosis.statistics import Array, Pools, Reference, Whitener, change_between, shrunk
 from ugat_marl.effects import EVERYWHERE
 
-Slope = dict[str, Array]
-"""Change of the statistics by block, for a move of a free value by 1."""
-
 Change = tuple[dict[str, Array], float]
 """Change of the statistics when a free value moves, by block, and length of this move."""
 
@@ -91,9 +88,9 @@ class Fitter:
     ) -> Fitted:
         """Take Gauss-Newton steps from a simulated model.
 
-        The first slopes are those between simulated strengths of `directions`, where these cover
-        every free value, and each step corrects them (Broyden 1965). Both cost no simulation. If
-        they lead nowhere, or cover not every value, slopes are finite differences.
+        The first derivatives are those between simulated strengths of `directions`, where these
+        cover every free value, and each step corrects them (Broyden 1965). Both cost no simulation.
+        If they lead nowhere, or cover not every value, derivatives are finite differences.
 
         Args:
             start: The model to start from.
@@ -101,29 +98,28 @@ class Fitter:
             directions: Changes of the statistics by single effects.
         """
         best, left = start, self.thresholds.steps if rounds is None else rounds
-        slopes = self._known_slopes(start, directions)
+        changes = self._known_changes(start, directions)
         exact = False
         while left and len(best.values):
-            if slopes is None:
-                slopes, exact = self._slopes(best), True
-            after = self._after_step(best, slopes)
+            if changes is None:
+                changes, exact = self.changes(best), True
+            after = self._after_step(best, changes)
             if after is None:
                 if exact:
                     break
-                slopes = None
+                changes = None
                 continue
             left -= 1
-            gain, slopes = best.cost - after.cost, self._corrected(slopes, best, after)
+            gain, changes = best.cost - after.cost, self._corrected(changes, best, after)
             best, exact = after, False
             if gain < self.thresholds.least_gain:
                 break
         return best
 
-    def _after_step(self, model: Fitted, slopes: Sequence[Slope]) -> Fitted | None:
+    def _after_step(self, model: Fitted, changes: Sequence[Change]) -> Fitted | None:
         """Return the model after a step, or a shorter one; None if neither costs less."""
         whitener = self.whitener(model)
-        jacobian = np.stack([whitener(slope) for slope in slopes])
-        step = _solve(jacobian, whitener.measured, self.thresholds.ridge)
+        step = _solve(derivatives(changes, whitener), whitener.measured, self.thresholds.ridge)
         for share in (1.0, self.thresholds.shorter_step):
             moved = self._moved(model, share * step)
             if moved == model.members:
@@ -133,9 +129,9 @@ class Fitter:
                 return after
         return None
 
-    def _known_slopes(self, model: Fitted, directions: Sequence[Direction]) -> list[Slope] | None:
-        """Return slopes of all free values from simulated strengths; None if one is not known."""
-        slopes: list[Slope] = []
+    def _known_changes(self, model: Fitted, directions: Sequence[Direction]) -> list[Change] | None:
+        """Return `changes` from simulated strengths; None if one is not known."""
+        changes: list[Change] = []
         for hypothesis, values in model.members:
             near = [
                 direction
@@ -148,22 +144,14 @@ class Fitter:
                 return None
             nearest = min(near, key=lambda one: abs(one.level[0] - values[0]))
             assert nearest.origin is not None
-            length = nearest.level[0] - nearest.origin[0]
             change = shrunk(nearest.difference, nearest.variance, self.thresholds)
-            slopes.append({name: values / length for name, values in change.items()})
-        return slopes or None
+            changes.append((change, nearest.level[0] - nearest.origin[0]))
+        return changes or None
 
-    def _slopes(self, model: Fitted) -> list[Slope]:
-        """Return slopes of all free values from finite differences."""
-        return [
-            {name: values / delta for name, values in change.items()}
-            for change, delta in self.changes(model)
-        ]
-
-    def _corrected(self, slopes: Sequence[Slope], before: Fitted, after: Fitted) -> list[Slope]:
-        """Return slopes after a step: with it, they give the change that was simulated."""
+    def _corrected(self, changes: Sequence[Change], before: Fitted, after: Fitted) -> list[Change]:
+        """Return changes by moves of 1 which, for the step, add up to what was simulated."""
         shared = [number for number in before.days if number in after.days]
-        change, _ = change_between(
+        simulated, _ = change_between(
             self.pools, [after.days[n] for n in shared], [before.days[n] for n in shared]
         )
         move = np.subtract(after.values, before.values)
@@ -171,12 +159,15 @@ class Fitter:
         weight = move / np.square(np.maximum(least, 1e-6))
         weight /= float(move @ weight)
         left = {
-            name: values - sum(x * slope[name] for x, slope in zip(move, slopes, strict=True))
-            for name, values in change.items()
+            name: values
+            - sum(
+                x / delta * change[name] for x, (change, delta) in zip(move, changes, strict=True)
+            )
+            for name, values in simulated.items()
         }
         return [
-            {name: slope[name] + share * left[name] for name in slope}
-            for share, slope in zip(weight, slopes, strict=True)
+            ({name: change[name] / delta + share * left[name] for name in change}, 1.0)
+            for share, (change, delta) in zip(weight, changes, strict=True)
         ]
 
     def settled(self, model: Fitted, errors: Array) -> Fitted:

@@ -436,32 +436,25 @@ def _beyond_doubt(tested: Tested, place: int, fitter: Fitter) -> bool:
     The errors of the values are those of all values together, so they hold what other effects could
     do in its place.
     """
-    members = tested.model.members
-    first = sum(len(values) for _, values in members[:place])
-    hypothesis, values = members[place]
-    errors = tested.errors[first : first + len(values)]
-    known = bool(values) and hypothesis.nominal is not None and bool((errors > 0.0).all())
+    hypothesis, values = tested.model.members[place]
+    certain = bool((tested.errors_of(place) > 0.0).all())
+    known = bool(values) and hypothesis.nominal is not None and certain
     return known and _deviations(tested, place) > fitter.thresholds.beyond_doubt
 
 
 def _deviations(tested: Tested, place: int) -> float:
     """Return how many standard errors the member at `place` is away from its usual values."""
-    members = tested.model.members
-    first = sum(len(values) for _, values in members[:place])
-    hypothesis, values = members[place]
-    errors = np.maximum(tested.errors[first : first + len(values)], 1e-12)
+    hypothesis, values = tested.model.members[place]
+    errors = np.maximum(tested.errors_of(place), 1e-12)
     return float((np.abs(np.subtract(values, hypothesis.nominal or 0.0)) / errors).max())
 
 
 def doubtful(tested: Tested, half_interval: float) -> list[int]:
     """Return indices of effects whose intervals hold the nominal values: they may be absent."""
     places: list[int] = []
-    first = 0
     for place, (hypothesis, values) in enumerate(tested.model.members):
-        errors = tested.errors[first : first + len(values)]
-        first += len(values)
         if values and hypothesis.nominal is not None:
             away = np.abs(np.subtract(values, hypothesis.nominal))
-            if (away <= half_interval * errors).all():
+            if (away <= half_interval * tested.errors_of(place)).all():
                 places.append(place)
     return places

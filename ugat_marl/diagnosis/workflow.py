@@ -393,12 +393,10 @@ def _named(best: Tested, selected: Selected, half_interval: float) -> tuple[Name
     worse_by = min(others) - best.model.cost if others else None
     grounds = SearchGrounds(best.model.distance.total, worse_by)
     effects: list[NamedEffect] = []
-    place = 0
-    for hypothesis, values in best.model.members:
-        errors = best.errors[place : place + len(values)]
+    for place, (hypothesis, values) in enumerate(best.model.members):
+        errors = best.errors_of(place)
         known = bool(np.isfinite(errors).all())
         margins = tuple(half_interval * float(error) for error in errors) if known else None
-        place += len(values)
         effects.append(_with_grounds(effect_record(hypothesis, values, margins), grounds))
     return tuple(effects)
 
