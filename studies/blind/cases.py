@@ -77,7 +77,7 @@ class Label:
     Attributes:
         case: Id of the case.
         scenario: Name of its scenario.
-        group: ``none``, ``single``, ``pair``, ``setting`` or ``outside``.
+        group: ``none``, ``single``, ``measurement``, ``pair``, ``setting`` or ``outside``.
         hidden: Name of the hidden effects: an effect, two joined by ``+``, ``V3``, ``bus_stops``.
         strength: ``small``, ``medium`` or ``large``, for groups that have a strength.
         effects: Hidden effects that a diagnosis can name. In the group ``outside`` none explains
@@ -91,6 +91,7 @@ class Label:
         policy: Controller of the signals.
         seed: Seed of the measured data.
         measured: Hash of the measured data.
+        day_to_day: Variation of the demand from day to day, as a share.
     """
 
     case: str
@@ -108,11 +109,12 @@ class Label:
     policy: str
     seed: int
     measured: str
+    day_to_day: float = 0.0
 
     @classmethod
     def from_dict(cls, raw: Mapping[str, Any]) -> Label:
         """Read from JSON."""
-        values = {item.name: raw[item.name] for item in fields(cls)}
+        values = {item.name: raw[item.name] for item in fields(cls) if item.name in raw}
         values["effects"] = tuple(Hidden.from_dict(item) for item in raw["effects"])
         for key in ("leave_out", "lights"):
             values[key] = tuple(raw[key])

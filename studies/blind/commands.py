@@ -10,7 +10,7 @@ from rich.console import Console
 from tyro.conf import Positional, arg
 
 from studies.blind.cases import Case
-from studies.blind.generate import Blueprint, generate
+from studies.blind.generate import VARIATIONS, Blueprint, generate
 from studies.blind.grade import grade_cases, read_grades
 from studies.blind.run import Diagnose, run_cases
 from studies.blind.sampling import GROUPS
@@ -40,7 +40,8 @@ class BlindGenerate:
     Attributes:
         scenario: Scenarios of the cases.
         out: Directory of the blind test; an existing one is continued.
-        classes: Classes to hide: none, single, pair, setting, outside, and names of effects.
+        classes: Classes to hide: none, single, measurement, pair, setting, outside, and names of
+            effects.
         strengths: Strengths of single effects: small, medium, large.
         cases: Number of cases.
         seed: Root of all seeds.
@@ -48,6 +49,7 @@ class BlindGenerate:
         speeds: Measure speeds at the detectors.
         pressure_share: Share of the cases under max-pressure instead of fixed-time control.
         duration_s: Length of a day in s.
+        day_to_day: Variations of the demand from day to day, as shares; each case has one of them.
     """
 
     scenario: tuple[str, ...]
@@ -60,6 +62,7 @@ class BlindGenerate:
     speeds: bool = True
     pressure_share: float = 0.2
     duration_s: LengthS = None
+    day_to_day: tuple[float, ...] = VARIATIONS
 
     def run(self, console: Console) -> int:
         """Generate the cases."""
@@ -73,6 +76,7 @@ class BlindGenerate:
             self.speeds,
             self.pressure_share,
             self.duration_s,
+            self.day_to_day,
         )
         require_writable(self.out / "plan.json")
         made = generate(self.out, blueprint, Bars(console))

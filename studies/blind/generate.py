@@ -37,6 +37,8 @@ FIXED_TIMES = ("fixed-time:20", "fixed-time:30", "fixed-time:40")
 PRESSURES = ("max-pressure:10", "max-pressure:20")
 """Controllers that react to traffic; the other cases have fixed-time control."""
 
+VARIATIONS = (0.0, 0.05, 0.1)
+"""Standard deviations of the demand of a day, as shares of its mean."""
 
 LEAST = 20
 """Least number of a day's detections that an effect must add, remove or move by over 0.1 s."""
@@ -48,7 +50,7 @@ class Blueprint:
 
     Attributes:
         scenarios: Names of scenarios, as for `load_scenario`.
-        classes: Groups (none, single, pair, setting, outside) and names of effects.
+        classes: Groups (none, single, measurement, pair, setting, outside) and names of effects.
         strengths: Strengths of single effects.
         cases: Number of cases.
         seed: Root of all seeds.
@@ -56,6 +58,7 @@ class Blueprint:
         speeds: True if speeds are measured.
         pressure_share: Share of the cases under max-pressure instead of fixed-time control.
         duration_s: Length of a day; None for the scenario's own.
+        day_to_day: Variations of the demand from day to day, as shares; each case has one.
     """
 
     scenarios: tuple[str, ...]
@@ -67,6 +70,7 @@ class Blueprint:
     speeds: bool = True
     pressure_share: float = 0.2
     duration_s: float | None = None
+    day_to_day: tuple[float, ...] = VARIATIONS
 
     def __post_init__(self) -> None:
         if not self.scenarios or not self.classes or not self.strengths:
@@ -78,6 +82,9 @@ class Blueprint:
             raise OptionError("cases and periods must be at least 1, and seed not negative")
         if not 0 <= self.pressure_share <= 1:
             raise OptionError(f"pressure_share = {self.pressure_share}: must be from 0 to 1")
+        if not self.day_to_day or not all(0 <= share < 1 for share in self.day_to_day):
+            shown = " ".join(f"{share:g}" for share in self.day_to_day)
+            raise OptionError(f"day_to_day = {shown}: needs shares from 0 to below 1")
 
 
 @dataclass(frozen=True)
@@ -88,6 +95,7 @@ class _Planned:
     sample: Sample
     policy: str
     seed: int
+    day_to_day: float
 
 
 def generate(directory: Path, blueprint: Blueprint, reporter: Reporter | None = None) -> int:
@@ -183,7 +191,9 @@ def _planned(
                     continue
                 case = Case(f"case{index + 1:03d}", name, sample.leave_out)
                 seed = derive_seed(blueprint.seed, "blind", "case", index)
-                return _Planned(case, sample, policy, seed)
+                own = numpy_generator(blueprint.seed, "blind", "day to day", index)
+                share = float(own.choice(blueprint.day_to_day))
+                return _Planned(case, sample, policy, seed, share)
     raise BlindTestError(
         f"none of the scenarios {', '.join(names)} has a place busy enough to hide "
         f"{task.member or task.group!r}; add a scenario with more traffic"
@@ -218,6 +228,7 @@ def _make(directory: Path, blueprint: Blueprint, item: _Planned, scenario: Scena
         periods=blueprint.periods,
         seed=item.seed,
         speeds=blueprint.speeds,
+        day_to_day=item.day_to_day,
     )
     write_measured(measured, directory / item.case.case / "measured")
     period = measured.periods[0]
@@ -237,6 +248,7 @@ def _make(directory: Path, blueprint: Blueprint, item: _Planned, scenario: Scena
         policy=item.policy,
         seed=item.seed,
         measured=measured.hash,
+        day_to_day=item.day_to_day,
     )
     write_label(directory, label)
 

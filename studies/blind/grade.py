@@ -21,7 +21,7 @@ from studies.blind.cases import (
     read_label,
     read_plan,
 )
-from studies.blind.strengths import KINDS
+from studies.blind.strengths import ALL_KINDS, ERRORS
 from ugat_marl.diagnosis import Diagnosis, EffectRecord, PolicyGap
 from ugat_marl.effects import EVERYWHERE
 from ugat_marl.errors import BlindTestError
@@ -105,6 +105,8 @@ class Grade:
         wall_s: Wall seconds of the diagnosis.
         visible: True if a test that knows the effect sees it, or the log of the signals shows it;
             None if this was not tested.
+        blamed: Effects on traffic or signals that are named, though only detectors are wrong.
+        day_to_day: Variation of the demand from day to day, as a share.
     """
 
     case: str
@@ -128,12 +130,15 @@ class Grade:
     policy_shrink: float | None
     wall_s: float | None
     visible: bool | None = None
+    blamed: tuple[str, ...] = ()
+    day_to_day: float = 0.0
 
     @classmethod
     def from_dict(cls, raw: Mapping[str, Any]) -> Grade:
         """Read from JSON."""
         values = dict(raw)
         values["named"] = tuple(raw["named"])
+        values["blamed"] = tuple(raw.get("blamed", ()))
         values["estimates"] = tuple(Estimate(**item) for item in raw["estimates"])
         return cls(**values)
 
@@ -241,7 +246,17 @@ def grade(label: Label, diagnosis: Diagnosis | None, wall_s: float | None = None
         shrink=None if diagnosis is None or diagnosis.heldout is None else diagnosis.heldout.shrink,
         policy_shrink=None if diagnosis is None else _policy_shrink(diagnosis.policy_gap or {}),
         wall_s=_number(wall_s),
+        blamed=_blamed(label, verdict, sets),
+        day_to_day=label.day_to_day,
     )
+
+
+def _blamed(label: Label, verdict: Verdict, sets: Sequence[set[str]]) -> tuple[str, ...]:
+    """Return what is named beside detectors where nothing but a measurement is wrong."""
+    if label.group != "measurement" or verdict in ("no_discrepancy", "failed"):
+        return ()
+    of_detectors = {name for name, kind in ALL_KINDS.items() if kind.family == "detectors"}
+    return tuple(sorted(set().union(*sets) - of_detectors - set(ERRORS)))
 
 
 def _outcome(
@@ -361,7 +376,7 @@ def canonical(effects: Iterable[Hidden], label: Label) -> list[Hidden]:
     found = [canonical_effect(item, label) for item in effects]
     kept: list[Hidden] = []
     for item in found:
-        kind = KINDS.get(item.name)
+        kind = ALL_KINDS.get(item.name)
         if kind is not None and kind.where == "light" and len(label.lights) > 1:
             same = [x for x in found if x.name == item.name]
             if {x.place for x in same} == set(label.lights):  # all lights are everywhere
@@ -378,7 +393,7 @@ def canonical_effect(item: Hidden, label: Label) -> Hidden:
     name, place, window, parameters = item.name, item.place, item.window, dict(item.parameters)
     if name == "demand_surge" and window is not None and _covers(window, label):
         name, window = "demand_level", None
-    kind = KINDS.get(name)
+    kind = ALL_KINDS.get(name)
     where = kind.where if kind else "everywhere"
     if where == "everywhere" and place in (None, EVERYWHERE):
         place = None

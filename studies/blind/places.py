@@ -7,7 +7,7 @@ from collections.abc import Collection, Mapping
 from dataclasses import dataclass
 
 from ugat_marl.diagnosis import Routes
-from ugat_marl.effects import network_places
+from ugat_marl.effects import EVERYWHERE, group_name, network_places
 from ugat_marl.experiments import policy_factory, record
 from ugat_marl.scenarios import Detector, Network, Scenario
 from ugat_marl.seeding import derive_seed
@@ -34,6 +34,7 @@ class Busy:
         lanes: Lanes before a traffic light.
         edges: Edges before a traffic light.
         detectors: Detectors.
+        groups: Places of groups of detectors: all, those of a kind, those of a kind on an edge.
         pairs: Detectors of one kind on neighbouring lanes that count differently.
         permitted: True if enough drivers have to yield on a green.
         several_lanes: True if an approach has more than one lane.
@@ -46,6 +47,7 @@ class Busy:
     lanes: tuple[str, ...]
     edges: tuple[str, ...]
     detectors: tuple[str, ...]
+    groups: tuple[str, ...]
     pairs: tuple[tuple[str, str], ...]
     permitted: bool
     several_lanes: bool
@@ -95,6 +97,7 @@ def busy_places(scenario: Scenario, seed: int) -> Busy:
         lanes=tuple(lanes),
         edges=tuple(sorted({network.lanes[x].edge for x in lanes})),
         detectors=tuple(item.id for item in detectors if rates.get(item.id, 0.0) >= BUSY_PER_HOUR),
+        groups=_groups(detectors, rates, network),
         pairs=_pairs(detectors, rates, network),
         permitted=any(turns.get(way, 0.0) >= YIELDING_PER_HOUR for way in _yielding(network)),
         several_lanes=any(cars[edge] > 1 for edge in approaches),
@@ -142,6 +145,19 @@ def _detected(scenario: Scenario, seed: int) -> tuple[dict[str, float], tuple[De
     )
     hours = (day.periods[0].end_s - day.periods[0].begin_s) / 3600.0
     return {x: len(seen) / hours for x, seen in day.periods[0].passages.items()}, day.detectors
+
+
+def _groups(
+    detectors: tuple[Detector, ...], rates: Mapping[str, float], network: Network
+) -> tuple[str, ...]:
+    """Return the places of groups of detectors, the groups on an edge if vehicles pass there."""
+    kinds = sorted({item.kind for item in detectors})
+    on_edges = {
+        group_name(item.kind, network.lanes[item.lane].edge)
+        for item in detectors
+        if rates.get(item.id, 0.0) >= BUSY_PER_HOUR
+    }
+    return (EVERYWHERE, *kinds, *sorted(on_edges))
 
 
 def _pairs(

@@ -11,14 +11,22 @@ import numpy as np
 
 from studies.blind.outside_effects import BusStops, Driveway
 from studies.blind.places import Busy
-from studies.blind.strengths import KINDS, MODELS, SCALE, STRENGTHS, nominal_of
+from studies.blind.strengths import ALL_KINDS, ERRORS, KINDS, MODELS, SCALE, STRENGTHS, nominal_of
 from ugat_marl.diagnosis import IN_THE_LOG
-from ugat_marl.effects import EVERYWHERE, PAPER_WORLDS, Effect, effect_from_record, known_effects
+from ugat_marl.effects import (
+    EVERYWHERE,
+    PAPER_WORLDS,
+    Effect,
+    effect_from_record,
+    known_effects,
+    measurement_effects,
+)
 from ugat_marl.errors import UnknownNameError
 from ugat_marl.scenarios import Scenario, edge_of_lane
 
 GROUPS: Mapping[str, float] = {
-    "none": 0.25, "single": 0.45, "pair": 0.10, "setting": 0.08, "outside": 0.12,
+    "none": 0.20, "single": 0.28, "measurement": 0.28, "pair": 0.10, "setting": 0.05,
+    "outside": 0.09,
 }  # fmt: skip
 """The groups of classes, and their usual shares of the cases."""
 
@@ -33,6 +41,9 @@ So the list of left-out effects does not reveal the hidden one.
 
 MARGIN_S = 600.0
 """Least seconds between a window and the ends of a period."""
+
+ADVANCE = "advance"
+"""Kind of the detectors ahead of the stop line."""
 
 ALSO_OUT: Mapping[str, tuple[str, ...]] = {"demand_level": ("demand_surge",)}
 """Effects that are left out together with an effect, because they mean the same."""
@@ -84,8 +95,8 @@ def draw_tasks(
         UnknownNameError: There is no such class or strength.
     """
     for name in classes:
-        if name not in GROUPS and name not in KINDS:
-            raise UnknownNameError("class", name, (*GROUPS, *KINDS))
+        if name not in GROUPS and name not in ALL_KINDS:
+            raise UnknownNameError("class", name, (*GROUPS, *ALL_KINDS))
     for name in strengths:
         if name not in STRENGTHS:
             raise UnknownNameError("strength", name, STRENGTHS)
@@ -114,15 +125,20 @@ def _members(name: str, strengths: Sequence[str]) -> list[Task]:
         return [Task(name, setting) for setting in PAPER_WORLDS]
     if name == "outside":
         return [Task(name, member) for member in OUTSIDE]
-    if name in GROUPS and name != "single":
+    several: Mapping[str, Sequence[str]] = {"single": tuple(KINDS), "measurement": tuple(ERRORS)}
+    if name in GROUPS and name not in several:
         return [Task(name)]
-    effects = [x for x in KINDS if x in known_effects()] if name == "single" else [name]
+    effects = several.get(name, (name,))
     found = [
-        Task("single", effect, strength)
+        Task(_group(effect), effect, strength)
         for effect, strength in product(effects, strengths)
-        if strength in KINDS[effect].strengths
+        if strength in ALL_KINDS[effect].strengths
     ]
-    return found or [Task("single", effect, KINDS[effect].strengths[0]) for effect in effects]
+    return found or [Task(_group(x), x, ALL_KINDS[x].strengths[0]) for x in effects]
+
+
+def _group(effect: str) -> str:
+    return "measurement" if effect in ERRORS else "single"
 
 
 def draw_sample(
@@ -141,14 +157,14 @@ def draw_sample(
     effect = draw_effect(task.member, task.strength, scenario, busy, generator)
     if effect is None:
         return None
-    return _with_decoy(Sample("single", task.member, task.strength, (effect,)), generator)
+    return _with_decoy(Sample(task.group, task.member, task.strength, (effect,)), generator)
 
 
 def draw_effect(
     name: str, strength: str, scenario: Scenario, busy: Busy, generator: np.random.Generator
 ) -> Effect | None:
     """Draw the place and time of an effect; return None if there is no place for it."""
-    kind = KINDS[name]
+    kind = ALL_KINDS[name]
     if (name == "gap_acceptance" and not busy.permitted) or (
         name == "lane_discipline" and not busy.several_lanes
     ):
@@ -156,8 +172,10 @@ def draw_effect(
     places = _places(kind.where, busy)
     if not places:
         return None
-    texts = known_effects()[name].texts
+    texts = {**known_effects(), **measurement_effects()}[name].texts
     place = places[int(generator.integers(len(places)))]
+    if kind.choices:
+        place = (*place, kind.choices[int(generator.integers(len(kind.choices)))])
     record: dict[str, Any] = {"name": name, **dict(zip(texts, place, strict=True))}
     if kind.parameter:
         nominal = nominal_of(name, scenario)[kind.parameter]
@@ -187,6 +205,8 @@ def _places(where: str, busy: Busy) -> list[tuple[str, ...]]:
         "lane": busy.lanes,
         "edge": busy.edges,
         "detector": busy.detectors,
+        "group": busy.groups,
+        "advance": tuple(place for place in busy.groups if place.startswith(ADVANCE)),
         "model": MODELS,
     }
     return [(name,) for name in names[where]]
@@ -205,11 +225,11 @@ def _window(
 
 def _pair(scenario: Scenario, busy: Busy, generator: np.random.Generator) -> Sample | None:
     """Draw two effects of different families, both medium or large."""
-    names = [x for x in KINDS if x in known_effects() and x not in IN_THE_LOG]
+    names = [x for x in ALL_KINDS if x not in IN_THE_LOG]
     for _ in range(100):
         one, two = (names[i] for i in generator.choice(len(names), 2, replace=False))
         strength = ("medium", "large")[int(generator.integers(2))]
-        if KINDS[one].family == KINDS[two].family:
+        if ALL_KINDS[one].family == ALL_KINDS[two].family:
             continue
         found = [draw_effect(x, strength, scenario, busy, generator) for x in (one, two)]
         effects = [effect for effect in found if effect is not None]

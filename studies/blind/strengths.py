@@ -22,10 +22,11 @@ COUNTED_HOURS = 3.0
 STRENGTHS: tuple[Strength, ...] = ("small", "medium", "large")
 SCALE: Mapping[str, float] = {"small": 0.5, "medium": 1.0, "large": 2.0}
 
-Family = Literal["vehicles", "signals", "demand", "road", "detectors"]
+Family = Literal["vehicles", "signals", "demand", "road", "detectors", "measurement"]
 Where = Literal[
-    "everywhere", "light", "origin", "turn", "closable", "lane", "edge", "detector", "pair", "model"
-]
+    "everywhere", "light", "origin", "turn", "closable", "lane", "edge", "detector", "pair",
+    "model", "advance", "group",
+]  # fmt: skip
 """Kind of place that is drawn for an effect."""
 
 
@@ -44,6 +45,7 @@ class Kind:
         either: True if the value may also lie on the other side of the nominal value.
         window_s: Seconds of its window at medium strength; 0 for no window.
         fixed: Fields with fixed values.
+        choices: Values of a second text field, one of which is drawn.
         strengths: Strengths that differ from each other.
     """
 
@@ -57,6 +59,7 @@ class Kind:
     either: bool = False
     window_s: float = 0.0
     fixed: Mapping[str, float] | None = None
+    choices: tuple[str, ...] = ()
     strengths: tuple[Strength, ...] = STRENGTHS
 
     def value(
@@ -124,10 +127,27 @@ KINDS: Mapping[str, Kind] = {
 That effect acts only in an emergency, so usual driving does not show it.
 """
 
+ERRORS: Mapping[str, Kind] = {
+    "detector_offset": Kind("measurement", "advance", "metres", 0.0, 6.0, either=True),
+    "detector_zone": Kind("measurement", "group", "metres", 0.0, 2.0),
+    "detector_extension": Kind(
+        "measurement", "group", "seconds", 0.0, 0.6, choices=("split", "merged")
+    ),
+    "detector_speeds": Kind(
+        "measurement", "group", choices=("front", "mean"), strengths=("medium",)
+    ),
+    "detector_pulse": Kind("measurement", "group", "seconds", 0.05, 0.1),
+    "detector_splash": Kind("measurement", "group", "share", 0.0, 0.1),
+}
+"""Every error of measurement. Offsets of loops at the stop line would lie behind it or beyond the
+queue's first vehicle, so that only those of advance loops are drawn."""
+
+ALL_KINDS: Mapping[str, Kind] = {**KINDS, **ERRORS}
+
 
 def nominal_of(name: str, scenario: Scenario) -> dict[str, float]:
     """Return the value of an effect's field without the effect, in a scenario."""
-    kind = KINDS.get(name)
+    kind = ALL_KINDS.get(name)
     if kind is None or not kind.parameter:
         return {}
     control, step = scenario.control, scenario.settings.step_length_s

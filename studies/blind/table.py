@@ -13,6 +13,7 @@ import numpy as np
 from scipy.stats import binomtest
 
 from studies.blind.cases import SCHEMA
+from studies.blind.generate import VARIATIONS
 from studies.blind.grade import Grade
 from ugat_marl.files import write_whole
 
@@ -97,6 +98,7 @@ def _naming(grades: Sequence[Grade]) -> list[Row]:
     none = [x for x in grades if x.group == "none"]
     outside = [x for x in grades if x.group == "outside"]
     whole = [x for x in outside if not x.hidden.startswith("without ")]
+    errors = [x for x in grades if x.group == "measurement"]
     pairs = [x for x in grades if x.group == "pair"]
     settings = [x for x in grades if x.group == "setting"]
     hidden = [x for x in grades if x.group not in ("none", "outside")]
@@ -109,6 +111,16 @@ def _naming(grades: Sequence[Grade]) -> list[Row]:
         _share("single effect, small, named", small, _right),
         _share(trio_text, trio, _right, 0.9),
         _share("nothing hidden, yet something named", none, _wrong, most=0.05),
+        *(
+            _share(
+                f"the same, {100 * share:g} % from day to day",
+                [x for x in none if x.day_to_day == share],
+                _wrong,
+            )
+            for share in VARIATIONS
+        ),
+        _share("error of measurement named", errors, _right),
+        _share("error of measurement called drivers' behaviour", errors, _blames, most=0.02),
         _share("effect outside the library called explained", outside, _explained, most=0.1),
         _share("of these, effects that no library has", whole, _explained),
         _share("confident and wrong", grades, lambda x: x.confident_wrong, most=0.03),
@@ -192,6 +204,10 @@ def _right(grade: Grade) -> bool:
 
 def _wrong(grade: Grade) -> bool:
     return grade.outcome == "wrong"
+
+
+def _blames(grade: Grade) -> bool:
+    return bool(grade.blamed)
 
 
 def _abstained(grade: Grade) -> bool:

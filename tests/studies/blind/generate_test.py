@@ -19,8 +19,16 @@ from studies.blind.generate import Blueprint, Consequences, differing, generate
 from studies.blind.outside_effects import BusStops, Driveway
 from studies.blind.places import Busy, busy_places, telling
 from studies.blind.run import run_cases
-from studies.blind.sampling import OUTSIDE, Sample, Task, draw_effect, draw_sample, draw_tasks
-from studies.blind.strengths import KINDS
+from studies.blind.sampling import (
+    GROUPS,
+    OUTSIDE,
+    Sample,
+    Task,
+    draw_effect,
+    draw_sample,
+    draw_tasks,
+)
+from studies.blind.strengths import ERRORS, KINDS
 from tests.studies.blind.diagnoses import says
 from ugat_marl.cli import run
 from ugat_marl.data import read_measured
@@ -36,7 +44,11 @@ from ugat_marl.scenarios import Network, Passages, Period, Scenario
 def test_folder(data: Path, tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, Blueprint]:
     directory = tmp_path_factory.mktemp("blind") / "test"
     blueprint = Blueprint(
-        (str(data / "crossing"),), ("none", "headway", "undercount"), cases=4, periods=2, seed=3
+        (str(data / "crossing"),),
+        ("none", "headway", "undercount", "detector_splash"),
+        cases=4,
+        periods=2,
+        seed=3,
     )
     assert generate(directory, blueprint) == 4
     return directory, blueprint
@@ -80,7 +92,7 @@ def test_the_data_hold_what_the_label_says(test_folder: tuple[Path, Blueprint]) 
         effects = tuple(f"{x.name}={','.join(_values(x))}" for x in label.effects)
         again = record(
             scenario, "+".join(effects) or "sim", policy_factory(label.policy), periods=2,
-            seed=label.seed,
+            seed=label.seed, day_to_day=label.day_to_day,
         )  # fmt: skip
         assert again.hash == label.measured
 
@@ -114,9 +126,10 @@ def test_a_test_is_gone_on_with_and_no_other_is_mixed_in(
 
 
 def test_shares_are_kept_and_nothing_hidden_is_rounded_up() -> None:
-    tasks = draw_tasks(("none", "single", "pair", "setting", "outside"), ("medium",), 50, rng())
+    tasks = draw_tasks(tuple(GROUPS), ("medium",), 50, rng())
     counts = Counter(task.group for task in tasks)
-    assert counts["none"] >= 0.25 * 50
+    assert counts["none"] >= 0.2 * 50
+    assert counts["measurement"] == counts["single"] == 14
     assert counts.total() == 50
     names = Counter(task.member for task in tasks if task.group == "single")
     assert max(names.values()) <= min(names.values()) + 1
@@ -169,6 +182,23 @@ def test_pairs_are_of_two_families_and_leaving_out_says_nothing(
         assert not names & set(drawn.leave_out)
         left_out += bool(drawn.leave_out)
     assert 0 < left_out < 30
+
+
+@pytest.mark.parametrize("name", ERRORS)
+def test_errors_of_measurement_are_hidden_where_detectors_are(
+    name: str, single: tuple[Scenario, Busy]
+) -> None:
+    scenario, busy = single
+    assert {"*", "advance", "stop", "exit", "advance@northA_A1"} <= set(busy.groups)
+    places = set[str]()
+    for number in range(30):
+        generator = np.random.default_rng(number)
+        drawn = draw_sample(Task("measurement", name, "medium"), scenario, busy, generator)
+        assert drawn is not None and drawn.group == "measurement"
+        places.add(str(drawn.effects[0].record()["place"]))
+    assert len(places) > 3
+    if name == "detector_offset":
+        assert {place.partition("@")[0] for place in places} == {"advance"}
 
 
 def test_buses_stop_and_cars_turn_off(single: tuple[Scenario, Busy]) -> None:
@@ -243,6 +273,7 @@ def test_cases_are_diagnosed_once_and_a_failure_is_noted(
         ({"scenarios": ()}, "at least one"),
         ({"classes": ("none", "none")}, "twice"),
         ({"pressure_share": 2.0}, "from 0 to 1"),
+        ({"day_to_day": (0.05, 1.0)}, "0.05 1: needs shares"),
     ],
 )
 def test_impossible_blueprints_are_refused(change: dict[str, object], says: str) -> None:

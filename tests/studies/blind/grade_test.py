@@ -12,11 +12,17 @@ import pytest
 
 from studies.blind.cases import Case, Hidden, Label, write_label, write_plan
 from studies.blind.grade import Grade, grade, grade_cases, read_grades
-from studies.blind.strengths import KINDS, nominal_of
+from studies.blind.strengths import ALL_KINDS, ERRORS, KINDS, nominal_of
 from studies.blind.table import AIMS, confusion, markdown, rows_of, wilson, write_table
 from tests.studies.blind.diagnoses import says
 from ugat_marl.diagnosis import Diagnosis
-from ugat_marl.effects import PAPER_WORLDS, effect_from_record, known_effects, load_scenario
+from ugat_marl.effects import (
+    PAPER_WORLDS,
+    effect_from_record,
+    known_effects,
+    load_scenario,
+    measurement_effects,
+)
 from ugat_marl.errors import BlindTestError
 
 
@@ -64,6 +70,8 @@ PAIR = label(
     group="pair",
 )
 NONE = label(group="none")
+OFFSET = label(hidden(name="detector_offset", place="advance", metres=-6.0), group="measurement")
+SHIFTED = effect("detector_offset", "advance", metres=(-7.0, -6.1, -5.2))
 OUTSIDE = replace(label(group="outside"), hidden="bus_stops")
 
 
@@ -94,6 +102,10 @@ THREE = (effect("acceleration"), effect("deceleration"), effect("startup_delay")
         (NONE, says("not_identifiable", effect("headway")), "wrong", False),
         (NONE, says("not_identifiable", alternatives=[alternative(effect("headway"))]),
          "wrong", False),
+        (OFFSET, says("explained", SHIFTED), "right", False),
+        (OFFSET, says("explained", effect("detector_offset", "stop")), "right", True),
+        (OFFSET, says("no_discrepancy"), "missed", False),
+        (OFFSET, says("explained", SHIFTED, effect("deceleration")), "wrong", True),
         (OUTSIDE, says("explained", effect("headway")), "wrong", True),
         (OUTSIDE, says("partially_explained", effect("headway")), "abstained", False),
         (OUTSIDE, says("unknown"), "abstained", False),
@@ -118,6 +130,26 @@ def test_outcomes(
     found = grade(truth, diagnosis)
     assert found.outcome == outcome
     assert found.confident_wrong == confident_wrong
+
+
+@pytest.mark.parametrize(
+    ("diagnosis", "blamed"),
+    [
+        (says("explained", SHIFTED), ()),
+        (says("unknown", SHIFTED), ()),
+        (says("explained", effect("undercount", "advance:a")), ()),
+        (says("partially_explained", SHIFTED, effect("deceleration")), ("deceleration",)),
+        (says("provisional", effect("headway")), ("headway",)),
+        (says("not_identifiable", alternatives=[alternative(effect("min_gap"))]), ("min_gap",)),
+    ],
+)
+def test_drivers_that_are_blamed_for_detectors(
+    diagnosis: Diagnosis, blamed: tuple[str, ...]
+) -> None:
+    assert grade(OFFSET, diagnosis).blamed == blamed
+    assert grade(HEADWAY, diagnosis).blamed == ()
+    (row,) = (x for x in rows_of([grade(OFFSET, diagnosis)]) if "drivers' behaviour" in x.measure)
+    assert row.count == bool(blamed)
 
 
 def test_places_and_windows() -> None:
@@ -276,9 +308,10 @@ def test_the_table_is_written(tmp_path: Path) -> None:
 
 def test_every_effect_of_the_library_can_be_hidden() -> None:
     assert set(KINDS) == set(known_effects()) - {"emergency_deceleration"}
+    assert set(ERRORS) == set(measurement_effects())
     scenario = load_scenario("single-v1")
-    for name, kind in KINDS.items():
-        ranges = known_effects()[name].ranges
+    for name, kind in ALL_KINDS.items():
+        ranges = {**known_effects(), **measurement_effects()}[name].ranges
         if kind.parameter:
             for strength in kind.strengths:
                 for side in (False, True):
