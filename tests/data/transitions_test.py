@@ -49,6 +49,16 @@ def recorded(episodes: int = 2, steps: int = 5, **changes: object) -> Transition
     return recorder.log()
 
 
+def test_the_first_decisions_of_each_episode_are_a_log() -> None:
+    log = recorded(episodes=2, steps=5)
+    begun = log.first(3)
+    assert (log.decisions, begun.decisions, begun.episodes) == (5, 3, 2)
+    rows = log.transitions("signal_0")
+    kept = begun.transitions("signal_0").observation
+    assert np.array_equal(kept, rows.observation[rows.step < 3])
+    assert log.first(5) is log
+
+
 def test_what_was_recorded_comes_out_per_agent() -> None:
     recorder = TransitionRecorder(provenance())
     buffer = np.arange(6, dtype=np.float32)

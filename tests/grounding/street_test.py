@@ -27,6 +27,7 @@ from ugat_marl.grounding import (
     street_env,
     street_prior,
 )
+from ugat_marl.grounding.summaries import NAMES
 from ugat_marl.policies import EpsilonGreedy, make_rule, observer_of, roll_out
 from ugat_marl.simulation import kept_warm
 
@@ -129,6 +130,27 @@ def test_each_part_can_be_fitted_alone(part: str) -> None:
         effects, service_s = street.posterior.sample(20)
         assert bool(effects.size) == (part == "effects")
         assert bool(service_s.any()) == (part == "service")
+
+
+@pytest.mark.parametrize(("recorded_s", "compared_s"), [(300.0, 60.0), (40.0, 40.0)])
+def test_a_street_is_compared_with_worlds_of_the_same_length(
+    recorded_s: float, compared_s: float
+) -> None:
+    """Queues of a whole peak are not compared with those of its beginning."""
+    config = replace(QUICK, parts=("effects",))
+    env = parallel_env(SCENARIO)
+    prior, view = street_prior(env, config), LaneView.of(env.network, "count")
+    rule = make_rule("fixed-time:20", env)
+    env.close()
+    log = recorded("sim", recorded_s)
+    street, known = fit_street(log, simulation(), rule, prior, view, config, seed=0)
+    decisions = compared_s / log.provenance.decision_interval_s
+    seen = {float(item.summary.rows[0, NAMES.index("mean")]) for item in known.simulated}
+    assert seen == {decisions}
+    begun = log.first(int(decisions))
+    again, _ = fit_street(begun, simulation(), rule, prior, view, config, seed=0)
+    assert street.posterior is not None and again.posterior is not None
+    assert np.array_equal(street.posterior.effects, again.posterior.effects)
 
 
 def test_a_log_of_the_simulation_itself_shows_no_fault() -> None:

@@ -198,6 +198,17 @@ class TransitionLog:
         """Number of rows, over all agents."""
         return self.frame.height
 
+    @property
+    def decisions(self) -> int:
+        """Number of decisions of the longest episode."""
+        return int(self.frame["step"].to_numpy().max(initial=-1)) + 1
+
+    def first(self, decisions: int) -> TransitionLog:
+        """Return the first decisions of each episode."""
+        if decisions >= self.decisions:
+            return self
+        return TransitionLog(self.provenance, self.frame.filter(pl.col("step") < decisions))
+
     def transitions(self, agent: str) -> Transitions:
         """Return the rows of one agent, ordered by episode and step.
 

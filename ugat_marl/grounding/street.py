@@ -68,7 +68,8 @@ class StreetConfig:
         parts: Parts that are fitted.
         simulations: N, worlds that are simulated for the first posterior.
         further: Worlds that each further iteration adds, half of them drawn from the posterior.
-        simulated_s: Length of an episode in such a world, in s.
+        simulated_s: Length of an episode in such a world, in s. Of longer episodes of the street
+            only this first part is compared.
         judged: Worlds of the fitted street in which policies are compared after each iteration; the
             best one is kept. 0 keeps the last one.
         without: Effects left out of the library.
@@ -439,10 +440,12 @@ def fit_street(
         service = FittedService(lanes, value.service_s)
         parts = (*street.world(one).parts, service)
         drawn.append(StreetWorld(worlds.effects(value), parts))
-    logs = simulation.logs(drawn, policy, seeds, config.simulated_s, on_done)
+    # Queues grow through a peak: worlds of half an hour tell nothing of an hour's second half.
+    decisions = min(real.decisions, max(1, int(config.simulated_s / interval_s)))
+    logs = simulation.logs(drawn, policy, seeds, decisions * interval_s, on_done)
     added = [Simulated(value, view.summary(log)) for value, log in zip(values, logs, strict=True)]
     simulated = (*known.simulated, *added)
-    posterior = Posterior.fit(worlds, simulated, view.summary(real))
+    posterior = Posterior.fit(worlds, simulated, view.summary(real.first(decisions)))
     street = FittedStreet(lanes, interval_s, channel, street.eyes, posterior)
     return street, Known(simulated, posterior)
 
