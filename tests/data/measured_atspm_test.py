@@ -184,6 +184,25 @@ def test_detectors_that_are_stamped_late(imported: Import) -> None:
     np.testing.assert_array_equal(read.periods[0].passages["7:5"].on_s, [30.8, 50.6])
 
 
+def test_a_late_stamp_belongs_to_the_period_in_which_it_happened(imported: Import) -> None:
+    late = MAPPING.replace("channel = 5", "channel = 5\nlatency_s = 2.0")
+    around = [
+        (-1.0, 82, 5), (0.5, 81, 5),  # before the begin
+        (1.5, 82, 5), (2.5, 81, 5),  # on before the begin, off in the period
+        (199.0, 82, 5), (201.5, 81, 5),  # off in the period, though stamped after it
+        (201.9, 82, 5), (203.0, 81, 5),  # off after the end
+        (201.0, 8, 2), (201.0, 82, 6),  # without a delay, so of the time after the end
+    ]  # fmt: skip
+    read = imported(log(sorted(LOG + around)), late)
+    (period,) = read.periods
+    stop = period.passages["7:5"]
+    np.testing.assert_array_equal(stop.on_s, [np.nan, 29.2, 49.0, 197.0, 199.9])
+    np.testing.assert_array_equal(stop.off_s, [0.5, 33.9, 49.7, 199.5, np.nan])
+    np.testing.assert_array_equal(period.passages["advance west"].on_s, [33.0])
+    assert period.signals == {"C": SIGNALS}
+    assert "outside of their periods" not in texts(read)
+
+
 def test_several_days_are_several_periods(imported: Import) -> None:
     other = [(time + 0.1 * (code in (81, 82)), code, number) for time, code, number in LOG]
     days = [ZERO + dt.timedelta(days=i) for i in range(3)]

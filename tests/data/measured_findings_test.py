@@ -24,7 +24,15 @@ from ugat_marl.data import (
 from ugat_marl.data.measured import coverage
 from ugat_marl.effects import known_effects
 from ugat_marl.errors import MeasuredDataError
-from ugat_marl.scenarios import Detector, Network, Passages, Period, Scenario, read_scenario
+from ugat_marl.scenarios import (
+    Detector,
+    Network,
+    Passages,
+    Period,
+    Scenario,
+    SignalLog,
+    read_scenario,
+)
 
 END = 7200.0
 DETECTORS = (
@@ -384,6 +392,28 @@ def test_greens_of_many_lengths_follow_the_traffic(
         assert findings == {}
     else:
         assert only(findings, "('C') with greens of many lengths", "arrivals they answered") == ()
+
+
+def test_a_state_every_second_is_the_log_of_its_changes(read: Read) -> None:
+    lengths = np.random.default_rng(1).choice([14.0, 20.0, 30.0, 47.0], 400)
+    times = np.cumsum([0.0, *lengths])
+    changes = tuple((float(t), ("Gr", "rG")[i % 2]) for i, t in enumerate(times) if t < END)
+    every = tuple(
+        (second, changes[np.searchsorted(times, second, side="right") - 1][1])
+        for second in np.arange(END).tolist()
+    )
+    whole = recording()
+
+    def read_of(log: SignalLog) -> tuple[MeasuredData, dict[str, tuple[str, ...]]]:
+        days = tuple(replace(period, signals={"C": log}) for period in whole.periods)
+        return read(replace(whole, periods=days))
+
+    sparse, findings = read_of(changes)
+    dense, dense_findings = read_of(every)
+    assert dense.hash == sparse.hash
+    assert dense.periods[0].signals == {"C": changes}
+    assert dense_findings == findings
+    only(findings, "('C') with greens of many lengths")
 
 
 def test_a_log_without_yellow(tmp_path: Path, scenario: Scenario, network: Network) -> None:

@@ -106,6 +106,28 @@ def test_a_turn_that_is_there_twice_is_refused(
         read_measured(write_measured(twice, tmp_path / "twice", csv=True), scenario, network)
 
 
+@pytest.mark.parametrize(("file", "owner"), [("counts", "detector"), ("turning", "turn")])
+def test_intervals_that_overlap_are_refused(
+    file: str, owner: str, tmp_path: Path, scenario: Scenario, network: Network
+) -> None:
+    given = sums()
+    table: pl.DataFrame = getattr(given, file)
+    first = table.row(0, named=True)
+    begin, end = first["begin_s"], first["end_s"]
+    third = (end - begin) / 3
+    within = table.head(1).with_columns(begin_s=begin + third, end_s=begin + 2 * third)
+    wrong = replace(given, **{file: pl.concat([table, within])})
+    message = (
+        rf"{file}\.csv, line {table.height + 2}: begin_s '[\d.]+' is before the end of an earlier "
+        rf"interval of its {owner}, {end:g} s; write intervals that do not overlap"
+    )
+    with pytest.raises(MeasuredDataError, match=message):
+        read_measured(write_measured(wrong, tmp_path / "wrong", csv=True), scenario, network)
+    shuffled = replace(given, **{file: table.reverse()})
+    read = read_measured(write_measured(shuffled, tmp_path / "right", csv=True), scenario, network)
+    assert getattr(read, file).height == table.height
+
+
 def ruled_out(measured: MeasuredData) -> set[str]:
     return {name for finding in measured.findings for name in finding.rules_out}
 

@@ -9,7 +9,7 @@ import numpy as np
 import polars as pl
 import pytest
 
-from ugat_marl.data import MeasuredData, read_measured, write_measured
+from ugat_marl.data import MeasuredData, read_measured, traffic_of_lanes, write_measured
 from ugat_marl.data.measured.tracks import passages_of_tracks
 from ugat_marl.errors import MeasuredDataError
 from ugat_marl.experiments import policy_factory, record
@@ -112,3 +112,60 @@ def test_tracks_give_what_loops_give(data: Path, tmp_path: Path) -> None:
         # SUMO changes speeds at once, and tracks between two positions: half a second's worth.
         assert np.nanmax(np.abs(seen.off_s - loop.off_s)) < 0.5, name
         assert np.nanmedian(np.abs(seen.speed_mps - loop.speed_mps)) < 1.5, name
+
+
+# --- vehicles on lanes ----------------------------------------------------------------------------
+
+
+def crowd(step_s: float, offset_s: float) -> pl.DataFrame:
+    """Positions of 30 vehicles at 10 m/s on three lanes of 100 m, the first from 5 s on."""
+    begins = np.linspace(5.0, 80.0, 30)
+    rows = [
+        ("day", f"v{number}", time, f"l_{int(driven // 100)}", driven % 100, 10.0)
+        for number, begin in enumerate(begins.tolist())
+        for time in np.arange(offset_s, 100.0, step_s).tolist()
+        if 0.0 <= (driven := 10.0 * (time - begin)) < 300.0
+    ]
+    names = ("period_id", "vehicle_id", "time_s", "lane_id", "position_m", "speed_mps")
+    return pl.DataFrame(rows, schema=names, orient="row")
+
+
+def on_lanes(rows: pl.DataFrame) -> dict[str, list[float | None]]:
+    """Return the vehicles on each lane in every second."""
+    table = traffic_of_lanes(rows, ["l_0", "l_1", "l_2", "l_9"], DAY)
+    assert table["vehicles"].is_null().to_list() == table["halting"].is_null().to_list()
+    return {str(lane): part["vehicles"].to_list() for (lane,), part in table.group_by("lane_id")}
+
+
+def test_vehicles_on_lanes_are_those_of_the_last_moment() -> None:
+    whole = on_lanes(crowd(1.0, 0.0))
+    assert whole["l_9"] == [None] * 5 + [0.0] * 95, "nobody was seen anywhere before 5 s"
+    assert whole["l_0"][30] == 4.0  # began within the last 10 s: at 20.5, 23.1, 25.7 and 28.3 s
+    shifted = on_lanes(crowd(1.0, 0.0).with_columns(pl.col("time_s") + 0.5))
+    for lane, counts in whole.items():  # the state half a second ago, of a whole second before
+        assert shifted[lane][1:] == counts[:-1]
+
+
+@pytest.mark.parametrize(("step_s", "offset_s"), [(1.0, 0.5), (2.0, 1.0), (0.04, 0.017)])
+def test_other_moments_change_vehicles_on_lanes_by_those_who_cross(
+    step_s: float, offset_s: float
+) -> None:
+    whole, other = on_lanes(crowd(1.0, 0.0)), on_lanes(crowd(step_s, offset_s))
+    begins = np.linspace(5.0, 80.0, 30)
+    for number in range(3):
+        edges = np.concatenate((begins + 10.0 * number, begins + 10.0 * (number + 1)))
+        for second in range(8, 100):
+            now, then = whole[f"l_{number}"][second], other[f"l_{number}"][second]
+            assert now is not None and then is not None
+            crossed = ((edges > second - step_s - 1e-6) & (edges <= second + 1e-6)).sum()
+            assert abs(now - then) <= crossed
+
+
+def test_of_seconds_long_after_the_last_moment_nothing_is_known() -> None:
+    rows = crowd(1.0, 0.0).filter(~pl.col("time_s").is_between(40.0, 49.0))
+    known = on_lanes(rows)["l_0"]
+    assert [second for second in range(10, 100) if known[second] is None] == list(range(42, 50))
+    moments = np.arange(100.0)
+    table = traffic_of_lanes(rows, ["l_0"], DAY, moments)
+    assert not table["vehicles"].null_count()
+    assert table["vehicles"][40:50].sum() == 0.0, "observed, and empty"

@@ -8,6 +8,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+import polars as pl
 import pytest
 
 from ugat_marl.__main__ import main
@@ -100,6 +101,40 @@ def test_a_table_of_lanes_or_trajectories_takes_the_place_of_the_estimate(
     assert found.observation[1:].tolist() == true.observation[1:].tolist()
     assert found.reward.tolist() == true.reward.tolist()
     assert not log.provenance.deviation
+
+
+def test_trajectories_between_whole_seconds_give_the_same_log(
+    crossing: Scenario, measured: MeasuredData
+) -> None:
+    assert measured.trajectories is not None
+
+    def observed(trajectories: pl.DataFrame) -> list[list[float]]:
+        given = replace(measured, lanes=None, trajectories=trajectories)
+        log = imported(given, crossing, source="best")
+        return log.transitions(log.agents[0]).observation.tolist()
+
+    early = measured.trajectories.with_columns(pl.col("time_s") - 0.4)
+    assert observed(early) == observed(measured.trajectories)
+
+
+def test_gaps_of_trajectories_are_said_or_refused(
+    crossing: Scenario, measured: MeasuredData
+) -> None:
+    assert measured.trajectories is not None
+    network = Network.read(crossing)
+    options: dict[str, Any] = {"observation": "count", "source": "best"}
+
+    def findings(trajectories: pl.DataFrame) -> str:
+        given = replace(measured, lanes=None, trajectories=trajectories)
+        return "\n".join(log_of_measured(given, crossing, network, "street", **options).findings)
+
+    busy = set(measured.trajectories["time_s"].to_list())
+    assert busy >= set(np.arange(10.0, 100.0).tolist())
+    assert "anywhere" not in findings(measured.trajectories)
+    hole = measured.trajectories.filter(~pl.col("time_s").is_between(20.0, 69.0))
+    assert "anywhere for up to 48 s (period 'day1', from 22 s on)" in findings(hole)
+    with pytest.raises(MeasuredDataError, match=r"positions every 5 s.*--vehicles detections"):
+        findings(measured.trajectories.filter(pl.col("time_s") % 5 == 0))
 
 
 def test_a_learner_and_a_fit_take_the_log(crossing: Scenario, measured: MeasuredData) -> None:

@@ -13,6 +13,8 @@ from .measured.intervals import occupied_between as occupied_between
 from .measured.lanes import traffic_of_lanes as traffic_of_lanes
 from .measured.passages import passages_as_written as passages_as_written
 from .measured.reading import read_measured as read_measured
+from .measured.tracks import COARSEST_S as COARSEST_S
+from .measured.tracks import step_of_tracks as step_of_tracks
 from .measured.values import Finding as Finding
 from .measured.values import MeasuredData as MeasuredData
 from .measured.values import split_periods as split_periods

@@ -17,11 +17,13 @@ import polars as pl
 from numpy.typing import NDArray
 
 from ugat_marl.data import (
+    COARSEST_S,
     MeasuredData,
     Provenance,
     TransitionLog,
     TransitionRecorder,
     installed_version,
+    step_of_tracks,
     traffic_of_lanes,
 )
 from ugat_marl.envs import OBSERVATION_UNITS, Observer, Rewarder
@@ -46,6 +48,9 @@ WITH_OUTGOING = ("movements", "pressure")
 """Observations that read the lanes that lead away, too."""
 REWARD = "queue"
 """Reward of the log. Vehicles outside of the measured lanes are unknown, so not `total-queue`."""
+LONG_EMPTY_S = 30.0
+"""Longest time without any vehicle that is not reported: a street at night, or a camera that was
+off, have longer ones."""
 
 
 @dataclass(frozen=True)
@@ -137,6 +142,13 @@ class _Street:
             return self.measured.lanes
         if self.measured.trajectories is None:
             return None
+        step = step_of_tracks(self.measured.trajectories)
+        if step > COARSEST_S:
+            raise MeasuredDataError(
+                f"trajectories: positions every {step:g} s; vehicles on lanes need positions at "
+                f"most {COARSEST_S:g} s apart: choose --vehicles detections, or add a table of "
+                "lanes"
+            )
         lanes = self.network.lane_table().ids
         parts = [
             traffic_of_lanes(
@@ -203,6 +215,8 @@ class _Street:
         incoming = [x for item in self.network.intersections for x in item.incoming_lanes]
         deviation = {x: float(np.sqrt(np.concatenate(variances[x]).mean())) for x in incoming}
         findings = self._findings(courses, deviation, unlike, table is not None)
+        if table is not None:
+            findings = (*_unseen(table), *findings)
         log = recorder.log()
         if table is None:
             log = TransitionLog(replace(log.provenance, deviation=deviation), log.frame)
@@ -248,7 +262,9 @@ class _Street:
         if seen is not None and not seen.is_empty():
             at = seen["time_s"].to_numpy()
             rows = np.clip(np.searchsorted(at, times_s + 1e-6, side="right") - 1, 0, None)
-            vehicles, halting = (seen[x].to_numpy()[rows] for x in ("vehicles", "halting"))
+            # Where nothing was seen the street counts as empty; `_unseen` reports it.
+            known = seen.select(pl.col("vehicles", "halting").fill_null(0.0))
+            vehicles, halting = (known[x].to_numpy()[rows] for x in ("vehicles", "halting"))
             return _LaneSeries(vehicles, halting, left, none)
         vehicles, deviation = course.vehicles(times_s), course.deviation(times_s)
         light = next(
@@ -392,6 +408,28 @@ class _Street:
             "and delays of greens are not in the data"
         )
         return tuple(found)
+
+
+def _unseen(table: pl.DataFrame) -> tuple[str, ...]:
+    """Return a finding on the longest time without any vehicle; none if it is short.
+
+    Args:
+        table: Traffic of lanes as in `traffic_of_lanes`.
+    """
+    times = table.filter(pl.col("vehicles").is_null()).select("period_id", "time_s").unique()
+    runs: list[tuple[int, str, float]] = []
+    for (period,), seconds in times.group_by("period_id", maintain_order=True):
+        when = np.sort(seconds["time_s"].to_numpy())
+        parts = np.split(when, np.flatnonzero(np.diff(when) > 1.0) + 1)
+        runs += [(len(part), str(period), float(part[0])) for part in parts]
+    longest, period, begin_s = max(runs, default=(0, "", 0.0))
+    if longest < LONG_EMPTY_S:
+        return ()
+    return (
+        f"no vehicle was seen anywhere for up to {longest} s (period {period!r}, from {begin_s:g} "
+        "s on), which counts as an empty street; if nothing was recorded then, end the period "
+        "before it",
+    )
 
 
 def phases_shown(

@@ -58,7 +58,8 @@ def draw_day(scenario: Scenario, seed: int, day_to_day: float = 0.0) -> Scenario
     """Draw another day: a Poisson number of copies of every vehicle, departures jittered.
 
     The same seed gives the same vehicles, names and speedFactors. Effects applied afterwards do not
-    change them, so two models can be compared on the same day.
+    change them, so two models can be compared on the same day. Vehicles that depart before the
+    scenario's begin are left out, as SUMO leaves them out.
 
     Args:
         scenario: Any scenario; `demand_as_vehicles` turns its trips and flows into vehicles.
@@ -77,6 +78,7 @@ def draw_day(scenario: Scenario, seed: int, day_to_day: float = 0.0) -> Scenario
         shape = day_to_day**-2.0
         level = float(numpy_generator(seed, "level of the day").gamma(shape, 1.0 / shape))
     copies = generator.poisson(level, count)
+    copies[vehicles.depart_s < begin] = 0  # SUMO leaves out what departs before the begin
     most = 8
     shifts = generator.uniform(-JITTER_S, JITTER_S, (most, count))
     draws = generator.standard_normal((most, count))

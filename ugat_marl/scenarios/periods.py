@@ -144,6 +144,11 @@ class Period:
     signals: Mapping[str, SignalLog]
     passages: Mapping[str, Passages]
 
+    @property
+    def window(self) -> tuple[float, float]:
+        """Begin and end on the scenario's clock, s."""
+        return self.begin_s, self.end_s
+
 
 def deciding_letter(states: Sequence[str]) -> str:
     """Return the letter that counts for a lane with several links: green, else yellow, else red."""

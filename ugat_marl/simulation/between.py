@@ -52,6 +52,8 @@ def read_between(
 ) -> tuple[NDArray[np.float64], ...]:
     """Read when vehicles pass the first place of each way, and their time to the second one.
 
+    Only vehicles that pass both places between the two times are read.
+
     Args:
         file: SUMO's output for `places_document`.
         ways: The ways of `places_document`.

@@ -152,21 +152,30 @@ def _passages(
     rear: list[tuple[float, bool, bytes, float, float]],
     speed_at: SpeedPoint,
 ) -> Passages:
-    """Pair the entry of each vehicle at the upstream end with its exit at the downstream end.
+    """Pair each entry at the upstream end with the exit of the same visit at the downstream end.
 
-    The speed of a vehicle without an entry is that of its rear, whatever `speed_at` says.
+    The exit of a visit is the first one at or after its entry, and before the next entry of the
+    vehicle. The speed of a visit without an entry is that of the rear, whatever `speed_at` says.
     """
-    left: dict[bytes, tuple[float, float]] = {
-        vehicle: (time, speed) for time, enters, vehicle, speed, _ in rear if not enters
-    }
+    left: dict[bytes, list[tuple[float, float]]] = defaultdict(list)
+    for time, enters, vehicle, speed, _ in rear:
+        if not enters:
+            left[vehicle].append((time, speed))
     rows: list[tuple[float, float, float, float]] = []
-    for time, enters, vehicle, speed, length in front:
+    # A vehicle inserted on the loop, or one that changed lanes onto it, leaves without entering.
+    strays: list[tuple[float, float]] = []
+    for time, enters, vehicle, speed, length in reversed(front):  # so that the last entry is first
         if enters:
-            off, speed_off = left.pop(vehicle, (np.inf, speed))
+            off, speed_off, exits = np.inf, speed, left[vehicle]
+            while exits and exits[-1][0] >= time:
+                if off < np.inf:
+                    strays.append((off, speed_off))
+                off, speed_off = exits.pop()
             seen = {"front": speed, "rear": speed_off, "mean": 0.5 * (speed + speed_off)}[speed_at]
             rows.append((time, off, seen, length))
-    # A vehicle inserted on the loop, or one that changed lanes onto it, leaves without entering.
-    rows += [(-np.inf, time, speed, np.nan) for time, speed in left.values()]
+    rows.reverse()
+    for exits in (*left.values(), strays):
+        rows += [(-np.inf, time, speed, np.nan) for time, speed in exits]
     if not rows:
         return Passages.none()
     table = np.array(sorted(rows, key=lambda row: min(row[0], row[1])), dtype=np.float64)

@@ -138,10 +138,12 @@ def import_atspm(events: Path, mapping: Path, scenario: Scenario, network: Netwo
             f"{events}: no event of a device in {mapping.name}; the log is of "
             f"{', '.join(map(repr, log['device'].unique().sort().to_list()[:8]))}"
         )
-    rows = _in_periods(events, known, spans, periods)
+    latencies = [zone.latency_s for device in table.devices for zone in device.detectors]
+    stamped = _in_periods(events, known, spans, periods, max(latencies, default=0.0))
+    rows = stamped.filter(pl.col("time_s") <= pl.col("end_s"))
     _report(events, rows, table, findings)
     signals = _signals(events, rows, table, periods, network, widths, findings)
-    stamps = _detections(rows, table)
+    stamps = _detections(stamped, table)
     if stamps.is_empty():
         raise MeasuredDataError(
             f"{events}: no detector event (81, 82) of a channel in {mapping.name}; check the "
@@ -209,18 +211,34 @@ def _numbered(frame: pl.DataFrame) -> pl.DataFrame:
 
 
 def _in_periods(
-    path: Path, log: pl.DataFrame, spans: Sequence[Span], periods: Sequence[Period]
+    path: Path,
+    log: pl.DataFrame,
+    spans: Sequence[Span],
+    periods: Sequence[Period],
+    late_s: float,
 ) -> pl.DataFrame:
-    """Return the events in and shortly before each period, with ``period_id`` and ``time_s``."""
+    """Return the events in and shortly before each period.
+
+    Args:
+        path: The log.
+        log: Its events.
+        spans: The periods as the mapping describes them.
+        periods: The periods.
+        late_s: Greatest delay of a stamp, s; events that much after a period are kept.
+
+    Returns:
+        The events with ``period_id``, ``begin_s`` and ``end_s`` of the period, and ``time_s``.
+    """
     parts: list[pl.DataFrame] = []
     for span, period in zip(spans, periods, strict=True):
         time = (pl.col("time") - pl.lit(span.zero)).dt.total_microseconds() / 1e6
         part = log.with_columns(
             pl.lit(period.id).alias("period_id"),
             pl.lit(period.begin_s).alias("begin_s"),
+            pl.lit(period.end_s).alias("end_s"),
             time.alias("time_s"),
-        ).filter(pl.col("time_s").is_between(period.begin_s - LOOK_BACK_S, period.end_s))
-        if part.filter(pl.col("time_s") >= period.begin_s).is_empty():
+        ).filter(pl.col("time_s").is_between(period.begin_s - LOOK_BACK_S, period.end_s + late_s))
+        if part.filter(pl.col("time_s").is_between(period.begin_s, period.end_s)).is_empty():
             raise MeasuredDataError(
                 f"{path}: no event in period {period.id!r}, of which second 0 is {span.zero}; the "
                 f"log goes from {log['time'].min()} to {log['time'].max()}"
@@ -254,7 +272,10 @@ def _report(path: Path, rows: pl.DataFrame, table: AtspmMapping, findings: list[
 
 
 def _detections(rows: pl.DataFrame, table: AtspmMapping) -> pl.DataFrame:
-    """Return detector events as rows of ``detections``."""
+    """Return detector events as rows of ``detections``.
+
+    An event belongs to the period in which it happened, which may end before its stamp.
+    """
     zones = pl.DataFrame(
         [
             (
@@ -274,13 +295,13 @@ def _detections(rows: pl.DataFrame, table: AtspmMapping) -> pl.DataFrame:
         },
         orient="row",
     )
-    begun = rows.filter(
-        pl.col("event").is_in([DETECTOR_OFF, DETECTOR_ON]) & (pl.col("time_s") >= pl.col("begin_s"))
-    )
-    return begun.join(zones, on=["device", "parameter"], maintain_order="left").select(
+    passed = rows.filter(pl.col("event").is_in([DETECTOR_OFF, DETECTOR_ON]))
+    passed = passed.join(zones, on=["device", "parameter"], maintain_order="left")
+    passed = passed.with_columns((pl.col("time_s") - pl.col("latency_s")).round(3))
+    return passed.filter(pl.col("time_s").is_between("begin_s", "end_s")).select(
         ROW,
         "period_id",
-        pl.col("time_s") - pl.col("latency_s"),
+        "time_s",
         "detector_id",
         pl.when(pl.col("event") == DETECTOR_ON)
         .then(pl.lit("on"))

@@ -75,7 +75,27 @@ def _checked_intervals(
         ),
     ):
         refuse(path, frame.filter(bad), column, complaint, "correct the row")
+    _refuse_overlaps(path, frame, keys, owner)
     return frame
+
+
+def _refuse_overlaps(path: Path, frame: pl.DataFrame, keys: tuple[str, ...], owner: str) -> None:
+    """Refuse intervals that begin before an earlier one has ended: vehicles would count twice."""
+    before = pl.col("end_s").cum_max().shift(1).over("period_id", *keys)
+    overlap = (
+        frame.sort("begin_s")
+        .with_columns(before.alias("before"))
+        .filter(pl.col("begin_s") < pl.col("before") - 1e-3)  # files hold milliseconds
+        .sort(ROW)
+    )
+    if overlap.height:
+        refuse(
+            path,
+            overlap,
+            "begin_s",
+            f"is before the end of an earlier interval of {owner}, {overlap['before'][0]:g} s",
+            "write intervals that do not overlap, and no totals of several of them",
+        )
 
 
 def _refuse_units(path: Path, frame: pl.DataFrame) -> None:

@@ -543,7 +543,10 @@ def _check_states(path: Path, frame: pl.DataFrame, widths: Mapping[str, int]) ->
 def _log(
     entries: list[tuple[float, str]], period: Period, where: str, findings: list[Finding]
 ) -> SignalLog:
-    """Return one log from the begin of the period; the last of equal times counts."""
+    """Return the changes of one log from the begin of the period; the last of equal times counts.
+
+    A logger that writes the state every second gives the same log as one that writes changes.
+    """
     kept: list[tuple[float, str]] = []
     clashes = 0
     for entry in entries:
@@ -569,15 +572,15 @@ def _log(
             )
         )
         kept[0] = (period.begin_s, kept[0][1])
-    changes = [since for i, (since, s) in enumerate(kept) if i == 0 or s != kept[i - 1][1]]
-    changes = [max(since, period.begin_s) for since in changes] + [period.end_s]
-    gaps = np.diff(changes)
-    if len(gaps) and gaps.max() > SIGNAL_GAP_S:
-        at = float(changes[int(gaps.argmax())])
+    log = tuple(entry for i, entry in enumerate(kept) if i == 0 or entry[1] != kept[i - 1][1])
+    times = [max(since, period.begin_s) for since, _ in log] + [period.end_s]
+    gaps = np.diff(times)
+    if gaps.max() > SIGNAL_GAP_S:
+        at = float(times[int(gaps.argmax())])
         findings.append(
             Finding(
                 f"{where} shows one state for {math.floor(gaps.max() / 60)} min from {at:g} s on; "
                 "was it recorded?"
             )
         )
-    return tuple(kept)
+    return log

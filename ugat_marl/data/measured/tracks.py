@@ -113,6 +113,20 @@ class _Track:
         return float(begin + (end - begin) * (distance_m - low) / (high - low))
 
 
+def step_of_tracks(vehicles: pl.DataFrame) -> float:
+    """Return the usual time between two positions of a vehicle, s; 0 if no vehicle has two.
+
+    Args:
+        vehicles: Rows of trajectories: ``period_id, vehicle_id, time_s``.
+    """
+    steps = (
+        vehicles.sort("time_s")
+        .select(pl.col("time_s").diff().over("period_id", "vehicle_id"))["time_s"]
+        .drop_nulls()
+    )
+    return float(steps.median() or 0.0) if len(steps) else 0.0  # pyright: ignore[reportArgumentType]
+
+
 def passages_of_tracks(
     path: Path,
     vehicles: pl.DataFrame,
@@ -140,12 +154,7 @@ def passages_of_tracks(
     for detector in detectors:
         for lane in detector.lanes:
             by_lane.setdefault(lane, []).append(detector)
-    steps = (
-        vehicles.sort("time_s")
-        .select(pl.col("time_s").diff().over("period_id", "vehicle_id"))["time_s"]
-        .drop_nulls()
-    )
-    step = float(steps.median() or 0.0) if len(steps) else 0.0  # pyright: ignore[reportArgumentType]
+    step = step_of_tracks(vehicles)
     if step > COARSEST_S:
         raise MeasuredDataError(
             f"{path}: positions every {step:g} s, and no detections; passages over detectors need "

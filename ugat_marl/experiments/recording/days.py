@@ -286,7 +286,8 @@ def _day(street: _Street, index: int, split: Split, stop: threading.Event) -> _D
     lanes = None
     if vehicles is not None and street.lanes:
         named = {detector.lane for detector in street.detectors}
-        lanes = traffic_of_lanes(vehicles, sorted(named), period)
+        every_second = np.arange(np.ceil(begin), end)  # also those without vehicles
+        lanes = traffic_of_lanes(vehicles, sorted(named), period, every_second)
     return _Day(period, lanes, vehicles if street.trajectories else None)
 
 
