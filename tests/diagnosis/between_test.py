@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -19,7 +20,7 @@ from ugat_marl.diagnosis.thresholds import Thresholds
 from ugat_marl.effects import load_scenario
 from ugat_marl.experiments import policy_factory, record
 from ugat_marl.scenarios import Network, Period, demand_as_vehicles
-from ugat_marl.simulation import Place
+from ugat_marl.simulation import Place, standard_detectors
 
 THRESHOLDS = Thresholds()
 PERIODS = (Period("one", 0.0, 900.0, "fit", {}, {}), Period("two", 0.0, 900.0, "heldout", {}, {}))
@@ -77,6 +78,31 @@ def test_simulated_vehicles_count_where_the_street_was_counted() -> None:
         [[0.0, 0.0]],
         [[4.0, 15.0]],
     ]
+
+
+def test_probes_that_arrive_after_the_period_are_not_compared(data: Path) -> None:
+    """A simulation ends with its period: probes of a longer day of the same model agree with it."""
+    scenario = demand_as_vehicles(load_scenario(data / "crossing"))
+    network = Network.read(scenario)
+    detectors = standard_detectors(network)
+    owner = DetectorLayout.of(network, detectors).owner
+    ways = ((Place("S_C", 20.0), Place("C_N", 100.0)), (Place("W_C", 20.0), Place("C_E", 100.0)))
+    replay = Replay(scenario, network, detectors, owner, THRESHOLDS, followed=ways)
+    signals = {"C": tuple((25.0 * i, ("Gr", "rG")[i % 2]) for i in range(8))}
+    short = Period("one", 0.0, 140.0, "fit", signals, {})
+    longer = replay.simulate((), replace(short, end_s=200.0), 3).between
+    measured = [
+        ("one", began, first.edge, first.position_m, last.edge, last.position_m, took)
+        for (first, last), seen in zip(ways, longer, strict=True)
+        for began, took in seen[seen[:, 0] < short.end_s].tolist()
+    ]
+    found = Between.of(MeasuredData((), (short,), travel_times=probes(*measured)))
+    assert found is not None and set(found.ways) == set(ways)
+    by_way = dict(zip(ways, replay.simulate((), short, 3).between, strict=True))
+    simulated = found.simulated(short, [by_way[way] for way in found.ways], None)[TRAVEL_TIME]
+    assert simulated[:, 0, 1].sum() < len(measured), "some arrive after the period"
+    assert simulated[:, 0, 1].all()
+    np.testing.assert_allclose(found.measured("one")[TRAVEL_TIME], simulated)
 
 
 def test_without_either_kind_there_is_nothing() -> None:

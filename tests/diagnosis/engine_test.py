@@ -39,6 +39,9 @@ class Streets(Replay):
         self._layout = layout
         self._calls = threading.Lock()
 
+    def shown(self, period: Period) -> Period:
+        return period
+
     def simulate(self, effects: Sequence[Effect], period: Period, seed: int) -> Day:
         names = tuple(map(str, effects))
         with self._calls:

@@ -3,14 +3,21 @@
 from __future__ import annotations
 
 import json
-from dataclasses import asdict
+from dataclasses import asdict, replace
 
 import numpy as np
 import pytest
 from numpy.typing import NDArray
 
 from ugat_marl.diagnosis import Reference, Tally
-from ugat_marl.diagnosis.features import BIN_FEATURES, FEATURES, INDEX, DetectorLayout, IncomingLane
+from ugat_marl.diagnosis.features import (
+    BIN_FEATURES,
+    FEATURES,
+    INDEX,
+    DetectorLayout,
+    IncomingLane,
+    bins_in,
+)
 from ugat_marl.diagnosis.locate import locate
 from ugat_marl.diagnosis.records import Disagreement
 from ugat_marl.diagnosis.statistics import Pools
@@ -104,6 +111,36 @@ def test_a_planted_window_is_found_with_its_bins(reference: Reference) -> None:
     assert item.window == (900.0, 1800.0)
     assert item.size == pytest.approx(75.0, abs=15.0)
     assert (item.statistic, item.unit) == ("count_advance in time", "vehicles")
+
+
+def test_a_window_of_joined_bins_lies_where_they_lie() -> None:
+    """Counts of 10 min in a period of 55 min: the last 5 min are in no joined bin."""
+
+    def of_55_min(tallies: list[Tally]) -> list[Tally]:
+        return [replace(day, bins=day.bins[..., :11]) for day in tallies]
+
+    pools = Pools.of(SITE, THRESHOLDS, together=2)
+    joined = Reference(pools, of_55_min(days(1, 150)))
+    bump = np.zeros((len(BIN_FEATURES), PLACES, BINS))
+    bump[BIN_FEATURES.index("count_advance"), 1, 4:8] = 25.0
+    distance = joined.distance(of_55_min(days(4, 5, bump=bump)))
+    items = locate(SITE, joined, distance, 0.05, (0.0, 3300.0))
+    assert [item.window for item in items if item.window] == [(1200.0, 2400.0)]
+
+
+@pytest.mark.parametrize(
+    ("length_s", "together", "covered_s"),
+    [(3600, 1, 3600), (3300, 2, 3000), (3000, 3, 2700), (600, 3, 600), (3150, 5, 3150)],
+)
+def test_joined_bins_cover_what_is_gathered(
+    length_s: float, together: int, covered_s: float
+) -> None:
+    pools = Pools.of(SITE, THRESHOLDS, together)
+    assert pools.grouped_s(length_s) == pytest.approx(covered_s)
+    bins = np.ones((len(BIN_FEATURES), PLACES, bins_in(length_s, THRESHOLDS)))
+    gathered, _ = Tally(np.zeros((len(FEATURES), PLACES, 2)), bins).gathered(together)
+    share = gathered[0, 0].sum() / bins.shape[-1]
+    assert pools.grouped_s(length_s) == pytest.approx(length_s * share)
 
 
 def test_a_constant_change_is_no_window(reference: Reference) -> None:

@@ -283,6 +283,26 @@ def test_only_what_is_allowed_is_proposed(reference: Reference) -> None:
     assert set(names(found)) <= {"demand_level", "turning"}
 
 
+def test_a_window_of_counts_lies_where_the_counts_lie() -> None:
+    """Counts of 10 min in a period of 55 min: the last 5 min are in no count."""
+
+    def of_55_min(periods: Sequence[Period]) -> list[Period]:
+        return [replace(period, end_s=3300.0) for period in periods]
+
+    pools = Pools.of(SITE, THRESHOLDS, together=2)
+    reference = Reference(pools, tallies(of_55_min([street(seed) for seed in range(40)])))
+    surge = {"a": lambda t: np.where((t >= 1800) & (t < 3000), 2.0, 1.0)}
+    data = of_55_min([street(320 + i, surge) for i in range(5)])
+    distance = reference.distance(tallies(data))
+    counted = [replace(period, passages={}) for period in data]
+    found = PlaceFinder(SITE, ROUTES, library(), THRESHOLDS).hypotheses(
+        reference, distance, counted
+    )
+    item = first(found, "demand_surge")
+    assert dict(item.fixed)["edge"] == "a_in"
+    assert overlap(window_of(item), (1800.0, 3000.0)) > 0.97
+
+
 def test_windows_need_periods_of_one_span(reference: Reference) -> None:
     surge = {"a": lambda t: np.where((t >= 600) & (t < 1500), 2.0, 1.0)}
     data = [street(320 + i, surge) for i in range(5)]

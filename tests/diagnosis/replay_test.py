@@ -68,6 +68,18 @@ def test_times_are_rounded_to_steps_and_not_durations(scenario: Scenario) -> Non
     assert sum(duration for duration, _ in rows[:-1]) == round(93.6)
 
 
+def test_greens_of_simulated_days_are_those_that_the_simulation_shows(scenario: Scenario) -> None:
+    network = Network.read(scenario)
+    drive = Replay(scenario, network, standard_detectors(network), {}, THRESHOLDS)
+    log = ((0.0, "Gr"), (30.4, "yr"), (33.4, "rG"), (60.6, "Gr"))
+    seen = drive.shown(a_period(log)).signals["C"]
+    assert seen == ((0.0, "Gr"), (30.0, "yr"), (33.0, "rG"), (61.0, "Gr"))
+    ends = np.cumsum([duration for duration, _ in phases(scenario, a_period(log))[1]])
+    assert list(ends[:3]) == [time for time, _ in seen[1:]]
+    again = tuple((time + 0.4, state) for time, state in log[:1]) + log[1:]
+    assert drive.shown(a_period(again)).signals["C"] == seen
+
+
 def test_a_state_shorter_than_a_step_gives_way_to_the_next(scenario: Scenario) -> None:
     log = ((0.0, "Gr"), (30.0, "yr"), (30.3, "rr"), (40.0, "rG"))
     assert phases(scenario, a_period(log))[1][:2] == [(30.0, "Gr"), (10.0, "rr")]

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -73,6 +74,38 @@ def test_a_shift_counts_with_the_number_of_days() -> None:
         values = np.full((days, len(USED), 1), 10.0)
         values[:, 0] += 3.0
         assert reference.distance(days_of(values)).total == pytest.approx(9.0 * days, rel=0.12)
+
+
+def stretches(seed: int, days: int, apart: float, shift: float = 0.0) -> list[Tally]:
+    """Days of a morning and of an afternoon, by turns, whose means are `apart`."""
+    values = gaussian(seed, days)
+    values[1::2] += apart
+    values[:, 0] += shift
+    windows = ((0.0, 1800.0), (1800.0, 3600.0))
+    return [replace(day, window=windows[k % 2]) for k, day in enumerate(days_of(values))]
+
+
+def test_each_stretch_of_the_day_is_compared_with_its_own() -> None:
+    """The same distances as of one stretch, though one has twice the values of the other."""
+    model, blind = stretches(5, 400, 10.0), days_of(gaussian(5, 400))
+    apart, alike = Reference(NETWORK, model), Reference(NETWORK, blind)
+    for data, shift in (((6, 2), 0.0), ((7, 4), 1.5)):
+        here = apart.distance(stretches(*data, 10.0, shift)).total
+        there = alike.distance(stretches(*data, 0.0, shift)).total
+        assert here == pytest.approx(there, rel=0.15)
+    # one stretch alone, as held-out periods may be
+    alone = [day for day in stretches(8, 8, 10.0) if day.window == (1800.0, 3600.0)]
+    assert apart.distance(alone).total < 20.0
+    assert apart.distance(days_of(gaussian(8, 4) + 10.0)).total > 300.0  # of no known stretch
+
+
+def test_other_stretches_are_no_chance() -> None:
+    """A shift of two standard errors or so is seen as well as within one stretch."""
+    pools = Pools({"network": np.ones((1, 1)), "lane": np.eye(1)}, THRESHOLDS)
+    null = Null(pools, stretches(9, 60, 10.0), 4, speeds=True)
+    assert null.expected < 4 * len(USED)
+    assert null.test(stretches(10, 4, 10.0)).p > 0.05
+    assert null.test(stretches(10, 4, 10.0, shift=4.0)).p < 0.01
 
 
 def test_means_are_ratios_and_their_variance_is_that_of_ratios() -> None:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import re
 from collections.abc import Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any, cast
@@ -22,6 +22,8 @@ from ugat_marl.diagnosis.statistics import Pools
 from ugat_marl.diagnosis.study import day_to_day_variation, effort_for, heard
 from ugat_marl.diagnosis.thresholds import Effort, Thresholds
 from ugat_marl.effects import Effect, Headway
+from ugat_marl.errors import MeasuredDataError
+from ugat_marl.progress import Silent
 from ugat_marl.scenarios import Detector, Passages, Period
 
 THRESHOLDS = Thresholds()
@@ -152,6 +154,52 @@ def test_where_signals_answered_nobody_nothing_is_left_open() -> None:
 def counts(generator: np.random.Generator, mean: float, share: float, days: int) -> np.ndarray:
     level = generator.gamma(share**-2.0, share**2.0, days) if share else np.ones(days)
     return generator.poisson(mean * level)[None].astype(np.float64)
+
+
+def test_an_interval_that_was_not_reported_is_no_quieter_day() -> None:
+    # 100 vehicles in each of four bins on both days; one bin of the second day is missing.
+    bins = np.full((len(BIN_FEATURES), 1, 4), 100.0)
+    known = np.ones_like(bins)
+    known[:, :, 2] = 0.0
+    sums = np.zeros((len(FEATURES), 1, 2))
+    days = [Tally(sums, bins), Tally(sums, bins * known, known=known)]
+    layout = SimpleNamespace(lanes=(SimpleNamespace(intersection=0),), intersections=("C",))
+    given = SimpleNamespace(periods=measured(NAMES, NAMES).periods)
+    found = module._variation(cast(Any, layout), cast(Any, given), days, THRESHOLDS)
+    assert found == 0.0
+
+
+@pytest.mark.parametrize(
+    ("first", "begin_s", "noted"),
+    [(80.0, 0.0, True), (62.0, 0.0, False), (80.0, -900.0, False)],
+)
+def test_a_street_that_is_fuller_than_an_empty_beginning_is_noted(
+    first: float, begin_s: float, noted: bool
+) -> None:
+    generator = np.random.default_rng(3)
+
+    def day(beginning: float) -> Tally:
+        bins = np.zeros((len(BIN_FEATURES), 1, 4))
+        bins[0] = generator.poisson((beginning, 100.0, 100.0, 100.0))
+        return Tally(np.zeros((len(FEATURES), 1, 2)), bins, window=(0.0, 100.0))
+
+    settings = SimpleNamespace(settings=SimpleNamespace(begin_s=begin_s))
+    base = SimpleNamespace(model=SimpleNamespace(tallies=[day(60.0) for _ in range(40)]))
+    here = replace(
+        study(Days({False: 8.0}), None),
+        scenario=cast(Any, settings),
+        measured=measured(NAMES, NAMES),
+        fit=tuple(day(first) for _ in range(8)),
+    )
+    found = here.begun(cast(Any, base), Silent()).measured.findings
+    assert ["begin empty with period 'day0'" in each.text for each in found] == [True] * noted
+
+
+def test_periods_of_different_lengths_are_refused_by_name() -> None:
+    periods = measured(NAMES, NAMES).periods
+    longer = replace(periods[1], end_s=160.0)
+    with pytest.raises(MeasuredDataError, match="'day1' is 160 s long, and 'day0' only 100 s"):
+        module._refuse_lengths((periods[0], longer))
 
 
 def test_demand_that_varies_from_day_to_day_is_told_from_chance() -> None:

@@ -2,8 +2,10 @@
 
 Simulated vehicles are followed over the same places. Turning counts are compared in the stretches
 of time that were counted, and as vehicles per minute. Travel times are compared as means: probes
-are a part of the vehicles, so their number says nothing. Of lanes the mean numbers of vehicles and
-of halting vehicles are compared, and the mean speed, each lane alone and all together.
+are a part of the vehicles, so their number says nothing. A simulation ends with its period, so
+vehicles on their way are not timed. Measured vehicles that arrive after the period are left out
+for the same reason. Of lanes the mean numbers of vehicles and of halting vehicles are compared,
+and the mean speed, each lane alone and all together.
 """
 
 from __future__ import annotations
@@ -60,7 +62,8 @@ class Between:
         ways: Pairs of places between which probes were timed.
         spans: For each period, begin and end of the counted intervals of each turn, s.
         counts: For each period, vehicles of each turn, ``(turns,)``.
-        times: For each period, sum and number of travel times of each way, ``(ways, 2)``.
+        times: For each period, sum and number of travel times of each way, ``(ways, 2)``, of the
+            probes that arrived within the period.
         lanes: SUMO ids of the lanes whose state was measured.
         states: For each period, sums and numbers of observations of the state of each lane,
             ``(lanes, 3, 2)``.
@@ -99,7 +102,8 @@ class Between:
             rows = [] if turning is None else [_turn(turning.filter(own), turn) for turn in turns]
             spans[period.id] = tuple(spans_of_turn for spans_of_turn, _ in rows)
             counts[period.id] = np.array([count for _, count in rows], np.float64)
-            totals = [] if probes is None else [_time(probes.filter(own), way) for way in ways]
+            timed = None if probes is None else _arrived(probes.filter(own), period)
+            totals = [] if timed is None else [_time(timed, way) for way in ways]
             times[period.id] = np.array(totals, np.float64).reshape(-1, 2)
         return cls(turns, ways, spans, counts, times, names, states)
 
@@ -180,6 +184,12 @@ def _turn(turning: pl.DataFrame, turn: tuple[str, str]) -> tuple[tuple[Span, ...
     own = turning.filter((pl.col("from_edge") == turn[0]) & (pl.col("to_edge") == turn[1]))
     spans = tuple(sorted(own.select("begin_s", "end_s").iter_rows()))
     return spans, float(own["count"].sum())
+
+
+def _arrived(probes: pl.DataFrame, period: Period) -> pl.DataFrame:
+    """Return the probes that passed both places within the period, as in `read_between`."""
+    begin, end = pl.col("time_s"), pl.col("time_s") + pl.col("travel_s")
+    return probes.filter((begin >= period.begin_s) & (end < period.end_s))
 
 
 def _time(probes: pl.DataFrame, way: Way) -> tuple[float, float]:

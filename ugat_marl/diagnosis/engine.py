@@ -96,7 +96,7 @@ def _counts(tallies: Sequence[Tally]) -> NDArray[np.float64]:
 
 # --- simulated days -------------------------------------------------------------------------------
 
-VERSION = 5
+VERSION = 6
 """Version of features and replays; tallies cached under another version are not used."""
 
 _BETWEEN = "between "
@@ -212,7 +212,8 @@ class Engine:
         self._thresholds = thresholds
         self._cache = cache
         self._workers = workers
-        self._greens: list[tuple[Greens, ...]] = [layout.greens(period) for period in periods]
+        # Lights of a simulated day change with its steps, those of the street at any time.
+        self._greens = [layout.greens(replay.shown(period)) for period in periods]
         self._days: OrderedDict[str, Day] = OrderedDict()
         self._known: dict[str, Replicate] = {}
         self._unmeasured = Unmeasured.of(periods)
@@ -452,7 +453,7 @@ class Engine:
     def _one(self, effects: tuple[Effect, ...], number: int) -> Replicate:
         key = self._key(effects, number)
         new = key not in self._known
-        day = self._known.get(key) or self._remembered(key)
+        day = self._known.get(key) or self._remembered(key, number)
         if day is None:
             others = tuple(effect for effect in effects if not effect.on_departures)
             if self._replay.answering and len(others) < len(effects):
@@ -529,7 +530,7 @@ class Engine:
         text = repr((self._root, tuple(map(str, effects)), number, signals))
         return hashlib.sha256(text.encode()).hexdigest()
 
-    def _remembered(self, key: str) -> Replicate | None:
+    def _remembered(self, key: str, number: int) -> Replicate | None:
         stored = self._stored(key)
         if stored is None:
             return None
@@ -543,6 +544,7 @@ class Engine:
                     for name, sums in stored.items()
                     if name.startswith(_BETWEEN)
                 },
+                window=self.periods[number % len(self.periods)].window,
             )
             due = None
             if "asked" in stored:

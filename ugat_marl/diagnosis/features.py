@@ -341,6 +341,7 @@ class Tally:
             distance contains them. None without single vehicles.
         between: Turning counts and travel times between places: sums and numbers of observations,
             ``(members, 1, 2)``, by block; see `between`.
+        window: Begin and end of the period, s; None if unknown, or for sums of different ones.
     """
 
     sums: Array
@@ -349,6 +350,7 @@ class Tally:
     known: Array | None = None
     journeys: Array | None = None
     between: Mapping[str, Array] = field(default_factory=dict)
+    window: tuple[float, float] | None = None
 
     @property
     def counted(self) -> Array:
@@ -383,12 +385,18 @@ class Tally:
             None if every else self.counted[..., :bins] + other.counted[..., :bins],
             None if mine is None or others is None else mine + others,
             {name: sums + other.between[name] for name, sums in self.between.items()},
+            self.window if self.window == other.window else None,
         )
 
 
 def bins_of(period: Period, thresholds: DayThresholds) -> int:
     """Return the number of bins of time in a period."""
-    return max(1, round((period.end_s - period.begin_s) / thresholds.bin_s))
+    return bins_in(period.end_s - period.begin_s, thresholds)
+
+
+def bins_in(length_s: float, thresholds: DayThresholds) -> int:
+    """Return the number of bins of time in a period of some length in s."""
+    return max(1, round(length_s / thresholds.bin_s))
 
 
 def tally(
@@ -432,7 +440,8 @@ def tally(
         counter.place = len(layout.lanes) + index
         exits[index] = counter.volume("count_exit", 2, _merged(period, names))
     _conserved(counter, layout, advances, stops, exits)
-    return Tally(counter.sums, counter.bins, journeys=_journeys(layout, period, greens, thresholds))
+    journeys = _journeys(layout, period, greens, thresholds)
+    return Tally(counter.sums, counter.bins, journeys=journeys, window=period.window)
 
 
 @dataclass

@@ -174,7 +174,7 @@ def _stretches(
     used = reference.blocks["time"].used
     places = len(layout.places)
     bins = z.shape[1]
-    width = (span[1] - span[0]) / bins
+    width = reference.pools.grouped_s(span[1] - span[0]) / bins
     rows: list[Disagreement] = []
     for row in range(z.shape[0]):
         if used[row].sum() < thresholds.least_bins:

@@ -218,7 +218,8 @@ class PlaceFinder:
         if not rows:
             return None
         begin, end = periods[0].begin_s, periods[0].end_s
-        minutes = max(int((end - begin) / self._thresholds.scan_s), 1)
+        length_s = reference.pools.grouped_s(end - begin)
+        minutes = max(int(length_s / self._thresholds.scan_s), 1)
         bins = block.mean.shape[1]
         which = np.minimum((np.arange(minutes) * bins) // minutes, bins - 1)
         per_bin = np.bincount(which, minlength=bins)

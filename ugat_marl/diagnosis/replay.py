@@ -216,6 +216,25 @@ class Replay:
             period = effect.observe(period, self._detectors, self._owner)
         return _logged(period)
 
+    def shown(self, period: Period) -> Period:
+        """Return a period whose lights change when those of its simulation do: with a step."""
+        begin_s, step_s = self._begin_s(period), self._scenario.settings.step_length_s
+        signals = {
+            tls: tuple(
+                (round(begin_s + step_s * tick, 6), state)
+                for tick, state in _ticks(log, begin_s, step_s)
+            )
+            for tls, log in period.signals.items()
+        }
+        return replace(period, signals=signals)
+
+    def _begin_s(self, period: Period) -> float:
+        """Return the begin of the simulation of a period, s: a step of the scenario."""
+        settings = self._scenario.settings
+        begin_s = max(settings.begin_s, period.begin_s - self._thresholds.warm_up_s)
+        step_s = settings.step_length_s
+        return settings.begin_s + step_s * round((begin_s - settings.begin_s) / step_s)
+
     def asked(self, effects: Sequence[Effect], period: Period, seed: int) -> Mapping[str, Array]:
         """Return the vehicles that a day of a model asks for, without a simulation; see `Due`.
 
@@ -252,10 +271,8 @@ class Replay:
         seed: int,
         directory: Path,
     ) -> Day:
-        settings = scenario.settings
+        settings, begin = scenario.settings, self._begin_s(period)
         step = settings.step_length_s
-        begin = max(settings.begin_s, period.begin_s - self._thresholds.warm_up_s)
-        begin = settings.begin_s + step * round((begin - settings.begin_s) / step)
         loops = directory / "loops.xml"
         true = installed_detectors((*self._own, *effects), self._detectors)
         served = [effect.service() for effect in controller_effects(scenario)]
@@ -365,17 +382,8 @@ def _from(log: SignalLog, period: Period, begin_s: float) -> SignalLog:
 def _durations(
     log: SignalLog, end_s: float, begin_s: float, step_s: float
 ) -> list[tuple[float, str]]:
-    """Return durations in s and states of phases, in whole steps, beyond the end of the period.
-
-    Times are rounded instead of durations, so that errors do not add up.
-    """
-    shown: list[tuple[int, str]] = []
-    for time, state in log:
-        tick = max(round((time - begin_s) / step_s), 0)
-        if shown and shown[-1][0] == tick:
-            shown[-1] = (tick, state)
-        elif not shown or shown[-1][1] != state:
-            shown.append((tick, state))
+    """Return durations in s and states of phases, in whole steps, beyond the end of the period."""
+    shown = _ticks(((max(time, begin_s), state) for time, state in log), begin_s, step_s)
     shown[0] = (0, shown[0][1])
     last = round((end_s - begin_s) / step_s) + 3600
     ticks = [tick for tick, _ in shown] + [max(last, shown[-1][0] + 1)]
@@ -383,6 +391,23 @@ def _durations(
         (round((after - tick) * step_s, 6), state)
         for (tick, state), after in zip(shown, ticks[1:], strict=True)
     ]
+
+
+def _ticks(
+    log: Iterable[tuple[float, str]], begin_s: float, step_s: float
+) -> list[tuple[int, str]]:
+    """Return the steps in which a log changes its state, counted from `begin_s`, and the states.
+
+    Times are rounded instead of durations, so that errors do not add up.
+    """
+    shown: list[tuple[int, str]] = []
+    for time, state in log:
+        tick = round((time - begin_s) / step_s)
+        if shown and shown[-1][0] == tick:
+            shown[-1] = (tick, state)
+        elif not shown or shown[-1][1] != state:
+            shown.append((tick, state))
+    return shown
 
 
 # --- arrivals -------------------------------------------------------------------------------------

@@ -25,6 +25,7 @@ from ugat_marl.diagnosis.statistics import (
     Group,
     Pools,
     Reference,
+    by_turns,
     correlation_groups,
     softened,
     sum_of,
@@ -72,6 +73,7 @@ class Null:
         self.reference = Reference(pools, tallies, speeds=speeds, doubt=doubt)
         self._directed = directed(self.reference) if directed else None
         draws: dict[str, list[float]] = {}
+        tallies = by_turns(tallies)
         for half in (0, 1):
             model = Reference(pools, tallies[half::2], speeds=speeds)
             directed_of_half = directed(model) if directed else None

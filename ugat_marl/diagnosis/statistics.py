@@ -5,6 +5,10 @@ over each intersection, over each lane. A fourth block holds counts in bins of t
 correlation between features. It is estimated from simulated days over all members of the block and
 shrunk (Ledoit and Wolf 2004). The distance is the sum of the blocks' Mahalanobis distances. The
 blocks depend on each other, so the distribution of the distance is always simulated.
+
+Periods may be different stretches of a day, with other demand and other queues. Each is compared
+with simulated days of its own stretch: the differences between the means of stretches are taken off
+measured and simulated days alike. Otherwise they would count as chance and hide everything.
 """
 
 from __future__ import annotations
@@ -24,10 +28,13 @@ from ugat_marl.diagnosis.features import (
     SPEED_FEATURES,
     DetectorLayout,
     Tally,
+    bins_in,
 )
 from ugat_marl.diagnosis.thresholds import Thresholds
 
 Array = NDArray[np.float64]
+Window = tuple[float, float] | None
+"""Begin and end of a stretch of a day, s."""
 
 SINGLE = ("lane", "time", LANES)
 """Blocks of single lanes and bins of time. Most differences there are chance, so differences that
@@ -72,6 +79,18 @@ class Pools:
             )
         blocks["lane"] = np.eye(places)
         return cls(blocks, thresholds, together, between or {})
+
+    def grouped_s(self, length_s: float) -> float:
+        """Return how much of a period lies in groups of bins, from its begin on.
+
+        Bins left over at the end are in no group, as in `Tally.gathered`.
+
+        Args:
+            length_s: Length of the period, s.
+        """
+        bins = bins_in(length_s, self.thresholds)
+        width = min(self.together, bins)
+        return length_s * (bins // width * width / bins)
 
     def pool(self, tally: Tally) -> dict[str, Array]:
         """Return sums and weights ``(members, features, 2)`` of every block.
@@ -160,6 +179,11 @@ class Reference:
             since both models have common random numbers.
         doubt: Variance of the means that more days do not reduce, by block; None for that of
             `prior`.
+
+    Attributes:
+        blocks: Statistics and noise by name of the block.
+        stretches: Mean of each stretch of the day minus that of all days, by block; those of
+            `prior` if it is given. Empty if all days are of one stretch.
     """
 
     def __init__(
@@ -177,13 +201,26 @@ class Reference:
         self._speeds = speeds
         self._thresholds = pools.thresholds
         stacked = _stack(pools, tallies)
-        partners = _stack(pools, paired) if paired else {}
+        self.stretches = prior.stretches if prior else _stretches(stacked, tallies)
+        stacked = self._level(stacked, tallies)
+        partners = self._level(_stack(pools, paired), paired) if paired else {}
         self.blocks: dict[str, Block] = {}
         for name, sums in stacked.items():
             before = prior.blocks[name] if prior else None
             block = self._block(sums, before, partners.get(name), name)
             known = before.doubt if before else 0.0
             self.blocks[name] = replace(block, doubt=doubt[name] if doubt else known)
+
+    def _level(self, stacked: dict[str, Array], tallies: Sequence[Tally]) -> dict[str, Array]:
+        """Take the means of stretches off the sums of days ``(days, members, features, 2)``."""
+        if not self.stretches:
+            return stacked
+        level: dict[str, Array] = {}
+        for name, sums in stacked.items():
+            own = [self.stretches.get(day.window, {}).get(name, 0.0) for day in tallies]
+            apart = np.stack([np.broadcast_to(x, sums.shape[1:3]) for x in own])
+            level[name] = np.stack((sums[..., 0] - sums[..., 1] * apart, sums[..., 1]), axis=-1)
+        return level
 
     def _block(self, sums: Array, prior: Block | None, partner: Array | None, name: str) -> Block:
         """Make a block from sums ``(days, members, features, 2)``."""
@@ -238,7 +275,11 @@ class Reference:
                 None for this model without a penalty.
             extra: Further variance of the expected statistics, by block.
         """
-        sums = self.pools.pool(sum_of(data))
+        if self.stretches:
+            days = self._level(_stack(self.pools, data), data)
+            sums = {name: several.sum(axis=0) for name, several in days.items()}
+        else:
+            sums = self.pools.pool(sum_of(data))
         total = penalty = 0.0
         parts: dict[str, float] = {}
         z: dict[str, Array] = {}
@@ -285,6 +326,39 @@ def _stack(pools: Pools, tallies: Sequence[Tally]) -> dict[str, Array]:
     """Return pooled sums of several days, ``(days, members, features, 2)``."""
     pooled = [pools.pool(tally) for tally in tallies]
     return {name: np.stack([sums[name] for sums in pooled]) for name in pooled[0]}
+
+
+def _stretches(
+    stacked: Mapping[str, Array], tallies: Sequence[Tally]
+) -> dict[Window, dict[str, Array]]:
+    """Return the mean of each stretch minus that of all days, by block; see `Reference`."""
+    windows = [day.window for day in tallies]
+    found: dict[Window, dict[str, Array]] = {}
+    if len(set(windows)) == 1:
+        return found
+    for window in set(windows):
+        own = np.array([other == window for other in windows])
+        found[window] = {
+            name: np.nan_to_num(_means(sums[own]) - _means(sums)) for name, sums in stacked.items()
+        }
+    return found
+
+
+def _means(sums: Array) -> Array:
+    """Return ratios of sums over days; NaN without observations."""
+    total = sums.sum(axis=0)
+    return np.where(total[..., 1] > 0, total[..., 0] / np.maximum(total[..., 1], 1e-9), np.nan)
+
+
+def by_turns(tallies: Sequence[Tally]) -> list[Tally]:
+    """Return days ordered by stretch, so that every other day is of every stretch."""
+    return sorted(tallies, key=lambda day: day.window or (0.0, 0.0))
+
+
+def of_the_same_stretches(days: Sequence[Tally], data: Sequence[Tally]) -> list[Tally]:
+    """Return the days of the stretches of measured data; all days if there are none."""
+    windows = {day.window for day in data}
+    return [day for day in days if day.window in windows] or list(days)
 
 
 def sum_of(tallies: Sequence[Tally]) -> Tally:

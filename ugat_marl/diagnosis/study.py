@@ -358,6 +358,39 @@ class Study:
         residual = self.null(tallies, len(self.fit)).test(self.fit)
         return Tested(model, residual, np.empty(0), {})
 
+    def begun(self, base: Tested, reporter: Reporter) -> Study:
+        """Note it if simulated days begin on an empty network, and those of the street do not.
+
+        Args:
+            base: The scenario as it is.
+            reporter: Reporter of the note.
+        """
+        thresholds, begin_s = self.config.thresholds, self.scenario.settings.begin_s
+        early = [p for p in self.measured.of("fit") if p.begin_s < begin_s + thresholds.bin_s]
+        if not early or not self.measured.has_events:
+            return self
+        windows = {period.window for period in early}
+
+        def first_and_all(days: Sequence[Tally]) -> Array:
+            own = [day.bins[:3].sum(axis=(0, 1)) for day in days if day.window in windows]
+            return np.array([(bins[0], bins.sum()) for bins in own])
+
+        here, there = first_and_all(self.fit), first_and_all(base.model.tallies)
+        if len(there) < 2:
+            return self
+        usual = there[:, 0] * here[:, 1].mean() / there[:, 1].mean()
+        more = float(here[:, 0].mean() - usual.mean())
+        error = float(usual.std(ddof=1)) * math.sqrt(1 / len(here) + 1 / len(there))
+        if more < thresholds.fuller * max(error, 1.0):
+            return self
+        finding = Finding(
+            f"simulated days begin empty with period {early[0].id!r}, the street does not: it has "
+            f"{more:.0f} passages more in the first {thresholds.bin_s / 60:g} minutes. "
+            "Begin the scenario ten minutes earlier (begin_s), with its vehicles"
+        )
+        reporter.say(f"note: {finding.text}")
+        return replace(self, measured=_noted(self.measured, (finding,)))
+
     def left_over(self, model: Tested, reporter: Reporter) -> tuple[Pattern, ...]:
         """Find patterns in what a model leaves; none if single vehicles were not detected.
 
@@ -418,6 +451,7 @@ class Study:
                 day.bins[..., :width] * known[..., :width],
                 day.days,
                 between=day.between,
+                window=day.window,
             )
             for day in tallies
         ]
@@ -511,7 +545,24 @@ def _noted(measured: MeasuredData, findings: Sequence[Finding]) -> MeasuredData:
 def _fitted_periods(measured: MeasuredData) -> tuple[Period, ...]:
     if not (periods := measured.of("fit")):
         raise MeasuredDataError("no period has the split 'fit'; there is nothing to fit")
+    _refuse_lengths(measured.periods)
     return periods
+
+
+def _refuse_lengths(periods: Sequence[Period]) -> None:
+    """Refuse periods of different lengths: their statistics are not of one kind.
+
+    Raises:
+        MeasuredDataError: The periods have different lengths.
+    """
+    lengths = {period.id: period.end_s - period.begin_s for period in periods}
+    shortest, longest = min(lengths, key=lengths.__getitem__), max(lengths, key=lengths.__getitem__)
+    if lengths[longest] - lengths[shortest] > 0.5:
+        raise MeasuredDataError(
+            f"periods.csv: {longest!r} is {lengths[longest]:g} s long, and {shortest!r} only "
+            f"{lengths[shortest]:g} s; a diagnosis needs periods of one length, so cut the longer "
+            "ones in begin_s and end_s"
+        )
 
 
 def _answering(measured: MeasuredData, lights: Sequence[str]) -> bool:
@@ -618,11 +669,12 @@ def _variation(
     if len({(period.begin_s, period.end_s) for period in measured.periods}) > 1:
         return 0.0
     owners = np.array([lane.intersection for lane in layout.lanes])
+    known = np.all([day.counted > 0 for day in days], axis=0)  # a missing interval is no zero
     rows: list[Array] = []
     for number in range(len(layout.intersections)):
         lanes = np.flatnonzero(owners == number)
         by_kind = [
-            np.array([day.bins[kind, lanes].sum() for day in days])
+            np.array([(day.bins * known)[kind, lanes].sum() for day in days])
             for kind in (BIN_FEATURES.index("count_stop"), BIN_FEATURES.index("count_advance"))
         ]
         rows.append(max(by_kind, key=lambda counts: float(counts.sum())))

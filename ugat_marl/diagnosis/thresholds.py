@@ -124,6 +124,9 @@ class DayThresholds:
     warm_up_s: float = 600.0
     """Simulated time before a period that begins later than the scenario, s. By hand: a few cycles.
     Halved: long trips have not reached the traffic lights when counting begins."""
+    fuller: float = 4.0
+    """Standard errors by which a street's first bin of time holds more than that of simulated days
+    that begin empty. By hand. Halved: one period in forty is noted without need."""
     held_up: float = 0.55
     """Share of the speed limit below which a vehicle at the advance detector counts as queued. By
     hand. Halved: arrivals of queued vehicles are late by their time in the queue."""

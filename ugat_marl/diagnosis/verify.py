@@ -29,7 +29,7 @@ from ugat_marl.diagnosis.records import (
     Verified,
 )
 from ugat_marl.diagnosis.residual import Null
-from ugat_marl.diagnosis.statistics import Array, sum_of
+from ugat_marl.diagnosis.statistics import Array, of_the_same_stretches, sum_of
 from ugat_marl.diagnosis.study import Study
 from ugat_marl.diagnosis.thresholds import Thresholds
 from ugat_marl.diagnosis.traffic import approach_table, traffic_check
@@ -71,8 +71,7 @@ def tables_of(study: Study, base: Tested, best: Tested) -> Tables:
         approach_table(
             study.layout,
             study.heldout,
-            _same_days(base, best),
-            best.model.tallies,
+            *_same_days(study, base, best),
             study.config.thresholds,
         ),
     )
@@ -82,13 +81,17 @@ def judged(study: Study, base: Tested, best: Tested) -> TrafficCheck | None:
     """Judge the correction by held-out measures that no fit uses; None if it changes no traffic."""
     if all(effect.on_detectors for effect in best.model.effects):
         return None
-    days = _same_days(base, best)
-    return traffic_check(study.heldout, days, best.model.tallies, study.config.thresholds)
+    days = _same_days(study, base, best)
+    return traffic_check(study.heldout, *days, study.config.thresholds)
 
 
-def _same_days(base: Tested, best: Tested) -> list[Tally]:
-    """Return those days of the scenario as it is that the corrected model has too."""
-    return [base.model.days[number] for number in best.model.days]
+def _same_days(study: Study, base: Tested, best: Tested) -> tuple[list[Tally], list[Tally]]:
+    """Return days that both models have, of the stretches of the held-out periods."""
+    before, after = base.model.days, best.model.days
+    return (
+        of_the_same_stretches([before[number] for number in after], study.heldout),
+        of_the_same_stretches(list(after.values()), study.heldout),
+    )
 
 
 def statistics_table(study: Study, base: Tested, best: Tested) -> tuple[StatisticRow, ...]:
@@ -148,9 +151,13 @@ def courtesy(study: Study, base: Tested, best: Tested) -> EngineeringCriteria:
     data, every = sum_of(study.heldout), study.all_days
 
     def row(model: Tested) -> CriteriaRow:
-        tallies = model.model.tallies
+        tallies = of_the_same_stretches(model.model.tallies, study.heldout)
         values = geh(hourly(data), hourly(sum_of(tallies)))
-        criteria = fhwa(every, tallies, study.pools.together, study.config.thresholds)
+        # They need the variation between days at the same time of day.
+        same = len({day.window for day in every}) == 1
+        criteria = (
+            fhwa(every, tallies, study.pools.together, study.config.thresholds) if same else None
+        )
         some = len(values) > 0
         return CriteriaRow(
             geh_below_5=float((values < 5).mean()) if some else None,
