@@ -144,7 +144,7 @@ def gone(pid: int) -> bool:
     return Path(f"/proc/{pid}/stat").read_text().rpartition(")")[2].split()[0] == "Z"
 
 
-def eventually(condition: Callable[[], bool], within_s: float = 5.0) -> bool:
+def eventually(condition: Callable[[], bool], within_s: float = 30.0) -> bool:
     deadline = time.monotonic() + within_s
     while not condition() and time.monotonic() < deadline:
         time.sleep(0.02)
@@ -656,7 +656,7 @@ def test_a_slow_environment_holds_up_no_other_one() -> None:
 
 
 def test_one_that_never_answers_is_replaced(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setenv("UGAT_MARL_DEADLINE_S", "5")
+    monkeypatch.setenv("UGAT_MARL_DEADLINE_S", "12")  # a replacement has to start within it
     with vector_env("single-v1", 2, duration_s=LENGTH_S) as env:
         expected = env.step(env.reset(1).masks.argmax(axis=-1))
         env.send(env.reset(1).masks.argmax(axis=-1))

@@ -37,7 +37,7 @@ GRID = load_scenario("grid2x2-v1")
 SITE = Site.of(GRID, {})
 LIGHT = SITE.lights[0]
 LANE = SITE.sees[LIGHT][0]
-QUICK = TrustLimits(return_after=2)
+QUICK = TrustLimits(answer_ms=2000, return_after=2)  # decisions in time on a busy machine
 Counts = dict[str, LaneCount]
 
 
