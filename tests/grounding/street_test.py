@@ -27,8 +27,10 @@ from ugat_marl.grounding import (
     street_env,
     street_prior,
 )
+from ugat_marl.grounding.state import RunState
+from ugat_marl.grounding.street_training import StreetTraining
 from ugat_marl.grounding.summaries import NAMES
-from ugat_marl.policies import EpsilonGreedy, make_rule, observer_of, roll_out
+from ugat_marl.policies import EpsilonGreedy, Policy, make_rule, observer_of, roll_out
 from ugat_marl.simulation import kept_warm
 
 SCENARIO = load_scenario("single-v1")
@@ -195,6 +197,32 @@ def test_an_interrupted_training_ends_as_an_unbroken_one(
     assert logged == numbers(tmp_path / "broken")
     assert logged[1, "channel/lag_2"] > 0.5
     assert logged[2, "street/commands"] >= 2.0
+
+
+def test_the_kept_policy_is_the_one_on_the_street(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    play_nothing(monkeypatch)
+    out_there: list[tuple[Policy, Policy | None]] = []
+    roll_out_of = StreetTraining._roll_out
+
+    def seen(self: StreetTraining, state: RunState[StreetFit], policy: Policy) -> None:
+        out_there.append((policy, state.best))
+        roll_out_of(self, state, policy)
+
+    def training_was_bad(
+        _self: StreetTraining, state: RunState[StreetFit], *_others: object
+    ) -> dict[str, float]:
+        state.best = state.direct
+        return {}
+
+    monkeypatch.setattr(StreetTraining, "_roll_out", seen)
+    monkeypatch.setattr(StreetTraining, "_keep_better", training_was_bad)
+    ugat = replace(SMALL.ugat, grounding="street", street=QUICK, iterations=2)
+    transfer(replace(SMALL, real=LATE, ugat=ugat), tmp_path / "run", workers=1)
+    (_, before), (second, kept) = out_there
+    assert before is None
+    assert second is kept
 
 
 def test_noise_as_a_control_is_refused_without_f(tmp_path: Path) -> None:

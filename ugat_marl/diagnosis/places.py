@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 
 from ugat_marl.data import occupied_between
 from ugat_marl.diagnosis.between import TURNING
-from ugat_marl.diagnosis.features import BIN_FEATURES, INDEX, DetectorLayout
+from ugat_marl.diagnosis.features import BIN_FEATURES, INDEX, DetectorLayout, bins_in
 from ugat_marl.diagnosis.hypotheses import Hypothesis, Members, examined
 from ugat_marl.diagnosis.statistics import Distance, Reference
 from ugat_marl.diagnosis.thresholds import Thresholds
@@ -79,7 +79,7 @@ class PlaceFinder:
         hypotheses: list[Hypothesis] = []
         hypotheses += self._volume.hypotheses(distance)
         hypotheses += turned(reference, distance)
-        hypotheses += self._timing(reference, distance)
+        hypotheses += self._timing(reference, distance, periods[0].end_s - periods[0].begin_s)
         hypotheses += self._windows(reference, distance, periods)
         hypotheses += self._places(reference, distance)
         hypotheses += fault_hypotheses(self._layout, reference, distance, periods)
@@ -102,14 +102,16 @@ class PlaceFinder:
 
     # --- time ---------------------------------------------------------------------------------
 
-    def _timing(self, reference: Reference, distance: Distance) -> list[Hypothesis]:
+    def _timing(
+        self, reference: Reference, distance: Distance, length_s: float
+    ) -> list[Hypothesis]:
         """Find origins whose demand would fit if it came sooner or later."""
         z, difference = distance.z["time"], distance.difference["time"]
         block = reference.blocks["time"]
         least, most = self._thresholds.strengths_of_a_shift
         fitting: list[tuple[float, str, float]] = []
         first = BIN_FEATURES.index("count_advance") * len(self._edges)
-        width = self._thresholds.bin_s * reference.pools.together
+        width = length_s / bins_in(length_s, self._thresholds) * reference.pools.together
         for origin in self._routes.passing:
             rows = [
                 first + index

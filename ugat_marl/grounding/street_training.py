@@ -4,14 +4,14 @@
 
      1  pre-train pi for M episodes in E_sim
      2  for i = 1, ..., I:
-     3      roll pi out in E_real, add the transitions to D_real
+     3      roll the kept policy out in E_real (at first pi), add the transitions to D_real
      4      fit the street to D_real (`street`)
-     5      roll pi out in worlds of the street; fit f to D_real, h to these roll-outs (`residual`)
+     5      roll it out in worlds of the street; fit f to D_real, h to these roll-outs (`residual`)
      6      watch the rule that is best in worlds of the street, if the learner has a teacher;
             for e = 1, ..., E episodes: draw a world of the street, update pi in it; where f is
             trusted, ground its actions
      7      keep the best of pi, pi after the lessons, and the policy kept so far, in the same
-            worlds of the street
+            worlds of the street; training goes on from pi
 
 Line 5 is an option. Where commands are late, a grounded action would be late as well, and none is
 grounded.
@@ -122,7 +122,7 @@ class StreetTraining(Algorithm):
         device_of(self.device)  # refuses a missing GPU before anything runs
         self._pretrain(state)  # line 1
         while state.iteration < self.config.iterations:  # line 2
-            policy = state.learner.policy()
+            policy = state.policy()
             self._roll_out(state, policy)  # line 3
             before = state.transform.view
             street = self._fit(state, policy)  # line 4
