@@ -96,6 +96,15 @@ def test_a_short_zone_is_found_by_what_is_never_counted() -> None:
     assert eyes.lag == 0
 
 
+@pytest.mark.parametrize("share", [0.05, 0.2, 0.5])
+def test_a_quiet_street_has_no_zone(share: float) -> None:
+    def quiet(counts: np.ndarray, generator: np.random.Generator) -> np.ndarray:
+        return generator.binomial(counts.astype(int), share).astype(float)
+
+    eyes = fit_eyes(log_of(quiet, episodes=16), log_of(episodes=16, seed=99), VIEW)
+    assert eyes.zone_m == (0.0, 0.0)
+
+
 def test_noise_is_found_with_its_size() -> None:
     def relative(counts: np.ndarray, generator: np.random.Generator) -> np.ndarray:
         return counts * np.maximum(1 + 0.1 * generator.standard_normal(counts.shape), 0)
