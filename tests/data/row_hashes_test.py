@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import datetime
+import errno
 import json
+import os
 import re
 from pathlib import Path
 
@@ -54,6 +56,13 @@ def test_what_was_written_is_whole(rows: int, tmp_path: Path) -> None:
     frame, metadata = read(tmp_path / "a.parquet")
     assert frame.equals(every_kind(rows))
     assert damage(frame, metadata, ("mine",)) == ""
+
+
+@pytest.mark.skipif(not Path("/dev/full").exists(), reason="no device that is always full")
+def test_a_full_disk_is_an_error_of_the_system() -> None:
+    with pytest.raises(OSError, match=re.escape(os.strerror(errno.ENOSPC))) as raised:
+        write_hashed(every_kind(40), Path("/dev/full"))
+    assert raised.value.errno == errno.ENOSPC
 
 
 def test_every_flipped_bit_of_the_numbers_is_seen(tmp_path: Path) -> None:

@@ -50,6 +50,17 @@ def test_queues_are_means_by_minute_and_intersection() -> None:
     assert {(row[2], row[5]) for row in record.frame().rows()} == {(0, 6), (1, 3)}
 
 
+def test_an_episode_whose_simulation_dies_counts_once() -> None:
+    whole, broken = QueueRecord(), QueueRecord()
+    env = stub(decisions=3, interval_s=10.0)
+    for record, steps in ((whole, [1, 2, 3]), (broken, [1, 2, 1, 2, 3])):
+        look = record.watch("rule", "V4", env)
+        for step in steps:
+            env.snapshot = SimpleNamespace(halting=np.full(len(env.network.lane_table().ids), step))
+            look(step)
+    assert broken.frame().equals(whole.frame())
+
+
 def test_long_intervals_leave_minutes_out() -> None:
     env = stub(decisions=2, interval_s=90.0)
     look = (record := QueueRecord()).watch("rule", "V4", env)
@@ -80,7 +91,7 @@ def test_another_evaluation_adds_its_episodes(tmp_path: Path) -> None:
     path = tmp_path / "queues.parquet"
 
     def write(domain: str, *episodes: float, keep: bool = True) -> None:
-        env = stub(decisions=2, interval_s=60.0)
+        env = stub(decisions=1, interval_s=60.0)
         look = (record := QueueRecord()).watch("policy", domain, env)
         for halting in episodes:
             lanes = len(env.network.lane_table().ids)

@@ -166,7 +166,10 @@ def test_domain_randomisation_resumes(tmp_path: Path) -> None:
     with pytest.raises(KeyboardInterrupt):
         transfer(config, tmp_path / "run", reporter=KillAfter("training: domain randomisation", 11))
     assert episodes(tmp_path / "run", "domain randomisation") == 10
+    (job,) = (tmp_path / "run").glob("trainings/*randomised*")
+    (job / ".queues.parquet.abc.tmp").touch()  # of a process that was killed
     transfer(config, tmp_path / "run", resume=True)
+    assert list(job.glob(".*.tmp")) == []
     name = "domain-randomisation"
     assert np.array_equal(weights(tmp_path / "run", name), weights(tmp_path / "unbroken", name))
 

@@ -16,6 +16,7 @@ import hashlib
 import io
 import json
 import os
+import re
 import sys
 import tempfile
 from collections.abc import Iterable, Iterator, Mapping
@@ -50,14 +51,22 @@ def write_hashed(
         frame: The table.
         path: File to write; the caller makes it whole or absent.
         metadata: Further metadata of the file; the hashes cover it too.
+
+    Raises:
+        OSError: The file cannot be written, such as for want of room.
     """
     own = dict(metadata or {})
     text = json.dumps(
         {"rows": frame.height, "head": _head(frame, own), "groups": [*_groups(frame, _GROUP_ROWS)]}
     )
-    frame.write_parquet(
-        path, metadata={**own, **dict.fromkeys(HASH_KEYS, text)}, row_group_size=_GROUP_ROWS
-    )
+    told = {**own, **dict.fromkeys(HASH_KEYS, text)}
+    try:
+        frame.write_parquet(path, metadata=told, row_group_size=_GROUP_ROWS)
+    except pl.exceptions.ComputeError as error:
+        # polars names some errors of the system in its text alone
+        if (number := re.search(r"\(os error (\d+)\)", str(error))) is None:
+            raise
+        raise OSError(int(number[1]), os.strerror(int(number[1]))) from None
 
 
 def write_csv_hashes(directory: Path, names: Iterable[str]) -> None:

@@ -330,6 +330,7 @@ def perform(
     Raises:
         OptionError: An evaluation is missing, and the training has already passed it.
     """
+    remove_temporaries(folder)
     record = Record.read(folder)
     if record.is_whole(job):
         return record
@@ -545,7 +546,6 @@ def _world(job: Job) -> AnyParallelEnv:
 
 def perform_described(folder: Path) -> int:
     """Perform the job that a folder describes; return the exit code and print what went wrong."""
-    remove_temporaries(folder)
     try:
         described = read_json(folder / JOB, CheckpointError)
         job = TypeAdapter(Job).validate_json(json.dumps(described))

@@ -40,7 +40,7 @@ class _Sums:
 
 
 class QueueRecord:
-    """Mean number of halting vehicles on incoming lanes, by minute, over all episodes."""
+    """Mean number of halting vehicles on incoming lanes, by minute, over all whole episodes."""
 
     def __init__(self) -> None:
         self._sums: dict[tuple[str, str], _Sums] = {}
@@ -72,12 +72,19 @@ class QueueRecord:
                 _Sums(names, np.zeros((minutes, len(names))), np.zeros(minutes)),
             )
 
+        episode: list[tuple[int, NDArray[np.float64]]] = []
+
         def look(step: int) -> None:
+            if step == 1:
+                episode.clear()  # an episode whose simulation died begins again
             minute = math.ceil(step * interval_s / 60) - 1
-            queues = np.add.reduceat(base.snapshot.halting[places], starts)
+            episode.append((minute, np.add.reduceat(base.snapshot.halting[places], starts)))
+            if step < base.scenario.decisions:
+                return
             with self._lock:
-                sums.queues[minute] += queues
-                sums.looks[minute] += 1
+                for minute, queues in episode:
+                    sums.queues[minute] += queues
+                    sums.looks[minute] += 1
 
         return look
 
