@@ -19,6 +19,9 @@ TOP = ""
 """The room of the ground stones, the modules at the top of the package."""
 MAX_STONES = 5
 MAX_FUNCTION_LINES = 60
+REGISTRATION = "register_single()"
+"""The one act of an import: ``gymnasium.make("module:name")`` imports a module that registers."""
+GYMNASIUM_LOADED = "'gymnasium' in sys.modules"
 UNPICKLERS = {"pickle", "cloudpickle", "dill", "shelve", "marshal", "joblib"}
 # `traci` is for a SUMO that runs elsewhere, in place of the street.
 ENGINES = {"libsumo": "simulation", "traci": "field"}
@@ -222,7 +225,7 @@ def nothing_is_unpickled(tree: Tree) -> list[str]:
 
 @check
 def importing_does_nothing(tree: Tree) -> list[str]:
-    """Module level holds definitions only."""
+    """Module level holds definitions only, and the names that Gymnasium learns by an import."""
     return [
         f"{module}:{statement.lineno} does something when imported"
         for module, parsed in tree.parsed.items()
@@ -262,12 +265,16 @@ def is_definition(statement: ast.stmt) -> bool:
             return True
         case ast.Expr(value=ast.Constant()):  # docstrings, of attributes too
             return True
+        case ast.Expr():
+            return ast.unparse(statement) == REGISTRATION
         case ast.Assign(targets=targets):
             return all(isinstance(target, ast.Name | ast.Tuple) for target in targets)
         case ast.If(test=test, body=body):
             if ast.unparse(test) == "__name__ == '__main__'":
                 return True
-            return ast.unparse(test).endswith("TYPE_CHECKING") and all(map(is_definition, body))
+            names = ast.unparse(test)
+            only_names = names.endswith("TYPE_CHECKING") or names == GYMNASIUM_LOADED
+            return only_names and all(map(is_definition, body))
         case _:
             return False
 
@@ -335,6 +342,7 @@ BROKEN: list[tuple[str, dict[str, str]]] = [
     ("importing_does_nothing", {"stone": "os.environ['A'] = '1'"}),
     ("importing_does_nothing", {"stone": "for x in y:\n    pass"}),
     ("importing_does_nothing", {"stone": "if TYPE_CHECKING:\n    f()"}),
+    ("importing_does_nothing", {"stone": "if 'gymnasium' in sys.modules:\n    f()"}),
     ("functions_are_short", {"stone": "def f():\n    '''D.'''\n" + "    x = 1\n" * 61}),
 ]
 

@@ -115,6 +115,7 @@ def test_other_processes_import_the_wheel_too() -> None:
 
 def test_importing_is_cheap() -> None:
     code = (
-        "import sys, ugat_marl; sys.exit(bool({'torch', 'libsumo', 'matplotlib'} & {*sys.modules}))"
+        "import sys, ugat_marl; "
+        "sys.exit(bool({'torch', 'libsumo', 'matplotlib', 'gymnasium'} & {*sys.modules}))"
     )
     assert subprocess.run([sys.executable, "-c", code], check=False).returncode == 0

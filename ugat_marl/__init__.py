@@ -5,8 +5,15 @@ domain, and a `TransitionLog` is what roll-outs record. Each name is loaded when
 so that importing the package is cheap.
 """
 
+import sys
+
 import lazy_loader
 
 __version__ = "0.1.0"
 
 __getattr__, __dir__, __all__ = lazy_loader.attach_stub(__name__, __file__)
+
+if "gymnasium" in sys.modules:  # gymnasium.make("ugat_marl:...") imports this module
+    from ugat_marl.envs import register_single
+
+    register_single()

@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import inspect
+import subprocess
+import sys
 from collections.abc import Callable
 from dataclasses import fields
 from pathlib import Path
@@ -18,7 +20,7 @@ from numpy.typing import NDArray
 import ugat_marl
 from ugat_marl.envs import EnvOptions, IntersectionView, SingleEnv
 from ugat_marl.envs.options import EnvKeywords
-from ugat_marl.envs.single import SINGLE, register
+from ugat_marl.envs.registration import SINGLE
 from ugat_marl.errors import CheckpointError, OptionError, UnknownNameError
 from ugat_marl.policies import DQN, DQNConfig
 from ugat_marl.scenarios.phases import programme_phases
@@ -163,7 +165,6 @@ def test_keywords_are_shown_with_their_defaults_and_documented() -> None:
 
 
 def test_one_light_is_an_environment_of_gymnasium() -> None:
-    register()
     for name in SINGLE:
         env = gymnasium.make(f"ugat_marl/{name}", domain="V4", duration_s=100.0)
         check_env(env.unwrapped, skip_render_check=True)
@@ -181,6 +182,22 @@ def test_one_light_is_an_environment_of_gymnasium() -> None:
         same.close()
     with pytest.raises(OptionError, match=r"has 4 intersections.*parallel_env"):
         SingleEnv("grid2x2-v1")
+
+
+@pytest.mark.parametrize(
+    "program",
+    [
+        'import gymnasium; light = gymnasium.make("ugat_marl:ugat_marl/single-v1")',
+        'import gymnasium, ugat_marl; light = gymnasium.make("ugat_marl/single-v1")',
+        'import gymnasium, ugat_marl; light = gymnasium.make("ugat_marl:ugat_marl/single-v1")',
+        "import ugat_marl, gymnasium; ugat_marl.parallel_env; "
+        'light = gymnasium.make("ugat_marl/single-v1")',
+    ],
+)
+def test_gymnasium_finds_one_light_in_a_fresh_interpreter(program: str) -> None:
+    code = f"{program}; print(light.unwrapped.parallel.scenario.id)"
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=False)
+    assert done.stdout.split() == ["single-v1"], done.stderr
 
 
 def test_render_without_a_mode_warns() -> None:

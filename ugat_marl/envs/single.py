@@ -1,7 +1,7 @@
 """A scenario with one intersection as an environment of Gymnasium.
 
-After the package is installed, ``gymnasium.make("ugat_marl/single-v1")`` makes one. Keywords are
-those of `ugat_marl.parallel_env`.
+``gymnasium.make("ugat_marl:ugat_marl/single-v1")`` makes one (`ugat_marl.envs.registration`).
+Keywords are those of `ugat_marl.parallel_env`.
 """
 
 from __future__ import annotations
@@ -18,9 +18,6 @@ from ugat_marl.effects import Domain
 from ugat_marl.envs.traffic_env import parallel_env
 from ugat_marl.errors import OptionError
 from ugat_marl.scenarios import Scenario
-
-SINGLE = ("single-v1",)
-"""Shipped scenarios with one intersection."""
 
 
 class SingleEnv(gymnasium.Env[NDArray[np.float32], int]):
@@ -81,13 +78,3 @@ class SingleEnv(gymnasium.Env[NDArray[np.float32], int]):
     def close(self) -> None:
         """End the simulation."""
         self.parallel.close()
-
-
-def register() -> None:
-    """Register the scenarios of `SINGLE`; Gymnasium calls this in the namespace ``ugat_marl``."""
-    for name in SINGLE:
-        full = f"ugat_marl/{name}"
-        if full not in gymnasium.registry:
-            gymnasium.register(
-                id=full, entry_point="ugat_marl.envs.single:SingleEnv", kwargs={"scenario": name}
-            )

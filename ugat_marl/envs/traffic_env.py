@@ -29,6 +29,7 @@ from ugat_marl.envs.actuators import Actuators
 from ugat_marl.envs.objectives import Objectives
 from ugat_marl.envs.observations import Observer, joint_space
 from ugat_marl.envs.options import EnvKeywords, EnvOptions, with_env_keywords
+from ugat_marl.envs.registration import register_single
 from ugat_marl.envs.rendering import NetworkRenderer
 from ugat_marl.envs.rewards import Rewarder
 from ugat_marl.envs.sensors import Sensors
@@ -39,6 +40,8 @@ from ugat_marl.simulation import Simulator, Snapshot, launch_of, simulator_of
 
 if TYPE_CHECKING:
     from ugat_marl.envs.description import Description
+
+register_single()
 
 
 class TrafficEnv(ParallelEnv[str, Any, Any]):
