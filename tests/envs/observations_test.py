@@ -11,8 +11,17 @@ import numpy as np
 import pytest
 
 from ugat_marl.data import AgentLayout
+from ugat_marl.effects import ControllerPart
+from ugat_marl.effects.sensors import (
+    CountingNoise,
+    DetectionZone,
+    DetectorFailure,
+    LostReadings,
+    ObservationDelay,
+)
 from ugat_marl.envs import OBSERVATION_UNITS, Observer
 from ugat_marl.envs.rewards import IntersectionView, Rewarder
+from ugat_marl.envs.sensors import Sensors
 from ugat_marl.errors import OptionError, UnknownNameError
 from ugat_marl.scenarios import Intersection, Lane, Link, Network
 from ugat_marl.simulation import Snapshot
@@ -252,3 +261,50 @@ def test_commands_follow_with_the_age_of_the_green_the_latest_first() -> None:
     assert remembered()[0][-1] == 1.0  # older than a minute
     memory.reset([0, 0, 0])
     assert remembered()[0] == [0, 0, 0, 0, 0, 0, 0]
+
+
+def views_through(*effects: ControllerPart, snapshots: int = 1) -> IntersectionView:
+    """View of intersection A that a function gets behind these effects, at the last snapshot."""
+    views: list[IntersectionView] = []
+
+    def features(view: IntersectionView) -> list[float]:
+        views.append(view)
+        return [0.0]
+
+    queued = replace(
+        SEEN,
+        mean_speed_mps=np.full(len(LANES), 2.0),
+        queued_upstream=np.full(len(LANES), 3.0),
+        near=np.tile([[2.0], [1.0], [9.0], [12.9]], len(LANES)),
+    )
+    observer = Observer(NETWORK, features)
+    sensors = Sensors.of(effects, NETWORK, 10.0)
+    assert sensors is not None
+    sensors.reset(1)
+    for _ in range(snapshots):
+        seen = sensors.see(queued)
+    views.clear()
+    observer.observe(seen, PHASES)
+    return views[0]
+
+
+@pytest.mark.parametrize(
+    "effect", [DetectorFailure(1.0), ObservationDelay(20.0), LostReadings(1.0)]
+)
+def test_a_function_sees_empty_lanes_where_no_counts_arrive(effect: ControllerPart) -> None:
+    view = views_through(effect, snapshots=2)
+    assert not np.any([view.vehicles, view.halting, view.waiting_s, view.outgoing_vehicles])
+    assert view.queued_upstream.tolist() == [0, 0]
+    assert view.mean_speed_mps.tolist() == [13.9, 13.9]
+    late = views_through(ObservationDelay(20.0), snapshots=3)
+    assert late.vehicles.tolist() == [5, 30] and late.queued_upstream.tolist() == [3, 3]
+    assert late.mean_speed_mps == pytest.approx([2.0, 2.0])
+
+
+def test_a_function_sees_the_zone_and_the_noise_that_others_see() -> None:
+    view = views_through(DetectionZone(30.0))
+    assert view.vehicles.tolist() == [2, 2] and view.queued_upstream.tolist() == [0, 0]
+    assert view.mean_speed_mps == pytest.approx([1.0, 1.0])
+    view = views_through(CountingNoise(0.5))
+    assert view.queued_upstream / 3 == pytest.approx(view.vehicles / [5, 30])
+    assert view.vehicles.tolist() != [5, 30] and view.mean_speed_mps == pytest.approx([2.0, 2.0])

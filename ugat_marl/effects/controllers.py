@@ -42,9 +42,10 @@ class Reading:
     """Measured lanes at one decision, on the way to a controller.
 
     Attributes:
-        counts: Vehicles, halting vehicles and waiting times in s, ``(3, lanes)``.
-        near: Counts in the detection zones before the stop lines, ``(3, lanes)``; empty if no
-            sensor has a zone.
+        counts: Vehicles, halting vehicles, waiting times in s, vehicles queued upstream, and how
+            many m/s the mean speed is below the speed limit, ``(5, lanes)``. An empty lane is 0.
+        near: Vehicles, halting vehicles, waiting times and m/s below the speed limit, in the
+            detection zones before the stop lines, ``(4, lanes)``; empty if no sensor has a zone.
         mean_left: Field `mean_left` of `ugat_marl.simulation.Snapshot`, ``(lanes,)``; empty if not
             measured.
     """

@@ -1,7 +1,8 @@
 """Effects on the counts that controllers see: the observation gap.
 
 Traffic, rewards and scores stay the same. The *counts* of a lane are its vehicles, its halting
-vehicles and their waiting time. Each effect makes a `Sensor` that changes the counts.
+vehicles, their waiting time and the vehicles queued upstream; its mean speed is seen with them.
+Each effect makes a `Sensor` that changes them. Errors of counting do not change the mean speed.
 """
 
 from __future__ import annotations
@@ -48,8 +49,9 @@ class _Noise(Sensor):
 
     def read(self, reading: Reading) -> Reading:
         drawn = self._random.standard_normal(reading.counts.shape[1])
-        factors = np.maximum(1.0 + self._share * drawn, 0.0)
-        return replace(reading, counts=reading.counts * factors)
+        counts = reading.counts.copy()
+        counts[:4] *= np.maximum(1.0 + self._share * drawn, 0.0)
+        return replace(reading, counts=counts)
 
 
 @dataclass(frozen=True)
@@ -158,7 +160,10 @@ class _Zone(Sensor):
         )
 
     def read(self, reading: Reading) -> Reading:
-        return replace(reading, counts=reading.near * self._at_stop_line)
+        vehicles, halting, waiting_s, below_limit_mps = reading.near * self._at_stop_line
+        upstream = np.zeros_like(vehicles)  # outside of the zone
+        seen = np.array([vehicles, halting, waiting_s, upstream, below_limit_mps])
+        return replace(reading, counts=seen)
 
 
 @dataclass(frozen=True)

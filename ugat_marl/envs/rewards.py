@@ -20,6 +20,9 @@ RewardName = Literal["total-queue", "queue", "pressure", "waiting"]
 class IntersectionView:
     """Part of a snapshot that belongs to one intersection, lanes in its own order.
 
+    Functions that make observations get what effects on observations let through; functions that
+    make rewards get what is measured.
+
     Attributes:
         time_s: Time on the scenario's clock, in s.
         vehicles: Number of vehicles per incoming lane.

@@ -205,7 +205,7 @@ class LibsumoSimulator:
             waiting_s=waiting_s,
             departed=departed,
             backlog=backlog,
-            near=_near_the_end(lanes, names, self._launch.zone_m),
+            near=_near_the_end(lanes, names, self._limits, self._launch.zone_m),
             queued_upstream=upstream,
         )
 
@@ -216,24 +216,32 @@ class LibsumoSimulator:
         raise SimulatorError(f"{action}: {said}") from None
 
 
-def _near_the_end(lanes: Sequence[str], taken: Sequence[str], zone_m: float) -> NDArray[np.float64]:
-    """Return vehicles, halting vehicles and waiting times at the end of each lane, ``(3, lanes)``.
+def _near_the_end(
+    lanes: Sequence[str], taken: Sequence[str], limits_mps: _Floats, zone_m: float
+) -> _Floats:
+    """Return the vehicles at the end of each lane, as `Snapshot.near`, ``(4, lanes)``.
 
     Args:
         lanes: All lanes.
         taken: Lanes with vehicles.
+        limits_mps: Speed limit of each lane.
         zone_m: Length of the zone in metres; with 0 the result is an empty array.
     """
     if not zone_m:
         return np.empty(0)
-    near = np.zeros((3, len(lanes)))
+    near = np.zeros((4, len(lanes)))
     places = {lane: place for place, lane in enumerate(lanes)}
     for lane in taken:
         begins = libsumo.lane.getLength(lane) - zone_m
         for name in libsumo.lane.getLastStepVehicleIDs(lane):
             if libsumo.vehicle.getLanePosition(name) >= begins:
-                halts = float(libsumo.vehicle.getSpeed(name) < HALTING_MPS)
-                near[:, places[lane]] += (1.0, halts, libsumo.vehicle.getWaitingTime(name))
+                place, speed_mps = places[lane], libsumo.vehicle.getSpeed(name)
+                waiting_s, slower_mps = (
+                    libsumo.vehicle.getWaitingTime(name),
+                    limits_mps[place] - speed_mps,
+                )
+                near[:, place] += (1.0, speed_mps < HALTING_MPS, waiting_s, slower_mps)
+    near[3] /= np.maximum(near[0], 1.0)
     return near
 
 

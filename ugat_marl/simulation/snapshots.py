@@ -29,8 +29,9 @@ class Snapshot:
             the seconds since the last snapshot, ``(lanes,)``. It is larger if vehicles leave
             earlier. Empty unless the simulator was started with `crossings`, and in the first
             snapshot.
-        near: Vehicles, halting vehicles and waiting time in the last `zone_m` metres of each lane,
-            ``(3, lanes)``. Empty unless the simulator was started with `zone_m`.
+        near: Vehicles, halting vehicles, waiting time and m/s of the mean speed below the limit, in
+            the last `zone_m` metres of each lane, ``(4, lanes)``. Empty unless the simulator was
+            started with `zone_m`.
         queued_upstream: Vehicles that queue for a lane but are not in `vehicles`: they halt on
             roads upstream of it, up to the light before, or wait to enter the network,
             ``(lanes,)``; see `ugat_marl.simulation.upstream`. Empty unless the simulator was
