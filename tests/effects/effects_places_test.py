@@ -27,6 +27,7 @@ from ugat_marl.effects import (
     late_greens,
     load_scenario,
     parse_domain,
+    scenario_in_domain,
     shift_parking,
     with_late_green_programmes,
 )
@@ -354,3 +355,27 @@ def test_an_effect_in_a_scenario_file(text: str, tmp_path: Path) -> None:
 def test_unknown_places(text: str, message: str) -> None:
     with pytest.raises(UnknownNameError, match=message):
         apply_effects(load_scenario("single-v1"), parse_domain(text))
+
+
+@pytest.mark.parametrize(
+    "domain",
+    [
+        "lane_closure=northA_A1_0,{0},{1}",
+        "demand_surge=*,{0},{1},2",
+        "stuck=northA_A1_0,{0},{1}",
+        "incident={0},60",
+    ],
+)
+def test_an_effect_outside_of_the_episode_is_refused(domain: str) -> None:
+    scenario = load_scenario("single-v1")  # 0 s to 3600 s
+    scenario_in_domain(scenario, domain.format(3590, 3700))  # an overlap is enough
+    late = domain.format(3600, 3700)
+    with pytest.raises(OptionError, match=r"from 3600 s to 3\d+ s.*'single-v1' from 0 s to 3600 s"):
+        scenario_in_domain(scenario, late)
+    early = domain.format(600, 700)
+    with pytest.raises(OptionError, match=r"from 600 s to \d+ s.* from 0 s to 300 s"):
+        parallel_env("single-v1", early, duration_s=300.0)
+    effects = tuple(effect.record() for effect in parse_domain(late))
+    listed = scenario.settings.model_copy(update={"effects": effects})
+    with pytest.raises(OptionError, match="longer duration_s"):
+        load_scenario(replace(scenario, settings=listed))

@@ -61,7 +61,7 @@ def dead(street: Sensors) -> NDArray[np.bool_]:
 
 def snapshot(network: Network, vehicles: float, halting: float, waiting: float = 0.0) -> Snapshot:
     lanes = np.ones(len(network.lane_table().ids))
-    near = np.array([lanes * vehicles / 2, lanes * halting / 2, lanes * waiting / 2])
+    near = np.array([lanes * vehicles / 2, lanes * halting / 2, lanes * waiting / 2, lanes])
     return Snapshot(
         10.0, lanes * vehicles, lanes * halting, lanes * 3.0, lanes * waiting, 5, 0, near=near
     )
@@ -298,6 +298,8 @@ class _Looks:
             assert self.env.seen.halting[place] == slow
             waited = sum(api.getWaitingTime(name) for name in close)
             assert self.env.seen.waiting_s[place] == pytest.approx(waited)
+            speeds = [api.getSpeed(name) for name in close] or [libsumo.lane.getMaxSpeed(lane)]
+            assert self.env.seen.mean_speed_mps[place] == pytest.approx(np.mean(speeds))
             self.compared += self.env.snapshot.vehicles[place] != len(close)
         found = observations["signal_0"][: len(near)] * COUNT_SCALE
         assert found == pytest.approx(near)

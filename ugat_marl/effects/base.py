@@ -132,6 +132,15 @@ class Effect(ControllerPart):
         """Return a scenario in which the effect is present; `scenario` itself does not change."""
         raise NotImplementedError(f"{type(self).__name__} has no apply()")
 
+    def window(self, scenario: Scenario) -> tuple[float, float] | None:
+        """Return the begin and end of the effect on the scenario's clock, in s.
+
+        Return None for an effect without times.
+        """
+        del scenario
+        begin, end = getattr(self, "begin_s", None), getattr(self, "end_s", None)
+        return None if begin is None or end is None else (begin, end)
+
     @staticmethod
     def apply_all(scenario: Scenario, effects: Sequence[Any]) -> Scenario:
         """Apply effects that have this method in common, one after the other."""

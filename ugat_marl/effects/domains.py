@@ -16,7 +16,13 @@ from typing import Any, Literal, get_args
 
 from ugat_marl.effects.base import Effect
 from ugat_marl.effects.sensors import DetectionZone
-from ugat_marl.effects.table import EFFECTS, apply_effects, effect_from_text, load_scenario
+from ugat_marl.effects.table import (
+    EFFECTS,
+    apply_effects,
+    effect_from_text,
+    load_scenario,
+    refuse_outside,
+)
 from ugat_marl.errors import OptionError, ScenarioError, UnknownNameError, nearest
 from ugat_marl.scenarios import Scenario
 
@@ -293,7 +299,8 @@ def scenario_in_domain(scenario: Scenario, domain: Domain) -> Scenario:
 
     Raises:
         UnknownNameError: The domain or an effect does not exist.
-        OptionError: An effect has an impossible value, or two of them exclude each other.
+        OptionError: An effect has an impossible value or lies outside of the scenario's time, or
+            two of them exclude each other.
         ScenarioError: A scenario named as a domain cannot be read or has other roads.
     """
     if (path := domain_path(domain)) is not None:
@@ -304,7 +311,18 @@ def scenario_in_domain(scenario: Scenario, domain: Domain) -> Scenario:
                 "a domain must be on the same network, or a policy means nothing in it"
             )
         return _checked(other)
+    check_windows(scenario, domain)
     return _checked(apply_effects(scenario, parse_domain(domain)))
+
+
+def check_windows(scenario: Scenario, domain: Domain) -> None:
+    """Refuse a domain with an effect whose times lie wholly outside of the scenario's.
+
+    Raises:
+        OptionError: The effect would change nothing.
+    """
+    if domain_path(domain) is None:
+        refuse_outside(scenario, parse_domain(domain))
 
 
 def _checked(scenario: Scenario) -> Scenario:

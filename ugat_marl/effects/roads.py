@@ -89,8 +89,12 @@ class Incident(Effect):
             )
         wide = [lane for lane in lanes if len(places.edges[places.lanes[lane].edge]) > 1]
         lane = min(wide or lanes, key=lambda lane: hashed_uniform(self.name, lane))
+        return LaneClosure(lane, *self.window(scenario)).apply(scenario)
+
+    def window(self, scenario: Scenario) -> tuple[float, float]:
+        """Return the begin and end of the incident on the scenario's clock, in s."""
         begin = scenario.settings.begin_s + self.after_s
-        return LaneClosure(lane, begin, begin + self.lasts_s).apply(scenario)
+        return begin, begin + self.lasts_s
 
 
 @dataclass(frozen=True)

@@ -173,7 +173,26 @@ def load_scenario(name: str | Path | Scenario) -> Scenario:
     where = f" in scenario {scenario.id!r}"
     effects = [effect_from_record(record, where) for record in scenario.settings.effects]
     plain = replace(scenario, settings=scenario.settings.model_copy(update={"effects": ()}))
+    refuse_outside(plain, effects)
     return apply_effects(plain, effects)
+
+
+def refuse_outside(scenario: Scenario, effects: Iterable[Effect]) -> None:
+    """Refuse effects whose times lie wholly outside of the scenario's.
+
+    Raises:
+        OptionError: An effect would change nothing.
+    """
+    begin = scenario.settings.begin_s
+    end = begin + scenario.settings.duration_s
+    for effect in effects:
+        window = effect.window(scenario)
+        if window is not None and (window[0] >= end or window[1] <= begin):
+            raise OptionError(
+                f"effect {effect}: it lasts from {window[0]:g} s to {window[1]:g} s, and the "
+                f"episode of scenario {scenario.id!r} from {begin:g} s to {end:g} s, so it would "
+                "change nothing; give times within the episode, or a longer duration_s"
+            )
 
 
 def detector_effects(scenario: Scenario) -> tuple[Effect, ...]:

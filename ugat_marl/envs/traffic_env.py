@@ -16,6 +16,7 @@ from ugat_marl.data import AgentLayout, EpisodeRecorder, Scores
 from ugat_marl.effects import (
     ControllerPart,
     Domain,
+    check_windows,
     controller_effects,
     domain_label,
     late_greens,
@@ -80,6 +81,7 @@ class TrafficEnv(ParallelEnv[str, Any, Any]):
         self.scenario = scenario_in_domain(scenario, domain)
         if options.duration_s is not None:
             self.scenario = self.scenario.with_duration(options.duration_s)
+            check_windows(self.scenario, domain)
         self.domain = domain_label(domain)
         self.options = options
         self.render_mode = options.render_mode
