@@ -32,7 +32,7 @@ from ugat_marl.effects import (
     with_late_green_programmes,
 )
 from ugat_marl.errors import OptionError, ScenarioError, UnknownNameError
-from ugat_marl.scenarios import Network, Scenario, check_demand
+from ugat_marl.scenarios import Network, Scenario, check_demand, driven_routes
 from ugat_marl.simulation import LibsumoSimulator, launch_of
 
 Crossing = Callable[..., Path]
@@ -379,3 +379,24 @@ def test_an_effect_outside_of_the_episode_is_refused(domain: str) -> None:
     listed = scenario.settings.model_copy(update={"effects": effects})
     with pytest.raises(OptionError, match="longer duration_s"):
         load_scenario(replace(scenario, settings=listed))
+
+
+def test_vehicles_that_block_a_lane_are_no_travellers(
+    simulator: LibsumoSimulator, crossing: Crossing, tmp_path: Path
+) -> None:
+    plain = load_scenario(crossing())
+    network = Network.read(plain)
+    blocked = apply_effects(plain, [LaneClosure("S_C_0", 20, 60), Parking("W_C_0", 180, 20)])
+    named = (
+        plain.routes[0].read().replace(b'flow id="north"', b'flow id="parking.north"')
+    )  # somebody's own name
+    own = replace(plain, routes=(plain.routes[0].edited(named),))
+    counts: list[tuple[int, int, int]] = []
+    for number, scenario in enumerate((plain, blocked, own)):
+        launch = launch_of(scenario, 1, tmp_path / str(number), list(network.lanes))
+        simulator.start(launch)
+        simulator.advance(200.0, {})
+        trips = simulator.finish()
+        drives = sum(1 for _ in driven_routes(scenario))
+        counts.append((len(trips.finished), check_demand(scenario, network).vehicles, drives))
+    assert counts[0][0] > 0 and counts[0] == counts[1] == counts[2]

@@ -14,7 +14,7 @@ from itertools import islice
 from typing import IO
 
 from ugat_marl.files import Draft, child_texts, scratch, xml_bytes
-from ugat_marl.scenarios import Document, Scenario, parse_time
+from ugat_marl.scenarios import Document, Scenario, is_blocker, parse_time
 
 DEFAULTS_FILE = "default-types.add.xml"
 """File with SUMO's default vehicle types, so that effects can change them."""
@@ -25,8 +25,6 @@ DEFAULT_TYPES = (
 """SUMO's default vehicle types. Vehicles without a type use the first one."""
 
 DEPARTING = frozenset({"vehicle", "trip", "flow"})
-BLOCKERS = ("closure.", "parking.")
-"""Beginnings of the ids of vehicles that block a lane and are no part of the demand."""
 
 _SORTED = DEPARTING | {"person", "personFlow", "container", "containerFlow"}
 _OVERLAP = 256
@@ -143,7 +141,8 @@ def with_default_types(scenario: Scenario) -> Scenario:
 
 def is_demand(element: Root) -> bool:
     """Return True if an element is a vehicle, trip or flow of the demand."""
-    return element.tag in DEPARTING and not element.get("id", "").startswith(BLOCKERS)
+    blocks = is_blocker(element.get("id", ""), element.get("type", ""))
+    return element.tag in DEPARTING and not blocks
 
 
 def depart_s(element: Root) -> float:

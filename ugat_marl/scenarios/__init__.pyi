@@ -76,6 +76,7 @@ from .programs import sumo_program as sumo_program
 from .routes import demand_as_vehicles as demand_as_vehicles
 from .routes import departures as departures
 from .routes import driven_routes as driven_routes
+from .routes import is_blocker as is_blocker
 from .scenario import Document as Document
 from .scenario import Scenario as Scenario
 from .scenario import read_scenario as read_scenario

@@ -9,7 +9,7 @@ from ugat_marl.errors import ScenarioError
 from ugat_marl.files import Tag
 from ugat_marl.progress import Reporter
 from ugat_marl.scenarios.network import Network
-from ugat_marl.scenarios.routes import OwnEdges
+from ugat_marl.scenarios.routes import OwnEdges, is_blocker
 from ugat_marl.scenarios.scenario import Document, Scenario
 from ugat_marl.scenarios.settings import parse_time
 
@@ -80,7 +80,10 @@ def check_demand(
                 if tag.name == "flow":
                     flows += depart < end and begin < _end_s(tag, document)
                 else:
-                    vehicles += begin <= depart < end
+                    blocks = is_blocker(
+                        tag.attributes.get("id", ""), tag.attributes.get("type", "")
+                    )
+                    vehicles += begin <= depart < end and not blocks
                 if in_routes and not whole and latest > end + SPARE_S:
                     routed &= not singles.lost
                     break

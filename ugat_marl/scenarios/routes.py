@@ -15,6 +15,19 @@ from ugat_marl.scenarios.programs import convert
 from ugat_marl.scenarios.scenario import Document, Scenario
 from ugat_marl.scenarios.settings import parse_time
 
+BLOCKERS = ("closure.", "parking.")
+"""Beginnings of the ids of vehicles that effects add to block a lane."""
+
+
+def is_blocker(vehicle: str, vehicle_type: str) -> bool:
+    """Return True for a vehicle that blocks a lane and is no part of the demand.
+
+    Args:
+        vehicle: Id of the vehicle.
+        vehicle_type: Its type. Blockers have a type of their own, and its name begins their ids.
+    """
+    return vehicle.startswith(BLOCKERS) and vehicle.rpartition(".")[0] == vehicle_type
+
 
 class OwnEdges:
     """Test of a route file: does it hold only single vehicles with their own edges?"""
@@ -67,6 +80,8 @@ def departures(
 ) -> Iterator[tuple[str, float, list[str]]]:
     """Yield name, departure in s, and roads of every vehicle that departs before the end.
 
+    Vehicles that block a lane for an effect are left out.
+
     Args:
         scenario: Scenario that has passed `check_demand`.
         routed: True if its route files hold only single vehicles with their own edges. Otherwise
@@ -76,14 +91,15 @@ def departures(
     begin = scenario.settings.begin_s
     end = begin + scenario.settings.duration_s
     for document in scenario.routes if routed else demand_as_vehicles(scenario).routes:
-        name, depart = "", 0.0
+        name, depart, blocks = "", 0.0, False
         for tag in document.scan(reporter):
             if tag.name == "vehicle":
                 name, text = tag.attributes.get("id", ""), tag.attributes.get("depart", "0")
                 depart = parse_time(text) if text[:1].isdigit() else begin
+                blocks = is_blocker(name, tag.attributes.get("type", ""))
                 if depart >= end:  # vehicles are sorted by departure
                     break
-            elif tag.name == "route" and "id" not in tag.attributes:
+            elif tag.name == "route" and "id" not in tag.attributes and not blocks:
                 yield name, depart, tag.attributes.get("edges", "").split()
 
 

@@ -65,6 +65,8 @@ class Snapshot:
 class Trips:
     """All vehicles due in an episode, finished or not, as SUMO reports them.
 
+    Vehicles that effects add to block a lane are left out.
+
     Attributes:
         travel_time_s: Time from the scheduled departure to the arrival, or to the end of the
             episode, ``(vehicles,)``. Waiting outside the network counts.

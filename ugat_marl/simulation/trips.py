@@ -9,6 +9,7 @@ from pathlib import Path
 import numpy as np
 
 from ugat_marl.errors import SimulatorError
+from ugat_marl.scenarios import is_blocker
 from ugat_marl.simulation.snapshots import Trips
 
 STATISTICS = "statistics.xml"
@@ -26,6 +27,8 @@ def measuring_options(directory: Path) -> list[str]:
 
 def read_trips(path: Path, persons: Mapping[str, float] | None = None) -> Trips:
     """Read SUMO's tripinfo file, unfinished and undeparted vehicles included.
+
+    Vehicles that block a lane for an effect are no travellers and are left out.
 
     Args:
         path: The file.
@@ -52,7 +55,8 @@ def _trips_in(path: Path, persons: Mapping[str, float]) -> Trips:
     for _, element in ET.iterparse(path):
         if element.tag == "emissions":  # ends before the trip it belongs to
             co2_mg = float(element.get("CO2_abs", "0"))
-        if element.tag == "tripinfo":
+        blocks = is_blocker(element.get("id", ""), element.get("vType", ""))
+        if element.tag == "tripinfo" and not blocks:
             entered = float(element.get("depart", "-1")) >= 0
             finished = float(element.get("arrival", "-1")) >= 0
             waited = float(element.get("departDelay", "0"))
