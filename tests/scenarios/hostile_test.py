@@ -216,7 +216,7 @@ def test_the_bait_works(crossing: Crossing, around: Path, tmp_path: Path) -> Non
         ("scale", "1_0", "not a number"),
         ("scale", "\u0661", "not a number"),
         ("routing-algorithm", "/etc/passwd", "not a plain word"),
-        ("max-depart-delay", "soon", "not a number"),
+        ("time-to-impatience", "soon", "not a number"),
     ],
 )
 def test_values_of_options(option: str, value: str, fault: str) -> None:

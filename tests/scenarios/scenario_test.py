@@ -261,7 +261,7 @@ def test_a_sumocfg_needs_nothing_else(crossing: Crossing) -> None:
         directory,
         INPUT + '<time><begin value="100"/><end value="0:05:00"/><step-length value="0.5"/></time>'
         '<processing><lateral-resolution value="0.8"/><time-to-teleport value="300"/>'
-        '<ignore-route-errors value="true"/></processing>'
+        '<max-depart-delay value="10"/><ignore-route-errors value="true"/></processing>'
         '<report><no-step-log value="true"/><error-log value="/tmp/e"/></report>'
         '<output><tripinfo-output value="/tmp/x"/></output>',
     )
@@ -269,7 +269,7 @@ def test_a_sumocfg_needs_nothing_else(crossing: Crossing) -> None:
     assert scenario.id == "city"
     settings = scenario.settings
     assert (settings.begin_s, settings.duration_s, settings.step_length_s) == (100, 200, 0.5)
-    # What concerns output, seeds and teleporting is the suite's own.
+    # What concerns output, seeds, teleporting and waiting to enter is the suite's own.
     assert settings.sumo == {"lateral-resolution": "0.8", "ignore-route-errors": "true"}
 
 
@@ -391,6 +391,7 @@ def test_what_is_no_time(text: str) -> None:
         ("end", False),
         ("step-length", False),
         ("time-to-teleport", False),
+        ("max-depart-delay", False),
         ("time-to-teleport.highways", True),
         ("no-warnings", False),
         ("remote-port", False),

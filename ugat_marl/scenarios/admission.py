@@ -84,7 +84,7 @@ _TIMES = _words(
     device.rerouting.cch-update-threshold.constant device.rerouting.period
     device.rerouting.pre-period device.rerouting.threshold.constant
     device.taxi.dispatch-keep-unreachable device.taxi.dispatch-period ignore-junction-blocker
-    intermodal-collision.stoptime keep-after-arrival lanechange.duration max-depart-delay
+    intermodal-collision.stoptime keep-after-arrival lanechange.duration
     meso-minor-penalty meso-recheck meso-tauff meso-taufj meso-taujf meso-taujj
     pedestrian.striping.jamtime pedestrian.striping.jamtime.crossing
     pedestrian.striping.jamtime.narrow person-device.rerouting.period persontrip.taxi.waiting-time
@@ -109,7 +109,11 @@ _WORDS = _words(
     """
 )
 OPTIONS = _SWITCHES | _NUMBERS | _TIMES | _WORDS
-"""Options of SUMO that a scenario may set: they shape the traffic and name no file or port."""
+"""Options of SUMO that a scenario may set: they shape the traffic and name no file or port.
+
+``max-depart-delay`` is none of them. It drops vehicles that find no space to enter. SUMO reports
+them nowhere, so a full network would have shorter travel times.
+"""
 
 _MOST_SCALE = 100.0
 """Largest value of the option ``scale``: SUMO holds so many copies of every vehicle."""
