@@ -3,13 +3,15 @@
 from __future__ import annotations
 
 import re
+from collections.abc import Callable
 from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 import pytest
 
 from ugat_marl.effects import load_scenario
-from ugat_marl.scenarios import Scenario, draw_day
+from ugat_marl.scenarios import Scenario, demand_as_vehicles, draw_day, read_scenario
 
 
 def vehicles(share: float, seed: int) -> int:
@@ -48,3 +50,103 @@ def test_vehicles_that_depart_before_the_begin_are_in_no_day() -> None:
     assert min(day.min() for day in days) >= 1800
     mean = np.mean([np.count_nonzero(day < 3600) for day in days])
     assert abs(mean - expected) < 3 * (expected / len(days)) ** 0.5  # Poisson
+
+
+def test_vehicles_that_depart_after_the_end_come_into_no_day() -> None:
+    whole = load_scenario("single-v1")
+    scenario = whole.with_duration(600)  # the demand goes on, and it rises
+    depart = departures(scenario)
+    expected = np.count_nonzero(depart < 600)
+    days = [departures(draw_day(scenario, seed)) for seed in range(40)]
+    mean = np.mean([np.count_nonzero(day < 600) for day in days])
+    assert abs(mean - expected) < 2 * (expected / len(days)) ** 0.5  # Poisson
+    after = np.mean([np.count_nonzero(day >= 600) for day in days])
+    assert after == pytest.approx(np.count_nonzero(depart >= 600), rel=0.02)
+
+
+PERSONS = """
+    <person id="one" depart="15"><walk edges="S_C"/></person>
+    <personFlow id="many" begin="20" end="100" number="4"><walk edges="S_C"/></personFlow>
+"""
+CAR = '<vehicle id="v{}" depart="{}" type="{}"><route edges="S_C C_N"/></vehicle>'
+
+
+def with_additional(crossing: Callable[..., Path], additional: str, vehicles: str) -> Scenario:
+    path = crossing(vehicles=vehicles, toml=lambda text: f'additional = ["x.add.xml"]\n{text}')
+    (path / "x.add.xml").write_text(f"<additional>{additional}</additional>")
+    return read_scenario(path)
+
+
+def tags(scenario: Scenario) -> list[str]:
+    """Return elements that are not vehicles, with their ids, in all files but the network."""
+    return sorted(
+        f"{tag.name} {tag.attributes.get('id', '')}"
+        for document in (*scenario.routes, *scenario.additional)
+        for tag in document.scan()
+        if tag.parent and tag.name not in ("vehicle", "trip", "flow", "walk")
+        and (tag.name != "route" or "id" in tag.attributes)
+    )  # fmt: skip
+
+
+@pytest.mark.parametrize(
+    "demand",
+    [
+        "".join(CAR.format(n, 10 * n, "mix") for n in range(9)),
+        '<flow id="f" begin="0" end="100" number="5" type="mix" from="S_C" to="C_N"/>',
+        '<trip id="t" depart="3" type="car" from="S_C" to="C_N"/>',
+    ],
+    ids=["vehicles", "flow", "trip"],
+)
+def test_a_drawn_day_keeps_all_that_is_not_a_vehicle(
+    crossing: Callable[..., Path], demand: str
+) -> None:
+    types = """
+        <vType id="slow" maxSpeed="5"/>
+        <vTypeDistribution id="mix"><vType id="a" probability="0.5"/>
+            <vType id="b" probability="0.5"/></vTypeDistribution>
+        <rerouter id="closed" edges="S_C"><interval begin="0" end="9">
+            <closingLaneReroute id="S_C_0" disallow="bus"/></interval></rerouter>
+    """
+    scenario = with_additional(crossing, types, demand + PERSONS)
+    for derived in (demand_as_vehicles(scenario), draw_day(scenario, 1), draw_day(scenario, 2)):
+        assert tags(derived) == tags(scenario)
+
+
+def test_demand_in_additional_files_is_drawn_and_counted_once(
+    crossing: Callable[..., Path],
+) -> None:
+    beside = '<flow id="h" begin="0" end="180" number="20" from="S_C" to="C_N"/>'
+    single = CAR.format(0, 10, "car")
+    for demand, expected in ((single, 21), ('<flow id="f" route="north" number="5"/>', 25)):
+        demand = demand.replace('number="5"', 'begin="0" end="100" number="5"')
+        scenario = with_additional(crossing, beside, demand)
+        routed = demand_as_vehicles(scenario)
+        files = (*routed.routes, *routed.additional)
+        texts = b"".join(document.read() for document in files)
+        assert texts.count(b"<vehicle ") == expected
+        assert b"<flow " not in texts
+        days = [draw_day(scenario, seed) for seed in range(30)]
+        assert all(b"<flow" not in x.read() for day in days for x in day.additional)
+        mean = np.mean([day.routes[0].read().count(b"<vehicle ") for day in days])
+        assert abs(mean - expected) < 3 * (expected / len(days)) ** 0.5
+
+
+def test_vehicles_that_block_a_lane_are_the_same_on_every_day(
+    crossing: Callable[..., Path],
+) -> None:
+    blocker = CAR.format(0, 10, "car").replace('"v0"', '"closure.S_C_0.0"')
+    scenario = with_additional(crossing, "", blocker + CAR.format(1, 20, "car"))
+    days = [draw_day(scenario, seed) for seed in range(8)]
+    blocked = [b"".join(x.read() for x in day.routes) for day in days]
+    assert all(text.count(b'"closure.S_C_0.0" depart="10"') == 1 for text in blocked)
+
+
+def test_drivers_without_a_type_follow_a_default_type_of_an_additional_file(
+    crossing: Callable[..., Path],
+) -> None:
+    default = '<vType id="DEFAULT_VEHTYPE" speedFactor="0.5" speedDev="0"/>'
+    cars = "".join(CAR.format(n, n, "car").replace(' type="car"', "") for n in range(9))
+    day = draw_day(with_additional(crossing, default, cars), 1)
+    factors = re.findall(rb'speedFactor="([\d.]+)"', day.routes[0].read())
+    assert factors
+    assert {float(factor) for factor in factors} == {0.5}

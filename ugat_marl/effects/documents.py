@@ -14,7 +14,14 @@ from itertools import islice
 from typing import IO
 
 from ugat_marl.files import Draft, child_texts, scratch, xml_bytes
-from ugat_marl.scenarios import Document, Scenario, is_blocker, parse_time
+from ugat_marl.scenarios import (
+    DEPARTING,
+    TRAVELLERS,
+    Document,
+    Scenario,
+    is_blocker,
+    parse_time,
+)
 
 DEFAULTS_FILE = "default-types.add.xml"
 """File with SUMO's default vehicle types, so that effects can change them."""
@@ -24,9 +31,7 @@ DEFAULT_TYPES = (
 )  # fmt: skip
 """SUMO's default vehicle types. Vehicles without a type use the first one."""
 
-DEPARTING = frozenset({"vehicle", "trip", "flow"})
-
-_SORTED = DEPARTING | {"person", "personFlow", "container", "containerFlow"}
+_SORTED = DEPARTING | TRAVELLERS
 _OVERLAP = 256
 """Largest length of a searched text, in bytes."""
 _RUN = 16 << 20

@@ -73,6 +73,8 @@ from .phases import conflicting_greens as conflicting_greens
 from .phases import turn_of as turn_of
 from .programs import run_program as run_program
 from .programs import sumo_program as sumo_program
+from .routes import DEPARTING as DEPARTING
+from .routes import TRAVELLERS as TRAVELLERS
 from .routes import demand_as_vehicles as demand_as_vehicles
 from .routes import departures as departures
 from .routes import driven_routes as driven_routes

@@ -18,7 +18,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ugat_marl.files import parse_xml, xml_bytes
-from ugat_marl.scenarios.routes import demand_as_vehicles
+from ugat_marl.scenarios.routes import demand_as_vehicles, is_blocker
 from ugat_marl.scenarios.scenario import Document, Scenario
 from ugat_marl.scenarios.settings import parse_time
 from ugat_marl.seeding import numpy_generator
@@ -29,6 +29,7 @@ DEFAULT_SPEED = (1.0, 0.1, 0.2, 2.0)
 """SUMO's normal distribution of speedFactor for cars: mean, standard deviation, least, greatest."""
 
 _TYPES, _VEHICLES = "types.add.xml", "vehicles.rou.xml"
+_TYPE_TAGS = ("vType", "vTypeDistribution")
 _NORMAL = re.compile(r"norm(c?)\(([^)]*)\)")
 
 
@@ -37,7 +38,9 @@ class _Vehicles:
     """Vehicles of a demand as text, ready to be written in any order.
 
     Attributes:
-        types: Additional file with the vehicle types.
+        types: Additional file with the vehicle types of the route files.
+        others: Route files with everything else: persons, containers, named routes, and vehicles
+            that block a lane or wait for a person.
         depart_s: Departures, s, ``(vehicles,)``.
         names: Ids.
         heads: Remaining attributes of each ``<vehicle>`` tag, up to its ``>``.
@@ -47,6 +50,7 @@ class _Vehicles:
     """
 
     types: Document
+    others: tuple[Document, ...]
     depart_s: NDArray[np.float64]
     names: tuple[str, ...]
     heads: tuple[str, ...]
@@ -59,7 +63,9 @@ def draw_day(scenario: Scenario, seed: int, day_to_day: float = 0.0) -> Scenario
 
     The same seed gives the same vehicles, names and speedFactors. Effects applied afterwards do not
     change them, so two models can be compared on the same day. Vehicles that depart before the
-    scenario's begin are left out, as SUMO leaves them out.
+    scenario's begin are left out, as SUMO leaves them out. A shift across the begin or the end of
+    the scenario is mirrored there, so the mean number of vehicles within it is that of the demand.
+    Persons, and vehicles that block a lane or wait for a person, are the same every day.
 
     Args:
         scenario: Any scenario; `demand_as_vehicles` turns its trips and flows into vehicles.
@@ -68,7 +74,9 @@ def draw_day(scenario: Scenario, seed: int, day_to_day: float = 0.0) -> Scenario
             comes on top of the Poisson numbers; 0 for none.
     """
     scenario = demand_as_vehicles(scenario)
-    vehicles = _vehicles(tuple(document.read() for document in scenario.routes))
+    vehicles = _vehicles(
+        tuple(document.read() for document in scenario.routes), _types_beside(scenario)
+    )
     generator = numpy_generator(seed, "another day")
     begin = scenario.settings.begin_s
     end = begin + scenario.settings.duration_s
@@ -87,7 +95,8 @@ def draw_day(scenario: Scenario, seed: int, day_to_day: float = 0.0) -> Scenario
     for copy in range(min(int(copies.max(initial=0)), most)):
         departs = vehicles.depart_s + shifts[copy]
         departs = np.where(departs < begin, 2 * begin - departs, departs)
-        departs = np.where((departs >= end) & (vehicles.depart_s < end), 2 * end - departs, departs)
+        crosses = (departs >= end) != (vehicles.depart_s >= end)
+        departs = np.where(crosses, 2 * end - departs, departs)
         departs = np.maximum(departs, begin)
         factors = np.clip(mean + deviation * draws[copy], least, greatest)
         suffix = f"~{seed}.{copy}"  # new names: effects choose other vehicles every day
@@ -107,42 +116,72 @@ def draw_day(scenario: Scenario, seed: int, day_to_day: float = 0.0) -> Scenario
     text = "<routes>\n" + "\n".join(row for _, row in rows) + "\n</routes>\n"
     return replace(
         scenario,
-        routes=(Document(_VEHICLES, None, text.encode()),),
+        routes=(Document(_VEHICLES, None, text.encode()), *vehicles.others),
         additional=(*scenario.additional, vehicles.types),
     )
 
 
+def _types_beside(scenario: Scenario) -> bytes:
+    """Return the vehicle types in the additional files of a scenario, as a document."""
+    types = ET.Element("additional")
+    for document in scenario.additional:
+        if any(tag.name in _TYPE_TAGS for tag in document.scan()):
+            types.extend(element for element in document.parse() if element.tag in _TYPE_TAGS)
+    return ET.tostring(types)
+
+
 @functools.lru_cache(maxsize=8)
-def _vehicles(routes: tuple[bytes, ...]) -> _Vehicles:
+def _vehicles(routes: tuple[bytes, ...], types_beside: bytes) -> _Vehicles:
     """Split route files into single vehicles; cached because many days use the same files."""
     types = ET.Element("additional")
+    others: list[Document] = []
     depart: list[float] = []
     names: list[str] = []
     heads: list[str] = []
     tails: list[str] = []
     kinds: list[str] = []
-    for content in routes:
+    for number, content in enumerate(routes):
+        rest = ET.Element("routes")
         for element in parse_xml(content, "routes"):
-            if element.tag in ("vType", "vTypeDistribution"):
+            if element.tag in _TYPE_TAGS:
                 types.append(element)
-            elif element.tag == "vehicle":
+            elif element.tag == "vehicle" and (time := _drawn_depart_s(element)) is not None:
                 names.append(element.get("id", ""))
-                depart.append(parse_time(element.get("depart", "0")))
+                depart.append(time)
                 kinds.append(element.get("type", ""))
                 heads.append(_attributes(element))
                 tails.append("".join(ET.tostring(part, "unicode").strip() for part in element))
-    known = {element.get("id", ""): _speed_of(element.attrib) for element in types.iter("vType")}
+            else:
+                rest.append(element)
+        if len(rest):
+            others.append(Document(f"others{number or ''}.rou.xml", None, xml_bytes(rest)))
+    known = {
+        element.get("id", ""): _speed_of(element.attrib)
+        for root in (parse_xml(types_beside, "additional"), types)
+        for element in root.iter("vType")
+    }
     default = known.get("DEFAULT_VEHTYPE", DEFAULT_SPEED)
     unknown = (np.nan, np.nan, 0.0, np.inf)  # SUMO draws the factor itself
     speeds = [known.get(kind, unknown if kind else default) for kind in kinds]
     return _Vehicles(
         Document(_TYPES, None, xml_bytes(types)),
+        tuple(others),
         np.array(depart),
         tuple(names),
         tuple(heads),
         tuple(tails),
         np.array(speeds, dtype=np.float64).reshape(-1, 4),
     )
+
+
+def _drawn_depart_s(element: ET.Element) -> float | None:
+    """Return the departure of a vehicle, s; None if it blocks a lane or something triggers it."""
+    if is_blocker(element.get("id", ""), element.get("type", "")):
+        return None
+    try:
+        return parse_time(element.get("depart", "0"))
+    except ValueError:
+        return None
 
 
 def _attributes(element: ET.Element) -> str:

@@ -9,7 +9,7 @@ from ugat_marl.errors import ScenarioError
 from ugat_marl.files import Tag
 from ugat_marl.progress import Reporter
 from ugat_marl.scenarios.network import Network
-from ugat_marl.scenarios.routes import OwnEdges, is_blocker
+from ugat_marl.scenarios.routes import DEPARTING, OwnEdges, is_blocker
 from ugat_marl.scenarios.scenario import Document, Scenario
 from ugat_marl.scenarios.settings import parse_time
 
@@ -28,7 +28,8 @@ class Demand:
     Attributes:
         vehicles: Number of single vehicles and trips that depart within the episode.
         flows: Number of flows within the episode; each flow makes many vehicles.
-        routed: True if the route files hold only single vehicles with their own edges.
+        routed: True if the route files hold only single vehicles with their own edges, and the
+            additional files hold no vehicles.
     """
 
     vehicles: int
@@ -72,7 +73,8 @@ def check_demand(
                 if not edges.issuperset(used):
                     edge = next(edge for edge in used if edge not in edges)
                     raise _unknown_edge(document, tag, edge, scenario)
-            if tag.name in ("vehicle", "trip", "flow"):
+            if tag.name in DEPARTING:
+                routed &= in_routes
                 depart = _depart_s(tag, document, max(begin, latest))
                 if depart < latest and in_routes:
                     raise _unsorted(document, tag, depart, latest)

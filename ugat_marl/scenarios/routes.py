@@ -4,12 +4,13 @@ from __future__ import annotations
 
 import functools
 import tempfile
-from collections.abc import Iterator
+import xml.etree.ElementTree as ET
+from collections.abc import Callable, Iterator
 from dataclasses import replace
 from pathlib import Path
 
 from ugat_marl.errors import ScenarioError
-from ugat_marl.files import Tag, replacing
+from ugat_marl.files import Draft, Tag, child_texts, replacing
 from ugat_marl.progress import Reporter
 from ugat_marl.scenarios.programs import convert
 from ugat_marl.scenarios.scenario import Document, Scenario
@@ -17,6 +18,14 @@ from ugat_marl.scenarios.settings import parse_time
 
 BLOCKERS = ("closure.", "parking.")
 """Beginnings of the ids of vehicles that effects add to block a lane."""
+DEPARTING = frozenset({"vehicle", "trip", "flow"})
+"""Elements of demand."""
+DEFINITIONS = frozenset({"vType", "vTypeDistribution", "route"})
+"""Elements of a route file that other elements name, apart from distributions of routes."""
+TRAVELLERS = frozenset({"person", "personFlow", "container", "containerFlow"})
+"""Elements of a route file that depart and are no vehicles."""
+
+_ROUTED = "routed.rou.xml"
 
 
 def is_blocker(vehicle: str, vehicle_type: str) -> bool:
@@ -56,12 +65,20 @@ class OwnEdges:
 def demand_as_vehicles(scenario: Scenario) -> Scenario:
     """Return the same demand as single vehicles with routes; duarouter resolves trips and flows.
 
+    Demand in additional files moves to the route files. Vehicle types, named routes, persons and
+    containers stay what they are.
+
     Raises:
         ScenarioError: duarouter refuses; the message quotes it.
     """
-    if all(map(_holds_single_vehicles, scenario.routes)):
+    beside = [_test_file(document, _holds_demand) for document in scenario.additional]
+    if not any(beside) and all(_test_file(x, _holds_single_vehicles) for x in scenario.routes):
         return scenario
-    return replace(scenario, routes=(_routed_by_duarouter(scenario),))
+    additional = tuple(
+        _without_demand(document) if holds_demand else document
+        for document, holds_demand in zip(scenario.additional, beside, strict=True)
+    )
+    return replace(scenario, routes=_routed_by_duarouter(scenario), additional=additional)
 
 
 def driven_routes(scenario: Scenario) -> Iterator[tuple[str, ...]]:
@@ -103,20 +120,25 @@ def departures(
                 yield name, depart, tag.attributes.get("edges", "").split()
 
 
-def _holds_single_vehicles(document: Document) -> bool:
-    """Return True if the file holds nothing but single vehicles with their own edges."""
+def _test_file(document: Document, test: Callable[[Document], bool]) -> bool:
+    """Return the result of a test of a whole file; a file that has not changed is read once."""
     if document.path is None or document.content is not None:
-        return _content_holds_single_vehicles(document, 0, 0)
+        return _test_content(document, test, 0, 0)
     state = document.path.stat()
-    return _content_holds_single_vehicles(
-        replace(document, home=None), state.st_size, state.st_mtime_ns
-    )
+    return _test_content(replace(document, home=None), test, state.st_size, state.st_mtime_ns)
 
 
-@functools.lru_cache(maxsize=8)
-def _content_holds_single_vehicles(document: Document, size: int, changed_ns: int) -> bool:
+@functools.lru_cache(maxsize=32)
+def _test_content(
+    document: Document, test: Callable[[Document], bool], size: int, changed_ns: int
+) -> bool:
     """Test the file; the size and time of change make the cache forget a changed file."""
     del size, changed_ns
+    return test(document)
+
+
+def _holds_single_vehicles(document: Document) -> bool:
+    """Return True if the file holds nothing but single vehicles with their own edges."""
     singles = OwnEdges()
     for tag in document.scan():
         singles.read(tag)
@@ -125,8 +147,29 @@ def _content_holds_single_vehicles(document: Document, size: int, changed_ns: in
     return singles.ended()
 
 
-def _routed_by_duarouter(scenario: Scenario) -> Document:
-    """Route all demand of the scenario with duarouter."""
+def _holds_demand(document: Document) -> bool:
+    """Return True if the file holds vehicles, trips or flows other than those of calibrators."""
+    return any(tag.name in DEPARTING and tag.parent != "calibrator" for tag in document.scan())
+
+
+def _without_demand(document: Document) -> Document:
+    """Return an additional file without its vehicles, trips and flows."""
+    draft = None
+    for part in document.parts():
+        part[:] = [element for element in part if element.tag not in DEPARTING]
+        draft = draft or Draft(document.name.removesuffix(".gz"), part)
+        draft.add(*child_texts(part))
+    assert draft is not None
+    return draft.document()
+
+
+def _routed_by_duarouter(scenario: Scenario) -> tuple[Document, ...]:
+    """Route all demand of the scenario with duarouter.
+
+    Returns:
+        The vehicles behind the definitions of the route files, and a second document with persons
+        and containers if there are any.
+    """
     with tempfile.TemporaryDirectory(prefix="ugat_marl-") as name:
         directory = Path(name)
         out = directory / "routed.rou.xml"
@@ -142,6 +185,7 @@ def _routed_by_duarouter(scenario: Scenario) -> Document:
             "--net-file", files((scenario.network,)),
             "--route-files", files(scenario.routes),
             "--output-file", str(out),
+            "--vtype-output", str(directory / "types.xml"),
             "--begin", repr(settings.begin_s),
             "--end", repr(settings.begin_s + settings.duration_s),
             "--ignore-errors", "true",
@@ -160,7 +204,30 @@ def _routed_by_duarouter(scenario: Scenario) -> Document:
                 f"scenario {scenario.id!r}: its trips or flows cannot be turned into routes: "
                 f"{error}"
             ) from None
-        return Document("routed.rou.xml", None, out.read_bytes())
+        routed = Draft(_ROUTED, ET.Element("routes"))
+        for document in scenario.routes:
+            for texts in _children(document, DEFINITIONS):
+                routed.add(*texts)
+        for texts in _children(Document(_ROUTED, out), frozenset({"vehicle"})):
+            routed.add(*texts)
+    travellers = [_travellers(document, i) for i, document in enumerate(scenario.routes)]
+    return (routed.document(), *(document for document in travellers if document is not None))
+
+
+def _travellers(document: Document, index: int) -> Document | None:
+    """Return the persons and containers of a route file; None if there are none."""
+    drafted, some = Draft(f"others{index or ''}.rou.xml", ET.Element("routes")), False
+    for texts in _children(document, TRAVELLERS):
+        drafted.add(*texts)
+        some |= bool(texts)
+    return drafted.document() if some else None
+
+
+def _children(document: Document, tags: frozenset[str]) -> Iterator[list[str]]:
+    """Yield the children of a document with one of the tags, as texts, part by part."""
+    for part in document.parts():
+        part[:] = [element for element in part if element.tag in tags]
+        yield child_texts(part) if len(part) else []
 
 
 def _for_sumo(document: Document, directory: Path) -> Path:

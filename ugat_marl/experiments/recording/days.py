@@ -292,7 +292,7 @@ def _day(street: _Street, index: int, split: Split, stop: threading.Event) -> _D
 
 
 def _renamed(scenario: Scenario, seed: int) -> Scenario:
-    """Rename the vehicles of a newly drawn day.
+    """Rename the vehicles of a newly drawn day, which stand in its first route file.
 
     Effects choose vehicles by name. With new names they choose other vehicles every day, as on a
     street, where the trucks of two days differ.
@@ -305,7 +305,8 @@ def _renamed(scenario: Scenario, seed: int) -> Scenario:
             content = content.replace(start, start + b"%08x." % seed)
         return document.edited(content)
 
-    return replace(scenario, routes=tuple(map(renamed, scenario.routes)))
+    drawn, *others = scenario.routes
+    return replace(scenario, routes=(renamed(drawn), *others))
 
 
 def _with_outputs(scenario: Scenario, street: _Street, directory: Path) -> Scenario:
