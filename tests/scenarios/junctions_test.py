@@ -11,9 +11,18 @@ import pytest
 from ugat_marl.effects import load_scenario
 from ugat_marl.errors import ScenarioError
 from ugat_marl.files import parse_xml
-from ugat_marl.scenarios import Intersection, Link, Network, Scenario, sumo_program, turn_of
+from ugat_marl.scenarios import (
+    Intersection,
+    Link,
+    Network,
+    Scenario,
+    degrees_of_saturation,
+    kerb_turn_of,
+    sumo_program,
+    turn_of,
+)
 from ugat_marl.scenarios.junctions import crossings_of, foes_of, has_bit, links_of, yields_of
-from ugat_marl.scenarios.phases import RightOfWay, are_foes, conflict_free_phases
+from ugat_marl.scenarios.phases import RightOfWay, are_foes, conflict_free_phases, suited
 
 ARMS = {"N": (0, 200), "E": (200, 0), "S": (0, -200), "W": (-200, 0)}
 
@@ -181,3 +190,55 @@ def test_permitted_phases_are_those_netconvert_draws_up(lanes: int, tmp_path: Pa
     item, _ = derived(scenario, "permitted")
     assert len(item.phases) == 2
     assert set(item.phases) <= own
+
+
+MIRRORED = {"N": "N", "E": "W", "S": "S", "W": "E"}
+
+
+def signs(item: Intersection, left_hand: bool) -> set[frozenset[tuple[str, str, str]]]:
+    """Return the greens of each phase by arm, turn and letter; mirrored for left-hand traffic."""
+    assert {link.left_hand for link in item.links} == {left_hand}
+    return {
+        frozenset(
+            (
+                MIRRORED[link.from_edge[0]] if left_hand else link.from_edge[0],
+                kerb_turn_of(link),
+                state[link.index],
+            )
+            for link in item.links
+            if state[link.index] != "r"
+        )
+        for state in item.phases
+    }
+
+
+@pytest.mark.parametrize("lanes", [1, 3])
+@pytest.mark.parametrize("kind", ["traffic_light", "traffic_light_right_on_red"])
+@pytest.mark.parametrize("phases", ["conflict-free", "permitted"])
+def test_left_hand_traffic_is_the_mirror_image(
+    tmp_path: Path, lanes: int, kind: str, phases: str
+) -> None:
+    both = []
+    for left_hand in (False, True):
+        folder = tmp_path / str(left_hand)
+        folder.mkdir()
+        options = ["--lefthand"] if left_hand else []
+        scenario = junction(folder, *options, kind=kind, lanes=lanes)
+        item, _ = derived(scenario, phases)
+        flows = {(link.from_edge, link.to_edge): 200.0 for link in item.links}
+        loaded = degrees_of_saturation(scenario.with_control(phases=phases), flows)
+        both.append((signs(item, left_hand), loaded, suited(folder / "n.net.xml")))
+    assert both[0] == both[1]
+
+
+def test_turns_of_left_hand_traffic_keep_their_names(tmp_path: Path) -> None:
+    item, _ = derived(junction(tmp_path, "--lefthand"), "conflict-free")
+    turns = {(link.from_edge, link.to_edge): turn_of(link) for link in item.links}
+    assert turns["SM", "MW"] == "l"  # northbound
+    assert turns["SM", "ME"] == "r"
+    giving_way = {
+        turns[link.from_edge, link.to_edge]
+        for state in item.phases
+        for link in green(item, state, "g")
+    }
+    assert "l" not in giving_way

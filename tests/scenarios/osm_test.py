@@ -49,6 +49,13 @@ def test_the_dual_carriageway_has_one_light(town: Scenario) -> None:
     assert len(cluster.incoming_lanes) == 6
 
 
+def test_traffic_keeps_to_the_left_on_request(tmp_path: Path, town: Scenario) -> None:
+    assert made(tmp_path / "left", TOWN, "--left-hand") == 0
+    left = Network.read(read_scenario(tmp_path / "left"))
+    assert all(link.left_hand for item in left.intersections for link in item.links)
+    assert not any(x.left_hand for item in Network.read(town).intersections for x in item.links)
+
+
 def test_a_light_at_a_crossing_is_no_agent(town: Scenario) -> None:
     assert Network.read(town).uncontrolled == ("8",)
 

@@ -67,6 +67,7 @@ class ScenarioNew:
         arterial: Intersections along a main road.
         osm: File of OpenStreetMap: .osm, .osm.gz, or .osm.pbf (needs the extra osm).
         guess_signals: Put lights at large junctions of --osm that have none.
+        left_hand: Traffic of --osm keeps to the left.
         sumo: SUMO configuration (with its vehicles) or network.
         cityflow: CityFlow's roadnet.json and flow.json (with its vehicles).
         draw: Seed from which roads, phases, timing and vehicles are drawn, at 0.3 to 1.1 of
@@ -96,6 +97,7 @@ class ScenarioNew:
     arterial: Annotated[int | None, _none("N")] = None
     osm: Annotated[Path | None, _none("FILE")] = None
     guess_signals: bool = False
+    left_hand: bool = False
     sumo: Annotated[Path | None, _none("FILE")] = None
     cityflow: Annotated[tuple[Path, Path] | None, _none("ROADNET FLOW")] = None
     draw: Annotated[int | None, _none("SEED")] = None
@@ -194,7 +196,7 @@ class ScenarioNew:
         if self.arterial is not None:
             return arterial_roads(self.arterial, self.spacing_m, self.speed_mps)
         if self.osm is not None:
-            return from_osm(self.osm, guess=self.guess_signals)
+            return from_osm(self.osm, guess=self.guess_signals, left_hand=self.left_hand)
         if self.cityflow is not None:
             return from_cityflow(
                 *self.cityflow,

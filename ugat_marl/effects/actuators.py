@@ -18,7 +18,14 @@ from numpy.typing import NDArray
 from ugat_marl.effects.base import ControllerEffect, Effect, NumberParameter, TextParameter
 from ugat_marl.effects.controllers import Actuator, Commands
 from ugat_marl.errors import ScenarioError
-from ugat_marl.scenarios import Intersection, Network, Scenario, SignalState, SignalTiming
+from ugat_marl.scenarios import (
+    Intersection,
+    Network,
+    Scenario,
+    SignalState,
+    SignalTiming,
+    kerb_turn_of,
+)
 from ugat_marl.seeding import numpy_generator
 
 PHASE_ORDERS = ("cyclic", "barrier-leading", "barrier-lagging", "barrier-both")
@@ -223,7 +230,10 @@ def successors(intersection: Intersection, rule: str = "") -> list[list[int]]:
 
 
 class _Served(NamedTuple):
-    """Approaches that a phase serves with through movements, and with protected left turns."""
+    """Approaches that a phase serves with through movements, and with protected left turns.
+
+    In left-hand traffic the turns across the opposite traffic are right turns; these count.
+    """
 
     through: frozenset[str]
     left: frozenset[str]
@@ -236,7 +246,7 @@ class _Served(NamedTuple):
         left = {
             x.from_edge
             for x in intersection.links
-            if x.direction in "lLt" and phase[x.index] == "G"
+            if kerb_turn_of(x) == "l" and phase[x.index] == "G"
         }
         return cls(frozenset(through), frozenset(left))
 

@@ -70,6 +70,7 @@ from .periods import SpeedPoint as SpeedPoint
 from .periods import Split as Split
 from .periods import deciding_letter as deciding_letter
 from .phases import conflicting_greens as conflicting_greens
+from .phases import kerb_turn_of as kerb_turn_of
 from .phases import turn_of as turn_of
 from .programs import run_program as run_program
 from .programs import sumo_program as sumo_program

@@ -24,7 +24,7 @@ from scipy import optimize
 
 from ugat_marl.scenarios.junctions import Link, foes_of, yields_of
 from ugat_marl.scenarios.network import Intersection, Network
-from ugat_marl.scenarios.phases import RightOfWay, turn_of
+from ugat_marl.scenarios.phases import RightOfWay, kerb_turn_of
 from ugat_marl.scenarios.routes import departures
 from ugat_marl.scenarios.scenario import Scenario
 from ugat_marl.scenarios.signals import GREEN
@@ -151,7 +151,7 @@ class _Loaded:
             places,
             tuple(
                 _equivalents(
-                    turn_of(movements[name][0]),
+                    kerb_turn_of(movements[name][0]),
                     network.lanes[lane].speed_mps,
                     yields=bool(yielding[name]),
                 )

@@ -31,6 +31,7 @@ class Link:
         direction: SUMO's letter: s straight, l/L left, r/R right, t turn-around; c for a crossing.
         junction: Id of the junction.
         request: Row of the link in the junction's right-of-way matrix, or -1 if there is none.
+        left_hand: True if traffic keeps to the left. Right turns then cross the opposite traffic.
     """
 
     index: int
@@ -39,6 +40,7 @@ class Link:
     direction: str
     junction: str = ""
     request: int = -1
+    left_hand: bool = False
 
     @property
     def from_edge(self) -> str:
@@ -54,6 +56,7 @@ class Link:
 def links_of(root: ET.Element) -> dict[str, list[Link]]:
     """Return the links for vehicles of every traffic light."""
     links: dict[str, list[Link]] = defaultdict(list)
+    left_hand = root.get("lefthand", "").lower() in ("true", "1")
     for element in root.iter("connection"):
         tls = element.get("tl")
         if tls is None or element.get("from", ":").startswith(":"):
@@ -67,6 +70,7 @@ def links_of(root: ET.Element) -> dict[str, list[Link]]:
                 direction=element.get("dir", "s"),
                 junction=junction,
                 request=request,
+                left_hand=left_hand,
             )
         )
     return links

@@ -121,7 +121,8 @@ def conflict_free_phases(
     A movement is a group of links with one approach and one direction. Movements that share a
     letter of the state count as one. Right turns are added to every phase that they do not conflict
     with; if they share a lane with another movement, one of these must be green as well. On a
-    junction with four arms and left lanes this gives the eight phases of the UGAT paper.
+    junction with four arms and left lanes this gives the eight phases of the UGAT paper. Where
+    traffic keeps to the left, left and right change places.
 
     A crossing is green in every phase in which only turning vehicles cross it; these wait (``g``).
     Phases with right turns only are preferred, else left turns count too. Crossings that no phase
@@ -178,7 +179,7 @@ def permitted_clash(links: Sequence[Link], rules: RightOfWay) -> Clash:
             {(a.from_edge, b.from_edge), (b.from_edge, a.from_edge)} & crossing
         )
         return not opposite or not any(
-            turn_of(x) == "l" and rules.waits(x, y) for x, y in ((a, b), (b, a))
+            kerb_turn_of(x) == "l" and rules.waits(x, y) for x, y in ((a, b), (b, a))
         )
 
     return clash
@@ -196,7 +197,11 @@ def _with_crossings(
             possible = [
                 number
                 for number, phase in enumerate(phases)
-                if all(turn_of(link) in turning for link in phase if are_foes(link, crossing, foes))
+                if all(
+                    kerb_turn_of(link) in turning
+                    for link in phase
+                    if are_foes(link, crossing, foes)
+                )
             ]
             if possible:
                 break
@@ -211,7 +216,7 @@ def state_of(green: Sequence[Link], links: Sequence[Link], rules: RightOfWay, wi
     """Return the state with green for links: ``G``, or ``g`` if a link must wait for another."""
     letters = ["r"] * width
     for link in links:
-        if link.junction in rules.right_on_red and turn_of(link) == "r":
+        if link.junction in rules.right_on_red and kerb_turn_of(link) == "r":
             letters[link.index] = "s"
     for link in green:
         letters[link.index] = "G"
@@ -251,7 +256,7 @@ def _movements(links: Sequence[Link]) -> dict[Movement, list[Link]]:
     """Group links by approach and turn; links that share a letter are one group."""
     groups: dict[Movement, list[Link]] = {}
     for link in links:
-        groups.setdefault((link.from_edge, _turn(link.direction)), []).append(link)
+        groups.setdefault((link.from_edge, kerb_turn_of(link)), []).append(link)
     # Right turns come last, so that they join the movement they share a letter with.
     for name in sorted(groups, key=lambda name: name[1] == "r"):
         letters = {link.index for link in groups.get(name, ())}
@@ -266,14 +271,20 @@ def _movements(links: Sequence[Link]) -> dict[Movement, list[Link]]:
     return groups
 
 
-def _turn(direction: str) -> str:
-    """Return s, l or r; partial turns and U-turns count as the turn they resemble."""
-    return {"L": "l", "t": "l", "T": "l", "R": "r"}.get(direction, direction)
-
-
 def turn_of(link: Link) -> str:
     """Return s, l or r; partial turns and U-turns count as the turn they resemble."""
-    return _turn(link.direction)
+    around = "r" if link.left_hand else "l"
+    return {"L": "l", "t": around, "T": around, "R": "r"}.get(link.direction, link.direction)
+
+
+def kerb_turn_of(link: Link) -> str:
+    """Return the turn that has the same conflicts where traffic keeps to the right.
+
+    A turn along the kerb is ``r`` and a turn across the opposite traffic is ``l``, so the turns of
+    left-hand traffic are mirrored.
+    """
+    turn = turn_of(link)
+    return {"l": "r", "r": "l"}.get(turn, turn) if link.left_hand else turn
 
 
 def _groups_conflict(a: Sequence[Link], b: Sequence[Link], clash: Clash) -> bool:
@@ -372,7 +383,7 @@ def _shared(links: Sequence[Link]) -> bool:
     turns: dict[str, set[str]] = defaultdict(set)
     for link in links:
         if link.direction not in "tT":
-            turns[link.from_lane].add(turn_of(link))
+            turns[link.from_lane].add(kerb_turn_of(link))
     return any({"s", "l"} <= lane_turns for lane_turns in turns.values())
 
 

@@ -10,7 +10,7 @@ from __future__ import annotations
 import importlib
 import math
 import tempfile
-from collections.abc import Collection, Iterable, Iterator
+from collections.abc import Collection, Iterable, Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -73,12 +73,13 @@ class _Extract:
     nodes: frozenset[str] = frozenset()
 
 
-def from_osm(path: Path, *, guess: bool) -> RoadSource:
+def from_osm(path: Path, *, guess: bool, left_hand: bool = False) -> RoadSource:
     """Return a source of the streets of an extract.
 
     Args:
         path: The extract: ``.osm``, ``.osm.gz`` or ``.pbf``.
         guess: True if netconvert may add lights at large junctions without a light in the extract.
+        left_hand: True if traffic keeps to the left.
 
     Raises:
         OptionError: The name of the file has another ending.
@@ -102,7 +103,8 @@ def from_osm(path: Path, *, guess: bool) -> RoadSource:
             plain = Path(name) / "extract.osm"
             write_roads(source, path, extract.nodes, plain, reporter)
             try:
-                notes = _convert(plain, extract, folder / NETWORK, Path(name), guess=guess)
+                more = (*(["--tls.guess"] * guess), *(["--lefthand"] * left_hand))
+                notes = _convert(plain, extract, folder / NETWORK, Path(name), more)
             except ScenarioError as error:  # netconvert names no file
                 raise ScenarioError(f"{path}: {error}") from None
             if not notes:
@@ -154,11 +156,11 @@ def _look(source: Path, path: Path, reporter: Reporter) -> _Extract:
     return _Extract(roads, signals, frozenset(walks), tuple(crossings), unlit, frozenset(nodes))
 
 
-def _convert(source: Path, extract: _Extract, out: Path, work: Path, *, guess: bool) -> list[str]:
+def _convert(
+    source: Path, extract: _Extract, out: Path, work: Path, more: Sequence[str]
+) -> list[str]:
     types = sumo_program("netconvert").parent.parent / "data/typemap/osmNetconvert.typ.xml"
-    arguments = ["--osm-files", str(source), "--type-files", str(types), *_OPTIONS]
-    if guess:
-        arguments.append("--tls.guess")
+    arguments = ["--osm-files", str(source), "--type-files", str(types), *_OPTIONS, *more]
     if extract.crossings:
         arguments.append("--sidewalks.guess.from-permissions")
     made = work / "made.net.xml"
