@@ -284,6 +284,20 @@ def test_a_sumocfg_may_use_other_names(crossing: Crossing) -> None:
     assert read_scenario(file).hash == expected
 
 
+def test_options_of_a_sumocfg_count_wherever_they_stand(crossing: Crossing) -> None:
+    directory = crossing()
+    times = '<begin value="100"/><end value="200"/>'
+    options = '<scale value="2"/><lateral-resolution value="0.8"/>'
+    usual = configure(directory, f"{INPUT}<time>{times}</time><processing>{options}</processing>")
+    expected = read_scenario(usual)
+    assert expected.settings.sumo == {"scale": "2", "lateral-resolution": "0.8"}
+    for content in (
+        INPUT + times + options,
+        f"{INPUT}<report>{options}</report><odd>{times}</odd>",
+    ):
+        assert read_scenario(configure(directory, content)).hash == expected.hash
+
+
 def test_file_names_with_blanks_and_lists(crossing: Crossing) -> None:
     directory = crossing()
     shutil.copy(directory / "demand.rou.xml", directory / "my demand.rou.xml")

@@ -245,12 +245,7 @@ def _load_sumocfg(path: Path, scenario_id: str) -> Scenario:
             "begin_s": begin,
             "duration_s": end - begin if end >= 0 else 3600.0,
             "step_length_s": seconds("step-length", "1"),
-            "sumo": {
-                element.tag: element.get("value", element.get("v", ""))
-                for section in (*root.iter("processing"), *root.iter("routing"))
-                for element in section
-                if element.tag in OPTIONS
-            },
+            "sumo": {option: given[option] for option in given if option in OPTIONS},
         },
         str(path),
     )
