@@ -133,3 +133,28 @@ def test_rows_are_for_the_episode_unless_they_say_more(tmp_path: Path) -> None:
         (("a",), 60, 660, 2),
         (("b",), 100, 200, 3),
     ]
+
+
+@pytest.mark.parametrize("kind", ["--counts", "--od"])
+@pytest.mark.parametrize(
+    ("intervals", "inside", "lost"),
+    [
+        (("25200,27000", "27000,28800"), 160, 0),
+        (("23400,25200", "25200,27000"), 60, 100),
+        (("24300,26100", "27000,30600"), 80, 80),
+    ],
+)
+def test_intervals_are_on_the_clock_of_the_begin(
+    tmp_path: Path, kind: str, intervals: tuple[str, str], inside: int, lost: int
+) -> None:
+    ends = "west1_A1,A1_B1" if kind == "--counts" else "west1_A1,B1_east1"
+    rows = "".join(f"{ends},{n},{x}\n" for n, x in zip((100, 60), intervals, strict=True))
+    (tmp_path / "c.csv").write_text("from,to,count,begin_s,end_s\n" + rows)
+    assert made(tmp_path / "city", kind, tmp_path / "c.csv", "--begin-s", "25200") == 0
+    found = [depart for depart, _ in drives(tmp_path / "city")]
+    assert len(found) == pytest.approx(160, abs=2)
+    within = sum(25200 <= depart < 28800 for depart in found)
+    # of an interval that lies half inside, about half of the vehicles drive
+    assert within == pytest.approx(inside, abs=2 if lost in (0, 100) else 20)
+    note = f"{lost} of the 160 vehicles of c.csv are outside of the episode (25200 to 28800 s)"
+    assert (note in (tmp_path / "city" / "README.md").read_text()) is (lost > 0)

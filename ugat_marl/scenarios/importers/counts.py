@@ -76,6 +76,7 @@ def read_rows(
     """Read a CSV file with the column ``count`` and either ``edge`` or ``from`` and ``to``.
 
     The columns ``begin_s`` and ``end_s`` are optional. Without them a row covers the whole episode.
+    They are on the scenario's clock, on which the episode starts at its own ``begin_s``.
     A row whose count is blank is left out: nothing was counted there.
 
     Args:
@@ -191,7 +192,8 @@ def from_counts(path: Path, begin_s: float, length_s: float, seed: int) -> Vehic
         fits = _fits(rows, sampled, names)
         write_fit(folder / FIT_SHEET, fits, names)
         write_whole(folder / COUNT_SHEET, b"".join(chunks_of(path)))
-        return VehicleFiles((ROUTES,), (_summary(fits, path),), fits=fits)
+        notes = (_summary(fits, path), *_outside(rows, path, begin_s, begin_s + length_s))
+        return VehicleFiles((ROUTES,), notes, fits=fits)
 
     return vehicles
 
@@ -325,9 +327,31 @@ def from_od(path: Path, begin_s: float, length_s: float, seed: int) -> VehicleSo
                     f"{row.roads[1]!r}"
                 )
         _route(_trips(rows, seed), network, folder / ROUTES, seed)
-        return VehicleFiles((ROUTES,))
+        return VehicleFiles((ROUTES,), tuple(_outside(rows, path, begin_s, begin_s + length_s)))
 
     return vehicles
+
+
+def _outside(rows: Iterable[Row], path: Path, begin_s: float, end_s: float) -> Iterator[str]:
+    """Yield a note if intervals lie outside of the episode, since their vehicles never drive.
+
+    Args:
+        rows: Rows of the table.
+        path: The table.
+        begin_s: Start of the episode, s.
+        end_s: End of the episode, s.
+    """
+    total = lost = 0.0
+    for row in rows:
+        inside_s = max(0.0, min(row.end_s, end_s) - max(row.begin_s, begin_s))
+        total += row.count
+        lost += row.count * (1 - inside_s / (row.end_s - row.begin_s))
+    if lost > 0:
+        yield (
+            f"{lost:.0f} of the {total:.0f} vehicles of {path.name} are outside of the episode "
+            f"({begin_s:g} to {end_s:g} s) and never drive; begin_s and end_s of the rows are on "
+            "the clock of --begin-s, and --duration-s makes the episode longer"
+        )
 
 
 def _trips(rows: Iterable[Row], seed: int) -> bytes:
