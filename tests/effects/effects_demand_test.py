@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import xml.etree.ElementTree as ET
 from collections import Counter
 from collections.abc import Callable
@@ -15,6 +16,7 @@ from ugat_marl.effects import (
     DemandLevel,
     DemandSurge,
     DemandTiming,
+    HeavyShare,
     LaneClosure,
     Parking,
     Turning,
@@ -201,6 +203,87 @@ def test_a_surge_cuts_flows_into_parts(crossing: Crossing) -> None:
     assert sum(rates(none).values()) == pytest.approx(40 + 4 * 15)
 
 
+def numbers(scenario: Scenario) -> dict[str, int]:
+    return {name: int(flow.get("number", "")) for name, flow in departing(scenario).items()}
+
+
+SMALL = {
+    "number": 'begin="{0}" end="180" number="1"',
+    "period": 'begin="{0}" end="180" period="200"',
+    "hourly": 'begin="{0}" end="180" vehsPerHour="1"',
+}
+"""Flows of one vehicle each."""
+
+
+@pytest.mark.parametrize("kind", SMALL)
+def test_many_small_flows_have_the_right_total(kind: str, crossing: Crossing) -> None:
+    flows = "".join(
+        f'<flow id="f{n}" route="east" {SMALL[kind].format(n / 10)}/>' for n in range(400)
+    )
+    scenario = load_scenario(crossing(vehicles=flows))
+    before: dict[str, int] = {}
+    for factor in (0.3, 1.2, 1.7, 2.0):
+        found = numbers(sound(apply_effects(scenario, [DemandLevel("*", factor)])))
+        assert sum(found.values()) == pytest.approx(400 * factor, abs=bounds(400, factor % 1))
+        assert set(found.values()) <= {math.floor(factor), math.ceil(factor)}
+        assert all(found[name] >= count for name, count in before.items())
+        before = found
+    for share in (0.12, 0.5):
+        found = numbers(sound(apply_effects(scenario, [HeavyShare(share)])))
+        heavy = sum(count for name, count in found.items() if name.endswith("+heavy"))
+        assert sum(found.values()) == 400
+        assert heavy == pytest.approx(400 * share, abs=bounds(400, share))
+    surge = sound(apply_effects(scenario, [DemandSurge("*", 20.05, 200, 1.5)]))
+    assert sum(numbers(surge).values()) == pytest.approx(200 + 199 * 1.5, abs=bounds(199, 0.5))
+    early = [n for name, n in numbers(surge).items() if float(name[1:].split("+")[0]) / 10 < 20.05]
+    assert sum(early) == 201
+
+
+def test_a_small_flow_turns_whole() -> None:
+    scenario = load_scenario("single-v1")
+    flows = "".join(
+        f'<flow id="f{n}" route="r" begin="{n}" end="1000" number="1"/>' for n in range(400)
+    )
+    text = f'<routes><route id="r" edges="east1_A1 A1_west1"/>{flows}</routes>'
+    made = replace(scenario, routes=(scenario.routes[0].edited(text.encode()),))
+    found = numbers(sound(apply_effects(made, [Turning(EDGE, "A1_northA", 0.3)])))
+    assert sum(found.values()) == 400
+    turned = sum(count for name, count in found.items() if "turning" in name)
+    assert turned == pytest.approx(120, abs=bounds(400, 0.3))
+
+
+def test_a_surge_does_not_move_the_vehicles_outside(crossing: Crossing) -> None:
+    flow = '<flow id="f" route="east" begin="3" end="183" number="18"/>'  # 3, 13, ..., 173
+    scenario = load_scenario(crossing(vehicles=flow))
+    cut = departing(sound(apply_effects(scenario, [DemandSurge("*", 50, 100, 3)])))
+    times = {
+        name: (part.get("begin"), part.get("end"), part.get("number")) for name, part in cut.items()
+    }
+    assert times == {
+        "f": ("3", "53", "5"),
+        "f+surge": ("53", "100", "15"),
+        "f+after": ("103", "183", "8"),
+    }
+
+
+def test_flows_that_are_shifted_before_the_begin_lose_their_first_vehicles(
+    crossing: Crossing,
+) -> None:
+    flows = (
+        '<flow id="e" route="east" begin="0" end="200" number="20"/>'
+        '<flow id="f" route="east" begin="0" number="20" period="10"/>'
+        '<flow id="g" route="east" begin="5" end="35" period="10"/>'
+    )
+    scenario = load_scenario(crossing(vehicles=flows))
+    shifted = departing(sound(apply_effects(scenario, [DemandTiming("*", -42)])))
+    times = {
+        name: (flow.get("begin"), flow.get("end"), flow.get("number"))
+        for name, flow in shifted.items()
+    }
+    # 20 vehicles from -42 s, 10 s apart: five of them before the begin
+    assert times == {"e": ("8", "158", "15"), "f": ("8", "158", "15")}
+
+
 def test_flows_are_shifted(crossing: Crossing) -> None:
     scenario = load_scenario(crossing(vehicles=FLOWS))
     later = departing(sound(apply_effects(scenario, [DemandTiming("W_C", 30)])))
@@ -294,8 +377,10 @@ def test_flows_and_trips_turn_too() -> None:
     )
     made = replace(scenario, routes=(routes.edited(text.encode()),))
     found = departing(sound(apply_effects(made, [Turning(EDGE, "A1_northA", 0.25)])))
-    assert float(found["f"].get("period", "")) == pytest.approx(40 / 3)
-    assert float(found["f+turning"].get("period", "")) == pytest.approx(40)
+    assert {name: found[name].get("number") for name in ("f", "f+turning")} == {
+        "f": "75",
+        "f+turning": "25",
+    }
     assert edges(found["f+turning"]) == [EDGE, "A1_northA"]
     moved = [item for item in found.values() if item.tag == "vehicle"]
     assert len(moved) == pytest.approx(25, abs=18)

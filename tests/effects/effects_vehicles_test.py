@@ -360,13 +360,13 @@ def test_trucks_are_long_and_slow_and_else_like_the_cars(
 
 
 def test_a_part_of_each_flow_is_heavy(crossing: Crossing) -> None:
-    flow = '<flow id="f" route="east" begin="0" end="200" vehsPerHour="600"/>'
+    flow = '<flow id="f" route="east" begin="0" end="200" vehsPerHour="720"/>'
     scenario = apply_effects(load_scenario(crossing(vehicles=flow)), [HeavyShare(0.25)])
     found = {
-        item.get("id"): (item.get("type"), float(item.get("vehsPerHour", "0")))
+        item.get("id"): (item.get("type"), item.get("number"))
         for item in scenario.routes[0].parse().iter("flow")
     }
-    assert found == {"f": (None, 450), "f+heavy": ("heavy.DEFAULT_VEHTYPE", 150)}
+    assert found == {"f": (None, "30"), "f+heavy": ("heavy.DEFAULT_VEHTYPE", "10")}
 
 
 def test_buses_stay_buses(crossing: Crossing) -> None:

@@ -10,8 +10,9 @@ import copy
 import math
 import re
 import xml.etree.ElementTree as ET
-from collections.abc import Callable, Mapping
-from dataclasses import dataclass, field
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, field, replace
+from itertools import accumulate, pairwise
 from typing import ClassVar
 
 from ugat_marl.effects.base import (
@@ -172,24 +173,19 @@ class DemandTiming(Effect):
             UnknownNameError: No such edge.
         """
         earliest = scenario.settings.begin_s
+        over = earliest + scenario.settings.duration_s
 
         def shifted(element: ET.Element) -> list[ET.Element]:
             begin = depart_s(element)
             if math.isnan(begin):
                 return [element]
-            key = "begin" if element.tag == "flow" else "depart"
+            if element.tag == "flow":
+                return _shifted_flow(element, self.seconds, earliest, over)
             if begin >= earliest:  # others take no part in the simulation anyway
                 begin += self.seconds
-            if element.tag == "flow":
-                if end := element.get("end"):
-                    until = parse_time(end) + self.seconds
-                    if until <= earliest:
-                        return []
-                    element.set("end", seconds_text(until))
-                begin = max(begin, earliest)
-            elif begin < earliest:
+            if begin < earliest:
                 return []
-            element.set(key, seconds_text(begin))
+            element.set("depart", seconds_text(begin))
             return [element]
 
         return replace_departing(scenario, self, self.edge, shifted)
@@ -233,35 +229,125 @@ def replace_departing(
     return edit_scenario(scenario, change, *TAGS, applied=str(effect), in_order=True)
 
 
-def scaled_flow(element: ET.Element, factor: float, end_s: float) -> ET.Element | None:
-    """Return the flow with another rate; None if nothing is left of it.
+@dataclass(frozen=True)
+class _Regular:
+    """A flow of so many vehicles at equal distances in time.
+
+    Attributes:
+        begin_s: First departure, s.
+        spacing_s: Time between two departures, s; 0 if the flow has no duration.
+        number: Number of vehicles.
+    """
+
+    begin_s: float
+    spacing_s: float
+    number: int
+
+    @property
+    def end_s(self) -> float:
+        """Time of the departure that would follow the last one, s."""
+        return self.begin_s + self.number * self.spacing_s
+
+    def before(self, time_s: float) -> int:
+        """Return the number of vehicles that depart before a time."""
+        if self.spacing_s <= 0:
+            return self.number if self.begin_s < time_s else 0
+        number = math.ceil((time_s - self.begin_s) / self.spacing_s - 1e-9)
+        return min(max(number, 0), self.number)
+
+    def cut(self, first: int, last: int) -> _Regular:
+        """Return the flow of the vehicles from number `first` to the one before `last`."""
+        return replace(
+            self, begin_s=self.begin_s + first * self.spacing_s, number=max(0, last - first)
+        )
+
+    def resized(self, number: int) -> _Regular:
+        """Return another number of vehicles in the same time."""
+        return replace(self, spacing_s=(self.end_s - self.begin_s) / number, number=number)
+
+    @classmethod
+    def of(cls, flow: ET.Element, over_s: float) -> _Regular | None:
+        """Read a flow as SUMO does; None if its departures are random.
+
+        Args:
+            flow: A ``<flow>``.
+            over_s: End of a flow that has none itself, s.
+        """
+        begin, text = depart_s(flow), flow.get("number")
+        period, end = _period_s(flow), flow.get("end")
+        until = parse_time(end) if end else max(over_s, begin)
+        if math.isnan(begin) or period is None or until < begin:
+            return None
+        if period and text is None:
+            return cls(begin, period, math.ceil((until - begin) / period - 1e-9))
+        number = round(float(text or 0))
+        return cls(begin, period or (until - begin) / max(number, 1), number)
+
+    def written(self, element: ET.Element) -> ET.Element:
+        """Return a copy of the element that is this flow."""
+        flow = copy.deepcopy(element)
+        for key in _RATES:
+            flow.attrib.pop(key, None)
+        flow.set("begin", seconds_text(self.begin_s))
+        flow.set("number", str(self.number))
+        if self.spacing_s > 0:
+            flow.set("end", seconds_text(self.end_s))
+        return flow
+
+
+_RATES = ("vehsPerHour", "perHour", "period", "probability")
+
+
+def _period_s(flow: ET.Element) -> float | None:
+    """Return the time between two departures, s: 0 without a rate, None if it is random."""
+    if "probability" in flow.attrib or _EXPONENTIAL.fullmatch(flow.get("period", "")):
+        return None
+    if hourly := flow.get("vehsPerHour") or flow.get("perHour"):
+        rate = float(hourly)
+        return 3600 / rate if rate > 0 else None
+    return float(flow.get("period", "0"))
+
+
+def parted_flow(
+    element: ET.Element, shares: Sequence[float], over_s: float, salt: str
+) -> list[ET.Element | None]:
+    """Return parts of a flow, each with a share of its vehicles.
+
+    Random departures get other rates. Other flows have whole numbers of vehicles. A hash of the
+    flow's id decides which of them are rounded up: the expectation is exact for each part, and
+    shares that sum up to 1 keep every vehicle.
 
     Args:
         element: A ``<flow>``.
-        factor: Factor of its rate.
-        end_s: End of the flow, in s, if it has none itself.
+        shares: Shares of its vehicles, 0 or more; they may sum up to more than 1.
+        over_s: End of the flow, in s, if it has none itself.
+        salt: Name of the decision, as for `hashed_uniform`.
+
+    Returns:
+        The parts, all with the id of the flow; None for those without vehicles.
     """
+    regular = _Regular.of(element, over_s)
+    if regular is None:
+        return [_scaled_rate(element, share, over_s) for share in shares]
+    offset = hashed_uniform(salt, "flow", element.get("id", ""))
+    sums = [0.0, *accumulate(shares)]
+    counts = [math.floor(round(regular.number * total, 9) + offset) for total in sums]
+    return [
+        regular.resized(last - first).written(element) if last > first else None
+        for first, last in pairwise(counts)
+    ]
+
+
+def _scaled_rate(element: ET.Element, factor: float, end_s: float) -> ET.Element | None:
+    """Return a flow of random departures with another rate; None if nothing is left of it."""
     if factor <= 0:
         return None
     flow = copy.deepcopy(element)
-    if number := flow.get("number"):
-        if "end" not in flow.attrib and any(key in flow.attrib for key in _RATES):
-            seconds = _seconds_of_number(flow, float(number))
-            flow.set("end", seconds_text(depart_s(flow) + seconds))
-            del flow.attrib["number"]
-        else:
-            count = round(float(number) * factor)
-            flow.set("number", str(count))
-            return flow if count else None
-    for key in ("vehsPerHour", "perHour"):
-        if text := flow.get(key):
-            flow.set(key, f"{float(text) * factor:.12g}")
-    if text := flow.get("period"):
-        rate = _EXPONENTIAL.fullmatch(text)
-        flow.set(
-            "period",
-            f"exp({float(rate[1]) * factor:.12g})" if rate else f"{float(text) / factor:.12g}",
-        )
+    if number := flow.attrib.pop("number", None):
+        seconds = float(number) * _mean_period_s(flow)
+        flow.attrib.setdefault("end", seconds_text(depart_s(flow) + seconds))
+    if rate := _EXPONENTIAL.fullmatch(flow.get("period", "")):
+        flow.set("period", f"exp({float(rate[1]) * factor:.12g})")
     if text := flow.get("probability"):
         share = float(text) * factor
         if share <= 1:
@@ -273,22 +359,30 @@ def scaled_flow(element: ET.Element, factor: float, end_s: float) -> ET.Element 
     return flow
 
 
-_RATES = ("vehsPerHour", "perHour", "period", "probability")
+def _mean_period_s(flow: ET.Element) -> float:
+    """Return the mean time between two random departures, s."""
+    exponential = _EXPONENTIAL.fullmatch(flow.get("period", ""))
+    return 1 / float(exponential[1] if exponential else flow.get("probability", "1"))
 
 
-def _seconds_of_number(flow: ET.Element, number: float) -> float:
-    """Return the duration of a flow of so many vehicles at its rate, in s."""
-    rates: Mapping[str, Callable[[float], float]] = {
-        "vehsPerHour": lambda x: 3600 / x,
-        "perHour": lambda x: 3600 / x,
-        "probability": lambda x: 1 / x,
-        "period": lambda x: x,
-    }
-    for key, period in rates.items():
-        if text := flow.get(key):
-            exponential = _EXPONENTIAL.fullmatch(text)
-            return number * (1 / float(exponential[1]) if exponential else period(float(text)))
-    return 0.0
+def _shifted_flow(
+    element: ET.Element, seconds: float, earliest_s: float, over_s: float
+) -> list[ET.Element]:
+    """Return the flow with later departures, without those before `earliest_s`."""
+    endless = "end" not in element.attrib and "number" not in element.attrib
+    regular = None if endless else _Regular.of(element, over_s)
+    if regular is not None:
+        later = replace(regular, begin_s=regular.begin_s + seconds)
+        kept = later.cut(later.before(earliest_s), later.number)
+        return [kept.written(element)] if kept.number else []
+    begin, end = depart_s(element) + seconds, element.get("end")
+    if end is not None:
+        until = parse_time(end) + seconds
+        if until <= earliest_s:
+            return []
+        element.set("end", seconds_text(until))
+    element.set("begin", seconds_text(max(begin, earliest_s)))
+    return [element]
 
 
 def _scaled(
@@ -303,7 +397,7 @@ def _scaled(
 
     def scaled(element: ET.Element) -> list[ET.Element]:
         if element.tag == "flow":
-            return _scaled_window(element, window, factor, over, mark)
+            return _scaled_window(element, window, factor, over, mark, salt)
         depart = depart_s(element)
         if not (math.isnan(depart) or begin <= depart < end):
             return [element]
@@ -333,24 +427,24 @@ def _mark(scenario: Scenario) -> str:
 
 
 def _scaled_window(
-    element: ET.Element, window: tuple[float, float], factor: float, over_s: float, mark: str
+    element: ET.Element,
+    window: tuple[float, float],
+    factor: float,
+    over_s: float,
+    mark: str,
+    salt: str,
 ) -> list[ET.Element]:
     """Return a flow in up to three parts: before, within and after the window."""
     begin = depart_s(element)
     if math.isnan(begin):
         return [element]
-    end = parse_time(element.get("end", "")) if element.get("end") else math.inf
-    if math.isinf(end):
-        number = float(element.get("number", "inf"))
-        by_rate = any(key in element.attrib for key in _RATES)
-        lasts = _seconds_of_number(element, number) if by_rate and number < math.inf else math.inf
-        end = min(begin + lasts, max(over_s, begin))
+    regular = _Regular.of(element, over_s)
+    end = regular.end_s if regular else _random_end_s(element, over_s)
     first, last = max(begin, window[0]), min(end, window[1])
-    if first >= last:
+    if first > last or (first == last and (regular is None or regular.spacing_s)):
         return [element]
     if first == begin and last == end:
-        whole = scaled_flow(element, factor, over_s)
-        return [] if whole is None else [whole]
+        return [flow for flow in parted_flow(element, (factor,), over_s, salt) if flow is not None]
     parts = (
         (begin, first, 1.0, ""),
         (first, last, factor, f"{mark}surge"),
@@ -358,14 +452,32 @@ def _scaled_window(
     )
     flows: list[ET.Element] = []
     for start, stop, rate, suffix in parts:
+        if stop <= start:
+            continue
         part = copy.deepcopy(element)
-        part.set("id", f"{element.get('id', '')}{suffix if start > begin else ''}")
-        part.set("begin", seconds_text(start))
-        part.set("end", seconds_text(stop))
-        number = part.attrib.pop("number", None)
-        if number is not None and not any(key in part.attrib for key in _RATES):
-            part.set("period", f"{(end - begin) / float(number):.12g}")
-        scaled = scaled_flow(part, rate, stop) if stop > start else None
-        if scaled is not None:
-            flows.append(scaled)
+        if regular is not None:
+            some = regular.cut(regular.before(start), regular.before(stop))
+            part = some.written(part)
+            if not some.number:
+                continue
+            if rate != 1:
+                part.set("end", seconds_text(min(some.end_s, stop)))
+        else:
+            part.set("begin", seconds_text(start))
+            part.set("end", seconds_text(stop))
+            part.attrib.pop("number", None)
+        if rate != 1:
+            part = parted_flow(part, (rate,), stop, salt)[0]
+        if part is not None:
+            part.set("id", f"{element.get('id', '')}{suffix if start > begin else ''}")
+            flows.append(part)
     return flows
+
+
+def _random_end_s(flow: ET.Element, over_s: float) -> float:
+    """Return the end of a flow of random departures, s."""
+    if end := flow.get("end"):
+        return parse_time(end)
+    begin, number = depart_s(flow), flow.get("number")
+    lasts_s = float(number) * _mean_period_s(flow) if number else math.inf
+    return min(begin + lasts_s, max(over_s, begin))

@@ -11,7 +11,7 @@ from statistics import NormalDist, fmean
 from typing import ClassVar
 
 from ugat_marl.effects.base import Effect, ExaminedStrengths, NumberParameter, hashed_uniform
-from ugat_marl.effects.demand import TAGS, scaled_flow
+from ugat_marl.effects.demand import TAGS, parted_flow
 from ugat_marl.effects.documents import (
     DEFAULT_TYPES,
     edit_scenario,
@@ -165,8 +165,7 @@ class HeavyShare(Effect):
                     element.set("type", truck)
                 return [element]
             used[truck] = cars[kind]
-            rest = scaled_flow(element, 1 - self.share, over)
-            part = scaled_flow(element, self.share, over)
+            part, rest = parted_flow(element, (self.share, 1 - self.share), over, self.name)
             if part is not None:
                 part.attrib |= {"id": f"{name}+heavy", "type": truck}
             return [flow for flow in (rest, part) if flow is not None]

@@ -12,7 +12,7 @@ from itertools import accumulate, chain, pairwise
 from typing import ClassVar
 
 from ugat_marl.effects.base import Effect, NumberParameter, TextParameter, hashed_uniform
-from ugat_marl.effects.demand import TAGS, Routes, scaled_flow
+from ugat_marl.effects.demand import TAGS, Routes, parted_flow
 from ugat_marl.effects.documents import edit_scenario, is_demand, mentions
 from ugat_marl.effects.places import Places, network_places
 from ugat_marl.errors import UnknownNameError
@@ -112,15 +112,14 @@ class Turning(Effect):
             if hashed_uniform(salt, name) >= self.share:
                 return [element]
             return [_with_route(element, (*edges[: place + 1], *_drawn(tails, salt, name)))]
-        parts = [scaled_flow(element, 1 - self.share, over_s)]
-        turned = scaled_flow(element, self.share, over_s)
         total = sum(tails.values())
-        for number, (tail, count) in enumerate(sorted(tails.items())):
-            part = scaled_flow(turned, count / total, over_s) if turned is not None else None
+        shares = [self.share * count / total for _, count in sorted(tails.items())]
+        *turned, rest = parted_flow(element, (*shares, 1 - self.share), over_s, salt)
+        parts = [rest]
+        for number, (part, tail) in enumerate(zip(turned, sorted(tails), strict=True)):
             if part is not None:
                 part.set("id", f"{name}+turning{number or ''}")
-                part = _with_route(part, (*edges[: place + 1], *tail))
-            parts.append(part)
+                parts.append(_with_route(part, (*edges[: place + 1], *tail)))
         return [part for part in parts if part is not None]
 
 
