@@ -16,9 +16,12 @@ from ugat_marl.scenarios import (
     Network,
     check_demand,
     demand_as_vehicles,
+    draw_day,
+    driven_routes,
     shipped_scenarios,
     survey,
 )
+from ugat_marl.scenarios.capacity import counted_flows_vph
 
 Crossing = Callable[..., Path]
 
@@ -70,6 +73,32 @@ def test_what_needs_no_router_is_known(vehicles: str, routed: bool, crossing: Cr
     directory = crossing(vehicles=vehicles)
     assert check(directory).routed is routed
     assert (demand_as_vehicles(load_scenario(directory)).routes[0].path is not None) is routed
+
+
+@pytest.mark.parametrize("kind", ["vehicles", "flow"])
+def test_the_scale_of_the_demand_counts(kind: str, crossing: Crossing) -> None:
+    demand = {
+        "vehicles": "".join(
+            f'<vehicle id="v{n}" depart="{n}"><route edges="S_C C_N"/></vehicle>' for n in range(40)
+        ),
+        "flow": '<flow id="f" begin="0" end="160" period="4" from="S_C" to="C_N"/>',
+    }[kind]
+    plain = load_scenario(crossing(vehicles=demand))
+    sheet = crossing(vehicles=demand, toml=lambda text: text + '[sumo]\nscale = "1.5"\n')
+    scaled = load_scenario(sheet)
+    found = demand_as_vehicles(scaled)
+    assert "scale" not in found.settings.sumo
+    assert sum(found.routes[0].read().count(x) for x in (b"<vehicle ", b"<flow ")) == 60
+    names = [tag.attributes["id"] for tag in found.routes[0].scan() if tag.name == "vehicle"]
+    assert len(set(names)) == 60
+    assert len(list(driven_routes(scaled))) == 60
+    flows = counted_flows_vph(plain)
+    assert counted_flows_vph(scaled) == pytest.approx({turn: 1.5 * x for turn, x in flows.items()})
+    assert check(sheet).vehicles == (60 if kind == "vehicles" else 0)
+    busiest = (survey(plain).busiest, survey(scaled).busiest)
+    assert busiest == (40, 60)
+    days = [draw_day(scaled, seed).routes[0].read().count(b"<vehicle ") for seed in range(30)]
+    assert sum(days) / 30 == pytest.approx(60, abs=3 * (60 / 30) ** 0.5)
 
 
 def test_an_episode_need_not_know_what_comes_long_after_it(crossing: Crossing) -> None:

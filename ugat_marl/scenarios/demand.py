@@ -9,7 +9,13 @@ from ugat_marl.errors import ScenarioError
 from ugat_marl.files import Tag
 from ugat_marl.progress import Reporter
 from ugat_marl.scenarios.network import Network
-from ugat_marl.scenarios.routes import DEPARTING, OwnEdges, is_blocker
+from ugat_marl.scenarios.routes import (
+    DEPARTING,
+    OwnEdges,
+    demand_scale,
+    is_blocker,
+    scaled_number,
+)
 from ugat_marl.scenarios.scenario import Document, Scenario
 from ugat_marl.scenarios.settings import parse_time
 
@@ -26,10 +32,11 @@ class Demand:
     """A count of the vehicles written in a scenario's files.
 
     Attributes:
-        vehicles: Number of single vehicles and trips that depart within the episode.
+        vehicles: Number of single vehicles and trips that depart within the episode, times SUMO's
+            option ``scale``.
         flows: Number of flows within the episode; each flow makes many vehicles.
         routed: True if the route files hold only single vehicles with their own edges, and the
-            additional files hold no vehicles.
+            additional files hold no vehicles, and SUMO does not scale them.
     """
 
     vehicles: int
@@ -97,7 +104,8 @@ def check_demand(
             f"{files}: no vehicle departs between {begin:g} s and {end:g} s; "
             "check begin_s and duration_s against the departure times"
         )
-    return Demand(vehicles, flows, routed)
+    scale = demand_scale(scenario)
+    return Demand(scaled_number(vehicles, scale), flows, routed and scale == 1)
 
 
 def edges_used(tag: Tag) -> list[str]:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import functools
+import math
 import tempfile
 import xml.etree.ElementTree as ET
 from collections.abc import Callable, Iterator
@@ -66,11 +67,14 @@ def demand_as_vehicles(scenario: Scenario) -> Scenario:
     """Return the same demand as single vehicles with routes; duarouter resolves trips and flows.
 
     Demand in additional files moves to the route files. Vehicle types, named routes, persons and
-    containers stay what they are.
+    containers stay what they are. SUMO's option ``scale`` is carried out and left out.
 
     Raises:
         ScenarioError: duarouter refuses; the message quotes it.
     """
+    scale = demand_scale(scenario)
+    if scale != 1:
+        return _scaled(demand_as_vehicles(_without_scale(scenario)), scale)
     beside = [_test_file(document, _holds_demand) for document in scenario.additional]
     if not any(beside) and all(_test_file(x, _holds_single_vehicles) for x in scenario.routes):
         return scenario
@@ -79,6 +83,55 @@ def demand_as_vehicles(scenario: Scenario) -> Scenario:
         for document, holds_demand in zip(scenario.additional, beside, strict=True)
     )
     return replace(scenario, routes=_routed_by_duarouter(scenario), additional=additional)
+
+
+def demand_scale(scenario: Scenario) -> float:
+    """Return SUMO's option ``scale``: the number of vehicles per vehicle of the files."""
+    return float(scenario.settings.sumo.get("scale", "1"))
+
+
+def scaled_number(vehicles: int, scale: float) -> int:
+    """Return the number of vehicles that SUMO makes of so many with its option ``scale``."""
+    return math.ceil(round(vehicles * scale, 9))
+
+
+def _without_scale(scenario: Scenario) -> Scenario:
+    options = {key: value for key, value in scenario.settings.sumo.items() if key != "scale"}
+    return replace(scenario, settings=scenario.settings.model_copy(update={"sumo": options}))
+
+
+def _scaled(scenario: Scenario, scale: float) -> Scenario:
+    """Return the scenario with `scale` copies of each vehicle, named as SUMO names its copies.
+
+    The first n vehicles of the files become ceil(n * scale), as with SUMO's option. Vehicles that
+    block a lane stay single.
+    """
+    read = 0
+
+    def copied(document: Document) -> Document:
+        nonlocal read
+        draft = None
+        for part in document.parts():
+            draft = draft or Draft(document.name.removesuffix(".gz"), part)
+            kept: list[ET.Element] = []
+            for element in part:
+                if element.tag != "vehicle" or element.get("id", "").startswith(BLOCKERS):
+                    kept.append(element)
+                    continue
+                copies = scaled_number(read + 1, scale) - scaled_number(read, scale)
+                read += 1
+                for number in range(copies):
+                    copy = ET.Element(element.tag, element.attrib)
+                    copy[:] = element[:]
+                    if number:
+                        copy.set("id", f"{element.get('id', '')}.{number}")
+                    kept.append(copy)
+            part[:] = kept
+            draft.add(*(child_texts(part) if kept else ()))
+        assert draft is not None
+        return draft.document()
+
+    return replace(scenario, routes=tuple(map(copied, scenario.routes)))
 
 
 def driven_routes(scenario: Scenario) -> Iterator[tuple[str, ...]]:
