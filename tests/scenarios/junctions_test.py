@@ -8,7 +8,8 @@ from pathlib import Path
 
 import pytest
 
-from ugat_marl.effects import load_scenario
+from ugat_marl import parallel_env
+from ugat_marl.effects import load_scenario, network_places
 from ugat_marl.errors import ScenarioError
 from ugat_marl.files import parse_xml
 from ugat_marl.scenarios import (
@@ -242,3 +243,66 @@ def test_turns_of_left_hand_traffic_keep_their_names(tmp_path: Path) -> None:
         for link in green(item, state, "g")
     }
     assert "l" not in giving_way
+
+
+def railway(folder: Path) -> Scenario:
+    """Lights A and B on a street that crosses a railway between them, with a rail signal at R."""
+    places = {
+        "W": (-400, 0, ""), "A": (-200, 0, "traffic_light"), "X": (0, 0, "rail_crossing"),
+        "B": (200, 0, "traffic_light"), "E": (400, 0, ""), "P": (-200, 200, ""),
+        "Q": (200, 200, ""), "R": (0, 150, "rail_signal"), "T": (0, 300, ""),
+        "U": (60, 300, ""), "V": (0, -200, ""),
+    }  # fmt: skip
+    streets = [x + y for a, b in ("WA", "AX", "XB", "BE", "PA", "QB") for x, y in (a + b, b + a)]
+    rails = ["TR", "UR", "RX", "XV"]
+    nodes = "".join(
+        f'<node id="{name}" x="{x}" y="{y}"' + (f' type="{kind}"/>' if kind else "/>")
+        for name, (x, y, kind) in places.items()
+    )
+    edges = "".join(
+        f'<edge id="{a}{b}" from="{a}" to="{b}" speed="13"{allowed}/>'
+        for ways, allowed in ((streets, ""), (rails, ' allow="rail"'))
+        for a, b in ways
+    )
+    ways = (("AX", "XB"), ("BX", "XA"), ("RX", "XV"))
+    links = "".join(f'<connection from="{a}" to="{b}"/>' for a, b in ways)
+    for kind, root, text in (
+        ("nod", "nodes", nodes), ("edg", "edges", edges), ("con", "connections", links),
+    ):  # fmt: skip
+        (folder / f"n.{kind}.xml").write_text(f"<{root}>{text}</{root}>")
+    subprocess.run(
+        [str(sumo_program("netconvert")), "-n", "n.nod.xml", "-e", "n.edg.xml", "-x", "n.con.xml",
+         "-o", "n.net.xml", "--no-turnarounds"],
+        cwd=folder, check=True, capture_output=True,
+    )  # fmt: skip
+    (folder / "r.rou.xml").write_text(
+        '<routes><vType id="train" vClass="rail"/>'
+        '<flow id="cars" begin="0" end="300" period="5"><route edges="WA AX XB BE"/></flow>'
+        '<flow id="trains" type="train" begin="0" end="300" period="100">'
+        '<route edges="TR RX XV"/></flow></routes>'
+    )
+    (folder / "scenario.toml").write_text(
+        'network = "n.net.xml"\nroutes = ["r.rou.xml"]\nduration_s = 300\n'
+    )
+    return load_scenario(folder)
+
+
+@pytest.mark.parametrize("phases", ["programme", "conflict-free", "permitted"])
+def test_signals_of_railways_are_no_traffic_lights(phases: str, tmp_path: Path) -> None:
+    scenario = railway(tmp_path).with_control(phases=phases)
+    controlled = {x.get("tl") for x in scenario.network.parse().iter("connection")} - {None}
+    assert controlled == {"A", "B", "X", "R"}
+    network = Network.read(scenario)
+    a, b = network.intersections
+    assert (a.id, b.id, a.neighbours, b.neighbours) == ("A", "B", ("B",), ("A",))
+    assert network.uncontrolled == ()
+    assert {*a.incoming_lanes, *b.incoming_lanes} == {
+        f"{e}_0" for e in ("WA", "XA", "PA", "XB", "EB", "QB")
+    }
+    assert network_places(scenario).lights == ("A", "B")
+    env = parallel_env(scenario, "late_green=*,2")
+    env.reset(seed=1)
+    while env.agents:
+        env.step(dict.fromkeys(env.agents, 0))
+    assert env.scores().departed > 5
+    env.close()

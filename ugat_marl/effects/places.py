@@ -12,7 +12,7 @@ from dataclasses import dataclass
 
 from ugat_marl.errors import UnknownNameError
 from ugat_marl.files import parse_xml
-from ugat_marl.scenarios import Scenario
+from ugat_marl.scenarios import Scenario, rail_signals_of
 
 
 @dataclass(frozen=True)
@@ -126,6 +126,7 @@ def _places(content: bytes, source: str) -> Places:
     lights = {element.get("id", ""): None for element in root.iter("tlLogic")}
     ends: dict[str, str] = {}
     begins: dict[str, str] = {}
+    rails = rail_signals_of(root)
     for connection in root.iter("connection"):
         start, end = connection.get("from", ":"), connection.get("to", ":")
         if start not in edges or end not in edges:
@@ -136,7 +137,8 @@ def _places(content: bytes, source: str) -> Places:
             leaving not in lanes or lanes[leaving].cars
         ):
             following[start][end] = None
-        if light := connection.get("tl"):
+        light = connection.get("tl")
+        if light and light not in rails:
             lights[light] = None
             ends.setdefault(entry, light)
             begins.setdefault(leaving, light)

@@ -53,13 +53,26 @@ class Link:
         return edge_of_lane(self.to_lane)
 
 
+def rail_signals_of(root: ET.Element) -> frozenset[str]:
+    """Return the signals that trains set: rail signals and level crossings.
+
+    SUMO gives them the id of their junction, and no programme. They are no traffic lights.
+    """
+    return frozenset(
+        element.get("id", "")
+        for element in root.iter("junction")
+        if element.get("type") in ("rail_signal", "rail_crossing")
+    )
+
+
 def links_of(root: ET.Element) -> dict[str, list[Link]]:
-    """Return the links for vehicles of every traffic light."""
+    """Return the links for vehicles of every traffic light, without signals that trains set."""
     links: dict[str, list[Link]] = defaultdict(list)
     left_hand = root.get("lefthand", "").lower() in ("true", "1")
+    rails = rail_signals_of(root)
     for element in root.iter("connection"):
         tls = element.get("tl")
-        if tls is None or element.get("from", ":").startswith(":"):
+        if tls is None or tls in rails or element.get("from", ":").startswith(":"):
             continue
         junction, request = _request_of(element.get("via", ""))
         links[tls].append(
@@ -122,8 +135,9 @@ def neighbours_of(
     """Return the neighbours of each traffic light: roads join them with no light in between."""
     enters = {link.from_edge: tls for tls, light_links in links.items() for link in light_links}
     following: dict[str, set[str]] = defaultdict(set)
+    no_light = {None, *rail_signals_of(root)}
     for element in root.iter("connection"):
-        if not element.get("from", ":").startswith(":") and element.get("tl") is None:
+        if not element.get("from", ":").startswith(":") and element.get("tl") in no_light:
             following[element.get("from", "")].add(element.get("to", ""))
     adjacent: dict[str, set[str]] = {tls: set() for tls in links}
     for tls, own in links.items():
