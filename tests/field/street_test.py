@@ -228,6 +228,23 @@ def test_late_greens_are_refused() -> None:
         SimulatedStreet(scenario, 0, ())
 
 
+@pytest.mark.parametrize(
+    "effect",
+    [
+        "execution_delay=20",
+        "lost_commands=0.3",
+        "phase_order=cyclic",
+        "counting_noise=0.5",
+        "objective=safety",
+        "lane_service=northA_A1_0,2,0",
+    ],
+)
+def test_effects_on_controllers_are_refused(effect: str) -> None:
+    scenario = scenario_in_domain(load_scenario("single-v1"), f"V4+{effect}")
+    with pytest.raises(OptionError, match=f"effect {effect} acts on .* only the environments"):
+        SimulatedStreet(scenario, 0, ())
+
+
 def test_the_own_sumo_of_a_demonstration_is_the_same_street(
     running: Callable[..., Any],
 ) -> None:

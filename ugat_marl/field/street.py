@@ -18,7 +18,7 @@ import traci
 import traci.constants as tc
 from traci.exceptions import FatalTraCIError, TraCIException
 
-from ugat_marl.effects import late_greens
+from ugat_marl.effects import controller_effects, late_greens
 from ugat_marl.errors import OptionError, SimulatorError
 from ugat_marl.files import OwnDirectory
 from ugat_marl.scenarios import Scenario
@@ -213,7 +213,8 @@ class SimulatedStreet:
         lanes: Lanes to count on.
 
     Raises:
-        OptionError: The scenario's lights turn green late, which SUMO does not do by itself.
+        OptionError: The scenario has late greens or effects on controllers, which SUMO does not
+            simulate by itself.
     """
 
     def __init__(self, scenario: Scenario, seed: int, lanes: Sequence[str]) -> None:
@@ -221,6 +222,12 @@ class SimulatedStreet:
             raise OptionError(
                 f"scenario {scenario.id!r}: traffic light {next(iter(late))!r} turns green late, "
                 "which only the environments do; start SUMO in another domain"
+            )
+        if effects := controller_effects(scenario):
+            raise OptionError(
+                f"scenario {scenario.id!r}: effect {effects[0]} acts on counts, commands or the "
+                "cost of controllers, which only the environments do; start SUMO in a domain "
+                "without it (`ugat-marl evaluate` plays this one)"
             )
         self._scenario, self._seed, self._lanes = scenario, seed, tuple(lanes)
 
