@@ -134,7 +134,7 @@ def test_demand_in_additional_files_is_drawn_and_counted_once(
 def test_vehicles_that_block_a_lane_are_the_same_on_every_day(
     crossing: Callable[..., Path],
 ) -> None:
-    blocker = CAR.format(0, 10, "car").replace('"v0"', '"closure.S_C_0.0"')
+    blocker = CAR.format(0, 10, "closure.S_C_0").replace('"v0"', '"closure.S_C_0.0"')
     scenario = with_additional(crossing, "", blocker + CAR.format(1, 20, "car"))
     days = [draw_day(scenario, seed) for seed in range(8)]
     blocked = [b"".join(x.read() for x in day.routes) for day in days]
