@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 
@@ -27,6 +28,7 @@ from ugat_marl.grounding import (
     street_env,
     street_prior,
 )
+from ugat_marl.grounding.posterior import Values
 from ugat_marl.grounding.state import RunState
 from ugat_marl.grounding.street_training import StreetTraining
 from ugat_marl.grounding.summaries import NAMES
@@ -114,6 +116,25 @@ def test_a_street_survives_its_file_and_refuses_another_network(
         FittedStreet.load(tmp_path / "street.pt", replace(prior, lanes=prior.lanes[:2]))
     with pytest.raises(CheckpointError, match="another library"):
         FittedStreet.load(tmp_path / "street.pt", replace(prior, library=prior.library[:2]))
+
+
+def test_values_of_the_simulation_s_own_vehicles_change_nothing(
+    crossing: Callable[..., Path],
+) -> None:
+    types = """<vType id="slow" accel="2.5" tau="3" decel="4.5"/>
+        <vType id="old"><carFollowing-Krauss accel="1.5"/></vType>"""
+    car = '<vehicle id="v" type="slow" route="north" depart="0"/>'
+    for domain, mean in (("sim", 2.0), ("acceleration=0.7", 0.7)):
+        env = parallel_env(crossing(vehicles=car, types=types), domain)
+        prior = street_prior(env, QUICK)
+        env.close()
+        found = {item.name: item for item in prior.library}
+        assert found["acceleration"].nominal == mean
+        headway = found["headway"]  # its range grows to hold it
+        assert (headway.nominal, headway.high) == (3.0, 3.0)
+        assert found["startup_delay"].nominal == 0.0
+        nominal = Values(np.array([x.nominal for x in prior.library]), np.zeros((2, 2)))
+        assert prior.effects(prior.clipped(nominal)) == ()
 
 
 @pytest.mark.parametrize("part", ["channel", "eyes", "service", "effects"])

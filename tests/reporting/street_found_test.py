@@ -56,6 +56,7 @@ def test_effects_and_unused_green(tmp_path: Path) -> None:
         "effects/acceleration": 0.5,
         "effects/acceleration/low": 0.4,
         "effects/acceleration/high": 0.9,
+        "effects/acceleration/nominal": 2.6,
         "unused/begin_s/signal_0": 1.25,
         "unused/begin_s_low/signal_0": 0.5,
         "unused/begin_s_high/signal_0": 2.0,

@@ -6,8 +6,6 @@ from collections.abc import Collection, Sequence
 from dataclasses import dataclass, fields
 from typing import Any
 
-import numpy as np
-
 from ugat_marl.effects import (
     EVERYWHERE,
     NO_SOFTER,
@@ -15,6 +13,8 @@ from ugat_marl.effects import (
     ExaminedStrengths,
     known_effects,
     measurement_effects,
+    nominal_number,
+    type_values,
 )
 from ugat_marl.errors import OptionError, UnknownNameError
 from ugat_marl.scenarios import Scenario
@@ -144,7 +144,7 @@ def global_hypotheses(scenario: Scenario, allowed: Collection[str]) -> list[Hypo
         if name not in allowed:
             continue
         kind, entry = known_effects()[name], examined(name)
-        nominal = _nominal(scenario, kind.attribute, entry.nominal)
+        nominal = nominal_number(scenario, kind.attribute, entry.nominal)
         extreme = tuple((level,) for level in entry.extreme)
         levels = tuple((level,) for level in entry.levels if abs(level - nominal) > entry.least)
         if name == "reaction_step":
@@ -165,7 +165,7 @@ def global_hypotheses(scenario: Scenario, allowed: Collection[str]) -> list[Hypo
             )
         )
     if "driver_model" in allowed:
-        now = _attribute(scenario, "carFollowModel")
+        now = type_values(scenario, "carFollowModel")
         hypotheses += [
             Hypothesis("driver_model", (("model", model),), (), ((),), None)
             for model in MODELS
@@ -223,28 +223,6 @@ def examined(name: str) -> ExaminedStrengths:
     strengths = known_effects()[name].examined
     assert strengths is not None, name
     return strengths
-
-
-def _nominal(scenario: Scenario, attribute: str, default: float) -> float:
-    """Return the mean of an attribute over the scenario's vehicle types, or `default`."""
-    values: list[float] = []
-    for text in _attribute(scenario, attribute) if attribute else ():
-        try:
-            values.append(float(text))
-        except ValueError:
-            return default
-    return float(np.mean(values)) if values else default
-
-
-def _attribute(scenario: Scenario, name: str) -> set[str]:
-    """Return the values of an attribute in the vehicle types of a scenario."""
-    texts: set[str] = set()
-    for document in (*scenario.additional, *scenario.routes):
-        if b"<vType" in document.read():
-            texts |= {
-                kind.get(name, "") for kind in document.parse().iter("vType") if kind.get(name)
-            }
-    return texts
 
 
 def free_values(effect: Effect, hypothesis: Hypothesis) -> tuple[float, ...]:

@@ -9,10 +9,11 @@ from __future__ import annotations
 import xml.etree.ElementTree as ET
 from collections.abc import Sequence
 from dataclasses import dataclass, fields, replace
+from statistics import fmean
 from typing import ClassVar
 
 from ugat_marl.effects.base import Effect, ExaminedStrengths, NumberParameter, TextParameter
-from ugat_marl.effects.documents import edit_scenario, with_default_types
+from ugat_marl.effects.documents import edit_scenario, mentions, with_default_types
 from ugat_marl.scenarios import Scenario
 
 _NOT_DRIVEN = frozenset(
@@ -33,6 +34,41 @@ of 1 s, which PWagner2009 does not."""
 def driven_types(root: ET.Element) -> list[ET.Element]:
     """Return all vehicle types of a document that drive on the road."""
     return [element for element in root.iter("vType") if element.get("vClass") not in _NOT_DRIVEN]
+
+
+def type_values(scenario: Scenario, attribute: str) -> set[str]:
+    """Return the values of an attribute in the driven vehicle types of a scenario."""
+    texts: set[str] = set()
+    for document in (*scenario.additional, *scenario.routes):
+        if mentions(document, "<vType"):
+            for part in document.parts():
+                texts |= {_text(kind, attribute) for kind in driven_types(part)}
+    return texts - {""}
+
+
+def nominal_number(scenario: Scenario, attribute: str, default: float) -> float:
+    """Return the value of an effect that changes nothing in a scenario.
+
+    Args:
+        scenario: The scenario without the effect.
+        attribute: Attribute of vehicle types with the effect's number, or "".
+        default: Value without an effect where no type names the attribute, or in words.
+
+    Returns:
+        The mean of the different values in the scenario's types.
+    """
+    try:
+        values = [float(text) for text in type_values(scenario, attribute)]
+    except ValueError:
+        return default
+    return fmean(sorted(values)) if values else default
+
+
+def _text(vehicle_type: ET.Element, attribute: str) -> str:
+    """Return an attribute of a type as text, also in the old way to write a type."""
+    models = [model for model in vehicle_type if model.tag.startswith("carFollowing-")]
+    texts = (element.get(attribute) for element in (*models, vehicle_type))
+    return next((text for text in texts if text), "")
 
 
 @dataclass(frozen=True)
@@ -77,9 +113,7 @@ def _set(element: ET.Element, attribute: str, number: float) -> None:
 
 
 def _get(vehicle_type: ET.Element, attribute: str, default: float) -> float:
-    models = [model for model in vehicle_type if model.tag.startswith("carFollowing-")]
-    texts = (element.get(attribute) for element in (*models, vehicle_type))
-    return float(next((text for text in texts if text is not None), default))
+    return float(_text(vehicle_type, attribute) or default)
 
 
 @dataclass(frozen=True)

@@ -19,10 +19,18 @@ from typing import Any, ClassVar
 import numpy as np
 from numpy.typing import NDArray
 
-from ugat_marl.effects import EVERYWHERE, NO_SOFTER, ControllerPart, Effect, known_effects
+from ugat_marl.effects import (
+    EVERYWHERE,
+    NO_SOFTER,
+    ControllerPart,
+    Effect,
+    known_effects,
+    nominal_number,
+)
 from ugat_marl.errors import CheckpointError, UnknownNameError
 from ugat_marl.grounding.regression import Design, Floats, kernel, left_out, ridge
 from ugat_marl.grounding.summaries import Summary
+from ugat_marl.scenarios import Scenario
 from ugat_marl.seeding import numpy_generator
 
 
@@ -45,6 +53,13 @@ class Prior:
     nominal: float
     group: str = ""
     chance: float = 0.35
+
+    def of(self, scenario: Scenario) -> Prior:
+        """Return the prior with a scenario's nominal value, which its range includes."""
+        kind = known_effects()[self.name]
+        nominal = nominal_number(scenario, kind.attribute, self.nominal)
+        low, high = min(self.low, nominal), max(self.high, nominal)
+        return replace(self, low=low, high=high, nominal=nominal)
 
 
 LIBRARY = (
@@ -111,6 +126,7 @@ class Worlds:
         lanes: Sequence[str],
         without: Sequence[str] = (),
         service: bool = True,
+        scenario: Scenario | None = None,
     ) -> Worlds:
         """Return the prior of a network.
 
@@ -118,6 +134,8 @@ class Worlds:
             lanes: Ids of the lanes.
             without: Effects to leave out.
             service: True to estimate the service of lanes.
+            scenario: The simulation without effects of the library; its vehicle types give the
+                nominal values. None for those of SUMO's passenger car.
 
         Raises:
             UnknownNameError: An effect to leave out is not in the library.
@@ -127,6 +145,8 @@ class Worlds:
             if name not in names:
                 raise UnknownNameError("effect of the library", name, names)
         library = tuple(item for item in LIBRARY if item.name not in without)
+        if scenario is not None:
+            library = tuple(item.of(scenario) for item in library)
         return cls(library, tuple(lanes), service)
 
     def draw(self, seed: int) -> Values:

@@ -210,6 +210,7 @@ class FittedStreet:
                 numbers[f"effects/{item.name}"] = float(middle)
                 numbers[f"effects/{item.name}/low"] = float(low)
                 numbers[f"effects/{item.name}/high"] = float(high)
+                numbers[f"effects/{item.name}/nominal"] = item.nominal
             for lane, (begin_s, each_s) in zip(self.lanes, service_s.mean(0), strict=True):
                 numbers[f"service/begin_s/{lane}"] = float(begin_s)
                 numbers[f"service/each_s/{lane}"] = float(each_s)
@@ -537,7 +538,7 @@ def street_prior(env: TrafficEnv, config: StreetConfig) -> Worlds:
     view = LaneView.of(env.network, str(env.options.observation))
     everything = tuple(item.name for item in LIBRARY)
     left_out = config.without if "effects" in config.parts else everything
-    return Worlds.of(view.lanes, left_out, "service" in config.parts)
+    return Worlds.of(view.lanes, left_out, "service" in config.parts, env.scenario)
 
 
 def _arrays(simulated: Sequence[Simulated]) -> dict[str, Tensor]:

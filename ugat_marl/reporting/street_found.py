@@ -97,14 +97,15 @@ def _effects(record: RunRecord) -> Grid | None:
     rows: list[list[str]] = []
     for prior in LIBRARY:
         name = f"effects/{prior.name}"
-        middle, low, high = (_last(record, f"{name}{end}") for end in ("", "/low", "/high"))
-        if middle is None or low is None or high is None:
+        ends = ("", "/low", "/high", "/nominal")
+        middle, low, high, nominal = (_last(record, f"{name}{end}") for end in ends)
+        if middle is None or low is None or high is None or nominal is None:
             continue
         unit = next(iter(known_effects()[prior.name].ranges.values())).unit or "–"
-        usual = "yes" if low <= prior.nominal <= high else "no"
+        usual = "yes" if low <= nominal <= high else "no"
         rows.append(
             [
-                prior.name.replace("_", " "), unit, number(prior.nominal), number(middle),
+                prior.name.replace("_", " "), unit, number(nominal), number(middle),
                 f"{number(low)} to {number(high)}", usual,
             ]
         )  # fmt: skip
