@@ -7,6 +7,7 @@ from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
+import polars as pl
 import pytest
 
 from tests.interrupts import KillAt
@@ -14,17 +15,19 @@ from tests.runs import SMALL, numbers, play_nothing, weights
 from ugat_marl.data import TransitionLog
 from ugat_marl.effects import load_scenario
 from ugat_marl.envs import parallel_env
-from ugat_marl.errors import CheckpointError, OptionError, UnknownNameError
+from ugat_marl.errors import CheckpointError, LogError, OptionError, UnknownNameError
 from ugat_marl.experiments import transfer
 from ugat_marl.grounding import (
     FittedStreet,
     LaneView,
+    NegativeControl,
     Simulation,
     StreetConfig,
     StreetFit,
     UgatConfig,
     fit_channel,
     fit_street,
+    require_histories,
     street_env,
     street_prior,
 )
@@ -246,7 +249,44 @@ def test_the_kept_policy_is_the_one_on_the_street(
     assert second is kept
 
 
-def test_noise_as_a_control_is_refused_without_f(tmp_path: Path) -> None:
+@pytest.mark.parametrize(
+    ("control", "message"), [("noise", "needs f"), ("shuffled", "leaves no histories")]
+)
+def test_controls_without_a_meaning_are_refused(
+    control: NegativeControl, message: str, tmp_path: Path
+) -> None:
     ugat = replace(SMALL.ugat, grounding="street", street=QUICK)
-    with pytest.raises(OptionError, match="needs f"):
-        transfer(replace(SMALL, placebo="noise", ugat=ugat), tmp_path, workers=1)
+    with pytest.raises(OptionError, match=message):
+        transfer(replace(SMALL, placebo=control, ugat=ugat), tmp_path, workers=1)
+
+
+def in_part(log: TransitionLog, kept: pl.Expr) -> TransitionLog:
+    return TransitionLog(log.provenance, log.frame.filter(kept))
+
+
+def test_a_log_without_histories_is_refused() -> None:
+    log = recorded(LATE, 300)
+    step = pl.col("step")
+    require_histories(log)
+    require_histories(in_part(log, step != 9))  # one decision was lost
+    require_histories(TransitionLog(log.provenance, log.frame.sample(fraction=1.0, shuffle=True)))
+    alone = log.frame.with_columns(episode=step, step=pl.lit(0, dtype=log.frame["step"].dtype))
+    alone = alone.with_columns(pl.col("episode").cast(log.frame["episode"].dtype))
+    for broken in (
+        in_part(log, step % 2 == 0),
+        in_part(log, step % 3 > 0),
+        TransitionLog(log.provenance, alone),
+    ):
+        with pytest.raises(LogError, match="follow the one before"):
+            require_histories(broken)
+        with pytest.raises(LogError, match="follow the one before"):
+            fit_street(broken, None, None, None, None, QUICK, 0)  # pyright: ignore[reportArgumentType]
+
+
+def test_a_broken_log_ends_a_training_before_it_begins(tmp_path: Path) -> None:
+    log = in_part(recorded(LATE, 300), pl.col("step") % 2 == 0)
+    log.write(tmp_path / "street.parquet")
+    ugat = replace(SMALL.ugat, grounding="street", street=QUICK)
+    config = replace(SMALL, ugat=ugat, real_log=tmp_path / "street.parquet")
+    with pytest.raises(LogError, match="follow the one before"):
+        transfer(config, tmp_path / "run", workers=1)

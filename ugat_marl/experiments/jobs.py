@@ -53,6 +53,7 @@ from ugat_marl.grounding import (
     SimulatedWorld,
     World,
     is_kept,
+    require_histories,
 )
 from ugat_marl.parallel import Workers, in_this_process
 from ugat_marl.policies import STANDARD_RULES, Policy, PolicyFactory, Taught
@@ -491,6 +492,8 @@ def worlds_of(job: Job, env: TrafficEnv, workers: Workers) -> tuple[SimulatedWor
     assert ugat is not None
     if job.real_log is not None:
         log = TransitionLog.read(Path(job.real_log))
+        if ugat.grounding == "street":
+            require_histories(log)  # now instead of after plain training
         recorded = RecordedWorld(log, env, ugat.fit.held_out_every)
     without_street = recorded is not None or job.setting.placebo == "same-world"
     street = job.sim if without_street else job.target

@@ -137,6 +137,11 @@ def train_grounded(
     if ugat.grounding == "street":
         if placebo == "noise":
             raise OptionError('the control "noise" needs f; grounding "street" has none')
+        if placebo == "shuffled":
+            raise OptionError(
+                'the control "shuffled" leaves no histories, from which grounding "street" is '
+                'read; use the control "same-world"'
+            )
         algorithm = street_training(make, workers, device=device, **common)
         residual = ugat.residual(env.recorded_layouts, seed, neighbours_of(env))
         fitted: Any = StreetFit(street_prior(env, ugat.street), residual=residual)

@@ -3,6 +3,7 @@ from .algorithm import DIRECT_LEARNER as DIRECT_LEARNER
 from .algorithm import Probe as Probe
 from .channel import CommandChannel as CommandChannel
 from .channel import fit_channel as fit_channel
+from .channel import require_histories as require_histories
 from .config import UgatConfig as UgatConfig
 from .config import as_published as as_published
 from .config import published_reward as published_reward

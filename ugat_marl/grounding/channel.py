@@ -33,6 +33,9 @@ from ugat_marl.seeding import numpy_generator
 
 Floats = NDArray[np.float64]
 
+LEAST_IN_ORDER = 0.8
+"""Smallest share of decisions that must follow the one before. With lags of up to six decisions,
+a fifth of the decisions of such a log still have a whole history."""
 UNEXPLAINED = 1e-3
 """Chance of a decision that no lag explains."""
 Table = NDArray[np.bool_]
@@ -229,6 +232,29 @@ class FittedActuator(Actuator):
             mask *= allowed
 
 
+def require_histories(log: TransitionLog) -> None:
+    """Refuse a log whose decisions are not in sequence, since nothing late can be seen in it.
+
+    Raises:
+        LogError: Too few decisions of an agent follow the one before in their episode.
+    """
+    for agent in log.agents:
+        rows = log.transitions(agent)
+        follows = int(_goes_on(rows).sum())
+        if follows < LEAST_IN_ORDER * (len(rows) - 1):
+            raise LogError(
+                f"only {follows} of the {len(rows)} decisions of {agent} in the log follow the one "
+                "before, step by step in an episode; a fitted street is read from histories of "
+                "commands and counts, so record whole episodes and keep their steps, or choose "
+                "another grounding (--grounding timed)"
+            )
+
+
+def _goes_on(rows: Transitions) -> NDArray[np.bool_]:
+    """Return whether each decision but the first follows the one before it, ``(n - 1,)``."""
+    return (np.diff(rows.episode) == 0) & (np.diff(rows.step) == 1)
+
+
 def fit_channel(
     log: TransitionLog, config: ChannelConfig | None = None, held_s: float = 0.0
 ) -> CommandChannel:
@@ -300,7 +326,7 @@ class _Course:
             raise LogError("a channel needs a log with two decisions or more of every agent")
         shown = rows.observation[:, layout.features : layout.features + layout.phases]
         running = shown.argmax(1).astype(np.int64)
-        goes_on = (np.diff(rows.episode) == 0) & (np.diff(rows.step) == 1)
+        goes_on = _goes_on(rows)
         asked = np.full((config.most_lag + 1, count), -1, dtype=np.int64)
         asked[0] = rows.action
         for lag in range(1, len(asked)):

@@ -35,7 +35,12 @@ from ugat_marl.data import TransitionLog, read_checkpoint, write_checkpoint
 from ugat_marl.effects import ControllerPart, Domain, Effect
 from ugat_marl.envs import AgentSet, ResetResult, TrafficEnv, parallel_env
 from ugat_marl.errors import CheckpointError, OptionError, ScenarioError, UnknownNameError
-from ugat_marl.grounding.channel import ChannelConfig, CommandChannel, fit_channel
+from ugat_marl.grounding.channel import (
+    ChannelConfig,
+    CommandChannel,
+    fit_channel,
+    require_histories,
+)
 from ugat_marl.grounding.eyes import Eyes, EyesConfig, fit_eyes
 from ugat_marl.grounding.posterior import (
     LIBRARY,
@@ -419,7 +424,11 @@ def fit_street(
 
     Returns:
         The street, and the results for a further fit.
+
+    Raises:
+        LogError: Too many decisions are missing in the log, or they are not in sequence.
     """
+    require_histories(real)
     known = known or Known()
     lanes, interval_s = worlds.lanes, real.provenance.decision_interval_s
     timing = simulation.scenario.timing
