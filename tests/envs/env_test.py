@@ -321,6 +321,40 @@ def test_under_the_networks_own_programme_actions_say_nothing() -> None:
         np.testing.assert_array_equal(a.observations["signal_0"], b.observations["signal_0"])
 
 
+def test_under_a_programme_the_observation_shows_the_green_of_the_light() -> None:
+    """The programme has two through greens, which are phases, and two left turns, which are none.
+
+    27 s through, 3 s yellow, 10 s left, 3 s yellow, 2 s red, and the same for the other road.
+    """
+    env = ugat_marl.parallel_env("single-v1", signals="programme", duration_s=110)
+    layout = env.layouts["signal_0"]
+    observations, _ = env.reset(seed=1)
+    one_hots = [observations["signal_0"][layout.features : layout.features + layout.phases]]
+    phases, executed = [env.phases[0]], [0]
+    while env.agents:
+        observations, _, _, _, infos = env.step({"signal_0": 5})
+        one_hots.append(observations["signal_0"][layout.features :])
+        phases.append(env.phases[0])
+        executed.append(infos["signal_0"]["executed_action"])
+    at_s = dict(zip(range(0, 120, 10), phases, strict=True))
+    assert (at_s[10], at_s[20]) == (0, 0) and at_s[40] == -1
+    assert (at_s[50], at_s[70]) == (1, 1) and at_s[80] == -1
+    assert (at_s[100], at_s[110]) == (0, 0)
+    for vector, phase in zip(one_hots, phases, strict=True):
+        assert np.flatnonzero(vector).tolist() == ([phase] if phase >= 0 else [])
+    assert executed[4] == 0 and executed[8] == 1  # the last phase of its own
+    env.close()
+    scenario = env.scenario.with_control(phases="programme")
+    env = ugat_marl.parallel_env(scenario, signals="programme", duration_s=110)
+    env.reset(seed=1)
+    shown: set[int] = set(env.phases)
+    while env.agents:
+        env.step({"signal_0": 0})
+        shown.add(env.phases[0])
+    assert shown == {0, 1, 2, 3}
+    env.close()
+
+
 # --- pictures -----------------------------------------------------------------------------------
 
 

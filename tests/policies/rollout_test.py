@@ -8,7 +8,9 @@ from typing import Any
 import numpy as np
 import pytest
 
+from ugat_marl.effects import load_scenario
 from ugat_marl.envs import TrafficEnv, parallel_env
+from ugat_marl.errors import OptionError
 from ugat_marl.policies import EpsilonGreedy, make_rule, observer_of, roll_out
 
 
@@ -101,3 +103,24 @@ def test_a_log_names_agents_as_the_environment_that_will_read_it() -> None:
         assert env.possible_agents == parallel_env("mixed-v1").possible_agents
     finally:
         env.close()
+
+
+def test_greens_that_no_action_means_are_not_recorded() -> None:
+    scenario = load_scenario("single-v1")
+    for phases in ("conflict-free", "programme"):
+        env = parallel_env(
+            scenario.with_control(phases=phases), signals="programme", duration_s=110
+        )
+        try:
+            rule = make_rule("programme", env)
+            if phases == "conflict-free":
+                with pytest.raises(
+                    OptionError, match=r"none of its phases.*phases = \"programme\""
+                ):
+                    roll_out(env, rule, 3, record=observer_of(env))
+                continue
+            log = roll_out(env, rule, 3, record=observer_of(env)).log
+            assert log is not None
+            assert set(log.transitions("signal_0").executed.tolist()) == {0, 1, 2, 3}
+        finally:
+            env.close()

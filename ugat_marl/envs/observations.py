@@ -155,7 +155,7 @@ class Observer:
 
         Args:
             snapshot: Measured lanes.
-            phases: Phase of each intersection that is green or about to be.
+            phases: Phase of each intersection that is green or about to be; -1 for none.
             memory: The last commands, for an observer that includes them.
 
         Returns:
@@ -163,7 +163,8 @@ class Observer:
         """
         vector = np.zeros(self._length, dtype=np.float32)
         vector[self._feature_places] = self._flat(snapshot)
-        vector[self._first_phases + np.array(phases)] = 1.0
+        places = np.array(phases)
+        vector[(self._first_phases + places)[places >= 0]] = 1.0
         seen = vector if self._context is None else vector[self._context]
         rows = [seen[part] for part in self._parts]
         if memory is None:

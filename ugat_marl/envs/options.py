@@ -71,7 +71,8 @@ class EnvOptions:
         commands: Number of its own last commands that an agent sees, and the age of its green with
             them; 0 for none. Needed where commands are late or lost.
         signals: ``"actions"``, or ``"programme"``: SUMO runs the network's own signal programme
-            and actions are ignored.
+            and actions are ignored. Agents see the phase with the same green links; while the green
+            is none of their phases, they see no phase.
         duration_s: Length of an episode in s; None for the scenario's own.
         simulator: ``"process"`` (any number at once, exactly repeatable), ``"spawn"`` (the same
             without forking), or ``"inprocess"`` (one per process, a little faster).

@@ -30,6 +30,7 @@ from ugat_marl.envs.actuators import Actuators
 from ugat_marl.envs.objectives import Objectives
 from ugat_marl.envs.observations import Observer, joint_space
 from ugat_marl.envs.options import EnvKeywords, EnvOptions, with_env_keywords
+from ugat_marl.envs.programmes import ProgrammePhases
 from ugat_marl.envs.registration import register_single
 from ugat_marl.envs.rendering import NetworkRenderer
 from ugat_marl.envs.rewards import Rewarder
@@ -105,6 +106,8 @@ class TrafficEnv(ParallelEnv[str, Any, Any]):
         self._objectives = Objectives.of(effects, self.scenario)
         self._name_agents()
         self._states = [signals.initial_state(self._timing) for _ in self.possible_agents]
+        own = options.signals == "programme"
+        self._programmes = ProgrammePhases(self.network) if own else None
         self._state_space = joint_space(list(self.observation_spaces.values()))
         self._simulator: Simulator | None = None
         self._directory = OwnDirectory()
@@ -146,7 +149,12 @@ class TrafficEnv(ParallelEnv[str, Any, Any]):
 
     @property
     def phases(self) -> list[int]:
-        """Phase of each intersection that is green or about to be, in the order of the agents."""
+        """Phase of each intersection that is green or about to be, in the order of the agents.
+
+        Under the network's own programmes -1 is a green that is none of the light's phases.
+        """
+        if self._programmes is not None:
+            return list(self._programmes.shown)
         return [state.phase for state in self._states]
 
     def describe(self) -> Description:
@@ -176,6 +184,9 @@ class TrafficEnv(ParallelEnv[str, Any, Any]):
         self._scores = None
         self._decision = 0
         self._states = [signals.initial_state(self._timing) for _ in self.agents]
+        if self._programmes is not None:
+            self._programmes.reset()
+            self._look_at_programmes()
         if self._memory is not None:
             self._memory.reset(self.phases)
         lights = self.network.intersections
@@ -365,12 +376,21 @@ class TrafficEnv(ParallelEnv[str, Any, Any]):
                 intersection.phases, state, phase, self.decision_interval_s, self._timing
             )
             states.append(after)
-        if self.options.signals == "programme":
-            plans, states = {}, self._states
+        if self._programmes is not None:
+            plans = {}
         plans = self._delays.hold(plans)
         agents, self.agents = self.agents, []  # the episode is over if SUMO fails
         self._look(self._simulator.advance(self.decision_interval_s, plans))
         self.agents, self._states = agents, states
+        self._look_at_programmes()
+
+    def _look_at_programmes(self) -> None:
+        """Take over the phases of lights that run SUMO's own programmes."""
+        assert self._simulator is not None
+        if self._programmes is not None:
+            self._programmes.look(self._simulator.signals())
+            start = signals.initial_state(self._timing)
+            self._states = [start._replace(phase=p, origin=p) for p in self._programmes.latest]
 
     def _look(self, snapshot: Snapshot) -> None:
         self._snapshot = snapshot

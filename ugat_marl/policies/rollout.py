@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 
 from ugat_marl.data import Provenance, TransitionLog, TransitionRecorder, installed_version
 from ugat_marl.envs import OBSERVATION_UNITS, Actions, AnyParallelEnv, Infos, Observations, Observer
+from ugat_marl.errors import OptionError
 from ugat_marl.policies.protocols import Policy
 from ugat_marl.seeding import numpy_generator
 from ugat_marl.simulation import Snapshot
@@ -120,6 +121,7 @@ class _Recording:
 
     def add(self, actions: Actions, rewards: Mapping[str, float], infos: Infos) -> None:
         then = self._look()
+        self._refuse_other_greens()
         executed = {agent: int(infos[agent]["executed_action"]) for agent in self._names}
         held = {agent: float(infos[agent].get("delay_s", 0.0)) for agent in self._names}
         acted, served, got, held = map(self._renamed, (actions, executed, rewards, held))
@@ -132,6 +134,16 @@ class _Recording:
 
     def log(self) -> TransitionLog:
         return self._recorder.log()
+
+    def _refuse_other_greens(self) -> None:
+        """Refuse decisions in which a programme shows a green that no action means."""
+        phases = dict(zip(self._base.possible_agents, self._base.phases, strict=True))
+        if lost := [agent for agent, phase in phases.items() if phase < 0]:
+            raise OptionError(
+                f"scenario {self._base.scenario.id!r}: the programme of {lost[0]!r} shows a green "
+                "that is none of its phases, so no action can be recorded for it; set "
+                'control.phases = "programme", or record another policy'
+            )
 
     def _served(self) -> dict[str, NDArray[np.float32]] | None:
         """Return the last decision's features minus the mean number of vehicles that left since.
