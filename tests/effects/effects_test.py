@@ -9,6 +9,7 @@ import subprocess
 import xml.etree.ElementTree as ET
 from collections.abc import Callable, Iterator
 from pathlib import Path
+from typing import Any
 
 import libsumo
 import numpy as np
@@ -395,6 +396,25 @@ def test_a_domain_on_other_roads_is_refused(crossing: Crossing) -> None:
     other = dict(shipped_scenarios())["single-v1"]
     with pytest.raises(ScenarioError, match=r"has other roads or signals than scenario 'crossing0"):
         scenario_in_domain(load_scenario(crossing()), str(other))
+
+
+@pytest.mark.parametrize(
+    ("control", "says"),
+    [
+        ({"decision_interval_s": 5.0}, r"decides every 5 s, and scenario '.*' every 10 s"),
+        ({"phases": "permitted"}, r"other phases than scenario 'single-v1': phase \d of .*'A1'"),
+        ({"phases": "programme"}, r"phase 1 of traffic light 'A1' is \w+ there and \w+ here"),
+    ],
+)
+def test_a_domain_in_which_actions_mean_something_else_is_refused(
+    control: dict[str, Any], says: str, tmp_path: Path
+) -> None:
+    scenario = load_scenario("single-v1")
+    other = scenario.with_control(**control).write(tmp_path / "other")
+    with pytest.raises(ScenarioError, match=says):
+        scenario_in_domain(scenario, str(other))
+    same = scenario.with_control(yellow_s=4.0, min_green_s=10.0).write(tmp_path / "same")
+    assert scenario_in_domain(scenario, str(same)).timing.yellow_s == 4.0
 
 
 # --- on what is shipped, in SUMO without the suite

@@ -11,6 +11,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from itertools import zip_longest
 from pathlib import Path
 from typing import Any, Literal, get_args
 
@@ -24,7 +25,7 @@ from ugat_marl.effects.table import (
     refuse_outside,
 )
 from ugat_marl.errors import OptionError, ScenarioError, UnknownNameError, nearest
-from ugat_marl.scenarios import Scenario
+from ugat_marl.scenarios import Network, Scenario
 
 Domain = str | Sequence[Effect]
 """``"sim"``, a named domain or its alias, ``"effect=value+effect=value"``, a scenario directory or
@@ -301,7 +302,8 @@ def scenario_in_domain(scenario: Scenario, domain: Domain) -> Scenario:
         UnknownNameError: The domain or an effect does not exist.
         OptionError: An effect has an impossible value or lies outside of the scenario's time, or
             two of them exclude each other.
-        ScenarioError: A scenario named as a domain cannot be read or has other roads.
+        ScenarioError: A scenario named as a domain cannot be read or has other roads, phases or
+            decision intervals.
     """
     if (path := domain_path(domain)) is not None:
         other = load_scenario(path)
@@ -310,6 +312,7 @@ def scenario_in_domain(scenario: Scenario, domain: Domain) -> Scenario:
                 f"domain {domain!r} has other roads or signals than scenario {scenario.id!r}; "
                 "a domain must be on the same network, or a policy means nothing in it"
             )
+        _refuse_other_actions(scenario, other, domain)
         return _checked(other)
     check_windows(scenario, domain)
     return _checked(apply_effects(scenario, parse_domain(domain)))
@@ -336,6 +339,34 @@ def _checked(scenario: Scenario) -> Scenario:
             "alone, a reach (control.reach_m) those upstream of it, too; leave out one of the two"
         )
     return scenario
+
+
+def _refuse_other_actions(scenario: Scenario, other: Scenario, domain: Domain) -> None:
+    """Refuse a scenario as a domain in which the same action means something else."""
+    own_s, other_s = (each.control.decision_interval_s for each in (scenario, other))
+    if own_s != other_s:
+        raise ScenarioError(
+            f"domain {domain!r} decides every {other_s:g} s, and scenario {scenario.id!r} every "
+            f"{own_s:g} s; give both the same control.decision_interval_s, or a policy decides at "
+            "other times in it"
+        )
+    own, others = (_greens(each) for each in (scenario, other))
+    for light in sorted({*own, *others}):
+        here, there = own.get(light, ()), others.get(light, ())
+        if here != there:
+            pairs = enumerate(zip_longest(here, there, fillvalue="none"))
+            place, (mine, theirs) = next((n, pair) for n, pair in pairs if pair[0] != pair[1])
+            raise ScenarioError(
+                f"domain {domain!r} has other phases than scenario {scenario.id!r}: phase {place} "
+                f"of traffic light {light!r} is {theirs} there and {mine} here; give both the same "
+                "control.phases and programmes, or an action means another green in it"
+            )
+
+
+def _greens(scenario: Scenario) -> dict[str, tuple[str, ...]]:
+    """Return the phases of every agent; it is not told who has to yield."""
+    lights = Network.read(scenario).intersections
+    return {light.id: tuple(p.replace("g", "G") for p in light.phases) for light in lights}
 
 
 def domain_path(domain: Domain) -> Path | None:
