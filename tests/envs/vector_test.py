@@ -21,7 +21,7 @@ from gymnasium import vector as gymnasium_vector
 from gymnasium.wrappers.vector import RecordEpisodeStatistics
 
 from ugat_marl import parallel_env, vector_env
-from ugat_marl.effects import StartupDelay, load_scenario
+from ugat_marl.effects import ControllerPart, StartupDelay, load_scenario, parse_domain
 from ugat_marl.envs import AgentSet, VectorEnv, agent_indicator, pad_spaces
 from ugat_marl.envs.vector.arrays import Arrays, Shape, shared_memory
 from ugat_marl.envs.vector.gymnasium_env import GymnasiumVectorEnv
@@ -37,6 +37,9 @@ from ugat_marl.errors import (
     UnknownNameError,
     WorkerError,
 )
+from ugat_marl.grounding import CommandChannel, FittedService
+from ugat_marl.grounding.eyes import DeadLanes
+from ugat_marl.scenarios import Network
 from ugat_marl.simulation import Host
 
 Crossing = Callable[..., Path]
@@ -162,6 +165,29 @@ def test_one_is_a_plain_environment_to_the_bit(domain: str, temporary: Path) -> 
     assert found == alone(plain, 3)
     plain.close()
     assert list(temporary.iterdir()) == []
+
+
+def test_a_fitted_street_is_the_same_as_alone() -> None:
+    lanes = Network.read(load_scenario("single-v1")).lane_table().ids
+    phases = np.ones((3, 8, 8), dtype=np.bool_)
+    phases[1] = np.eye(8, dtype=np.bool_)  # a phase stays for a second decision
+    parts: tuple[ControllerPart, ...] = (
+        FittedService(lanes, np.tile([[2.0, 1.0]], (len(lanes), 1))),
+        CommandChannel(
+            ("signal_0",), np.array([0.3, 0.5, 0.2]), np.array([[30.0, 50.0, 20.0]]), (phases,), 9.0
+        ),
+        DeadLanes(lanes[:2]),
+        *parse_domain("counting_error=2"),
+    )
+    digests: list[str] = []
+    for fitted in ((), *((part,) for part in parts), parts):
+        with vector_env("single-v1", 1, duration_s=LENGTH_S, fitted=fitted) as env:
+            ((found,),) = together(env, 3)
+        plain = parallel_env("single-v1", duration_s=LENGTH_S, fitted=fitted)
+        assert found == alone(plain, 3)
+        plain.close()
+        digests.append(found)
+    assert len({*digests}) == len(digests)  # each of them changes something
 
 
 def test_an_episode_depends_on_its_seed_and_domain_alone() -> None:

@@ -195,6 +195,10 @@ class Effect(ControllerPart):
         """Return name and parameters, as in ``[[effects]]`` of a scenario file."""
         return {"name": self.name} | self._values()
 
+    def state_dict(self) -> dict[str, Any]:
+        """Return the parameters by name."""
+        return self._values()
+
     def _values(self) -> dict[str, Any]:
         return {field.name: getattr(self, field.name) for field in fields(self)}
 

@@ -11,7 +11,7 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from enum import IntEnum
-from typing import ClassVar
+from typing import Any, ClassVar, Self
 
 import numpy as np
 from numpy.typing import NDArray
@@ -83,6 +83,17 @@ class ControllerPart:
     def service(self) -> Mapping[str, tuple[float, float]]:
         """Return lane to red in its greens, in s: at their beginning, and in each decision."""
         return {}
+
+    def state_dict(self) -> dict[str, Any]:
+        """Return the change as values for JSON, to send it to another process."""
+        raise NotImplementedError(
+            f"{type(self).__name__} has no state_dict(), which vector_env sends to its processes"
+        )
+
+    @classmethod
+    def from_state(cls, state: Mapping[str, Any]) -> Self:
+        """Restore `state_dict`."""
+        return cls(**state)
 
 
 class Sensor:

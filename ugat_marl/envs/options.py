@@ -77,7 +77,7 @@ class EnvOptions:
         simulator: ``"process"`` (any number at once, exactly repeatable), ``"spawn"`` (the same
             without forking), or ``"inprocess"`` (one per process, a little faster).
         fitted: Fitted changes of sensors, commands and greens, beside those of the scenario's
-            effects.
+            effects, such as the parts of a `ugat_marl.grounding.StreetWorld`.
         crossings: True to measure when vehicles cross the stop lines, for roll-outs to record. It
             is slower, because lanes are read every second.
         render_mode: None, ``"rgb_array"`` (a picture from `render`) or ``"human"`` (sumo-gui).

@@ -190,6 +190,10 @@ class DeadLanes(ControllerPart):
     def __init__(self, lanes: Sequence[str]) -> None:
         self._lanes = tuple(lanes)
 
+    def state_dict(self) -> dict[str, Any]:
+        """Return the lanes."""
+        return {"lanes": list(self._lanes)}
+
     def sensor(self, network: Network, decision_interval_s: float) -> Sensor:
         """Make a sensor with these dead detectors."""
         del decision_interval_s

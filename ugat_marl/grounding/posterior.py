@@ -216,6 +216,15 @@ class FittedService(ControllerPart):
         """Return lane to red in its greens, in s: at their beginning, and in each decision."""
         return self._red
 
+    def state_dict(self) -> dict[str, Any]:
+        """Return the lanes with red and their seconds."""
+        return {"lanes": list(self._red), "service_s": list(map(list, self._red.values()))}
+
+    @classmethod
+    def from_state(cls, state: Mapping[str, Any]) -> FittedService:
+        """Restore `state_dict`."""
+        return cls(state["lanes"], np.array(state["service_s"], float).reshape(-1, 2))
+
 
 @dataclass(frozen=True)
 class Simulated:

@@ -41,6 +41,7 @@ class Spec:
         applied: Effects in the scenario; some of them are in no file.
         options: Options of `EnvOptions`.
         functions: Option to ``"module:name"``, for a reward or an observation that is a function.
+        fitted: ``"module:name"`` of each fitted change, with its values.
         wraps: ``"module:name"`` of each wrapper.
     """
 
@@ -48,6 +49,7 @@ class Spec:
     applied: Sequence[str]
     options: Mapping[str, Any]
     functions: Mapping[str, str]
+    fitted: Sequence[tuple[str, Mapping[str, Any]]]
     wraps: Sequence[str]
 
     @classmethod
@@ -64,6 +66,10 @@ class Spec:
             scenario.applied,
             plain,
             functions,
+            [
+                (spelling("fitted", type(part)), part.state_dict())
+                for part in plain.pop("fitted", ())
+            ],
             [spelling("wrap", each) for each in listed(wraps)],
         )
 
@@ -75,6 +81,7 @@ class Spec:
         """Make the environment in a domain of `sent`, with the simulator in this process."""
         options = dict(self.options)
         options |= {name: imported(text) for name, text in self.functions.items()}
+        options["fitted"] = tuple(imported(text).from_state(state) for text, state in self.fitted)
         options["simulator"] = "inprocess"
         scenario = replace(load_scenario(self.scenario), applied=tuple(self.applied))
         env: AnyParallelEnv = parallel_env(scenario, received(domain), **options)
