@@ -25,17 +25,20 @@ Fault = Callable[[np.ndarray, np.random.Generator], np.ndarray]
 
 
 def counted(
-    decisions: int, generator: np.random.Generator, starts: tuple[float, ...] = (4.0, 4.0, 4.0)
+    decisions: int,
+    generator: np.random.Generator,
+    starts: tuple[float, ...] = (4.0, 4.0, 4.0),
+    rate: float = 1.7,
 ) -> tuple[np.ndarray, np.ndarray]:
     """Return counts ``(decisions + 1, lanes)`` and the phases that ran in between.
 
-    `starts` is what a lane serves in each decision of its green.
+    `starts` is what a lane serves in each decision of its green, `rate` what comes in a decision.
     """
     counts = np.zeros((decisions + 1, LANES))
     phases = (np.arange(decisions) // 3) % PHASES
     for t, phase in enumerate(phases):
         served = np.where(GREEN[:, phase], starts[t % len(starts)], 0.0)
-        arrivals = generator.poisson(1.7, LANES)
+        arrivals = generator.poisson(rate, LANES)
         counts[t + 1] = np.minimum(np.maximum(counts[t] - served, 0.0) + arrivals, 30.0)
     return counts, phases
 
@@ -45,11 +48,12 @@ def log_of(
     episodes: int = 4,
     seed: int = 0,
     starts: tuple[float, ...] = (4.0, 4.0, 4.0),
+    rate: float = 1.7,
 ) -> TransitionLog:
     generator = np.random.default_rng(seed)
     recorder = TransitionRecorder(Provenance("by hand", "", "street", (), 10.0, "count", LAYOUTS))
     for episode in range(episodes):
-        counts, phases = counted(300, generator, starts)
+        counts, phases = counted(300, generator, starts, rate)
         shown = counts if fault is None else fault(counts, generator)
         before = 0
         for t, phase in enumerate(phases):
@@ -103,6 +107,23 @@ def test_a_quiet_street_has_no_zone(share: float) -> None:
 
     eyes = fit_eyes(log_of(quiet, episodes=16), log_of(episodes=16, seed=99), VIEW)
     assert eyes.zone_m == (0.0, 0.0)
+
+
+@pytest.mark.parametrize("rate", [0.003, 0.02, 0.06])
+@pytest.mark.parametrize("usual", [0.02, 1.7])
+def test_a_long_quiet_log_has_no_fault(rate: float, usual: float) -> None:
+    """At night hardly anybody comes, whatever the simulation's own demand is."""
+    eyes = fit_eyes(log_of(episodes=60, rate=rate), log_of(seed=99, rate=usual), VIEW)
+    assert not eyes.changes, eyes.describe()
+
+
+def test_a_dead_lane_is_found_in_quiet_traffic() -> None:
+    def dead(counts: np.ndarray, _: np.random.Generator) -> np.ndarray:
+        return counts * np.array([1.0, 0.0, 1.0, 1.0])
+
+    eyes = fit_eyes(log_of(dead, rate=0.4), PERFECT, VIEW)
+    assert eyes.dead[1] > 0.7
+    assert np.delete(eyes.dead, 1).max() < 0.2
 
 
 def test_noise_is_found_with_its_size() -> None:

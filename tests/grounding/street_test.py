@@ -31,6 +31,7 @@ from ugat_marl.grounding import (
     street_env,
     street_prior,
 )
+from ugat_marl.grounding.eyes import Eyes, fit_eyes
 from ugat_marl.grounding.posterior import Values
 from ugat_marl.grounding.state import RunState
 from ugat_marl.grounding.street_training import StreetTraining
@@ -290,3 +291,23 @@ def test_a_broken_log_ends_a_training_before_it_begins(tmp_path: Path) -> None:
     config = replace(SMALL, ugat=ugat, real_log=tmp_path / "street.parquet")
     with pytest.raises(LogError, match="follow the one before"):
         transfer(config, tmp_path / "run", workers=1)
+
+
+def test_detectors_are_compared_over_equally_long_logs(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Of a street and a simulation of different lengths the common beginning is compared."""
+    seen: list[int] = []
+
+    def fit(real: TransitionLog, simulated: TransitionLog, *_: object) -> Eyes:
+        seen.extend((real.decisions, simulated.decisions))
+        return fit_eyes(real, simulated, view)
+
+    monkeypatch.setattr("ugat_marl.grounding.street.fit_eyes", fit)
+    config = replace(QUICK, parts=("eyes",))
+    env = parallel_env(SCENARIO)
+    prior, view = street_prior(env, config), LaneView.of(env.network, "count")
+    rule = make_rule("fixed-time:20", env)
+    env.close()
+    log = recorded("sim", 100)
+    for seconds, decisions in ((60.0, 6), (300.0, 10)):
+        fit_street(log, simulation(seconds), rule, prior, view, config, seed=0)
+        assert seen[-2:] == [decisions, decisions]

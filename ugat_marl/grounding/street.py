@@ -74,7 +74,7 @@ class StreetConfig:
         simulations: N, worlds that are simulated for the first posterior.
         further: Worlds that each further iteration adds, half of them drawn from the posterior.
         simulated_s: Length of an episode in such a world, in s. Of longer episodes of the street
-            only this first part is compared.
+            only this first part is compared. Detectors are compared over whole episodes.
         judged: Worlds of the fitted street in which policies are compared after each iteration; the
             best one is kept. 0 keeps the last one.
         without: Effects left out of the library.
@@ -438,8 +438,10 @@ def fit_street(
     if "eyes" in config.parts:
         seeds = [derive_seed(seed, "street", "baseline", k) for k in range(BASELINE_EPISODES)]
         plain = [street.world(one) for one in seeds]
-        logs = simulation.logs(plain, policy, seeds, None, on_done)
-        eyes = fit_eyes(real, TransitionLog.concatenate(logs), view, config.eyes)
+        logs = simulation.logs(plain, policy, seeds, real.decisions * interval_s, on_done)
+        baseline = TransitionLog.concatenate(logs)
+        # Of equal length: queues grow through a peak, and a log that ends before it has none.
+        eyes = fit_eyes(real.first(baseline.decisions), baseline, view, config.eyes)
         street = FittedStreet(lanes, interval_s, channel, eyes)
     if not config.simulates:
         return street, known
