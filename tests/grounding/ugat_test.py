@@ -371,7 +371,7 @@ def test_a_correction_that_cannot_be_trained_in_is_refused_at_once(
         transfer(replace(SMALL, corrected="no-such-directory"), tmp_path / "run")
     fewer = scenario_in_domain(load_scenario("single-v1"), "sim").with_control(phases="programme")
     fewer.write(tmp_path / "fewer")
-    with pytest.raises(ScenarioError, match="other agents, observations or phases"):
+    with pytest.raises(ScenarioError, match="has other phases than scenario"):
         transfer(replace(SMALL, corrected=str(tmp_path / "fewer")), tmp_path / "run")
     assert not (tmp_path / "run").exists()
 
