@@ -129,7 +129,7 @@ def test_domains_a_network_does_not_allow_are_left_out(
     late = {name for name, item in NAMED_DOMAINS.items() if "demand_timing=*,300" in item.effects}
     transitions = {name for name, named in NAMED_DOMAINS.items() if named.gap == "transition"}
     assert late and transitions - set(left) == {
-        *late, "meso",
+        *late, "incident", "meso",
     }  # fmt: skip
     assert all(f"{name} is left out: " in capture.get() for name in late)
     assert "no vehicle departs between 0 s and 300 s" in capture.get()

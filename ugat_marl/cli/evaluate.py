@@ -111,7 +111,7 @@ class Evaluate:
             if name in NAMED_DOMAINS and name not in self.domains and _may_not_fit(name):
                 try:
                     parallel_env(scenario, name, duration_s=self.duration_s)
-                except ScenarioError as error:
+                except (OptionError, ScenarioError) as error:
                     console.print(f"{name} is left out: {error}", style="dim", markup=False)
                     continue
             names.append(name)
