@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from typing import Any
 
 import pytest
+from tyro.conf import CascadeSubcommandArgs
 
 from ugat_marl.errors import OptionError
 from ugat_marl.experiments import PaperConfig, TransferConfig
@@ -23,6 +25,45 @@ def test_the_preset_restores_every_departure_and_keeps_numbers_of_episodes() -> 
     assert ugat.gate.scope == "pooled"
     assert replace(config, seed=3).ugat == ugat  # applied twice it changes nothing
     assert as_published(ugat) == ugat
+
+
+COUNTS = (
+    "pretrain_episodes",
+    "iterations",
+    "grounded_episodes",
+    "sim_rollouts",
+    "real_rollouts",
+)
+
+
+def command(config: type[Any], *words: str) -> Any:
+    import tyro
+
+    return tyro.cli(config, args=["--preset", "paper", *words], config=(CascadeSubcommandArgs,))
+
+
+@pytest.mark.parametrize("name", COUNTS)
+def test_a_number_that_is_given_stays_though_it_is_the_usual_one(name: str) -> None:
+    usual = int(getattr(UgatConfig, name))
+    free = TransferConfig("single-v1", preset="paper").ugat
+    assert (usual != getattr(free, name)) is (name not in ("grounded_episodes", "sim_rollouts"))
+    option = f"--{name.replace('_', '-')}"
+    for config in (
+        TransferConfig("single-v1", preset="paper", ugat=UgatConfig(**{name: usual})),
+        command(TransferConfig, "single-v1", option, str(usual)),
+    ):
+        assert getattr(config.ugat, name) == usual
+        others = [x for x in COUNTS if x != name]
+        assert [getattr(config.ugat, x) for x in others] == [getattr(free, x) for x in others]
+        assert replace(config, seed=3).ugat == config.ugat
+    row = "episodes" if name == "pretrain_episodes" else name
+    paper = command(PaperConfig, f"--{row.replace('_', '-')}", str(usual))
+    assert getattr(paper, row) == getattr(paper.ugat, name) == usual
+
+
+def test_a_learner_that_is_given_stays() -> None:
+    assert PaperConfig().learner == PaperConfig(preset="paper", learner="universal").learner
+    assert PaperConfig(preset="paper").learner == "dqn"
 
 
 def test_what_the_preset_decides_cannot_be_given_beside_it() -> None:

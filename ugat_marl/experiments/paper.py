@@ -305,7 +305,7 @@ class PaperConfig:
         neighbours: Agents also see the intersections up to so many roads away.
         duration_s: Length of an episode in s; default: the scenario's own.
         learner: Learner of all rows: universal or dqn, the suite's own, or a baseline
-            (docs/how-to/learners.md).
+            (docs/how-to/learners.md); default: universal, and dqn with the preset "paper".
         learner_settings: Settings of a baseline as NAME=VALUE, such as learning_rate=0.001; commas
             separate the parts of a tuple.
         device: Device for the learner's updates and the fits: cpu, cuda, or cuda:N; all trainings
@@ -323,11 +323,11 @@ class PaperConfig:
     sim: str = "sim"
     seeds: int = 5
     first_seed: int = 0
-    episodes: int = 20
-    iterations: int = 2
-    grounded_episodes: int = 10
-    sim_rollouts: int = 3
-    real_rollouts: int = 2
+    episodes: int = UgatConfig.pretrain_episodes
+    iterations: int = UgatConfig.iterations
+    grounded_episodes: int = UgatConfig.grounded_episodes
+    sim_rollouts: int = UgatConfig.sim_rollouts
+    real_rollouts: int = UgatConfig.real_rollouts
     preset: Literal["paper"] | None = None
     groundings: tuple[str, ...] = ()
     constants: tuple[int, ...] = (1, 2, 3, 4, 5, 6)
@@ -338,7 +338,7 @@ class PaperConfig:
     reward: str = "total-queue"
     neighbours: int = 0
     duration_s: float | None = None
-    learner: str = UNIVERSAL_NAME
+    learner: str = ""
     learner_settings: tuple[str, ...] = ()
     device: str = "cpu"
     dqn: DQNConfig = field(default_factory=DQNConfig)
@@ -351,6 +351,8 @@ class PaperConfig:
     def __post_init__(self) -> None:
         if self.preset is not None:
             self._take_published()
+        if not self.learner:
+            object.__setattr__(self, "learner", UNIVERSAL_NAME)
         for name in ("seeds", "evaluation_seeds", "episodes"):
             if getattr(self, name) < 1:
                 raise OptionError(f"{name} = {getattr(self, name)}: must be at least 1")
@@ -385,7 +387,7 @@ class PaperConfig:
         values: dict[str, Any] = {
             "groundings": ("phase",),
             "reward": published_reward(self.reward),
-            "learner": DQN_NAME if self.learner == UNIVERSAL_NAME else self.learner,
+            "learner": self.learner or DQN_NAME,
             "episodes": published.pretrain_episodes,
             "iterations": published.iterations,
             "grounded_episodes": published.grounded_episodes,

@@ -23,6 +23,10 @@ from ugat_marl.grounding.view import InputsConfig, Neighbours
 GROUNDINGS = ("phase", "timed", "street")
 
 
+class Usual(int):
+    """Default of a number that the preset "paper" replaces unless the same number is given."""
+
+
 @dataclass(frozen=True)
 class UgatConfig:
     """Settings of the algorithm.
@@ -51,11 +55,11 @@ class UgatConfig:
     """
 
     grounding: Literal["phase", "timed", "street"] = "street"
-    pretrain_episodes: int = 20
-    iterations: int = 2
-    grounded_episodes: int = 10
-    sim_rollouts: int = 3
-    real_rollouts: int = 2
+    pretrain_episodes: int = Usual(20)
+    iterations: int = Usual(2)
+    grounded_episodes: int = Usual(10)
+    sim_rollouts: int = Usual(3)
+    real_rollouts: int = Usual(2)
     rollout_epsilon: float = 0.3
     least_accuracy: float | None = 0.0
     inputs: InputsConfig = field(default_factory=InputsConfig)
@@ -182,17 +186,15 @@ def as_published(config: UgatConfig) -> UgatConfig:
     """Return Algorithm 1 of the paper without departures, with these numbers of episodes.
 
     Every departure, its reason and what it changes: docs/explanation/departures.md. Numbers of
-    episodes that are left at their defaults become those of `COUNTS`: a learner that begins with
-    nothing needs more of them.
+    episodes that were not given become those of `COUNTS`: a learner that begins with nothing needs
+    more of them.
 
     Raises:
         OptionError: Another setting than a number of episodes was changed.
     """
-    usual = UgatConfig()
     given: dict[str, Any] = {name: getattr(config, name) for name in COUNTS}
     counts: dict[str, Any] = {
-        name: COUNTS[name] if value == getattr(usual, name) else value
-        for name, value in given.items()
+        name: COUNTS[name] if isinstance(value, Usual) else value for name, value in given.items()
     }
     published = UgatConfig(
         **counts,
