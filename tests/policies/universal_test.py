@@ -9,10 +9,12 @@ from typing import Any
 import numpy as np
 import pytest
 import torch
+import tyro
 from torch import Tensor
 
 from ugat_marl.envs import AGE_SCALE_S, AgentSet, parallel_env
 from ugat_marl.errors import CheckpointError, OptionError
+from ugat_marl.experiments import TransferConfig
 from ugat_marl.policies import (
     DQN,
     UNIVERSAL_NAME,
@@ -305,3 +307,25 @@ def test_discount_and_steps_are_those_of_ten_seconds(interval_s: float, steps: i
     learner = DQN(agents, replace(QUICK, discount=0.5, steps=3), structure=structure)
     assert learner._discount == pytest.approx(0.5 ** (interval_s / 10))
     assert learner._steps == steps
+
+
+@pytest.mark.parametrize(
+    ("words", "name", "value"),
+    [
+        (("--dqn.teacher", "None"), "teacher", None),
+        (("--dqn.hidden", "48", "48"), "hidden", (48, 48)),
+        (("--dqn.steps", "1"), "steps", 1),
+        (("--dqn.warmup-decisions", "200"), "warmup_decisions", 200),
+        (("--dqn.epsilon-decay-decisions", "3600"), "epsilon_decay_decisions", 3600),
+    ],
+)
+def test_settings_that_are_given_stay_though_they_are_those_of_dqn(
+    words: tuple[str, ...], name: str, value: Any
+) -> None:
+    usual = suite_config(UNIVERSAL_NAME, tyro.cli(TransferConfig, args=["single-v1"]).dqn)
+    assert usual == suite_config(UNIVERSAL_NAME)
+    assert getattr(usual, name) != value == getattr(suite_config("dqn"), name)
+    parsed = tyro.cli(TransferConfig, args=["single-v1", *words]).dqn
+    for given in (parsed, DQNConfig(**{name: value})):
+        assert suite_config(UNIVERSAL_NAME, given) == replace(usual, **{name: value})
+        assert suite_config("dqn", given) == suite_config("dqn")

@@ -19,12 +19,9 @@ from ugat_marl.grounding.street import StreetConfig
 from ugat_marl.grounding.timed import TimedConfig, TimedTransform
 from ugat_marl.grounding.transform import Transform
 from ugat_marl.grounding.view import InputsConfig, Neighbours
+from ugat_marl.policies import Usual
 
 GROUNDINGS = ("phase", "timed", "street")
-
-
-class Usual(int):
-    """Default of a number that the preset "paper" replaces unless the same number is given."""
 
 
 @dataclass(frozen=True)

@@ -26,7 +26,7 @@ from pydantic import TypeAdapter, ValidationError
 from ugat_marl.data import installed_version
 from ugat_marl.envs import AnyParallelEnv
 from ugat_marl.errors import OptionError, UnknownNameError, install_command
-from ugat_marl.policies.learners.dqn_config import DQNConfig
+from ugat_marl.policies.learners.dqn_config import DQNConfig, Usual, UsualSizes
 from ugat_marl.policies.own import OwnLearnerFactory, is_own, load_own, own_learner_options
 from ugat_marl.policies.protocols import Learner
 
@@ -162,13 +162,27 @@ def suite_config(name: str, given: DQNConfig | None = None) -> DQNConfig:
 
     Args:
         name: One of `SUITE_LEARNERS`.
-        given: Settings of the user; those that differ from the defaults of DQN are taken.
+        given: Settings of the user; those that were given, or differ from the defaults of DQN, are
+            taken.
     """
     usual = DQNConfig()
     given = given or usual
+    own = SUITE_LEARNERS[name]
     values = {option.name: getattr(given, option.name) for option in fields(usual)}
-    changed = {key: value for key, value in values.items() if value != getattr(usual, key)}
-    return replace(SUITE_LEARNERS[name], **changed)
+    changed = {
+        key: value
+        for key, value in values.items()
+        if value != getattr(usual, key) or (key in _OF_THE_NAME and not _is_usual(value))
+    }
+    return replace(own, **{"teacher": own.teacher or None, **changed})
+
+
+_OF_THE_NAME = ("hidden", "steps", "warmup_decisions", "epsilon_decay_decisions")
+"""Settings that the name of a learner decides, unless they are given, even as DQN's defaults."""
+
+
+def _is_usual(value: object) -> bool:
+    return isinstance(value, Usual | UsualSizes)
 
 
 def observed_options(name: str) -> dict[str, Any]:

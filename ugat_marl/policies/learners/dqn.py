@@ -258,7 +258,7 @@ class DQN:
                 f"the environment's agents are {AgentSet.of(env)}, this learner's {self.agents}; "
                 "make a new learner with DQN.of(env)"
             )
-        if self.config.teacher is not None and self.episodes == self.taught == 0:
+        if self.config.teacher and self.episodes == self.taught == 0:
             self.attend(env, seed)
         with one_thread():
             for _ in range(episodes):
@@ -285,7 +285,7 @@ class DQN:
             UnknownNameError: No rule has the teacher's name.
             OptionError: The teacher reads other observations than the environment's.
         """
-        if self.config.teacher is None:
+        if not self.config.teacher:
             return None
         root = derive_seed(seed, "dqn", "lessons", self.taught)
         name, teacher = find_teacher(env, self.config.teacher, root, on_play)
@@ -304,7 +304,7 @@ class DQN:
     def plays(self, env: AnyParallelEnv) -> int:
         """Return the number of episodes that `attend` plays."""
         teacher = self.config.teacher
-        return 0 if teacher is None else plays(env, teacher, self.config.lessons)
+        return plays(env, teacher, self.config.lessons) if teacher else 0
 
     def _watch(self, env: AnyParallelEnv, teacher: Policy, seed: int) -> None:
         """Let the teacher play an episode, and store its decisions."""
@@ -444,7 +444,7 @@ class DQN:
         losses = nn.functional.huber_loss(
             chosen, wanted, reduction="none", delta=self.config.huber_delta
         )
-        if config.teacher is not None:
+        if config.teacher:
             losses = losses + self._margin_losses(values, batch.action, chosen) * batch.shown
         # a mean over agents would make the step of each network depend on the number of agents
         losses.mean(dim=1).sum().backward()

@@ -15,6 +15,14 @@ They are enough for a quantile, and too few to reach back to the exploration at 
 """
 
 
+class Usual(int):
+    """Default of a number; a preset replaces it, unless the same number is given."""
+
+
+class UsualSizes(tuple[int, ...]):
+    """Default of sizes; a learner's own sizes replace it, unless the same sizes are given."""
+
+
 @dataclass(frozen=True)
 class DQNConfig:
     """Settings of DQN.
@@ -70,8 +78,9 @@ class DQNConfig:
             the last 1000 decisions of training. In a fuller street than in training, a policy then
             acts as in the fullest street it knows. None cuts nothing.
         teacher: Rule that shows the learner its first episodes, such as "max-pressure:20". "best"
-            takes the best of the standard rules in the environment of the training. None for none.
-            With a teacher, exploration begins at `epsilon_end`.
+            takes the best of the standard rules in the environment of the training. None for none;
+            "" for "best" with the learner "universal", and for none with others. With a teacher,
+            exploration begins at `epsilon_end`.
         lessons: Episodes that the teacher shows.
         lesson_updates: Updates after them, before the learner acts.
         margin: Q of an action that the teacher did not choose should be lower than that of its own
@@ -79,17 +88,17 @@ class DQNConfig:
             the teacher made, and so less and less as the memory fills.
     """
 
-    hidden: tuple[int, ...] = (48, 48)
+    hidden: tuple[int, ...] = UsualSizes((48, 48))
     learning_rate: float = 1e-3
     discount: float = 0.95
     batch_size: int = 32
     replay_capacity: int = 10_000
-    warmup_decisions: int = 200
+    warmup_decisions: int = Usual(200)
     update_every: int = 1
     target_rate: float = 0.01
     epsilon_start: float = 1.0
     epsilon_end: float = 0.05
-    epsilon_decay_decisions: int = 3_600
+    epsilon_decay_decisions: int = Usual(3_600)
     sticky_decisions: int = 3
     huber_delta: float = 1.0
     reward_scale: float | None = None
@@ -97,16 +106,17 @@ class DQNConfig:
     shared: bool = False
     network: NetworkName = "mlp"
     start: str | None = None
-    steps: int = 1
+    steps: int = Usual(1)
     ceiling: float | None = None
-    teacher: str | None = None
+    teacher: str | None = ""
     lessons: int = 3
     lesson_updates: int = 1_000
     margin: float = 0.2
 
     def __post_init__(self) -> None:
         # JSON gives a list, which would differ from the tuple of a checkpoint
-        object.__setattr__(self, "hidden", tuple(self.hidden))
+        if not isinstance(self.hidden, UsualSizes):
+            object.__setattr__(self, "hidden", tuple(self.hidden))
         for name in (
             "batch_size",
             "replay_capacity",
@@ -155,7 +165,7 @@ class DQNConfig:
 
     def epsilon(self, decisions: int) -> float:
         """Return the share of exploratory decisions after `decisions` decisions."""
-        if self.teacher is not None:
+        if self.teacher:
             return self.epsilon_end
         progress = min(1.0, decisions / self.epsilon_decay_decisions)
         return self.epsilon_start + progress * (self.epsilon_end - self.epsilon_start)
