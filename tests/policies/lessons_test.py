@@ -62,6 +62,22 @@ def test_a_learner_acts_as_its_teacher_before_its_first_episode(env: TrafficEnv)
     assert agreement(learner, env) > max(0.8, untaught + 0.2)
 
 
+def test_lessons_and_decisions_have_one_scale() -> None:
+    """What was learnt in the lessons would be forgotten if its inputs changed their size."""
+    settings = DQNConfig(teacher=RULE, lessons=1, lesson_updates=600, warmup_decisions=20)
+    with contextlib.closing(
+        parallel_env("single-v1", duration_s=400, observation="movements")
+    ) as env:
+        learner = DQN.of(env, settings, 0)
+        learner.attend(env, 0)
+        taught = {name: value.clone() for name, value in learner._tensors().items()}
+        assert (learner._inputs > 1.5).any()
+        learner.learn(env, 1, 0)
+        assert learner.decisions > settings.warmup_decisions
+    for name in ("inputs", "centre", "scale"):
+        assert torch.equal(learner._tensors()[name], taught[name])
+
+
 def test_the_best_of_the_standard_rules_is_found(env: TrafficEnv) -> None:
     heard: list[str] = []
     name, teacher = find_teacher(env, BEST, 3, heard.append)

@@ -294,6 +294,8 @@ class DQN:
             self._watch(env, teacher, derive_seed(root, "shown", lesson))
             if on_play is not None:
                 on_play(name)
+        if not self.taught and self.decisions < self.config.warmup_decisions:
+            self._measure()  # updates in other units would be lost at the end of the warm-up
         sampling = torch_generator(root, "replay")
         with one_thread():
             for _ in range(self.config.lesson_updates):
@@ -387,7 +389,7 @@ class DQN:
         }
 
     def _is_time_to_update(self) -> bool:
-        if self.decisions == self.config.warmup_decisions:
+        if self.decisions == self.config.warmup_decisions and not self.taught:
             self._measure()
         return (
             self.decisions >= self.config.warmup_decisions

@@ -28,7 +28,8 @@ class DQNConfig:
     """Settings of DQN.
 
     Rewards are centred and scaled for each agent: ``(reward - mean) / deviation``. Mean and
-    standard deviation are measured once, over the first `warmup_decisions`, and then kept. So
+    standard deviation are measured once, over the first `warmup_decisions` or, with a teacher, over
+    its first lessons, and then kept, in other worlds too. So
     targets are of order one for any traffic. A constant shift of the reward moves all Q-values
     alike in episodes without a natural end, and changes no decision. If an agent terminates, its
     bootstrap value is shifted as well. `reward_scale` replaces the measured scale for all agents,
