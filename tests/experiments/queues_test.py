@@ -90,14 +90,14 @@ def test_an_evaluation_fills_it(tmp_path: Path) -> None:
 def test_another_evaluation_adds_its_episodes(tmp_path: Path) -> None:
     path = tmp_path / "queues.parquet"
 
-    def write(domain: str, *episodes: float, keep: bool = True) -> None:
+    def write(domain: str, *episodes: float, keep: bool = True, anew: bool = False) -> None:
         env = stub(decisions=1, interval_s=60.0)
         look = (record := QueueRecord()).watch("policy", domain, env)
         for halting in episodes:
             lanes = len(env.network.lane_table().ids)
             env.snapshot = SimpleNamespace(halting=np.full(lanes, halting))
             look(1)
-        record.write(path, keep=keep)
+        record.write(path, keep=keep, anew=anew)
 
     path.write_bytes(b"broken")
     write("sim", 1.0)
@@ -109,6 +109,10 @@ def test_another_evaluation_adds_its_episodes(tmp_path: Path) -> None:
     assert len(again) == len(first)
     assert again.filter(domain="sim").equals(first.filter(domain="sim"))
     assert again.filter(domain="V4")["queue"].sum() == 2 * first.filter(domain="V4")["queue"].sum()
+    whole = path.read_bytes()
+    for _ in range(2):  # the same episodes after a kill between queues and scores
+        write("V4", 2.0, 4.0, 6.0, anew=True)
+        assert path.read_bytes() == whole
     write("V1", 1.0, keep=False)
     assert set(read_queues(path)["domain"]) == {"V1"}
 

@@ -374,10 +374,12 @@ def _judge(
             watch=queues.watch,
             approaches=True,
         )
-        record.scores |= {(mark, domain, r.seed): r.scores for r in played.results}
+        # The queues come before the record, which marks these episodes as played. A process that
+        # died between the two left queues of episodes that are now played again.
+        anew = not any((mark, domain) == scored[:2] for scored in record.scores)
         if mark in job.rows:
-            # Before the record: it marks these episodes as played, so they are not played again.
-            queues.write(folder / QUEUES, keep=True)
+            queues.write(folder / QUEUES, keep=True, anew=anew)
+        record.scores |= {(mark, domain, r.seed): r.scores for r in played.results}
         record.write(folder)
 
 

@@ -103,17 +103,21 @@ class QueueRecord:
                     rows += [(policy, domain, minute, t, q / looks, looks) for t, q in named]
         return pl.DataFrame(rows, schema=_SCHEMA, orient="row")
 
-    def write(self, path: Path, *, keep: bool = False) -> None:
+    def write(self, path: Path, *, keep: bool = False, anew: bool = False) -> None:
         """Write `frame` as Parquet, whole or not at all.
 
         Args:
             path: The file.
             keep: True to include the record in the file, if there is one that can be read.
+            anew: True to leave out of that record the policies and domains of this one.
         """
         frame = self.frame()
         if keep and path.exists():
             with contextlib.suppress(CheckpointError):
-                both = pl.concat([read_queues(path), frame]).group_by(_PLACE, maintain_order=True)
+                kept = read_queues(path)
+                if anew:
+                    kept = kept.join(frame, on=["policy", "domain"], how="anti")
+                both = pl.concat([kept, frame]).group_by(_PLACE, maintain_order=True)
                 mean = (pl.col("queue") * pl.col("looks")).sum() / pl.col("looks").sum()
                 frame = both.agg(mean, pl.col("looks").sum())
         with replacing(path) as temporary:
