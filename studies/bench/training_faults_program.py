@@ -40,8 +40,6 @@ KINDS = (
 _DEADLINE_S = 5.0
 """Time after which a stopped simulation counts as dead, s."""
 _PATIENCE_S = 300.0
-_UNCOMPARED = ("tensorboard", ".lock")
-"""Curves have the time in their names; locks are empty."""
 
 
 class Steps(Silent):
@@ -100,7 +98,7 @@ def digests(folder: Path) -> dict[str, str]:
     found: dict[str, str] = {}
     for path in sorted(folder.rglob("*")):
         name = str(path.relative_to(folder))
-        if path.is_file() and not any(part in name for part in _UNCOMPARED):
+        if path.is_file() and path.name != ".lock":
             content = path.read_bytes()
             if path.suffix == ".pt":  # torch writes the name of the temporary file into it
                 content = repr(_plain(torch.load(path, weights_only=True))).encode()

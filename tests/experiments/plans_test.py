@@ -2,12 +2,16 @@
 
 from __future__ import annotations
 
+import contextlib
+import math
 import sys
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 import pytest
+from tensorboard.backend.event_processing.event_file_loader import EventFileLoader
+from tensorboard.util import tensor_util
 
 from tests.runs import SMALL, play_nothing
 from ugat_marl.__main__ import main
@@ -54,30 +58,39 @@ def test_what_is_done_is_neither_planned_nor_counted(
 
 
 def test_tensorboard_has_the_curves_that_matter(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    tmp_path: Path,
 ) -> None:
-    class Board:
-        def __init__(self) -> None:
-            self.names: list[str] = []
-
-        def add_scalar(self, name: str, _value: float, _step: int) -> None:
-            self.names.append(name)
-
-        def close(self) -> None:
-            pass
-
     class Verbose(Silent):
         verbose = True
 
     numbers = {"att_s/V4": 1.0, "forward/error": 2.0, "forward/error/A1": 3.0, "other": 4.0}
     for reporter, expected in ((Silent(), 2), (Verbose(), 4)):
-        board: Any = Board()
-        monkeypatch.setattr(Run, "_tensorboard", lambda *_, board=board: board)
         run = Run(tmp_path / str(expected), {}, reporter)
         run.log("iteration", 1, numbers)
         run.close()
-        assert len(board.names) == expected
+        assert len(points(tmp_path / str(expected))) == expected
         assert len(run.metrics.rows) == 4
+
+
+def test_curves_are_read_by_tensorboard(tmp_path: Path) -> None:
+    with contextlib.closing(Run(tmp_path, {}, Silent())) as run:
+        for step, value in enumerate((1.5, math.nan, 2.5)):
+            run.log("iteration", step, {"forward/error": value, "gate/alpha": 10.0 * step})
+    assert points(tmp_path) == [
+        ("iteration/forward/error", 0, 1.5), ("iteration/gate/alpha", 0, 0.0),
+        ("iteration/gate/alpha", 1, 10.0),
+        ("iteration/forward/error", 2, 2.5), ("iteration/gate/alpha", 2, 20.0),
+    ]  # fmt: skip
+
+
+def points(run: Path) -> list[tuple[str, int, float]]:
+    """All points of a run's curves, as TensorBoard's own reader finds them."""
+    (file,) = (run / "tensorboard").iterdir()
+    return [
+        (value.tag, event.step, tensor_util.make_ndarray(value.tensor).item())
+        for event in EventFileLoader(str(file)).Load()
+        for value in event.summary.value
+    ]
 
 
 def test_an_interrupted_training_says_how_to_go_on(

@@ -20,6 +20,7 @@ from typing import IO, Any
 
 import polars as pl
 
+from ugat_marl.data.curves import CURVES_FILE, Curves
 from ugat_marl.data.row_hashes import damage, read_quietly, write_hashed
 from ugat_marl.errors import CheckpointError, OptionError
 from ugat_marl.files import read_json, replacing, require_writable, write_whole
@@ -122,7 +123,7 @@ class Run:
         self.reporter = reporter
         self._on_log = on_log
         self.metrics = Metrics()
-        self._board: Any = None
+        self._curves: Curves | None = None
         require_writable(directory / IDENTITY_FILE)
         self._lock = lock_folder(directory)
         _remove_remains(directory)
@@ -158,8 +159,8 @@ class Run:
     def write_metrics(self) -> None:
         """Write all metrics so far."""
         self.metrics.write(self.directory / METRICS_FILE)
-        if self._board is not None:
-            self._board.flush()
+        if self._curves is not None:
+            self._curves.flush()
 
     def restore(self, read: Callable[[Path], None]) -> dict[str, Any]:
         """Restore the checkpoint.
@@ -182,6 +183,8 @@ class Run:
             raise CheckpointError(f"{error}; remove {self.directory} and start again") from None
         read(folder)
         self.metrics = Metrics.read(folder / METRICS_FILE)
+        for stage, step, name, value in self.metrics.rows:  # without what is now repeated
+            self._draw(stage, step, {name: value})
         return state
 
     def log(self, stage: str, step: int, numbers: Mapping[str, float]) -> None:
@@ -190,28 +193,23 @@ class Run:
         TensorBoard receives the `MAIN_CURVES`, and all numbers if the reporter is verbose.
         """
         self.metrics.add(stage, step, numbers)
-        board = self._tensorboard(step)
-        for name, value in numbers.items():
-            if math.isfinite(value) and (self.reporter.verbose or _is_main(stage, name)):
-                board.add_scalar(f"{stage}/{name}", value, step)
+        self._draw(stage, step, numbers)
         if self._on_log is not None:
             self._on_log(stage, step, dict(numbers))
 
     def close(self) -> None:
         """End the TensorBoard file and release the folder."""
         self._lock.close()
-        if self._board is not None:
-            self._board.close()
-            self._board = None
+        if self._curves is not None:
+            self._curves.close()
+            self._curves = None
 
-    def _tensorboard(self, step: int) -> Any:
-        if self._board is None:
-            from torch.utils.tensorboard import SummaryWriter
-
-            folder = self.directory / "tensorboard"
-            again = step if folder.exists() else None  # hides rows that a killed run logged later
-            self._board = SummaryWriter(str(folder), purge_step=again)
-        return self._board
+    def _draw(self, stage: str, step: int, numbers: Mapping[str, float]) -> None:
+        if self._curves is None:
+            self._curves = Curves(self.directory / CURVES_FILE)
+        for name, value in numbers.items():
+            if math.isfinite(value) and (self.reporter.verbose or _is_main(stage, name)):
+                self._curves.add_scalar(f"{stage}/{name}", value, step)
 
 
 def _is_main(stage: str, name: str) -> bool:

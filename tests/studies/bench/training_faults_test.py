@@ -16,8 +16,8 @@ from ugat_marl.errors import OptionError
 def test_files_are_compared_by_their_content(tmp_path: Path) -> None:
     def written(name: str, weight: float, text: str) -> dict[str, str]:
         folder = tmp_path / name
-        (folder / "tensorboard").mkdir(parents=True)
-        (folder / "tensorboard" / name).write_text(name)
+        folder.mkdir()
+        (folder / ".lock").write_text(name)
         (folder / "table.json").write_text(text)
         torch.save({"w": torch.tensor([weight, 2.0])}, folder / f"{name}.pt")
         (folder / f"{name}.pt").rename(folder / "policy.pt")
