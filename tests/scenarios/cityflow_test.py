@@ -229,6 +229,7 @@ def changed(*path: Any, to: Any) -> dict[str, Any]:
         (changed(*LIGHT, 1, "time", to="long"),
          "'time' is missing or not a number"),
         (changed("intersections", 0, "point", to=None), "a point is None, not an object"),
+        (changed("intersections", 0, "trafficLight", to=1.5), "trafficLight is 1.5, not an object"),
         ([], "the file is [], not an object in braces"),
         ({"roads": []}, "'intersections' is missing or not a list"),
     ],

@@ -410,6 +410,8 @@ def _lanes_of(where: str, names: Sequence[str], network: Network) -> list[Lane]:
                 + (f"; did you mean {near!r}?" if near else "; lanes are called <edge>_<number>")
             )
         lanes.append(lane)
+    if not names:
+        raise MeasuredDataError(f"{where} lies on no lane; lane_id is <edge>_<number>")
     if len(set(names)) < len(names) or len({lane.edge for lane in lanes}) > 1:
         raise MeasuredDataError(
             f"{where} lies on the lanes {', '.join(names)}; a zone on several lanes names each "

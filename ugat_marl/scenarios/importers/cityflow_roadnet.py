@@ -183,7 +183,7 @@ class _Reader:
         table = self.table(raw, "an intersection")
         name = self._name(table, "id", "an intersection")
         where = f"intersection {name!r}"
-        light = table.get("trafficLight") or {}
+        light = self.table(table.get("trafficLight") or {}, f"{where}: trafficLight")
         phases = self.items(light, "lightphases", where) if "lightphases" in light else []
         return Crossing(
             name,
