@@ -20,14 +20,15 @@ class Curves:
 
     def __init__(self, path: Path) -> None:
         # Both take a while to import, and most commands draw no curve.
-        from tensorboard.compat.proto.event_pb2 import Event
+        from tensorboard.compat.proto import event_pb2
         from tensorboard.summary.writer.record_writer import RecordWriter
 
-        self._event: Any = Event
+        generated: Any = event_pb2  # its classes are made when it is imported
+        self._event: Any = generated.Event
         path.parent.mkdir(parents=True, exist_ok=True)
         self._file = path.open("wb")
         self._records: Any = RecordWriter(self._file)
-        self._write(Event(wall_time=0.0, file_version="brain.Event:2"))
+        self._write(self._event(wall_time=0.0, file_version="brain.Event:2"))
         self.flush()
 
     def add_scalar(self, tag: str, value: float, step: int) -> None:

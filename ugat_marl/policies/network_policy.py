@@ -122,9 +122,12 @@ class NetworkPolicy:
         try:
             agents, hidden, env_options, shared = parse_header(content)
             structure = structure_in(content, agents)
-            arguments = (agents, hidden, content["parameters"], env_options, shared, structure)
+            parameters = content["parameters"]
+            if getattr(parameters, "dtype", None) != torch.float32:
+                raise TypeError("its parameters are no tensor of float32")
+            arguments = (agents, hidden, parameters, env_options, shared, structure)
             return cls(*arguments, content.get("ceiling"))
-        except (KeyError, TypeError, ValueError, RuntimeError) as error:
+        except (KeyError, TypeError, ValueError, RuntimeError, OverflowError) as error:
             reason = (str(error).splitlines() or [type(error).__name__])[0]  # torch adds its stack
             raise CheckpointError(f"{path}: not a whole policy ({reason}); save it again") from None
 
