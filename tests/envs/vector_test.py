@@ -669,9 +669,10 @@ def test_a_killed_simulation_is_taken_up_again_while_others_are_received() -> No
 
 def test_a_slow_environment_holds_up_no_other_one() -> None:
     with vector_env("single-v1", 3, duration_s=10_000) as env:
-        env.send(env.reset(1).masks.argmax(axis=-1))
-        os.kill(pids(env)[1], signal.SIGSTOP)
+        first = env.reset(1)
+        os.kill(pids(env)[1], signal.SIGSTOP)  # before it is asked, or it may have answered
         try:
+            env.send(first.masks.argmax(axis=-1))
             first = env.recv(2)
             assert first.numbers.tolist() == [0, 2]
             env.send(first.masks.argmax(axis=-1), where=[0, 2])
