@@ -143,7 +143,7 @@ def parse_time(text: str) -> float:
     """Return the seconds of a time as SUMO writes it: ``seconds``, ``h:m:s`` or ``days:h:m:s``.
 
     Raises:
-        ValueError: Not a time.
+        ValueError: Not a time, or one too large.
     """
     parts = [parse_decimal(part) for part in text.split(":")]
     if len(parts) not in (1, 3, 4):
@@ -151,6 +151,8 @@ def parse_time(text: str) -> float:
     seconds = 0.0
     for part, unit in zip(reversed(parts), (1, 60, 3600, 86400), strict=False):
         seconds += part * unit
+    if not math.isfinite(seconds):  # each part may be finite, and their sum not
+        raise ValueError(text)
     return seconds
 
 
