@@ -297,12 +297,14 @@ def attempt(surface: Surface, seed: int, sound: Path) -> str:
 
 
 def _damage(surface: Surface, seed: int, folder: Path) -> None:
+    import polars as pl
+
     draw = random.Random(f"{surface.name} {seed}")
     files = sorted(path for path in folder.glob(surface.files) if path.is_file())
     for _ in range(draw.choice([1, 1, 1, 2])):
         file = draw.choice(files)
         if file.exists():
-            with contextlib.suppress(Exception):
+            with contextlib.suppress(Exception, pl.exceptions.PanicException):
                 # A second damage may find a file that no reader reads any more.
                 draw.choice(list(surface.damages))(file, draw)
 
