@@ -217,6 +217,7 @@ def test_neighbours_are_those_within_some_roads_nearest_first() -> None:
     assert within_hops(ring, 0)["a"] == ()
     assert within_hops(ring, 1)["a"] == ("b", "e")
     assert within_hops(ring, 2)["a"] == ("b", "e", "c", "d") == within_hops(ring, 9)["a"]
+    assert within_hops(ring, 10**12) == within_hops(ring, 2)
     assert within_hops({"a": (), "b": ()}, 3) == {"a": (), "b": ()}
 
 

@@ -88,7 +88,8 @@ class Metrics:
                 f"{path}: cannot be read ({reason}); it may have been cut short. Remove the run "
                 "folder and start again"
             ) from None
-        if frame.schema != pl.Schema(_SCHEMA):
+        # Parquet allows an empty cell in every column; `write` leaves none.
+        if frame.schema != pl.Schema(_SCHEMA) or any(frame.null_count().row(0)):
             raise CheckpointError(f"{path}: not the metrics of a run")
         if wrong := damage(frame, metadata):
             raise CheckpointError(

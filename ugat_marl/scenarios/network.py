@@ -232,6 +232,8 @@ def within_hops(neighbours: Mapping[str, Sequence[str]], hops: int) -> dict[str,
     for name in neighbours:
         reached, frontier = [name], [name]
         for _ in range(hops):
+            if not frontier:
+                break
             ahead = (other for one in frontier for other in neighbours[one])
             frontier = list(dict.fromkeys(other for other in ahead if other not in reached))
             reached += frontier
