@@ -112,6 +112,14 @@ def scratch() -> Iterator[None]:
         ) from None
 
 
+def with_home(text: str) -> Path:
+    """Return the path of `text`, where a leading ``~`` or ``~user`` is the user's home folder.
+
+    It stays as it is where the system knows no such user: it may be the name of a file.
+    """
+    return Path(os.path.expanduser(text))  # noqa: PTH111 - Path.expanduser raises RuntimeError
+
+
 def user_cache(name: str) -> Path:
     """Return the folder in the user's cache that keeps results of the kind `name` between runs."""
     base = os.environ.get("XDG_CACHE_HOME")

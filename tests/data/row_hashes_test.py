@@ -114,6 +114,20 @@ def test_a_damaged_table_is_one_line(tmp_path: Path) -> None:
         Metrics.read(path)
 
 
+def test_a_table_with_an_empty_cell_is_refused(tmp_path: Path) -> None:
+    path = tmp_path / "metrics.parquet"
+    Metrics([("real", 0, "att_s", 1.0)]).write(path)
+    metadata = pl.read_parquet_metadata(path)
+    kept = {key: value for key, value in metadata.items() if key not in HASH_KEYS}
+    frame = pl.read_parquet(path)
+    step = frame.columns[1]
+    frame.with_columns(pl.lit(None, frame.schema[step]).alias(step)).write_parquet(
+        path, metadata={key: value for key, value in kept.items() if key != "ARROW:schema"}
+    )
+    with pytest.raises(CheckpointError):
+        Metrics.read(path)
+
+
 def csv_of(tmp_path: Path, rows: int) -> Path:
     path = tmp_path / "a.csv"
     lines = "".join(f"n{row},{row / 4}\n" for row in range(rows))

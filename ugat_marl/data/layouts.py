@@ -6,6 +6,9 @@ from dataclasses import dataclass
 
 from ugat_marl.errors import LogError
 
+MOST_NUMBERS = 32_767
+"""Most numbers of an observation. The columns of a log count phases in 16 bits."""
+
 
 @dataclass(frozen=True)
 class AgentLayout:
@@ -25,6 +28,8 @@ class AgentLayout:
     def __post_init__(self) -> None:
         if self.features < 1 or self.phases < 1 or self.context < 0:
             raise LogError(f"{self}: needs features >= 1, phases >= 1 and context >= 0")
+        if self.size > MOST_NUMBERS:
+            raise LogError(f"{self}: an observation has at most {MOST_NUMBERS} numbers")
 
     @property
     def size(self) -> int:

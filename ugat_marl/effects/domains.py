@@ -25,6 +25,7 @@ from ugat_marl.effects.table import (
     refuse_outside,
 )
 from ugat_marl.errors import OptionError, ScenarioError, UnknownNameError, nearest
+from ugat_marl.files import with_home
 from ugat_marl.scenarios import Network, Scenario
 
 Domain = str | Sequence[Effect]
@@ -373,7 +374,7 @@ def domain_path(domain: Domain) -> Path | None:
     """Return the path if a domain is a scenario directory or a ``.sumocfg``, else None."""
     if not isinstance(domain, str):
         return None
-    path = Path(domain).expanduser()
+    path = with_home(domain)
     try:
         named = path.suffix == ".sumocfg" or (path / "scenario.toml").is_file()
     except OSError:  # a long list of effects is no possible path

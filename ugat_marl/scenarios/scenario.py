@@ -18,7 +18,7 @@ from pathlib import Path
 from typing import Any
 
 from ugat_marl.errors import ScenarioError, UnknownNameError, install_command
-from ugat_marl.files import Document, parse_xml, read_bytes, read_toml, write_whole
+from ugat_marl.files import Document, parse_xml, read_bytes, read_toml, with_home, write_whole
 from ugat_marl.scenarios.admission import OPTIONS, admitted
 from ugat_marl.scenarios.settings import (
     ControlSettings,
@@ -144,7 +144,7 @@ def read_scenario(name: str | Path) -> Scenario:
     text = str(name)
     if text.startswith("resco:"):
         return _load_sumocfg(_resco_configuration(text.removeprefix("resco:")), text)
-    path = Path(text).expanduser()
+    path = with_home(text)
     if path.suffix == ".sumocfg" or path.name.endswith(".sumocfg.xml"):
         return _load_sumocfg(path, path.name.split(".")[0])
     if _is_file(path / "scenario.toml"):

@@ -211,7 +211,7 @@ class LibsumoSimulator:
 
     def _fail(self, action: str, error: Exception) -> None:
         assert self._launch is not None
-        said = _errors_of(Path(self._launch.directory)) or str(error)
+        said = _errors_of(Path(self._launch.directory)) or one_line_message(str(error))
         self.close()
         raise SimulatorError(f"{action}: {said}") from None
 
