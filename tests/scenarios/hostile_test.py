@@ -121,10 +121,10 @@ def hostile(crossing: Crossing, kind: str, name: str, user: Path) -> Path:
     return path
 
 
-def play(path: Path) -> str:
+def play(path: Path, simulator: str = "process") -> str:
     """Simulate a scenario for a minute; return the error, or nothing."""
     try:
-        env = parallel_env(read_scenario(path))
+        env = parallel_env(read_scenario(path), simulator=simulator)
     except UgatMarlError as error:
         return str(error)
     try:
@@ -187,6 +187,37 @@ def test_the_kernel_holds_the_workers_of_a_vector(crossing: Crossing, around: Pa
         assert worker is not None
         status = Path(f"/proc/{worker._pid}/status").read_text()
         assert "NoNewPrivs:\t1" in status  # set with the rules of the kernel, and never before
+
+
+EVIL = (
+    '<routes><vehicle id="s" depart="0"><route edges="S_C C_N"/>'
+    '<param key="has.ssm.device" value="true"/>'
+    '<param key="device.ssm.file" value="{out}"/></vehicle></routes>'
+)
+
+
+@pytest.mark.parametrize("simulator", ["inprocess", "process"])
+@pytest.mark.parametrize("name", ["${UNSET}evil.rou.xml", "none,evil.rou.xml", "none;evil.rou.xml"])
+def test_sumo_reads_the_file_that_was_looked_through(
+    name: str, simulator: str, crossing: Crossing, around: Path
+) -> None:
+    """SUMO puts variables into file names: it would read a hostile file under a harmless name."""
+    directory = crossing()
+    (directory / "demand.rou.xml").rename(directory / name)
+    (directory / "evil.rou.xml").write_text(EVIL.format(out=around / "kept.txt"))
+    settings_file = directory / "scenario.toml"
+    settings_file.write_text(settings_file.read_text().replace("demand.rou.xml", name))
+    assert play(directory, simulator) == ""
+
+
+@pytest.mark.parametrize("name", ["trips.xml", "errors.log", "statistics.xml"])
+def test_an_edited_file_with_the_name_of_an_output_is_read(name: str, crossing: Crossing) -> None:
+    directory = crossing()
+    (directory / name).write_text('<additional><edgeData id="d" file="x"/></additional>')
+    settings_file = directory / "scenario.toml"
+    settings_file.write_text(f'additional = ["{name}"]\n{settings_file.read_text()}')
+    assert read_scenario(directory).additional[0].content is not None
+    assert play(directory) == ""
 
 
 def test_the_bait_works(crossing: Crossing, around: Path, tmp_path: Path) -> None:

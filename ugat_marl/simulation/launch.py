@@ -5,6 +5,7 @@ The module does not load libsumo, so that a process whose simulations run elsewh
 
 from __future__ import annotations
 
+import re
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
@@ -34,6 +35,11 @@ SignalPlans = Mapping[str, Sequence[Segment]]
 
 TRIPS, ERRORS = "trips.xml", "errors.log"
 """Files of a simulation in its folder: the trips of its vehicles, and SUMO's error log."""
+
+_EDITED = "scenario"
+"""Folder in it for the scenario's edited files, whose names may be those of SUMO's outputs."""
+_READ_OTHERWISE = re.compile(r"[,;$]")
+"""Characters in the name of a file that mean something to SUMO."""
 
 
 @dataclass(frozen=True)
@@ -246,12 +252,14 @@ def launch_of(
 def _on_disk(document: Document, directory: Path, written: dict[str, bytes]) -> str:
     """Return a path SUMO can open.
 
-    Edited documents and paths with a comma get an entry in `written`: SUMO ends a name at a comma.
+    Edited documents, and those whose path SUMO would read as another one, get an entry in
+    `written`. SUMO ends a name at a comma and puts the environment variable ``NAME`` in the place
+    of ``${NAME}``: it would open a file that nobody has looked through.
     """
-    if document.path is not None and "," not in str(document.path.resolve()):
+    if document.path is not None and not _READ_OTHERWISE.search(str(document.path.resolve())):
         return str(document.path.resolve())
-    name = document.name.removesuffix(".gz").replace(",", "_")
+    name = f"{_EDITED}/{_READ_OTHERWISE.sub('_', document.name.removesuffix('.gz'))}"
     while name in written:
-        name = f"_{name}"
+        name = name.replace("/", "/_", 1)
     written[name] = document.read()
     return str(directory / name)
