@@ -260,7 +260,8 @@ def test_edited_files_are_written_and_others_are_not_copied(
     launch = launch_of(apply_effects(scenario, [StartupDelay(1)]), 7, own, LANES)
     assert not own.exists()
     launch.write()
-    assert {file.name for file in own.iterdir()} == {"default-types.add.xml", "demand.rou.xml"}
+    files = {str(file.relative_to(own)) for file in own.rglob("*.xml")}
+    assert files == {"scenario/default-types.add.xml", "scenario/demand.rou.xml"}
     assert own.stat().st_mode & 0o777 == 0o700
     arguments = dict(zip(launch.arguments[::2], launch.arguments[1::2], strict=True))
     assert arguments["--seed"] == "7"
