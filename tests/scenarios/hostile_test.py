@@ -7,6 +7,7 @@ must keep its content, or `{secret}`, one whose content must not come out. Witho
 
 from __future__ import annotations
 
+import os
 import re
 import shutil
 from collections.abc import Callable, Iterator
@@ -19,7 +20,7 @@ from ugat_marl.envs import parallel_env, vector_env
 from ugat_marl.errors import UgatMarlError
 from ugat_marl.files import Document
 from ugat_marl.scenarios import read_scenario, scenario, settings
-from ugat_marl.scenarios.confinement import confinement_missing
+from ugat_marl.scenarios.confinement import MEMORY_VARIABLE, confinement_missing
 
 Crossing = Callable[..., Path]
 
@@ -243,6 +244,9 @@ def test_the_bait_works(crossing: Crossing, around: Path, tmp_path: Path) -> Non
     [
         ("ignore-route-errors", "--summary=x", "neither true nor false"),
         ("scale", "1e9", "between 0 and 100"),
+        ("meso-edgelength", "0.000001", "between 1 and 1e"),
+        ("lateral-resolution", "1e-7", "between 0.01 and 100"),
+        ("pedestrian.striping.stripe-width", "1e-8", "between 0.01 and 100"),
         ("scale", "nan", "not a number"),
         ("scale", "1_0", "not a number"),
         ("scale", "\u0661", "not a number"),
@@ -263,6 +267,46 @@ def test_a_pile_of_elements_is_refused(crossing: Crossing) -> None:
     routes.write_text(f"<routes>{deep}</routes>")
     with pytest.raises(UgatMarlError, match="line 1: more than 64 elements inside each other"):
         read_scenario(directory)
+
+
+@pytest.mark.parametrize(
+    ("vehicles", "extra", "fault"),
+    [
+        ('<flow id="a" begin="0" end="60" number="400000000" route="east"/>', "", "more than 1000"),
+        ("", '<parkingArea id="p" lane="W_C_0" roadsideCapacity="400000000"/>', "more than 100000"),
+    ],
+)
+def test_numbers_that_fill_the_memory_are_refused(
+    vehicles: str, extra: str, fault: str, crossing: Crossing
+) -> None:
+    directory = crossing(vehicles=vehicles or None)
+    if extra:
+        (directory / "extra.add.xml").write_text(f"<additional>{extra}</additional>")
+        settings_file = directory / "scenario.toml"
+        settings_file.write_text(f'additional = ["extra.add.xml"]\n{settings_file.read_text()}')
+    with pytest.raises(UgatMarlError, match=rf"line \d+: <.* is {fault}"):
+        read_scenario(directory)
+
+
+@pytest.mark.skipif(not hasattr(os, "fork"), reason="no limit of memory on Windows")
+def test_a_simulation_that_asks_for_all_memory_is_refused(
+    crossing: Crossing, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Beneath the limits of single numbers: persons that no number of a flow forbids."""
+    monkeypatch.setenv(MEMORY_VARIABLE, "0.3")
+    vehicle = '<vehicle id="a" depart="0" route="east"/>'
+    many = '<personFlow id="p" begin="0" end="60" number="9000000"><walk edges="W_C"/></personFlow>'
+    said = play(crossing(vehicles=vehicle + many), "spawn")
+    assert re.search(rf"needs more memory than .*\(0\.3 GB\).*{MEMORY_VARIABLE}", said)
+    assert play(crossing(vehicles=vehicle), "spawn") == ""
+
+
+@pytest.mark.parametrize("text", ["all", "0", "-1", "nan", "inf"])
+def test_impossible_limits_of_memory(
+    text: str, crossing: Crossing, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setenv(MEMORY_VARIABLE, text)
+    assert f"{MEMORY_VARIABLE} = {text!r}: give a number" in play(crossing(), "spawn")
 
 
 @pytest.mark.parametrize("attribute", ["length", "speed"])

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import os
 import signal
+import sys
 import time
 from collections.abc import Callable
 from pathlib import Path
@@ -12,11 +13,11 @@ import numpy as np
 import pytest
 
 from ugat_marl.envs import vector_env
-from ugat_marl.errors import OptionError, SimulatorCrashed
-from ugat_marl.scenarios import read_scenario
+from ugat_marl.errors import OptionError, ScenarioError, SimulatorCrashed
+from ugat_marl.scenarios import DEADLINE_VARIABLE, finished, read_scenario
 from ugat_marl.simulation import Host, ProcessSimulator, launch_of
 from ugat_marl.simulation.channel import ChannelClosed
-from ugat_marl.simulation.host import DEADLINE_VARIABLE, StartMethod
+from ugat_marl.simulation.host import StartMethod
 
 Crossing = Callable[..., Path]
 
@@ -105,6 +106,12 @@ def test_a_worker_that_stops_in_the_middle_of_a_message_counts_as_dead(
     assert 2.5 < time.monotonic() - begun < 10.0
     assert "did not answer 'large' within 3 s and was killed" in worker.obituary("large")
     host.close()
+
+
+def test_a_program_that_does_not_end_is_killed(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv(DEADLINE_VARIABLE, "0.5")
+    with pytest.raises(ScenarioError, match=r"netconvert: did not end within 0.5 s and was killed"):
+        finished("netconvert", [sys.executable, "-c", "import time; time.sleep(60)"])
 
 
 @pytest.mark.parametrize("text", ["soon", "0", "-1", "nan", "inf"])

@@ -15,7 +15,6 @@ replaced by counts that are read from the demand itself (`corrected`).
 from __future__ import annotations
 
 import functools
-import subprocess
 import tempfile
 import threading
 import xml.etree.ElementTree as ET
@@ -66,6 +65,7 @@ from ugat_marl.scenarios import (
     Withheld,
     demand_as_vehicles,
     draw_day,
+    finished,
     late_green_log,
     withheld_log,
 )
@@ -296,7 +296,7 @@ class Replay:
         # The files are those of the scenario. Reading the schemas takes longer than a short day.
         unchecked = ("--xml-validation", "never", "--xml-validation.routes", "never")
         command = launch.command("--end", repr(period.end_s), *unchecked)
-        done = subprocess.run(command, capture_output=True, text=True, check=False)
+        done = finished("sumo", command)
         if done.returncode:
             said = one_line_message(done.stderr) or f"exit code {done.returncode}"
             # a negative exit code means that a signal of the system ended SUMO

@@ -1,8 +1,11 @@
 from . import signals as signals
 from .capacity import degrees_of_saturation as degrees_of_saturation
+from .confinement import MEMORY_VARIABLE as MEMORY_VARIABLE
 from .confinement import confine as confine
 from .confinement import confined_command as confined_command
 from .confinement import confinement_missing as confinement_missing
+from .confinement import limit_memory as limit_memory
+from .confinement import most_memory as most_memory
 from .days import draw_day as draw_day
 from .demand import Demand as Demand
 from .demand import check_demand as check_demand
@@ -73,8 +76,11 @@ from .periods import deciding_letter as deciding_letter
 from .phases import conflicting_greens as conflicting_greens
 from .phases import kerb_turn_of as kerb_turn_of
 from .phases import turn_of as turn_of
+from .programs import DEADLINE_VARIABLE as DEADLINE_VARIABLE
+from .programs import finished as finished
 from .programs import run_program as run_program
 from .programs import sumo_program as sumo_program
+from .programs import usual_deadline_s as usual_deadline_s
 from .routes import DEPARTING as DEPARTING
 from .routes import TRAVELLERS as TRAVELLERS
 from .routes import demand_as_vehicles as demand_as_vehicles

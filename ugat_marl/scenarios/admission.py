@@ -115,8 +115,16 @@ OPTIONS = _SWITCHES | _NUMBERS | _TIMES | _WORDS
 them nowhere, so a full network would have shorter travel times.
 """
 
-_MOST_SCALE = 100.0
-"""Largest value of the option ``scale``: SUMO holds so many copies of every vehicle."""
+_BOUNDS: Mapping[str, tuple[float, float]] = {
+    "scale": (0.0, 100.0),  # SUMO holds so many copies of every vehicle
+    "lateral-resolution": (0.01, 100.0),  # metres; SUMO holds every lane in such strips,
+    "pedestrian.striping.stripe-width": (0.01, 100.0),  # every path too,
+    "meso-edgelength": (1.0, 1e6),  # and every road in such segments
+}
+"""Least and largest values of options for which SUMO takes memory or time."""
+_MOST_OF: Mapping[str, int] = {"number": 10_000_000, "roadsideCapacity": 100_000}
+"""Largest values of attributes for which SUMO takes memory or time: the vehicles of a flow, and
+the spaces of a parking area."""
 
 _YES_OR_NO = _words(
     """
@@ -290,9 +298,8 @@ def option_fault(option: str, value: str) -> str:
         return "is not a number"
     if not math.isfinite(number):
         return "is not finite"
-    if option == "scale" and not 0 <= number <= _MOST_SCALE:
-        return f"is not between 0 and {_MOST_SCALE:g}"
-    return ""
+    low, high = _BOUNDS.get(option, (-math.inf, math.inf))
+    return "" if low <= number <= high else f"is not between {low:g} and {high:g}"
 
 
 def admitted(document: Document) -> Document:
@@ -357,6 +364,10 @@ def _number_fault(tag: Tag) -> str:
         value = tag.attributes[attribute]
         if _is_odd_number(value):
             return f"<{tag.name} {attribute}={value[:40]!r}> is not a finite number in plain digits"
+    for attribute in _MOST_OF.keys() & tag.attributes.keys():
+        value, most = tag.attributes[attribute], _MOST_OF[attribute]
+        if DECIMAL.fullmatch(value) and float(value) > most:
+            return f"<{tag.name} {attribute}={value[:40]!r}> is more than {most}"
     return ""
 
 

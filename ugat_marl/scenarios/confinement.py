@@ -3,7 +3,7 @@
 A scenario's files may name other files. `ugat_marl.scenarios.admission` lists what they may say;
 beneath that list the kernel holds the process of a simulation to the scenario's own files, SUMO's
 data and the folder of the simulation. It holds SUMO's converters to their folder in the same way.
-None of them opens or reaches a TCP port.
+None of them opens or reaches a TCP port, or takes more memory than a limit.
 
 The file is a program too, for ``sumo``, ``netconvert`` and the like: it confines itself and becomes
 the other program. It therefore imports nothing of the package.
@@ -28,6 +28,10 @@ _CREATE_RULESET, _ADD_RULE, _RESTRICT_SELF = 444, 445, 446
 _VERSION = 1
 _PATH_BENEATH = 1
 _NO_NEW_PRIVILEGES = 38
+
+MEMORY_VARIABLE = "UGAT_MARL_MEMORY_GB"
+"""Environment variable with the most memory of a simulation, GB; by default half of the machine's.
+With a quarter, honest cities would fail on a laptop."""
 
 _EXECUTE, _WRITE_FILE, _READ_FILE, _READ_DIR = (1 << bit for bit in range(4))
 _BIND_TCP, _CONNECT_TCP = 1, 2
@@ -102,6 +106,43 @@ def confine(
     return ""
 
 
+def most_memory() -> int:
+    """Return the most bytes that a simulation may use.
+
+    Raises:
+        ValueError: The variable `MEMORY_VARIABLE` is not a number above 0; the message says so.
+    """
+    text = os.environ.get(MEMORY_VARIABLE, "")
+    if text:
+        with contextlib.suppress(ValueError):
+            if 0 < (gigabytes := float(text)) < 1e9:
+                return int(gigabytes * 1e9)
+        raise ValueError(f"{MEMORY_VARIABLE} = {text!r}: give a number of gigabytes above 0")
+    machine = os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES")
+    with contextlib.suppress(OSError, ValueError):  # "max" where a container has no limit
+        machine = min(machine, int(Path("/sys/fs/cgroup/memory.max").read_text()))
+    return machine // 2
+
+
+def limit_memory() -> None:
+    """Limit the memory of this process, and of what it starts, to `most_memory`.
+
+    A few bytes of a scenario can ask SUMO for any amount of memory. Not on Windows.
+
+    Raises:
+        ValueError: As for `most_memory`.
+    """
+    if os.name == "nt":
+        return
+    import resource
+
+    most = most_memory()
+    _, hard = resource.getrlimit(resource.RLIMIT_DATA)
+    if hard != resource.RLIM_INFINITY:
+        most = min(most, hard)
+    resource.setrlimit(resource.RLIMIT_DATA, (most, most))
+
+
 def confined_command(
     command: Sequence[str], reads: Sequence[str], writes: Sequence[str]
 ) -> list[str]:
@@ -160,6 +201,7 @@ def _checked(number: int, *arguments: Any) -> int:
 
 
 def _main(rules: str, *command: str) -> None:
+    limit_memory()
     confine(*json.loads(rules))
     os.execv(command[0], command)
 

@@ -2,18 +2,40 @@
 
 from __future__ import annotations
 
+import contextlib
 import os
 import re
 import subprocess
 import sys
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 
-from ugat_marl.errors import ScenarioError
+from ugat_marl.errors import OptionError, ScenarioError
 from ugat_marl.scenarios.confinement import confined_command
+
+DEADLINE_S = 900.0
+"""Seconds within which a process has to answer; then it counts as dead. Loading a city takes
+minutes, so half of it would kill honest simulations on slow machines."""
+DEADLINE_VARIABLE = "UGAT_MARL_DEADLINE_S"
+"""Environment variable that replaces `DEADLINE_S`."""
 
 _MOST_WORDS = 60
 """Most words quoted from a program's error; netconvert can print pages."""
+
+
+def usual_deadline_s() -> float:
+    """Return the seconds within which a process has to answer.
+
+    Raises:
+        OptionError: The variable `DEADLINE_VARIABLE` is not a number of seconds above 0.
+    """
+    text = os.environ.get(DEADLINE_VARIABLE, "")
+    if not text:
+        return DEADLINE_S
+    with contextlib.suppress(ValueError):
+        if 0 < (seconds := float(text)) < float("inf"):
+            return seconds
+    raise OptionError(f"{DEADLINE_VARIABLE} = {text!r}: give a number of seconds above 0")
 
 
 def sumo_program(name: str) -> Path:
@@ -84,12 +106,40 @@ def run_program(name: str, command: Sequence[str]) -> str:
         ScenarioError: The program failed; the message quotes it.
     """
     environment = {**os.environ, "SUMO_HOME": str(sumo_program(name).parent.parent)}
-    done = subprocess.run(
-        list(command), capture_output=True, text=True, env=environment, check=False
-    )
+    done = finished(name, command, environment)
     if done.returncode:
         raise ScenarioError(f"{name}: {_short(_errors(done.stderr) or done.stderr or done.stdout)}")
     return done.stderr.strip()
+
+
+def finished(
+    name: str, command: Sequence[str], environment: Mapping[str, str] | None = None
+) -> subprocess.CompletedProcess[str]:
+    """Run a program until it ends, or kill it at its deadline; return its exit code and its words.
+
+    Args:
+        name: Name of the program in errors.
+        command: The program and its options.
+        environment: Its environment variables; None for those of this process.
+
+    Raises:
+        ScenarioError: The program did not end in time.
+    """
+    deadline_s = usual_deadline_s()
+    try:
+        return subprocess.run(
+            list(command),
+            capture_output=True,
+            text=True,
+            env=environment,
+            check=False,
+            timeout=deadline_s,
+        )
+    except subprocess.TimeoutExpired:
+        raise ScenarioError(
+            f"{name}: did not end within {deadline_s:g} s and was killed (stopped, or too little "
+            f"for this network: set {DEADLINE_VARIABLE})"
+        ) from None
 
 
 def _errors(said: str) -> str:

@@ -33,6 +33,7 @@ from numpy.typing import NDArray
 
 from ugat_marl import errors
 from ugat_marl.errors import OptionError, SimulatorCrashed, UgatMarlError, WorkerError
+from ugat_marl.scenarios import DEADLINE_VARIABLE, usual_deadline_s
 from ugat_marl.simulation.channel import Channel, ChannelClosed, Message
 
 StartMethod = Literal["forkserver", "spawn"]
@@ -48,12 +49,6 @@ PATIENCE_S = 10.0
 
 _END_S = 0.05
 """Seconds between two looks for the end of a process that was killed."""
-
-DEADLINE_S = 900.0
-"""Seconds within which a process has to answer; then it counts as dead. Loading a city takes
-minutes, so half of it would kill honest simulations on slow machines."""
-DEADLINE_VARIABLE = "UGAT_MARL_DEADLINE_S"
-"""Environment variable that replaces `DEADLINE_S`."""
 
 _CAN_FORK = hasattr(os, "fork") and hasattr(socket, "send_fds")
 _PROGRAM = "ugat_marl.simulation.worker"
@@ -111,7 +106,7 @@ class Host:
         start_method: ``"forkserver"`` (the default where processes can fork) or ``"spawn"``.
         defaults: Environment variables of the processes, unless the user has set them.
         deadline_s: Seconds within which a process has to answer; None for the variable
-            ``UGAT_MARL_DEADLINE_S``, or `DEADLINE_S`.
+            ``UGAT_MARL_DEADLINE_S``, or 900.
 
     Raises:
         OptionError: The method is unknown, this system does not have it, or the deadline is not a
@@ -133,7 +128,7 @@ class Host:
         self._service = service
         self._method: StartMethod = method
         self._defaults = dict(defaults or {})
-        self._deadline_s = _usual_deadline_s() if deadline_s is None else deadline_s
+        self._deadline_s = usual_deadline_s() if deadline_s is None else deadline_s
         if not 0 < self._deadline_s < float("inf"):
             raise OptionError(f"deadline_s = {deadline_s}: give seconds above 0")
         self._parent: _WarmParent | None = None
@@ -523,16 +518,6 @@ def _channel_of(mine: socket.socket, deadline_s: float) -> Channel:
         mine.close()
 
     return Channel(mine.makefile("rb"), mine.makefile("wb"), hang_up)
-
-
-def _usual_deadline_s() -> float:
-    text = os.environ.get(DEADLINE_VARIABLE, "")
-    if not text:
-        return DEADLINE_S
-    try:
-        return float(text)
-    except ValueError:
-        raise OptionError(f"{DEADLINE_VARIABLE} = {text!r}: give a number of seconds") from None
 
 
 def one_line_message(text: str) -> str:

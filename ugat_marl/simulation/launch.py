@@ -14,6 +14,7 @@ from typing import Any, Protocol
 import numpy as np
 from numpy.typing import NDArray
 
+from ugat_marl.errors import OptionError
 from ugat_marl.files import write_whole
 from ugat_marl.scenarios import (
     NO_UPSTREAM_LANES,
@@ -24,6 +25,7 @@ from ugat_marl.scenarios import (
     UpstreamLanes,
     confine,
     confined_command,
+    limit_memory,
     sumo_program,
 )
 from ugat_marl.simulation.mesoscopic import refuse_in_queues
@@ -106,9 +108,17 @@ class Launch:
     def confine(self) -> None:
         """Confine this thread to the files of this simulation, where the system can do that.
 
-        A simulation with a window stays free, because it needs the display.
+        The memory of the process is limited too. A simulation with a window stays free, because it
+        needs the display.
+
+        Raises:
+            OptionError: The limit of the memory that the user gave is no number.
         """
         if not self.gui:
+            try:
+                limit_memory()
+            except ValueError as error:
+                raise OptionError(str(error)) from None
             confine(self.reads, self._writable)
 
     @property

@@ -19,8 +19,10 @@ from numpy.typing import NDArray
 
 from ugat_marl.errors import SimulatorBusy, SimulatorError
 from ugat_marl.scenarios import (
+    MEMORY_VARIABLE,
     UpstreamLanes,
     edge_of_lane,
+    most_memory,
 )
 from ugat_marl.simulation.host import one_line_message
 from ugat_marl.simulation.launch import ERRORS, TRIPS, Launch, SignalPlans, VehiclePositions
@@ -213,6 +215,11 @@ class LibsumoSimulator:
         assert self._launch is not None
         said = _errors_of(Path(self._launch.directory)) or one_line_message(str(error))
         self.close()
+        if "bad_alloc" in f"{said}{error}":
+            said = (
+                f"it needs more memory than a simulation may use ({most_memory() / 1e9:.3g} GB); "
+                f"is a number in its files far too large? {MEMORY_VARIABLE} sets another limit"
+            )
         raise SimulatorError(f"{action}: {said}") from None
 
 

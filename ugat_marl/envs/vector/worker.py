@@ -29,8 +29,8 @@ from ugat_marl.envs.agents import AgentSet
 from ugat_marl.envs.types import AnyParallelEnv
 from ugat_marl.envs.vector.arrays import Arrays, Shape
 from ugat_marl.envs.vector.spec import Spec, agents_of
-from ugat_marl.errors import EpisodeError, ScenarioError
-from ugat_marl.scenarios import Scenario, confine
+from ugat_marl.errors import EpisodeError, OptionError, ScenarioError
+from ugat_marl.scenarios import Scenario, confine, limit_memory
 from ugat_marl.simulation import Message
 
 _KEPT = 64
@@ -142,8 +142,13 @@ class _EpisodeServer:
     def _confine(self) -> None:
         """Confine this process to the files of its scenario, unless it runs functions of the user.
 
-        A user's reward, observation or wrapper may well write files of its own.
+        Its memory is limited in any case. A user's reward, observation or wrapper may well write
+        files of its own.
         """
+        try:
+            limit_memory()
+        except ValueError as error:
+            raise OptionError(str(error)) from None
         spec = self._order["spec"]
         if not spec["functions"] and not spec["wraps"]:
             base: Any = self._running.unwrapped

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import re
-import subprocess
 import tempfile
 import threading
 import xml.etree.ElementTree as ET
@@ -17,7 +16,7 @@ from ugat_marl.envs import EnvOptions, TrafficEnv, parallel_env
 from ugat_marl.errors import SimulatorError
 from ugat_marl.files import parse_xml, xml_bytes
 from ugat_marl.policies import PolicyFactory, roll_out, stop_callback
-from ugat_marl.scenarios import Document, Network, Scenario, SignalLog, signals
+from ugat_marl.scenarios import Document, Network, Scenario, SignalLog, finished, signals
 from ugat_marl.simulation import launch_of
 
 _STATE = re.compile(r'<tlsState time="([\d.]+)" id="([^"]*)" [^>]*?state="([^"]*)"')
@@ -102,7 +101,7 @@ def own_programmes(
         launch = launch_of(empty, 0, directory / "sumo", ())
         launch.write()
         command = launch.command("--end", repr(begin + end))
-        done = subprocess.run(command, capture_output=True, text=True, check=False)
+        done = finished("sumo", command)
         if done.returncode:
             said = " ".join(done.stderr.split())
             raise SimulatorError(f"SUMO cannot run the signals of {scenario.id!r}: {said}")
