@@ -46,6 +46,8 @@ _LONGEST = 64 << 20
 _LARGEST = 1 << 256
 """Largest integer of a JSON or TOML file. One beyond 2^1024 is no float; the state of a random
 generator has 128 bits."""
+_TOO_DEEP = f"more than {_DEEPEST} tables or lists inside each other, which no such file needs"
+_TOO_LONG = "a number is far too long, which no such file needs"
 _NO_ROOM = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG)
 _END = "\0"
 """Mark after each child of an element during writing. XML cannot contain this character."""
@@ -236,14 +238,10 @@ def _read_text(
 def _parsed(
     text: str, name: str, fault: type[UgatMarlError], parse: Callable[[str], Any], kind: str
 ) -> Any:
-    too_deep = fault(
-        f"{name}: more than {_DEEPEST} tables or lists inside each other, which no such file needs"
-    )
-    too_long = fault(f"{name}: a number is far too long, which no such file needs")
     try:
         content = parse(text)
     except RecursionError:
-        raise too_deep from None
+        raise fault(f"{name}: {_TOO_DEEP}") from None
     except json.JSONDecodeError as error:
         raise fault(
             f"{name}, line {error.lineno}: not valid {kind} ({error.msg}); the file may have been "
@@ -254,15 +252,30 @@ def _parsed(
             f"{name}: not valid {kind}: {error}; the file may have been cut short"
         ) from None
     except ValueError:  # more digits than Python reads
-        raise too_long from None
+        raise fault(f"{name}: {_TOO_LONG}") from None
+    require_bounded(content, name, fault)
+    return content
+
+
+def require_bounded(content: Any, name: str, fault: type[UgatMarlError]) -> None:
+    """Refuse what was read from JSON or TOML if it is nested too deeply or has a huge integer.
+
+    Args:
+        content: The plain values.
+        name: Name of their place in errors.
+        fault: Kind of the error to raise.
+
+    Raises:
+        UgatMarlError: As `fault`.
+    """
     level = [content]
     for _ in range(_DEEPEST):
         level = [part for value in level for part in _parts_of(value)]
         if any(isinstance(value, int) and abs(value) > _LARGEST for value in level):
-            raise too_long
+            raise fault(f"{name}: {_TOO_LONG}")
         if not level:
-            return content
-    raise too_deep
+            return
+    raise fault(f"{name}: {_TOO_DEEP}")
 
 
 def _parts_of(value: Any) -> Iterable[Any]:

@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import Any, cast
 
 from ugat_marl.errors import ScenarioError
-from ugat_marl.files import Tag, chunks_of, parse_json, read_bytes, scan_xml
+from ugat_marl.files import Tag, chunks_of, parse_json, read_bytes, require_bounded, scan_xml
 from ugat_marl.progress import Reporter
 
 _MOST = 32 << 20
@@ -65,6 +65,7 @@ def objects(path: Path, reporter: Reporter) -> Iterator[tuple[dict[str, Any], in
             raise _strange(f"{path}, line {line}", error) from None
         if not isinstance(parsed_object, dict):
             raise ScenarioError(f"{path}, line {line}: an object in braces was expected here")
+        require_bounded(parsed_object, f"{path}, line {line}", ScenarioError)
         yield cast("dict[str, Any]", parsed_object), line
         line += text.count("\n", at, end)
         at = end
