@@ -17,7 +17,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from ugat_marl import files
-from ugat_marl.errors import LogError, MeasuredDataError, ScenarioError
+from ugat_marl.errors import LogError, MeasuredDataError, OutputError, ScenarioError
 from ugat_marl.files import parse_xml, read_bytes, replacing, write_whole, xml_bytes
 
 
@@ -272,3 +272,28 @@ def test_json_and_toml_as_deep_as_allowed_are_read(tmp_path: Path) -> None:
         files.read_json(tmp_path / "none.json", LogError)
     with pytest.raises(LogError, match="^provenance: more than 64 tables"):
         files.parse_json("[" * 65 + "]" * 65, "provenance", LogError)
+
+
+@pytest.mark.skipif(not hasattr(os, "mkfifo"), reason="no pipes with names on Windows")
+def test_a_pipe_is_refused_and_not_waited_for(tmp_path: Path) -> None:
+    path = tmp_path / "x.sumocfg"
+    os.mkfifo(path)
+    for read in (
+        lambda: files.read_bytes(path),
+        lambda: list(files.chunks_of(path)),
+        lambda: files.read_json(path, ScenarioError),
+    ):
+        with pytest.raises(ScenarioError, match=r"x\.sumocfg: is a pipe or a device"):
+            read()
+
+
+def test_a_cache_without_a_home(monkeypatch: pytest.MonkeyPatch) -> None:
+    def no_home() -> Path:
+        raise RuntimeError("Could not determine home directory.")
+
+    monkeypatch.setattr(Path, "home", no_home)
+    monkeypatch.delenv("XDG_CACHE_HOME", raising=False)
+    with pytest.raises(OutputError, match="no home folder.*XDG_CACHE_HOME"):
+        files.user_cache("x")
+    monkeypatch.setenv("XDG_CACHE_HOME", "/cache")
+    assert files.user_cache("x") == Path("/cache/ugat_marl/x")

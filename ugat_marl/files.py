@@ -15,6 +15,7 @@ import json
 import os
 import secrets
 import shutil
+import stat
 import tempfile
 import tomllib
 import weakref
@@ -123,9 +124,34 @@ def with_home(text: str) -> Path:
 
 
 def user_cache(name: str) -> Path:
-    """Return the folder in the user's cache that keeps results of the kind `name` between runs."""
+    """Return the folder in the user's cache that keeps results of the kind `name` between runs.
+
+    Raises:
+        OutputError: The user has no home folder.
+    """
     base = os.environ.get("XDG_CACHE_HOME")
-    return (Path(base) if base else Path.home() / ".cache") / "ugat_marl" / name
+    try:
+        return (Path(base) if base else Path.home() / ".cache") / "ugat_marl" / name
+    except RuntimeError:  # the system does not know the user, as in some containers
+        raise OutputError(
+            "there is no home folder to keep results in; name a folder in XDG_CACHE_HOME"
+        ) from None
+
+
+def refuse_endless(path: Path, fault: type[UgatMarlError]) -> None:
+    """Refuse a pipe or a device, whose reading may never end; a missing file is let through.
+
+    Args:
+        path: The file.
+        fault: Kind of the error to raise.
+
+    Raises:
+        UgatMarlError: As `fault`.
+    """
+    with contextlib.suppress(OSError):
+        mode = path.stat().st_mode
+        if not (stat.S_ISREG(mode) or stat.S_ISDIR(mode)):
+            raise fault(f"{path}: is a pipe or a device; copy what it gives into a file")
 
 
 def read_bytes(path: Path) -> bytes:
@@ -134,6 +160,7 @@ def read_bytes(path: Path) -> bytes:
     Raises:
         ScenarioError: The file is missing, unreadable or a broken archive.
     """
+    refuse_endless(path, ScenarioError)
     try:
         data = path.read_bytes()
     except FileNotFoundError:
@@ -221,6 +248,7 @@ def parse_json(text: str, name: str, fault: type[UgatMarlError]) -> Any:
 def _read_text(
     path: Path, fault: type[UgatMarlError], parse: Callable[[str], Any], kind: str
 ) -> Any:
+    refuse_endless(path, fault)
     try:
         if path.stat().st_size > _LONGEST:
             raise fault(
@@ -310,6 +338,7 @@ def chunks_of(path: Path, reporter: Reporter | None = None) -> Iterator[bytes]:
     Raises:
         ScenarioError: As for `read_bytes`.
     """
+    refuse_endless(path, ScenarioError)
     try:
         with path.open("rb") as raw, gzip.open(raw) if path.suffix == ".gz" else raw as file:
             pieces = iter(lambda: file.read(_PIECE), b"")

@@ -88,7 +88,10 @@ def algorithm(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Any:
     monkeypatch.chdir(tmp_path)
     monkeypatch.syspath_prepend(str(tmp_path))
     monkeypatch.delitem(sys.modules, "my_algo", raising=False)
-    return importlib.import_module("my_algo")
+    module = importlib.import_module("my_algo")
+    del sys.modules["my_algo"]
+    monkeypatch.setitem(sys.modules, "my_algo", module)  # gone after the test: others use the name
+    return module
 
 
 def trained(folder: Path, learner: str, *words: str) -> int:
