@@ -28,7 +28,7 @@ LEARNERS = "baselines"
 
 TRAIN = (
     "train single-v1 --real V4 --out run --duration-s 300 --pretrain-episodes 1 --iterations 1 "
-    "--grounded-episodes 1 --real-rollouts 1 --street.simulations 4 --evaluation-seeds 1 "
+    "--grounded-episodes 1 --real-rollouts 1 --street.simulations 20 --evaluation-seeds 1 "
     "--tuning-seeds 1 --no-control"
 )
 COMMANDS = (

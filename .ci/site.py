@@ -89,7 +89,8 @@ def unpacked(module: str, name: str) -> bool:
 def home(module: str, name: str) -> str:
     """Return the module that defines a name, followed over imports and stubs."""
     folder = ROOT.joinpath(*module.split("."))
-    file = folder / "__init__.pyi" if folder.is_dir() else folder.with_suffix(".py")
+    stub = folder / "__init__.pyi"  # a folder beside a module of its name holds data alone
+    file = stub if stub.is_file() else folder.with_suffix(".py")
     for node in ast.parse(file.read_text()).body:
         if (
             isinstance(node, ast.ImportFrom)
