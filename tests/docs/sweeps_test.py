@@ -14,7 +14,7 @@ import ugat_marl
 
 FOLDER = Path(__file__).resolve().parents[2] / "docs" / "how-to"
 EXAMPLES = sorted((FOLDER / "sweeps").glob("*.py"))
-NEEDS = {"with_optuna": "optuna"}
+NEEDS = {"with_optuna": "optuna", "with_ray_tune": "ray.tune"}
 
 
 def test_every_example_is_on_the_page() -> None:
