@@ -86,7 +86,7 @@ SHORT: dict[str, tuple[str, ...]] = {
 """Short names of commands, and the words that replace them."""
 
 GROUPS: dict[str, str] = {
-    "policy": "the policies that are shipped, and cards of yours: list, card, pack",
+    "policy": "shipped policies, and cards for yours: list, card, pack",
     "scenario": "make, check, draw and list scenarios: new, check, draw, list",
     "paper": "the tables of the paper: main, ablation, alpha, uncertainty, gap",
 }

@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+import ast
 import importlib
 import inspect
 import re
 import shlex
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
@@ -69,6 +71,65 @@ def in_help() -> list[Any]:
     return found
 
 
+def in_makefile() -> list[Any]:
+    """Every command that `make` or the trial of the wheel runs."""
+    made = [
+        line.replace("$(BIN)/", "").replace("$(ARGS)", "").removeprefix("OMP_NUM_THREADS=1 ")
+        for line in map(str.strip, whole_lines((ROOT / "Makefile").read_text()))
+        if "/ugat-marl " in line
+    ]
+    tree = ast.parse((ROOT / ".ci" / "package.py").read_text())
+    tried = [
+        f"ugat-marl {node.value}"
+        for place in tree.body
+        if isinstance(place, ast.Assign) and ast.unparse(place.targets[0]) in ("TRAIN", "COMMANDS")
+        for node in ast.walk(place.value)
+        if isinstance(node, ast.Constant)
+    ]
+    return [pytest.param(line, id=f"make: {line[:60]}") for line in (*made, *tried)]
+
+
+def sentences(path: Path) -> Iterator[str]:
+    """Yield the texts of a module but docstrings; ``{}`` stands for what is filled in."""
+    tree = ast.parse(path.read_text(encoding="utf-8"))
+    loose = {id(node.value) for node in ast.walk(tree) if isinstance(node, ast.Expr)}
+    parts = {
+        id(part)
+        for node in ast.walk(tree)
+        if isinstance(node, ast.JoinedStr)
+        for part in ast.walk(node)
+        if part is not node
+    }
+    for node in ast.walk(tree):
+        if id(node) in loose or id(node) in parts:
+            continue
+        if isinstance(node, ast.Constant) and isinstance(node.value, str):
+            yield node.value
+        elif isinstance(node, ast.JoinedStr):
+            yield "".join(
+                part.value if isinstance(part, ast.Constant) else "{}"  # pyright: ignore
+                for part in node.values
+            )
+
+
+def in_messages() -> list[Any]:
+    """Every command that a message tells to give, with words for what is filled in."""
+    found: dict[str, Any] = {}
+    for path in sorted((ROOT / "ugat_marl").rglob("*.py")):
+        for text in sentences(path):
+            for told in re.findall(r"ugat-marl ([a-z][^`\n,;)(]*)", text):
+                line = f"ugat-marl {told}".partition(" (")[0].strip()
+                if path.name == "__main__.py" or len(line.split()) < 3 or " lists " in line:
+                    continue  # an example of the help, or the name of a verb
+                for end in (" as programmes", " for the", " and "):
+                    line = line.partition(end)[0]
+                name = f"{path.stem}: {line[:60]}"
+                line = re.sub(r"(--draw) \{\}|(--out DIR) \{\}$", r"\1\2", line)
+                filled = line.replace("--draw", "--draw 7").replace("{}", "single-v1")
+                found[line] = pytest.param(filled, id=name)
+    return [*found.values()]
+
+
 def words_of(command: str) -> list[str]:
     """The words after the program's name, without comments and redirections."""
     words = shlex.split(command, comments=True)[1:]
@@ -88,14 +149,16 @@ def folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
 
 
 COMMAND_LINES = [*in_pages(), *in_help()]
+SAID = [*in_makefile(), *in_messages()]
 
 
 def test_commands_are_found() -> None:
     assert len(in_pages()) > 60 and len(in_help()) > 40
+    assert len(in_makefile()) > 6 and len(in_messages()) > 5
 
 
 @pytest.mark.usefixtures("folder")
-@pytest.mark.parametrize("command", COMMAND_LINES)
+@pytest.mark.parametrize("command", [*COMMAND_LINES, *SAID])
 def test_a_documented_command_is_understood(
     command: str, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:

@@ -38,7 +38,7 @@ class Description:
         with pl.Config(tbl_rows=-1, tbl_cols=-1, fmt_str_lengths=60, tbl_width_chars=100):
             return (
                 f"{self.observation}\nunit of features: {self.unit}\n{self.phases}\n"
-                "as drawings: ugat-marl scenario draw SCENARIO"
+                "as drawings: ugat-marl scenario draw SCENARIO --out pictures"
             )
 
 
