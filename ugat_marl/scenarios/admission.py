@@ -122,6 +122,8 @@ _BOUNDS: Mapping[str, tuple[float, float]] = {
     "meso-edgelength": (1.0, 1e6),  # and every road in such segments
 }
 """Least and largest values of options for which SUMO takes memory or time."""
+_OFF_BELOW_0: frozenset[str] = frozenset({"lateral-resolution"})
+"""Options of these that 0 or less switches off."""
 _MOST_OF: Mapping[str, int] = {"number": 10_000_000, "roadsideCapacity": 100_000}
 """Largest values of attributes for which SUMO takes memory or time: the vehicles of a flow, and
 the spaces of a parking area."""
@@ -298,6 +300,8 @@ def option_fault(option: str, value: str) -> str:
         return "is not a number"
     if not math.isfinite(number):
         return "is not finite"
+    if option in _OFF_BELOW_0 and number <= 0:
+        return ""
     low, high = _BOUNDS.get(option, (-math.inf, math.inf))
     return "" if low <= number <= high else f"is not between {low:g} and {high:g}"
 
