@@ -29,12 +29,12 @@ from ugat_marl.experiments import (
     tuned_rules,
     tuning,
 )
-from ugat_marl.experiments.evaluation import race
+from ugat_marl.experiments.evaluation import race_rules
 from ugat_marl.experiments.jobs import EVALUATION_SEED, RULE_FILE, Job, perform
 from ugat_marl.experiments.scores import Result, Trial
 from ugat_marl.experiments.settings import RULE, Setting
-from ugat_marl.experiments.tuning import rungs, settings_of
-from ugat_marl.policies import RULES, format_rule, parse_rule
+from ugat_marl.experiments.tuning import rungs
+from ugat_marl.policies import RULES, format_rule, parse_rule, rule_settings
 from ugat_marl.progress import Silent
 from ugat_marl.reporting import tuning_table
 
@@ -78,7 +78,7 @@ FIVE = [f"fixed-time:{s}" for s in (10, 20, 30, 40, 50)]
 
 
 def test_the_worse_half_is_left_behind_after_each_rung(streets: Streets) -> None:
-    found = race(load_scenario("single-v1"), "sim", FIVE, [[1], [2, 3], [4]])
+    found = race_rules(load_scenario("single-v1"), "sim", FIVE, [[1], [2, 3], [4]])
     assert found == (
         Trial("fixed-time:50", 100.0, 4),
         Trial("fixed-time:40", 110.0, 4),
@@ -92,9 +92,9 @@ def test_the_worse_half_is_left_behind_after_each_rung(streets: Streets) -> None
 
 def test_a_lucky_first_episode_does_not_win(streets: Streets) -> None:
     streets.luck[("fixed-time:30", 1)] = -25.0  # 95 s where it is 120 s
-    found = race(load_scenario("single-v1"), "sim", FIVE, [[1], [2], [3]])
+    found = race_rules(load_scenario("single-v1"), "sim", FIVE, [[1], [2], [3]])
     assert found[0].spec == "fixed-time:50"
-    assert race(load_scenario("single-v1"), "sim", FIVE, [[1]])[0].spec == "fixed-time:30"
+    assert race_rules(load_scenario("single-v1"), "sim", FIVE, [[1]])[0].spec == "fixed-time:30"
 
 
 def test_the_best_rule_is_searched_in_each_domain_by_itself(streets: Streets) -> None:
@@ -124,17 +124,17 @@ def test_a_race_stays_within_its_budget(settings: int, extra: int) -> None:
 
 
 def test_a_small_budget_thins_the_settings_out_evenly() -> None:
-    assert settings_of("fixed-time", 100) == [f"fixed-time:{s}" for s in (10, 20, 30, 40, 50, 60)]
-    assert settings_of("fixed-time", 5) == ["fixed-time:30", "fixed-time:40", "fixed-time:60"]
-    assert settings_of("fixed-time", 2) == ["fixed-time:30", "fixed-time:50"]
+    assert rule_settings("fixed-time", 100) == [f"fixed-time:{s}" for s in (10, 20, 30, 40, 50, 60)]
+    assert rule_settings("fixed-time", 5) == ["fixed-time:30", "fixed-time:40", "fixed-time:60"]
+    assert rule_settings("fixed-time", 2) == ["fixed-time:30", "fixed-time:50"]
     for name, rule in RULES.items():  # the usual setting is never thinned out
         usual = format_rule(name, [parameter.default for parameter in rule.parameters])
-        assert all(usual in settings_of(name, budget) for budget in (2, 5, 8, 16, 24, 100))
+        assert all(usual in rule_settings(name, budget) for budget in (2, 5, 8, 16, 24, 100))
     both = len(RULES["actuated"].parameters[0].choices) * len(
         RULES["actuated"].parameters[1].choices
     )
-    assert len(settings_of("actuated", 1000)) == both
-    assert settings_of("programme", 2) == ["programme"]
+    assert len(rule_settings("actuated", 1000)) == both
+    assert rule_settings("programme", 2) == ["programme"]
 
 
 def test_tuning_finds_the_setting_and_remembers_it(streets: Streets, tmp_path: Path) -> None:

@@ -5,10 +5,12 @@ from __future__ import annotations
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import polars as pl
 import pytest
+from numpy.typing import NDArray
 
 from tests.interrupts import KillAt
 from tests.runs import SMALL, numbers, play_nothing, weights
@@ -36,7 +38,15 @@ from ugat_marl.grounding.posterior import Values
 from ugat_marl.grounding.state import RunState
 from ugat_marl.grounding.street_training import StreetTraining
 from ugat_marl.grounding.summaries import NAMES
-from ugat_marl.policies import EpsilonGreedy, Policy, make_rule, observer_of, roll_out
+from ugat_marl.policies import (
+    EpsilonGreedy,
+    NamedRule,
+    Policy,
+    make_rule,
+    observer_of,
+    roll_out,
+    rule_in,
+)
 from ugat_marl.simulation import kept_warm
 
 SCENARIO = load_scenario("single-v1")
@@ -248,6 +258,47 @@ def test_the_kept_policy_is_the_one_on_the_street(
     (_, before), (second, kept) = out_there
     assert before is None
     assert second is kept
+
+
+def test_a_rule_that_is_better_in_the_fitted_street_is_kept(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    play_nothing(monkeypatch)
+    compare, out_there = Simulation.compare, list[Policy]()
+    roll_out_of = StreetTraining._roll_out
+
+    def rules_are_better(
+        self: Simulation, worlds: Any, policies: Any, seeds: Any, on_done: Any
+    ) -> NDArray[np.float64]:
+        times_s = compare(self, worlds, policies, seeds, on_done)
+        for policy, row in zip(policies, times_s, strict=True):
+            row[:] = 5.0 if getattr(policy, "spec", "") == "fixed-time:50" else row + 10.0
+        return times_s
+
+    def seen(self: StreetTraining, state: RunState[StreetFit], policy: Policy) -> None:
+        out_there.append(policy)
+        roll_out_of(self, state, policy)
+
+    monkeypatch.setattr(Simulation, "compare", rules_are_better)
+    monkeypatch.setattr(StreetTraining, "_roll_out", seen)
+    street = replace(QUICK, rule_budget=2)
+    config = replace(
+        SMALL, real=LATE, ugat=replace(SMALL.ugat, grounding="street", street=street, iterations=2)
+    )
+    with pytest.raises(KeyboardInterrupt):
+        transfer(config, tmp_path, reporter=KillAt("fitting, iteration 2"), workers=1)
+    transfer(config, tmp_path, resume=True, workers=1)
+    assert rule_in(tmp_path / "policies" / "fitted-street.pt") == "fixed-time:50"
+    _, second, resumed = out_there
+    assert isinstance(second, NamedRule)
+    assert isinstance(resumed, NamedRule)
+    assert numbers(tmp_path)[2, "judged/of_the_rule"] == 5.0
+
+
+def test_so_few_episodes_of_a_rule_are_refused() -> None:
+    for budget in (-1, 1):
+        with pytest.raises(OptionError, match="at least 2, or 0"):
+            StreetConfig(rule_budget=budget)
 
 
 @pytest.mark.parametrize(

@@ -53,6 +53,16 @@ def agreement(learner: DQN, env: TrafficEnv) -> float:
     return float(np.mean(same))
 
 
+def test_a_best_rule_that_is_known_teaches_where_the_best_one_is_asked_for(
+    env: TrafficEnv,
+) -> None:
+    learner = DQN.of(env, replace(SETTINGS, teacher=BEST, lesson_updates=1), 0)
+    assert learner.plays(env, RULE) == 1
+    assert learner.attend(env, 0, best=RULE) == RULE
+    named = DQN.of(env, replace(SETTINGS, lesson_updates=1), 0)
+    assert named.attend(env, 0, best="max-pressure:10") == RULE
+
+
 def test_a_learner_acts_as_its_teacher_before_its_first_episode(env: TrafficEnv) -> None:
     learner = DQN.of(env, SETTINGS, 0)
     assert isinstance(learner, Taught)

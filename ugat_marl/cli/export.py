@@ -11,7 +11,7 @@ from tyro.conf import Positional, arg
 
 from ugat_marl.effects import load_scenario
 from ugat_marl.envs import parallel_env
-from ugat_marl.policies import NetworkPolicy, export_policy
+from ugat_marl.policies import export_policy, load_policy
 
 
 @dataclass(frozen=True)
@@ -38,7 +38,7 @@ class Export:
 
     def run(self, console: Console) -> int:
         """Export and print the paths."""
-        policy, env = NetworkPolicy.load(self.policy), None
+        policy, env = load_policy(self.policy), None
         if self.scenario is not None:
             env = parallel_env(load_scenario(self.scenario), **policy.env_options)
         side_car = export_policy(policy, self.out, env)

@@ -13,9 +13,9 @@ from tyro.conf import Positional, arg
 from ugat_marl.cli.arguments import LengthS, RayAddress, Workers, workers_of
 from ugat_marl.effects import domain_label, load_scenario
 from ugat_marl.errors import OptionError, UnknownNameError
-from ugat_marl.experiments import BUDGET, LEAST_BUDGET, TUNED_RULES, tune
+from ugat_marl.experiments import BUDGET, LEAST_BUDGET, tune
 from ugat_marl.files import require_writable, write_whole
-from ugat_marl.policies import RULE_NAMES, RULES
+from ugat_marl.policies import RULE_NAMES, RULES, TUNED_RULES
 from ugat_marl.progress import Bars
 from ugat_marl.reporting import tuning_table
 

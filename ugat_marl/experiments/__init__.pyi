@@ -93,7 +93,6 @@ from .transfers import TransferConfig as TransferConfig
 from .transfers import transfer as transfer
 from .tuning import BUDGET as BUDGET
 from .tuning import LEAST_BUDGET as LEAST_BUDGET
-from .tuning import TUNED_RULES as TUNED_RULES
 from .tuning import VERSION as VERSION
 from .tuning import tune as tune
 from .tuning import tuned_rules as tuned_rules

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import copy
-import math
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
@@ -38,7 +37,9 @@ from ugat_marl.policies import (
     make_rule,
     own_policy,
     parse_rule,
+    race,
     roll_out,
+    rule_in,
     stop_callback,
 )
 from ugat_marl.progress import Reporter, Silent
@@ -143,7 +144,7 @@ def best_rules(
     """
     best: dict[str, str] = {}
     for domain in domains:
-        trials = race(
+        trials = race_rules(
             scenario,
             domain,
             rules,
@@ -158,7 +159,7 @@ def best_rules(
 
 
 @kept_warm()
-def race(
+def race_rules(
     scenario: Scenario,
     domain: Domain,
     specs: Sequence[str],
@@ -185,29 +186,23 @@ def race(
         All rules, first those of the last rung, then those that dropped out, the latest first. In
         each rung the order is by mean ATT.
     """
-    played: dict[str, list[float]] = {spec: [] for spec in specs}
-    running, left = list(played), list[str]()
-    for rung, rung_seeds in enumerate(seeds):
+
+    def play(rung: int, running: Sequence[str]) -> list[list[float]]:
         evaluation = evaluate(
             scenario,
             {spec: RuleFactory(spec) for spec in running},
             [domain],
-            rung_seeds,
+            seeds[rung],
             duration_s=duration_s,
             workers=workers,
             reporter=reporter,
             title=title,
         )
-        for spec in running:
-            played[spec] += evaluation.values(spec, evaluation.domains[0], "att_s").tolist()
-        # The sort is stable: of equal rules, the one named first stays first.
-        running.sort(key=lambda spec: float(np.mean(played[spec])))
-        if rung + 1 < len(seeds):
-            kept = max(2, math.ceil(len(running) / 2))
-            running, left = running[:kept], running[kept:] + left
-    return tuple(
-        Trial(spec, float(np.mean(played[spec])), len(played[spec])) for spec in running + left
-    )
+        (played_in,) = evaluation.domains
+        return [evaluation.values(spec, played_in, "att_s").tolist() for spec in running]
+
+    played = race(specs, len(seeds), play)
+    return tuple(Trial(spec, float(np.mean(each)), len(each)) for spec, each in played.items())
 
 
 @dataclass(frozen=True)
@@ -291,6 +286,8 @@ def policy_factory(spec: str) -> PolicyFactory:
         raise CheckpointError(f"{path} is a folder; name the .pt file of a policy in it")
     if path.suffix != ".pt" and not path.is_file() and "/" not in spec:
         return rule_factory(spec)
+    if (rule := rule_in(path)) is not None:  # a fitted street may keep a rule
+        return rule_factory(rule)
     return TrainedPolicy(load_policy(spec), spec)
 
 

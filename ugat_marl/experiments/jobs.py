@@ -43,7 +43,7 @@ from ugat_marl.experiments.queues import QUEUES, QueueRecord
 from ugat_marl.experiments.randomised import randomised_env
 from ugat_marl.experiments.settings import DIRECT, Setting, file_hash
 from ugat_marl.experiments.training import Effort, simulated_worlds, train_grounded, train_through
-from ugat_marl.experiments.tuning import TUNED_RULES, VERSION, tuned_rules
+from ugat_marl.experiments.tuning import VERSION, tuned_rules
 from ugat_marl.files import read_json, write_whole
 from ugat_marl.grounding import (
     ChangePenalty,
@@ -56,7 +56,7 @@ from ugat_marl.grounding import (
     require_histories,
 )
 from ugat_marl.parallel import Workers, in_this_process
-from ugat_marl.policies import STANDARD_RULES, Policy, PolicyFactory, Taught
+from ugat_marl.policies import STANDARD_RULES, TUNED_RULES, Policy, PolicyFactory, Taught
 from ugat_marl.progress import Bars, Reporter
 from ugat_marl.simulation import exit_when_input_ends, kept_warm
 

@@ -7,9 +7,8 @@ from collections.abc import Sequence
 from pathlib import Path
 
 from ugat_marl.experiments.jobs import Job, Record
-from ugat_marl.experiments.tuning import TUNED_RULES
 from ugat_marl.grounding import UgatConfig
-from ugat_marl.policies import STANDARD_RULES
+from ugat_marl.policies import STANDARD_RULES, TUNED_RULES, race_fields, rule_settings
 from ugat_marl.progress import Share
 
 EPOCH = 0.05
@@ -103,6 +102,11 @@ def _grounded_work(ugat: UgatConfig, episode_s: float) -> dict[str, tuple[float,
         work["fitting"] = (worlds if times else 0, short)
         work["fitted street"] = (times * ugat.grounded_episodes, 1.0)
         work["comparing"] = (2 * street.judged * times, 1.0)
+        if street.rule_budget:
+            specs = [
+                spec for name in TUNED_RULES for spec in rule_settings(name, street.rule_budget)
+            ]
+            work["rules"] = (times * sum(race_fields(len(specs))), 1.0)
         return work
     rollouts = ugat.sim_rollouts + ugat.real_rollouts
     work["roll-outs"] = (2 * times, rollouts / 2)

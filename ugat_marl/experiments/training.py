@@ -43,8 +43,10 @@ from ugat_marl.policies import (
     EpisodeCallback,
     Learner,
     LearnerFactory,
+    NamedRule,
     NetworkPolicy,
     Policy,
+    rule_in,
 )
 from ugat_marl.scenarios import Scenario, green_begins_at_once
 
@@ -162,11 +164,17 @@ def train_grounded(
 
 
 def _policy_reader(make: LearnerFactory, env: TrafficEnv) -> Callable[[Path], Policy]:
-    """Return the function that reads the policies of a learner from a checkpoint."""
-    read = getattr(make, "read_policy", None)  # makers of users' learners have it
-    return (
-        NetworkPolicy.load if read is None else partial(read, partial(parallel_env, env.scenario))
+    """Return the function that reads policies of a learner, and rules, from a checkpoint."""
+    own = getattr(make, "read_policy", None)  # makers of users' learners have it
+    learned = (
+        NetworkPolicy.load if own is None else partial(own, partial(parallel_env, env.scenario))
     )
+
+    def read(path: Path) -> Policy:
+        spec = rule_in(path)
+        return learned(path) if spec is None else NamedRule(spec, env)
+
+    return read
 
 
 def _keep(_state: RunState[Any]) -> None:

@@ -56,7 +56,7 @@ from ugat_marl.experiments.settings import (
     Setting,
     file_hash,
 )
-from ugat_marl.experiments.tuning import LEAST_BUDGET, TUNED_RULES
+from ugat_marl.experiments.tuning import LEAST_BUDGET
 from ugat_marl.files import require_writable, write_whole
 from ugat_marl.grounding import (
     DIRECT_LEARNER,
@@ -70,6 +70,7 @@ from ugat_marl.parallel import Workers
 from ugat_marl.policies import (
     DQN_NAME,
     STANDARD_RULES,
+    TUNED_RULES,
     UNIVERSAL_NAME,
     DQNConfig,
     check_own_learner,

@@ -9,7 +9,6 @@ same seeds.
 from __future__ import annotations
 
 import hashlib
-import itertools
 import json
 import math
 from collections.abc import Sequence
@@ -20,11 +19,11 @@ from typing import Any
 from ugat_marl.data import installed_version
 from ugat_marl.effects import Domain, domain_label, scenario_in_domain
 from ugat_marl.errors import CheckpointError, OptionError, UnknownNameError
-from ugat_marl.experiments.evaluation import TUNING_SEED, best_rules, race
+from ugat_marl.experiments.evaluation import TUNING_SEED, best_rules, race_rules
 from ugat_marl.experiments.scores import Trial, Tuned
 from ugat_marl.files import read_json, user_cache, write_whole
 from ugat_marl.parallel import Workers
-from ugat_marl.policies import RULE_NAMES, RULES, format_rule
+from ugat_marl.policies import RULE_NAMES, RULES, TUNED_RULES, race_fields, rule_settings
 from ugat_marl.progress import Reporter
 from ugat_marl.scenarios import Scenario
 
@@ -36,9 +35,6 @@ BUDGET = 24
 
 LEAST_BUDGET = 2
 """Smallest budget: one episode each for two settings."""
-
-TUNED_RULES = tuple(name for name in RULE_NAMES if name != "random")
-"""Rules that are tuned in a search for the best rule."""
 
 UNTUNED_EPISODES = 3
 """Most episodes of a rule without parameters to tune."""
@@ -80,11 +76,11 @@ def tune(
         raise UnknownNameError("controller", name, RULE_NAMES)
     if budget < LEAST_BUDGET:
         raise OptionError(f"budget = {budget}: must be at least {LEAST_BUDGET} episodes")
-    specs = settings_of(name, budget)
+    specs = rule_settings(name, budget)
     place = _place(name, scenario, domain, budget, duration_s, specs)
     if not fresh and (trials := _recall(place, specs)):
         return Tuned(name, domain_label(domain), trials)
-    trials = race(
+    trials = race_rules(
         scenario,
         domain,
         specs,
@@ -153,7 +149,7 @@ def rungs(settings: int, budget: int) -> list[list[int]]:
     """
     if settings < 2:
         return [[TUNING_SEED + k for k in range(min(budget, UNTUNED_EPISODES))]]
-    fields = _fields(settings)
+    fields = race_fields(settings)
     rungs_seeds: list[list[int]] = []
     following, left = TUNING_SEED, budget
     for rung, field in enumerate(fields):
@@ -164,28 +160,6 @@ def rungs(settings: int, budget: int) -> list[list[int]]:
         following += episodes
         left -= episodes * field
     return rungs_seeds
-
-
-def settings_of(name: str, budget: int) -> list[str]:
-    """Return the spellings to race within a budget: the default, and others spread evenly."""
-    rule = RULES[name]
-    values = itertools.product(*(parameter.choices for parameter in rule.parameters))
-    specs = [format_rule(name, list(each)) for each in values]
-    many = len(specs)
-    while many > 1 and sum(_fields(many)) > budget:
-        many -= 1
-    kept = [(2 * k + 1) * len(specs) // (2 * many) for k in range(many)]
-    usual = specs.index(format_rule(name, [parameter.default for parameter in rule.parameters]))
-    kept[min(range(many), key=lambda k: abs(kept[k] - usual))] = usual
-    return [specs[k] for k in kept]
-
-
-def _fields(settings: int) -> list[int]:
-    """Return the number of settings in each rung: half of the rung before, down to two."""
-    fields = [settings]
-    while fields[-1] > 2:
-        fields.append(math.ceil(fields[-1] / 2))
-    return fields
 
 
 def _place(

@@ -63,17 +63,25 @@ class Algorithm:
                 self.run.log("iteration", 0, self.probe(state.direct))
             state.save(self.run)
 
-    def _attend(self, state: RunState[Any], env: AnyParallelEnv, title: str) -> Policy | None:
+    def _attend(
+        self, state: RunState[Any], env: AnyParallelEnv, title: str, best: str | None = None
+    ) -> Policy | None:
         """Let the learner watch the rule that is good in an environment, if it has a teacher.
+
+        Args:
+            state: The state, with the learner.
+            env: The environment.
+            title: Name of the environment in messages.
+            best: The best rule there, if it is known.
 
         Returns:
             The policy after the lessons; None without a teacher.
         """
         learner = state.learner
-        if not isinstance(learner, Taught) or not (number := learner.plays(env)):
+        if not isinstance(learner, Taught) or not (number := learner.plays(env, best)):
             return None
         with self.run.reporter.task(f"lessons, {title}", number) as advance:
-            name = learner.attend(env, self.seed, lambda rule: advance(note=rule))
+            name = learner.attend(env, self.seed, lambda rule: advance(note=rule), best)
         self.run.reporter.say(f"{title}: {name} teaches")
         return state.learner.policy()
 

@@ -77,6 +77,9 @@ class StreetConfig:
             only this first part is compared. Detectors are compared over whole episodes.
         judged: Worlds of the fitted street in which policies are compared after each iteration; the
             best one is kept. 0 keeps the last one.
+        rule_budget: Most episodes that one rule plays in worlds of the fitted street, with all its
+            settings. The best rule of all teaches the learner, and is kept if it is better than
+            the trained policies. With 0 only trained policies are kept.
         without: Effects left out of the library.
         channel: Numbers of the fit of the command channel.
         eyes: Numbers of the fit of the detectors.
@@ -88,6 +91,7 @@ class StreetConfig:
     further: int = 40
     simulated_s: float = 1800.0
     judged: int = 4
+    rule_budget: int = 0
     without: tuple[str, ...] = ()
     channel: ChannelConfig = field(default_factory=ChannelConfig)
     eyes: EyesConfig = field(default_factory=EyesConfig)
@@ -105,6 +109,10 @@ class StreetConfig:
             raise OptionError(f"further = {self.further}: must not be negative")
         if self.judged < 0:
             raise OptionError(f"judged = {self.judged}: must not be negative")
+        if self.rule_budget < 0 or self.rule_budget == 1:
+            raise OptionError(
+                f"rule_budget = {self.rule_budget}: must be at least 2, or 0 for no rules"
+            )
         if self.simulated_s <= 0:
             raise OptionError(f"simulated_s = {self.simulated_s}: must be above 0")
 

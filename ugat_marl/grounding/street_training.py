@@ -7,11 +7,11 @@
      3      roll the kept policy out in E_real (at first pi), add the transitions to D_real
      4      fit the street to D_real (`street`)
      5      roll it out in worlds of the street; fit f to D_real, h to these roll-outs (`residual`)
-     6      watch the rule that is best in worlds of the street, if the learner has a teacher;
-            for e = 1, ..., E episodes: draw a world of the street, update pi in it; where f is
-            trusted, ground its actions
-     7      keep the best of pi, pi after the lessons, and the policy kept so far, in the same
-            worlds of the street; training goes on from pi
+     6      find the rule that is best in worlds of the street; watch it, if the learner has a
+            teacher; for e = 1, ..., E episodes: draw a world of the street, update pi in it; where
+            f is trusted, ground its actions
+     7      keep the best of pi, pi after the lessons, the rule, and the policy kept so far, in the
+            same worlds of the street; training goes on from pi
 
 Line 5 is an option. Where commands are late, a grounded action would be late as well, and none is
 grounded.
@@ -24,6 +24,7 @@ or that learnt other numbers, begins anew in the fitted street, with M episodes 
 from __future__ import annotations
 
 import contextlib
+from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 
@@ -44,7 +45,16 @@ from ugat_marl.grounding.street import (
     street_log,
 )
 from ugat_marl.grounding.summaries import LaneView
-from ugat_marl.policies import LearnerFactory, Policy, device_of
+from ugat_marl.policies import (
+    TUNED_RULES,
+    LearnerFactory,
+    NamedRule,
+    Policy,
+    device_of,
+    race,
+    race_fields,
+    rule_settings,
+)
 from ugat_marl.seeding import derive_seed
 
 RESIDUAL = "residual.pt"
@@ -139,12 +149,13 @@ class StreetTraining(Algorithm):
             env = street_env(street, self.simulation, street.commands)
             with contextlib.closing(env):
                 grounded = env if residual is None else residual.around(env)
-                taught = self._attend(state, grounded, title)
-                self._learn(state, grounded, episodes, title)  # line 6
+                rule = self._best_rule(state, street)  # line 6
+                taught = self._attend(state, grounded, title, rule and rule.spec)
+                self._learn(state, grounded, episodes, title)
             if residual is not None and residual.acts:
                 gate = residual.end_iteration().as_dict()
                 numbers |= {f"residual/gate/{name}": value for name, value in gate.items()}
-            numbers |= self._keep_better(state, street, taught)  # line 7
+            numbers |= self._keep_better(state, street, taught, rule)  # line 7
             if self.probe is not None:
                 numbers |= self.probe(state.policy())
             self.run.log("iteration", state.iteration + 1, numbers)
@@ -152,8 +163,36 @@ class StreetTraining(Algorithm):
             state.save(self.run)
         return state.policy()
 
+    def _best_rule(self, state: RunState[StreetFit], street: FittedStreet) -> NamedRule | None:
+        """Return the rule that is best in worlds of the street; None if rules are left out.
+
+        All settings of all rules that read the learner's observations race. Each rung has a world
+        of its own, and all rules of a rung play in that world.
+        """
+        budget = self.config.street.rule_budget
+        if budget == 0:
+            return None
+        with contextlib.closing(self.simulation.plain(0)) as env:
+            specs = (spec for name in TUNED_RULES for spec in rule_settings(name, budget))
+            rules = {spec: NamedRule(spec, env) for spec in specs}
+            rules = {spec: rule for spec, rule in rules.items() if rule.reads(env)}
+        fields = race_fields(len(rules))
+        with self.run.reporter.task(f"rules, {iteration_name(state)}", sum(fields)) as advance:
+
+            def play(rung: int, running: Sequence[str]) -> list[list[float]]:
+                seed = derive_seed(self.seed, "rules", state.iteration, rung)
+                playing = [rules[spec] for spec in running]
+                world = [street.world(seed)]
+                return self.simulation.compare(world, playing, [seed], advance).tolist()
+
+            return rules[next(iter(race(list(rules), len(fields), play)))]
+
     def _keep_better(
-        self, state: RunState[StreetFit], street: FittedStreet, taught: Policy | None
+        self,
+        state: RunState[StreetFit],
+        street: FittedStreet,
+        taught: Policy | None,
+        rule: NamedRule | None,
     ) -> dict[str, float]:
         """Compare the new policies with the kept one in worlds of the street; keep the best.
 
@@ -161,6 +200,7 @@ class StreetTraining(Algorithm):
             state: The state, with the learner after its training.
             street: The fitted street.
             taught: Policy after the lessons; None if there were none.
+            rule: The best rule; None if rules are left out.
 
         Returns:
             Average travel times in s, for the metrics.
@@ -170,7 +210,12 @@ class StreetTraining(Algorithm):
             return {}
         kept = state.best or state.direct
         assert kept is not None  # plain training comes first
-        known = {"before": kept, "after the lessons": taught, "after": state.learner.policy()}
+        known = {
+            "before": kept,
+            "after the lessons": taught,
+            "after": state.learner.policy(),
+            "of the rule": rule,
+        }
         policies = {name: policy for name, policy in known.items() if policy is not None}
         seeds = [derive_seed(self.seed, "judged", state.iteration, k) for k in range(count)]
         worlds = [street.world(seed) for seed in seeds]
@@ -181,8 +226,11 @@ class StreetTraining(Algorithm):
         best = min(times_s, key=lambda name: times_s[name])  # of equal ones that before
         state.best = policies[best]
         told = ", ".join(f"{name} {time_s:.1f} s" for name, time_s in times_s.items())
+        named = "that " + best
+        if rule is not None and policies[best] is rule:
+            named += f" {rule.spec}"
         self.run.reporter.say(
-            f"{iteration_name(state)}: in the fitted street the policy {told}; that {best} is kept"
+            f"{iteration_name(state)}: in the fitted street the policy {told}; {named} is kept"
         )
         return {f"judged/{name.replace(' ', '_')}": time_s for name, time_s in times_s.items()}
 

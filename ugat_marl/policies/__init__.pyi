@@ -69,7 +69,13 @@ from .rules.catalogue import STANDARD_RULES as STANDARD_RULES
 from .rules.catalogue import format_rule as format_rule
 from .rules.catalogue import make_rule as make_rule
 from .rules.catalogue import parse_rule as parse_rule
+from .rules.named import NamedRule as NamedRule
+from .rules.named import rule_in as rule_in
 from .rules.open_loop import FixedTime as FixedTime
+from .rules.race import TUNED_RULES as TUNED_RULES
+from .rules.race import race as race
+from .rules.race import race_fields as race_fields
+from .rules.race import rule_settings as rule_settings
 from .shipped import CardScores as CardScores
 from .shipped import PolicyCard as PolicyCard
 from .shipped import load_policy as load_policy

@@ -89,14 +89,25 @@ class Learner(Protocol):
 class Taught(Protocol):
     """A learner that can watch a rule before it acts itself."""
 
-    def plays(self, env: AnyParallelEnv) -> int:
+    def plays(self, env: AnyParallelEnv, best: str | None = None) -> int:
         """Return the number of episodes that `attend` plays; 0 without a teacher."""
         ...
 
     def attend(
-        self, env: AnyParallelEnv, seed: int, on_play: Callable[[str], None] | None = None
+        self,
+        env: AnyParallelEnv,
+        seed: int,
+        on_play: Callable[[str], None] | None = None,
+        best: str | None = None,
     ) -> str | None:
-        """Watch the rule that is good in an environment, and return its spelling."""
+        """Watch the rule that is good in an environment, and return its spelling.
+
+        Args:
+            env: The environment.
+            seed: Root of the seeds of the episodes.
+            on_play: Called after every episode with the rule that played it.
+            best: The best rule there, if it is known.
+        """
         ...
 
 

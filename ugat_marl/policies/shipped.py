@@ -18,6 +18,7 @@ from pydantic import TypeAdapter, ValidationError
 from ugat_marl.errors import CheckpointError, UnknownNameError
 from ugat_marl.files import read_json, write_whole
 from ugat_marl.policies.network_policy import NetworkPolicy
+from ugat_marl.policies.rules.named import rule_in
 
 FOLDER = Path(__file__).parent / "shipped"
 """Folder of the shipped policies; it holds a folder for each scenario."""
@@ -138,10 +139,14 @@ def load_policy(name: str | Path, *, folder: Path = FOLDER) -> NetworkPolicy:
 
     Raises:
         UnknownNameError: There is no such policy.
-        CheckpointError: The file is damaged or no policy.
+        CheckpointError: The file is damaged, no policy, or holds a rule.
     """
     path = Path(name)
     if path.suffix == ".pt" or path.is_file():
+        if (spec := rule_in(path)) is not None:
+            raise CheckpointError(
+                f"{path}: holds the rule {spec}, which has no network; give {spec} in its place"
+            )
         return NetworkPolicy.load(path)
     card = policy_card(str(name), folder=folder)
     file = shipped_policies(folder)[str(name)]

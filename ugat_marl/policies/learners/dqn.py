@@ -23,7 +23,7 @@ from ugat_marl.envs import ActionMask, AgentSet, AnyParallelEnv
 from ugat_marl.errors import CheckpointError, EpisodeError, OptionError
 from ugat_marl.policies.devices import CPU
 from ugat_marl.policies.learners.dqn_config import CEILING_DECISIONS, DQNConfig
-from ugat_marl.policies.learners.lessons import OnPlay, find_teacher, plays
+from ugat_marl.policies.learners.lessons import BEST, OnPlay, find_teacher, plays
 from ugat_marl.policies.learners.replay import Replay
 from ugat_marl.policies.learners.scaling import ceilings, input_factors
 from ugat_marl.policies.learners.start import Start
@@ -267,7 +267,13 @@ class DQN:
                     on_episode(self.episodes - 1, numbers)
         return self.policy()
 
-    def attend(self, env: AnyParallelEnv, seed: int, on_play: OnPlay | None = None) -> str | None:
+    def attend(
+        self,
+        env: AnyParallelEnv,
+        seed: int,
+        on_play: OnPlay | None = None,
+        best: str | None = None,
+    ) -> str | None:
         """Watch the teacher in an environment; what earlier teachers did is an example no more.
 
         `learn` calls it before the first episode. Call it again in an environment of other
@@ -277,6 +283,8 @@ class DQN:
             env: An environment with the agents of this learner; it is reset.
             seed: Root of the seeds of the episodes and of the replay.
             on_play: Called after every episode with the rule that played it, `plays` times.
+            best: Spelling of the rule that is best in the environment, if that is known; then the
+                teacher "best" need not be looked for.
 
         Returns:
             Spelling of the teacher; None without one.
@@ -288,7 +296,7 @@ class DQN:
         if not self.config.teacher:
             return None
         root = derive_seed(seed, "dqn", "lessons", self.taught)
-        name, teacher = find_teacher(env, self.config.teacher, root, on_play)
+        name, teacher = find_teacher(env, self._teacher(best), root, on_play)
         self._replay.forget_teacher()
         for lesson in range(self.config.lessons):
             self._watch(env, teacher, derive_seed(root, "shown", lesson))
@@ -303,10 +311,15 @@ class DQN:
         self.taught += 1
         return name
 
-    def plays(self, env: AnyParallelEnv) -> int:
+    def plays(self, env: AnyParallelEnv, best: str | None = None) -> int:
         """Return the number of episodes that `attend` plays."""
-        teacher = self.config.teacher
+        teacher = self._teacher(best)
         return plays(env, teacher, self.config.lessons) if teacher else 0
+
+    def _teacher(self, best: str | None) -> str:
+        """Return the teacher's spelling, or `BEST` if it has to be looked for."""
+        teacher = self.config.teacher or ""
+        return best if teacher == BEST and best is not None else teacher
 
     def _watch(self, env: AnyParallelEnv, teacher: Policy, seed: int) -> None:
         """Let the teacher play an episode, and store its decisions."""

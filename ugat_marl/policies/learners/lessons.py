@@ -7,7 +7,6 @@ the rule is as good from the first episode, and learning goes on from there.
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from typing import Any
 
 import numpy as np
 
@@ -15,7 +14,8 @@ from ugat_marl.envs import AnyParallelEnv
 from ugat_marl.errors import OptionError
 from ugat_marl.policies.protocols import Policy
 from ugat_marl.policies.rollout import roll_out
-from ugat_marl.policies.rules.catalogue import STANDARD_RULES, make_rule
+from ugat_marl.policies.rules.catalogue import STANDARD_RULES
+from ugat_marl.policies.rules.named import NamedRule
 from ugat_marl.seeding import derive_seed
 
 BEST = "best"
@@ -50,8 +50,8 @@ def find_teacher(
         OptionError: The rule reads other observations than the environment's.
     """
     if name != BEST:
-        rule = make_rule(name, env.unwrapped)
-        if not _reads(rule, env):
+        rule = NamedRule(name, env.unwrapped)
+        if not rule.reads(env):
             raise OptionError(
                 f"teacher {name}: it needs environments with {dict(rule.env_options)}; give one of "
                 f"{', '.join(spec for spec, _ in _candidates(env))}, or {BEST}"
@@ -88,11 +88,5 @@ def plays(env: AnyParallelEnv, name: str, shown: int) -> int:
 
 
 def _candidates(env: AnyParallelEnv) -> Sequence[tuple[str, Policy]]:
-    rules = [(spec, make_rule(spec, env.unwrapped)) for spec in STANDARD_RULES]
-    return [(spec, rule) for spec, rule in rules if _reads(rule, env)]
-
-
-def _reads(rule: Policy, env: AnyParallelEnv) -> bool:
-    """Return True if the environment has the options that the rule relies on."""
-    given: Any = getattr(env.unwrapped, "env_options", {})
-    return all(given.get(name) == value for name, value in rule.env_options.items())
+    rules = [NamedRule(spec, env.unwrapped) for spec in STANDARD_RULES]
+    return [(rule.spec, rule) for rule in rules if rule.reads(env)]
