@@ -18,7 +18,7 @@ from tests.runs import search_few_rules
 from ugat_marl.__main__ import main
 from ugat_marl.data import Metrics
 from ugat_marl.errors import ActionError, CheckpointError, OptionError, UnknownNameError
-from ugat_marl.experiments import policy_factory
+from ugat_marl.experiments import PaperConfig, policy_factory
 from ugat_marl.policies import (
     OwnLearnerFactory,
     check_own_learner,
@@ -98,6 +98,27 @@ def trained(folder: Path, learner: str, *words: str) -> int:
     """The exit code of a small training by the command line."""
     call = ["train", "single-v1", "--grounding", "phase", "--learner", learner]
     return main([*call, *SHORT, *FEW, "--out", str(folder), *words])
+
+
+@pytest.mark.usefixtures("algorithm")
+def test_a_learner_with_two_methods_has_its_row_in_a_table(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    search_few_rules(monkeypatch, "programme")
+    out = tmp_path / "table.csv"
+    call = ["compare", "single-v1", "--name", "mine", "--learner", "my_algo:Cycle"]
+    few = ["--seeds", "1", "--episodes", "2", "--domains", "V1", "--evaluation-seeds", "1"]
+    where = ["--duration-s", "100", "--runs", str(tmp_path / "runs"), "--out", str(out)]
+    assert main([*call, *few, *where]) == 0
+    assert "mine" in capsys.readouterr().out
+    assert "mine" in out.read_text()
+
+
+@pytest.mark.usefixtures("algorithm")
+def test_rows_that_go_on_from_direct_transfer_need_a_learner_that_is_kept() -> None:
+    with pytest.raises(OptionError, match="give its class the methods save"):
+        PaperConfig(scenario=("single-v1",), learner="my_algo:Cycle")
+    PaperConfig(scenario=("single-v1",), learner="my_algo:Kept")
 
 
 @pytest.mark.usefixtures("algorithm")

@@ -369,7 +369,8 @@ class PaperConfig:
         if self.timed.match:
             raise OptionError("rewards are matched in a row of its own; leave timed.match out")
         _ = self.ugat  # it checks its options when it is made
-        if not self.spec.savable:
+        # direct transfer alone starts from nothing
+        if not self.spec.savable and set(self.rows) != {DIRECT}:
             raise OptionError(
                 f"learner {self.learner!r}: rows of a table start from what direct transfer has "
                 "learnt; give its class the methods save(path) and load(path)"
