@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import os
 import signal
+import subprocess
 import sys
 import time
 from collections.abc import Callable
@@ -106,6 +107,56 @@ def test_a_worker_that_stops_in_the_middle_of_a_message_counts_as_dead(
     assert 2.5 < time.monotonic() - begun < 10.0
     assert "did not answer 'large' within 3 s and was killed" in worker.obituary("large")
     host.close()
+
+
+HELD = """
+import ctypes
+import pathlib
+import sys
+import time
+
+class Held:
+    def prepare(self, order): pass
+    def told(self, order): pass
+    def abandoned(self): pass
+    def open(self, order, descriptors):
+        return lambda question: ctypes.PyDLL(None).sleep(60)  # keeps the interpreter's lock
+
+if __name__ == "__main__":
+    from ugat_marl.simulation import Host
+
+    host = Host("held_service:Held", "forkserver")
+    worker = host.start({"directory": sys.argv[1]})
+    worker.ask("anything")
+    time.sleep(0.5)
+    print(worker._pid, flush=True)
+    time.sleep(60)
+"""
+
+
+def test_a_worker_inside_a_long_call_ends_with_the_process_of_the_user(tmp_path: Path) -> None:
+    program, folder = tmp_path / "held_service.py", tmp_path / "folder"
+    program.write_text(HELD)
+    folder.mkdir()
+    paths = os.pathsep.join(map(str, (tmp_path, *sys.path)))
+    user = subprocess.Popen(
+        [sys.executable, program, folder],
+        env={**os.environ, "PYTHONPATH": paths, "PYTHONSAFEPATH": ""},
+        stdout=subprocess.PIPE,
+        text=True,
+    )
+    assert user.stdout is not None
+    worker = int(user.stdout.readline())
+    user.kill()
+    user.wait()
+    user.stdout.close()
+    until = time.monotonic() + 20
+    while (Path(f"/proc/{worker}/environ").exists() or folder.exists()) and (
+        time.monotonic() < until
+    ):
+        time.sleep(0.1)
+    assert not Path(f"/proc/{worker}/environ").exists()
+    assert not folder.exists()
 
 
 def test_a_program_that_does_not_end_is_killed(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -31,6 +31,9 @@ if TYPE_CHECKING:
 LOOK_EVERY_S = 1.0
 """Seconds between two checks of the user's process."""
 
+_GRACE_S = 4.0
+"""Seconds in which a worker ends itself; it looks every second and removes its folder."""
+
 _MOST_DESCRIPTORS = 8
 """Largest number of open files with an order."""
 
@@ -127,7 +130,7 @@ def _serve(service: Service, user: int, descriptor: int) -> None:
     """Fork a worker for every order, until the host says goodbye or is gone."""
     signal.signal(signal.SIGINT, signal.SIG_IGN)
     signal.signal(signal.SIGCHLD, signal.SIG_IGN)  # workers leave no zombies
-    here = os.getpid()
+    here, workers = os.getpid(), dict[int, str | None]()
     with socket.socket(fileno=descriptor) as control, contextlib.suppress(ConnectionError):
         while (request := _next(control, user)) is not None:
             message, descriptors = request
@@ -151,7 +154,39 @@ def _serve(service: Service, user: int, descriptor: int) -> None:
             for number in descriptors:
                 os.close(number)
             control.sendall(pid.to_bytes(8, "little"))
+            workers = {each: folder for each, folder in workers.items() if _runs(each)}
+            workers[pid] = order.get("directory")
     service.abandoned()
+    _end_workers(workers, user)
+
+
+def _runs(worker: int) -> bool:
+    """Return True if a worker of this process runs."""
+    try:
+        return os.waitpid(worker, os.WNOHANG) == (0, 0)
+    except ChildProcessError:
+        return False
+
+
+def _end_workers(workers: dict[int, str | None], user: int) -> None:
+    """Kill the workers that cannot end themselves after the user's process has ended.
+
+    A worker inside a long call of SUMO does not come to its own watch: the call keeps the lock of
+    the interpreter.
+
+    Args:
+        workers: Number of each worker, and its folder, which is removed.
+        user: Number of the user's process.
+    """
+    until = time.monotonic() + _GRACE_S
+    while (running := [*filter(_runs, workers)]) and time.monotonic() < until:
+        time.sleep(LOOK_EVERY_S / 4)
+    if not running or not _abandoned(user, user):
+        return
+    for worker in running:
+        os.kill(worker, signal.SIGKILL)
+        if (folder := workers[worker]) is not None:
+            shutil.rmtree(folder, ignore_errors=True)
 
 
 def _next(control: socket.socket, user: int) -> tuple[dict[str, Any], list[int]] | None:
