@@ -98,6 +98,9 @@ def main(arguments: Sequence[str] | None = None) -> None:
     parser.add_argument("--largest", type=int, default=9, help="most intersections of a network")
     parser.add_argument("--simulations", type=int, default=80)
     parser.add_argument("--rule-budget", type=int, default=6)
+    parser.add_argument(
+        "--street-rules", type=int, default=0, help="episodes of each rule in the fitted street"
+    )
     parser.add_argument("--jobs", type=int)
     given = parser.parse_args(arguments)
     config = PaperConfig(
@@ -111,7 +114,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
         rows=ROWS,
         evaluation_seeds=3,
         rule_budget=given.rule_budget,
-        street=StreetConfig(simulations=given.simulations),
+        street=StreetConfig(simulations=given.simulations, rule_budget=given.street_rules),
     )
     console, outcomes = Console(width=100), list[Outcome]()
     for scenario in scenarios(given):
