@@ -388,8 +388,9 @@ def test_whoever_stops_it_finds_nothing_left(
     number: int, code: int, python: list[str], tmp_path: Path
 ) -> None:
     os.mkfifo(tmp_path / "cars.rou.xml")  # reading waits until somebody writes
+    pipes_too = "import ugat_marl.files as f; f.refuse_endless = lambda *_: None"
     words = ["--sumo", SINGLE / "network.net.xml", "--routes", "cars.rou.xml"]
-    process = run_apart(python, tmp_path, "pass", "city", *words)
+    process = run_apart(python, tmp_path, pipes_too, "city", *words)
     with (tmp_path / "cars.rou.xml").open("w") as pipe:
         pipe.write("<routes>")
         pipe.flush()

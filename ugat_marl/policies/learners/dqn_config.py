@@ -18,9 +18,16 @@ They are enough for a quantile, and too few to reach back to the exploration at 
 class Usual(int):
     """Default of a number; a preset replaces it, unless the same number is given."""
 
+    # A cache of defaults, such as the command line's, has to tell it from the number it equals
+    def __hash__(self) -> int:
+        return hash((Usual, int(self)))
+
 
 class UsualSizes(tuple[int, ...]):
     """Default of sizes; a learner's own sizes replace it, unless the same sizes are given."""
+
+    def __hash__(self) -> int:
+        return hash((UsualSizes, tuple(self)))
 
 
 @dataclass(frozen=True)
