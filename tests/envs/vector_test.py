@@ -686,9 +686,10 @@ def test_one_that_never_answers_is_replaced(monkeypatch: pytest.MonkeyPatch) -> 
     monkeypatch.setenv("UGAT_MARL_DEADLINE_S", "12")  # a replacement has to start within it
     with vector_env("single-v1", 2, duration_s=LENGTH_S) as env:
         expected = env.step(env.reset(1).masks.argmax(axis=-1))
-        env.send(env.reset(1).masks.argmax(axis=-1))
+        actions = env.reset(1).masks.argmax(axis=-1)
         stopped = pids(env)[0]
-        os.kill(stopped, signal.SIGSTOP)
+        os.kill(stopped, signal.SIGSTOP)  # before it is asked: afterwards it may have answered
+        env.send(actions)
         batch = env.recv(2)
         assert gone(stopped)
         assert batch.numbers.tolist() == [0, 1]
