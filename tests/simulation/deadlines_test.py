@@ -125,22 +125,25 @@ class Held:
 if __name__ == "__main__":
     from ugat_marl.simulation import Host
 
-    host = Host("held_service:Held", "forkserver")
+    host = Host("held_service:Held", sys.argv[2])
     worker = host.start({"directory": sys.argv[1]})
     worker.ask("anything")
-    time.sleep(0.5)
+    time.sleep(2)
     print(worker._pid, flush=True)
     time.sleep(60)
 """
 
 
-def test_a_worker_inside_a_long_call_ends_with_the_process_of_the_user(tmp_path: Path) -> None:
+@pytest.mark.parametrize("method", ["forkserver", "spawn"])
+def test_a_worker_inside_a_long_call_ends_with_the_process_of_the_user(
+    method: StartMethod, tmp_path: Path
+) -> None:
     program, folder = tmp_path / "held_service.py", tmp_path / "folder"
     program.write_text(HELD)
     folder.mkdir()
     paths = os.pathsep.join(map(str, (tmp_path, *sys.path)))
     user = subprocess.Popen(
-        [sys.executable, program, folder],
+        [sys.executable, program, folder, method],
         env={**os.environ, "PYTHONPATH": paths, "PYTHONSAFEPATH": ""},
         stdout=subprocess.PIPE,
         text=True,
@@ -157,6 +160,17 @@ def test_a_worker_inside_a_long_call_ends_with_the_process_of_the_user(tmp_path:
         time.sleep(0.1)
     assert not Path(f"/proc/{worker}/environ").exists()
     assert not folder.exists()
+
+
+def test_the_guard_of_a_spawned_worker_ends_with_it(crossing: Crossing, tmp_path: Path) -> None:
+    simulator = ProcessSimulator("spawn")
+    simulator.start(launch_of(read_scenario(crossing()), 0, tmp_path / "run", ()))
+    worker = simulator._worker
+    assert worker is not None
+    children = Path(f"/proc/{worker._pid}/task/{worker._pid}/children")
+    (guard,) = children.read_text().split()
+    simulator.close()
+    assert not Path(f"/proc/{guard}").exists()
 
 
 def test_a_program_that_does_not_end_is_killed(monkeypatch: pytest.MonkeyPatch) -> None:

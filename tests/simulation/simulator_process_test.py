@@ -477,7 +477,8 @@ def test_nothing_is_left_when_the_user_s_process_ends(
     simulators = ["process", "process", "spawn"]
     script = run_script(ENDLESS.format(path=str(crossing()), simulators=simulators))
     script.wait_for("running")
-    assert len(script.relatives()) == 1 + 1 + 3  # the script, the warm parent, three workers
+    # the script, the warm parent, three workers, the guard of the spawned one
+    assert len(script.relatives()) == 1 + 1 + 3 + 1
     assert len(list(script.temporary.iterdir())) == 3
     os.killpg(script.process.pid, getattr(signal, how))
     _, said = script.process.communicate(timeout=20)
@@ -518,7 +519,8 @@ def test_nothing_is_left_though_a_forked_child_survives(
     fork = 'import os, time\nif os.fork() == 0:\n    time.sleep(60)\nprint("running")'
     script = run_script(text.replace('print("running")', fork))
     script.wait_for("running")
-    assert len(script.relatives()) == 2 + 1 + 2  # the script, its child, warm parent, two workers
+    # the script, its child, the warm parent, two workers, the guard of the spawned one
+    assert len(script.relatives()) == 2 + 1 + 2 + 1
     script.process.kill()
     script.process.wait()
     assert eventually(lambda: len(script.relatives()) == 1 and not list(script.temporary.iterdir()))

@@ -1,8 +1,9 @@
 """The program of a host's processes: the warm parent, its workers, and how they end.
 
 ``parent`` has loaded its service and forks a worker for every order. ``spawned`` is a worker in a
-new interpreter. All of them end when their connection closes or when the user's process has ended.
-The second check is needed because a child of the user's process may hold the connection open.
+new interpreter, with a guard that kills it where it cannot end itself. All of them end when their
+connection closes or when the user's process has ended. The second check is needed because a child
+of the user's process may hold the connection open.
 """
 
 from __future__ import annotations
@@ -75,12 +76,16 @@ class _Life:
         parent: Number of the process that started this one.
         user: Number of the user's process.
         directory: Folder to remove at the end, or None.
+        guard: Number of the process of `_guard`, or None.
     """
 
-    def __init__(self, parent: int, user: int, directory: str | None) -> None:
+    def __init__(
+        self, parent: int, user: int, directory: str | None, guard: int | None = None
+    ) -> None:
         self._parent = parent
         self._user = user
         self._directory = directory
+        self._guard = guard
         self._over = threading.Event()
         threading.Thread(target=self._watch, daemon=True).start()
 
@@ -95,6 +100,10 @@ class _Life:
             pass
         if self._directory is not None:
             shutil.rmtree(self._directory, ignore_errors=True)
+        if self._guard is not None:
+            with contextlib.suppress(ProcessLookupError, ChildProcessError):
+                os.kill(self._guard, signal.SIGKILL)
+                os.waitpid(self._guard, 0)
         os._exit(0)  # no destructors: libsumo's may take long on a large network
 
 
@@ -105,10 +114,11 @@ def _work(
     descriptors: list[int],
     parent: int,
     user: int,
+    guard: int | None = None,
 ) -> NoReturn:
     """Answer questions until the connection closes, then exit."""
     signal.signal(signal.SIGINT, signal.SIG_IGN)
-    life = _Life(parent, user, order.get("directory"))
+    life = _Life(parent, user, order.get("directory"), guard)
     answer = service.open(order, descriptors)
     with contextlib.suppress(ChannelClosed, OSError):
         while (question := channel.receive()).header["what"] != "close":
@@ -189,6 +199,36 @@ def _end_workers(workers: dict[int, str | None], user: int) -> None:
             shutil.rmtree(folder, ignore_errors=True)
 
 
+def _guard(user: int, folder: str | None) -> int | None:
+    """Start a process that does for this worker what `_end_workers` does for forked ones.
+
+    Args:
+        user: Number of the user's process.
+        folder: Folder of the worker, which is removed if the worker is killed.
+
+    Returns:
+        Number of the process; None where processes cannot fork.
+    """
+    if not hasattr(os, "fork"):
+        return None
+    worker = os.getpid()
+    if guard := os.fork():
+        return guard
+    nothing = os.open(os.devnull, os.O_RDWR)
+    for stream in (0, 1, 2):  # the user's process waits until all copies of them are closed
+        os.dup2(nothing, stream)
+    while os.getppid() == worker and not _abandoned(0, user):
+        time.sleep(LOOK_EVERY_S)
+    until = time.monotonic() + _GRACE_S
+    while os.getppid() == worker and time.monotonic() < until:
+        time.sleep(LOOK_EVERY_S / 4)
+    if os.getppid() == worker:
+        os.kill(worker, signal.SIGKILL)
+        if folder is not None:
+            shutil.rmtree(folder, ignore_errors=True)
+    os._exit(0)
+
+
 def _next(control: socket.socket, user: int) -> tuple[dict[str, Any], list[int]] | None:
     """Return the next message and its open files; None if the user's process has ended."""
     control.settimeout(LOOK_EVERY_S)
@@ -216,7 +256,7 @@ def _exactly(control: socket.socket, count: int) -> bytes:
     return data
 
 
-def _spawned(service: Service, user: int, order: dict[str, Any]) -> None:
+def _spawned(service: Service, user: int, order: dict[str, Any], guard: int | None) -> None:
     """Work in a new interpreter.
 
     Messages move to copies of the standard streams, because SUMO may print to standard output.
@@ -224,17 +264,22 @@ def _spawned(service: Service, user: int, order: dict[str, Any]) -> None:
     reader, writer = os.fdopen(os.dup(0), "rb"), os.fdopen(os.dup(1), "wb")
     os.dup2(2, 1)
     service.prepare(order)
-    _work(service, Channel(reader, writer, writer.close), order, [], user, user)
+    _work(service, Channel(reader, writer, writer.close), order, [], user, user, guard)
 
 
 def _main(kind: str, name: str, user: str, argument: str) -> None:
     module, _, member = name.partition(":")
-    service: Service = getattr(importlib.import_module(module), member)()
     if kind == "parent":
-        _serve(service, int(user), int(argument))
+        _serve(_service(module, member), int(user), int(argument))
         os._exit(0)  # unloading SUMO or torch takes long
     else:
-        _spawned(service, int(user), json.loads(argument))
+        order = json.loads(argument)
+        guard = _guard(int(user), order.get("directory"))  # before a library starts a thread
+        _spawned(_service(module, member), int(user), order, guard)
+
+
+def _service(module: str, member: str) -> Service:
+    return getattr(importlib.import_module(module), member)()
 
 
 if __name__ == "__main__":
