@@ -30,6 +30,7 @@ from ugat_marl.errors import OptionError, SimulatorCrashed
 from ugat_marl.experiments import evaluate, rule_factory
 from ugat_marl.grounding import RollOutSettings, roll_outs
 from ugat_marl.parallel import (
+    DEADLINE_VARIABLE,
     RETRIES,
     LocalProcesses,
     RayExecutor,
@@ -129,6 +130,22 @@ def test_processes_that_die_are_replaced(tmp_path: Path) -> None:
         assert processes.submit(int, "1").result() == 1
     with pytest.raises(RuntimeError, match="shutdown"):
         processes.submit(int, "1")
+
+
+def test_a_stopped_process_is_killed_and_its_part_repeated(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setenv(DEADLINE_VARIABLE, "15")  # an interpreter starts within it
+    once = f"""
+import os, pathlib, signal
+mark = pathlib.Path({str(tmp_path / "mark")!r})
+if not mark.exists():
+    mark.touch()
+    os.kill(os.getpid(), signal.SIGSTOP)
+"""
+    with LocalProcesses(1) as processes:
+        processes.submit(exec, once).result(120)
+        assert (tmp_path / "mark").exists()
 
 
 @pytest.mark.slow

@@ -14,6 +14,7 @@ import multiprocessing
 import os
 import sys
 import threading
+import time
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from concurrent.futures import (
     FIRST_COMPLETED,
@@ -31,6 +32,16 @@ from ugat_marl.errors import OptionError, SimulatorCrashed, install_command
 
 Workers = int | Executor | None
 """Number of parts at a time, None for the number of usable cores, or an executor."""
+
+DEADLINE_S = 900.0
+"""Seconds within which a process has to answer; then it counts as dead. Loading a city takes
+minutes, so half of it would kill honest simulations on slow machines."""
+DEADLINE_VARIABLE = "UGAT_MARL_DEADLINE_S"
+"""Environment variable that replaces `DEADLINE_S`."""
+
+
+_BEAT_S = 1.0
+"""Seconds between two signs of life of a process."""
 
 Done = TypeVar("Done")
 
@@ -56,6 +67,91 @@ class Stop(threading.Event):
 
     def __reduce__(self) -> tuple[type[Stop], tuple[()]]:
         return Stop, ()
+
+
+def usual_deadline_s() -> float:
+    """Return the seconds within which a process has to answer.
+
+    Raises:
+        OptionError: The variable `DEADLINE_VARIABLE` is not a number of seconds above 0.
+    """
+    text = os.environ.get(DEADLINE_VARIABLE, "")
+    if not text:
+        return DEADLINE_S
+    return deadline_of(f"{DEADLINE_VARIABLE} = {text!r}", text)
+
+
+def deadline_of(place: str, text: str) -> float:
+    """Return the seconds of a text.
+
+    Args:
+        place: Begin of the message, which names the text.
+        text: The text.
+
+    Raises:
+        OptionError: It is not a number of seconds above 0.
+    """
+    with contextlib.suppress(ValueError):  # Python reads 1_000 and digits of other scripts, too
+        if text.isascii() and "_" not in text and 0 < (seconds := float(text)) < float("inf"):
+            return seconds
+    raise OptionError(f"{place}: give a number of seconds above 0")
+
+
+def require_deadline(deadline_s: Any) -> None:
+    """Refuse a deadline that is not a number of seconds above 0.
+
+    Args:
+        deadline_s: Seconds, or None for `usual_deadline_s`.
+
+    Raises:
+        OptionError: It is something else.
+    """
+    if deadline_s is None:
+        return
+    number = isinstance(deadline_s, int | float) and not isinstance(deadline_s, bool)
+    if not number or not 0 < deadline_s < float("inf"):
+        raise OptionError(f"deadline_s = {deadline_s!r}: give a number of seconds above 0")
+
+
+def show_life(sign: Callable[[], object]) -> None:
+    """Give a sign of life every second, in a thread, as long as this process runs on.
+
+    A process that is stopped gives none, and one that is busy does: its thread needs the
+    interpreter for some microseconds only.
+    """
+
+    def beat() -> None:
+        while True:
+            with contextlib.suppress(OSError):
+                sign()
+            time.sleep(_BEAT_S)
+
+    threading.Thread(target=beat, daemon=True).start()
+
+
+class Pulse:
+    """The signs of life of a process, as its starter sees them.
+
+    No limit of time could tell a long piece of work from one that never ends; a process that does
+    not run on can be told.
+
+    Args:
+        sign: Returns a number that differs after every sign of `show_life`.
+        deadline_s: Seconds without a sign after which the process counts as dead; None for
+            `usual_deadline_s`.
+    """
+
+    def __init__(self, sign: Callable[[], int], deadline_s: float | None = None) -> None:
+        self.deadline_s = usual_deadline_s() if deadline_s is None else deadline_s
+        self._sign = sign
+        self._last = sign()
+        self._seen_s = time.monotonic()
+
+    def is_lost(self) -> bool:
+        """Return True if the process has given no sign for too long."""
+        if (sign := self._sign()) != self._last:
+            self._last, self._seen_s = sign, time.monotonic()
+        return time.monotonic() - self._seen_s > self.deadline_s
 
 
 def usable_cores() -> int:
@@ -150,7 +246,8 @@ class LocalProcesses(Executor):
 
     Each interpreter takes seconds to start and needs the memory of the suite with torch. A script
     that uses this class guards its code with ``if __name__ == "__main__":``. If a process dies,
-    another process repeats its part. A pool of the standard library would stay broken.
+    another process repeats its part. A pool of the standard library would stay broken. A process
+    that gives no sign of life for the time of `usual_deadline_s`, because it is stopped, is killed.
 
     Args:
         workers: Number of processes; None for one per usable core.
@@ -159,7 +256,7 @@ class LocalProcesses(Executor):
     def __init__(self, workers: int | None = None) -> None:
         self.parts_at_a_time = parts_at_a_time(workers)
         self._threads = ThreadPoolExecutor(self.parts_at_a_time)  # each waits for one process
-        self._idle: list[ProcessPoolExecutor] = []
+        self._idle: list[_Process] = []
         self._is_open = True
 
     def submit(self, fn: Callable[..., Any], /, *args: Any, **kwargs: Any) -> Future[Any]:
@@ -181,10 +278,10 @@ class LocalProcesses(Executor):
         try:
             process = self._idle.pop()
         except IndexError:
-            process = ProcessPoolExecutor(1, mp_context=multiprocessing.get_context("spawn"))
+            process = _Process()
         is_alive = True
         try:
-            return process.submit(part).result()
+            return process.done(part)
         except BrokenProcessPool:
             is_alive = False
             raise
@@ -193,6 +290,36 @@ class LocalProcesses(Executor):
                 self._idle.append(process)
             else:
                 process.shutdown(wait=False)
+
+
+class _Process(ProcessPoolExecutor):
+    """One interpreter, which is killed if it is stopped."""
+
+    def __init__(self) -> None:
+        context = multiprocessing.get_context("spawn")
+        self._beats = context.Value("Q", 0, lock=False)
+        super().__init__(1, context, _beat, (self._beats,))
+
+    def done(self, part: Callable[[], Any]) -> Any:
+        """Do a part and return its result.
+
+        Raises:
+            BrokenProcessPool: The process died, or was stopped and killed.
+        """
+        future = self.submit(part)
+        pulse = Pulse(lambda: self._beats.value)
+        while not wait([future], timeout=_BEAT_S).done:
+            if pulse.is_lost():
+                for each in [*self._processes.values()]:  # the pool has no method for it
+                    each.kill()
+        return future.result()
+
+
+def _beat(beats: Any) -> None:
+    def add() -> None:
+        beats.value += 1
+
+    show_life(add)
 
 
 class RayExecutor(Executor):
@@ -220,7 +347,8 @@ class RayExecutor(Executor):
         self._ray: Any = ray
         self._owns = not ray.is_initialized()
         if self._owns:
-            variables = {"OMP_NUM_THREADS": "1", "PYTHONPATH": _import_path()}
+            own = {k: v for k, v in os.environ.items() if k.startswith("UGAT_MARL_")}  # limits
+            variables = {**own, "OMP_NUM_THREADS": "1", "PYTHONPATH": _import_path()}
             known: dict[str, Any] = {} if address != "local" else {"include_dashboard": False}
             try:
                 ray.init(

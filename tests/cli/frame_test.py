@@ -12,6 +12,7 @@ import pytest
 from rich.console import Console
 
 from ugat_marl.cli import CommandLine, frame, run
+from ugat_marl.parallel import DEADLINE_VARIABLE, usual_deadline_s
 
 
 @pytest.mark.parametrize(
@@ -62,3 +63,29 @@ def test_a_terminated_command_ends_in_order(
     assert capsys.readouterr().err == "prog: terminated; go on with: prog\n"
     assert cleared == ["folder"]
     assert signal.getsignal(signal.SIGTERM) == before
+
+
+@pytest.mark.parametrize("words", [["--deadline-s", "7.5", "go"], ["go", "--deadline-s=7.5", "x"]])
+def test_the_deadline_holds_for_all_that_a_command_starts(
+    words: list[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    seen: list[tuple[list[str], float]] = []
+
+    def work(line: CommandLine, words: list[str], console: Console) -> int:
+        seen.append((words, usual_deadline_s()))
+        return 0
+
+    monkeypatch.setattr(frame, "_dispatch", work)
+    monkeypatch.setenv(DEADLINE_VARIABLE, "60")
+    assert run(CommandLine("prog", "", {}), words) == 0
+    assert seen == [([w for w in words if "7.5" not in w and w != "--deadline-s"], 7.5)]
+    assert usual_deadline_s() == 60
+
+
+@pytest.mark.parametrize("seconds", ["soon", "0", "-5", "inf", "1_000", ""])
+def test_an_impossible_deadline_of_a_command(
+    seconds: str, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert run(CommandLine("prog", "", {}), ["go", "--deadline-s", seconds]) == 2
+    said = f"prog: error: --deadline-s {seconds}".rstrip()
+    assert capsys.readouterr().err == f"{said}: give a number of seconds above 0\n"

@@ -24,6 +24,8 @@ from ugat_marl.experiments import (
     LearnerSpec,
     Record,
     Setting,
+    driver,
+    forked,
     perform_all,
     perform_here,
     record_of,
@@ -40,7 +42,7 @@ from ugat_marl.experiments.jobs import (
 )
 from ugat_marl.experiments.paper import TABLES, settings_of
 from ugat_marl.grounding import FitConfig, UgatConfig
-from ugat_marl.parallel import Stop
+from ugat_marl.parallel import DEADLINE_VARIABLE, Pulse, Stop
 from ugat_marl.policies import BASELINES, DQN_NAME, DQNConfig, learner_is_installed
 from ugat_marl.progress import Silent
 from ugat_marl.simulation import kept_warm
@@ -262,6 +264,46 @@ def test_a_forked_job_that_is_stopped_is_dead(tmp_path: Path) -> None:
         assert eventually(lambda: not writers(tmp_path / LOG), 20)
 
 
+def job_of(log: Path) -> int:
+    """The process that was started to write the log; others that write it are its children."""
+    others = writers(log) - {str(os.getpid())}
+    parents = {pid: Path(f"/proc/{pid}/stat").read_text().split()[3] for pid in others}
+    (job,) = (pid for pid, parent in parents.items() if parent not in parents)
+    return int(job)
+
+
+@pytest.mark.parametrize("forked", [pytest.param(True, marks=needs_forks), False])
+def test_a_stopped_job_is_killed_and_taken_up_again_with_the_same_numbers(
+    forked: bool, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    job = replace(PLAIN, episodes=30, every=10, evaluation_seeds=evaluation_seeds(1))
+    perform_here([job], tmp_path / "here", Silent())
+    monkeypatch.setattr(driver, "jobs_fork_on", lambda device: forked)
+    monkeypatch.setenv(DEADLINE_VARIABLE, "15")  # an interpreter starts within it
+    place = tmp_path / "apart" / job.name
+    with ThreadPoolExecutor(1) as pool:
+        done = pool.submit(perform_all, [job], tmp_path / "apart", 1, Silent(), "test")
+        assert eventually((place / SCORES).exists, 60)
+        stopped = job_of(place / LOG)
+        os.kill(stopped, signal.SIGSTOP)
+        assert done.result(120) == {}
+    assert not Path(f"/proc/{stopped}/environ").exists()
+    assert Record.read(place).scores == Record.read(tmp_path / "here" / job.name).scores
+
+
+@needs_forks
+def test_a_job_that_is_stopped_again_and_again_is_reported(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    class Still(Pulse):
+        def is_lost(self) -> bool:
+            return True
+
+    monkeypatch.setattr(forked, "Pulse", Still)
+    with pytest.raises(MeasurementError, match=r"did not run on for 900 s .* was killed"):
+        perform_all([PLAIN], tmp_path, 1, Silent(), "test")
+
+
 @needs_forks
 def test_a_forked_job_ends_with_a_killed_driver(python: list[str], tmp_path: Path) -> None:
     replace(PLAIN, episodes=10**6).write(tmp_path)
@@ -269,7 +311,7 @@ def test_a_forked_job_ends_with_a_killed_driver(python: list[str], tmp_path: Pat
 import sys
 from pathlib import Path
 from ugat_marl.experiments.forked import perform_forked
-from ugat_marl.parallel import Stop
+from ugat_marl.parallel import DEADLINE_VARIABLE, Pulse, Stop
 with Path(sys.argv[2]).open("wb") as log:
     perform_forked(Path(sys.argv[1]), log, Stop())
 """

@@ -13,6 +13,7 @@ from PIL import Image
 from ugat_marl.__main__ import main
 from ugat_marl.envs import TrafficEnv, parallel_env
 from ugat_marl.errors import OptionError, OutputError
+from ugat_marl.parallel import DEADLINE_VARIABLE
 from ugat_marl.policies import make_rule, roll_out
 from ugat_marl.reporting import film_episode, film_frames, require_video, write_video
 from ugat_marl.reporting import video as filming
@@ -123,6 +124,24 @@ def test_ffmpeg_gets_all_frames_and_its_words_are_kept(
     write_video(pictures, video, 10)
     assert video.read_text().split()[0] == str(4 * 20 * 30 * 3)
     assert "30x20" in video.read_text() and "-r 10" in video.read_text()
+
+
+@pytest.mark.parametrize("reads", [0, 1])
+def test_a_stopped_ffmpeg_is_killed(
+    reads: int, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    program = tmp_path / "ffmpeg"
+    program.write_text(
+        f"#!{sys.executable}\nimport os, signal, sys\n"
+        f"{'sys.stdin.buffer.read()' if reads else ''}\nos.kill(os.getpid(), signal.SIGSTOP)\n"
+    )
+    program.chmod(0o755)
+    monkeypatch.setattr(filming, "_ffmpeg", lambda: str(program))
+    monkeypatch.setenv(DEADLINE_VARIABLE, "1.5")
+    pictures = [np.zeros((400, 400, 3), np.uint8)] * 3  # more than a pipe holds
+    with pytest.raises(OutputError, match=r"ffmpeg did not go on for 1.5 s and was killed"):
+        write_video(pictures, tmp_path / "out.mp4", 10)
+    assert not (tmp_path / "out.mp4").exists()
 
 
 @pytest.mark.skipif(filming._ffmpeg() is None, reason="no ffmpeg to write a video with")

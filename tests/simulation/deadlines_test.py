@@ -9,13 +9,15 @@ import sys
 import time
 from collections.abc import Callable
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
 
-from ugat_marl.envs import vector_env
+from ugat_marl.envs import parallel_env, vector_env
 from ugat_marl.errors import OptionError, ScenarioError, SimulatorCrashed
-from ugat_marl.scenarios import DEADLINE_VARIABLE, finished, read_scenario
+from ugat_marl.parallel import DEADLINE_VARIABLE
+from ugat_marl.scenarios import finished, read_scenario
 from ugat_marl.simulation import Host, ProcessSimulator, launch_of
 from ugat_marl.simulation.channel import ChannelClosed
 from ugat_marl.simulation.host import StartMethod
@@ -46,13 +48,9 @@ def test_a_stopped_simulation_counts_as_dead(
     simulator.close()
 
 
-def test_a_stopped_worker_of_a_vector_is_replaced_with_the_same_numbers(
-    crossing: Crossing, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.setenv(DEADLINE_VARIABLE, "8")  # the warm parent starts within it as well
-
+def test_a_stopped_worker_of_a_vector_is_replaced_with_the_same_numbers(crossing: Crossing) -> None:
     def play(stopped_at: int | None) -> list[float]:
-        env = vector_env(crossing(), 2)
+        env = vector_env(crossing(), 2, deadline_s=8.0)  # the warm parent starts within it as well
         rewards: list[float] = []
         env.reset(seed=3)
         for decision in range(6):
@@ -66,6 +64,34 @@ def test_a_stopped_worker_of_a_vector_is_replaced_with_the_same_numbers(
         return rewards
 
     assert play(2) == play(None)
+
+
+@pytest.mark.parametrize("simulator", ["process", "spawn"])
+def test_a_plain_environment_has_the_deadline_that_it_is_given(
+    simulator: str, crossing: Crossing
+) -> None:
+    env = parallel_env(crossing(), simulator=simulator, deadline_s=6)
+    first, _ = env.reset(seed=3)
+    worker = env._simulator._worker  # pyright: ignore[reportAttributeAccessIssue, reportOptionalMemberAccess]
+    os.kill(worker._pid, signal.SIGSTOP)
+    with pytest.raises(SimulatorCrashed, match=r"did not answer 'advance' within 6 s"):
+        env.step(dict.fromkeys(env.agents, 0))
+    again, _ = env.reset(seed=3)
+    for agent, row in first.items():
+        np.testing.assert_array_equal(again[agent], row)
+    env.close()
+
+
+@pytest.mark.parametrize("deadline_s", [0, -1, float("nan"), float("inf"), True, "5"])
+def test_impossible_deadlines_of_environments(deadline_s: Any, crossing: Crossing) -> None:
+    for make in (parallel_env, lambda *given, **options: vector_env(*given, 2, **options)):
+        with pytest.raises(OptionError, match="deadline_s = .*: give a number of seconds above 0"):
+            make(crossing(), deadline_s=deadline_s)
+
+
+def test_a_simulation_in_this_process_has_no_deadline(crossing: Crossing) -> None:
+    with pytest.raises(OptionError, match="leave it out with simulator='inprocess'"):
+        parallel_env(crossing(), simulator="inprocess", deadline_s=5.0)
 
 
 LARGE = """
@@ -179,7 +205,7 @@ def test_a_program_that_does_not_end_is_killed(monkeypatch: pytest.MonkeyPatch) 
         finished("netconvert", [sys.executable, "-c", "import time; time.sleep(60)"])
 
 
-@pytest.mark.parametrize("text", ["soon", "0", "-1", "nan", "inf"])
+@pytest.mark.parametrize("text", ["soon", "0", "-1", "nan", "inf", "1_000", "\u0665"])
 def test_impossible_deadlines(text: str, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv(DEADLINE_VARIABLE, text)
     with pytest.raises(OptionError, match="give "):

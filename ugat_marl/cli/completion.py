@@ -11,7 +11,7 @@ from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from typing import Any, Literal, get_args, get_origin
 
-from ugat_marl.cli.help import HELP_ALL, is_positional, options_of
+from ugat_marl.cli.help import DEADLINE, HELP_ALL, is_positional, options_of
 from ugat_marl.effects import NAMED_DOMAINS
 from ugat_marl.errors import UnknownNameError
 from ugat_marl.policies import BASELINES, RULE_NAMES, SUITE_LEARNERS
@@ -74,7 +74,8 @@ def _verb(place: str, purpose: str) -> Verb:
         if hint is bool:
             *path, last = option.removeprefix("--").split(".")
             options["--" + ".".join([*path, f"no-{last}"])] = ()
-    helps = ["--help", "--quiet", "--verbose", *[HELP_ALL] * bool(getattr(command, "FIRST", ()))]
+    helps = ["--help", "--quiet", "--verbose", DEADLINE]
+    helps += [HELP_ALL] * bool(getattr(command, "FIRST", ()))
     return Verb(purpose, {**options, **dict.fromkeys(helps, ())}, arguments)
 
 

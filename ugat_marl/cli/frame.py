@@ -17,7 +17,7 @@ from typing import Any
 
 from rich.console import Console
 
-from ugat_marl.cli.help import HELP, HELP_ALL, described, options_of, print_help
+from ugat_marl.cli.help import DEADLINE, HELP, HELP_ALL, described, options_of, print_help
 from ugat_marl.errors import UgatMarlError, UnknownNameError, nearest
 from ugat_marl.progress import Bars, Loudness, loudness, showing
 
@@ -84,9 +84,10 @@ def run(line: CommandLine, arguments: Sequence[str]) -> int:
     """
     console = Console(highlight=False)
     arguments, level = _without_loudness(arguments)
+    arguments, seconds = _without_deadline(arguments)
     progress = console if console.is_terminal else Console(stderr=True, highlight=False)
     try:
-        with _ended_in_order(), loudness(level), showing(Bars(progress)):
+        with _ended_in_order(), loudness(level), showing(Bars(progress)), _deadline(seconds):
             return _dispatch(line, list(arguments), console)
     except UgatMarlError as error:
         print(f"{line.program}: error: {_in_one_line(str(error))}", file=sys.stderr)
@@ -153,6 +154,43 @@ def _without_loudness(words: Sequence[str]) -> tuple[list[str], Loudness]:
     asked = [word for word in words if word in LOUDNESS]
     rest = [word for word in words if word not in LOUDNESS]
     return rest, LOUDNESS[asked[-1]] if asked else "usual"
+
+
+def _without_deadline(words: Sequence[str]) -> tuple[list[str], str | None]:
+    """Return the words without --deadline-s, and its seconds; None if it is not among them."""
+    rest, seconds = list[str](), None
+    left = iter(words)
+    for word in left:
+        option, equals, value = word.partition("=")
+        if option == DEADLINE:
+            seconds = value if equals else next(left, "")
+        else:
+            rest.append(word)
+    return rest, seconds
+
+
+@contextlib.contextmanager
+def _deadline(seconds: str | None) -> Iterator[None]:
+    """Set the deadline of simulations, SUMO's programs and jobs, for all processes started here.
+
+    Raises:
+        OptionError: It is not a number of seconds above 0.
+    """
+    if seconds is None:
+        yield
+        return
+    from ugat_marl.parallel import DEADLINE_VARIABLE, deadline_of
+
+    deadline_of(f"{DEADLINE} {seconds}".rstrip(), seconds)
+    before = os.environ.get(DEADLINE_VARIABLE)
+    os.environ[DEADLINE_VARIABLE] = seconds
+    try:
+        yield
+    finally:
+        if before is None:
+            del os.environ[DEADLINE_VARIABLE]
+        else:
+            os.environ[DEADLINE_VARIABLE] = before
 
 
 def _dispatch(line: CommandLine, words: list[str], console: Console) -> int:
@@ -267,7 +305,8 @@ def _print_help(line: CommandLine, console: Console, prefix: str = "") -> None:
     console.print(
         f"\n{line.program} {prefix}COMMAND --help shows options and examples of a command."
     )
-    console.print("With every command: --quiet (results only), --verbose (all that is measured).")
+    console.print("With every command: --quiet (results only), --verbose (all that is measured),")
+    console.print(f"{DEADLINE} SECONDS (a simulation that does not answer is replaced; 900).")
     if not prefix and line.short:
         short = ", ".join(f"{name} = {' '.join(words)}" for name, words in line.short.items())
         console.print(f"Short: {short}.")

@@ -13,6 +13,8 @@ from collections.abc import Collection, Sequence
 from typing import Annotated, Any, Union, get_args, get_origin, get_type_hints
 
 HELP = ("-h", "--help")
+DEADLINE = "--deadline-s"
+"""Option of every command: seconds within which a simulation has to answer."""
 HELP_ALL = "--help-all"
 
 

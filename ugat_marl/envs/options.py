@@ -9,6 +9,7 @@ from typing import Any, Literal, TypedDict, TypeVar, get_args
 
 from ugat_marl.effects import ControllerPart
 from ugat_marl.errors import OptionError, UnknownNameError
+from ugat_marl.parallel import require_deadline
 
 Function = TypeVar("Function", bound=Callable[..., Any])
 
@@ -28,6 +29,7 @@ class EnvKeywords(TypedDict, total=False):
     fitted: tuple[ControllerPart, ...]
     crossings: bool
     render_mode: str | None
+    deadline_s: float | None
 
 
 def with_env_keywords(function: Function) -> Function:
@@ -81,6 +83,9 @@ class EnvOptions:
         crossings: True to measure when vehicles cross the stop lines, for roll-outs to record. It
             is slower, because lanes are read every second.
         render_mode: None, ``"rgb_array"`` (a picture from `render`) or ``"human"`` (sumo-gui).
+        deadline_s: Seconds within which the simulation's process has to answer. Then it is killed:
+            `parallel_env` raises `SimulatorCrashed`, and `vector_env` replaces it. None for the
+            variable ``UGAT_MARL_DEADLINE_S``, or 900. ``"inprocess"`` has no deadline.
     """
 
     observation: str | Callable[[Any], Any] = "count"
@@ -93,6 +98,7 @@ class EnvOptions:
     fitted: tuple[ControllerPart, ...] = ()
     crossings: bool = False
     render_mode: str | None = None
+    deadline_s: float | None = None
 
     def __post_init__(self) -> None:
         for name, allowed in (
@@ -105,11 +111,17 @@ class EnvOptions:
                 names = [choice for choice in allowed if choice]
                 raise UnknownNameError(f"value of option {name!r}:", str(value), names)
         roads: Any = self.neighbours
-        if not isinstance(roads, int) or roads < 0:
+        if not _is_count(roads):
             raise OptionError(f"neighbours = {roads!r}: must be 0 or a number of roads, such as 1")
         commands: Any = self.commands
-        if not isinstance(commands, int) or commands < 0:
+        if not _is_count(commands):
             raise OptionError(f"commands = {commands!r}: must be 0 or a number of decisions")
+        require_deadline(self.deadline_s)
+        if self.deadline_s is not None and self.simulator == "inprocess":
+            raise OptionError(
+                "deadline_s is for simulations in a process of their own; leave it out with "
+                "simulator='inprocess', which cannot be killed alone"
+            )
 
     @classmethod
     def of(cls, options: Mapping[str, Any]) -> EnvOptions:
@@ -123,3 +135,7 @@ class EnvOptions:
             if name not in known:
                 raise UnknownNameError("option", name, known)
         return cls(**options)
+
+
+def _is_count(value: Any) -> bool:
+    return isinstance(value, int) and not isinstance(value, bool) and value >= 0

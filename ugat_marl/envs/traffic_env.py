@@ -344,7 +344,7 @@ class TrafficEnv(ParallelEnv[str, Any, Any]):
 
     def _start(self, seed: int) -> None:
         if self._simulator is None:
-            self._simulator = simulator_of(self.options.simulator)
+            self._simulator = simulator_of(self.options.simulator, self.options.deadline_s)
         needs_upstream = self._rewarder.needs_upstream or self._observer.needs_upstream
         launch = launch_of(
             with_late_green_programmes(self.scenario),

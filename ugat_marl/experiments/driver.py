@@ -16,13 +16,20 @@ import sys
 from collections.abc import Sequence
 from concurrent.futures import FIRST_COMPLETED, Future, wait
 from pathlib import Path
+from typing import IO
 
 from ugat_marl.data import LogCallback, lock_folder
 from ugat_marl.errors import MeasurementError
-from ugat_marl.experiments.forked import ONE_CORE, jobs_fork_on, perform_forked
+from ugat_marl.experiments.forked import (
+    ONE_CORE,
+    jobs_fork_on,
+    perform_forked,
+    pulse_of,
+    say_stopped,
+)
 from ugat_marl.experiments.jobs import Job, Record, perform
 from ugat_marl.files import require_writable
-from ugat_marl.parallel import Stop, Workers, executor_of, in_this_process
+from ugat_marl.parallel import RETRIES, Stop, Workers, executor_of, in_this_process
 from ugat_marl.progress import Reporter
 from ugat_marl.simulation import kept_warm
 
@@ -135,22 +142,35 @@ def perform_here(
 
 
 def _perform_apart(folder: str, stop: Stop, forked: bool) -> None:
-    """Perform the job in a folder in another process; end it when `stop` is set."""
-    with Path(folder, LOG).open("wb") as log:
-        if forked:
-            perform_forked(Path(folder), log, stop)
-            return
-        process = subprocess.Popen(
-            [sys.executable, "-m", "ugat_marl.experiments.jobs", folder],
-            stdin=subprocess.PIPE,
-            stdout=log,
-            stderr=subprocess.STDOUT,
-            env={**ONE_CORE, **os.environ},
-            start_new_session=True,  # Ctrl-C reaches this process only; it ends the jobs itself
-        )
+    """Perform the job in a folder in another process; end it when `stop` is set.
+
+    A job that was stopped and killed is taken up again at its last checkpoint.
+    """
+    for _ in range(1 + RETRIES):
+        with Path(folder, LOG).open("wb") as log:
+            job = perform_forked if forked else _perform_in_new_interpreter
+            if job(Path(folder), log, stop):
+                return
+
+
+def _perform_in_new_interpreter(folder: Path, log: IO[bytes], stop: Stop) -> bool:
+    """Do the same as `perform_forked` where a process cannot be forked."""
+    process = subprocess.Popen(
+        [sys.executable, "-m", "ugat_marl.experiments.jobs", str(folder)],
+        stdin=subprocess.PIPE,
+        stdout=log,
+        stderr=subprocess.STDOUT,
+        env={**ONE_CORE, **os.environ},
+        start_new_session=True,  # Ctrl-C reaches this process only; it ends the jobs itself
+    )
     try:
+        pulse = pulse_of(log)
         while process.poll() is None and not stop.wait(0.1):
-            pass
+            if pulse.is_lost():
+                say_stopped(log, pulse)
+                process.kill()
+                return False
+        return True
     finally:
         _end(process)
 

@@ -16,7 +16,7 @@ from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import IO, Any
 
-from ugat_marl.parallel import Stop
+from ugat_marl.parallel import DEADLINE_VARIABLE, Pulse, Stop, show_life
 from ugat_marl.simulation import ChannelClosed, Host, Message
 
 PRELOADED = ("torch", "torch._dynamo", "scipy.stats", "libsumo", "pydantic", "rich.progress")
@@ -37,8 +37,10 @@ def jobs_fork_on(device: str) -> bool:
     return sys.platform == "linux" and device == "cpu"
 
 
-def perform_forked(folder: Path, log: IO[bytes], stop: Stop) -> None:
+def perform_forked(folder: Path, log: IO[bytes], stop: Stop) -> bool:
     """Perform the job in a folder in a forked process; end it when `stop` is set.
+
+    Return False if the process was stopped and has been killed, see `pulse_of`.
 
     Args:
         folder: Folder of the job.
@@ -50,8 +52,11 @@ def perform_forked(folder: Path, log: IO[bytes], stop: Stop) -> None:
         patience_s = 0.0  # a job that is stopped would train on
         try:
             worker.ask("perform")
+            pulse = pulse_of(log)
             while not (answered := worker.has_answered(0.1)) and not stop.is_set():
-                pass
+                if pulse.is_lost():
+                    say_stopped(log, pulse)
+                    return False
             if answered:
                 worker.answer()
                 patience_s = 10.0
@@ -59,6 +64,24 @@ def perform_forked(folder: Path, log: IO[bytes], stop: Stop) -> None:
             pass  # it died; its record lacks evaluations
         finally:
             worker.end(patience_s)
+    return True
+
+
+def pulse_of(log: IO[bytes]) -> Pulse:
+    """Return the signs of life of the process of a job, which sets the time of its log anew.
+
+    A job may take days, so it has no deadline of its own. The simulations for which it waits have.
+    """
+    return Pulse(lambda: os.fstat(log.fileno()).st_mtime_ns)
+
+
+def say_stopped(log: IO[bytes], pulse: Pulse) -> None:
+    """Write into the log of a job that its process was stopped."""
+    log.write(
+        f"\nthe process of this job did not run on for {pulse.deadline_s:g} s (stopped?) and was "
+        f"killed; {DEADLINE_VARIABLE} sets other seconds\n".encode()
+    )
+    log.flush()
 
 
 class Jobs:
@@ -77,6 +100,7 @@ class Jobs:
         folder, (log,) = Path(order["folder"]), descriptors
         os.dup2(log, 1)
         os.dup2(log, 2)
+        show_life(lambda: os.utime(log))  # see `pulse_of`
 
         def perform(_: Message) -> Message:
             try:

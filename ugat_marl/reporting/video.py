@@ -7,7 +7,8 @@ import importlib
 import importlib.util
 import shutil
 import subprocess
-from collections.abc import Iterable, Iterator, Sequence
+import threading
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -18,6 +19,7 @@ from numpy.typing import NDArray
 from ugat_marl.envs import NetworkRenderer, TrafficEnv
 from ugat_marl.errors import OptionError, OutputError, install_command
 from ugat_marl.files import replacing
+from ugat_marl.parallel import DEADLINE_VARIABLE, usual_deadline_s
 from ugat_marl.policies import Policy, RollOutStopped, roll_out
 from ugat_marl.simulation import (
     HALTING_MPS,
@@ -285,23 +287,53 @@ def _by_ffmpeg(pictures: Iterable[Frame], path: Path, form: str, per_second: flo
         f"{width}x{height}", "-r", f"{per_second:g}", "-i", "-", "-an", "-pix_fmt", "yuv420p",
         "-crf", "20", "-f", form, str(path),
     ]  # fmt: skip
+    deadline_s = usual_deadline_s()
     process = subprocess.Popen(command, stdin=subprocess.PIPE, stderr=subprocess.PIPE)
-    assert process.stdin is not None
-    assert process.stderr is not None
+    into, said = process.stdin, process.stderr
+    assert into is not None
+    assert said is not None
+    killed = threading.Event()
+
+    def kill() -> None:
+        killed.set()
+        process.kill()
+
+    def write(picture: Frame) -> None:  # the making of a picture does not count
+        with _at_most(deadline_s, kill):
+            into.write(picture.tobytes())
+
     try:
-        process.stdin.write(first.tobytes())
-        for picture in stream:
-            process.stdin.write(picture.tobytes())
-        process.stdin.close()
-    except BrokenPipeError:
-        pass  # ffmpeg has ended; its error text is read below
+        with contextlib.suppress(BrokenPipeError):  # it has ended; its error text is read below
+            write(first)
+            for picture in stream:
+                write(picture)
+        with _at_most(deadline_s, kill):
+            with contextlib.suppress(BrokenPipeError):
+                into.close()
+            words = said.read().decode(errors="replace")
+            status = process.wait()
     except BaseException:
         process.kill()
         process.wait()
         raise
-    words = process.stderr.read().decode(errors="replace")
-    if process.wait():
+    if killed.is_set():
+        raise OutputError(
+            f"{path.name}: ffmpeg did not go on for {deadline_s:g} s and was killed (stopped, or "
+            f"too slow for these pictures: set {DEADLINE_VARIABLE})"
+        )
+    if status:
         raise OutputError(f"{path.name}: ffmpeg failed: {' '.join(words.split())[-300:]}")
+
+
+@contextlib.contextmanager
+def _at_most(seconds: float, too_late: Callable[[], object]) -> Iterator[None]:
+    """Call a function if the block takes longer."""
+    timer = threading.Timer(seconds, too_late)
+    timer.start()
+    try:
+        yield
+    finally:
+        timer.cancel()
 
 
 def _ffmpeg() -> str | None:

@@ -76,11 +76,9 @@ from .periods import deciding_letter as deciding_letter
 from .phases import conflicting_greens as conflicting_greens
 from .phases import kerb_turn_of as kerb_turn_of
 from .phases import turn_of as turn_of
-from .programs import DEADLINE_VARIABLE as DEADLINE_VARIABLE
 from .programs import finished as finished
 from .programs import run_program as run_program
 from .programs import sumo_program as sumo_program
-from .programs import usual_deadline_s as usual_deadline_s
 from .routes import DEPARTING as DEPARTING
 from .routes import TRAVELLERS as TRAVELLERS
 from .routes import demand_as_vehicles as demand_as_vehicles

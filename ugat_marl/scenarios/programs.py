@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import contextlib
 import os
 import re
 import subprocess
@@ -10,32 +9,12 @@ import sys
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 
-from ugat_marl.errors import OptionError, ScenarioError
+from ugat_marl.errors import ScenarioError
+from ugat_marl.parallel import DEADLINE_VARIABLE, usual_deadline_s
 from ugat_marl.scenarios.confinement import confined_command
-
-DEADLINE_S = 900.0
-"""Seconds within which a process has to answer; then it counts as dead. Loading a city takes
-minutes, so half of it would kill honest simulations on slow machines."""
-DEADLINE_VARIABLE = "UGAT_MARL_DEADLINE_S"
-"""Environment variable that replaces `DEADLINE_S`."""
 
 _MOST_WORDS = 60
 """Most words quoted from a program's error; netconvert can print pages."""
-
-
-def usual_deadline_s() -> float:
-    """Return the seconds within which a process has to answer.
-
-    Raises:
-        OptionError: The variable `DEADLINE_VARIABLE` is not a number of seconds above 0.
-    """
-    text = os.environ.get(DEADLINE_VARIABLE, "")
-    if not text:
-        return DEADLINE_S
-    with contextlib.suppress(ValueError):
-        if 0 < (seconds := float(text)) < float("inf"):
-            return seconds
-    raise OptionError(f"{DEADLINE_VARIABLE} = {text!r}: give a number of seconds above 0")
 
 
 def sumo_program(name: str) -> Path:

@@ -33,7 +33,7 @@ from numpy.typing import NDArray
 
 from ugat_marl import errors
 from ugat_marl.errors import OptionError, SimulatorCrashed, UgatMarlError, WorkerError
-from ugat_marl.scenarios import DEADLINE_VARIABLE, usual_deadline_s
+from ugat_marl.parallel import DEADLINE_VARIABLE, require_deadline, usual_deadline_s
 from ugat_marl.simulation.channel import Channel, ChannelClosed, Message
 
 StartMethod = Literal["forkserver", "spawn"]
@@ -128,9 +128,8 @@ class Host:
         self._service = service
         self._method: StartMethod = method
         self._defaults = dict(defaults or {})
+        require_deadline(deadline_s)
         self._deadline_s = usual_deadline_s() if deadline_s is None else deadline_s
-        if not 0 < self._deadline_s < float("inf"):
-            raise OptionError(f"deadline_s = {deadline_s}: give seconds above 0")
         self._parent: _WarmParent | None = None
 
     def start(self, order: Order, descriptors: Sequence[int] = ()) -> Worker:
@@ -358,7 +357,7 @@ class Worker:
             return (
                 f"the simulator process {self._pid} did not answer {doing!r} within "
                 f"{self._deadline_s:g} s and was killed (stopped, or too little for this network: "
-                f"set {DEADLINE_VARIABLE}). reset() starts this environment afresh"
+                f"set deadline_s or {DEADLINE_VARIABLE}). reset() starts this environment afresh"
             )
         said = f"it said: {words}" if words else "it said nothing (killed, or out of memory?)"
         return (

@@ -115,13 +115,18 @@ class ProcessSimulator:
             raise SimulatorCrashed(worker.obituary(request)) from None
 
 
-def simulator_of(option: str) -> Simulator:
-    """Return the simulator for an option of `EnvOptions`: inprocess, spawn or another name."""
+def simulator_of(option: str, deadline_s: float | None = None) -> Simulator:
+    """Return the simulator for an option of `EnvOptions`.
+
+    Args:
+        option: ``"inprocess"``, ``"spawn"`` or another name.
+        deadline_s: Seconds within which its process has to answer, as in `Host`.
+    """
     if option == "inprocess":
         from ugat_marl.simulation.simulator import LibsumoSimulator  # loads libsumo
 
         return LibsumoSimulator()
-    return ProcessSimulator("spawn" if option == "spawn" else None)
+    return ProcessSimulator("spawn" if option == "spawn" else None, deadline_s)
 
 
 def _snapshot(reply: Message) -> Snapshot:

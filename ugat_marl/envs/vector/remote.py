@@ -93,7 +93,7 @@ class Shared:
     ) -> None:
         self.agents = agents
         self.shape = Shape(n, len(agents), agents.widest_observation, agents.most_actions)
-        self.host = Host(SERVICE)
+        self.host = Host(SERVICE, deadline_s=options.get("deadline_s"))
         self._scenario = scenario
         self._spec = Spec.of(scenario, options, wraps)
         self._folder: Path | None = None

@@ -56,6 +56,7 @@ class Spec:
     def of(cls, scenario: Scenario, options: Mapping[str, Any], wraps: Wraps) -> Spec:
         """Return the specification of an environment; its scenario still has to be written."""
         plain = dict(options)
+        plain.pop("deadline_s", None)  # the user's process keeps it
         functions = {
             name: spelling(name, plain.pop(name))
             for name in ("reward", "observation")
