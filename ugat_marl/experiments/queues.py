@@ -154,6 +154,8 @@ def read_queues(path: Path) -> pl.DataFrame:
         raise CheckpointError(f"{path}: cannot be read ({reason})") from None
     if frame.schema != pl.Schema(_SCHEMA):
         raise CheckpointError(f"{path}: not the queues of a run")
+    if sum(frame.null_count().row(0)):
+        raise CheckpointError(f"{path}: not the queues of a run, since a cell is empty")
     if wrong := damage(frame, metadata):
         raise CheckpointError(f"{path}: damaged, {wrong}")
     return frame

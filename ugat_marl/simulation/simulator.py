@@ -33,6 +33,9 @@ from ugat_marl.simulation.upstream import UpstreamQueues
 
 _Floats = NDArray[np.float64]
 
+_FAULTS = (libsumo.TraCIException, libsumo.FatalTraCIError, UnicodeDecodeError)
+"""Errors of libsumo; the last one for messages of SUMO with one byte of a longer character."""
+
 
 class LibsumoSimulator:
     """SUMO inside this process.
@@ -76,7 +79,7 @@ class LibsumoSimulator:
         self._launch = launch
         try:
             libsumo.start([program, *launch.arguments])
-        except (libsumo.TraCIException, libsumo.FatalTraCIError) as error:
+        except _FAULTS as error:
             self._fail("SUMO did not start", error)
         self._shown, self._on = {}, {}
         self._time_s = launch.begin_s
@@ -120,7 +123,7 @@ class LibsumoSimulator:
                         libsumo.trafficlight.setRedYellowGreenState(tls, state)
                         self._shown[tls] = state
             libsumo.simulation.step(begin + seconds)
-        except (libsumo.TraCIException, libsumo.FatalTraCIError) as error:
+        except _FAULTS as error:
             self._fail(f"SUMO failed after {begin:g} s", error)
         self._time_s = begin + seconds
         snapshot = self._snapshot()
@@ -213,7 +216,10 @@ class LibsumoSimulator:
 
     def _fail(self, action: str, error: Exception) -> None:
         assert self._launch is not None
-        said = _errors_of(Path(self._launch.directory)) or one_line_message(str(error))
+        words = str(error)
+        if isinstance(error, UnicodeDecodeError):
+            words = error.object.decode(errors="replace")
+        said = _errors_of(Path(self._launch.directory)) or one_line_message(words)
         self.close()
         if "bad_alloc" in f"{said}{error}":
             said = (
