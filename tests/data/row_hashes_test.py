@@ -21,7 +21,9 @@ from ugat_marl.data.row_hashes import (
     csv_damage,
     csv_texts,
     damage,
+    json_damage,
     read_quietly,
+    with_hashes,
     write_csv,
     write_hashed,
 )
@@ -248,3 +250,37 @@ def test_a_damaged_file_prints_nothing(tmp_path: Path, capfd: pytest.CaptureFixt
             failed += 1
     assert failed > 10
     assert capfd.readouterr().err == ""
+
+
+TABLE = {"note": "snow", "rows": [{"seed": k, "att_s": 100.5 + k, "by": (1, 2)} for k in range(5)]}
+
+
+@pytest.mark.parametrize("indent", [None, 1])
+def test_no_flipped_bit_of_a_json_table_is_read_as_other_data(indent: int | None) -> None:
+    whole = json.dumps(with_hashes(TABLE, "rows"), indent=indent).encode()
+    stored = json.loads(whole)
+    assert json_damage(stored, "rows") == ""
+    for place in range(8 * len(whole)):
+        flipped = bytearray(whole)
+        flipped[place // 8] ^= 1 << place % 8
+        try:
+            found = json.loads(flipped)
+            damaged = json_damage(found, "rows")
+        except (ValueError, KeyError, TypeError):
+            continue
+        del found[next(key for key in found if key not in TABLE)]
+        same = found == {key: value for key, value in stored.items() if key in TABLE}
+        assert same or damaged, flipped
+
+
+def test_the_damaged_row_of_a_json_table_is_named() -> None:
+    table = with_hashes(TABLE, "rows")
+    table["rows"][3]["att_s"] += 1
+    assert json_damage(table, "rows").startswith("row 3 of rows is not what was written")
+    table = with_hashes(TABLE, "rows")
+    table["rows"].pop()
+    assert json_damage(table, "rows").startswith("it has 4 rows, and had 5")
+    table = {**with_hashes(TABLE, "rows"), "note": "rain"}
+    assert json_damage(table, "rows").startswith("what stands beside its rows")
+    del table["row_hashes"]
+    assert json_damage(table, "rows") == ""

@@ -13,6 +13,7 @@ from concurrent.futures import ThreadPoolExecutor
 from dataclasses import asdict, replace
 from pathlib import Path
 
+import numpy as np
 import pytest
 from pydantic import TypeAdapter
 
@@ -343,6 +344,18 @@ def test_what_a_killed_job_was_writing_is_cleared(tmp_path: Path) -> None:
 def test_a_broken_record_is_an_empty_one(tmp_path: Path, content: str) -> None:
     (tmp_path / SCORES).write_text(content)
     assert Record.read(tmp_path) == Record()
+
+
+def test_no_flipped_bit_of_a_record_is_read_as_another_one(tmp_path: Path) -> None:
+    record = whole_record()
+    record.write(tmp_path)
+    file = tmp_path / SCORES
+    content = file.read_bytes()
+    for place in np.random.default_rng(5).integers(0, 8 * len(content), 400).tolist():
+        flipped = bytearray(content)
+        flipped[place // 8] ^= 1 << place % 8
+        file.write_bytes(flipped)
+        assert Record.read(tmp_path) in (record, Record())
 
 
 def test_a_job_is_done_when_everything_was_played(tmp_path: Path) -> None:

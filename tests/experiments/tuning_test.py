@@ -171,7 +171,15 @@ def test_a_broken_memory_is_replaced(streets: Streets, tmp_path: Path, content: 
     file.write_bytes(content)
     assert tune("fixed-time", scenario, "sim", 24) == found
     assert len(streets.played) == 2 * found.episodes
-    assert json.loads(file.read_text())[0]["spec"] == "fixed-time:50"
+    assert json.loads(file.read_text())["trials"][0]["spec"] == "fixed-time:50"
+
+
+def test_a_memory_with_a_flipped_digit_is_replaced(streets: Streets, tmp_path: Path) -> None:
+    found = tune("fixed-time", load_scenario("single-v1"), "sim", 24)
+    (file,) = (tmp_path / "ugat_marl" / "tuned").iterdir()
+    file.write_text(file.read_text().replace("100.0", "108.0", 1))
+    assert tune("fixed-time", load_scenario("single-v1"), "sim", 24) == found
+    assert len(streets.played) == 2 * found.episodes
 
 
 def test_a_memory_that_is_not_finite_is_replaced(streets: Streets, tmp_path: Path) -> None:

@@ -13,7 +13,7 @@ from pathlib import Path
 import pytest
 
 from ugat_marl.errors import OptionError, OutputError
-from ugat_marl.field import Decision, DecisionLog
+from ugat_marl.field import Decision, DecisionLog, read_decisions
 
 SEGMENT = 4096
 """Size of a segment in these tests, so that many are made."""
@@ -46,15 +46,15 @@ def filled(path: Path, count: int, begin: int = 0) -> DecisionLog:
 
 def test_segments_become_one_file_in_order(tmp_path: Path) -> None:
     path = tmp_path / "field.jsonl"
-    log = filled(path, 500)
+    log = filled(path, 503)
     (segment,) = tmp_path.glob("*.part")
     assert path.stat().st_size > 10 * SEGMENT
     assert segment.stat().st_size < SEGMENT
-    assert numbers(path) + numbers(segment) == [*range(500)]  # as cat reads a running log
+    assert numbers(path) + numbers(segment) == [*range(503)]  # as cat reads a running log
     log.close()
     assert names(tmp_path) == ["field.jsonl"]
-    filled(path, 30, begin=500).close()
-    assert numbers(path) == [*range(530)]
+    filled(path, 30, begin=503).close()
+    assert numbers(path) == [*range(533)]
 
 
 def test_a_decision_is_on_the_disk_when_its_call_returns(tmp_path: Path) -> None:
@@ -96,7 +96,7 @@ def test_a_killed_loop_loses_nothing_that_it_had_told(
 
 
 def test_a_merge_killed_at_any_byte_is_completed(tmp_path: Path) -> None:
-    path, lines = tmp_path / "field.jsonl", [decision(n).line() + "\n" for n in range(6)]
+    path, lines = tmp_path / "field.jsonl", [decision(n).line().decode() for n in range(6)]
     before, segment = "".join(lines[:3]), "".join(lines[3:])
     for done in range(len(segment) + 1):
         path.write_text(before + segment[:done])
@@ -107,7 +107,7 @@ def test_a_merge_killed_at_any_byte_is_completed(tmp_path: Path) -> None:
 
 
 def test_a_line_killed_at_any_byte_is_left_out(tmp_path: Path) -> None:
-    path, lines = tmp_path / "field.jsonl", [decision(n).line() + "\n" for n in range(3)]
+    path, lines = tmp_path / "field.jsonl", [decision(n).line().decode() for n in range(3)]
     for done in range(len(lines[2])):
         path.write_text(lines[0])
         part = tmp_path / f"field.jsonl.{len(lines[0]):015d}.part"
@@ -127,7 +127,7 @@ def test_segments_of_another_log_are_left_alone(tmp_path: Path) -> None:
 def test_a_torn_file_is_refused_though_a_segment_is_there(tmp_path: Path) -> None:
     path = tmp_path / "field.jsonl"
     path.write_text('{"time_s": 0')
-    (tmp_path / "field.jsonl.000000000000500.part").write_text(decision(0).line() + "\n")
+    (tmp_path / "field.jsonl.000000000000500.part").write_text(decision(0).line().decode())
     with pytest.raises(OptionError, match="whole line"):
         DecisionLog(path)
 
@@ -191,9 +191,40 @@ def test_a_decision_writes_as_much_after_many_segments_as_at_first(
         written.clear()
         log.add(decision(number))
         per_decision.append(sum(written))
-    line = len(decision(2999).line()) + 1
+    line = len(decision(2999).line())
     assert log.path.stat().st_size > 80 * SEGMENT
     assert max(per_decision) <= SEGMENT + 2 * line
     assert sum(per_decision[-500:]) <= 2 * 500 * line + SEGMENT
     log.close()
     assert numbers(log.path) == [*range(3000)]
+
+
+def test_decisions_are_read_with_what_was_written(tmp_path: Path) -> None:
+    path = tmp_path / "field.jsonl"
+    log = filled(path, 20)
+    (segment,) = tmp_path.glob("*.part")
+    running = [*read_decisions(segment)]
+    log.close()
+    assert [*read_decisions(path)] == running
+    assert running[3] == {
+        "time_s": 30.0, "source": "both", "reasons": {"A0": "missing: no count"},
+        "phases": {"A0": 3, "A1": 0}, "read_ms": 0.1, "latency_ms": 1,
+    }  # fmt: skip
+    with pytest.raises(OptionError, match="no.jsonl: cannot be read"):
+        next(read_decisions(tmp_path / "no.jsonl"))
+
+
+def test_no_flipped_bit_of_a_log_is_read_as_another_decision(tmp_path: Path) -> None:
+    path = tmp_path / "field.jsonl"
+    filled(path, 2).close()
+    whole, lines = path.read_bytes(), [*read_decisions(path)]
+    for place in range(0, 8 * len(whole), 5):
+        flipped = bytearray(whole)
+        flipped[place // 8] ^= 1 << place % 8
+        path.write_bytes(flipped)
+        line = whole[: place // 8].count(b"\n")
+        read: list[object] = []
+        with pytest.raises(OptionError, match=f"line {line + 1} is not what was written"):
+            read.extend(read_decisions(path))
+        path.write_bytes(whole)
+    assert [*read_decisions(path)] == lines

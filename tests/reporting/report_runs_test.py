@@ -313,8 +313,17 @@ def test_a_file_that_makes_its_reader_panic_is_broken(
         assert f"{name} cannot be used (cannot be read (assertion failed)" in page.text
 
 
+def test_a_changed_digit_of_the_table_is_damage_with_its_row(run: Path) -> None:
+    table = json.loads((run / "table.json").read_text())
+    table["episodes"][7]["att_s"] += 8
+    (run / "table.json").write_text(json.dumps(table))
+    _, page = page_of(run)
+    assert "damaged, row 7 of episodes is not what was written" in page.text
+
+
 def test_values_of_a_wrong_kind_are_no_traceback(run: Path) -> None:
     table = json.loads((run / "table.json").read_text())
+    del table["row_hashes"]  # else it is damaged
     table["episodes"][0]["att_s"] = None
     table["episodes"][9]["queue"] = None
     (run / "table.json").write_text(json.dumps(table))

@@ -24,7 +24,9 @@ from .row_hashes import CSV_HASHES as CSV_HASHES
 from .row_hashes import csv_damage as csv_damage
 from .row_hashes import csv_texts as csv_texts
 from .row_hashes import damage as damage
+from .row_hashes import json_damage as json_damage
 from .row_hashes import read_quietly as read_quietly
+from .row_hashes import with_hashes as with_hashes
 from .row_hashes import write_csv as write_csv
 from .row_hashes import write_hashed as write_hashed
 from .runs import CHECKPOINT_FOLDER as CHECKPOINT_FOLDER

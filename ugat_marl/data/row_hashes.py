@@ -7,6 +7,8 @@ hashes are there twice: one flipped bit in their name would otherwise hide them.
 CSV has no place for hashes that other programs would not read as a row. Those of `write_csv_hashes`
 stand in a file beside the tables. A table that is not listed there, such as one made by hand, has
 none.
+
+A table in JSON holds its hashes itself, see `with_hashes`.
 """
 
 from __future__ import annotations
@@ -30,6 +32,9 @@ from ugat_marl.files import parse_json, read_json, write_whole
 
 HASH_KEYS = ("ugat_marl.row_hashes", "ugat_marl.row_hashes.copy")
 """Keys of the hashes in the metadata of the file."""
+
+JSON_HASHES = "row_hashes"
+"""Key of the hashes in a table in JSON."""
 
 CSV_HASHES = "row-hashes.json"
 """Name of the file with the hashes of the CSV tables in its folder."""
@@ -96,6 +101,51 @@ def write_csv(path: Path, text: str) -> None:
         _store_csv_hashes(path.parent, tables)
     write_whole(path, text)
     write_csv_hashes(path.parent, [path.name])
+
+
+def with_hashes(content: Mapping[str, Any], rows: str) -> dict[str, Any]:
+    """Return values for JSON with the hashes of their rows, and one of everything else.
+
+    Args:
+        content: The values.
+        rows: Key of the list of rows among them.
+    """
+    plain = json.loads(json.dumps(content))  # as they are when they are read
+    return {**plain, JSON_HASHES: _json_hashes(plain, rows)}
+
+
+def json_damage(content: Mapping[str, Any], rows: str) -> str:
+    """Return what is damaged in values of `with_hashes`; empty if they are whole or have no hashes.
+
+    Args:
+        content: The values.
+        rows: Key of the list of rows among them.
+
+    Returns:
+        The damage as words that follow the name of the file, with the way out.
+
+    Raises:
+        TypeError: The values have another form.
+        KeyError: There are no rows.
+    """
+    if JSON_HASHES not in content:
+        return ""
+    stored, now = content[JSON_HASHES], _json_hashes(content, rows)
+    if stored == now:
+        return ""
+    way_out = f"copy it again, or remove {JSON_HASHES} from it if you changed it yourself"
+    was = stored[rows]
+    for number, (one, other) in enumerate(zip(was, now[rows], strict=False)):
+        if one != other:
+            return f"row {number} of {rows} is not what was written; {way_out}"
+    if len(was) != len(now[rows]):
+        return f"it has {len(now[rows])} rows, and had {len(was)} when written; {way_out}"
+    return f"what stands beside its rows is not what was written; {way_out}"
+
+
+def _json_hashes(content: Mapping[str, Any], rows: str) -> dict[str, Any]:
+    rest = {key: value for key, value in content.items() if key not in (rows, JSON_HASHES)}
+    return {"rest": _hash(rest), rows: [_hash(row) for row in content[rows]]}
 
 
 def csv_texts(content: bytes) -> pl.DataFrame:

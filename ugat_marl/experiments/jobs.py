@@ -28,7 +28,9 @@ from ugat_marl.data import (
     Scores,
     TransitionLog,
     installed_versions,
+    json_damage,
     remove_temporaries,
+    with_hashes,
 )
 from ugat_marl.effects import load_scenario, scenario_in_domain
 from ugat_marl.envs import AnyParallelEnv, TrafficEnv, parallel_env
@@ -266,16 +268,18 @@ class Record:
 
     @classmethod
     def read(cls, folder: Path) -> Record:
-        """Read a record that `write` wrote; an empty record if the file is missing or broken."""
+        """Read a record that `write` wrote; an empty record if the file is missing or damaged."""
         try:
             content = read_json(folder / SCORES, CheckpointError)
+            if json_damage(content, "episodes"):
+                return cls()
             scores: dict[tuple[int, str, int], Scores] = {}
             for row in content["episodes"]:
                 key = int(row.pop("trained")), str(row.pop("domain")), int(row.pop("seed"))
                 row["approaches"] = {k: tuple(v) for k, v in row.get("approaches", {}).items()}
                 scores[key] = Scores(**row)
             return cls(scores, **content["training"])
-        except (CheckpointError, ValueError, TypeError, KeyError, AttributeError):
+        except (CheckpointError, ArithmeticError, ValueError, TypeError, KeyError, AttributeError):
             return cls()
 
     def write(self, folder: Path) -> None:
@@ -285,7 +289,8 @@ class Record:
             for (trained, domain, seed), scores in self.scores.items()
         ]
         training = {name: getattr(self, name) for name in ("episodes", "seconds", "own_seconds")}
-        content = json.dumps({"training": training, "episodes": rows}, indent=1)
+        hashed = with_hashes({"training": training, "episodes": rows}, "episodes")
+        content = json.dumps(hashed, indent=1)
         write_whole(folder / SCORES, content + "\n")
 
     def add(self, effort: Effort) -> None:

@@ -20,7 +20,7 @@ import numpy as np
 import polars as pl
 from numpy.typing import NDArray
 
-from ugat_marl.data import MEASURES, Scores, mean_delay_s
+from ugat_marl.data import MEASURES, Scores, json_damage, mean_delay_s, with_hashes
 from ugat_marl.errors import CheckpointError
 from ugat_marl.experiments.statistics import Interval
 from ugat_marl.files import read_json, write_whole
@@ -190,7 +190,8 @@ class Evaluation:
 
     def write(self, path: Path) -> None:
         """Write `as_dict` as JSON, whole or not at all; nan becomes null."""
-        content = json.dumps(_without_nan(self.as_dict()), indent=1, allow_nan=False)
+        hashed = with_hashes(_without_nan(self.as_dict()), "episodes")
+        content = json.dumps(hashed, indent=1, allow_nan=False)
         write_whole(path, content + "\n")
 
     @classmethod
@@ -202,13 +203,18 @@ class Evaluation:
         """
         try:
             content = read_json(path, CheckpointError)
+            damaged = json_damage(content, "episodes")
             results = _whole(tuple(result_of(row) for row in content["episodes"]))
             notes = {str(key): str(text) for key, text in content["notes"].items()}
-            return cls(str(content["scenario"]), str(content["scenario_hash"]), results, notes)
-        except (ValueError, TypeError, KeyError, AttributeError) as error:
+            scenario, its_hash = str(content["scenario"]), str(content["scenario_hash"])
+            evaluation = cls(scenario, its_hash, results, notes)
+        except (ArithmeticError, ValueError, TypeError, KeyError, AttributeError) as error:
             raise CheckpointError(
                 f"{path}: not the table of a run ({error!r}); it may have been cut short"
             ) from None
+        if damaged:
+            raise CheckpointError(f"{path}: damaged, {damaged}")
+        return evaluation
 
 
 @dataclass(frozen=True)

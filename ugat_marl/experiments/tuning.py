@@ -16,7 +16,7 @@ from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
-from ugat_marl.data import installed_version
+from ugat_marl.data import installed_version, json_damage, with_hashes
 from ugat_marl.effects import Domain, domain_label, scenario_in_domain
 from ugat_marl.errors import CheckpointError, OptionError, UnknownNameError
 from ugat_marl.experiments.evaluation import TUNING_SEED, best_rules, race_rules
@@ -90,7 +90,8 @@ def tune(
         reporter=reporter,
         title=f"tuning {name}",
     )
-    write_whole(place, json.dumps([asdict(trial) for trial in trials], indent=1) + "\n")
+    hashed = with_hashes({"trials": [asdict(trial) for trial in trials]}, "trials")
+    write_whole(place, json.dumps(hashed, indent=1) + "\n")
     return Tuned(name, domain_label(domain), trials)
 
 
@@ -180,11 +181,14 @@ def _place(
 
 
 def _recall(place: Path, specs: Sequence[str]) -> tuple[Trial, ...] | None:
-    """Return the result in a file; None if the file is missing or holds other settings."""
+    """Return the result in a file; None if it is missing, damaged or of other settings."""
     try:
-        rows: Any = read_json(place, CheckpointError)
+        content: Any = read_json(place, CheckpointError)
+        if json_damage(content, "trials"):
+            return None
+        rows = content["trials"]
         trials = tuple(Trial(str(r["spec"]), float(r["att_s"]), int(r["episodes"])) for r in rows)
-    except (CheckpointError, ValueError, KeyError, TypeError):
+    except (CheckpointError, ArithmeticError, ValueError, KeyError, TypeError):
         return None
     whole = sorted(trial.spec for trial in trials) == sorted(specs)
     return trials if whole and all(math.isfinite(trial.att_s) for trial in trials) else None

@@ -1,5 +1,6 @@
 from .decisions import Decision as Decision
 from .decisions import DecisionLog as DecisionLog
+from .decisions import read_decisions as read_decisions
 from .health import Health as Health
 from .loop import FieldLoop as FieldLoop
 from .loop import LoopSummary as LoopSummary

@@ -4,14 +4,15 @@ from __future__ import annotations
 
 import contextlib
 import errno
+import hashlib
 import importlib.util
 import json
 import os
 import re
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Literal
+from typing import Any, Literal
 
 from ugat_marl.errors import OptionError, OutputError
 from ugat_marl.files import require_writable
@@ -23,6 +24,9 @@ _MOST_WAITING = 100_000
 """Most decisions that wait in memory for a disk that is full: 11 days of one in 10 s."""
 _AT_ONCE = 64
 """Most waiting decisions that one decision writes, so that none takes long after a full disk."""
+
+_HASHED = re.compile(rb'(\{.*), "hash": "([0-9a-f]{16})"\}\n')
+"""A line without its hash, and the hash."""
 
 Source = Literal["policy", "fallback", "both"]
 
@@ -52,9 +56,9 @@ class Decision:
             return "policy"
         return "fallback" if len(self.fallback) == len(self.phases) else "both"
 
-    def line(self) -> str:
-        """Return the decision as a line of JSON."""
-        return json.dumps(
+    def line(self) -> bytes:
+        """Return the decision as a line of JSON, with a hash of the line as its last value."""
+        text = json.dumps(
             {
                 "time_s": self.time_s,
                 "source": self.source,
@@ -63,7 +67,8 @@ class Decision:
                 "read_ms": round(self.read_ms, 3),
                 "latency_ms": round(self.latency_ms, 3),
             }
-        )
+        ).encode()
+        return text[:-1] + b', "hash": "%s"}\n' % _line_hash(text)
 
 
 class DecisionLog:
@@ -116,7 +121,7 @@ class DecisionLog:
 
     def add(self, decision: Decision) -> None:
         """Write the line of a decision; keep it for the next call if the disk is full."""
-        self._waiting.append(decision.line().encode() + b"\n")
+        self._waiting.append(decision.line())
         if len(self._waiting) > _MOST_WAITING:
             del self._waiting[0]
             self.lost += 1
@@ -225,6 +230,33 @@ class DecisionLog:
             if descriptor >= 0:
                 os.close(descriptor)
         self._segment = self._file = -1
+
+
+def read_decisions(path: Path) -> Iterator[dict[str, Any]]:
+    """Yield the decisions of a log, as values of JSON, and refuse a damaged line.
+
+    Args:
+        path: File of a `DecisionLog`, or a segment of a loop that runs.
+
+    Raises:
+        OptionError: There is no such file, or a line is not what was written.
+    """
+    try:
+        with path.open("rb") as lines:
+            for number, line in enumerate(lines, 1):
+                match = _HASHED.fullmatch(line)
+                if match is None or _line_hash(match[1] + b"}") != match[2]:
+                    raise OptionError(
+                        f"{path}: line {number} is not what was written; copy the log again, or "
+                        "remove the line"
+                    )
+                yield json.loads(match[1] + b"}")
+    except OSError as error:
+        raise OptionError(f"{path}: cannot be read ({error.strerror}); name a log") from None
+
+
+def _line_hash(text: bytes) -> bytes:
+    return hashlib.blake2b(text, digest_size=8).hexdigest().encode()
 
 
 def _whole_lines(part: Path) -> bytes:

@@ -25,6 +25,7 @@ from ugat_marl.data import (
     Metrics,
     csv_damage,
     csv_texts,
+    json_damage,
 )
 from ugat_marl.errors import CheckpointError, OptionError, UgatMarlError
 from ugat_marl.experiments import QUEUES, TRAININGS, Evaluation, read_queues, result_of
@@ -177,7 +178,7 @@ class _Reader:
             if path.stat().st_size > _LONGEST:
                 raise ValueError(f"it has more than {_LONGEST // 1_000_000} MB")
             return parse(path)
-        except (UgatMarlError, OSError, ValueError, TypeError, KeyError) as error:
+        except (UgatMarlError, OSError, ArithmeticError, ValueError, TypeError, KeyError) as error:
             reason = " ".join(str(error).replace(f"{path}: ", "").split())
             self.missing.append(f"{name} cannot be used ({reason[:160]}): {without}")
             return None
@@ -333,7 +334,10 @@ def _written(directory: Path, checkpoint: str) -> float:
 
 
 def _scores(path: Path, settings: Mapping[str, Any]) -> Evaluation:
-    rows = _object(path)["episodes"]
+    content = _object(path)
+    rows = content["episodes"]
+    if wrong := json_damage(content, "episodes"):
+        raise ValueError(f"damaged, {wrong}")
     if not isinstance(rows, list) or not rows:
         raise ValueError("no scores in it")
     policy = str(settings.get("name", "unknown"))
