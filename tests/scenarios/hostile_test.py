@@ -274,6 +274,7 @@ def test_a_pile_of_elements_is_refused(crossing: Crossing) -> None:
     [
         ('<flow id="a" begin="0" end="60" number="400000000" route="east"/>', "", "more than 1000"),
         ("", '<parkingArea id="p" lane="W_C_0" roadsideCapacity="400000000"/>', "more than 100000"),
+        ("", '<busStop id="p" lane="W_C_0" personCapacity="400000000"/>', "more than 100000"),
     ],
 )
 def test_numbers_that_fill_the_memory_are_refused(
@@ -288,14 +289,42 @@ def test_numbers_that_fill_the_memory_are_refused(
         read_scenario(directory)
 
 
+@pytest.mark.parametrize("shortest", ["0", "-5", "0.0001", "0.0"])
+def test_phases_that_never_end_are_refused(shortest: str, crossing: Crossing) -> None:
+    """SUMO changes between actuated phases of no time without end, in one step."""
+    directory = crossing()
+    phases = "".join(f'<phase duration="9" minDur="{shortest}" state="{s}"/>' for s in ("rG", "Gr"))
+    logic = f'<tlLogic id="C" type="actuated" programID="x" offset="0">{phases}</tlLogic>'
+    (directory / "extra.add.xml").write_text(f"<additional>{logic}</additional>")
+    settings_file = directory / "scenario.toml"
+    settings_file.write_text(f'additional = ["extra.add.xml"]\n{settings_file.read_text()}')
+    with pytest.raises(UgatMarlError, match=rf"<phase minDur='{shortest}'> is no time above 0"):
+        read_scenario(directory)
+
+
+@pytest.mark.parametrize(("model", "segment"), [("true", ""), ("false", "98"), ("1", "98")])
+def test_the_mesoscopic_model_is_whole_or_absent(
+    model: str, segment: str, crossing: Crossing
+) -> None:
+    directory = crossing()
+    with (directory / "scenario.toml").open("a") as file:
+        file.write(f'[sumo]\nmesosim = "{model}"\n')
+        file.write(f'meso-edgelength = "{segment}"\n' if segment else "")
+    with pytest.raises(UgatMarlError, match=f"sumo.mesosim = '{model}': the mesoscopic model"):
+        read_scenario(directory)
+
+
 @pytest.mark.skipif(not hasattr(os, "fork"), reason="no limit of memory on Windows")
+@pytest.mark.parametrize("of", ["persons", "vehicles"])
 def test_a_simulation_that_asks_for_all_memory_is_refused(
-    crossing: Crossing, monkeypatch: pytest.MonkeyPatch
+    of: str, crossing: Crossing, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """Beneath the limits of single numbers: persons that no number of a flow forbids."""
     monkeypatch.setenv(MEMORY_VARIABLE, "0.3")
     vehicle = '<vehicle id="a" depart="0" route="east"/>'
     many = '<personFlow id="p" begin="0" end="60" number="9000000"><walk edges="W_C"/></personFlow>'
+    if of == "vehicles":
+        many = '<flow id="p" begin="0" end="60" number="9000000" route="east"/>'
     said = play(crossing(vehicles=vehicle + many), "spawn")
     assert re.search(rf"needs more memory than .*\(0\.3 GB\).*{MEMORY_VARIABLE}", said)
     assert play(crossing(vehicles=vehicle), "spawn") == ""

@@ -2,8 +2,12 @@
 
 from __future__ import annotations
 
+import re
 import subprocess
 import sys
+
+from ugat_marl.simulation.channel import Message
+from ugat_marl.simulation.worker import _answered
 
 START = "from ugat_marl.simulation.worker import exit_when_input_ends; exit_when_input_ends(); "
 
@@ -23,3 +27,12 @@ def test_a_process_ends_with_its_input() -> None:
     process = started("import time; time.sleep(600)")
     process.communicate(timeout=60)
     assert process.returncode == 1
+
+
+def test_a_full_memory_is_told_as_what_it_is() -> None:
+    def full(question: Message) -> Message:
+        raise MemoryError
+
+    said = _answered(full, Message({"what": "advance"}, [])).header
+    assert said["kinds"] == ["SimulatorError"]
+    assert re.match(r"it needs more memory than a simulation may use \(.* GB\)", said["error"])

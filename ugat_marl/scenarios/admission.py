@@ -124,9 +124,13 @@ _BOUNDS: Mapping[str, tuple[float, float]] = {
 """Least and largest values of options for which SUMO takes memory or time."""
 _OFF_BELOW_0: frozenset[str] = frozenset({"lateral-resolution"})
 """Options of these that 0 or less switches off."""
-_MOST_OF: Mapping[str, int] = {"number": 10_000_000, "roadsideCapacity": 100_000}
-"""Largest values of attributes for which SUMO takes memory or time: the vehicles of a flow, and
-the spaces of a parking area."""
+_MOST_OF: Mapping[str, int] = {
+    "number": 10_000_000,
+    "roadsideCapacity": 100_000,
+    "personCapacity": 100_000,
+}
+"""Largest values of attributes for which SUMO takes memory or time: the vehicles of a flow, the
+spaces of a parking area, and the places of a stop."""
 
 _YES_OR_NO = _words(
     """
@@ -368,11 +372,21 @@ def _number_fault(tag: Tag) -> str:
         value = tag.attributes[attribute]
         if _is_odd_number(value):
             return f"<{tag.name} {attribute}={value[:40]!r}> is not a finite number in plain digits"
+    if tag.name == "phase" and _never_ends(tag.attributes.get("minDur", "1")):
+        return (
+            f"<phase minDur={tag.attributes['minDur'][:40]!r}> is no time above 0; SUMO would "
+            "change between such phases without end"
+        )
     for attribute in _MOST_OF.keys() & tag.attributes.keys():
         value, most = tag.attributes[attribute], _MOST_OF[attribute]
         if DECIMAL.fullmatch(value) and float(value) > most:
             return f"<{tag.name} {attribute}={value[:40]!r}> is more than {most}"
     return ""
+
+
+def _never_ends(duration: str) -> bool:
+    """Return True for a duration that is 0 in SUMO's clock, which has milliseconds, or less."""
+    return DECIMAL.fullmatch(duration) is not None and float(duration) < 0.001
 
 
 def _parameter_fault(tag: Tag) -> str:

@@ -117,6 +117,12 @@ def validate_settings(raw: Mapping[str, Any], source: str) -> ScenarioFile:
             f"{source}: control.reach_m = {control.reach_m:g}, but in SUMO's mesoscopic model "
             "(queue_model) it is not counted who is upstream of a lane; leave out one of the two"
         )
+    model = settings.sumo.get("mesosim")
+    if model is not None and (model != "true" or "meso-edgelength" not in settings.sumo):
+        raise ScenarioError(
+            f"{source}: sumo.mesosim = {model!r}: the mesoscopic model is 'true' with a "
+            "meso-edgelength, as the effect queue_model sets them; leave it out for car following"
+        )
     if settings.duration_s < control.decision_interval_s:
         raise ScenarioError(
             f"{source}: duration_s = {settings.duration_s:g} is shorter than one decision interval "

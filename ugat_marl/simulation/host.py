@@ -16,6 +16,7 @@ import atexit
 import contextlib
 import json
 import os
+import re
 import select
 import signal
 import socket
@@ -34,6 +35,7 @@ from numpy.typing import NDArray
 from ugat_marl import errors
 from ugat_marl.errors import OptionError, SimulatorCrashed, UgatMarlError, WorkerError
 from ugat_marl.parallel import DEADLINE_VARIABLE, require_deadline, usual_deadline_s
+from ugat_marl.scenarios import MEMORY_VARIABLE, most_memory
 from ugat_marl.simulation.channel import Channel, ChannelClosed, Message
 
 StartMethod = Literal["forkserver", "spawn"]
@@ -359,6 +361,8 @@ class Worker:
                 f"{self._deadline_s:g} s and was killed (stopped, or too little for this network: "
                 f"set deadline_s or {DEADLINE_VARIABLE}). reset() starts this environment afresh"
             )
+        if re.search(r"allocate memory|bad_alloc|MemoryError", words):
+            return f"the simulator process {self._pid} died during {doing!r}: {too_much_memory()}"
         said = f"it said: {words}" if words else "it said nothing (killed, or out of memory?)"
         return (
             f"the simulator process {self._pid} died{status} during {doing!r}; {said}. "
@@ -523,6 +527,14 @@ def one_line_message(text: str) -> str:
     """Return SUMO's output as one line, without its standard phrases."""
     lines = [line.strip().removeprefix("Error: ") for line in text.splitlines()]
     return " ".join(line for line in lines if line and line != "Quitting (on error).")
+
+
+def too_much_memory() -> str:
+    """Return the words for a simulation that has filled its limit of memory."""
+    return (
+        f"it needs more memory than a simulation may use ({most_memory() / 1e9:.3g} GB); is a "
+        f"number in its files far too large? {MEMORY_VARIABLE} sets another limit"
+    )
 
 
 def _framed(message: dict[str, Any]) -> bytes:

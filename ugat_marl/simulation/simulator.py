@@ -18,13 +18,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ugat_marl.errors import SimulatorBusy, SimulatorError
-from ugat_marl.scenarios import (
-    MEMORY_VARIABLE,
-    UpstreamLanes,
-    edge_of_lane,
-    most_memory,
-)
-from ugat_marl.simulation.host import one_line_message
+from ugat_marl.scenarios import UpstreamLanes, edge_of_lane
+from ugat_marl.simulation.host import one_line_message, too_much_memory
 from ugat_marl.simulation.launch import ERRORS, TRIPS, Launch, SignalPlans, VehiclePositions
 from ugat_marl.simulation.mesoscopic import MesoscopicLanes
 from ugat_marl.simulation.snapshots import HALTING_MPS, Snapshot, Trips
@@ -33,8 +28,12 @@ from ugat_marl.simulation.upstream import UpstreamQueues
 
 _Floats = NDArray[np.float64]
 
-_FAULTS = (libsumo.TraCIException, libsumo.FatalTraCIError, UnicodeDecodeError)
-"""Errors of libsumo; the last one for messages of SUMO with one byte of a longer character."""
+_FAULTS = (libsumo.TraCIException, libsumo.FatalTraCIError, UnicodeDecodeError, MemoryError)
+"""Errors of libsumo. A message of SUMO with one byte of a longer character cannot be decoded, and
+with a full memory there may be no room for an error."""
+
+_RESERVE_BYTES = 32 << 20
+"""Memory that is kept for the message of a simulation that has filled its limit."""
 
 
 class LibsumoSimulator:
@@ -46,6 +45,7 @@ class LibsumoSimulator:
 
     def __init__(self) -> None:
         self._launch: Launch | None = None
+        self._reserve = bytearray()
         self._shown: dict[str, str] = {}
         self._time_s = 0.0
         self._limits = np.empty(0)
@@ -77,6 +77,7 @@ class LibsumoSimulator:
         program = "sumo-gui" if launch.gui else "sumo"
         self._owner = os.getpid()
         self._launch = launch
+        self._reserve = bytearray(_RESERVE_BYTES)
         try:
             libsumo.start([program, *launch.arguments])
         except _FAULTS as error:
@@ -216,16 +217,14 @@ class LibsumoSimulator:
 
     def _fail(self, action: str, error: Exception) -> None:
         assert self._launch is not None
+        self._reserve = bytearray()
         words = str(error)
         if isinstance(error, UnicodeDecodeError):
             words = error.object.decode(errors="replace")
         said = _errors_of(Path(self._launch.directory)) or one_line_message(words)
         self.close()
-        if "bad_alloc" in f"{said}{error}":
-            said = (
-                f"it needs more memory than a simulation may use ({most_memory() / 1e9:.3g} GB); "
-                f"is a number in its files far too large? {MEMORY_VARIABLE} sets another limit"
-            )
+        if isinstance(error, MemoryError) or "bad_alloc" in f"{said}{error}":
+            said = too_much_memory()
         raise SimulatorError(f"{action}: {said}") from None
 
 

@@ -22,9 +22,9 @@ import traceback
 from collections.abc import Callable
 from typing import TYPE_CHECKING, Any, NoReturn
 
-from ugat_marl.errors import UgatMarlError
+from ugat_marl.errors import SimulatorError, UgatMarlError
 from ugat_marl.simulation.channel import Channel, ChannelClosed, Message
-from ugat_marl.simulation.host import LENGTH
+from ugat_marl.simulation.host import LENGTH, too_much_memory
 
 if TYPE_CHECKING:
     from ugat_marl.simulation.host import Service
@@ -132,6 +132,8 @@ def _answered(answer: Callable[[Message], Message], question: Message) -> Messag
     except UgatMarlError as error:
         kinds = [kind.__name__ for kind in type(error).__mro__]
         return Message({"error": str(error), "kinds": kinds}, [])
+    except MemoryError:
+        return Message({"error": too_much_memory(), "kinds": [SimulatorError.__name__]}, [])
     except Exception:  # noqa: BLE001 - the user's reward or wrapper may raise anything
         return Message({"error": traceback.format_exc(limit=-5), "kinds": []}, [])
 
