@@ -19,7 +19,7 @@ import pytest
 from ugat_marl.envs import parallel_env, vector_env
 from ugat_marl.errors import UgatMarlError
 from ugat_marl.files import Document
-from ugat_marl.scenarios import read_scenario, scenario, settings
+from ugat_marl.scenarios import admission, read_scenario, scenario, settings
 from ugat_marl.scenarios.confinement import MEMORY_VARIABLE, confinement_missing
 
 Crossing = Callable[..., Path]
@@ -312,6 +312,21 @@ def test_the_mesoscopic_model_is_whole_or_absent(
         file.write(f'meso-edgelength = "{segment}"\n' if segment else "")
     with pytest.raises(UgatMarlError, match=f"sumo.mesosim = '{model}': the mesoscopic model"):
         read_scenario(directory)
+
+
+@pytest.mark.skipif(not hasattr(os, "fork"), reason="no limit of memory on Windows")
+def test_the_limit_of_memory_alone_holds(
+    crossing: Crossing, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Without the bounds of the list; SUMO's own words are on its standard error alone here."""
+    monkeypatch.setattr(admission, "_MOST_OF", {})
+    monkeypatch.setenv(MEMORY_VARIABLE, "0.5")
+    directory = crossing()
+    area = '<parkingArea id="p" lane="W_C_0" roadsideCapacity="400000000"/>'
+    (directory / "extra.add.xml").write_text(f"<additional>{area}</additional>")
+    settings_file = directory / "scenario.toml"
+    settings_file.write_text(f'additional = ["extra.add.xml"]\n{settings_file.read_text()}')
+    assert play(directory, "spawn").startswith("SUMO did not start: it needs more memory than")
 
 
 @pytest.mark.skipif(not hasattr(os, "fork"), reason="no limit of memory on Windows")

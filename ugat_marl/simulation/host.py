@@ -49,6 +49,9 @@ LENGTH = struct.Struct("<I")
 PATIENCE_S = 10.0
 """Seconds that a process has to end after a request; then it is killed."""
 
+_FULL_MEMORY = re.compile("allocate memory|bad_alloc|MemoryError")
+"""Words of a process that has filled its limit of memory."""
+
 _END_S = 0.05
 """Seconds between two looks for the end of a process that was killed."""
 
@@ -361,7 +364,7 @@ class Worker:
                 f"{self._deadline_s:g} s and was killed (stopped, or too little for this network: "
                 f"set deadline_s or {DEADLINE_VARIABLE}). reset() starts this environment afresh"
             )
-        if re.search(r"allocate memory|bad_alloc|MemoryError", words):
+        if _FULL_MEMORY.search(words):
             return f"the simulator process {self._pid} died during {doing!r}: {too_much_memory()}"
         said = f"it said: {words}" if words else "it said nothing (killed, or out of memory?)"
         return (
@@ -376,6 +379,8 @@ class Worker:
             if kind is not None and name != "UnknownNameError":
                 # SUMO's error log may hold only the end of SUMO's output.
                 words, error = self._words(), reply["error"]
+                if _FULL_MEMORY.search(words) and too_much_memory() not in error:
+                    return kind(f"{error.partition(':')[0]}: {too_much_memory()}")
                 return kind(error if words in error else f"{error} {words}")
         return WorkerError(
             "an exception that is not the suite's own was raised in the process of a simulation, "
