@@ -22,7 +22,13 @@ from ugat_marl.diagnosis import Diagnosis, statistic
 from ugat_marl.diagnosis.features import ALL_FEATURES, FEATURES
 from ugat_marl.diagnosis.verdict import STATISTICS
 from ugat_marl.effects import load_scenario
-from ugat_marl.reporting import commands_on_page, diagnosis_summary, formats, write_diagnosis_page
+from ugat_marl.reporting import (
+    LightNames,
+    commands_on_page,
+    diagnosis_summary,
+    formats,
+    write_diagnosis_page,
+)
 from ugat_marl.reporting import diagnosis_words as words
 from ugat_marl.reporting.diagnosis_page import diagnosis_page
 from ugat_marl.scenarios import Network
@@ -186,7 +192,7 @@ class Page(HTMLParser):
 
 def printed(diagnosis: Diagnosis) -> str:
     console = Console(width=80, record=True, file=io.StringIO())
-    console.print(diagnosis_summary(diagnosis))
+    console.print(diagnosis_summary(diagnosis, LightNames()))
     return console.export_text()
 
 

@@ -213,9 +213,9 @@ def test_a_whole_run_is_shown_with_the_numbers_of_its_records(run: Path) -> None
     assert "Missing here" not in page.text
     gate = page.row("signal_3")
     assert gate[:4] == ["signal_3", "B2", "80 %", "0.6"] and gate[4] == "0.35"
-    worst = page.row("B2")
+    worst = page.row("B2 (signal_3)")
     # B2 has 3 + minute vehicles under UGAT: 7.5 in the mean, 12 in the last minute
-    assert worst == ["B2", "7.5", "12", "minute 9", "15", "24", "minute 9"]
+    assert worst == ["B2 (signal_3)", "7.5", "12", "minute 9", "15", "24", "minute 9"]
     names = [picture.name for picture in made.pictures]
     assert names == list(dict.fromkeys(names))
     assert {"first-radar-V4", "first-gate", "first-map-acceptance", "first-map-queue"} <= set(names)

@@ -22,7 +22,7 @@ from ugat_marl.reporting import (
     transfer_table,
 )
 from ugat_marl.reporting.service_tables import service_grid
-from ugat_marl.scenarios import Network, named_approaches
+from ugat_marl.scenarios import Network
 
 BASE = Scores(0.0, 90.0, 500.0, -3.0, 3.0, 0.4, 50.0, 520.0, 515.0, 0.0)
 ATT = {
@@ -130,8 +130,9 @@ def test_levels_of_service_of_policies_and_approaches(found: Evaluation) -> None
     assert [row[2:4] for row in rows] == [["A1_B1", "300"], ["A1_A2", "100"]]  # the worst first
     assert [row[0] for row in rows] == ["B1", "A2"]
     assert [row[1] for row in rows] == ["eastbound", "northbound"]
+    assert "(signal_" in printed(tables)  # the agent stands below the light
     assert service_tables(found, network) == []  # nothing was measured
-    grid = service_grid(replace(found, results=results), ["UGAT"], named_approaches(network))
+    grid = service_grid(replace(found, results=results), ["UGAT"], network)
     assert grid is not None
-    assert grid.rows[0] == ["B1", "eastbound", "A1_B1", "100 F"]
-    assert service_grid(found, ["UGAT"], {}) is None
+    assert grid.rows[0] == ["B1 (signal_2)", "eastbound", "A1_B1", "100 F"]
+    assert service_grid(found, ["UGAT"], None) is None

@@ -25,7 +25,7 @@ from ugat_marl.effects import known_effects, load_scenario, measurement_effects
 from ugat_marl.errors import OptionError, OutputError
 from ugat_marl.files import require_writable
 from ugat_marl.progress import Bars
-from ugat_marl.reporting import diagnosis_summary, write_diagnosis_page
+from ugat_marl.reporting import LightNames, diagnosis_summary, write_diagnosis_page
 from ugat_marl.scenarios import Network
 
 REPORT = "report.html"
@@ -98,7 +98,7 @@ class Diagnose:
                 diagnosis = diagnose(scenario, measured, self.out, config, Bars(console))
         except KeyboardInterrupt as interrupt:
             raise type(interrupt)("the same command goes on where it stopped") from None
-        console.print(diagnosis_summary(diagnosis))
+        console.print(diagnosis_summary(diagnosis, LightNames.of(network)))
         if self.report:
             write_diagnosis_page(diagnosis, network, self.out / REPORT, self._commands(diagnosis))
         self._say_where(diagnosis, console)

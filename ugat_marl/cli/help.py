@@ -6,16 +6,24 @@ dashes. The others appear with ``--help-all``.
 
 from __future__ import annotations
 
+import contextlib
 import dataclasses
 import inspect
+import io
+import re
+import shutil
+import sys
 import types
 from collections.abc import Collection, Sequence
-from typing import Annotated, Any, Union, get_args, get_origin, get_type_hints
+from typing import Annotated, Any, TextIO, Union, get_args, get_origin, get_type_hints
 
 HELP = ("-h", "--help")
 DEADLINE = "--deadline-s"
 """Option of every command: seconds within which a simulation has to answer."""
 HELP_ALL = "--help-all"
+LEAST_WIDTH = 40
+"""Width of lines in narrower terminals, in characters."""
+_STYLE = re.compile(r"\x1b\[[\d;]*m")
 
 
 def print_help(command: Any, program: str, words: Sequence[str]) -> None:
@@ -36,17 +44,63 @@ def print_help(command: Any, program: str, words: Sequence[str]) -> None:
     description = described(command)
     if not everything:
         description += f"\n\nThe options used most. All of them: {program} {HELP_ALL}"
-    tyro.cli(
-        _shown(command, None if everything else set(first)),
-        args=["--help"],
-        prog=program,
-        description=description,
-    )
+    text = _Text(sys.stdout)
+    try:
+        with contextlib.redirect_stdout(text):
+            tyro.cli(
+                _shown(command, None if everything else set(first)),
+                args=["--help"],
+                prog=program,
+                description=description,
+            )
+    finally:
+        width = shutil.get_terminal_size().columns
+        for line in text.getvalue().splitlines():
+            print(_wrapped(line, max(width, LEAST_WIDTH)))
 
 
 def described(command: Any) -> str:
-    """Return the docstring with its examples, without its list of attributes."""
-    return (inspect.getdoc(command) or "").partition("\nAttributes:")[0].strip()
+    """Return the docstring with its examples, one line each, without its list of attributes."""
+    text = (inspect.getdoc(command) or "").partition("\nAttributes:")[0].strip()
+    before, heading, examples = text.partition("Examples:\n")
+    return before + heading + re.sub(r"\n +(?!ugat-marl)(?=\S)", " ", examples)
+
+
+class _Text(io.StringIO):
+    """Text that is kept; it takes the colours and lines that its goal takes."""
+
+    def __init__(self, goal: TextIO) -> None:
+        super().__init__()
+        self._goal = goal
+
+    @property
+    def encoding(self) -> str:  # pyright: ignore[reportIncompatibleVariableOverride]
+        """Encoding of the goal."""
+        return self._goal.encoding
+
+    def isatty(self) -> bool:
+        """Return True if the text goes to a terminal."""
+        return self._goal.isatty()
+
+
+def _wrapped(line: str, width: int) -> str:
+    """Return a line of the help in lines that fit; a long command goes on behind a backslash.
+
+    tyro breaks the texts of options, but neither its usage nor descriptions.
+    """
+    if len(_STYLE.sub("", line)) <= width:
+        return line
+    indent = line[: len(line) - len(line.lstrip())]
+    command = line.lstrip().startswith("ugat-marl ")
+    later = indent + ("    " if command or line.startswith("usage:") else "")
+    lines, room = [indent], width - (2 if command else 0)
+    for word in re.findall(r"""(?:"[^"]*"|'[^']*'|\[[^]]*\]|\S)+""", line):
+        longer = lines[-1] + ("" if lines[-1].isspace() or not lines[-1] else " ") + word
+        if len(_STYLE.sub("", longer)) <= room or not lines[-1].strip():
+            lines[-1] = longer
+        else:
+            lines.append(later + word)
+    return (" \\\n" if command else "\n").join(lines)
 
 
 def options_of(command: Any, prefix: str = "") -> dict[str, Any]:

@@ -8,7 +8,6 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, Any
 
-from rich import box
 from rich.console import Console
 from rich.table import Table
 from rich.text import Text
@@ -19,6 +18,7 @@ from ugat_marl.errors import OptionError
 from ugat_marl.experiments import policy_factory, typical_plans
 from ugat_marl.files import require_writable
 from ugat_marl.progress import Bars
+from ugat_marl.reporting import LIGHT, LightNames, titled_table
 from ugat_marl.scenarios import (
     Network,
     Scenario,
@@ -41,9 +41,9 @@ class Plan:
     """Write signal plans as a table, or put a table's plans into a scenario.
 
     The table has a row for every phase: cycle, offset, split, yellow and all-red in s, ring and
-    barrier, and the movements with green, as NBL for a left turn of northbound traffic. Without
-    --policy it holds the programmes of the network, as a template to change. With --apply, out is
-    a new scenario whose lights run the plans as their programme.
+    barrier, and the movements with green, as NBL for a left turn of northbound traffic. It
+    holds the programmes of the network, as a template to change, or the typical plans of --policy.
+    With --apply, out is a new scenario whose lights run the plans as their programme.
 
     Examples:
         ugat-marl plan single-v1 --out plans.csv
@@ -94,7 +94,7 @@ class Plan:
         )
         network = Network.read(scenario_in_domain(scenario, self.domain))
         write_plans(self.out, plans, network)
-        console.print(plan_table(plans))
+        console.print(plan_table(plans, LightNames.of(network)))
         out, name = shlex.quote(str(self.out)), shlex.quote(self.scenario)
         console.print(f"plans: {out}", markup=False, soft_wrap=True)
         console.print(
@@ -114,10 +114,10 @@ class Plan:
         else:
             plans = read_plans(table)
         planned = with_plans(scenario, plans, str(table))
-        Network.read(planned)
+        network = Network.read(planned)
         with new_folder(self.out, force=self.force) as folder:
             planned.write(folder)
-        console.print(plan_table(plans))
+        console.print(plan_table(plans, LightNames.of(network)))
         for note in notes:
             console.print(f"note: {note}", markup=False, soft_wrap=True)
         name = shlex.quote(str(self.out))
@@ -139,19 +139,20 @@ class Plan:
         return pairs
 
 
-def plan_table(plans: Sequence[SignalPlan]) -> Table:
-    """Return the plans as a table, with the green time of each phase."""
-    table = Table(box=box.SIMPLE_HEAD, pad_edge=False, padding=(0, 1, 0, 0))
-    for heading in ("light", "cycle", "offset", "ring", "phase", "movements"):
+def plan_table(plans: Sequence[SignalPlan], names: LightNames) -> Table:
+    """Return the plans as a table, with the green time of each phase; rings if there are some."""
+    table = titled_table("")
+    rings = any((phase.ring, phase.barrier) != (1, 1) for plan in plans for phase in plan.phases)
+    for heading in (LIGHT, "cycle", "offset", *(["ring"] if rings else []), "phase", "turns"):
         table.add_column(heading, overflow="fold")
     for heading in ("split", "green", "yellow", "all-red"):
         table.add_column(heading, justify="right")
     for plan in plans:
         for number, phase in enumerate(plan.phases, 1):
-            first = (plan.light, f"{plan.cycle_s:g}", f"{plan.offset_s:g}")
+            first = (names.text(plan.light), f"{plan.cycle_s:g}", f"{plan.offset_s:g}")
             cells = first if number == 1 else ("", "", "")
             times = (phase.split_s, phase.green_s, phase.yellow_s, phase.all_red_s)
-            ring = f"{phase.ring}|{phase.barrier}"
-            texts = (*cells, ring, f"{number}", " ".join(phase.movements) or "-")
+            ring = [f"{phase.ring}|{phase.barrier}"] if rings else []
+            texts = (*cells, *ring, f"{number}", " ".join(phase.movements) or "-")
             table.add_row(*map(Text, texts), *(f"{seconds:g}" for seconds in times))
     return table

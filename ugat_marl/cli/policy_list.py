@@ -4,12 +4,10 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-from rich import box
 from rich.console import Console
-from rich.table import Table
 
 from ugat_marl.policies import policy_card, shipped_policies
-from ugat_marl.reporting import number_text
+from ugat_marl.reporting import number_text, titled_table
 
 
 @dataclass(frozen=True)
@@ -30,7 +28,7 @@ class PolicyList:
 
     def run(self, console: Console) -> int:
         """Print the list."""
-        table = Table(box=box.SIMPLE_HEAD, pad_edge=False)
+        table = titled_table("")
         for heading in ("id", "setting", "travel time, s"):
             table.add_column(heading, overflow="fold")
         for name in shipped_policies():

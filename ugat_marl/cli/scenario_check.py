@@ -4,11 +4,10 @@ from __future__ import annotations
 
 import json
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Annotated, Any
 
-from rich import box
 from rich.console import Console
 from rich.table import Table
 from tyro.conf import Positional, arg
@@ -32,16 +31,15 @@ from ugat_marl.experiments import (
     remarks,
 )
 from ugat_marl.progress import Bars, Silent
-from ugat_marl.reporting import approach_table
+from ugat_marl.reporting import LIGHT, LightNames, approach_table, titled_table
 from ugat_marl.scenarios import (
     PHASE_SOURCES,
     QUARTER_S,
     SHORT_LANE_M,
     IntersectionFacts,
-    NamedApproach,
+    Network,
     Survey,
     confinement_missing,
-    named_approaches,
     survey,
 )
 from ugat_marl.testing import (
@@ -123,9 +121,8 @@ class ScenarioCheck:
             )
             print(text)
         else:
-            env = parallel_env(scenario)
-            console.print(_named_agents(env.intersection_of), markup=False, soft_wrap=True)
-            show(console, facts, runs, rows, wrong, named_approaches(env.network))
+            network = Network.read(scenario)
+            show(console, facts, runs, rows, wrong, network)
             if reason := confinement_missing():
                 console.print(
                     f"note: simulations are not confined, because {reason}; see SECURITY.md before "
@@ -162,14 +159,14 @@ def show(
     runs: Sequence[RuleEpisode],
     rows: Sequence[HeadroomRow] | None,
     wrong: Sequence[str],
-    names: Mapping[str, NamedApproach],
+    network: Network,
 ) -> None:
     """Print everything as tables that fit 80 columns."""
 
     def say(text: str) -> None:
         console.print(text, markup=False, soft_wrap=True)
 
-    agents = facts.intersections
+    agents, names = facts.intersections, LightNames.of(network)
     say(
         f"{facts.scenario}: {len(agents)} agents, "
         f"{sum(len(light.phases) for light in agents)} green phases, "
@@ -191,13 +188,13 @@ def show(
         say(f"no agent: traffic light {tls!r}: {facts.reasons[tls]}")
     if len(facts.uncontrolled) > MOST_LIGHTS:
         say(f"no agents either: {', '.join(facts.uncontrolled[MOST_LIGHTS:])}")
-    console.print(_intersections(agents))
+    console.print(_intersections(agents, names))
     for light in [light for light in agents if light.name][:MOST_LIGHTS]:
-        say(f"{light.id}: {light.name}")
-    for text in _greens_of_file(agents):
+        say(f"{names.text(light.id)}: {light.name}")
+    for text in _greens_of_file(agents, names):
         console.print(text, markup=False)
-    console.print(_approaches(agents))
-    console.print(_phase_sources(agents))
+    console.print(_approaches(agents, names))
+    console.print(_phase_sources(agents, names))
     if short := sum(len(light.short_lanes) for light in agents):
         say(
             f"lanes at lights that are shorter than {SHORT_LANE_M:g} m: {short}. Agents see nobody "
@@ -206,7 +203,7 @@ def show(
     if runs:
         console.print(_runs(runs))
         delays = {run.rule: run.approaches for run in runs}
-        console.print(approach_table("Control delay and level of service (HCM)", delays, names))
+        console.print(approach_table("Control delay and level of service (HCM)", delays, network))
     if rows is None:
         say("headroom: not measured; --headroom 1 measures it with one seed")
     else:
@@ -219,32 +216,27 @@ def show(
         say("nothing to mend")
 
 
-def _named_agents(lights: Mapping[str, str]) -> str:
-    """Return which agent has which traffic light, in one line."""
-    shown = [f"{agent} is light {light}" for agent, light in [*lights.items()][:MOST_LIGHTS]]
-    more = len(lights) - len(shown)
-    return f"agents: {', '.join(shown)}{f' and {more} more' if more else ''}"
-
-
 def _table(title: str, *columns: str) -> Table:
-    table = Table(title=title, box=box.SIMPLE_HEAD, pad_edge=False, title_justify="left")
+    table = titled_table(title)
     for number, column in enumerate(columns):
         table.add_column(column, justify="right" if number else "left", overflow="fold")
     return table
 
 
-def _intersections(agents: Sequence[IntersectionFacts]) -> Table:
+def _intersections(agents: Sequence[IntersectionFacts], names: LightNames) -> Table:
     """Return the table of intersections, with one row for all that are alike."""
     groups: dict[tuple[str, ...], list[str]] = {}
     for light in agents:
-        groups.setdefault(_row(light), []).append(light.id)
+        groups.setdefault(_row(light), []).append(names.text(light.id))
     table = _table(
-        "Intersections", "light", "lanes", "links", "movem.", "conflicts", "phases", "remarks"
+        "Intersections", LIGHT, "lanes", "links", "movem.", "conflicts", "phases", "remarks"
     )
     table.columns[-1].justify = "left"
-    for row, names in groups.items():
-        listed = ", ".join(names) if len(names) <= 3 else f"{names[0]} ... {names[-1]}"
-        table.add_row(f"{listed} ({len(names)})" if len(names) > 3 else listed, *row)
+    for row, lights in groups.items():
+        listed = ", ".join(lights)
+        if len(lights) > 3:
+            listed = f"{len(lights)}: {lights[0]} ... {lights[-1]}"
+        table.add_row(listed, *row)
     return table
 
 
@@ -268,25 +260,26 @@ def _row(light: IntersectionFacts) -> tuple[str, ...]:
     return (*map(str, counts), "; ".join(f"{n} {what}" for what, n in remarks.items() if n))
 
 
-def _greens_of_file(agents: Sequence[IntersectionFacts]) -> list[str]:
+def _greens_of_file(agents: Sequence[IntersectionFacts], names: LightNames) -> list[str]:
     """Return lines on which green of the file's programme each phase is."""
     kinds: dict[tuple[int | None, ...], list[str]] = {}
     for light in agents:
-        kinds.setdefault(tuple(phase.green_of_file for phase in light.phases), []).append(light.id)
+        greens = tuple(phase.green_of_file for phase in light.phases)
+        kinds.setdefault(greens, []).append(names.text(light.id))
     parts: list[str] = []
-    for greens, names in list(kinds.items())[:MOST_LIGHTS]:
+    for greens, lights in list(kinds.items())[:MOST_LIGHTS]:
         known = [f"{n} is green {g}" for n, g in enumerate(greens) if g is not None]
         if greens == tuple(range(len(greens))):
             known = ["n is green n"]
         text = f"phase {', '.join(known)}" if known else "no phase is one of its greens"
         if known and None in greens:
             text += ", the others are none of its greens"
-        listed = f"{names[0]} and {len(names) - 1} more" if len(names) > 1 else names[0]
+        listed = f"{lights[0]} and {len(lights) - 1} more" if len(lights) > 1 else lights[0]
         parts.append(f"{listed}: {text}")
     return [f"in the file's programme, {part}" for part in parts]
 
 
-def _phase_sources(agents: Sequence[IntersectionFacts]) -> Table:
+def _phase_sources(agents: Sequence[IntersectionFacts], names: LightNames) -> Table:
     """Return the degree of saturation of the fullest lights with each source of phases."""
 
     def degree(light: IntersectionFacts, source: str) -> float:
@@ -295,7 +288,7 @@ def _phase_sources(agents: Sequence[IntersectionFacts]) -> Table:
 
     fullest = sorted(agents, key=lambda light: -degree(light, "now"))[:MOST_LIGHTS]
     title = "Demand as a share of capacity with other phases, busiest quarter of an hour"
-    table = _table(title, "light", "now", *PHASE_SOURCES, "best")
+    table = _table(title, LIGHT, "now", *PHASE_SOURCES, "best")
     for light in fullest:
         cells = [
             "-" if light.degrees.get(source) is None else f"{degree(light, source):.0%}"
@@ -303,29 +296,29 @@ def _phase_sources(agents: Sequence[IntersectionFacts]) -> Table:
         ]
         source, least = best_phases(light)
         best = source if least < MUCH_LESS * degree(light, "now") else "as now"
-        table.add_row(light.id, *cells, best)
+        table.add_row(names.text(light.id), *cells, best)
     return table
 
 
-def _approaches(agents: Sequence[IntersectionFacts]) -> Table:
+def _approaches(agents: Sequence[IntersectionFacts], names: LightNames) -> Table:
     all_roads = [(light.id, road) for light in agents for road in light.approaches]
     all_roads.sort(key=lambda pair: -(pair[1].saturation or pair[1].flow_ratio))
     shown = all_roads[:MOST_APPROACHES]
     title = f"Saturation by approach, the highest {len(shown)} of {len(all_roads)}"
     headings = ("veh/h", "worst 15 min", "flow ratio", "own programme")
-    table = _table(title, "light", "road", "lanes", *headings)
+    table = _table(title, LIGHT, "road", "lanes", *headings)
     table.columns[1].justify = "left"
     for name, road in shown:
         saturation = "no green" if road.saturation is None else f"{road.saturation:.0%}"
         flows = (f"{road.vph:.0f}", f"{road.worst_vph:.0f}")
         cells = (str(road.lanes), *flows, f"{road.flow_ratio:.0%}", saturation)
-        table.add_row(name, road.edge, *cells)
+        table.add_row(names.text(name), road.edge, *cells)
     return table
 
 
 def _runs(runs: Sequence[RuleEpisode]) -> Table:
     table = _table(
-        "An episode in sim", "rule", "ATT [s]", "due", "entered", "arrived", "left outside"
+        "An episode in sim", "rule", "ATT, s", "due", "entered", "arrived", "left outside"
     )
     for run in runs:
         counts = (run.due, run.departed, run.arrived, run.backlog)
@@ -337,7 +330,7 @@ def _headroom(rows: Sequence[HeadroomRow]) -> Table:
     """Return the table of headroom: in each domain, the loss of the rule that is best in sim."""
     holds = [f"{hold_s} s" for hold_s in HOLDS_S]
     table = _table(
-        "Headroom: ATT [s] of the largest-queue rule held so long", "domain", *holds,
+        "Headroom: ATT in s of the largest-queue rule held so long", "domain", *holds,
         "programme", "lost", "arrived",
     )  # fmt: skip
     for row in rows:

@@ -4,12 +4,11 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-from rich import box
 from rich.console import Console
-from rich.table import Table
 
 from ugat_marl.effects import DOMAIN_ALIASES, PAPER_WORLDS, load_scenario
 from ugat_marl.errors import ScenarioError, install_command
+from ugat_marl.reporting import titled_table
 from ugat_marl.scenarios import Network, check_demand, resco_maps, shipped_scenarios
 
 
@@ -23,7 +22,7 @@ class ScenarioList:
 
     def run(self, console: Console) -> int:
         """Print the lists."""
-        table = Table(box=box.SIMPLE_HEAD, pad_edge=False)
+        table = titled_table("")
         table.add_column("scenario")
         for heading in ("agents", "phases", "vehicles"):
             table.add_column(heading, justify="right")

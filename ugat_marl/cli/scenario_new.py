@@ -8,14 +8,13 @@ from dataclasses import MISSING, dataclass, fields
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
-from rich import box
 from rich.console import Console
 from rich.table import Table
 from tyro.conf import Positional, arg
 
 from ugat_marl.errors import OptionError
 from ugat_marl.progress import Bars
-from ugat_marl.reporting import draw_network
+from ugat_marl.reporting import LIGHT, LightNames, draw_network, titled_table
 from ugat_marl.scenarios import (
     CountFit,
     RoadSource,
@@ -140,7 +139,7 @@ class ScenarioNew:
             soft_wrap=True,
         )
         if made.fits:
-            console.print(_fit_table(made.fits))
+            console.print(_fit_table(made.fits, LightNames.of(made.network)))
         for note in made.notes:
             console.print(f"note: {note}", markup=False, soft_wrap=True)
         where = shlex.quote(str(self.name))
@@ -251,16 +250,11 @@ class ScenarioNew:
         return shlex.join(words)
 
 
-def _fit_table(fits: Sequence[CountFit]) -> Table:
+def _fit_table(fits: Sequence[CountFit], names: LightNames) -> Table:
     """Return the counts that are met worst, with their GEH."""
     worst = sorted(fits, key=lambda fit: -fit.geh)[:MOST_COUNTS]
-    table = Table(
-        title=f"Counts and vehicles, the {len(worst)} largest GEH of {len(fits)}",
-        box=box.SIMPLE_HEAD,
-        pad_edge=False,
-        title_justify="left",
-    )
-    for name in ("light", "from", "turn", "to", "counted", "driven", "GEH"):
+    table = titled_table(f"Counts and vehicles, the {len(worst)} largest GEH of {len(fits)}")
+    for name in (LIGHT, "from", "turn", "to", "counted", "driven", "GEH"):
         right = name in ("counted", "driven", "GEH")
         table.add_column(name, justify="right" if right else "left", overflow="fold")
     for fit in worst:
@@ -268,7 +262,7 @@ def _fit_table(fits: Sequence[CountFit]) -> Table:
         start = f"{turn.street or fit.roads[0]}, {turn.approach}" if turn else fit.roads[0]
         goal = (turn.to_street if turn else "") or (fit.roads[-1] if len(fit.roads) > 1 else "")
         cells = (f"{fit.counted:g}", f"{fit.driven}", f"{fit.geh:.1f}")
-        light, way = (turn.light, turn.turn) if turn else ("", "")
+        light, way = (names.text(turn.light), turn.turn) if turn else ("", "")
         table.add_row(light, start, way, goal, *cells)
     return table
 

@@ -19,9 +19,10 @@ class Description:
     """Tables of the numbers that agents see and of the phases that they choose.
 
     Attributes:
-        observation: One row per number of each agent's observation: ``agent``, ``entry`` (its
-            place in the vector), ``of`` (the agent whose intersection it shows), ``part``
-            ("feature", "phase", "asked" or "age"), ``name`` (lane, or phase) and ``shows``.
+        observation: One row per number of each agent's observation: ``agent``, ``intersection``
+            (SUMO's id), ``entry`` (its place in the vector), ``of`` (the agent whose intersection
+            it shows), ``part`` ("feature", "phase", "asked" or "age"), ``name`` (lane, or phase)
+            and ``shows``.
         phases: One row per agent, phase and movement: ``agent``, ``intersection`` (SUMO's id),
             ``phase`` (the action), ``green_of_file`` (number of the green of the file's programme
             with the same links, from 0; null if there is none), ``from`` and ``to`` (edges),
@@ -67,7 +68,15 @@ def describe(network: Network, observer: Observer, agents: Sequence[str]) -> Des
         if observer.commands:
             entries.append((agent, "age", "", "age of the green / 60 s"))
         rows.extend(
-            {"agent": agent, "entry": number, "of": of, "part": part, "name": name, "shows": shows}
+            {
+                "agent": agent,
+                "intersection": network.intersections[place].id,
+                "entry": number,
+                "of": of,
+                "part": part,
+                "name": name,
+                "shows": shows,
+            }
             for number, (of, part, name, shows) in enumerate(entries)
         )
     movements: list[dict[str, object]] = [

@@ -18,6 +18,8 @@ from .gap_tables import objective_tables as objective_tables
 from .headroom_table import headroom_markdown as headroom_markdown
 from .learning_curves import curves_as_csv as curves_as_csv
 from .learning_curves import curves_page as curves_page
+from .light_names import LIGHT as LIGHT
+from .light_names import LightNames as LightNames
 from .phase_diagrams import draw_network as draw_network
 from .run_records import RunRecord as RunRecord
 from .run_records import TableRecord as TableRecord

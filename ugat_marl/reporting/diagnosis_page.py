@@ -27,6 +27,7 @@ from ugat_marl.files import write_whole
 from ugat_marl.reporting import diagnosis_words as words
 from ugat_marl.reporting.charts import BAND, statistics_picture
 from ugat_marl.reporting.formats import chance, number, share, signed
+from ugat_marl.reporting.light_names import LightNames
 from ugat_marl.reporting.network_maps import disagreement_map
 from ugat_marl.reporting.page import Figure, Grid, Page, render
 from ugat_marl.reporting.style import DISAGREEMENT
@@ -75,7 +76,7 @@ def write_diagnosis_page(
 
 def diagnosis_page(diagnosis: Diagnosis, network: Network, commands: Sequence[str] = ()) -> str:
     """Return the page as text; see `write_diagnosis_page`."""
-    page = Page()
+    page, names = Page(), LightNames.of(network)
     verdict, heldout = words.VERDICTS[diagnosis.verdict], diagnosis.heldout
     return render(
         "diagnosis.html.j2",
@@ -84,7 +85,7 @@ def diagnosis_page(diagnosis: Diagnosis, network: Network, commands: Sequence[st
         verdict=(_BADGES[diagnosis.verdict], verdict),
         partial=words.partial(diagnosis),
         meaning=words.meaning(diagnosis),
-        effects=_effects(diagnosis.effects),
+        effects=_effects(diagnosis.effects, names),
         judged="fitted" if diagnosis.verified_on_fitted_periods else "held-out",
         heldout=None if heldout is None else _heldout(heldout),
         expected=number(None if heldout is None else heldout.expected),
@@ -93,10 +94,10 @@ def diagnosis_page(diagnosis: Diagnosis, network: Network, commands: Sequence[st
         maps=_maps(page, diagnosis, network),
         map_key=[(f"d{place}", text) for place, (_, text) in enumerate(DISAGREEMENT)],
         statistics=_statistics(page, diagnosis),
-        where=_where(diagnosis),
+        where=_where(diagnosis, names),
         patterns=_patterns(diagnosis),
-        unnamed=_effects(diagnosis.unnamed),
-        ranking=_ranking(diagnosis),
+        unnamed=_effects(diagnosis.unnamed, names),
+        ranking=_ranking(diagnosis, names),
         courtesy=_courtesy(diagnosis),
         criteria=words.criteria_line(diagnosis),
         policy_gap=_policy_gap(diagnosis),
@@ -118,12 +119,12 @@ def commands_on_page(path: Path) -> list[str]:
     return unescape(match[1]).splitlines() if match else []
 
 
-def _effects(effects: Sequence[NamedEffect]) -> Grid | None:
+def _effects(effects: Sequence[NamedEffect], names: LightNames) -> Grid | None:
     """Return a table of the named effects with intervals; None without effects."""
     rows = [
         (
             words.effect_name(effect),
-            words.place(effect),
+            words.place(effect, names),
             words.window(effect.window) or "always",
             words.values(effect),
             effect.evidence.in_words(number),
@@ -224,22 +225,22 @@ def _strip(row: StatisticRow, *, after: bool) -> tuple[str, str, float, float | 
     return statistic(row.statistic), remark, row.z_before, row.z_after if after else None
 
 
-def _where(diagnosis: Diagnosis) -> dict[str, Grid | None] | None:
+def _where(diagnosis: Diagnosis, names: LightNames) -> dict[str, Grid | None] | None:
     """Return tables of the places where data and simulation disagree, before and after."""
     where, left = diagnosis.where, diagnosis.left
     if not where:
         return None
     return {
-        "first": _disagreements(where[:_PLACES]),
-        "more": _disagreements(where[_PLACES:]) if len(where) > _PLACES else None,
-        "left": _disagreements(left) if left else None,
+        "first": _disagreements(where[:_PLACES], names),
+        "more": _disagreements(where[_PLACES:], names) if len(where) > _PLACES else None,
+        "left": _disagreements(left, names) if left else None,
     }
 
 
-def _disagreements(disagreements: Sequence[Disagreement]) -> Grid:
+def _disagreements(disagreements: Sequence[Disagreement], names: LightNames) -> Grid:
     rows = [
         (
-            words.disagreement_place(disagreement),
+            words.disagreement_place(disagreement, names),
             disagreement.regime,
             statistic(disagreement.statistic),
             f"{signed(disagreement.size)} {disagreement.unit}".rstrip(),
@@ -266,7 +267,7 @@ def _patterns(diagnosis: Diagnosis) -> Grid | None:
     return Grid(headings, rows, headings[1:]) if rows else None
 
 
-def _ranking(diagnosis: Diagnosis) -> list[dict[str, Any]]:
+def _ranking(diagnosis: Diagnosis, names: LightNames) -> list[dict[str, Any]]:
     """Return the simulated explanations, the chosen one first."""
     if not diagnosis.alternatives:
         return []
@@ -274,8 +275,10 @@ def _ranking(diagnosis: Diagnosis) -> list[dict[str, Any]]:
     if diagnosis.effects:
         best = diagnosis.best
         left, cost = (None, None) if best is None else (best.distance, best.cost)
-        explanations.append((_set(diagnosis.effects), left, cost, True))
-    explanations += [(_set(x.effects), x.distance, x.cost, False) for x in diagnosis.alternatives]
+        explanations.append((_set(diagnosis.effects, names), left, cost, True))
+    explanations += [
+        (_set(x.effects, names), x.distance, x.cost, False) for x in diagnosis.alternatives
+    ]
     most = max(
         (distance for _, distance, _, _ in explanations if distance is not None), default=1.0
     )
@@ -298,12 +301,12 @@ def _logarithm(distance: float | None, most: float) -> float:
     return 100 * math.log1p(max(distance, 0.0)) / math.log1p(max(most, 1.0))
 
 
-def _set(effects: Sequence[EffectRecord]) -> str:
-    return " + ".join(map(_in_words, effects))
+def _set(effects: Sequence[EffectRecord], names: LightNames) -> str:
+    return " + ".join(_in_words(effect, names) for effect in effects)
 
 
-def _in_words(effect: EffectRecord) -> str:
-    place = words.place(effect)
+def _in_words(effect: EffectRecord, names: LightNames) -> str:
+    place = words.place(effect, names)
     text = words.effect_name(effect) + ("" if place == "everywhere" else f" at {place}")
     text += f", {words.window(effect.window)}" if effect.window else ""
     return f"{text} ({words.values(effect, intervals=False)})" if effect.parameters else text

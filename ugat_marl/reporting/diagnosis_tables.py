@@ -11,14 +11,20 @@ from rich.text import Text
 from ugat_marl.diagnosis import Diagnosis, HeldOut, NamedEffect, statistic
 from ugat_marl.reporting import diagnosis_words as words
 from ugat_marl.reporting.formats import chance, number, share, signed
+from ugat_marl.reporting.light_names import LightNames
 from ugat_marl.reporting.terminal import titled_table
 
 _SHOWN = 3
 """Number of disagreements in the table."""
 
 
-def diagnosis_summary(diagnosis: Diagnosis) -> RenderableType:
-    """Return verdict, effects, strongest disagreements and the numbers of the held-out periods."""
+def diagnosis_summary(diagnosis: Diagnosis, names: LightNames) -> RenderableType:
+    """Return verdict, effects, strongest disagreements and the numbers of the held-out periods.
+
+    Args:
+        diagnosis: The diagnosis.
+        names: Names of the network's lights.
+    """
     blocks: list[RenderableType] = []
     if (text := words.criteria_line(diagnosis)) is not None:
         blocks.append(Text(text))
@@ -29,9 +35,9 @@ def diagnosis_summary(diagnosis: Diagnosis) -> RenderableType:
     if diagnosis.next_measurement:
         blocks.append(Text(f"What would tell: {diagnosis.next_measurement}."))
     if diagnosis.effects:
-        blocks.append(_effects(diagnosis.effects))
+        blocks.append(_effects(diagnosis.effects, names))
     if diagnosis.where:
-        blocks.append(_where(diagnosis))
+        blocks.append(_where(diagnosis, names))
     if diagnosis.heldout is not None:
         blocks.append(_heldout(diagnosis.heldout, fitted=diagnosis.verified_on_fitted_periods))
     if diagnosis.approaches:
@@ -41,7 +47,7 @@ def diagnosis_summary(diagnosis: Diagnosis) -> RenderableType:
     return Group(*blocks)
 
 
-def _effects(effects: Sequence[NamedEffect]) -> Table:
+def _effects(effects: Sequence[NamedEffect], names: LightNames) -> Table:
     table = titled_table("effects (value with 95 % interval)")
     table.add_column("effect", overflow="fold", max_width=20)
     table.add_column("where", overflow="fold", max_width=22)
@@ -51,12 +57,12 @@ def _effects(effects: Sequence[NamedEffect]) -> Table:
     table.add_column("value", overflow="fold")
     for effect in effects:
         when = [words.window(effect.window) or "always"] if timed else []
-        cells = [words.effect_name(effect), words.place(effect), *when, words.values(effect)]
+        cells = [words.effect_name(effect), words.place(effect, names), *when, words.values(effect)]
         table.add_row(*map(Text, cells))
     return table
 
 
-def _where(diagnosis: Diagnosis) -> Table:
+def _where(diagnosis: Diagnosis, names: LightNames) -> Table:
     table = titled_table("strongest disagreements (measured minus simulated)")
     table.add_column("where", overflow="fold", max_width=18)
     table.add_column("what", overflow="fold", max_width=36)
@@ -67,12 +73,8 @@ def _where(diagnosis: Diagnosis) -> Table:
         observed = f"{disagreement.regime}: {statistic(disagreement.statistic)}"
         if disagreement.window:
             observed += f", {words.window(disagreement.window)}"
-        table.add_row(
-            *map(
-                Text,
-                (words.disagreement_place(disagreement), observed, size, signed(disagreement.z)),
-            )
-        )
+        where = words.disagreement_place(disagreement, names)
+        table.add_row(*map(Text, (where, observed, size, signed(disagreement.z))))
     return table
 
 
@@ -94,7 +96,6 @@ def _heldout(heldout: HeldOut, *, fitted: bool) -> RenderableType:
     where = "fitted periods" if fitted else "held-out periods"
     lines: list[RenderableType] = [Text(f"distance of the data from the simulation, {where}")]
     table = titled_table("")
-    table.title = None
     for heading in ("before", "after", "floor", "shrink", "p before", "p after"):
         table.add_column(heading, justify="right")
     corrected = heldout.shrink is not None

@@ -17,6 +17,7 @@ from ugat_marl.diagnosis import (
     clock,
 )
 from ugat_marl.reporting.formats import chance, number, share
+from ugat_marl.reporting.light_names import LightNames
 
 UNTRIED = 8
 """Most effects that are named as not examined; of more, the text gives their number."""
@@ -61,12 +62,13 @@ def effect_name(effect: EffectRecord) -> str:
     return effect.name.replace("_", " ")
 
 
-def place(effect: EffectRecord) -> str:
-    """Return the place of an effect."""
+def place(effect: EffectRecord, names: LightNames) -> str:
+    """Return the place of an effect; a light with its agent."""
     where = effect.place
     if where in (None, "*", ""):
         return "everywhere"
-    return " → ".join("everywhere" if part == "*" else part for part in where.split(">"))
+    parts = ("everywhere" if part == "*" else names.text(part) for part in where.split(">"))
+    return " → ".join(parts)
 
 
 def window(span: tuple[float, float] | None) -> str:
@@ -97,10 +99,10 @@ def _rounded(value: float, width: float) -> str:
     return f"{value:.{decimals}f}".replace("-", "−")
 
 
-def disagreement_place(disagreement: Disagreement) -> str:
+def disagreement_place(disagreement: Disagreement, names: LightNames) -> str:
     """Return the narrowest known place of a disagreement: lane, approach or traffic light."""
     places = (disagreement.lane, disagreement.approach, disagreement.tls)
-    return next((name for name in places if name is not None), "all of the network")
+    return next((names.text(name) for name in places if name is not None), "all of the network")
 
 
 def strongest(diagnosis: Diagnosis, count: int) -> list[Disagreement]:

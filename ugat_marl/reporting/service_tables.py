@@ -10,9 +10,10 @@ from rich.text import Text
 from ugat_marl.data import level_of_service, mean_delay_s
 from ugat_marl.experiments import Evaluation
 from ugat_marl.reporting.formats import number_text
+from ugat_marl.reporting.light_names import LIGHT, LightNames
 from ugat_marl.reporting.page import Grid
 from ugat_marl.reporting.terminal import titled_table
-from ugat_marl.scenarios import NamedApproach, Network, named_approaches
+from ugat_marl.scenarios import Network, named_approaches
 
 MOST_APPROACHES = 8
 """Most approaches in a table of the terminal."""
@@ -38,7 +39,6 @@ def service_tables(evaluation: Evaluation, network: Network) -> list[RenderableT
         evaluation: Episodes with `Scores.approaches`; without, the list is empty.
         network: The network.
     """
-    names = named_approaches(network)
     measured = {
         (policy, domain): found
         for domain in evaluation.domains
@@ -59,24 +59,23 @@ def service_tables(evaluation: Evaluation, network: Network) -> list[RenderableT
         table.add_row(*(Text(text, style="dim") for text in ("  worst approach", *cells)))
     last = evaluation.domains[-1]
     delays = {policy: measured.get((policy, last), {}) for policy in evaluation.policies}
-    return [Group(table, approach_table(f"The same by approach, in {last}", delays, names))]
+    return [Group(table, approach_table(f"The same by approach, in {last}", delays, network))]
 
 
-def approach_table(
-    title: str, delays: Mapping[str, Delays], names: Mapping[str, NamedApproach]
-) -> RenderableType:
+def approach_table(title: str, delays: Mapping[str, Delays], network: Network) -> RenderableType:
     """Return delay and level of service of the worst approaches under several controllers.
 
     Args:
         title: Title of the table.
         delays: Delays by controller; the first one decides which approaches are the worst.
-        names: Names of the approaches.
+        network: The network.
     """
+    names, lights = named_approaches(network), LightNames.of(network)
     roads = _worst_first(delays)
     shown = roads[:MOST_APPROACHES]
     more = f", the worst {len(shown)} of {len(roads)}" if len(roads) > len(shown) else ""
     table = titled_table(f"{title}{more}")
-    for heading in ("light", "approach", "road"):
+    for heading in (LIGHT, "approach", "road"):
         table.add_column(heading, overflow="fold", max_width=22)
     table.add_column("veh", justify="right")
     for name in delays:
@@ -85,28 +84,30 @@ def approach_table(
         named = names.get(road)
         cells = [delay_text(own[road][1]) if road in own else "-" for own in delays.values()]
         count = next(own[road][0] for own in delays.values() if road in own)
-        light, approach = (named.light, named.name) if named else ("", "")
+        light, approach = (lights.text(named.light), named.name) if named else ("", "")
         table.add_row(Text(light), Text(approach), Text(road), f"{count:.0f}", *cells)
     return Group(table, Text(LEGEND, style="dim"))
 
 
 def service_grid(
-    evaluation: Evaluation, policies: Sequence[str], names: Mapping[str, NamedApproach]
+    evaluation: Evaluation, policies: Sequence[str], network: Network | None
 ) -> Grid | None:
     """Return delay and level of service of all approaches in the last domain; None without any.
 
     Args:
         evaluation: The episodes.
         policies: Policies to show.
-        names: Names of the approaches; those missing are shown by their road alone.
+        network: The network; None shows approaches by their road alone.
     """
+    names = {} if network is None else named_approaches(network)
+    lights = LightNames() if network is None else LightNames.of(network)
     domain = evaluation.domains[-1]
     delays = {policy: evaluation.approaches(policy, domain) for policy in policies}
     rows: list[list[str]] = []
     for road in _worst_first(delays):
         named = names.get(road)
         cells = [delay_text(own[road][1]) if road in own else "–" for own in delays.values()]
-        texts = (named.intersection or named.light, named.name) if named else ("", "")
+        texts = (lights.whole(named.light), named.name) if named else ("", "")
         rows.append([*texts, road, *cells])
     headings = [f"{policy}, s per vehicle" for policy in delays]
     return Grid(["intersection", "approach", "road", *headings], rows, headings) if rows else None

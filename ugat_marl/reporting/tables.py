@@ -5,9 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping, Sequence
 
-from rich import box
 from rich.console import Group, RenderableType
-from rich.table import Table
 from rich.text import Text
 
 from ugat_marl.data import MEASURES
@@ -20,13 +18,8 @@ from ugat_marl.reporting.terminal import titled_table
 def transfer_table(evaluation: Evaluation) -> RenderableType:
     """Return ATT of every policy in the simulation and the real domains, with gap and regret."""
     first, *others = evaluation.domains
-    table = Table(
-        box=box.SIMPLE_HEAD,
-        title=Text(f"{evaluation.scenario}: average travel time in s (95 % interval)"),
-        title_justify="left",
-        caption=Text(_caption(evaluation)),
-        caption_justify="left",
-        pad_edge=False,
+    table = titled_table(
+        f"{evaluation.scenario}: average travel time in s (95 % interval)", _caption(evaluation)
     )
     table.add_column("policy", max_width=22)
     table.add_column(first, justify="right")
@@ -72,17 +65,10 @@ def measures_table(evaluation: Evaluation) -> RenderableType:
 
 def tuning_table(title: str, results: Sequence[Tuned]) -> RenderableType:
     """Return the best settings of each rule, the best rule first."""
-    table = Table(
-        box=box.SIMPLE_HEAD,
-        title=Text(f"{title}: rules at their best"),
-        title_justify="left",
-        caption=Text(
-            "ATT: mean in s over the tuning seeds, all vehicles due. worst: of the settings "
-            "tried. Numbers after a name are its settings; see docs/reference/rules.md."
-        ),
-        caption_justify="left",
-        pad_edge=False,
-        padding=(0, 1, 0, 0),
+    table = titled_table(
+        f"{title}: rules at their best",
+        "ATT: mean in s over the tuning seeds, all vehicles due. worst: of the settings "
+        "tried. Numbers after a name are its settings; see docs/reference/rules.md.",
     )
     table.add_column("best setting", max_width=28, overflow="fold")
     for heading in ("ATT s", "worst s", "settings", "episodes"):
@@ -107,17 +93,10 @@ def policy_gap_table(title: str, gaps: Mapping[str, PolicyGap], seeds: int) -> R
         gaps: Gap of each policy; see `ugat_marl.experiments.policy_gaps.policy_gap`.
         seeds: Number of episodes behind every number.
     """
-    table = Table(
-        box=box.SIMPLE_HEAD,
-        title=Text(title),
-        title_justify="left",
-        caption=Text(
-            f"{seeds} seeds. before: |real - sim|, after: |real - corrected|, "
-            "both in s; shrink: share of the gap that is gone."
-        ),
-        caption_justify="left",
-        pad_edge=False,
-        padding=(0, 1, 0, 0),
+    table = titled_table(
+        title,
+        f"{seeds} seeds. before: |real - sim|, after: |real - corrected|, "
+        "both in s; shrink: share of the gap that is gone.",
     )
     table.add_column("policy", max_width=24, overflow="fold")
     for heading in ("sim", "corrected", "real", "before", "after", "shrink"):

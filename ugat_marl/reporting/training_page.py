@@ -19,6 +19,7 @@ from ugat_marl.experiments import Estimate, Evaluation, check_run, is_grounded, 
 from ugat_marl.reporting import charts
 from ugat_marl.reporting.figures import NamedFigure, printable
 from ugat_marl.reporting.formats import number, share, signed
+from ugat_marl.reporting.light_names import LightNames
 from ugat_marl.reporting.network_maps import minutes_picture, node_map
 from ugat_marl.reporting.page import Figure, Grid, Page, render
 from ugat_marl.reporting.places import Places, places_of
@@ -26,7 +27,6 @@ from ugat_marl.reporting.run_groups import groups, seeds_of_one
 from ugat_marl.reporting.run_records import RunRecord, TableRecord, as_number
 from ugat_marl.reporting.service_tables import LEGEND, service_grid
 from ugat_marl.reporting.street_found import found_on_street
-from ugat_marl.scenarios import named_approaches
 
 Commands = Mapping[Path, Sequence[str]]
 """Folder of a training to the commands that repeat the training."""
@@ -385,7 +385,7 @@ def _scores(
         _file_name(record.name, "travel-times"),
     )
     caption = "Mean over the episodes with its 95 % interval."
-    names = named_approaches(places.network) if isinstance(places, Places) else {}
+    network = places.network if isinstance(places, Places) else None
     check, outcome = check_run(evaluation), outcome_of(evaluation)
     return {
         "sim": first,
@@ -394,7 +394,7 @@ def _scores(
         "episodes": len({result.seed for result in evaluation.results}),
         "table": Grid(headings, rows, headings[1:]),
         "measures": _measures(evaluation),
-        "service": service_grid(evaluation, _main_policies(evaluation), names),
+        "service": service_grid(evaluation, _main_policies(evaluation), network),
         "real": evaluation.domains[-1],
         "levels": LEGEND,
         "figures": page.figures((scores, caption), *((radar, _RADAR) for radar in radars)),
@@ -518,11 +518,12 @@ def _worst(page: Page, record: RunRecord, places: Places | None) -> dict[str, An
             (0.0, max(means.values()) or 1.0), "vehicles standing",
         )  # fmt: skip
         figures.append((picture, "Halting vehicles before each intersection."))
-    table = _worst_grid(by_policy)
+    names = LightNames() if places is None else LightNames.of(places.network)
+    table = _worst_grid(by_policy, names)
     return {"domain": domain, "table": table, "figures": page.figures(*figures)}
 
 
-def _worst_grid(by_policy: Mapping[str, Queues]) -> Grid:
+def _worst_grid(by_policy: Mapping[str, Queues], names: LightNames) -> Grid:
     """Return the intersections with the longest queues, in the order of the first policy."""
     policies = list(by_policy)
     means = {p: {tls: sum(q) / len(q) for tls, q in by_policy[p].items() if q} for p in policies}
@@ -533,7 +534,7 @@ def _worst_grid(by_policy: Mapping[str, Queues]) -> Grid:
         headings += [*numbers[-2:], f"{policy}: when"]
     rows: list[list[str]] = []
     for tls in order:
-        cells = [tls]
+        cells = [names.whole(tls)]
         for policy in policies:
             row = by_policy[policy].get(tls, ())
             if not row:
