@@ -3,12 +3,14 @@
 Run by `make docs`: ``python .ci/site.py``. The pages are staged in ``.cache/site/pages``, in the
 tree they have in the repository, so that a link that works on a code host works in the site too.
 A page of reference is written for each room, with all that its ``__init__.pyi`` exports. Broken
-links and names that cannot be resolved fail the build.
+links and names that cannot be resolved fail the build. A notebook becomes a page with its outputs.
 """
 
 from __future__ import annotations
 
 import ast
+import base64
+import json
 import os
 import re
 import shutil
@@ -44,12 +46,46 @@ def stage() -> None:
                 target = PAGES / path.relative_to(ROOT)
                 target.parent.mkdir(parents=True, exist_ok=True)
                 shutil.copyfile(path, target)
+    for book in sorted(PAGES.glob("docs/notebooks/*.ipynb")):
+        book.with_suffix(".md").write_text(notebook(book))
+    for page in PAGES.rglob("*.md"):
+        text = page.read_text()
+        if "](" in text and ".ipynb)" in text:
+            page.write_text(re.sub(r"(\]\([^()\s]*)\.ipynb\)", r"\1.md)", text))
     folder = PAGES / "docs" / "reference" / "python"
     folder.mkdir(parents=True)
     (folder / "ugat_marl.md").write_text(reference("ugat_marl", PACKAGE / "__init__.pyi"))
     for stub in sorted(PACKAGE.glob("*/__init__.pyi")):
         name = stub.parent.name
         (folder / f"{name}.md").write_text(reference(f"ugat_marl.{name}", stub))
+
+
+def notebook(book: Path) -> str:
+    """Return the page of a notebook, and write its pictures beside it.
+
+    Texts, code and outputs are all that ours hold, and the page loads nothing from elsewhere.
+    """
+    name = f"docs/notebooks/{book.name}"
+    parts: list[str] = []
+    for number, cell in enumerate(json.loads(book.read_text())["cells"]):
+        source = "".join(cell["source"]).strip()
+        if cell["cell_type"] == "markdown":
+            parts.append(source)
+            continue
+        parts.append(f"```python\n{source}\n```")
+        for place, output in enumerate(cell["outputs"]):
+            data = output.get("data", {})
+            if "image/png" in data:
+                picture = book.with_name(f"{book.stem}-{number}-{place}.png")
+                picture.write_bytes(base64.b64decode("".join(data["image/png"])))
+                parts.append(f"![Output of the code above]({picture.name})")
+            else:
+                text = "".join(output.get("text", data.get("text/plain", ""))).strip("\n")
+                text = re.sub(r"\x1b\[[\d;]*m", "", text)  # colours of a terminal
+                parts.append(f"```text\n{text}\n```")
+    title, _, rest = "\n\n".join(parts).partition("\n\n")
+    hint = f"*This page is the notebook `{name}` of the repository, with what it showed.*"
+    return f"{title}\n\n{hint}\n\n{rest}\n"
 
 
 def reference(module: str, stub: Path) -> str:

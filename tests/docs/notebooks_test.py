@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import importlib.util
 import json
 import os
 import re
@@ -74,3 +75,24 @@ def test_links_of_a_notebook_lead_somewhere(book: Path) -> None:
     targets = [target for text in texts for target in re.findall(r"\]\(([^)#]+)\)", text)]
     assert targets
     assert not [name for name in targets if not (book.parent / name).exists()]
+
+
+@pytest.mark.parametrize("book", BOOKS, ids=lambda book: book.stem)
+def test_the_site_has_a_page_of_a_notebook(book: Path, tmp_path: Path) -> None:
+    """The page has every text, every cell and every output; pictures are files beside it."""
+    spec = importlib.util.spec_from_file_location("site_builder", FOLDER.parents[1] / ".ci/site.py")
+    assert spec is not None and spec.loader is not None
+    site: Any = importlib.util.module_from_spec(spec)
+    spec.loader.exec_module(site)
+    copy = tmp_path / book.name
+    copy.write_bytes(book.read_bytes())
+    page = site.notebook(copy)
+    assert "\x1b" not in page
+    assert page.startswith("# ") and page.splitlines()[2].startswith("*This page is the notebook")
+    for cell in cells(book):
+        source = "".join(cell["source"]).strip()
+        assert all(line in page for line in source.splitlines())
+    outputs = [output for cell in code(book) for output in cell["outputs"]]
+    assert page.count("\n```text\n") + page.count("![Output") == len(outputs)
+    pictures = re.findall(r"!\[[^]]+\]\(([^)]+)\)", page)
+    assert sorted(pictures) == sorted(path.name for path in tmp_path.glob("*.png"))

@@ -10,6 +10,8 @@ from pathlib import Path
 
 import pytest
 
+import ugat_marl
+
 ROOT = Path(__file__).resolve().parents[2]
 README = (ROOT / "README.md").read_text(encoding="utf-8")
 PROJECT = tomllib.loads((ROOT / "pyproject.toml").read_text(encoding="utf-8"))["project"]
@@ -30,6 +32,19 @@ def test_the_example_runs() -> None:
     done = subprocess.run(command, cwd=ROOT, capture_output=True, text=True, check=False)
     assert done.returncode == 0, done.stderr
     assert "att_s" in done.stdout
+
+
+def test_badges_say_what_the_package_says() -> None:
+    badges = dict(re.findall(r"!\[(\w+): ([^]]+)\]\(docs/images/badge-", README))
+    least = PROJECT["requires-python"].removeprefix(">=")
+    assert badges == {
+        "version": ugat_marl.__version__,
+        "python": f"{least} or newer",
+        "licence": PROJECT["license"],
+    }
+    for name, text in badges.items():
+        picture = (ROOT / "docs" / "images" / f"badge-{name}.svg").read_text(encoding="utf-8")
+        assert re.findall(r"<text[^>]*>([^<]+)<", picture) == [name, text]
 
 
 def test_every_dependency_is_explained() -> None:

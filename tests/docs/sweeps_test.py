@@ -3,14 +3,18 @@
 from __future__ import annotations
 
 import ast
+import contextlib
 import inspect
 import re
 import subprocess
+import sys
+import types
 from pathlib import Path
 
 import pytest
 
 import ugat_marl
+from ugat_marl.data import LogCallback
 
 FOLDER = Path(__file__).resolve().parents[2] / "docs" / "how-to"
 EXAMPLES = sorted((FOLDER / "sweeps").glob("*.py"))
@@ -55,3 +59,31 @@ def test_an_example_runs(example: Path, python: list[str], tmp_path: Path) -> No
     )
     assert done.returncode == 0, done.stderr
     assert re.search(r"best travel time \d+\.\d s with .*learning_rate", done.stdout)
+
+
+@pytest.mark.parametrize("logger", ["wandb", "mlflow"])
+def test_a_logger_gets_names_that_it_takes(logger: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    """The example on the page, with a logger in place of the library and of the training."""
+    page = (FOLDER / "sweeps.md").read_text(encoding="utf-8")
+    (example,) = re.findall(rf"```python\n(import {logger}\n.*?)```", page, flags=re.DOTALL)
+    logged: dict[str, float] = {}
+    library = types.SimpleNamespace(
+        init=lambda **_: None,
+        log=logged.update,
+        start_run=contextlib.nullcontext,
+        log_metrics=lambda metrics, step: logged.update({**metrics, "step": step}),
+    )
+
+    def train(*_: str, real: str, callback: LogCallback) -> None:
+        numbers = {"effects/headway": 1.2, "effects/headway/low": 1.0}
+        callback("iteration", 1, numbers)
+        callback("evaluation", 20, {f"rule max-pressure:20/{real}/att_s": 98.2})
+
+    monkeypatch.setitem(sys.modules, logger, library)
+    monkeypatch.setattr(ugat_marl, "train", train)
+    exec(example, {})  # the page's own words
+    names = [name for name in logged if name not in ("step", "iteration", "evaluation")]
+    assert len(names) == 3
+    if logger == "mlflow":  # its store of files has a file for each name
+        assert all(re.fullmatch(r"[/\w.\- :]+", name) for name in names)
+        assert not [name for name in names if any(n.startswith(f"{name}/") for n in names)]
