@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import json
 from pathlib import Path
 
 import numpy as np
@@ -149,6 +150,31 @@ def test_broken_provenance_is_refused(tmp_path: Path, text: str) -> None:
     path = tmp_path / "log.parquet"
     write_hashed(recorded().frame, path, {METADATA_KEY: text})
     with pytest.raises(LogError, match=r"log\.parquet: provenance"):
+        TransitionLog.read(path)
+
+
+@pytest.mark.parametrize(
+    ("key", "value"),
+    [
+        ("decision_interval_s", "NaN"),
+        ("decision_interval_s", "Infinity"),
+        ("decision_interval_s", str(1 << 63) + "0" * 400),
+        ("seeds", f"[{1 << 63}]"),
+        ("seeds", "[NaN]"),
+        ("deviation", '{"lane": NaN}'),
+        ("versions", f'{{"sumo": {1 << 63}}}'),
+        ("layouts", f'{{"a": {{"features": {1 << 63}, "phases": 2}}}}'),
+    ],
+)
+def test_provenance_with_impossible_numbers_is_refused(
+    key: str, value: str, tmp_path: Path
+) -> None:
+    path = tmp_path / "log.parquet"
+    recorded().write(path)
+    text = pl.read_parquet_metadata(path)[METADATA_KEY]
+    given = json.loads(text) | {key: "HERE"}
+    write_hashed(recorded().frame, path, {METADATA_KEY: json.dumps(given).replace('"HERE"', value)})
+    with pytest.raises(LogError, match=r"log\.parquet: (provenance|AgentLayout)"):
         TransitionLog.read(path)
 
 

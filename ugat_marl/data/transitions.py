@@ -98,10 +98,13 @@ class Provenance:
     def __post_init__(self) -> None:
         if self.source not in SOURCES:
             raise LogError(f"provenance: source is {self.source!r}; allowed: {', '.join(SOURCES)}")
-        if not self.decision_interval_s > 0:
+        if not 0 < self.decision_interval_s < np.inf:
             raise LogError(
                 f"provenance: decision_interval_s is {self.decision_interval_s}; must be > 0"
             )
+        for lane, vehicles in self.deviation.items():
+            if not 0 <= vehicles < np.inf:
+                raise LogError(f"provenance: deviation of lane {lane!r} is {vehicles!r}")
         if not self.layouts:
             raise LogError("provenance: layouts is empty; name at least one agent")
 
@@ -122,6 +125,12 @@ class Provenance:
             if content.pop("format") != FORMAT:
                 raise LogError(f"provenance has another format; this version reads {FORMAT}")
             layouts = {name: AgentLayout(**part) for name, part in content.pop("layouts").items()}
+            for seed in content["seeds"]:
+                if type(seed) is not int or not 0 <= seed < 1 << 63:
+                    raise LogError(f"provenance: {seed!r} among the seeds is no seed of an episode")
+            for told in (*content["versions"].values(), *content["units"].values()):
+                if not isinstance(told, str):
+                    raise LogError(f"provenance: {told!r} is no version and no unit")
             return cls(seeds=tuple(content.pop("seeds")), layouts=layouts, **content)
         except (ValueError, TypeError, KeyError, AttributeError) as error:
             raise LogError(f"provenance cannot be understood ({error!r})") from None
