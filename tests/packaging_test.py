@@ -119,3 +119,8 @@ def test_importing_is_cheap() -> None:
         "sys.exit(bool({'torch', 'libsumo', 'matplotlib', 'gymnasium'} & {*sys.modules}))"
     )
     assert subprocess.run([sys.executable, "-c", code], check=False).returncode == 0
+
+
+def test_a_look_at_a_scenario_needs_no_torch() -> None:
+    code = "import sys, ugat_marl.cli.scenario_check; sys.exit('torch' in sys.modules)"
+    assert subprocess.run([sys.executable, "-c", code], check=False).returncode == 0

@@ -7,7 +7,7 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
@@ -26,25 +26,25 @@ from ugat_marl.parallel import (
 from ugat_marl.policies import (
     RULES,
     STANDARD_RULES,
-    NetworkPolicy,
     OwnLearnerFactory,
     Policy,
     PolicyFactory,
     StepCallback,
     is_own,
     load_own,
-    load_policy,
     make_rule,
     own_policy,
     parse_rule,
     race,
     roll_out,
-    rule_in,
     stop_callback,
 )
 from ugat_marl.progress import Reporter, Silent
 from ugat_marl.scenarios import Scenario
 from ugat_marl.simulation import ApproachDelays, kept_warm, measured_approaches
+
+if TYPE_CHECKING:
+    from ugat_marl.policies import NetworkPolicy
 
 Watch = Callable[[str, str, TrafficEnv], StepCallback]
 """Maker of a callback from the name of the policy, the name of the domain and the environment. The
@@ -286,6 +286,8 @@ def policy_factory(spec: str) -> PolicyFactory:
         raise CheckpointError(f"{path} is a folder; name the .pt file of a policy in it")
     if path.suffix != ".pt" and not path.is_file() and "/" not in spec:
         return rule_factory(spec)
+    from ugat_marl.policies import load_policy, rule_in  # torch, which rules do without
+
     if (rule := rule_in(path)) is not None:  # a fitted street may keep a rule
         return rule_factory(rule)
     return TrainedPolicy(load_policy(spec), spec)
