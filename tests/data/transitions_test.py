@@ -163,6 +163,7 @@ def test_broken_provenance_is_refused(tmp_path: Path, text: str) -> None:
         ("seeds", "[NaN]"),
         ("deviation", '{"lane": NaN}'),
         ("versions", f'{{"sumo": {1 << 63}}}'),
+        ("layouts", '{"a": {"features": NaN, "phases": 2}}'),
         ("layouts", f'{{"a": {{"features": {1 << 63}, "phases": 2}}}}'),
     ],
 )

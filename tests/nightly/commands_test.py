@@ -30,7 +30,7 @@ ELSEWHERE = {
     r"ugat-marl field ": "waits for a street; played by tests/field",
     r"--ray": "needs Ray; executors_test",
     r"--device cuda": "needs a GPU",
-    r"(maskable|sb3|ip)-?po": "needs the library of a baseline; `make compat`",
+    r"(maskable-p|ip)po": "needs the library of a baseline; `make compat`",
     r"runs/pretraining|runs/ippo": "a file of baselines/",
     r"import-atspm|my-scenario street": "played by tests/data/measured_atspm_test.py",
     r"synchro\.csv": "played by tests/scenarios/signal_plans_test.py",

@@ -125,6 +125,9 @@ class Provenance:
             if content.pop("format") != FORMAT:
                 raise LogError(f"provenance has another format; this version reads {FORMAT}")
             layouts = {name: AgentLayout(**part) for name, part in content.pop("layouts").items()}
+            for name, layout in layouts.items():
+                if not all(type(size) is int for size in dataclasses.astuple(layout)):
+                    raise LogError(f"provenance: the sizes of agent {name!r} are no whole numbers")
             for seed in content["seeds"]:
                 if type(seed) is not int or not 0 <= seed < 1 << 63:
                     raise LogError(f"provenance: {seed!r} among the seeds is no seed of an episode")
