@@ -136,8 +136,8 @@ def stock(tmp_path_factory: pytest.TempPathFactory) -> Path:
     do("scenario new town --osm town.osm --counts docs/tutorials/town/counts.csv")
     do("scenario new my-grid --grid 1x2 --vph 200 --duration-s 600")
     do("scenario new my-town --arterial 2 --vph 200 --duration-s 600")
-    for name in ("my-city", "my-scenario"):
-        shutil.copytree(folder / "town", folder / name)
+    for name in ("my-city", "my-scenario"):  # the network of found/corrected and of the logs
+        shutil.copytree(ROOT / "scenarios" / "single-v1", folder / name)
     do("plan single-v1 --out plans.csv")
     do("plan single-v1 --apply plans.csv --out my-planned")
     for name in ("diagnosis", "found", "corrected"):
