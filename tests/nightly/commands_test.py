@@ -146,7 +146,7 @@ def stock(tmp_path_factory: pytest.TempPathFactory) -> Path:
         configure(folder, place)
     for scenario in ("single-v1", "grid2x2-v1"):
         do(f"train {scenario} --real V4 --out {scenario}/first --no-control")
-        for name in ("second", "demo", "s0", "s1", "corrected", "street", "paper"):
+        for name in ("second", "demo", "s0", "s1", "corrected", "street", "paper", "paper-small"):
             shutil.copytree(folder / scenario / "first", folder / scenario / name)
         do(f"record {scenario} --domain V4 --lanes --out {scenario}-measured")
         do(f"rollout {scenario} --domain V4 --episodes 2 --out {scenario}.parquet --crossings")
