@@ -366,7 +366,8 @@ class Worker:
             )
         if _FULL_MEMORY.search(words):
             return f"the simulator process {self._pid} died during {doing!r}: {too_much_memory()}"
-        said = f"it said: {words}" if words else "it said nothing (killed, or out of memory?)"
+        doubt = f"killed, or out of memory? {MEMORY_VARIABLE} sets the limit"
+        said = f"it said: {words}" if words else f"it said nothing ({doubt})"
         return (
             f"the simulator process {self._pid} died{status} during {doing!r}; {said}. "
             "Other environments go on; reset() starts this one afresh"
