@@ -9,6 +9,7 @@ import signal
 import subprocess
 import sys
 import threading
+import time
 from collections.abc import Iterator
 from concurrent.futures import Executor, ThreadPoolExecutor
 from concurrent.futures.process import BrokenProcessPool
@@ -106,6 +107,13 @@ def results(workers: Any, policies: Any = None) -> Any:
     ).results
 
 
+STOPS = """
+import os, pathlib, signal
+mark = pathlib.Path({mark!r})
+if not mark.exists():
+    mark.touch()
+    os.kill(os.getpid(), signal.SIGSTOP)
+"""
 DIES = """
 import os, pathlib
 folder = pathlib.Path({folder!r})
@@ -136,15 +144,8 @@ def test_a_stopped_process_is_killed_and_its_part_repeated(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setenv(DEADLINE_VARIABLE, "15")  # an interpreter starts within it
-    once = f"""
-import os, pathlib, signal
-mark = pathlib.Path({str(tmp_path / "mark")!r})
-if not mark.exists():
-    mark.touch()
-    os.kill(os.getpid(), signal.SIGSTOP)
-"""
     with LocalProcesses(1) as processes:
-        processes.submit(exec, once).result(120)
+        processes.submit(exec, STOPS.format(mark=str(tmp_path / "mark"))).result(120)
         assert (tmp_path / "mark").exists()
 
 
@@ -323,6 +324,17 @@ def test_ray_s_errors_are_the_parts_own(ray: Executor) -> None:
 def test_ray_replaces_a_worker_that_dies(ray: Executor, tmp_path: Path) -> None:
     list(as_done(ray, exec, [(DIES.format(folder=str(tmp_path), times=2),)], Stop()))
     assert len(list(tmp_path.iterdir())) == 3
+
+
+def test_ray_replaces_a_worker_that_is_stopped(
+    ray: Executor, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setenv(DEADLINE_VARIABLE, "4")
+    part = ray.submit(exec, STOPS.format(mark=str(tmp_path / "mark")))
+    long = ray.submit(time.sleep, 12.0)  # longer than the deadline, and alive
+    part.result(120)
+    assert (tmp_path / "mark").exists()
+    long.result(120)
 
 
 def test_what_is_watched_is_played_here(ray: Executor) -> None:

@@ -10,8 +10,10 @@ from __future__ import annotations
 
 import contextlib
 import functools
+import logging
 import multiprocessing
 import os
+import signal
 import sys
 import threading
 import time
@@ -26,7 +28,7 @@ from concurrent.futures import (
 )
 from concurrent.futures.process import BrokenProcessPool
 from pathlib import Path
-from typing import Any, TypeVar
+from typing import Any, NamedTuple, TypeVar
 
 from ugat_marl.errors import OptionError, SimulatorCrashed, install_command
 
@@ -38,7 +40,6 @@ DEADLINE_S = 900.0
 minutes, so half of it would kill honest simulations on slow machines."""
 DEADLINE_VARIABLE = "UGAT_MARL_DEADLINE_S"
 """Environment variable that replaces `DEADLINE_S`."""
-
 
 _BEAT_S = 1.0
 """Seconds between two signs of life of a process."""
@@ -91,10 +92,10 @@ def deadline_of(place: str, text: str) -> float:
     Raises:
         OptionError: It is not a number of seconds above 0.
     """
+    seconds = None
     with contextlib.suppress(ValueError):  # Python reads 1_000 and digits of other scripts, too
-        if text.isascii() and "_" not in text and 0 < (seconds := float(text)) < float("inf"):
-            return seconds
-    raise OptionError(f"{place}: give a number of seconds above 0")
+        seconds = float(text) if text.isascii() and "_" not in text else None
+    return _seconds(seconds, place)
 
 
 def require_deadline(deadline_s: Any) -> None:
@@ -106,11 +107,15 @@ def require_deadline(deadline_s: Any) -> None:
     Raises:
         OptionError: It is something else.
     """
-    if deadline_s is None:
-        return
-    number = isinstance(deadline_s, int | float) and not isinstance(deadline_s, bool)
-    if not number or not 0 < deadline_s < float("inf"):
-        raise OptionError(f"deadline_s = {deadline_s!r}: give a number of seconds above 0")
+    if deadline_s is not None:
+        _seconds(deadline_s, f"deadline_s = {deadline_s!r}")
+
+
+def _seconds(value: Any, place: str) -> float:
+    number = isinstance(value, int | float) and not isinstance(value, bool)
+    if not number or not 0 < value < float("inf"):
+        raise OptionError(f"{place}: give a number of seconds above 0")
+    return value
 
 
 def show_life(sign: Callable[[], object]) -> None:
@@ -326,7 +331,9 @@ class RayExecutor(Executor):
     """Ray as a standard executor; every part is a task on one core.
 
     Ray repeats a task if its process or machine died. A repeated task gives the same result,
-    because results depend only on the arguments. The suite must be installed on all machines.
+    because results depend only on the arguments. A process that gives no sign of life for the time
+    of `usual_deadline_s`, because it is stopped, is killed. The suite must be installed on all
+    machines.
 
     Args:
         address: ``"local"`` starts Ray on this machine; ``"auto"``, ``"host:port"`` or
@@ -355,7 +362,7 @@ class RayExecutor(Executor):
                     address=address,
                     runtime_env={"env_vars": variables},
                     log_to_driver=False,
-                    logging_level="error",
+                    logging_level=logging.ERROR,
                     **known,
                 )
             except (ConnectionError, ValueError, RuntimeError) as error:
@@ -364,9 +371,11 @@ class RayExecutor(Executor):
                     "local, auto, host:port or ray://host:port"
                 ) from None
         self._task: Any = ray.remote(num_cpus=1, max_retries=RETRIES)(_call)
+        self._signs: Any = ray.remote(num_cpus=0, max_restarts=-1)(_Signs).remote()
         self._running: dict[Future[Any], Any] = {}
         self._lock = threading.Lock()
         self._is_open = True
+        threading.Thread(target=self._watch, daemon=True).start()
 
     @property
     def parts_at_a_time(self) -> int:
@@ -378,7 +387,7 @@ class RayExecutor(Executor):
         if not self._is_open:
             raise RuntimeError("cannot schedule new futures after shutdown")
         future: Future[Any] = Future()
-        reference = self._task.remote(fn, args, kwargs)
+        reference = self._task.remote(self._signs, fn, args, kwargs)
         with self._lock:
             self._running[future] = reference
         reference.future().add_done_callback(lambda found: self._settle(future, found))
@@ -416,9 +425,95 @@ class RayExecutor(Executor):
         if reference is not None and future.cancelled():
             self._ray.cancel(reference, force=True)
 
+    def _watch(self) -> None:
+        """Kill processes that run a part and give no sign of life, until the executor is closed.
 
-def _call(fn: Callable[..., Any], args: tuple[Any, ...], kwargs: dict[str, Any]) -> Any:
+        Ray itself notices machines and processes that are gone, and none that are stopped.
+        """
+        from ray.util.scheduling_strategies import (  # pyright: ignore[reportMissingImports]
+            NodeAffinitySchedulingStrategy,
+        )
+
+        kill = self._ray.remote(num_cpus=0, max_retries=0)(_kill)
+        counts: dict[_Place, int] = {}
+        pulses: dict[_Place, Pulse] = {}
+        while self._is_open:
+            time.sleep(_BEAT_S)
+            with self._lock:
+                parts = {reference.task_id().hex() for reference in self._running.values()}
+            with contextlib.suppress(Exception):  # the machine of the signs may be lost for a while
+                now = self._ray.get(self._signs.of.remote(parts), timeout=60)
+                counts.clear()
+                counts.update(now)
+                pulses = {
+                    place: pulses.get(place) or Pulse(functools.partial(counts.__getitem__, place))
+                    for place in counts
+                }
+                for place in [place for place, pulse in pulses.items() if pulse.is_lost()]:
+                    there = NodeAffinitySchedulingStrategy(place.node, soft=False)
+                    kill.options(scheduling_strategy=there).remote(place.process)
+                    self._signs.forget.remote(place.part)
+
+
+class _Place(NamedTuple):
+    """Where a part runs."""
+
+    part: str
+    node: str
+    process: int
+
+
+class _Signs:
+    """Signs of life of the processes that run parts, counted in a process of Ray."""
+
+    def __init__(self) -> None:
+        self._counts: dict[str, tuple[_Place, int]] = {}
+
+    def add(self, place: _Place) -> None:
+        """Count a sign of the process that runs a part."""
+        last, count = self._counts.get(place.part, (place, 0))
+        self._counts[place.part] = (place, count + 1 if last == place else 1)
+
+    def forget(self, part: str) -> None:
+        """Leave a part out until its next sign."""
+        self._counts.pop(part, None)
+
+    def of(self, parts: set[str]) -> dict[_Place, int]:
+        """Return the number of signs for each of these parts that has begun; forget all others."""
+        self._counts = {part: sign for part, sign in self._counts.items() if part in parts}
+        return dict(self._counts.values())
+
+
+class _Life:
+    """What runs in this process of Ray, and who counts its signs of life."""
+
+    signs: Any = None
+    place: _Place
+
+    @classmethod
+    def show(cls) -> None:
+        """Give a sign of life."""
+        cls.signs.add.remote(cls.place)
+
+
+def _call(signs: Any, fn: Callable[..., Any], args: tuple[Any, ...], kwargs: dict[str, Any]) -> Any:
+    import ray  # pyright: ignore[reportMissingImports]
+
+    here: Any = ray.get_runtime_context()
+    is_first = _Life.signs is None
+    _Life.place = _Place(here.get_task_id(), here.get_node_id(), os.getpid())
+    _Life.signs = signs
+    if is_first:
+        show_life(_Life.show)
+    _Life.show()
     return fn(*args, **kwargs)
+
+
+def _kill(process: int) -> None:
+    """Kill a process of Ray on this machine; another one may have its number by now."""
+    name = Path(f"/proc/{process}/cmdline")
+    if not name.parent.parent.exists() or b"ray" in name.read_bytes():
+        os.kill(process, signal.SIGKILL)
 
 
 def _import_path() -> str:
