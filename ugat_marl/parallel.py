@@ -456,7 +456,7 @@ class RayExecutor(Executor):
 
 
 class _Place(NamedTuple):
-    """Where a part runs."""
+    """Machine and process of a running part."""
 
     part: str
     node: str
@@ -485,7 +485,7 @@ class _Signs:
 
 
 class _Life:
-    """What runs in this process of Ray, and who counts its signs of life."""
+    """Part of this process of Ray, and the counter of its signs of life."""
 
     signs: Any = None
     place: _Place
