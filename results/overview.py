@@ -97,7 +97,7 @@ def heading(page: Path) -> str:
 def overview(folder: Path = FOLDER) -> str:
     """Return the overview as Markdown: every domain of every table of transfer, and means."""
     lines = [
-        "| table | | direct transfer (regret) | UGAT, timed | timed, rewards matched "
+        "| table | | direct transfer (regret) | timed | timed, rewards matched "
         "| fitted street | more plain `sim` | constant delay | trained in real | best rule there |",
         "|---|---|---:|---:|---:|---:|---:|---:|---:|---:|",
     ]

@@ -17,14 +17,14 @@ from ugat_marl.__main__ import COMMANDS, LINE, main
 from ugat_marl.cli import frame
 from ugat_marl.errors import install_command
 from ugat_marl.experiments.jobs import file_name
-from ugat_marl.experiments.settings import CONTROL, CORRECTED, DIRECT, STREET, TIMED, UGAT
+from ugat_marl.experiments.settings import CONTROL, CORRECTED, DIRECT, PHASE, STREET, TIMED
 
 ROOT = Path(__file__).resolve().parents[2]
 PAGES = [
     *(ROOT / name for name in ("README.md", "scenarios/README.md", "baselines/README.md")),
     *sorted((ROOT / "docs").rglob("*.md")),
 ]
-WRITTEN = {file_name(name) for name in (CONTROL, CORRECTED, DIRECT, STREET, TIMED, UGAT)}
+WRITTEN = {file_name(name) for name in (CONTROL, CORRECTED, DIRECT, PHASE, STREET, TIMED)}
 """Names of the policies that a run writes, without suffix."""
 
 ALGORITHM = """

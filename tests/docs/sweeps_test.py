@@ -48,7 +48,7 @@ def test_an_example_uses_the_public_functions_alone(example: Path) -> None:
 @pytest.mark.timeout(900)  # two trainings
 @pytest.mark.parametrize("example", EXAMPLES, ids=lambda path: path.stem)
 def test_an_example_runs(example: Path, python: list[str], tmp_path: Path) -> None:
-    pytest.importorskip(NEEDS[example.stem])
+    pytest.importorskip(NEEDS[example.stem], exc_type=ImportError)
     budget = ["--trials", "2", "--episodes", "1", "--duration-s", "120"]
     done = subprocess.run(
         [*python, str(example), *budget, "--out", str(tmp_path / "runs")],

@@ -35,47 +35,57 @@ def trials(setting: str, by_seed: dict[int | None, tuple[float, float]]) -> list
 def found() -> Comparison:
     rows = [
         *trials("direct transfer", {0: (70.0, 200.0), 1: (72.0, 240.0)}),
-        *trials("UGAT", {1: (71.0, 150.0), 0: (71.0, 130.0)}),
+        *trials("phase (the paper's UGAT)", {1: (71.0, 150.0), 0: (71.0, 130.0)}),
         *trials("constant delay 2 s", {0: (70.0, 120.0), 1: (70.0, 160.0)}),
         *trials("best rule, tuned there", {None: (80.0, 120.0)}),
     ]
-    kinds = {"constants": ("constant delay 2 s",), "grounded": ("UGAT",)}
+    kinds = {"constants": ("constant delay 2 s",), "grounded": ("phase (the paper's UGAT)",)}
     return Comparison("toy", "0" * 8, "sim", tuple(rows), {}, **kinds)
 
 
 def test_values_are_in_the_order_of_the_training_seeds(found: Comparison) -> None:
     assert found.training_seeds == [0, 1]
-    assert found.values("UGAT", "V4", "att_s").tolist() == [130.0, 150.0]
+    assert found.values("phase (the paper's UGAT)", "V4", "att_s").tolist() == [130.0, 150.0]
     assert found.values("best rule, tuned there", "V4", "att_s").tolist() == [120.0, 120.0]
     assert found.gaps("direct transfer", "V4", "att_s").tolist() == [130.0, 168.0]
 
 
 def test_regret_won_back_by_hand(found: Comparison) -> None:
     assert found.best("V4") == "best rule, tuned there"
-    assert found.won_back("UGAT", "V4", "direct transfer") == pytest.approx((220 - 140) / 100)
+    assert found.won_back("phase (the paper's UGAT)", "V4", "direct transfer") == pytest.approx(
+        (220 - 140) / 100
+    )
     assert found.won_back("direct transfer", "V4", "direct transfer") == 0.0
     assert found.won_back("best rule, tuned there", "V4", "direct transfer") == 1.0
-    assert found.regret_s("UGAT", "V4").tolist() == [10.0, 30.0]
+    assert found.regret_s("phase (the paper's UGAT)", "V4").tolist() == [10.0, 30.0]
     # the gap: 149 s before, (130 - 71 + 150 - 71) / 2 = 69 after
-    assert found.reduction("UGAT", "V4", "direct transfer") == pytest.approx(1 - 69 / 149)
+    assert found.reduction("phase (the paper's UGAT)", "V4", "direct transfer") == pytest.approx(
+        1 - 69 / 149
+    )
 
 
 def test_nothing_to_win_has_no_share() -> None:
-    rows = trials("direct transfer", {0: (70.0, 80.0)}) + trials("UGAT", {0: (70.0, 90.0)})
+    rows = trials("direct transfer", {0: (70.0, 80.0)}) + trials(
+        "phase (the paper's UGAT)", {0: (70.0, 90.0)}
+    )
     found = Comparison("toy", "0", "sim", tuple(rows), {})
-    assert math.isnan(found.won_back("UGAT", "V4", "direct transfer"))
+    assert math.isnan(found.won_back("phase (the paper's UGAT)", "V4", "direct transfer"))
 
 
 def test_what_loses_nothing_on_the_way_has_no_gap_to_make_smaller() -> None:
-    rows = trials("direct transfer", {0: (90.0, 80.0)}) + trials("UGAT", {0: (70.0, 290.0)})
+    rows = trials("direct transfer", {0: (90.0, 80.0)}) + trials(
+        "phase (the paper's UGAT)", {0: (70.0, 290.0)}
+    )
     found = Comparison("toy", "0", "sim", tuple(rows), {})
-    assert math.isnan(found.reduction("UGAT", "V4", "direct transfer"))
+    assert math.isnan(found.reduction("phase (the paper's UGAT)", "V4", "direct transfer"))
     served = [
         replace(row, scores=replace(row.scores, throughput=30.0 if row.domain == "V4" else 50.0))
         for row in rows
     ]
     found = Comparison("toy", "0", "sim", tuple(served), {})
-    assert found.reduction("UGAT", "V4", "direct transfer", "throughput") == 0.0  # fewer: a gap
+    assert (
+        found.reduction("phase (the paper's UGAT)", "V4", "direct transfer", "throughput") == 0.0
+    )  # fewer: a gap
 
 
 def test_episodes_that_broke_down_are_counted_one_by_one() -> None:
@@ -113,12 +123,12 @@ def test_bars_are_told_apart_within_the_picture(shared: str, tmp_path: Path) -> 
 def test_pages_hold_the_numbers(found: Comparison) -> None:
     page = comparison_page(found, "direct transfer", "main", FACTS)
     assert "# toy: main" in page
-    assert "| UGAT | −54 % |" in page
-    assert "| UGAT | 0.80 |" in page
+    assert "| phase (the paper's UGAT) | −54 % |" in page
+    assert "| phase (the paper's UGAT) | 0.80 |" in page
     assert "| direct transfer | 100 (-154 to 354) |" in page  # t = 12.71, 20 s apart from the mean
     assert "| best constant | constant delay 2 s |" in page
-    assert "| UGAT | -80.0 (" in page
+    assert "| phase (the paper's UGAT) | -80.0 (" in page
     table = comparison_csv(found).splitlines()
     assert len(table) == 5
     assert table[0].startswith("scenario,setting,domain,training_seeds,att_s,")
-    assert "UGAT,V4,0,130.0,71.0,0.0" in seeds_csv(found).splitlines()
+    assert "phase (the paper's UGAT),V4,0,130.0,71.0,0.0" in seeds_csv(found).splitlines()

@@ -32,7 +32,8 @@ def row(name: str, config: PaperConfig = SHORT, table: str = "main") -> Setting:
 def test_main_has_the_controls_an_honest_table_needs() -> None:
     names = [setting.name for setting in SHORT.settings("main")]
     assert names == [
-        "direct transfer", "UGAT", "UGAT, timed", "fitted street", "UGAT, timed: rewards matched",
+        "direct transfer", "phase (the paper's UGAT)", "timed", "fitted street",
+        "timed: rewards matched",
         "more plain sim",
         "domain randomisation", "random delay", "penalty on changes",
         *(f"constant delay {s} s" for s in (1, 2, 3, 4, 5, 6)),
@@ -44,7 +45,7 @@ def test_rewards_are_matched_in_the_row_that_says_so_alone() -> None:
     matching = {
         setting.name for table in TABLES for setting in SHORT.settings(table) if setting.matches
     }
-    assert matching == {"UGAT, timed: rewards matched"}
+    assert matching == {"timed: rewards matched"}
 
 
 def test_rows_share_what_is_given_and_keep_what_they_are_named_for() -> None:
@@ -57,10 +58,10 @@ def test_rows_share_what_is_given_and_keep_what_they_are_named_for() -> None:
     assert all(own.inputs.hops == 1 for own in grounded.values())
     assert all(own.gate.window_epochs == 3 for own in grounded.values())
     named = {name: own.fit.uncertainty for name, own in grounded.items()}
-    assert {named.pop(f"{name}: no uncertainty (GAT)") for name in ("UGAT", TIMED)} == {"none"}
+    assert {named.pop(f"{name}: no uncertainty (GAT)") for name in ("phase", TIMED)} == {"none"}
     assert set(named.values()) == {"dropout"}
     pairs = {name for name, own in grounded.items() if own.fit.pairs == "smoothed"}
-    assert pairs == {"UGAT: h on smoothed pairs"}
+    assert pairs == {"phase: h on smoothed pairs"}
     without = {name for name, own in grounded.items() if own.timed.answer == "constant"}
     assert without == {f"{TIMED}: lost times without h"}
 
@@ -79,7 +80,7 @@ def test_the_ablation_of_a_street_has_its_parts_and_its_residuals() -> None:
 
 def test_the_ablation_has_a_row_for_each_departure_from_the_paper() -> None:
     rows = {s.name: s.ugat for s in SHORT.settings("ablation") if s.ugat is not None}
-    for name in ("UGAT", TIMED):
+    for name in ("phase", TIMED):
         assert rows[f"{name}: own heads"].inverse.head == "own"
         of_h, after_f = (rows[f"{name}: several f, u of h{x}"] for x in ("", " after f"))
         assert of_h.forward == after_f.forward and of_h.forward.members > 1
@@ -90,7 +91,7 @@ def test_the_ablation_has_a_row_for_each_departure_from_the_paper() -> None:
 
 def test_rewards_that_cannot_be_matched_have_no_such_row() -> None:
     names = [setting.name for setting in replace(SHORT, reward="pressure").settings("main")]
-    assert "UGAT, timed" in names and "UGAT, timed: rewards matched" not in names
+    assert "timed" in names and "timed: rewards matched" not in names
 
 
 @pytest.mark.parametrize("table", TABLES)
@@ -101,7 +102,7 @@ def test_rows_of_a_table_have_names_of_their_own_and_begin_with_direct_transfer(
 
 
 def test_rows_can_be_picked_and_keep_their_order() -> None:
-    some = replace(SHORT, rows=("trained in real", "UGAT, timed"))
+    some = replace(SHORT, rows=("trained in real", "timed"))
     assert [x.name for x in some.settings("main")] == [DIRECT, TIMED, "trained in real"]
     with pytest.raises(UnknownNameError, match="trained in real"):
         replace(SHORT, rows=("traned in real",)).settings("main")
@@ -127,11 +128,11 @@ def test_every_policy_has_as_many_episodes() -> None:
 
 
 def test_tables_share_trainings() -> None:
-    main_names = {job.name for job in planner().jobs(row("UGAT"))}
+    main_names = {job.name for job in planner().jobs(row("phase (the paper's UGAT)"))}
     for table, name in (
-        ("ablation", "UGAT"),
-        ("alpha", "UGAT"),
-        ("uncertainty", "UGAT: evidential"),
+        ("ablation", "phase (the paper's UGAT)"),
+        ("alpha", "phase (the paper's UGAT)"),
+        ("uncertainty", "phase: evidential"),
     ):
         one_domain = replace(SHORT, domains=("V1",))
         own = planner(one_domain, table).jobs(row(name, one_domain, table))
@@ -139,7 +140,7 @@ def test_tables_share_trainings() -> None:
 
 
 def test_what_decides_a_policy_decides_its_folder() -> None:
-    (first, *_) = planner().jobs(row("UGAT"))
+    (first, *_) = planner().jobs(row("phase (the paper's UGAT)"))
     other = UgatConfig(grounded_episodes=6)
     for change in (
         {"seed": 7},

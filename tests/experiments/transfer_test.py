@@ -82,7 +82,7 @@ def test_every_control_is_trained_as_long_as_it_says_where_it_says(
     config = replace(SMALL, **CONTROLS)
     found = transfer(config, tmp_path)
     names = [
-        "direct transfer", "UGAT", "more plain sim", "random delay 0-5 s",
+        "direct transfer", "phase (the paper's UGAT)", "more plain sim", "random delay 0-5 s",
         "fine-tuned on the same data", "domain randomisation", "trained in real",
     ]  # fmt: skip
     assert trained(found) == names
@@ -126,12 +126,12 @@ def test_domains_whose_names_differ_by_a_sign_are_trained_in_one_by_one(tmp_path
 
 def test_controls_can_be_added_to_a_run_and_change_nothing_else(tmp_path: Path) -> None:
     transfer(SMALL, tmp_path / "run")
-    policies = ("ugat", "direct-transfer", "trained-in-real", "random-delay-0-5-s")
-    before = weights(tmp_path / "run", "ugat")
+    policies = ("phase", "direct-transfer", "trained-in-real", "random-delay-0-5-s")
+    before = weights(tmp_path / "run", "phase")
     more = replace(SMALL, oracle=True, random_delay_s=5)
     transfer(more, tmp_path / "run", resume=True)
     transfer(more, tmp_path / "at once")
-    assert np.array_equal(before, weights(tmp_path / "run", "ugat"))
+    assert np.array_equal(before, weights(tmp_path / "run", "phase"))
     for name in policies:
         one, two = (weights(tmp_path / run, name) for run in ("run", "at once"))
         assert np.array_equal(one, two), name
@@ -216,7 +216,9 @@ def test_with_the_same_world_nothing_real_is_ever_seen(tmp_path: Path) -> None:
         log = TransitionLog.read(checkpoint_of(tmp_path / run) / "real-000.parquet")
         assert log.provenance.domain == "sim" and follows(tmp_path / run) == 1.0
     # Where a policy is judged decides nothing about its training.
-    assert np.array_equal(weights(tmp_path / "alone", "ugat"), weights(tmp_path / "judged", "ugat"))
+    assert np.array_equal(
+        weights(tmp_path / "alone", "phase"), weights(tmp_path / "judged", "phase")
+    )
 
 
 def test_shuffled_data_of_the_street_lead_nowhere(tmp_path: Path) -> None:

@@ -66,7 +66,10 @@ def unbroken(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 def test_a_run_leaves_what_it_promises(unbroken: Path) -> None:
     table = json.loads((unbroken / "table.json").read_text())
-    assert {row["policy"] for row in table["summary"]} >= {"direct transfer", "UGAT"}
+    assert {row["policy"] for row in table["summary"]} >= {
+        "direct transfer",
+        "phase (the paper's UGAT)",
+    }
     assert {row["domain"] for row in table["summary"]} == {"sim", "V4"}
     assert table["scenario_hash"] == load_scenario("single-v1").hash
     metrics = Metrics.read(unbroken / "metrics.parquet")
@@ -81,7 +84,7 @@ def test_a_run_leaves_what_it_promises(unbroken: Path) -> None:
     episodes = [step for stage, step, name, _ in metrics.rows if (stage, name) == ("episode", "return")]  # fmt: skip  # noqa: E501
     assert episodes == list(range(12 + 2 * 2))
     assert list(unbroken.glob("trainings/*/tensorboard/events*"))
-    assert not np.array_equal(weights(unbroken, "ugat"), weights(unbroken, "direct-transfer"))
+    assert not np.array_equal(weights(unbroken, "phase"), weights(unbroken, "direct-transfer"))
 
 
 def test_alpha_starts_infinite_and_then_is_the_mean_of_u(unbroken: Path) -> None:
@@ -112,7 +115,7 @@ def test_a_resumed_run_is_an_unbroken_one_byte_for_byte(unbroken: Path, tmp_path
     transfer(LONG, folder, resume=True)
     one, two = contents(folder), contents(unbroken)
     assert [name for name in one.keys() | two.keys() if one.get(name) != two.get(name)] == []
-    assert {"table.json", "metrics.parquet", "queues.parquet", "policies/ugat.pt"} <= one.keys()
+    assert {"table.json", "metrics.parquet", "queues.parquet", "policies/phase.pt"} <= one.keys()
     for ending in ("checkpoint/learner.pt", "tensorboard/events.out.tfevents.run"):
         assert any(name.endswith(ending) for name in one), ending
 
@@ -320,7 +323,7 @@ def test_a_policy_trained_in_the_corrected_sim_stands_beside_the_others(
 
     monkeypatch.setattr(DQN, "learn", counting)
     found = transfer(config, tmp_path / "run")
-    names = ["direct transfer", "UGAT", "more plain sim"]
+    names = ["direct transfer", "phase (the paper's UGAT)", "more plain sim"]
     further = [f"further in {late}", "further in V4"]
     assert found.policies[:6] == [*names, *further, "corrected sim"]
     for name in (late, "V4"):  # from where direct transfer stood, as long as the control
@@ -328,12 +331,12 @@ def test_a_policy_trained_in_the_corrected_sim_stands_beside_the_others(
     assert found.domains == ["sim", "V4"]
     assert found.notes["corrected sim"] == str(repaired)
     assert {r.seed for r in found.results if r.policy == "corrected sim"} == {
-        r.seed for r in found.results if r.policy == "UGAT"
+        r.seed for r in found.results if r.policy == "phase (the paper's UGAT)"
     }
     there = [episodes for domain, episodes in trained if domain == str(repaired)]
     assert sum(there) == config.episodes == 12
     mine = weights(tmp_path / "run", "corrected-sim")
-    for other in ("ugat", "direct-transfer", "more-plain-sim", "further-in-v4"):
+    for other in ("phase", "direct-transfer", "more-plain-sim", "further-in-v4"):
         assert not np.array_equal(mine, weights(tmp_path / "run", other))
 
 

@@ -469,7 +469,7 @@ def test_a_run_is_the_same_elsewhere_and_goes_on_here(
         monkeypatch.setattr(f"{module}.device_of", named)
 
     def final(folder: Path) -> np.ndarray[Any, Any]:
-        return NetworkPolicy.load(folder / "policies" / "ugat.pt").parameters
+        return NetworkPolicy.load(folder / "policies" / "phase.pt").parameters
 
     transfer(RUN, tmp_path / "cpu")
     elsewhere = dataclasses.replace(RUN, device="cuda")

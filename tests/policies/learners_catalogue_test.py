@@ -146,10 +146,10 @@ def test_ugat_trains_a_baseline_and_takes_it_up_again(
 ) -> None:
     search_few_rules(monkeypatch, "largest-queue:20")
     found = transfer(IPPO, tmp_path / "whole")
-    assert found.policies[:3] == ["direct transfer", "UGAT", "more plain sim"]
+    assert found.policies[:3] == ["direct transfer", "phase (the paper's UGAT)", "more plain sim"]
     assert found.notes["learner"] == "ippo"
     files = sorted(path.name for path in (tmp_path / "whole" / "policies").iterdir())
-    assert files == ["direct-transfer.pt", "more-plain-sim.pt", "ugat.pt"]
+    assert files == ["direct-transfer.pt", "more-plain-sim.pt", "phase.pt"]
     for name in files:
         path = tmp_path / "whole" / "policies" / name
         assert NetworkPolicy.load(path).hidden == (16,)

@@ -131,7 +131,7 @@ def test_a_learner_with_two_methods_is_trained_and_judged_in_every_row(
     assert "my_algo:Cycle has no save(path) and load(path)" in out
     table = json.loads((tmp_path / "run" / "table.json").read_text())
     names = [row["policy"] for row in table["summary"] if row["domain"] == "V4"]
-    assert names[:3] == ["direct transfer", "UGAT", "more plain sim"]
+    assert names[:3] == ["direct transfer", "phase (the paper's UGAT)", "more plain sim"]
     rows = Metrics.read(tmp_path / "run" / "metrics.parquet").rows
     assert sorted(step for _, step, name, _ in rows if name == "return") == [0, 1, 2]
     assert not list((tmp_path / "run" / "policies").glob("*"))
@@ -153,7 +153,7 @@ def test_a_learner_that_can_be_saved_resumes_to_the_numbers_of_an_unbroken_run(
         ugat_marl.train("single-v1", out=tmp_path / "cut", reporter=stop, **common)
     again = ugat_marl.train("single-v1", out=tmp_path / "cut", resume=True, **common)
     assert again.table.equals(whole.table)
-    assert set(again.policies) == {"direct-transfer", "ugat", "more-plain-sim"}
+    assert set(again.policies) == {"direct-transfer", "phase", "more-plain-sim"}
     direct = again.policies["direct-transfer"]
     played = ugat_marl.evaluate(
         "single-v1", f"my_algo:Kept@{direct}", ["sim"], seeds=1, duration_s=100.0

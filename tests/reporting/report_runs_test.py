@@ -52,7 +52,7 @@ RESULTS = Path(__file__).parents[2] / "results"
 NASTY = "</style><script>alert(1)</script>\"'><img src=x onerror=alert(2)>&amp;$\\frac{x}"
 ATT = {
     "direct transfer": ((100.0, 102.0), (150.0, 154.0)),
-    "UGAT": ((99.0, 101.0), (130.0, 134.0)),
+    "phase (the paper's UGAT)": ((99.0, 101.0), (130.0, 134.0)),
     "more plain sim": ((98.0, 99.0), (155.0, 160.0)),
     "rule largest-queue:40": ((120.0, 121.0), (125.0, 126.0)),
 }
@@ -98,7 +98,7 @@ def metrics(iterations: int = 2, episodes: int = 24, shift: float = 0.0) -> Metr
 def queues() -> pl.DataFrame:
     rows = [
         (policy, domain, minute, tls, float(k + (minute if tls == "B2" else 0)) * factor, 6)
-        for policy, factor in (("direct transfer", 2.0), ("UGAT", 1.0))
+        for policy, factor in (("direct transfer", 2.0), ("phase (the paper's UGAT)", 1.0))
         for domain in ("sim", "V4")
         for minute in range(10)
         for k, tls in enumerate(LIGHTS)
@@ -197,18 +197,20 @@ def page_of(*paths: Path) -> tuple[MadePage, Page]:
 def test_a_whole_run_is_shown_with_the_numbers_of_its_records(run: Path) -> None:
     made, page = page_of(run)
     found = evaluation()
-    row = page.row("UGAT")
-    real = found.estimate("UGAT", "V4", "att_s")
+    row = page.row("phase (the paper's UGAT)")
+    real = found.estimate("phase (the paper's UGAT)", "V4", "att_s")
     assert (
         row[2] == f"{words.number(real.mean)} (107 to 157)" and real.mean == 132
     )  # t of one degree of freedom: 12.7
-    assert row[3] == words.signed(found.gap("UGAT", "V4", "att_s").mean) == "+32"
-    assert row[4] == words.number(found.regret("UGAT", "V4").mean) == "6.5"
+    assert (
+        row[3] == words.signed(found.gap("phase (the paper's UGAT)", "V4", "att_s").mean) == "+32"
+    )
+    assert row[4] == words.number(found.regret("phase (the paper's UGAT)", "V4").mean) == "6.5"
     assert page.row("direct transfer")[2].startswith("152 (127 to 177)")
     # (152 - 101) of gap before, (132 - 100) after
     assert words.share(1 - 32 / 51) in page.text
-    for part in ("Travel time in V4: direct transfer 152 s, UGAT 132 s", "whole",
-                 "grid2x2-v1", "rule largest-queue:40"):  # fmt: skip
+    for part in ("Travel time in V4: direct transfer 152 s, phase (the paper's UGAT) 132 s",
+                 "whole", "grid2x2-v1", "rule largest-queue:40"):  # fmt: skip
         assert part in page.text
     assert "Missing here" not in page.text
     gate = page.row("signal_3")
@@ -349,7 +351,7 @@ def test_what_only_an_objective_measures_is_shown_with_its_unit(run: Path) -> No
     replace(found, results=results).write(run / "table.json")
     _, page = page_of(run)
     assert "CO2 [g/veh]" in page.text
-    rows = [row for row in page.cells if row[:1] == ["UGAT"] and len(row) == 10]
+    rows = [row for row in page.cells if row[:1] == ["phase (the paper's UGAT)"] and len(row) == 10]
     assert [row[-1] for row in rows] == ["–", "250"]
 
 
@@ -406,10 +408,12 @@ def test_seeds_are_put_together_with_intervals(tmp_path: Path) -> None:
         make_run(tmp_path / "runs" / f"s{seed}", seed=seed)
     made, page = page_of(tmp_path / "runs")
     interval = Interval.of(np.array([132.0, 135.0, 138.0]))
-    row = next(row for row in page.cells if row[:1] == ["UGAT"] and len(row) == 2)
+    row = next(
+        row for row in page.cells if row[:1] == ["phase (the paper's UGAT)"] and len(row) == 2
+    )
     assert row[1] == f"135 ({words.number(interval.low)} to {words.number(interval.high)})"
     assert "3 training seeds" in page.text and "best rule there" in page.text
-    assert page.row("s1")[3:6] == ["UGAT", "1", "whole"]
+    assert page.row("s1")[3:6] == ["phase (the paper's UGAT)", "1", "whole"]
     curves = [d.name for d in made.pictures if "seeds" in d.name]
     assert curves == [f"grid2x2-v1-V4-phase-seeds-{w}" for w in ("learning", "att", "gate")]
 
@@ -420,8 +424,10 @@ def test_domains_stand_in_columns_and_what_differs_stays_apart(tmp_path: Path) -
     make_run(tmp_path / "other", duration_s=600.0)
     _, page = page_of(tmp_path / "rain", tmp_path / "snow", tmp_path / "other")
     assert page.text.count("Over training seeds") == 1  # one of its own is no group
-    row = next(row for row in page.cells if row[:1] == ["UGAT"] and len(row) == 3)
-    assert row == ["UGAT", "132", "132"]  # a single seed has no interval
+    row = next(
+        row for row in page.cells if row[:1] == ["phase (the paper's UGAT)"] and len(row) == 3
+    )
+    assert row == ["phase (the paper's UGAT)", "132", "132"]  # a single seed has no interval
     assert "1 training seed; no intervals" in page.text
 
 
@@ -440,7 +446,7 @@ def make_job(folder: Path, name: str, played: Sequence[str], setting: Setting, *
 def test_jobs_of_a_paper_make_a_table(tmp_path: Path) -> None:
     direct, oracle = Setting("direct transfer", "direct"), Setting("trained in real", "scratch")
     ugat = UgatConfig(grounding="timed")
-    timed = Setting("UGAT, timed", "grounded", ugat=ugat)
+    timed = Setting("timed", "grounded", ugat=ugat)
     fixed = replace(timed, ugat=replace(ugat, gate=GateConfig(mode="static", static_alpha=0.5)))
     for seed in (0, 1):
         make_job(tmp_path, f"direct-{seed}", ("sim", "V1", "V4"), direct, seed=seed)
@@ -452,7 +458,7 @@ def test_jobs_of_a_paper_make_a_table(tmp_path: Path) -> None:
     row = next(row for row in page.cells if row[:1] == ["direct transfer"] and len(row) == 3)
     interval = Interval.of(np.array([150.5, 160.5]))
     assert row[1] == f"156 ({words.number(interval.low)} to {words.number(interval.high)})"
-    assert next(r for r in page.cells if r[:1] == ["UGAT, timed (gate.mode static)"])[2] == "150"
+    assert next(r for r in page.cells if r[:1] == ["timed (gate.mode static)"])[2] == "150"
     assert "Left out, since not judged in both domains: half, waiting" in page.text
     assert page.row("waiting")[5] == "not finished"
 
@@ -470,7 +476,7 @@ def test_a_job_shows_its_worst_minutes(tmp_path: Path) -> None:
 
 
 def test_a_command_is_read_as_it_was_written() -> None:
-    command = "ugat-marl paper main --rows 'direct transfer' 'UGAT, timed' " + "--seeds 5 " * 20
+    command = "ugat-marl paper main --rows 'direct transfer' 'timed' " + "--seeds 5 " * 20
     lines = command_block(command.strip())
     assert max(map(len, lines)) <= 102
     assert commands_in("\n".join(["# A page", "", *lines, ""])) == [command.strip()]
@@ -482,7 +488,7 @@ def test_a_finished_table_is_shown_with_its_command() -> None:
     made, page = page_of(RESULTS / "single-v1" / "main")
     assert "ugat-marl paper main" in page.text
     rows = pl.read_csv(RESULTS / "single-v1" / "main" / "table.csv").rows(named=True)
-    for setting in ("direct transfer", "UGAT, timed"):
+    for setting in ("direct transfer", "timed"):
         values = [r for r in rows if r["setting"] == setting]
         shown = page.row(setting)[1:]
         for row, cell in zip(values, shown, strict=True):

@@ -27,7 +27,7 @@ from ugat_marl.scenarios import Network
 BASE = Scores(0.0, 90.0, 500.0, -3.0, 3.0, 0.4, 50.0, 520.0, 515.0, 0.0)
 ATT = {
     "direct transfer": ((100.0, 102.0, 101.0), (150.0, 151.0, 900.0)),
-    "UGAT": ((99.0, 100.0, 98.0), (130.0, 131.0, 132.0)),
+    "phase (the paper's UGAT)": ((99.0, 100.0, 98.0), (130.0, 131.0, 132.0)),
     "rule largest-queue:40": ((120.0, 121.0, 119.0), (125.0, 126.0, 124.0)),
 }
 
@@ -52,7 +52,7 @@ def printed(table: RenderableType) -> str:
 def test_the_transfer_table_says_it_all_in_80_columns(found: Evaluation) -> None:
     text = printed(transfer_table(found))
     assert max(map(len, text.splitlines())) <= 80
-    row = next(line for line in text.splitlines() if "UGAT" in line)
+    row = next(line for line in text.splitlines() if "phase (the paper" in line)
     for cell in ("99.0", "131", "+32.0", "6.0"):
         assert cell in row
     assert "best rule in V4: largest-queue:40" in text
@@ -65,7 +65,11 @@ def test_six_policies_have_room(found: Evaluation) -> None:
     more = ("more plain sim", "corrected sim", "rule max-pressure:20")
     results = [*found.results]
     for policy in more:
-        results += [replace(r, policy=policy) for r in found.results if r.policy == "UGAT"]
+        results += [
+            replace(r, policy=policy)
+            for r in found.results
+            if r.policy == "phase (the paper's UGAT)"
+        ]
     six = Evaluation(
         found.scenario, "0", tuple(results), {"corrected sim": "runs/v4-diagnosis/corrected"}
     )
@@ -132,7 +136,7 @@ def test_levels_of_service_of_policies_and_approaches(found: Evaluation) -> None
     assert [row[1] for row in rows] == ["eastbound", "northbound"]
     assert "(signal_" in printed(tables)  # the agent stands below the light
     assert service_tables(found, network) == []  # nothing was measured
-    grid = service_grid(replace(found, results=results), ["UGAT"], network)
+    grid = service_grid(replace(found, results=results), ["phase (the paper's UGAT)"], network)
     assert grid is not None
     assert grid.rows[0] == ["B1 (signal_2)", "eastbound", "A1_B1", "100 F"]
-    assert service_grid(found, ["UGAT"], None) is None
+    assert service_grid(found, ["phase (the paper's UGAT)"], None) is None

@@ -22,8 +22,8 @@ spec.loader.exec_module(script)
 TABLE = """setting,domain,att_s,att_s_gap
 direct transfer,V1,100,40
 direct transfer,V4,200,140
-"UGAT, timed",V1,80,20
-"UGAT, timed",V4,110,28
+"timed",V1,80,20
+"timed",V4,110,28
 constant delay 2 s,V1,75,14
 constant delay 2 s,V4,120,46
 constant delay 3 s,V1,84,22

@@ -58,10 +58,10 @@ from .settings import CONTROL as CONTROL
 from .settings import DIRECT as DIRECT
 from .settings import GROUNDED_NAME as GROUNDED_NAME
 from .settings import ORACLE as ORACLE
+from .settings import PHASE as PHASE
 from .settings import RULE as RULE
 from .settings import STREET as STREET
 from .settings import TIMED as TIMED
-from .settings import UGAT as UGAT
 from .settings import UNTRAINED as UNTRAINED
 from .settings import LearnerSpec as LearnerSpec
 from .settings import Setting as Setting

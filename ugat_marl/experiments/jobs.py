@@ -44,7 +44,7 @@ from ugat_marl.experiments.evaluation import (
 )
 from ugat_marl.experiments.queues import QUEUES, QueueRecord
 from ugat_marl.experiments.randomised import randomised_env
-from ugat_marl.experiments.settings import DIRECT, Setting, file_hash
+from ugat_marl.experiments.settings import DIRECT, Setting, file_hash, short_name
 from ugat_marl.experiments.training import Effort, simulated_worlds, train_grounded, train_through
 from ugat_marl.experiments.tuning import VERSION, tuned_rules
 from ugat_marl.files import read_json, write_whole
@@ -227,7 +227,7 @@ def file_stem(scenario: str) -> str:
 
 def file_name(name: str) -> str:
     """Return the name of a policy in the form of a file's name."""
-    return _cut(re.sub(r"[^a-z0-9.]+", "-", name.lower())).strip("-")
+    return _cut(re.sub(r"[^a-z0-9.]+", "-", short_name(name).lower())).strip("-")
 
 
 def _cut(name: str) -> str:

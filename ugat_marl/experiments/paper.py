@@ -33,6 +33,8 @@ from ugat_marl.experiments.settings import (
     UNTRAINED,
     LearnerSpec,
     Setting,
+    short_name,
+    variant_name,
 )
 from ugat_marl.experiments.training import check_worlds
 from ugat_marl.experiments.tuning import BUDGET, LEAST_BUDGET
@@ -128,7 +130,7 @@ def constant_name(seconds: int) -> str:
 
 def matched_name(grounding: str) -> str:
     """Return the name of the row of a grounding that matches rewards."""
-    return f"{GROUNDED_NAME[grounding]}: rewards matched"
+    return variant_name(grounding, "rewards matched")
 
 
 def late_in(sim: str, seconds: int) -> str:
@@ -176,23 +178,24 @@ def _controls(ugat: UgatConfig, sim: str, constants: Sequence[int]) -> list[Sett
 
 def _ablated(name: str, base: UgatConfig) -> list[Setting]:
     """Return Table 3 of the paper (static α, no uncertainty) and rows that change another part."""
-    full = GROUNDED_NAME[name]
     if name == "street":
         return [_ugat(row, replace(base, street=x)) for row, x in _streets(base.street).items()]
     ungated = replace(base, gate=replace(base.gate, mode="infinite"))
     variants = {
-        full: base,
-        f"{full}: α = 0.5": replace(base, gate=_static(base, 0.5)),
-        f"{full}: α from the first fit on": replace(base, gate=replace(base.gate, start="fitted")),
-        f"{full}: no gate": ungated,
-        f"{full}: no uncertainty (GAT)": replace(
+        GROUNDED_NAME[name]: base,
+        variant_name(name, "α = 0.5"): replace(base, gate=_static(base, 0.5)),
+        variant_name(name, "α from the first fit on"): replace(
+            base, gate=replace(base.gate, start="fitted")
+        ),
+        variant_name(name, "no gate"): ungated,
+        variant_name(name, "no uncertainty (GAT)"): replace(
             ungated, fit=replace(base.fit, uncertainty="none")
         ),
     }
     proven = replace(base, least_accuracy=0.0)
     if base != proven:
-        variants[f"{full}: where f and h are proven"] = proven
-    variants |= _departures(full, base)
+        variants[variant_name(name, "where f and h are proven")] = proven
+    variants |= _departures(name, base)
     rows = [_ugat(variant, ugat) for variant, ugat in variants.items()]
     return [*rows, _other_answers(name, base), *_matching(name, base)]
 
@@ -214,49 +217,52 @@ def residual_name(kind: str) -> str:
     return f"{STREET}: all parts and residual, {kind}"
 
 
-def _departures(full: str, base: UgatConfig) -> dict[str, UgatConfig]:
+def _departures(name: str, base: UgatConfig) -> dict[str, UgatConfig]:
     """Return rows for the choices of docs/explanation/departures.md that concern f and h."""
     several = replace(base, forward=replace(base.forward, members=SEVERAL))
     of_h = replace(several, gate=replace(base.gate, uncertainty_of="h"))
     return {
-        f"{full}: own heads": replace(base, inverse=replace(base.inverse, head="own")),
-        f"{full}: several f, u of h": of_h,
-        f"{full}: several f, u of h after f": several,
-        f"{full}: KL weight 1": replace(base, fit=replace(base.fit, kl_weight=1.0)),
-        f"{full}: no off-data loss": replace(base, fit=replace(base.fit, off_data_weight=0.0)),
+        variant_name(name, "own heads"): replace(base, inverse=replace(base.inverse, head="own")),
+        variant_name(name, "several f, u of h"): of_h,
+        variant_name(name, "several f, u of h after f"): several,
+        variant_name(name, "KL weight 1"): replace(base, fit=replace(base.fit, kl_weight=1.0)),
+        variant_name(name, "no off-data loss"): replace(
+            base, fit=replace(base.fit, off_data_weight=0.0)
+        ),
     }
 
 
 def _other_answers(name: str, base: UgatConfig) -> Setting:
     """Return phase grounding with h fitted to smoothed pairs, or timed grounding without h."""
-    full = GROUNDED_NAME[name]
     if name == "phase":
         smoothed = replace(base, fit=replace(base.fit, pairs="smoothed"))
-        return _ugat(f"{full}: h on smoothed pairs", smoothed)
+        return _ugat(variant_name(name, "h on smoothed pairs"), smoothed)
     constants = replace(base, timed=replace(base.timed, answer="constant"))
-    return _ugat(f"{full}: lost times without h", constants)
+    return _ugat(variant_name(name, "lost times without h"), constants)
 
 
 def _alphas(name: str, base: UgatConfig) -> list[Setting]:
-    full = _gated(name)
+    _require_gate(name)
     alphas = (0.2, 0.4, 0.5, 0.6, 0.8)
     pooled = replace(base, gate=replace(base.gate, scope="pooled"))
     return [
-        *(_ugat(f"{full}: α = {a}", replace(base, gate=_static(base, a))) for a in alphas),
-        _ugat(full, base),
-        _ugat(f"{full}: α pooled over the network", pooled),
+        *(
+            _ugat(variant_name(name, f"α = {a}"), replace(base, gate=_static(base, a)))
+            for a in alphas
+        ),
+        _ugat(GROUNDED_NAME[name], base),
+        _ugat(variant_name(name, "α pooled over the network"), pooled),
     ]
 
 
-def _gated(name: str) -> str:
-    """Return the name of the row of a grounding with a gate.
+def _require_gate(name: str) -> None:
+    """Refuse a grounding without a gate.
 
     Raises:
         OptionError: The grounding has none.
     """
     if name == "street":
         raise OptionError("a fitted street has no gate: give --groundings phase timed")
-    return GROUNDED_NAME[name]
 
 
 def _static(base: UgatConfig, alpha: float) -> GateConfig:
@@ -264,14 +270,16 @@ def _static(base: UgatConfig, alpha: float) -> GateConfig:
 
 
 def _methods(name: str, base: UgatConfig) -> list[Setting]:
-    full = _gated(name)
+    _require_gate(name)
     methods: dict[str, FitConfig] = {
         "evidential": replace(base.fit, uncertainty="edl"),
         "Concrete Dropout": replace(base.fit, uncertainty="dropout"),
         "Deep Ensembles": replace(base.fit, uncertainty="ensemble"),
         "none (GAT)": replace(base.fit, uncertainty="none"),
     }
-    return [_ugat(f"{full}: {method}", replace(base, fit=fit)) for method, fit in methods.items()]
+    return [
+        _ugat(variant_name(name, method), replace(base, fit=fit)) for method, fit in methods.items()
+    ]
 
 
 # --- tables -------------------------------------------------------------------------------------
@@ -297,7 +305,8 @@ class PaperConfig:
             learner dqn; only the numbers of episodes stay free.
         groundings: Kinds of grounding: phase, timed, street; default: all that the table can have.
         constants: Constant delays in s that "main" sweeps.
-        rows: Names of the rows to train; direct transfer is always trained. Default: all rows.
+        rows: Names of the rows to train, of which what stands in brackets may be left out; direct
+            transfer is always trained. Default: all rows.
         evaluation_seeds: Number of evaluation episodes of each policy in each domain.
         rule_budget: Most episodes to tune one rule in one domain.
         observation: Kind of observation; default: the one that the learner needs, or count.
@@ -444,11 +453,12 @@ class PaperConfig:
         rows = settings_of(table, self.ugat, self.sim, self.groundings, self.constants, self.spec)
         if self.reward not in MATCHED_REWARDS:
             rows = [setting for setting in rows if not setting.matches]
-        names = [setting.name for setting in rows]
-        for row in self.rows:
-            if row not in names:
-                raise UnknownNameError(f"row of table {table!r}:", row, names)
-        return [row for row in rows if not self.rows or row.name in (DIRECT, *self.rows)]
+        names = {setting.name for setting in rows}
+        full = {short_name(name): name for name in names}
+        wanted = {DIRECT, *(full.get(row, row) for row in self.rows)}
+        for row in sorted(wanted - names):
+            raise UnknownNameError(f"row of table {table!r}:", row, names)
+        return [row for row in rows if not self.rows or row.name in wanted]
 
 
 def compare(

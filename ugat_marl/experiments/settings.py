@@ -25,7 +25,7 @@ from ugat_marl.policies import (
     suite_config,
 )
 
-DIRECT, UGAT, TIMED = "direct transfer", "UGAT", "UGAT, timed"
+DIRECT, PHASE, TIMED = "direct transfer", "phase (the paper's UGAT)", "timed"
 CONTROL = "more plain sim"
 CORRECTED = "corrected sim"
 RANDOMISED = "domain randomisation"
@@ -39,13 +39,23 @@ RULE = "best rule, tuned there"
 STREET = "fitted street"
 UNTRAINED = "pretrained, not trained here"
 
-GROUNDED_NAME = {"phase": UGAT, "timed": TIMED, "street": STREET}
+GROUNDED_NAME = {"phase": PHASE, "timed": TIMED, "street": STREET}
 """Name of the row of each kind of grounding."""
 
 
+def short_name(name: str) -> str:
+    """Return the name of a row without what stands in brackets at its end."""
+    return name.partition(" (")[0] if name == PHASE else name
+
+
+def variant_name(grounding: str, what: str) -> str:
+    """Return the name of a row that differs from that of its grounding, as "timed: no gate"."""
+    return f"{short_name(GROUNDED_NAME[grounding])}: {what}"
+
+
 def is_grounded(name: str) -> bool:
-    """Return True for the name of a row of a grounding, such as "UGAT, timed: rewards matched"."""
-    return name.partition(":")[0] in GROUNDED_NAME.values()
+    """Return True for the name of a row of a grounding, such as "timed: rewards matched"."""
+    return short_name(name).partition(":")[0] in map(short_name, GROUNDED_NAME.values())
 
 
 SEEN_COMMANDS = 4

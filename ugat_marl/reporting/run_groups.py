@@ -8,7 +8,7 @@ from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
-from ugat_marl.experiments import DIRECT, UGAT, Comparison, Trial
+from ugat_marl.experiments import DIRECT, Comparison, Trial, is_grounded
 from ugat_marl.reporting.run_records import RunRecord
 
 _APART = (
@@ -124,9 +124,12 @@ def _of_job(record: RunRecord, name: str) -> Iterable[Trial]:
 
 
 def _rank(setting: str) -> int:
-    """Return the place of a setting: direct transfer, UGAT, other settings, rules."""
-    order = (DIRECT, UGAT, "", "best rule")
-    return next(n for n in (0, 1, 3, 2) if setting.startswith(order[n]))
+    """Return the place of a setting: direct transfer, groundings, other settings, rules."""
+    if setting.startswith(DIRECT):
+        return 0
+    if setting.startswith("best rule"):
+        return 3
+    return 1 if is_grounded(setting) else 2
 
 
 def _seed(record: RunRecord) -> int | None:

@@ -15,7 +15,7 @@ from typing import Any
 
 from ugat_marl.data import MEASURES
 from ugat_marl.envs import OBJECTIVE_MEASURES
-from ugat_marl.experiments import Estimate, Evaluation, check_run, is_grounded, outcome_of
+from ugat_marl.experiments import PHASE, Estimate, Evaluation, check_run, is_grounded, outcome_of
 from ugat_marl.reporting import charts
 from ugat_marl.reporting.figures import NamedFigure, printable
 from ugat_marl.reporting.formats import number, share, signed
@@ -41,7 +41,7 @@ _OPEN = 4
 """Largest number of sections that are shown unfolded."""
 _WORST = 10
 """Number of intersections in the table of the longest queues."""
-_RADARS = ("direct transfer", "UGAT", "fitted street", "trained in real", "best rule")
+_RADARS = ("direct transfer", PHASE, "fitted street", "trained in real", "best rule")
 _RADAR = "Every axis is scaled by its best value, at the rim; the middle is worst."
 _STRETCH = "Mean of a stretch of episodes, with its 95 % interval over "
 
