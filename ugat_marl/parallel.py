@@ -505,7 +505,8 @@ def _call(signs: Any, fn: Callable[..., Any], args: tuple[Any, ...], kwargs: dic
     _Life.signs = signs
     if is_first:
         show_life(_Life.show)
-    _Life.show()
+    with contextlib.suppress(Exception):  # the first sign has arrived before anything can stop it
+        ray.get(signs.add.remote(_Life.place), timeout=60)
     return fn(*args, **kwargs)
 
 
