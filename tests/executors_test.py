@@ -310,6 +310,8 @@ def ray() -> Iterator[Executor]:
     pytest.importorskip("ray")
     with RayExecutor() as executor:
         yield executor
+    time.sleep(2)
+    assert not sys.modules["ray"].is_initialized()  # nor was another one started since
 
 
 def test_ray_gives_what_threads_give(ray: Executor) -> None:

@@ -43,6 +43,8 @@ DEADLINE_VARIABLE = "UGAT_MARL_DEADLINE_S"
 
 _BEAT_S = 1.0
 """Seconds between two signs of life of a process."""
+_PATIENCE_S = 10.0
+"""Seconds to wait for the process of Ray that counts signs; the next beat asks again."""
 
 Done = TypeVar("Done")
 
@@ -375,7 +377,9 @@ class RayExecutor(Executor):
         self._running: dict[Future[Any], Any] = {}
         self._lock = threading.Lock()
         self._is_open = True
-        threading.Thread(target=self._watch, daemon=True).start()
+        self._closed = threading.Event()
+        self._watcher = threading.Thread(target=self._watch, daemon=True)
+        self._watcher.start()
 
     @property
     def parts_at_a_time(self) -> int:
@@ -404,6 +408,8 @@ class RayExecutor(Executor):
                 future.cancel()
             elif wait:
                 future.exception()
+        self._closed.set()
+        self._watcher.join()  # a call of it after the end would start a Ray of its own
         if self._owns and self._ray.is_initialized():
             self._ray.shutdown()
 
@@ -426,7 +432,7 @@ class RayExecutor(Executor):
             self._ray.cancel(reference, force=True)
 
     def _watch(self) -> None:
-        """Kill processes that run a part and give no sign of life, until the executor is closed.
+        """Kill processes that run a part and give no sign of life, until no part is left to run.
 
         Ray itself notices machines and processes that are gone, and none that are stopped.
         """
@@ -437,19 +443,21 @@ class RayExecutor(Executor):
         kill = self._ray.remote(num_cpus=0, max_retries=0)(_kill)
         counts: dict[_Place, int] = {}
         pulses: dict[_Place, Pulse] = {}
-        while self._is_open:
-            time.sleep(_BEAT_S)
+        while not self._closed.wait(_BEAT_S) and self._ray.is_initialized():
             with self._lock:
                 parts = {reference.task_id().hex() for reference in self._running.values()}
-            with contextlib.suppress(Exception):  # the machine of the signs may be lost for a while
-                now = self._ray.get(self._signs.of.remote(parts), timeout=60)
-                counts.clear()
-                counts.update(now)
-                pulses = {
-                    place: pulses.get(place) or Pulse(functools.partial(counts.__getitem__, place))
-                    for place in counts
-                }
-                for place in [place for place, pulse in pulses.items() if pulse.is_lost()]:
+            try:
+                now = self._ray.get(self._signs.of.remote(parts), timeout=_PATIENCE_S)
+            except self._ray.exceptions.RayError:  # the machine of the signs is lost for a while
+                continue
+            counts.clear()
+            counts.update(now)
+            pulses = {
+                place: pulses.get(place) or Pulse(functools.partial(counts.__getitem__, place))
+                for place in counts
+            }
+            for place, pulse in pulses.items():
+                if pulse.is_lost():
                     there = NodeAffinitySchedulingStrategy(place.node, soft=False)
                     kill.options(scheduling_strategy=there).remote(place.process)
                     self._signs.forget.remote(place.part)
@@ -505,8 +513,9 @@ def _call(signs: Any, fn: Callable[..., Any], args: tuple[Any, ...], kwargs: dic
     _Life.signs = signs
     if is_first:
         show_life(_Life.show)
-    with contextlib.suppress(Exception):  # the first sign has arrived before anything can stop it
-        ray.get(signs.add.remote(_Life.place), timeout=60)
+    failures: Any = ray.exceptions  # pyright: ignore[reportAttributeAccessIssue]
+    with contextlib.suppress(failures.RayError):  # a part without a sign is never missed
+        ray.get(signs.add.remote(_Life.place), timeout=_PATIENCE_S)
     return fn(*args, **kwargs)
 
 

@@ -44,8 +44,8 @@ GROUNDED_NAME = {"phase": PHASE, "timed": TIMED, "street": STREET}
 
 
 def short_name(name: str) -> str:
-    """Return the name of a row without what stands in brackets at its end."""
-    return name.partition(" (")[0] if name == PHASE else name
+    """Return the name of a row, without the brackets if it is that of phase grounding."""
+    return "phase" if name == PHASE else name
 
 
 def variant_name(grounding: str, what: str) -> str:
