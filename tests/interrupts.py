@@ -1,8 +1,11 @@
-"""Reporters that interrupt the work they are told of, as a user does."""
+"""What interrupts work: a user, at a chosen step, and a system that has no more to give."""
 
 from __future__ import annotations
 
 import contextlib
+import resource
+from collections.abc import Iterator
+from pathlib import Path
 from typing import Any
 
 from ugat_marl.progress import Silent
@@ -37,3 +40,15 @@ class KillAfter(Silent):
                     raise KeyboardInterrupt
 
             yield one
+
+
+@contextlib.contextmanager
+def few_descriptors(spare: int) -> Iterator[None]:
+    """Leave this process only `spare` descriptors more than it has open."""
+    taken = len([*Path("/proc/self/fd").iterdir()]) - 1  # without the one that lists them
+    limits = resource.getrlimit(resource.RLIMIT_NOFILE)
+    resource.setrlimit(resource.RLIMIT_NOFILE, (taken + spare, limits[1]))
+    try:
+        yield
+    finally:
+        resource.setrlimit(resource.RLIMIT_NOFILE, limits)

@@ -17,7 +17,7 @@ import numpy as np
 import pytest
 from pydantic import TypeAdapter
 
-from tests.interrupts import KillAfter
+from tests.interrupts import KillAfter, few_descriptors
 from ugat_marl.data import Scores, lock_folder
 from ugat_marl.errors import MeasurementError, OptionError
 from ugat_marl.experiments import (
@@ -169,6 +169,18 @@ def test_a_killed_job_goes_on_and_ends_with_the_same_numbers(
     played = (tmp_path / "killed" / SCORES).read_bytes()
     assert perform(job, tmp_path / "killed", Silent()).scores == whole.scores
     assert (tmp_path / "killed" / SCORES).read_bytes() == played
+
+
+def test_scores_that_cannot_be_read_now_are_not_replaced(tmp_path: Path) -> None:
+    """An empty record would be written over the scores of episodes that were played."""
+    job = replace(PLAIN, episodes=2)
+    perform(job, tmp_path, Silent())
+    before = (tmp_path / SCORES).read_bytes()
+    with few_descriptors(0), pytest.raises(OSError, match="Too many open files"):
+        Record.read(tmp_path)
+    assert (tmp_path / SCORES).read_bytes() == before
+    (tmp_path / SCORES).write_bytes(before[:-20])
+    assert not Record.read(tmp_path).scores
 
 
 def test_more_episodes_train_only_those_and_fewer_are_refused(tmp_path: Path) -> None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
@@ -10,6 +11,7 @@ import numpy as np
 import polars as pl
 import pytest
 
+from tests.interrupts import few_descriptors
 from ugat_marl.effects import load_scenario
 from ugat_marl.errors import CheckpointError
 from ugat_marl.experiments import evaluate, read_queues, rule_factory
@@ -140,6 +142,29 @@ def test_queues_of_several_policies_share_a_file_under_their_new_names(tmp_path:
     assert not last.drop("policy").equals(record.frame().filter(policy="first").drop("policy"))
     write_queues(tmp_path / "queues.parquet", {})
     assert read_queues(tmp_path / "queues.parquet").is_empty()
+
+
+@pytest.mark.parametrize("spare", range(5))
+def test_a_record_that_cannot_be_read_now_is_not_replaced(spare: int, tmp_path: Path) -> None:
+    """Reading takes more descriptors than writing: a sound record must not count as damaged."""
+    env = stub(decisions=1, interval_s=60.0)
+    look = (record := QueueRecord()).watch("policy", "V4", env)
+    env.snapshot = SimpleNamespace(halting=np.ones(len(env.network.lane_table().ids)))
+    look(1)
+    kept, together = tmp_path / "kept.parquet", tmp_path / "together.parquet"
+    record.write(kept)
+    sources = {"policy": (kept, "policy")}
+    write_queues(together, sources)
+    looks = 1
+    with few_descriptors(spare):
+        with contextlib.suppress(OSError):
+            record.write(kept, keep=True)
+            looks += 1
+        with contextlib.suppress(OSError):
+            write_queues(together, sources)
+    assert set(read_queues(kept)["looks"]) == {looks}
+    assert set(read_queues(together)["policy"]) == {"policy"}
+    assert looks == 1 or spare > 0
 
 
 @pytest.mark.parametrize("content", [b"", b"PAR1 no more"])

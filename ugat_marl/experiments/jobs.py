@@ -47,7 +47,7 @@ from ugat_marl.experiments.randomised import randomised_env
 from ugat_marl.experiments.settings import DIRECT, Setting, file_hash, short_name
 from ugat_marl.experiments.training import Effort, simulated_worlds, train_grounded, train_through
 from ugat_marl.experiments.tuning import VERSION, tuned_rules
-from ugat_marl.files import read_json, write_whole
+from ugat_marl.files import parse_json, read_json, write_whole
 from ugat_marl.grounding import (
     ChangePenalty,
     Probe,
@@ -268,9 +268,18 @@ class Record:
 
     @classmethod
     def read(cls, folder: Path) -> Record:
-        """Read a record that `write` wrote; an empty record if the file is missing or damaged."""
+        """Read a record that `write` wrote; an empty record if the file is missing or damaged.
+
+        Raises:
+            OSError: The file is there, and the system cannot read it now. An empty record would
+                replace it.
+        """
+        path = folder / SCORES
+        if not path.exists():
+            return cls()
+        data = path.read_bytes()
         try:
-            content = read_json(folder / SCORES, CheckpointError)
+            content = parse_json(data.decode(), str(path), CheckpointError)
             if json_damage(content, "episodes"):
                 return cls()
             scores: dict[tuple[int, str, int], Scores] = {}
@@ -561,7 +570,7 @@ def perform_described(folder: Path) -> int:
         described = read_json(folder / JOB, CheckpointError)
         job = TypeAdapter(Job).validate_json(json.dumps(described))
         perform(job, folder, Bars(Console(width=100)))
-    except UgatMarlError as error:
+    except (UgatMarlError, OSError) as error:
         print(" ".join(str(error).split()), file=sys.stderr)
         return 2
     return 0

@@ -110,10 +110,14 @@ class QueueRecord:
             path: The file.
             keep: True to include the record in the file, if there is one that can be read.
             anew: True to leave out of that record the policies and domains of this one.
+
+        Raises:
+            OSError: The file cannot be written, or the record in it cannot be read now, such as
+                when the process has no descriptors left. The file stays as it was.
         """
         frame = self.frame()
         if keep and path.exists():
-            with contextlib.suppress(CheckpointError):
+            with contextlib.suppress(CheckpointError):  # a damaged record is given up
                 kept = read_queues(path)
                 if anew:
                     kept = kept.join(frame, on=["policy", "domain"], how="anti")
@@ -125,12 +129,15 @@ class QueueRecord:
 
 
 def write_queues(path: Path, sources: Mapping[str, tuple[Path, str]]) -> None:
-    """Write the queues of several policies into one file; files that cannot be read are left out.
+    """Write the queues of several policies into one file; missing and damaged files are left out.
 
     Args:
         path: File to write, whole or not at all.
         sources: For the name of each policy, a file that `QueueRecord.write` wrote and the name of
             the policy in it.
+
+    Raises:
+        OSError: A file cannot be read or written now; `path` stays as it was.
     """
     frames = [pl.DataFrame(schema=_SCHEMA)]
     for name, (source, name_there) in sources.items():
@@ -146,10 +153,11 @@ def read_queues(path: Path) -> pl.DataFrame:
 
     Raises:
         CheckpointError: The file is missing, cut short or of another form.
+        OSError: The file is there, and the system cannot read it now.
     """
     try:
         frame, metadata = read_quietly(path)
-    except (OSError, pl.exceptions.PolarsError, pl.exceptions.PanicException) as error:
+    except (FileNotFoundError, pl.exceptions.PolarsError, pl.exceptions.PanicException) as error:
         reason = str(error).splitlines()[0]
         raise CheckpointError(f"{path}: cannot be read ({reason})") from None
     if frame.schema != pl.Schema(_SCHEMA):
