@@ -419,7 +419,15 @@ def hidden_of(effect: EffectRecord) -> Hidden:
 
 def match(item: Hidden, others: Sequence[Hidden]) -> Hidden | None:
     """Return the effect of the same name at the same place."""
-    return next((x for x in others if (x.name, x.place) == (item.name, item.place)), None)
+    return next((x for x in others if x.name == item.name and _same_place(x, item)), None)
+
+
+def _same_place(one: Hidden, other: Hidden) -> bool:
+    """Return True for equal places; a form that is said to be unknown contradicts no other one."""
+    if one.place == other.place:
+        return True
+    parts = [item.place.rpartition(">") if item.place else ("", "", "") for item in (one, other)]
+    return parts[0][0] == parts[1][0] and "unknown" in {form for _, _, form in parts}
 
 
 def same_name(name: str, others: Sequence[Hidden]) -> Hidden | None:

@@ -14,11 +14,8 @@ from ugat_marl.diagnosis.measurement import (
     FOURTH,
     SECOND,
     THIRD,
-    Equation,
     Measurement,
     Sightings,
-    by_place,
-    solved,
     together,
 )
 from ugat_marl.diagnosis.thresholds import Thresholds
@@ -92,44 +89,6 @@ def named(measured: Sightings, simulated: Sightings) -> list[str]:
     return [str(error.effect) for error in errors]
 
 
-def test_a_line_through_two_regimes_gives_extension_and_zone() -> None:
-    # y = 0.5 v / reach + 2 / reach for reach 5 m at 5 and 15 m/s
-    rows = [Equation(0.5 * v / 5 + 2 / 5, (v / 5, 1 / 5), 0.0, 1e-3) for v in (5.0, 15.0)]
-    solution = solved(rows, 1.0, (1.0, 3.0), 8.0)
-    assert [x.value for x in solution.estimates] == pytest.approx([0.5, 2.0], rel=1e-3)
-    # (a / sd)^2 of the prior, and two parameters
-    assert solution.cost == pytest.approx(0.5**2 + (2 / 3) ** 2 + 16, rel=1e-3)
-
-
-def test_parameters_that_are_not_needed_are_nothing() -> None:
-    rows = [Equation(0.5 * v / 5, (v / 5, 1 / 5), 0.0, 1e-3) for v in (5.0, 15.0)]
-    first, second = solved(rows, 1.0, (1.0, 3.0), 8.0).estimates
-    assert (round(first.value, 3), second.value, second.error) == (0.5, 0.0, 0.0)
-    assert solved([Equation(0.01, (1.0,), 0.0, 0.01)], 1.0, (1.0,), 8.0).cost == pytest.approx(1)
-
-
-def test_bends_are_taken_off_in_the_direction_of_the_point() -> None:
-    rows = [Equation(-0.2, (1.0,), 0.2, 0.01)]
-    assert [solved(rows, x, (1.0,), 8.0).cost for x in (1.0, 0.0, -1.0)] == pytest.approx(
-        [8 + 0.4**2, 8 + 0.2**2, 0.0], abs=0.1
-    )
-
-
-def test_the_fewest_numbers_that_suffice_are_taken() -> None:
-    def rows(value: float) -> list[Equation]:
-        return [Equation(value, (1.0,), 0.0, 0.01)]
-
-    def places(**of: float) -> dict[str, float]:
-        groups = {tuple(name.split("_")): rows(value) for name, value in of.items()}
-        found, _ = by_place(groups, 0.0, (1.0,), 8.0)  # pyright: ignore[reportArgumentType]
-        return {place: round(x.estimates[0].value, 2) for place, x in found.items()}
-
-    assert places(stop_a=1.0, stop_b=1.0, exit_a=1.0) == {"*": 1.0}
-    assert places(stop_a=1.0, stop_b=1.0, exit_a=0.0) == {"stop": 1.0, "exit": 0.0}
-    assert places(stop_a=1.0, stop_b=0.0) == {"stop@a": 1.0, "stop@b": 0.0}
-    assert places(stop_a=0.0, stop_b=0.01) == {"*": 0.0}
-
-
 @pytest.mark.parametrize(
     ("hidden", "place", "value"),
     [
@@ -137,7 +96,7 @@ def test_the_fewest_numbers_that_suffice_are_taken() -> None:
         ({"zone_m": 3.0}, "detector_zone=*", 3.0),
         ({"distance_m": GAP_M + 18.0}, "detector_offset=advance", -18.0),
         ({"distance_m": GAP_M - 10.0}, "detector_offset=advance", 10.0),
-        ({"twins": 0.1}, "detector_splash=advance", 0.1),
+        ({"twins": 0.15}, "detector_splash=advance", 0.15),
     ],
 )
 def test_what_is_wrong_is_named_and_nothing_else(
@@ -171,7 +130,7 @@ def test_extensions_are_seen_without_speeds() -> None:
     found = named(day(7, extension_s=1.0, speeds=False), usual)
     (only,) = found
     assert only.startswith("detector_extension=*,")
-    assert float(only.split(",")[1]) == pytest.approx(1.0, abs=0.03)
+    assert float(only.split(",")[1]) == pytest.approx(1.0, abs=0.05)
     assert named(day(7, speeds=False), usual) == []
 
 
@@ -180,8 +139,11 @@ def test_pulses_are_seen(seconds: float) -> None:
     usual = together([day(seed) for seed in range(3)])
     pulses = day(7)
     pulses.passages[:, 2] = seconds
-    kinds = [f"detector_pulse={kind}@in,{seconds:g}" for kind in ("advance", "stop")]
-    assert named(pulses, usual) == kinds
+    assert named(pulses, usual) == [f"detector_pulse=*,{seconds:g}"]
+    one_kind = day(7)
+    advance = one_kind.passages[:, 0] < 2
+    one_kind.passages[advance, 2] = seconds
+    assert named(one_kind, usual) == [f"detector_pulse=advance,{seconds:g}"]
 
 
 def test_sightings_are_stored_and_read() -> None:

@@ -96,7 +96,7 @@ def _counts(tallies: Sequence[Tally]) -> NDArray[np.float64]:
 
 # --- simulated days -------------------------------------------------------------------------------
 
-VERSION = 7
+VERSION = 8
 """Version of features and replays; tallies cached under another version are not used."""
 
 _BETWEEN = "between "

@@ -13,14 +13,22 @@ those of the scenario as it is. No hypothesis is simulated.
 
 from __future__ import annotations
 
-import itertools
+import math
 from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass, fields
-from typing import Self
+from typing import Literal, Self
 
 import numpy as np
 from numpy.typing import NDArray
 
+from ugat_marl.diagnosis.error_places import (
+    Choice,
+    Equation,
+    ErrorPlaces,
+    Estimate,
+    Group,
+    Number,
+)
 from ugat_marl.diagnosis.features import DetectorLayout, Greens
 from ugat_marl.diagnosis.thresholds import Thresholds
 from ugat_marl.effects import (
@@ -45,7 +53,14 @@ ALONE, SECOND, THIRD, FOURTH, SIXTH, BRAKING = range(6)
 """Regimes of a passage: alone in free flow; second, third, fourth to fifth, sixth to eighth of a
 queue at a stop detector; braking alone for a red at an advance detector."""
 
-GAP_S = np.append(0.0, np.arange(0.25, 5.25, 0.25))
+Form = Literal["excess", "ratio"]
+"""What is compared of vehicles with speeds: the excess time over the zone, or the ratio G."""
+FORMS: tuple[Form, ...] = ("excess", "ratio")
+
+_EXTENSION = 0
+"""Index of the extension in the numbers of a place; the other one is the length of the zone."""
+
+GAP_S = 0.05 * np.arange(101)
 """Edges of the bins of the time between two passages, s."""
 
 # --- what is seen of single vehicles ------------------------------------------------------------
@@ -189,6 +204,7 @@ class _Track:
         gaps = np.diff(on)
         before, after = np.append(np.inf, gaps), np.append(gaps, np.inf)
         free = after - over > thresholds.touching_s
+        apart = (after - over)[:-1] > thresholds.no_gap_s
         length = np.where(np.isfinite(seen.length_m), seen.length_m, thresholds.length_m)
         return cls(
             on,
@@ -198,9 +214,7 @@ class _Track:
             before,
             after,
             free,
-            np.append(
-                float((~free[:-1]).sum()), np.histogram((after - over)[:-1][free[:-1]], GAP_S)[0]
-            ),
+            np.append(float((~apart).sum()), np.histogram((after - over)[:-1][apart], GAP_S)[0]),
             thresholds,
         )
 
@@ -322,22 +336,17 @@ def _twins(track: _Track, others: Sequence[_Track], thresholds: Thresholds) -> t
 
 
 @dataclass(frozen=True)
-class Estimate:
-    """A number with its standard error."""
+class _Median(Estimate):
+    """A median with its error, and the robust spread of single values."""
 
-    value: float
-    error: float
-
-    def differs(self, least: float, deviations: float) -> bool:
-        """Return True if the value is away from 0 by at least `least`, and beyond chance."""
-        return abs(self.value) >= least and abs(self.value) > deviations * self.error
+    spread: float
 
 
-def _median(values: Array) -> Estimate:
+def _median(values: Array) -> _Median:
     """Return the median and its error, ``1.2533 * 1.4826 MAD / sqrt(n)``."""
     middle = float(np.median(values))
-    spread = 1.4826 * float(np.median(np.abs(values - middle)))
-    return Estimate(middle, 1.2533 * max(spread, 1e-3) / float(np.sqrt(len(values))))
+    spread = max(1.4826 * float(np.median(np.abs(values - middle))), 1e-3)
+    return _Median(middle, 1.2533 * spread / float(np.sqrt(len(values))), spread)
 
 
 def _grain_s(times: Array) -> float:
@@ -355,108 +364,6 @@ def _grain_s(times: Array) -> float:
 
 
 @dataclass(frozen=True)
-class Equation:
-    """One linear equation ``value = coefficients . parameters + bend * rear`` with its error.
-
-    Attributes:
-        value: Measured minus expected.
-        coefficients: One for each parameter of a group of detectors.
-        bend: Difference of accelerating vehicles from steady ones if speeds are those of the rear.
-        error: Standard error of `value`.
-    """
-
-    value: float
-    coefficients: tuple[float, ...]
-    bend: float
-    error: float
-
-
-@dataclass(frozen=True)
-class Solution:
-    """Parameters of a group of detectors.
-
-    Attributes:
-        estimates: The parameters; those that are not needed are 0 without an error.
-        cost: Squared standardised misfit, with the prior and a price for every parameter.
-    """
-
-    estimates: tuple[Estimate, ...]
-    cost: float
-
-
-def solved(
-    equations: Sequence[Equation], rear: float, prior: Sequence[float], price: float
-) -> Solution:
-    """Solve by least squares, with as few parameters as the data ask for.
-
-    Args:
-        equations: The equations of a group.
-        rear: Weight of the bends: 1 for speeds of the rear, -1 of the front, 0 of the mean.
-        prior: Prior standard deviation of each parameter; the mean is 0.
-        price: Price of a parameter that is not 0.
-    """
-    error = np.array([one.error for one in equations])
-    value = np.array([one.value - rear * one.bend for one in equations]) / error
-    design = np.array([one.coefficients for one in equations]) / error[:, None]
-    scale = np.array(prior)
-    best = Solution(tuple(Estimate(0.0, 0.0) for _ in prior), float(value @ value))
-    for count in range(1, len(prior) + 1):
-        for chosen in itertools.combinations(range(len(prior)), count):
-            part, spread = design[:, chosen], scale[list(chosen)]
-            covariance = np.linalg.inv(part.T @ part + np.diag(spread**-2.0))
-            found = covariance @ (part.T @ value)
-            left = value - part @ found
-            cost = float(left @ left + ((found / spread) ** 2).sum() + price * count)
-            if cost < best.cost:
-                estimates = [Estimate(0.0, 0.0) for _ in prior]
-                for index, number, own in zip(chosen, found, np.diag(covariance), strict=True):
-                    estimates[index] = Estimate(float(number), float(np.sqrt(own)))
-                best = Solution(tuple(estimates), cost)
-    return best
-
-
-Group = tuple[str, str]
-"""Kind of detectors and edge."""
-
-
-def by_place(
-    equations: Mapping[Group, Sequence[Equation]],
-    rear: float,
-    prior: Sequence[float],
-    price: float,
-) -> tuple[dict[str, Solution], float]:
-    """Solve for all detectors together, for kinds or for approaches, whichever costs least.
-
-    Args:
-        equations: Equations by group.
-        rear: Weight of the bends, see `solved`.
-        prior: Prior standard deviations of the parameters.
-        price: Price of a parameter that is not 0.
-
-    Returns:
-        Solutions by place (see `ugat_marl.effects.detectors_at`), and their cost.
-    """
-
-    def of(groups: Sequence[Group]) -> Solution:
-        rows = [one for group in groups for one in equations[group]]
-        return solved(rows, rear, prior, price)
-
-    parts: dict[str, Solution] = {}
-    for kind in sorted({kind for kind, _ in equations}):
-        groups = [group for group in equations if group[0] == kind]
-        whole = {kind: of(groups)}
-        apart = {group_name(*group): of([group]) for group in groups}
-        parts |= min(whole, apart, key=_cost) if len(groups) > 1 else whole
-    everything = {EVERYWHERE: of(list(equations))} if equations else {}
-    best = everything if everything and _cost(everything) <= _cost(parts) else parts
-    return best, _cost(best)
-
-
-def _cost(solutions: Mapping[str, Solution]) -> float:
-    return sum(solution.cost for solution in solutions.values())
-
-
-@dataclass(frozen=True)
 class DetectorError:
     """An error of measurement that the data show.
 
@@ -468,6 +375,18 @@ class DetectorError:
 
     effect: Effect
     margin: float | None = None
+
+
+def _cheapest(
+    searches: Sequence[ErrorPlaces], elsewhere: Mapping[str, float] | None = None
+) -> Choice:
+    """Return the cheapest choice of several searches, each of which goes on from the others'."""
+    best = Choice({}, 0.0)
+    for turn in range(2):
+        choices = [search.choose(elsewhere, [*best.estimates]) for search in searches]
+        best = min(choices, key=lambda choice: choice.cost, default=best)
+        del turn
+    return best
 
 
 class Measurement:
@@ -492,6 +411,7 @@ class Measurement:
         self._simulated = simulated
         self._thresholds = thresholds
         self._grain_s = _grain_s(measured.passages[:, 2])
+        self._kinds = frozenset(detector.kind for detector in detectors)
         self._groups: dict[Group, list[int]] = {}
         for index, detector in enumerate(detectors):
             group = (detector.kind, edge_of_lane(detector.lane))
@@ -508,32 +428,37 @@ class Measurement:
             return ()
         pulses = self._pulses()
         found = [
-            DetectorError(DetectorPulse(place, round(seconds, 2)))
-            for place, seconds in pulses.items()
+            DetectorError(DetectorPulse(place, seconds))
+            for place, seconds in self._together(pulses).items()
         ]
-        point, zones = self._zones(pulses)
-        if point is not None:
-            found.append(DetectorError(DetectorSpeeds(EVERYWHERE, point)))
-        for place, (extension, zone) in zones.items():
-            if extension.differs(limit.least_extension_s, limit.named_deviations):
-                seconds = round(extension.value, 2)
-                longer = DetectorExtension(place, seconds, self._overlap(place, seconds))
-                found.append(DetectorError(longer, limit.half_interval * extension.error))
-            if zone.differs(limit.least_zone_m, limit.named_deviations):
-                changed = DetectorZone(place, round(zone.value, 1))
-                found.append(DetectorError(changed, limit.half_interval * zone.error))
-        for place, (farther,) in self._distances(bool(found)).items():
-            if farther.differs(limit.least_offset_m, limit.named_deviations):
-                moved = DetectorOffset(place, -round(farther.value, 1))
-                found.append(DetectorError(moved, limit.half_interval * farther.error))
+        speeds = bool(np.isfinite(self._measured.pairs[:, 2]).all())
+        offsets = self._offsets() if speeds else {}
+        moved = frozenset(index for place in offsets for index in self._members(place))
+        points, zones = self._zones(pulses, moved)
+        found += [DetectorError(DetectorSpeeds(place, point)) for place, point in points.items()]
+        for (place, index), number in zones.items():
+            least = (limit.least_extension_s, limit.least_zone_m)[index]
+            if not number.differs(least, limit.named_deviations):
+                continue
+            if index == _EXTENSION:
+                seconds = round(number.value, 2)
+                wrong = DetectorExtension(place, seconds, self._overlap(place, seconds))
+            else:
+                wrong = DetectorZone(place, round(number.value, 1))
+            found.append(DetectorError(wrong, limit.half_interval * number.error))
+        if not speeds and not found:  # or times over the zones say nothing about speeds
+            offsets = self._offsets()
+        for place, farther in offsets.items():
+            wrong = DetectorOffset(place, -round(farther.value, 1))
+            found.append(DetectorError(wrong, limit.half_interval * farther.error))
         found += self._splashes()
         return tuple(error for error in found if error.effect.name not in left_out)
 
     # --- single kinds of errors -------------------------------------------------------------------
 
-    def _pulses(self) -> dict[str, float]:
-        """Return the length of pulses by place, s, where detectors report no presence."""
-        pulses: dict[str, float] = {}
+    def _pulses(self) -> dict[Group, float]:
+        """Return the length of pulses by group, s, where detectors report no presence."""
+        pulses: dict[Group, float] = {}
         for group, members in self._groups.items():
             data, model = (self._of(x.passages, members) for x in (self._measured, self._simulated))
             if min(len(data), len(model)) < self._thresholds.least_sightings:
@@ -545,56 +470,106 @@ class Measurement:
             # Times in tenths of seconds are alike too, but not far from those of simulated days.
             apart = abs(float(np.median(data[:, 2]) - np.median(model[:, 2])))
             same = alike[0] > self._thresholds.pulse_share > 2.0 * alike[1]
-            if same and apart > self._thresholds.least_extension_s:
-                pulses[group_name(*group)] = float(np.median(data[:, 2]))
+            if same and apart > max(self._grain_s, self._thresholds.touching_s):
+                pulses[group] = round(float(np.median(data[:, 2])), 2)
         return pulses
 
-    def _zones(
-        self, pulses: Collection[str]
-    ) -> tuple[SpeedPoint | None, dict[str, tuple[Estimate, ...]]]:
-        """Return the point of speed measurement, and extension and zone by place.
+    def _together(self, pulses: Mapping[Group, float]) -> dict[str, float]:
+        """Return the pulses by place, with all groups of a kind as the kind if they are alike."""
+        places: dict[str, float] = {}
+        for kind in sorted({kind for kind, _ in pulses}):
+            own = {group: seconds for group, seconds in pulses.items() if group[0] == kind}
+            seconds = next(iter(own.values()))
+            times = [
+                self._of(self._measured.passages, members)[:, 2]
+                for (other, _), members in self._groups.items()
+                if other == kind
+            ]
+            same = [np.abs(x - seconds) < self._thresholds.touching_s for x in times if len(x)]
+            if all(x.mean() > self._thresholds.pulse_share for x in same):
+                places[kind] = seconds
+            else:
+                places |= {group_name(*group): seconds for group, seconds in own.items()}
+        whole = {kind for kind, _ in self._groups}
+        if len(whole) > 1 and set(places) == whole and len(set(places.values())) == 1:
+            return {EVERYWHERE: next(iter(places.values()))}
+        return places
 
-        The point is None if it is stated, cannot be told, or is the one of simulated days.
+    def _zones(
+        self, pulses: Collection[Group], moved: Collection[int]
+    ) -> tuple[dict[str, SpeedPoint], Mapping[Number, Estimate]]:
+        """Return points of speed measurement by place, and extensions and zones.
+
+        No point is returned if one is stated, if it cannot be told, or if it is the one of
+        simulated days.
         """
         stated = any(detector.speed_at is not None for detector in self._detectors)
-        point, best = self._point(pulses, "rear", fixed=stated)
-        zones = {place: solution.estimates for place, solution in best.items()}
-        return (None if point == "rear" else point), zones
+        return self._points(pulses, "rear", moved, fixed=stated)
 
-    def _point(
-        self, pulses: Collection[str], usual: SpeedPoint, *, fixed: bool = False
-    ) -> tuple[SpeedPoint, dict[str, Solution]]:
-        """Return the point of speed measurement for which vehicles that accelerate speak.
+    def _points(
+        self,
+        pulses: Collection[Group],
+        usual: SpeedPoint,
+        moved: Collection[int] = (),
+        *,
+        fixed: bool = False,
+    ) -> tuple[dict[str, SpeedPoint], Mapping[Number, Estimate]]:
+        """Return the points of speed measurement for which vehicles that accelerate speak.
 
         Args:
-            pulses: Places that are left out.
+            pulses: Groups that are left out.
             usual: Point of simulated days; another one needs `Thresholds.sure_of_a_point`.
+            moved: Indices of detectors that stand elsewhere.
             fixed: True to take `usual` as it is.
 
         Returns:
-            The point, and extensions and zones by place.
+            The place where speeds are measured at another point, if there is one, and extensions
+            and zones.
         """
         limit = self._thresholds
-        steady = self._steady()
-        equations = {
-            group: self._equations(members, steady)
-            for group, members in self._groups.items()
-            if group_name(*group) not in pulses
-        }
-        equations = {group: rows for group, rows in equations.items() if rows}
-        prior = (limit.usual_extension_s, limit.usual_zone_m)
-        best, least = by_place(equations, 1.0, prior, limit.price_of_an_error)
-        point, first = usual, least
-        # Bends are those of the point of simulated days, and opposite at the other end.
-        others: dict[SpeedPoint, float] = {
-            "front" if usual == "rear" else "rear": -1.0,
-            "mean": 0.0,
-        }
-        for name, weight in [] if fixed else others.items():
-            places, cost = by_place(equations, weight, prior, limit.price_of_an_error)
-            if cost < min(least, first - limit.sure_of_a_point):
-                point, best, least = name, places, cost
-        return point, best
+        searches = self._searches(pulses, moved)
+        best = _cheapest(searches)
+        if fixed or not searches:
+            return {}, best.estimates
+        numbers, places = [*best.estimates], searches[0].places
+        other: SpeedPoint = "front" if usual == "rear" else "rear"
+        shares: dict[SpeedPoint, float] = {other: 1.0, "mean": 0.5}
+        least = best.cost - limit.sure_of_a_point
+        points: dict[str, SpeedPoint] = {}
+        for place in places:  # a smaller place has to be better than a larger one
+            for point, share in shares.items():
+                here = {place: share}
+                if place in (EVERYWHERE, *self._kinds):
+                    choice = _cheapest(searches, here)
+                else:
+                    choice = min((s.of(numbers, here) for s in searches), key=lambda c: c.cost)
+                cost = choice.cost + searches[0].chances[place]
+                if cost < least - (limit.narrower_place if points else 0.0):
+                    least, best = cost, choice
+                    points = {place: point}
+        return points, best.estimates
+
+    def _searches(
+        self, pulses: Collection[Group], moved: Collection[int]
+    ) -> tuple[ErrorPlaces, ...]:
+        """Return the searches for extensions and zones: one for each form of the equations.
+
+        An extension adds the same to all excess times, and a zone the same to all ratios. Where
+        vehicles are not alike, the other form is less exact.
+        """
+        limit, steady = self._thresholds, self._steady()
+        searches: list[ErrorPlaces] = []
+        for form in FORMS:
+            equations = {
+                group: rows
+                for group, members in self._groups.items()
+                if group not in pulses
+                and (rows := self._equations(members, steady, form, set(members) <= set(moved)))
+            }
+            priors = (limit.usual_extension_s, limit.usual_zone_m)
+            if equations:
+                searches.append(ErrorPlaces(equations, priors, limit.price_of_an_error))
+        return tuple(searches)
 
     def contradicted_point(self) -> tuple[SpeedPoint, SpeedPoint] | None:
         """Return the stated point of speed measurement, and the one for which vehicles speak.
@@ -606,8 +581,8 @@ class Measurement:
         stated = points.pop() if len(points) == 1 else None
         if stated is None or stated == "mean" or self._grain_s > self._thresholds.coarsest_clock_s:
             return None
-        seen, _ = self._point(self._pulses(), stated)
-        return None if seen == stated else (stated, seen)
+        seen, _ = self._points(self._pulses(), stated)
+        return next(((stated, point) for point in seen.values()), None)
 
     def _steady(self) -> float:
         """Return the ratio G of steady vehicles on simulated days.
@@ -623,11 +598,14 @@ class Measurement:
         ratio = ratio[np.isfinite(ratio)]
         return float(np.median(ratio)) if len(ratio) >= self._thresholds.least_sightings else 1.0
 
-    def _equations(self, members: Sequence[int], steady: float) -> list[Equation]:
+    def _equations(
+        self, members: Sequence[int], steady: float, form: Form, moved: bool
+    ) -> list[Equation]:
         """Return the equations of a group for extension and zone.
 
-        Lone vehicles at advance detectors make two of them, since the slow and the quick half tell
-        both apart. At other detectors the slow ones turn and do not drive steadily.
+        Lone vehicles make two of them where they do not wait for a light, since the slow and the
+        quick half tell both apart. Of detectors that stand elsewhere only the quick half counts:
+        others accelerate and brake there as on no simulated day.
         """
         data, model = (self._of(x.passages, members) for x in (self._measured, self._simulated))
         speeds = np.isfinite(data[:, 3]).mean() > 0.5 if len(data) else False
@@ -636,104 +614,145 @@ class Measurement:
         equations: list[Equation] = []
         for regime in np.unique(data[:, 1]).astype(int).tolist():
             pair = [x[x[:, 1] == regime] for x in (data, model)]
-            parts = [pair]
-            steadily = regime == ALONE and self._detectors[members[0]].kind == "advance"
+            parts = {} if moved else {"": pair}
+            steadily = regime == ALONE and self._detectors[members[0]].kind != "stop"
             if speeds and steadily and all(map(len, pair)):
                 quick = [x[:, 3] > np.median(x[:, 3]) for x in pair]
-                parts = [
-                    [x[q == half] for x, q in zip(pair, quick, strict=True)] for half in (0, 1)
-                ]
-            for seen, known in parts:
+                parts = {
+                    name: [x[q == half] for x, q in zip(pair, quick, strict=True)]
+                    for half, name in enumerate(("slow", "quick"))
+                    if not moved or name == "quick"
+                }
+            for name, (seen, known) in parts.items():
                 if min(len(seen), len(known)) >= self._thresholds.least_sightings:
                     equations.append(
-                        self._of_ratio(seen, known, steady)
+                        self._of_speeds(seen, known, steady, form, name)
                         if speeds
-                        else self._of_time(seen, known, len(np.unique(data[:, 1])))
+                        else self._of_time(seen, known)
                     )
         return equations
 
-    def _of_ratio(self, seen: Array, known: Array, steady: float) -> Equation:
-        """Return the equation of a regime for the ratio G."""
-        limit = self._thresholds
-        found, usual = (_median(x[:, 2] * x[:, 3] / x[:, 4]) for x in (seen, known))
-        bend = usual.value / steady - 1.0
-        # The same drivers pass all groups of a kind, so more groups are not more exact.
-        kind = self._detectors[int(seen[0, 0])].kind
-        alike = sum(kind == other for other, _ in self._groups)
-        doubt = limit.inexact * found.value + limit.bent * abs(bend) * np.sqrt(alike)
-        doubt += 0.0 if seen[0, 1] == ALONE else limit.unlike
-        pace = float(np.median(seen[:, 3] / seen[:, 4]))
-        doubt += 0.5 * self._grain_s * pace
-        error = float(np.sqrt(found.error**2 + usual.error**2 + doubt**2)) / steady
-        coefficients = (pace / steady, 1.0 / float(np.median(seen[:, 4])) / steady)
-        return Equation(found.value / steady - 1.0, coefficients, bend, error)
+    def _of_speeds(
+        self, seen: Array, known: Array, steady: float, form: Form, half: str
+    ) -> Equation:
+        """Return the equation of a regime with speeds, in s.
 
-    def _of_time(self, seen: Array, known: Array, regimes: int) -> Equation:
+        The value is ``d - (L + z) / v``, or ``(G - 1) (L + z) / v`` with the median of G. Both are
+        the same for one vehicle.
+        """
+        limit = self._thresholds
+        speed, reach = (float(np.median(seen[:, column])) for column in (3, 4))
+        if form == "excess":
+            found, usual = (_median(x[:, 2] - steady * x[:, 4] / x[:, 3]) for x in (seen, known))
+        else:
+            found, usual = (
+                _median((x[:, 2] * x[:, 3] / x[:, 4] - steady) * reach / speed)
+                for x in (seen, known)
+            )
+        over = float(np.median(known[:, 2]))
+        doubt = limit.inexact * over + limit.bent_here * abs(usual.value) + 0.5 * self._grain_s
+        alike = limit.bent_alone * abs(usual.value)
+        kind, regime = self._detectors[int(seen[0, 0])].kind, int(seen[0, 1])
+        if regime != ALONE:
+            alike += limit.unlike * over
+        elif kind == "exit":  # some still accelerate, and a lorry does so for longer
+            alike += limit.bent * usual.spread
+        return Equation(
+            found.value - usual.value,
+            (1.0, 1.0 / speed),
+            float(np.sqrt(found.error**2 + usual.error**2 + doubt**2)),
+            shared={kind: limit.bent * usual.value, f"{kind} {regime} {half}": alike},
+            bend=-2.0 * usual.value,
+        )
+
+    def _of_time(self, seen: Array, known: Array) -> Equation:
         """Return the equation of a regime for the time over the zone, where speeds are missing."""
         limit = self._thresholds
         found, usual = _median(seen[:, 2]), _median(known[:, 2])
         kind = self._detectors[int(seen[0, 0])].kind
         steadily = seen[0, 1] == ALONE and kind == "advance"
-        share = limit.speed_doubt if steadily else limit.queue_doubt
-        # The same drivers pass all groups of a kind, so more groups are not more exact.
-        alike = sum(kind == other for other, _ in self._groups) * (1 if steadily else regimes)
-        doubt = share * usual.value * np.sqrt(alike) + 0.5 * self._grain_s
-        error = float(np.hypot(found.error, doubt))
+        doubt = usual.value * (limit.speed_doubt if steadily else limit.queue_doubt)
         slowness = usual.value / float(np.median(known[:, 4]))
-        return Equation(found.value - usual.value, (1.0, slowness), 0.0, error)
+        return Equation(
+            found.value - usual.value,
+            (1.0, slowness),
+            float(np.hypot(found.error, doubt + 0.5 * self._grain_s)),
+            shared={f"{kind} {steadily}": doubt},
+        )
 
     def _overlap(self, place: str, seconds: float) -> Overlap:
         """Return how close vehicles are reported, from the passages that touch the next one."""
-        names = detectors_at(place, self._detectors)
-        members = [index for index, one in enumerate(self._detectors) if one.id in names]
+        limit, members = self._thresholds, self._members(place)
         data, model = (x.gaps[members].sum(axis=0) for x in (self._measured, self._simulated))
-        expected = model[: 1 + int(np.searchsorted(GAP_S, seconds))].sum() / max(model.sum(), 1.0)
-        touching = data[0] / max(data.sum(), 1.0)
-        return "merged" if touching < self._thresholds.merged_share * expected else "split"
+        closer = model[: 1 + int(np.searchsorted(GAP_S, seconds + 1e-9, "right") - 1)].sum()
+        share = closer / max(model.sum(), 1.0)
+        expected = float(share * data.sum())
+        if expected < limit.least_touching:
+            return "unknown"
+        # Some gaps are too small for the clock, and no sign of vehicles apart.
+        chance = data[1] * max(self._grain_s, limit.no_gap_s) / GAP_S[1]
+        return "split" if data[0] - chance > limit.merged_share * expected else "merged"
 
-    def _distances(self, times_changed: bool) -> dict[str, tuple[Estimate, ...]]:
+    def _members(self, place: str) -> list[int]:
+        names = detectors_at(place, self._detectors)
+        return [index for index, one in enumerate(self._detectors) if one.id in names]
+
+    def _offsets(self) -> dict[str, Estimate]:
         """Return by how much advance and stop detectors are farther apart than stated, m."""
         limit = self._thresholds
-        equations: dict[Group, list[Equation]] = {}
+        speeds = bool(np.isfinite(self._measured.pairs[:, 2]).all())
+        least = limit.least_pairs if speeds else 2 * limit.least_sightings
+        distances: dict[Group, tuple[Array, Array]] = {}
         for group, members in self._groups.items():
             data, model = (self._of(x.pairs, members) for x in (self._measured, self._simulated))
-            speeds = bool(np.isfinite(data[:, 2]).all())
-            least = limit.least_sightings * (1 if speeds else 2)
-            if group[0] != "advance" or min(len(data), len(model)) < least:
-                continue
-            if not speeds and times_changed:
-                continue  # times over the zones then say nothing about speeds
-            found, usual = (_median(x[:, 1] * x[:, 2 if speeds else 3]) for x in (data, model))
+            if group[0] == "advance" and len(data) >= least and 2 * len(model) >= least:
+                travel = [x[:, 1] * x[:, 2 if speeds else 3] for x in (data, model)]
+                distances[group] = travel[0], travel[1]
+        # The spread of a few may be small by chance.
+        spread = float(np.median([_median(model).spread for _, model in distances.values()] or [0]))
+        equations: dict[Group, list[Equation]] = {}
+        for group, pair in distances.items():
+            found, usual = map(_median, pair)
+            chance = [max(_median(x).error, 1.2533 * spread / np.sqrt(len(x))) for x in pair]
             doubt = (limit.inexact if speeds else limit.pace_doubt) * usual.value
-            error = float(np.sqrt(found.error**2 + usual.error**2 + doubt**2))
-            equations[group] = [Equation(found.value - usual.value, (1.0,), 0.0, error)]
-        places, _ = by_place(equations, 0.0, (limit.usual_offset_m,), limit.price_of_an_error)
+            error = math.hypot(doubt, *chance)
+            equations[group] = [Equation(found.value - usual.value, (1.0,), error)]
+        search = ErrorPlaces(equations, (limit.usual_offset_m,), limit.price_of_an_error)
         return {
-            ("advance" if place == EVERYWHERE else place): solution.estimates
-            for place, solution in places.items()
+            place: farther
+            for (place, _), farther in search.choose().estimates.items()
+            if farther.differs(limit.least_offset_m, limit.named_deviations)
         }
 
     def _splashes(self) -> list[DetectorError]:
-        """Return the kinds of detectors that report vehicles of the next lane.
+        """Return the places of detectors that report vehicles of the next lane.
 
-        With s the share of reported vehicles, a share ``f = 2 s / (1 + s)`` of lone passages has a
-        twin: both the vehicle and its splash have one.
+        A share s of reported vehicles gives a share ``f = 2 s / (1 + c s)`` of lone passages with a
+        twin: both the vehicle and its splash have one, but not on the lanes at its other side. With
+        n next lanes of each of the detectors, c is the sum of n^2 by the sum of n.
         """
-        limit = self._thresholds
-        found: list[DetectorError] = []
-        for kind in sorted({kind for kind, _ in self._groups}):
-            members = [i for i, one in enumerate(self._detectors) if one.kind == kind]
+        limit, beside = self._thresholds, next_detectors(self._detectors)
+        equations: dict[Group, list[Equation]] = {}
+        for group, members in self._groups.items():
             data, model = (x.twins[members].sum(axis=0) for x in (self._measured, self._simulated))
             if min(data[1], model[1]) < limit.least_sightings:
                 continue
-            share, usual = data[0] / data[1], model[0] / model[1]
-            error = np.sqrt((share + 1.0 / data[1]) / data[1] + (usual + 1.0 / model[1]) / model[1])
-            excess = Estimate(float(share - usual), float(error))
-            if excess.differs(2.0 * limit.least_splash, limit.named_deviations):
-                splash = excess.value / (2.0 - excess.value)
-                margin = limit.half_interval * excess.error / (2.0 - excess.value)
-                found.append(DetectorError(DetectorSplash(kind, round(splash, 3)), margin))
-        return found
+            lanes = np.array([len(beside[self._detectors[index].id]) for index in members])
+            c = float((lanes**2).sum() / lanes.sum())
+            twins = [x[0] / x[1] for x in (data, model)]
+            chance = [(f + 1.0 / x[1]) / x[1] for f, x in zip(twins, (data, model), strict=True)]
+            excess, error = twins[0] - twins[1], np.sqrt(sum(chance))
+            slope = 2.0 / (2.0 - c * excess) ** 2
+            row = Equation(float(excess / (2.0 - c * excess)), (1.0,), float(slope * error))
+            equations[group] = [row]
+        search = ErrorPlaces(equations, (limit.usual_splash,), limit.price_of_an_error)
+        return [
+            DetectorError(
+                DetectorSplash(place, round(share.value, 3)), limit.half_interval * share.error
+            )
+            for (place, _), share in search.choose().estimates.items()
+            if share.differs(limit.least_splash, limit.named_deviations)
+        ]
 
     @staticmethod
     def _of(rows: Array, members: Sequence[int]) -> Array:

@@ -261,9 +261,15 @@ class Thresholds(DayThresholds):
     least_sightings: int = 15
     """Vehicles below which a group of detectors is not judged by itself. By hand. Halved: medians
     of a few vehicles are compared."""
+    least_pairs: int = 5
+    """The same for vehicles seen at two detectors, with their speeds. By hand: each tells the
+    distance to a meter or two. Halved: two vehicles move a detector."""
     touching_s: float = 0.02
     """Time between two passages below which the detector did not go off between them, s: above the
     rounding of logs to 10 ms. Halved: no change for logs in ms."""
+    no_gap_s: float = 0.005
+    """Time between two passages below which the second began as the first ended, s: half of 10 ms.
+    Halved: no change for logs in ms."""
     longest_alone_s: float = 8.0
     """Longest time of a moving vehicle over a zone, s. By hand: long zones and long extensions.
     Halved: extensions of 4 s and more are not seen."""
@@ -291,14 +297,27 @@ class Thresholds(DayThresholds):
     """The same for vehicles that accelerate, as a share of their difference from steady ones. By
     hand: drivers may accelerate half or one and a half times as hard. Halved: slow drivers look
     like speeds measured elsewhere."""
+    bent_alone: float = 0.2
+    """The same for one kind of passage, compared with the others. By hand: drivers who accelerate
+    otherwise do so from the second to the eighth of a queue. Halved: as above."""
+    bent_here: float = 0.15
+    """The same for the vehicles of one approach, compared with those of the others. By hand: the
+    same drivers pass all approaches. Halved: an approach with other limits looks like an error."""
     unlike: float = 0.015
     """The same for queues and vehicles that brake, added to both. By hand. Halved: as above."""
     sure_of_a_point: float = 9.0
     """Difference in cost from which speeds are not taken for those of the rear. By hand: three
     deviations. Halved: slow drivers look like speeds measured elsewhere."""
+    narrower_place: float = 4.0
+    """Cost by which a place must be better than a larger one that holds it. By hand: two
+    deviations. Halved: one kind of detectors is named for all of them by chance."""
     price_of_an_error: float = 8.0
     """Price of an error of a group of detectors, in squared deviations. By hand. Halved: approaches
     are judged apart from each other by chance."""
+    least_touching: float = 5.0
+    """Expected number of passages without a gap from which their lack tells that close vehicles are
+    reported as one. By hand: none of five is seen by chance in one case of 150. Halved: in one of
+    12."""
     merged_share: float = 0.3
     """Share of the expected passages without a gap below which close vehicles are reported as one.
     By hand. Halved: more such reports count as split."""
@@ -320,16 +339,19 @@ class Thresholds(DayThresholds):
     usual_offset_m: float = 15.0
     """Prior standard deviation of the position of an advance detector, m. By hand: setbacks are
     read off plans, and sometimes given to another point. Halved: large errors are drawn to 0."""
+    usual_splash: float = 0.2
+    """Prior standard deviation of the share of passages with a twin. By hand: a loop that reports
+    every fourth vehicle beside it is soon mended. Halved: large shares are drawn to 0."""
     named_deviations: float = 4.0
     """Standard errors beyond which an error of detectors is named. By hand: many groups are judged.
     Halved: one group in twenty is blamed by chance."""
     least_extension_s: float = 0.15
     """Extension below which it does not matter, s: above the response time of loop detectors.
     Halved: response times are named."""
-    least_zone_m: float = 1.0
+    least_zone_m: float = 0.7
     """Error of a zone's length below which it does not matter, m. By hand: the field of a loop
     reaches beyond its edge by as much. Halved: such fields are named."""
-    least_offset_m: float = 3.0
+    least_offset_m: float = 1.0
     """Error of a position below which it does not matter, m. By hand: setbacks are read off plans.
     Halved: errors are named that hardly change any statistic."""
     least_splash: float = 0.02

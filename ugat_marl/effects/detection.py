@@ -33,9 +33,10 @@ from ugat_marl.scenarios import (
 
 _PLACE = TextParameter("detectors", everywhere=True)
 
-Overlap = Literal["split", "merged"]
+Overlap = Literal["split", "merged", "unknown"]
 """Report of vehicles that follow so closely that the detector never goes off between them:
-``split`` ends the first at the arrival of the second, ``merged`` reports one long passage."""
+``split`` ends the first at the arrival of the second, ``merged`` reports one long passage.
+``unknown`` is simulated as ``split``: no vehicle follows so closely that it could be told."""
 
 
 def detectors_at(place: str, detectors: Sequence[Detector], effect: str = "") -> frozenset[str]:
@@ -190,7 +191,9 @@ class DetectorExtension(_OfDetectors):
     ranges: ClassVar[dict[str, NumberParameter]] = {"seconds": NumberParameter("s", -5.0, 10.0)}
     texts: ClassVar[dict[str, TextParameter]] = {
         "place": _PLACE,
-        "overlap": TextParameter("report of close vehicles", allowed=("split", "merged")),
+        "overlap": TextParameter(
+            "report of close vehicles", allowed=("split", "merged", "unknown")
+        ),
     }
     seconds: float
     overlap: Overlap
