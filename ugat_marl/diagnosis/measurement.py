@@ -650,13 +650,12 @@ class Measurement:
                 for x in (seen, known)
             )
         over = float(np.median(known[:, 2]))
-        doubt = limit.inexact * over + limit.bent_here * abs(usual.value) + 0.5 * self._grain_s
-        alike = limit.bent_alone * abs(usual.value)
+        bend = max(abs(usual.value), usual.spread)
+        doubt = limit.inexact * over + limit.bent_here * bend + 0.5 * self._grain_s
+        alike = limit.bent_alone * bend
         kind, regime = self._detectors[int(seen[0, 0])].kind, int(seen[0, 1])
         if regime != ALONE:
             alike += limit.unlike * over
-        elif kind == "exit":  # some still accelerate, and a lorry does so for longer
-            alike += limit.bent * usual.spread
         return Equation(
             found.value - usual.value,
             (1.0, 1.0 / speed),
@@ -741,7 +740,8 @@ class Measurement:
             c = float((lanes**2).sum() / lanes.sum())
             twins = [x[0] / x[1] for x in (data, model)]
             chance = [(f + 1.0 / x[1]) / x[1] for f, x in zip(twins, (data, model), strict=True)]
-            excess, error = twins[0] - twins[1], np.sqrt(sum(chance))
+            excess = twins[0] - twins[1]
+            error = np.sqrt(sum(chance) + (limit.twin_doubt * twins[1]) ** 2)
             slope = 2.0 / (2.0 - c * excess) ** 2
             row = Equation(float(excess / (2.0 - c * excess)), (1.0,), float(slope * error))
             equations[group] = [row]
@@ -751,7 +751,7 @@ class Measurement:
                 DetectorSplash(place, round(share.value, 3)), limit.half_interval * share.error
             )
             for (place, _), share in search.choose().estimates.items()
-            if share.differs(limit.least_splash, limit.named_deviations)
+            if share.value > 0.0 and share.differs(limit.least_splash, limit.named_deviations)
         ]
 
     @staticmethod

@@ -297,12 +297,13 @@ class Thresholds(DayThresholds):
     """The same for vehicles that accelerate, as a share of their difference from steady ones. By
     hand: drivers may accelerate half or one and a half times as hard. Halved: slow drivers look
     like speeds measured elsewhere."""
-    bent_alone: float = 0.2
-    """The same for one kind of passage, compared with the others. By hand: drivers who accelerate
-    otherwise do so from the second to the eighth of a queue. Halved: as above."""
-    bent_here: float = 0.15
+    bent_alone: float = 0.5
+    """The same for one kind of passage, compared with the others. By hand: slow drivers are not
+    equally slow at every place of a queue. Halved: as above."""
+    bent_here: float = 0.3
     """The same for the vehicles of one approach, compared with those of the others. By hand: the
-    same drivers pass all approaches. Halved: an approach with other limits looks like an error."""
+    same drivers pass all approaches, but with other speeds and turns. Halved: an approach with
+    other limits looks like an error."""
     unlike: float = 0.015
     """The same for queues and vehicles that brake, added to both. By hand. Halved: as above."""
     sure_of_a_point: float = 9.0
@@ -339,6 +340,9 @@ class Thresholds(DayThresholds):
     usual_offset_m: float = 15.0
     """Prior standard deviation of the position of an advance detector, m. By hand: setbacks are
     read off plans, and sometimes given to another point. Halved: large errors are drawn to 0."""
+    twin_doubt: float = 0.3
+    """Share by which twins of vehicles side by side may differ. By hand: other drivers form other
+    platoons. Halved: platoons look like splash."""
     usual_splash: float = 0.2
     """Prior standard deviation of the share of passages with a twin. By hand: a loop that reports
     every fourth vehicle beside it is soon mended. Halved: large shares are drawn to 0."""
