@@ -9,7 +9,7 @@ from typing import Annotated
 from rich.console import Console
 from tyro.conf import Positional, arg
 
-from studies.blind.cases import Case
+from studies.blind.cases import Case, read_plan
 from studies.blind.generate import VARIATIONS, Blueprint, generate
 from studies.blind.grade import grade_cases, read_grades
 from studies.blind.run import Diagnose, run_cases
@@ -223,8 +223,9 @@ class BlindTable:
         if self.out is not None:
             require_writable(self.out)
         grades = [item for directory in self.directories for item in read_grades(directory)]
-        console.print(markdown(grades), soft_wrap=True, markup=False)
+        drawn = sum(len(read_plan(directory)) for directory in self.directories)
+        console.print(markdown(grades, drawn), soft_wrap=True, markup=False)
         if self.out is not None:
-            write_table(grades, self.out)
+            write_table(grades, self.out, drawn)
             console.print(f"table: {self.out}", soft_wrap=True)
         return 0

@@ -163,9 +163,16 @@ def confusion(grades: Iterable[Grade]) -> dict[str, Counter[str]]:
     return dict(sorted(found.items()))
 
 
-def markdown(grades: Sequence[Grade]) -> str:
-    """Return the table and the confusions as Markdown."""
+def markdown(grades: Sequence[Grade], drawn: int | None = None) -> str:
+    """Return the table and the confusions as Markdown.
+
+    Args:
+        grades: Grades of the cases.
+        drawn: Number of cases that were drawn; None to leave it out.
+    """
+    left = "" if drawn is None else f"{len(grades)} of {drawn} cases that were drawn are graded."
     lines = [
+        *([left, ""] if left else []),
         "| measure | n | result | 95 % interval, or quartiles | goal | met | aim |",
         "|---|---|---|---|---|---|---|",
     ]
@@ -185,13 +192,21 @@ def markdown(grades: Sequence[Grade]) -> str:
     return "\n".join(lines) + "\n"
 
 
-def write_table(grades: Sequence[Grade], path: Path) -> None:
-    """Write the table as Markdown, or as JSON if the name ends in ``.json``."""
+def write_table(grades: Sequence[Grade], path: Path, drawn: int) -> None:
+    """Write the table as Markdown, or as JSON if the name ends in ``.json``.
+
+    Args:
+        grades: Grades of the cases.
+        path: The file.
+        drawn: Number of cases that were drawn.
+    """
     if path.suffix != ".json":
-        write_whole(path, markdown(grades))
+        write_whole(path, markdown(grades, drawn))
         return
     content = {
         "schema": SCHEMA,
+        "drawn": drawn,
+        "graded": len(grades),
         "rows": [asdict(row) for row in rows_of(grades)],
         "confusion": confusion(grades),
     }

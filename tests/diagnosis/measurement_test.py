@@ -146,6 +146,74 @@ def test_pulses_are_seen(seconds: float) -> None:
     assert named(one_kind, usual) == [f"detector_pulse=advance,{seconds:g}"]
 
 
+def pairs_only(*distances_m: float) -> Sightings:
+    """One period in which vehicles at 10 m/s show these distances, at the first detector."""
+    rows = [(0, m / 10.0, 10.0, 10.0) for m in distances_m]
+    return replace(day(0), passages=np.empty((0, 5)), pairs=np.array(rows))
+
+
+@pytest.mark.parametrize(
+    ("seen", "place"),
+    [((56.0, 56.2, 55.8, 56.1, 56.3), "detector_offset=advance,-6.1"), ((56.0,) * 4, None)],
+)
+def test_five_vehicles_move_a_detector_and_four_do_not(
+    seen: tuple[float, ...], place: str | None
+) -> None:
+    usual = pairs_only(*np.linspace(49.5, 50.5, 30).tolist())
+    assert named(pairs_only(*seen), usual) == ([] if place is None else [place])
+
+
+def close(seed: int, *, extension_s: float = 0.0, merged: bool = False, least: float) -> Sightings:
+    """One period in which every third vehicle follows within `least` to `least` + 1 s."""
+    generator = np.random.default_rng(seed)
+    gaps = np.where(np.arange(300) % 3, 12.0, generator.uniform(least, least + 1.0, 300))
+    times = 10.0 + np.cumsum(gaps)
+    pace = np.full(300, 12.0)
+    passages: dict[str, Passages] = {}
+    for name in ("", " left"):
+        for place, at in ((f"far{name}", times), (f"line{name}", times + GAP_M / pace)):
+            seen = crossings(at, pace, extension_s)
+            touching = np.append(seen.off_s[:-1] > seen.on_s[1:], False)
+            if merged:
+                first = np.append(True, ~touching[:-1])
+                last = np.append(~touching[:-1], True)
+                cut = Passages(
+                    seen.on_s[first], seen.off_s[last], pace[first], seen.length_m[first]
+                )
+            else:
+                ends = np.where(touching, np.append(seen.on_s[1:], 0.0), seen.off_s)
+                cut = Passages(seen.on_s, ends, pace, seen.length_m)
+            passages[place] = cut
+    period = Period("day", 0.0, 3600.0, "fit", {}, passages)
+    return Sightings.of(LAYOUT, period, [GREEN, GREEN], THRESHOLDS)
+
+
+@pytest.mark.parametrize(
+    ("merged", "least", "form"),
+    [(True, 0.6, "merged"), (False, 0.6, "split"), (True, 3.0, "unknown"), (False, 3.0, "unknown")],
+)
+def test_close_vehicles_tell_whether_they_are_merged(merged: bool, least: float, form: str) -> None:
+    usual = together([close(seed, least=least) for seed in range(3)])
+    found = named(close(7, extension_s=0.8, merged=merged, least=least), usual)
+    assert found == [f"detector_extension=*,0.8,{form}"]
+
+
+def test_splash_onto_three_lanes_by_hand() -> None:
+    """Of three lanes the middle one gets splash of both, and has twins on one side only.
+
+    1000 vehicles on each lane and a share of 0.2. An outer lane reports 1200 passages, and 200
+    vehicles and 200 splashes have a twin in the middle. The middle lane looks to both sides: for
+    1000 vehicles and 400 splashes, that is 2800 times; 400 vehicles and 400 splashes have a twin.
+    """
+    detectors = [Detector(f"far{n}", f"in_{n}", 100.0, 0.0, "advance") for n in range(3)]
+    empty = Sightings(np.empty((0, 5)), np.empty((0, 4)), np.zeros((3, 101)), np.zeros((3, 2)))
+    usual = replace(empty, twins=np.array([(0.0, 1000.0), (0.0, 2000.0), (0.0, 1000.0)]))
+    twins = np.array([(200 + 200, 1200), (400 + 400, 2000 + 800), (200 + 200, 1200)], float)
+    (error,) = Measurement(detectors, replace(empty, twins=twins), usual, THRESHOLDS).errors()
+    assert str(error.effect).startswith("detector_splash=advance,")
+    assert float(str(error.effect).split(",")[1]) == pytest.approx(0.2, rel=0.02)
+
+
 def test_sightings_are_stored_and_read() -> None:
     one = day(1)
     again = Sightings.from_arrays(one.arrays())

@@ -1,4 +1,4 @@
-"""Which detectors err, and in which numbers: as few of them as the data ask for.
+"""Choice of the detectors that err, and of their numbers: as few as the data ask for.
 
 Every group of detectors gives linear equations ``value = coefficients . numbers + doubt``. A number
 belongs to all detectors, to those of a kind, or to a group; each one costs a price. What drivers do

@@ -168,6 +168,20 @@ def test_places_and_windows() -> None:
     assert grade(CLOSURE, says("explained", effect("parking", "e_1"))).place_right is None
 
 
+def test_a_form_that_is_said_to_be_unknown_is_not_wrong() -> None:
+    longer = hidden(name="detector_extension", place="exit", seconds=0.6, overlap="merged")
+    case = label(longer, group="measurement")
+
+    def right(place: str) -> bool | None:
+        named = effect("detector_extension", place, seconds=(0.58, 0.6, 0.62))
+        found = grade(case, says("explained", named))
+        assert len(found.estimates) == (found.place_right is True)
+        return found.place_right
+
+    assert right("exit>merged") and right("exit>unknown")
+    assert right("exit>split") is right("stop>unknown") is right("exit@a>unknown") is False
+
+
 def test_parameters_are_judged_by_value_by_effect_and_by_interval() -> None:
     found = grade(HEADWAY, says("explained", effect("headway", seconds=(1.4, 1.5, 1.6))))
     (estimate,) = found.estimates
@@ -296,12 +310,13 @@ def test_every_aim_belongs_to_a_row() -> None:
 
 
 def test_the_table_is_written(tmp_path: Path) -> None:
-    write_table(some_grades(), tmp_path / "table.md")
+    write_table(some_grades(), tmp_path / "table.md", 40)
     text = (tmp_path / "table.md").read_text()
-    assert text == markdown(some_grades())
+    assert text.startswith(f"{len(some_grades())} of 40 cases that were drawn are graded.\n")
+    assert text.endswith(markdown(some_grades()))
     assert "| 10 | 9 of 10: 90.0 % | 59.6 % to 98.2 % | at least 90 % | yes | 98 % |" in text
     assert "| headway | 12 | 10 | headway (10), acceleration (2) |" in text
-    write_table(some_grades(), tmp_path / "table.json")
+    write_table(some_grades(), tmp_path / "table.json", 40)
     content = json.loads((tmp_path / "table.json").read_text())
     assert content["confusion"]["none"] == {"nothing": 2}
 
