@@ -163,6 +163,12 @@ def test_five_vehicles_move_a_detector_and_four_do_not(
     assert named(pairs_only(*seen), usual) == ([] if place is None else [place])
 
 
+def test_a_distance_beyond_all_streets_is_no_position() -> None:
+    """Lone vehicles of other lanes can look like one; an effect of 65 m could not even be made."""
+    usual = pairs_only(*np.linspace(4.5, 5.5, 30).tolist())
+    assert named(pairs_only(*np.linspace(69.0, 71.0, 9).tolist()), usual) == []
+
+
 def close(seed: int, *, extension_s: float = 0.0, merged: bool = False, least: float) -> Sightings:
     """One period in which every third vehicle follows within `least` to `least` + 1 s."""
     generator = np.random.default_rng(seed)

@@ -20,6 +20,7 @@ from ugat_marl.experiments import transfer
 from ugat_marl.experiments.plans import described_plan, work_of
 from ugat_marl.experiments.transfers import TRAININGS, planned_jobs
 from ugat_marl.grounding import StreetConfig, UgatConfig
+from ugat_marl.policies import DQN_NAME, UNIVERSAL_NAME, DQNConfig
 from ugat_marl.progress import Silent
 
 
@@ -41,6 +42,19 @@ def test_a_fitted_street_simulates_shorter_worlds(tmp_path: Path) -> None:
     work = work_of(planned_jobs(config), tmp_path, 7200.0)
     assert (work["fitting"].units, work["fitting"].weight) == (60, 0.25)
     assert work["comparing"].units == 2 * 3 * 2
+
+
+def test_lessons_are_work(tmp_path: Path) -> None:
+    def lessons(budget: int, learner: str) -> int:
+        ugat = UgatConfig(iterations=2, street=StreetConfig(rule_budget=budget))
+        config = replace(SMALL, ugat=ugat, learner=learner, dqn=DQNConfig())
+        return work_of(planned_jobs(config), tmp_path, 7200.0)["lessons"].units
+
+    # 14 rules once, 3 of them twice more, 3 episodes shown: in the simulation and per iteration
+    assert lessons(0, UNIVERSAL_NAME) == 3 * (14 + 3 * 2 + 3)
+    # where rules race in the fitted street anyway, only the shown ones
+    assert lessons(4, UNIVERSAL_NAME) == (14 + 3 * 2 + 3) + 2 * 3
+    assert lessons(0, DQN_NAME) == 0
 
 
 def test_what_is_done_is_neither_planned_nor_counted(

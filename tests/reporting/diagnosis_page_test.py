@@ -348,10 +348,12 @@ def test_the_usual_criteria_stand_first_and_ours_beside_them() -> None:
         "As it is: GEH < 5 on 100 % of counts (met, usual: 85 %), FHWA 1 of 4 criteria met; our "
         "test not met, p < 0.001. Corrected: GEH < 5 on 100 % of counts (met, usual: 85 %), FHWA "
         "not known (it needs three measured days); our test met, p = 0.33. GEH does not see this "
-        "gap. Ours is stricter. GEH and FHWA see how many vehicles pass"
+        "gap. Ours is stricter than GEH, which sees how many vehicles pass"
     )
+    assert "whose own chance can fail a model" not in text  # where FHWA failed, so did ours
     same = " ".join(printed(diagnosis_of("no_discrepancy")).split())
-    assert "our test met, p = 0.4. Ours is stricter" in same
+    assert "our test met, p = 0.4. Ours is stricter than GEH" in same
+    assert "whose own chance can fail a model; ours holds all days against it." in same
     assert "Corrected:" not in same
 
 

@@ -64,3 +64,14 @@ def test_plans_and_approaches_fit_without_divided_words(plans: list[SignalPlan])
     delays = {rule: {"A1_B1": (300.0, 60.0)} for rule in ("programme", "max-pressure-loss")}
     words = set(" ".join(lines_of(approach_table("Delay", delays, network))).split())
     assert {"B1", "(signal_2)", "eastbound", "max-pressure-loss"} <= words
+
+
+def test_an_approach_that_nobody_passes_is_the_worst_and_hides_no_other() -> None:
+    network = Network.read(load_scenario("grid2x2-v1"))
+    starved = {"A1_A2": (100.0, 20.0), "A1_B1": (0.0, float("nan")), "B1_A1": (50.0, 90.0)}
+    rows = lines_of(approach_table("Delay", {"mine": starved}, network))
+    found = [line.split() for line in rows if "A1" in line and "_" in line]
+    assert [next(word for word in row if "_" in word and "(" not in word) for row in found] == [
+        "A1_B1", "B1_A1", "A1_A2",
+    ]  # fmt: skip
+    assert "none passed" in " ".join(found[0])

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable
 from pathlib import Path
 
@@ -135,6 +136,7 @@ def test_levels_are_those_of_the_manual(delay_s: float, level: str) -> None:
 
 def test_delays_are_weighed_by_vehicles(tmp_path: Path) -> None:
     assert mean_delay_s([(300, 10.0), (100, 50.0)]) == 20.0
+    assert mean_delay_s([(300, 10.0), (0, math.nan)]) == 10.0, "an approach that nobody passed"
     scenario = load_scenario("single-v1").with_duration(100)
     found = evaluate(
         scenario, {"p": rule_factory("programme")}, ("sim",), (1, 2), workers=1, approaches=True

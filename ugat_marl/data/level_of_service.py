@@ -23,8 +23,9 @@ def mean_delay_s(approaches: Iterable[tuple[float, float]]) -> float:
     """Return the mean control delay of several approaches; nan if nobody passed.
 
     Args:
-        approaches: For each approach, the number of vehicles and their mean control delay, s.
+        approaches: For each approach, the number of vehicles and their mean control delay, s; an
+            approach that nobody passed does not count.
     """
-    pairs = list(approaches)
+    pairs = [(count, delay_s) for count, delay_s in approaches if count]
     vehicles = sum(count for count, _ in pairs)
     return sum(count * delay_s for count, delay_s in pairs) / vehicles if vehicles else math.nan

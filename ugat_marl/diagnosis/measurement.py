@@ -438,7 +438,8 @@ class Measurement:
         found += [DetectorError(DetectorSpeeds(place, point)) for place, point in points.items()]
         for (place, index), number in zones.items():
             least = (limit.least_extension_s, limit.least_zone_m)[index]
-            if not number.differs(least, limit.named_deviations):
+            possible = (DetectorExtension.ranges["seconds"], DetectorZone.ranges["metres"])[index]
+            if not (number.differs(least, limit.named_deviations) and possible.holds(number.value)):
                 continue
             if index == _EXTENSION:
                 seconds = round(number.value, 2)
@@ -721,6 +722,7 @@ class Measurement:
             place: farther
             for (place, _), farther in search.choose().estimates.items()
             if farther.differs(limit.least_offset_m, limit.named_deviations)
+            and DetectorOffset.ranges["metres"].holds(-farther.value)
         }
 
     def _splashes(self) -> list[DetectorError]:
@@ -751,7 +753,8 @@ class Measurement:
                 DetectorSplash(place, round(share.value, 3)), limit.half_interval * share.error
             )
             for (place, _), share in search.choose().estimates.items()
-            if share.value > 0.0 and share.differs(limit.least_splash, limit.named_deviations)
+            if share.differs(limit.least_splash, limit.named_deviations)
+            and DetectorSplash.ranges["share"].holds(share.value)
         ]
 
     @staticmethod

@@ -48,6 +48,10 @@ class NumberParameter:
     low: float
     high: float
 
+    def holds(self, value: float) -> bool:
+        """Return True if a value is plausible."""
+        return self.low <= value <= self.high
+
 
 @dataclass(frozen=True)
 class TextParameter:
@@ -213,7 +217,7 @@ class Effect(ControllerPart):
             isinstance(value, bool)
             or not isinstance(value, Real)
             or not math.isfinite(value)
-            or not allowed.low <= float(value) <= allowed.high
+            or not allowed.holds(float(value))
         ):
             raise OptionError(
                 f"effect {self.name!r}: {field} = {value!r} is outside "

@@ -8,7 +8,13 @@ from pathlib import Path
 
 from ugat_marl.experiments.jobs import Job, Record
 from ugat_marl.grounding import UgatConfig
-from ugat_marl.policies import STANDARD_RULES, TUNED_RULES, race_fields, rule_settings
+from ugat_marl.policies import (
+    STANDARD_RULES,
+    TUNED_RULES,
+    lesson_episodes,
+    race_fields,
+    rule_settings,
+)
 from ugat_marl.progress import Share
 
 EPOCH = 0.05
@@ -77,6 +83,11 @@ def work_of(plan: Sequence[Job], folder: Path, episode_s: float) -> dict[str, Sh
         else:
             for name, (count, weight) in _grounded_work(ugat, episode_s).items():
                 add(name, count, weight)
+            learner = job.setting.learner
+            known = ugat.grounding == "street" and bool(ugat.street.rule_budget)
+            first = lesson_episodes(learner.name, learner.dqn) if ugat.pretrain_episodes else 0
+            later = lesson_episodes(learner.name, learner.dqn, known=known)
+            add("lessons", first + ugat.iterations * later)
     return {name: Share(round(count), weights[name]) for name, count in units.items()}
 
 

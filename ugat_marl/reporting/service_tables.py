@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping, Sequence
 
 from rich.console import Group, RenderableType
@@ -25,6 +26,15 @@ LEGEND = (
 
 Delays = Mapping[str, tuple[float, float]]
 """Approach to the number of vehicles that passed and their mean control delay, s."""
+
+
+NOBODY = "none passed"
+"""Cell of an approach that nobody passed, though vehicles may stand there."""
+
+
+def approach_text(vehicles: float, delay_s: float) -> str:
+    """Return delay and level of service of an approach, or that nobody passed."""
+    return delay_text(delay_s) if vehicles else NOBODY
 
 
 def delay_text(delay_s: float) -> str:
@@ -54,8 +64,8 @@ def service_tables(evaluation: Evaluation, network: Network) -> list[RenderableT
     for policy in evaluation.policies:
         own = [measured.get((policy, domain), {}) for domain in evaluation.domains]
         table.add_row(Text(policy), *(delay_text(mean_delay_s(d.values())) for d in own))
-        worst = [max(delays.items(), key=lambda item: item[1][1], default=None) for delays in own]
-        cells = ["-" if at is None else delay_text(at[1][1]) for at in worst]
+        worst = [max(delays.values(), key=_badness, default=None) for delays in own]
+        cells = ["-" if at is None else approach_text(*at) for at in worst]
         table.add_row(*(Text(text, style="dim") for text in ("  worst approach", *cells)))
     last = evaluation.domains[-1]
     delays = {policy: measured.get((policy, last), {}) for policy in evaluation.policies}
@@ -82,7 +92,7 @@ def approach_table(title: str, delays: Mapping[str, Delays], network: Network) -
         table.add_column(name, justify="right", overflow="fold")
     for road in shown:
         named = names.get(road)
-        cells = [delay_text(own[road][1]) if road in own else "-" for own in delays.values()]
+        cells = [approach_text(*own[road]) if road in own else "-" for own in delays.values()]
         count = next(own[road][0] for own in delays.values() if road in own)
         light, approach = (lights.text(named.light), named.name) if named else ("", "")
         table.add_row(Text(light), Text(approach), Text(road), f"{count:.0f}", *cells)
@@ -106,7 +116,7 @@ def service_grid(
     rows: list[list[str]] = []
     for road in _worst_first(delays):
         named = names.get(road)
-        cells = [delay_text(own[road][1]) if road in own else "–" for own in delays.values()]
+        cells = [approach_text(*own[road]) if road in own else "–" for own in delays.values()]
         texts = (lights.whole(named.light), named.name) if named else ("", "")
         rows.append([*texts, road, *cells])
     headings = [f"{policy}, s per vehicle" for policy in delays]
@@ -116,4 +126,10 @@ def service_grid(
 def _worst_first(delays: Mapping[str, Delays]) -> list[str]:
     roads = dict.fromkeys(road for own in delays.values() for road in own)
     first = next(iter(delays.values()), {})
-    return sorted(roads, key=lambda road: -first.get(road, (0.0, 0.0))[1])
+    return sorted(roads, key=lambda road: -_badness(first.get(road, (1.0, 0.0))))
+
+
+def _badness(approach: tuple[float, float]) -> float:
+    """Return the delay of an approach; infinite if nobody passed."""
+    vehicles, delay_s = approach
+    return delay_s if vehicles else math.inf

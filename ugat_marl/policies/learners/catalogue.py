@@ -177,6 +177,22 @@ def suite_config(name: str, given: DQNConfig | None = None) -> DQNConfig:
     return replace(own, **{"teacher": own.teacher or None, **changed})
 
 
+def lesson_episodes(name: str, given: DQNConfig | None = None, *, known: bool = False) -> int:
+    """Return how many episodes the lessons of a learner play at most; 0 if it has none.
+
+    Args:
+        name: Name of the learner.
+        given: Settings of the user, see `suite_config`.
+        known: True if the best rule is known, so that none has to be looked for.
+    """
+    from ugat_marl.policies.learners.lessons import most_plays  # torch, which a list does without
+
+    config = suite_config(name, given) if name in SUITE_LEARNERS else None
+    if config is None or not config.teacher:
+        return 0
+    return config.lessons if known else most_plays(config.teacher, config.lessons)
+
+
 _OF_THE_NAME = ("hidden", "steps", "warmup_decisions", "epsilon_decay_decisions")
 """Settings that the name of a learner decides, unless they are given, even as DQN's defaults."""
 

@@ -87,6 +87,11 @@ def plays(env: AnyParallelEnv, name: str, shown: int) -> int:
     return candidates + FINAL_EPISODES * min(FINALISTS, candidates) + shown
 
 
+def most_plays(name: str, shown: int) -> int:
+    """Return the number of episodes that lessons play where all standard rules are looked at."""
+    return len(STANDARD_RULES) + FINAL_EPISODES * FINALISTS + shown if name == BEST else shown
+
+
 def _candidates(env: AnyParallelEnv) -> Sequence[tuple[str, Policy]]:
     rules = [NamedRule(spec, env.unwrapped) for spec in STANDARD_RULES]
     return [(rule.spec, rule) for rule in rules if rule.reads(env)]
