@@ -220,6 +220,13 @@ def test_splash_onto_three_lanes_by_hand() -> None:
     assert float(str(error.effect).split(",")[1]) == pytest.approx(0.2, rel=0.02)
 
 
+def test_positions_are_not_examined_where_there_is_splash() -> None:
+    usual = together([day(seed) for seed in range(3)])
+    both = together([day(seed, twins=0.3, distance_m=GAP_M + 18.0) for seed in (7, 8)])
+    (only,) = named(both, usual)
+    assert only.startswith("detector_splash=advance,")
+
+
 def test_sightings_are_stored_and_read() -> None:
     one = day(1)
     again = Sightings.from_arrays(one.arrays())

@@ -77,13 +77,16 @@ def test_tensorboard_has_the_curves_that_matter(
     class Verbose(Silent):
         verbose = True
 
-    numbers = {"att_s/V4": 1.0, "forward/error": 2.0, "forward/error/A1": 3.0, "other": 4.0}
-    for reporter, expected in ((Silent(), 2), (Verbose(), 4)):
+    numbers = {
+        "att_s/V4": 1.0, "forward/error": 2.0, "forward/error/A1": 3.0, "other": 4.0,
+        "channel/lag_2": 0.5, "effects/headway": 1.4, "effects/headway/low": 1.3,
+    }  # fmt: skip
+    for reporter, expected in ((Silent(), 4), (Verbose(), 7)):
         run = Run(tmp_path / str(expected), {}, reporter)
         run.log("iteration", 1, numbers)
         run.close()
         assert len(points(tmp_path / str(expected))) == expected
-        assert len(run.metrics.rows) == 4
+        assert len(run.metrics.rows) == 7
 
 
 def test_curves_are_read_by_tensorboard(tmp_path: Path) -> None:

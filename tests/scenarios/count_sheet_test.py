@@ -109,6 +109,7 @@ def test_counts_come_back_with_their_geh(draft: Path, capsys: pytest.CaptureFixt
         wanted = math.sqrt(2 * (m - c) ** 2 / (m + c)) if m + c else 0.0
         assert float(fit["geh"]) == pytest.approx(wanted, abs=0.005)
     assert (draft / "counts.csv").read_bytes() == filled
+    assert len([*(draft / "pictures").iterdir()]) > 0, "the drawings of the same roads are kept"
 
 
 def test_counts_that_cannot_all_be_met_come_first(

@@ -44,6 +44,14 @@ MAIN_CURVES = (
     "iteration/gate/acceptance",
     "iteration/gate/alpha",
     "iteration/lost_time/best_s",
+    "iteration/channel/lag_[0-3]",
+    "iteration/channel/lost",
+    "iteration/eyes/lost",
+    "iteration/eyes/zone_m",
+    "iteration/effects/acceleration",
+    "iteration/effects/headway",
+    "iteration/effects/startup_delay",
+    "iteration/judged/after_the_lessons",
 )
 """Curves that TensorBoard shows; the metrics of a run and --verbose have all."""
 LogCallback = Callable[[str, int, Mapping[str, float]], None]

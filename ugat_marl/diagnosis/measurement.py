@@ -432,7 +432,8 @@ class Measurement:
             for place, seconds in self._together(pulses).items()
         ]
         speeds = bool(np.isfinite(self._measured.pairs[:, 2]).all())
-        offsets = self._offsets() if speeds else {}
+        splashes = self._splashes()
+        offsets = self._offsets(splashes) if speeds else {}
         moved = frozenset(index for place in offsets for index in self._members(place))
         points, zones = self._zones(pulses, moved)
         found += [DetectorError(DetectorSpeeds(place, point)) for place, point in points.items()]
@@ -448,11 +449,11 @@ class Measurement:
                 wrong = DetectorZone(place, round(number.value, 1))
             found.append(DetectorError(wrong, limit.half_interval * number.error))
         if not speeds and not found:  # or times over the zones say nothing about speeds
-            offsets = self._offsets()
+            offsets = self._offsets(splashes)
         for place, farther in offsets.items():
             wrong = DetectorOffset(place, -round(farther.value, 1))
             found.append(DetectorError(wrong, limit.half_interval * farther.error))
-        found += self._splashes()
+        found += splashes
         return tuple(error for error in found if error.effect.name not in left_out)
 
     # --- single kinds of errors -------------------------------------------------------------------
@@ -697,15 +698,25 @@ class Measurement:
         names = detectors_at(place, self._detectors)
         return [index for index, one in enumerate(self._detectors) if one.id in names]
 
-    def _offsets(self) -> dict[str, Estimate]:
-        """Return by how much advance and stop detectors are farther apart than stated, m."""
+    def _offsets(self, splashes: Sequence[DetectorError]) -> dict[str, Estimate]:
+        """Return by how much advance and stop detectors are farther apart than stated, m.
+
+        Approaches with splash are left out: what crosses both detectors need not be one vehicle.
+        """
         limit = self._thresholds
+        splashed = {
+            edge_of_lane(self._detectors[index].lane)
+            for error in splashes
+            for index in self._members(str(error.effect.record()["place"]))
+        }
         speeds = bool(np.isfinite(self._measured.pairs[:, 2]).all())
         least = limit.least_pairs if speeds else 2 * limit.least_sightings
         distances: dict[Group, tuple[Array, Array]] = {}
         for group, members in self._groups.items():
             data, model = (self._of(x.pairs, members) for x in (self._measured, self._simulated))
-            if group[0] == "advance" and len(data) >= least and 2 * len(model) >= least:
+            if group[0] != "advance" or group[1] in splashed:
+                continue
+            if len(data) >= least and 2 * len(model) >= least:
                 travel = [x[:, 1] * x[:, 2 if speeds else 3] for x in (data, model)]
                 distances[group] = travel[0], travel[1]
         # The spread of a few may be small by chance.

@@ -2,8 +2,11 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+import shutil
+import textwrap
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
+from typing import Any
 
 import polars as pl
 
@@ -35,12 +38,47 @@ class Description:
     unit: str
 
     def __str__(self) -> str:
-        """Return both tables whole, as text."""
-        with pl.Config(tbl_rows=-1, tbl_cols=-1, fmt_str_lengths=60, tbl_width_chars=100):
-            return (
-                f"{self.observation}\nunit of features: {self.unit}\n{self.phases}\n"
-                "as drawings: ugat-marl scenario draw SCENARIO --out pictures"
-            )
+        """Return both tables as text, one agent after the other, as wide as the terminal."""
+        width = shutil.get_terminal_size().columns
+        lines: list[str] = []
+        for (agent, light), entries in _groups(self.observation, "agent", "intersection"):
+            lines.append(agent if agent == light else f"{agent} ({light})")
+            for number, entry in enumerate(entries):
+                own = entry["of"] == agent
+                what = f"{entry['name']}: {entry['shows']}" if entry["name"] else entry["shows"]
+                lines += _wrapped(f"  [{number}]", what if own else f"{entry['of']}: {what}", width)
+            of_agent = self.phases.filter(agent=agent)
+            for (phase, green), moves in _groups(of_agent, "phase", "green_of_file"):
+                here = f"  phase {phase}"
+                here += "" if green is None else f" (green {green} of the file)"
+                ways = [
+                    f"{m['from']} {m['turn']} to {m['to']}"
+                    + (" (yields)" if m["right_of_way"] == "yields" else "")
+                    for m in moves
+                ]
+                lines += _wrapped(f"{here}:", "; ".join(ways), width)
+        lines.append(f"unit of features: {self.unit}")
+        lines.append("as drawings: ugat-marl scenario draw SCENARIO --out pictures")
+        return "\n".join(lines)
+
+
+def _groups(
+    frame: pl.DataFrame, *keys: str
+) -> Iterator[tuple[tuple[Any, ...], list[dict[str, Any]]]]:
+    """Yield the rows of a frame by keys, in their order."""
+    for values, part in frame.group_by(*keys, maintain_order=True):
+        yield values, part.rows(named=True)
+
+
+def _wrapped(head: str, text: str, width: int) -> list[str]:
+    """Return a text behind its head, in lines of a width, that divide no word."""
+    return textwrap.wrap(
+        f"{head} {text}",
+        width,
+        subsequent_indent=" " * 6,
+        break_long_words=False,
+        break_on_hyphens=False,
+    )
 
 
 def describe(network: Network, observer: Observer, agents: Sequence[str]) -> Description:

@@ -104,7 +104,7 @@ class StreetConfig:
             if part not in PARTS:
                 raise UnknownNameError("part of a street", part, PARTS)
         if self.simulations < 20:
-            raise OptionError(f"simulations = {self.simulations}: must be at least 20")
+            raise OptionError(f"street.simulations = {self.simulations}: must be at least 20")
         if self.further < 0:
             raise OptionError(f"further = {self.further}: must not be negative")
         if self.judged < 0:

@@ -52,11 +52,12 @@ def measures_table(evaluation: Evaluation) -> RenderableType:
             estimates.append(evaluation.regret(policy, domain))
             table.add_row(Text(policy), *(number_text(e.mean) for e in estimates))
             if not math.isnan(estimates[0].low):
-                halves = (f"±{number_text((e.high - e.low) / 2)}" for e in estimates)
-                table.add_row(*_dim("  95 % interval", *halves))
+                table.add_row(*_dim("  95 % interval", *map(_half, estimates)))
             if domain != evaluation.domains[0]:
                 gaps = [evaluation.gap(policy, domain, measure) for measure in MEASURES]
                 table.add_row(*_dim(f"  gap to {evaluation.domains[0]}", *map(_signed, gaps)))
+                if not math.isnan(gaps[0].low):
+                    table.add_row(*_dim("  its 95 % interval", *map(_half, gaps)))
         blocks.append(table)
         blocks += [Text(line, style="dim") for line in _backlog(evaluation, domain)]
     blocks.append(Text(_legend(evaluation), style="dim"))
@@ -182,6 +183,11 @@ def _with_interval(estimate: Estimate) -> str:
     return (
         f"{number_text(estimate.mean)} ({number_text(estimate.low)}-{number_text(estimate.high)})"
     )
+
+
+def _half(estimate: Estimate) -> str:
+    """Return half of an interval."""
+    return f"±{number_text((estimate.high - estimate.low) / 2)}"
 
 
 def _signed(estimate: Estimate) -> str:

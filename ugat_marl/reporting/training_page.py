@@ -330,16 +330,29 @@ def _boxes(record: RunRecord) -> list[tuple[str, str]]:
     real, direct = evaluation.domains[1], evaluation.policies[0]
     boxes: list[tuple[str, str]] = []
     for name in _main_policies(evaluation):
-        text = number(evaluation.estimate(name, real, "att_s").mean)
-        boxes.append((f"{text} s", f"{name} in {real}"))
+        travel = evaluation.estimate(name, real, "att_s")
+        boxes.append((f"{number(travel.mean)} s", f"{name} in {real}{_between(travel)}"))
     grounded = next(filter(is_grounded, evaluation.policies), None)
     if grounded is not None:
         start, now = (evaluation.gap(p, real, "att_s").mean for p in (direct, grounded))
         if start > 0 and math.isfinite(now):
             boxes.append((share(1 - now / start), f"of the gap Δ is gone with {grounded}"))
-        regret_s = number(evaluation.regret(grounded, real).mean)
-        boxes.append((f"{regret_s} s", f"regret of {grounded}"))
+        saved = Estimate.of(
+            evaluation.values(direct, real, "att_s") - evaluation.values(grounded, real, "att_s")
+        )
+        boxes.append(
+            (f"{number(saved.mean)} s", f"less in {real} with {grounded}{_between(saved)}")
+        )
+        regret = evaluation.regret(grounded, real)
+        boxes.append((f"{number(regret.mean)} s", f"regret of {grounded}{_between(regret)}"))
     return boxes
+
+
+def _between(estimate: Estimate) -> str:
+    """Return the 95 % interval of a number in a box; "" without one."""
+    if not math.isfinite(estimate.low) or estimate.low == estimate.high:
+        return ""
+    return f", 95 %: {number(estimate.low)} to {number(estimate.high)} s"
 
 
 def _main_policies(evaluation: Evaluation) -> list[str]:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import filecmp
 import shlex
 import shutil
 import signal
@@ -322,6 +323,7 @@ def new_folder(target: Path, *, force: bool) -> Iterator[Path]:
             yield made
             require_free(target, force=force)  # it may have appeared meanwhile
             _require_counts_kept(made, target)
+            _keep_pictures(made, target)
             _put(made, target, folder / "before")
     except ScenarioError as error:
         # Files are checked in the temporary folder, but errors should name the final one.
@@ -364,6 +366,15 @@ def _require_counts_kept(made: Path, target: Path) -> None:
         return
     if is_filled(old) and not (new.is_file() and new.read_bytes() == old.read_bytes()):
         raise OutputError(f"{old} would be lost; give it with --counts, or move it away first")
+
+
+def _keep_pictures(made: Path, target: Path) -> None:
+    """Keep the drawings of a folder without vehicles if its network stays the same."""
+    pictures, networks = target / PICTURES, [folder / NETWORK for folder in (target, made)]
+    if (target / "scenario.toml").exists() or not pictures.is_dir() or (made / PICTURES).exists():
+        return
+    if all(map(Path.is_file, networks)) and filecmp.cmp(*networks, shallow=False):
+        shutil.copytree(pictures, made / PICTURES)
 
 
 def _put(made: Path, target: Path, before: Path) -> None:
