@@ -752,7 +752,11 @@ class Measurement:
             lanes = np.array([len(beside[self._detectors[index].id]) for index in members])
             c = float((lanes**2).sum() / lanes.sum())
             twins = [x[0] / x[1] for x in (data, model)]
-            chance = [(f + 1.0 / x[1]) / x[1] for f, x in zip(twins, (data, model), strict=True)]
+            # variances of shares, with one more twin, since none of a few is no certainty
+            chance = [
+                (f * (1.0 - f) + 1.0 / x[1]) / x[1]
+                for f, x in zip(twins, (data, model), strict=True)
+            ]
             excess = twins[0] - twins[1]
             error = np.sqrt(sum(chance) + (limit.twin_doubt * twins[1]) ** 2)
             slope = 2.0 / (2.0 - c * excess) ** 2

@@ -293,11 +293,11 @@ class Thresholds(DayThresholds):
     inexact: float = 0.01
     """Share by which kinematics of simulated and real vehicles may differ. By hand. Halved: errors
     of detectors by small differences of driving are named."""
-    bent: float = 0.5
+    bent: float = 0.3
     """The same for vehicles that accelerate, as a share of their difference from steady ones. By
-    hand: drivers may accelerate half or one and a half times as hard. Halved: slow drivers look
-    like speeds measured elsewhere."""
-    bent_alone: float = 0.5
+    hand: drivers may accelerate a third harder or less hard. Halved: slow drivers look like speeds
+    measured elsewhere."""
+    bent_alone: float = 0.3
     """The same for one kind of passage, compared with the others. By hand: slow drivers are not
     equally slow at every place of a queue. Halved: as above."""
     bent_here: float = 0.3
