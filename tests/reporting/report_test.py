@@ -83,7 +83,8 @@ def test_the_measures_table_tells_who_was_kept_out(found: Evaluation) -> None:
     assert max(map(len, text.splitlines())) <= 80
     assert "never entered: direct transfer 2.3" in text
     assert "gap to sim" in text
-    assert text.count("95 % interval") == 6
+    assert text.count("its 95 % interval") == 3  # of the gaps
+    assert text.count("95 % interval") == 6 + 3
 
 
 def test_the_picture_is_a_picture(found: Evaluation, tmp_path: Path) -> None:
