@@ -195,7 +195,8 @@ CHEAP = ("scenario list", "domains", "evaluate")
         for case in COMMAND_LINES
         if str(case.values[0]).removeprefix("ugat-marl ").startswith(CHEAP)
         and not re.search(
-            r"\.pt|my[-_]|street1136|evaluate today|resco:|--domains all|>", str(case.values[0])
+            r"\.pt|my[-_]|street1136|evaluate to(day|morrow)|resco:|--domains all|>",
+            str(case.values[0]),
         )
     ],
 )
