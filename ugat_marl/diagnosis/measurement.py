@@ -724,7 +724,10 @@ class Measurement:
         equations: dict[Group, list[Equation]] = {}
         for group, pair in distances.items():
             found, usual = map(_median, pair)
-            chance = [max(_median(x).error, 1.2533 * spread / np.sqrt(len(x))) for x in pair]
+            chance = [
+                max(one.error, 1.2533 * spread / np.sqrt(len(x)))
+                for one, x in zip((found, usual), pair, strict=True)
+            ]
             doubt = (limit.inexact if speeds else limit.pace_doubt) * usual.value
             error = math.hypot(doubt, *chance)
             equations[group] = [Equation(found.value - usual.value, (1.0,), error)]

@@ -81,15 +81,15 @@ def plays(env: AnyParallelEnv, name: str, shown: int) -> int:
         name: Spelling of a rule, or `BEST`.
         shown: Episodes that the teacher shows.
     """
+    return most_plays(name, shown, len(_candidates(env))) if name == BEST else shown
+
+
+def most_plays(name: str, shown: int, candidates: int | None = None) -> int:
+    """Return the number of episodes of lessons with so many candidates for `BEST`; None: all."""
     if name != BEST:
         return shown
-    candidates = len(_candidates(env))
+    candidates = len(STANDARD_RULES) if candidates is None else candidates
     return candidates + FINAL_EPISODES * min(FINALISTS, candidates) + shown
-
-
-def most_plays(name: str, shown: int) -> int:
-    """Return the number of episodes that lessons play where all standard rules are looked at."""
-    return len(STANDARD_RULES) + FINAL_EPISODES * FINALISTS + shown if name == BEST else shown
 
 
 def _candidates(env: AnyParallelEnv) -> Sequence[tuple[str, Policy]]:
