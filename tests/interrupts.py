@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import os
 import resource
 from collections.abc import Iterator
 from pathlib import Path
@@ -45,10 +46,17 @@ class KillAfter(Silent):
 @contextlib.contextmanager
 def few_descriptors(spare: int) -> Iterator[None]:
     """Leave this process only `spare` descriptors more than it has open."""
-    taken = len([*Path("/proc/self/fd").iterdir()]) - 1  # without the one that lists them
-    limits = resource.getrlimit(resource.RLIMIT_NOFILE)
-    resource.setrlimit(resource.RLIMIT_NOFILE, (taken + spare, limits[1]))
-    try:
+    soft, hard = resource.getrlimit(resource.RLIMIT_NOFILE)
+    highest = max(int(entry.name) for entry in Path("/proc/self/fd").iterdir())
+    with contextlib.ExitStack() as held:
+        held.callback(resource.setrlimit, resource.RLIMIT_NOFILE, (soft, hard))
+        resource.setrlimit(resource.RLIMIT_NOFILE, (highest + 1 + spare, hard))
+        # The limit is on numbers: those that are free below it are taken, too.
+        with contextlib.suppress(OSError):
+            while True:
+                taken = os.open(os.devnull, os.O_RDONLY)
+                if taken > highest:  # of the spare ones
+                    os.close(taken)
+                    break
+                held.callback(os.close, taken)
         yield
-    finally:
-        resource.setrlimit(resource.RLIMIT_NOFILE, limits)

@@ -92,29 +92,31 @@ def test_an_evaluation_fills_it(tmp_path: Path) -> None:
 def test_another_evaluation_adds_its_episodes(tmp_path: Path) -> None:
     path = tmp_path / "queues.parquet"
 
-    def write(domain: str, *episodes: float, keep: bool = True, anew: bool = False) -> None:
+    def write(domain: str, *episodes: float, keep: bool = True, batch: int = 0) -> None:
         env = stub(decisions=1, interval_s=60.0)
         look = (record := QueueRecord()).watch("policy", domain, env)
         for halting in episodes:
             lanes = len(env.network.lane_table().ids)
             env.snapshot = SimpleNamespace(halting=np.full(lanes, halting))
             look(1)
-        record.write(path, keep=keep, anew=anew)
+        record.write(path, keep=keep, batch=batch)
 
     path.write_bytes(b"broken")
     write("sim", 1.0)
     write("V4", 2.0)
     first = read_queues(path)
     assert set(first["domain"]) == {"sim", "V4"}
-    write("V4", 4.0, 6.0)
+    write("V4", 4.0, 6.0, batch=1)
     again = read_queues(path)
     assert len(again) == len(first)
     assert again.filter(domain="sim").equals(first.filter(domain="sim"))
     assert again.filter(domain="V4")["queue"].sum() == 2 * first.filter(domain="V4")["queue"].sum()
     whole = path.read_bytes()
     for _ in range(2):  # the same episodes after a kill between queues and scores
-        write("V4", 2.0, 4.0, 6.0, anew=True)
+        write("V4", 4.0, 6.0, batch=1)
         assert path.read_bytes() == whole
+    write("V4", 2.0, 4.0, 6.0)  # a batch grows, since more seeds were asked for after the kill
+    assert set(read_queues(path).filter(domain="V4")["looks"]) == {5}
     write("V1", 1.0, keep=False)
     assert set(read_queues(path)["domain"]) == {"V1"}
 
@@ -158,7 +160,7 @@ def test_a_record_that_cannot_be_read_now_is_not_replaced(spare: int, tmp_path: 
     looks = 1
     with few_descriptors(spare):
         with contextlib.suppress(OSError):
-            record.write(kept, keep=True)
+            record.write(kept, keep=True, batch=1)
             looks += 1
         with contextlib.suppress(OSError):
             write_queues(together, sources)

@@ -97,13 +97,13 @@ def metrics(iterations: int = 2, episodes: int = 24, shift: float = 0.0) -> Metr
 
 def queues() -> pl.DataFrame:
     rows = [
-        (policy, domain, minute, tls, float(k + (minute if tls == "B2" else 0)) * factor, 6)
+        (policy, domain, 0, minute, tls, float(k + (minute if tls == "B2" else 0)) * factor, 6)
         for policy, factor in (("direct transfer", 2.0), ("phase (the paper's UGAT)", 1.0))
         for domain in ("sim", "V4")
         for minute in range(10)
         for k, tls in enumerate(LIGHTS)
     ]
-    names = ["policy", "domain", "minute", "intersection", "queue", "looks"]
+    names = ["policy", "domain", "batch", "minute", "intersection", "queue", "looks"]
     return pl.DataFrame(rows, schema=names, orient="row")
 
 
@@ -379,8 +379,8 @@ def test_hostile_names_stay_text(tmp_path: Path) -> None:
     results = tuple(replace(r, policy=f"{NASTY}{r.policy}", domain=f"{NASTY}{r.domain}")
                     for r in found.results)  # fmt: skip
     replace(found, results=results).write(run / "table.json")
-    names = [(f"{NASTY}{p}", f"{NASTY}{d}", m, f"{NASTY}\x1b{t}", *means)
-             for p, d, m, t, *means in queues().rows()]  # fmt: skip
+    names = [(f"{NASTY}{p}", f"{NASTY}{d}", batch, m, f"{NASTY}\x1b{t}", *means)
+             for p, d, batch, m, t, *means in queues().rows()]  # fmt: skip
     pl.DataFrame(names, schema=queues().schema, orient="row").write_parquet(run / "queues.parquet")
     numbers = Metrics([(s, n, f"{k}{NASTY}\x07", v) for s, n, k, v in metrics().rows])
     Metrics([*metrics().rows, *numbers.rows]).write(run / "metrics.parquet")
@@ -465,9 +465,8 @@ def test_jobs_of_a_paper_make_a_table(tmp_path: Path) -> None:
 
 def test_a_job_shows_its_worst_minutes(tmp_path: Path) -> None:
     make_job(tmp_path, "direct-0", ("sim", "V4"), Setting("direct transfer", "direct"))
-    rows = [("direct transfer", d, m, "A1", 3.0 + m, 6) for d in ("sim", "V4") for m in range(5)]
-    schema = ["policy", "domain", "minute", "intersection", "queue", "looks"]
-    pl.DataFrame(rows, schema=schema, orient="row").write_parquet(
+    rows = [("direct transfer", d, 0, m, "A1", 3.0 + m, 6) for d in ("sim", "V4") for m in range(5)]
+    pl.DataFrame(rows, schema=queues().schema, orient="row").write_parquet(
         tmp_path / "direct-0" / "queues.parquet"
     )
     _, page = page_of(tmp_path / "direct-0")

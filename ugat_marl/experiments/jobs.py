@@ -389,11 +389,10 @@ def _judge(
             watch=queues.watch,
             approaches=True,
         )
-        # The queues come before the record, which marks these episodes as played. A process that
-        # died between the two left queues of episodes that are now played again.
-        anew = not any((mark, domain) == scored[:2] for scored in record.scores)
+        # The queues come before the record, which marks these episodes as played. If a process dies
+        # between the two, the same episodes are played again; their first seed is their number.
         if mark in job.rows:
-            queues.write(folder / QUEUES, keep=True, anew=anew)
+            queues.write(folder / QUEUES, keep=True, batch=seeds[0])
         record.scores |= {(mark, domain, r.seed): r.scores for r in played.results}
         record.write(folder)
 

@@ -24,11 +24,13 @@ QUEUES = "queues.parquet"
 _SCHEMA = {
     "policy": pl.String,
     "domain": pl.String,
+    "batch": pl.Int64,
     "minute": pl.Int64,
     "intersection": pl.String,
     "queue": pl.Float64,
     "looks": pl.Int64,
 }
+_BATCH = ["policy", "domain", "batch"]
 _PLACE = ["policy", "domain", "minute", "intersection"]
 
 
@@ -101,31 +103,28 @@ class QueueRecord:
                     looks = int(sums.looks[minute])
                     named = zip(sums.intersections, sums.queues[minute].tolist(), strict=True)
                     rows += [(policy, domain, minute, t, q / looks, looks) for t, q in named]
-        return pl.DataFrame(rows, schema=_SCHEMA, orient="row")
+        schema = {name: kind for name, kind in _SCHEMA.items() if name != "batch"}
+        return pl.DataFrame(rows, schema=schema, orient="row")
 
-    def write(self, path: Path, *, keep: bool = False, anew: bool = False) -> None:
-        """Write `frame` as Parquet, whole or not at all.
+    def write(self, path: Path, *, keep: bool = False, batch: int = 0) -> None:
+        """Write the record as Parquet, whole or not at all.
 
         Args:
             path: The file.
-            keep: True to include the record in the file, if there is one that can be read.
-            anew: True to leave out of that record the policies and domains of this one.
+            keep: True to keep the other batches in the file, if there is one that can be read.
+            batch: Number of these episodes. A batch of this number in the file, with the same
+                policies and domains, is replaced.
 
         Raises:
             OSError: The file cannot be written, or the record in it cannot be read now, such as
                 when the process has no descriptors left. The file stays as it was.
         """
-        frame = self.frame()
+        frame = self.frame().with_columns(pl.lit(batch, pl.Int64).alias("batch")).select(*_SCHEMA)
         if keep and path.exists():
             with contextlib.suppress(CheckpointError):  # a damaged record is given up
-                kept = read_queues(path)
-                if anew:
-                    kept = kept.join(frame, on=["policy", "domain"], how="anti")
-                both = pl.concat([kept, frame]).group_by(_PLACE, maintain_order=True)
-                mean = (pl.col("queue") * pl.col("looks")).sum() / pl.col("looks").sum()
-                frame = both.agg(mean, pl.col("looks").sum())
-        with replacing(path) as temporary:
-            write_hashed(frame.sort(_PLACE), temporary)
+                kept = _batches(path).join(frame, on=_BATCH, how="anti")
+                frame = pl.concat([kept, frame])
+        _write(frame, path)
 
 
 def write_queues(path: Path, sources: Mapping[str, tuple[Path, str]]) -> None:
@@ -142,19 +141,32 @@ def write_queues(path: Path, sources: Mapping[str, tuple[Path, str]]) -> None:
     frames = [pl.DataFrame(schema=_SCHEMA)]
     for name, (source, name_there) in sources.items():
         with contextlib.suppress(CheckpointError):
-            rows = read_queues(source).filter(policy=name_there)
+            rows = _batches(source).filter(policy=name_there)
             frames.append(rows.with_columns(policy=pl.lit(name)))
-    with replacing(path) as temporary:
-        write_hashed(pl.concat(frames).sort(_PLACE), temporary)
+    _write(pl.concat(frames), path)
 
 
 def read_queues(path: Path) -> pl.DataFrame:
-    """Read a table that `QueueRecord.write` wrote.
+    """Read a table that `QueueRecord.write` wrote, as means over all episodes.
+
+    Returns:
+        A table with the columns of `QueueRecord.frame`.
 
     Raises:
         CheckpointError: The file is missing, cut short or of another form.
         OSError: The file is there, and the system cannot read it now.
     """
+    mean = (pl.col("queue") * pl.col("looks")).sum() / pl.col("looks").sum()
+    return _batches(path).group_by(_PLACE, maintain_order=True).agg(mean, pl.col("looks").sum())
+
+
+def _write(frame: pl.DataFrame, path: Path) -> None:
+    with replacing(path) as temporary:
+        write_hashed(frame.sort([*_PLACE, "batch"]), temporary)
+
+
+def _batches(path: Path) -> pl.DataFrame:
+    """Read a table of queues with every batch of episodes by itself."""
     try:
         frame, metadata = read_quietly(path)
     except (FileNotFoundError, pl.exceptions.PolarsError, pl.exceptions.PanicException) as error:
