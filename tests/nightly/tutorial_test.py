@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import os
 import re
 import subprocess
@@ -51,3 +52,6 @@ def test_a_traffic_engineer_s_way(python: list[str], tmp_path: Path) -> None:
     clone = play("your-town.md", python, tmp_path)
     for left in ("town/counts-fit.csv", "found/report.html", "home.csv", "tomorrow/plans.add.xml"):
         assert (clone / left).exists(), left
+    found = json.loads((clone / "found" / "diagnosis.json").read_text(encoding="utf-8"))
+    assert found["verdict"] == "explained"
+    assert [effect["name"] for effect in found["effects"]] == ["startup_delay"]

@@ -218,6 +218,20 @@ def test_a_page_for_every_verdict(verdict: str, network: Network) -> None:
         assert "the best attempt, which is not named" in page.text
 
 
+def test_headways_are_drawn_by_position_in_the_queue(network: Network) -> None:
+    diagnosis = diagnosis_of("explained")
+    page = Page(diagnosis_page(diagnosis, network))
+    assert "How queues discharge" in page.text
+    for tip in ("measured: 2.20 s", "simulated: 2.00 s", "corrected: 2.21 s"):
+        assert page.text.count(tip) == 6  # the first vehicle, four gaps, and the ninth vehicle on
+    alike = Page(diagnosis_page(diagnosis_of("no_discrepancy"), network))
+    assert "4th–5th, simulated: 2.00 s" in alike.text and "corrected: 2" not in alike.text
+    one = replace(
+        diagnosis, statistics=tuple(s for s in diagnosis.statistics if s.statistic == "gap3")
+    )
+    assert "How queues discharge" not in diagnosis_page(one, network)
+
+
 @pytest.mark.parametrize("verdict", ["unknown", "partially_explained"])
 def test_a_partial_result_says_so_first(verdict: str, network: Network) -> None:
     diagnosis = diagnosis_of(verdict, complete=False)

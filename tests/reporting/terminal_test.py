@@ -64,6 +64,11 @@ def test_plans_and_approaches_fit_without_divided_words(plans: list[SignalPlan])
     delays = {rule: {"A1_B1": (300.0, 60.0)} for rule in ("programme", "max-pressure-loss")}
     words = set(" ".join(lines_of(approach_table("Delay", delays, network))).split())
     assert {"B1", "(signal_2)", "eastbound", "max-pressure-loss"} <= words
+    rules = ("programme", "webster", "actuated:40", "max-pressure:20")
+    lines = lines_of(approach_table("Delay", dict.fromkeys(rules, delays["programme"]), network))
+    assert max(map(len, lines)) <= 80
+    assert {"(signal_2)", "eastbound", *rules} <= set(" ".join(lines).split())
+    assert sum("A1_B1" in line for line in lines) == 2  # three rules side by side, one beneath
 
 
 def test_an_approach_that_nobody_passes_is_the_worst_and_hides_no_other() -> None:

@@ -227,6 +227,13 @@ def test_a_short_episode_and_a_full_road_are_named(single: Scenario) -> None:
     assert problems(survey(single), runs) == []
 
 
+def test_vehicles_due_in_the_last_seconds_make_no_road_full(single: Scenario) -> None:
+    short = survey(single.with_duration(300))
+    assert problems(short, [RuleEpisode("rule", 90, 133, 131, 90, 2)]) == []
+    (text,) = problems(short, [RuleEpisode("rule", 90, 133, 120, 90, 13)])
+    assert "13 of 133 vehicles cannot enter" in text
+
+
 def test_phases_a_rule_cannot_work_with_are_named() -> None:
     mixed = load_scenario("mixed-v1")
     runs = [
@@ -265,7 +272,7 @@ def test_the_command_prints_tables(
     monkeypatch.setenv("COLUMNS", "80")
     assert main(["scenario", "check", "single-v1", "--duration-s", "600"]) == 0
     text = capsys.readouterr().out
-    for word in ("1 agents, 8 green phases", "Saturation by approach", "largest-queue:20",
+    for word in ("1 agent, 8 green phases", "Saturation by approach", "largest-queue:20",
                  "left outside", "headroom: not measured", "nothing to mend"):  # fmt: skip
         assert word in text
     assert max(len(line) for line in text.splitlines()) <= 80

@@ -32,6 +32,7 @@ from ugat_marl.field import (
 from ugat_marl.files import require_writable
 from ugat_marl.policies import Policy
 from ugat_marl.progress import Bars, Silent
+from ugat_marl.reporting import counted
 
 Port = Annotated[int | None, arg(metavar="INT", help_behavior_hint="(or --start)")]
 Log = Annotated[Path | None, arg(metavar="FILE", help_behavior_hint="(default: nowhere)")]
@@ -193,7 +194,7 @@ def _told(summary: LoopSummary, lights: int) -> str:
     low, high, most = (summary.latency_ms(q) for q in (0.5, 0.95, 1.0))
     reasons = ", ".join(f"{kind} {count}" for kind, count in summary.reasons.most_common())
     return (
-        f"{summary.decisions} decisions for {lights} light{'s' if lights > 1 else ''}; "
+        f"{counted(summary.decisions, 'decision')} for {counted(lights, 'light')}; "
         f"ready after {low:.1f} ms (median), {high:.1f} ms (95 %), {most:.1f} ms (longest); "
         f"fixed time in {summary.fallback_share:.1%}{f' ({reasons})' if reasons else ''}"
     )

@@ -42,8 +42,9 @@ def print_help(command: Any, program: str, words: Sequence[str]) -> None:
     first: Sequence[str] = getattr(command, "FIRST", ())
     everything = not first or HELP_ALL in words
     description = described(command)
+    description += f"\n\nAlso, as with every command: --quiet, --verbose, {DEADLINE} SECONDS."
     if not everything:
-        description += f"\n\nThe options used most. All of them: {program} {HELP_ALL}"
+        description += f"\nThe options used most. All of them: {program} {HELP_ALL}"
     text = _Text(sys.stdout)
     try:
         with contextlib.redirect_stdout(text):

@@ -31,7 +31,7 @@ from ugat_marl.experiments import (
     remarks,
 )
 from ugat_marl.progress import Bars, Silent
-from ugat_marl.reporting import LIGHT, LightNames, approach_table, titled_table
+from ugat_marl.reporting import LIGHT, LightNames, approach_table, counted, titled_table
 from ugat_marl.scenarios import (
     PHASE_SOURCES,
     QUARTER_S,
@@ -113,7 +113,7 @@ class ScenarioCheck:
             rows = measure_headroom(
                 scenario, seeds=range(self.headroom), workers=self.workers, reporter=reporter
             )
-        outside = left_outside(scenario, self.seed) if is_full(runs) else {}
+        outside = left_outside(scenario, self.seed) if is_full(runs, facts.duration_s) else {}
         wrong = problems(facts, runs, outside)
         if self.json:
             text = json.dumps(
@@ -168,7 +168,7 @@ def show(
 
     agents, names = facts.intersections, LightNames.of(network)
     say(
-        f"{facts.scenario}: {len(agents)} agents, "
+        f"{facts.scenario}: {counted(len(agents), 'agent')}, "
         f"{sum(len(light.phases) for light in agents)} green phases, "
         f"{sum(light.lanes for light in agents)} lanes, "
         f"{sum(light.movements for light in agents)} movements, "

@@ -14,7 +14,7 @@ from tyro.conf import Positional, arg
 
 from ugat_marl.errors import OptionError
 from ugat_marl.progress import Bars
-from ugat_marl.reporting import LIGHT, LightNames, draw_network, titled_table
+from ugat_marl.reporting import LIGHT, LightNames, counted, draw_network, titled_table
 from ugat_marl.scenarios import (
     CountFit,
     RoadSource,
@@ -132,7 +132,7 @@ class ScenarioNew:
         agents = len(made.network.intersections)
         phases = sum(len(light.phases) for light in made.network.intersections)
         console.print(
-            f"{self.name}: {agents} intersections with {phases} green phases, "
+            f"{self.name}: {counted(agents, 'intersection')} with {phases} green phases, "
             f"{made.demand.vehicles} vehicles"
             + (f" and {made.demand.flows} flows" if made.demand.flows else ""),
             markup=False,
@@ -158,9 +158,9 @@ class ScenarioNew:
             reporter=reporter,
         )
         sheet = shlex.quote(str(draft.sheet))
+        lights = counted(len(draft.network.intersections), "intersection")
         for text in (
-            f"{self.name}: roads with {len(draft.network.intersections)} intersections, no "
-            "vehicles yet",
+            f"{self.name}: roads with {lights}, no vehicles yet",
             *(f"note: {note}" for note in draft.notes),
             f"fill in: {sheet}, {draft.turns} turns; {self.name}/pictures shows the lights",
             f"next: {self._command()} --counts {sheet} (or --vph N, --routes FILE, --od FILE)",

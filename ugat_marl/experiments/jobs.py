@@ -385,7 +385,7 @@ def _judge(
             duration_s=job.duration_s,
             workers=workers if in_this_process(workers) else None,  # queues are watched here
             reporter=reporter,
-            title=f"evaluating in {domain}",
+            title=f"evaluating {name} in {domain}",
             watch=queues.watch,
             approaches=True,
         )

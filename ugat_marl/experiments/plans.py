@@ -41,9 +41,11 @@ def described_plan(
         if setting.recipe == "rule":
             does = f"search for the best rule in {job.target or job.sim}"
         elif setting.ugat is not None:
+            times = setting.ugat.iterations
             does = (
                 f"{setting.name}: {setting.ugat.pretrain_episodes} episodes in {job.sim}, then "
-                f"{setting.ugat.iterations} times {setting.ugat.grounded_episodes} for {job.target}"
+                f"{times} iteration{'' if times == 1 else 's'} of {setting.ugat.grounded_episodes} "
+                f"for {job.target}"
             )
         else:
             does = f"{setting.name}: {job.episodes} episodes"

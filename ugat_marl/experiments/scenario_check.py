@@ -33,6 +33,8 @@ MUCH_LESS = 0.9
 """A degree of saturation divided by another one below which it is worth a change of phases."""
 MOST_BACKLOG = 0.01
 """Largest share of the vehicles due that may wait outside under the better rule."""
+JUST_DUE_S = 10.0
+"""Vehicles that are due in so many last seconds may wait for the one ahead of them."""
 
 
 @dataclass(frozen=True)
@@ -92,9 +94,15 @@ def play_check_rules(
     )
 
 
-def is_full(runs: Sequence[RuleEpisode]) -> bool:
-    """Return True if too many vehicles stay outside under every rule."""
-    return bool(runs) and all(run.backlog > MOST_BACKLOG * run.due for run in runs)
+def is_full(runs: Sequence[RuleEpisode], duration_s: float) -> bool:
+    """Return True if too many vehicles stay outside under every rule.
+
+    Args:
+        runs: Episodes of the rules.
+        duration_s: Length of these episodes, s.
+    """
+    most = max(MOST_BACKLOG, JUST_DUE_S / duration_s)
+    return bool(runs) and all(run.backlog > most * run.due for run in runs)
 
 
 def left_outside(scenario: Scenario, seed: int) -> Counter[str]:
@@ -154,7 +162,7 @@ def problems(
         faults.append(text)
     if runs:
         best = min(runs, key=lambda run: run.backlog)
-        if is_full(runs):
+        if is_full(runs, facts.duration_s):
             roads = Counter(outside or {}).most_common(_NAMED)
             where = "; they wait at " + ", ".join(f"{road} ({n})" for road, n in roads)
             faults.append(

@@ -33,7 +33,7 @@ from ugat_marl.reporting.figures import (
     shortened,
     write_png,
 )
-from ugat_marl.reporting.formats import tick_text
+from ugat_marl.reporting.formats import counted, tick_text
 from ugat_marl.reporting.run_records import RunRecord
 from ugat_marl.reporting.style import LIGHT, curve_style, styled
 
@@ -197,7 +197,7 @@ def _several(records: Sequence[RunRecord]) -> str:
     first = records[0]
     name = first.scenario + (f" → {first.real}" if first.real else "")
     kind = first.grounding
-    return f"{shortened(name, 26)}{f', {kind}' if kind else ''}, {len(records)} seeds"
+    return f"{shortened(name, 26)}{f', {kind}' if kind else ''}, {counted(len(records), 'seed')}"
 
 
 def _domains(records: Sequence[RunRecord]) -> list[str]:
@@ -316,7 +316,7 @@ def travel_times(evaluation: Evaluation) -> dict[str, list[Estimated]]:
 def _draw_policies(axes: Any, evaluation: Evaluation) -> None:
     _draw_estimates(axes, evaluation.policies, travel_times(evaluation), "s")
     seeds = len({result.seed for result in evaluation.results})
-    title = f"final policies, {seeds} seeds, 95 % intervals, s"
+    title = f"final policies, {counted(seeds, 'seed')}, 95 % intervals, s"
     axes.set_title(title, color=LIGHT["soft"], x=-178 / _points_wide(axes))
 
 
@@ -584,6 +584,48 @@ def statistics_picture(rows: Sequence[Deviation], most: float, name: str) -> Nam
                 printable(text), (0, place), (0, -down), xycoords=("axes fraction", "data"),
                 textcoords="offset points", fontsize=size, color=LIGHT[colour],
             )  # fmt: skip
+    return picture
+
+
+# --- headways -------------------------------------------------------------------------------------
+
+
+@styled()
+def headway_picture(
+    positions: Sequence[str],
+    series: Mapping[str, Sequence[float | None]],
+    noise_s: Sequence[float],
+    name: str,
+) -> NamedFigure:
+    """Draw discharge headways against the position in the queue.
+
+    Args:
+        positions: Positions in the queue, such as "4th–5th".
+        series: Headways by name, s, the measured ones first. None where nothing passed.
+        noise_s: Standard deviation of each measured headway, s; drawn twofold.
+        name: Name of the picture.
+    """
+    from matplotlib.ticker import FuncFormatter
+
+    below = legend_height(list(series))
+    picture = new_picture(name, "Headway by position in the queue, s", 250 + below)
+    axes = add_axes(picture, 44, TOP, 16, 48 + below)
+    places = np.arange(len(positions))
+    for number, (title, gaps_s) in enumerate(series.items()):
+        values = np.array([math.nan if gap is None else gap for gap in gaps_s])
+        style = curve_style(number)
+        if number == 0:
+            spread = 2 * np.array(noise_s)
+            axes.errorbar(places, values, spread, color=style["color"], fmt="none", capsize=4)
+        axes.plot(places, values, **style, markersize=7, zorder=3)
+        for place in np.flatnonzero(np.isfinite(values)).tolist():
+            (dot,) = axes.plot(place, values[place], "o", alpha=0, markersize=11, zorder=4)
+            add_tip(dot, f"{positions[place]}, {title}: {values[place]:.2f} s")
+    axes.set_xticks(places, positions)
+    axes.set_xlim(-0.4, len(positions) - 0.6)
+    axes.yaxis.set_major_formatter(FuncFormatter(tick_text))
+    axes.set_xlabel("position in the queue", loc="right")
+    add_legend(picture, list(series))
     return picture
 
 

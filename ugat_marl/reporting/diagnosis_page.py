@@ -25,7 +25,7 @@ from ugat_marl.diagnosis import (
 )
 from ugat_marl.files import write_whole
 from ugat_marl.reporting import diagnosis_words as words
-from ugat_marl.reporting.charts import BAND, statistics_picture
+from ugat_marl.reporting.charts import BAND, headway_picture, statistics_picture
 from ugat_marl.reporting.formats import chance, number, share, signed
 from ugat_marl.reporting.light_names import LightNames
 from ugat_marl.reporting.network_maps import disagreement_map
@@ -37,6 +37,11 @@ _PLACES = 10
 """Number of places in the table of disagreements that is shown at once."""
 _LOUD, _QUIET = 16, 6
 """Most strips that are shown at once: of statistics outside their noise, else of those inside."""
+_POSITIONS = {
+    "lost": "1st", "gap2": "2nd", "gap3": "3rd", "gap4-5": "4th–5th", "gap6-8": "6th–8th",
+    "gap9+": "from 9th",
+}  # fmt: skip
+"""Positions in the queue by the name of their statistic."""
 _STRIPS = 8
 """Most strips in one picture; two pictures stand side by side."""
 _COMMANDS = re.compile(r"<h2>Run it again</h2>\s*<pre><code>(.*?)</code></pre>", re.DOTALL)
@@ -99,6 +104,7 @@ def diagnosis_page(diagnosis: Diagnosis, network: Network, commands: Sequence[st
         unnamed=_effects(diagnosis.unnamed, names),
         ranking=_ranking(diagnosis, names),
         courtesy=_courtesy(diagnosis),
+        headways=_headways(page, diagnosis),
         criteria=words.criteria_line(diagnosis),
         policy_gap=_policy_gap(diagnosis),
         data=_data(diagnosis),
@@ -325,6 +331,24 @@ def _courtesy(diagnosis: Diagnosis) -> Grid | None:
         rows.append(("mean travel time (s)", "", number(times.before_s), number(times.after_s)))
     columns = ("measured", "before", "after")
     return Grid(("criterion", *columns), rows, columns)
+
+
+def _headways(page: Page, diagnosis: Diagnosis) -> list[Figure]:
+    """Return a picture of the gaps in discharging queues; none with fewer than two positions."""
+    rows = [row for row in diagnosis.statistics if row.statistic in _POSITIONS and row.measured]
+    if len(rows) < 2:
+        return []
+    rows.sort(key=lambda row: list(_POSITIONS).index(row.statistic))
+    series: dict[str, Sequence[float | None]] = {
+        "measured": [row.measured for row in rows], "simulated": [row.before for row in rows],
+    }  # fmt: skip
+    if any(row.z_before != row.z_after for row in rows):
+        series["corrected"] = [row.after for row in rows]
+    picture = headway_picture(
+        [_POSITIONS[row.statistic] for row in rows], series, [row.noise for row in rows], "headways"
+    )
+    caption = "Queues that discharge, held-out periods; bars: twice the chance of the measurement."
+    return page.figures((picture, caption))
 
 
 def _policy_gap(diagnosis: Diagnosis) -> Grid | None:

@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 
 from ugat_marl.progress import Reporter
 from ugat_marl.reporting.figures import NamedFigure, printable, shortened
+from ugat_marl.reporting.formats import counted
 from ugat_marl.reporting.style import LIGHT, styled
 from ugat_marl.scenarios import Intersection, Link, Network, Scenario, green_of_file
 
@@ -348,7 +349,7 @@ def _overview(network: Network, scenario: str) -> NamedFigure:
     wide = 9.0
     tall = float(np.clip(wide * height / width, 3.0, 12.0))
     count = len(network.intersections)
-    picture = _picture("network", f"{scenario}: {count} agents", wide, tall + 0.5)
+    picture = _picture("network", f"{scenario}: {counted(count, 'agent')}", wide, tall + 0.5)
     axes = picture.figure.add_axes((0.01, 0.01, 0.98, tall / (tall + 0.5) - 0.02))
     axes.set_aspect("equal", adjustable="datalim")
     axes.axis("off")

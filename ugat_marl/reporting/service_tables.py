@@ -18,6 +18,8 @@ from ugat_marl.scenarios import Network, named_approaches
 
 MOST_APPROACHES = 8
 """Most approaches in a table of the terminal."""
+MOST_CONTROLLERS = 3
+"""Most controllers side by side in a table of the terminal: more leave names no room."""
 LEGEND = (
     "Mean control delay in s per vehicle that passed the light, and the level of service of the "
     "Highway Capacity Manual: A to 10 s, B to 20, C to 35, D to 55, E to 80, F above. Vehicles "
@@ -77,26 +79,31 @@ def approach_table(title: str, delays: Mapping[str, Delays], network: Network) -
 
     Args:
         title: Title of the table.
-        delays: Delays by controller; the first one decides which approaches are the worst.
+        delays: Delays by controller; the first one decides which approaches are the worst. Three
+            controllers stand side by side, more beneath each other.
         network: The network.
     """
     names, lights = named_approaches(network), LightNames.of(network)
     roads = _worst_first(delays)
     shown = roads[:MOST_APPROACHES]
     more = f", the worst {len(shown)} of {len(roads)}" if len(roads) > len(shown) else ""
-    table = titled_table(f"{title}{more}")
-    for heading in (LIGHT, "approach", "road"):
-        table.add_column(heading, overflow="fold", max_width=22)
-    table.add_column("veh", justify="right")
-    for name in delays:
-        table.add_column(name, justify="right", overflow="fold")
-    for road in shown:
-        named = names.get(road)
-        cells = [approach_text(*own[road]) if road in own else "-" for own in delays.values()]
-        count = next(own[road][0] for own in delays.values() if road in own)
-        light, approach = (lights.text(named.light), named.name) if named else ("", "")
-        table.add_row(Text(light), Text(approach), Text(road), f"{count:.0f}", *cells)
-    return Group(table, Text(LEGEND, style="dim"))
+    tables: list[RenderableType] = []
+    for first in range(0, len(delays), MOST_CONTROLLERS):
+        part = dict([*delays.items()][first : first + MOST_CONTROLLERS])
+        table = titled_table(f"{title}{more}")
+        for heading in (LIGHT, "approach", "road"):
+            table.add_column(heading, overflow="fold", max_width=22)
+        table.add_column("veh", justify="right")
+        for name in part:
+            table.add_column(name, justify="right", overflow="fold")
+        for road in shown:
+            named = names.get(road)
+            cells = [approach_text(*own[road]) if road in own else "-" for own in part.values()]
+            count = next((own[road][0] for own in part.values() if road in own), 0.0)
+            light, approach = (lights.text(named.light), named.name) if named else ("", "")
+            table.add_row(Text(light), Text(approach), Text(road), f"{count:.0f}", *cells)
+        tables.append(table)
+    return Group(*tables, Text(LEGEND, style="dim"))
 
 
 def service_grid(

@@ -11,16 +11,14 @@ from rich.text import Text
 from ugat_marl.data import MEASURES
 from ugat_marl.diagnosis import PolicyGap, TravelTimeEstimate
 from ugat_marl.experiments import Estimate, Evaluation, Tuned, check_run
-from ugat_marl.reporting.formats import number_text
+from ugat_marl.reporting.formats import counted, number_text
 from ugat_marl.reporting.terminal import titled_table
 
 
 def transfer_table(evaluation: Evaluation) -> RenderableType:
     """Return ATT of every policy in the simulation and the real domains, with gap and regret."""
     first, *others = evaluation.domains
-    table = titled_table(
-        f"{evaluation.scenario}: average travel time in s (95 % interval)", _caption(evaluation)
-    )
+    table = titled_table(f"{evaluation.scenario}: average travel time in s (95 % interval)")
     table.add_column("policy", max_width=22)
     table.add_column(first, justify="right")
     for domain in others:
@@ -35,7 +33,7 @@ def transfer_table(evaluation: Evaluation) -> RenderableType:
                 number_text(evaluation.regret(policy, domain).mean),
             ]
         table.add_row(Text(policy), *cells)
-    return table
+    return Group(table, Text(_caption(evaluation), style="dim"))
 
 
 def measures_table(evaluation: Evaluation) -> RenderableType:
@@ -66,11 +64,7 @@ def measures_table(evaluation: Evaluation) -> RenderableType:
 
 def tuning_table(title: str, results: Sequence[Tuned]) -> RenderableType:
     """Return the best settings of each rule, the best rule first."""
-    table = titled_table(
-        f"{title}: rules at their best",
-        "ATT: mean in s over the tuning seeds, all vehicles due. worst: of the settings "
-        "tried. Numbers after a name are its settings; see docs/reference/rules.md.",
-    )
+    table = titled_table(f"{title}: rules at their best")
     table.add_column("best setting", max_width=28, overflow="fold")
     for heading in ("ATT s", "worst s", "settings", "episodes"):
         table.add_column(heading, justify="right")
@@ -83,7 +77,11 @@ def tuning_table(title: str, results: Sequence[Tuned]) -> RenderableType:
             str(len(tuned.trials)),
             str(tuned.episodes),
         )
-    return table
+    legend = (
+        "ATT: mean in s over the tuning seeds, all vehicles due. worst: of the settings tried. "
+        "Numbers after a name are its settings; see docs/reference/rules.md."
+    )
+    return Group(table, Text(legend, style="dim"))
 
 
 def policy_gap_table(title: str, gaps: Mapping[str, PolicyGap], seeds: int) -> RenderableType:
@@ -94,11 +92,7 @@ def policy_gap_table(title: str, gaps: Mapping[str, PolicyGap], seeds: int) -> R
         gaps: Gap of each policy; see `ugat_marl.experiments.policy_gaps.policy_gap`.
         seeds: Number of episodes behind every number.
     """
-    table = titled_table(
-        title,
-        f"{seeds} seeds. before: |real - sim|, after: |real - corrected|, "
-        "both in s; shrink: share of the gap that is gone.",
-    )
+    table = titled_table(title)
     table.add_column("policy", max_width=24, overflow="fold")
     for heading in ("sim", "corrected", "real", "before", "after", "shrink"):
         table.add_column(heading, justify="right")
@@ -113,7 +107,11 @@ def policy_gap_table(title: str, gaps: Mapping[str, PolicyGap], seeds: int) -> R
         )
         if any(time.low is not None for time in times):
             table.add_row(*_dim("  95 % interval", *map(_limits, times)))
-    return table
+    legend = (
+        f"{counted(seeds, 'seed')}. before: |real - sim|, after: |real - corrected|, both in s; "
+        "shrink: share of the gap that is gone."
+    )
+    return Group(table, Text(legend, style="dim"))
 
 
 def _limits(time: TravelTimeEstimate) -> str:
@@ -142,9 +140,9 @@ def _caption(evaluation: Evaluation) -> str:
     for domain in evaluation.domains:
         lines += [f"in {domain}, {line}" for line in _backlog(evaluation, domain)]
     if len(evaluation.domains) == 1:
-        return "\n".join([*lines, f"{_seeds(evaluation)} seeds"])
+        return "\n".join([*lines, _seeds(evaluation)])
     lines.append(
-        f"{_seeds(evaluation)} seeds. Δ: minus {evaluation.domains[0]}. regret: ATT above the "
+        f"{_seeds(evaluation)}. Δ: minus {evaluation.domains[0]}. regret: ATT above the "
         "best of these policies in that domain."
     )
     return "\n".join(lines)
@@ -163,14 +161,14 @@ def _medians(evaluation: Evaluation) -> list[str]:
 
 def _legend(evaluation: Evaluation) -> str:
     return (
-        f"{_seeds(evaluation)} seeds. ATT: all vehicles due, scheduled departure to arrival or "
+        f"{_seeds(evaluation)}. ATT: all vehicles due, scheduled departure to arrival or "
         "end. queue: halting vehicles per intersection. delay: 1 - v/vmax of incoming lanes. "
         "delay s: time loss plus departure delay. regret: ATT above the best of these policies."
     )
 
 
-def _seeds(evaluation: Evaluation) -> int:
-    return len({result.seed for result in evaluation.results})
+def _seeds(evaluation: Evaluation) -> str:
+    return counted(len({result.seed for result in evaluation.results}), "seed")
 
 
 def _dim(*cells: str) -> list[Text]:

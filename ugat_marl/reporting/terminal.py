@@ -57,14 +57,12 @@ def _widths(spans: Sequence[Measurement], room: int) -> list[int]:
     return widths
 
 
-def titled_table(title: str, caption: str = "") -> Table:
+def titled_table(title: str) -> Table:
     """Return a table without columns, under its title, as narrow as its cells."""
     return WholeWords(
         box=box.SIMPLE_HEAD,
         title=Text(title) if title else None,
         title_justify="left",
-        caption=Text(caption) if caption else None,
-        caption_justify="left",
         pad_edge=False,
         padding=(0, 1, 0, 0),
     )
