@@ -4,14 +4,14 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from contextlib import nullcontext
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
 import pytest
 
-from ugat_marl.diagnosis import workflow
+from ugat_marl.diagnosis import TrafficCheck, workflow
 from ugat_marl.diagnosis.features import BIN_FEATURES, FEATURES, INDEX, Tally
 from ugat_marl.diagnosis.thresholds import Thresholds
 from ugat_marl.diagnosis.traffic import approach_table, traffic_check
@@ -131,6 +131,25 @@ def test_why_a_scenario_is_not_corrected(verdict: str, better: bool, refused: st
     reason = reason_against(conclusion, check)
     assert (reason is not None) == bool(refused)
     assert refused in (reason or "")
+
+
+@pytest.mark.parametrize(
+    ("before", "after", "noise", "said"),
+    [
+        (0.191, 0.160, 0.041, "more or longer periods can tell"),  # it falls, within the noise
+        (0.160, 0.191, 0.041, "do not bring travel time and queue near"),
+        (9.0, 3.0, 0.3, "do not bring travel time and queue near"),  # far off still
+    ],
+)
+def test_a_correction_that_is_refused_says_whether_more_data_would_tell(
+    before: float, after: float, noise: float, said: str
+) -> None:
+    check = TrafficCheck("travel time and queue", before, after, noise, better=False)
+    conclusion: Any = SimpleNamespace(verdict="explained")
+    reason = reason_against(conclusion, check)
+    assert reason is not None and said in reason
+    assert ("can tell" in reason) == check.undecided
+    assert reason_against(conclusion, replace(check, better=True)) is None
 
 
 @dataclass(frozen=True)

@@ -178,6 +178,8 @@ def test_one_light_is_an_environment_of_gymnasium() -> None:
             others, rewards, *_ = same.step({agent: 1})
             assert np.array_equal(seen, others[agent]) and reward == rewards[agent]
             assert not ended and info["action_mask"].shape == (env.action_space.n,)  # pyright: ignore[reportAttributeAccessIssue]
+        light: Any = env.unwrapped
+        assert str(light.describe()) == str(same.describe())
         env.close()
         same.close()
     with pytest.raises(OptionError, match=r"has 4 intersections.*parallel_env"):

@@ -551,6 +551,11 @@ class TrafficCheck:
     noise: float
     better: bool
 
+    @property
+    def undecided(self) -> bool:
+        """True if the error falls, but by no more than chance could do: the data are too few."""
+        return not self.better and 0.0 < self.error_before - self.error_after < 2 * self.noise
+
 
 @dataclass(frozen=True)
 class Pattern:

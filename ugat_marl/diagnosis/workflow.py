@@ -239,11 +239,16 @@ def _reason_against(conclusion: Conclusion, check: TrafficCheck | None) -> str |
         return "The effects named explain only a part, so the scenario is not corrected by them."
     if check is None or check.better:
         return None
+    if check.undecided:
+        does = f"bring {check.measure} nearer to the held-out periods, by no more than chance could"
+        way_out = "; more or longer periods can tell"
+    else:
+        does = f"do not bring {check.measure} near to the held-out periods"
+        way_out = ""
     return (
-        f"The effects named do not bring {check.measure} nearer to the held-out periods, or leave "
-        f"them far off: the sum of relative errors is {100 * check.error_before:.1f} % before and "
-        f"{100 * check.error_after:.1f} % after (standard error of the difference: "
-        f"{100 * check.noise:.1f} %). So the scenario is not corrected by them."
+        f"The effects named {does}: the sum of relative errors is {100 * check.error_before:.1f} % "
+        f"before and {100 * check.error_after:.1f} % after (standard error of the difference: "
+        f"{100 * check.noise:.1f} %). So the scenario is not corrected by them{way_out}."
     )
 
 

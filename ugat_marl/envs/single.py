@@ -7,7 +7,7 @@ Keywords are those of `ugat_marl.parallel_env`.
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import gymnasium
 import numpy as np
@@ -18,6 +18,9 @@ from ugat_marl.effects import Domain
 from ugat_marl.envs.traffic_env import parallel_env
 from ugat_marl.errors import OptionError
 from ugat_marl.scenarios import Scenario
+
+if TYPE_CHECKING:
+    from ugat_marl.envs.description import Description
 
 
 class SingleEnv(gymnasium.Env[NDArray[np.float32], int]):
@@ -70,6 +73,10 @@ class SingleEnv(gymnasium.Env[NDArray[np.float32], int]):
         agent = self._agent
         seen, rewards, ended, cut, infos = self.parallel.step({agent: action})
         return seen[agent], float(rewards[agent]), ended[agent], cut[agent], infos[agent]
+
+    def describe(self) -> Description:
+        """Return tables of the observed numbers and of the phases; ``print`` shows them whole."""
+        return self.parallel.describe()
 
     def render(self) -> Any:
         """Return a picture in render mode "rgb_array", uint8 ``(height, width, 3)``."""

@@ -172,6 +172,8 @@ def traffic_check_line(diagnosis: Diagnosis) -> str | None:
     if check is None:
         return None
     nearer = "come nearer" if check.better else "do not come nearer"
+    if check.undecided:
+        nearer = "come nearer, by no more than chance could do,"
     unfitted = check.measure == "travel time and queue"
     apart = "which no fit used" if unfitted else "of periods that no fit used"
     before, after = share(check.error_before), share(check.error_after)
