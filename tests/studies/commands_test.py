@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import re
 import subprocess
 import sys
 from pathlib import Path
@@ -32,6 +33,30 @@ def test_every_command_explains_itself(
     text = capsys.readouterr().out
     assert f"usage: {line.program} {command}" in text
     assert f"    {line.program} {command}" in text, "no example"
+
+
+def test_examples_of_other_programs_stay_commands(
+    capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setenv("COLUMNS", "80")
+    with pytest.raises(SystemExit):
+        run(blind.LINE, ["generate", "--help"])
+    text = capsys.readouterr().out
+    commands = re.findall(r"^ +(python -m studies\.blind generate .*)$", text, flags=re.MULTILINE)
+    assert len(commands) == 2 and commands[1].endswith("\\"), "the second goes on in the next line"
+    assert "--quiet" in text
+
+
+def test_a_long_purpose_goes_on_beside_its_name(
+    capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setenv("COLUMNS", "80")
+    assert run(bench.LINE, ["--help"]) == 0
+    lines = capsys.readouterr().out.splitlines()
+    assert max(map(len, lines)) <= 80
+    first = next(place for place, line in enumerate(lines) if line.startswith("  field-soak"))
+    start = lines[first].index("drive")
+    assert lines[first + 1].startswith(" " * start) and lines[first + 1].strip()
 
 
 @pytest.mark.parametrize("study", ["bench", "blind"])

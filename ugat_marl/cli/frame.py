@@ -10,6 +10,7 @@ import os
 import re
 import signal
 import sys
+import textwrap
 import threading
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
@@ -301,7 +302,9 @@ def _print_help(line: CommandLine, console: Console, prefix: str = "") -> None:
         listed[COMPLETION] = "print a script for tab completion in bash, zsh or fish"
     width = max(map(len, listed))
     for name, text in listed.items():
-        console.print(f"  {name:<{width}}  {text}")
+        begin, later = f"  {name:<{width}}  ", " " * (width + 4)
+        entry = textwrap.fill(text, console.width, initial_indent=begin, subsequent_indent=later)
+        console.print(entry, markup=False)
     console.print(
         f"\n{line.program} {prefix}COMMAND --help shows options and examples of a command."
     )

@@ -64,7 +64,7 @@ def described(command: Any) -> str:
     """Return the docstring with its examples, one line each, without its list of attributes."""
     text = (inspect.getdoc(command) or "").partition("\nAttributes:")[0].strip()
     before, heading, examples = text.partition("Examples:\n")
-    return before + heading + re.sub(r"\n +(?!ugat-marl)(?=\S)", " ", examples)
+    return before + heading + re.sub(r"\n +(?!ugat-marl|python -m)(?=\S)", " ", examples)
 
 
 class _Text(io.StringIO):
@@ -92,7 +92,7 @@ def _wrapped(line: str, width: int) -> str:
     if len(_STYLE.sub("", line)) <= width:
         return line
     indent = line[: len(line) - len(line.lstrip())]
-    command = line.lstrip().startswith("ugat-marl ")
+    command = line.lstrip().startswith(("ugat-marl ", "python -m "))
     later = indent + ("    " if command or line.startswith("usage:") else "")
     lines, room = [indent], width - (2 if command else 0)
     for word in re.findall(r"""(?:"[^"]*"|'[^']*'|\[[^]]*\]|\S)+""", line):
