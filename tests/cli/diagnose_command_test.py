@@ -256,7 +256,12 @@ def test_the_policy_gap_stays_as_long_as_the_same_is_found(
     assert "max-pressure:20" in page.read_text()
     (effect,) = before["effects"]
     seconds = effect["parameters"]["seconds"] | {"value": 5.0}
-    others = {"effects": [effect | {"parameters": {"seconds": seconds}}], "hashes": {}}
+    others = {
+        "effects": [effect | {"parameters": {"seconds": seconds}}],
+        "hashes": {},
+        "unnamed": [effect],
+        "corrected": None,
+    }
     for key, value in others.items():
         file.write_text(json.dumps(before | {"policy_gap": GAP, key: value}))
         assert main(street.arguments(tmp_path, "--no-report")) == 0

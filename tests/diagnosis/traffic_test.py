@@ -16,7 +16,8 @@ from ugat_marl.diagnosis.features import BIN_FEATURES, FEATURES, INDEX, Tally
 from ugat_marl.diagnosis.thresholds import Thresholds
 from ugat_marl.diagnosis.traffic import approach_table, traffic_check
 from ugat_marl.diagnosis.workflow import _reason_against as reason_against
-from ugat_marl.effects import Effect, Headway, LaneService
+from ugat_marl.diagnosis.workflow import _without_search as without_search
+from ugat_marl.effects import DemandSurge, DetectorExtension, Effect, Headway, LaneService
 
 THRESHOLDS = Thresholds()
 LAYOUT: Any = SimpleNamespace(
@@ -121,7 +122,7 @@ def test_an_approach_in_terms_of_traffic() -> None:
         ("explained", True, ""),
         ("explained", False, "travel time and queue"),
         ("provisional", False, "travel time and queue"),
-        ("partially_explained", True, "only a part"),
+        ("partially_explained", True, "Something besides"),
     ],
 )
 def test_why_a_scenario_is_not_corrected(verdict: str, better: bool, refused: str) -> None:
@@ -139,6 +140,7 @@ def test_why_a_scenario_is_not_corrected(verdict: str, better: bool, refused: st
         (0.191, 0.160, 0.041, "more or longer periods can tell"),  # it falls, within the noise
         (0.160, 0.191, 0.041, "do not bring travel time and queue near"),
         (9.0, 3.0, 0.3, "do not bring travel time and queue near"),  # far off still
+        (1.4, 1.2, 0.3, "do not bring travel time and queue near"),  # of other vehicles
     ],
 )
 def test_a_correction_that_is_refused_says_whether_more_data_would_tell(
@@ -150,6 +152,15 @@ def test_a_correction_that_is_refused_says_whether_more_data_would_tell(
     assert reason is not None and said in reason
     assert ("can tell" in reason) == check.undecided
     assert reason_against(conclusion, replace(check, better=True)) is None
+
+
+def test_what_was_not_fitted_has_no_interval_and_a_window_is_a_window() -> None:
+    surge = without_search(DemandSurge("in", 600.0, 1200.0, 1.5), "patterns")
+    assert (surge.place, surge.window) == ("in", (600.0, 1200.0))
+    assert [*surge.parameters] == ["factor"]
+    assert surge.parameters["factor"].low is None and surge.parameters["factor"].high is None
+    loops = without_search(DetectorExtension("advance", 1.0, "merged"), "detections", 0.1)
+    assert (loops.window, loops.parameters["seconds"].low) == (None, pytest.approx(0.9))
 
 
 @dataclass(frozen=True)

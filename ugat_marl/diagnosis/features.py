@@ -304,6 +304,10 @@ ALL_FEATURES = (*FEATURES, *INTERVAL_FEATURES)
 
 INDEX = {name: index for index, (name, _, _) in enumerate(ALL_FEATURES)}
 """Index of a feature in `ALL_FEATURES`, by name."""
+SATURATION_GAPS = tuple(INDEX[name] for name in ("gap4-5", "gap6-8", "gap9+"))
+"""Indices of the gaps of queued vehicles from the fourth on: those of saturation flow."""
+SERVICE_COUNTS = ("count_stop", "count_exit")
+"""Names of the counts of vehicles that have crossed the stop line."""
 SPEED_FEATURES = frozenset(
     {
         "speed1", "speed2", "speed3", "speed4-5", "speed6-8", "free_speed", "free_speed_spread",

@@ -60,7 +60,7 @@ FORMS: tuple[Form, ...] = ("excess", "ratio")
 _EXTENSION = 0
 """Index of the extension in the numbers of a place; the other one is the length of the zone."""
 
-GAP_S = 0.05 * np.arange(101)
+GAP_EDGES_S = 0.05 * np.arange(101)
 """Edges of the bins of the time between two passages, s."""
 
 # --- what is seen of single vehicles ------------------------------------------------------------
@@ -77,9 +77,9 @@ class Sightings:
             speed in m/s (NaN if not measured), mean ratio of length to time over the zones in m/s:
             ``(pairs, 4)``.
         gaps: Numbers of passages by the time without a vehicle after them, ``(detectors, bins)``:
-            none at all, then bins of `GAP_S`.
-        twins: Rows for every detector: lone passages with a twin on the next lane, and those with
-            nothing else there: ``(detectors, 2)``.
+            none at all, then bins of `GAP_EDGES_S`.
+        twins: Rows for every detector: lone passages with a twin on the next lane, and all those
+            with a twin or with no passage there: ``(detectors, 2)``.
     """
 
     passages: Array
@@ -116,10 +116,10 @@ class Sightings:
             advance, stop = (lane.detectors.get(kind, ())[:1] for kind in ("advance", "stop"))
             for name in advance:
                 track = tracks[name]
-                rows.append(track.rows(number[name], _before_red(track, green, thresholds)))
+                rows.append(track.rows(number[name], _regimes_at_advance(track, green, thresholds)))
             for name in stop:
                 track = tracks[name]
-                rows.append(track.rows(number[name], _queued(track, green, thresholds)))
+                rows.append(track.rows(number[name], _regimes_at_stop(track, green, thresholds)))
             if advance and stop:
                 pairs.append(
                     _pairs(
@@ -206,6 +206,7 @@ class _Track:
         free = after - over > thresholds.touching_s
         apart = (after - over)[:-1] > thresholds.no_gap_s
         length = np.where(np.isfinite(seen.length_m), seen.length_m, thresholds.length_m)
+        counts = np.histogram((after - over)[:-1][apart], GAP_EDGES_S)[0]
         return cls(
             on,
             over,
@@ -214,13 +215,14 @@ class _Track:
             before,
             after,
             free,
-            np.append(float((~apart).sum()), np.histogram((after - over)[:-1][apart], GAP_S)[0]),
+            np.append(float((~apart).sum()), counts),
             thresholds,
         )
 
     def leading(self) -> NDArray[np.bool_]:
         """Mark moving vehicles without another one close ahead."""
         limit = self.thresholds
+        # The negations are True for unknown speeds (NaN), here and below.
         moving = ~(self.speed <= limit.moving_mps) & (self.over < limit.longest_alone_s)
         return (self.before > limit.free_gap_s) & moving
 
@@ -247,7 +249,7 @@ def _cycles(times: Array, greens: Greens) -> tuple[NDArray[np.int64], NDArray[np
     return np.maximum(cycle, 0), (cycle >= 0) & (times < greens.end_s[np.maximum(cycle, 0)])
 
 
-def _before_red(track: _Track, greens: Greens, thresholds: Thresholds) -> NDArray[np.int64]:
+def _regimes_at_advance(track: _Track, greens: Greens, thresholds: Thresholds) -> NDArray[np.int64]:
     """Return the regimes of passages over an advance detector."""
     cycle, green = _cycles(track.on, greens)
     regime = np.full(len(track.on), -1)
@@ -263,7 +265,7 @@ def _before_red(track: _Track, greens: Greens, thresholds: Thresholds) -> NDArra
     return regime
 
 
-def _queued(track: _Track, greens: Greens, thresholds: Thresholds) -> NDArray[np.int64]:
+def _regimes_at_stop(track: _Track, greens: Greens, thresholds: Thresholds) -> NDArray[np.int64]:
     """Return the regimes of passages over a stop detector."""
     regime = np.full(len(track.on), -1)
     if not len(greens.start_s) or not len(track.on):
@@ -315,7 +317,7 @@ def _pairs(
 
 
 def _twins(track: _Track, others: Sequence[_Track], thresholds: Thresholds) -> tuple[float, float]:
-    """Count lone passages for which the next lane reports the same, and those where it could."""
+    """Count pairs of a lone passage and a next lane: with a twin, and with a twin or nothing."""
     lone = np.flatnonzero(track.alone())
     on, over = track.on[lone], track.over[lone]
     twins = possible = 0.0
@@ -380,12 +382,14 @@ class DetectorError:
 def _cheapest(
     searches: Sequence[ErrorPlaces], elsewhere: Mapping[str, float] | None = None
 ) -> Choice:
-    """Return the cheapest choice of several searches, each of which goes on from the others'."""
+    """Return the cheapest choice of several searches.
+
+    All are repeated from the best choice of the first pass.
+    """
     best = Choice({}, 0.0)
-    for turn in range(2):
+    for _ in range(2):
         choices = [search.choose(elsewhere, [*best.estimates]) for search in searches]
         best = min(choices, key=lambda choice: choice.cost, default=best)
-        del turn
     return best
 
 
@@ -431,11 +435,10 @@ class Measurement:
             DetectorError(DetectorPulse(place, seconds))
             for place, seconds in self._together(pulses).items()
         ]
-        speeds = bool(np.isfinite(self._measured.pairs[:, 2]).all())
         splashes = self._splashes()
-        offsets = self._offsets(splashes) if speeds else {}
-        moved = frozenset(index for place in offsets for index in self._members(place))
-        points, zones = self._zones(pulses, moved)
+        offsets = self._offsets(splashes) if self._pairs_have_speeds else {}
+        stated = any(detector.speed_at is not None for detector in self._detectors)
+        points, zones = self._points_and_zones(pulses, "rear", self._moved(offsets), fixed=stated)
         found += [DetectorError(DetectorSpeeds(place, point)) for place, point in points.items()]
         for (place, index), number in zones.items():
             least = (limit.least_extension_s, limit.least_zone_m)[index]
@@ -448,13 +451,23 @@ class Measurement:
             else:
                 wrong = DetectorZone(place, round(number.value, 1))
             found.append(DetectorError(wrong, limit.half_interval * number.error))
-        if not speeds and not found:  # or times over the zones say nothing about speeds
+        # Without speeds, distances come from times over the zones, which any other error falsifies.
+        if not self._pairs_have_speeds and not found:
             offsets = self._offsets(splashes)
         for place, farther in offsets.items():
             wrong = DetectorOffset(place, -round(farther.value, 1))
             found.append(DetectorError(wrong, limit.half_interval * farther.error))
         found += splashes
         return tuple(error for error in found if error.effect.name not in left_out)
+
+    @property
+    def _pairs_have_speeds(self) -> bool:
+        """True if every pair of passages has speeds."""
+        return bool(np.isfinite(self._measured.pairs[:, 2]).all())
+
+    def _moved(self, offsets: Collection[str]) -> frozenset[int]:
+        """Return indices of the detectors that stand elsewhere than stated."""
+        return frozenset(index for place in offsets for index in self._members(place))
 
     # --- single kinds of errors -------------------------------------------------------------------
 
@@ -497,18 +510,7 @@ class Measurement:
             return {EVERYWHERE: next(iter(places.values()))}
         return places
 
-    def _zones(
-        self, pulses: Collection[Group], moved: Collection[int]
-    ) -> tuple[dict[str, SpeedPoint], Mapping[Number, Estimate]]:
-        """Return points of speed measurement by place, and extensions and zones.
-
-        No point is returned if one is stated, if it cannot be told, or if it is the one of
-        simulated days.
-        """
-        stated = any(detector.speed_at is not None for detector in self._detectors)
-        return self._points(pulses, "rear", moved, fixed=stated)
-
-    def _points(
+    def _points_and_zones(
         self,
         pulses: Collection[Group],
         usual: SpeedPoint,
@@ -516,7 +518,9 @@ class Measurement:
         *,
         fixed: bool = False,
     ) -> tuple[dict[str, SpeedPoint], Mapping[Number, Estimate]]:
-        """Return the points of speed measurement for which vehicles that accelerate speak.
+        """Return where speeds are measured, by place, and extensions and zones.
+
+        Vehicles that accelerate tell the points apart.
 
         Args:
             pulses: Groups that are left out.
@@ -525,8 +529,8 @@ class Measurement:
             fixed: True to take `usual` as it is.
 
         Returns:
-            The place where speeds are measured at another point, if there is one, and extensions
-            and zones.
+            The place where speeds are measured at another point than `usual`, if there is one, and
+            extensions and zones.
         """
         limit = self._thresholds
         searches = self._searches(pulses, moved)
@@ -574,7 +578,7 @@ class Measurement:
         return tuple(searches)
 
     def contradicted_point(self) -> tuple[SpeedPoint, SpeedPoint] | None:
-        """Return the stated point of speed measurement, and the one for which vehicles speak.
+        """Return the stated point of speed measurement, and the one that the vehicles show.
 
         None if they agree, if not all detectors state the same end of a passage, or if nothing is
         stated. The mean of both ends says nothing about either.
@@ -583,18 +587,20 @@ class Measurement:
         stated = points.pop() if len(points) == 1 else None
         if stated is None or stated == "mean" or self._grain_s > self._thresholds.coarsest_clock_s:
             return None
-        seen, _ = self._points(self._pulses(), stated)
-        return next(((stated, point) for point in seen.values()), None)
+        offsets = self._offsets(self._splashes()) if self._pairs_have_speeds else {}
+        shown, _ = self._points_and_zones(self._pulses(), stated, self._moved(offsets))
+        return next(((stated, point) for point in shown.values()), None)
 
     def _steady(self) -> float:
         """Return the ratio G of steady vehicles on simulated days.
 
-        It is 1 if lengths of vehicles are known, and else it corrects the assumed length.
+        It is near 1 if lengths of vehicles are known, and else it corrects the assumed length. With
+        too few vehicles it is 1.
         """
-        kinds = [
+        indices = [
             index for index, one in enumerate(self._detectors) if one.kind in ("advance", "exit")
         ]
-        rows = self._of(self._simulated.passages, kinds)
+        rows = self._of(self._simulated.passages, indices)
         rows = rows[rows[:, 1] == ALONE]
         ratio = rows[:, 2] * rows[:, 3] / rows[:, 4]
         ratio = ratio[np.isfinite(ratio)]
@@ -685,13 +691,13 @@ class Measurement:
         """Return how close vehicles are reported, from the passages that touch the next one."""
         limit, members = self._thresholds, self._members(place)
         data, model = (x.gaps[members].sum(axis=0) for x in (self._measured, self._simulated))
-        closer = model[: 1 + int(np.searchsorted(GAP_S, seconds + 1e-9, "right") - 1)].sum()
+        closer = model[: 1 + int(np.searchsorted(GAP_EDGES_S, seconds + 1e-9, "right") - 1)].sum()
         share = closer / max(model.sum(), 1.0)
         expected = float(share * data.sum())
         if expected < limit.least_touching:
             return "unknown"
         # Some gaps are too small for the clock, and no sign of vehicles apart.
-        chance = data[1] * max(self._grain_s, limit.no_gap_s) / GAP_S[1]
+        chance = data[1] * max(self._grain_s, limit.no_gap_s) / GAP_EDGES_S[1]
         return "split" if data[0] - chance > limit.merged_share * expected else "merged"
 
     def _members(self, place: str) -> list[int]:
@@ -709,7 +715,7 @@ class Measurement:
             for error in splashes
             for index in self._members(str(error.effect.record()["place"]))
         }
-        speeds = bool(np.isfinite(self._measured.pairs[:, 2]).all())
+        speeds = self._pairs_have_speeds
         least = limit.least_pairs if speeds else 2 * limit.least_sightings
         distances: dict[Group, tuple[Array, Array]] = {}
         for group, members in self._groups.items():

@@ -542,7 +542,8 @@ class TrafficCheck:
         error_before: Sum of the relative errors of the scenario as it is.
         error_after: Sum of the relative errors of the corrected model.
         noise: Standard error of their difference.
-        better: True if the correction lowers the error by more than this noise, to at most 1.
+        better: True if the correction lowers the error by more than 1.645 times the noise, and to
+            at most 1.
     """
 
     measure: str
@@ -554,7 +555,7 @@ class TrafficCheck:
     @property
     def undecided(self) -> bool:
         """True if the error falls, but by no more than chance could do: the data are too few."""
-        return not self.better and 0.0 < self.error_before - self.error_after < 2 * self.noise
+        return not self.better and self.error_after < min(self.error_before, 1.0)
 
 
 @dataclass(frozen=True)
@@ -691,7 +692,7 @@ class Diagnosis:
         courtesy: Usual criteria of traffic engineers, before and after.
         travel_time: Mean simulated travel times, before and after.
         approaches: Capacity, queue and delay of each approach, before and after.
-        traffic_check: Judgement of the correction by measures that no fit uses; None if there is
+        traffic_check: Judgement of the correction on the held-out periods; None if there is
             nothing to judge, or nothing to judge by.
         patterns: Patterns in what is left where the effects do not explain the data.
         unnamed: Correction of service and demand that imitates these patterns, whatever their

@@ -152,9 +152,9 @@ class Selector:
         return [day.tally for day in days.values()]
 
     def _untested(self, model: Fitted, base: Tested) -> Tested:
-        """Return a model with the test of the scenario as it is, for there was no time for its own.
+        """Return a model for whose own test there was no time; its errors are not known.
 
-        Its errors are not known.
+        It has the test of the scenario as it is.
         """
         return Tested(model, base.residual, np.full(len(model.values), np.nan), {})
 
@@ -323,13 +323,13 @@ class Selector:
         return models_tried
 
     def _refined(
-        self, models: Sequence[Fitted], gap: float, directions: Sequence[Direction]
+        self, models: Sequence[Fitted], cost_before: float, directions: Sequence[Direction]
     ) -> Fitted | None:
         """Fit the most promising models and the best single effect; return the best of them.
 
         Args:
             models: Simulated models.
-            gap: Cost of the model before.
+            cost_before: Cost of the model before.
             directions: Changes by single effects on top of the model before.
         """
         ranked, count = sorted(models, key=cost_of), self._thresholds.candidates_fitted
@@ -338,7 +338,8 @@ class Selector:
         best: Fitted | None = None
         with self._reporter.task("fitting", len(ranked)) as advance:
             for model in ranked:
-                if best is None or gap - model.cost > self._thresholds.hopeful * (gap - best.cost):
+                won = 0.0 if best is None else self._thresholds.hopeful * (cost_before - best.cost)
+                if best is None or cost_before - model.cost > won:
                     fitted = self._kept(self._fitter.fitted(model, directions))
                     best = fitted if best is None or fitted.cost < best.cost else best
                 advance(note=names_of(model.members))
@@ -412,9 +413,9 @@ def pruned(
         if least.cost > best.model.cost and not enough and not vain:
             break
         best = tested
-    something = merged((), best.model.members)
-    if len(something) < len(best.model.members):
-        best = test(fitter.simulate(something)) if something else base
+    remaining = merged((), best.model.members)
+    if len(remaining) < len(best.model.members):
+        best = test(fitter.simulate(remaining)) if remaining else base
     return _sure(best, base, fitter, test)
 
 
@@ -431,7 +432,7 @@ def _sure(best: Tested, base: Tested, fitter: Fitter, test: Callable[[Fitted], T
 
 
 def _beyond_doubt(tested: Tested, place: int, fitter: Fitter) -> bool:
-    """Return True if the data fit so much worse without the member at `place` that none need try.
+    """Return True if the data fit so much worse without the member at `place` that it stays.
 
     The errors of the values are those of all values together, so they hold what other effects could
     do in its place.

@@ -15,6 +15,8 @@ from ugat_marl.diagnosis.features import (
     ALL_FEATURES,
     BIN_FEATURES,
     INDEX,
+    SATURATION_GAPS,
+    SERVICE_COUNTS,
     DetectorLayout,
     Tally,
 )
@@ -22,9 +24,7 @@ from ugat_marl.diagnosis.records import ApproachRow, Sides, TrafficCheck
 from ugat_marl.diagnosis.statistics import Array, sum_of
 from ugat_marl.diagnosis.thresholds import Thresholds
 
-_STEADY = [INDEX[name] for name in ("gap4-5", "gap6-8", "gap9+")]
-"""Gaps of queued vehicles from the fourth on: those of saturation flow."""
-_SERVED = [BIN_FEATURES.index(name) for name in ("count_stop", "count_exit")]
+_SERVED = [BIN_FEATURES.index(name) for name in SERVICE_COUNTS]
 _PASSING = [
     [INDEX[f"{name}_{kind}"] for kind in ("advance", "stop", "exit")]
     for name in ("mean_speed", "over")
@@ -74,7 +74,7 @@ def _of_approach(
     """
     assert tally.journeys is not None
     places = list(lanes)
-    total, count = tally.sums[_STEADY][:, places].sum(axis=(0, 1))
+    total, count = tally.sums[list(SATURATION_GAPS)][:, places].sum(axis=(0, 1))
     capacity = 3600.0 * count / total if count >= thresholds.least_gaps else None
     times, queues = tally.journeys[:, places]
     known = times[:, 1].sum()
@@ -93,7 +93,9 @@ def traffic_check(
     after: Sequence[Tally],
     thresholds: Thresholds,
 ) -> TrafficCheck | None:
-    """Judge a correction by measures that no fit uses.
+    """Judge a correction on held-out periods.
+
+    Travel times and queues, which no fit uses, decide if there are any; else fitted measures do.
 
     The error of a model is the sum over the measures of ``Σ w |measured - simulated| / Σ w
     measured``, with the numbers of observations w of the lanes. Data sets are drawn around the

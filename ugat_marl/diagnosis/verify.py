@@ -15,7 +15,14 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from ugat_marl.diagnosis.features import ALL_FEATURES, BIN_FEATURES, INDEX, Tally
+from ugat_marl.diagnosis.features import (
+    ALL_FEATURES,
+    BIN_FEATURES,
+    INDEX,
+    SATURATION_GAPS,
+    SERVICE_COUNTS,
+    Tally,
+)
 from ugat_marl.diagnosis.records import (
     CriteriaRow,
     EngineeringCriteria,
@@ -78,7 +85,7 @@ def tables_of(study: Study, base: Tested, best: Tested) -> Tables:
 
 
 def judged(study: Study, base: Tested, best: Tested) -> TrafficCheck | None:
-    """Judge the correction by held-out measures that no fit uses; None if it changes no traffic."""
+    """Judge the correction on the held-out periods; None if it changes no traffic."""
     if all(effect.on_detectors for effect in best.model.effects):
         return None
     days = _same_days(study, base, best)
@@ -175,8 +182,7 @@ def courtesy(study: Study, base: Tested, best: Tested) -> EngineeringCriteria:
 def _headway(days: Sequence[Tally]) -> float | None:
     """Return the mean gap of queued vehicles from the fourth on, s."""
     sums = sum_of(days).sums
-    rows = [INDEX["gap4-5"], INDEX["gap6-8"], INDEX["gap9+"]]
-    total = sums[rows].sum(axis=(0, 1))
+    total = sums[list(SATURATION_GAPS)].sum(axis=(0, 1))
     return float(total[0] / total[1]) if total[1] else None
 
 
@@ -199,8 +205,6 @@ def _number(value: float | np.floating) -> float | None:
 
 
 # --- usual criteria on counts ---------------------------------------------------------------------
-
-_COUNTED = ("count_stop", "count_exit")
 
 
 @dataclass(frozen=True)
@@ -226,7 +230,7 @@ class Criteria:
 
 def hourly(tally: Tally) -> Array:
     """Return vehicles per hour at every stop and exit detector, 0 without one; ``(2 places,)``."""
-    sums = tally.sums[[INDEX[name] for name in _COUNTED]].reshape(-1, 2)
+    sums = tally.sums[[INDEX[name] for name in SERVICE_COUNTS]].reshape(-1, 2)
     return 60.0 * sums[:, 0] / np.maximum(sums[:, 1], 1e-9)
 
 
@@ -300,6 +304,6 @@ def _intervals(day: Tally, bins: int, count: int) -> tuple[Array, NDArray[np.boo
     Returns:
         Both ``(detectors, intervals)``.
     """
-    rows = [BIN_FEATURES.index(name) for name in _COUNTED]
+    rows = [BIN_FEATURES.index(name) for name in SERVICE_COUNTS]
     sums, known = (values[rows, :, :count].reshape(-1, count) for values in day.gathered(bins))
     return sums, known > 0

@@ -1,4 +1,6 @@
-"""The diagnosis from data to a corrected scenario: locate, propose, fit, select, verify, correct.
+"""The diagnosis from data to a corrected scenario.
+
+Stages: check the detectors, locate, propose, fit, select, verify, correct.
 
 Every simulated day is kept in a cache. An interrupted diagnosis continues from there, and another
 diagnosis of the same scenario under the same signals needs few simulations.
@@ -7,7 +9,7 @@ diagnosis of the same scenario under the same signals needs few simulations.
 from __future__ import annotations
 
 import shutil
-from collections.abc import Collection
+from collections.abc import Collection, Sequence
 from dataclasses import replace
 from pathlib import Path
 
@@ -15,6 +17,7 @@ import numpy as np
 
 from ugat_marl.data import MeasuredData, installed_versions
 from ugat_marl.diagnosis.engine import OutOfTime
+from ugat_marl.diagnosis.hypotheses import WINDOW
 from ugat_marl.diagnosis.locate import disagreements, locate_gap
 from ugat_marl.diagnosis.patterns import unnamed_effects
 from ugat_marl.diagnosis.places import Routes
@@ -111,7 +114,11 @@ def diagnose(
 def _diagnosed(
     study: Study, timing: tuple[Effect, ...], reporter: Reporter
 ) -> tuple[Diagnosis, tuple[Effect, ...]]:
-    """Run all stages, and return the record and the effects beside those of the signal log."""
+    """Run all stages.
+
+    Returns:
+        The record, and the effects of the corrected scenario besides those of the signal log.
+    """
     errors: tuple[Effect, ...] = ()
     try:
         study = study.detectors_as_they_are(reporter)
@@ -130,7 +137,8 @@ def _compared(
     """Run all stages after the simulation of the scenario as it is.
 
     Returns:
-        The record, and the effects that the search names.
+        The record, and the effects of the corrected scenario besides those of the signal log and
+        of the detectors; none if it is not corrected.
     """
     selector = study.selector(base, reporter)
     located = locate_gap(study, base, selector)
@@ -159,8 +167,7 @@ def _compared(
     except OutOfTime:
         selected = replace(selected, complete=False)
         verified = verify_model(study, located.base, located.base)
-        conclusion = unverified(selected)
-        conclusion = told(conclusion)
+        conclusion = told(unverified(selected))
         diagnosis = _record(study, timing, located, selected, verified, conclusion, tables=False)
     diagnosis = _with_patterns(study, diagnosis, located.base, conclusion, reporter)
     unnamed = _unnamed(study, diagnosis, located.base, conclusion, reporter)
@@ -175,7 +182,7 @@ def _compared(
 
 
 def _explained_by(base: Tested, conclusion: Conclusion) -> Tested:
-    """Return the model whose effects are named: an effect that is not named explains nothing."""
+    """Return the selected model if its effects are named, else the scenario as it is."""
     return conclusion.best if conclusion.verdict == "partially_explained" else base
 
 
@@ -236,7 +243,10 @@ def _with_patterns(
 def _reason_against(conclusion: Conclusion, check: TrafficCheck | None) -> str | None:
     """Return why the effects of a conclusion are not put into the scenario; None if they are."""
     if conclusion.verdict == "partially_explained":
-        return "The effects named explain only a part, so the scenario is not corrected by them."
+        return (
+            "Something besides the effects named may be behind the difference, so the scenario is "
+            "not corrected by them."
+        )
     if check is None or check.better:
         return None
     if check.undecided:
@@ -358,7 +368,7 @@ def _begun(
         effects=(
             *(_without_search(effect, "signal log") for effect in timing),
             *(
-                _without_search(error.effect, "detections of single vehicles", error.margin or 0.0)
+                _without_search(error.effect, "detections of single vehicles", error.margin)
                 for error in study.detection
             ),
         ),
@@ -407,17 +417,29 @@ def _named(best: Tested, selected: Selected, half_interval: float) -> tuple[Name
     return tuple(effects)
 
 
-def _without_search(effect: Effect, source: str, margin: float = 0.0) -> NamedEffect:
-    """Return the record of an effect read off the data; `margin` is half its 95 % interval."""
+def _without_search(effect: Effect, source: str, margin: float | None = None) -> NamedEffect:
+    """Return the record of an effect that the search did not fit.
+
+    Args:
+        effect: The effect.
+        source: What it was read off.
+        margin: Half the width of the 95 % interval of its number; None without an interval.
+    """
     values = effect.record()
     name = str(values.pop("name"))
     texts = [str(values[key]) for key in effect.texts]
     numbers = {key: (float(values[key]), limits.unit) for key, limits in effect.ranges.items()}
+    window = None
+    if all(key in numbers for key in WINDOW):
+        begin_s, end_s = (numbers.pop(key)[0] for key in WINDOW)
+        window = (begin_s, end_s)
     parameters = {
-        key: Parameter(value, value - margin, value + margin, unit)
+        key: Parameter(value, None, None, unit)
+        if margin is None
+        else Parameter(value, value - margin, value + margin, unit)
         for key, (value, unit) in numbers.items()
     }
-    return NamedEffect(name, ">".join(texts) or None, None, parameters, LogGrounds(source))
+    return NamedEffect(name, ">".join(texts) or None, window, parameters, LogGrounds(source))
 
 
 def _with_grounds(effect: EffectRecord, grounds: SearchGrounds) -> NamedEffect:
@@ -445,17 +467,28 @@ def _known_gap(directory: Path, diagnosis: Diagnosis) -> dict[str, PolicyGap] | 
     """Return the policy gap of an earlier record, if that still holds; else None.
 
     `ugat-marl policy-gap` measured it by simulations. It holds as long as scenario, data, versions
-    and effects are the same.
+    and the corrected scenario are the same.
     """
     try:
         earlier = Diagnosis.read(directory)
     except ValueError:
         return None  # no file, or no diagnosis of this version
-    same = (earlier.hashes, earlier.versions) == (diagnosis.hashes, diagnosis.versions)
-    return earlier.policy_gap if same and _values(earlier) == _values(diagnosis) else None
+    return earlier.policy_gap if _gap_inputs(earlier) == _gap_inputs(diagnosis) else None
 
 
-def _values(diagnosis: Diagnosis) -> list[object]:
+def _gap_inputs(diagnosis: Diagnosis) -> tuple[object, ...]:
+    """Return everything that the policy gap depends on."""
+    return (
+        diagnosis.hashes,
+        diagnosis.versions,
+        diagnosis.corrected,
+        diagnosis.not_corrected is None,
+        _values(diagnosis.effects),
+        _values(diagnosis.unnamed),
+    )
+
+
+def _values(effects: Sequence[NamedEffect]) -> list[object]:
     """Return the effects without intervals and grounds, since these change no simulation."""
     return [
         (
@@ -464,5 +497,5 @@ def _values(diagnosis: Diagnosis) -> list[object]:
             effect.window,
             {name: parameter.value for name, parameter in effect.parameters.items()},
         )
-        for effect in diagnosis.effects
+        for effect in effects
     ]
