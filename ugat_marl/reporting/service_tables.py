@@ -93,14 +93,14 @@ def approach_table(title: str, delays: Mapping[str, Delays], network: Network) -
         table = titled_table(f"{title}{more}")
         for heading in (LIGHT, "approach", "road"):
             table.add_column(heading, overflow="fold", max_width=22)
-        table.add_column("veh", justify="right")
-        for name in part:
-            table.add_column(name, justify="right", overflow="fold")
+        for heading in ("veh", *part):
+            table.add_column(heading, justify="right", overflow="fold")
         for road in shown:
             named = names.get(road)
-            cells = [approach_text(*own[road]) if road in own else "-" for own in part.values()]
-            count = next((own[road][0] for own in part.values() if road in own), 0.0)
             light, approach = (lights.text(named.light), named.name) if named else ("", "")
+            passed = [own.get(road) for own in part.values()]
+            count = next((at[0] for at in passed if at is not None), 0.0)
+            cells = ["-" if at is None else approach_text(*at) for at in passed]
             table.add_row(Text(light), Text(approach), Text(road), f"{count:.0f}", *cells)
         tables.append(table)
     return Group(*tables, Text(LEGEND, style="dim"))
