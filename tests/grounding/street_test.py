@@ -33,6 +33,7 @@ from ugat_marl.grounding import (
     street_env,
     street_prior,
 )
+from ugat_marl.grounding.channel import CommandChannel
 from ugat_marl.grounding.eyes import Eyes, fit_eyes
 from ugat_marl.grounding.posterior import Values
 from ugat_marl.grounding.state import RunState
@@ -130,6 +131,30 @@ def test_a_street_survives_its_file_and_refuses_another_network(
         FittedStreet.load(tmp_path / "street.pt", replace(prior, lanes=prior.lanes[:2]))
     with pytest.raises(CheckpointError, match="another library"):
         FittedStreet.load(tmp_path / "street.pt", replace(prior, library=prior.library[:2]))
+
+
+def test_metrics_tell_intersections_apart_each_with_its_interval() -> None:
+    # a: 1,000 commands of which 200 are lost and half of the others are two decisions late; b: none
+    weights = np.array([0.4, 0.0, 0.4, 0.2])
+    counts = np.array([1000 * weights, np.zeros(4)])
+    free = np.ones((3, 2, 2), dtype=bool)
+    channel = CommandChannel(("a", "b"), weights, counts, (free, free), pull=10.0)
+    eyes = Eyes(np.array([1.0, 0.5, 0.0, 0.0]), (0.0, 0.0), 0.0, 0.0, 0, 0.0)
+    street = FittedStreet(("0", "1", "2", "3"), 10.0, channel, eyes)
+    numbers = street.as_dict({"a": (0, 1), "b": (2, 3)})
+    assert numbers["channel/late_s/a"] == pytest.approx(10.0, abs=0.5)
+    assert numbers["channel/missing/a"] == pytest.approx(0.2, abs=0.01)
+    assert numbers["channel/missing_low/a"] > 0.17
+    assert numbers["channel/missing_high/a"] < 0.23
+    # Ten decisions' worth of belief leaves b wide around the network's share.
+    assert numbers["channel/missing_low/b"] < 0.1 < 0.3 < numbers["channel/missing_high/b"]
+    assert [numbers[f"eyes/unseen{end}/a"] for end in ("_low", "_high")] == [1.0, 2.0]
+    assert [numbers[f"eyes/unseen{end}/b"] for end in ("_low", "", "_high")] == [0.0] * 3
+
+    obeyed = replace(channel, network=np.array([1.0, 0, 0, 0]), counts=np.zeros((2, 4)))
+    perfect = FittedStreet(street.lanes, 10.0, obeyed, replace(eyes, dead=np.zeros(4)))
+    names = perfect.as_dict({"a": (0, 1), "b": (2, 3)})
+    assert not [name for name in names if name.endswith(("/a", "/b"))]
 
 
 def test_values_of_the_simulation_s_own_vehicles_change_nothing(

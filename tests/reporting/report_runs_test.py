@@ -220,7 +220,7 @@ def test_a_whole_run_is_shown_with_the_numbers_of_its_records(run: Path) -> None
     assert worst == ["B2 (signal_3)", "7.5", "12", "minute 9", "15", "24", "minute 9"]
     names = [picture.name for picture in made.pictures]
     assert names == list(dict.fromkeys(names))
-    assert {"first-radar-V4", "first-gate", "first-map-acceptance", "first-map-queue"} <= set(names)
+    assert {"first-radar-V4", "first-gate", "first-map-queue"} <= set(names)
 
 
 def test_the_page_needs_nothing_else_and_every_picture_has_words(run: Path) -> None:

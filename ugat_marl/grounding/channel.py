@@ -110,6 +110,11 @@ class CommandChannel(ControllerPart):
         return float(self.network[-1])
 
     @property
+    def late(self) -> bool:
+        """True if some commands take effect at a later decision."""
+        return bool(self.network[1:-1].any())
+
+    @property
     def forbids(self) -> bool:
         """True if some phase is forbidden at some age."""
         return not all(table[1:].all() for table in self.tables)

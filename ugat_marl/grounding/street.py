@@ -20,7 +20,7 @@ from __future__ import annotations
 
 import contextlib
 import copy
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
@@ -60,6 +60,9 @@ from ugat_marl.seeding import derive_seed, numpy_generator
 
 KIND = "street"
 """Name of this kind of checkpoint, written into the file."""
+
+_DRAWS = 200
+"""Draws from a fitted part, for its intervals."""
 
 PARTS = ("channel", "eyes", "service", "effects")
 """Parts of a street, each of which can be left out."""
@@ -182,7 +185,7 @@ class FittedStreet:
         """Return what was found, a line for each part."""
         lines = [part.describe() for part in (self.channel, self.eyes) if part is not None]
         if self.posterior is not None:
-            effects, service_s = self.posterior.sample(200)
+            effects, service_s = self.posterior.sample(_DRAWS)
             low, high = np.quantile(effects, (0.05, 0.95), axis=0)
             ranges = zip(self.posterior.worlds.library, low, high, strict=True)
             named = (f"{x.name} {a:.2g} to {b:.2g}" for x, a, b in ranges)
@@ -206,6 +209,15 @@ class FittedStreet:
             numbers |= {f"channel/lag_{k}": float(w) for k, w in enumerate(weights[:-1]) if w > 0}
             numbers["channel/lost"] = self.channel.lost
             numbers["channel/forbids"] = float(self.channel.forbids)
+            drawn = np.array([self.channel.drawn(seed) for seed in range(_DRAWS)])
+            if self.channel.late:
+                arrive = drawn[:, :, :-1] / (1.0 - drawn[:, :, -1:]).clip(1e-9)
+                late_s = self.interval_s * arrive @ np.arange(arrive.shape[-1])
+                numbers |= _with_intervals("channel/late_s", late_s.T, self.channel.agents)
+            if self.channel.lost:
+                numbers |= _with_intervals(
+                    "channel/missing", drawn[:, :, -1].T, self.channel.agents
+                )
         if self.eyes is not None:
             numbers |= {
                 "eyes/dead": float(self.eyes.dead.sum()),
@@ -216,8 +228,13 @@ class FittedStreet:
                 "eyes/lost": self.eyes.lost,
                 "eyes/step": self.eyes.step,
             }
+            if self.eyes.dead.any():
+                dead = numpy_generator(0, "eyes", "dead").random((_DRAWS, len(self.lanes)))
+                dead = dead < self.eyes.dead
+                draws = [dead[:, list(places)].sum(1) for places in lanes_of.values()]
+                numbers |= _with_intervals("eyes/unseen", np.array(draws), lanes_of)
         if self.posterior is not None:
-            effects, service_s = self.posterior.sample(200)
+            effects, service_s = self.posterior.sample(_DRAWS)
             for place, item in enumerate(self.posterior.worlds.library):
                 low, middle, high = np.quantile(effects[:, place], (0.05, 0.5, 0.95))
                 numbers[f"effects/{item.name}"] = float(middle)
@@ -227,12 +244,10 @@ class FittedStreet:
             for lane, (begin_s, each_s) in zip(self.lanes, service_s.mean(0), strict=True):
                 numbers[f"service/begin_s/{lane}"] = float(begin_s)
                 numbers[f"service/each_s/{lane}"] = float(each_s)
-            for agent, places in lanes_of.items():
-                unused_s = service_s[:, list(places)].mean(1)
-                quantiles = np.quantile(unused_s, (0.05, 0.5, 0.95), axis=0)
-                for end, row in zip(("_low", "", "_high"), quantiles, strict=True):
-                    numbers[f"unused/begin_s{end}/{agent}"] = float(row[0])
-                    numbers[f"unused/each_s{end}/{agent}"] = float(row[1])
+            for column, name in enumerate(("unused/begin_s", "unused/each_s")):
+                unused_s = service_s[:, :, column]
+                draws = [unused_s[:, list(places)].mean(1) for places in lanes_of.values()]
+                numbers |= _with_intervals(name, np.array(draws), lanes_of)
         return numbers
 
     def save(self, path: Path, simulated: Sequence[Simulated] = ()) -> None:
@@ -558,6 +573,19 @@ def street_prior(env: TrafficEnv, config: StreetConfig) -> Worlds:
     everything = tuple(item.name for item in LIBRARY)
     left_out = config.without if "effects" in config.parts else everything
     return Worlds.of(view.lanes, left_out, "service" in config.parts, env.scenario)
+
+
+def _with_intervals(
+    name: str, draws: NDArray[np.floating] | NDArray[np.integer], agents: Iterable[str]
+) -> dict[str, float]:
+    """Return median and 90 % interval of a number of each agent, from draws ``(agents, n)``."""
+    ends = ("_low", "", "_high")
+    low_to_high = np.quantile(draws, (0.05, 0.5, 0.95), axis=1)
+    return {
+        f"{name}{end}/{agent}": float(value)
+        for end, row in zip(ends, low_to_high, strict=True)
+        for agent, value in zip(agents, row, strict=True)
+    }
 
 
 def _arrays(simulated: Sequence[Simulated]) -> dict[str, Tensor]:

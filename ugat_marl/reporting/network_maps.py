@@ -59,7 +59,7 @@ def node_map(
         values: Intersection to its number and to the text in its circle; nan gets no colour.
         ends: Lower and upper end of the scale of colours.
         unit: Unit of the number.
-        intervals: Intersection to the interval of its number, for the tip of its circle.
+        intervals: Intersection to the interval of its number, below its name and in its tip.
     """
     centres = {
         intersection.id: intersection.position
@@ -86,6 +86,8 @@ def node_map(
             )  # fmt: skip
         if len(centres) <= _NAMED:
             _name(axes, tls, (x, y), -radius - 9)
+            if intervals and tls in intervals:
+                _name(axes, f"({intervals[tls]})", (x, y), -radius - 22, "soft")
     _add_scale(picture, ends, unit)
     return picture
 
@@ -212,10 +214,10 @@ def _radius(points: Sequence[Point]) -> float:
     return min(max(0.36 * min(distances, default=60.0), 3.0), 17.0)
 
 
-def _name(axes: Any, name: str, at: Point, down: float) -> None:
+def _name(axes: Any, name: str, at: Point, down: float, colour: str = "ink") -> None:
     axes.annotate(
         printable(shortened(name, 14)), at, (0, down), textcoords="offset points", ha="center",
-        va="center", fontsize=11, zorder=5,
+        va="center", fontsize=11, color=LIGHT[colour], zorder=5,
         bbox={"boxstyle": "round,pad=0.1", "facecolor": LIGHT["paper"], "edgecolor": "none",
               "alpha": 0.75},
     )  # fmt: skip

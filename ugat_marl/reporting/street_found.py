@@ -1,50 +1,34 @@
-"""Findings of a training in the log of the street: commands, detectors, effects, unused green."""
+"""Findings of a training in the log of the street: commands, detectors, effects."""
 
 from __future__ import annotations
 
-import math
-from collections.abc import Mapping
 from typing import Any
 
 from ugat_marl.effects import known_effects
 from ugat_marl.grounding import LIBRARY
-from ugat_marl.reporting.figures import NamedFigure
 from ugat_marl.reporting.formats import number
-from ugat_marl.reporting.network_maps import node_map
-from ugat_marl.reporting.page import Grid, Page
-from ugat_marl.reporting.places import Places
+from ugat_marl.reporting.page import Grid
 from ugat_marl.reporting.run_records import RunRecord
 
-_UNUSED = {
-    "begin_s": "green unused at its beginning",
-    "each_s": "green unused in each further decision",
-}
 _LATEST = 20
 """Largest lag of commands that is looked for in a record, in decisions."""
 
 
-def found_on_street(page: Page, record: RunRecord, places: Places | str) -> dict[str, Any] | None:
-    """Return the section of a fitted street, as the last iteration left it.
+def found_on_street(record: RunRecord) -> dict[str, Any] | None:
+    """Return what was found of the network as a whole, as the last iteration left it.
 
     Args:
-        page: The page; it numbers its pictures.
         record: The training.
-        places: Where its agents are, or why they are not known.
 
     Returns:
         None if the training fitted no street.
     """
     if _last(record, "street/commands") is None:
         return None
-    known = places if isinstance(places, Places) else None
-    figures = [] if known is None else [_map(record, known, key) for key in _UNUSED]
     return {
         "commands": commands_found(record),
         "detectors": detectors_found(record),
         "effects": _effects(record),
-        "unused": _unused(record, known),
-        "figures": page.figures(*figures),
-        "note": known.note if known is not None else places,
         "kept": _kept(record),
     }
 
@@ -111,57 +95,6 @@ def _effects(record: RunRecord) -> Grid | None:
         )  # fmt: skip
     headings = ["effect", "unit", "simulation", "street", "90 % interval", "simulation possible"]
     return Grid(headings, rows, headings[2:5]) if rows else None
-
-
-def _of_agents(record: RunRecord, key: str) -> list[dict[str, float]]:
-    """Return median, lower and upper end of one kind of unused green, by agent."""
-    return [
-        {agent: rows[-1][1] for agent, rows in record.agents(f"unused/{key}{end}").items()}
-        for end in ("", "_low", "_high")
-    ]
-
-
-def _unused(record: RunRecord, places: Places | None) -> Grid | None:
-    """Return the unused green of each intersection; None if it was not fitted."""
-    columns = {key: _of_agents(record, key) for key in _UNUSED}
-    lights: Mapping[str, str] = {} if places is None else places.intersection_of
-    rows = [
-        [
-            agent,
-            lights.get(agent, "–"),
-            *(
-                f"{number(middle.get(agent, math.nan), 2)} "
-                f"({number(low.get(agent, math.nan), 2)} to {number(high.get(agent, math.nan), 2)})"
-                for middle, low, high in columns.values()
-            ),
-        ]
-        for agent in columns["begin_s"][0]
-    ]
-    headings = ["agent", "traffic light", *(f"{text}, s" for text in _UNUSED.values())]
-    return Grid(headings, rows, headings[2:]) if rows else None
-
-
-def _map(record: RunRecord, places: Places, key: str) -> tuple[NamedFigure | None, str]:
-    """Return a map of one kind of unused green; a single intersection needs none."""
-    middle, low, high = _of_agents(record, key)
-    values = {
-        light: (middle[agent], f"{middle[agent]:.1f}")
-        for agent, light in places.intersection_of.items()
-        if agent in middle
-    }
-    if len(values) < 2:
-        return None, ""
-    title = _UNUSED[key]
-    tips = {
-        places.intersection_of[agent]: f"{low[agent]:.1f} to {high[agent]:.1f}"
-        for agent in middle
-        if agent in places.intersection_of
-    }
-    most = max(1.0, *(value for value, _ in values.values()))
-    name = f"{record.name}-map-{key}".replace("/", "-")
-    picture = node_map(name, title, places.network, values, (0.0, most), "s", tips)
-    text = "mean over its lanes; the tip of a disc has the 90 % interval"
-    return picture, f"{title[0].upper()}{title[1:]} at each intersection ({text})."
 
 
 def _kept(record: RunRecord) -> str:

@@ -19,6 +19,7 @@ from ugat_marl.experiments import PHASE, Estimate, Evaluation, check_run, is_gro
 from ugat_marl.reporting import charts
 from ugat_marl.reporting.figures import NamedFigure, printable
 from ugat_marl.reporting.formats import number, share, signed
+from ugat_marl.reporting.intersection_findings import findings_maps, findings_table
 from ugat_marl.reporting.light_names import LightNames
 from ugat_marl.reporting.network_maps import minutes_picture, node_map
 from ugat_marl.reporting.page import Figure, Grid, Page, render
@@ -313,7 +314,9 @@ def _training(page: Page, record: RunRecord, commands: Commands) -> dict[str, An
         if evaluation is not None and judged
         else None,
         "curves": page.figures((learning, f"{_STRETCH}its episodes."), (travel, once)),
-        "street": found_on_street(page, record, places),
+        "street": found_on_street(record),
+        "found": _found(page, record, places),
+        "places": places.note if isinstance(places, Places) else places,
         "gate": _gate(page, record, places),
         "queues": _worst(page, record, places if isinstance(places, Places) else None),
         "commands": commands.get(record.directory, ()),
@@ -432,53 +435,34 @@ def _measures(evaluation: Evaluation) -> Grid:
     return Grid(headings, rows, headings[2:])
 
 
+def _found(page: Page, record: RunRecord, places: Places | str) -> dict[str, Any] | None:
+    """Return what was found at each intersection; None if nothing was looked for there."""
+    known = places if isinstance(places, Places) else None
+    table = findings_table(record, known)
+    if table is None:
+        return None
+    return {
+        "figures": page.figures(*(findings_maps(record, known) if known is not None else ())),
+        "table": table,
+    }
+
+
 def _gate(page: Page, record: RunRecord, places: Places | str) -> dict[str, Any] | None:
     """Return the gate over the iterations and, for the last iteration, by intersection."""
     curve = charts.gate_picture([record], _file_name(record.name, "gate"))
     if curve is None:
         return None
     caption = "Means over the intersections. A grounded action is taken where u is below α."
-    figures = [(curve, caption)]
-    if isinstance(places, Places):
-        figures += [
-            _gate_map(record, places, *row)
-            for row in (
-                ("gate/acceptance", "accepted grounded actions", "% of decisions"),
-                ("gate/mean_u", "mean uncertainty u", "from 0 to 1"),
-                ("gate/alpha", "threshold α", "as u; ∞ takes everything"),
-            )
-        ]
     return {
-        "figures": page.figures(*figures),
-        "note": places.note if isinstance(places, Places) else places,
+        "figures": page.figures((curve, caption)),
         "table": _gate_grid(record, places if isinstance(places, Places) else None),
     }
-
-
-def _gate_map(
-    record: RunRecord, places: Places, key: str, quantity: str, unit: str
-) -> tuple[NamedFigure | None, str]:
-    series = record.agents(key)
-    last = max((rows[-1][0] for rows in series.values() if rows), default=0)
-    scale = 100.0 if unit.startswith("%") else 1.0
-    values: dict[str, tuple[float, str]] = {}
-    for agent, tls in places.intersection_of.items():
-        value = dict(series.get(agent, [])).get(last, math.nan) * scale
-        text = "∞" if math.isinf(value) else f"{value:.0f}" if scale > 1 else f"{value:.2f}"
-        values[tls] = (value, "" if math.isnan(value) else text)
-    if len(values) < 2 or not any(text for _, text in values.values()):
-        return None, ""  # a single intersection needs no map
-    title = f"{quantity}, iteration {last}"
-    name = _file_name(record.name, "map", key.rpartition("/")[2])
-    picture = node_map(name, title, places.network, values, (0.0, scale), unit)
-    return picture, f"{quantity[0].upper()}{quantity[1:]} at each intersection ({unit})."
 
 
 def _gate_grid(record: RunRecord, places: Places | None) -> Grid:
     columns = {
         "gate/acceptance": "accepted", "gate/mean_u": "mean u", "gate/alpha": "α",
         "gate/change_rate": "changed", "gate/trusted": "f and h are proven",
-        "lost_time/best_s": "lost time, s",
     }  # fmt: skip
     last = {
         key: {agent: rows[-1][1] for agent, rows in record.agents(key).items()} for key in columns
