@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from ugat_marl.diagnosis import Hypothesis, Reference, Tally
 from ugat_marl.diagnosis.engine import Engine, Replicate, Usual
 from ugat_marl.diagnosis.features import BIN_FEATURES, FEATURES
-from ugat_marl.diagnosis.fit import Fitter, uncertainty
+from ugat_marl.diagnosis.fit import Fitter, _may_move, uncertainty
 from ugat_marl.diagnosis.hypotheses import Members
 from ugat_marl.diagnosis.propose import Direction
 from ugat_marl.diagnosis.records import Fitted
@@ -146,6 +146,50 @@ def test_steps_correct_slopes() -> None:
     ]
     best = fitter.refine(fitter.simulate(start((HEADWAY, 1.2), (GAP, 4.0))), 6, twice)
     assert best.values == pytest.approx([1.43, 3.3], abs=0.2)
+
+
+class Bent(World):
+    """A strong response that falls off: long moves say less than short ones."""
+
+    def played(self, number: int, effects: Sequence[Effect]) -> Tally:
+        values = {e.name: float(e.record()["seconds"]) for e in effects}
+        return day(number, {name: 1.0 + 400.0 / value for name, value in values.items()})
+
+
+def test_near_the_data_moves_are_shortened_to_where_statistics_are_linear() -> None:
+    fitter = a_fitter({"headway": 1.0 + 400.0 / 3.0}, street=17)
+    fitter.engine = Bent()
+    model = fitter.simulate(start((HEADWAY, 3.0)))
+    ((_, far),) = fitter.changes(model)
+    ((_, near),) = fitter.changes(model, closely=True)
+    assert far == pytest.approx(THRESHOLDS.nearby * 2.0)
+    assert near == pytest.approx(HEADWAY.least)
+
+
+EMERGENCY = Hypothesis("emergency_deceleration", (), ("mps2",), ((3.0,),), (9.0,), 0.5)
+
+
+class Bounded(World):
+    """An emergency deceleration that changes nothing above 2 m/s^2."""
+
+    def played(self, number: int, effects: Sequence[Effect]) -> Tally:
+        values = {
+            e.name: float(next(v for k, v in e.record().items() if k != "name")) for e in effects
+        }
+        hard = values.pop("emergency_deceleration", 9.0) < 2.0
+        return day(number, {**values, "min_gap": 4.0 if hard else 2.5})
+
+
+def test_an_effect_near_its_bound_does_not_hold_the_others_back() -> None:
+    fitter = a_fitter({"headway": 1.4, "min_gap": 4.0}, street=17, world=Bounded())
+    assert [list(free) for free in _may_move(start((HEADWAY, 1.2), (EMERGENCY, 1.9)))] == [
+        [True, True],
+        [True, False],
+    ]
+    assert len(_may_move(start((EMERGENCY, 1.9)))) == len(_may_move(start((HEADWAY, 1.2)))) == 1
+    best = fitter.refine(fitter.simulate(start((HEADWAY, 1.2), (EMERGENCY, 1.9))))
+    assert best.values[0] == pytest.approx(1.4, abs=0.06)
+    assert best.values[1] < 2.0
 
 
 def test_the_true_model_costs_least() -> None:

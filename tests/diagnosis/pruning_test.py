@@ -5,6 +5,7 @@ from __future__ import annotations
 import contextlib
 from collections.abc import Iterator
 from dataclasses import dataclass, field, replace
+from types import SimpleNamespace
 from typing import Any, cast
 
 import numpy as np
@@ -15,7 +16,7 @@ from ugat_marl.diagnosis.fit import Fitter
 from ugat_marl.diagnosis.hypotheses import Members, library
 from ugat_marl.diagnosis.records import Fitted
 from ugat_marl.diagnosis.select import Selector, doubtful, pruned
-from ugat_marl.diagnosis.thresholds import Thresholds
+from ugat_marl.diagnosis.thresholds import Effort, Thresholds
 from ugat_marl.effects import known_effects, load_scenario
 from ugat_marl.progress import Advance, Silent
 
@@ -36,6 +37,7 @@ class Ledger:
     chances: dict[tuple[str, ...], float]
     luck: dict[tuple[str, ...], float] = field(default_factory=dict)
     tested: list[tuple[str, ...]] = field(default_factory=list)
+    exactly: list[tuple[str, ...]] = field(default_factory=list)
     refined: dict[tuple[str, ...], Members] = field(default_factory=dict)
     thresholds: Thresholds = THRESHOLDS
 
@@ -46,14 +48,22 @@ class Ledger:
         blank = cast(Any, None)
         return Fitted(members, {}, blank, blank, cost)
 
-    def refine(self, start: Fitted, rounds: int) -> Fitted:
-        del rounds
+    def refine(self, start: Fitted, rounds: int, *, closely: bool = False) -> Fitted:
+        del rounds, closely
         members = self.refined.get(names(start.members), start.members)
         return replace(start, members=members)
+
+    def fitted(self, start: Fitted, directions: object) -> Fitted:
+        del directions
+        return self.refine(start, 1)
 
     def test(self, model: Fitted) -> records.Tested:
         self.tested.append(names(model.members))
         return self.with_chance(self.simulate(model.members, 16))
+
+    def exact(self, tested: records.Tested) -> records.Tested:
+        self.exactly.append(names(tested.model.members))
+        return tested
 
     def with_chance(self, model: Fitted, errors: float = 0.0) -> records.Tested:
         chance = cast(Any, Chance(self.chances[names(model.members)]))
@@ -64,7 +74,10 @@ class Ledger:
         fitter = cast(Fitter, cast(object, self))
         blank = cast(Any, None)
         base = records.Tested(Fitted((), {}, blank, blank, 0.0), blank, np.empty(0), {})
-        return pruned(best, base, fitter, lambda model: model, self.test, 0.05).model.members
+        left = pruned(best, base, fitter, lambda model: model, self.test, self.exact, 0.05)
+        if left.model.members:
+            assert self.exactly[-1] == names(left.model.members), "the result has exact errors"
+        return left.model.members
 
 
 @dataclass
@@ -105,6 +118,7 @@ def test_what_leaves_more_than_chance_behind_stays() -> None:
     )
     assert ledger.left(HEADWAY, DEMAND) == (HEADWAY, DEMAND)
     assert ledger.tested == [("headway",)]
+    assert ledger.exactly == [both], "no exact errors of what is not taken"
 
 
 def test_no_time_is_lost_on_sets_that_plainly_do_not_suffice() -> None:
@@ -169,7 +183,7 @@ def test_progress_is_told_of_every_smaller_set() -> None:
             yield lambda note="": notes.append(note)
 
     fitter = cast(Fitter, cast(object, ledger))
-    pruned(best, best, fitter, lambda model: model, ledger.test, 0.05, Heard())
+    pruned(best, best, fitter, lambda model: model, ledger.test, ledger.exact, 0.05, Heard())
     assert sorted(notes) == ["demand_level", "headway"]
 
 
@@ -260,3 +274,32 @@ def test_sets_without_an_effect_beyond_doubt_are_not_tried(
     monkeypatch.setattr(ledger, "simulate", watched)
     assert names(ledger.left(HEADWAY, SPEED, errors=errors)) == ("headway", "desired_speed")
     assert (("headway",) in asked) == tried
+
+
+def test_a_further_effect_is_compared_on_equal_numbers_of_days() -> None:
+    both = ("headway", "demand_level")
+    ledger = Ledger({both: 700.0, ("headway",): 1000.0}, {both: 0.9, ("headway",): 0.01})
+    start = ledger.with_chance(ledger.simulate((HEADWAY,), 16))
+    selector: Any = object.__new__(Selector)
+    selector._fitter, selector._thresholds, selector._reporter = ledger, THRESHOLDS, Silent()
+    selector._seen, selector._of_round, selector._alpha = {}, {}, 0.05
+    selector.test = ledger.test
+    # With few days both cost more than the headway alone does with many.
+    assert ledger.simulate((HEADWAY, DEMAND)).cost > start.model.cost
+    found = selector._fitted(start, [(DEMAND,)], 1, "candidates")
+    assert found.model.members == (HEADWAY, DEMAND)
+    ledger.costs[both] = 1000.0 - THRESHOLDS.price / 2
+    selector.test = lambda model: pytest.fail("half a price is no gain")
+    assert selector._fitted(start, [(DEMAND,)], 1, "candidates") is None
+
+
+def test_simulated_strengths_that_cost_less_are_candidates_themselves() -> None:
+    costs = {("headway",): 1000.0, ("headway", "demand_level"): 900.0}
+    ledger = Ledger({**costs, ("headway", "desired_speed"): 1100.0}, {})
+    selector: Any = object.__new__(Selector)
+    selector._fitter, selector._thresholds, selector._effort = ledger, THRESHOLDS, Effort()
+    one, other = (SimpleNamespace(hypothesis=h, level=level) for h, level in (SPEED, DEMAND))
+    selector._of_round = {1: [one, other]}
+    model = ledger.simulate((HEADWAY,), 16)
+    assert selector._nearer(model, 1) == [(DEMAND,)]
+    assert selector._nearer(model, 2) == []

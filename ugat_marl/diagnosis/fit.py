@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
 
 import numpy as np
+from numpy.typing import NDArray
 
 from ugat_marl.diagnosis.between import EVERY_LANE, TRAVEL_TIME
 from ugat_marl.diagnosis.engine import Engine
@@ -14,7 +16,7 @@ from ugat_marl.diagnosis.hypotheses import WINDOW, Hypothesis, Members, effects_
 from ugat_marl.diagnosis.propose import Direction
 from ugat_marl.diagnosis.records import Fitted
 from ugat_marl.diagnosis.statistics import Array, Pools, Reference, Whitener, change_between, shrunk
-from ugat_marl.effects import EVERYWHERE
+from ugat_marl.effects import EVERYWHERE, NO_SOFTER
 
 Change = tuple[dict[str, Array], float]
 """Change of the statistics when a free value moves, by block, and length of this move."""
@@ -84,7 +86,12 @@ class Fitter:
         return Fitted(members, known, reference, distance, cost)
 
     def refine(
-        self, start: Fitted, rounds: int | None = None, directions: Sequence[Direction] = ()
+        self,
+        start: Fitted,
+        rounds: int | None = None,
+        directions: Sequence[Direction] = (),
+        *,
+        closely: bool = False,
     ) -> Fitted:
         """Take Gauss-Newton steps from a simulated model.
 
@@ -96,13 +103,14 @@ class Fitter:
             start: The model to start from.
             rounds: Largest number of steps; None for `Thresholds.steps`.
             directions: Changes of the statistics by single effects.
+            closely: True if the data are near, see `changes`.
         """
         best, left = start, self.thresholds.steps if rounds is None else rounds
         changes = self._known_changes(start, directions)
         exact = False
         while left and len(best.values):
             if changes is None:
-                changes, exact = self.changes(best), True
+                changes, exact = self.changes(best, closely=closely), True
             after = self._after_step(best, changes)
             if after is None:
                 if exact:
@@ -119,14 +127,17 @@ class Fitter:
     def _after_step(self, model: Fitted, changes: Sequence[Change]) -> Fitted | None:
         """Return the model after a step, or a shorter one; None if neither costs less."""
         whitener = self.whitener(model)
-        step = _solve(derivatives(changes, whitener), whitener.measured, self.thresholds.ridge)
-        for share in (1.0, self.thresholds.shorter_step):
-            moved = self._moved(model, share * step)
-            if moved == model.members:
-                return None
-            after = self.simulate(moved)
-            if after.cost < model.cost:
-                return after
+        slopes = derivatives(changes, whitener)
+        for free in _may_move(model.members):
+            step = np.zeros(len(slopes))
+            step[free] = _solve(slopes[free], whitener.measured, self.thresholds.ridge)
+            for share in (1.0, self.thresholds.shorter_step):
+                moved = self._moved(model, share * step)
+                if moved == model.members:
+                    break
+                after = self.simulate(moved)
+                if after.cost < model.cost:
+                    return after
         return None
 
     def _known_changes(self, model: Fitted, directions: Sequence[Direction]) -> list[Change] | None:
@@ -238,21 +249,28 @@ class Fitter:
         """Return derivatives of the whitened statistics, ``(free values, statistics)``."""
         return derivatives(self.changes(model), whitener)
 
-    def changes(self, model: Fitted) -> list[Change]:
+    def changes(self, model: Fitted, *, closely: bool = False) -> list[Change]:
         """Move every free value; return the changes of the statistics and the lengths of the moves.
 
         A move is lengthened if its change of the statistics may be chance.
+
+        Args:
+            model: The model.
+            closely: True to shorten moves that leave the region where statistics are linear. Far
+                from the data, long moves lead farther.
         """
-        whitener = self.whitener(model)
+        whitener, thresholds = self.whitener(model), self.thresholds
         changes: list[Change] = []
         for place, (hypothesis, values) in enumerate(model.members):
             for index in range(len(values)):
-                change, delta = self._change(model, place, index, self.thresholds.nearby)
+                change, delta = self._change(model, place, index, thresholds.nearby)
                 errors = float(np.linalg.norm(whitener(change)))
-                if errors < self.thresholds.plain_move and not hypothesis.step:
+                most = thresholds.largest_move if closely else math.inf
+                wanted = min(max(errors, thresholds.plain_move), most)
+                if errors != wanted and not hypothesis.step:
                     share = min(
-                        self.thresholds.nearby * self.thresholds.plain_move / max(errors, 1e-9),
-                        self.thresholds.far,
+                        thresholds.nearby * wanted / max(errors, 1e-9),
+                        thresholds.far,
                     )
                     change, delta = self._change(model, place, index, share)
                 changes.append((change, delta))
@@ -317,6 +335,17 @@ class Fitter:
                 place += 1
             moved.append((hypothesis, hypothesis.clipped(changed)))
         return tuple(moved)
+
+
+def _may_move(members: Members) -> list[NDArray[np.bool_]]:
+    """Return which values move in a step that is tried, and in the next one if that fails.
+
+    An effect with a bound changes nothing until it comes near it. Then its slope leads nowhere, and
+    the other values move alone.
+    """
+    bounded = np.array([h.name in NO_SOFTER for h, values in members for _ in values], dtype=bool)
+    every = np.ones(len(bounded), dtype=bool)
+    return [every, ~bounded] if bounded.any() and not bounded.all() else [every]
 
 
 def _moved_a_little(

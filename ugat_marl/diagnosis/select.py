@@ -33,7 +33,7 @@ from ugat_marl.errors import OptionError, ScenarioError, SimulatorError
 from ugat_marl.progress import Reporter, Silent
 from ugat_marl.scenarios import Period
 
-MOVES_OF_A_VALUE = 8
+MOVES_OF_A_VALUE = 4
 """Approximate number of moves of a free value in the test of its model, for the progress bar."""
 
 
@@ -106,8 +106,9 @@ class Selector:
                 if best.residual.p > self._alpha:
                     break
             best = pruned(
-                best, base, self._fitter, self._kept, self.test, self._alpha, self._reporter
-            )
+                best, base, self._fitter, self._kept, self.test, self.exact, self._alpha,
+                self._reporter,
+            )  # fmt: skip
         except OutOfTime:
             complete = False
             cheapest = min(self._seen.values(), key=cost_of, default=best.model)
@@ -124,7 +125,10 @@ class Selector:
         return frozenset(np.flatnonzero(sum_of(self._fitter.data).sums[..., 1].any(1)).tolist())
 
     def test(self, model: Fitted) -> Tested:
-        """Simulate more days of a model and test the remaining difference."""
+        """Simulate more days of a model and test the remaining difference.
+
+        The errors of its values are those of statistics that are linear in them, see `exact`.
+        """
         fitter = self._fitter
         moves = len(model.values) * MOVES_OF_A_VALUE * fitter.days
         days = self._thresholds.settling_days + self._effort.test + moves
@@ -138,13 +142,29 @@ class Selector:
         fitter = self._fitter
         model = self._kept(fitter.settled(model, uncertainty(fitter, model)[0]))
         days = self._days(model)
-        errors, extra = uncertainty(fitter, model, days, steps=True)
+        errors, extra = uncertainty(fitter, model, days)
         for name, difference in self._first.difference.items():
             extra[name] = extra[name] + (self._thresholds.tolerance * difference) ** 2
         fitted = tuple(change for change, _ in fitter.changes(model))
         directions = Directions((*self._of_library, *self._places), extra, fitted)
         null = self._null(days, len(fitter.data), directions, model.effects)
         return Tested(model, null.test(fitter.data, extra), errors, extra)
+
+    def exact(self, tested: Tested) -> Tested:
+        """Add the error of statistics that are not linear in the values, by further days.
+
+        It does not change the test, so only models that may be named need it.
+        """
+        fitter, model = self._fitter, tested.model
+        days = len(model.values) * len(self._thresholds.straightness_moves) * fitter.days
+        if not days:
+            return tested
+        with (
+            self._reporter.task("how certain the values are", days) as advance,
+            fitter.engine.watched(advance, days),
+        ):
+            errors, _ = uncertainty(fitter, model, self._days(model), steps=True)
+        return replace(tested, errors=errors)
 
     def _days(self, model: Fitted) -> list[Tally]:
         engine = self._fitter.engine
@@ -193,6 +213,8 @@ class Selector:
             chosen += (
                 cautious_drivers(self._library) if gap > self._thresholds.huge * chance else []
             )
+        else:
+            chosen += self._nearer(start.model, number)
         best = self._fitted(start, chosen, number, "candidates")
         if best is None and not near:  # simulations did not confirm the prediction of the library
             chosen = self._elsewhere(start.model, directions, number)
@@ -204,11 +226,14 @@ class Selector:
     ) -> Tested | None:
         """Return the best set of effects on top of a model; None if none is worth its price."""
         title = f"round {number + 1}: {what}"
+        before = self._cost_before(start.model)
         tried = self._tried(start.model, list(dict.fromkeys(chosen)), title)
-        best = self._refined(tried, start.model.cost, self._of_round.get(number, ()))
+        best = self._refined(tried, before, self._of_round.get(number, ()))
         if best is None:
             return None
-        gain = start.model.cost - best.cost
+        steps = self._thresholds.steps_of_the_best
+        best = self._kept(self._fitter.refine(best, steps, closely=True))
+        gain = before - best.cost
         if gain > self._thresholds.price:
             return self.test(best)
         # An effect may be clear along its own direction although the total distance hardly changes.
@@ -219,6 +244,14 @@ class Selector:
             tested = self.test(best)
             return tested if tested.residual.p > self._alpha else None
         return None
+
+    def _cost_before(self, model: Fitted) -> float:
+        """Return the cost of a model from as many days as candidates on top of it have.
+
+        A tested model has more days, by which the same model costs less. Where queues are long, an
+        effect that is there would seem to make it worse.
+        """
+        return self._fitter.simulate(model.members).cost if model.members else model.cost
 
     def _nearest(self) -> list[Members]:
         """Return the simulated single effects of the library that come nearest to the data.
@@ -238,6 +271,23 @@ class Selector:
                 if squared_gap(model.distance, base, periods) < self._thresholds.nearer * gap:
                     near.append((model.cost, place))
         return [strengths[place] for _, place in sorted(near)[: self._thresholds.nearest]]
+
+    def _nearer(self, model: Fitted, number: int) -> list[Members]:
+        """Return the strengths simulated on top of a model that cost less than it, best first.
+
+        As in `_nearest`, linear prediction misses effects that act in steps. An emergency
+        deceleration changes nothing until it comes near the usual one.
+        """
+        days = self._effort.bank
+        before = self._fitter.simulate(model.members, days).cost
+        near: list[tuple[float, int]] = []
+        added = [((one.hypothesis, one.level),) for one in self._of_round.get(number, ())]
+        for place, members in enumerate(added):
+            with contextlib.suppress(SimulatorError, OptionError, ScenarioError):
+                cost = self._fitter.simulate(merged(model.members, members), days).cost
+                if cost < before:
+                    near.append((cost, place))
+        return [added[place] for _, place in sorted(near)[: self._thresholds.nearest]]
 
     def _elsewhere(
         self, model: Fitted, directions: Sequence[Direction], number: int
@@ -362,6 +412,7 @@ def pruned(
     fitter: Fitter,
     kept: Callable[[Fitted], Fitted],
     test: Callable[[Fitted], Tested],
+    exact: Callable[[Tested], Tested],
     alpha: float,
     reporter: Reporter | None = None,
 ) -> Tested:
@@ -377,8 +428,12 @@ def pruned(
         fitter: Simulator and fitter of models.
         kept: Function that keeps a fitted model for the list of rivals.
         test: Function that tests a model.
+        exact: Function that makes the errors of a tested model exact.
         alpha: Level of the tests.
         reporter: Display of progress; None for no display.
+
+    Returns:
+        The smallest set, with exact errors.
     """
     reporter = reporter or Silent()
 
@@ -388,6 +443,7 @@ def pruned(
     members = tuple(member for member in best.model.members if member[0].matters(member[1]))
     if members and len(members) < len(best.model.members):
         best = test(fitter.refine(fitter.simulate(members), fitter.thresholds.steps_without))
+    best = exact(best)
     while len(best.model.members) > 1:
         fewer: dict[int, Fitted] = {}
         parts = each_left_out(best.model.members)
@@ -412,15 +468,18 @@ def pruned(
         vain = least in unsure and best.residual.p <= alpha
         if least.cost > best.model.cost and not enough and not vain:
             break
-        best = tested
+        best = exact(tested)
     remaining = merged((), best.model.members)
     if len(remaining) < len(best.model.members):
-        best = test(fitter.simulate(remaining)) if remaining else base
-    return _sure(best, base, fitter, test)
+        best = exact(test(fitter.simulate(remaining))) if remaining else base
+    return _sure(best, base, fitter, lambda model: exact(test(model)))
 
 
 def _sure(best: Tested, base: Tested, fitter: Fitter, test: Callable[[Fitted], Tested]) -> Tested:
-    """Drop effects whose intervals hold their usual values, the least certain one first."""
+    """Drop effects whose intervals hold their usual values, the least certain one first.
+
+    The errors of `best` are exact, and so are those that `test` returns.
+    """
     thresholds = fitter.thresholds
     while unsure := doubtful(best, thresholds.half_interval):
         least = min(unsure, key=lambda place: _deviations(best, place))

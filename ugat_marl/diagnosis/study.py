@@ -254,6 +254,7 @@ class Study:
             "round 1: candidates": Share(2 * sum(limits.candidates), effort.fit),
             "fitting": Share(2 * limits.candidates_fitted, moves * effort.fit),
             "is what is left chance": Share(2 * test),
+            "how certain the values are": Share(2 * len(limits.straightness_moves), effort.fit),
             "round 2": Share(2 * len(self.hypotheses), effort.bank),
             "patterns": Share(limits.pattern_days),
             "unnamed": Share(limits.settling_days if self.config.unnamed else 0),

@@ -558,8 +558,12 @@ class Thresholds(DayThresholds):
     """Share of a measured difference that counts as noise during a fit: the simulation rounds to
     its steps, the street does not. By hand. Halved: large differences bias the values."""
     steps: int = 3
-    """Largest number of steps of a fit. By hand: later ones gain almost nothing. Halved: values far
-    from the first simulation are not reached."""
+    """Largest number of steps of a candidate's fit. By hand: enough to compare candidates. Halved:
+    values far from the first simulation are not reached."""
+    steps_of_the_best: int = 6
+    """Largest number of further steps of the best set of a round. By hand: a step costs six days,
+    and what a fit leaves behind is searched in a whole round. Halved: in worlds with three effects
+    some of them are left to a further round, which finds imitations."""
     steps_without: int = 2
     """The same if one effect is left out of a fitted set. By hand: the others are near already.
     Halved: more superfluous effects stay."""
@@ -578,6 +582,10 @@ class Thresholds(DayThresholds):
     plain_move: float = 10.0
     """Change that such a move should make, in standard deviations of the statistics. By hand.
     Halved: derivatives have errors of a fifth instead of a tenth."""
+    largest_move: float = 60.0
+    """Largest change that such a move should make, in the same unit. By hand: an acceleration of
+    0.5 that moves to 0.9 empties the queues. Halved: derivatives of strong effects hold more
+    chance."""
     ridge: float = 1e-3
     """Ridge of a Gauss-Newton step relative to its normal equations. By hand: only against singular
     equations. Halved: no visible change."""
@@ -653,9 +661,10 @@ class Thresholds(DayThresholds):
     little: float = 2.0
     """Distance per statistic of the network below which the pools show nothing, so that places are
     examined. By hand. Halved: places are examined less often."""
-    hopeful: float = 0.9
-    """Share of the best candidate's gain that another candidate must reach to be fitted. By hand.
-    Halved: more candidates are fitted."""
+    hopeful: float = 0.6
+    """Share of the best candidate's gain that another candidate must reach to be fitted. By hand:
+    its gain is that before its fit, the other's that after it. Halved: more candidates are
+    fitted."""
     huge: float = 20.0
     """Distance per statistic beyond which several effects at once are likely from the start. By
     hand. Halved: cautious drivers are tried more often."""
