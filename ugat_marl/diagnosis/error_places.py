@@ -31,16 +31,16 @@ class Equation:
         value: Measured minus expected.
         coefficients: One for each number, such as extension and zone.
         error: Standard error of `value`, of this equation alone.
-        shared: By cause, what all equations with this cause have in common, times its standard
-            deviation; the sign tells equations apart that a cause moves in opposite directions.
-        bend: What `value` has in addition if speeds are measured at the other end of a passage.
+        shared: Cause to the change of `value` by one standard deviation of it. All equations with
+            this cause change together; those with the other sign in the other direction.
+        other_end: Change of `value` if speeds are measured at the other end of a passage.
     """
 
     value: float
     coefficients: tuple[float, ...]
     error: float
     shared: Mapping[str, float] = field(default_factory=dict)
-    bend: float = 0.0
+    other_end: float = 0.0
 
 
 @dataclass(frozen=True)
@@ -102,7 +102,7 @@ class ErrorPlaces:
         self._prices = {place: price + chance for place, chance in self.chances.items()}
         self._white = _whitening([one for _, one in rows])
         self._value = self._white @ np.array([one.value for _, one in rows])
-        self._bend = np.array([one.bend for _, one in rows])
+        self._other_end = np.array([one.other_end for _, one in rows])
         design = np.array([one.coefficients for _, one in rows]).reshape(len(rows), len(priors))
         self._inside = {place: self._rows_at(place) for place in self.places}
         self._columns = {
@@ -124,7 +124,7 @@ class ErrorPlaces:
                 a passage, 0.5 in the mean of both.
             start: Numbers to begin with.
         """
-        value = self._value - self._bent(elsewhere or {})
+        value = self._value - self._change_by_points(elsewhere or {})
         choice = self._solved([*start], value)
         while True:
             tried = (self._solved(numbers, value) for numbers in self._next_to([*choice.estimates]))
@@ -133,9 +133,11 @@ class ErrorPlaces:
                 return choice
             choice = cheapest
 
-    def of(self, numbers: Sequence[Number], elsewhere: Mapping[str, float]) -> Choice:
+    def cheaper_of_none_and(
+        self, numbers: Sequence[Number], elsewhere: Mapping[str, float]
+    ) -> Choice:
         """Return the cheaper one of some numbers and none, if speeds are measured elsewhere."""
-        value = self._value - self._bent(elsewhere)
+        value = self._value - self._change_by_points(elsewhere)
         return min(
             (self._solved(chosen, value) for chosen in ((), numbers)), key=lambda one: one.cost
         )
@@ -145,11 +147,11 @@ class ErrorPlaces:
             [place in (EVERYWHERE, kind, group_name(kind, edge)) for kind, edge in self._groups]
         )
 
-    def _bent(self, elsewhere: Mapping[str, float]) -> Array:
-        share = np.zeros(len(self._bend))
+    def _change_by_points(self, elsewhere: Mapping[str, float]) -> Array:
+        share = np.zeros(len(self._other_end))
         for place, at in elsewhere.items():
             share[self._inside[place]] = at
-        return self._white @ (share * self._bend)
+        return self._white @ (share * self._other_end)
 
     def _next_to(self, numbers: Sequence[Number]) -> Iterator[tuple[Number, ...]]:
         """Yield the sets with one more in place of others there, one less, or one in parts."""

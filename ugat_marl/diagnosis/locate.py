@@ -28,7 +28,7 @@ def locate_gap(study: Study, base: Tested, selector: Selector) -> Located:
     complete = True
     if base.residual.p > study.config.alpha:
         try:
-            base = selector.looked_closer(base)
+            base = selector.tested_along_effects(base)
         except OutOfTime:
             complete = False
     contradicted = base.residual.p <= study.config.alpha

@@ -475,18 +475,20 @@ class Measurement:
         """Return the length of pulses by group, s, where detectors report no presence."""
         pulses: dict[Group, float] = {}
         for group, members in self._groups.items():
-            data, model = (self._of(x.passages, members) for x in (self._measured, self._simulated))
-            if min(len(data), len(model)) < self._thresholds.least_sightings:
+            measured, simulated = (
+                self._of(x.passages, members) for x in (self._measured, self._simulated)
+            )
+            if min(len(measured), len(simulated)) < self._thresholds.least_sightings:
                 continue
             alike = [
                 float(np.mean(np.abs(x[:, 2] - np.median(x[:, 2])) < self._thresholds.touching_s))
-                for x in (data, model)
+                for x in (measured, simulated)
             ]
             # Times in tenths of seconds are alike too, but not far from those of simulated days.
-            apart = abs(float(np.median(data[:, 2]) - np.median(model[:, 2])))
+            apart = abs(float(np.median(measured[:, 2]) - np.median(simulated[:, 2])))
             same = alike[0] > self._thresholds.pulse_share > 2.0 * alike[1]
             if same and apart > max(self._grain_s, self._thresholds.touching_s):
-                pulses[group] = round(float(np.median(data[:, 2])), 2)
+                pulses[group] = round(float(np.median(measured[:, 2])), 2)
         return pulses
 
     def _together(self, pulses: Mapping[Group, float]) -> dict[str, float]:
@@ -548,7 +550,10 @@ class Measurement:
                 if place in (EVERYWHERE, *self._kinds):
                     choice = _cheapest(searches, here)
                 else:
-                    choice = min((s.of(numbers, here) for s in searches), key=lambda c: c.cost)
+                    choice = min(
+                        (s.cheaper_of_none_and(numbers, here) for s in searches),
+                        key=lambda c: c.cost,
+                    )
                 cost = choice.cost + searches[0].chances[place]
                 if cost < least - (limit.narrower_place if points else 0.0):
                     least, best = cost, choice
@@ -615,13 +620,15 @@ class Measurement:
         quick half tell both apart. Of detectors that stand elsewhere only the quick half counts:
         others accelerate and brake there as on no simulated day.
         """
-        data, model = (self._of(x.passages, members) for x in (self._measured, self._simulated))
-        speeds = np.isfinite(data[:, 3]).mean() > 0.5 if len(data) else False
+        measured, simulated = (
+            self._of(x.passages, members) for x in (self._measured, self._simulated)
+        )
+        speeds = np.isfinite(measured[:, 3]).mean() > 0.5 if len(measured) else False
         if speeds:
-            data, model = (x[np.isfinite(x[:, 3])] for x in (data, model))
+            measured, simulated = (x[np.isfinite(x[:, 3])] for x in (measured, simulated))
         equations: list[Equation] = []
-        for regime in np.unique(data[:, 1]).astype(int).tolist():
-            pair = [x[x[:, 1] == regime] for x in (data, model)]
+        for regime in np.unique(measured[:, 1]).astype(int).tolist():
+            pair = [x[x[:, 1] == regime] for x in (measured, simulated)]
             parts = {} if moved else {"": pair}
             steadily = regime == ALONE and self._detectors[members[0]].kind != "stop"
             if speeds and steadily and all(map(len, pair)):
@@ -631,17 +638,17 @@ class Measurement:
                     for half, name in enumerate(("slow", "quick"))
                     if not moved or name == "quick"
                 }
-            for name, (seen, known) in parts.items():
-                if min(len(seen), len(known)) >= self._thresholds.least_sightings:
+            for name, (of_street, of_model) in parts.items():
+                if min(len(of_street), len(of_model)) >= self._thresholds.least_sightings:
                     equations.append(
-                        self._of_speeds(seen, known, steady, form, name)
+                        self._of_speeds(of_street, of_model, steady, form, name)
                         if speeds
-                        else self._of_time(seen, known)
+                        else self._of_time(of_street, of_model)
                     )
         return equations
 
     def _of_speeds(
-        self, seen: Array, known: Array, steady: float, form: Form, half: str
+        self, measured: Array, simulated: Array, steady: float, form: Form, half: str
     ) -> Equation:
         """Return the equation of a regime with speeds, in s.
 
@@ -649,19 +656,21 @@ class Measurement:
         the same for one vehicle.
         """
         limit = self._thresholds
-        speed, reach = (float(np.median(seen[:, column])) for column in (3, 4))
+        speed, reach = (float(np.median(measured[:, column])) for column in (3, 4))
         if form == "excess":
-            found, usual = (_median(x[:, 2] - steady * x[:, 4] / x[:, 3]) for x in (seen, known))
+            found, usual = (
+                _median(x[:, 2] - steady * x[:, 4] / x[:, 3]) for x in (measured, simulated)
+            )
         else:
             found, usual = (
                 _median((x[:, 2] * x[:, 3] / x[:, 4] - steady) * reach / speed)
-                for x in (seen, known)
+                for x in (measured, simulated)
             )
-        over = float(np.median(known[:, 2]))
+        over = float(np.median(simulated[:, 2]))
         bend = max(abs(usual.value), usual.spread)
         doubt = limit.inexact * over + limit.bent_here * bend + 0.5 * self._grain_s
         alike = limit.bent_alone * bend
-        kind, regime = self._detectors[int(seen[0, 0])].kind, int(seen[0, 1])
+        kind, regime = self._detectors[int(measured[0, 0])].kind, int(measured[0, 1])
         if regime != ALONE:
             alike += limit.unlike * over
         return Equation(
@@ -669,17 +678,17 @@ class Measurement:
             (1.0, 1.0 / speed),
             float(np.sqrt(found.error**2 + usual.error**2 + doubt**2)),
             shared={kind: limit.bent * usual.value, f"{kind} {regime} {half}": alike},
-            bend=-2.0 * usual.value,
+            other_end=-2.0 * usual.value,
         )
 
-    def _of_time(self, seen: Array, known: Array) -> Equation:
+    def _of_time(self, measured: Array, simulated: Array) -> Equation:
         """Return the equation of a regime for the time over the zone, where speeds are missing."""
         limit = self._thresholds
-        found, usual = _median(seen[:, 2]), _median(known[:, 2])
-        kind = self._detectors[int(seen[0, 0])].kind
-        steadily = seen[0, 1] == ALONE and kind == "advance"
+        found, usual = _median(measured[:, 2]), _median(simulated[:, 2])
+        kind = self._detectors[int(measured[0, 0])].kind
+        steadily = measured[0, 1] == ALONE and kind == "advance"
         doubt = usual.value * (limit.speed_doubt if steadily else limit.queue_doubt)
-        slowness = usual.value / float(np.median(known[:, 4]))
+        slowness = usual.value / float(np.median(simulated[:, 4]))
         return Equation(
             found.value - usual.value,
             (1.0, slowness),
@@ -690,15 +699,19 @@ class Measurement:
     def _overlap(self, place: str, seconds: float) -> Overlap:
         """Return how close vehicles are reported, from the passages that touch the next one."""
         limit, members = self._thresholds, self._members(place)
-        data, model = (x.gaps[members].sum(axis=0) for x in (self._measured, self._simulated))
-        closer = model[: 1 + int(np.searchsorted(GAP_EDGES_S, seconds + 1e-9, "right") - 1)].sum()
-        share = closer / max(model.sum(), 1.0)
-        expected = float(share * data.sum())
+        measured, simulated = (
+            x.gaps[members].sum(axis=0) for x in (self._measured, self._simulated)
+        )
+        closer = simulated[
+            : 1 + int(np.searchsorted(GAP_EDGES_S, seconds + 1e-9, "right") - 1)
+        ].sum()
+        share = closer / max(simulated.sum(), 1.0)
+        expected = float(share * measured.sum())
         if expected < limit.least_touching:
             return "unknown"
         # Some gaps are too small for the clock, and no sign of vehicles apart.
-        chance = data[1] * max(self._grain_s, limit.no_gap_s) / GAP_EDGES_S[1]
-        return "split" if data[0] - chance > limit.merged_share * expected else "merged"
+        chance = measured[1] * max(self._grain_s, limit.no_gap_s) / GAP_EDGES_S[1]
+        return "split" if measured[0] - chance > limit.merged_share * expected else "merged"
 
     def _members(self, place: str) -> list[int]:
         names = detectors_at(place, self._detectors)
@@ -719,14 +732,18 @@ class Measurement:
         least = limit.least_pairs if speeds else 2 * limit.least_sightings
         distances: dict[Group, tuple[Array, Array]] = {}
         for group, members in self._groups.items():
-            data, model = (self._of(x.pairs, members) for x in (self._measured, self._simulated))
+            measured, simulated = (
+                self._of(x.pairs, members) for x in (self._measured, self._simulated)
+            )
             if group[0] != "advance" or group[1] in splashed:
                 continue
-            if len(data) >= least and 2 * len(model) >= least:
-                travel = [x[:, 1] * x[:, 2 if speeds else 3] for x in (data, model)]
+            if len(measured) >= least and 2 * len(simulated) >= least:
+                travel = [x[:, 1] * x[:, 2 if speeds else 3] for x in (measured, simulated)]
                 distances[group] = travel[0], travel[1]
         # The spread of a few may be small by chance.
-        spread = float(np.median([_median(model).spread for _, model in distances.values()] or [0]))
+        spread = float(
+            np.median([_median(simulated).spread for _, simulated in distances.values()] or [0])
+        )
         equations: dict[Group, list[Equation]] = {}
         for group, pair in distances.items():
             found, usual = map(_median, pair)
@@ -755,16 +772,18 @@ class Measurement:
         limit, beside = self._thresholds, next_detectors(self._detectors)
         equations: dict[Group, list[Equation]] = {}
         for group, members in self._groups.items():
-            data, model = (x.twins[members].sum(axis=0) for x in (self._measured, self._simulated))
-            if min(data[1], model[1]) < limit.least_sightings:
+            measured, simulated = (
+                x.twins[members].sum(axis=0) for x in (self._measured, self._simulated)
+            )
+            if min(measured[1], simulated[1]) < limit.least_sightings:
                 continue
             lanes = np.array([len(beside[self._detectors[index].id]) for index in members])
             c = float((lanes**2).sum() / lanes.sum())
-            twins = [x[0] / x[1] for x in (data, model)]
+            twins = [x[0] / x[1] for x in (measured, simulated)]
             # variances of shares, with one more twin, since none of a few is no certainty
             chance = [
                 (f * (1.0 - f) + 1.0 / x[1]) / x[1]
-                for f, x in zip(twins, (data, model), strict=True)
+                for f, x in zip(twins, (measured, simulated), strict=True)
             ]
             excess = twins[0] - twins[1]
             error = np.sqrt(sum(chance) + (limit.twin_doubt * twins[1]) ** 2)

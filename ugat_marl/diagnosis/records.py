@@ -136,10 +136,10 @@ class Tested:
     errors: Array
     extra: dict[str, Array]
 
-    def errors_of(self, place: int) -> Array:
-        """Return the standard errors of the free values of the member at `place`."""
-        first = sum(len(values) for _, values in self.model.members[:place])
-        return self.errors[first : first + len(self.model.members[place][1])]
+    def errors_of(self, index: int) -> Array:
+        """Return the standard errors of the free values of the member at `index`."""
+        first = sum(len(values) for _, values in self.model.members[:index])
+        return self.errors[first : first + len(self.model.members[index][1])]
 
 
 @dataclass(frozen=True)

@@ -81,14 +81,16 @@ class Selector:
         self._of_round: dict[int, list[Direction]] = {}
         self.examined: set[str] = set()
 
-    def looked_closer(self, base: Tested) -> Tested:
+    def tested_along_effects(self, base: Tested) -> Tested:
         """Test the scenario as it is along the directions of single effects.
 
         Raises:
             OutOfTime: The budget does not suffice for their simulation.
         """
         data = self._fitter.data
-        self._places = tuple(self._bank(base.model, self._place_finder.everywhere(), 0, "places"))
+        self._places = tuple(
+            self._directions(base.model, self._place_finder.everywhere(), 0, "places")
+        )
         directions = Directions((*self._library_directions(base.model, 0), *self._places))
         null = self._null(base.model.tallies, len(data), directions, ())
         return replace(base, residual=null.test(data))
@@ -182,7 +184,7 @@ class Selector:
         """Return the best model that was simulated with none but the certain effects of another."""
         unsure = doubtful(best, self._thresholds.half_interval)
         members = best.model.members
-        certain = {h.key for place, (h, _) in enumerate(members) if place not in unsure}
+        certain = {h.key for index, (h, _) in enumerate(members) if index not in unsure}
         parts = [
             model
             for model in self._seen.values()
@@ -207,7 +209,7 @@ class Selector:
         summed = len(self._fitter.data[0].sums) > len(FEATURES)
         near = little or summed or not proposals or proposals[0].expected > enough
         if near:
-            chosen = [*chosen[:2], *self._elsewhere(start.model, directions, number)]
+            chosen = [*chosen[:2], *self._at_places(start.model, directions, number)]
         if number == 0:
             chosen += self._nearest()
             chosen += (
@@ -217,7 +219,7 @@ class Selector:
             chosen += self._nearer(start.model, number)
         best = self._fitted(start, chosen, number, "candidates")
         if best is None and not near:  # simulations did not confirm the prediction of the library
-            chosen = self._elsewhere(start.model, directions, number)
+            chosen = self._at_places(start.model, directions, number)
             best = self._fitted(start, chosen, number, "places")
         return best
 
@@ -227,7 +229,7 @@ class Selector:
         """Return the best set of effects on top of a model; None if none is worth its price."""
         title = f"round {number + 1}: {what}"
         before = self._cost_before(start.model)
-        tried = self._tried(start.model, list(dict.fromkeys(chosen)), title)
+        tried = self._simulated(start.model, list(dict.fromkeys(chosen)), title)
         best = self._refined(tried, before, self._of_round.get(number, ()))
         if best is None:
             return None
@@ -265,12 +267,12 @@ class Selector:
         near: list[tuple[float, int]] = []
         base, periods = self._fitter.base, len(self._fitter.data)
         gap = squared_gap(self._first, base, periods)
-        for place, members in enumerate(strengths):
+        for index, members in enumerate(strengths):
             with contextlib.suppress(SimulatorError, OptionError, ScenarioError):
                 model = self._fitter.simulate(members, self._effort.bank)
                 if squared_gap(model.distance, base, periods) < self._thresholds.nearer * gap:
-                    near.append((model.cost, place))
-        return [strengths[place] for _, place in sorted(near)[: self._thresholds.nearest]]
+                    near.append((model.cost, index))
+        return [strengths[index] for _, index in sorted(near)[: self._thresholds.nearest]]
 
     def _nearer(self, model: Fitted, number: int) -> list[Members]:
         """Return the strengths simulated on top of a model that cost less than it, best first.
@@ -282,14 +284,14 @@ class Selector:
         before = self._fitter.simulate(model.members, days).cost
         near: list[tuple[float, int]] = []
         added = [((one.hypothesis, one.level),) for one in self._of_round.get(number, ())]
-        for place, members in enumerate(added):
+        for index, members in enumerate(added):
             with contextlib.suppress(SimulatorError, OptionError, ScenarioError):
                 cost = self._fitter.simulate(merged(model.members, members), days).cost
                 if cost < before:
-                    near.append((cost, place))
-        return [added[place] for _, place in sorted(near)[: self._thresholds.nearest]]
+                    near.append((cost, index))
+        return [added[index] for _, index in sorted(near)[: self._thresholds.nearest]]
 
-    def _elsewhere(
+    def _at_places(
         self, model: Fitted, directions: Sequence[Direction], number: int
     ) -> list[Members]:
         """Propose effects at places and in windows; lanes and bins of time are compared as well."""
@@ -298,7 +300,7 @@ class Selector:
         local = [hypothesis for hypothesis in proposed if hypothesis.key not in present]
         known = [] if number else list(self._places)  # simulated on the scenario as it is
         places = {direction.hypothesis.key for direction in known}
-        added = self._bank(model, [h for h in local if h.key not in places], number, "places")
+        added = self._directions(model, [h for h in local if h.key not in places], number, "places")
         added += known
         proposals = propose([*directions, *added], self._whitener(model, None), self._thresholds)
         places |= {hypothesis.key for hypothesis in local}
@@ -321,11 +323,11 @@ class Selector:
     def _library_directions(self, model: Fitted, number: int) -> tuple[Direction, ...]:
         """Return directions of the library on top of a model; those of the first round are kept."""
         if number:
-            return tuple(self._bank(model, self._library, number))
-        self._of_library = self._of_library or tuple(self._bank(model, self._library, 0))
+            return tuple(self._directions(model, self._library, number))
+        self._of_library = self._of_library or tuple(self._directions(model, self._library, 0))
         return self._of_library
 
-    def _bank(
+    def _directions(
         self, model: Fitted, hypotheses: Sequence[Hypothesis], number: int, what: str = "library"
     ) -> list[Direction]:
         """Simulate hypotheses on top of a model, and return the changes of the statistics."""
@@ -358,7 +360,7 @@ class Selector:
         self._of_round.setdefault(number, []).extend(directions)
         return directions
 
-    def _tried(self, model: Fitted, chosen: Sequence[Members], title: str) -> list[Fitted]:
+    def _simulated(self, model: Fitted, chosen: Sequence[Members], title: str) -> list[Fitted]:
         """Simulate sets of effects on top of a model."""
         models_tried: list[Fitted] = []
         with self._reporter.task(title, len(chosen)) as advance:
@@ -447,16 +449,16 @@ def pruned(
     while len(best.model.members) > 1:
         fewer: dict[int, Fitted] = {}
         parts = each_left_out(best.model.members)
-        places = [place for place in range(len(parts)) if not _beyond_doubt(best, place, fitter)]
-        if not places:
+        indices = [index for index in range(len(parts)) if not _beyond_doubt(best, index, fitter)]
+        if not indices:
             break
-        with reporter.task("without single effects", len(places)) as advance:
-            for place in places:
-                part = parts[place]
+        with reporter.task("without single effects", len(indices)) as advance:
+            for index in indices:
+                part = parts[index]
                 without = fitter.refine(fitter.simulate(part), fitter.thresholds.steps_without)
-                fewer[place] = kept(settled(without))
+                fewer[index] = kept(settled(without))
                 advance(note=names_of(part))
-        unsure = [fewer[place] for place in doubtful(best, fitter.thresholds.half_interval)]
+        unsure = [fewer[index] for index in doubtful(best, fitter.thresholds.half_interval)]
         least = min(fewer.values(), key=cost_of)
         if least.cost - settled(best.model).cost > fitter.thresholds.negligible:
             if not unsure:
@@ -482,7 +484,7 @@ def _sure(best: Tested, base: Tested, fitter: Fitter, test: Callable[[Fitted], T
     """
     thresholds = fitter.thresholds
     while unsure := doubtful(best, thresholds.half_interval):
-        least = min(unsure, key=lambda place: _deviations(best, place))
+        least = min(unsure, key=lambda index: _deviations(best, index))
         members = each_left_out(best.model.members)[least]
         if not members:
             return base
@@ -490,31 +492,31 @@ def _sure(best: Tested, base: Tested, fitter: Fitter, test: Callable[[Fitted], T
     return best
 
 
-def _beyond_doubt(tested: Tested, place: int, fitter: Fitter) -> bool:
-    """Return True if the data fit so much worse without the member at `place` that it stays.
+def _beyond_doubt(tested: Tested, index: int, fitter: Fitter) -> bool:
+    """Return True if the data fit so much worse without the member at `index` that it stays.
 
     The errors of the values are those of all values together, so they hold what other effects could
     do in its place.
     """
-    hypothesis, values = tested.model.members[place]
-    certain = bool((tested.errors_of(place) > 0.0).all())
+    hypothesis, values = tested.model.members[index]
+    certain = bool((tested.errors_of(index) > 0.0).all())
     known = bool(values) and hypothesis.nominal is not None and certain
-    return known and _deviations(tested, place) > fitter.thresholds.beyond_doubt
+    return known and _deviations(tested, index) > fitter.thresholds.beyond_doubt
 
 
-def _deviations(tested: Tested, place: int) -> float:
-    """Return how many standard errors the member at `place` is away from its usual values."""
-    hypothesis, values = tested.model.members[place]
-    errors = np.maximum(tested.errors_of(place), 1e-12)
+def _deviations(tested: Tested, index: int) -> float:
+    """Return how many standard errors the member at `index` is away from its usual values."""
+    hypothesis, values = tested.model.members[index]
+    errors = np.maximum(tested.errors_of(index), 1e-12)
     return float((np.abs(np.subtract(values, hypothesis.nominal or 0.0)) / errors).max())
 
 
 def doubtful(tested: Tested, half_interval: float) -> list[int]:
     """Return indices of effects whose intervals hold the nominal values: they may be absent."""
-    places: list[int] = []
-    for place, (hypothesis, values) in enumerate(tested.model.members):
+    indices: list[int] = []
+    for index, (hypothesis, values) in enumerate(tested.model.members):
         if values and hypothesis.nominal is not None:
             away = np.abs(np.subtract(values, hypothesis.nominal))
-            if (away <= half_interval * tested.errors_of(place)).all():
-                places.append(place)
-    return places
+            if (away <= half_interval * tested.errors_of(index)).all():
+                indices.append(index)
+    return indices
