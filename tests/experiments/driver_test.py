@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import json
 import os
 import signal
@@ -251,12 +252,12 @@ def eventually(condition: Callable[[], object], within_s: float) -> bool:
 def writers(log: Path) -> set[str]:
     """Processes that have the file open."""
     found: set[str] = set()
-    for descriptor in Path("/proc").glob("[0-9]*/fd/*"):
-        try:
-            if descriptor.readlink() == log:
-                found.add(descriptor.parts[2])
-        except OSError:
-            continue
+    for process in Path("/proc").iterdir():
+        with contextlib.suppress(OSError):  # a process may end, and a file be closed, meanwhile
+            for descriptor in (process / "fd").iterdir() if process.name.isdigit() else ():
+                with contextlib.suppress(OSError):
+                    if descriptor.readlink() == log:
+                        found.add(process.name)
     return found
 
 
