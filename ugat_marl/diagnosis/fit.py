@@ -268,10 +268,8 @@ class Fitter:
                 most = thresholds.largest_move if closely else math.inf
                 wanted = min(max(errors, thresholds.plain_move), most)
                 if errors != wanted and not hypothesis.step:
-                    share = min(
-                        thresholds.nearby * wanted / max(errors, 1e-9),
-                        thresholds.far,
-                    )
+                    share = thresholds.nearby * wanted / max(errors, 1e-9)
+                    share = min(share, thresholds.far)
                     change, delta = self._change(model, place, index, share)
                 changes.append((change, delta))
         return changes

@@ -33,29 +33,21 @@ class _Quantity:
     scale: float = 1.0
 
 
+def _ends(name: str) -> tuple[str, str, str]:
+    """Return the metrics of a part of a fitted street: number, low end and high end."""
+    return name, f"{name}_low", f"{name}_high"
+
+
 _QUANTITIES = (
     _Quantity(
         ("lost_time/best_s", "lost_time/low_s", "lost_time/high_s"), "delay of greens", "s", 95
     ),
-    _Quantity(
-        ("channel/late_s", "channel/late_s_low", "channel/late_s_high"), "delay of commands", "s"
-    ),
-    _Quantity(
-        ("channel/missing", "channel/missing_low", "channel/missing_high"),
-        "commands that are lost", "%", scale=100.0,
-    ),
-    _Quantity(
-        ("unused/begin_s", "unused/begin_s_low", "unused/begin_s_high"),
-        "green unused at its beginning", "s",
-    ),
-    _Quantity(
-        ("unused/each_s", "unused/each_s_low", "unused/each_s_high"),
-        "green unused in each further decision", "s",
-    ),
-    _Quantity(
-        ("eyes/unseen", "eyes/unseen_low", "eyes/unseen_high"), "lanes that are not seen", "lanes"
-    ),
-)  # fmt: skip
+    _Quantity(_ends("channel/late_s"), "delay of commands", "s"),
+    _Quantity(_ends("channel/missing"), "commands that are lost", "%", scale=100.0),
+    _Quantity(_ends("unused/begin_s"), "green unused at its beginning", "s"),
+    _Quantity(_ends("unused/each_s"), "green unused in each further decision", "s"),
+    _Quantity(_ends("eyes/unseen"), "lanes that are not seen", "lanes"),
+)
 """What timed grounding (the first) and a fitted street find."""
 
 _Found = dict[str, tuple[float, float, float]]
