@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import gc
 import gzip
 import os
 import random
@@ -10,6 +11,7 @@ import signal
 import stat
 import subprocess
 import time
+import weakref
 from pathlib import Path
 
 import pytest
@@ -165,6 +167,16 @@ def test_xml_survives_reading_and_writing() -> None:
         assert tree.tag == "net"
         assert tree.get("xsi:noNamespaceSchemaLocation", "").endswith("net_file.xsd")
         assert [edge.get("id") for edge in tree.iter("edge")] == ["a&b", "ü"]
+
+
+def test_a_tree_is_freed_with_its_last_name() -> None:
+    """In a cycle it would wait for the garbage collection, which frozen processes do without."""
+    gc.disable()
+    try:
+        freed = weakref.ref(parse_xml(DOCUMENT, "net"))
+        assert freed() is None
+    finally:
+        gc.enable()
 
 
 @given(st.dictionaries(st.sampled_from("abc"), st.text(max_size=20).filter(str.isprintable)))

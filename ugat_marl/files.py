@@ -484,6 +484,15 @@ def _refusing_parser(name: str) -> expat.XMLParserType:
     return parser
 
 
+_HANDLERS = (
+    "StartElementHandler",
+    "EndElementHandler",
+    "CharacterDataHandler",
+    "StartDoctypeDeclHandler",
+    "EntityDeclHandler",
+)
+
+
 def _parse(parser: expat.XMLParserType, content: bytes, last: bool, name: str) -> None:
     try:
         parser.Parse(content, last)
@@ -493,6 +502,10 @@ def _parse(parser: expat.XMLParserType, content: bytes, last: bool, name: str) -
         ) from None
     except (ValueError, LookupError) as error:
         raise ScenarioError(f"{name}: cannot be decoded: {error}") from None
+    finally:
+        if last:  # handlers know the parser; in this cycle the whole tree would wait for the gc
+            for handler in _HANDLERS:
+                setattr(parser, handler, None)
 
 
 def xml_bytes(root: ET.Element) -> bytes:

@@ -11,9 +11,10 @@ import sys
 import time
 import uuid
 import warnings
+import weakref
 from collections.abc import Callable, Iterator
 from pathlib import Path
-from typing import Any
+from typing import Any, cast
 
 import numpy as np
 import pytest
@@ -26,7 +27,8 @@ from ugat_marl.envs import AgentSet, VectorEnv, agent_indicator, pad_spaces
 from ugat_marl.envs.vector.arrays import Arrays, Shape, shared_memory
 from ugat_marl.envs.vector.gymnasium_env import GymnasiumVectorEnv
 from ugat_marl.envs.vector.remote import SERVICE
-from ugat_marl.envs.vector.spec import in_turn
+from ugat_marl.envs.vector.spec import Spec, in_turn
+from ugat_marl.envs.vector.worker import Episodes
 from ugat_marl.errors import (
     ActionError,
     EpisodeError,
@@ -353,11 +355,42 @@ def test_a_domain_with_other_phases_is_refused(crossing: Crossing) -> None:
     env.close()
 
 
+@needs_proc
+def test_the_parent_has_loaded_sumo_for_all_episodes(crossing: Crossing) -> None:
+    with vector_env(crossing(), 1, duration_s=LENGTH_S) as env:
+        env.reset(1)
+        (worker,) = pids(env)
+        status = Path(f"/proc/{worker}/status").read_text()
+        parent = status.partition("PPid:")[2].split()[0]
+        assert "libsumo" in Path(f"/proc/{parent}/maps").read_text()
+
+
+def test_the_parent_frees_the_environments_of_a_closed_vector(crossing: Crossing) -> None:
+    directory = crossing()
+    spec = Spec.of(load_scenario(directory), {"duration_s": LENGTH_S}, []).as_dict()
+    service = Episodes()
+    order = {
+        "spec": {**spec, "scenario": str(directory)},
+        "domain": "sim",
+        "folder": "mine",
+        "path": [],
+    }
+    for _ in range(2):
+        service.prepare(order)
+    made = weakref.ref(env := cast("Any", service._ready))
+    env.wrapped_by_a_user_s_code = [env]
+    service.prepare({**order, "folder": "another", "domain": "V1"})
+    del env
+    service.told({"forget": "mine"})
+    assert made() is None
+    gc.unfreeze()
+
+
 # --- nothing is left
 
 
 @needs_proc
-def test_opened_and_closed_twenty_times(crossing: Crossing, temporary: Path) -> None:
+def test_opened_and_closed_ten_times(crossing: Crossing, temporary: Path) -> None:
     directory = crossing()
 
     def once(number: int) -> list[int]:
@@ -375,8 +408,8 @@ def test_opened_and_closed_twenty_times(crossing: Crossing, temporary: Path) -> 
     once(0)
     gc.collect()
     before, shared = len(entries("/proc/self/fd")), entries("/dev/shm")
-    seen = [pid for number in range(20) for pid in once(number)]
-    assert len(set(seen)) == 40
+    seen = [pid for number in range(10) for pid in once(number)]
+    assert len(set(seen)) == 20
     assert eventually(lambda: all(map(gone, seen)))
     assert len(entries("/proc/self/fd")) <= before
     assert list(temporary.iterdir()) == []

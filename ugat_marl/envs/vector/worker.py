@@ -38,9 +38,15 @@ _KEPT = 64
 
 
 class Episodes:
-    """The service of a vector: one episode in each worker."""
+    """Service of a vector: one episode in each worker.
+
+    Making it loads libsumo: once, in the warm parent, for all workers.
+    """
 
     def __init__(self) -> None:
+        from ugat_marl.simulation import LibsumoSimulator  # its import loads libsumo
+
+        del LibsumoSimulator
         self._kept: OrderedDict[str, tuple[str, AnyParallelEnv | None]] = OrderedDict()
         self._folders: set[str] = set()
         self._ready: AnyParallelEnv | None = None
@@ -61,8 +67,7 @@ class Episodes:
                 self._kept[key] = folder, Spec(**order["spec"]).environment(order["domain"])
                 gc.freeze()  # garbage collection in a child would copy every page
         self._kept.move_to_end(key)
-        while len(self._kept) > _KEPT:
-            self._kept.popitem(last=False)
+        self._drop(list(self._kept)[:-_KEPT])
         self._ready = self._kept[key][1]
 
     def open(
@@ -78,9 +83,15 @@ class Episodes:
         """Forget the environments of a closed vector."""
         folder = order["forget"]
         self._folders.discard(folder)
-        for key in [key for key, (owner, _) in self._kept.items() if owner == folder]:
-            del self._kept[key]
-        gc.collect()
+        self._drop([key for key, (owner, _) in self._kept.items() if owner == folder])
+
+    def _drop(self, keys: Sequence[str]) -> None:
+        dropped = [self._kept.pop(key) for key in keys]
+        if any(env is not None for _, env in dropped):
+            dropped.clear()
+            gc.unfreeze()  # environments hold cycles, and what is frozen is never collected
+            gc.collect()
+            gc.freeze()
 
     def abandoned(self) -> None:
         """Remove the folders of vectors when their last worker has ended."""
