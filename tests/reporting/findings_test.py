@@ -61,13 +61,17 @@ def test_effects_and_the_policy_that_was_kept(tmp_path: Path) -> None:
         "effects/acceleration/high": 0.9,
         "effects/acceleration/nominal": 2.6,
         "judged/before": 110.0,
-        "judged/after": 99.0,
+        "judged/after": 102.0,
+        "judged/of_the_rule": 99.0,
     }
     section = found_on_street(record(tmp_path / "run", numbers))
     assert section is not None
     (effect,) = section["effects"].rows
     assert effect == ["acceleration", "m/s^2", "2.6", "0.5", "0.4 to 0.9", "no"]
-    assert section["kept"].endswith("before 110 s, after 99 s; the one after was kept.")
+    assert section["kept"].endswith(
+        "the policy kept so far 110 s, the policy after training 102 s, the rule 99 s. "
+        "Kept was the rule."
+    )
     assert found_on_street(record(tmp_path / "other", {"gate/alpha": 0.5})) is None
 
 

@@ -48,6 +48,7 @@ from .street import StreetWorld as StreetWorld
 from .street import fit_street as fit_street
 from .street import street_env as street_env
 from .street import street_prior as street_prior
+from .street_training import JUDGED as JUDGED
 from .street_training import StreetFit as StreetFit
 from .street_training import StreetTraining as StreetTraining
 from .summaries import LaneView as LaneView

@@ -60,6 +60,14 @@ from ugat_marl.seeding import derive_seed
 RESIDUAL = "residual.pt"
 """File of the residual, beside that of the street."""
 
+JUDGED = {
+    "before": "the policy kept so far",
+    "after_the_lessons": "the policy after the lessons",
+    "after": "the policy after training",
+    "of_the_rule": "the rule",
+}
+"""Metrics ``judged/<name>`` of the policies that are compared in the fitted street, in words."""
+
 
 @dataclass
 class StreetFit:
@@ -210,29 +218,26 @@ class StreetTraining(Algorithm):
             return {}
         kept = state.best or state.direct
         assert kept is not None  # plain training comes first
-        known = {
-            "before": kept,
-            "after the lessons": taught,
-            "after": state.learner.policy(),
-            "of the rule": rule,
+        known = (kept, taught, state.learner.policy(), rule)
+        policies = {
+            name: policy for name, policy in zip(JUDGED, known, strict=True) if policy is not None
         }
-        policies = {name: policy for name, policy in known.items() if policy is not None}
         seeds = [derive_seed(self.seed, "judged", state.iteration, k) for k in range(count)]
         worlds = [street.world(seed) for seed in seeds]
         title = f"comparing, {iteration_name(state)}"
         with self.run.reporter.task(title, len(policies) * count) as advance:
             compared = self.simulation.compare(worlds, [*policies.values()], seeds, advance)
         times_s = dict(zip(policies, compared.mean(1).tolist(), strict=True))
-        best = min(times_s, key=lambda name: times_s[name])  # of equal ones that before
+        best = min(times_s, key=lambda name: times_s[name])  # of equal ones the one kept so far
         state.best = policies[best]
-        told = ", ".join(f"{name} {time_s:.1f} s" for name, time_s in times_s.items())
-        named = "that " + best
+        told = ", ".join(f"{JUDGED[name]} {time_s:.1f} s" for name, time_s in times_s.items())
+        named = JUDGED[best]
         if rule is not None and policies[best] is rule:
             named += f" {rule.spec}"
         self.run.reporter.say(
-            f"{iteration_name(state)}: in the fitted street the policy {told}; {named} is kept"
+            f"{iteration_name(state)}: travel time in the fitted street: {told}; {named} is kept"
         )
-        return {f"judged/{name.replace(' ', '_')}": time_s for name, time_s in times_s.items()}
+        return {f"judged/{name}": time_s for name, time_s in times_s.items()}
 
     def renew(self, state: RunState[StreetFit]) -> None:
         """Replace the learner by a new one, if policies see something else in the street."""

@@ -5,7 +5,7 @@ from __future__ import annotations
 from typing import Any
 
 from ugat_marl.effects import known_effects
-from ugat_marl.grounding import LIBRARY
+from ugat_marl.grounding import JUDGED, LIBRARY
 from ugat_marl.reporting.formats import number
 from ugat_marl.reporting.page import Grid
 from ugat_marl.reporting.run_records import RunRecord
@@ -99,11 +99,10 @@ def _effects(record: RunRecord) -> Grid | None:
 
 def _kept(record: RunRecord) -> str:
     """Return which policy was kept, by its travel times in worlds of the street."""
-    names = {"before": "before", "after_the_lessons": "after the lessons", "after": "after"}
-    times = {text: _last(record, f"judged/{name}") for name, text in names.items()}
+    times = {text: _last(record, f"judged/{name}") for name, text in JUDGED.items()}
     told = {text: time_s for text, time_s in times.items() if time_s is not None}
     if not told:
         return ""
     best = min(told, key=lambda text: told[text])
     values = ", ".join(f"{text} {number(time_s)} s" for text, time_s in told.items())
-    return f"In worlds of the street the policy took {values}; the one {best} was kept."
+    return f"Average travel time in the fitted street: {values}. Kept was {best}."
