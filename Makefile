@@ -2,7 +2,8 @@
 #
 #   make demo       trains a policy across the gap on a shipped network; table, page, film
 #   make test       builds the wheel, installs it into .venv and tests it
-#   make test-all   the same, small versions of the paper's tables, 3,000 damaged inputs, and each documented command (over two hours)
+#   make test-slow  the tests that take long and are left out there
+#   make test-all   both, small versions of the paper's tables, 3,000 damaged inputs, and each documented command (over two hours)
 #   make check      format, lint, types, architecture, words, tests
 #   make compat     the learners of other libraries: what runs where (LATEST=1: their newest releases)
 #   make bench      the figures of docs/, measured on this machine
@@ -31,7 +32,7 @@ unexport PYTHONPATH PYTHONHOME SUMO_HOME VIRTUAL_ENV
 export PYTHONSAFEPATH := 1
 export PYTHONNOUSERSITE := 1
 
-.PHONY: help demo test test-all check static format lint types architecture words docs package notebooks bench scenarios oldest compat python environment environment-dev environment-notebooks
+.PHONY: help demo test test-slow test-all check static format lint types architecture words docs package notebooks bench scenarios oldest compat python environment environment-dev environment-notebooks
 .DEFAULT_GOAL := help
 
 help:
@@ -49,8 +50,10 @@ demo: environment
 test: environment-dev
 	UGAT_MARL_TEST_INSTALLED=1 OMP_NUM_THREADS=1 $(BIN)/python -m pytest -q -n $(JOBS) --dist worksteal $(TESTS) $(ARGS)
 
-test-all: environment-dev
-	UGAT_MARL_TEST_INSTALLED=1 OMP_NUM_THREADS=1 $(BIN)/python -m pytest -q -n $(JOBS) --dist worksteal $(TESTS) $(ARGS)
+test-slow: environment-dev
+	UGAT_MARL_TEST_INSTALLED=1 OMP_NUM_THREADS=1 $(BIN)/python -m pytest -q -m slow -n $(JOBS) --dist worksteal $(TESTS) $(ARGS)
+
+test-all: test test-slow
 	UGAT_MARL_TEST_INSTALLED=1 OMP_NUM_THREADS=1 $(BIN)/python -m pytest -q -m nightly $(TESTS)/nightly $(ARGS)
 
 check: static

@@ -124,7 +124,6 @@ if marks < {times}:
 """
 
 
-@pytest.mark.slow
 def test_processes_that_die_are_replaced(tmp_path: Path) -> None:
     twice, always = (DIES.format(folder=str(tmp_path), times=times) for times in (2, 100))
     with LocalProcesses(1) as processes:
@@ -140,6 +139,7 @@ def test_processes_that_die_are_replaced(tmp_path: Path) -> None:
         processes.submit(int, "1")
 
 
+@pytest.mark.slow
 def test_a_stopped_process_is_killed_and_its_part_repeated(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -149,7 +149,6 @@ def test_a_stopped_process_is_killed_and_its_part_repeated(
         assert (tmp_path / "mark").exists()
 
 
-@pytest.mark.slow
 def test_processes_give_what_threads_give() -> None:
     with LocalProcesses(2) as processes:
         assert results(processes) == results(2)
@@ -178,7 +177,6 @@ def engine_of(data: Path, workers: Any) -> Engine:
     return Engine(scenario, layout, replay, periods, 3, THRESHOLDS, workers=workers)
 
 
-@pytest.mark.slow
 def test_days_of_a_diagnosis_are_the_same_in_processes(data: Path) -> None:
     found: list[Any] = []
     with LocalProcesses(1) as processes:

@@ -7,6 +7,7 @@ from pathlib import Path
 
 import pytest
 
+from tests.runs import search_few_rules
 from ugat_marl.__main__ import COMMANDS, main
 from ugat_marl.cli.evaluate import names_of
 from ugat_marl.data import TransitionLog
@@ -138,7 +139,10 @@ def test_evaluate_prints_and_writes(
     assert len(content["episodes"]) == 2 * 2 * 2
 
 
-def test_a_recorded_log_trains(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_a_recorded_log_trains(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    search_few_rules(monkeypatch, "largest-queue:20", "programme")
     log = tmp_path / "v4.parquet"
     short = ["--duration-s", "200"]
     call = ["rollout", "single-v1", "--domain", "V4", "--episodes", "2", "--out", str(log)]
@@ -147,6 +151,7 @@ def test_a_recorded_log_trains(tmp_path: Path, capsys: pytest.CaptureFixture[str
     call = ["train", "single-v1", "--real", "none", "--real-log", str(log), "--out"]
     call += [str(tmp_path / "run"), "--pretrain-episodes", "1", "--iterations", "1"]
     call += ["--grounded-episodes", "1", "--fit.epochs", "1", "--tuning-seeds", "1"]
+    call += ["--dqn.teacher", "None", "--street.simulations", "20", "--street.judged", "1"]
     assert main([*call, "--evaluation-seeds", "1", "--no-control", *short]) == 0
     assert "direct transfer" in capsys.readouterr().out
     picture = (tmp_path / "run" / "gap.png").read_bytes()

@@ -222,6 +222,7 @@ def test_counts_are_those_asked_for(crossing: tuple[Scenario, Network, DetectorL
     assert not found.sums[INDEX["platoon_gap"]].any()
 
 
+@pytest.mark.slow
 def test_days_under_signals_that_answered_others_are_like_the_measured_one(data: Path) -> None:
     """Closed loop: nothing is hidden, and only measured arrivals make the replay agree."""
     scenario = load_scenario("single-v1").with_duration(1200.0)

@@ -31,7 +31,6 @@ def test_there_are_notebooks() -> None:
     assert {book.stem for book in BOOKS} == {"first-environment", "your-street"}
 
 
-@pytest.mark.slow
 @pytest.mark.parametrize("book", BOOKS, ids=lambda book: book.stem)
 def test_a_notebook_runs(book: Path, python: list[str], tmp_path: Path) -> None:
     """Cells without the magic words of notebooks are one program."""

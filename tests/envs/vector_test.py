@@ -679,7 +679,7 @@ def one_by_one(
             return [own[:episodes] for own in found]
 
 
-@pytest.mark.parametrize("count", [1, 2])
+@pytest.mark.parametrize("count", [1, pytest.param(2, marks=pytest.mark.slow)])
 def test_the_order_in_which_environments_are_ready_changes_no_episode(count: int) -> None:
     with vector_env("grid2x2-v1", 3, ["sim", "V4", "V1"], duration_s=LENGTH_S) as env:
         assert one_by_one(env, 4, episodes=2, count=count) == together(env, 4, episodes=2)
@@ -715,6 +715,7 @@ def test_a_slow_environment_holds_up_no_other_one() -> None:
         assert env.recv().numbers.tolist() == [1]
 
 
+@pytest.mark.slow
 def test_one_that_never_answers_is_replaced(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("UGAT_MARL_DEADLINE_S", "12")  # a replacement has to start within it
     with vector_env("single-v1", 2, duration_s=LENGTH_S) as env:

@@ -286,6 +286,7 @@ def job_of(log: Path) -> int:
     return int(job)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("forked", [pytest.param(True, marks=needs_forks), False])
 def test_a_stopped_job_is_killed_and_taken_up_again_with_the_same_numbers(
     forked: bool, tmp_path: Path, monkeypatch: pytest.MonkeyPatch

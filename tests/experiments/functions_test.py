@@ -10,6 +10,7 @@ import polars as pl
 import pytest
 
 import ugat_marl
+from tests.runs import search_few_rules
 from ugat_marl.data import Scores
 from ugat_marl.errors import OptionError, UnknownNameError
 from ugat_marl.experiments import Evaluation, TransferConfig, run_folder
@@ -84,7 +85,10 @@ class Stopped(Exception):
     """Raised by a callback, as a search does that prunes a trial."""
 
 
-def test_a_callback_gets_what_is_logged_and_may_end_the_run(tmp_path: Path) -> None:
+def test_a_callback_gets_what_is_logged_and_may_end_the_run(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    search_few_rules(monkeypatch, "largest-queue:20", "programme")
     options: dict[str, Any] = {
         "learner": "ippo", "grounding": "phase", "pretrain_episodes": 2, "iterations": 1,
         "grounded_episodes": 1, "real_rollouts": 1, "evaluation_seeds": 1, "duration_s": 100,

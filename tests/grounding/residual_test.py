@@ -262,6 +262,7 @@ def test_where_commands_are_late_no_action_is_grounded(
     assert (1, "residual/gate/decisions") not in logged
 
 
+@pytest.mark.slow
 def test_an_interrupted_training_ends_as_an_unbroken_one(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

@@ -194,7 +194,10 @@ def test_each_part_can_be_fitted_alone(part: str) -> None:
         assert bool(service_s.any()) == (part == "service")
 
 
-@pytest.mark.parametrize(("recorded_s", "compared_s"), [(300.0, 60.0), (40.0, 40.0)])
+@pytest.mark.parametrize(
+    ("recorded_s", "compared_s"),
+    [pytest.param(300.0, 60.0, marks=pytest.mark.slow), (40.0, 40.0)],
+)
 def test_a_street_is_compared_with_worlds_of_the_same_length(
     recorded_s: float, compared_s: float
 ) -> None:
@@ -239,6 +242,7 @@ def test_unknown_parts_and_too_few_simulations_are_refused() -> None:
         UgatConfig(grounding="street").transform({}, 0)
 
 
+@pytest.mark.slow
 def test_an_interrupted_training_ends_as_an_unbroken_one(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -285,6 +289,7 @@ def test_the_kept_policy_is_the_one_on_the_street(
     assert second is kept
 
 
+@pytest.mark.slow
 def test_a_rule_that_is_better_in_the_fitted_street_is_kept(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

@@ -166,7 +166,8 @@ def test_a_killed_process_resumes(
         "train", "single-v1", "--duration-s", "60", "--out", str(folder), "--pretrain-episodes",
         "11", "--iterations", "1", "--grounded-episodes", "1", "--sim-rollouts", "2",
         "--real-rollouts", "2", "--fit.epochs", "2", "--no-control", "--evaluation-seeds", "1",
-        "--tuning-seeds", "1",
+        "--tuning-seeds", "1", "--learner", "dqn", "--street.simulations", "20",
+        "--street.judged", "1",
     ]  # fmt: skip
     process = subprocess.Popen(
         [*python, "-m", "ugat_marl", *command], stdout=subprocess.DEVNULL, start_new_session=True
@@ -309,6 +310,7 @@ SHORT = replace(
 )
 
 
+@pytest.mark.slow
 def test_a_policy_trained_in_the_corrected_sim_stands_beside_the_others(
     repaired: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

@@ -137,6 +137,7 @@ def test_a_learner_with_two_methods_is_trained_and_judged_in_every_row(
     assert not list((tmp_path / "run" / "policies").glob("*"))
 
 
+@pytest.mark.slow
 @pytest.mark.usefixtures("algorithm")
 def test_a_learner_that_can_be_saved_resumes_to_the_numbers_of_an_unbroken_run(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch

@@ -20,6 +20,7 @@ import polars as pl
 import pytest
 import tyro
 
+from tests.runs import search_few_rules
 from ugat_marl.__main__ import main
 from ugat_marl.cli.report import again, train_options
 from ugat_marl.cli.train import Train
@@ -737,9 +738,11 @@ def test_the_page_is_drawn_in_light_and_dark(dark: bool, run: Path, tmp_path: Pa
 # --- a real training ----------------------------------------------------------------------------
 
 
-@pytest.mark.slow
-@pytest.mark.parametrize("grounding", ["phase", "street"])
-def test_a_run_leaves_all_that_its_page_wants(grounding: Any, tmp_path: Path) -> None:
+@pytest.mark.parametrize("grounding", ["phase", pytest.param("street", marks=pytest.mark.slow)])
+def test_a_run_leaves_all_that_its_page_wants(
+    grounding: Any, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    search_few_rules(monkeypatch, "largest-queue:20", "programme")
     ugat = UgatConfig(
         grounding,
         pretrain_episodes=1,
@@ -750,8 +753,9 @@ def test_a_run_leaves_all_that_its_page_wants(grounding: Any, tmp_path: Path) ->
         fit=FitConfig(epochs=1),
         street=StreetConfig(simulations=20, simulated_s=60.0, judged=1),
     )
+    learner = "dqn" if grounding == "phase" else "universal"  # the latter takes lessons first
     config = TransferConfig("grid2x2-v1", duration_s=100, evaluation_seeds=2, tuning_seeds=1,
-                            control=False, ugat=ugat)  # fmt: skip
+                            control=False, learner=learner, ugat=ugat)  # fmt: skip
     found = transfer(config, tmp_path / "run")
     made, page = page_of(tmp_path / "run")
     assert "Missing here" not in page.text and "whole" in page.text

@@ -9,8 +9,6 @@ import pytest
 
 from ugat_marl.effects import load_scenario
 
-pytestmark = pytest.mark.slow
-
 
 @dataclass(frozen=True)
 class Case:
@@ -51,7 +49,13 @@ def overlap(window: list[float], truth: tuple[float, float]) -> float:
     return both / (max(window[1], truth[1]) - min(window[0], truth[0]))
 
 
-@pytest.mark.parametrize("family", CASES)
+QUICK = {"vehicles", "signals", "detectors"}
+
+
+@pytest.mark.parametrize(
+    "family",
+    [pytest.param(each, marks=() if each in QUICK else pytest.mark.slow) for each in CASES],
+)
 def test_a_hidden_effect_is_named(street, tmp_path: Path, family: str) -> None:
     case = CASES[family]
     found = street.diagnose(street.measure(case.domain), tmp_path)
@@ -72,6 +76,7 @@ def test_a_hidden_effect_is_named(street, tmp_path: Path, family: str) -> None:
     assert (corrected.hash == street.scenario.hash) == (family == "detectors")
 
 
+@pytest.mark.slow
 def test_a_closed_lane_is_named_with_its_window(street, tmp_path: Path) -> None:
     # Windows are known to the minute and no better, which leaves part of so large a gap.
     found = street.diagnose(street.measure("lane_closure=S_C_0,300,780"), tmp_path)
@@ -91,6 +96,7 @@ def test_where_nothing_is_hidden_nothing_is_named(street, tmp_path: Path) -> Non
         assert found["heldout"]["before"] < found["heldout"]["floor"] * 1.2
 
 
+@pytest.mark.slow
 def test_an_effect_outside_the_library_is_not_explained_away(street, tmp_path: Path) -> None:
     # Drivers of another kind, and nothing but the old kind's numbers to explain them with.
     among = {"acceleration", "headway", "startup_delay", "late_green"}

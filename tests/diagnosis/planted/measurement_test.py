@@ -12,8 +12,6 @@ from ugat_marl.effects import load_scenario
 from ugat_marl.experiments import policy_factory, record
 from ugat_marl.progress import Silent
 
-pytestmark = pytest.mark.slow
-
 FAMILIES = {
     "extension": ("detector_extension=*,1,split", "detector_extension=*", 1.0),
     "delay": ("detector_extension=*,-0.2,split", "detector_extension=*", -0.2),

@@ -27,6 +27,7 @@ def of_sums(street, domain: str, length_s: float, out: Path, **options: Any) -> 
     return street.diagnose(as_counts(street.measure(domain), length_s), out, among=AMONG, **options)
 
 
+@pytest.mark.slow
 def test_a_long_headway_is_found_without_a_single_vehicle(street, tmp_path: Path) -> None:
     found = of_sums(street, "headway=1.45", 300.0, tmp_path, effort=FEW)
     assert found["verdict"] == "explained", found["sentence"]
@@ -50,7 +51,6 @@ def test_a_slow_road_is_found_with_its_place(street, tmp_path: Path, length_s: f
     assert factor["low"] <= 0.8 <= factor["high"]
 
 
-@pytest.mark.slow
 @pytest.mark.parametrize("length_s", [60.0, 300.0])
 def test_sums_of_the_scenario_itself_do_not_contradict_it(
     street, tmp_path: Path, length_s: float
@@ -117,7 +117,6 @@ def test_slow_drivers_are_found_from_counts_and_times_of_probes(street, tmp_path
     assert found["traffic_check"]["measure"] == "travel times of probes"
 
 
-@pytest.mark.slow
 def test_a_loop_that_stays_on_is_not_taken_for_drivers(street, tmp_path: Path) -> None:
     whole = street.measure("sim")
 

@@ -156,6 +156,7 @@ def test_counts_of_the_scenario_itself_do_not_contradict_it(
     assert run(street, gap, tmp_path / "gap")["verdict"] == "no_discrepancy"
 
 
+@pytest.mark.slow
 def test_counts_alone_can_show_a_surge(street, tmp_path: Path) -> None:
     alone = counts_of(street.measure("demand_surge=S_C,300,900,0.3"), 300.0)
     found = run(street, alone, tmp_path, among={"demand_level", "demand_surge", "dropout"})

@@ -199,6 +199,7 @@ def test_a_tape_plays_the_same_episode_again() -> None:
     np.testing.assert_array_equal(last[0]["agent_1"], repeated[0]["agent_1"])
 
 
+@pytest.mark.slow
 def test_bench_env(tmp_path: Path) -> None:
     out = tmp_path / "env.json"
     bench = EnvBench((SCENARIO,), rounds=2, duration_s=120, sumo_rl=False, out=out)
@@ -227,6 +228,7 @@ def test_bench_learning() -> None:
     assert "20 decisions and 20 updates" in report.notes[0]
 
 
+@pytest.mark.slow
 def test_bench_fitting(tmp_path: Path) -> None:
     out = tmp_path / "fitting.json"
     report = FittingBench(SCENARIO, episodes=2, duration_s=200, rounds=2, epochs=2, out=out).run()
@@ -242,6 +244,7 @@ def test_bench_fitting(tmp_path: Path) -> None:
     assert json.loads(out.read_text())["settings"]["domain"] == "V4"
 
 
+@pytest.mark.slow
 def test_bench_memory() -> None:
     report = MemoryBench(SCENARIO, resets=4, settled=2, steps=1).run()
     assert {row["simulator"] for row in report.rows} == {"process", "inprocess"}

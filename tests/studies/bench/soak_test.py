@@ -115,6 +115,7 @@ def test_every_ten_minutes_something_fails_and_every_kind_in_its_turn() -> None:
     assert events != drawn_events(36_000, ["A", "B"], seed=4)
 
 
+@pytest.mark.slow
 @pytest.mark.skipif(sys.platform != "linux", reason="limits other processes' files")
 def test_two_hours_with_faults_have_no_unsafe_second() -> None:
     report = FieldSoakBench(hours=2, scenario="single-v1").run()

@@ -45,6 +45,7 @@ def test_no_faults_are_refused() -> None:
         TrainingFaultsBench(faults=0)
 
 
+@pytest.mark.slow
 @pytest.mark.skipif(sys.platform != "linux", reason="limits other processes' files")
 def test_a_training_with_a_fault_has_the_numbers_of_an_unbroken_one() -> None:
     report = TrainingFaultsBench(faults=2, seed=9).run()
