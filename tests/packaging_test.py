@@ -121,6 +121,7 @@ def test_importing_is_cheap() -> None:
     assert subprocess.run([sys.executable, "-c", code], check=False).returncode == 0
 
 
-def test_a_look_at_a_scenario_needs_no_torch() -> None:
-    code = "import sys, ugat_marl.cli.scenario_check; sys.exit('torch' in sys.modules)"
+@pytest.mark.parametrize("verb", ["scenario_check", "diagnose", "record"])
+def test_who_trains_nothing_waits_for_no_torch(verb: str) -> None:
+    code = f"import sys, ugat_marl.cli.{verb}; sys.exit('torch' in sys.modules)"
     assert subprocess.run([sys.executable, "-c", code], check=False).returncode == 0

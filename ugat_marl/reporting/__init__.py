@@ -2,7 +2,7 @@
 
 - `style`: the palette in light and dark, markers, dashes, and matplotlib's settings.
 - `figures`: a matplotlib figure as SVG for a page, as an SVG file and as PNG.
-- `charts`, `network_maps`, `phase_diagrams`: records as figures.
+- `charts`, `diagnosis_charts`, `network_maps`, `phase_diagrams`: records as figures.
 - `page`, ``templates/``: pages of HTML; `training_page` and `diagnosis_page` fill them in.
 - `run_records`, `run_groups`: trainings, read from their folders and put into groups.
 - `tables`, `gap_tables`, `comparison_tables`, `diagnosis_tables`, `headroom_table`,

@@ -25,7 +25,7 @@ from ugat_marl.diagnosis import (
 )
 from ugat_marl.files import write_whole
 from ugat_marl.reporting import diagnosis_words as words
-from ugat_marl.reporting.charts import BAND, headway_picture, statistics_picture
+from ugat_marl.reporting.diagnosis_charts import BAND, headway_picture, statistics_picture
 from ugat_marl.reporting.formats import chance, number, share, signed
 from ugat_marl.reporting.light_names import LightNames
 from ugat_marl.reporting.network_maps import disagreement_map
