@@ -58,7 +58,7 @@ def main() -> None:
             workers=1,
             callback=report,
         )
-        policy = run.policies["ugat-timed"]
+        policy = run.policies["timed"]
         scores = ugat_marl.evaluate(
             given.scenario,
             policy,

@@ -49,7 +49,7 @@ def trial(settings: Mapping[str, float], given: argparse.Namespace) -> None:
         workers=1,
         callback=report,
     )
-    policy = run.policies["ugat-timed"]
+    policy = run.policies["timed"]
     scores = ugat_marl.evaluate(
         given.scenario,
         policy,
