@@ -5,7 +5,7 @@ from __future__ import annotations
 import json
 from dataclasses import replace
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
 import numpy as np
 import polars as pl
@@ -159,6 +159,7 @@ def test_the_folder_is_locked_until_the_table_is_written(
     assert len(refused) == 2
 
 
+@pytest.mark.slow
 def test_domain_randomisation_resumes(tmp_path: Path) -> None:
     ugat = replace(SMALL.ugat, pretrain_episodes=8, iterations=1, grounded_episodes=4)
     config = replace(SMALL, ugat=ugat, randomised=True)
@@ -267,3 +268,13 @@ def test_names_of_policies_are_names_of_files_of_their_own() -> None:
     names = ["direct transfer", "further in a=-1", "further in a=1", "further in a-1"]
     expected = ["direct-transfer", "further-in-a-1", "further-in-a-1-2", "further-in-a-1-3"]
     assert file_names(names) == expected
+
+
+@pytest.mark.parametrize("grounding", ["timed", "street"])
+def test_a_queue_model_that_shows_no_crossings_is_refused_at_once(
+    grounding: Literal["timed", "street"], tmp_path: Path
+) -> None:
+    config = replace(SMALL, sim="meso", ugat=replace(SMALL.ugat, grounding=grounding))
+    with pytest.raises(OptionError, match="use the grounding phase, or no iterations"):
+        transfer(config, tmp_path / "run")
+    assert not (tmp_path / "run" / "trainings").exists()

@@ -253,9 +253,19 @@ def simulated_worlds(
         workers: Simulations at a time, or an executor, see `SimulatedWorld`.
 
     Raises:
-        OptionError: `check_worlds` fails, or the rewards cannot be matched.
+        OptionError: `check_worlds` fails, the rewards cannot be matched, or a domain is SUMO's
+            queue model and the grounding needs crossings.
     """
     check_worlds(scenario, sim, real, ugat.grounding == "timed")
+    # crossing vehicles show best when a green began, and how fast it serves
+    crossings = ugat.most_delay_s > 0 or ugat.grounding == "street"
+    for domain in (sim, real) if crossings and ugat.iterations else ():
+        if "mesosim" in scenario_in_domain(scenario, domain).settings.sumo:
+            raise OptionError(
+                f"the grounding {ugat.grounding} needs to know when vehicles cross the stop lines, "
+                f"and SUMO's queue model ({domain_label(domain)!r}) cannot tell; use the grounding "
+                "phase, or no iterations"
+            )
     reward = options.get("reward", MATCHED_REWARDS[0])
     if ugat.matches and reward not in MATCHED_REWARDS:
         raise OptionError(
@@ -265,8 +275,6 @@ def simulated_worlds(
         )
 
     def world(domain: Domain, name: str, episodes: int, most_delay_s: int = 0) -> SimulatedWorld:
-        # crossing vehicles show best when a green began, and how fast it serves
-        crossings = ugat.most_delay_s > 0 or ugat.grounding == "street"
         given = {"crossings": crossings, **options}
         make = partial(parallel_env, scenario, domain, **given)
         return SimulatedWorld(make, name, episodes, ugat.rollout_epsilon, most_delay_s, workers)
