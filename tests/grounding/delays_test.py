@@ -151,6 +151,7 @@ def test_chance_is_seldom_taken_for_a_delay_and_a_delay_seldom_for_chance(agents
     assert np.mean(found[4.0]) > 0.95  # where lost time says 1 s
 
 
+@pytest.mark.slow
 def test_a_planted_delay_is_found() -> None:
     make = partial(parallel_env, "single-v1", **SIGHT)
     env = make()

@@ -299,7 +299,8 @@ def test_the_kind_of_grounding_decides_what_is_made(env: TrafficEnv) -> None:
         replace(timely, forward=ForwardConfig(include_phase=True)).transform(env.layouts, 0)
 
 
-@pytest.mark.parametrize("match", [pytest.param(False, marks=pytest.mark.slow), True])
+@pytest.mark.slow
+@pytest.mark.parametrize("match", [False, True])
 @pytest.mark.usefixtures("few_rules")
 def test_a_run_with_timed_grounding_resumes_where_it_was(match: bool, tmp_path: Path) -> None:
     timed = replace(LATE.ugat.timed, match=match)

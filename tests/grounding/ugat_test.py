@@ -342,6 +342,7 @@ def test_a_policy_trained_in_the_corrected_sim_stands_beside_the_others(
         assert not np.array_equal(mine, weights(tmp_path / "run", other))
 
 
+@pytest.mark.slow
 @pytest.mark.usefixtures("unjudged")
 def test_training_in_the_corrected_sim_resumes(repaired: Path, tmp_path: Path) -> None:
     config = replace(SHORT, corrected=str(repaired))

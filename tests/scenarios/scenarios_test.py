@@ -275,6 +275,7 @@ def test_readme_states_headroom_of_at_least_15_percent(name: str) -> None:
     assert float(table["sim"][-1]) <= too_late, "vehicles never get in, under the best rule in sim"
 
 
+@pytest.mark.slow
 def test_headroom_is_there_when_measured() -> None:
     rows = measure_headroom(read_scenario("single-v1"), ["sim", "V4"], (20, 40), [100], workers=2)
     assert [row.best_hold_s for row in rows] == [20, 40]

@@ -97,6 +97,7 @@ def test_wrong_options() -> None:
     assert "ray" in PARTS
 
 
+@pytest.mark.slow
 def test_a_training_s_time_is_divided_between_sumo_torch_and_the_rest() -> None:
     asked = {"scenario": "single-v1", "duration_s": 600.0, "learner": "ippo", "seed": 1}
     shares = ask("learner", episodes=2, **asked)

@@ -125,6 +125,7 @@ def test_two_hours_with_faults_have_no_unsafe_second() -> None:
     assert "disobeys" in report.notes[1]
 
 
+@pytest.mark.slow
 @pytest.mark.skipif(sys.platform != "linux", reason="limits other processes' files")
 def test_a_loop_that_does_not_look_at_lights_is_caught() -> None:
     report = FieldSoakBench(hours=1, scenario="single-v1", subject="blind").run()

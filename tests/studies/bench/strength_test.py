@@ -68,6 +68,7 @@ def test_impossible_settings_are_named(option: str) -> None:
         replace(StrengthBench(), **{option: 0})
 
 
+@pytest.mark.slow
 def test_a_named_rule_is_not_searched_for() -> None:
     config = DQNConfig(warmup_decisions=10, batch_size=4)
     bench = StrengthBench(episodes=1, seeds=(1,), evaluation_seeds=1, duration_s=100, dqn=config)
