@@ -15,6 +15,8 @@ import pytest
 
 import ugat_marl
 from ugat_marl.data import LogCallback
+from ugat_marl.experiments import GROUNDED_NAME
+from ugat_marl.experiments.jobs import file_name
 
 FOLDER = Path(__file__).resolve().parents[2] / "docs" / "how-to"
 EXAMPLES = sorted((FOLDER / "sweeps").glob("*.py"))
@@ -42,6 +44,14 @@ def test_an_example_uses_the_public_functions_alone(example: Path) -> None:
             assert {word.arg for word in node.keywords} <= set(taken)
             calls += 1
     assert calls == 2
+
+
+@pytest.mark.parametrize("example", EXAMPLES, ids=lambda path: path.stem)
+def test_an_example_asks_for_a_policy_that_its_training_leaves(example: Path) -> None:
+    text = example.read_text(encoding="utf-8")
+    (grounding,) = re.findall(r'grounding="(\w+)"', text)
+    (policy,) = re.findall(r'run\.policies\["([^"]+)"\]', text)
+    assert policy == file_name(GROUNDED_NAME[grounding])
 
 
 @pytest.mark.slow
