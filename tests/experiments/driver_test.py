@@ -13,6 +13,7 @@ from collections.abc import Callable, Iterator
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import asdict, replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -45,7 +46,14 @@ from ugat_marl.experiments.jobs import (
 from ugat_marl.experiments.paper import TABLES, settings_of
 from ugat_marl.grounding import FitConfig, UgatConfig
 from ugat_marl.parallel import DEADLINE_VARIABLE, Pulse, Stop
-from ugat_marl.policies import BASELINES, DQN_NAME, DQNConfig, learner_is_installed
+from ugat_marl.policies import (
+    BASELINES,
+    DQN_NAME,
+    SUITE_LEARNERS,
+    DQNConfig,
+    learner_is_installed,
+    suite_config,
+)
 from ugat_marl.progress import Silent
 from ugat_marl.simulation import kept_warm
 from ugat_marl.simulation.host import _WarmParent
@@ -111,7 +119,21 @@ def test_a_job_file_carries_the_setting_with_its_name(table: str, sim: str, tmp_
         job.write(tmp_path)
         content = (tmp_path / JOB).read_bytes()
         assert json.loads(content)["setting"]["name"] == row.name
-        assert TypeAdapter(Job).validate_json(content) == job
+        again = TypeAdapter(Job).validate_json(content)
+        assert again == job and again.name == job.name
+
+
+@pytest.mark.parametrize("name", SUITE_LEARNERS)
+@pytest.mark.parametrize("given", [{}, {"steps": 1, "hidden": (48, 48)}, {"steps": 3}])
+def test_a_job_file_keeps_what_the_learner_decides(
+    name: str, given: dict[str, Any], tmp_path: Path
+) -> None:
+    """JSON does not tell a default from the same number that somebody gave."""
+    spec = LearnerSpec(name, dqn=DQNConfig(**given))
+    replace(PLAIN, setting=replace(PLAIN.setting, learner=spec)).write(tmp_path)
+    read = TypeAdapter(Job).validate_json((tmp_path / JOB).read_bytes()).setting.learner
+    assert read is not None and read.dqn == suite_config(name, DQNConfig(**given))
+    assert read.identity == spec.identity
 
 
 def test_a_setting_has_settings_of_ugat_if_it_is_grounded() -> None:

@@ -9,7 +9,7 @@ import shutil
 import subprocess
 import xml.etree.ElementTree as ET
 from collections.abc import Sequence
-from dataclasses import asdict, replace
+from dataclasses import replace
 from html.parser import HTMLParser
 from pathlib import Path
 from typing import Any
@@ -40,6 +40,7 @@ from ugat_marl.experiments import (
 )
 from ugat_marl.experiments.scores import Result
 from ugat_marl.grounding import FitConfig, GateConfig, StreetConfig, UgatConfig
+from ugat_marl.policies import DQNConfig
 from ugat_marl.reporting import RunRecord, read_records, runs_page, style, write_pictures
 from ugat_marl.reporting import formats as words
 from ugat_marl.reporting.charts import radar_picture
@@ -119,9 +120,9 @@ def make_run(directory: Path, *, seed: int = 0, real: str = "V4", **changes: Any
     if config.duration_s is not None:
         scenario = scenario.with_duration(config.duration_s)
     hashes = {"sim": scenario.hash, "real": "r" * 64}
-    identity = {**asdict(config), "scenario_hash": hashes, "domains": ["sim", real]}
+    identity = {**config.as_dict(), "scenario_hash": hashes, "domains": ["sim", real]}
     (directory / "run.json").write_text(json.dumps(identity))
-    write_settings(directory, asdict(config))
+    write_settings(directory, config.as_dict())
     evaluation(3.0 * seed, real).write(directory / "table.json")
     metrics(shift=float(seed)).write(directory / "metrics.parquet")
     metrics(1).write(checkpoint / "metrics.parquet")
@@ -529,20 +530,33 @@ def test_the_command_writes_page_and_pictures(run: Path, tmp_path: Path) -> None
         {"seed": 3, "real": "V2", "control": False, "oracle": True, "further": ("V4", "V3")},
         {"duration_s": 600.0, "evaluation_seeds": 2, "corrected": "some dir/x", "sim": "V1"},
         {"ugat": UgatConfig(grounding="timed", iterations=7, least_accuracy=None)},
+        {"preset": "paper"},
+        {"preset": "paper", "ugat": UgatConfig(iterations=2, pretrain_episodes=20)},
+        {"preset": "paper", "learner": "universal"},
+        {"learner": "dqn"},
+        {"learner": "ippo"},
+        {"dqn": DQNConfig(hidden=(48, 48), steps=1)},  # given, though they are those of "dqn"
     ],
 )
 def test_the_command_on_the_page_makes_the_same_run(change: dict[str, Any], tmp_path: Path) -> None:
     config = TransferConfig("grid2x2-v1", **change)
-    write_settings(tmp_path, asdict(config))
+    write_settings(tmp_path, config.as_dict())
     (tmp_path / "run.json").write_text("{}")
     (record,) = read_records([tmp_path])
     assert isinstance(record, RunRecord)
     options = train_options(record.settings)
-    assert tyro.cli(Train, args=["grid2x2-v1", *options]).config == config
+    again = tyro.cli(Train, args=["grid2x2-v1", *options]).config
+    assert again == config and again.as_dict() == config.as_dict()
+
+
+def test_a_learner_that_lies_elsewhere_is_named_all_the_same() -> None:
+    settings = {**TransferConfig("x", learner="ippo").as_dict(), "learner": "nowhere:Thing"}
+    settings = json.loads(json.dumps(settings, default=str))
+    assert train_options(settings) == ["--learner", "nowhere:Thing"]
 
 
 def test_nested_settings_come_back_too() -> None:
-    settings = asdict(TransferConfig("x"))
+    settings = TransferConfig("x").as_dict()
     settings["ugat"]["fit"]["warm_start"] = not settings["ugat"]["fit"]["warm_start"]
     settings["ugat"]["gate"]["mode"] = "static"
     settings["dqn"]["hidden"] = [16, 8]

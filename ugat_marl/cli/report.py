@@ -16,6 +16,7 @@ from tyro.conf import Positional, arg
 from ugat_marl.errors import OptionError
 from ugat_marl.experiments import TransferConfig
 from ugat_marl.files import require_writable, write_whole
+from ugat_marl.policies import is_own
 from ugat_marl.reporting import RunRecord, TableRecord, read_records, runs_page, write_pictures
 
 PAGE = "report.html"
@@ -107,7 +108,14 @@ def train_options(settings: Mapping[str, Any]) -> list[str]:
     Args:
         settings: Settings of a `TransferConfig`, read from JSON; unknown ones are ignored.
     """
-    usual = json.loads(json.dumps(asdict(TransferConfig("-")), default=str))
+    preset, learner = settings.get("preset"), settings.get("learner") or ""
+    plain = TransferConfig("-", preset=preset)
+    if is_own(learner):  # its module may lie elsewhere, and it decides no other setting
+        decided = asdict(plain)
+    else:
+        decided = TransferConfig("-", preset=preset, learner=learner).as_dict()
+    usual = {**decided, "preset": None, "learner": plain.learner}
+    usual = json.loads(json.dumps(usual, default=str))
     usual.pop("scenario")
     return _options(settings, usual, "")
 

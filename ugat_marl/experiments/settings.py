@@ -102,7 +102,8 @@ class LearnerSpec:
         name: "universal" or "dqn", the suite's own, the name of a baseline, or ``module:name`` of a
             user's learner.
         settings: Settings of a baseline or of a user's learner as ``NAME=VALUE``.
-        dqn: Settings of the suite's own learners that differ from the defaults.
+        dqn: Settings of the suite's own learners. Those that are not given are replaced by the
+            learner's own, so that they survive JSON, which does not tell them from given ones.
     """
 
     name: str = UNIVERSAL_NAME
@@ -111,6 +112,8 @@ class LearnerSpec:
 
     def __post_init__(self) -> None:
         require_known_learner(self.name)
+        if self.name in SUITE_LEARNERS:
+            object.__setattr__(self, "dqn", suite_config(self.name, self.dqn))
 
     def factory(self, device: str = "cpu") -> LearnerFactory:
         """Return a factory of fresh learners.
@@ -150,7 +153,7 @@ class LearnerSpec:
                 with cannot be read.
         """
         if self.name in SUITE_LEARNERS:
-            settings = asdict(suite_config(self.name, self.dqn))
+            settings = asdict(self.dqn)
             if self.dqn.start is not None:
                 settings["start"] = file_hash(Path(self.dqn.start))
             return {"name": self.name, "settings": settings}

@@ -224,6 +224,10 @@ class TransferConfig:
         """The learner of all policies."""
         return LearnerSpec(self.learner, self.learner_settings, self.dqn)
 
+    def as_dict(self) -> dict[str, Any]:
+        """Return the fields for JSON; settings of the learner that were not given are its own."""
+        return {**asdict(self), "dqn": asdict(self.spec.dqn)}
+
     @property
     def settings(self) -> list[Setting]:
         """Settings trained in addition to direct transfer and UGAT."""
@@ -313,7 +317,7 @@ def transfer(
                 f"{directory} holds a run already; use --resume to go on with it, or another --out"
             )
         write_identity(directory, identity, begun=begun)
-        write_settings(directory, asdict(config))
+        write_settings(directory, config.as_dict())
         episode_s = config.duration_s or scenario.settings.duration_s
         for line in described_plan(plan, directory, folder, episode_s):
             reporter.say(line)
@@ -496,7 +500,7 @@ def _require_same_agents(
 
 def _identity(config: TransferConfig, scenario: Scenario, env: TrafficEnv) -> dict[str, Any]:
     """Return everything that must be the same when a run is resumed."""
-    settings = asdict(config)
+    settings = config.as_dict()
     for other in ("evaluation_seeds", "tuning_seeds", "rule_budget", "device", "corrected", *ADDED):
         settings.pop(other)
     log = config.real_log  # identified by its content, so the file may be moved
