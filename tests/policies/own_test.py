@@ -328,6 +328,22 @@ def test_a_training_with_the_same_seed_is_the_same(algorithm: Any) -> None:
     assert len(set(seen[0])) == 3 and -1.0 not in seen[0]
 
 
+def test_files_of_one_name_in_two_folders_are_two_modules(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(sys, "path", [*sys.path])
+    for number in (1, 2):
+        (tmp_path / str(number)).mkdir()
+        (tmp_path / str(number) / "twice.py").write_text(
+            f"def policy(observations): return {number}"
+        )
+    found = [load_own(f"{tmp_path}/{number}/twice.py:policy", "policy") for number in (1, 2)]
+    assert [policy({}) for policy in found] == [1, 2]
+    assert load_own(f"{tmp_path}/1/twice.py:policy", "policy") is found[0]
+    with pytest.raises(OptionError, match="no module 'twice'"):
+        load_own(f"{tmp_path}/3/twice.py:policy", "policy")
+
+
 @pytest.mark.usefixtures("algorithm")
 @pytest.mark.parametrize(
     ("name", "error", "says"),

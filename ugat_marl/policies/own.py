@@ -14,7 +14,7 @@ from __future__ import annotations
 import ast
 import contextlib
 import copy
-import importlib
+import importlib.util
 import inspect
 import io
 import json
@@ -25,6 +25,7 @@ import warnings
 import zipfile
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
+from types import ModuleType
 from typing import Any, get_type_hints
 
 from pettingzoo.utils import BaseParallelWrapper
@@ -75,18 +76,19 @@ def load_own(name: str, what: str) -> Any:
         what: Kind of thing for messages, such as "learner".
 
     Raises:
-        OptionError: The module or the object is missing.
+        OptionError: The module is missing.
+        UnknownNameError: The object is missing in it.
     """
     if name in _given:
         return _given[name]
     place, _, path = name.partition(":")
-    file = Path(place) if place.endswith(".py") else None
-    folder = str(Path.cwd() if file is None else file.resolve().parent)
+    file = Path(place).resolve() if place.endswith(".py") else None
+    folder = str(Path.cwd() if file is None else file.parent)
     if folder not in sys.path:
         sys.path.insert(0, folder)
     module_name = place if file is None else file.stem
     try:
-        found: Any = importlib.import_module(module_name)
+        found: Any = importlib.import_module(place) if file is None else _module_in(file)
     except ModuleNotFoundError as error:
         if error.name != module_name.partition(".")[0]:
             raise OptionError(
@@ -102,6 +104,27 @@ def load_own(name: str, what: str) -> Any:
             raise UnknownNameError(f"{what} in {module_name}", part, names)
         found = getattr(found, part)
     return found
+
+
+def _module_in(file: Path) -> ModuleType:
+    """Return the module of a file, under a name of its own: files of two folders may share theirs.
+
+    Raises:
+        ModuleNotFoundError: There is no such file, or the module needs another one.
+    """
+    name = f"{file.stem} in {file.parent}"
+    if name in sys.modules:
+        return sys.modules[name]
+    specification = importlib.util.spec_from_file_location(name, file)
+    if specification is None or specification.loader is None or not file.exists():
+        raise ModuleNotFoundError(name=file.stem)
+    module = sys.modules[name] = importlib.util.module_from_spec(specification)
+    try:
+        specification.loader.exec_module(module)
+    except BaseException:
+        del sys.modules[name]
+        raise
+    return module
 
 
 class OwnPolicy:
