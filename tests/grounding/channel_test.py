@@ -159,6 +159,12 @@ def test_the_actuator_repeats_the_street() -> None:
     assert list(actuator.under_way) == [[2, 2], [3, 3]]
 
 
+def test_where_every_command_is_lost_a_policy_has_none_to_see() -> None:
+    channel = fit_channel(log_of(lost=1.0, rows=dict.fromkeys(AGENTS, 200)))
+    assert channel.lost > 0.95
+    assert channel.memory == 1
+
+
 def test_the_seed_of_an_episode_decides_what_is_lost() -> None:
     channel = fit_channel(log_of(lost=0.3))
     actuator = channel.actuator(None, TIMING, INTERVAL_S)  # type: ignore[arg-type]

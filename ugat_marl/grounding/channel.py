@@ -128,7 +128,7 @@ class CommandChannel(ControllerPart):
     def memory(self) -> int:
         """Number of own commands that a policy has to see; 0 for a channel that changes nothing."""
         late = np.flatnonzero(self.network[:-1] > 0)
-        return max(1, int(late.max())) if self.changes else 0
+        return max(1, int(late.max(initial=0))) if self.changes else 0
 
     def drawn(self, seed: int) -> Floats:
         """Draw weights from the posterior, ``(agents, most_lag + 2)``."""
