@@ -100,6 +100,8 @@ class ScenarioCheck:
             return self._kit(console)
         if self.headroom < 0:
             raise OptionError(f"--headroom {self.headroom}: give a number of seeds, or 0")
+        if self.headroom and self.domain != "sim":
+            raise OptionError("--headroom plays sim and V1 to V4 by itself; leave out --domain")
         scenario = scenario_in_domain(load_scenario(self.scenario), self.domain)
         if self.duration_s is not None:
             scenario = scenario.with_duration(self.duration_s)
@@ -318,7 +320,7 @@ def _approaches(agents: Sequence[IntersectionFacts], names: LightNames) -> Table
 
 def _runs(runs: Sequence[RuleEpisode]) -> Table:
     table = _table(
-        "An episode in sim", "rule", "ATT, s", "due", "entered", "arrived", "left outside"
+        "An episode of each rule", "rule", "ATT, s", "due", "entered", "arrived", "left outside"
     )
     for run in runs:
         counts = (run.due, run.departed, run.arrived, run.backlog)

@@ -16,7 +16,7 @@ from ugat_marl.errors import CheckpointError, OptionError
 from ugat_marl.experiments.jobs import DIRECT_POLICY, JOB, POLICY, Job, Record, file_name, file_stem
 from ugat_marl.experiments.statistics import Interval
 from ugat_marl.files import read_json, write_whole
-from ugat_marl.policies import CardScores, NetworkPolicy, PolicyCard, rule_in
+from ugat_marl.policies import CardScores, NetworkPolicy, PolicyCard, is_own, rule_in
 
 _LIBRARIES = ("ugat-marl", "eclipse-sumo", "torch", "numpy")
 
@@ -65,8 +65,9 @@ def _cards(place: Path, command: str) -> list[tuple[PolicyCard, bytes]]:
     cards: list[tuple[PolicyCard, bytes]] = []
     for mark, setting in job.rows.items():
         file = place / (POLICY if mark == job.episodes else DIRECT_POLICY)
-        if file.exists() and rule_in(file) is None:  # a rule needs no file
-            NetworkPolicy.load(file)  # what cannot be loaded is not packed
+        own = is_own(job.setting.learner.name)  # whose files only its own module reads
+        if file.exists() and not own and rule_in(file) is None:  # a rule needs no file
+            NetworkPolicy.load(file)  # a damaged file is refused
             content = file.read_bytes()
             cards.append((_card(job, record, mark, setting, command, content), content))
     return cards

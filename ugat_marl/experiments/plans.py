@@ -45,7 +45,7 @@ def described_plan(
             does = (
                 f"{setting.name}: {setting.ugat.pretrain_episodes} episodes in {job.sim}, then "
                 f"{times} iteration{'' if times == 1 else 's'} of {setting.ugat.grounded_episodes} "
-                f"for {job.target}"
+                f"for {job.target or 'the street of the log'}"
             )
         else:
             does = f"{setting.name}: {job.episodes} episodes"

@@ -39,7 +39,7 @@ JUST_DUE_S = 10.0
 
 @dataclass(frozen=True)
 class RuleEpisode:
-    """Episode under a rule, in sim.
+    """Episode under a rule, in the domain that is checked.
 
     Attributes:
         rule: The rule.

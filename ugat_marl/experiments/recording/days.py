@@ -9,7 +9,6 @@ from __future__ import annotations
 
 import concurrent.futures
 import math
-import os
 import tempfile
 import threading
 from collections.abc import Iterable, Mapping
@@ -46,6 +45,7 @@ from ugat_marl.experiments.recording.controller import (
     switches,
 )
 from ugat_marl.experiments.recording.tracks import tracks
+from ugat_marl.parallel import parts_at_a_time
 from ugat_marl.policies import PolicyFactory
 from ugat_marl.progress import Advance, Reporter, Silent
 from ugat_marl.scenarios import (
@@ -197,7 +197,7 @@ def record(
         trajectories,
     )
     with (reporter or Silent()).task("measuring", periods) as advance:
-        days = _all_days(street, periods, workers or os.cpu_count() or 1, advance)
+        days = _all_days(street, periods, parts_at_a_time(workers), advance)
     return MeasuredData(
         street.detectors,
         tuple(day.period for day in days),
