@@ -6,9 +6,9 @@
 
 The committed file is studies/behaviour_digests.json.
 
-Parts play episodes in process, in worker processes and in vectors, visit every named domain, and
-train, record and diagnose by the command line. They use only public names and the command line, so
-that modules may move.
+Parts play episodes in process, in worker processes and in vectors, visit named domains of every
+kind, and train, record and diagnose by the command line. They use only public names and the command
+line, so that modules may move.
 
 A part has *values* (label to a list of numbers and short texts) and *names* (further texts). The
 digest of a part is the SHA-256 over its sorted values, without labels and names. If only labels or

@@ -3,7 +3,8 @@
 ``python -m studies.osm_extracts city.osm.pbf --seed 1 --out towns`` cuts boxes around signals drawn
 at random, and makes a scenario of each that has 3 to 10 intersections, overlaps no other one and
 passes the check. The demand is scaled to a drawn load (`degrees_of_saturation`). Boxes that do not
-fit are named with the reason. It needs the extra ``osm``; no data come with the suite.
+fit are named with the reason, but for those that overlap another. It needs the extra ``osm``; no
+data come with the suite.
 """
 
 from __future__ import annotations

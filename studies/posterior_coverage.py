@@ -5,8 +5,8 @@
 Worlds are simulated once for each network, as a training does. Then streets are drawn and
 simulated, and the posterior is asked for the values of each. Half of the streets come from the
 prior of the worlds. The other half come from another distribution, so that the prior is wrong
-about them: each effect is there with a chance of a half, alone, and a third of the lanes loses
-green at its beginning.
+about them: each effect is there with a chance of a half, whatever the others, and a third of the
+lanes loses green at its beginning.
 
 A value is covered if the 90 % interval of its draws holds it. A value at the end of its range is
 covered by an interval that ends there.

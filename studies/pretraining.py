@@ -1,7 +1,6 @@
 """Pretrain one network "universal" on drawn road networks; its weights may start a training.
 
     python -m studies.pretraining OUT --networks 150 --episodes 800
-    python -m studies.pretraining OUT --resume ...
 
 Road networks are drawn by seeds from `FIRST_SEED` on. Each episode takes the next one of a random
 order, in a world drawn for it: the plain simulation, one of random vehicles and drivers, or one
@@ -39,7 +38,7 @@ from ugat_marl.seeding import derive_seed, numpy_generator
 from ugat_marl.simulation import kept_warm
 
 FIRST_SEED = 100_000
-"""Seed of the first road network of the training; tables use smaller ones."""
+"""Seed of the first road network of the training."""
 
 FIRST_CHECK_SEED = 90_000
 """Seed of the first road network of the checks."""

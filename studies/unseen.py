@@ -15,6 +15,7 @@ from __future__ import annotations
 
 import argparse
 import math
+import shutil
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -140,7 +141,11 @@ def scenarios(given: argparse.Namespace) -> list[Path]:
     if given.pbf is not None:
         towns = given.out / "towns"
         if not towns.exists():
-            make_all(given.pbf, given.seed, towns, given.extracts)
+            half = given.out / "towns-half-made"
+            shutil.rmtree(half, ignore_errors=True)
+            make_all(given.pbf, given.seed, half / towns.name, given.extracts)
+            (half / towns.name).rename(towns)
+            half.rmdir()
         folders += sorted(path for path in towns.iterdir() if path.is_dir())
     return folders
 

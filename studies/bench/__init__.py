@@ -1,4 +1,4 @@
-"""Benchmarks: speed of the environment, cost and strength of learning, memory.
+"""Benchmarks: speed, many simulations, learning, fits, GPUs, memory, the field loop under faults.
 
 Every bench is a frozen dataclass of options with a ``run()`` that returns a `Report`: rows, targets
 and the machine. Ratios are taken between runs of the same round, which follow each other directly,

@@ -20,9 +20,9 @@ _PROGRAM = ["-m", "studies.bench.device_program"]
 class DeviceBench:
     """Time updates of DQN and fits of f and h on the CPU and on a GPU.
 
-    Observations, rewards and transitions are random; nothing is simulated. Every round measures
-    each size on the CPU and directly after it on the GPU. Times are wall time and include all
-    transfers. The CPU computes on one thread, as in training.
+    Observations, transitions and the learner's rewards are random; nothing is simulated. Every
+    round measures each size on the CPU and directly after it on the GPU. Times are wall time and
+    include all transfers. The CPU computes on one thread, as in training.
 
     Examples:
         python -m studies.bench device --device cuda --out device.json

@@ -1,7 +1,7 @@
 """Measured program: SUMO alone shows given signal states at given seconds, and nothing else.
 
-`studies.bench.env` compares all variants with it. It uses libsumo without the suite. Only this file
-and the simulator import libsumo.
+`studies.bench.env` compares all variants with it. It uses libsumo without the suite. Only this
+file, `studies.bench.soak_program` and the simulator import libsumo.
 """
 
 from __future__ import annotations

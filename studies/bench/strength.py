@@ -53,7 +53,7 @@ class StrengthBench:
         last: Number of evaluations at the end, which have to be close to the best one.
         seeds: Seeds of training, one policy each.
         evaluation_seeds: Episodes of every evaluation.
-        rule: Rule to compare with; default: the best one of `evaluation.best_rules`.
+        rule: Rule to compare with; default: the best of the standard rules, chosen on other seeds.
         tuning_seeds: Episodes for the choice of the rule.
         duration_s: Simulated seconds per episode; default: the scenario's own.
         observation: Observation of the agents; default: the one that the learner needs, or count.

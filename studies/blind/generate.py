@@ -41,7 +41,7 @@ VARIATIONS = (0.0, 0.05, 0.1)
 """Standard deviations of the demand of a day, as shares of its mean."""
 
 LEAST = 20
-"""Least number of a day's detections that an effect must add, remove or move by over 0.1 s."""
+"""Least number of detections, to 0.1 s, that a day has only with the effect or only without it."""
 
 
 @dataclass(frozen=True)
@@ -145,7 +145,7 @@ def _plan(
     busy: dict[str, Busy],
     reporter: Reporter,
 ) -> list[_Planned]:
-    """Draw all cases one by one, so that a longer test begins like a shorter one."""
+    """Draw all cases; another number of cases gives other cases."""
     generator = numpy_generator(blueprint.seed, "blind", "deck")
     tasks = draw_tasks(blueprint.classes, blueprint.strengths, blueprint.cases, generator)
     spare = _spare(tasks)

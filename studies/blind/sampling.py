@@ -48,11 +48,14 @@ ADVANCE = "advance"
 ALSO_OUT: Mapping[str, tuple[str, ...]] = {"demand_level": ("demand_surge",)}
 """Effects that are left out together with an effect, because they mean the same."""
 
+UNKNOWN = ("bus_stops", "driveway", "double_parking")
+"""What the library has in no form."""
+
 OUTSIDE = (
-    "bus_stops", "driveway", "double_parking", "reaction_step", *MODELS,
+    *UNKNOWN, "reaction_step", *MODELS,
     *(f"without {x}" for x in KINDS if x not in (*IN_THE_LOG, "driver_model", "reaction_step")),
 )  # fmt: skip
-_OWN = OUTSIDE[: 4 + len(MODELS)]
+_OWN = (*UNKNOWN, "reaction_step", *MODELS)
 
 
 @dataclass(frozen=True)
@@ -111,7 +114,7 @@ def draw_tasks(
     for name, count in zip(classes, counts.tolist(), strict=True):
         members = _members(name, strengths)
         order = [members[i] for i in generator.permutation(len(members))]
-        if name == "outside":  # half are effects of no library, half are left out of this one
+        if name == "outside":  # half have a form of their own, half are left out by name
             own = [task for task in order if task.member in _OWN]
             denied = [task for task in order if task.member not in _OWN]
             order = [task for pair in zip(cycle(own), denied, strict=False) for task in pair]

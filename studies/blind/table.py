@@ -15,6 +15,7 @@ from scipy.stats import binomtest
 from studies.blind.cases import SCHEMA
 from studies.blind.generate import VARIATIONS
 from studies.blind.grade import Grade
+from studies.blind.sampling import UNKNOWN
 from ugat_marl.files import write_whole
 
 TRIO = frozenset({"acceleration", "startup_delay", "headway"})
@@ -54,7 +55,7 @@ class Row:
         value: The share or the median; None without cases.
         low: Lower end of the 95 % Wilson interval of a share, or the lower quartile.
         high: Upper end of this interval, or the upper quartile.
-        unit: Unit of the value; ``""`` for shares and ratios.
+        unit: Unit of the value; ``"%"`` for shares, stored as 0 to 1; ``""`` for ratios.
         ship: The goal, in words.
         met: True if `value` meets the goal; None without cases or without a goal.
     """
@@ -97,7 +98,7 @@ def _naming(grades: Sequence[Grade]) -> list[Row]:
     trio = [x for x in strong if x.hidden in TRIO]
     none = [x for x in grades if x.group == "none"]
     outside = [x for x in grades if x.group == "outside"]
-    whole = [x for x in outside if not x.hidden.startswith("without ")]
+    whole = [x for x in outside if x.hidden in UNKNOWN]
     errors = [x for x in grades if x.group == "measurement"]
     pairs = [x for x in grades if x.group == "pair"]
     settings = [x for x in grades if x.group == "setting"]

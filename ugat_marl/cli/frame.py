@@ -317,4 +317,7 @@ def _print_help(line: CommandLine, console: Console, prefix: str = "") -> None:
         console.print("\nA first try:\n")
         for example in line.examples:
             console.print(f"  {example}", markup=False)
-    console.print("\nExit codes: 0 done, 1 a check or target failed, 2 a wrong call or input.")
+    console.print(
+        "\nExit codes: 0 done, 1 a check or target failed, 2 a wrong call or input, "
+        "130 and 143 interrupted."
+    )

@@ -33,7 +33,7 @@ class ImportLog:
         measured: Directory with measured data (docs/reference/measured-data.md).
         out: Parquet file to write.
         observation: Observation to record: movements, count, queue, pressure, density. The learner
-            universal reads movements.
+            universal reads movements by default.
         vehicles: Source of the vehicles on lanes: best (a table of lanes or trajectories if there
             is one, else detections) or detections.
         latency_s: Constant delay of the detectors' stamps, in s; it is taken off them.

@@ -67,7 +67,7 @@ class Rollout:
         epsilon: Chance of a random phase. The log then also holds actions that the policy would not
             take.
         observation: Observation to record: movements, count, queue, pressure, waiting, density. The
-            learner universal reads movements.
+            learner universal reads movements by default.
         neighbours: Distance in roads up to which other intersections are observed too.
         duration_s: Length of an episode in s; default: the scenario's own.
         crossings: Also record when vehicles cross the stop lines, which groundings of greens read.

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 from ugat_marl.errors import LogError
 
 MOST_NUMBERS = 32_767
-"""Most numbers of an observation. The columns of a log count phases in 16 bits."""
+"""Most numbers of an observation, the largest that a log can count: it stores phases in 16 bits."""
 
 
 @dataclass(frozen=True)
@@ -18,7 +18,7 @@ class AgentLayout:
         features: Count of traffic numbers of the intersection itself. The forward model predicts
             them and the inverse model compares them.
         phases: Number of green phases, the size of the action space and of the one-hot part.
-        context: Count of numbers about the neighbours; may be 0.
+        context: Count of numbers about the neighbours and the own last commands; may be 0.
     """
 
     features: int

@@ -182,7 +182,7 @@ class Engine:
         base_days: Number of days of the scenario as it is that decide which days are ordinary; 0 if
             all days are.
         interval_s: Length of the intervals whose features are compared, s; None for none.
-        between: Measured turning counts and travel times; None without any.
+        between: Measured turning counts, travel times and states of lanes; None without any.
     """
 
     def __init__(

@@ -59,11 +59,6 @@ class Hypothesis:
         """Name and place: a model holds each such pair once."""
         return (self.name, tuple(field for field in self.fixed if isinstance(field[1], str)))
 
-    @property
-    def faults_only(self) -> bool:
-        """True if the effect changes detectors and not traffic."""
-        return known_effects()[self.name].on_detectors
-
     def effect(self, values: Sequence[float]) -> Effect:
         """Make the effect with these values of the free fields, clipped to their ranges."""
         given = dict(self.fixed)

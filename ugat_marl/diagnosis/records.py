@@ -150,7 +150,8 @@ class Disagreement:
         tls: SUMO id of the traffic light; None for all of the network.
         approach: SUMO id of the edge; None for all.
         lane: SUMO id of the lane; None for all.
-        regime: discharge, free flow, approach to red, yellow, storage, volume or vehicles.
+        regime: discharge, free flow, approach to red, yellow, storage, volume, vehicles, occupancy,
+            mean speed, turning, travel time, lanes or every lane.
         statistic: The statistic that differs most there.
         window: Begin and end on the scenario's clock, s; None for all of the time.
         size: Measured minus simulated, in `unit`.

@@ -115,7 +115,7 @@ class DemandLevel(Effect):
     factor: float
 
     def apply(self, scenario: Scenario) -> Scenario:
-        """Leave out or double vehicles, and change the rates of flows.
+        """Leave out or repeat vehicles, and change the rates of flows.
 
         Raises:
             UnknownNameError: No such edge.
@@ -141,7 +141,7 @@ class DemandSurge(Effect):
     factor: float
 
     def apply(self, scenario: Scenario) -> Scenario:
-        """Leave out or double vehicles that depart then, and cut flows into parts.
+        """Leave out or repeat vehicles that depart then, and cut flows into parts.
 
         Raises:
             UnknownNameError: No such edge.
@@ -267,7 +267,7 @@ class _Regular:
 
     @classmethod
     def of(cls, flow: ET.Element, over_s: float) -> _Regular | None:
-        """Read a flow as SUMO does; None if its departures are random.
+        """Read a flow as SUMO does; None if departures are random, or its time is empty or unknown.
 
         Args:
             flow: A ``<flow>``.
@@ -299,7 +299,7 @@ _RATES = ("vehsPerHour", "perHour", "period", "probability")
 
 
 def _period_s(flow: ET.Element) -> float | None:
-    """Return the time between two departures, s: 0 without a rate, None if it is random."""
+    """Return the time between two departures, s: 0 without a rate, None if random or never."""
     if "probability" in flow.attrib or _EXPONENTIAL.fullmatch(flow.get("period", "")):
         return None
     if hourly := flow.get("vehsPerHour") or flow.get("perHour"):

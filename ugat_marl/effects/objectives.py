@@ -20,8 +20,8 @@ OBJECTIVES: dict[str, dict[str, float]] = {
     "safety": {"queue": 0.5, "hard_brakings": 5.0, "collisions": 5.0},
     "person-delay": {"person_delay_s": 1.0},
 }
-"""Weights of measures, by name of the objective. Those of queue, emissions, fairness and safety are
-from Sim2Signal (Al Rafi et al. 2026)."""
+"""Weights of measures, by name of the objective. Those of efficiency, emissions, fairness and
+safety are from Sim2Signal (Al Rafi et al. 2026)."""
 
 NORMS: dict[str, float] = {
     "queue": 10.0,

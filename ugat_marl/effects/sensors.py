@@ -56,7 +56,7 @@ class _Noise(Sensor):
 
 @dataclass(frozen=True)
 class CountingError(ControllerEffect):
-    """Every count has a normal error of so many vehicles, also on an empty lane."""
+    """Vehicles and halting vehicles have a normal error of so many, also on an empty lane."""
 
     name: ClassVar[str] = "counting_error"
     ranges: ClassVar[dict[str, NumberParameter]] = {"vehicles": NumberParameter("veh", 0.0, 100.0)}
@@ -230,7 +230,7 @@ class _Lossy(Sensor):
 
 @dataclass(frozen=True)
 class QuantisedCounts(ControllerEffect):
-    """Counts are multiples of so many vehicles, rounded to the nearest."""
+    """Vehicles and halting vehicles are multiples of so many, rounded to the nearest."""
 
     name: ClassVar[str] = "quantised_counts"
     ranges: ClassVar[dict[str, NumberParameter]] = {"vehicles": NumberParameter("veh", 1.0, 100.0)}

@@ -79,7 +79,10 @@ class Turning(Effect):
     def _tails(
         self, scenario: Scenario, way: Callable[[ET.Element], Way], places: Places
     ) -> Counter[Way]:
-        """Return the further ways of vehicles that take the turn, and the number on each."""
+        """Return the further ways of those that take the turn, with their numbers.
+
+        A flow counts once.
+        """
         tails: Counter[Way] = Counter()
         for document in (*scenario.additional, *scenario.routes):
             if not mentions(document, *TAGS):
@@ -124,7 +127,7 @@ class Turning(Effect):
 
 
 def _drawn(tails: Counter[Way], salt: str, name: str) -> Way:
-    """Return one of the further ways, drawn by the number of vehicles on each."""
+    """Return one of the further ways, drawn by the number of vehicles and flows on each."""
     ways = sorted(tails)
     bounds = list(accumulate(tails[way] for way in ways))
     return ways[bisect_right(bounds, hashed_uniform(salt, "way", name) * bounds[-1])]

@@ -13,7 +13,10 @@ import polars as pl
 from ugat_marl.envs.observations import OBSERVATION_UNITS, Observer
 from ugat_marl.scenarios import Intersection, Network, green_of_file
 
-TURNS = {"s": "through", "l": "left", "L": "left", "r": "right", "R": "right", "t": "turn-around"}
+TURNS = {
+    "s": "through", "l": "left", "L": "left", "r": "right", "R": "right", "t": "turn-around",
+    "T": "turn-around",
+}  # fmt: skip
 """Words for SUMO's letters of directions."""
 
 

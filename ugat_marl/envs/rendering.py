@@ -209,7 +209,7 @@ class _Heads:
         self._across, self._along = np.array(across), np.array(along)
 
     def shown(self, states: Mapping[str, str]) -> tuple[Floats, list[str]]:
-        """Return lines, ``(links, 2, 2)``, and their colours; grey for unknown states."""
+        """Return lines, ``(links, 2, 2)``, and their colours; grey where no state is known."""
         letters = [states.get(tls, "")[index : index + 1] for tls, index in self._keys]
         green = np.array([letter in ("G", "g") for letter in letters])
         lines = np.where(green[:, None, None], self._along, self._across)

@@ -1,7 +1,7 @@
 """Path of measured counts to the controllers, through the sensors of a scenario's effects.
 
-An environment has `Sensors` only if its scenario lists effects on observations. Functions that make
-observations see what arrives, too. Rewards and scores use the measured counts.
+An environment has `Sensors` if its scenario or its option `fitted` has effects on observations.
+Functions that make observations see what arrives, too. Rewards and scores use the measured counts.
 """
 
 from __future__ import annotations

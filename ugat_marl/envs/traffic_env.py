@@ -54,12 +54,17 @@ class TrafficEnv(ParallelEnv[str, Any, Any]):
 
     Args:
         scenario: Road network, demand and signals.
-        domain: Domain of the simulation: ``"sim"``, ``"V1"``..``"V4"``, effects, ....
+        domain: Domain of the simulation: ``"sim"``, ``"V1"``..``"V4"``, effects such as
+            ``"headway=1.4"``, or a directory.
         options: Options of the environment.
 
     Attributes:
         scenario: The scenario in its domain.
         domain: Name of the domain.
+        options: Options of the environment.
+        render_mode: ``"human"``, ``"rgb_array"`` or None.
+        demand: Vehicles that are due, from the files of the scenario.
+        decision_interval_s: Seconds between decisions.
         network: Lanes and intersections of the road network.
         layouts: Agent to the parts of its observation.
         recorded_layouts: The same without the memory of commands; logs record these.

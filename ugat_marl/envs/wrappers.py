@@ -1,9 +1,10 @@
 """Wrappers for learners that need equal spaces or larger observations.
 
 They take any `ParallelEnv` whose agents observe one-dimensional boxes, act in `Discrete(n)` and
-live to the end of the episode. They can be stacked in any order; `masked_observation` comes last.
-Rewards, ends, infos and `state()` stay those of the wrapped environment; only `pad_spaces`
-lengthens ``action_mask`` in the infos.
+live to the end of the episode. They can be stacked in any order, but `masked_observation` comes
+last, `legal_actions` outside of `pad_spaces`, and `intersection_names` outside of all others.
+Rewards, ends and `state()` stay those of the wrapped environment. So do infos, but `pad_spaces`
+lengthens or adds ``action_mask``, and `legal_actions` adds ``action_replaced``.
 """
 
 from __future__ import annotations
@@ -205,9 +206,9 @@ class PaddedDiscrete(spaces.Discrete):
         own: Number of actions that exist.
     """
 
-    def __init__(self, n: int, n_valid: int) -> None:
+    def __init__(self, n: int, own: int) -> None:
         super().__init__(n)
-        self.own = n_valid
+        self.own = own
 
     def sample(self, mask: Any = None, probability: Any = None) -> np.int64:
         """Draw an action by `mask` or `probability`, or by default among those that exist."""

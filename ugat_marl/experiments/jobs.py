@@ -99,8 +99,8 @@ class Job:
             recipe "grounded"; None to simulate them.
         probe_domains: Domains in which a grounded policy is measured after every iteration, only
             for the metrics; not part of `identity`.
-        rule_budget: Most episodes to tune one rule, for recipe "rule"; None to use default
-            parameters.
+        rule_budget: Most episodes to tune one rule, for recipe "rule"; None for the usual settings
+            of `STANDARD_RULES`.
         tuning_seeds: Number of seeds on which the best rule is chosen.
         domains: Domains of the evaluation; not part of `identity`.
         evaluation_seeds: Seeds of each evaluation's episodes; not part of `identity`.
@@ -339,8 +339,8 @@ def perform(
         job: The job.
         folder: Folder of the job.
         reporter: Shows progress.
-        workers: Simulations at a time, or an executor, for roll-outs, evaluations and the search
-            for rules. Learning stays in this process.
+        workers: Simulations at a time, or an executor, for roll-outs and the search for rules.
+            Learning stays in this process, and evaluations on this machine.
         on_log: Called with the numbers that a job of recipe "grounded" logs.
 
     Raises:

@@ -37,7 +37,8 @@ def _program() -> list[str]:
     """Return the words to type for the running program; an absolute path is cut to its name."""
     path = Path(sys.argv[0])
     if path.name == "__main__.py":
-        return ["ugat-marl"]
+        package = path.parent.parts[-2:] if path.parent.parent.name == "studies" else ()
+        return ["python", "-m", ".".join(package)] if package else ["ugat-marl"]
     if path.suffix == ".py":
         return ["python", path.name if path.is_absolute() else path.as_posix()]
     return [path.name]

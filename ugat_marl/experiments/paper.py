@@ -61,7 +61,7 @@ from ugat_marl.policies import (
 from ugat_marl.progress import Reporter
 
 SEVERAL = 5
-"""Networks of f in the rows that tell u of h from u of h after f."""
+"""Number of networks of f in the rows that compare u of h with u of h after f."""
 
 TABLES = ("main", "ablation", "alpha", "uncertainty", "gap")
 
@@ -85,7 +85,7 @@ def settings_of(
         groundings: Kinds of grounding to try: "phase", "timed", "street"; empty for all that the
             table can have. "alpha" and "uncertainty" need a gate, which "street" has not.
         constants: Constant delays in s that "main" sweeps.
-        learner: The learner of all rows; None for DQN with its default settings.
+        learner: The learner of all rows; None for "universal".
 
     Raises:
         OptionError: A grounding, delay or table does not exist.
@@ -302,11 +302,11 @@ class PaperConfig:
         sim_rollouts: Episodes added to D_sim per iteration.
         real_rollouts: Episodes added to D_real per iteration.
         preset: "paper" for Algorithm 1 exactly as published: phase grounding, the reward queue, the
-            learner dqn; only the numbers of episodes stay free.
+            learner dqn. Numbers of episodes that are not given become 60, 4, 10, 3 and 3.
         groundings: Kinds of grounding: phase, timed, street; default: all that the table can have.
         constants: Constant delays in s that "main" sweeps.
-        rows: Names of the rows to train, of which what stands in brackets may be left out; direct
-            transfer is always trained. Default: all rows.
+        rows: Names of the rows to train; phase stands for the paper's UGAT, and direct transfer is
+            always trained. Default: all rows.
         evaluation_seeds: Number of evaluation episodes of each policy in each domain.
         rule_budget: Most episodes to tune one rule in one domain.
         observation: Kind of observation; default: the one that the learner needs, or count.
@@ -314,7 +314,8 @@ class PaperConfig:
         neighbours: Agents also see the intersections up to so many roads away.
         duration_s: Length of an episode in s; default: the scenario's own.
         learner: Learner of all rows: universal or dqn, the suite's own, or a baseline
-            (docs/how-to/learners.md); default: universal, and dqn with the preset "paper".
+            (docs/how-to/learners.md), or your own as my_module:MyLearner; default: universal, and
+            dqn with the preset "paper".
         learner_settings: Settings of a baseline as NAME=VALUE, such as learning_rate=0.001; commas
             separate the parts of a tuple.
         device: Device for the learner's updates and the fits: cpu, cuda, or cuda:N; all trainings

@@ -99,18 +99,19 @@ class TransferConfig:
             needs `real_log`: only the log is known of the real domain.
         sim: The simulation to train in; "sim", or a domain like `real`.
         preset: "paper" for Algorithm 1 exactly as published; it decides the reward (queue) and all
-            settings of the algorithm but the numbers of episodes.
+            settings of the algorithm. Numbers of episodes that are not given become 60, 4, 10, 3
+            and 3.
         real_log: Transition log that replaces the roll-outs in the real domain.
         seed: Root of every random choice in training.
         observation: Kind of observation: count, queue, pressure, waiting, density, movements;
-            default: movements for the learner universal, which needs it, and count for others.
+            default: movements for the learner universal, and count for others.
         reward: Kind of reward: total-queue, queue, pressure, waiting.
         neighbours: Agents also see the intersections up to so many roads away.
         duration_s: Length of an episode in s; default: the scenario's own.
         evaluation_seeds: Number of evaluation episodes of each policy in each domain.
         tuning_seeds: Number of episodes on which the best rule is chosen.
         rule_budget: Most episodes to tune each rule in each domain before the best is chosen;
-            default: no tuning, rules with default parameters.
+            default: no tuning, but the usual settings of each rule.
         control: Also train direct transfer for as many further episodes in plain sim.
         further: Domains in which direct transfer is trained further, as long as the control, with
             one policy each. "late_green=*,3" delays all greens by 3 s; "V4" fine-tunes in the real
@@ -126,7 +127,7 @@ class TransferConfig:
         oracle: Also train from scratch in the real domain, for as many episodes as UGAT in all.
         placebo: A negative control; grounding must win nothing with it. "same-world" records D_real
             in the simulation, "shuffled" permutes the outcomes in D_real, "noise" replaces f by
-            noise.
+            noise; the last two with phase or timed.
         learner: The learner: universal or dqn, the suite's own, a baseline, or your own as
             my_module:MyLearner (docs/how-to/learners.md); default: universal, and dqn with the
             preset "paper".

@@ -1,6 +1,6 @@
 """Tuning of rules: a race finds the best parameters of a rule in a domain, and a file keeps them.
 
-A rule has one or two parameters. They act in whole decisions, so a few values of each are enough.
+A rule has up to two parameters. They act in whole decisions, so a few values of each are enough.
 One episode says little about a value, so the values are raced by successive halving (Jamieson and
 Talwalkar 2016): all of them play a few episodes, then the better half plays more. All play the
 same seeds.

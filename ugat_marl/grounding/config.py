@@ -35,7 +35,7 @@ class UgatConfig:
         pretrain_episodes: M, episodes in plain sim before the first iteration.
         iterations: I, repetitions of rolling out, fitting and grounded training.
         grounded_episodes: E, episodes of training in the grounded sim per iteration.
-        sim_rollouts: Episodes added to D_sim per iteration.
+        sim_rollouts: Episodes added to D_sim per iteration, with "phase" and "timed".
         real_rollouts: Episodes added to D_real per iteration.
         rollout_epsilon: Chance of a random phase in these roll-outs.
         least_accuracy: Smallest held-out accuracy of h with which grounded actions are taken at an
@@ -43,7 +43,7 @@ class UgatConfig:
             be better than trivial answers, such as "no change" or the most frequent phase; 0
             requires only this. None takes grounded actions from the start, as the paper does.
         inputs: Inputs of f and h beside the intersection's own state and action.
-        forward: Shape of f.
+        forward: Shape of f; with "street", as the next three, only that of a residual.
         inverse: Shape of h.
         fit: Settings of the training of f and h.
         gate: Settings of alpha.

@@ -103,12 +103,12 @@ class Jam:
     Attributes:
         begin_s: Time at which the last free vehicle before it came on the lane.
         end_s: The same for the first free vehicle after it; the end of the period without one.
-        count: Vehicles of the jam, without those in `beyond`.
+        count: Vehicles of the jam, with those that an open one is estimated to have had beyond.
         open: True if it did not end within the period.
         error: Relative error of the rate at which vehicles come in an open jam.
         share: Share of a Poisson variance that the number of these vehicles has. Below 1, exit
             detectors counted the vehicles of the road, and only their lane is unsure.
-        at_s: Times of `variance`, ``(times,)``; without `variance` if the jam is open.
+        at_s: Times of `variance`, ``(times,)``; both are empty if an open jam was filled by a rate.
         variance: Variance of the vehicles of a closed jam that came by then, ``(times,)``.
     """
 

@@ -100,7 +100,7 @@ class FitConfig:
 # --- data of a fit
 
 EpochCallback = Callable[[str, int, float], None]
-"""Called as ``callback("forward" or "inverse", epoch, held_out_loss)`` after every epoch."""
+"""Called as ``callback(name of the model, epoch, held_out_loss)`` after every epoch."""
 
 RowLoss = Callable[[Tensor, int], Tensor]
 """Loss of some columns of the data in an epoch; epoch -1 is the final loss, for held-out rows.

@@ -37,8 +37,8 @@ class ResidualConfig:
         worlds: Roll-outs per iteration in worlds drawn from the fitted street, with which f is
             compared. Timed grounding needs as many again, with random delays.
         members: Networks of f; their disagreement is part of u.
-        history: Number of the last observations that f sees at least with "phase", with the phases
-            that were asked for. "timed" does not raise it, because lost times are then biased.
+        history: With "phase", least number of last observations that f sees, with the phases that
+            were asked for. "timed" does not raise it, because lost times are then biased.
         trust: Settings of the comparison of f and the fitted world.
     """
 

@@ -80,9 +80,9 @@ class StreetConfig:
             only this first part is compared. Detectors are compared over whole episodes.
         judged: Worlds of the fitted street in which policies are compared after each iteration; the
             best one is kept. 0 keeps the last one.
-        rule_budget: Most episodes that one rule plays in worlds of the fitted street, with all its
-            settings. The best rule of all teaches the learner, and is kept if it is better than
-            the trained policies. With 0 only trained policies are kept.
+        rule_budget: Budget that decides how many settings of each rule race in worlds of the fitted
+            street. The best rule of all teaches the learner, and is kept if it is better than the
+            trained policies. With 0 only trained policies are kept.
         without: Effects left out of the library.
         channel: Numbers of the fit of the command channel.
         eyes: Numbers of the fit of the detectors.

@@ -135,7 +135,7 @@ class StreetTraining(Algorithm):
             state: A fresh state, or one restored from a checkpoint.
 
         Returns:
-            The policy after the last iteration.
+            The policy that is kept.
         """
         device_of(self.device)  # refuses a missing GPU before anything runs
         self._pretrain(state)  # line 1

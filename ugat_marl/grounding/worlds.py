@@ -48,7 +48,7 @@ class World(Protocol):
         ...
 
     def replay(self) -> Policy | None:
-        """Return a policy that repeats the transitions' commands; None if `collect`'s one acted."""
+        """Return a policy that repeats the commands; None if the policy of `collect` acted."""
         ...
 
     def stop(self) -> None:

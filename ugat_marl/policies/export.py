@@ -6,6 +6,7 @@ observation_width)``, padded with zeros, and ``allowed``, bool ``(agents, action
 where padded. Its output is the allowed action of highest value, int64 ``(agents,)``. The JSON file
 holds:
 
+- ``kind``: what the file is, which `load` requires.
 - ``network``: name of the network, as in `DQNConfig.network`.
 - ``agents``, ``observation_sizes``, ``action_counts``: the rows, and how many columns each uses.
 - ``observation_width``, ``action_width``: numbers of columns, padding included.

@@ -21,7 +21,6 @@ from ugat_marl.reporting.figures import (
 )
 from ugat_marl.reporting.formats import tick_text
 from ugat_marl.reporting.style import (
-    DISAGREEMENT,
     LIGHT,
     STEPS,
     disagreement_level,
@@ -240,7 +239,3 @@ def _add_scale(picture: NamedFigure, ends: tuple[float, float], unit: str) -> No
     style = {"color": LIGHT["soft"], "va": "center_baseline"}
     figure.text(44 / width, 18 / height, low, ha="right", **style)
     figure.text((56 + 22 * len(STEPS)) / width, 18 / height, f"{high} {unit}", **style)
-
-
-DISAGREEMENT_KEY = tuple((f"d{number}", text) for number, (_, text) in enumerate(DISAGREEMENT))
-"""Colour and text of each class of disagreement, for the key of the maps."""

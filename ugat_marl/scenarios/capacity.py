@@ -77,7 +77,8 @@ def degrees_of_saturation(scenario: Scenario, flows_vph: Flows | None = None) ->
             the episode of the routes in the scenario's files.
 
     Returns:
-        Intersection to degree; infinite if no phase serves a lane with traffic.
+        Intersection to degree; infinite if no phase serves a lane with traffic, or lost time fills
+        the cycle.
 
     Source:
         Webster, Traffic Signal Settings, Road Research Technical Paper 39, 1958. Critical

@@ -28,7 +28,7 @@ class Link:
         index: Position of its letter in the state; several links may share one letter.
         from_lane: Incoming lane.
         to_lane: Outgoing lane.
-        direction: SUMO's letter: s straight, l/L left, r/R right, t turn-around; c for a crossing.
+        direction: SUMO's letter: s straight, l/L left, r/R right, t/T turn-around, c a crossing.
         junction: Id of the junction.
         request: Row of the link in the junction's right-of-way matrix, or -1 if there is none.
         left_hand: True if traffic keeps to the left. Right turns then cross the opposite traffic.

@@ -14,7 +14,9 @@ Shares = tuple[tuple[tuple[str, float], ...], ...]
 
 
 class UpstreamLanes(NamedTuple):
-    """Lanes and roads counted with lanes shorter than the reach (see `junctions.behind_of`).
+    """Lanes and roads counted with lanes shorter than the reach or a vehicle.
+
+    See `junctions.behind_of`.
 
     Attributes:
         lanes: For each measured lane, the lanes upstream of it, inside and outside of junctions.

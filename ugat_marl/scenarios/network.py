@@ -48,7 +48,8 @@ class Lane:
         length_m: Length.
         speed_mps: Speed limit.
         shape: Centre line, ``((x, y), ...)`` in m.
-        behind: Upstream lanes and roads counted with this lane, if it is shorter than the reach.
+        behind: Upstream lanes and roads counted with this lane, if it is shorter than the reach or
+            than the space of a vehicle.
         room_m: Length on which vehicles are counted, upstream lanes and reach included; 0 for lanes
             that are long enough or not at an agent.
     """

@@ -688,7 +688,7 @@ ENVIRONMENT_CHECKS = (an_episode_runs, *LIFE, *DECLARED, *BEHAVIOUR)
 def check_environment(make_env: MakeEnv, seed: int = 1) -> list[CheckResult]:
     """Check an environment: one of the suite, a wrapped one, or a third-party one.
 
-    The checks play about three whole episodes, so use an environment with short episodes.
+    The checks play four or more whole episodes, so use an environment with short episodes.
 
     Args:
         make_env: Function that returns a new environment.

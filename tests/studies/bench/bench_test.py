@@ -103,6 +103,7 @@ def test_a_process_finds_itself() -> None:
     [
         ("/opt/lib/ugat_marl/__main__.py", "ugat-marl --seeds 2"),
         ("/opt/bin/ugat-marl", "ugat-marl --seeds 2"),
+        ("/opt/tree/studies/bench/__main__.py", "python -m studies.bench --seeds 2"),
         ("baselines/results.py", "python baselines/results.py --seeds 2"),
         ("/opt/tree/baselines/results.py", "python results.py --seeds 2"),
     ],

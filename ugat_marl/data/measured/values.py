@@ -39,7 +39,7 @@ class MeasuredData:
         lanes: Table of lanes at instants, or None. Columns: ``period_id, time_s, lane_id, vehicles,
             halting, mean_speed_mps``.
         trajectories: Table of vehicles at instants, or None. Columns: ``period_id, vehicle_id,
-            time_s, lane_id, position_m, speed_mps``.
+            time_s, lane_id, position_m, speed_mps``, and ``length_m`` where it was measured.
         counts: Table of counts, or None. Columns: ``period_id, begin_s, end_s, detector_id,
             count``, and ``occupancy`` (share of time, 0 to 1) and ``mean_speed_mps`` where they
             were measured.

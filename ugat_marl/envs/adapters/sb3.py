@@ -2,9 +2,9 @@
 
     from stable_baselines3 import PPO
     from ugat_marl.envs.adapters.sb3 import AgentsVecEnv
-    from ugat_marl.envs.wrappers import agent_indicator, pad
+    from ugat_marl.envs.wrappers import agent_indicator, pad_spaces
 
-    env = AgentsVecEnv([agent_indicator(pad(ugat_marl.parallel_env("grid4x4-v1")))])
+    env = AgentsVecEnv([agent_indicator(pad_spaces(ugat_marl.parallel_env("grid4x4-v1")))])
     PPO("MlpPolicy", env, seed=1).learn(100_000)
 
 Unlike SuperSuit's version, it supports seeds and masks, can be closed, and marks truncations.
@@ -204,7 +204,8 @@ def _common_spaces(
             if space != common:
                 raise OptionError(
                     f"agent {agent!r} has {space}, agent {first!r} {common}; Stable-Baselines3 "
-                    "needs equal spaces: wrap each environment in ugat_marl.envs.wrappers.pad, "
-                    "and for environments of several networks give all the sizes of the largest"
+                    "needs equal spaces: wrap each environment in "
+                    "ugat_marl.envs.wrappers.pad_spaces; environments whose largest intersections "
+                    "differ cannot share one VecEnv"
                 )
     return box, spaces.Discrete(int(actions.n))

@@ -219,7 +219,7 @@ class DQN:
 
         Raises:
             OptionError: `env` has a space that this learner cannot use, or lacks the road network
-                that "frap" or "colight" needs.
+                that "frap", "colight" or "universal" needs.
         """
         if env_options is None:
             env_options = getattr(env.unwrapped, "env_options", {})
@@ -505,7 +505,7 @@ class DQN:
         """Take the weights of a start.
 
         Raises:
-            OptionError: The network is not "universal", or its observations are of another kind.
+            OptionError: The network is not "universal", or has another number of weights.
         """
         if not self._is_universal:
             raise OptionError('only a network "universal" begins with the weights of another')

@@ -59,7 +59,7 @@ class DQNConfig:
             1988). With "universal" they are decisions of 10 s as well.
         batch_size: Transitions per update and agent.
         replay_capacity: Decisions that the replay memory holds.
-        warmup_decisions: Decisions before the first update.
+        warmup_decisions: Own decisions before the first update; those of a teacher do not count.
         update_every: Decisions from one update to the next.
         target_rate: Share of the online network mixed into the target network at every update.
         epsilon_start: Share of exploratory decisions at the beginning.

@@ -34,8 +34,8 @@ class UniversalNetwork(nn.Module):
 
     The embedding of a movement is ``e_m = ReLU(f(x_m))``. A phase p serves ``d_p = sum_m green_pm
     e_m``, and the whole intersection holds ``t = sum_m e_m`` (Zaheer et al. 2017, deep sets). Q of
-    phase p is ``v(t) + g(d_p, t)``, with perceptrons f, v and g of one hidden layer each. The value
-    v is shared by all phases (Wang et al. 2016, dueling networks).
+    phase p is ``v(t) + g(d_p, t)``, with perceptrons f and v of one hidden layer and g of two. The
+    value v is shared by all phases (Wang et al. 2016, dueling networks).
 
     Args:
         agents: Sizes of the agents.

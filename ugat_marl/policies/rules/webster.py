@@ -76,7 +76,6 @@ class Webster:
     def reset(self, seed: int) -> None:
         """Forget all counts and start every cycle again."""
         self._counts = {a: _RedCounts(w) for a, w in self._network.approaches.items()}
-        self._plans: dict[str, list[int]] = {}
         self._left: dict[str, list[int]] = {}
 
     def act(self, observations: Observations, infos: Infos) -> Actions:

@@ -44,7 +44,7 @@ def from_sumo(path: Path, *, link: bool, own_vehicles: bool) -> RoadSource:
                 network=name,
                 copied={path.name: path},
             )
-        return _configured(path, folder, link, own_vehicles, reporter)
+        return _configured(path, folder, link, own_vehicles)
 
     return roads
 
@@ -66,9 +66,7 @@ def from_routes(paths: Sequence[Path], *, link: bool) -> VehicleSource:
     return vehicles
 
 
-def _configured(
-    path: Path, folder: Path, link: bool, own_vehicles: bool, reporter: Reporter
-) -> RoadFiles:
+def _configured(path: Path, folder: Path, link: bool, own_vehicles: bool) -> RoadFiles:
     if own_vehicles:
         scenario = read_scenario(path)
         network, routes, additional = scenario.network, scenario.routes, scenario.additional
