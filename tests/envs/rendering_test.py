@@ -11,7 +11,7 @@ from matplotlib.colors import to_rgb
 
 from ugat_marl.effects import load_scenario
 from ugat_marl.envs import NetworkRenderer, parallel_env
-from ugat_marl.envs.rendering import _RED, _SIGNALS, _SPEEDS
+from ugat_marl.envs.rendering import _OFF, _RED, _SIGNALS, _SPEEDS
 from ugat_marl.scenarios import Network
 from ugat_marl.simulation import VehiclePositions
 
@@ -82,6 +82,8 @@ def test_links_of_one_lane_have_heads_of_their_own() -> None:
     assert len(lines) == len(item.links) == len(colours)
     ends = {tuple(np.round(line, 6).ravel()) for line in lines}
     assert len(ends) == len(lines)  # none hides another
+    for states, colour in (("r" * 99, _RED), ("O" * 99, _OFF), ("o" * 99, _OFF), ("", _OFF)):
+        assert set(picture._heads.shown({item.id: states})[1]) == {colour}
 
 
 def test_names_are_written_where_there_is_room(network: Network) -> None:

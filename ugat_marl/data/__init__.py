@@ -3,7 +3,7 @@
 - `transitions`: the log of transitions of roll-outs, one row per episode, step and agent.
 - `layouts`: layout of observations.
 - `measured`: measured data of a street, their readers (CSV, Parquet, ATSPM) and their writer.
-- `runs`: the folder of a training run.
+- `runs`: the folder of a training run; `curves`: its numbers for TensorBoard.
 - `checkpoints`: dictionaries of tensors.
 - `row_hashes`: hashes of the rows of tables, which tell damaged ones.
 - `scores`: the measures of an episode.

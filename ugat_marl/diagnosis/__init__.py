@@ -9,9 +9,12 @@ content of ``diagnosis.json``.
     thresholds  every number of the method, with its unit and its reason
     records     the records of the stages, and the form of ``diagnosis.json``
     features    measured lanes, and the features of one period there
+    intervals   counts, occupancies and mean speeds per interval
+    between     turning counts, travel times of probes and states of lanes
     journeys    travel times and queues between detectors, which no fit uses
     statistics  statistics of several periods, their noise, distances, whitening
     measurement errors of the detectors, read off single vehicles before all else
+    error_places  choice of the detectors that err: as few as the data ask for
     replay      one simulated day under the measured signals, with measured arrivals
     engine      simulated days in parallel, with a cache, within a budget
     locate      test of the scenario as it is, and the places that contradict it

@@ -6,7 +6,8 @@ corrected scenario contains them.
 - `base`: base of all effects; `table`: all effects by name.
 - `domains`: named lists of effects, with V1 to V4 of the UGAT paper.
 - `vehicles`, `fleet`, `demand`, `turning`, `roads`, `signals`, `engine`: effects on the simulation.
-- `detectors`: effects on the reports of detectors.
+- `detectors`: effects on the reports of detectors; `detection`: where detectors really lie, and
+  what they report of each vehicle.
 - `sensors`, `actuators`, `objectives`: effects on controllers, made of the parts in `controllers`.
 - `service`: an effect on the green of single lanes.
 - `documents`, `places`: edits of SUMO's files, and the places of a network.

@@ -209,11 +209,13 @@ class _Heads:
         self._across, self._along = np.array(across), np.array(along)
 
     def shown(self, states: Mapping[str, str]) -> tuple[Floats, list[str]]:
-        """Return lines, ``(links, 2, 2)``, and their colours; grey where no state is known."""
+        """Return lines, ``(links, 2, 2)``, and colours; grey where lights are off or not known."""
         letters = [states.get(tls, "")[index : index + 1] for tls, index in self._keys]
         green = np.array([letter in ("G", "g") for letter in letters])
         lines = np.where(green[:, None, None], self._along, self._across)
-        return lines, [_SIGNALS.get(letter, _RED if letter else _OFF) for letter in letters]
+        return lines, [
+            _OFF if letter in ("", "o", "O") else _SIGNALS.get(letter, _RED) for letter in letters
+        ]
 
 
 def _head(

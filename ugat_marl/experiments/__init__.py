@@ -5,10 +5,13 @@ domain, a training seed and a folder. The driver performs jobs in processes or o
 interrupted ones. `train`, the tables of the UGAT paper, the learning curves of the learners and
 ``studies.bench strength`` are lists of settings.
 
-- `settings`, `jobs`, `driver`, `training`: a setting, a job, many jobs, one training.
+- `functions`: `train` and `evaluate` for scripts and notebooks.
+- `settings`, `jobs`, `driver`, `forked`, `training`: a setting, a job, many jobs, jobs in forked
+  processes, one training.
+- `plans`: the plan of a run and its expected work; `packing`: trained policies with their cards.
 - `transfers`, `paper`, `learning_curves`, `baseline`: the trainings of each command.
-- `evaluation`, `scores`, `comparison`, `statistics`, `gap_costs`: episodes of policies, their
-  scores and intervals.
+- `evaluation`, `scores`, `comparison`, `standings`, `statistics`, `gap_costs`: episodes of
+  policies, their scores and intervals.
 - `tuning`, `transfer_headroom`, `scenario_check`: the tuning of rules, and the check of scenarios
   with them.
 - `sim_check`, `transfer_outcome`: is a policy trained; what did grounding change?

@@ -10,8 +10,8 @@ returns a `Snapshot`. At the end of an episode it returns `Trips`.
 - `host`: start and end of processes, for `process` and for vectors of environments.
 - `worker`: the program of these processes.
 - `channel`: messages to and from a worker.
-- `snapshots`, `trips`, `detectors`, `between`, `lane_states`,
-  `approach_delays`: measurements.
+- `snapshots`, `trips`, `detectors`, `between`, `lane_states`, `upstream`, `approach_delays`:
+  measurements.
 """
 
 import lazy_loader
