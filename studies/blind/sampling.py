@@ -51,11 +51,12 @@ ALSO_OUT: Mapping[str, tuple[str, ...]] = {"demand_level": ("demand_surge",)}
 UNKNOWN = ("bus_stops", "driveway", "double_parking")
 """What the library has in no form."""
 
+_OWN = (*UNKNOWN, "reaction_step", *MODELS)
+
 OUTSIDE = (
-    *UNKNOWN, "reaction_step", *MODELS,
+    *_OWN,
     *(f"without {x}" for x in KINDS if x not in (*IN_THE_LOG, "driver_model", "reaction_step")),
 )  # fmt: skip
-_OWN = (*UNKNOWN, "reaction_step", *MODELS)
 
 
 @dataclass(frozen=True)
