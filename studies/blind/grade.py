@@ -22,7 +22,7 @@ from studies.blind.cases import (
     read_plan,
 )
 from studies.blind.strengths import ALL_KINDS, ERRORS
-from ugat_marl.diagnosis import Diagnosis, EffectRecord, PolicyGap
+from ugat_marl.diagnosis import Diagnosis, EffectRecord, LogGrounds, NamedEffect, PolicyGap
 from ugat_marl.effects import EVERYWHERE
 from ugat_marl.errors import BlindTestError
 from ugat_marl.files import write_whole
@@ -212,7 +212,8 @@ def grade(label: Label, diagnosis: Diagnosis | None, wall_s: float | None = None
         for other in (() if diagnosis is None else diagnosis.alternatives)
         if verdict == "not_identifiable"  # with other verdicts these were tried, not named
     ]
-    sets = [{effect.name for effect in answer} for answer in (named, *others)]
+    names = [{effect.name for effect in answer} for answer in (named, *others)]
+    sets = [*names, *_with_rivals(names[0], effects)]
     required, allowed = required_and_allowed(label, truth)
     outcome = _outcome(label, verdict, sets, required, allowed)
     fits = [required <= names <= allowed for names in sets]
@@ -232,7 +233,7 @@ def grade(label: Label, diagnosis: Diagnosis | None, wall_s: float | None = None
         verdict=verdict,
         named=tuple(sorted(sets[0])) if verdict not in ("no_discrepancy", "failed") else (),
         outcome=outcome,
-        among=verdict == "not_identifiable" and hidden and any(fits),
+        among=outcome == "abstained" and hidden and any(fits),
         found=len(required & sets[0]) / len(required) if required and verdict in NAMING else 0.0,
         confident_wrong=verdict == "explained" and (outcome == "wrong" or place_right is False),
         place_right=place_right,
@@ -249,6 +250,16 @@ def grade(label: Label, diagnosis: Diagnosis | None, wall_s: float | None = None
         blamed=_blamed(label, verdict, sets),
         day_to_day=label.day_to_day,
     )
+
+
+def _with_rivals(names: set[str], effects: Sequence[NamedEffect]) -> list[set[str]]:
+    """Return the names with another error of detectors that is said to look the same."""
+    rivals = [
+        (effect.name, effect.evidence.rival.partition("=")[0])
+        for effect in effects
+        if isinstance(effect.evidence, LogGrounds) and effect.evidence.rival is not None
+    ]
+    return [(names - {name}) | {rival} for name, rival in rivals]
 
 
 def _blamed(label: Label, verdict: Verdict, sets: Sequence[set[str]]) -> tuple[str, ...]:
@@ -278,7 +289,9 @@ def _outcome(
         return "wrong" if verdict == "explained" else "abstained"
     if verdict not in NAMING:
         return "abstained"
-    return "right" if required <= sets[0] <= allowed else "wrong"
+    if required <= sets[0] <= allowed:
+        return "right"
+    return "abstained" if any(required <= names <= allowed for names in sets) else "wrong"
 
 
 def _where(

@@ -77,7 +77,7 @@ def test_what_drivers_share_makes_no_approach_stand_out() -> None:
 def test_bends_are_taken_off_at_the_places_of_other_points() -> None:
     rows = [Equation(-0.2, (1.0,), 0.01, other_end=-0.2)]
     search = ErrorPlaces({("stop", "a"): rows, ("exit", "a"): one(0.0)}, (1.0,), PRICE)
-    costs = [search.cheaper_of_none_and([], {"stop": share}).cost for share in (0.0, 0.5, 1.0)]
+    costs = [search.solved([], {"stop": share}).cost for share in (0.0, 0.5, 1.0)]
     assert costs == pytest.approx([400.0, 100.0, 0.0], abs=1e-9)
     # twice as far, or a number
     assert search.choose({"stop": 2.0}).cost == pytest.approx(8 + 2 * np.log(2) + 0.2**2, abs=0.1)

@@ -19,6 +19,7 @@ from ugat_marl.diagnosis.measurement import (
     together,
 )
 from ugat_marl.diagnosis.thresholds import Thresholds
+from ugat_marl.diagnosis.verdict import describe_errors
 from ugat_marl.scenarios import Detector, Passages, Period
 
 THRESHOLDS = Thresholds()
@@ -110,6 +111,26 @@ def test_what_is_wrong_is_named_and_nothing_else(
     assert float(only.split(",")[1]) == pytest.approx(share * value, rel=0.3 if share < 1 else 0.03)
 
 
+@pytest.mark.parametrize("pace", [None, 10.0])
+def test_an_extension_looks_like_a_zone_where_all_drive_at_one_speed(pace: float | None) -> None:
+    """At 10 m/s an extension of 0.3 s is a zone of 3 m; at 8 to 15 m/s it is none."""
+    days = [day(seed, extension_s=0.3 * (seed > 2)) for seed in (0, 1, 2, 7, 8)]
+    if pace is not None:
+        for one, extension_s in zip(days, (0.0, 0.0, 0.0, 0.3, 0.3), strict=True):
+            one.passages[:, 3] = np.random.default_rng(4).normal(pace, 0.05, len(one.passages))
+            one.passages[:, 2] = CAR_M / one.passages[:, 3] + extension_s
+    usual, street = together(days[:3]), together(days[3:])
+    (error,) = Measurement(DETECTORS, street, usual, THRESHOLDS).errors()
+    assert str(error.effect).startswith("detector_extension=*,0.3")
+    said = describe_errors([error])
+    if pace is None:
+        assert error.rival is None
+        assert "or have zones" not in said
+    else:
+        assert str(error.rival) == "detector_zone=*,3"
+        assert said.endswith(", or have zones 3 m longer than stated (here both look the same)")
+
+
 def test_nothing_is_named_where_nothing_is_wrong() -> None:
     usual = together([day(seed) for seed in range(3)])
     assert named(together([day(seed) for seed in (7, 8)]), usual) == []
@@ -123,6 +144,25 @@ def test_slower_drivers_are_no_error_of_detectors() -> None:
     slow.pairs[:, 1] /= 0.8
     slow.pairs[:, 2] *= 0.8
     assert named(slow, usual) == []
+
+
+@pytest.mark.parametrize(("share", "names"), [(1.0, True), (0.6, False)])
+def test_the_end_of_a_slower_road_is_no_extension(share: float, names: bool) -> None:
+    """Vehicles that leave a slowed lane gain speed over the stop detector, all in the same way.
+
+    From the front over the line to the rear they are at 2.6 m/s^2, and reach the speed v, so that
+    ``CAR_M = v d - 1.3 d^2``. It looks like an extension of 0.18 s. Where the lane is as quick as
+    ever, the same times over the detector are one.
+    """
+    usual = together([day(seed) for seed in range(3)])
+    slow = day(9)
+    line = slow.passages[:, 0] >= 2
+    usual.passages[usual.passages[:, 0] >= 2, 3] = 6.5 / share
+    usual.passages[usual.passages[:, 0] >= 2, 2] = CAR_M / (6.5 / share)
+    slow.passages[line, 3] = speed = np.random.default_rng(1).normal(6.5, 0.1, line.sum())
+    slow.passages[line, 2] = (speed - np.sqrt(speed**2 - 2.0 * 2.6 * CAR_M)) / 2.6
+    found = [text for text in named(slow, usual) if "offset" not in text]
+    assert len(found) == names
 
 
 def test_extensions_are_seen_without_speeds() -> None:

@@ -133,14 +133,11 @@ class ErrorPlaces:
                 return choice
             choice = cheapest
 
-    def cheaper_of_none_and(
-        self, numbers: Sequence[Number], elsewhere: Mapping[str, float]
+    def solved(
+        self, numbers: Collection[Number], elsewhere: Mapping[str, float] | None = None
     ) -> Choice:
-        """Return the cheaper one of some numbers and none, if speeds are measured elsewhere."""
-        value = self._value - self._change_by_points(elsewhere)
-        return min(
-            (self._solved(chosen, value) for chosen in ((), numbers)), key=lambda one: one.cost
-        )
+        """Return given numbers, with their best values; `elsewhere` as in `choose`."""
+        return self._solved([*numbers], self._value - self._change_by_points(elsewhere or {}))
 
     def _rows_at(self, place: str) -> NDArray[np.bool_]:
         return np.array(

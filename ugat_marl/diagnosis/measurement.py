@@ -16,6 +16,7 @@ from __future__ import annotations
 import math
 from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass, fields
+from itertools import product
 from typing import Literal, Self
 
 import numpy as np
@@ -373,10 +374,28 @@ class DetectorError:
         effect: The error.
         margin: Half the width of the 95 % interval of its number, in the unit of the number; None
             if it has none.
+        rival: Another error at the same place that explains the data as well; None if none does.
     """
 
     effect: Effect
     margin: float | None = None
+    rival: Effect | None = None
+
+
+@dataclass(frozen=True)
+class _Zones:
+    """Points of speed measurement, extensions, and lengths of zones.
+
+    Attributes:
+        points: Places where speeds are measured at another point than usual.
+        estimates: Extensions and lengths of zones.
+        rivals: For some of them, the other number at the same place, if it alone explains the data
+            hardly worse.
+    """
+
+    points: Mapping[str, SpeedPoint]
+    estimates: Mapping[Number, Estimate]
+    rivals: Mapping[Number, Estimate]
 
 
 def _cheapest(
@@ -438,19 +457,18 @@ class Measurement:
         splashes = self._splashes()
         offsets = self._offsets(splashes) if self._pairs_have_speeds else {}
         stated = any(detector.speed_at is not None for detector in self._detectors)
-        points, zones = self._points_and_zones(pulses, "rear", self._moved(offsets), fixed=stated)
-        found += [DetectorError(DetectorSpeeds(place, point)) for place, point in points.items()]
-        for (place, index), number in zones.items():
-            least = (limit.least_extension_s, limit.least_zone_m)[index]
-            possible = (DetectorExtension.ranges["seconds"], DetectorZone.ranges["metres"])[index]
-            if not (number.differs(least, limit.named_deviations) and possible.holds(number.value)):
-                continue
-            if index == _EXTENSION:
-                seconds = round(number.value, 2)
-                wrong = DetectorExtension(place, seconds, self._overlap(place, seconds))
-            else:
-                wrong = DetectorZone(place, round(number.value, 1))
-            found.append(DetectorError(wrong, limit.half_interval * number.error))
+        zones = self._points_and_zones(pulses, "rear", self._moved(offsets), fixed=stated)
+        found += [DetectorError(DetectorSpeeds(at, point)) for at, point in zones.points.items()]
+        for number, estimate in zones.estimates.items():
+            if self._matters(number, estimate):
+                place, index = number
+                other = zones.rivals.get(number)
+                rival = None if other is None else self._of_zone(place, 1 - index, other)
+                wrong, margin = (
+                    self._of_zone(*number, estimate),
+                    limit.half_interval * estimate.error,
+                )
+                found.append(DetectorError(wrong, margin, rival))
         # Without speeds, distances come from times over the zones, which any other error falsifies.
         if not self._pairs_have_speeds and not found:
             offsets = self._offsets(splashes)
@@ -468,6 +486,26 @@ class Measurement:
     def _moved(self, offsets: Collection[str]) -> frozenset[int]:
         """Return indices of the detectors that stand elsewhere than stated."""
         return frozenset(index for place in offsets for index in self._members(place))
+
+    @staticmethod
+    def _possible(index: int, estimate: Estimate) -> bool:
+        """Return True if an extension or zone is within the range of its effect."""
+        ranges = (DetectorExtension.ranges["seconds"], DetectorZone.ranges["metres"])
+        return ranges[index].holds(estimate.value)
+
+    def _matters(self, number: Number, estimate: Estimate) -> bool:
+        """Return True if an extension or zone is possible, large enough, and beyond chance."""
+        limit, (_, index) = self._thresholds, number
+        least = (limit.least_extension_s, limit.least_zone_m)[index]
+        differs = estimate.differs(least, limit.named_deviations)
+        return differs and self._possible(index, estimate)
+
+    def _of_zone(self, place: str, index: int, estimate: Estimate) -> Effect:
+        """Return the effect of an extension or of the length of a zone."""
+        if index == _EXTENSION:
+            seconds = round(estimate.value, 2)
+            return DetectorExtension(place, seconds, self._overlap(place, seconds))
+        return DetectorZone(place, round(estimate.value, 1))
 
     # --- single kinds of errors -------------------------------------------------------------------
 
@@ -519,7 +557,7 @@ class Measurement:
         moved: Collection[int] = (),
         *,
         fixed: bool = False,
-    ) -> tuple[dict[str, SpeedPoint], Mapping[Number, Estimate]]:
+    ) -> _Zones:
         """Return where speeds are measured, by place, and extensions and zones.
 
         Vehicles that accelerate tell the points apart.
@@ -529,36 +567,49 @@ class Measurement:
             usual: Point of simulated days; another one needs `Thresholds.sure_of_a_point`.
             moved: Indices of detectors that stand elsewhere.
             fixed: True to take `usual` as it is.
-
-        Returns:
-            The place where speeds are measured at another point than `usual`, if there is one, and
-            extensions and zones.
         """
         limit = self._thresholds
         searches = self._searches(pulses, moved)
         best = _cheapest(searches)
-        if fixed or not searches:
-            return {}, best.estimates
-        numbers, places = [*best.estimates], searches[0].places
-        other: SpeedPoint = "front" if usual == "rear" else "rear"
-        shares: dict[SpeedPoint, float] = {other: 1.0, "mean": 0.5}
-        least = best.cost - limit.sure_of_a_point
         points: dict[str, SpeedPoint] = {}
-        for place in places:  # a smaller place has to be better than a larger one
-            for point, share in shares.items():
+        there: dict[str, float] = {}
+        if searches and not fixed:
+            numbers, places = [*best.estimates], searches[0].places
+            other: SpeedPoint = "front" if usual == "rear" else "rear"
+            shares: dict[SpeedPoint, float] = {other: 1.0, "mean": 0.5}
+            least = best.cost - limit.sure_of_a_point
+            # a smaller place has to be better than a larger one
+            for place, (point, share) in product(places, shares.items()):
                 here = {place: share}
                 if place in (EVERYWHERE, *self._kinds):
                     choice = _cheapest(searches, here)
                 else:
-                    choice = min(
-                        (s.cheaper_of_none_and(numbers, here) for s in searches),
-                        key=lambda c: c.cost,
-                    )
+                    tried = (s.solved(some, here) for s in searches for some in ((), numbers))
+                    choice = min(tried, key=lambda one: one.cost)
                 cost = choice.cost + searches[0].chances[place]
                 if cost < least - (limit.narrower_place if points else 0.0):
                     least, best = cost, choice
-                    points = {place: point}
-        return points, best.estimates
+                    points, there = {place: point}, here
+        return _Zones(points, best.estimates, self._rivals(searches, best, there))
+
+    def _rivals(
+        self, searches: Sequence[ErrorPlaces], best: Choice, elsewhere: Mapping[str, float]
+    ) -> dict[Number, Estimate]:
+        """Return extensions that explain the data as well as a zone does, and the reverse."""
+        rivals: dict[Number, Estimate] = {}
+        for number in best.estimates:
+            place, index = number
+            other = (place, 1 - index)
+            if other in best.estimates:
+                continue
+            numbers = [other if one == number else one for one in best.estimates]
+            tried = (search.solved(numbers, elsewhere) for search in searches)
+            instead = min(tried, key=lambda one: one.cost)
+            estimate = instead.estimates[other]
+            near = instead.cost < best.cost + self._thresholds.told_apart
+            if near and self._possible(1 - index, estimate):
+                rivals[number] = estimate
+        return rivals
 
     def _searches(
         self, pulses: Collection[Group], moved: Collection[int]
@@ -593,7 +644,7 @@ class Measurement:
         if stated is None or stated == "mean" or self._grain_s > self._thresholds.coarsest_clock_s:
             return None
         offsets = self._offsets(self._splashes()) if self._pairs_have_speeds else {}
-        shown, _ = self._points_and_zones(self._pulses(), stated, self._moved(offsets))
+        shown = self._points_and_zones(self._pulses(), stated, self._moved(offsets)).points
         return next(((stated, point) for point in shown.values()), None)
 
     def _steady(self) -> float:
@@ -653,10 +704,11 @@ class Measurement:
         """Return the equation of a regime with speeds, in s.
 
         The value is ``d - (L + z) / v``, or ``(G - 1) (L + z) / v`` with the median of G. Both are
-        the same for one vehicle.
+        the same for one vehicle. Vehicles that accelerate by a add ``a d^2 / (2 v)``. Where speeds
+        are not those of the simulated days, a need not be theirs either.
         """
-        limit = self._thresholds
-        speed, reach = (float(np.median(measured[:, column])) for column in (3, 4))
+        limit, one = self._thresholds, self._detectors[int(measured[0, 0])]
+        over_here, speed, reach = (float(np.median(measured[:, column])) for column in (2, 3, 4))
         if form == "excess":
             found, usual = (
                 _median(x[:, 2] - steady * x[:, 4] / x[:, 3]) for x in (measured, simulated)
@@ -670,14 +722,21 @@ class Measurement:
         bend = max(abs(usual.value), usual.spread)
         doubt = limit.inexact * over + limit.bent_here * bend + 0.5 * self._grain_s
         alike = limit.bent_alone * bend
-        kind, regime = self._detectors[int(measured[0, 0])].kind, int(measured[0, 1])
+        kind, regime = one.kind, int(measured[0, 1])
         if regime != ALONE:
             alike += limit.unlike * over
+        usual_speed = float(np.median(simulated[:, 3]))
+        changed = 1.0 - min(speed, usual_speed) / max(speed, usual_speed)
+        driven = limit.hard_mps2 * over_here**2 / (2.0 * speed)
         return Equation(
             found.value - usual.value,
             (1.0, 1.0 / speed),
             float(np.sqrt(found.error**2 + usual.error**2 + doubt**2)),
-            shared={kind: limit.bent * usual.value, f"{kind} {regime} {half}": alike},
+            shared={
+                kind: limit.bent * usual.value,
+                f"{kind} {regime} {half}": alike,
+                f"speeds of {kind}@{edge_of_lane(one.lane)}": changed * driven,
+            },
             other_end=-2.0 * usual.value,
         )
 

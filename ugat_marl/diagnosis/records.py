@@ -307,14 +307,16 @@ class LogGrounds:
 
     Attributes:
         source: The data it is read from.
+        rival: Text of another effect that looks the same in the data; None if none does.
     """
 
     source: str
+    rival: str | None = None
 
     def in_words(self, number: Callable[[float], str]) -> str:
         """Return the grounds as a phrase; it has no number."""
         del number
-        return self.source
+        return self.source if self.rival is None else f"{self.source}; looks like {self.rival} too"
 
 
 @dataclass(frozen=True)

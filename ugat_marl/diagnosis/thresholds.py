@@ -306,12 +306,19 @@ class Thresholds(DayThresholds):
     other limits looks like an error."""
     unlike: float = 0.015
     """The same for queues and vehicles that brake, added to both. By hand. Halved: as above."""
+    hard_mps2: float = 2.6
+    """Acceleration of a vehicle over a detector whose speeds are others than simulated, m/s^2,
+    times the share by which they differ. It is SUMO's usual acceleration. Halved: the end of a
+    slower road looks like an extension."""
     sure_of_a_point: float = 9.0
     """Difference in cost from which speeds are not taken for those of the rear. By hand: three
     deviations. Halved: slow drivers look like speeds measured elsewhere."""
     narrower_place: float = 4.0
     """Cost by which a place must be better than a larger one that holds it. By hand: two
     deviations. Halved: one kind of detectors is named for all of them by chance."""
+    told_apart: float = 4.0
+    """Difference in cost from which a longer zone and an extension are told apart. By hand: two
+    deviations. Halved: one of them is said alone where chance decides."""
     price_of_an_error: float = 8.0
     """Price of an error of a group of detectors, in squared deviations. By hand. Halved: approaches
     are judged apart from each other by chance."""

@@ -273,15 +273,16 @@ def describe_effect(hypothesis: Hypothesis, values: tuple[float, ...]) -> str:
 
 def describe_errors(errors: Sequence[DetectorError]) -> str:
     """Describe errors of measurement as a part of a sentence, such as ``all detectors ...``."""
-    return listed([describe_error(error.effect) for error in errors])
+    return listed([describe_error(error.effect, error.rival) for error in errors])
 
 
-def describe_error(error: Effect) -> str:
-    """Describe one error of measurement, with the detectors it is about."""
+def describe_error(error: Effect, rival: Effect | None = None) -> str:
+    """Describe one error of measurement, or two that look the same, and the detectors."""
     values = error.record()
     kind, _, edge = str(values["place"]).partition("@")
     noun = {"*": "all detectors"}.get(kind, f"{kind} detectors")
-    return f"{noun}{f' of approach {edge}' if edge else ''} {error.in_words()}"
+    said = f"{noun}{f' of approach {edge}' if edge else ''} {error.in_words()}"
+    return f"{said}, or {rival.in_words()} (here both look the same)" if rival else said
 
 
 def capitalised(text: str) -> str:

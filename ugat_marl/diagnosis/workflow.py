@@ -368,7 +368,9 @@ def _begun(
         effects=(
             *(_without_search(effect, "signal log") for effect in timing),
             *(
-                _without_search(error.effect, "detections of single vehicles", error.margin)
+                _without_search(
+                    error.effect, "detections of single vehicles", error.margin, error.rival
+                )
                 for error in study.detection
             ),
         ),
@@ -417,13 +419,16 @@ def _named(best: Tested, selected: Selected, half_interval: float) -> tuple[Name
     return tuple(effects)
 
 
-def _without_search(effect: Effect, source: str, margin: float | None = None) -> NamedEffect:
+def _without_search(
+    effect: Effect, source: str, margin: float | None = None, rival: Effect | None = None
+) -> NamedEffect:
     """Return the record of an effect that the search did not fit.
 
     Args:
         effect: The effect.
         source: What it was read off.
         margin: Half the width of the 95 % interval of its number; None without an interval.
+        rival: Another effect that looks the same in the data.
     """
     values = effect.record()
     name = str(values.pop("name"))
@@ -439,7 +444,8 @@ def _without_search(effect: Effect, source: str, margin: float | None = None) ->
         else Parameter(value, value - margin, value + margin, unit)
         for key, (value, unit) in numbers.items()
     }
-    return NamedEffect(name, ">".join(texts) or None, window, parameters, LogGrounds(source))
+    grounds = LogGrounds(source, None if rival is None else str(rival))
+    return NamedEffect(name, ">".join(texts) or None, window, parameters, grounds)
 
 
 def _with_grounds(effect: EffectRecord, grounds: SearchGrounds) -> NamedEffect:

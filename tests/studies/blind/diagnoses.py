@@ -24,6 +24,6 @@ def says(verdict: str, *effects: Mapping[str, Any], **more: Any) -> Diagnosis | 
             "budget_h": None, "budget_s": 1.0,
             "periods": {"fit": [], "heldout": []}, "hashes": {}, "versions": {},
             "verified_on_fitted_periods": True, "sentence": "", "complete": True,
-            "verdict": verdict, "effects": [{**each, "evidence": grounds} for each in effects],
+            "verdict": verdict, "effects": [{"evidence": grounds, **each} for each in effects],
         } | more
     )  # fmt: skip

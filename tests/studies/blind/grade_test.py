@@ -235,6 +235,24 @@ def test_abstaining_between_right_and_wrong_is_noted() -> None:
     assert not grade(HEADWAY, says("not_identifiable", effect("min_gap"))).among
 
 
+@pytest.mark.parametrize(
+    ("rival", "judged"),
+    [
+        ("detector_offset=advance,-6", ("abstained", True, False)),
+        ("detector_extension=advance,0.2,unknown", ("wrong", False, True)),
+        (None, ("wrong", False, True)),
+    ],
+)
+def test_an_error_of_detectors_that_looks_the_same_is_listed(
+    rival: str | None, judged: tuple[str, bool, bool]
+) -> None:
+    grounds = {"source": "detections of single vehicles", "rival": rival}
+    zone = effect("detector_zone", "advance", metres=(1.0, 2.0, 3.0)) | {"evidence": grounds}
+    graded = grade(OFFSET, says("explained", zone))
+    assert (graded.outcome, graded.among, graded.confident_wrong) == judged
+    assert not graded.blamed
+
+
 def test_half_of_a_pair_is_half() -> None:
     assert grade(PAIR, says("explained", effect("headway"))).found == 0.5
     assert grade(PAIR, says("unknown", effect("headway"))).found == 0
