@@ -13,6 +13,10 @@ COMMANDS: dict[str, tuple[str, str]] = {
         "studies.blind.commands:BlindVisible",
         "test if the hidden effects can be seen at all",
     ),
+    "detectors": (
+        "studies.blind.commands:BlindDetectors",
+        "read off the errors of detectors alone, and open all labels",
+    ),
     "grade": ("studies.blind.commands:BlindGrade", "open the labels of diagnosed cases"),
     "table": ("studies.blind.commands:BlindTable", "sum up graded blind tests"),
 }

@@ -10,6 +10,8 @@ from rich.console import Console
 from tyro.conf import Positional, arg
 
 from studies.blind.cases import Case, read_plan
+from studies.blind.detectors import first_stages
+from studies.blind.detectors import markdown as detectors_markdown
 from studies.blind.generate import VARIATIONS, Blueprint, generate
 from studies.blind.grade import grade_cases, read_grades
 from studies.blind.run import Diagnose, run_cases
@@ -169,6 +171,36 @@ class BlindVisible:
         for case, deviations in sorted(found.items()):
             said = "in the log of the signals" if deviations is None else f"{deviations:.1f} sd"
             console.print(f"{case}  {said}", soft_wrap=True)
+        return 0
+
+
+@dataclass(frozen=True)
+class BlindDetectors:
+    """Read off the errors of detectors alone, without a search, and open all labels.
+
+    The set is spent by it; draw another one for whole diagnoses.
+
+    Examples:
+        python -m studies.blind detectors blind
+
+    Attributes:
+        directory: Directory of a blind test.
+        seed: Seed of the simulated days.
+        only: Names of the cases to look at.
+    """
+
+    directory: Annotated[Positional[Path], arg(metavar="DIR")]
+    seed: int = 0
+    only: Annotated[
+        tuple[str, ...], arg(metavar="CASE ...", help_behavior_hint="(default: all)")
+    ] = ()
+
+    def run(self, console: Console) -> int:
+        """Read off and print."""
+        grades = first_stages(
+            self.directory, only=self.only, seed=self.seed, reporter=Bars(console)
+        )
+        console.print(detectors_markdown(grades), soft_wrap=True, markup=False)
         return 0
 
 

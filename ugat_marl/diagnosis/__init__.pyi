@@ -5,6 +5,7 @@ from .hypotheses import free_values as free_values
 from .hypotheses import global_hypotheses as global_hypotheses
 from .hypotheses import ordered as ordered
 from .locate import locate_gap as locate_gap
+from .measurement import DetectorError as DetectorError
 from .places import Routes as Routes
 from .records import CORRECTED as CORRECTED
 from .records import FILE as FILE
