@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
+import math
 from collections import Counter
 from collections.abc import Collection, Mapping
 from dataclasses import dataclass
 
 from ugat_marl.diagnosis import Routes
-from ugat_marl.effects import EVERYWHERE, group_name, network_places
+from ugat_marl.effects import EVERYWHERE, detectors_at, group_name, network_places
 from ugat_marl.experiments import policy_factory, record
 from ugat_marl.scenarios import Detector, Network, Scenario
 from ugat_marl.seeding import derive_seed
@@ -35,6 +36,8 @@ class Busy:
         edges: Edges before a traffic light.
         detectors: Detectors.
         groups: Places of groups of detectors: all, those of a kind, those of a kind on an edge.
+        room_m: Lengths of lane before and behind all detectors of such a place, m. Behind advance
+            detectors it ends at the next detector.
         pairs: Detectors of one kind on neighbouring lanes that count differently.
         permitted: True if enough drivers have to yield on a green.
         several_lanes: True if an approach has more than one lane.
@@ -48,6 +51,7 @@ class Busy:
     edges: tuple[str, ...]
     detectors: tuple[str, ...]
     groups: tuple[str, ...]
+    room_m: Mapping[str, tuple[float, float]]
     pairs: tuple[tuple[str, str], ...]
     permitted: bool
     several_lanes: bool
@@ -78,6 +82,7 @@ def busy_places(scenario: Scenario, seed: int) -> Busy:
     ways = {
         (edge, other) for edge in sorted(approaches) for other in places.following.get(edge, ())
     }
+    groups = _groups(detectors, rates, network)
     return Busy(
         lights=tuple(item.id for item in network.intersections),
         origins={
@@ -97,7 +102,8 @@ def busy_places(scenario: Scenario, seed: int) -> Busy:
         lanes=tuple(lanes),
         edges=tuple(sorted({network.lanes[x].edge for x in lanes})),
         detectors=tuple(item.id for item in detectors if rates.get(item.id, 0.0) >= BUSY_PER_HOUR),
-        groups=_groups(detectors, rates, network),
+        groups=groups,
+        room_m={place: _room_m(place, detectors, network) for place in groups},
         pairs=_pairs(detectors, rates, network),
         permitted=any(turns.get(way, 0.0) >= YIELDING_PER_HOUR for way in _yielding(network)),
         several_lanes=any(cars[edge] > 1 for edge in approaches),
@@ -158,6 +164,21 @@ def _groups(
         if rates.get(item.id, 0.0) >= BUSY_PER_HOUR
     }
     return (EVERYWHERE, *kinds, *sorted(on_edges))
+
+
+def _room_m(place: str, detectors: tuple[Detector, ...], network: Network) -> tuple[float, float]:
+    """Return the room before and behind all detectors of a place, m."""
+    names = detectors_at(place, detectors)
+    before, behind = math.inf, math.inf
+    for one in (item for item in detectors if item.id in names):
+        ends = [x.position_m for x in detectors if x.lane == one.lane]
+        next_m = min(
+            (end for end in ends if end > one.position_m),
+            default=network.lanes[one.lane].length_m,
+        )
+        before = min(before, one.position_m)
+        behind = min(behind, next_m - one.position_m - one.length_m)
+    return before, behind
 
 
 def _pairs(

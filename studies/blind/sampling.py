@@ -174,6 +174,10 @@ def draw_effect(
     ):
         return None
     places = _places(kind.where, busy)
+    if name in ("detector_offset", "detector_zone"):  # zones grow downstream
+        size_m = abs(kind.value(strength))
+        sides = slice(1, None) if name == "detector_zone" else slice(None)
+        places = [one for one in places if min(busy.room_m[one[0]][sides]) >= size_m]
     if not places:
         return None
     texts = {**known_effects(), **measurement_effects()}[name].texts

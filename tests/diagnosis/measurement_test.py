@@ -165,6 +165,26 @@ def test_the_end_of_a_slower_road_is_no_extension(share: float, names: bool) -> 
     assert len(found) == names
 
 
+@pytest.mark.parametrize(("spread", "names"), [(0.02, True), (0.3, False)])
+def test_drivers_who_speed_up_and_slow_down_over_the_loops_make_no_zone(
+    spread: float, names: bool
+) -> None:
+    """G is 1.18 in the median at all exits, with vehicles far from alike or nearly so."""
+    detectors = tuple(Detector(f"exit {x}", f"{x}_0", 10.0, 0.0, "exit") for x in "abcd")
+    generator = np.random.default_rng(5)
+    index = np.repeat(np.arange(4), 150)
+    speed = generator.uniform(9.0, 13.0, len(index))
+
+    def seen(ratio: np.ndarray) -> Sightings:
+        over = ratio * CAR_M / speed
+        rows = np.column_stack((index, np.full(600, ALONE), over, speed, np.full(600, CAR_M)))
+        return Sightings(rows, np.empty((0, 4)), np.zeros((4, 101)), np.zeros((4, 2)))
+
+    usual = seen(generator.normal(1.0, 0.02, 600))
+    street = seen(1.18 + generator.normal(0.0, spread, 600))
+    assert bool(Measurement(detectors, street, usual, THRESHOLDS).errors()) == names
+
+
 def test_extensions_are_seen_without_speeds() -> None:
     usual = together([day(seed, speeds=False) for seed in range(3)])
     found = named(day(7, extension_s=1.0, speeds=False), usual)
@@ -265,6 +285,44 @@ def test_positions_are_not_examined_where_there_is_splash() -> None:
     both = together([day(seed, twins=0.3, distance_m=GAP_M + 18.0) for seed in (7, 8)])
     (only,) = named(both, usual)
     assert only.startswith("detector_splash=advance,")
+
+
+def test_positions_are_not_examined_where_simulated_pairs_go_astray() -> None:
+    """Where the distance is not found on simulated days, pairs are not of one vehicle each."""
+    usual = together([day(seed, distance_m=GAP_M + 5.0) for seed in range(3)])
+    assert named(day(7, distance_m=GAP_M - 12.0), usual) == []
+
+
+def test_no_detector_lies_before_its_lane() -> None:
+    """The advance detectors are 8 m after the start of the lane, so none lies 18 m upstream."""
+    short = [replace(one, position_m=one.position_m - 92.0) for one in DETECTORS]
+    usual = together([day(seed) for seed in range(3)])
+    for metres, count in ((18.0, 0), (8.0, 1)):
+        street = together([day(seed, distance_m=GAP_M + metres) for seed in (7, 8)])
+        assert len(Measurement(short, street, usual, THRESHOLDS).errors()) == count
+
+
+def test_pulses_of_a_kind_leave_no_zone_where_vehicles_are_alike() -> None:
+    """On a quick road times are nearly as alike as pulses, so the road is judged with its kind."""
+    detectors = tuple(
+        Detector(f"exit {edge}", f"{edge}_0", 10.0, 0.0, "exit") for edge in ("a", "b")
+    )
+    generator = np.random.default_rng(3)
+    speed = np.concatenate([generator.uniform(8.0, 15.0, 150), generator.normal(14.0, 0.8, 150)])
+    index = np.repeat([0, 1], 150)
+    over = CAR_M / speed
+    none = np.full(300, ALONE)
+    usual, street = (
+        Sightings(
+            np.column_stack((index, none, times, speed, np.full(300, CAR_M))),
+            np.empty((0, 4)),
+            np.zeros((2, 101)),
+            np.zeros((2, 2)),
+        )
+        for times in (over, np.full(300, 0.1))
+    )
+    errors = Measurement(detectors, street, usual, THRESHOLDS).errors()
+    assert [str(error.effect) for error in errors] == ["detector_pulse=exit,0.1"]
 
 
 def test_sightings_are_stored_and_read() -> None:

@@ -398,6 +398,12 @@ class _Zones:
     rivals: Mapping[Number, Estimate]
 
 
+def _changed(measured: Array, simulated: Array) -> float:
+    """Return the share by which the median speeds of passages differ, from 0 to 1."""
+    low, high = sorted(float(np.median(rows[:, 3])) for rows in (measured, simulated))
+    return 1.0 - low / high
+
+
 def _cheapest(
     searches: Sequence[ErrorPlaces], elsewhere: Mapping[str, float] | None = None
 ) -> Choice:
@@ -449,11 +455,8 @@ class Measurement:
         limit = self._thresholds
         if self._grain_s > limit.coarsest_clock_s:
             return ()
-        pulses = self._pulses()
-        found = [
-            DetectorError(DetectorPulse(place, seconds))
-            for place, seconds in self._together(pulses).items()
-        ]
+        pulses = self._together(self._pulses())
+        found = [DetectorError(DetectorPulse(place, seconds)) for place, seconds in pulses.items()]
         splashes = self._splashes()
         offsets = self._offsets(splashes) if self._pairs_have_speeds else {}
         stated = any(detector.speed_at is not None for detector in self._detectors)
@@ -552,7 +555,7 @@ class Measurement:
 
     def _points_and_zones(
         self,
-        pulses: Collection[Group],
+        pulses: Collection[str],
         usual: SpeedPoint,
         moved: Collection[int] = (),
         *,
@@ -563,7 +566,7 @@ class Measurement:
         Vehicles that accelerate tell the points apart.
 
         Args:
-            pulses: Groups that are left out.
+            pulses: Places that are left out.
             usual: Point of simulated days; another one needs `Thresholds.sure_of_a_point`.
             moved: Indices of detectors that stand elsewhere.
             fixed: True to take `usual` as it is.
@@ -611,21 +614,20 @@ class Measurement:
                 rivals[number] = estimate
         return rivals
 
-    def _searches(
-        self, pulses: Collection[Group], moved: Collection[int]
-    ) -> tuple[ErrorPlaces, ...]:
+    def _searches(self, pulses: Collection[str], moved: Collection[int]) -> tuple[ErrorPlaces, ...]:
         """Return the searches for extensions and zones: one for each form of the equations.
 
         An extension adds the same to all excess times, and a zone the same to all ratios. Where
         vehicles are not alike, the other form is less exact.
         """
         limit, steady = self._thresholds, self._steady()
+        short = {index for place in pulses for index in self._members(place)}
         searches: list[ErrorPlaces] = []
         for form in FORMS:
             equations = {
                 group: rows
                 for group, members in self._groups.items()
-                if group not in pulses
+                if short.isdisjoint(members)
                 and (rows := self._equations(members, steady, form, set(members) <= set(moved)))
             }
             priors = (limit.usual_extension_s, limit.usual_zone_m)
@@ -644,7 +646,8 @@ class Measurement:
         if stated is None or stated == "mean" or self._grain_s > self._thresholds.coarsest_clock_s:
             return None
         offsets = self._offsets(self._splashes()) if self._pairs_have_speeds else {}
-        shown = self._points_and_zones(self._pulses(), stated, self._moved(offsets)).points
+        pulses = self._together(self._pulses())
+        shown = self._points_and_zones(pulses, stated, self._moved(offsets)).points
         return next(((stated, point) for point in shown.values()), None)
 
     def _steady(self) -> float:
@@ -690,7 +693,9 @@ class Measurement:
                     if not moved or name == "quick"
                 }
             for name, (of_street, of_model) in parts.items():
-                if min(len(of_street), len(of_model)) >= self._thresholds.least_sightings:
+                if min(len(of_street), len(of_model)) < self._thresholds.least_sightings:
+                    continue
+                if not speeds or _changed(of_street, of_model) <= self._thresholds.like_speeds:
                     equations.append(
                         self._of_speeds(of_street, of_model, steady, form, name)
                         if speeds
@@ -719,14 +724,13 @@ class Measurement:
                 for x in (measured, simulated)
             )
         over = float(np.median(simulated[:, 2]))
-        bend = max(abs(usual.value), usual.spread)
+        bend = max(abs(usual.value), usual.spread, found.spread)
         doubt = limit.inexact * over + limit.bent_here * bend + 0.5 * self._grain_s
         alike = limit.bent_alone * bend
         kind, regime = one.kind, int(measured[0, 1])
         if regime != ALONE:
             alike += limit.unlike * over
-        usual_speed = float(np.median(simulated[:, 3]))
-        changed = 1.0 - min(speed, usual_speed) / max(speed, usual_speed)
+        changed = _changed(measured, simulated)
         driven = limit.hard_mps2 * over_here**2 / (2.0 * speed)
         return Equation(
             found.value - usual.value,
@@ -798,7 +802,13 @@ class Measurement:
                 continue
             if len(measured) >= least and 2 * len(simulated) >= least:
                 travel = [x[:, 1] * x[:, 2 if speeds else 3] for x in (measured, simulated)]
-                distances[group] = travel[0], travel[1]
+                here_m, there_m = (float(np.median(x)) for x in travel)
+                before_m = min(self._detectors[index].position_m for index in members)
+                # On very short roads, what crosses both need not be one vehicle either: then the
+                # stated distance is not found on simulated days, or the lane is too short for it.
+                astray_m = max(abs(there_m - self._stated_m(members)), here_m - there_m - before_m)
+                if not astray_m > limit.most_astray_m:
+                    distances[group] = travel[0], travel[1]
         # The spread of a few may be small by chance.
         spread = float(
             np.median([_median(simulated).spread for _, simulated in distances.values()] or [0])
@@ -820,6 +830,12 @@ class Measurement:
             if farther.differs(limit.least_offset_m, limit.named_deviations)
             and DetectorOffset.ranges["metres"].holds(-farther.value)
         }
+
+    def _stated_m(self, members: Sequence[int]) -> float:
+        """Return the stated distance of advance detectors from those at the stop line, m."""
+        stops = {one.lane: one.position_m for one in self._detectors if one.kind == "stop"}
+        advance = [self._detectors[index] for index in members]
+        return float(np.median([stops[x.lane] - x.position_m for x in advance if x.lane in stops]))
 
     def _splashes(self) -> list[DetectorError]:
         """Return the places of detectors that report vehicles of the next lane.
@@ -852,7 +868,8 @@ class Measurement:
         search = ErrorPlaces(equations, (limit.usual_splash,), limit.price_of_an_error)
         return [
             DetectorError(
-                DetectorSplash(place, round(share.value, 3)), limit.half_interval * share.error
+                DetectorSplash(place, round(share.value, 3)),
+                limit.half_interval * math.hypot(share.error, limit.splash_doubt * share.value),
             )
             for (place, _), share in search.choose().estimates.items()
             if share.differs(limit.least_splash, limit.named_deviations)

@@ -284,6 +284,10 @@ class Thresholds(DayThresholds):
     longest_travel_s: float = 12.0
     """Longest such time, s. By hand: 100 m at 30 km/h. Halved: advance detectors far upstream are
     not judged."""
+    most_astray_m: float = 3.0
+    """Distance of detectors on simulated days from the stated one, beyond which pairs are not of
+    one vehicle each, m. By hand: it is within 1 m elsewhere. Halved: a tenth of approaches is not
+    judged where vehicles are few."""
     steady_share: float = 0.15
     """Change of a speed between the two detectors, as a share of the limit, beyond which a vehicle
     did not drive steadily. By hand. Halved: fewer vehicles, each more exact."""
@@ -306,6 +310,10 @@ class Thresholds(DayThresholds):
     other limits looks like an error."""
     unlike: float = 0.015
     """The same for queues and vehicles that brake, added to both. By hand. Halved: as above."""
+    like_speeds: float = 0.25
+    """Share by which median speeds over a detector may differ from the simulated ones. Beyond it
+    the vehicles move there as on no simulated day and are not compared. By hand: rain and snow slow
+    queues by less, and a road with half the limit by more. Halved: fewer passages in snow."""
     hard_mps2: float = 2.6
     """Acceleration of a vehicle over a detector whose speeds are others than simulated, m/s^2,
     times the share by which they differ. It is SUMO's usual acceleration. Halved: the end of a
@@ -350,6 +358,9 @@ class Thresholds(DayThresholds):
     twin_doubt: float = 0.3
     """Share by which twins of vehicles side by side may differ. By hand: other drivers form other
     platoons. Halved: platoons look like splash."""
+    splash_doubt: float = 0.1
+    """Share by which the share of splash may be wrong. By hand: in dense traffic fewer passages are
+    alone. Halved: intervals of large shares are too narrow."""
     usual_splash: float = 0.2
     """Prior standard deviation of the share of passages with a twin. By hand: a loop that reports
     every fourth vehicle beside it is soon mended. Halved: large shares are drawn to 0."""

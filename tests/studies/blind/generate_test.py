@@ -8,6 +8,7 @@ import shutil
 from collections import Counter
 from collections.abc import Callable
 from dataclasses import replace
+from itertools import product
 from pathlib import Path
 
 import numpy as np
@@ -320,6 +321,22 @@ def test_the_demand_that_is_hidden_is_what_can_be_counted(single: tuple[Scenario
         assert effect is not None
         found.add(effect.record()["factor"])
     assert found == {1.3162, 0.6838}
+
+
+def test_detectors_have_room_for_the_errors_that_are_hidden(single: tuple[Scenario, Busy]) -> None:
+    """A zone of 4 m has no room behind the stop detectors, which lie 2.5 m before the line."""
+    scenario, busy = single
+    assert busy.room_m["stop"][1] == pytest.approx(2.5)
+    assert busy.room_m["advance"][1] == pytest.approx(47.5)
+    kinds = dict[str, set[str]]()
+    for strength, number in product(("medium", "large"), range(30)):
+        generator = np.random.default_rng(number)
+        effect = draw_effect("detector_zone", strength, scenario, busy, generator)
+        assert effect is not None
+        place = effect.record()["place"]
+        kinds.setdefault(strength, set()).add(place.partition("@")[0])
+    assert kinds["medium"] == {"*", "advance", "stop", "exit"}
+    assert kinds["large"] == {"advance", "exit"}
 
 
 def test_vehicles_among_others_tell_less_than_alone() -> None:
