@@ -258,6 +258,22 @@ def test_when_the_budget_ends_no_doubtful_effect_is_named_either() -> None:
     assert selector._without_doubtful(best, base) is base
 
 
+@pytest.mark.parametrize(("factor", "kept"), [(0.99, (HEADWAY,)), (0.95, (HEADWAY, DEMAND))])
+def test_when_the_budget_ends_nothing_too_small_to_matter_is_named(
+    factor: float, kept: Members
+) -> None:
+    """A demand of 0.99 is below the least change of 0.02 that is worth a name."""
+    weak = (DEMAND[0], (factor,))
+    both = ("headway", "demand_level")
+    ledger = Ledger({both: 900.0, ("headway",): 1000.0, ("demand_level",): 950.0}, {})
+    selector: Any = object.__new__(Selector)
+    models = [ledger.simulate(members, 16) for members in ((HEADWAY, weak), (HEADWAY,), (weak,))]
+    selector._seen = {str(number): model for number, model in enumerate(models)}
+    assert names(selector._that_matter(models[0]).members) == names(kept)
+    selector._seen = {"both": models[0]}
+    assert selector._that_matter(models[0]) is models[0]
+
+
 @pytest.mark.parametrize(("errors", "tried"), [(0.05, True), (0.005, False)])
 def test_sets_without_an_effect_beyond_doubt_are_not_tried(
     errors: float, tried: bool, monkeypatch: pytest.MonkeyPatch

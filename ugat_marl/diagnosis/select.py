@@ -115,7 +115,7 @@ class Selector:
             complete = False
             cheapest = min(self._seen.values(), key=cost_of, default=best.model)
             if cheapest.cost < best.model.cost:
-                best = self._untested(cheapest, base)
+                best = self._untested(self._that_matter(cheapest), base)
             elif doubtful(best, self._thresholds.half_interval):
                 best = self._without_doubtful(best, base)
         rivals = tuple(sorted(self._seen.values(), key=cost_of))
@@ -182,15 +182,26 @@ class Selector:
 
     def _without_doubtful(self, best: Tested, base: Tested) -> Tested:
         """Return the best model that was simulated with none but the certain effects of another."""
-        unsure = doubtful(best, self._thresholds.half_interval)
-        members = best.model.members
-        certain = {h.key for index, (h, _) in enumerate(members) if index not in unsure}
-        parts = [
-            model
-            for model in self._seen.values()
-            if model.members and {hypothesis.key for hypothesis, _ in model.members} <= certain
-        ]
+        parts = self._parts(best.model, doubtful(best, self._thresholds.half_interval))
         return self._untested(min(parts, key=cost_of), base) if parts else base
+
+    def _that_matter(self, model: Fitted) -> Fitted:
+        """Return the best model that was simulated with none but the effects that matter.
+
+        It is the given model if all of its effects matter, or none was simulated.
+        """
+        weak = [index for index, (h, values) in enumerate(model.members) if not h.matters(values)]
+        parts = self._parts(model, weak) if weak else ()
+        return min(parts, key=cost_of, default=model)
+
+    def _parts(self, model: Fitted, left_out: Sequence[int]) -> list[Fitted]:
+        """Return the models that were simulated with none but the other members of a model."""
+        kept = {h.key for index, (h, _) in enumerate(model.members) if index not in left_out}
+        return [
+            part
+            for part in self._seen.values()
+            if part.members and {hypothesis.key for hypothesis, _ in part.members} <= kept
+        ]
 
     def _round(self, start: Tested, number: int) -> Tested | None:
         """Add, change or remove effects; return None if no change is worth its price."""
