@@ -99,7 +99,7 @@ def deviations_of(study: Study, effects: Sequence[Effect]) -> float:
         effects: Hidden effects with their true values.
     """
     base = study.base(Silent()).model
-    with_them = [day.tally for day in study.engine.replicates(effects, study.engine.first(DAYS))]
+    with_them = [day.tally for day in study.engine.replicates(effects, list(base.days)[:DAYS])]
     without = base.tallies[: len(with_them)]
     return separation(base.reference, study.fit, with_them, without)
 

@@ -545,7 +545,7 @@ def counted(tmp_path: Path) -> Path:
     days = tuple(replace(p, signals={}, passages={}) for p in base.periods)
     directory = write_measured(replace(base, periods=days), tmp_path / "street")
     assert not (directory / "detections.parquet").exists()
-    (directory / "signals.parquet").unlink()
+    assert not (directory / "signals.parquet").exists()
     (directory / CSV_HASHES).unlink()  # tests edit the tables by hand
     return directory
 
@@ -560,6 +560,40 @@ def test_counts_alone_can_tell_a_few_things(
     assert set(findings[text]) == set(known_effects()) - set(coverage.COUNTABLE)
     assert "startup_delay" in findings[text]
     assert any("no signals: the network's own programme" in text for text in findings)
+    again = read_measured(write_measured(read, tmp_path / "again"), scenario, network)
+    assert [period.signals for period in again.periods] == [{}] * 3
+    assert again.counts is not None and again.counts.equals(read.counts)
+
+
+def test_counts_of_one_kind_of_detectors_show_no_undercount(
+    tmp_path: Path, scenario: Scenario, network: Network
+) -> None:
+    directory = counted(tmp_path)
+    assert not _ruled_out(directory, scenario, network) & {"undercount"}
+    stops = [d.id for d in DETECTORS if d.kind == "stop"]
+    rows = pl.read_csv(directory / "counts.csv").filter(pl.col("detector_id").is_in(stops))
+    rows.write_csv(directory / "counts.csv")
+    assert "undercount" in _ruled_out(directory, scenario, network)
+
+
+def _ruled_out(directory: Path, scenario: Scenario, network: Network) -> set[str]:
+    findings = read_measured(directory, scenario, network).findings
+    return {name for finding in findings for name in finding.rules_out}
+
+
+def test_counts_of_a_detector_with_broken_events_are_of_a_listed_detector(
+    tmp_path: Path, scenario: Scenario, network: Network
+) -> None:
+    """A detector that only ever comes on is not used, but its counts are no fault of the table."""
+    directory = write_measured(recording(counts=counts()), tmp_path / "street")
+    path = directory / "detections.parquet"
+    rows = pl.read_parquet(path)
+    first = rows["detector_id"][0]
+    kept = (pl.col("detector_id") != first) | (pl.col("event") == "on")
+    rows.filter(kept).write_parquet(path)
+    read = read_measured(directory, scenario, network)
+    assert first not in [d.id for d in read.detectors]
+    assert read.counts is not None and first not in read.counts["detector_id"]
 
 
 @pytest.mark.parametrize(

@@ -47,6 +47,14 @@ def test_times_are_interpolated_and_the_rear_leaves_behind_the_zone() -> None:
     assert seen.length_m.tolist() == [4.0]
 
 
+def test_a_vehicle_may_leave_a_zone_before_its_first_position_on_the_lane() -> None:
+    """It is 3 m before lane b at 10 s and 12 m on it at 11 s, at 15 m/s."""
+    rows = track(["a_0", "b_0", "b_0"], [25.0, 12.0, 27.0], 15.0, length_m=[5.0] * 3)
+    seen = passages(rows, Detector("exit", "b_0", 2.0, 0.0, "exit"))["exit"]
+    assert seen.on_s.tolist() == pytest.approx([11.0 - 10.0 / 15.0], abs=1e-3)
+    assert seen.off_s.tolist() == pytest.approx([11.0 - 5.0 / 15.0], abs=1e-3)
+
+
 def test_a_stop_line_between_two_positions_is_crossed_though_the_road_ends() -> None:
     # The lane ends at 28 m; the junction is 12 m long. Speeds tell the way between the lanes.
     rows = track(["a_0", "a_0", "a_0", ":j_0", "b_0"], [5.0, 15.0, 25.0, 7.0, 5.0], 10.0)

@@ -13,7 +13,7 @@ import pytest
 
 from ugat_marl.diagnosis import Tally, default_cache
 from ugat_marl.diagnosis import engine as module
-from ugat_marl.diagnosis.engine import Budget, Engine, OutOfTime, Replicate
+from ugat_marl.diagnosis.engine import Budget, Engine, OutOfTime, Replicate, _signals_hash
 from ugat_marl.diagnosis.features import BIN_FEATURES, FEATURES, DetectorLayout
 from ugat_marl.diagnosis.replay import Day, Replay, Unmeasured
 from ugat_marl.diagnosis.thresholds import Thresholds
@@ -449,3 +449,15 @@ def test_no_day_is_prepared_when_time_is_up(
     with pytest.raises(OutOfTime, match="budget"):
         late.prepare([((), [0, 1]), (HEADWAY, [0])])
     assert streets.calls == []
+
+
+def test_measured_speeds_decide_arrivals_and_so_the_day() -> None:
+    on = np.array([100.0, 190.0, 193.0, 200.0])
+
+    def period(speed_mps: list[float]) -> Period:
+        seen = Passages(on, on + 1.0, np.array(speed_mps), np.full(4, 5.0))
+        return Period("day", 0.0, 900.0, "fit", {}, {"far": seen})
+
+    quick, slow = period([13.0, 13.0, 13.0, 13.0]), period([13.0, 3.0, 3.0, 13.0])
+    assert _signals_hash(quick, True) != _signals_hash(slow, True)
+    assert _signals_hash(quick, False) == _signals_hash(slow, False)

@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import json
 from dataclasses import asdict, replace
+from types import SimpleNamespace
+from typing import Any
 
 import numpy as np
 import pytest
@@ -18,7 +20,7 @@ from ugat_marl.diagnosis.features import (
     IncomingLane,
     bins_in,
 )
-from ugat_marl.diagnosis.locate import locate
+from ugat_marl.diagnosis.locate import _stretches, locate
 from ugat_marl.diagnosis.records import Disagreement
 from ugat_marl.diagnosis.statistics import Pools
 from ugat_marl.diagnosis.thresholds import Thresholds
@@ -173,3 +175,15 @@ def test_disagreements_can_be_written(reference: Reference) -> None:
         again = json.loads(json.dumps(asdict(item), allow_nan=False))
         assert 0 <= again["p"] <= 1
         assert again["window"] is None or len(again["window"]) == 2
+
+
+def test_bins_without_data_are_no_stretch() -> None:
+    """Counts are 4 deviations too high all day long, and two hours are missing."""
+    z = np.array([[4.0, 4.1, 3.9, 4.0, 0.0, 0.0, 0.0, 0.0, 4.0, 4.1, 3.9, 4.0]])
+    used = z != 0.0
+    site = replace(SITE, lanes=SITE.lanes[:1], exits=())
+    pools: Any = SimpleNamespace(thresholds=THRESHOLDS, grouped_s=lambda length_s: length_s)
+    reference: Any = SimpleNamespace(pools=pools, blocks={"time": SimpleNamespace(used=used)})
+    distance: Any = SimpleNamespace(z={"time": z}, difference={"time": z})
+    (found,) = _stretches(site, reference, distance, SPAN)
+    assert abs(found.z) < 0.5

@@ -2,12 +2,15 @@
 
 from __future__ import annotations
 
+import inspect
+import re
 from dataclasses import replace
 from typing import Any
 
 import numpy as np
 import pytest
 
+from ugat_marl.diagnosis import measurement
 from ugat_marl.diagnosis.features import DetectorLayout, Greens, IncomingLane
 from ugat_marl.diagnosis.measurement import (
     ALONE,
@@ -18,7 +21,7 @@ from ugat_marl.diagnosis.measurement import (
     Sightings,
     together,
 )
-from ugat_marl.diagnosis.thresholds import Thresholds
+from ugat_marl.diagnosis.thresholds import OF_SIGHTINGS, Thresholds
 from ugat_marl.diagnosis.verdict import describe_errors
 from ugat_marl.scenarios import Detector, Passages, Period
 
@@ -291,6 +294,38 @@ def test_positions_are_not_examined_where_simulated_pairs_go_astray() -> None:
     """Where the distance is not found on simulated days, pairs are not of one vehicle each."""
     usual = together([day(seed, distance_m=GAP_M + 5.0) for seed in range(3)])
     assert named(day(7, distance_m=GAP_M - 12.0), usual) == []
+
+
+def test_single_pairs_without_speeds_hide_no_position() -> None:
+    usual = together([day(seed) for seed in range(3)])
+    street = together([day(seed, distance_m=GAP_M + 18.0) for seed in (7, 8)])
+    street.pairs[:3, 2] = np.nan
+    (only,) = named(street, usual)
+    assert only.startswith("detector_offset=advance,-18")
+
+
+def test_detectors_farther_upstream_hide_no_position() -> None:
+    """Pairs are of the first advance detector of a lane; another one is 20 m before the line."""
+    second = (
+        Detector("near", "in_0", 130.0, 0.0, "advance"),
+        Detector("near left", "in_1", 130.0, 0.0, "advance"),
+    )
+    usual = together([day(seed) for seed in range(3)])
+    street = together([day(seed, distance_m=GAP_M + 18.0) for seed in (7, 8)])
+    gaps, twins = (np.vstack((x, np.zeros((2, x.shape[1])))) for x in (usual.gaps, usual.twins))
+    days = (replace(x, gaps=gaps, twins=twins) for x in (street, usual))
+    (error,) = Measurement((*DETECTORS, *second), *days, THRESHOLDS).errors()
+    assert str(error.effect).startswith("detector_offset=advance,-18")
+
+
+def test_cached_sightings_depend_on_every_number_they_are_made_with() -> None:
+    """Those of a day are in the key of the day already."""
+    source = inspect.getsource(measurement).partition("# --- estimates")[0]
+    used = set(re.findall(r"(?:thresholds|limit)\.(\w+)", source))
+    of_a_day = {name for name, _ in THRESHOLDS.of_a_day()}
+    assert used - of_a_day == set(OF_SIGHTINGS)
+    other = replace(THRESHOLDS, twin_s=0.3)
+    assert other.of_sightings() != THRESHOLDS.of_sightings()
 
 
 def test_no_detector_lies_before_its_lane() -> None:

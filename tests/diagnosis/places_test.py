@@ -250,6 +250,13 @@ def test_a_detector_that_was_dead_all_day(reference: Reference) -> None:
     assert window_of(item) == (0.0, 3600.0)
 
 
+def test_counts_alone_make_no_detector_silent(reference: Reference) -> None:
+    data = [replace(street(320 + i), passages={}) for i in range(5)]
+    place_finder = PlaceFinder(SITE, ROUTES, library(), THRESHOLDS)
+    distance = reference.distance(tallies([street(320 + i) for i in range(5)]))
+    assert "dropout" not in names(place_finder.hypotheses(reference, distance, data))
+
+
 def test_a_closed_lane(reference: Reference) -> None:
     def closed(period: Period) -> Period:
         """From 1200 to 2100 s one vehicle in five comes through, and stands for 30 s."""

@@ -265,13 +265,18 @@ def test_when_the_budget_ends_nothing_too_small_to_matter_is_named(
     """A demand of 0.99 is below the least change of 0.02 that is worth a name."""
     weak = (DEMAND[0], (factor,))
     both = ("headway", "demand_level")
-    ledger = Ledger({both: 900.0, ("headway",): 1000.0, ("demand_level",): 950.0}, {})
+    costs = {both: 900.0, ("headway",): 1000.0, ("demand_level",): 950.0}
+    ledger = Ledger(costs, {("demand_level",): 0.9})
     selector: Any = object.__new__(Selector)
     models = [ledger.simulate(members, 16) for members in ((HEADWAY, weak), (HEADWAY,), (weak,))]
+    base = replace(models[0], members=(), cost=2000.0)
     selector._seen = {str(number): model for number, model in enumerate(models)}
-    assert names(selector._that_matter(models[0]).members) == names(kept)
+    assert names(selector._that_matter(models[0], base).members) == names(kept)
     selector._seen = {"both": models[0]}
-    assert selector._that_matter(models[0]) is models[0]
+    assert selector._that_matter(models[0], base) is models[0]
+    if factor == 0.99:
+        assert selector._that_matter(models[2], base) is base
+        assert ledger.left(weak) == ()
 
 
 @pytest.mark.parametrize(("errors", "tried"), [(0.05, True), (0.005, False)])

@@ -265,7 +265,8 @@ class Engine:
         def reduce(period: Period, greens: Sequence[Greens]) -> dict[str, Any]:
             return Sightings.of(self.layout, period, greens, self._thresholds).arrays()
 
-        days = self.reduced((), numbers, "vehicles", reduce, advance)
+        name = f"vehicles-{self._thresholds.of_sightings()}"
+        days = self.reduced((), numbers, name, reduce, advance)
         return [Sightings.from_arrays(arrays) for arrays in days]
 
     def reduced(
@@ -607,7 +608,8 @@ def _signals_hash(period: Period, answering: bool) -> str:
     content = (period.begin_s, period.end_s, sorted(period.signals.items()))
     digest = hashlib.sha256(repr(content).encode())
     if answering:
-        digest.update(b"arrivals/2")
+        digest.update(b"arrivals/3")
     for name, seen in sorted(period.passages.items()) if answering else ():
-        digest.update(repr((name, seen.on_s.tolist(), seen.off_s.tolist())).encode())
+        times = (name, seen.on_s.tolist(), seen.off_s.tolist(), seen.speed_mps.tolist())
+        digest.update(repr(times).encode())
     return digest.hexdigest()

@@ -180,7 +180,7 @@ def _stretches(
         if used[row].sum() < thresholds.least_bins:
             continue
         middle = float(np.median(z[row][used[row]]))
-        best = _stretch(z[row] - middle, thresholds)
+        best = _stretch(np.where(used[row], z[row] - middle, 0.0), thresholds)
         if best is None:
             continue
         value, first, last = best

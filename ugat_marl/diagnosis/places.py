@@ -833,6 +833,8 @@ def _silent(
 ) -> list[Hypothesis]:
     """Find detectors that were silent at the same time of every period, against expectation."""
     ranked: list[tuple[float, Hypothesis]] = []
+    if not any(period.passages for period in periods):
+        return []  # counts alone do not say when a detector was silent
     for name, expected in rate.items():
         begin, end = -np.inf, np.inf
         for period in periods:

@@ -115,7 +115,7 @@ class Selector:
             complete = False
             cheapest = min(self._seen.values(), key=cost_of, default=best.model)
             if cheapest.cost < best.model.cost:
-                best = self._untested(self._that_matter(cheapest), base)
+                best = self._untested(self._that_matter(cheapest, base.model), base)
             elif doubtful(best, self._thresholds.half_interval):
                 best = self._without_doubtful(best, base)
         rivals = tuple(sorted(self._seen.values(), key=cost_of))
@@ -185,12 +185,15 @@ class Selector:
         parts = self._parts(best.model, doubtful(best, self._thresholds.half_interval))
         return self._untested(min(parts, key=cost_of), base) if parts else base
 
-    def _that_matter(self, model: Fitted) -> Fitted:
+    def _that_matter(self, model: Fitted, base: Fitted) -> Fitted:
         """Return the best model that was simulated with none but the effects that matter.
 
-        It is the given model if all of its effects matter, or none was simulated.
+        It is the given model if all of its effects matter, or none was simulated, and the scenario
+        as it is if no effect matters.
         """
         weak = [index for index, (h, values) in enumerate(model.members) if not h.matters(values)]
+        if len(weak) == len(model.members):
+            return base
         parts = self._parts(model, weak) if weak else ()
         return min(parts, key=cost_of, default=model)
 
@@ -454,7 +457,9 @@ def pruned(
         return fitter.simulate(model.members, fitter.thresholds.settling_days)
 
     members = tuple(member for member in best.model.members if member[0].matters(member[1]))
-    if members and len(members) < len(best.model.members):
+    if not members:
+        return base
+    if len(members) < len(best.model.members):
         best = test(fitter.refine(fitter.simulate(members), fitter.thresholds.steps_without))
     best = exact(best)
     while len(best.model.members) > 1:

@@ -409,7 +409,9 @@ class Study:
 
         numbers = self.engine.first(thresholds.pattern_days)
         with reporter.task("patterns in what is left", len(numbers)) as advance:
-            simulated = self.engine.reduced(effects, numbers, "cells", cells, advance)
+            simulated = self.engine.reduced(
+                effects, numbers, f"cells of {thresholds.pattern_bin_s:g} s", cells, advance
+            )
         # Under signals that follow the traffic, simulated counts are the measured ones.
         quantities = QUANTITIES if self.other_days is None else QUANTITIES[:-1]
         return patterns(

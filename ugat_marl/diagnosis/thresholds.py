@@ -7,6 +7,7 @@ That follows from the method and was not measured.
 
 from __future__ import annotations
 
+import hashlib
 from dataclasses import dataclass, fields
 
 
@@ -163,6 +164,13 @@ class DayThresholds:
     def of_a_day(self) -> tuple[tuple[str, object], ...]:
         """Return the names and values of these numbers alone, for the key of cached days."""
         return tuple((item.name, getattr(self, item.name)) for item in fields(DayThresholds))
+
+
+OF_SIGHTINGS = (
+    "touching_s", "no_gap_s", "longest_alone_s", "crawling_mps", "least_braking_mps",
+    "least_travel_s", "longest_travel_s", "steady_share", "twin_s",
+)  # fmt: skip
+"""Numbers that decide what is kept of single vehicles, beside those of a day."""
 
 
 @dataclass(frozen=True)
@@ -781,3 +789,8 @@ class Thresholds(DayThresholds):
     interval_s: float = 900.0
     """Interval of FHWA's criteria, s (FHWA-HOP-18-036, chapter 5). Halved: counts are noisier and
     fail the criteria."""
+
+    def of_sightings(self) -> str:
+        """Return a digest of the numbers in `OF_SIGHTINGS`, for the key of cached days."""
+        text = repr([getattr(self, name) for name in OF_SIGHTINGS])
+        return hashlib.sha256(text.encode()).hexdigest()[:12]

@@ -296,7 +296,7 @@ def _record(
         if selected is None or conclusion.verdict == "unknown"
         else _named(best, selected, study.config.thresholds.half_interval)
     )
-    searched = _begun(
+    searched = _unsearched(
         study, timing, conclusion.verdict, conclusion.sentence, None if complete else examined
     )
     return replace(
@@ -324,10 +324,10 @@ def _nothing_simulated(study: Study, timing: tuple[Effect, ...]) -> Diagnosis:
         "scenario as it is, before anything could be compared. Run the same command again to go "
         "on, or give a larger budget."
     )
-    return _begun(study, timing, "provisional", sentence, ())
+    return _unsearched(study, timing, "provisional", sentence, ())
 
 
-def _begun(
+def _unsearched(
     study: Study,
     timing: tuple[Effect, ...],
     verdict: Verdict,

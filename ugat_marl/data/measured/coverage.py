@@ -49,8 +49,6 @@ COUNTABLE = (
     "demand_timing",
     "turning",
     "undercount",
-    "stuck",
-    "dropout",
     "swapped",
 )
 """Effects that counts alone can show."""
@@ -231,20 +229,20 @@ def _of_counts(measured: MeasuredData, network: Network) -> Iterator[Finding]:
             f"counts.csv also {', '.join(SUMMED)}",
             hidden,
         )
-        return
-    yield Finding(
-        "no detections of single vehicles, but sums of intervals: examined are "
-        f"{', '.join(sorted(shown))}; detections would show {', '.join(hidden)} too",
-        hidden,
-    )
+    else:
+        yield Finding(
+            "no detections of single vehicles, but sums of intervals: examined are "
+            f"{', '.join(sorted(shown))}; detections would show {', '.join(hidden)} too",
+            hidden,
+        )
     if counts is None:
         return
-    if missing:
+    yield from _of_each_kind(measured, network, set(counts["detector_id"]))
+    if summed and missing:
         yield Finding(
             f"counts.csv: no {missing[0]}; several effects change one of occupancy and mean speed "
             "alike, and both together tell them apart"
         )
-    yield from _of_each_kind(measured, network, set(counts["detector_id"]))
 
 
 def _of_each_kind(
@@ -345,12 +343,12 @@ def _of_agreement(measured: MeasuredData, network: Network) -> Iterator[Finding]
     for detector in measured.detectors:
         if detector.kind == "stop" and not detector.beside:
             stops.setdefault(detector.lane, []).append(detector.id)
-    for detector in network.intersections:
+    for light in network.intersections:
         total = red = 0
-        for lane in detector.incoming_lanes:
-            links = sorted({link.index for link in detector.links if link.from_lane == lane})
+        for lane in light.incoming_lanes:
+            links = sorted({link.index for link in light.links if link.from_lane == lane})
             for period in measured.periods:
-                log = period.signals.get(detector.id)
+                log = period.signals.get(light.id)
                 if not log:
                     continue
                 since = np.array([since for since, _ in log])
@@ -364,7 +362,7 @@ def _of_agreement(measured: MeasuredData, network: Network) -> Iterator[Finding]
         if total >= BUSY and red > MOST_ON_RED * total:
             yield Finding(
                 f"{red} of {total} vehicles leave the stop detectors of traffic light "
-                f"{detector.id!r} while their lane has red; are lanes and links the right ones, "
+                f"{light.id!r} while their lane has red; are lanes and links the right ones, "
                 "and the clocks?"
             )
 

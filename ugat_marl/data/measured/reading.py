@@ -87,27 +87,25 @@ def read_measured(directory: Path, scenario: Scenario, network: Network) -> Meas
         rows = files.rows(tables.SIGNALS)
         signals = _signals(*rows, periods, scenario, network, files.findings)
     passages: tuple[dict[str, Passages], ...] = tuple({} for _ in periods)
+    usable = detectors
     if files.has(tables.DETECTIONS):
         passages, broken = _passages(
             *files.rows(tables.DETECTIONS), periods, detectors, files.findings
         )
-        detectors = tuple(detector for detector in detectors if detector.id not in broken)
+        usable = tuple(detector for detector in detectors if detector.id not in broken)
     lanes = _of_moments(files, tables.LANES, periods)
     trajectories = _of_moments(files, tables.TRAJECTORIES, periods)
     if trajectories is not None and files.seen_on_tracks:
         path = files.path(tables.TRAJECTORIES)
-        passages = passages_of_tracks(path, trajectories, periods, detectors, files.findings)
+        passages = passages_of_tracks(path, trajectories, periods, usable, files.findings)
     periods = tuple(
         replace(period, signals=shown, passages=seen)
         for period, shown, seen in zip(periods, signals, passages, strict=True)
     )
-    measured = MeasuredData(
-        detectors,
-        periods,
-        lanes,
-        trajectories,
-        *_summed(files, periods, detectors, network),
-    )
+    counts, turning, times = _summed(files, periods, detectors, network)
+    if counts is not None:
+        counts = counts.filter(pl.col("detector_id").is_in([one.id for one in usable]))
+    measured = MeasuredData(usable, periods, lanes, trajectories, counts, turning, times)
     files.findings += coverage(measured, scenario, network)
     return replace(measured, findings=tuple(files.findings))
 

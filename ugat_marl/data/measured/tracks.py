@@ -91,7 +91,7 @@ class _Track:
         if on is None:
             return None
         rear = start + detector.position_m + detector.length_m + self.length_m
-        off = self._when(rear, begin, len(self.lane) - 1)
+        off = self._when(rear, first, len(self.lane) - 1)
         at = {"front": (on,), "mean": (on, off or on)}.get(
             detector.speed_at or "rear", (off or on,)
         )

@@ -61,7 +61,8 @@ def write_measured(measured: MeasuredData, directory: Path, *, csv: bool = False
     try:
         _write(_detectors(measured), temporary / "detectors.csv")
         _write(_periods(measured.periods), temporary / "periods.csv")
-        _write(_signals(measured.periods), temporary / f"signals{suffix}")
+        if any(period.signals for period in measured.periods):
+            _write(_signals(measured.periods), temporary / f"signals{suffix}")
         if measured.has_events or measured.counts is None:
             _write(_detections(measured.periods), temporary / f"detections{suffix}")
         if measured.lanes is not None:
