@@ -100,7 +100,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
     parser.add_argument("--simulations", type=int, default=80)
     parser.add_argument("--rule-budget", type=int, default=6)
     parser.add_argument(
-        "--street-rules", type=int, default=0, help="episodes of each rule in the fitted street"
+        "--street-rules", type=int, help="episodes of each rule in the fitted street; 0 for none"
     )
     parser.add_argument("--jobs", type=int)
     given = parser.parse_args(arguments)

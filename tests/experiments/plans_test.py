@@ -57,6 +57,19 @@ def test_lessons_are_work(tmp_path: Path) -> None:
     assert lessons(0, DQN_NAME) == 0
 
 
+@pytest.mark.parametrize(
+    ("learner", "budget", "races"),
+    [(UNIVERSAL_NAME, None, True), (DQN_NAME, None, False), (DQN_NAME, 2, True),
+     (UNIVERSAL_NAME, 0, False)],
+)  # fmt: skip
+def test_rules_race_in_the_fitted_street_where_rules_teach(
+    tmp_path: Path, learner: str, budget: int | None, races: bool
+) -> None:
+    ugat = UgatConfig(iterations=1, street=StreetConfig(rule_budget=budget))
+    config = replace(SMALL, ugat=ugat, learner=learner, dqn=DQNConfig())
+    assert ("rules" in work_of(planned_jobs(config), tmp_path, 7200.0)) == races
+
+
 def test_what_is_done_is_neither_planned_nor_counted(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

@@ -83,10 +83,12 @@ def work_of(plan: Sequence[Job], folder: Path, episode_s: float) -> dict[str, Sh
         elif (ugat := job.setting.ugat) is None:
             add("training", job.episodes if job.start is None else job.episodes // 2)
         else:
-            for name, (count, weight) in _grounded_work(ugat, episode_s).items():
-                add(name, count, weight)
             learner = job.setting.learner
-            known = ugat.grounding == "street" and bool(ugat.street.rule_budget)
+            taught = lesson_episodes(learner.name, learner.dqn) > 0
+            budget = ugat.street.budget_of_rules(taught=taught)
+            for name, (count, weight) in _grounded_work(ugat, episode_s, budget).items():
+                add(name, count, weight)
+            known = ugat.grounding == "street" and bool(budget)
             first = lesson_episodes(learner.name, learner.dqn) if ugat.pretrain_episodes else 0
             later = lesson_episodes(learner.name, learner.dqn, known=known)
             add("lessons", first + ugat.iterations * later)
@@ -104,8 +106,16 @@ def _rule_episodes(job: Job) -> int:
     return episodes
 
 
-def _grounded_work(ugat: UgatConfig, episode_s: float) -> dict[str, tuple[float, float]]:
-    """Return number and weight of the units of a grounded training's tasks."""
+def _grounded_work(
+    ugat: UgatConfig, episode_s: float, rule_budget: int
+) -> dict[str, tuple[float, float]]:
+    """Return number and weight of the units of a grounded training's tasks.
+
+    Args:
+        ugat: Settings of the training.
+        episode_s: Length of an episode, in s.
+        rule_budget: Budget of the race of rules in a fitted street; 0 without a race.
+    """
     times, street = ugat.iterations, ugat.street
     work: dict[str, tuple[float, float]] = {"plain sim": (ugat.pretrain_episodes, 1.0)}
     if ugat.grounding == "street":
@@ -115,10 +125,8 @@ def _grounded_work(ugat: UgatConfig, episode_s: float) -> dict[str, tuple[float,
         work["fitting"] = (worlds if times else 0, short)
         work["fitted street"] = (times * ugat.grounded_episodes, 1.0)
         work["comparing"] = (2 * street.judged * times, 1.0)
-        if street.rule_budget:
-            specs = [
-                spec for name in TUNED_RULES for spec in rule_settings(name, street.rule_budget)
-            ]
+        if rule_budget:
+            specs = [spec for name in TUNED_RULES for spec in rule_settings(name, rule_budget)]
             work["rules"] = (times * sum(race_fields(len(specs))), 1.0)
         return work
     rollouts = ugat.sim_rollouts + ugat.real_rollouts

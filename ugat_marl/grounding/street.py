@@ -68,6 +68,10 @@ PARTS = ("channel", "eyes", "service", "effects")
 """Parts of a street, each of which can be left out."""
 
 
+RULE_BUDGET = 6
+"""Budget of each rule in worlds of the fitted street, with a learner that rules teach."""
+
+
 @dataclass(frozen=True)
 class StreetConfig:
     """Settings of the fit of a street.
@@ -82,7 +86,8 @@ class StreetConfig:
             best one is kept. 0 keeps the last one.
         rule_budget: Budget that decides how many settings of each rule race in worlds of the fitted
             street. The best rule of all teaches the learner, and is kept if it is better than the
-            trained policies. With 0 only trained policies are kept.
+            trained policies. With 0 only trained policies are kept. None stands for `RULE_BUDGET`
+            with a learner that rules teach, and for 0 with others.
         without: Effects left out of the library.
         channel: Numbers of the fit of the command channel.
         eyes: Numbers of the fit of the detectors.
@@ -94,7 +99,7 @@ class StreetConfig:
     further: int = 40
     simulated_s: float = 1800.0
     judged: int = 4
-    rule_budget: int = 0
+    rule_budget: int | None = None
     without: tuple[str, ...] = ()
     channel: ChannelConfig = field(default_factory=ChannelConfig)
     eyes: EyesConfig = field(default_factory=EyesConfig)
@@ -112,12 +117,22 @@ class StreetConfig:
             raise OptionError(f"further = {self.further}: must not be negative")
         if self.judged < 0:
             raise OptionError(f"judged = {self.judged}: must not be negative")
-        if self.rule_budget < 0 or self.rule_budget == 1:
+        if self.rule_budget is not None and (self.rule_budget < 0 or self.rule_budget == 1):
             raise OptionError(
                 f"rule_budget = {self.rule_budget}: must be at least 2, or 0 for no rules"
             )
         if self.simulated_s <= 0:
             raise OptionError(f"simulated_s = {self.simulated_s}: must be above 0")
+
+    def budget_of_rules(self, *, taught: bool) -> int:
+        """Return the budget of the race of rules, or 0 without one.
+
+        Args:
+            taught: True if rules teach the learner.
+        """
+        if self.rule_budget is None:
+            return RULE_BUDGET if taught else 0
+        return self.rule_budget
 
     def of_log(self, real: TransitionLog) -> StreetConfig:
         """Return the settings for a log; estimated vehicles are no readings of detectors."""

@@ -50,6 +50,7 @@ from ugat_marl.policies import (
     LearnerFactory,
     NamedRule,
     Policy,
+    Taught,
     device_of,
     race,
     race_fields,
@@ -172,12 +173,14 @@ class StreetTraining(Algorithm):
         return state.policy()
 
     def _best_rule(self, state: RunState[StreetFit], street: FittedStreet) -> NamedRule | None:
-        """Return the rule that is best in worlds of the street; None if rules are left out.
+        """Return the rule that is best in worlds of the street; None if rules do not race.
 
         All settings of all rules that read the learner's observations race. Each rung has a world
         of its own, and all rules of a rung play in that world.
         """
-        budget = self.config.street.rule_budget
+        learner = state.learner
+        taught = isinstance(learner, Taught) and learner.plays(self.env) > 0
+        budget = self.config.street.budget_of_rules(taught=taught)
         if budget == 0:
             return None
         with contextlib.closing(self.simulation.plain(0)) as env:
