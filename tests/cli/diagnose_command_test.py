@@ -203,7 +203,7 @@ KEYS = re.compile(r"^\| `([\w.\[\]<>-]+)` \| [a-z ,]+ \|", flags=re.MULTILINE)
 LIKE_ANOTHER = ("left", "alternatives[].effects", "best.effects", "unnamed")
 """Lists of what is described elsewhere on the page."""
 SOMETIMES = (
-    {"effects[].evidence.source", "policy_gap", "traffic_check"}
+    {"effects[].evidence.source", "effects[].evidence.rival", "policy_gap", "traffic_check"}
     | {f"patterns[].{field}" for field in Pattern.__dataclass_fields__}
     | {f"alternatives[].{key}" for key in ("effects", "distance", "cost")}
 )
