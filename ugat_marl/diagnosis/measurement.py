@@ -399,9 +399,20 @@ class _Zones:
 
 
 def _changed(measured: Array, simulated: Array) -> float:
-    """Return the share by which the median speeds of passages differ, from 0 to 1."""
-    low, high = sorted(float(np.median(rows[:, 3])) for rows in (measured, simulated))
-    return 1.0 - low / high
+    """Return the share by which vehicles pass at another speed than simulated, from 0 to 1.
+
+    Reported speeds alone may be measured elsewhere, and times over the zone alone may be extended.
+    So it is the smaller change of both, and 0 if one says faster and the other slower.
+    """
+    changes = [
+        np.log(float(np.median(values(measured))) / float(np.median(values(simulated))))
+        for values in (
+            lambda rows: rows[:, 3],
+            lambda rows: rows[:, 4] / np.maximum(rows[:, 2], 1e-3),
+        )
+    ]
+    least = min(changes, key=abs)
+    return float(-np.expm1(-abs(least))) if min(changes) * max(changes) > 0.0 else 0.0
 
 
 def _cheapest(
@@ -725,7 +736,9 @@ class Measurement:
                 for x in (measured, simulated)
             )
         over = float(np.median(simulated[:, 2]))
-        bend = max(abs(usual.value), usual.spread, found.spread)
+        bend = max(abs(usual.value), usual.spread)
+        if int(measured[0, 1]) == ALONE:  # queues spread if speeds are measured elsewhere, too
+            bend = max(bend, found.spread)
         doubt = limit.inexact * over + limit.bent_here * bend + 0.5 * self._grain_s
         alike = limit.bent_alone * bend
         kind, regime = one.kind, int(measured[0, 1])
