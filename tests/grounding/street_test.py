@@ -392,3 +392,28 @@ def test_detectors_are_compared_over_equally_long_logs(monkeypatch: pytest.Monke
     for seconds, decisions in ((60.0, 6), (300.0, 10)):
         fit_street(log, simulation(seconds), rule, prior, view, config, seed=0)
         assert seen[-2:] == [decisions, decisions]
+
+
+def test_a_learner_begins_anew_when_late_commands_are_found_no_more(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The first fit finds late commands, the second none; a learner of both would not fit."""
+    play_nothing(monkeypatch)
+    fit, views = StreetTraining._fit, list[tuple[int, bool]]()
+
+    def found_once(
+        self: StreetTraining, state: RunState[StreetFit], policy: Policy
+    ) -> FittedStreet:
+        street = fit(self, state, policy)
+        if state.iteration:
+            street = state.transform.street = replace(street, channel=None)
+        views.append(state.transform.view)
+        return street
+
+    monkeypatch.setattr(StreetTraining, "_fit", found_once)
+    config = replace(
+        SMALL, real=LATE, ugat=replace(SMALL.ugat, grounding="street", street=QUICK, iterations=2)
+    )
+    transfer(config, tmp_path, workers=1)
+    assert views[0][0] > 0
+    assert views[1][0] == 0

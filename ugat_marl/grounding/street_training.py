@@ -147,7 +147,7 @@ class StreetTraining(Algorithm):
             street = self._fit(state, policy)  # line 4
             episodes = self.config.grounded_episodes
             if self._begins_anew(before, state.transform.view):
-                self.renew(state)
+                self._begin(state)
                 episodes += self.config.pretrain_episodes
             agents = list(state.real[0].provenance.layouts)
             numbers = street.as_dict(self.view.lanes_of(agents))
@@ -243,11 +243,15 @@ class StreetTraining(Algorithm):
         return {f"judged/{name}": time_s for name, time_s in times_s.items()}
 
     def renew(self, state: RunState[StreetFit]) -> None:
-        """Replace the learner by a new one, if policies see something else in the street."""
-        commands, _ = state.transform.view
+        """Replace the learner of a restored run, if policies see something else in the street."""
         if self._begins_anew((0, False), state.transform.view):
-            with contextlib.closing(self.simulation.plain(commands)) as env:
-                state.learner = self.make(env, self.seed)
+            self._begin(state)
+
+    def _begin(self, state: RunState[StreetFit]) -> None:
+        """Replace the learner by a new one for what policies see in the street."""
+        commands, _ = state.transform.view
+        with contextlib.closing(self.simulation.plain(commands)) as env:
+            state.learner = self.make(env, self.seed)
 
     def _begins_anew(self, before: tuple[int, bool], now: tuple[int, bool]) -> bool:
         """Return True if a policy of the view `before` is of no use with the view `now`."""
