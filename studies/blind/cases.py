@@ -12,9 +12,11 @@ from dataclasses import asdict, dataclass, field, fields
 from pathlib import Path
 from typing import Any
 
-from ugat_marl.effects import Effect
+from ugat_marl.data import MeasuredData, read_measured
+from ugat_marl.effects import Effect, load_scenario
 from ugat_marl.errors import BlindTestError, UnknownNameError
 from ugat_marl.files import write_whole
+from ugat_marl.scenarios import Network, Scenario
 
 PLAN, LABELS, GRADES, VISIBLE = "plan.json", "labels", "grades.json", "visible.json"
 DIAGNOSIS, RUN = "diagnosis.json", "run.json"
@@ -174,6 +176,12 @@ def chosen(directory: Path, only: Sequence[str]) -> tuple[Case, ...]:
         if name not in known:
             raise UnknownNameError("case", name, known)
     return tuple(case for case in cases if not only or case.case in only)
+
+
+def read_street(name: str, measured: Path) -> tuple[Scenario, MeasuredData]:
+    """Read the scenario of a case, and the measured data in a folder."""
+    scenario = load_scenario(name)
+    return scenario, read_measured(measured, scenario, Network.read(scenario))
 
 
 def label_path(directory: Path, case: str) -> Path:

@@ -9,7 +9,7 @@ from typing import Annotated
 from rich.console import Console
 from tyro.conf import Positional, arg
 
-from studies.blind.cases import Case, read_plan
+from studies.blind.cases import Case, read_plan, read_street
 from studies.blind.detectors import first_stages
 from studies.blind.detectors import markdown as detectors_markdown
 from studies.blind.generate import VARIATIONS, Blueprint, generate
@@ -20,13 +20,13 @@ from studies.blind.strengths import STRENGTHS
 from studies.blind.table import markdown, write_table
 from studies.blind.visibility import judge_visibility
 from ugat_marl.cli import LengthS
-from ugat_marl.data import read_measured
 from ugat_marl.diagnosis import DiagnosisConfig, diagnose
-from ugat_marl.effects import load_scenario
 from ugat_marl.errors import OptionError
 from ugat_marl.files import require_writable
 from ugat_marl.progress import Bars, Silent
-from ugat_marl.scenarios import Network
+
+Directory = Annotated[Positional[Path], arg(metavar="DIR")]
+Only = Annotated[tuple[str, ...], arg(metavar="CASE ...", help_behavior_hint="(default: all)")]
 
 
 @dataclass(frozen=True)
@@ -102,14 +102,12 @@ class BlindRun:
         only: Names of the cases to diagnose.
     """
 
-    directory: Annotated[Positional[Path], arg(metavar="DIR")]
+    directory: Directory
     jobs: int = 1
     budget_s: float = 600.0
     alpha: float = 0.05
     seed: int = 0
-    only: Annotated[
-        tuple[str, ...], arg(metavar="CASE ...", help_behavior_hint="(default: all)")
-    ] = ()
+    only: Only = ()
 
     def run(self, console: Console) -> int:
         """Run; the exit code is 1 if a diagnosis failed."""
@@ -132,11 +130,10 @@ class BlindRun:
 
     def _diagnose(self) -> Diagnose:
         def run_diagnosis(case: Case, measured: Path, directory: Path) -> None:
-            scenario = load_scenario(case.scenario)
+            scenario, data = read_street(case.scenario, measured)
             config = DiagnosisConfig(
                 budget_s=self.budget_s, alpha=self.alpha, seed=self.seed, leave_out=case.leave_out
             )
-            data = read_measured(measured, scenario, Network.read(scenario))
             diagnose(scenario, data, directory, config, Silent())
 
         return run_diagnosis
@@ -157,11 +154,9 @@ class BlindVisible:
         only: Names of the cases to test.
     """
 
-    directory: Annotated[Positional[Path], arg(metavar="DIR")]
+    directory: Directory
     seed: int = 0
-    only: Annotated[
-        tuple[str, ...], arg(metavar="CASE ...", help_behavior_hint="(default: all)")
-    ] = ()
+    only: Only = ()
 
     def run(self, console: Console) -> int:
         """Test and print."""
@@ -189,11 +184,9 @@ class BlindDetectors:
         only: Names of the cases to look at.
     """
 
-    directory: Annotated[Positional[Path], arg(metavar="DIR")]
+    directory: Directory
     seed: int = 0
-    only: Annotated[
-        tuple[str, ...], arg(metavar="CASE ...", help_behavior_hint="(default: all)")
-    ] = ()
+    only: Only = ()
 
     def run(self, console: Console) -> int:
         """Read off and print."""
@@ -215,7 +208,7 @@ class BlindGrade:
         directory: Directory of a blind test.
     """
 
-    directory: Annotated[Positional[Path], arg(metavar="DIR")]
+    directory: Directory
 
     def run(self, console: Console) -> int:
         """Grade and print."""

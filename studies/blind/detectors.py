@@ -12,15 +12,12 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Literal
 
-from studies.blind.cases import Case, Hidden, chosen, read_label
+from studies.blind.cases import Case, Hidden, chosen, read_label, read_street
 from studies.blind.grade import canonical, match
 from studies.blind.strengths import ERRORS
 from studies.blind.table import wilson
-from ugat_marl.data import read_measured
 from ugat_marl.diagnosis import DetectorError, DiagnosisConfig, Study
-from ugat_marl.effects import load_scenario
 from ugat_marl.progress import Reporter, Silent
-from ugat_marl.scenarios import Network
 
 Outcome = Literal["invented", "wrong", "one of two", "missed", "right"]
 OUTCOMES: tuple[Outcome, ...] = ("invented", "wrong", "one of two", "missed", "right")
@@ -78,8 +75,7 @@ def first_stages(
 
 
 def _errors(directory: Path, case: Case, seed: int) -> tuple[DetectorError, ...]:
-    scenario = load_scenario(case.scenario)
-    measured = read_measured(directory / case.case / "measured", scenario, Network.read(scenario))
+    scenario, measured = read_street(case.scenario, directory / case.case / "measured")
     config = DiagnosisConfig(seed=seed, leave_out=case.leave_out)
     return Study.of(scenario, measured, config).detectors_as_they_are(Silent()).detection
 

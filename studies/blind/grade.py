@@ -212,11 +212,11 @@ def grade(label: Label, diagnosis: Diagnosis | None, wall_s: float | None = None
         for other in (() if diagnosis is None else diagnosis.alternatives)
         if verdict == "not_identifiable"  # with other verdicts these were tried, not named
     ]
-    names = [{effect.name for effect in answer} for answer in (named, *others)]
-    sets = [*names, *_with_rivals(names[0], effects)]
+    sets = [{effect.name for effect in answer} for answer in (named, *others)]
+    sets += _with_rivals(sets[0], effects)
     required, allowed = required_and_allowed(label, truth)
-    outcome = _outcome(label, verdict, sets, required, allowed)
     fits = [required <= names <= allowed for names in sets]
+    outcome = _outcome(label, verdict, sets, fits)
     hidden = label.group not in ("none", "outside")
     names_right = hidden and verdict in NAMING and fits[0]
     matched = [(x, match(x, named)) for x in truth] if names_right else []
@@ -274,8 +274,7 @@ def _outcome(
     label: Label,
     verdict: Verdict,
     sets: Sequence[set[str]],
-    required: frozenset[str],
-    allowed: frozenset[str],
+    fits: Sequence[bool],
 ) -> Outcome:
     if verdict == "failed":
         return "failed"
@@ -289,9 +288,9 @@ def _outcome(
         return "wrong" if verdict == "explained" else "abstained"
     if verdict not in NAMING:
         return "abstained"
-    if required <= sets[0] <= allowed:
+    if fits[0]:
         return "right"
-    return "abstained" if any(required <= names <= allowed for names in sets) else "wrong"
+    return "abstained" if any(fits) else "wrong"
 
 
 def _where(

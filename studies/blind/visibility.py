@@ -15,8 +15,16 @@ from pathlib import Path
 
 import numpy as np
 
-from studies.blind.cases import DIAGNOSIS, VISIBLE, WINDOW, Hidden, chosen, read_json, read_label
-from ugat_marl.data import read_measured
+from studies.blind.cases import (
+    DIAGNOSIS,
+    VISIBLE,
+    WINDOW,
+    Hidden,
+    chosen,
+    read_json,
+    read_label,
+    read_street,
+)
 from ugat_marl.diagnosis import (
     IN_THE_LOG,
     DiagnosisConfig,
@@ -28,10 +36,9 @@ from ugat_marl.diagnosis import (
     sum_of,
     whitened,
 )
-from ugat_marl.effects import Effect, effect_from_record, known_effects, load_scenario
+from ugat_marl.effects import Effect, effect_from_record, known_effects
 from ugat_marl.files import write_whole
 from ugat_marl.progress import Reporter, Silent
-from ugat_marl.scenarios import Network
 
 DAYS = 24
 """Number of days that are simulated with the effect, and again without it."""
@@ -69,9 +76,8 @@ def judge_visibility(
             if any(effect.name in IN_THE_LOG for effect in effects):
                 found[label.case] = None
             else:
-                scenario = load_scenario(label.scenario)
                 data = directory / label.case / "measured"
-                measured = read_measured(data, scenario, Network.read(scenario))
+                scenario, measured = read_street(label.scenario, data)
                 config = DiagnosisConfig(budget_h=math.inf, seed=seed)
                 found[label.case] = deviations_of(Study.of(scenario, measured, config), effects)
             write_whole(path, json.dumps(found, indent=1, allow_nan=False) + "\n")

@@ -404,15 +404,21 @@ def _changed(measured: Array, simulated: Array) -> float:
     Reported speeds alone may be measured elsewhere, and times over the zone alone may be extended.
     So it is the smaller change of both, and 0 if one says faster and the other slower.
     """
-    changes = [
-        np.log(float(np.median(values(measured))) / float(np.median(values(simulated))))
-        for values in (
-            lambda rows: rows[:, 3],
-            lambda rows: rows[:, 4] / np.maximum(rows[:, 2], 1e-3),
+    reported, timed = (
+        np.log(np.median(street) / np.median(model))
+        for street, model in (
+            (measured[:, 3], simulated[:, 3]),
+            (_paces(measured), _paces(simulated)),
         )
-    ]
-    least = min(changes, key=abs)
-    return float(-np.expm1(-abs(least))) if min(changes) * max(changes) > 0.0 else 0.0
+    )
+    if reported * timed <= 0.0:
+        return 0.0
+    return float(-np.expm1(-min(abs(reported), abs(timed))))
+
+
+def _paces(passages: Array) -> Array:
+    """Return lengths by times over the zone, m/s."""
+    return passages[:, 4] / np.maximum(passages[:, 2], 1e-3)
 
 
 def _cheapest(
@@ -478,11 +484,8 @@ class Measurement:
                 place, index = number
                 other = zones.rivals.get(number)
                 rival = None if other is None else self._of_zone(place, 1 - index, other)
-                wrong, margin = (
-                    self._of_zone(*number, estimate),
-                    limit.half_interval * estimate.error,
-                )
-                found.append(DetectorError(wrong, margin, rival))
+                margin = limit.half_interval * estimate.error
+                found.append(DetectorError(self._of_zone(*number, estimate), margin, rival))
         # Without speeds, distances come from times over the zones, which any other error falsifies.
         if not self._pairs_have_speeds and not found:
             offsets = self._offsets(splashes)

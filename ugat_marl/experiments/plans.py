@@ -84,12 +84,12 @@ def work_of(plan: Sequence[Job], folder: Path, episode_s: float) -> dict[str, Sh
             add("training", job.episodes if job.start is None else job.episodes // 2)
         else:
             learner = job.setting.learner
-            taught = lesson_episodes(learner.name, learner.dqn) > 0
-            budget = ugat.street.budget_of_rules(taught=taught)
+            lessons = lesson_episodes(learner.name, learner.dqn)
+            budget = ugat.street.budget_of_rules(taught=lessons > 0)
             for name, (count, weight) in _grounded_work(ugat, episode_s, budget).items():
                 add(name, count, weight)
             known = ugat.grounding == "street" and bool(budget)
-            first = lesson_episodes(learner.name, learner.dqn) if ugat.pretrain_episodes else 0
+            first = lessons if ugat.pretrain_episodes else 0
             later = lesson_episodes(learner.name, learner.dqn, known=known)
             add("lessons", first + ugat.iterations * later)
     return {name: Share(round(count), weights[name]) for name, count in units.items()}
