@@ -6,10 +6,13 @@ from typing import Any
 
 import numpy as np
 import polars as pl
+import pytest
 
 from ugat_marl.data import AgentLayout, Provenance, TransitionLog, TransitionRecorder
+from ugat_marl.errors import LogError
 from ugat_marl.grounding import ShuffledWorld
 from ugat_marl.grounding.controls import shuffled
+from ugat_marl.grounding.worlds import Replay
 from ugat_marl.policies import Policy
 
 LAYOUTS = {"a_0": AgentLayout(2, 2), "b_0": AgentLayout(1, 2, 1)}
@@ -91,3 +94,44 @@ def test_a_shuffled_world_asks_the_other_one() -> None:
     made.stop()
     made.close()
     assert world.done == [*(f"collect nobody {i} 5" for i in range(3)), "replay", "stop", "close"]
+
+
+def commanded(commands: dict[str, dict[int, list[int]]]) -> TransitionLog:
+    """Commands of each agent and episode; -1 for a decision that the log lacks."""
+    whole = {a: max(map(len, e.values()), default=0) for a, e in commands.items()}
+    recorder = TransitionRecorder(Provenance("by hand", "", "street", (), 10.0, "count", LAYOUTS))
+    seen = {"a_0": np.array([0, 0, 1, 0]), "b_0": np.array([0, 1, 0, 0])}
+    zero = dict.fromkeys(LAYOUTS, 0)
+    episodes = sorted({episode for e in commands.values() for episode in e})
+    for episode in episodes:
+        for step in range(max(whole.values())):
+            asked = {a: max(0, [*e.get(episode, []), *[0] * 9][step]) for a, e in commands.items()}
+            recorder.record(episode, step, seen, asked, zero, dict.fromkeys(LAYOUTS, 0.0), seen)
+    log = recorder.log()
+    kept = pl.Series([
+        step < len(given := commands[agent].get(episode, [])) and given[step] >= 0
+        for episode, step, agent in log.frame.select("episode", "step", "agent").iter_rows()
+    ])  # fmt: skip
+    return TransitionLog(log.provenance, log.frame.filter(kept))
+
+
+def played(log: TransitionLog, episode: int, decisions: int) -> dict[str, list[int]]:
+    replay = Replay(log)
+    replay.reset(episode)
+    acts = [replay.act(dict.fromkeys(LAYOUTS), {}) for _ in range(decisions)]
+    return {agent: [act[agent] for act in acts] for agent in LAYOUTS}
+
+
+def test_a_missing_decision_shifts_no_later_command() -> None:
+    log = commanded({"a_0": {0: [1, -1, 0, 1]}, "b_0": {0: [-1, 1, -1, -1]}})
+    assert played(log, 0, 6) == {"a_0": [1, 1, 0, 1, 1, 1], "b_0": [1, 1, 1, 1, 1, 1]}
+
+
+def test_episodes_without_commands_of_an_agent_are_not_repeated() -> None:
+    log = commanded({"a_0": {0: [0, 0], 4: [1, 0]}, "b_0": {4: [1, 1]}})
+    for episode in (0, 1):
+        assert played(log, episode, 2) == {"a_0": [1, 0], "b_0": [1, 1]}
+    with pytest.raises(LogError, match="no row of b_0"):
+        Replay(commanded({"a_0": {0: [0]}, "b_0": {}}))
+    with pytest.raises(LogError, match="no episode has a decision of every agent$"):
+        Replay(commanded({"a_0": {0: [0]}, "b_0": {1: [0]}}))

@@ -9,7 +9,10 @@ from dataclasses import dataclass
 from functools import partial
 from typing import Any, Protocol
 
-from ugat_marl.data import Scores, TransitionLog
+import numpy as np
+from numpy.typing import NDArray
+
+from ugat_marl.data import Scores, TransitionLog, Transitions
 from ugat_marl.effects import Domain
 from ugat_marl.envs import (
     Actions,
@@ -101,7 +104,8 @@ class SimulatedWorld:
         if isinstance(self._workers, Executor):
             logs = self._played_by(self._workers, policy, [(s, None) for s in seeds])
             return TransitionLog.concatenate(logs)
-        exploring = EpsilonGreedy(policy, self._epsilon)
+        own = copy.deepcopy(policy)  # another world may ask the same policy in another thread
+        exploring = EpsilonGreedy(own, self._epsilon)
         env = self._env_of(policy)
         return TransitionLog.concatenate([_recorded(env, exploring, s, self._stop) for s in seeds])
 
@@ -300,18 +304,29 @@ def roll_outs(
 class Replay:
     """Policy that repeats the commands of a log, decision by decision.
 
-    Each episode repeats one of the log's. After its last decision, the last command stays.
+    Each episode repeats one in which every agent has a command. A decision that the log lacks
+    repeats the command before it. After the last decision, the last command stays.
 
     Args:
         log: The transitions.
+
+    Raises:
+        LogError: No episode of the log has commands of every agent.
     """
 
     def __init__(self, log: TransitionLog) -> None:
         self.env_options: Mapping[str, Any] = {"observation": log.provenance.observation}
         rows = {agent: log.transitions(agent) for agent in log.agents}
+        whole = set[int].intersection(*(set(own.episode.tolist()) for own in rows.values()))
+        if not whole:
+            alone = [agent for agent, own in rows.items() if not len(own)]
+            raise LogError(
+                "commands of the log cannot be repeated: no episode has a decision of every "
+                f"agent{'; no row of ' + ', '.join(alone) if alone else ''}"
+            )
         self._commands = [
-            {agent: own.action[own.episode == episode] for agent, own in rows.items()}
-            for episode in sorted(set(log.frame["episode"]))
+            {agent: _commands_of(own, episode) for agent, own in rows.items()}
+            for episode in sorted(whole)
         ]
         self._episode, self._step = 0, 0
 
@@ -327,6 +342,14 @@ class Replay:
         return {
             name: int(commands[name][min(step, len(commands[name]) - 1)]) for name in observations
         }
+
+
+def _commands_of(own: Transitions, episode: int) -> NDArray[np.int64]:
+    """Return an agent's command at each decision of an episode, ``(decisions,)``."""
+    here = own.episode == episode
+    steps, commands = own.step[here], own.action[here]
+    before = np.searchsorted(steps, np.arange(steps[-1] + 1), side="right") - 1
+    return commands[np.maximum(before, 0)]
 
 
 class RecordedWorld:
