@@ -30,6 +30,20 @@ def test_alpha_starts_at_infinity_and_becomes_the_mean_of_the_logged_u() -> None
     assert run(gate, (0.25, 0.75), (0.375, 0.7)) == [[True, False], [False, True]]
 
 
+def test_what_is_not_counted_changes_neither_alpha_nor_the_report() -> None:
+    gate, watched = Gate(AGENTS, GateConfig()), Gate(AGENTS, GateConfig())
+    for one in (gate, watched):
+        run(one, (0.25, 1.0))
+    with watched.uncounted():
+        assert run(watched, (0.9, 0.9)) == [[True, True]]
+        watched.end_epoch()
+        run(watched, (0.8, 0.1))
+    for one in (gate, watched):
+        run(one, (0.5, 0.5))
+    assert gate.update().as_dict() == watched.update().as_dict()
+    assert gate.alpha.tolist() == watched.alpha.tolist() == [0.375, 0.75]
+
+
 def test_pooled_alpha_is_one_mean_over_all_intersections() -> None:
     gate = Gate(AGENTS, GateConfig(scope="pooled"))
     run(gate, (0.2, 1.0), (0.4, 0.4))

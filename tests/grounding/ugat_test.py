@@ -103,6 +103,14 @@ def test_alpha_can_start_at_what_the_first_fit_expects(tmp_path: Path) -> None:
     assert rows["gate/acceptance"] < 1.0
 
 
+@pytest.mark.usefixtures("unjudged")
+def test_lessons_of_a_rule_count_in_no_gate(tmp_path: Path) -> None:
+    transfer(replace(SMALL, learner="universal"), tmp_path / "run")
+    rows = {(step, name): value for _, step, name, value in Metrics.read(tmp_path / "run/metrics.parquet").rows}  # fmt: skip  # noqa: E501
+    decisions = SMALL.ugat.grounded_episodes * 10  # of 10 s each, in 100 s
+    assert [rows[k, "gate/decisions"] for k in (1, 2)] == [decisions, decisions]
+
+
 def test_a_resumed_run_is_an_unbroken_one_byte_for_byte(unbroken: Path, tmp_path: Path) -> None:
     """One run is interrupted at four moments, and taken up again after each."""
     folder = tmp_path / "run"

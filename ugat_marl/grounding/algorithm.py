@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from typing import Any
@@ -9,6 +10,7 @@ from typing import Any
 from ugat_marl.data import Run
 from ugat_marl.envs import AnyParallelEnv
 from ugat_marl.grounding.config import UgatConfig
+from ugat_marl.grounding.gate import Gate
 from ugat_marl.grounding.state import RunState, is_kept
 from ugat_marl.grounding.worlds import World
 from ugat_marl.policies import Policy, Taught
@@ -64,7 +66,12 @@ class Algorithm:
             state.save(self.run)
 
     def _attend(
-        self, state: RunState[Any], env: AnyParallelEnv, title: str, best: str | None = None
+        self,
+        state: RunState[Any],
+        env: AnyParallelEnv,
+        title: str,
+        best: str | None = None,
+        gate: Gate | None = None,
     ) -> Policy | None:
         """Let the learner watch the rule that is good in an environment, if it has a teacher.
 
@@ -73,6 +80,7 @@ class Algorithm:
             env: The environment.
             title: Name of the environment in messages.
             best: The best rule there, if it is known.
+            gate: Gate of the environment, if it has one; lessons do not count there.
 
         Returns:
             The policy after the lessons; None without a teacher.
@@ -80,7 +88,10 @@ class Algorithm:
         learner = state.learner
         if not isinstance(learner, Taught) or not (number := learner.plays(env, best)):
             return None
-        with self.run.reporter.task(f"lessons, {title}", number) as advance:
+        with (
+            self.run.reporter.task(f"lessons, {title}", number) as advance,
+            contextlib.nullcontext() if gate is None else gate.uncounted(),
+        ):
             name = learner.attend(env, self.seed, lambda rule: advance(note=rule), best)
         self.run.reporter.say(f"{title}: {name} teaches")
         return state.learner.policy()

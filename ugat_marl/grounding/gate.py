@@ -8,9 +8,10 @@ an infinite one (GAT, no gate). Where every u was 0, alpha keeps its value.
 
 from __future__ import annotations
 
+import contextlib
 import warnings
 from collections import deque
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any, Literal
 
@@ -188,6 +189,15 @@ class Gate:
             self._epochs.append(self._running)
             self._running = np.zeros_like(self._running)
 
+    @contextlib.contextmanager
+    def uncounted(self) -> Iterator[None]:
+        """Forget the decisions of a block: alpha follows those of the learner alone."""
+        state = self.state_dict()
+        try:
+            yield
+        finally:
+            self.load_state_dict(state)
+
     def update(self) -> GateReport:
         """End an iteration: report, set a dynamic alpha to mean(u), and reset the counts.
 
@@ -239,7 +249,7 @@ class Gate:
         if not parts:
             return ""
         return (
-            f"iteration {self.iteration}: {'; '.join(parts)}: the gate does not discriminate "
+            f"iteration {self.iteration + 1}: {'; '.join(parts)}: the gate does not discriminate "
             "there; look at alpha and the calibration of u in the report"
         )
 

@@ -97,7 +97,7 @@ class Ugat(Algorithm):
             report = self._fit(state, device, rewards)  # lines 5 and 6
             self._prepare_gate(state, report)  # input alpha, line 13
             title = f"grounded, {iteration_name(state)}"
-            self._attend(state, grounded_env, title)
+            self._attend(state, grounded_env, title, gate=state.transform.gate)
             self._learn(state, grounded_env, self.config.grounded_episodes, title)  # lines 8 to 16
             gate = self._update_alpha(state)  # line 17
             self._log(state, report, gate)
