@@ -142,6 +142,21 @@ def test_a_residual_at_rest_leaves_every_green_alone(
         assert not grounded.delay_s.any() and grounded.executed.tolist() == asked
 
 
+def test_constant_delays_act_where_no_h_is_trusted(
+    late_greens: tuple[Residual, ResidualReport], tmp_path: Path
+) -> None:
+    residual, report = late_greens
+    assert report.acting == ("a_0",)
+    residual.save(tmp_path / "residual.pt")
+    other = TIMED.residual(QUEUES, 1)
+    assert other is not None
+    other.load(tmp_path / "residual.pt")
+    other.transform.gate.trust(np.zeros(2, bool))
+    assert other.transform.acting.tolist() == [True, False] and other.acts
+    other.rest()
+    assert not other.transform.acting.any() and not other.acts
+
+
 def test_too_few_decisions_prove_nothing() -> None:
     residual = PHASE.residual(LAYOUTS, 0)
     assert residual is not None

@@ -107,7 +107,7 @@ class Residual:
     @property
     def acts(self) -> bool:
         """True if some action may be grounded."""
-        return self.transform.fitted and bool(self.transform.gate.trusted.any())
+        return self.transform.fitted and bool(self.transform.acting.any())
 
     def fit(
         self,
@@ -136,7 +136,7 @@ class Residual:
         transform.gate.trust(proven)
         transform.restrict(trust.better)
         transform.gate.begin(report.expected_u)
-        acting = [a for a, on in zip(agents, transform.gate.trusted, strict=True) if on]
+        acting = [a for a, on in zip(agents, transform.acting, strict=True) if on]
         return ResidualReport(report, trust, tuple(acting))
 
     def rest(self) -> None:

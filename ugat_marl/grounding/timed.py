@@ -223,6 +223,12 @@ class TimedTransform(Transform):
         begins = self.stack.current_phase(data.observation) != data.asked
         return lesson, data.weight * begins
 
+    @property
+    def acting(self) -> NDArray[np.bool_]:
+        """True for agents with a trusted h or with constant delays, ``(agents,)``."""
+        constant = self.constants.delay_s + self.constants.beyond_s
+        return self.gate.trusted | (constant != 0).any(1).numpy()
+
     def restrict(self, agents: NDArray[np.bool_]) -> None:
         """Leave the greens of all other agents as they are, without constant delays, too."""
         super().restrict(agents)

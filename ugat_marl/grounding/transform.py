@@ -145,6 +145,11 @@ class Transform(abc.ABC):
         The second part is ``(agents, n)``, 1 for such a decision and 0 for others and for padding.
         """
 
+    @property
+    def acting(self) -> NDArray[np.bool_]:
+        """True for agents whose actions may be grounded, ``(agents,)``."""
+        return self.gate.trusted.copy()
+
     def restrict(self, agents: NDArray[np.bool_]) -> None:
         """Leave the actions of all other agents as they are.
 
