@@ -33,8 +33,8 @@ from ugat_marl.grounding import (
     street_env,
     street_prior,
 )
-from ugat_marl.grounding.channel import CommandChannel
-from ugat_marl.grounding.eyes import Eyes, fit_eyes
+from ugat_marl.grounding.channel import ChannelConfig, CommandChannel
+from ugat_marl.grounding.eyes import Eyes, EyesConfig, fit_eyes
 from ugat_marl.grounding.posterior import Values
 from ugat_marl.grounding.state import RunState
 from ugat_marl.grounding.street_training import StreetTraining
@@ -195,11 +195,15 @@ def test_each_part_can_be_fitted_alone(part: str) -> None:
 
 
 @pytest.mark.parametrize(
-    ("recorded_s", "compared_s"),
-    [pytest.param(300.0, 60.0, marks=pytest.mark.slow), (40.0, 40.0)],
+    ("recorded_s", "simulated_s", "compared_s"),
+    [
+        pytest.param(300.0, 100.0, 60.0, marks=pytest.mark.slow),
+        (40.0, 100.0, 40.0),
+        pytest.param(60.0, 40.0, 40.0, marks=pytest.mark.slow),
+    ],
 )
 def test_a_street_is_compared_with_worlds_of_the_same_length(
-    recorded_s: float, compared_s: float
+    recorded_s: float, simulated_s: float, compared_s: float
 ) -> None:
     """Queues of a whole peak are not compared with those of its beginning."""
     config = replace(QUICK, parts=("effects",))
@@ -208,12 +212,13 @@ def test_a_street_is_compared_with_worlds_of_the_same_length(
     rule = make_rule("fixed-time:20", env)
     env.close()
     log = recorded("sim", recorded_s)
-    street, known = fit_street(log, simulation(), rule, prior, view, config, seed=0)
+    shown = simulation(simulated_s)
+    street, known = fit_street(log, shown, rule, prior, view, config, seed=0)
     decisions = compared_s / log.provenance.decision_interval_s
     seen = {float(item.summary.rows[0, NAMES.index("mean")]) for item in known.simulated}
     assert seen == {decisions}
     begun = log.first(int(decisions))
-    again, _ = fit_street(begun, simulation(), rule, prior, view, config, seed=0)
+    again, _ = fit_street(begun, shown, rule, prior, view, config, seed=0)
     assert street.posterior is not None and again.posterior is not None
     assert np.array_equal(street.posterior.effects, again.posterior.effects)
 
@@ -238,6 +243,25 @@ def test_unknown_parts_and_too_few_simulations_are_refused() -> None:
         StreetConfig(parts=("eye",))
     with pytest.raises(OptionError, match="at least 20"):
         StreetConfig(simulations=3)
+    for wrong, told in (
+        ({"most_lag": -1}, "most_lag is -1"),
+        ({"ages": 1}, "ages is 1; allowed: >= 2"),
+        ({"pull": 0.0}, "pull is 0.0; allowed: > 0"),
+        ({"refused": 1.0}, "refused is 1.0; allowed: 0 to 1"),
+        ({"gain": float("nan")}, "gain is nan"),
+    ):
+        with pytest.raises(OptionError, match=told):
+            ChannelConfig(**wrong)
+    for wrong, told in (
+        ({"most_lag": -1}, "most_lag is -1"),
+        ({"together": 0.0}, "together is 0.0; allowed: > 0"),
+        ({"filled": 1.5}, "filled is 1.5; allowed: 0 to 1"),
+        ({"queue": float("inf")}, "queue is inf"),
+        ({"absolute": ()}, "absolute is .*at least one"),
+        ({"relative": (0.1, -0.1)}, "relative is .*>= 0"),
+    ):
+        with pytest.raises(OptionError, match=told):
+            EyesConfig(**wrong)
     with pytest.raises(OptionError, match="no transform"):
         UgatConfig(grounding="street").transform({}, 0)
 

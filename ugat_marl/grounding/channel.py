@@ -27,7 +27,7 @@ from numpy.typing import NDArray
 
 from ugat_marl.data import AgentLayout, TransitionLog, Transitions
 from ugat_marl.effects import Actuator, Commands, ControllerPart
-from ugat_marl.errors import CheckpointError, LogError
+from ugat_marl.errors import CheckpointError, LogError, OptionError
 from ugat_marl.scenarios import Network, SignalState, SignalTiming
 from ugat_marl.seeding import numpy_generator
 
@@ -71,6 +71,18 @@ class ChannelConfig:
     refused: float = 0.2
     least_share: float = 0.02
     gain: float = 1.0
+
+    def __post_init__(self) -> None:
+        for name, least in (("most_lag", 0), ("ages", 2), ("least_rows", 1)):
+            if getattr(self, name) < least:
+                raise OptionError(f"channel {name} is {getattr(self, name)}; allowed: >= {least}")
+        for name in ("refused", "least_share"):
+            if not 0 <= getattr(self, name) < 1:
+                raise OptionError(f"channel {name} is {getattr(self, name)}; allowed: 0 to 1")
+        if not 0 < self.pull < math.inf:
+            raise OptionError(f"channel pull is {self.pull}; allowed: > 0, finite")
+        if not 0 <= self.gain < math.inf:
+            raise OptionError(f"channel gain is {self.gain}; allowed: >= 0, finite")
 
 
 @dataclass(frozen=True)

@@ -37,7 +37,7 @@ from ugat_marl.effects import (
     Sensor,
     Stage,
 )
-from ugat_marl.errors import CheckpointError
+from ugat_marl.errors import CheckpointError, OptionError
 from ugat_marl.grounding.summaries import Floats, LaneRows, LaneView
 from ugat_marl.scenarios import Network
 from ugat_marl.seeding import numpy_generator
@@ -86,6 +86,24 @@ class EyesConfig:
     least_served: int = 20
     least_stays: int = 5
     least_lost: float = 0.08
+
+    def __post_init__(self) -> None:
+        for name in ("most_lag", "least_served", "least_stays"):
+            if getattr(self, name) < 0:
+                raise OptionError(f"eyes {name} is {getattr(self, name)}; allowed: >= 0")
+        for name in ("surprise", "together", "pull"):
+            if not 0 < getattr(self, name) < math.inf:
+                raise OptionError(f"eyes {name} is {getattr(self, name)}; allowed: > 0, finite")
+        for name in ("queue", "long_queue", "fraction"):
+            if not 0 <= getattr(self, name) < math.inf:
+                raise OptionError(f"eyes {name} is {getattr(self, name)}; allowed: >= 0, finite")
+        for name in ("filled", "least_lost"):
+            if not 0 <= getattr(self, name) <= 1:
+                raise OptionError(f"eyes {name} is {getattr(self, name)}; allowed: 0 to 1")
+        for name in ("absolute", "relative"):
+            tried = getattr(self, name)
+            if not tried or not all(0 <= value < math.inf for value in tried):
+                raise OptionError(f"eyes {name} is {tried}; allowed: numbers >= 0, at least one")
 
 
 @dataclass(frozen=True)

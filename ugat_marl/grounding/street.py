@@ -495,7 +495,9 @@ def fit_street(
     logs = simulation.logs(drawn, policy, seeds, decisions * interval_s, on_done)
     added = [Simulated(value, view.summary(log)) for value, log in zip(values, logs, strict=True)]
     simulated = (*known.simulated, *added)
-    posterior = Posterior.fit(worlds, simulated, view.summary(real.first(decisions)))
+    # Episodes of the simulation may be shorter than those of the log.
+    seen = real.first(max(log.decisions for log in logs))
+    posterior = Posterior.fit(worlds, simulated, view.summary(seen))
     street = FittedStreet(lanes, interval_s, channel, street.eyes, posterior)
     return street, Known(simulated, posterior)
 
