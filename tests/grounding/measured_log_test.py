@@ -103,6 +103,26 @@ def test_a_table_of_lanes_or_trajectories_takes_the_place_of_the_estimate(
     assert not log.provenance.deviation
 
 
+def test_lanes_that_a_table_lacks_are_said_to_be_estimated(
+    crossing: Scenario, measured: MeasuredData
+) -> None:
+    assert measured.lanes is not None
+    network = Network.read(crossing)
+    some = measured.lanes.filter(pl.col("lane_id") != "S_C_0")
+    given = replace(measured, lanes=some, trajectories=None)
+    made = log_of_measured(given, crossing, network, "street", "count", "best")
+    alone = imported(measured, crossing)
+    assert made.log.provenance.deviation == {"S_C_0": alone.provenance.deviation["S_C_0"]}
+    assert "(median of 1 lanes)" in made.findings[0]
+    found, guessed = (x.transitions(x.agents[0]).observation for x in (made.log, alone))
+    whole = imported(replace(measured, trajectories=None), crossing, source="best")
+    true = whole.transitions(whole.agents[0]).observation
+    assert len(found) == len(guessed) < len(true)  # the end of the estimate is left out
+    config = StreetConfig()
+    assert "eyes" not in config.of_log(made.log).parts
+    assert "eyes" in config.of_log(whole).parts
+
+
 def test_trajectories_between_whole_seconds_give_the_same_log(
     crossing: Scenario, measured: MeasuredData
 ) -> None:

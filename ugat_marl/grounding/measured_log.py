@@ -185,13 +185,12 @@ class _Street:
         """Return the log, and what it does not know."""
         courses = self._courses()
         table, observer = self.table, Observer(self.network, self.observation)
+        estimated = {x: own for x, own in courses.items() if x not in self._measured_lanes(table)}
         recorder = TransitionRecorder(self._provenance(observer, place))
         variances: dict[str, list[Floats]] = {}
         unlike: dict[str, list[float]] = {}
         for episode, period in enumerate(self.measured.periods):
-            blind_s = (
-                0.0 if table is not None else max(c[episode].blind_s for c in courses.values())
-            )
+            blind_s = max((c[episode].blind_s for c in estimated.values()), default=0.0)
             last = int((period.end_s - blind_s - period.begin_s) / self.interval_s + 1e-9)
             if last < 2:
                 raise MeasuredDataError(
@@ -213,14 +212,24 @@ class _Street:
                 variances.setdefault(lane, []).append(one.deviation**2)
             self._record(recorder, observer, episode, times_s, np.stack(phases, 1), lanes)
         incoming = [x for item in self.network.intersections for x in item.incoming_lanes]
-        deviation = {x: float(np.sqrt(np.concatenate(variances[x]).mean())) for x in incoming}
-        findings = self._findings(courses, deviation, unlike, table is not None)
+        deviation = {
+            x: float(np.sqrt(np.concatenate(variances[x]).mean()))
+            for x in incoming
+            if x in estimated
+        }
+        findings = self._findings(estimated, deviation, unlike)
         if table is not None:
             findings = (*_unseen(table), *findings)
         log = recorder.log()
-        if table is None:
-            log = TransitionLog(replace(log.provenance, deviation=deviation), log.frame)
+        log = TransitionLog(replace(log.provenance, deviation=deviation), log.frame)
         return MeasuredLog(log, findings)
+
+    def _measured_lanes(self, table: pl.DataFrame | None) -> set[str]:
+        """Return the lanes whose vehicles the table holds in every period."""
+        if table is None:
+            return set()
+        held = table.group_by("lane_id").agg(pl.col("period_id").n_unique())
+        return set(held.filter(pl.col("period_id") == len(self.measured.periods))["lane_id"])
 
     @property
     def _lanes(self) -> tuple[str, ...]:
@@ -357,11 +366,16 @@ class _Street:
         courses: dict[str, list[LaneCourse]],
         deviation: dict[str, float],
         unlike: dict[str, list[float]],
-        counted: bool,
     ) -> tuple[str, ...]:
-        """Return what the log does not know, most important first."""
+        """Return what the log does not know, most important first.
+
+        Args:
+            courses: Courses of the lanes whose vehicles are estimated.
+            deviation: Their standard deviations where they lead to a traffic light.
+            unlike: Shares of time with greens of no phase, at each light.
+        """
         found: list[str] = []
-        if not counted:
+        if deviation:
             worst = max(deviation, key=lambda lane: deviation[lane])
             found.append(
                 f"vehicles on a lane are estimated to {np.median(list(deviation.values())):.1f} "
