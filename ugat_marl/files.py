@@ -10,6 +10,7 @@ from __future__ import annotations
 import contextlib
 import errno
 import gzip
+import hashlib
 import io
 import json
 import os
@@ -28,7 +29,7 @@ from pathlib import Path
 from typing import Any, BinaryIO, NamedTuple
 from xml.parsers import expat
 
-from ugat_marl.errors import OutputError, ScenarioError, UgatMarlError
+from ugat_marl.errors import OptionError, OutputError, ScenarioError, UgatMarlError
 from ugat_marl.progress import Reporter, Silent, usual, watched
 
 _PIECE = 1 << 20
@@ -91,6 +92,18 @@ def require_writable(path: Path) -> None:
         raise OutputError(
             f"{path}: cannot be written ({error.strerror}); give another place"
         ) from None
+
+
+def file_hash(path: Path) -> str:
+    """Return the SHA-256 of a file's content, so that the file may be moved.
+
+    Raises:
+        OptionError: The file cannot be read.
+    """
+    try:
+        return hashlib.sha256(path.read_bytes()).hexdigest()
+    except OSError as error:
+        raise OptionError(f"{path}: {error.strerror}; name a file that can be read") from None
 
 
 def write_whole(path: Path, content: bytes | str) -> None:

@@ -44,10 +44,10 @@ from ugat_marl.experiments.evaluation import (
 )
 from ugat_marl.experiments.queues import QUEUES, QueueRecord
 from ugat_marl.experiments.randomised import randomised_env
-from ugat_marl.experiments.settings import DIRECT, Setting, file_hash, short_name
+from ugat_marl.experiments.settings import DIRECT, Setting, short_name
 from ugat_marl.experiments.training import Effort, simulated_worlds, train_grounded, train_through
 from ugat_marl.experiments.tuning import VERSION, tuned_rules
-from ugat_marl.files import parse_json, read_json, write_whole
+from ugat_marl.files import file_hash, parse_json, read_json, write_whole
 from ugat_marl.grounding import (
     ChangePenalty,
     Probe,

@@ -2,12 +2,12 @@
 
 from __future__ import annotations
 
-import hashlib
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import Any, Literal, get_args
 
 from ugat_marl.errors import OptionError, UnknownNameError
+from ugat_marl.files import file_hash
 from ugat_marl.grounding import NEGATIVE_CONTROLS, NegativeControl, UgatConfig
 from ugat_marl.policies import (
     SUITE_LEARNERS,
@@ -21,6 +21,7 @@ from ugat_marl.policies import (
     learner_library,
     load_own,
     observed_options,
+    own_source,
     require_known_learner,
     suite_config,
 )
@@ -66,18 +67,6 @@ MOST_DELAY_S = 5
 
 CHANGE_COST = 5.0
 """Cost of a change of phase of the recipe "penalty", in halting vehicles."""
-
-
-def file_hash(path: Path) -> str:
-    """Return the SHA-256 of a file's content, so that the file may be moved.
-
-    Raises:
-        OptionError: The file cannot be read.
-    """
-    try:
-        return hashlib.sha256(path.read_bytes()).hexdigest()
-    except OSError as error:
-        raise OptionError(f"{path}: {error.strerror}; name a file that can be read") from None
 
 
 Recipe = Literal[
@@ -158,7 +147,8 @@ class LearnerSpec:
                 settings["start"] = file_hash(Path(self.dqn.start))
             return {"name": self.name, "settings": settings}
         if is_own(self.name):
-            return {"name": self.name, "settings": list(self.settings)}
+            source = own_source(self.name, "learner")
+            return {"name": self.name, "settings": list(self.settings), "source": source}
         settings = baseline_settings(self.name, self.settings)
         return {"name": self.name, "settings": settings, "library": learner_library(self.name)}
 

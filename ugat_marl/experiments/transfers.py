@@ -54,10 +54,9 @@ from ugat_marl.experiments.settings import (
     RULE,
     LearnerSpec,
     Setting,
-    file_hash,
 )
 from ugat_marl.experiments.tuning import LEAST_BUDGET
-from ugat_marl.files import require_writable, write_whole
+from ugat_marl.files import file_hash, require_writable, write_whole
 from ugat_marl.grounding import (
     DIRECT_LEARNER,
     NEGATIVE_CONTROLS,

@@ -52,6 +52,7 @@ from .own import is_savable as is_savable
 from .own import load_own as load_own
 from .own import own_name as own_name
 from .own import own_policy as own_policy
+from .own import own_source as own_source
 from .protocols import EpisodeCallback as EpisodeCallback
 from .protocols import Learner as Learner
 from .protocols import Policy as Policy

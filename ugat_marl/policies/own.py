@@ -41,7 +41,7 @@ from ugat_marl.envs import (
     checked_phases,
 )
 from ugat_marl.errors import CheckpointError, OptionError, UgatMarlError, UnknownNameError
-from ugat_marl.files import parse_json, require_stored, write_whole
+from ugat_marl.files import file_hash, parse_json, require_stored, write_whole
 from ugat_marl.policies.protocols import EpisodeCallback, Policy
 from ugat_marl.seeding import derive_seed
 
@@ -104,6 +104,26 @@ def load_own(name: str, what: str) -> Any:
             raise UnknownNameError(f"{what} in {module_name}", part, names)
         found = getattr(found, part)
     return found
+
+
+def own_source(name: str, what: str) -> str | None:
+    """Return the hash of the file that defines a user's object; None if it is in no file.
+
+    Args:
+        name: Name as for `load_own`.
+        what: Kind of thing for messages, such as "learner".
+
+    Raises:
+        OptionError: The module is missing.
+        UnknownNameError: The object is missing in it.
+    """
+    found = load_own(name, what)
+    kind = found if hasattr(found, "__qualname__") else type(found)
+    try:
+        file = inspect.getsourcefile(kind)
+    except (TypeError, OSError):  # built in, or typed at a prompt
+        return None
+    return None if file is None or not Path(file).is_file() else file_hash(Path(file))
 
 
 def _module_in(file: Path) -> ModuleType:
