@@ -35,7 +35,7 @@ from torchrl.envs.utils import ExplorationType, set_exploration_type
 
 from ugat_marl.envs import AnyParallelEnv, agent_indicator, pad_spaces
 from ugat_marl.errors import OptionError, UnknownNameError
-from ugat_marl.experiments import BaselineArgs, Result, baseline_command, train_baseline
+from ugat_marl.experiments import BaselineArgs, BaselineResult, baseline_command, train_baseline
 from ugat_marl.policies import (
     EpisodeCallback,
     LibraryLearner,
@@ -326,7 +326,7 @@ class Args(BaselineArgs):
     benchmarl: Annotated[BenchMARLConfig, tyro.conf.arg(name="")] = BenchMARLConfig()
 
 
-def train(args: Args, on_episode: EpisodeCallback | None = None) -> Result:
+def train(args: Args, on_episode: EpisodeCallback | None = None) -> BaselineResult:
     """Train and evaluate; write the results if `args.out` is given."""
     return train_baseline(args, lambda env: BenchMARL(env, args.benchmarl, args.seed), on_episode)
 

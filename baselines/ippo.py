@@ -25,7 +25,7 @@ from ugat_marl.data import read_checkpoint, write_checkpoint
 from ugat_marl.envs import AgentSet
 from ugat_marl.envs import AnyParallelEnv as Env
 from ugat_marl.errors import CheckpointError, EpisodeError, OptionError
-from ugat_marl.experiments import BaselineArgs, Result, baseline_command, train_baseline
+from ugat_marl.experiments import BaselineArgs, BaselineResult, baseline_command, train_baseline
 from ugat_marl.policies import (
     BatchedMLP,
     InputScale,
@@ -336,7 +336,7 @@ class Args(BaselineArgs):
     ppo: Annotated[IPPOConfig, tyro.conf.arg(name="")] = IPPOConfig()
 
 
-def train(args: Args, on_episode: Callback | None = None) -> Result:
+def train(args: Args, on_episode: Callback | None = None) -> BaselineResult:
     """Train and evaluate; write the results if `args.out` is given."""
     return train_baseline(args, lambda env: IPPO(env, args.ppo, args.seed), on_episode)
 

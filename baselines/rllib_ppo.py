@@ -31,7 +31,7 @@ from torch import Tensor, nn
 
 from ugat_marl.envs import AnyParallelEnv, agent_groups, agent_indicator, masked_observation
 from ugat_marl.errors import UgatMarlError
-from ugat_marl.experiments import BaselineArgs, Result, baseline_command, train_baseline
+from ugat_marl.experiments import BaselineArgs, BaselineResult, baseline_command, train_baseline
 from ugat_marl.policies import (
     EpisodeCallback,
     LibraryLearner,
@@ -251,7 +251,7 @@ class Args(BaselineArgs):
     ppo: Annotated[RLlibConfig, tyro.conf.arg(name="")] = RLlibConfig()
 
 
-def train(args: Args, on_episode: EpisodeCallback | None = None) -> Result:
+def train(args: Args, on_episode: EpisodeCallback | None = None) -> BaselineResult:
     """Train and evaluate; write the results if `args.out` is given."""
     return train_baseline(args, lambda env: RLlib(env, args.ppo, args.seed), on_episode)
 

@@ -34,7 +34,7 @@ from torch import Tensor, nn
 
 from ugat_marl.envs import AgentsVecEnv, AnyParallelEnv, agent_indicator, pad_spaces
 from ugat_marl.errors import EpisodeError, UnknownNameError
-from ugat_marl.experiments import BaselineArgs, Result, baseline_command, train_baseline
+from ugat_marl.experiments import BaselineArgs, BaselineResult, baseline_command, train_baseline
 from ugat_marl.policies import (
     EpisodeCallback,
     LibraryLearner,
@@ -298,7 +298,7 @@ class Args(BaselineArgs):
     sb3: Annotated[SB3Config, tyro.conf.arg(name="")] = SB3Config()
 
 
-def train(args: Args, on_episode: EpisodeCallback | None = None) -> Result:
+def train(args: Args, on_episode: EpisodeCallback | None = None) -> BaselineResult:
     """Train and evaluate; write the results if `args.out` is given."""
     return train_baseline(args, lambda env: SB3(env, args.sb3, args.seed), on_episode)
 

@@ -33,7 +33,7 @@ from torch import Tensor, nn
 
 from ugat_marl.envs import AnyParallelEnv, agent_groups, appended_mask
 from ugat_marl.errors import OptionError
-from ugat_marl.experiments import BaselineArgs, Result, baseline_command, train_baseline
+from ugat_marl.experiments import BaselineArgs, BaselineResult, baseline_command, train_baseline
 from ugat_marl.policies import (
     EpisodeCallback,
     LibraryLearner,
@@ -225,7 +225,7 @@ class Args(BaselineArgs):
     ppo: Annotated[SkrlConfig, tyro.conf.arg(name="")] = SkrlConfig()
 
 
-def train(args: Args, on_episode: EpisodeCallback | None = None) -> Result:
+def train(args: Args, on_episode: EpisodeCallback | None = None) -> BaselineResult:
     """Train and evaluate; write the results if `args.out` is given."""
     return train_baseline(args, lambda env: Skrl(env, args.ppo, args.seed), on_episode)
 

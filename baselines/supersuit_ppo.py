@@ -28,7 +28,7 @@ from supersuit.vector import MarkovVectorEnv
 from supersuit.vector.sb3_vector_wrapper import SB3VecEnvWrapper
 
 from ugat_marl.envs import AnyParallelEnv, agent_indicator, appended_mask, pad_spaces
-from ugat_marl.experiments import BaselineArgs, Result, baseline_command, train_baseline
+from ugat_marl.experiments import BaselineArgs, BaselineResult, baseline_command, train_baseline
 from ugat_marl.policies import EpisodeCallback, load_baseline
 
 _sb3: Any = load_baseline("sb3-ppo")
@@ -61,7 +61,7 @@ class Args(BaselineArgs):
     sb3: Annotated[SuperSuitConfig, tyro.conf.arg(name="")] = SuperSuitConfig()
 
 
-def train(args: Args, on_episode: EpisodeCallback | None = None) -> Result:
+def train(args: Args, on_episode: EpisodeCallback | None = None) -> BaselineResult:
     """Train and evaluate; write the results if `args.out` is given."""
     return train_baseline(args, lambda env: SuperSuitPPO(env, args.sb3, args.seed), on_episode)
 

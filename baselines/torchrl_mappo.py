@@ -27,7 +27,7 @@ from torchrl.objectives import ClipPPOLoss, ValueEstimators
 
 from ugat_marl.envs import AnyParallelEnv, agent_indicator, pad_spaces
 from ugat_marl.errors import OptionError
-from ugat_marl.experiments import BaselineArgs, Result, baseline_command, train_baseline
+from ugat_marl.experiments import BaselineArgs, BaselineResult, baseline_command, train_baseline
 from ugat_marl.policies import (
     EpisodeCallback,
     LibraryLearner,
@@ -192,7 +192,7 @@ class Args(BaselineArgs):
     mappo: Annotated[TorchRLConfig, tyro.conf.arg(name="")] = TorchRLConfig()
 
 
-def train(args: Args, on_episode: EpisodeCallback | None = None) -> Result:
+def train(args: Args, on_episode: EpisodeCallback | None = None) -> BaselineResult:
     """Train and evaluate; write the results if `args.out` is given."""
     return train_baseline(args, lambda env: TorchRLMAPPO(env, args.mappo, args.seed), on_episode)
 

@@ -15,6 +15,7 @@ from ugat_marl.data import Scores
 from ugat_marl.errors import OptionError, UnknownNameError
 from ugat_marl.experiments import Evaluation, TransferConfig, run_folder
 from ugat_marl.experiments.scores import Result as Episode
+from ugat_marl.policies import DQNConfig
 
 
 def scored(att_s: float) -> Scores:
@@ -66,6 +67,8 @@ def test_wrong_calls_are_refused() -> None:
     for policies in (["random", "random"], []):
         with pytest.raises(OptionError, match="policies"):
             ugat_marl.evaluate("single-v1", policies, ["sim"])
+    with pytest.raises(OptionError, match="settings dqn are of the learners dqn and universal"):
+        ugat_marl.train("single-v1", learner="ippo", dqn=DQNConfig(batch_size=8))
     with pytest.raises(OptionError, match="at least one"):
         ugat_marl.evaluate("single-v1", ["random"], [])
     with pytest.raises(UnknownNameError, match="largest-queue"):

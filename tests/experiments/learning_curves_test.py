@@ -63,6 +63,9 @@ def test_a_curve_is_the_means_of_a_record() -> None:
     assert found.att_s == {2: 1004.0, 4: 1006.0}  # seeds 1000 to 1004
     assert found.speed == 4 * scenario.decisions / 2
     assert found.own_ms == 1000 / (4 * scenario.decisions)
+    short = replace(job, options={**job.options, "duration_s": 50.0})
+    half = Curve.of(short, Record(played, episodes=4, seconds=2.0, own_seconds=1.0), scenario)
+    assert (half.speed, half.own_ms) == (found.speed / 2, 2 * found.own_ms)
 
 
 def test_all_learners_have_a_seed_before_one_has_two() -> None:

@@ -130,3 +130,6 @@ def test_rules_are_put_into_a_table(tmp_path: Path, capsys: pytest.CaptureFixtur
     for wrong in ([], ["--policies", "random", "--learner", "dqn"]):
         assert main(["compare", "single-v1", "--name", "mine", *wrong]) == 2
         assert "one of the two" in capsys.readouterr().err
+    for option, value in (("--seeds", "4"), ("--learner-settings", "a=1")):
+        assert main([*call, option, value]) == 2
+        assert f"{option} is of a training" in capsys.readouterr().err

@@ -44,6 +44,7 @@ IPPO = replace(
     learner="ippo",
     learner_settings=("hidden=16", "update_every=5", "epochs=2"),
     control=True,
+    dqn=DQNConfig(),
 )
 
 

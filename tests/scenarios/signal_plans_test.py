@@ -288,6 +288,8 @@ def test_the_typical_plan_of_a_fixed_time_is_itself(single: Scenario) -> None:
     assert {code for phase in plan.phases for code in phase.movements} == {
         f"{way}{turn}" for way in ("NB", "EB", "SB", "WB") for turn in "LTR"
     }
+    # A phase is asked for every 30 s, and its green follows the clearance of 5 s.
+    assert plan.offset_s % 30 == 5
 
 
 def test_the_typical_plan_of_the_programme_is_the_programme(single: Scenario) -> None:

@@ -100,6 +100,8 @@ class Compare:
         """Judge, print the table, write it."""
         if bool(self.policies) == (self.learner is not None):
             raise OptionError("compare needs --policies or --learner, one of the two")
+        if self.policies:
+            self._refuse_settings_of_trainings()
         if self.evaluation_seeds < 1 or (self.workers is not None and self.workers < 1):
             raise OptionError("--evaluation-seeds and --workers must be at least 1")
         if self.out is not None:
@@ -119,6 +121,14 @@ class Compare:
             write_csv(self.out, whole.write_csv())
             console.print(f"table: {self.out}", soft_wrap=True)
         return 0
+
+    def _refuse_settings_of_trainings(self) -> None:
+        for option in ("learner_settings", "seeds", "episodes", "runs"):
+            if getattr(self, option) != getattr(type(self), option):
+                raise OptionError(
+                    f"--{option.replace('_', '-')} is of a training, and --policies are trained "
+                    "already; leave it out, or give --learner instead"
+                )
 
     def _domains(self, table: pl.DataFrame) -> tuple[str, ...]:
         known = table["domain"].unique(maintain_order=True).to_list()

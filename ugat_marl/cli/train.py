@@ -65,7 +65,7 @@ class Train:
         """Train and evaluate; print and draw the table."""
         config = self.config
         if self.out == Path():
-            raise OptionError("--out is empty; give the name of a folder")
+            raise OptionError("--out is the working folder itself, or empty; name a folder")
         directory = self.out or run_folder(config)
         try:
             with workers_of(None, self.ray) as workers:

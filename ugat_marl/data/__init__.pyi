@@ -50,3 +50,4 @@ from .transitions import Provenance as Provenance
 from .transitions import TransitionLog as TransitionLog
 from .transitions import TransitionRecorder as TransitionRecorder
 from .transitions import Transitions as Transitions
+from .transitions import consecutive as consecutive

@@ -314,6 +314,11 @@ class TransitionLog:
             raise LogError(f"{path}: {error}") from None
 
 
+def consecutive(episode: NDArray[np.int64], step: NDArray[np.int64]) -> NDArray[np.bool_]:
+    """Return whether each decision but the first follows the one before it, ``(n - 1,)``."""
+    return (np.diff(episode) == 0) & (np.diff(step) == 1)
+
+
 _Row = tuple[
     NDArray[np.float32],
     int,

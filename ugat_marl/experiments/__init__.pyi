@@ -1,5 +1,5 @@
 from .baseline import BaselineArgs as BaselineArgs
-from .baseline import Result as Result
+from .baseline import BaselineResult as BaselineResult
 from .baseline import baseline_command as baseline_command
 from .baseline import train_baseline as train_baseline
 from .comparison import LEAST_SHARE_ARRIVED as LEAST_SHARE_ARRIVED

@@ -55,8 +55,8 @@ class BaselineArgs:
     out: Path | None = None
 
 
-class Result(NamedTuple):
-    """Result of a training.
+class BaselineResult(NamedTuple):
+    """BaselineResult of a training.
 
     Attributes:
         policy: The trained policy.
@@ -73,7 +73,7 @@ def train_baseline(
     args: BaselineArgs,
     make: Callable[[AnyParallelEnv], Any],
     on_episode: EpisodeCallback | None = None,
-) -> Result:
+) -> BaselineResult:
     """Train and evaluate; write the results if `args.out` is given.
 
     Args:
@@ -102,7 +102,7 @@ def train_baseline(
                 played = {"it": fixed_policy(policy)}
                 evaluation = evaluate(scenario, played, [args.domain], seeds, duration_s=length)
                 att_s[mark] = [result.scores.att_s for result in evaluation.results]
-        result = Result(learner.policy(), returns, att_s)
+        result = BaselineResult(learner.policy(), returns, att_s)
     if args.out is not None:
         result.policy.save(args.out / "policy.pt")
         learner.save(args.out / "learner.pt")
@@ -112,7 +112,7 @@ def train_baseline(
 
 
 def baseline_command(
-    kind: type[BaselineArgs], train: Callable[[Any, EpisodeCallback | None], Result]
+    kind: type[BaselineArgs], train: Callable[[Any, EpisodeCallback | None], BaselineResult]
 ) -> None:
     """Read the command line into `kind`, train and print the results; an error is one line."""
     name = Path(sys.argv[0]).name

@@ -14,7 +14,7 @@ import numpy as np
 from ugat_marl.effects import Domain, domain_label
 from ugat_marl.envs import AgentSet, TrafficEnv, parallel_env
 from ugat_marl.errors import CheckpointError, OptionError
-from ugat_marl.experiments.scores import Evaluation, Result, Trial
+from ugat_marl.experiments.scores import Evaluation, Result, RuleTrial
 from ugat_marl.parallel import (
     Stop,
     Workers,
@@ -169,7 +169,7 @@ def race_rules(
     workers: Workers = None,
     reporter: Reporter | None = None,
     title: str = "racing",
-) -> tuple[Trial, ...]:
+) -> tuple[RuleTrial, ...]:
     """Race rules by successive halving: after each rung, the better half plays the next rung.
 
     Args:
@@ -202,7 +202,7 @@ def race_rules(
         return [evaluation.values(spec, played_in, "att_s").tolist() for spec in running]
 
     played = race(specs, len(seeds), play)
-    return tuple(Trial(spec, float(np.mean(each)), len(each)) for spec, each in played.items())
+    return tuple(RuleTrial(spec, float(np.mean(each)), len(each)) for spec, each in played.items())
 
 
 @dataclass(frozen=True)

@@ -56,6 +56,8 @@ class Curve:
         """
         (domain,) = job.domains
         assert job.seed is not None
+        if job.duration_s is not None:
+            scenario = scenario.with_duration(job.duration_s)
         decisions = record.episodes * scenario.decisions
         return cls(
             job.setting.name,

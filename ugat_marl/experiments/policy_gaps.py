@@ -7,7 +7,6 @@ diagnosis did not use. Only a real domain that is itself a simulation allows thi
 
 from __future__ import annotations
 
-import math
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
@@ -17,6 +16,7 @@ from ugat_marl.effects import Domain, domain_label, load_scenario, scenario_in_d
 from ugat_marl.errors import OptionError, ScenarioError
 from ugat_marl.experiments.evaluation import evaluate
 from ugat_marl.experiments.scores import Estimate, Evaluation
+from ugat_marl.experiments.statistics import number_or_none
 from ugat_marl.parallel import Workers
 from ugat_marl.policies import PolicyFactory
 from ugat_marl.progress import Reporter, Silent
@@ -102,11 +102,9 @@ def _gap(evaluations: Mapping[str, Evaluation], policy: str) -> PolicyGap:
 
 
 def _travel_time(estimate: Estimate) -> TravelTimeEstimate:
-    return TravelTimeEstimate(estimate.mean, _or_none(estimate.low), _or_none(estimate.high))
-
-
-def _or_none(value: float) -> float | None:
-    return None if math.isnan(value) else value
+    return TravelTimeEstimate(
+        estimate.mean, number_or_none(estimate.low), number_or_none(estimate.high)
+    )
 
 
 def read_diagnosis(directory: Path, scenario: Scenario) -> tuple[Diagnosis, Scenario]:

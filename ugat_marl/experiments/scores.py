@@ -218,7 +218,7 @@ class Evaluation:
 
 
 @dataclass(frozen=True)
-class Trial:
+class RuleTrial:
     """Result of one rule with its parameters in a race.
 
     Attributes:
@@ -244,10 +244,10 @@ class Tuned:
 
     rule: str
     domain: str
-    trials: tuple[Trial, ...]
+    trials: tuple[RuleTrial, ...]
 
     @property
-    def best(self) -> Trial:
+    def best(self) -> RuleTrial:
         """The trial with the best parameters."""
         return self.trials[0]
 

@@ -22,7 +22,7 @@ from ugat_marl.experiments.comparison import Comparison
 from ugat_marl.experiments.evaluation import evaluate
 from ugat_marl.experiments.jobs import EVALUATION_SEED
 from ugat_marl.experiments.settings import DIRECT
-from ugat_marl.experiments.statistics import Interval, student_p
+from ugat_marl.experiments.statistics import Interval, number_or_none, student_p
 from ugat_marl.parallel import Workers
 from ugat_marl.policies import PolicyFactory, policy_card, shipped_policies
 from ugat_marl.progress import Reporter
@@ -264,8 +264,8 @@ def ranked(table: pl.DataFrame) -> pl.DataFrame:
                     "setting": setting,
                     "trainings": own.size,
                     "att_s": interval.mean,
-                    "low_s": _or_none(interval.low),
-                    "high_s": _or_none(interval.high),
+                    "low_s": number_or_none(interval.low),
+                    "high_s": number_or_none(interval.high),
                     "gap_s": interval.mean - float(values[setting]["att_s_sim"].to_numpy().mean()),
                     "regret_s": regrets[setting],
                     "won_back": 1.0 - regrets[setting] / start if start > 0 else None,
@@ -273,10 +273,6 @@ def ranked(table: pl.DataFrame) -> pl.DataFrame:
                 }
             )
     return pl.DataFrame(rows, infer_schema_length=None)
-
-
-def _or_none(value: float) -> float | None:
-    return None if math.isnan(value) else value
 
 
 def _welch_p(one: Any, other: Any) -> float | None:

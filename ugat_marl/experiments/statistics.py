@@ -68,6 +68,11 @@ class PairedTest:
         return cls(Interval.of(differences), p, better, count)
 
 
+def number_or_none(value: float) -> float | None:
+    """Return a number for JSON and tables: None for NaN."""
+    return None if math.isnan(value) else value
+
+
 def student_p(t: float, degrees: float) -> float:
     """Return the two-sided p-value of Student's t.
 

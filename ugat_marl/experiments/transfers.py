@@ -69,6 +69,7 @@ from ugat_marl.parallel import Workers
 from ugat_marl.policies import (
     DQN_NAME,
     STANDARD_RULES,
+    SUITE_LEARNERS,
     TUNED_RULES,
     UNIVERSAL_NAME,
     DQNConfig,
@@ -194,6 +195,11 @@ class TransferConfig:
 
     def _refuse_impossible_controls(self) -> None:
         require_known_learner(self.learner)
+        if self.learner not in SUITE_LEARNERS and self.dqn != DQNConfig():
+            raise OptionError(
+                f"settings dqn are of the learners {' and '.join(SUITE_LEARNERS)}, not of "
+                f"{self.learner!r}; give those of yours as learner_settings"
+            )
         require_device_name(self.device)
         if self.placebo not in NEGATIVE_CONTROLS:
             raise UnknownNameError("placebo", self.placebo, NEGATIVE_CONTROLS)

@@ -20,7 +20,7 @@ from ugat_marl.data import installed_version, json_damage, with_hashes
 from ugat_marl.effects import Domain, domain_label, scenario_in_domain
 from ugat_marl.errors import CheckpointError, OptionError, UnknownNameError
 from ugat_marl.experiments.evaluation import TUNING_SEED, best_rules, race_rules
-from ugat_marl.experiments.scores import Trial, Tuned
+from ugat_marl.experiments.scores import RuleTrial, Tuned
 from ugat_marl.files import read_json, user_cache, write_whole
 from ugat_marl.parallel import Workers
 from ugat_marl.policies import RULE_NAMES, RULES, TUNED_RULES, race_fields, rule_settings
@@ -180,14 +180,16 @@ def _place(
     return user_cache("tuned") / f"{hashlib.sha256(repr(content).encode()).hexdigest()}.json"
 
 
-def _recall(place: Path, specs: Sequence[str]) -> tuple[Trial, ...] | None:
+def _recall(place: Path, specs: Sequence[str]) -> tuple[RuleTrial, ...] | None:
     """Return the result in a file; None if it is missing, damaged or of other settings."""
     try:
         content: Any = read_json(place, CheckpointError)
         if json_damage(content, "trials"):
             return None
         rows = content["trials"]
-        trials = tuple(Trial(str(r["spec"]), float(r["att_s"]), int(r["episodes"])) for r in rows)
+        trials = tuple(
+            RuleTrial(str(r["spec"]), float(r["att_s"]), int(r["episodes"])) for r in rows
+        )
     except (CheckpointError, ArithmeticError, ValueError, KeyError, TypeError):
         return None
     whole = sorted(trial.spec for trial in trials) == sorted(specs)

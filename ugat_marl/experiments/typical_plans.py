@@ -54,7 +54,7 @@ class _Shown:
         decisions: Phase to the number of decisions in which it was shown.
         greens: Movement to the number of its greens.
         following: Pair of a phase and the next one to how often it came.
-        begins_s: Phase to the times at which it began, s on the scenario's clock.
+        begins_s: Phase to the times at which its green began, s on the scenario's clock.
     """
 
     served: Sequence[frozenset[str]]
@@ -63,7 +63,9 @@ class _Shown:
     following: Counter[tuple[int, int]] = field(default_factory=Counter[tuple[int, int]])
     begins_s: dict[int, list[float]] = field(default_factory=dict[int, list[float]])
 
-    def add(self, phases: Sequence[int], begin_s: float, interval_s: float) -> None:
+    def add(
+        self, phases: Sequence[int], begin_s: float, interval_s: float, clearance_s: float
+    ) -> None:
         """Add the phases of one episode, one per decision."""
         self.decisions.update(phases)
         starts = [0, *(i for i, (a, b) in enumerate(pairwise(phases), 1) if a != b)]
@@ -71,7 +73,9 @@ class _Shown:
         for start in starts:
             now = self.served[phases[start]]
             self.greens.update(now - before)
-            self.begins_s.setdefault(phases[start], []).append(begin_s + start * interval_s)
+            # The first green has no clearance before it; its cycle is that of the others.
+            green_s = begin_s + start * interval_s + clearance_s
+            self.begins_s.setdefault(phases[start], []).append(green_s)
             before = now
         self.following.update(pairwise(phases[start] for start in starts))
 
@@ -110,14 +114,14 @@ def typical_plans(
     if env.options.signals == "programme":
         return tuple(programme_plan(light, network) for light in network.intersections)
     shown = [_Shown(_served(light, network)) for light in network.intersections]
-    begin_s = env.scenario.settings.begin_s
+    begin_s, clearance_s = env.scenario.settings.begin_s, env.scenario.timing.clearance_s
     try:
         with reporter.task("playing episodes", len(seeds)) as advance:
             for seed in seeds:
                 course: list[list[int]] = []
                 roll_out(env, policy, seed, on_step=lambda _, c=course: c.append(env.phases))
                 for light, phases in zip(shown, zip(*course, strict=True), strict=True):
-                    light.add(phases, begin_s, control.decision_interval_s)
+                    light.add(phases, begin_s, control.decision_interval_s, clearance_s)
                 advance()
     finally:
         env.close()

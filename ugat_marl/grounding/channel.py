@@ -25,7 +25,7 @@ from typing import Any, ClassVar
 import numpy as np
 from numpy.typing import NDArray
 
-from ugat_marl.data import AgentLayout, TransitionLog, Transitions
+from ugat_marl.data import AgentLayout, TransitionLog, Transitions, consecutive
 from ugat_marl.effects import Actuator, Commands, ControllerPart
 from ugat_marl.errors import CheckpointError, LogError, OptionError
 from ugat_marl.scenarios import Network, SignalState, SignalTiming
@@ -257,7 +257,7 @@ def require_histories(log: TransitionLog) -> None:
     """
     for agent in log.agents:
         rows = log.transitions(agent)
-        follows = int(_goes_on(rows).sum())
+        follows = int(consecutive(rows.episode, rows.step).sum())
         if follows < LEAST_IN_ORDER * (len(rows) - 1):
             raise LogError(
                 f"only {follows} of the {len(rows)} decisions of {agent} in the log follow the one "
@@ -265,11 +265,6 @@ def require_histories(log: TransitionLog) -> None:
                 "commands and counts, so record whole episodes and keep their steps, or choose "
                 "another grounding (--grounding timed)"
             )
-
-
-def _goes_on(rows: Transitions) -> NDArray[np.bool_]:
-    """Return whether each decision but the first follows the one before it, ``(n - 1,)``."""
-    return (np.diff(rows.episode) == 0) & (np.diff(rows.step) == 1)
 
 
 def fit_channel(
@@ -343,7 +338,7 @@ class _Course:
             raise LogError("a channel needs a log with two decisions or more of every agent")
         shown = rows.observation[:, layout.features : layout.features + layout.phases]
         running = shown.argmax(1).astype(np.int64)
-        goes_on = _goes_on(rows)
+        goes_on = consecutive(rows.episode, rows.step)
         asked = np.full((config.most_lag + 1, count), -1, dtype=np.int64)
         asked[0] = rows.action
         for lag in range(1, len(asked)):

@@ -24,7 +24,7 @@ from typing import Any, ClassVar
 import numpy as np
 from numpy.typing import NDArray
 
-from ugat_marl.data import TransitionLog
+from ugat_marl.data import TransitionLog, consecutive
 from ugat_marl.effects import (
     ControllerPart,
     CountingError,
@@ -397,15 +397,10 @@ def _lag(rows: Sequence[LaneRows], perfect: Sequence[LaneRows], config: EyesConf
     return config.most_lag
 
 
-def _goes_on(own: LaneRows) -> NDArray[np.bool_]:
-    """Return whether each decision but the first follows the one before it, ``(n - 1,)``."""
-    return (np.diff(own.episode) == 0) & (np.diff(own.step) == 1)
-
-
 def _since_green(own: LaneRows) -> NDArray[np.int64]:
     """Return the decisions since a lane had its last green; 0 in green, -1 if none is known."""
     since = np.zeros(len(own.has), dtype=np.int64)
-    goes_on = np.concatenate([[False], _goes_on(own)])
+    goes_on = np.concatenate([[False], consecutive(own.episode, own.step)])
     for t in range(len(since)):
         before = since[t - 1] if goes_on[t] else -1
         since[t] = 0 if own.has[t] else before + (before >= 0)
@@ -430,7 +425,7 @@ def _fall_in_green(rows: Sequence[LaneRows], lag: int, config: EyesConfig) -> fl
     for own in rows:
         green = own.has.copy()
         for _ in range(lag):
-            green = np.concatenate([[False], green[:-1] & _goes_on(own)])
+            green = np.concatenate([[False], green[:-1] & consecutive(own.episode, own.step)])
         falls.append((own.before - own.after)[(own.before >= config.queue) & green])
     return _mean_of_many(falls, config)
 
@@ -451,7 +446,7 @@ def _lost(rows: Sequence[LaneRows], config: EyesConfig) -> float:
     after_fall: list[float] = []
     for own in rows:
         served = own.had & own.has & (own.before >= config.long_queue)
-        follows = served[:-1] & served[1:] & (np.diff(own.step) == 1)
+        follows = served[:-1] & served[1:] & consecutive(own.episode, own.step)
         fall = own.before - own.after
         stayed = follows & (fall[:-1] == 0)
         stays += (fall[served] == 0).tolist()

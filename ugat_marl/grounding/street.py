@@ -180,7 +180,7 @@ class FittedStreet:
     @property
     def late(self) -> bool:
         """True if some commands act in a later decision."""
-        return self.channel is not None and bool(self.channel.network[1:-1].any())
+        return self.channel is not None and self.channel.late
 
     def world(self, seed: int) -> StreetWorld:
         """Draw the world of an episode."""
