@@ -5,8 +5,10 @@ from __future__ import annotations
 import threading
 import time
 from collections.abc import Sequence
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -225,6 +227,42 @@ def test_faults_of_detectors_cost_no_simulation(scenario: Scenario, layout: Dete
     assert len(streets.calls) == 2
     assert faulty[0].tally.bins[0].sum() < plain[0].tally.bins[0].sum()
     assert faulty[0].travel_time_s == plain[0].travel_time_s
+
+
+def test_threads_that_need_the_same_day_simulate_it_once(
+    scenario: Scenario, layout: DetectorLayout, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    budget = Budget()
+    made, streets = an_engine(scenario, layout, None, budget=budget)
+    simulate = streets.simulate
+
+    def slow(*args: Any) -> Day:
+        time.sleep(0.1)
+        return simulate(*args)
+
+    monkeypatch.setattr(streets, "simulate", slow)
+    models = [parse_domain(f"detector_extension=*,{k},split") for k in (0.1, 0.2, 0.3, 0.4)]
+    with ThreadPoolExecutor(5) as pool:
+        days = list(pool.map(lambda effects: made.replicates(effects, [0]), ((), *models)))
+    assert len(streets.calls) == budget.days == 1
+    assert len({day.travel_time_s for (day,) in days}) == 1
+    sums = [day.tally.sums.tolist() for (day,) in days]
+    assert all(other != sums[0] for other in sums[1:])
+
+
+def test_a_day_that_failed_is_tried_again(
+    scenario: Scenario, layout: DetectorLayout, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    made, streets = an_engine(scenario, layout, None)
+
+    def fails(*_: Any) -> Day:
+        raise SimulatorError("once")
+
+    with monkeypatch.context() as patch:
+        patch.setattr(streets, "simulate", fails)
+        with pytest.raises(SimulatorError, match="once"):
+            made.replicates((), [0])
+    assert len(made.replicates((), [0])) == len(streets.calls) == 1
 
 
 @pytest.mark.parametrize("damage", ["empty", "half", "text", "flipped", "other"])

@@ -145,6 +145,9 @@ def test_splash_reports_a_share_of_the_next_lane() -> None:
 def test_the_lanes_beside() -> None:
     beside = next_detectors(DETECTORS)
     assert beside == {"far": ("far left",), "far left": ("far",), "line": (), "other": ()}
+    farther = (Detector("farther left", "in_1", 20.0, 2.0, "advance"), *DETECTORS)
+    assert next_detectors(farther)["far"] == ("far left",)
+    assert next_detectors(farther)["farther left"] == ("far",)
 
 
 def test_what_is_stated_does_not_change() -> None:

@@ -15,7 +15,7 @@ import zipfile
 import zlib
 from collections import OrderedDict
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from concurrent.futures import Executor, ThreadPoolExecutor
+from concurrent.futures import Executor, Future, ThreadPoolExecutor
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, TypeVar
@@ -214,7 +214,8 @@ class Engine:
         self._workers = workers
         # Lights of a simulated day change with its steps, those of the street at any time.
         self._greens = [layout.greens(replay.shown(period)) for period in periods]
-        self._days: OrderedDict[str, Day] = OrderedDict()
+        self._days: OrderedDict[str, Future[Day]] = OrderedDict()
+        self._of_days = threading.Lock()
         self._known: dict[str, Replicate] = {}
         self._unmeasured = Unmeasured.of(periods)
         versions = installed_version("eclipse-sumo"), installed_version("numpy")
@@ -503,22 +504,28 @@ class Engine:
         """Return a day as the detectors saw it; faults of detectors need no new simulation."""
         faults = tuple(effect for effect in effects if _after_simulation(effect))
         physics = tuple(effect for effect in effects if not _after_simulation(effect))
-        key = self._key(physics, number)
-        day = self._days.get(key)
-        if day is None:
-            period = self.periods[number % len(self.periods)]
-            self._budget.spend(period)
-            seed = derive_seed(self._seed, "replicate", number)
-            day = self._simulated(physics, period, seed)
-            self._days[key] = day
-            while len(self._days) > _KEPT_DAYS:
-                try:
+        key, period = self._key(physics, number), self.periods[number % len(self.periods)]
+        with self._of_days:
+            day = self._days.get(key)
+            new = day is None
+            if day is None:
+                self._budget.spend(period)
+                day = self._days[key] = Future[Day]()
+                while len(self._days) > _KEPT_DAYS:
                     self._days.popitem(last=False)
-                except KeyError:  # another thread was quicker
-                    break
+        if new:  # other threads that need the day wait for this one
+            try:
+                seed = derive_seed(self._seed, "replicate", number)
+                day.set_result(self._simulated(physics, period, seed))
+            except BaseException as error:
+                with self._of_days:
+                    self._days.pop(key, None)
+                day.set_exception(error)
+                raise
+        seen = day.result()
         if not faults:
-            return day
-        return replace(day, period=self._replay.observed(faults, day.period))
+            return seen
+        return replace(seen, period=self._replay.observed(faults, seen.period))
 
     def _simulated(self, effects: tuple[Effect, ...], period: Period, seed: int) -> Day:
         if not isinstance(self._workers, Executor):

@@ -214,8 +214,7 @@ def _greens(log: SignalLog, links: tuple[int, ...], period: Period) -> Greens:
         shown = seen.get(state)
         if shown is None:
             shown = seen[state] = deciding_letter([state[index] for index in links])
-        kind = "G" if shown in GREEN else "y" if shown in YELLOW else "r"
-        if not changes or _kind(changes[-1][1]) != kind:
+        if not changes or _kind(changes[-1][1]) != _kind(shown):
             changes.append((time, shown))
     rows: list[tuple[float, float, float, bool]] = []
     for (start, shown), (end, after), (later, _) in zip(
@@ -442,7 +441,7 @@ def tally(
     exits = np.zeros(len(layout.exits))
     for index, (_, _, names) in enumerate(layout.exits):
         counter.place = len(layout.lanes) + index
-        exits[index] = counter.volume("count_exit", 2, _merged(period, names))
+        exits[index] = counter.volume("count_exit", 2, _recorded(period, names))
     _conserved(counter, layout, advances, stops, exits)
     journeys = _journeys(layout, period, greens, thresholds)
     return Tally(counter.sums, counter.bins, journeys=journeys, window=period.window)
@@ -485,13 +484,13 @@ class _Counter:
 def _passages(period: Period, lane: IncomingLane, kind: str) -> Passages | None:
     """Return the passages over the lane's detector of a kind; None if it has none."""
     names = lane.detectors.get(kind)  # pyright: ignore[reportArgumentType,reportCallIssue]
-    return None if not names else _merged(period, names)
+    return None if not names else _recorded(period, names)
 
 
-def _merged(period: Period, names: Sequence[str]) -> Passages:
+def _recorded(period: Period, names: Sequence[str]) -> Passages:
     """Return the passages of the first detector with a record, so that no vehicle counts twice."""
-    recorded = [period.passages[name] for name in names if name in period.passages]
-    return recorded[0] if recorded else Passages.none()
+    recorded = (period.passages[name] for name in names if name in period.passages)
+    return next(recorded, Passages.none())
 
 
 @dataclass(frozen=True, eq=False)
@@ -682,9 +681,7 @@ def _storage(counter: _Counter, advance: Passages, greens: Greens) -> None:
     on, off = on[lone], np.maximum(off[lone], on[lone])
     times = np.concatenate(([period.begin_s], np.sort(on), np.sort(off), [period.end_s]))
     steps = np.concatenate(([0.0], np.ones(len(on)), -np.ones(len(off)), [0.0]))
-    order = np.argsort(
-        np.concatenate(([period.begin_s], np.sort(on), np.sort(off), [period.end_s])), kind="stable"
-    )
+    order = np.argsort(times, kind="stable")
     times, present = times[order], np.minimum(np.cumsum(steps[order]), 1.0)
     # occupied seconds from the begin of the period up to each time
     filled = np.append(0.0, np.cumsum(np.diff(times) * present[:-1]))

@@ -309,16 +309,22 @@ class DetectorSplash(_OfDetectors):
 
 
 def next_detectors(detectors: Sequence[Detector]) -> dict[str, tuple[str, ...]]:
-    """Return the detectors of the same kind on the lanes beside, by detector."""
-    by_place: dict[tuple[str, str], list[str]] = {}
+    """Return the nearest detector of the same kind on each lane beside, by detector."""
+    by_place: dict[tuple[str, str], list[Detector]] = {}
     for detector in detectors:
-        by_place.setdefault((detector.lane, detector.kind), []).append(detector.id)
+        by_place.setdefault((detector.lane, detector.kind), []).append(detector)
     beside: dict[str, tuple[str, ...]] = {}
     for detector in detectors:
+
+        def distance_m(other: Detector, here_m: float = detector.position_m) -> float:
+            return abs(other.position_m - here_m)
+
         edge, _, number = detector.lane.rpartition("_")
         lanes = (f"{edge}_{int(number) + step}" for step in (-1, 1))
-        others = [name for lane in lanes for name in by_place.get((lane, detector.kind), ())[:1]]
-        beside[detector.id] = tuple(others)
+        there = [
+            by_place[lane, detector.kind] for lane in lanes if (lane, detector.kind) in by_place
+        ]
+        beside[detector.id] = tuple(min(others, key=distance_m).id for others in there)
     return beside
 
 
