@@ -16,6 +16,7 @@ from ugat_marl.diagnosis.features import FEATURES
 from ugat_marl.diagnosis.places import one_behind_the_other
 from ugat_marl.diagnosis.records import EffectRecord, Located, Parameter, Selected
 from ugat_marl.diagnosis.verdict import (
+    _rivals,
     combined,
     conclude,
     describe_effect,
@@ -302,3 +303,14 @@ def test_two_tests_as_a_whole() -> None:
     assert combined(1.0, 1.0) == 1.0
     product = np.random.default_rng(1).random((2, 100_000)).prod(axis=0)
     assert np.mean([combined(p, 1.0) < 0.05 for p in product]) == pytest.approx(0.05, abs=0.003)
+
+
+@pytest.mark.parametrize(("settled", "named"), [(110.0, 1), (140.0, 0)])
+def test_a_rival_is_as_near_after_as_many_days(settled: float, named: int) -> None:
+    best: Any = SimpleNamespace(model=SimpleNamespace(members=((HEADWAY, (1.5,)),), cost=100.0))
+    rival: Any = SimpleNamespace(members=((PARKING, (20.0,)),), cost=105.0)  # of few days
+    again = SimpleNamespace(members=rival.members, cost=settled)
+    tested = SimpleNamespace(model=again, residual=SimpleNamespace(p=0.5))
+    selector: Any = SimpleNamespace(test=lambda _model: tested)
+    selection = Selected(best, (rival,), True, examined=frozenset())
+    assert len(_rivals(selection, selector, DiagnosisConfig())) == named

@@ -192,8 +192,10 @@ def _rivals(selection: Selected, selector: Selector, config: DiagnosisConfig) ->
     ]
     for rival in near[: config.thresholds.rivals_tested]:
         tested = selector.test(rival)
-        if tested.residual.p > config.alpha:
-            sufficient.append(rival)
+        # Costs of the search are of fewer days; now both models have equally many.
+        near_still = tested.model.cost - best.cost < config.thresholds.indistinct
+        if tested.residual.p > config.alpha and near_still:
+            sufficient.append(tested.model)
     return tuple(sufficient)
 
 
