@@ -18,6 +18,7 @@ from ugat_marl.diagnosis.replay import Replay
 from ugat_marl.diagnosis.statistics import Pools, Reference
 from ugat_marl.diagnosis.thresholds import Thresholds
 from ugat_marl.effects import load_scenario
+from ugat_marl.errors import MeasuredDataError
 from ugat_marl.experiments import policy_factory, record
 from ugat_marl.scenarios import Network, Period, demand_as_vehicles
 from ugat_marl.simulation import Place, standard_detectors
@@ -145,9 +146,9 @@ def test_a_planted_turn_is_proposed_with_its_share_and_no_other() -> None:
 def test_lanes_are_means_over_moments_and_vehicles() -> None:
     rows = [
         ("one", 0.0, "a_0", 2.0, 1.0, 4.0),
-        ("one", 1.0, "a_0", 4.0, 0.0, 7.0),
+        ("one", 450.0, "a_0", 4.0, 0.0, 7.0),
         ("one", 0.0, "b_0", 0.0, 0.0, None),
-        ("one", 1.0, "b_0", 1.0, 0.0, 9.0),
+        ("one", 450.0, "b_0", 1.0, 0.0, 9.0),
     ]
     names = ("period_id", "time_s", "lane_id", "vehicles", "halting", "mean_speed_mps")
     lanes = pl.DataFrame(rows, schema=names, orient="row")
@@ -160,6 +161,11 @@ def test_lanes_are_means_over_moments_and_vehicles() -> None:
     every = blocks[EVERY_LANE][0, :, 0] / blocks[EVERY_LANE][0, :, 1]
     assert every.tolist() == [7.0 / 4.0, 1.0 / 4.0, 45.0 / 7.0]
     assert not found.measured("two")[LANES].any(), "nothing is known of the other day"
+    part = lanes.with_columns(pl.col("time_s") * 0.8)
+    with pytest.raises(
+        MeasuredDataError, match=r"'[ab]_0' was observed for 12 of 15 min of period"
+    ):
+        Between.of(MeasuredData((), PERIODS, lanes=part))
     simulated = found.simulated(PERIODS[0], [], np.array([[1800.0, 90.0, 9000.0], [0.0, 0.0, 0.0]]))
     assert simulated[LANES].tolist() == [
         [[1800.0, 900.0], [90.0, 900.0], [9000.0, 1800.0]],

@@ -19,6 +19,7 @@ import polars as pl
 from numpy.typing import NDArray
 
 from ugat_marl.data import MeasuredData
+from ugat_marl.errors import MeasuredDataError
 from ugat_marl.scenarios import Period, edge_of_lane
 from ugat_marl.simulation import Place, Way
 
@@ -36,6 +37,11 @@ MEASURES: Mapping[str, tuple[tuple[str, str], ...]] = {
     ),
 }
 """Names and units of the statistics of each block."""
+
+
+LEAST_OBSERVED = 0.9
+"""Smallest share of a period in which a lane must be observed; its mean is compared with that of
+the whole period."""
 
 
 @dataclass(frozen=True)
@@ -79,7 +85,11 @@ class Between:
 
     @classmethod
     def of(cls, measured: MeasuredData) -> Between | None:
-        """Collect the measured data; None if they hold no kind."""
+        """Collect the measured data; None if they hold no kind.
+
+        Raises:
+            MeasuredDataError: A lane was observed in a part of a period only.
+        """
         turning, probes, lanes = measured.turning, measured.travel_times, measured.lanes
         if turning is None and probes is None and lanes is None:
             return None
@@ -208,6 +218,9 @@ def _states(lanes: pl.DataFrame, period: Period, names: Sequence[str]) -> Array:
     """Return sums and numbers of observations of the lanes in a period, ``(lanes, 3, 2)``.
 
     Both are scaled to a moment per second of the period, as simulated lanes have.
+
+    Raises:
+        MeasuredDataError: A lane was observed in a part of the period only.
     """
     moments = lanes.filter(pl.col("period_id") == period.id)
     speed = pl.col("mean_speed_mps") if "mean_speed_mps" in lanes.columns else pl.lit(None)
@@ -218,17 +231,26 @@ def _states(lanes: pl.DataFrame, period: Period, names: Sequence[str]) -> Array:
         pl.col("halting").sum().alias("halting"),
         (pl.col("vehicles") * speed).sum().alias("metres"),
         pl.len().alias("moments"),
+        (pl.col("time_s").max() - pl.col("time_s").min()).alias("between_s"),
         known.sum().alias("moving"),
     )
     found = {row["lane_id"]: row for row in sums.iter_rows(named=True)}
     states = np.zeros((len(names), 3, 2))
     for number, name in enumerate(names):
         if (row := found.get(name)) is not None:
-            seen = float(row["moments"])
+            seen, whole_s = float(row["moments"]), period.end_s - period.begin_s
+            # n moments have n - 1 times between them
+            observed_s = float(row["between_s"]) * seen / max(seen - 1.0, 1.0)
+            if observed_s < LEAST_OBSERVED * whole_s:
+                raise MeasuredDataError(
+                    f"lanes: {name!r} was observed for {observed_s / 60:.0f} of "
+                    f"{whole_s / 60:.0f} min of period {period.id!r}, and traffic differs within a "
+                    "period; give periods as long as the observation, or leave the lane out"
+                )
             rows = [
                 (float(row["vehicles"]), seen),
                 (float(row["halting"]), seen),
                 (float(row["metres"]), float(row["moving"])),
             ]
-            states[number] = np.array(rows) * (period.end_s - period.begin_s) / seen
+            states[number] = np.array(rows) * whole_s / seen
     return states
