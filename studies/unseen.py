@@ -102,6 +102,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
     parser.add_argument(
         "--street-rules", type=int, help="episodes of each rule in the fitted street; 0 for none"
     )
+    parser.add_argument("--only", nargs="+", help="names of the networks to run; all are drawn")
     parser.add_argument("--jobs", type=int)
     given = parser.parse_args(arguments)
     config = PaperConfig(
@@ -147,6 +148,8 @@ def scenarios(given: argparse.Namespace) -> list[Path]:
             (half / towns.name).rename(towns)
             half.rmdir()
         folders += sorted(path for path in towns.iterdir() if path.is_dir())
+    if given.only:
+        folders = [folder for folder in folders if folder.name in given.only]
     return folders
 
 

@@ -1,0 +1,48 @@
+"""Networks nobody has seen: what counts, what is harm, and which are run."""
+
+from __future__ import annotations
+
+import argparse
+from pathlib import Path
+
+import pytest
+
+from studies import unseen
+from studies.unseen import Outcome, scenarios, summary
+
+
+def outcome(network: str, direct: float, street: float, rule: float, sim: float = 50.0) -> Outcome:
+    att_s = {"direct transfer": direct, "fitted street": street, unseen.RULE: rule}
+    return Outcome(network, "V4", att_s, {"direct transfer": sim, unseen.RULE: 60.0})
+
+
+def test_the_worst_comes_first_and_cases_without_headroom_count_in_no_mean() -> None:
+    half, harmed = outcome("half", 100.0, 90.0, 80.0), outcome("harmed", 100.0, 104.0, 90.0)
+    nothing = outcome("nothing", 100.0, 99.0, 96.0, sim=61.0)
+    assert [x.counts for x in (half, harmed, nothing)] == [True, True, False]
+    assert half.won_back("fitted street") == 0.5 and harmed.won_back("fitted street") == -0.4
+    lines = summary([nothing, half, harmed]).splitlines()
+    rows = [line.split(" | ")[0].strip("| ") for line in lines[4:7]]
+    assert rows == ["harmed", "half", "nothing"]
+    assert "no headroom" in lines[6] and "not trained yet" in lines[6]
+    assert "Road networks and domains: 3, with headroom: 2." in lines[0]
+    assert "Harmed by more than 3%: 1 of 3." in lines
+    assert "Regret won back by fitted street, mean: 0.05." in lines
+    assert lines[-1].endswith("2 of 3 networks.")
+
+
+def test_some_of_the_drawn_networks_are_run(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    drawn: list[int] = []
+
+    def draw(folder: Path, seed: int, _ranges: object) -> None:
+        folder.mkdir(parents=True)
+        drawn.append(seed)
+
+    monkeypatch.setattr(unseen, "draw_scenario", draw)
+    given = argparse.Namespace(out=tmp_path, seed=1, networks=3, largest=2, pbf=None, only=None)
+    assert [folder.name for folder in scenarios(given)] == ["drawn-0", "drawn-1", "drawn-2"]
+    given.only = ["drawn-2"]
+    assert [folder.name for folder in scenarios(given)] == ["drawn-2"]
+    assert len(set(drawn)) == len(drawn) == 3  # those that exist are kept
