@@ -12,7 +12,7 @@ import pytest
 
 import ugat_marl
 from ugat_marl.effects import StartupDelay
-from ugat_marl.envs import TrafficEnv, rewards
+from ugat_marl.envs import TrafficEnv, parallel_env, rewards
 from ugat_marl.errors import (
     ActionError,
     EpisodeError,
@@ -21,7 +21,9 @@ from ugat_marl.errors import (
     SimulatorError,
     UnknownNameError,
 )
+from ugat_marl.policies import make_rule, observer_of, roll_out
 from ugat_marl.scenarios import Network
+from ugat_marl.simulation import Snapshot
 from ugat_marl.testing.episodes import play, random_actions
 
 
@@ -412,3 +414,60 @@ def test_an_episode_without_vehicles_at_its_beginning_is_a_warning() -> None:
     with pytest.warns(UserWarning, match="no vehicle has entered the network in the first 10 s"):
         env.step({"signal_0": 0})
     env.close()
+
+
+def test_an_error_of_a_reward_ends_the_episode() -> None:
+    calls: list[int] = []
+
+    def reward(before: Snapshot, after: Snapshot) -> float:
+        calls.append(1)
+        if len(calls) == 3:
+            raise ValueError("planted")
+        return float(after.halting.sum() - before.halting.sum())
+
+    env = parallel_env("single-v1", duration_s=60, reward=reward)
+    env.reset(seed=1)
+    for _ in range(2):
+        env.step({"signal_0": 0})
+    with pytest.raises(ValueError, match="planted"):
+        env.step({"signal_0": 0})
+    assert env.agents == []
+    with pytest.raises(EpisodeError, match="call reset"):
+        env.step({"signal_0": 0})
+    with pytest.raises(EpisodeError, match="whole episode"):
+        env.scores()
+    env.close()
+
+
+def test_a_reset_that_fails_leaves_no_scores_behind(monkeypatch: pytest.MonkeyPatch) -> None:
+    env = parallel_env("single-v1", duration_s=20)
+    env.reset(seed=1)
+    while env.agents:
+        env.step({"signal_0": 0})
+    env.scores()
+
+    def fails(*_: Any) -> None:
+        raise SimulatorError("planted")
+
+    monkeypatch.setattr(env._simulator, "start", fails)
+    with pytest.raises(SimulatorError, match="planted"):
+        env.reset(seed=2)
+    with pytest.raises(EpisodeError, match="whole episode"):
+        env.scores()
+    with pytest.raises(EpisodeError, match="call reset"):
+        env.step({})
+    env.close()
+
+
+def test_what_a_recording_reads_is_measured() -> None:
+    env = parallel_env("single-v1", "V4", duration_s=100)
+    other = parallel_env("single-v1", "V4", duration_s=100, observation="waiting")
+    rule = make_rule("fixed-time:20", env)
+    observer = observer_of(env, "waiting")
+    logs = [roll_out(each, rule, 1, record=observer).log for each in (env, other)]
+    env.close()
+    other.close()
+    assert logs[0] is not None and logs[1] is not None
+    first, second = (log.transitions(log.agents[0]) for log in logs)
+    assert np.array_equal(first.observation, second.observation)
+    assert first.observation[-1].max() > 0

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import gc
 import hashlib
+import importlib
 import os
 import signal
 import subprocess
@@ -218,6 +219,63 @@ def test_an_episode_depends_on_its_seed_and_domain_alone() -> None:
     plain = parallel_env("grid2x2-v1", "V4", **options)
     assert alone(plain, episode.seed) == found[3][2][2]
     plain.close()
+
+
+def test_a_reset_of_some_leaves_the_step_of_the_others() -> None:
+    nothing = np.zeros((2, 1), dtype=np.int64)
+    with (
+        vector_env("single-v1", 2, duration_s=LENGTH_S) as env,
+        vector_env("single-v1", 2, duration_s=LENGTH_S) as other,
+    ):
+        env.reset(seed=1)
+        other.reset(seed=1)
+        env.step_async(nothing)
+        env.reset(where=[0])
+        assert env.step_wait().rewards[1] == other.step(nothing).rewards[1]
+        assert env.step(nothing).rewards[1] == other.step(nothing).rewards[1]
+
+
+def test_a_reset_forgets_an_episode_that_was_to_begin() -> None:
+    nothing = np.zeros((1, 1), dtype=np.int64)
+    with vector_env("single-v1", 1, duration_s=20, autoreset="next-step") as env:
+        env.reset(seed=1)
+        for _ in range(2):
+            env.step(nothing)
+        env.step_async(nothing)  # begins the next episode
+        env.reset(seed=5)
+        with pytest.raises(EpisodeError, match="step_wait\\(\\) without step_async"):
+            env.step_wait()
+        assert env.step(nothing).rewards.shape == (1, 1)
+
+
+FAILS_ONCE = """
+import os, pathlib
+
+def reward(before, after):
+    if os.getpid() == int(pathlib.Path(__file__).with_name("victim").read_text()):
+        raise ValueError("planted")
+    return float(after.halting.sum() - before.halting.sum())
+"""
+
+
+def test_what_ends_beside_an_error_is_handed_over_with_the_next_step(
+    module: Callable[[str], str], tmp_path: Path
+) -> None:
+    victim = tmp_path / "victim"
+    victim.write_text("-1")
+    reward = importlib.import_module(module(FAILS_ONCE)).reward
+    nothing = np.zeros((2, 1), dtype=np.int64)
+    with vector_env("single-v1", 2, duration_s=20, reward=reward) as env:
+        env.reset(seed=1)
+        env.step(nothing)
+        victim.write_text(str(pids(env)[0]))
+        with pytest.raises(WorkerError, match="planted"):
+            env.step(nothing)
+        victim.write_text("-1")
+        env.reset(where=[0])
+        (ended,) = env.step(nothing).ended
+        assert ended.environment == 1 and ended.episode.number == 0 and ended.scores is not None
+        assert len(env.step(nothing).ended) == 2
 
 
 def test_two_halves_are_the_whole() -> None:

@@ -21,6 +21,7 @@ from ugat_marl.errors import ActionError, CheckpointError, OptionError, UnknownN
 from ugat_marl.experiments import PaperConfig, policy_factory
 from ugat_marl.policies import (
     OwnLearnerFactory,
+    OwnPolicy,
     check_own_learner,
     load_own,
     own_name,
@@ -211,6 +212,17 @@ def test_policies_of_every_form_are_evaluated(algorithm: Any) -> None:
         "single-v1", algorithm.holding, ["sim"], seeds=[7], duration_s=200.0, each_episode=True
     )
     assert each.select("policy", "seed").rows() == [("Holding", 7)]
+
+
+def test_an_option_of_a_policy_does_not_get_the_infos() -> None:
+    def plain(observations: Any, deterministic: bool = True) -> Any:
+        return dict.fromkeys(observations, int(deterministic is not True))
+
+    def asks(observations: Any, infos: Any = None) -> Any:
+        return dict.fromkeys(observations, int(infos is None))
+
+    for act in (plain, asks):
+        assert OwnPolicy(act, "mine", {}).act({"a": [1]}, {"a": {"action_mask": [1]}}) == {"a": 0}
 
 
 def test_a_policy_of_the_command_line(

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import importlib
 import os
 import signal
 import subprocess
@@ -64,6 +65,36 @@ def test_a_stopped_worker_of_a_vector_is_replaced_with_the_same_numbers(crossing
         return rewards
 
     assert play(2) == play(None)
+
+
+SLOW = """
+import time
+
+def reward(before, after):
+    time.sleep(0.3)
+    return float(after.halting.sum() - before.halting.sum())
+"""
+
+
+@pytest.mark.slow
+def test_an_episode_longer_than_the_deadline_is_repeated(
+    crossing: Crossing, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The deadline is that of a decision, not of all that a fresh process repeats."""
+    (tmp_path / "slow_reward_of_a_test.py").write_text(SLOW)
+    monkeypatch.syspath_prepend(str(tmp_path))
+    reward = importlib.import_module("slow_reward_of_a_test").reward
+    env = vector_env(crossing(), 1, deadline_s=3.0, reward=reward)
+    env.reset(seed=3)
+    rewards: list[float] = []
+    for decision in range(15):
+        if decision == 14:
+            os.kill(env._environments[0].worker._pid, signal.SIGKILL)
+        rewards.append(float(env.step(np.zeros((1, 1), dtype=np.int64)).rewards[0, 0]))
+    env.reset(seed=3)
+    again = [float(env.step(np.zeros((1, 1), dtype=np.int64)).rewards[0, 0]) for _ in range(15)]
+    env.close()
+    assert rewards == again
 
 
 @pytest.mark.parametrize("simulator", ["process", "spawn"])

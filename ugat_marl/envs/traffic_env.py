@@ -35,6 +35,7 @@ from ugat_marl.envs.registration import register_single
 from ugat_marl.envs.rendering import NetworkRenderer
 from ugat_marl.envs.rewards import Rewarder
 from ugat_marl.envs.sensors import Sensors
+from ugat_marl.envs.types import StepResult
 from ugat_marl.errors import EpisodeError, OptionError
 from ugat_marl.files import OwnDirectory
 from ugat_marl.scenarios import Network, Scenario, check_demand, signals
@@ -120,6 +121,7 @@ class TrafficEnv(ParallelEnv[str, Any, Any]):
         self.agents: list[str] = []
         self._scores: Scores | None = None
         self._renderer: NetworkRenderer | None = None
+        self._recorded: tuple[Observer, ...] = ()
 
     # --- spaces -------------------------------------------------------------------------------
 
@@ -184,9 +186,9 @@ class TrafficEnv(ParallelEnv[str, Any, Any]):
             raise OptionError(f"seed = {seed}: must not be negative")
         if seed is not None:
             self.np_random = np.random.default_rng(seed)
+        self._scores, self.agents = None, []  # if SUMO does not start, no episode has begun
         self._start(int(self.np_random.integers(2**31)))
         self.agents = self.possible_agents[:]
-        self._scores = None
         self._decision = 0
         self._states = [signals.initial_state(self._timing) for _ in self.agents]
         if self._programmes is not None:
@@ -236,6 +238,14 @@ class TrafficEnv(ParallelEnv[str, Any, Any]):
         asked = requested = checked_phases(actions, self.agents, self.action_spaces)
         if self._actuators is not None:
             requested = self._actuators.obey(requested, self._states)
+        try:
+            return self._stepped(asked, requested)
+        except BaseException:  # of SUMO, or of a reward of the user: the interval has passed
+            self.agents = []
+            raise
+
+    def _stepped(self, asked: list[int], requested: list[int]) -> StepResult:
+        """Simulate a decision interval; return the results of `step`."""
         before = self._snapshot
         self._advance(requested)
         if self._memory is not None:
@@ -257,10 +267,15 @@ class TrafficEnv(ParallelEnv[str, Any, Any]):
             self._finish()
         return result
 
+    def measure_for(self, *observers: Observer) -> None:
+        """Measure from the next episode on what these observers read, too; none measures less."""
+        self._recorded = observers
+
     def delay_greens(self, seconds: Mapping[str, float]) -> None:
         """Delay the greens that begin in the next step; ends of greens do not change.
 
-        Observations and infos do not show these delays, nor a late green of the scenario.
+        Observations and infos do not show these delays, nor a late green of the scenario. Lights
+        that run SUMO's own programmes (`signals="programme"`) have no such delays.
 
         Args:
             seconds: Agent to the additional red of its links, in s. Greens begin at whole
@@ -350,21 +365,21 @@ class TrafficEnv(ParallelEnv[str, Any, Any]):
     def _start(self, seed: int) -> None:
         if self._simulator is None:
             self._simulator = simulator_of(self.options.simulator, self.options.deadline_s)
-        needs_upstream = self._rewarder.needs_upstream or self._observer.needs_upstream
+        readers = (self._rewarder, self._observer, *self._recorded)
         launch = launch_of(
             with_late_green_programmes(self.scenario),
             seed,
             self._directory.fresh(),
             self._lanes.ids,
-            waiting=self._observer.needs_waiting or self._rewarder.needs_waiting,
+            waiting=any(reader.needs_waiting for reader in readers),
             crossings=self.options.crossings,
             gui=self.render_mode == "human",
+            pictures=self.render_mode is not None,
             zone_m=self._sensors.zone_m if self._sensors else 0.0,
             persons=self._objectives.persons if self._objectives else None,
             behind=self._lanes.behind,
-            turns=self._lanes.turns if needs_upstream else (),
+            turns=self._lanes.turns if any(reader.needs_upstream for reader in readers) else (),
         )
-        self.agents = []
         for part in (self._sensors, self._actuators):
             if part is not None:
                 part.reset(seed)
@@ -384,9 +399,8 @@ class TrafficEnv(ParallelEnv[str, Any, Any]):
         if self._programmes is not None:
             plans = {}
         plans = self._delays.hold(plans)
-        agents, self.agents = self.agents, []  # the episode is over if SUMO fails
         self._look(self._simulator.advance(self.decision_interval_s, plans))
-        self.agents, self._states = agents, states
+        self._states = states
         self._look_at_programmes()
 
     def _look_at_programmes(self) -> None:

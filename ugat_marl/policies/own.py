@@ -181,7 +181,7 @@ class OwnPolicy:
             **getattr(given, "env_options", {}),
         }
         self._given, self._name, self._state, self._shared = given, name, state, shared
-        self._sees_infos = _takes(act, 2)
+        self._sees_infos = _sees_infos(act)
 
     @property
     def savable(self) -> bool:
@@ -518,6 +518,16 @@ def _takes(function: Callable[..., Any], number: int) -> bool:
         return False
     except ValueError:  # a function in C without a signature
         return True
+    return True
+
+
+def _sees_infos(act: Callable[..., Any]) -> bool:
+    """Return True if a policy's second argument is the infos, not an option of its own."""
+    if not _takes(act, 2):
+        return False
+    with contextlib.suppress(TypeError, ValueError):  # a function in C without a signature
+        second = [*inspect.signature(act).parameters.values()][1:2]
+        return all(one.default is one.empty or one.name == "infos" for one in second)
     return True
 
 

@@ -72,6 +72,9 @@ def roll_out(
             those that the policy reads. It needs an environment of the suite.
         on_step: Function called after every decision.
     """
+    if record is not None:
+        base: Any = env.unwrapped
+        base.measure_for(record)
     observations, infos = env.reset(seed=seed)
     policy.reset(seed)
     recording = _Recording(env, record, seed, infos) if record else None

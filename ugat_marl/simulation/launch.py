@@ -184,6 +184,7 @@ def launch_of(
     waiting: bool = False,
     crossings: bool = False,
     gui: bool = False,
+    pictures: bool = False,
     zone_m: float = 0.0,
     persons: Mapping[str, float] | None = None,
     behind: UpstreamLanes = NO_UPSTREAM_LANES,
@@ -199,6 +200,7 @@ def launch_of(
         waiting: True to measure waiting times.
         crossings: True to look every second for vehicles that left a lane's road.
         gui: True to open a window.
+        pictures: True if pictures of the vehicles are drawn.
         zone_m: Length of a zone at the end of each lane that is measured separately; 0 for none.
         persons: Vehicle type to the persons in each vehicle, "" for all other types. If given, the
             hidden measures of `Trips` (CO2, persons, dangers) are taken.
@@ -208,7 +210,9 @@ def launch_of(
     """
     settings = scenario.settings
     if "mesosim" in settings.sumo:
-        refuse_in_queues(scenario.id, crossings=crossings, zone=bool(zone_m), gui=gui)
+        refuse_in_queues(
+            scenario.id, crossings=crossings, zone=bool(zone_m), pictures=gui or pictures
+        )
     files = {
         "--net-file": [scenario.network],
         "--route-files": list(scenario.routes),

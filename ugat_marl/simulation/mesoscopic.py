@@ -198,7 +198,7 @@ def refuse_in_queues(scenario: str, **requested: bool) -> None:
 
     Args:
         scenario: Id of the scenario.
-        requested: ``crossings``, ``zone`` and ``gui``: True if requested.
+        requested: ``crossings``, ``zone`` and ``pictures``: True if requested.
 
     Raises:
         OptionError: One of them is requested.
@@ -206,7 +206,7 @@ def refuse_in_queues(scenario: str, **requested: bool) -> None:
     words = {
         "crossings": "when vehicles cross stop lines (crossings, timed grounding)",
         "zone": "who is near a stop line (detection_zone)",
-        "gui": 'pictures of vehicles (render_mode "human")',
+        "pictures": "pictures of vehicles (render_mode, films)",
     }
     for name, wanted in requested.items():
         if wanted:

@@ -153,6 +153,7 @@ class VectorEnv:
         self._shared = shared
         self._counts = np.array(self.agent_set.action_counts)
         self._begun: list[int] = []
+        self._owed: tuple[Ended, ...] = ()  # of a step in which another environment failed
         self._stepped: list[int] = []
         self._sent: dict[int, _Sent] = {}
 
@@ -205,7 +206,10 @@ class VectorEnv:
         for index in chosen:
             self._environments[index].close()
             self._sent.pop(index, None)
-        self._stepped = []
+        gone = set(chosen)
+        self._stepped = [index for index in self._stepped if index not in gone]
+        self._begun = [index for index in self._begun if index not in gone]
+        self._owed = tuple(each for each in self._owed if each.environment not in gone)
         self._begin(chosen, seeds)
         self._memory.rewards[chosen] = 0.0
         return self._batch(np.zeros(self.n, dtype=np.bool_), ())
@@ -220,7 +224,8 @@ class VectorEnv:
             ActionError: The shape is wrong, or an agent does not have the phase; nothing was
                 simulated.
             EpisodeError: An environment has no running episode.
-            SimulatorError: SUMO failed. The other environments have made their step.
+            SimulatorError: SUMO failed. The other environments have made their step; what ended
+                there is handed over with the next step.
         """
         self.step_async(actions)
         return self.step_wait()
@@ -240,17 +245,20 @@ class VectorEnv:
             raise EpisodeError("step_wait() without step_async()")
         stepped, begun = self._stepped, self._begun
         self._stepped, self._begun = [], []
-        answers = self._answers([*stepped, *begun])
+        answers, failed = self._arrived([*stepped, *begun])
         memory = self._memory
         memory.rewards[begun] = 0.0
-        over = [index for index in stepped if answers[index].over]
+        over = [index for index in stepped if index in answers and answers[index].over]
         truncated = np.zeros(self.n, dtype=np.bool_)
         truncated[over] = True
-        ended = tuple(self._ended(index, answers[index]) for index in over)
+        self._owed += tuple(self._ended(index, answers[index]) for index in over)
         if over and self.autoreset == "same-step":
             rewards, executed = memory.rewards[over], memory.executed[over]
             self._begin(over, dict.fromkeys(over))
             memory.rewards[over], memory.executed[over] = rewards, executed
+        if failed:
+            raise failed[0]
+        ended, self._owed = self._owed, ()
         return self._batch(truncated, ended)
 
     def send(self, actions: ArrayLike, where: ArrayLike | None = None) -> None:
@@ -421,10 +429,12 @@ class VectorEnv:
     def _begin(self, chosen: list[int], seeds: dict[int, int | None]) -> None:
         for index in chosen:
             self._environments[index].begin(seeds[index], self._domains)
-        self._answers(chosen)
+        _, failed = self._arrived(chosen)
+        if failed:
+            raise failed[0]
 
-    def _answers(self, chosen: list[int]) -> dict[int, Answer]:
-        """Return all answers; an error is raised after all have arrived."""
+    def _arrived(self, chosen: list[int]) -> tuple[dict[int, Answer], list[UgatMarlError]]:
+        """Wait for all answers; return them, and the errors of environments that failed."""
         answers: dict[int, Answer] = {}
         failed: list[UgatMarlError] = []
         for index in chosen:
@@ -434,9 +444,7 @@ class VectorEnv:
                 failed.append(error)
         for text in dict.fromkeys(_said(answers.values())):
             warnings.warn(text, stacklevel=4)
-        if failed:
-            raise failed[0]
-        return answers
+        return answers, failed
 
     def _ended(self, index: int, answer: Answer) -> Ended:
         memory, episode = self._memory, self._environments[index].episode

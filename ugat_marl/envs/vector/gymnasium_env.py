@@ -129,6 +129,8 @@ class GymnasiumVectorEnv(vector.VectorEnv[Any, Any, Any]):
         final = {
             "action_mask": masks,
             "_action_mask": truncated,
+            "executed_action": self._flat(batch.executed).copy(),
+            "_executed_action": truncated,
             "att_s": travel_time_s,
             "_att_s": truncated,
         }

@@ -165,6 +165,7 @@ class RemoteEnv:
         self._root: int | None = None
         self._domain: Domain = "sim"
         self._history: list[NDArray[np.int64]] = []
+        self._to_repeat: list[NDArray[np.int64]] = []  # by a process that replaces another one
         self._deaths = 0
         self._worker: Worker | None = None
 
@@ -183,12 +184,14 @@ class RemoteEnv:
 
     def act(self, actions: NDArray[np.int64]) -> None:
         """Ask for a decision."""
-        assert self._worker is not None
         self._history.append(actions)
-        self.arrays.actions[:] = actions
         self.pending = True
+        self._ask(actions)
+
+    def _ask(self, actions: NDArray[np.int64]) -> None:
+        self.arrays.actions[:] = actions
         with contextlib.suppress(ChannelClosed):  # `answer` replaces a dead process
-            self._worker.ask("step")
+            self.worker.ask("step")
 
     @property
     def worker(self) -> Worker:
@@ -209,7 +212,7 @@ class RemoteEnv:
         return answer
 
     def answer_or_replace(self) -> Answer | None:
-        """Wait for the answer; None if the process died, another one repeats its episode then.
+        """Wait for the answer; None while another process repeats the episode of one that died.
 
         Raises:
             SimulatorError: SUMO failed; the message contains its output.
@@ -224,6 +227,9 @@ class RemoteEnv:
         except BaseException:  # an error of the episode, or Ctrl-C: the process has ended
             self.close()
             raise
+        if self._to_repeat:
+            self._ask(self._to_repeat.pop(0))
+            return None
         self._deaths = 0
         self.pending = False
         self.over = reply["over"]
@@ -256,18 +262,19 @@ class RemoteEnv:
             )
 
     def _start(self) -> None:
-        """Start a process for the episode; it repeats the actions of the episode so far."""
+        """Start a process for the episode, which repeats the decisions of the episode so far.
+
+        Each decision is a question of its own, since the deadline is that of one decision.
+        """
         assert self.episode is not None
         self._end()
         shared = self._shared
         self._worker = shared.start(self._domain, self.index)
         self.over, self.pending = False, True
-        size = len(self._history), len(shared.agents)
-        history = np.array(self._history, dtype=np.float64).reshape(size)
+        self._to_repeat = list(self._history)
         with contextlib.suppress(ChannelClosed):
             self._worker.ask(
                 "begin",
-                [history],
                 seed=self.episode.seed,
                 index=self.index,
                 shape=asdict(shared.shape),

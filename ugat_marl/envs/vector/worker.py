@@ -146,9 +146,6 @@ class _EpisodeServer:
         nothing = dict.fromkeys(self._agents.names, 0.0)
         none_shown = np.zeros(len(self._agents), dtype=np.int64)
         self._publish(observations, nothing, infos, none_shown)
-        (history,) = question.arrays
-        for row in history.astype(np.int64):
-            self._step(row)
 
     def _confine(self) -> None:
         """Confine this process to the files of its scenario, unless it runs functions of the user.
