@@ -14,7 +14,11 @@ if TYPE_CHECKING:
 
 
 def derive_seed(seed: int, *path: int | str) -> int:
-    """Return a 31-bit seed, independent for every `path` below the same root `seed`."""
+    """Return a 31-bit seed, independent for every `path` below the same root `seed`.
+
+    Numbers count modulo 2^32, the root modulo 2^64, and a text of one letter as the letter's code:
+    a part that is a number at one call should not be a text at another.
+    """
     words = [seed & 0xFFFFFFFF, (seed >> 32) & 0xFFFFFFFF]
     for part in path:
         words.extend(part.encode() if isinstance(part, str) else [part & 0xFFFFFFFF])

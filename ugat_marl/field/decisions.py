@@ -166,6 +166,9 @@ class DecisionLog:
             self._open_file()
         end = os.fstat(self._file).st_size + sum(part.stat().st_size for _, part in self._parts())
         self._part = self.path.with_name(f"{self.path.name}.{end:015d}.part")
+        if self._segment >= 0:
+            deleted, self._segment = self._segment, -1
+            os.close(deleted)
         self._segment = os.open(self._part, os.O_RDWR | os.O_CREAT | os.O_TRUNC, 0o666)
         self._size = 0
 

@@ -99,8 +99,9 @@ class FieldLoop:
         self.summary = LoopSummary()
         self.driven_s = 0.0
         self._answer = _answer_of(policy, site)
+        lights = Lights(site, street, limits)  # a street that does not answer leaves no thread
         self._asked = Answering()
-        self._begin(street, Lights(site, street, limits))
+        self._begin(street, lights)
 
     def take_over(self, street: Street) -> None:
         """Go on with a street that came back, from what its lights show now.
