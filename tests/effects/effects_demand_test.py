@@ -22,9 +22,10 @@ from ugat_marl.effects import (
     Turning,
     apply_effects,
     load_scenario,
+    parse_domain,
 )
-from ugat_marl.errors import UnknownNameError
-from ugat_marl.scenarios import Network, Scenario, check_demand
+from ugat_marl.errors import ScenarioError, UnknownNameError
+from ugat_marl.scenarios import Document, Network, Scenario, check_demand
 
 Crossing = Callable[..., Path]
 EDGE = "east1_A1"
@@ -405,3 +406,18 @@ def test_flows_and_trips_turn_too() -> None:
 def test_unknown_edges(effect: DemandLevel, message: str) -> None:
     with pytest.raises(UnknownNameError, match=message):
         effect.apply(load_scenario("single-v1"))
+
+
+@pytest.mark.parametrize(
+    ("flow", "domain"),
+    [
+        ('vehsPerHour="many"', "demand_level=*,1.2"),
+        ('probability="0" number="5"', "demand_level=*,1.2"),
+    ],
+)
+def test_a_number_that_is_none_is_told_with_the_effect(flow: str, domain: str) -> None:
+    routes = f'<routes><flow id="f" begin="0" end="900" {flow} from="a" to="b"/></routes>'
+    scenario = load_scenario("single-v1")
+    scenario = replace(scenario, routes=(Document("d.rou.xml", None, routes.encode()),))
+    with pytest.raises(ScenarioError, match=r"demand_level=.*cannot be applied, since a number"):
+        apply_effects(scenario, parse_domain(domain))

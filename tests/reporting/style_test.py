@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
+from ugat_marl.reporting import formats
 from ugat_marl.reporting.style import CURVES, DARK, LIGHT, curve_style
 
 # Machado, Oliveira, Fernandes 2009, severity 1: linear RGB as a colour-blind eye sees it.
@@ -81,3 +82,19 @@ def test_curves_differ_without_colour_too() -> None:
     for one, other in itertools.combinations(styles, 2):
         assert (one["marker"], one["linestyle"]) != (other["marker"], other["linestyle"])
         assert one["color"] != other["color"] or one["linestyle"] != other["linestyle"]
+
+
+@pytest.mark.parametrize(
+    ("made", "text"),
+    [
+        (formats.number(999.6), "1\u00a0000"),
+        (formats.number(-999.7), "−1\u00a0000"),
+        (formats.number(99.6, 2), "100"),
+        (formats.number(999.4), "999"),
+        (formats.tick_text(9999.7), "10\u2009000"),
+        (formats.tick_text(9999.2), "9999"),
+        (formats.share(float("nan")), "–"),
+    ],
+)
+def test_numbers_that_round_up_to_another_length_stay_readable(made: str, text: str) -> None:
+    assert made == text

@@ -279,6 +279,44 @@ def test_two_lights_need_a_word_on_which_is_which(tmp_path: Path) -> None:
         read_utdf(synchro(tmp_path), network, {})
 
 
+def test_a_later_plan_of_another_light_keeps_the_earlier_one() -> None:
+    grid = load_scenario("grid2x2-v1")
+    lights = Network.read(grid).intersections[:2]
+    longer: list[SignalPlan] = []
+    for light in lights:
+        plan = programme_plan(light, Network.read(grid))
+        first = replace(plan.phases[0], split_s=plan.phases[0].split_s + 10)
+        longer.append(replace(plan, cycle_s=plan.cycle_s + 10, phases=(first, *plan.phases[1:])))
+    both = with_plans(with_plans(grid, longer[:1], "a.csv"), longer[1:], "b.csv")
+    shown = {light.id: light.programme for light in Network.read(both).intersections}
+    for plan in longer:
+        assert sum(seconds for seconds, _ in shown[plan.light]) == plan.cycle_s
+
+
+@pytest.mark.parametrize(
+    ("text", "told"),
+    [
+        ("A1,60,0,NBT,30,3,1,5", "line 2: '5' is beyond the last column; a decimal comma"),
+        ("x" * 200_000, "line 2: not CSV"),
+    ],
+)
+def test_cells_beyond_the_columns_are_refused(text: str, told: str, tmp_path: Path) -> None:
+    path = tmp_path / "plans.csv"
+    path.write_text(f"light,cycle_s,offset_s,movements,split_s,yellow_s,all_red_s\n{text}\n")
+    with pytest.raises(ScenarioError, match=told):
+        read_plans(path)
+
+
+def test_a_column_that_is_there_twice_is_refused(tmp_path: Path) -> None:
+    path = tmp_path / "plans.csv"
+    path.write_text("light,cycle_s,offset_s,movements,split_s,yellow_s,all_red_s,split_s\n")
+    with pytest.raises(ScenarioError, match="the column split_s is there twice"):
+        read_plans(path)
+    path.write_text("x" * 200_000)
+    with pytest.raises(ScenarioError, match="line 1: not CSV"):
+        read_plans(path)
+
+
 def test_the_typical_plan_of_a_fixed_time_is_itself(single: Scenario) -> None:
     """Four phases of 30 s: needs of 25/120 each, so C = 20 / (1 - 100/120) = 120 s."""
     (plan,) = typical_plans(

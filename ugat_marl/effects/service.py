@@ -58,5 +58,8 @@ def withheld(network: Network, lanes: Mapping[str, Seconds]) -> dict[str, Withhe
 def _of_light(item: Intersection, lanes: Mapping[str, Seconds]) -> Withheld:
     begin_s, each_s = ([0.0] * len(item.phases[0]) for _ in range(2))
     for link in item.links:
-        begin_s[link.index], each_s[link.index] = lanes.get(link.from_lane, (0.0, 0.0))
+        begin, each = lanes.get(link.from_lane, (0.0, 0.0))
+        # Lanes that share a signal have the red of the slower one.
+        begin_s[link.index] = max(begin_s[link.index], begin)
+        each_s[link.index] = max(each_s[link.index], each)
     return Withheld(tuple(begin_s), tuple(each_s))

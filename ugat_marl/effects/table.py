@@ -50,7 +50,7 @@ from ugat_marl.effects.vehicles import (
     StartupDelay,
     YellowRunning,
 )
-from ugat_marl.errors import OptionError, UnknownNameError
+from ugat_marl.errors import OptionError, ScenarioError, UgatMarlError, UnknownNameError
 from ugat_marl.scenarios import Scenario, parse_decimal, read_scenario
 
 _MEASURABLE: dict[str, type[Effect]] = {
@@ -158,9 +158,23 @@ def effect_from_text(text: str) -> Effect:
 
 
 def apply_effects(scenario: Scenario, effects: Iterable[Effect]) -> Scenario:
-    """Apply effects one after the other."""
+    """Apply effects one after the other.
+
+    Raises:
+        ScenarioError: The files of the scenario hold something else where a number should be.
+    """
     for apply_all, group in groupby(effects, lambda effect: effect.apply_all):
-        scenario = apply_all(scenario, list(group))
+        applied = list(group)
+        try:
+            scenario = apply_all(scenario, applied)
+        except (ValueError, ArithmeticError) as error:
+            if isinstance(error, UgatMarlError):
+                raise
+            raise ScenarioError(
+                f"scenario {scenario.id!r}: {' + '.join(map(str, applied))} cannot be applied, "
+                f"since a number in its files is none, or 0 where it must not be ({error}); correct "
+                "the file"
+            ) from error
     return scenario
 
 

@@ -484,6 +484,9 @@ def goodness(values: NDArray[np.float64], more_is_better: bool) -> NDArray[np.fl
 def _draw_radar(axes: Any, rows: Sequence[Sequence[float]]) -> None:
     """Draw lines on polar axes, one axis for each of `MEASURES`; skip rows with a nan."""
     table = np.array(rows, dtype=float)
+    if not np.isfinite(table).any(axis=0).all():  # no row has some measure
+        axes.set_axis_off()
+        return
     scaled = np.stack([goodness(table[:, i], m == "throughput") for i, m in enumerate(MEASURES)])
     angles = np.linspace(0, 2 * np.pi, len(MEASURES), endpoint=False)
     axes.set_theta_zero_location("N")

@@ -21,7 +21,7 @@ def number(value: Any, digits: int = 3) -> str:
         return "–" if value is None else str(value)
     if not math.isfinite(value):
         return "–"
-    if abs(value) >= 10**digits:
+    if abs(value) >= 10**digits - 0.5:
         return f"{value:,.0f}".replace(",", "\u00a0").replace("-", "−")
     return f"{value:.{digits}g}".replace("-", "−")
 
@@ -34,7 +34,7 @@ def signed(value: Any) -> str:
 
 def share(value: Any) -> str:
     """Return a share in per cent; a share below 1 is never rounded to 100 %."""
-    if value is None:
+    if value is None or math.isnan(value):
         return "–"
     percent = 100 * float(value)
     if percent < 0:
@@ -79,7 +79,7 @@ def percent_text(value: float) -> str:
 
 def tick_text(value: float, _: Any = None) -> str:
     """Return the text of a number on a scale; the second argument is matplotlib's and unused."""
-    if abs(value) >= 10_000:
+    if abs(value) >= 9_999.5:
         return f"{value:,.0f}".replace(",", "\u2009").replace("-", "−")
     return f"{round(value, 6):.4g}".replace("-", "−")
 

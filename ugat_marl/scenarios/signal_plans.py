@@ -20,6 +20,7 @@ from pathlib import Path
 
 from ugat_marl.errors import ScenarioError, nearest
 from ugat_marl.files import Document, read_bytes, write_whole, xml_bytes
+from ugat_marl.scenarios.csv_tables import columns_of, rows_of
 from ugat_marl.scenarios.junctions import Link, foes_of, right_on_red_of, yields_of
 from ugat_marl.scenarios.network import Intersection, Network
 from ugat_marl.scenarios.phases import RightOfWay, are_foes, permitted_clash, state_of, turn_of
@@ -304,7 +305,7 @@ def with_plans(scenario: Scenario, plans: Iterable[SignalPlan], source: str) -> 
     """Return the scenario with plans as the programmes of their lights.
 
     Args:
-        scenario: The scenario; lights without a plan keep their programme.
+        scenario: The scenario; lights without a plan keep their programme, or an earlier plan.
         plans: The plans, one for each light.
         source: Name of their file in errors.
 
@@ -329,7 +330,10 @@ def with_plans(scenario: Scenario, plans: Iterable[SignalPlan], source: str) -> 
         )  # fmt: skip
         for seconds, state in plan_states(plan, lights[plan.light], network, rules, source):
             ET.SubElement(logic, "phase", duration=f"{seconds:g}", state=state)
-    name = "plans.add.xml"
+    name, planned = "plans.add.xml", {logic.get("id") for logic in top}
+    for document in scenario.additional:
+        if document.name == name:
+            top.extend(logic for logic in document.parse() if logic.get("id") not in planned)
     others = tuple(document for document in scenario.additional if document.name != name)
     return replace(scenario, additional=(*others, Document(name, None, xml_bytes(top))))
 
@@ -410,8 +414,7 @@ def read_plans(path: Path) -> tuple[SignalPlan, ...]:
     reader = csv.DictReader(
         io.StringIO(text, newline=""), delimiter=";" if ";" in text.partition("\n")[0] else ","
     )
-    columns = [name.strip() for name in reader.fieldnames or ()]
-    reader.fieldnames = columns
+    columns = columns_of(reader, path)
     optional = {"intersection", "phase", "ring", "barrier"}
     if missing := [name for name in COLUMNS if name not in columns and name not in optional]:
         guess = nearest(missing[0], columns)
@@ -421,19 +424,16 @@ def read_plans(path: Path) -> tuple[SignalPlan, ...]:
         )
     phases: dict[str, list[PlanPhase]] = defaultdict(list)
     frames: dict[str, tuple[float, float]] = {}
-    try:
-        for row in reader:
-            where = f"{path}, line {reader.line_num}"
-            light = (row["light"] or "").strip()
-            frame = _seconds(row, "cycle_s", where), _seconds(row, "offset_s", where)
-            if frames.setdefault(light, frame) != frame:
-                raise ScenarioError(
-                    f"{where}: light {light!r} has another cycle_s or offset_s than in its first "
-                    "row; a light has one plan"
-                )
-            phases[light].append(_phase(row, where))
-    except csv.Error as error:
-        raise ScenarioError(f"{path}, line {reader.line_num + 1}: not CSV ({error})") from None
+    for row in rows_of(reader, path):
+        where = f"{path}, line {reader.line_num}"
+        light = (row["light"] or "").strip()
+        frame = _seconds(row, "cycle_s", where), _seconds(row, "offset_s", where)
+        if frames.setdefault(light, frame) != frame:
+            raise ScenarioError(
+                f"{where}: light {light!r} has another cycle_s or offset_s than in its first "
+                "row; a light has one plan"
+            )
+        phases[light].append(_phase(row, where))
     if not phases:
         raise ScenarioError(f"{path}: no row holds a phase")
     plans = tuple(SignalPlan(light, *frames[light], tuple(own)) for light, own in phases.items())

@@ -21,6 +21,7 @@ from numpy.typing import NDArray
 from ugat_marl.errors import ScenarioError, nearest
 from ugat_marl.files import chunks_of, parse_xml, read_bytes, write_whole, xml_bytes
 from ugat_marl.progress import Reporter
+from ugat_marl.scenarios.csv_tables import columns_of, rows_of
 from ugat_marl.scenarios.importers.count_sheet import (
     FIT_SHEET,
     CountFit,
@@ -92,8 +93,7 @@ def read_rows(
     texts = lines(path, reporter)
     first = next(texts, "")
     reader = csv.DictReader(chain((first,), texts), delimiter=";" if ";" in first else ",")
-    columns = [name.strip() for name in reader.fieldnames or ()]
-    reader.fieldnames = columns
+    columns = columns_of(reader, path)
     turns = {"from", "to"} <= set(columns)
     if "count" not in columns or not (turns or ("edge" in columns and not pairs)):
         wanted = "from, to and count" if pairs else "count and edge, or count, from and to"
@@ -102,7 +102,7 @@ def read_rows(
         )
     rows_read: list[Row] = []
     total = 0.0
-    for values in _whole(reader, path):
+    for values in rows_of(reader, path):
         where = f"{path}, line {reader.line_num}"
         counted = values.get("count")
         if counted is not None and not counted.strip():
@@ -133,13 +133,6 @@ def read_rows(
     if not total:
         raise ScenarioError(f"{path}: no row counts a vehicle; fill in the column count")
     return rows_read
-
-
-def _whole(reader: csv.DictReader[str], path: Path) -> Iterator[dict[str, str]]:
-    try:
-        yield from reader
-    except csv.Error as error:
-        raise ScenarioError(f"{path}, line {reader.line_num + 1}: not CSV ({error})") from None
 
 
 def _number(text: str | None, key: str, where: str) -> float:
