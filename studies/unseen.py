@@ -189,7 +189,9 @@ def summary(outcomes: Sequence[Outcome]) -> str:
     for row in rows if counted else []:
         won = float(np.mean([x.won_back(row) for x in counted]))
         lines.append(f"Regret won back by {row}, mean: {won:.2f}.")
-    in_sim = {x.network: x.is_trained for x in told}
+    in_sim: dict[str, bool] = {}
+    for x in told:  # a rule tuned in any of the domains counts
+        in_sim[x.network] = in_sim.get(x.network, True) and x.is_trained
     lines.append(
         f"Direct transfer at or below the best tuned rule in sim: {sum(in_sim.values())} of "
         f"{len(in_sim)} networks."

@@ -31,7 +31,7 @@ from ugat_marl.experiments import (
 )
 from ugat_marl.experiments.evaluation import race_rules
 from ugat_marl.experiments.jobs import EVALUATION_SEED, RULE_FILE, Job, perform
-from ugat_marl.experiments.scores import Result, Trial
+from ugat_marl.experiments.scores import Result, RuleTrial
 from ugat_marl.experiments.settings import RULE, Setting
 from ugat_marl.experiments.tuning import rungs
 from ugat_marl.policies import RULES, format_rule, parse_rule, rule_settings
@@ -80,11 +80,11 @@ FIVE = [f"fixed-time:{s}" for s in (10, 20, 30, 40, 50)]
 def test_the_worse_half_is_left_behind_after_each_rung(streets: Streets) -> None:
     found = race_rules(load_scenario("single-v1"), "sim", FIVE, [[1], [2, 3], [4]])
     assert found == (
-        Trial("fixed-time:50", 100.0, 4),
-        Trial("fixed-time:40", 110.0, 4),
-        Trial("fixed-time:30", 120.0, 3),  # behind after the second rung
-        Trial("fixed-time:20", 130.0, 1),
-        Trial("fixed-time:10", 140.0, 1),
+        RuleTrial("fixed-time:50", 100.0, 4),
+        RuleTrial("fixed-time:40", 110.0, 4),
+        RuleTrial("fixed-time:30", 120.0, 3),  # behind after the second rung
+        RuleTrial("fixed-time:20", 130.0, 1),
+        RuleTrial("fixed-time:10", 140.0, 1),
     )
     assert streets.played[:5] == [(spec, "sim", 1) for spec in FIVE]
     assert len(streets.played) == 5 + 2 * 3 + 2
@@ -140,7 +140,7 @@ def test_a_small_budget_thins_the_settings_out_evenly() -> None:
 def test_tuning_finds_the_setting_and_remembers_it(streets: Streets, tmp_path: Path) -> None:
     scenario = load_scenario("single-v1")
     found = tune("fixed-time", scenario, "sim", 24)
-    assert found.best == Trial("fixed-time:50", 100.0, found.best.episodes)
+    assert found.best == RuleTrial("fixed-time:50", 100.0, found.best.episodes)
     assert found.episodes == len(streets.played) <= 24
     assert {seed for _, _, seed in streets.played} == set(range(SEED, SEED + found.best.episodes))
     again = tune("fixed-time", scenario, "sim", 24)
@@ -248,8 +248,10 @@ def test_the_command_refuses(call: list[str], said: str, capsys: Any) -> None:
 
 def test_the_table_fits_80_columns_and_begins_with_the_best() -> None:
     found = [
-        Tuned("slow", "V4", (Trial("longest-waiting:60", 1234.5, 9), Trial("x", 2000.0, 1))),
-        Tuned("fast", "V4", (Trial("delay-actuated:120:40", 61.27, 3),)),
+        Tuned(
+            "slow", "V4", (RuleTrial("longest-waiting:60", 1234.5, 9), RuleTrial("x", 2000.0, 1))
+        ),
+        Tuned("fast", "V4", (RuleTrial("delay-actuated:120:40", 61.27, 3),)),
     ]
     page = io.StringIO()
     Console(file=page, width=80).print(tuning_table("single-v1 in V4", found))

@@ -418,6 +418,7 @@ def test_detectors_are_compared_over_equally_long_logs(monkeypatch: pytest.Monke
         assert seen[-2:] == [decisions, decisions]
 
 
+@pytest.mark.slow
 def test_a_learner_begins_anew_when_late_commands_are_found_no_more(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

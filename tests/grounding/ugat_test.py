@@ -103,6 +103,7 @@ def test_alpha_can_start_at_what_the_first_fit_expects(tmp_path: Path) -> None:
     assert rows["gate/acceptance"] < 1.0
 
 
+@pytest.mark.slow
 @pytest.mark.usefixtures("unjudged")
 def test_lessons_of_a_rule_count_in_no_gate(tmp_path: Path) -> None:
     transfer(replace(SMALL, learner="universal"), tmp_path / "run")

@@ -21,7 +21,7 @@ from ugat_marl.scenarios import (
     intersection_name,
     read_scenario,
 )
-from ugat_marl.scenarios.importers.count_sheet import write_template
+from ugat_marl.scenarios.importers.count_sheet import is_filled, write_template
 from ugat_marl.scenarios.street_names import heading_rad
 
 TOWN = Path(__file__).parents[1] / "fixtures" / "town.osm"
@@ -259,3 +259,13 @@ def test_a_light_without_turns_needs_no_row(tmp_path: Path) -> None:
         "net",
     )
     assert write_template(tmp_path / "t.csv", root) == 0
+
+
+def test_a_street_name_with_a_semicolon_hides_no_count(tmp_path: Path) -> None:
+    sheet = tmp_path / "counts.csv"
+    sheet.write_text("street,count,from,to\nMain St;Route 5,12,a,b\n")
+    assert is_filled(sheet)
+    sheet.write_text("street,count,from,to\nMain St;Route 5,,a,b\n")
+    assert not is_filled(sheet)
+    sheet.write_text("street;count;from;to\nMain St;7;a;b\n")
+    assert is_filled(sheet)

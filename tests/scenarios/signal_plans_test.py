@@ -334,3 +334,8 @@ def test_the_typical_plan_of_the_programme_is_the_programme(single: Scenario) ->
     network = Network.read(single)
     (plan,) = typical_plans(single, rule_factory("programme"), "sim", (1,), Silent())
     assert plan == programme_plan(network.intersections[0], network)
+
+
+def test_two_plans_of_one_light_are_refused(single: Scenario) -> None:
+    with pytest.raises(ScenarioError, match="two plans for light 'A1'"):
+        with_plans(single, [dual_ring(), dual_ring(5.0)], "plans.csv")

@@ -83,10 +83,15 @@ def run(line: CommandLine, arguments: Sequence[str]) -> int:
         The exit code: 0, 1 (a check or target failed), 2 (wrong call or input; one line names the
         fault), 130 (interrupted), 143 (terminated).
     """
-    console = Console(highlight=False)
+    for stream in (sys.stdout, sys.stderr):  # a terminal without Greek letters shows "?" for them
+        if isinstance(stream, io.TextIOWrapper):
+            stream.reconfigure(errors="replace")
+    console = Console(highlight=False, markup=False)
     arguments, level = _without_loudness(arguments)
     arguments, seconds = _without_deadline(arguments)
-    progress = console if console.is_terminal else Console(stderr=True, highlight=False)
+    progress = (
+        console if console.is_terminal else Console(stderr=True, highlight=False, markup=False)
+    )
     try:
         with _ended_in_order(), loudness(level), showing(Bars(progress)), _deadline(seconds):
             return _dispatch(line, list(arguments), console)

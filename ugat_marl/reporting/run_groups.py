@@ -59,7 +59,12 @@ def groups(records: Sequence[RunRecord]) -> list[Group]:
 
 def seeds_of_one(records: Sequence[RunRecord]) -> list[list[RunRecord]]:
     """Return lists of trainings that differ in their seed alone; one curve shows each list."""
-    return list(_parted(records, lambda r: (*_common(r), r.real, _ugat(r), r.setting)).values())
+
+    def alike(record: RunRecord) -> tuple[Any, ...]:
+        trained = json.dumps(_trained(record), sort_keys=True)
+        return (*_common(record), record.real, _ugat(record), record.setting, trained)
+
+    return list(_parted(records, alike).values())
 
 
 def _common(record: RunRecord) -> tuple[Any, ...]:
@@ -137,8 +142,8 @@ def _seed(record: RunRecord) -> int | None:
 
 
 def job_labels(records: Sequence[RunRecord]) -> list[str]:
-    """Return names of jobs; equal names get the settings of UGAT in which the jobs differ."""
-    flat = [dict(_flat(record.ugat)) for record in records]
+    """Return names of jobs; equal names get the settings in which the jobs differ."""
+    flat = [dict(_flat(record.ugat)) | _trained(record) for record in records]
     names = [record.setting for record in records]
     labels: list[str] = []
     for record, name, settings in zip(records, names, flat, strict=True):
@@ -150,6 +155,21 @@ def job_labels(records: Sequence[RunRecord]) -> list[str]:
         unusual = [f"{key} {settings[key]}" for key in varied if settings[key] != usual[key]]
         labels.append(f"{name} ({', '.join(unusual)})" if record.job and unusual else name)
     return labels
+
+
+def _trained(record: RunRecord) -> dict[str, str]:
+    """Return learner, episodes and options of a job; nothing for a run, whose key has them."""
+    if not record.job:
+        return {}
+    learner = record.settings.get("learner")
+    options = record.settings.get("options")
+    told: dict[str, str] = {"episodes": str(record.settings.get("episodes", ""))}
+    if isinstance(learner, Mapping):
+        own = learner.get("settings")
+        told["learner"] = " ".join(map(str, [learner.get("name"), *(own or ())]))
+    if isinstance(options, Mapping):
+        told |= dict(_flat(options, "options."))
+    return told
 
 
 def _flat(settings: Mapping[str, Any], prefix: str = "") -> Iterable[tuple[str, str]]:

@@ -256,7 +256,7 @@ def _run(directory: Path, name: str) -> RunRecord:
     settings = kept.get("settings", kept)
     settings = settings if isinstance(settings, dict) else {}
     if isinstance(setting := settings.get("setting"), dict):  # a job nests its setting and its name
-        settings = {**settings, **setting}
+        settings = {**setting, **settings}  # the episodes are those of the job
     if job:
         evaluation = reader.read(
             SCORES, lambda path: _scores(path, settings), "it has not been judged (yet)"

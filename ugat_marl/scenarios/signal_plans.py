@@ -323,6 +323,8 @@ def with_plans(scenario: Scenario, plans: Iterable[SignalPlan], source: str) -> 
                 f"{source}: light {plan.light!r} is no agent of scenario {scenario.id!r}; its "
                 f"agents are {', '.join(lights)}"
             )
+        if any(logic.get("id") == plan.light for logic in top):
+            raise ScenarioError(f"{source}: two plans for light {plan.light!r}; give it one")
         check_plan(plan, source)
         logic = ET.SubElement(
             top, "tlLogic", id=plan.light, type="static", programID=_PROGRAM,
@@ -333,7 +335,12 @@ def with_plans(scenario: Scenario, plans: Iterable[SignalPlan], source: str) -> 
     name, planned = "plans.add.xml", {logic.get("id") for logic in top}
     for document in scenario.additional:
         if document.name == name:
-            top.extend(logic for logic in document.parse() if logic.get("id") not in planned)
+            kept = (
+                other
+                for other in document.parse()
+                if other.tag != "tlLogic" or other.get("id") not in planned
+            )
+            top.extend(kept)
     others = tuple(document for document in scenario.additional if document.name != name)
     return replace(scenario, additional=(*others, Document(name, None, xml_bytes(top))))
 

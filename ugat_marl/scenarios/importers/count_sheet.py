@@ -110,7 +110,9 @@ def is_filled(path: Path) -> bool:
     """Return False if no count of a sheet has been filled in; True if it cannot be read."""
     try:
         text = path.read_text(encoding="utf-8-sig")
-        reader = csv.DictReader(io.StringIO(text), delimiter=";" if ";" in text else ",")
+        # Names of streets hold semicolons, too: the first line decides.
+        delimiter = ";" if ";" in text.partition("\n")[0] else ","
+        reader = csv.DictReader(io.StringIO(text), delimiter=delimiter)
         return any((row.get("count") or "").strip() for row in reader)
     except (OSError, ValueError, csv.Error):
         return True
