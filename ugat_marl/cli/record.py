@@ -10,9 +10,8 @@ from rich.console import Console
 from tyro.conf import Positional, arg
 
 from ugat_marl.cli.arguments import LengthS, Workers
-from ugat_marl.data import as_counts, require_replaceable, write_measured
+from ugat_marl.data import as_counts, require_interval, require_replaceable, write_measured
 from ugat_marl.effects import load_scenario, scenario_in_domain
-from ugat_marl.errors import OptionError
 from ugat_marl.experiments import policy_factory, record
 from ugat_marl.files import require_writable
 from ugat_marl.progress import Bars
@@ -71,8 +70,8 @@ class Record:
             scenario, self.domain
         )  # a wrong name is an error before anything is written
         policy = policy_factory(self.policy)
-        if self.counts_every_s is not None and not self.counts_every_s > 0:
-            raise OptionError(f"--counts-every-s {self.counts_every_s:g}: must be above 0")
+        if self.counts_every_s is not None:
+            require_interval(self.counts_every_s)
         require_replaceable(self.out)
         require_writable(self.out / "periods.csv")
         measured = record(

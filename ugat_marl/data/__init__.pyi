@@ -10,6 +10,7 @@ from .measured.coverage import is_actuated as is_actuated
 from .measured.intervals import Intervals as Intervals
 from .measured.intervals import as_counts as as_counts
 from .measured.intervals import occupied_between as occupied_between
+from .measured.intervals import require_interval as require_interval
 from .measured.lanes import traffic_of_lanes as traffic_of_lanes
 from .measured.passages import passages_as_written as passages_as_written
 from .measured.reading import read_measured as read_measured

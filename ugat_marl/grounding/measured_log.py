@@ -221,7 +221,8 @@ class _Street:
         if table is not None:
             findings = (*_unseen(table), *findings)
         log = recorder.log()
-        log = TransitionLog(replace(log.provenance, deviation=deviation), log.frame)
+        if deviation:
+            log = TransitionLog(replace(log.provenance, deviation=deviation), log.frame)
         return MeasuredLog(log, findings)
 
     def _measured_lanes(self, table: pl.DataFrame | None) -> set[str]:

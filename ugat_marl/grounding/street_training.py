@@ -159,8 +159,8 @@ class StreetTraining(Algorithm):
             with contextlib.closing(env):
                 grounded = env if residual is None else residual.around(env)
                 rule = self._best_rule(state, street)  # line 6
-                gate = residual and residual.transform.gate
-                taught = self._attend(state, grounded, title, rule and rule.spec, gate)
+                held = residual and residual.transform.gate
+                taught = self._attend(state, grounded, title, rule and rule.spec, held)
                 self._learn(state, grounded, episodes, title)
             if residual is not None and residual.acts:
                 gate = residual.end_iteration().as_dict()

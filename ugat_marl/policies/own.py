@@ -62,7 +62,7 @@ def is_own(name: str) -> bool:
 
 def own_name(given: Any) -> str:
     """Return the name ``module:name`` of an object, under which `load_own` finds it here."""
-    kind = given if hasattr(given, "__qualname__") else type(given)
+    kind = _named(given)
     name = f"{kind.__module__}:{kind.__qualname__}"
     _given[name] = given
     return name
@@ -106,6 +106,11 @@ def load_own(name: str, what: str) -> Any:
     return found
 
 
+def _named(given: Any) -> Any:
+    """Return the class or function by whose name an object is known."""
+    return given if hasattr(given, "__qualname__") else type(given)
+
+
 def own_source(name: str, what: str) -> str | None:
     """Return the hash of the file that defines a user's object; None if it is in no file.
 
@@ -117,10 +122,8 @@ def own_source(name: str, what: str) -> str | None:
         OptionError: The module is missing.
         UnknownNameError: The object is missing in it.
     """
-    found = load_own(name, what)
-    kind = found if hasattr(found, "__qualname__") else type(found)
     try:
-        file = inspect.getsourcefile(kind)
+        file = inspect.getsourcefile(_named(load_own(name, what)))
     except (TypeError, OSError):  # built in, or typed at a prompt
         return None
     return None if file is None or not Path(file).is_file() else file_hash(Path(file))

@@ -10,6 +10,11 @@ from typing import Any
 from ugat_marl.errors import ScenarioError
 
 
+def delimiter_of(text: str) -> str:
+    """Return what separates cells: a semicolon if the first line has one, else a comma."""
+    return ";" if ";" in text.partition("\n")[0] else ","
+
+
 def columns_of(reader: csv.DictReader[str], path: Path) -> list[str]:
     """Read the first line; return the names without blanks, which then name the cells of rows.
 

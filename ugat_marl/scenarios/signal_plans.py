@@ -20,7 +20,7 @@ from pathlib import Path
 
 from ugat_marl.errors import ScenarioError, nearest
 from ugat_marl.files import Document, read_bytes, write_whole, xml_bytes
-from ugat_marl.scenarios.csv_tables import columns_of, rows_of
+from ugat_marl.scenarios.csv_tables import columns_of, delimiter_of, rows_of
 from ugat_marl.scenarios.junctions import Link, foes_of, right_on_red_of, yields_of
 from ugat_marl.scenarios.network import Intersection, Network
 from ugat_marl.scenarios.phases import RightOfWay, are_foes, permitted_clash, state_of, turn_of
@@ -316,15 +316,16 @@ def with_plans(scenario: Scenario, plans: Iterable[SignalPlan], source: str) -> 
     root = scenario.network.parse()
     rules = RightOfWay(foes_of(root), yields_of(root), right_on_red_of(root))
     lights = {light.id: light for light in network.intersections}
-    top = ET.Element("additional")
+    top, planned = ET.Element("additional"), set[str]()
     for plan in plans:
         if plan.light not in lights:
             raise ScenarioError(
                 f"{source}: light {plan.light!r} is no agent of scenario {scenario.id!r}; its "
                 f"agents are {', '.join(lights)}"
             )
-        if any(logic.get("id") == plan.light for logic in top):
+        if plan.light in planned:
             raise ScenarioError(f"{source}: two plans for light {plan.light!r}; give it one")
+        planned.add(plan.light)
         check_plan(plan, source)
         logic = ET.SubElement(
             top, "tlLogic", id=plan.light, type="static", programID=_PROGRAM,
@@ -332,7 +333,7 @@ def with_plans(scenario: Scenario, plans: Iterable[SignalPlan], source: str) -> 
         )  # fmt: skip
         for seconds, state in plan_states(plan, lights[plan.light], network, rules, source):
             ET.SubElement(logic, "phase", duration=f"{seconds:g}", state=state)
-    name, planned = "plans.add.xml", {logic.get("id") for logic in top}
+    name = "plans.add.xml"
     for document in scenario.additional:
         if document.name == name:
             kept = (
@@ -418,9 +419,7 @@ def read_plans(path: Path) -> tuple[SignalPlan, ...]:
             names the line. Or a plan does not fit together.
     """
     text = text_of_table(path)
-    reader = csv.DictReader(
-        io.StringIO(text, newline=""), delimiter=";" if ";" in text.partition("\n")[0] else ","
-    )
+    reader = csv.DictReader(io.StringIO(text, newline=""), delimiter=delimiter_of(text))
     columns = columns_of(reader, path)
     optional = {"intersection", "phase", "ring", "barrier"}
     if missing := [name for name in COLUMNS if name not in columns and name not in optional]:

@@ -78,6 +78,16 @@ def occupied_between(on: Array, off: Array, edges: Array) -> Array:
     return np.diff(filled)
 
 
+def require_interval(length_s: float) -> None:
+    """Refuse an impossible length of intervals.
+
+    Raises:
+        OptionError: The length is not above 0.
+    """
+    if not length_s > 0:
+        raise OptionError(f"an interval of {length_s:g} s: the length must be above 0")
+
+
 def as_counts(measured: MeasuredData, length_s: float) -> MeasuredData:
     """Return the data as detectors report them that add up intervals and log no single vehicle.
 
@@ -91,8 +101,7 @@ def as_counts(measured: MeasuredData, length_s: float) -> MeasuredData:
     Raises:
         OptionError: The length is not above 0.
     """
-    if not length_s > 0:
-        raise OptionError(f"an interval of {length_s:g} s: the length must be above 0")
+    require_interval(length_s)
     parts: list[pl.DataFrame] = []
     for period in measured.periods:
         for detector in measured.detectors:

@@ -15,6 +15,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from ugat_marl.files import write_whole
+from ugat_marl.scenarios.csv_tables import delimiter_of
 from ugat_marl.scenarios.junctions import Link, links_of
 from ugat_marl.scenarios.network import lanes_of, streets_of
 from ugat_marl.scenarios.street_names import NamedTurn, intersection_name, named_turns
@@ -110,9 +111,7 @@ def is_filled(path: Path) -> bool:
     """Return False if no count of a sheet has been filled in; True if it cannot be read."""
     try:
         text = path.read_text(encoding="utf-8-sig")
-        # Names of streets hold semicolons, too: the first line decides.
-        delimiter = ";" if ";" in text.partition("\n")[0] else ","
-        reader = csv.DictReader(io.StringIO(text), delimiter=delimiter)
+        reader = csv.DictReader(io.StringIO(text), delimiter=delimiter_of(text))
         return any((row.get("count") or "").strip() for row in reader)
     except (OSError, ValueError, csv.Error):
         return True

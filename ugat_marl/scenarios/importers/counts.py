@@ -21,7 +21,7 @@ from numpy.typing import NDArray
 from ugat_marl.errors import ScenarioError, nearest
 from ugat_marl.files import chunks_of, parse_xml, read_bytes, write_whole, xml_bytes
 from ugat_marl.progress import Reporter
-from ugat_marl.scenarios.csv_tables import columns_of, rows_of
+from ugat_marl.scenarios.csv_tables import columns_of, delimiter_of, rows_of
 from ugat_marl.scenarios.importers.count_sheet import (
     FIT_SHEET,
     CountFit,
@@ -92,7 +92,7 @@ def read_rows(
     """
     texts = lines(path, reporter)
     first = next(texts, "")
-    reader = csv.DictReader(chain((first,), texts), delimiter=";" if ";" in first else ",")
+    reader = csv.DictReader(chain((first,), texts), delimiter=delimiter_of(first))
     columns = columns_of(reader, path)
     turns = {"from", "to"} <= set(columns)
     if "count" not in columns or not (turns or ("edge" in columns and not pairs)):
