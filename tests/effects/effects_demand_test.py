@@ -285,6 +285,27 @@ def test_flows_that_are_shifted_before_the_begin_lose_their_first_vehicles(
     assert times == {"e": ("8", "158", "15"), "f": ("8", "158", "15")}
 
 
+def test_what_departs_before_the_begin_is_shifted_into_the_scenario_by_nobody(
+    crossing: Crossing,
+) -> None:
+    begins = lambda text: f"begin_s = 100\n{text}"  # noqa: E731
+    flow = '<flow id="f" route="east" begin="0" end="200" period="10"/>'
+    single = "".join(
+        f'<vehicle id="v{time}" route="east" depart="{time}"/>' for time in range(0, 200, 10)
+    )
+    for seconds, expected in ((50, (150, 240, 10)), (-50, (100, 140, 5))):
+        effect = DemandTiming("*", seconds)
+        cars = apply_effects(load_scenario(crossing(vehicles=single, toml=begins)), [effect])
+        times = [float(x.get("depart", "")) for x in departing(sound(cars)).values()]
+        present = [time for time in times if time >= 100]
+        assert (min(present), max(present), len(present)) == expected
+        whole = apply_effects(load_scenario(crossing(vehicles=flow, toml=begins)), [effect])
+        (shifted,) = departing(sound(whole)).values()
+        number = int(shifted.get("number", ""))
+        first = float(shifted.get("begin", ""))
+        assert (first, first + 10 * (number - 1), number) == expected
+
+
 def test_flows_are_shifted(crossing: Crossing) -> None:
     scenario = load_scenario(crossing(vehicles=FLOWS))
     later = departing(sound(apply_effects(scenario, [DemandTiming("W_C", 30)])))

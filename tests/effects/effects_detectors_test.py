@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -20,11 +21,15 @@ from ugat_marl.effects import (
     Swapped,
     Undercount,
     apply_detector_effects,
+    apply_effects,
+    controller_effects,
+    detector_effects,
     detector_lights,
     load_scenario,
     network_places,
     parse_domain,
 )
+from ugat_marl.envs import parallel_env, vector_env
 from ugat_marl.errors import OptionError, UnknownNameError
 from ugat_marl.scenarios import Detector, Passages, Period
 
@@ -143,11 +148,29 @@ def test_unknown_detectors(effect: DetectorEffect) -> None:
         effect.observe(DAY, DETECTORS, OWNER)
 
 
-def test_the_scenario_is_left_alone() -> None:
+def test_the_files_of_a_scenario_are_left_alone() -> None:
     scenario = load_scenario("single-v1")
     after = Undercount("*", 0.1).apply(scenario)
-    assert after.hash == scenario.hash
+    assert after.documents == scenario.documents
     assert after.applied == ("undercount=*,0.1",)
+
+
+def test_effects_on_detectors_are_written_and_read_with_the_scenario(tmp_path: Path) -> None:
+    effects = parse_domain("signal_clock=A1,3+undercount=*,0.1+counting_error=3+dropout=b,0,50")
+    street = apply_effects(load_scenario("single-v1"), effects)
+    read = load_scenario(street.write(tmp_path / "street-v1"))
+    on_detectors = [effect for effect in effects if effect.on_detectors]
+    assert len(on_detectors) == 3
+    assert sorted(map(str, detector_effects(read))) == sorted(map(str, on_detectors))
+    assert detector_effects(load_scenario(read)) == detector_effects(read)
+    assert [effect.name for effect in controller_effects(read)] == ["counting_error"]
+
+
+def test_effects_on_detectors_are_no_domain_of_agents() -> None:
+    with pytest.raises(OptionError, match="'undercount' changes the reports of detectors, which"):
+        parallel_env("single-v1", "V4+undercount=*,0.2")
+    with pytest.raises(OptionError, match="'undercount'"):
+        vector_env("single-v1", 2, domains=["sim", "undercount=*,0.2"])
 
 
 def test_detectors_belong_to_the_light_they_lead_to_or_stand_behind() -> None:

@@ -226,6 +226,21 @@ def test_traffic_on_an_edge_is_slower(
     assert speeds(both, "twice") == pytest.approx((3, 9))
 
 
+def test_edges_that_differ_in_a_special_character_have_signs_of_their_own(
+    crossing: Crossing,
+) -> None:
+    network = lambda text: text.replace("S_C", "a@C").replace("W_C", "a~C")  # noqa: E731
+    scenario = load_scenario(crossing(vehicles="", edit=network))
+    slow = apply_effects(scenario, [LocalSpeed("a@C", 0.6), LocalSpeed("a~C", 0.9)])
+    signs = {
+        sign.get("lanes"): [float(step.get("speed", "")) for step in sign]
+        for document in slow.additional
+        for sign in document.parse().iter("variableSpeedSign")
+    }
+    assert signs == {"a@C_0": [6], "a~C_0": [9]}
+    assert len({document.name for document in slow.additional}) == len(slow.additional)
+
+
 # --- signals
 
 STANDING = '<vehicle id="v" type="car" route="east" depart="0" departPos="490" departSpeed="0"/>'

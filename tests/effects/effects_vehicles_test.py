@@ -32,10 +32,9 @@ from ugat_marl.effects import (
     load_scenario,
     scenario_in_domain,
 )
-from ugat_marl.effects.fleet import Speeds
 from ugat_marl.effects.vehicles import DRIVER_MODELS
 from ugat_marl.errors import UnknownNameError
-from ugat_marl.scenarios import Scenario
+from ugat_marl.scenarios import Scenario, SpeedFactors
 from ugat_marl.simulation import LibsumoSimulator, launch_of
 
 Crossing = Callable[..., Path]
@@ -220,13 +219,16 @@ def test_drivers_run_yellow_and_red(
 CLASSES = (
     "passenger", "truck", "bus", "delivery", "taxi", "bicycle", "motorcycle", "moped", "trailer",
     "coach", "emergency", "evehicle", "hov", "private", "custom1", "army", "vip", "authority",
-    "ignoring",
+    "ignoring", "tram", "rail", "rail_urban", "rail_electric", "rail_fast", "subway", "cable_car",
+    "ship", "aircraft", "drone", "pedestrian", "wheelchair", "container", "scooter",
 )  # fmt: skip
 WRITTEN = {
     "number": 'speedFactor="1.2"',
     "number and deviation": 'speedFactor="1.2" speedDev="0.05"',
     "normal": 'speedFactor="norm(1.1,0.2)"',
     "cut": 'speedFactor="normc(1.1,0.2,0.5,1.5)"',
+    "mean in words": 'speedFactor="normc(1.1)"',
+    "without limits": 'speedFactor="normc(1.1,0.2)"',
     "cut and deviation": 'speedFactor="normc(1.1,0.2,0.5,1.5)" speedDev="0.03"',
     "deviation": 'speedDev="0.02"',
     "truck": 'vClass="truck" speedFactor="0.9"',
@@ -250,7 +252,7 @@ def test_types_are_read_as_sumo_reads_them(
         simulator.start(launch_of(world, 1, own, ()))
         for item in scenario.routes[0].parse().iter("vType"):
             name = item.get("id", "")
-            speeds = Speeds.of(item, option)
+            speeds = SpeedFactors.of(item.attrib, scenario.settings.sumo)
             api = libsumo.vehicletype
             assert api.getSpeedFactor(name) == pytest.approx(speeds.mean), name
             assert api.getSpeedDeviation(name) == pytest.approx(speeds.deviation), name
@@ -346,17 +348,19 @@ def test_trucks_are_long_and_slow_and_else_like_the_cars(
 
     def nature(name: str) -> object:
         api = libsumo.vehicle
+        if api.getTypeID(name) == "r2":
+            return "a truck before"
         return tuple(
             round(f(name), 3) for f in (api.getLength, api.getAccel, api.getDecel, api.getTau)
         )
 
     before = apply_effects(scenario, [Headway(1.5), Acceleration(2), HeavyShare(1)])
     seen = asked(simulator, before, tmp_path / "before", nature)
-    assert set(seen.values()) == {(12, 1, 3.5, 1.5)}
+    assert set(seen.values()) == {(12, 1, 3.5, 1.5), "a truck before"}
     assert len(seen) == 12 + 2 + 6 + 1
     after = apply_effects(scenario, [HeavyShare(1), Headway(1.5), Acceleration(2)])
     seen = asked(simulator, after, tmp_path / "after", nature)
-    assert set(seen.values()) == {(12, 2, 3.5, 1.5)}
+    assert set(seen.values()) == {(12, 2, 3.5, 1.5), "a truck before"}
 
 
 def test_a_part_of_each_flow_is_heavy(crossing: Crossing) -> None:
@@ -374,6 +378,42 @@ def test_buses_stay_buses(crossing: Crossing) -> None:
     vehicles = '<vehicle id="v" type="bus" route="east" depart="0"/>'
     scenario = load_scenario(crossing(vehicles=vehicles, types=types))
     assert kinds(apply_effects(scenario, [HeavyShare(1)])) == {"v": "bus"}
+
+
+LISTED = (
+    '<vType id="lorry" vClass="truck"/><vType id="van" accel="2"/>'
+    '<vTypeDistribution id="fleet" vTypes="lorry van" probabilities="0.25 0.75"/>'
+)
+NESTED = (
+    '<vTypeDistribution id="fleet"><vType id="lorry" vClass="truck" probability="1"/>'
+    '<vType id="van" accel="2" probability="3"/></vTypeDistribution>'
+)
+
+
+@pytest.mark.parametrize("types", [LISTED, NESTED], ids=["listed", "nested"])
+def test_only_the_cars_of_a_mixed_fleet_become_trucks(
+    types: str, simulator: LibsumoSimulator, crossing: Crossing, tmp_path: Path
+) -> None:
+    scenario = load_scenario(crossing(vehicles=CARS, types=types))
+    twice = apply_effects(scenario, [HeavyShare(0.5), HeavyShare(0.5)])
+    simulator.start(launch_of(twice, 1, tmp_path / "own", ()))
+    drawn: list[str] = []
+    for number in range(4000):
+        libsumo.vehicle.add(f"x{number}", "north", "fleet", depart="999")
+        drawn.append(libsumo.vehicle.getTypeID(f"x{number}"))
+    shares = {kind: drawn.count(kind) / len(drawn) for kind in set(drawn)}
+    expected = {"lorry": 0.25, "van": 0.75 / 4, "heavy.van": 0.75 * 3 / 4}
+    assert shares == pytest.approx(expected, abs=4 * (0.25 / len(drawn)) ** 0.5)
+    assert kinds(twice) == kinds(apply_effects(scenario, [HeavyShare(0.5)]))  # single cars: a hash
+
+
+def test_a_headway_is_no_shorter_than_the_usual_time_between_decisions(crossing: Crossing) -> None:
+    option = '[sumo]\n"default.action-step-length" = "2"\n'
+    types = '<vType id="quick" actionStepLength="1"/>'
+    scenario = load_scenario(crossing(vehicles=CARS, types=types, toml=lambda text: text + option))
+    driven = apply_effects(scenario, [Headway(0.5)])
+    taus = {x.get("id"): x.get("tau") for x in driven.routes[0].parse().iter("vType")}
+    assert taus == {"car": "2", "quick": "1"}
 
 
 # --- driver models

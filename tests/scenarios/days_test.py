@@ -150,3 +150,37 @@ def test_drivers_without_a_type_follow_a_default_type_of_an_additional_file(
     factors = re.findall(rb'speedFactor="([\d.]+)"', day.routes[0].read())
     assert factors
     assert {float(factor) for factor in factors} == {0.5}
+
+
+SPEEDS = {
+    'speedFactor="1.2"': (1.2, 0.1),
+    'speedFactor="1.2" vClass="truck"': (1.2, 0.05),
+    'vClass="bus"': (1.0, 0.0),
+    'speedFactor="normc(1,0.3)"': (1.0, 0.3),
+    'speedFactor="normc(1,0.5,0.9,1.1)"': (1.0, 0.0573),  # drawn again beyond a limit
+    'speedFactor="normc(1.1,0.2,0.5,1.5)" speedDev="0.03"': (1.1, 0.03),
+}
+
+
+@pytest.mark.parametrize("option", [None, 0.2])
+@pytest.mark.parametrize("text", SPEEDS)
+def test_drivers_are_drawn_from_the_distribution_that_sumo_reads(
+    text: str, option: float | None, crossing: Callable[..., Path]
+) -> None:
+    cars = "".join(CAR.format(n, n / 10, "own") for n in range(2000))
+    settings = f'[sumo]\n"default.speeddev" = "{option}"\n'
+    scenario = load_scenario(
+        crossing(
+            vehicles=cars,
+            types=f'<vType id="own" {text}/>',
+            toml=(lambda toml: toml + settings) if option is not None else None,
+        )
+    )
+    day = draw_day(scenario, 1).routes[0].read()
+    factors = np.array([float(x) for x in re.findall(rb'speedFactor="([\d.]+)"', day)])
+    mean, deviation = SPEEDS[text]
+    if option is not None and "norm" not in text:
+        deviation = option
+    assert len(factors) > 1500
+    assert factors.mean() == pytest.approx(mean, abs=0.03)
+    assert factors.std() == pytest.approx(deviation, rel=0.08)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import hashlib
 import math
-from collections.abc import Collection, Mapping, Sequence
+from collections.abc import Collection, Iterable, Mapping, Sequence
 from dataclasses import dataclass, fields, replace
 from numbers import Real
 from typing import Any, ClassVar, Literal
@@ -233,8 +233,10 @@ class Effect(ControllerPart):
             else bool(value) and not set(value) & _FORBIDDEN
         )
         if not isinstance(value, str) or not named:
+            article = "an" if text.kind == "edge" else "a"
             raise OptionError(
-                f"effect {self.name!r}: {field} = {value!r} is not the name of a {text.kind}"
+                f"effect {self.name!r}: {field} = {value!r} is not the name of {article} "
+                f"{text.kind}"
             )
         if value == EVERYWHERE and not text.everywhere:
             raise OptionError(f"effect {self.name!r}: {field} must be one {text.kind}, not '*'")
@@ -267,10 +269,16 @@ class ControllerEffect(Effect):
 
         own = self.record()
         others = [item for item in scenario.settings.effects if identity(item) != identity(own)]
-        listed = sorted([*others, own], key=identity)
-        settings = scenario.settings.model_copy(update={"effects": tuple(listed)})
-        known = () if str(self) in scenario.applied else (str(self),)  # a scenario is loaded twice
-        return replace(scenario, settings=settings, applied=(*scenario.applied, *known))
+        return with_listed_effects(scenario, self, sorted([*others, own], key=identity))
+
+
+def with_listed_effects(
+    scenario: Scenario, effect: Effect, records: Iterable[Mapping[str, Any]]
+) -> Scenario:
+    """Return the scenario with these records of effects in its settings, `effect` among them."""
+    settings = scenario.settings.model_copy(update={"effects": tuple(records)})
+    known = () if str(effect) in scenario.applied else (str(effect),)  # a scenario is loaded twice
+    return replace(scenario, settings=settings, applied=(*scenario.applied, *known))
 
 
 def hashed_uniform(salt: str, *names: str) -> float:

@@ -368,14 +368,18 @@ def _mean_period_s(flow: ET.Element) -> float:
 def _shifted_flow(
     element: ET.Element, seconds: float, earliest_s: float, over_s: float
 ) -> list[ET.Element]:
-    """Return the flow with later departures, without those before `earliest_s`."""
+    """Return the flow with later departures, without those before `earliest_s`.
+
+    Vehicles that were due before `earliest_s` take no part in the simulation; none is shifted.
+    """
     endless = "end" not in element.attrib and "number" not in element.attrib
     regular = None if endless else _Regular.of(element, over_s)
     if regular is not None:
-        later = replace(regular, begin_s=regular.begin_s + seconds)
+        present = regular.cut(regular.before(earliest_s), regular.number)
+        later = replace(present, begin_s=present.begin_s + seconds)
         kept = later.cut(later.before(earliest_s), later.number)
         return [kept.written(element)] if kept.number else []
-    begin, end = depart_s(element) + seconds, element.get("end")
+    begin, end = max(depart_s(element), earliest_s) + seconds, element.get("end")
     if end is not None:
         until = parse_time(end) + seconds
         if until <= earliest_s:

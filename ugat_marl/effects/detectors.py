@@ -18,6 +18,7 @@ from ugat_marl.effects.base import (
     Owner,
     TextParameter,
     hashed_uniform,
+    with_listed_effects,
 )
 from ugat_marl.effects.places import network_places
 from ugat_marl.errors import UnknownNameError
@@ -50,12 +51,16 @@ def detector_lights(scenario: Scenario, detectors: Sequence[Detector]) -> dict[s
 
 @dataclass(frozen=True)
 class DetectorEffect(Effect):
-    """Base of effects on the reports of detectors; the simulation does not change."""
+    """Base of effects on the reports of detectors; the simulation does not change.
+
+    No files change. The scenario lists the effect in its `effects`, so it is hashed, written and
+    read with the scenario, and whoever measures the scenario applies it.
+    """
 
     on_detectors: ClassVar[bool] = True
 
     def apply(self, scenario: Scenario) -> Scenario:
-        """Add the effect to `applied`; the files do not change.
+        """List the effect in the scenario, behind those listed before.
 
         Raises:
             UnknownNameError: No such traffic light.
@@ -65,7 +70,8 @@ class DetectorEffect(Effect):
             if text.kind == "traffic light" and name != EVERYWHERE:
                 places = network_places(scenario)
                 places.check(self.name, text.kind, name, places.lights)
-        return replace(scenario, applied=(*scenario.applied, str(self)))
+        listed = (*scenario.settings.effects, self.record())
+        return with_listed_effects(scenario, self, listed)
 
 
 @dataclass(frozen=True)

@@ -329,6 +329,24 @@ def check_windows(scenario: Scenario, domain: Domain) -> None:
         refuse_outside(scenario, parse_domain(domain))
 
 
+def refuse_detectors(domain: Domain) -> None:
+    """Refuse a domain of agents that names effects on detectors.
+
+    Raises:
+        OptionError: Such an effect would change nothing that agents see.
+    """
+    if domain_path(domain) is not None:
+        return
+    for effect in parse_domain(domain):
+        if effect.on_detectors:
+            raise OptionError(
+                f"domain {domain_label(domain)!r}: {effect.name!r} changes the reports of "
+                "detectors, which agents do not see, so it would change nothing; 'ugat-marl "
+                f"record' measures with it, and counting_error, detector_failure and "
+                "detection_zone change what agents see"
+            )
+
+
 def _checked(scenario: Scenario) -> Scenario:
     """Return the scenario; refuse a detection zone together with a reach."""
     zones = (

@@ -3,9 +3,8 @@
 from __future__ import annotations
 
 import copy
-import re
 import xml.etree.ElementTree as ET
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
 from statistics import NormalDist, fmean
 from typing import ClassVar
@@ -21,65 +20,9 @@ from ugat_marl.effects.documents import (
 )
 from ugat_marl.effects.vehicles import driven_types
 from ugat_marl.files import xml_bytes
-from ugat_marl.scenarios import Scenario
-
-_LEAST, _GREATEST = 0.2, 2.0
-"""SUMO's default limits of speedFactor."""
+from ugat_marl.scenarios import Scenario, SpeedFactors
 
 _HEAVY = "heavy."
-_NORMAL = re.compile(r"\s*norm(c?)\(([^)]*)\)\s*")
-_STEADY = frozenset({"bus", "emergency", "ignoring", "army", "authority"})
-_CALM = frozenset({"truck", "trailer", "coach", "delivery", "taxi"})
-
-
-@dataclass(frozen=True)
-class Speeds:
-    """Distribution of speedFactor in a vehicle type: normal, cut at both ends."""
-
-    mean: float
-    deviation: float
-    least: float = _LEAST
-    greatest: float = _GREATEST
-
-    def write(self, element: ET.Element) -> None:
-        """Write the distribution into a type in SUMO's form."""
-        values = (self.mean, self.deviation, self.least, self.greatest)
-        element.attrib.pop("speedDev", None)
-        element.set("speedFactor", f"normc({','.join(f'{value:.8g}' for value in values)})")
-
-    @classmethod
-    def of(cls, element: ET.Element, general: float | None) -> Speeds:
-        """Read a type as SUMO does.
-
-        Args:
-            element: A ``<vType>``.
-            general: SUMO's option ``default.speeddev``, if it is set.
-        """
-        mean, deviation, least, greatest = (
-            1.0,
-            default_deviation(element, general),
-            _LEAST,
-            _GREATEST,
-        )
-        text = element.get("speedFactor", "")
-        if normal := _NORMAL.fullmatch(text):
-            numbers = [float(part) for part in normal[2].split(",")]
-            mean, deviation = numbers[0], numbers[1] if len(numbers) > 1 else 0.0
-            if len(numbers) > 3:
-                least, greatest = numbers[2], numbers[3]
-        elif text:
-            mean = float(text)
-        if deviation_text := element.get("speedDev"):
-            deviation = float(deviation_text)
-        return cls(mean, deviation, least, greatest)
-
-
-def default_deviation(element: ET.Element, general: float | None) -> float:
-    """Return the default deviation of speedFactor of a vehicle class."""
-    if general is not None and general >= 0:
-        return general
-    kind = element.get("vClass", "passenger")
-    return 0.0 if kind in _STEADY else 0.05 if kind in _CALM else 0.1
 
 
 @dataclass(frozen=True)
@@ -94,9 +37,9 @@ class DesiredSpeed(Effect):
     def apply(self, scenario: Scenario) -> Scenario:
         """Multiply every speedFactor."""
 
-        def typed(old: Speeds) -> Speeds:
+        def typed(old: SpeedFactors) -> SpeedFactors:
             x = self.factor
-            return Speeds(old.mean * x, old.deviation * x, old.least * x, old.greatest * x)
+            return SpeedFactors(old.mean * x, old.deviation * x, old.least * x, old.greatest * x)
 
         return _with_speeds(scenario, self, typed, lambda _, value, __: value * self.factor)
 
@@ -117,10 +60,10 @@ class SpeedSpread(Effect):
         The speed of a vehicle whose type has no spread follows from a hash of its id.
         """
 
-        def typed(old: Speeds) -> Speeds:
+        def typed(old: SpeedFactors) -> SpeedFactors:
             return replace(old, deviation=self.deviation)
 
-        def single(name: str, value: float, old: Speeds) -> float:
+        def single(name: str, value: float, old: SpeedFactors) -> float:
             if old.deviation > 0:
                 place = (value - old.mean) / old.deviation
             else:
@@ -150,7 +93,8 @@ class HeavyShare(Effect):
         """Give vehicles chosen by a hash of their ids, and a part of each flow, truck types."""
         scenario = with_default_types(scenario)
         over = scenario.settings.begin_s + scenario.settings.duration_s
-        cars = _cars(scenario)
+        types, members = _types(scenario)
+        cars = _cars(types, members)
         used: dict[str, ET.Element] = {}
 
         def heavy(element: ET.Element) -> list[ET.Element]:
@@ -173,15 +117,18 @@ class HeavyShare(Effect):
         def change(root: ET.Element) -> bool:
             parts = [heavy(element) for element in root]
             root[:] = [element for part in parts for element in part]
-            return any(len(part) != 1 or is_demand(part[0]) for part in parts)
+            mixed = [x for x in root.iter("vTypeDistribution") if x.get("id") not in cars]
+            for distribution in mixed:
+                used.update(_mix_trucks_in(distribution, types, cars, self.share))
+            return bool(mixed) or any(len(part) != 1 or is_demand(part[0]) for part in parts)
 
-        scenario = edit_scenario(scenario, change, *TAGS, applied=str(self))
+        scenario = edit_scenario(scenario, change, *TAGS, "<vTypeDistribution", applied=str(self))
 
-        types, *others = scenario.additional
-        root = types.parse()
+        declared, *others = scenario.additional
+        root = declared.parse()
         present = {element.get("id") for element in root.iter("vType")}
         root.extend(_truck(used[name], name) for name in sorted(set(used) - present))
-        return replace(scenario, additional=(types.edited(xml_bytes(root)), *others))
+        return replace(scenario, additional=(declared.edited(xml_bytes(root)), *others))
 
 
 def _types(scenario: Scenario) -> tuple[dict[str, ET.Element], dict[str, list[str]]]:
@@ -199,18 +146,58 @@ def _types(scenario: Scenario) -> tuple[dict[str, ET.Element], dict[str, list[st
     return types, members
 
 
-def _cars(scenario: Scenario) -> dict[str, ET.Element]:
-    """Return types and distributions of cars; a distribution is given with its first car type."""
-    types, members = _types(scenario)
+def _cars(
+    types: Mapping[str, ET.Element], members: Mapping[str, list[str]]
+) -> dict[str, ET.Element]:
+    """Return types of cars, and distributions of cars alone, each with its first type."""
     passenger_cars = {
         name: element
         for name, element in types.items()
         if element.get("vClass", "passenger") == "passenger" and not name.startswith(_HEAVY)
     }
     for distribution, names in members.items():
-        if cars := [passenger_cars[name] for name in names if name in passenger_cars]:
-            passenger_cars[distribution] = cars[0]
+        if names and all(name in passenger_cars for name in names):
+            passenger_cars[distribution] = passenger_cars[names[0]]
     return passenger_cars
+
+
+def _mix_trucks_in(
+    distribution: ET.Element,
+    types: Mapping[str, ET.Element],
+    cars: Mapping[str, ET.Element],
+    share: float,
+) -> dict[str, ET.Element]:
+    """Give trucks a share of the probability of each car in a distribution.
+
+    Returns:
+        Replaced cars, by the names of their trucks.
+    """
+    names = distribution.get("vTypes", "").split()
+    given = [float(text) for text in distribution.get("probabilities", "").split()]
+    usual = [_chance(types[name]) if name in types else 1.0 for name in names]
+    listed = dict(zip(names, [*given, *usual[len(given) :]], strict=True))
+    nested = {element.get("id", ""): _chance(element) for element in distribution.iter("vType")}
+    chances = dict(listed)
+    trucks: dict[str, ET.Element] = {}
+    for name, chance in (listed | nested).items():
+        if name in cars:
+            truck = f"{_HEAVY}{name}"
+            trucks[truck] = cars[name]
+            chances[truck] = chances.get(truck, 0.0) + chance * share
+    for name in set(listed) & set(cars):
+        chances[name] *= 1 - share
+    for element in distribution.iter("vType"):
+        if (name := element.get("id", "")) in cars:
+            element.set("probability", f"{nested[name] * (1 - share):.12g}")
+    if trucks:
+        distribution.set("vTypes", " ".join(chances))
+        distribution.set("probabilities", " ".join(f"{x:.12g}" for x in chances.values()))
+    return trucks
+
+
+def _chance(vehicle_type: ET.Element) -> float:
+    """Return the probability of a type in a distribution, as SUMO reads it."""
+    return float(vehicle_type.get("probability", "1"))
 
 
 def _truck(car: ET.Element, name: str) -> ET.Element:
@@ -229,19 +216,19 @@ def _truck(car: ET.Element, name: str) -> ET.Element:
 def _with_speeds(
     scenario: Scenario,
     effect: Effect,
-    typed: Callable[[Speeds], Speeds],
-    single: Callable[[str, float, Speeds], float],
+    typed: Callable[[SpeedFactors], SpeedFactors],
+    single: Callable[[str, float, SpeedFactors], float],
 ) -> Scenario:
     """Change the speeds of all types, and of the vehicles that have their own."""
     scenario = with_default_types(scenario)
-    general = scenario.settings.sumo.get("default.speeddev")
-    known = _speeds(scenario, float(general) if general is not None else None)
-    usual = Speeds(1.0, 0.1)
+    known = _speeds(scenario)
+    usual = SpeedFactors.of({}, scenario.settings.sumo)
 
     def change(root: ET.Element) -> bool:
         types = driven_types(root)
         for element in types:
-            typed(known[element.get("id", "")]).write(element)
+            element.attrib.pop("speedDev", None)
+            element.set("speedFactor", typed(known[element.get("id", "")]).text)
         with_factor = [x for x in root if is_demand(x) and "speedFactor" in x.attrib]
         for element in with_factor:
             kind = known.get(element.get("type", DEFAULT_TYPES[0]), usual)
@@ -252,13 +239,14 @@ def _with_speeds(
     return edit_scenario(scenario, change, "<vType", "speedFactor", applied=str(effect))
 
 
-def _speeds(scenario: Scenario, general: float | None) -> dict[str, Speeds]:
+def _speeds(scenario: Scenario) -> dict[str, SpeedFactors]:
     """Return the speeds of each type, and the mean speeds of each distribution of types."""
     types, members = _types(scenario)
-    speeds = {name: Speeds.of(element, general) for name, element in types.items()}
+    sumo = scenario.settings.sumo
+    speeds = {name: SpeedFactors.of(element.attrib, sumo) for name, element in types.items()}
     for distribution, names in members.items():
         if inner := [speeds[name] for name in names if name in speeds]:
-            speeds[distribution] = Speeds(
+            speeds[distribution] = SpeedFactors(
                 fmean(x.mean for x in inner), fmean(x.deviation for x in inner)
             )
     return speeds

@@ -144,7 +144,9 @@ class LocalSpeed(Effect):
         """
         places = network_places(scenario)
         places.check(self.name, "edge", self.edge, places.edges)
-        file = re.sub(r"[^\w.#-]", "_", f"local-speed.{self.edge}.add.xml")
+        # not "_": two edges that differ in such a character need two files
+        name = re.sub(r"[^\w.#-]", lambda sign: f"%{ord(sign[0]):x}", self.edge)
+        file = f"local-speed.{name}.add.xml"
         before = [added for added in scenario.additional if added.name == file]
         if before:
             root = before[0].parse()

@@ -181,7 +181,8 @@ def apply_effects(scenario: Scenario, effects: Iterable[Effect]) -> Scenario:
 def load_scenario(name: str | Path | Scenario) -> Scenario:
     """Load a scenario and apply the effects listed in its file (see `read_scenario`).
 
-    Effects on controllers stay listed in its settings, because the environment applies them.
+    Effects on controllers and detectors stay listed in its settings: the environment applies the
+    first, and whoever measures the scenario the others.
     """
     scenario = name if isinstance(name, Scenario) else read_scenario(name)
     where = f" in scenario {scenario.id!r}"
@@ -214,14 +215,13 @@ def detector_effects(scenario: Scenario) -> tuple[Effect, ...]:
 
     They do not change its files, so code that measures the scenario has to apply them.
     """
-    names = (text.partition("=")[0] for text in scenario.applied)
-    return tuple(
-        effect_from_text(text)  # undoes str(effect)
-        for name, text in zip(names, scenario.applied, strict=True)
-        if name in EFFECTS and EFFECTS[name].on_detectors
-    )
+    return tuple(effect for effect in _listed(scenario) if effect.on_detectors)
 
 
 def controller_effects(scenario: Scenario) -> tuple[Effect, ...]:
     """Return the effects on controllers that were applied to a scenario."""
+    return tuple(effect for effect in _listed(scenario) if not effect.on_detectors)
+
+
+def _listed(scenario: Scenario) -> tuple[Effect, ...]:
     return tuple(map(effect_from_record, scenario.settings.effects))

@@ -14,7 +14,7 @@ from typing import ClassVar
 
 from ugat_marl.effects.base import Effect, ExaminedStrengths, NumberParameter, TextParameter
 from ugat_marl.effects.documents import edit_scenario, mentions, with_default_types
-from ugat_marl.scenarios import Scenario
+from ugat_marl.scenarios import Scenario, ScenarioFile
 
 _NOT_DRIVEN = frozenset(
     {
@@ -82,25 +82,25 @@ class VehicleEffect(Effect):
     @staticmethod
     def apply_all(scenario: Scenario, effects: Sequence[VehicleEffect]) -> Scenario:
         """Apply effects one after the other; the files are read and written once."""
-        step_s = scenario.settings.step_length_s
+        settings = scenario.settings
 
         def change(root: ET.Element) -> bool:
             types = driven_types(root)
             for element in types:
                 for effect in effects:
-                    effect.write(element, step_s)
+                    effect.write(element, settings)
             return bool(types)
 
         edited = edit_scenario(with_default_types(scenario), change, "<vType", applied="")
         return replace(edited, applied=(*scenario.applied, *map(str, effects)))
 
-    def write(self, element: ET.Element, step_s: float) -> None:
-        """Put the effect into one type, of a scenario with this step length."""
-        self._write(element, getattr(self, fields(self)[0].name), step_s)
+    def write(self, element: ET.Element, settings: ScenarioFile) -> None:
+        """Put the effect into one type of a scenario with these settings."""
+        self._write(element, getattr(self, fields(self)[0].name), settings)
 
-    def _write(self, element: ET.Element, number: float, step_s: float) -> None:
-        """Write the effect's number into one type, for this step length in s."""
-        del step_s
+    def _write(self, element: ET.Element, number: float, settings: ScenarioFile) -> None:
+        """Write the effect's number into one type of a scenario with these settings."""
+        del settings
         _set(element, self.attribute, number)
 
 
@@ -184,8 +184,10 @@ class Headway(VehicleEffect):
     examined: ClassVar[ExaminedStrengths] = ExaminedStrengths((1.3, 1.7), 1.0, 0.05)
     seconds: float
 
-    def _write(self, element: ET.Element, number: float, step_s: float) -> None:
-        _set(element, "tau", max(number, step_s, _get(element, "actionStepLength", 0)))
+    def _write(self, element: ET.Element, number: float, settings: ScenarioFile) -> None:
+        decides_s = float(settings.sumo.get("default.action-step-length", 0))
+        decides_s = _get(element, "actionStepLength", decides_s)
+        _set(element, "tau", max(number, settings.step_length_s, decides_s))
 
 
 @dataclass(frozen=True)
@@ -223,7 +225,8 @@ class ReactionStep(VehicleEffect):
     examined: ClassVar[ExaminedStrengths] = ExaminedStrengths((2.0,), 1.0, 0.5)
     seconds: float
 
-    def _write(self, element: ET.Element, number: float, step_s: float) -> None:
+    def _write(self, element: ET.Element, number: float, settings: ScenarioFile) -> None:
+        step_s = settings.step_length_s
         steps = max(round(number / step_s), 1)
         _set(element, "actionStepLength", steps * step_s)
         _set(element, "tau", max(_get(element, "tau", 1), steps * step_s))

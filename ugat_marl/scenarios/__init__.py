@@ -9,6 +9,7 @@ hashes it. It also derives the static network. Nothing here runs a simulation of
 - `signal_plans`: fixed-time plans in rings and barriers, and their tables.
 - `signals`: signal timing as pure functions.
 - `demand`, `routes`, `days`: checks of route files, routes of vehicles, other days of a demand.
+- `speed_factors`: distributions of desired speeds in vehicle types.
 - `periods`: detectors, and the recordings of detectors and signals.
 - `inspection`: facts about a scenario.
 - `capacity`: demand as a share of capacity.

@@ -91,6 +91,7 @@ from .scenario import read_scenario as read_scenario
 from .scenario import resco_maps as resco_maps
 from .scenario import shipped_scenarios as shipped_scenarios
 from .settings import Real as Real
+from .settings import ScenarioFile as ScenarioFile
 from .settings import parse_decimal as parse_decimal
 from .settings import parse_time as parse_time
 from .settings import validate_settings as validate_settings
@@ -113,6 +114,7 @@ from .signals import green_begins_at_once as green_begins_at_once
 from .signals import late_green_log as late_green_log
 from .signals import with_late_green as with_late_green
 from .signals import withheld_log as withheld_log
+from .speed_factors import SpeedFactors as SpeedFactors
 from .street_names import NamedApproach as NamedApproach
 from .street_names import NamedTurn as NamedTurn
 from .street_names import approach_directions as approach_directions

@@ -8,10 +8,9 @@ not exist.
 from __future__ import annotations
 
 import functools
-import re
 import xml.etree.ElementTree as ET
 from collections.abc import Mapping
-from dataclasses import dataclass, replace
+from dataclasses import astuple, dataclass, replace
 from xml.sax.saxutils import quoteattr
 
 import numpy as np
@@ -21,16 +20,17 @@ from ugat_marl.files import parse_xml, xml_bytes
 from ugat_marl.scenarios.routes import demand_as_vehicles, is_blocker
 from ugat_marl.scenarios.scenario import Document, Scenario
 from ugat_marl.scenarios.settings import parse_time
+from ugat_marl.scenarios.speed_factors import SpeedFactors
 from ugat_marl.seeding import numpy_generator
 
 JITTER_S = 120.0
 """Greatest shift of a departure, earlier or later, s; small enough to keep the profile of a day."""
-DEFAULT_SPEED = (1.0, 0.1, 0.2, 2.0)
-"""SUMO's normal distribution of speedFactor for cars: mean, standard deviation, least, greatest."""
-
+_AGAIN = 100
 _TYPES, _VEHICLES = "types.add.xml", "vehicles.rou.xml"
 _TYPE_TAGS = ("vType", "vTypeDistribution")
-_NORMAL = re.compile(r"norm(c?)\(([^)]*)\)")
+_Speed = tuple[float, float, float, float]
+_DEFAULT = "DEFAULT_VEHTYPE"
+_LEFT_TO_SUMO: _Speed = (np.nan, np.nan, 0.0, np.inf)
 
 
 @dataclass(frozen=True)
@@ -75,7 +75,9 @@ def draw_day(scenario: Scenario, seed: int, day_to_day: float = 0.0) -> Scenario
     """
     scenario = demand_as_vehicles(scenario)
     vehicles = _vehicles(
-        tuple(document.read() for document in scenario.routes), _types_beside(scenario)
+        tuple(document.read() for document in scenario.routes),
+        _types_beside(scenario),
+        tuple(scenario.settings.sumo.items()),
     )
     generator = numpy_generator(seed, "another day")
     begin = scenario.settings.begin_s
@@ -90,6 +92,7 @@ def draw_day(scenario: Scenario, seed: int, day_to_day: float = 0.0) -> Scenario
     most = 8
     shifts = generator.uniform(-JITTER_S, JITTER_S, (most, count))
     draws = generator.standard_normal((most, count))
+    again = numpy_generator(seed, "speeds again")
     rows: list[tuple[float, str]] = []
     mean, deviation, least, greatest = vehicles.speeds.T
     for copy in range(min(int(copies.max(initial=0)), most)):
@@ -98,7 +101,12 @@ def draw_day(scenario: Scenario, seed: int, day_to_day: float = 0.0) -> Scenario
         crosses = (departs >= end) != (vehicles.depart_s >= end)
         departs = np.where(crosses, 2 * end - departs, departs)
         departs = np.maximum(departs, begin)
-        factors = np.clip(mean + deviation * draws[copy], least, greatest)
+        factors = mean + deviation * draws[copy]
+        for _ in range(_AGAIN):  # SUMO, too, draws again what lies beyond a limit
+            if not (beyond := (factors < least) | (factors > greatest)).any():
+                break
+            factors = np.where(beyond, mean + deviation * again.standard_normal(count), factors)
+        factors = np.clip(factors, least, greatest)
         suffix = f"~{seed}.{copy}"  # new names: effects choose other vehicles every day
         for index in np.flatnonzero(copies > copy).tolist():
             name = quoteattr(vehicles.names[index] + suffix)
@@ -131,7 +139,9 @@ def _types_beside(scenario: Scenario) -> bytes:
 
 
 @functools.lru_cache(maxsize=8)
-def _vehicles(routes: tuple[bytes, ...], types_beside: bytes) -> _Vehicles:
+def _vehicles(
+    routes: tuple[bytes, ...], types_beside: bytes, sumo: tuple[tuple[str, str], ...]
+) -> _Vehicles:
     """Split route files into single vehicles; cached because many days use the same files."""
     types = ET.Element("additional")
     others: list[Document] = []
@@ -156,13 +166,12 @@ def _vehicles(routes: tuple[bytes, ...], types_beside: bytes) -> _Vehicles:
         if len(rest):
             others.append(Document(f"others{number or ''}.rou.xml", None, xml_bytes(rest)))
     known = {
-        element.get("id", ""): _speed_of(element.attrib)
+        element.get("id", ""): _speed_of(element.attrib, dict(sumo))
         for root in (parse_xml(types_beside, "additional"), types)
         for element in root.iter("vType")
     }
-    default = known.get("DEFAULT_VEHTYPE", DEFAULT_SPEED)
-    unknown = (np.nan, np.nan, 0.0, np.inf)  # SUMO draws the factor itself
-    speeds = [known.get(kind, unknown if kind else default) for kind in kinds]
+    known.setdefault(_DEFAULT, _speed_of({}, dict(sumo)))
+    speeds = [known.get(kind or _DEFAULT, _LEFT_TO_SUMO) for kind in kinds]
     return _Vehicles(
         Document(_TYPES, None, xml_bytes(types)),
         tuple(others),
@@ -189,20 +198,9 @@ def _attributes(element: ET.Element) -> str:
     return "".join(f" {key}={quoteattr(value)}" for key, value in left.items()) + ">"
 
 
-def _speed_of(attributes: Mapping[str, str]) -> tuple[float, float, float, float]:
+def _speed_of(attributes: Mapping[str, str], sumo: Mapping[str, str]) -> _Speed:
     """Return mean, deviation, least and greatest speedFactor of a type; NaN if SUMO must draw."""
-    text, deviation = attributes.get("speedFactor"), attributes.get("speedDev")
-    passenger = attributes.get("vClass", "passenger") == "passenger"
     try:
-        if text is None:
-            if not passenger and deviation is None:
-                return (np.nan, np.nan, 0.0, np.inf)
-            return (1.0, float(deviation or 0.1), 0.2, 2.0)
-        if match := _NORMAL.fullmatch(text.replace(" ", "")):
-            values = [float(part) for part in match[2].split(",")]
-            mean, spread = values[:2]
-            least, greatest = values[2:4] if match[1] else (0.2, 2.0)
-            return (mean, spread, least, greatest)
-        return (float(text), float(deviation or 0.0), 0.2, 2.0)
+        return astuple(SpeedFactors.of(attributes, sumo))
     except ValueError:
-        return (np.nan, np.nan, 0.0, np.inf)
+        return _LEFT_TO_SUMO

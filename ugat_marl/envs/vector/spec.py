@@ -13,6 +13,7 @@ from ugat_marl.effects import (
     effect_from_record,
     load_scenario,
     parse_domain,
+    refuse_detectors,
     scenario_in_domain,
 )
 from ugat_marl.envs.agents import AgentSet
@@ -183,7 +184,7 @@ def domain_chooser(
         return domains
     given: Any = domains
     if isinstance(given, str) or not any(map(_is_domain, given)):
-        scenario_in_domain(scenario, given)
+        _check_domain(scenario, given)
         return lambda environment, episode: given
     listed: list[Any] = list(given)
     if effects := [choice for choice in listed if not _is_domain(choice)]:
@@ -197,8 +198,13 @@ def domain_chooser(
             "ugat_marl.envs.vector.spec.in_turn(domains), which goes through a list of any length"
         )
     for domain in {str(sent(domain)): domain for domain in listed}.values():
-        scenario_in_domain(scenario, domain)
+        _check_domain(scenario, domain)
     return lambda environment, episode: listed[environment]
+
+
+def _check_domain(scenario: Scenario, domain: Domain) -> None:
+    refuse_detectors(domain)
+    scenario_in_domain(scenario, domain)
 
 
 def in_turn(domains: Sequence[Domain]) -> DomainOf:
