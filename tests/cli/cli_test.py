@@ -68,6 +68,42 @@ def test_a_wrong_call_is_one_line_with_the_nearest_name(
     assert says in complaint(capsys, *arguments)
 
 
+@pytest.mark.parametrize(
+    ("arguments", "unused"),
+    [
+        ("scenario check single-v1 --conformance --headroom 2 --json", "--headroom, --json"),
+        ("scenario check single-v1 --observation queue", "--observation"),
+        ("plan single-v1 --out p --lights 1=A1 --force", "--lights, --force"),
+        ("plan single-v1 --out p --seeds 5", "--seeds"),
+        ("plan single-v1 --out p --apply p.csv --domain V4 --first-seed 3", "--domain, --first-"),
+        ("rollout single-v1 --video f.gif --episodes 5 --workers 2", "--episodes, --workers"),
+        ("rollout single-v1 --out l.parquet --film.speed 5", "--film"),
+        ("scenario new x --grid 1x1 --vph 100 --left-hand --link", "--left-hand"),
+        ("scenario new x --grid 1x1 --counts c.csv --turns 0.1 0.8 0.1", "--turns"),
+        ("scenario new x --draw 3 --vph 100", "--vph"),
+    ],
+)
+def test_options_that_would_do_nothing_are_refused(
+    arguments: str, unused: str, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert f"; leave out {unused}" in complaint(capsys, *arguments.split())
+
+
+def test_one_light_has_one_intersection(capsys: pytest.CaptureFixture[str], tmp_path: Path) -> None:
+    table = tmp_path / "synchro.csv"
+    table.write_text("[Network]\nNetwork Settings\nRECORDNAME,DATA\n")
+    words = ["plan", "single-v1", "--out", "p", "--apply", str(table), "--lights", "1=A1", "2=A1"]
+    assert "2=A1: intersection or light is given twice" in complaint(capsys, *words)
+
+
+def test_policies_of_an_unknown_scenario_are_not_an_empty_list(
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    assert "Did you mean 'single-v1'" in complaint(
+        capsys, "policy", "list", "--scenario", "singel-v1"
+    )
+
+
 @pytest.mark.parametrize("command", list(COMMANDS))
 def test_every_command_explains_itself(
     command: str, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch

@@ -463,6 +463,10 @@ def test_jobs_of_a_paper_make_a_table(tmp_path: Path) -> None:
     assert next(r for r in page.cells if r[:1] == ["timed (gate.mode static)"])[2] == "150"
     assert "Left out, since not judged in both domains: half, waiting" in page.text
     assert page.row("waiting")[5] == "not finished"
+    assert page.row("direct-0")[2] == "sim → V1, V4"
+    times = page.row("direct-0")[8]
+    assert times.startswith("V1 150 (") and ", V4 150 (" in times
+    assert page.row("timed-1")[2] == "sim → V4" and page.row("timed-1")[8].startswith("160 (")
 
 
 def test_a_job_shows_its_worst_minutes(tmp_path: Path) -> None:

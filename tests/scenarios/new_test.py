@@ -213,7 +213,9 @@ def test_a_network_with_routes(files: Path, tmp_path: Path) -> None:
 
 def test_other_vehicles_for_a_configuration(files: Path, tmp_path: Path) -> None:
     assert made(tmp_path / "a", "--sumo", files / "city.sumocfg", "--vph", "120") == 0
-    assert [d.name for d in read_scenario(tmp_path / "a").routes] == ["demand.rou.xml"]
+    scenario = read_scenario(tmp_path / "a")
+    assert [d.name for d in scenario.routes] == ["demand.rou.xml"]
+    assert scenario.settings.sumo == {"lateral-resolution": "0.8"}  # SUMO drives as it did
 
 
 # --- bad input ------------------------------------------------------------------------------------

@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 import contextlib
-from collections.abc import Iterator
-from typing import Annotated
+from collections.abc import Collection, Iterator
+from dataclasses import MISSING, Field, fields
+from typing import Annotated, Any
 
 from tyro.conf import arg
 
@@ -23,6 +24,43 @@ LengthS = Annotated[
     float | None, arg(metavar="FLOAT", help_behavior_hint="(default: the scenario's own)")
 ]
 """Length of a day or an episode, s."""
+
+
+def given_options(command: Any) -> list[str]:
+    """Return the options of a command, by the names of its fields, that differ from the default."""
+    return [
+        field.name
+        for field in fields(command)
+        if not _required(field) and getattr(command, field.name) != _default(field)
+    ]
+
+
+def _required(field: Field[Any]) -> bool:
+    return field.default is MISSING and field.default_factory is MISSING
+
+
+def _default(field: Field[Any]) -> Any:
+    return field.default if field.default_factory is MISSING else field.default_factory()
+
+
+def option_text(name: str) -> str:
+    """Return an option as it is typed: ``--duration-s`` for ``duration_s``."""
+    return f"--{name.replace('_', '-')}"
+
+
+def refuse_options(command: Any, names: Collection[str], reason: str) -> None:
+    """Refuse options that the command would ignore.
+
+    Args:
+        command: The command.
+        names: Names of fields that it would not use.
+        reason: First words of the error, as in "--draw draws everything".
+
+    Raises:
+        OptionError: One of the options is given.
+    """
+    if unused := [name for name in given_options(command) if name in names]:
+        raise OptionError(f"{reason}; leave out {', '.join(map(option_text, unused))}")
 
 
 @contextlib.contextmanager

@@ -13,6 +13,7 @@ from rich.table import Table
 from rich.text import Text
 from tyro.conf import Positional, arg
 
+from ugat_marl.cli.arguments import refuse_options
 from ugat_marl.effects import load_scenario, scenario_in_domain
 from ugat_marl.errors import OptionError
 from ugat_marl.experiments import policy_factory, typical_plans
@@ -79,6 +80,17 @@ class Plan:
         """Write the table or the scenario, and show the plans."""
         if self.apply is not None and self.policy is not None:
             raise OptionError("--apply reads plans and --policy makes them; leave out one of them")
+        if self.apply is not None:
+            played = ("domain", "seeds", "first_seed")
+            refuse_options(self, played, "--apply reads plans and plays no episode")
+        else:
+            refuse_options(self, ("lights", "force"), "without --apply a table is written")
+        if self.policy is None:
+            refuse_options(
+                self,
+                ("seeds", "first_seed"),
+                "without --policy the programmes are written as they are",
+            )
         if self.seeds < 1 or self.first_seed < 0:
             raise OptionError("--seeds must be at least 1, and --first-seed not negative")
         scenario = load_scenario(self.scenario)
@@ -135,6 +147,8 @@ class Plan:
             name, equals, light = text.partition("=")
             if not (name and equals and light):
                 raise OptionError(f"--lights {text}: give INTID=LIGHT, as in 1=A1")
+            if name in pairs or light in pairs.values():
+                raise OptionError(f"--lights {text}: intersection or light is given twice")
             pairs[name] = light
         return pairs
 

@@ -6,6 +6,7 @@ from dataclasses import dataclass
 
 from rich.console import Console
 
+from ugat_marl.errors import UnknownNameError
 from ugat_marl.policies import policy_card, shipped_policies
 from ugat_marl.reporting import number_text, titled_table
 
@@ -28,6 +29,11 @@ class PolicyList:
 
     def run(self, console: Console) -> int:
         """Print the list."""
+        scenarios = sorted({name.partition("/")[0] for name in shipped_policies()})
+        if self.scenario is not None and self.scenario not in scenarios:
+            raise UnknownNameError(
+                "scenario", self.scenario, scenarios, "Policies of these come with the package."
+            )
         table = titled_table("")
         for heading in ("id", "setting", "travel time, s"):
             table.add_column(heading, overflow="fold")

@@ -10,7 +10,7 @@ from typing import Annotated, Any
 from rich.console import Console
 from tyro.conf import Positional, arg
 
-from ugat_marl.cli.arguments import RayAddress, Workers, workers_of
+from ugat_marl.cli.arguments import RayAddress, Workers, refuse_options, workers_of
 from ugat_marl.cli.evaluate import names_of
 from ugat_marl.effects import domain_label, load_scenario
 from ugat_marl.envs import parallel_env
@@ -112,6 +112,19 @@ class Rollout:
             raise OptionError("nothing to write: give --out FILE.parquet, --video FILE, or both")
         if self.beside is not None and self.video is None:
             raise OptionError("--beside needs --video, which shows both policies")
+        if self.out is None:
+            recorded = (
+                "episodes",
+                "epsilon",
+                "observation",
+                "neighbours",
+                "crossings",
+                "workers",
+                "ray",
+            )
+            refuse_options(self, recorded, "without --out nothing is recorded")
+        if self.video is None:
+            refuse_options(self, ("film",), "without --video nothing is filmed")
         for path in (self.out, self.video):
             if path is not None:
                 require_writable(path)

@@ -12,7 +12,7 @@ from rich.console import Console
 from rich.table import Table
 from tyro.conf import Positional, arg
 
-from ugat_marl.cli.arguments import LengthS, Workers
+from ugat_marl.cli.arguments import LengthS, Workers, refuse_options
 from ugat_marl.effects import load_scenario, scenario_in_domain
 from ugat_marl.envs import TrafficEnv, parallel_env
 from ugat_marl.errors import OptionError
@@ -97,7 +97,13 @@ class ScenarioCheck:
     def run(self, console: Console) -> int:
         """Check and print."""
         if self.conformance:
+            refuse_options(
+                self,
+                ("headroom", "simulate", "seed", "json", "workers"),
+                "--conformance runs the conformance kit instead",
+            )
             return self._kit(console)
+        refuse_options(self, ("observation",), "only --conformance reads an observation")
         if self.headroom < 0:
             raise OptionError(f"--headroom {self.headroom}: give a number of seeds, or 0")
         if self.headroom and self.domain != "sim":

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import shlex
 from collections.abc import Mapping, Sequence
-from dataclasses import MISSING, dataclass, fields
+from dataclasses import dataclass, fields
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
@@ -12,6 +12,7 @@ from rich.console import Console
 from rich.table import Table
 from tyro.conf import Positional, arg
 
+from ugat_marl.cli.arguments import given_options, option_text, refuse_options
 from ugat_marl.errors import OptionError
 from ugat_marl.progress import Bars
 from ugat_marl.reporting import LIGHT, LightNames, counted, draw_network, titled_table
@@ -37,6 +38,15 @@ ROADS = ("grid", "arterial", "osm", "sumo", "cityflow", "draw")
 DEMANDS = ("routes", "vph", "counts", "od")
 MOST_COUNTS = 8
 """Largest number of counts that are shown; the file has them all."""
+_ONLY_FOR = {
+    ("spacing_m", "speed_mps"): ("grid", "arterial"),
+    ("guess_signals", "left_hand"): ("osm",),
+    ("exact_drivers",): ("cityflow",),
+    ("link",): ("sumo", "routes"),
+    ("turns",): ("vph",),
+    ("seed",): ("vph", "counts", "od"),
+}
+"""Options that only some sources of roads or vehicles use."""
 _OWN = Annotated[float | None, arg(metavar="FLOAT", help_behavior_hint="(default: the source's)")]
 
 
@@ -171,17 +181,9 @@ class ScenarioNew:
     def _sources(self) -> tuple[RoadSource, VehicleSource | None]:
         if self.draw is None:
             return self._roads(), self._vehicles()
-        if others := [name for name in self._given() if name not in ("draw", "force")]:
-            raise OptionError(
-                "--draw draws roads and vehicles with all their settings; "
-                f"leave out {', '.join(map(_option, others))}"
-            )
+        others = {field.name for field in fields(self)} - {"name", "draw", "force"}
+        refuse_options(self, others, "--draw draws roads and vehicles with all their settings")
         return drawn_sources(self.draw)
-
-    def _given(self) -> list[str]:
-        """Return the options, without the name, that differ from their default."""
-        options = (f for f in fields(self) if f.default is not MISSING)
-        return [f.name for f in options if getattr(self, f.name) != f.default]
 
     def _roads(self) -> RoadSource:
         given = [name for name in ROADS if getattr(self, name) is not None]
@@ -190,6 +192,9 @@ class ScenarioNew:
                 f"scenario new needs one source of roads, not {len(given)}: "
                 f"give one of {_listed(ROADS)}"
             )
+        for names, sources in _ONLY_FOR.items():
+            if not set(sources) & {*given, *self._demands()}:
+                refuse_options(self, names, f"only {_listed(sources)} would use it")
         if self.grid is not None:
             return grid_roads(self.grid, self.spacing_m, self.speed_mps)
         if self.arterial is not None:
@@ -242,11 +247,11 @@ class ScenarioNew:
     def _command(self) -> str:
         """Return the command line that makes the same scenario again."""
         words = ["ugat-marl", "scenario", "new", str(self.name)]
-        for name in self._given():
+        for name in given_options(self):
             value = getattr(self, name)
             if name != "force":
                 values = value if isinstance(value, tuple) else () if value is True else (value,)
-                words += [_option(name), *map(str, values)]
+                words += [option_text(name), *map(str, values)]
         return shlex.join(words)
 
 
@@ -267,9 +272,6 @@ def _fit_table(fits: Sequence[CountFit], names: LightNames) -> Table:
     return table
 
 
-def _option(name: str) -> str:
-    return f"--{name.replace('_', '-')}"
-
-
 def _listed(names: tuple[str, ...]) -> str:
-    return f"{', '.join(map(_option, names[:-1]))} or {_option(names[-1])}"
+    texts = [option_text(name) for name in names]
+    return " or ".join(filter(None, (", ".join(texts[:-1]), texts[-1])))

@@ -184,24 +184,35 @@ def _overview_row(record: RunRecord) -> list[str]:
     accepted = record.series("iteration", "gate/acceptance")
     cells = dict.fromkeys(("sim", "direct", "real", "rule"), "–")
     policy = record.setting if record.job else record.grounding
+    reals = [record.real] if record.real else []
     if evaluation is not None and evaluation.policies:
         shown = _main_policies(evaluation)
         policy = next(filter(is_grounded, shown), shown[0])
-        sim, real = evaluation.domains[0], evaluation.domains[-1]
+        sim, *reals = evaluation.domains
+        rules = {real: f"rule {evaluation.notes.get(f'best rule in {real}')}" for real in reals}
         cells["sim"] = _with_interval(evaluation.estimate(policy, sim, "att_s"))
-        if real != sim:
-            cells["real"] = _with_interval(evaluation.estimate(policy, real, "att_s"))
+        cells["real"] = _in_each(evaluation, dict.fromkeys(reals, policy))
         if not record.job:
-            direct = evaluation.policies[0]
-            cells["direct"] = _with_interval(evaluation.estimate(direct, real, "att_s"))
-        rule = f"rule {evaluation.notes.get(f'best rule in {real}')}"
-        if rule in evaluation.policies:
-            cells["rule"] = _with_interval(evaluation.estimate(rule, real, "att_s"))
+            direct = dict.fromkeys(reals or [sim], evaluation.policies[0])
+            cells["direct"] = _in_each(evaluation, direct)
+        judged = {real: rule for real, rule in rules.items() if rule in evaluation.policies}
+        cells["rule"] = _in_each(evaluation, judged, named=len(reals) > 1)
     return [
-        record.name, record.scenario or "–", f"{record.sim} → {record.real or '–'}",
+        record.name, record.scenario or "–", f"{record.sim} → {', '.join(reals) or '–'}",
         policy or "–", record.seed or "–", _status(record)[1], *cells.values(),
         share(accepted[-1][1]) if accepted else "–",
     ]  # fmt: skip
+
+
+def _in_each(evaluation: Evaluation, policies: Mapping[str, str], *, named: bool = False) -> str:
+    """Return the travel time of a policy for each domain, with the domain if there are several."""
+    texts = {
+        domain: _with_interval(evaluation.estimate(policy, domain, "att_s"))
+        for domain, policy in policies.items()
+    }
+    if named or len(texts) > 1:
+        return ", ".join(f"{domain} {text}" for domain, text in texts.items()) or "–"
+    return next(iter(texts.values()), "–")
 
 
 def _table(page: Page, record: TableRecord, commands: Commands) -> dict[str, Any]:

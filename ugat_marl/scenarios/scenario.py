@@ -206,12 +206,41 @@ _SYNONYMS = {
 """Names that SUMO allows for the elements of a configuration."""
 
 
-def _load_sumocfg(path: Path, scenario_id: str) -> Scenario:
-    root = parse_xml(read_bytes(path), str(path))
-    given = {element.tag: element.get("value", element.get("v", "")) for element in root.iter()}
+class _Configuration:
+    """Values of a SUMO configuration."""
 
-    def value(key: str, default: str = "") -> str:
-        return next((given[name] for name in _SYNONYMS[key] if name in given), default)
+    def __init__(self, path: Path) -> None:
+        self.path = path
+        root = parse_xml(read_bytes(path), str(path))
+        self.given = {item.tag: item.get("value", item.get("v", "")) for item in root.iter()}
+
+    def value(self, key: str, default: str = "") -> str:
+        return next((self.given[name] for name in _SYNONYMS[key] if name in self.given), default)
+
+    def seconds(self, key: str, default: str) -> float:
+        text = self.value(key, default)
+        try:
+            return parse_time(text)
+        except ValueError:
+            raise ScenarioError(f"{self.path}: {key} = {text!r} is not a time in seconds") from None
+
+    def physics(self) -> dict[str, Any]:
+        options = {option: self.given[option] for option in self.given if option in OPTIONS}
+        return {"step_length_s": self.seconds("step-length", "1"), "sumo": options}
+
+
+def sumocfg_physics(path: Path) -> dict[str, Any]:
+    """Return the step length and the options of SUMO in a ``.sumocfg``, as in ``scenario.toml``.
+
+    Raises:
+        ScenarioError: The file cannot be read.
+    """
+    return _Configuration(path).physics()
+
+
+def _load_sumocfg(path: Path, scenario_id: str) -> Scenario:
+    configuration = _Configuration(path)
+    value, seconds = configuration.value, configuration.seconds
 
     def documents(key: str, kind: str = "") -> tuple[Document, ...]:
         names = _names(value(key), path.parent)
@@ -223,13 +252,6 @@ def _load_sumocfg(path: Path, scenario_id: str) -> Scenario:
                     f"{path}: <{key}> names {name!r}, but {path.parent / name} does not exist"
                 )
         return tuple(admitted(Document(Path(name).name, path.parent / name)) for name in names)
-
-    def seconds(key: str, default: str) -> float:
-        text = value(key, default)
-        try:
-            return parse_time(text)
-        except ValueError:
-            raise ScenarioError(f"{path}: {key} = {text!r} is not a time in seconds") from None
 
     begin, end = seconds("begin", "0"), seconds("end", "-1")
     if 0 <= end <= begin:
@@ -244,8 +266,7 @@ def _load_sumocfg(path: Path, scenario_id: str) -> Scenario:
             "additional": [document.name for document in additional],
             "begin_s": begin,
             "duration_s": end - begin if end >= 0 else 3600.0,
-            "step_length_s": seconds("step-length", "1"),
-            "sumo": {option: given[option] for option in given if option in OPTIONS},
+            **configuration.physics(),
         },
         str(path),
     )

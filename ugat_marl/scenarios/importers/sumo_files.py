@@ -14,7 +14,7 @@ from ugat_marl.progress import Reporter
 from ugat_marl.scenarios.demand import edges_used
 from ugat_marl.scenarios.importers.long_files import scan
 from ugat_marl.scenarios.importers.making import RoadFiles, RoadSource, VehicleFiles, VehicleSource
-from ugat_marl.scenarios.scenario import Document, read_scenario
+from ugat_marl.scenarios.scenario import Document, read_scenario, sumocfg_physics
 
 _CONFIGURATIONS = (".sumocfg", ".sumocfg.xml")
 
@@ -72,8 +72,10 @@ def _configured(path: Path, folder: Path, link: bool, own_vehicles: bool) -> Roa
         network, routes, additional = scenario.network, scenario.routes, scenario.additional
         settings = scenario.settings.model_dump(mode="json", exclude_defaults=True)
     else:
-        network, settings = _network_of(path), {}
+        network, settings = _network_of(path), sumocfg_physics(path)
         routes = additional = ()
+        if settings["step_length_s"] == 1:
+            del settings["step_length_s"]
     times = ("begin_s", "duration_s", "step_length_s", "sumo")
     kept = {key: settings[key] for key in times if settings.get(key)}
 
