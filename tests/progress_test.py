@@ -12,6 +12,15 @@ from ugat_marl import progress
 from ugat_marl.progress import Bars, Share, loudness
 
 
+def test_brackets_in_names_and_notes_are_no_markup() -> None:
+    written = io.StringIO()
+    bars = Bars(Console(file=written, width=160, force_terminal=True, color_system=None))
+    with bars.task("town[north]", 1) as advance:
+        advance(note="detector [/a] [bold]")
+    assert "town[north]" in written.getvalue()
+    assert "detector [/a] [bold]" in written.getvalue()
+
+
 @pytest.mark.parametrize("width", [80, 100, 160])
 def test_a_note_is_whole_or_left_out(width: int) -> None:
     written = io.StringIO()

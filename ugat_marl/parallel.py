@@ -169,11 +169,17 @@ def usable_cores() -> int:
 
 
 def parts_at_a_time(workers: Workers) -> int:
-    """Return the number of parts done at once; for unknown executors the usable cores."""
+    """Return the number of parts done at once; for unknown executors the usable cores.
+
+    Raises:
+        OptionError: The number is below 1.
+    """
     if isinstance(workers, Executor):
         return getattr(workers, "parts_at_a_time", None) or getattr(
             workers, "_max_workers", usable_cores()
         )
+    if workers is not None and workers < 1:
+        raise OptionError(f"workers = {workers}: must be at least 1, or None for all cores")
     return workers or usable_cores()
 
 

@@ -228,13 +228,13 @@ def _bars(console: Console, counted: bool = True) -> Progress:
     )
 
     return Progress(
-        TextColumn(f"{{task.description:<{_NAME_WIDTH}}}"),
+        TextColumn(f"{{task.description:<{_NAME_WIDTH}}}", markup=False),
         BarColumn(bar_width=10),
         MofNCompleteColumn() if counted else TaskProgressColumn(),
         TimeElapsedColumn(),
         TextColumn("left"),
         TimeRemainingColumn(compact=True),
-        TextColumn("[dim]{task.fields[note]}"),
+        TextColumn("{task.fields[note]}", style="dim", markup=False),
         console=console,
         auto_refresh=console.is_terminal,
     )

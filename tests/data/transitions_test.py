@@ -277,6 +277,12 @@ def test_concatenation_renumbers_episodes_and_keeps_their_order() -> None:
     assert (rows.observation[:6] == first.transitions("signal_0").observation).all()
 
 
+def test_a_concatenated_log_is_as_uncertain_as_the_worst_of_its_parts() -> None:
+    one, two = ({"a": 1.0, "b": 3.0}, {"a": 2.0, "c": 0.5})
+    logs = [TransitionLog(provenance(deviation=each), recorded().frame) for each in (one, two)]
+    assert TransitionLog.concatenate(logs).provenance.deviation == {"a": 2.0, "b": 3.0, "c": 0.5}
+
+
 @pytest.mark.parametrize(
     ("change", "name"),
     [

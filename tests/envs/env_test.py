@@ -5,6 +5,7 @@ from __future__ import annotations
 import pickle
 from collections.abc import Iterator
 from dataclasses import replace
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -246,6 +247,7 @@ def test_scores_are_those_of_the_episode(mixed: TrafficEnv) -> None:
         ({"domain": "startup_delai=1"}, UnknownNameError, "mean 'startup_delay'"),
         ({"domain": "startup_delay=99"}, OptionError, r"outside \[0, 10\] s"),
         ({"domain": ["V1"]}, OptionError, "'V1' is not an effect; give a name such as 'V1' on its"),
+        ({"domain": Path("x")}, OptionError, "give a scenario directory as text"),
         ({"observation": None}, UnknownNameError, "observation 'None'. Known: count"),
         ({"reward": None}, UnknownNameError, "reward 'None'. Known: pressure"),
         ({"signals": "programm"}, UnknownNameError, "'signals'.* mean 'programme'"),

@@ -261,6 +261,8 @@ class TransitionLog:
     def concatenate(logs: Sequence[TransitionLog]) -> TransitionLog:
         """Return the logs as one, with episodes renumbered from 0.
 
+        A lane's deviation is the largest of all logs.
+
         Raises:
             LogError: There are no logs, or they differ in one of `SAME_IN_CONCATENATION`.
         """
@@ -269,17 +271,20 @@ class TransitionLog:
         first = logs[0].provenance
         frames: list[pl.DataFrame] = []
         versions: dict[str, str] = {}
+        deviation: dict[str, float] = {}
         offset = 0
         for log in logs:
             _refuse_difference(first, log.provenance)
             for name, version in log.provenance.versions.items():
                 known = versions.get(name, "").split(", ") + version.split(", ")
                 versions[name] = ", ".join(dict.fromkeys(part for part in known if part))
+            for lane, vehicles in log.provenance.deviation.items():
+                deviation[lane] = max(vehicles, deviation.get(lane, 0.0))
             number = (pl.col("episode").rank("dense").cast(pl.Int32) - 1 + offset).alias("episode")
             frames.append(log.frame.with_columns(number))
             offset += log.episodes
         seeds = tuple(seed for log in logs for seed in log.provenance.seeds)
-        provenance = dataclasses.replace(first, seeds=seeds, versions=versions)
+        provenance = dataclasses.replace(first, seeds=seeds, versions=versions, deviation=deviation)
         return TransitionLog(provenance, pl.concat(frames))
 
     def write(self, path: Path) -> None:

@@ -238,7 +238,9 @@ def parse_domain(domain: Domain) -> tuple[Effect, ...]:
         OptionError: An effect has an impossible value.
     """
     if not isinstance(domain, str):
-        given: Sequence[Any] = domain
+        given: Any = domain
+        if isinstance(given, Path):
+            raise OptionError(f"domain {given!r}: give a scenario directory as text, str(path)")
         for part_or_effect in given:
             if not isinstance(part_or_effect, Effect):
                 raise OptionError(
@@ -341,9 +343,8 @@ def refuse_detectors(domain: Domain) -> None:
         if effect.on_detectors:
             raise OptionError(
                 f"domain {domain_label(domain)!r}: {effect.name!r} changes the reports of "
-                "detectors, which agents do not see, so it would change nothing; 'ugat-marl "
-                f"record' measures with it, and counting_error, detector_failure and "
-                "detection_zone change what agents see"
+                "detectors, which agents do not see, so it would change nothing here; it is for "
+                "recordings, and counting_error, detector_failure and detection_zone are for agents"
             )
 
 

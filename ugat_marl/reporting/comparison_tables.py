@@ -261,11 +261,9 @@ def _meaning(comparison: Comparison, direct: str) -> list[str]:
 
 def _better_everywhere(comparison: Comparison, setting: str, direct: str) -> bool:
     """Return True if a setting is faster than another in each domain, with p < `CERTAIN`."""
-    tests = [
-        comparison.test(setting, direct, t)
-        for t in comparison.targets
-        if comparison.has(setting, t)
-    ]
+    if not all(comparison.has(setting, target) for target in comparison.targets):
+        return False
+    tests = [comparison.test(setting, direct, target) for target in comparison.targets]
     return all(test.difference.mean < 0 and test.p < CERTAIN for test in tests)
 
 
