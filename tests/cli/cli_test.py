@@ -33,6 +33,7 @@ def complaint(capsys: pytest.CaptureFixture[str], *arguments: str) -> str:
         (["train", "single-v1", "--real", "V44"], "'V4'"),
         (["train", "single-v1", "--real", "sim"], "the simulation itself"),
         (["train", "single-v1", "--rael", "V4"], "'--real'"),
+        (["train", "single-v1", "--real", "undercount=*,0.2"], "which agents do not see"),
         (["train", "single-v1", "--iteratoins", "4"], "'--iterations'"),
         (["train", "single-v1", "--gate.moed", "static"], "'--gate.mode'"),
         (["train", "single-v1", "--seed", "one"], "--seed"),

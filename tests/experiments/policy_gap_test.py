@@ -67,6 +67,8 @@ def test_a_gap_that_is_not_there_cannot_shrink() -> None:
 def test_the_simulation_is_no_real_world() -> None:
     with pytest.raises(OptionError, match="the simulation itself"):
         gap_of("V4", "sim")
+    with pytest.raises(OptionError, match="the simulation itself"):
+        gap_of("V4", "undercount=*,0.2")  # nobody drives otherwise
     with pytest.raises(OptionError, match="at least one policy"):
         policy_gap(SCENARIO, "V4", "V4", {}, [1])
 

@@ -23,6 +23,11 @@ from ugat_marl.reporting import Film, Frame, film_episode, film_frames, require_
 from ugat_marl.scenarios import Scenario
 from ugat_marl.seeding import derive_seed
 
+_RECORDED = (
+    "episodes", "epsilon", "observation", "neighbours", "crossings", "workers", "ray",
+)  # fmt: skip
+"""Options of the recording alone."""
+
 
 @dataclass(frozen=True)
 class VideoConfig:
@@ -113,16 +118,7 @@ class Rollout:
         if self.beside is not None and self.video is None:
             raise OptionError("--beside needs --video, which shows both policies")
         if self.out is None:
-            recorded = (
-                "episodes",
-                "epsilon",
-                "observation",
-                "neighbours",
-                "crossings",
-                "workers",
-                "ray",
-            )
-            refuse_options(self, recorded, "without --out nothing is recorded")
+            refuse_options(self, _RECORDED, "without --out nothing is recorded")
         if self.video is None:
             refuse_options(self, ("film",), "without --video nothing is filmed")
         for path in (self.out, self.video):

@@ -218,6 +218,12 @@ def detector_effects(scenario: Scenario) -> tuple[Effect, ...]:
     return tuple(effect for effect in _listed(scenario) if effect.on_detectors)
 
 
+def without_detector_effects(scenario: Scenario) -> Scenario:
+    """Return the scenario as agents meet it: it lists no effects on detectors."""
+    listed = tuple(effect.record() for effect in controller_effects(scenario))
+    return replace(scenario, settings=scenario.settings.model_copy(update={"effects": listed}))
+
+
 def controller_effects(scenario: Scenario) -> tuple[Effect, ...]:
     """Return the effects on controllers that were applied to a scenario."""
     return tuple(effect for effect in _listed(scenario) if not effect.on_detectors)

@@ -12,7 +12,13 @@ from dataclasses import replace
 from pathlib import Path
 
 from ugat_marl.diagnosis import CORRECTED, FILE, Diagnosis, PolicyGap, TravelTimeEstimate
-from ugat_marl.effects import Domain, domain_label, load_scenario, scenario_in_domain
+from ugat_marl.effects import (
+    Domain,
+    domain_label,
+    load_scenario,
+    scenario_in_domain,
+    without_detector_effects,
+)
 from ugat_marl.errors import OptionError, ScenarioError
 from ugat_marl.experiments.evaluation import evaluate
 from ugat_marl.experiments.scores import Estimate, Evaluation
@@ -65,7 +71,7 @@ def policy_gap(
     if not policies or not seeds:
         raise OptionError("a policy gap needs at least one policy and one seed")
     world = scenario_in_domain(scenario, real)
-    if world.hash == scenario.hash:
+    if without_detector_effects(world).hash == without_detector_effects(scenario).hash:
         raise OptionError(
             f"real = {domain_label(real)!r} is the simulation itself; there is no gap"
         )
