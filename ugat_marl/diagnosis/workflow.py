@@ -103,7 +103,9 @@ def diagnose(
         shutil.rmtree(place)
     named = (*timing, *named)
     if named:
-        apply_effects(scenario, named).write(place)
+        # errors of this street's detectors are no part of the model of its traffic
+        traffic = [effect for effect in named if not effect.on_detectors]
+        apply_effects(scenario, traffic).write(place)
         diagnosis = replace(diagnosis, corrected=CORRECTED)
     written = Diagnosis.from_json(diagnosis.to_json())  # numbers rounded like those of the file
     written = replace(written, policy_gap=_known_gap(directory, written))
