@@ -13,7 +13,7 @@ from ugat_marl.cli.arguments import LengthS, Workers
 from ugat_marl.cli.diagnose import REPORT
 from ugat_marl.cli.evaluate import names_of
 from ugat_marl.diagnosis import FILE
-from ugat_marl.effects import domain_label, load_scenario, without_detector_effects
+from ugat_marl.effects import domain_label, load_scenario, same_for_agents
 from ugat_marl.errors import OptionError
 from ugat_marl.experiments import policy_factory, policy_gap, read_diagnosis, write_policy_gap
 from ugat_marl.files import require_writable
@@ -69,7 +69,7 @@ class PolicyGap:
         scenario = load_scenario(self.scenario)
         diagnosis, corrected = read_diagnosis(self.directory, scenario)
         require_writable(self.directory / FILE)
-        if without_detector_effects(corrected).hash == without_detector_effects(scenario).hash:
+        if same_for_agents(corrected, scenario):
             console.print("note: only detectors were at fault; the traffic was not corrected")
         files = [Path(spec).suffix == ".pt" for spec in self.policies]
         names = [

@@ -95,7 +95,7 @@ from .table import effects_on_controllers as effects_on_controllers
 from .table import known_effects as known_effects
 from .table import load_scenario as load_scenario
 from .table import measurement_effects as measurement_effects
-from .table import without_detector_effects as without_detector_effects
+from .table import same_for_agents as same_for_agents
 from .turning import Turning as Turning
 from .vehicles import NO_SOFTER as NO_SOFTER
 from .vehicles import Acceleration as Acceleration

@@ -218,10 +218,15 @@ def detector_effects(scenario: Scenario) -> tuple[Effect, ...]:
     return tuple(effect for effect in _listed(scenario) if effect.on_detectors)
 
 
-def without_detector_effects(scenario: Scenario) -> Scenario:
-    """Return the scenario as agents meet it: it lists no effects on detectors."""
-    listed = tuple(effect.record() for effect in controller_effects(scenario))
-    return replace(scenario, settings=scenario.settings.model_copy(update={"effects": listed}))
+def same_for_agents(one: Scenario, other: Scenario) -> bool:
+    """Return True if two scenarios differ in nothing but effects on detectors."""
+
+    def met(scenario: Scenario) -> str:
+        listed = tuple(effect.record() for effect in controller_effects(scenario))
+        settings = scenario.settings.model_copy(update={"effects": listed})
+        return replace(scenario, settings=settings).hash
+
+    return met(one) == met(other)
 
 
 def controller_effects(scenario: Scenario) -> tuple[Effect, ...]:

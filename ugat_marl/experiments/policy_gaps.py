@@ -16,8 +16,8 @@ from ugat_marl.effects import (
     Domain,
     domain_label,
     load_scenario,
+    same_for_agents,
     scenario_in_domain,
-    without_detector_effects,
 )
 from ugat_marl.errors import OptionError, ScenarioError
 from ugat_marl.experiments.evaluation import evaluate
@@ -71,7 +71,7 @@ def policy_gap(
     if not policies or not seeds:
         raise OptionError("a policy gap needs at least one policy and one seed")
     world = scenario_in_domain(scenario, real)
-    if without_detector_effects(world).hash == without_detector_effects(scenario).hash:
+    if same_for_agents(world, scenario):
         raise OptionError(
             f"real = {domain_label(real)!r} is the simulation itself; there is no gap"
         )

@@ -165,12 +165,13 @@ def _vehicles(
                 rest.append(element)
         if len(rest):
             others.append(Document(f"others{number or ''}.rou.xml", None, xml_bytes(rest)))
+    options = dict(sumo)
     known = {
-        element.get("id", ""): _speed_of(element.attrib, dict(sumo))
+        element.get("id", ""): _speed_of(element.attrib, options)
         for root in (parse_xml(types_beside, "additional"), types)
         for element in root.iter("vType")
     }
-    known.setdefault(_DEFAULT, _speed_of({}, dict(sumo)))
+    known.setdefault(_DEFAULT, _speed_of({}, options))
     speeds = [known.get(kind or _DEFAULT, _LEFT_TO_SUMO) for kind in kinds]
     return _Vehicles(
         Document(_TYPES, None, xml_bytes(types)),
