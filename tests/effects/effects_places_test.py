@@ -378,7 +378,6 @@ def test_unknown_places(text: str, message: str) -> None:
     [
         "lane_closure=northA_A1_0,{0},{1}",
         "demand_surge=*,{0},{1},2",
-        "stuck=northA_A1_0,{0},{1}",
         "incident={0},60",
     ],
 )
@@ -395,6 +394,13 @@ def test_an_effect_outside_of_the_episode_is_refused(domain: str) -> None:
     listed = scenario.settings.model_copy(update={"effects": effects})
     with pytest.raises(OptionError, match="longer duration_s"):
         load_scenario(replace(scenario, settings=listed))
+
+
+def test_a_detector_that_errs_outside_of_the_record_is_refused() -> None:
+    scenario = load_scenario("single-v1")  # 0 s to 3600 s
+    scenario_in_domain(scenario, "stuck=northA_A1_0,3590,3700", recorded=True)
+    with pytest.raises(OptionError, match=r"from 3600 s to 3700 s.*'single-v1' from 0 s to 3600"):
+        scenario_in_domain(scenario, "stuck=northA_A1_0,3600,3700", recorded=True)
 
 
 def test_vehicles_that_block_a_lane_are_no_travellers(

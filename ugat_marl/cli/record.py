@@ -66,9 +66,8 @@ class Record:
     def run(self, console: Console) -> int:
         """Record and write."""
         scenario = load_scenario(self.scenario)
-        scenario_in_domain(
-            scenario, self.domain
-        )  # a wrong name is an error before anything is written
+        # a wrong name is an error before anything is written
+        scenario_in_domain(scenario, self.domain, recorded=True)
         policy = policy_factory(self.policy)
         if self.counts_every_s is not None:
             require_interval(self.counts_every_s)

@@ -56,7 +56,6 @@ from .domains import domain_label as domain_label
 from .domains import domain_path as domain_path
 from .domains import expand_domains as expand_domains
 from .domains import parse_domain as parse_domain
-from .domains import refuse_detectors as refuse_detectors
 from .domains import scenario_in_domain as scenario_in_domain
 from .engine import BlockerPatience as BlockerPatience
 from .engine import QueueModel as QueueModel

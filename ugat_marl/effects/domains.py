@@ -9,7 +9,7 @@ benchmark trains in CityFlow and simulates the real domain in SUMO; here both ar
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from itertools import zip_longest
 from pathlib import Path
@@ -294,17 +294,18 @@ def domain_label(domain: Domain) -> str:
     return "+".join(map(str, domain)) or "sim"
 
 
-def scenario_in_domain(scenario: Scenario, domain: Domain) -> Scenario:
+def scenario_in_domain(scenario: Scenario, domain: Domain, *, recorded: bool = False) -> Scenario:
     """Return the scenario with the effects of `domain`.
 
     Args:
         scenario: Scenario from `load_scenario`.
         domain: Effects, a name of effects, or the path of another scenario on the same network.
+        recorded: True if detectors are recorded there, so that effects on them are accepted.
 
     Raises:
         UnknownNameError: The domain or an effect does not exist.
-        OptionError: An effect has an impossible value or lies outside of the scenario's time, or
-            two of them exclude each other.
+        OptionError: An effect has an impossible value or lies outside of the scenario's time, two
+            of them exclude each other, or one changes detectors that nobody reads.
         ScenarioError: A scenario named as a domain cannot be read or has other roads, phases or
             decision intervals.
     """
@@ -317,8 +318,11 @@ def scenario_in_domain(scenario: Scenario, domain: Domain) -> Scenario:
             )
         _refuse_other_actions(scenario, other, domain)
         return _checked(other)
-    check_windows(scenario, domain)
-    return _checked(apply_effects(scenario, parse_domain(domain)))
+    effects = parse_domain(domain)
+    if not recorded:
+        _refuse_detectors(domain, effects)
+    refuse_outside(scenario, effects)
+    return _checked(apply_effects(scenario, effects))
 
 
 def check_windows(scenario: Scenario, domain: Domain) -> None:
@@ -331,15 +335,9 @@ def check_windows(scenario: Scenario, domain: Domain) -> None:
         refuse_outside(scenario, parse_domain(domain))
 
 
-def refuse_detectors(domain: Domain) -> None:
-    """Refuse a domain of agents that names effects on detectors.
-
-    Raises:
-        OptionError: Such an effect would change nothing that agents see.
-    """
-    if domain_path(domain) is not None:
-        return
-    for effect in parse_domain(domain):
+def _refuse_detectors(domain: Domain, effects: Iterable[Effect]) -> None:
+    """Refuse effects on detectors, which would change nothing that agents see."""
+    for effect in effects:
         if effect.on_detectors:
             raise OptionError(
                 f"domain {domain_label(domain)!r}: {effect.name!r} changes the reports of "

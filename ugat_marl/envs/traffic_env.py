@@ -21,7 +21,6 @@ from ugat_marl.effects import (
     domain_label,
     late_greens,
     load_scenario,
-    refuse_detectors,
     scenario_in_domain,
     with_late_green_programmes,
     withheld,
@@ -90,7 +89,6 @@ class TrafficEnv(ParallelEnv[str, Any, Any]):
         if options.duration_s is not None:
             self.scenario = self.scenario.with_duration(options.duration_s)
             check_windows(self.scenario, domain)
-        refuse_detectors(domain)
         self.domain = domain_label(domain)
         self.options = options
         self.render_mode = options.render_mode

@@ -70,13 +70,15 @@ def policy_gap(
     """
     if not policies or not seeds:
         raise OptionError("a policy gap needs at least one policy and one seed")
-    world = scenario_in_domain(scenario, real)
+    world = scenario_in_domain(scenario, real, recorded=True)
     if same_for_agents(world, scenario):
         raise OptionError(
             f"real = {domain_label(real)!r} is the simulation itself; there is no gap"
         )
     repaired = (
-        corrected if isinstance(corrected, Scenario) else scenario_in_domain(scenario, corrected)
+        corrected
+        if isinstance(corrected, Scenario)
+        else scenario_in_domain(scenario, corrected, recorded=True)
     )
     evaluations: dict[str, Evaluation] = {}
     for name, place in (("sim", scenario), ("corrected", repaired), ("real", world)):

@@ -16,7 +16,7 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 from ugat_marl.data import Run
-from ugat_marl.effects import Domain, domain_label, refuse_detectors, scenario_in_domain
+from ugat_marl.effects import Domain, domain_label, scenario_in_domain
 from ugat_marl.envs import AnyParallelEnv, TrafficEnv, parallel_env
 from ugat_marl.errors import OptionError
 from ugat_marl.grounding import (
@@ -215,8 +215,6 @@ def check_worlds(scenario: Scenario, sim: Domain, real: Domain, timed: bool = Fa
         OptionError: The reaches differ, greens begin too late for timed grounding, or a domain is
             one of detectors.
     """
-    for world in (sim, real):
-        refuse_detectors(world)
     here, there = (scenario_in_domain(scenario, world) for world in (sim, real))
     for world in (here, there) if timed else ():
         timing, interval_s = world.timing, world.control.decision_interval_s

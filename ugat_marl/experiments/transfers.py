@@ -25,7 +25,7 @@ from ugat_marl.data import (
     write_identity,
     write_settings,
 )
-from ugat_marl.effects import domain_label, load_scenario, refuse_detectors, scenario_in_domain
+from ugat_marl.effects import domain_label, load_scenario, scenario_in_domain
 from ugat_marl.envs import AgentSet, TrafficEnv, parallel_env
 from ugat_marl.errors import OptionError, ScenarioError, UnknownNameError
 from ugat_marl.experiments.driver import perform_here
@@ -466,7 +466,7 @@ def _check(config: TransferConfig, scenario: Scenario, env: TrafficEnv, reporter
         reporter: Receives a note if the real log is from another domain.
     """
     if config.real != "none":
-        refuse_detectors(config.real)
+        scenario_in_domain(scenario, config.real)
     make = config.spec.factory(config.device)
     if is_own(config.learner) and not check_own_learner(make, env, config.seed).savable:
         reporter.say(

@@ -13,7 +13,6 @@ from ugat_marl.effects import (
     effect_from_record,
     load_scenario,
     parse_domain,
-    refuse_detectors,
     scenario_in_domain,
 )
 from ugat_marl.envs.agents import AgentSet
@@ -184,7 +183,7 @@ def domain_chooser(
         return domains
     given: Any = domains
     if isinstance(given, str) or not any(map(_is_domain, given)):
-        _check_domain(scenario, given)
+        scenario_in_domain(scenario, given)
         return lambda environment, episode: given
     listed: list[Any] = list(given)
     if effects := [choice for choice in listed if not _is_domain(choice)]:
@@ -198,13 +197,8 @@ def domain_chooser(
             "ugat_marl.envs.vector.spec.in_turn(domains), which goes through a list of any length"
         )
     for domain in {str(sent(domain)): domain for domain in listed}.values():
-        _check_domain(scenario, domain)
+        scenario_in_domain(scenario, domain)
     return lambda environment, episode: listed[environment]
-
-
-def _check_domain(scenario: Scenario, domain: Domain) -> None:
-    refuse_detectors(domain)
-    scenario_in_domain(scenario, domain)
 
 
 def in_turn(domains: Sequence[Domain]) -> DomainOf:

@@ -211,7 +211,7 @@ def _world(scenario: Scenario, domain: Domain) -> tuple[Scenario, tuple[Effect, 
 
     A scenario's documents hold the effects of its file already, except those on detectors.
     """
-    changed = scenario_in_domain(scenario, domain)  # a wrong name is an error now
+    changed = scenario_in_domain(scenario, domain, recorded=True)  # a wrong name is an error now
     if domain_path(domain) is not None:
         return changed, detector_effects(changed)
     return scenario, (*detector_effects(scenario), *parse_domain(domain))
