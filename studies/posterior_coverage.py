@@ -11,13 +11,16 @@ lanes loses green at its beginning.
 A value is covered if the 90 % interval of its draws holds it. A value at the end of its range is
 covered by an interval that ends there.
 
-The statistics of all episodes are kept in the folder ``--out`` and read again by the same command.
+The statistics of all episodes are kept in the folder ``--out`` and read again by the same command,
+unless the network, its library of effects or SUMO has changed.
 """
 
 from __future__ import annotations
 
 import argparse
 import contextlib
+import hashlib
+import json
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -28,7 +31,7 @@ from rich.console import Console
 from scipy.stats import binomtest
 
 from ugat_marl import parallel_env
-from ugat_marl.data import TransitionLog
+from ugat_marl.data import TransitionLog, installed_versions
 from ugat_marl.effects import load_scenario
 from ugat_marl.experiments import policy_factory
 from ugat_marl.files import replacing
@@ -157,12 +160,14 @@ def study(network: Network, number: int, simulations: int, seed: int, kept: Path
         number: Number of streets.
         simulations: Number of worlds for the posterior.
         seed: Root of all random choices.
-        kept: File of the statistics of all episodes; they are read if it exists.
+        kept: File of the statistics of all episodes. They are read if it holds these worlds and
+            streets of this network; it is written anew otherwise.
     """
     worlds = network.worlds
     streets = streets_of(worlds, number, seed)
     values = [worlds.draw(derive_seed(seed, "world", k)) for k in range(simulations)]
-    if not kept.exists():
+    played = _digest(network, [*values, *(value for _, value in streets)])
+    if not kept.exists() or _digest_of(kept) != played:
         of_streets = [value for _, value in streets for _ in range(2)]  # two episodes of each
         logs = network.play([*values, *of_streets], seed)
         pairs = range(simulations, len(logs), 2)
@@ -170,6 +175,7 @@ def study(network: Network, number: int, simulations: int, seed: int, kept: Path
         summaries = [network.view.summary(log) for log in logs]
         every = np.ones_like(summaries[0].rows, dtype=np.bool_)
         stacked = {
+            "played": np.array(played),
             "values": np.stack([x.values for x in summaries]),
             "rows": np.stack([x.rows for x in summaries]),
             "usable": np.stack([every if x.usable is None else x.usable for x in summaries]),
@@ -189,6 +195,21 @@ def study(network: Network, number: int, simulations: int, seed: int, kept: Path
     for (kind, truth), summary in zip(streets, summaries[simulations:], strict=True):
         asked += answers(Posterior.fit(worlds, known, summary), kind, truth, prior)
     return asked
+
+
+def _digest(network: Network, values: Sequence[Values]) -> str:
+    """Return a digest of the network, the worlds and the simulator of the episodes."""
+    names = [item.name for item in network.worlds.library]
+    told = [network.simulation.scenario.hash, names, installed_versions("eclipse-sumo")]
+    digest = hashlib.sha256(json.dumps(told).encode())
+    for value in values:
+        digest.update(value.effects.tobytes() + value.service_s.tobytes())
+    return digest.hexdigest()
+
+
+def _digest_of(kept: Path) -> str:
+    with np.load(kept, allow_pickle=False) as file:
+        return str(file["played"]) if "played" in file else ""
 
 
 @dataclass(frozen=True)

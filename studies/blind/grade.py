@@ -152,7 +152,8 @@ def grade_cases(directory: Path) -> tuple[Grade, ...]:
         BlindTestError: The directory holds no blind test, or a diagnosis is damaged.
     """
     grades: list[Grade] = []
-    judged = read_json(directory / VISIBLE) if (directory / VISIBLE).exists() else {}
+    seen = directory / VISIBLE
+    judged = read_json(seen)["cases"] if seen.exists() else {}
     for case in read_plan(directory):
         folder = directory / case.case
         run = read_json(folder / RUN) if (folder / RUN).exists() else {}

@@ -63,7 +63,9 @@ def judge_visibility(
         UnknownNameError: There is no such case.
     """
     path = directory / VISIBLE
-    found: dict[str, float | None] = read_json(path) if path.exists() else {}
+    before = read_json(path) if path.exists() else {}
+    # simulated days are those of the seed, so another seed begins anew
+    found: dict[str, float | None] = before["cases"] if before.get("seed") == seed else {}
     labels = [
         read_label(directory, case.case)
         for case in chosen(directory, only)
@@ -80,7 +82,8 @@ def judge_visibility(
                 scenario, measured = read_street(label.scenario, data)
                 config = DiagnosisConfig(budget_h=math.inf, seed=seed)
                 found[label.case] = deviations_of(Study.of(scenario, measured, config), effects)
-            write_whole(path, json.dumps(found, indent=1, allow_nan=False) + "\n")
+            told = {"seed": seed, "cases": found}
+            write_whole(path, json.dumps(told, indent=1, allow_nan=False) + "\n")
             advance(note=label.case)
     return found
 

@@ -117,12 +117,20 @@ def test_what_the_log_shows_is_visible_and_the_table_says_so(tmp_path: Path) -> 
     hide(tmp_path, case001="yellow_time", case002="headway", case003="headway")
     assert judge_visibility(tmp_path, only=["case001"]) == {"case001": None}
     known = {"case001": None, "case002": SEEN - 0.1}
-    (tmp_path / visibility.VISIBLE).write_text(json.dumps(known))
+    (tmp_path / visibility.VISIBLE).write_text(json.dumps({"seed": 0, "cases": known}))
     grades = grade_cases(tmp_path)
     assert [item.visible for item in grades] == [True, False, None]
     row = next(x for x in rows_of(grades) if "knows the effect" in x.measure)
     assert (row.n, row.count) == (1, 0), "only the first is known to be visible, and was missed"
     assert asdict(grades[0])["visible"] is True
+
+
+def test_another_seed_judges_every_case_anew(tmp_path: Path) -> None:
+    hide(tmp_path, case001="yellow_time")
+    of_seed_0 = {"seed": 0, "cases": {"case001": 7.0}}
+    (tmp_path / visibility.VISIBLE).write_text(json.dumps(of_seed_0))
+    assert judge_visibility(tmp_path, seed=0) == {"case001": 7.0}
+    assert judge_visibility(tmp_path, seed=1) == {"case001": None}
 
 
 def test_a_case_that_is_not_there(tmp_path: Path) -> None:
