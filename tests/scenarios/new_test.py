@@ -211,9 +211,14 @@ def test_a_network_with_routes(files: Path, tmp_path: Path) -> None:
     assert check_demand(scenario, Network.read(scenario)).vehicles > 100
 
 
-def test_other_vehicles_for_a_configuration(files: Path, tmp_path: Path) -> None:
+def test_other_vehicles_for_a_configuration(
+    files: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
     assert made(tmp_path / "a", "--sumo", files / "city.sumocfg", "--vph", "120") == 0
+    said = " ".join("".join(capsys.readouterr()).split())
+    assert "note: city.sumocfg: its vehicles are replaced, so its additional files are left" in said
     scenario = read_scenario(tmp_path / "a")
+    assert scenario.additional == ()
     assert [d.name for d in scenario.routes] == ["demand.rou.xml"]
     assert scenario.settings.sumo == {"lateral-resolution": "0.8"}  # SUMO drives as it did
 

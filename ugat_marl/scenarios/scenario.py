@@ -238,6 +238,15 @@ def sumocfg_physics(path: Path) -> dict[str, Any]:
     return _Configuration(path).physics()
 
 
+def sumocfg_additional(path: Path) -> list[str]:
+    """Return the names of the additional files in a ``.sumocfg``.
+
+    Raises:
+        ScenarioError: The file cannot be read.
+    """
+    return _names(_Configuration(path).value("additional-files"), path.parent)
+
+
 def _load_sumocfg(path: Path, scenario_id: str) -> Scenario:
     configuration = _Configuration(path)
     value, seconds = configuration.value, configuration.seconds

@@ -14,7 +14,12 @@ from ugat_marl.progress import Reporter
 from ugat_marl.scenarios.demand import edges_used
 from ugat_marl.scenarios.importers.long_files import scan
 from ugat_marl.scenarios.importers.making import RoadFiles, RoadSource, VehicleFiles, VehicleSource
-from ugat_marl.scenarios.scenario import Document, read_scenario, sumocfg_physics
+from ugat_marl.scenarios.scenario import (
+    Document,
+    read_scenario,
+    sumocfg_additional,
+    sumocfg_physics,
+)
 
 _CONFIGURATIONS = (".sumocfg", ".sumocfg.xml")
 
@@ -44,7 +49,7 @@ def from_sumo(path: Path, *, link: bool, own_vehicles: bool) -> RoadSource:
                 network=name,
                 copied={path.name: path},
             )
-        return _configured(path, folder, link, own_vehicles)
+        return _configured(path, folder, link, own_vehicles, reporter)
 
     return roads
 
@@ -66,7 +71,9 @@ def from_routes(paths: Sequence[Path], *, link: bool) -> VehicleSource:
     return vehicles
 
 
-def _configured(path: Path, folder: Path, link: bool, own_vehicles: bool) -> RoadFiles:
+def _configured(
+    path: Path, folder: Path, link: bool, own_vehicles: bool, reporter: Reporter
+) -> RoadFiles:
     if own_vehicles:
         scenario = read_scenario(path)
         network, routes, additional = scenario.network, scenario.routes, scenario.additional
@@ -74,6 +81,11 @@ def _configured(path: Path, folder: Path, link: bool, own_vehicles: bool) -> Roa
     else:
         network, settings = _network_of(path), sumocfg_physics(path)
         routes = additional = ()
+        if left_out := sumocfg_additional(path):
+            reporter.say(
+                f"note: {path.name}: its vehicles are replaced, so its additional files are left "
+                f"out, too ({', '.join(left_out)}); add those without vehicles to scenario.toml"
+            )
         if settings["step_length_s"] == 1:
             del settings["step_length_s"]
     times = ("begin_s", "duration_s", "step_length_s", "sumo")
