@@ -8,7 +8,13 @@ from collections.abc import Collection, Mapping
 from dataclasses import dataclass
 
 from ugat_marl.diagnosis import Routes
-from ugat_marl.effects import EVERYWHERE, detectors_at, group_name, network_places
+from ugat_marl.effects import (
+    EVERYWHERE,
+    detectors_at,
+    group_name,
+    network_places,
+    next_detectors,
+)
 from ugat_marl.experiments import policy_factory, record
 from ugat_marl.scenarios import Detector, Network, Scenario
 from ugat_marl.seeding import derive_seed
@@ -36,6 +42,7 @@ class Busy:
         edges: Edges before a traffic light.
         detectors: Detectors.
         groups: Places of groups of detectors: all, those of a kind, those of a kind on an edge.
+        beside: Those of `groups` with a busy detector of the same kind on a next lane.
         room_m: Lengths of lane before and behind all detectors of such a place, m. Behind advance
             detectors it ends at the next detector.
         pairs: Detectors of one kind on neighbouring lanes that count differently.
@@ -51,6 +58,7 @@ class Busy:
     edges: tuple[str, ...]
     detectors: tuple[str, ...]
     groups: tuple[str, ...]
+    beside: tuple[str, ...]
     room_m: Mapping[str, tuple[float, float]]
     pairs: tuple[tuple[str, str], ...]
     permitted: bool
@@ -103,6 +111,7 @@ def busy_places(scenario: Scenario, seed: int) -> Busy:
         edges=tuple(sorted({network.lanes[x].edge for x in lanes})),
         detectors=tuple(item.id for item in detectors if rates.get(item.id, 0.0) >= BUSY_PER_HOUR),
         groups=groups,
+        beside=tuple(place for place in groups if has_next_lane(place, detectors, rates)),
         room_m={place: _room_m(place, detectors, network) for place in groups},
         pairs=_pairs(detectors, rates, network),
         permitted=any(turns.get(way, 0.0) >= YIELDING_PER_HOUR for way in _yielding(network)),
@@ -164,6 +173,13 @@ def _groups(
         if rates.get(item.id, 0.0) >= BUSY_PER_HOUR
     }
     return (EVERYWHERE, *kinds, *sorted(on_edges))
+
+
+def has_next_lane(place: str, detectors: tuple[Detector, ...], rates: Mapping[str, float]) -> bool:
+    """Return True if vehicles on a next lane can be reported by the detectors of a place."""
+    beside = next_detectors(detectors)
+    names = detectors_at(place, detectors)
+    return any(rates.get(x, 0.0) >= BUSY_PER_HOUR for name in names for x in beside[name])
 
 
 def _room_m(place: str, detectors: tuple[Detector, ...], network: Network) -> tuple[float, float]:

@@ -214,6 +214,7 @@ def _places(where: str, busy: Busy) -> list[tuple[str, ...]]:
         "edge": busy.edges,
         "detector": busy.detectors,
         "group": busy.groups,
+        "beside": busy.beside,
         "advance": tuple(place for place in busy.groups if place.startswith(ADVANCE)),
         "model": MODELS,
     }

@@ -25,7 +25,7 @@ SCALE: Mapping[str, float] = {"small": 0.5, "medium": 1.0, "large": 2.0}
 Family = Literal["vehicles", "signals", "demand", "road", "detectors", "measurement"]
 Where = Literal[
     "everywhere", "light", "origin", "turn", "closable", "lane", "edge", "detector", "pair",
-    "model", "advance", "group",
+    "model", "advance", "group", "beside",
 ]  # fmt: skip
 """Kind of place that is drawn for an effect."""
 
@@ -137,7 +137,7 @@ ERRORS: Mapping[str, Kind] = {
         "measurement", "group", choices=("front", "mean"), strengths=("medium",)
     ),
     "detector_pulse": Kind("measurement", "group", "seconds", 0.05, 0.1),
-    "detector_splash": Kind("measurement", "group", "share", 0.0, 0.1),
+    "detector_splash": Kind("measurement", "beside", "share", 0.0, 0.1),
 }
 """Every error of measurement. Offsets of loops at the stop line would lie behind it or beyond the
 queue's first vehicle, so that only those of advance loops are drawn."""

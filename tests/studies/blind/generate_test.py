@@ -6,7 +6,7 @@ import json
 import math
 import shutil
 from collections import Counter
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import replace
 from itertools import product
 from pathlib import Path
@@ -18,7 +18,7 @@ from studies.blind.__main__ import LINE
 from studies.blind.cases import Case, read_label, read_plan
 from studies.blind.generate import Blueprint, Consequences, differing, generate
 from studies.blind.outside_effects import BusStops, Driveway
-from studies.blind.places import Busy, busy_places, telling
+from studies.blind.places import Busy, busy_places, has_next_lane, telling
 from studies.blind.run import run_cases
 from studies.blind.sampling import (
     GROUPS,
@@ -38,7 +38,7 @@ from ugat_marl.diagnosis.hypotheses import library
 from ugat_marl.effects import effect_from_record, known_effects, load_scenario
 from ugat_marl.errors import BlindTestError, OptionError, UnknownNameError
 from ugat_marl.experiments import policy_factory, record
-from ugat_marl.scenarios import Network, Passages, Period, Scenario
+from ugat_marl.scenarios import Detector, Network, Passages, Period, Scenario
 
 
 @pytest.fixture(scope="module")
@@ -337,6 +337,19 @@ def test_detectors_have_room_for_the_errors_that_are_hidden(single: tuple[Scenar
         kinds.setdefault(strength, set()).add(place.partition("@")[0])
     assert kinds["medium"] == {"*", "advance", "stop", "exit"}
     assert kinds["large"] == {"advance", "exit"}
+
+
+def test_splash_is_hidden_where_a_next_lane_is_busy() -> None:
+    lanes = {"wide_0": 300.0, "wide_1": 90.0, "narrow_0": 300.0}
+    detectors = tuple(Detector(f"stop:{lane}", lane, 97.5, 0.0, "stop") for lane in lanes)
+
+    def shown(place: str, rates: Mapping[str, float]) -> bool:
+        return has_next_lane(place, detectors, {f"stop:{lane}": n for lane, n in rates.items()})
+
+    assert shown("*", lanes)
+    assert shown("stop@wide", lanes)
+    assert not shown("stop@narrow", lanes)
+    assert not shown("stop@wide", {**lanes, "wide_0": 90.0})
 
 
 def test_vehicles_among_others_tell_less_than_alone() -> None:
