@@ -293,7 +293,7 @@ class DetectorSplash(_OfDetectors):
             for other in beside.get(name, ()):
                 seen = period.passages.get(other, Passages.none())
                 parts.append(seen.at(self._chosen(name, other, seen)))
-            return joined(parts)
+            return Passages.concatenated(parts)
 
         return self._edited(period, detectors, splashed)
 
@@ -326,13 +326,3 @@ def next_detectors(detectors: Sequence[Detector]) -> dict[str, tuple[str, ...]]:
         ]
         beside[detector.id] = tuple(min(others, key=distance_m).id for others in there)
     return beside
-
-
-def joined(parts: Sequence[Passages]) -> Passages:
-    """Return several passages as one, sorted by time."""
-    columns = [
-        np.concatenate([getattr(part, key) for part in parts])
-        for key in ("on_s", "off_s", "speed_mps", "length_m")
-    ]
-    times = np.where(np.isnan(columns[0]), columns[1], columns[0])
-    return Passages(*columns).at(np.argsort(times, kind="stable"))

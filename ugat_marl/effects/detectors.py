@@ -172,13 +172,7 @@ class Stuck(DetectorEffect):
 
         def held(name: str, passages: Passages) -> Passages:
             del name
-            rest = passages.at(~_within(passages, begin, end))
-            parts = [
-                np.concatenate([getattr(rest, key), getattr(long, key)])
-                for key in ("on_s", "off_s", "speed_mps", "length_m")
-            ]
-            times = np.where(np.isnan(parts[0]), parts[1], parts[0])
-            return Passages(*parts).at(np.argsort(times, kind="stable"))
+            return Passages.concatenated([passages.at(~_within(passages, begin, end)), long])
 
         return edited(period, names, held)
 

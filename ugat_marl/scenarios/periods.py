@@ -90,6 +90,14 @@ class Passages:
         return cls(empty, empty, empty, empty)
 
     @classmethod
+    def concatenated(cls, parts: Sequence[Passages]) -> Passages:
+        """Return all passages of several parts, sorted by time."""
+        rows = [[x.on_s, x.off_s, x.speed_mps, x.length_m] for x in parts]
+        whole = cls(*np.concatenate(rows, axis=1))
+        times = np.where(np.isnan(whole.on_s), whole.off_s, whole.on_s)
+        return whole.at(np.argsort(times, kind="stable"))
+
+    @classmethod
     def together(cls, lanes: Sequence[Passages]) -> Passages:
         """Return the passages over a zone on several lanes, from those over each of its lanes.
 
