@@ -71,12 +71,7 @@ def day(
             passages[place] = Passages(seen.on_s, seen.off_s + more, pace, seen.length_m)
     chosen = generator.random(150) < twins
     whole = passages["far"]
-    splash = [
-        np.concatenate([getattr(passages["far left"], key), getattr(whole, key)[chosen]])
-        for key in ("on_s", "off_s", "speed_mps", "length_m")
-    ]
-    order = np.argsort(splash[0])
-    passages["far left"] = Passages(*splash).at(order)
+    passages["far left"] = Passages.concatenated([passages["far left"], whole.at(chosen)])
     if not speeds:
         none = np.full(len(whole), np.nan)
         passages = {
