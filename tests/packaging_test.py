@@ -125,3 +125,16 @@ def test_importing_is_cheap() -> None:
 def test_who_trains_nothing_waits_for_no_torch(verb: str) -> None:
     code = f"import sys, ugat_marl.cli.{verb}; sys.exit('torch' in sys.modules)"
     assert subprocess.run([sys.executable, "-c", code], check=False).returncode == 0
+
+
+def test_all_that_the_rooms_offer_is_there_without_the_extras() -> None:
+    extras = ["stable_baselines3", "sb3_contrib", "torchrl", "skrl", "benchmarl", "ray", "onnx"]
+    extras += ["osmium", "imageio_ffmpeg", "atspm", "sumo_rl"]
+    rooms = sorted(x.parent.name for x in PACKAGE.glob("*/__init__.py"))
+    lines = [
+        f"import sys; sys.modules |= dict.fromkeys({extras})",
+        *(f"from ugat_marl.{room} import *" for room in rooms if not room.startswith("_")),
+    ]
+    command = [sys.executable, "-c", "\n".join(lines)]
+    done = subprocess.run(command, capture_output=True, text=True, check=False)
+    assert done.returncode == 0, done.stderr

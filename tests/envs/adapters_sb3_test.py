@@ -12,7 +12,7 @@ from ugat_marl.errors import ActionError, EpisodeError, OptionError
 from ugat_marl.testing import ToyTraffic
 
 pytest.importorskip("stable_baselines3")
-from ugat_marl.envs import AgentsVecEnv
+from ugat_marl.envs.adapters.sb3 import AgentsVecEnv
 
 
 class Noted(ToyTraffic):

@@ -13,7 +13,7 @@ from ugat_marl.envs import agent_indicator, pad_spaces
 from ugat_marl.errors import OptionError
 
 pytest.importorskip("stable_baselines3")
-from ugat_marl.envs import AgentsVecEnv
+from ugat_marl.envs.adapters.sb3 import AgentsVecEnv
 from ugat_marl.envs.adapters.sb3_vector import SimulationsVecEnv
 
 pytestmark = pytest.mark.skipif(not hasattr(os, "fork"), reason="needs a system that can fork")

@@ -1,5 +1,4 @@
 from .actions import checked_phases as checked_phases
-from .adapters.sb3 import AgentsVecEnv as AgentsVecEnv
 from .agents import ActionMask as ActionMask
 from .agents import AgentSet as AgentSet
 from .agents import agent_groups as agent_groups
