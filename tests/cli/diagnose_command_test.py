@@ -235,7 +235,7 @@ GAP = {
 
 def test_the_manual_lists_exactly_the_keys_there_are(found: tuple[Path, str, str]) -> None:
     diagnosed = json.loads((found[0] / "diagnosis.json").read_text())
-    page = (Path(__file__).parents[2] / "docs" / "explanation" / "diagnosis.md").read_text()
+    page = (Path(__file__).parents[2] / "docs" / "reference" / "diagnosis-file.md").read_text()
     assert diagnosed["schema"] in page
     listed = KEYS.findall(page.partition("## diagnosis.json")[2])
     assert len(listed) == len(set(listed))
@@ -269,7 +269,7 @@ def test_the_policy_gap_stays_as_long_as_the_same_is_found(
 
 
 def test_every_verdict_is_explained_in_the_manual() -> None:
-    page = (Path(__file__).parents[2] / "docs" / "explanation" / "diagnosis.md").read_text()
+    page = (Path(__file__).parents[2] / "docs" / "reference" / "diagnosis-file.md").read_text()
     table = page.partition("## Verdicts")[2].partition("##")[0]
     assert set(re.findall(r"^\| `(\w+)`", table, flags=re.MULTILINE)) == set(VERDICTS)
 
@@ -277,7 +277,7 @@ def test_every_verdict_is_explained_in_the_manual() -> None:
 def test_the_steps_in_the_manual_run_one_by_one(
     street: Street, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    page = (Path(__file__).parents[2] / "docs" / "explanation" / "diagnosis.md").read_text()
+    page = (Path(__file__).parents[2] / "docs" / "how-to" / "diagnose.md").read_text()
     (text,) = re.findall(r"```python\n(.*?)```", page, flags=re.DOTALL)
     names = {"FEW": FEW, "LEFT_OUT": LEFT_OUT, "CACHE": street.cache}
     for old, new in (

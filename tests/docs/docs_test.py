@@ -33,7 +33,9 @@ from ugat_marl.grounding import UNCERTAINTY_METHODS, FitConfig
 from ugat_marl.scenarios import validate_settings
 from ugat_marl.scenarios.settings import ControlSettings, IntersectionSettings, ScenarioFile
 
-PAGE = (Path(__file__).parents[2] / "docs" / "how-to" / "scenarios.md").read_text()
+DOCS = Path(__file__).parents[2] / "docs"
+PAGE = (DOCS / "reference" / "scenario-file.md").read_text()
+HOW_TO = (DOCS / "how-to" / "scenarios.md").read_text()
 
 
 def test_every_key_of_a_scenario_file_is_documented() -> None:
@@ -56,7 +58,7 @@ def test_the_defaults_on_the_page_are_those_of_the_code() -> None:
 def test_the_example_is_a_scenario_file() -> None:
     example = re.search(r"```toml\n(.*?)```", PAGE, flags=re.DOTALL)
     assert example is not None
-    settings = validate_settings(tomllib.loads(example[1]), "docs/how-to/scenarios.md")
+    settings = validate_settings(tomllib.loads(example[1]), "docs/reference/scenario-file.md")
     assert settings.intersections["C1"].phases == ("GGrr", "rrGG")
     for record in settings.effects:
         effect_from_record(record)
@@ -64,7 +66,7 @@ def test_the_example_is_a_scenario_file() -> None:
 
 def test_what_is_added_in_ten_lines_works(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.chdir(tmp_path)
-    section = PAGE.partition("## Adding something")[2]
+    section = HOW_TO.partition("## Adding something")[2]
     blocks = re.findall(r"```(\w+)\n(.*?)```", section, flags=re.DOTALL)
     assert [kind for kind, _ in blocks] == ["sh", "python", "python", "python"]
     assert all(len(text.splitlines()) <= 10 for _, text in blocks)
@@ -102,7 +104,7 @@ def test_the_example_of_drawn_networks_works(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.chdir(tmp_path)
-    section = PAGE.partition("### Networks drawn from a seed")[2]
+    section = HOW_TO.partition("### Networks drawn from a seed")[2]
     example = re.search(r"```python\n(.*?)```", section, flags=re.DOTALL)
     assert example is not None
     names: dict[str, Any] = {}

@@ -82,7 +82,7 @@ def diagnose(
         reporter: Display of progress; None for no display.
 
     Returns:
-        The content of ``diagnosis.json``; docs/explanation/diagnosis.md explains every key. The
+        The content of ``diagnosis.json``; docs/reference/diagnosis-file.md explains every key. The
         policy gap of an earlier diagnosis in `directory` is kept if its inputs, versions and
         effects were the same.
 
