@@ -17,3 +17,9 @@ def test_of_a_long_list_the_nearest_are_shown_and_the_rest_counted() -> None:
     assert said.startswith("unknown effect 'dely'. Did you mean 'delay'? Known: delay, delays, ")
     assert said.endswith("and 2 more. See the page.")
     assert error.allowed == sorted(names)
+
+
+def test_the_only_name_that_begins_so_is_meant() -> None:
+    names = ["observation", "reward", "neighbours"]
+    assert "Did you mean 'observation'?" in str(UnknownNameError("option", "obs", names))
+    assert "Did you mean" not in str(UnknownNameError("option", "ob", names))

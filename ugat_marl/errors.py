@@ -124,7 +124,13 @@ def install_command(extra: str) -> str:
 
 
 def nearest(name: str, allowed: Iterable[str]) -> str | None:
-    """Return the name in `allowed` closest to `name`, or None if none is close."""
+    """Return the name in `allowed` closest to `name`, or None if none is close.
+
+    The only name that begins with three letters or more of `name` is close.
+    """
     by_lower = {candidate.lower(): candidate for candidate in allowed}
+    longer = [lower for lower in by_lower if lower.startswith(name.lower())]
+    if len(longer) == 1 and len(name) > 2:
+        return by_lower[longer[0]]
     found = difflib.get_close_matches(name.lower(), by_lower, n=1, cutoff=0.5)
     return by_lower[found[0]] if found else None

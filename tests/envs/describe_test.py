@@ -80,6 +80,7 @@ def test_phases_are_described_by_their_movements() -> None:
     assert set(phases["turn"]) <= {"left", "through", "right", "turn-around"}
     text = str(env.describe())
     assert "…" not in text and light.phases and light.incoming_lanes[-1] in text
+    assert f"ugat-marl scenario draw {env.unwrapped.scenario.id} --out pictures" in text
 
 
 def test_phases_say_which_green_of_the_file_they_are(crossing: Callable[..., Path]) -> None:

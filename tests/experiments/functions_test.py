@@ -63,6 +63,11 @@ def test_a_run_has_a_folder_of_its_own(scenario: str, real: str, folder: str) ->
     assert run_folder(TransferConfig(scenario, real=real, seed=3)) == Path("runs", folder)
 
 
+def test_one_domain_may_be_a_text() -> None:
+    frame = ugat_marl.evaluate("single-v1", "random", "V1", seeds=1, duration_s=100, workers=1)
+    assert frame["domain"].to_list() == ["V1"]
+
+
 def test_wrong_calls_are_refused() -> None:
     for policies in (["random", "random"], []):
         with pytest.raises(OptionError, match="policies"):

@@ -408,6 +408,28 @@ def test_a_class_of_policies_is_made(algorithm: Any) -> None:
 
 
 @pytest.mark.usefixtures("algorithm")
+def test_a_learner_in_the_place_of_a_policy_is_refused_with_the_way_out() -> None:
+    with pytest.raises(OptionError, match="'my_algo:Cycle' is a learner.*my_algo:Cycle@FILE"):
+        policy_factory("my_algo:Cycle")(ToyTraffic())
+
+
+def test_a_class_that_needs_more_is_refused() -> None:
+    class Greedy:
+        def __init__(self, env: Any, depth: int) -> None: ...
+
+    with pytest.raises(OptionError, match=r"Greedy\(env\) .* takes \(env.*depth.*give further"):
+        own_policy(Greedy, "greedy", ToyTraffic())
+
+
+@pytest.mark.usefixtures("algorithm")
+def test_names_that_a_module_imports_are_not_among_its_own() -> None:
+    with pytest.raises(UnknownNameError) as error:
+        load_own("my_algo:Nothing", "learner")
+    assert "Cycle" in error.value.allowed
+    assert not {"Path", "Any", "np"} & set(error.value.allowed)
+
+
+@pytest.mark.usefixtures("algorithm")
 def test_tables_need_a_learner_that_can_be_kept(capsys: pytest.CaptureFixture[str]) -> None:
     assert main(["paper", "main", "--learner", "my_algo:Cycle"]) == 2
     assert "rows of a table start from what direct transfer has learnt" in capsys.readouterr().err

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import io
+import math
 from pathlib import Path
 
 import pytest
@@ -73,10 +74,19 @@ def test_plans_and_approaches_fit_without_divided_words(plans: list[SignalPlan])
 
 def test_an_approach_that_nobody_passes_is_the_worst_and_hides_no_other() -> None:
     network = Network.read(load_scenario("grid2x2-v1"))
-    starved = {"A1_A2": (100.0, 20.0), "A1_B1": (0.0, float("nan")), "B1_A1": (50.0, 90.0)}
+    starved = {"A1_A2": (100.0, 20.0), "A1_B1": (0.0, math.inf), "B1_A1": (50.0, 90.0)}
     rows = lines_of(approach_table("Delay", {"mine": starved}, network))
     found = [line.split() for line in rows if "A1" in line and "_" in line]
     assert [next(word for word in row if "_" in word and "(" not in word) for row in found] == [
         "A1_B1", "B1_A1", "A1_A2",
     ]  # fmt: skip
     assert "none passed" in " ".join(found[0])
+
+
+def test_an_approach_to_which_nobody_comes_is_not_the_worst() -> None:
+    network = Network.read(load_scenario("grid2x2-v1"))
+    quiet = {"A1_B1": (0.0, math.nan), "A1_A2": (100.0, 20.0)}
+    rows = [
+        line for line in lines_of(approach_table("Delay", {"a": quiet}, network)) if "A1_" in line
+    ]
+    assert "A1_A2" in rows[0] and "none came" in rows[1]

@@ -138,6 +138,10 @@ def test_the_worse_one_of_programme_and_rule_is_named(single: Scenario) -> None:
     ]
     (text,) = [text for text in remarks(facts, runs) if "programme takes" in text]
     assert "its timing is the worse one, and the phases suit" in text
+    full = replace(facts.intersections[0], degrees={"now": 1.3})
+    over = replace(facts, intersections=(full,))
+    (text,) = [text for text in remarks(over, runs) if "programme takes" in text]
+    assert "though no timing of these phases serves all (demand: 130% of their capacity)" in text
     runs = [
         RuleEpisode("programme", 90, 9, 9, 9, 0),
         RuleEpisode("largest-queue:20", 300, 9, 9, 9, 0),

@@ -34,11 +34,13 @@ class Description:
             with the same links, from 0; null if there is none), ``from`` and ``to`` (edges),
             ``turn``, ``lanes`` (incoming), and ``right_of_way`` ("protected", or "yields").
         unit: Meaning and unit of the features.
+        scenario: Name of the scenario.
     """
 
     observation: pl.DataFrame
     phases: pl.DataFrame
     unit: str
+    scenario: str
 
     def __str__(self) -> str:
         """Return both tables as text, one agent after the other, as wide as the terminal."""
@@ -61,7 +63,7 @@ class Description:
                 ]
                 lines += _wrapped(f"{here}:", "; ".join(ways), width)
         lines.append(f"unit of features: {self.unit}")
-        lines.append("as drawings: ugat-marl scenario draw SCENARIO --out pictures")
+        lines.append(f"as drawings: ugat-marl scenario draw {self.scenario} --out pictures")
         return "\n".join(lines)
 
 
@@ -84,10 +86,13 @@ def _wrapped(head: str, text: str, width: int) -> list[str]:
     )
 
 
-def describe(network: Network, observer: Observer, agents: Sequence[str]) -> Description:
+def describe(
+    scenario: str, network: Network, observer: Observer, agents: Sequence[str]
+) -> Description:
     """Return the description of an environment.
 
     Args:
+        scenario: Name of the scenario.
         network: The network.
         observer: Observer of the environment.
         agents: Names of the agents, in the order of the network's intersections.
@@ -134,7 +139,7 @@ def describe(network: Network, observer: Observer, agents: Sequence[str]) -> Des
     ]
     unit = OBSERVATION_UNITS.get(observer.name, "as the function returns them")
     phases = pl.DataFrame(movements, schema_overrides={"green_of_file": pl.Int64})
-    return Description(pl.DataFrame(rows), phases, unit)
+    return Description(pl.DataFrame(rows), phases, unit, scenario)
 
 
 def _own_entries(

@@ -168,7 +168,7 @@ class TrafficEnv(ParallelEnv[str, Any, Any]):
         """Return tables of the observed numbers and of the phases; ``print`` shows them whole."""
         from ugat_marl.envs.description import describe  # loads polars, which no episode needs
 
-        return describe(self.network, self._observer, self.possible_agents)
+        return describe(self.scenario.id, self.network, self._observer, self.possible_agents)
 
     # --- episode ------------------------------------------------------------------------------
 

@@ -162,7 +162,7 @@ def train(
 def evaluate(
     scenario: str | Path | Scenario,
     policies: Any = ("programme", "largest-queue:20", "max-pressure:10", "random"),
-    domains: Sequence[Domain] = ("sim", "V1", "V2", "V3", "V4"),
+    domains: Sequence[Domain] | str = ("sim", "V1", "V2", "V3", "V4"),
     *,
     seeds: int | Sequence[int] = 5,
     duration_s: float | None = None,
@@ -178,7 +178,7 @@ def evaluate(
             spelling of a rule, the file of a trained policy, ``module:name``, an object with
             ``act(observations, infos)``, a function of the same arguments, or a class or a function
             of ``env`` that makes one.
-        domains: Domains; gaps are differences from the first.
+        domains: Domains; gaps are differences from the first. A text is one domain.
         seeds: Number of episodes of each policy in each domain, or the seeds themselves.
         duration_s: Length of an episode in s; None for the scenario's own.
         each_episode: Return one row per episode with all measures.
@@ -197,7 +197,7 @@ def evaluate(
     played = evaluation.evaluate(
         load_scenario(scenario),
         _factories(policies),
-        domains,
+        [domains] if isinstance(domains, str) else domains,
         numbers,
         duration_s=duration_s,
         workers=workers,

@@ -239,9 +239,14 @@ def _compared(facts: Survey, runs: Sequence[RuleEpisode]) -> list[str]:
     most = max((_degree(light, "now") for light in facts.intersections), default=0.0)
     busiest = f"{most:.0%} of their capacity" if most < math.inf else "more than they can serve"
     if programme_s > MUCH_WORSE * rule_s:
+        suits = (
+            f"and the phases suit (demand: at most {busiest})"
+            if most <= 1.0
+            else f"though no timing of these phases serves all (demand: {busiest})"
+        )
         return [
             f"the programme takes {programme_s:g} s where {RULES[1]} takes {rule_s:g} s: its "
-            f"timing is the worse one, and the phases suit (demand: at most {busiest})"
+            f"timing is the worse one, {suits}"
         ]
     if rule_s > MUCH_WORSE * programme_s:
         return [

@@ -103,17 +103,20 @@ class Evaluation:
     def approaches(self, policy: str, domain: str) -> dict[str, tuple[float, float]]:
         """Return, for each approach, vehicles per episode and mean control delay in s.
 
-        The delay is the mean over all vehicles of all episodes. Empty if it was not measured.
+        The delay is the mean over all vehicles of all episodes. Where nobody passed it is infinite
+        if vehicles waited, and nan if none came. Empty if it was not measured.
         """
         played = [r.scores for r in self.results if r.policy == policy and r.domain == domain]
         pairs: dict[str, list[tuple[float, float]]] = defaultdict(list)
         for scores in played:
             for road, pair in scores.approaches.items():
                 pairs[road].append(pair)
-        return {
-            road: (sum(count for count, _ in own) / len(played), mean_delay_s(own))
-            for road, own in pairs.items()
-        }
+        delays: dict[str, tuple[float, float]] = {}
+        for road, own in pairs.items():
+            passed = sum(count for count, _ in own)
+            starved = not passed and any(lost_s > 0.0 for _, lost_s in own)
+            delays[road] = (passed / len(played), math.inf if starved else mean_delay_s(own))
+        return delays
 
     def regret(self, policy: str, domain: str) -> Estimate:
         """Return the ATT of a policy minus that of the best policy there, in s, paired by seed."""

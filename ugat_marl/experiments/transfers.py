@@ -322,6 +322,8 @@ def transfer(
             raise OptionError(
                 f"{directory} holds a run already; use --resume to go on with it, or another --out"
             )
+        if resume and not begun:
+            reporter.say(f"note: {directory} holds no run to go on with; a new one begins")
         write_identity(directory, identity, begun=begun)
         write_settings(directory, config.as_dict())
         episode_s = config.duration_s or scenario.settings.duration_s

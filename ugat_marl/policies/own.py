@@ -100,7 +100,12 @@ def load_own(name: str, what: str) -> Any:
         ) from None
     for part in path.split("."):
         if not hasattr(found, part):
-            names = [key for key, value in vars(found).items() if callable(value)]
+            own = getattr(found, "__name__", None)
+            names = [
+                key
+                for key, value in vars(found).items()
+                if callable(value) and getattr(value, "__module__", own) == own
+            ]
             raise UnknownNameError(f"{what} in {module_name}", part, names)
         found = getattr(found, part)
     return found
@@ -234,10 +239,25 @@ def own_policy(given: Any, name: str, env: AnyParallelEnv) -> Policy:
         env: The environment.
     """
     if inspect.isclass(given):
+        if not (_takes(given, 1) or _takes(given, 0)):
+            raise OptionError(_not_made(given, name))
         given = given(*[env] if _takes(given, 1) else [])
     elif inspect.isroutine(given) and _first_argument(given) == "env":
         given = given(env)
     return OwnPolicy(given, name, {})
+
+
+def _not_made(given: Any, name: str) -> str:
+    """Return the reason why a class cannot be made into a policy, with the way out."""
+    if all(hasattr(given, method) for method in NEEDED):
+        return (
+            f"policy {name!r} is a learner: train it (ugat-marl train SCENARIO --learner {name}) "
+            f"and give the file of its policy, as {name}@FILE"
+        )
+    return (
+        f"policy {name!r}: the class is made as {given.__name__}(env) or {given.__name__}(), and "
+        f"takes {inspect.signature(given)}; give further arguments defaults"
+    )
 
 
 class OwnLearner:

@@ -31,12 +31,15 @@ Delays = Mapping[str, tuple[float, float]]
 
 
 NOBODY = "none passed"
-"""Cell of an approach that nobody passed, though vehicles may stand there."""
+"""Cell of an approach at which vehicles waited and none passed."""
+EMPTY = "none came"
 
 
 def approach_text(vehicles: float, delay_s: float) -> str:
-    """Return delay and level of service of an approach, or that nobody passed."""
-    return delay_text(delay_s) if vehicles else NOBODY
+    """Return delay and level of service of an approach, or that nobody passed or came."""
+    if vehicles:
+        return delay_text(delay_s)
+    return EMPTY if math.isnan(delay_s) else NOBODY
 
 
 def delay_text(delay_s: float) -> str:
@@ -137,6 +140,6 @@ def _worst_first(delays: Mapping[str, Delays]) -> list[str]:
 
 
 def _badness(approach: tuple[float, float]) -> float:
-    """Return the delay of an approach; infinite if nobody passed."""
-    vehicles, delay_s = approach
-    return delay_s if vehicles else math.inf
+    """Return the delay of an approach; below 0 if nobody came."""
+    delay_s = approach[1]
+    return -1.0 if math.isnan(delay_s) else delay_s
