@@ -91,6 +91,22 @@ def test_the_whole_counts_tasks_by_their_weight() -> None:
     assert "whole run" in written.getvalue()
 
 
+def test_a_log_says_once_a_minute_how_far_the_whole_is(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Short tasks, none of which lasts a minute."""
+    now = [0.0]
+    monkeypatch.setattr("ugat_marl.progress.time.monotonic", lambda: now[0])
+    written = io.StringIO()
+    bars = Bars(Console(file=written, width=80))
+    with bars.whole("whole run", {"step": Share(10)}):
+        for number in range(5):
+            with bars.task(f"step {number}", 2) as advance:
+                for _ in range(2):
+                    now[0] += 20.0
+                    advance()
+    lines = [line.split() for line in written.getvalue().splitlines() if "whole run" in line]
+    assert [line[3] for line in lines] == ["30%", "60%", "90%"]  # of 200 s
+
+
 def test_quiet_says_nothing_and_verbose_all() -> None:
     written = io.StringIO()
     console = Console(file=written, width=80)

@@ -140,8 +140,9 @@ class Bars:
                 whole.advance(name, 1)
             if not self._console.is_terminal and time.monotonic() - printed >= _QUIET_S:
                 printed = time.monotonic()
-                for bars in (progress, *([whole.progress] if whole else [])):
-                    self._console.print(bars.make_tasks_table(bars.tasks))
+                self._console.print(progress.make_tasks_table(progress.tasks))
+            if whole is not None:
+                whole.print_at_times()
 
         with contextlib.nullcontext() if whole is not None else progress:
             if whole is not None:
@@ -152,6 +153,7 @@ class Bars:
                 if whole is not None:
                     whole.advance(name, max(left, 0))
                     self._console.print(progress.make_tasks_table(progress.tasks))
+                    whole.print_at_times()
             finally:
                 if whole is not None:
                     whole.step = None
@@ -187,6 +189,8 @@ class _Whole:
 
     def __init__(self, name: str, shares: Mapping[str, Share], console: Console) -> None:
         self._shares = shares
+        self._console = console
+        self._printed = time.monotonic()
         self._left = {name: float(share.units) for name, share in shares.items()}
         self.progress = _bars(console, counted=False)
         self.step: Progress | None = None
@@ -201,6 +205,12 @@ class _Whole:
                 self._left[kind] -= counted
                 self.progress.update(self._bar, advance=counted * share.weight)
                 return
+
+    def print_at_times(self) -> None:
+        """Print the bar if there is no terminal, at most once a minute."""
+        if not self._console.is_terminal and time.monotonic() - self._printed >= _QUIET_S:
+            self._printed = time.monotonic()
+            self._console.print(self.progress.make_tasks_table(self.progress.tasks))
 
     def drawn(self) -> Group:
         """Return both bars."""
