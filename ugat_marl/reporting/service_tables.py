@@ -96,8 +96,11 @@ def approach_table(title: str, delays: Mapping[str, Delays], network: Network) -
         table = titled_table(f"{title}{more}")
         for heading in (LIGHT, "approach", "road"):
             table.add_column(heading, overflow="fold", max_width=22)
-        for heading in ("veh", *part):
-            table.add_column(heading, justify="right", overflow="fold")
+        table.add_column("veh", justify="right")
+        for controller in part:
+            lines = controller.replace(":", ":\n", 1)
+            least = min(max(map(len, lines.split())), 22)
+            table.add_column(lines, justify="right", overflow="fold", min_width=least)
         for road in shown:
             named = names.get(road)
             light, approach = (lights.text(named.light), named.name) if named else ("", "")
