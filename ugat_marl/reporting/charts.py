@@ -293,9 +293,10 @@ def transfer_picture(evaluation: Evaluation, metrics: Metrics, path: Path) -> No
                 evaluation.estimate(rule, domain, "att_s").mean,
             )
             right.axhline(level, color=colour, linestyle=(0, (1, 2)), linewidth=1)
+            # at the left, where direct transfer is far from the rule, and not where curves meet it
             right.annotate(
-                printable(f"best rule in {domain}"), (1, level), (0, 3), color=colour,
-                xycoords=("axes fraction", "data"), textcoords="offset points", ha="right",
+                printable(f"best rule in {domain}"), (0.12, level), (0, 3), color=colour,
+                xycoords=("axes fraction", "data"), textcoords="offset points", ha="left",
                 fontsize=10,
             )  # fmt: skip
     add_legend(picture, labels)
