@@ -282,6 +282,14 @@ def test_the_command_prints_tables(
     assert max(len(line) for line in text.splitlines()) <= 80
 
 
+def test_turns_that_yield_are_said_to_count_whole(capsys: pytest.CaptureFixture[str]) -> None:
+    said: list[bool] = []
+    for scenario in ("single-v1", "mixed-v1"):  # of the two only the second has such turns
+        assert main(["scenario", "check", scenario, "--no-simulate"]) == 0
+        said.append("permitted greens count whole" in capsys.readouterr().out)
+    assert said == [False, True]
+
+
 def test_the_command_prints_json(capsys: pytest.CaptureFixture[str]) -> None:
     words = ["scenario", "check", "mixed-v1", "--json", "--no-simulate"]
     assert main(words) == 0

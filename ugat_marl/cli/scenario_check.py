@@ -202,6 +202,11 @@ def show(
     for text in _greens_of_file(agents, names):
         console.print(text, markup=False)
     console.print(_approaches(agents, names))
+    if any(phase.permitted for light in agents for phase in light.phases):
+        say(
+            "permitted greens count whole here: where turns wait for others, an approach is nearer "
+            "to saturation than this"
+        )
     console.print(_phase_sources(agents, names))
     if short := sum(len(light.short_lanes) for light in agents):
         say(
