@@ -286,7 +286,7 @@ def test_turns_that_yield_are_said_to_count_whole(capsys: pytest.CaptureFixture[
     said: list[bool] = []
     for scenario in ("single-v1", "mixed-v1"):  # of the two only the second has such turns
         assert main(["scenario", "check", scenario, "--no-simulate"]) == 0
-        said.append("permitted greens count whole" in capsys.readouterr().out)
+        said.append("Permitted greens count whole" in capsys.readouterr().out)
     assert said == [False, True]
 
 

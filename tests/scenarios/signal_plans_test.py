@@ -265,7 +265,7 @@ def test_files_of_synchro_that_are_wrong(
 def test_a_plan_becomes_a_scenario(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     words = ["plan", "single-v1", "--apply", str(synchro(tmp_path)), "--out", str(tmp_path / "p")]
     assert main(words) == 0
-    assert "single-v1 with 1 plans as programmes" in capsys.readouterr().out
+    assert "single-v1 with programmes from 1 plan\n" in capsys.readouterr().out
     (light,) = Network.read(read_scenario(tmp_path / "p")).intersections
     assert sum(seconds for seconds, _ in light.programme) == 90
     assert len(light.phases) == 8  # agents keep their phases

@@ -19,7 +19,7 @@ from ugat_marl.errors import OptionError
 from ugat_marl.experiments import policy_factory, typical_plans
 from ugat_marl.files import require_writable
 from ugat_marl.progress import Bars
-from ugat_marl.reporting import LIGHT, LightNames, titled_table
+from ugat_marl.reporting import LIGHT, LightNames, counted, titled_table
 from ugat_marl.scenarios import (
     Network,
     Scenario,
@@ -134,7 +134,7 @@ class Plan:
             console.print(f"note: {note}", markup=False, soft_wrap=True)
         name = shlex.quote(str(self.out))
         console.print(
-            f"{self.out}: {scenario.id} with {len(plans)} plans as programmes\n"
+            f"{self.out}: {scenario.id} with programmes from {counted(len(plans), 'plan')}\n"
             f"next: ugat-marl evaluate {name} --policies programme --domains sim",
             markup=False,
             soft_wrap=True,

@@ -202,11 +202,6 @@ def show(
     for text in _greens_of_file(agents, names):
         console.print(text, markup=False)
     console.print(_approaches(agents, names))
-    if any(phase.permitted for light in agents for phase in light.phases):
-        say(
-            "permitted greens count whole here: where turns wait for others, an approach is nearer "
-            "to saturation than this"
-        )
     console.print(_phase_sources(agents, names))
     if short := sum(len(light.short_lanes) for light in agents):
         say(
@@ -259,7 +254,7 @@ def _row(light: IntersectionFacts) -> tuple[str, ...]:
         "junctions joined": len(light.junctions) if len(light.junctions) > 1 else 0,
         "phases with permitted turns": permitted,
         "links on red after a stop": light.right_on_red,
-        "always green": light.always_green,
+        "links always green": light.always_green,
         "U-turns": light.u_turns,
         "crossings": light.crossings,
         "crossings never green": light.unserved_crossings,
@@ -270,7 +265,13 @@ def _row(light: IntersectionFacts) -> tuple[str, ...]:
         "lanes counted with those behind": len(light.lanes_behind),
     }
     counts = (light.lanes, light.links, light.movements, light.conflicts, len(light.phases))
-    return (*map(str, counts), "; ".join(f"{n} {what}" for what, n in remarks.items() if n))
+    return (*map(str, counts), "; ".join(_counted(n, what) for what, n in remarks.items() if n))
+
+
+def _counted(count: int, what: str) -> str:
+    """Return a number with a noun in the plural, such as "2 lanes served in part"."""
+    noun, space, rest = what.partition(" ")
+    return f"{count} {noun.removesuffix('s') if count == 1 else noun}{space}{rest}"
 
 
 def _greens_of_file(agents: Sequence[IntersectionFacts], names: LightNames) -> list[str]:
@@ -321,6 +322,11 @@ def _approaches(agents: Sequence[IntersectionFacts], names: LightNames) -> Table
     headings = ("veh/h", "worst 15 min", "flow ratio", "own programme")
     table = _table(title, LIGHT, "road", "lanes", *headings)
     table.columns[1].justify = "left"
+    if any(phase.permitted for light in agents for phase in light.phases):
+        table.caption_justify = "left"
+        table.caption = (
+            "Permitted greens count whole: where turns wait for others, an approach is fuller."
+        )
     for name, road in shown:
         saturation = "no green" if road.saturation is None else f"{road.saturation:.0%}"
         flows = (f"{road.vph:.0f}", f"{road.worst_vph:.0f}")
