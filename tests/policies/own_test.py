@@ -111,7 +111,8 @@ def test_a_learner_with_two_methods_has_its_row_in_a_table(
     few = ["--seeds", "1", "--episodes", "2", "--domains", "V1", "--evaluation-seeds", "1"]
     where = ["--duration-s", "100", "--runs", str(tmp_path / "runs"), "--out", str(out)]
     assert main([*call, *few, *where]) == 0
-    assert "mine" in capsys.readouterr().out
+    said = capsys.readouterr().out
+    assert "mine" in said and "so the row stands alone" in said
     assert "mine" in out.read_text()
 
 

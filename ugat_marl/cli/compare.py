@@ -111,6 +111,12 @@ class Compare:
             table = read_standings(self.table)
         else:
             table = shipped_standings(scenario, self.evaluation_seeds, self.duration_s)
+            if table.is_empty():
+                console.print(
+                    f"note: no shipped policy of {scenario.id} was judged in episodes of this "
+                    "number and length, so the row stands alone; --table takes a table of yours",
+                    soft_wrap=True,
+                )
         domains = self._domains(table)
         with workers_of(self.workers, self.ray) as workers:
             own = self._judged(scenario, domains, workers, Bars(console))
