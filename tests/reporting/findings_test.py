@@ -2,13 +2,16 @@
 
 from __future__ import annotations
 
+import contextlib
 from pathlib import Path
 from typing import Any
 
 import pytest
 
+import ugat_marl
 from ugat_marl.data import Metrics
 from ugat_marl.effects import load_scenario
+from ugat_marl.policies import NamedRule
 from ugat_marl.reporting.intersection_findings import findings_maps, findings_table
 from ugat_marl.reporting.places import Places
 from ugat_marl.reporting.run_records import RunRecord
@@ -72,6 +75,15 @@ def test_effects_and_the_policy_that_was_kept(tmp_path: Path) -> None:
         "the policy kept so far 110 s, the policy after training 102 s, the rule 99 s. "
         "Kept was the rule."
     )
+    kept = tmp_path / "run" / "policies" / "fitted-street.pt"
+    kept.parent.mkdir(parents=True)
+    with contextlib.closing(ugat_marl.parallel_env("single-v1")) as env:
+        NamedRule("max-pressure:20", env).save(kept)
+    section = found_on_street(record(tmp_path / "run", numbers))
+    assert section is not None and section["kept"].endswith("Kept was the rule max-pressure:20.")
+    kept.write_bytes(b"damaged")
+    section = found_on_street(record(tmp_path / "run", numbers))
+    assert section is not None and section["kept"].endswith("Kept was the rule.")
     assert found_on_street(record(tmp_path / "other", {"gate/alpha": 0.5})) is None
 
 

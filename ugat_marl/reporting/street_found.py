@@ -2,10 +2,13 @@
 
 from __future__ import annotations
 
+import contextlib
 from typing import Any
 
 from ugat_marl.effects import known_effects
+from ugat_marl.errors import CheckpointError
 from ugat_marl.grounding import JUDGED, LIBRARY
+from ugat_marl.policies import rule_in
 from ugat_marl.reporting.formats import number
 from ugat_marl.reporting.page import Grid
 from ugat_marl.reporting.run_records import RunRecord
@@ -105,4 +108,16 @@ def _kept(record: RunRecord) -> str:
         return ""
     best = min(told, key=lambda text: told[text])
     values = ", ".join(f"{text} {number(time_s)} s" for text, time_s in told.items())
+    if rule := _rule_kept(record):
+        best = f"{JUDGED['of_the_rule']} {rule}"
     return f"Average travel time in the fitted street: {values}. Kept was {best}."
+
+
+def _rule_kept(record: RunRecord) -> str | None:
+    """Return the spelling of the rule that was kept; None if a trained policy was."""
+    files = ("policy.pt", "policies/fitted-street.pt")  # of a job of tables, and of a training
+    for path in (record.directory / name for name in files):
+        if path.exists():
+            with contextlib.suppress(CheckpointError):
+                return rule_in(path)
+    return None
