@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import functools
 import json
+import math
 import re
 import struct
 import xml.etree.ElementTree as ET
@@ -16,6 +17,7 @@ from ugat_marl.__main__ import main
 from ugat_marl.effects import load_scenario
 from ugat_marl.experiments import (
     RuleEpisode,
+    as_json,
     best_phases,
     left_outside,
     measure_headroom,
@@ -297,6 +299,14 @@ def test_the_command_prints_json(capsys: pytest.CaptureFixture[str]) -> None:
     assert [len(item["phases"]) for item in facts["intersections"]] == [8, 3, 6, 2, 2, 4, 3]
     assert facts["headroom"] is None
     assert facts["problems"] == []
+
+
+def test_an_approach_that_nobody_passed_has_no_delay_in_json(single: Scenario) -> None:
+    delays = {"a": (3.0, 12.5), "b": (0.0, math.nan), "c": (0.0, math.inf)}
+    run = RuleEpisode("programme", 90, 9, 9, 9, 0, delays)
+    text = json.dumps(as_json(survey(single), [run], None, []), allow_nan=False)
+    (told,) = json.loads(text)["runs"]
+    assert told["approaches"] == {"a": [3.0, 12.5], "b": [0.0, None], "c": [0.0, None]}
 
 
 def test_a_scenario_to_mend_is_an_exit_code(capsys: pytest.CaptureFixture[str]) -> None:

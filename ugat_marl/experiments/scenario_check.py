@@ -286,9 +286,21 @@ def as_json(
     wrong: Sequence[str],
     outside: Mapping[str, int] | None = None,
 ) -> dict[str, object]:
-    """Return survey, runs, headroom and faults as values for JSON."""
+    """Return survey, runs, headroom and faults as values for JSON.
+
+    The delay of an approach is null where nobody passed.
+    """
     content: dict[str, object] = asdict(facts)
-    content["runs"] = [asdict(run) for run in runs]
+    content["runs"] = [
+        asdict(run)
+        | {
+            "approaches": {
+                road: (vehicles, delay_s if math.isfinite(delay_s) else None)
+                for road, (vehicles, delay_s) in run.approaches.items()
+            }
+        }
+        for run in runs
+    ]
     content["headroom"] = None if rows is None else [asdict(row) for row in rows]
     content["left_outside"] = dict(outside or {})
     content["problems"] = list(wrong)
