@@ -251,8 +251,8 @@ def _not_made(given: Any, name: str) -> str:
     """Return the reason why a class cannot be made into a policy, with the way out."""
     if all(hasattr(given, method) for method in NEEDED):
         return (
-            f"policy {name!r} is a learner: train it (ugat-marl train SCENARIO --learner {name}) "
-            f"and give the file of its policy, as {name}@FILE"
+            f"policy {name!r} is a learner: train it with --learner {name}, and give the file of "
+            f"its policy, as {name}@FILE"
         )
     return (
         f"policy {name!r}: the class is made as {given.__name__}(env) or {given.__name__}(), and "
