@@ -428,6 +428,9 @@ def test_names_that_a_module_imports_are_not_among_its_own() -> None:
         load_own("my_algo:Nothing", "learner")
     assert "Cycle" in error.value.allowed
     assert not {"Path", "Any", "np"} & set(error.value.allowed)
+    with pytest.raises(UnknownNameError) as error:
+        load_own("my_algo:Cycle.Nothing", "learner")
+    assert {"learn", "policy"} <= set(error.value.allowed)
 
 
 @pytest.mark.usefixtures("algorithm")

@@ -100,7 +100,7 @@ def load_own(name: str, what: str) -> Any:
         ) from None
     for part in path.split("."):
         if not hasattr(found, part):
-            own = getattr(found, "__name__", None)
+            own = getattr(found, "__module__", getattr(found, "__name__", None))
             names = [
                 key
                 for key, value in vars(found).items()
