@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections import Counter
-from collections.abc import Collection, Mapping
+from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass
 
 from ugat_marl.diagnosis import Routes
@@ -111,7 +111,7 @@ def busy_places(scenario: Scenario, seed: int) -> Busy:
         edges=tuple(sorted({network.lanes[x].edge for x in lanes})),
         detectors=tuple(item.id for item in detectors if rates.get(item.id, 0.0) >= BUSY_PER_HOUR),
         groups=groups,
-        beside=tuple(place for place in groups if has_next_lane(place, detectors, rates)),
+        beside=with_next_lane(groups, detectors, rates),
         room_m={place: _room_m(place, detectors, network) for place in groups},
         pairs=_pairs(detectors, rates, network),
         permitted=any(turns.get(way, 0.0) >= YIELDING_PER_HOUR for way in _yielding(network)),
@@ -175,11 +175,16 @@ def _groups(
     return (EVERYWHERE, *kinds, *sorted(on_edges))
 
 
-def has_next_lane(place: str, detectors: tuple[Detector, ...], rates: Mapping[str, float]) -> bool:
-    """Return True if vehicles on a next lane can be reported by the detectors of a place."""
-    beside = next_detectors(detectors)
-    names = detectors_at(place, detectors)
-    return any(rates.get(x, 0.0) >= BUSY_PER_HOUR for name in names for x in beside[name])
+def with_next_lane(
+    places: Sequence[str], detectors: tuple[Detector, ...], rates: Mapping[str, float]
+) -> tuple[str, ...]:
+    """Return the places whose detectors can report vehicles of a busy next lane."""
+    reporting = {
+        name
+        for name, beside in next_detectors(detectors).items()
+        if any(rates.get(other, 0.0) >= BUSY_PER_HOUR for other in beside)
+    }
+    return tuple(place for place in places if reporting & set(detectors_at(place, detectors)))
 
 
 def _room_m(place: str, detectors: tuple[Detector, ...], network: Network) -> tuple[float, float]:

@@ -18,7 +18,7 @@ from studies.blind.__main__ import LINE
 from studies.blind.cases import Case, read_label, read_plan
 from studies.blind.generate import Blueprint, Consequences, differing, generate
 from studies.blind.outside_effects import BusStops, Driveway
-from studies.blind.places import Busy, busy_places, has_next_lane, telling
+from studies.blind.places import Busy, busy_places, telling, with_next_lane
 from studies.blind.run import run_cases
 from studies.blind.sampling import (
     GROUPS,
@@ -344,7 +344,8 @@ def test_splash_is_hidden_where_a_next_lane_is_busy() -> None:
     detectors = tuple(Detector(f"stop:{lane}", lane, 97.5, 0.0, "stop") for lane in lanes)
 
     def shown(place: str, rates: Mapping[str, float]) -> bool:
-        return has_next_lane(place, detectors, {f"stop:{lane}": n for lane, n in rates.items()})
+        at = {f"stop:{lane}": n for lane, n in rates.items()}
+        return with_next_lane([place], detectors, at) == (place,)
 
     assert shown("*", lanes)
     assert shown("stop@wide", lanes)
