@@ -127,22 +127,20 @@ class Bars:
             return
         progress = _bars(self._console)
         bar = progress.add_task(name, total=total, note="")
-        printed, left = time.monotonic(), total
+        lines, left = _Lines(self._console, progress), total
         room = self._console.width - _TAKEN - max(len(name), _NAME_WIDTH)
         whole = self._whole
 
         def advance(note: str = "") -> None:
-            nonlocal printed, left
+            nonlocal left
             fields: dict[str, Any] = {"note": note if len(note) <= room else ""} if note else {}
             progress.update(bar, advance=1, **fields)
             left -= 1
             if whole is not None and left >= 0:
                 whole.advance(name, 1)
-            if not self._console.is_terminal and time.monotonic() - printed >= _QUIET_S:
-                printed = time.monotonic()
-                self._console.print(progress.make_tasks_table(progress.tasks))
+            lines.print_at_times()
             if whole is not None:
-                whole.print_at_times()
+                whole.lines.print_at_times()
 
         with contextlib.nullcontext() if whole is not None else progress:
             if whole is not None:
@@ -152,8 +150,8 @@ class Bars:
                 progress.update(bar, completed=total)  # the work may end early by its own rule
                 if whole is not None:
                     whole.advance(name, max(left, 0))
-                    self._console.print(progress.make_tasks_table(progress.tasks))
-                    whole.print_at_times()
+                    lines.print()
+                    whole.lines.print_at_times()
             finally:
                 if whole is not None:
                     whole.step = None
@@ -184,15 +182,32 @@ class Bars:
             self._console.print(text, highlight=False, markup=False)
 
 
+class _Lines:
+    """Lines that bars leave behind."""
+
+    def __init__(self, console: Console, bars: Progress) -> None:
+        self._console, self._bars = console, bars
+        self._printed = time.monotonic()
+
+    def print(self) -> None:
+        """Print the bars."""
+        self._console.print(self._bars.make_tasks_table(self._bars.tasks))
+
+    def print_at_times(self) -> None:
+        """Print the bars if there is no terminal, at most once a minute."""
+        if not self._console.is_terminal and time.monotonic() - self._printed >= _QUIET_S:
+            self._printed = time.monotonic()
+            self.print()
+
+
 class _Whole:
     """Bar of everything, in units of weight, and the bar of the task at hand."""
 
     def __init__(self, name: str, shares: Mapping[str, Share], console: Console) -> None:
         self._shares = shares
-        self._console = console
-        self._printed = time.monotonic()
         self._left = {name: float(share.units) for name, share in shares.items()}
         self.progress = _bars(console, counted=False)
+        self.lines = _Lines(console, self.progress)
         self.step: Progress | None = None
         total = sum(share.units * share.weight for share in shares.values())
         self._bar = self.progress.add_task(name, total=max(total, 1e-9), note="")
@@ -205,12 +220,6 @@ class _Whole:
                 self._left[kind] -= counted
                 self.progress.update(self._bar, advance=counted * share.weight)
                 return
-
-    def print_at_times(self) -> None:
-        """Print the bar if there is no terminal, at most once a minute."""
-        if not self._console.is_terminal and time.monotonic() - self._printed >= _QUIET_S:
-            self._printed = time.monotonic()
-            self._console.print(self.progress.make_tasks_table(self.progress.tasks))
 
     def drawn(self) -> Group:
         """Return both bars."""

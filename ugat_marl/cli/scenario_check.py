@@ -251,27 +251,22 @@ def _intersections(agents: Sequence[IntersectionFacts], names: LightNames) -> Ta
 def _row(light: IntersectionFacts) -> tuple[str, ...]:
     permitted = sum(bool(phase.permitted) for phase in light.phases)
     remarks = {
-        "junctions joined": len(light.junctions) if len(light.junctions) > 1 else 0,
-        "phases with permitted turns": permitted,
-        "links on red after a stop": light.right_on_red,
-        "links always green": light.always_green,
-        "U-turns": light.u_turns,
-        "crossings": light.crossings,
-        "crossings never green": light.unserved_crossings,
-        "phases for people on foot alone": light.foot_phases,
-        "links without a light": light.uncontrolled,
-        "links never green": len(light.unserved_links),
-        "lanes served in part": len(light.partly_served),
-        "lanes counted with those behind": len(light.lanes_behind),
+        ("junction", " joined"): len(light.junctions) if len(light.junctions) > 1 else 0,
+        ("phase", " with permitted turns"): permitted,
+        ("link", " on red after a stop"): light.right_on_red,
+        ("link", " always green"): light.always_green,
+        ("U-turn", ""): light.u_turns,
+        ("crossing", ""): light.crossings,
+        ("crossing", " never green"): light.unserved_crossings,
+        ("phase", " for people on foot alone"): light.foot_phases,
+        ("link", " without a light"): light.uncontrolled,
+        ("link", " never green"): len(light.unserved_links),
+        ("lane", " served in part"): len(light.partly_served),
+        ("lane", " counted with those behind"): len(light.lanes_behind),
     }
     counts = (light.lanes, light.links, light.movements, light.conflicts, len(light.phases))
-    return (*map(str, counts), "; ".join(_counted(n, what) for what, n in remarks.items() if n))
-
-
-def _counted(count: int, what: str) -> str:
-    """Return a number with a noun in the plural, such as "2 lanes served in part"."""
-    noun, space, rest = what.partition(" ")
-    return f"{count} {noun.removesuffix('s') if count == 1 else noun}{space}{rest}"
+    told = (f"{counted(n, noun)}{rest}" for (noun, rest), n in remarks.items() if n)
+    return (*map(str, counts), "; ".join(told))
 
 
 def _greens_of_file(agents: Sequence[IntersectionFacts], names: LightNames) -> list[str]:

@@ -21,8 +21,8 @@ EPOCH = 0.05
 """Rough cost of an epoch of the fits of f and h, in episodes."""
 
 
-def _episodes(count: int) -> str:
-    return f"{count} episode{'' if count == 1 else 's'}"
+def _counted(count: int, noun: str) -> str:
+    return f"{count} {noun}{'' if count == 1 else 's'}"
 
 
 def described_plan(
@@ -47,12 +47,13 @@ def described_plan(
         elif setting.ugat is not None:
             times = setting.ugat.iterations
             does = (
-                f"{setting.name}: {_episodes(setting.ugat.pretrain_episodes)} in {job.sim}, then "
-                f"{times} iteration{'' if times == 1 else 's'} of {setting.ugat.grounded_episodes} "
+                f"{setting.name}: {_counted(setting.ugat.pretrain_episodes, 'episode')} in "
+                f"{job.sim}, then {_counted(times, 'iteration')} of "
+                f"{setting.ugat.grounded_episodes} "
                 f"for {job.target or 'the street of the log'}"
             )
         else:
-            does = f"{setting.name}: {_episodes(job.episodes)}"
+            does = f"{setting.name}: {_counted(job.episodes, 'episode')}"
         lines.append(f"  {number}. {does}; {evaluated * len(job.rows)} to judge it")
     total = sum(share.units * share.weight for share in work_of(todo, folder, episode_s).values())
     lines.append(f"  in all about {total:.0f} episodes; the bar says how long they take")

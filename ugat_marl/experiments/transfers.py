@@ -467,8 +467,6 @@ def _check(config: TransferConfig, scenario: Scenario, env: TrafficEnv, reporter
         env: The simulation.
         reporter: Receives a note if the real log is from another domain.
     """
-    if config.real != "none":
-        scenario_in_domain(scenario, config.real)
     make = config.spec.factory(config.device)
     if is_own(config.learner) and not check_own_learner(make, env, config.seed).savable:
         reporter.say(

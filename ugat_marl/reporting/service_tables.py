@@ -33,6 +33,7 @@ Delays = Mapping[str, tuple[float, float]]
 NOBODY = "none passed"
 """Cell of an approach at which vehicles waited and none passed."""
 EMPTY = "none came"
+"""Cell of an approach that no vehicle came to."""
 
 
 def approach_text(vehicles: float, delay_s: float) -> str:

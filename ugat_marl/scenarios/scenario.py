@@ -206,8 +206,15 @@ _SYNONYMS = {
 """Names that SUMO allows for the elements of a configuration."""
 
 
-class _Configuration:
-    """Values of a SUMO configuration."""
+class SumoConfiguration:
+    """Values of a ``.sumocfg``, under any of the names that SUMO allows for them.
+
+    Args:
+        path: The file.
+
+    Raises:
+        ScenarioError: The file cannot be read.
+    """
 
     def __init__(self, path: Path) -> None:
         self.path = path
@@ -215,9 +222,19 @@ class _Configuration:
         self.given = {item.tag: item.get("value", item.get("v", "")) for item in root.iter()}
 
     def value(self, key: str, default: str = "") -> str:
+        """Return the text of an element; `default` if it is missing."""
         return next((self.given[name] for name in _SYNONYMS[key] if name in self.given), default)
 
+    def names(self, key: str) -> list[str]:
+        """Return the names of files in an element."""
+        return _names(self.value(key), self.path.parent)
+
     def seconds(self, key: str, default: str) -> float:
+        """Return a time in s.
+
+        Raises:
+            ScenarioError: It is none.
+        """
         text = self.value(key, default)
         try:
             return parse_time(text)
@@ -225,34 +242,17 @@ class _Configuration:
             raise ScenarioError(f"{self.path}: {key} = {text!r} is not a time in seconds") from None
 
     def physics(self) -> dict[str, Any]:
+        """Return the step length and the options of SUMO, as in ``scenario.toml``."""
         options = {option: self.given[option] for option in self.given if option in OPTIONS}
         return {"step_length_s": self.seconds("step-length", "1"), "sumo": options}
 
 
-def sumocfg_physics(path: Path) -> dict[str, Any]:
-    """Return the step length and the options of SUMO in a ``.sumocfg``, as in ``scenario.toml``.
-
-    Raises:
-        ScenarioError: The file cannot be read.
-    """
-    return _Configuration(path).physics()
-
-
-def sumocfg_additional(path: Path) -> list[str]:
-    """Return the names of the additional files in a ``.sumocfg``.
-
-    Raises:
-        ScenarioError: The file cannot be read.
-    """
-    return _names(_Configuration(path).value("additional-files"), path.parent)
-
-
 def _load_sumocfg(path: Path, scenario_id: str) -> Scenario:
-    configuration = _Configuration(path)
-    value, seconds = configuration.value, configuration.seconds
+    configuration = SumoConfiguration(path)
+    seconds = configuration.seconds
 
     def documents(key: str, kind: str = "") -> tuple[Document, ...]:
-        names = _names(value(key), path.parent)
+        names = configuration.names(key)
         if kind and not names:
             raise ScenarioError(f"{path}: no <{key} value=...>; a scenario needs {kind}")
         for name in names:

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import shutil
-import xml.etree.ElementTree as ET
 from collections.abc import Iterator, Mapping, Sequence
 from itertools import pairwise
 from pathlib import Path
@@ -14,12 +13,7 @@ from ugat_marl.progress import Reporter
 from ugat_marl.scenarios.demand import edges_used
 from ugat_marl.scenarios.importers.long_files import scan
 from ugat_marl.scenarios.importers.making import RoadFiles, RoadSource, VehicleFiles, VehicleSource
-from ugat_marl.scenarios.scenario import (
-    Document,
-    read_scenario,
-    sumocfg_additional,
-    sumocfg_physics,
-)
+from ugat_marl.scenarios.scenario import Document, SumoConfiguration, read_scenario
 
 _CONFIGURATIONS = (".sumocfg", ".sumocfg.xml")
 
@@ -79,9 +73,10 @@ def _configured(
         network, routes, additional = scenario.network, scenario.routes, scenario.additional
         settings = scenario.settings.model_dump(mode="json", exclude_defaults=True)
     else:
-        network, settings = _network_of(path), sumocfg_physics(path)
+        configuration = SumoConfiguration(path)
+        network, settings = _network_of(configuration), configuration.physics()
         routes = additional = ()
-        if left_out := sumocfg_additional(path):
+        if left_out := configuration.names("additional-files"):
             reporter.say(
                 f"note: {path.name}: its vehicles are replaced, so its additional files are left "
                 f"out, too ({', '.join(left_out)}); add those without vehicles to scenario.toml"
@@ -109,15 +104,14 @@ def _configured(
     )
 
 
-def _network_of(path: Path) -> Document:
-    root: ET.Element = parse_xml(read_bytes(path), str(path))
-    for element in root.iter():
-        if element.tag in ("net-file", "net", "n"):
-            file = path.parent / element.get("value", element.get("v", ""))
-            if not file.is_file():
-                raise ScenarioError(f"{path}: <{element.tag}> names {file}, which does not exist")
-            return Document(file.name, file)
-    raise ScenarioError(f"{path}: no <net-file value=...>; a scenario needs a network")
+def _network_of(configuration: SumoConfiguration) -> Document:
+    path, name = configuration.path, configuration.value("net-file")
+    if not name:
+        raise ScenarioError(f"{path}: no <net-file value=...>; a scenario needs a network")
+    file = path.parent / name
+    if not file.is_file():
+        raise ScenarioError(f"{path}: <net-file> names {file}, which does not exist")
+    return Document(file.name, file)
 
 
 def _put(document: Document, folder: Path, link: bool) -> str:
