@@ -27,7 +27,7 @@ from studies.osm_extracts import make_all
 from ugat_marl.data import write_csv
 from ugat_marl.experiments import DIRECT, RULE, STREET, Comparison, PaperConfig, compare
 from ugat_marl.files import write_whole
-from ugat_marl.grounding import StreetConfig
+from ugat_marl.grounding import RIVALS, StreetConfig
 from ugat_marl.progress import Bars
 from ugat_marl.reporting import seeds_csv
 from ugat_marl.scenarios import NetworkRanges, draw_scenario
@@ -102,6 +102,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
     parser.add_argument(
         "--street-rules", type=int, help="episodes of each rule in the fitted street; 0 for none"
     )
+    parser.add_argument("--rival", choices=RIVALS, default=StreetConfig.rival)
     parser.add_argument("--only", nargs="+", help="names of the networks to run; all are drawn")
     parser.add_argument("--jobs", type=int)
     given = parser.parse_args(arguments)
@@ -116,7 +117,9 @@ def main(arguments: Sequence[str] | None = None) -> None:
         rows=ROWS,
         evaluation_seeds=3,
         rule_budget=given.rule_budget,
-        street=StreetConfig(simulations=given.simulations, rule_budget=given.street_rules),
+        street=StreetConfig(
+            simulations=given.simulations, rule_budget=given.street_rules, rival=given.rival
+        ),
     )
     console, outcomes = Console(width=100), list[Outcome]()
     for scenario in scenarios(given):

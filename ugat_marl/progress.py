@@ -214,12 +214,12 @@ class _Whole:
 
     def advance(self, name: str, units: int) -> None:
         """Count units of a task; more of them than expected count nothing."""
-        for kind, share in self._shares.items():
-            if name.startswith(kind):
-                counted = min(units, self._left[kind])
-                self._left[kind] -= counted
-                self.progress.update(self._bar, advance=counted * share.weight)
-                return
+        kinds = [kind for kind in self._shares if name.startswith(kind)]
+        if kinds:
+            kind = max(kinds, key=len)
+            counted = min(units, self._left[kind])
+            self._left[kind] -= counted
+            self.progress.update(self._bar, advance=counted * self._shares[kind].weight)
 
     def drawn(self) -> Group:
         """Return both bars."""

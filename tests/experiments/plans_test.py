@@ -42,11 +42,13 @@ def test_a_fitted_street_simulates_shorter_worlds(tmp_path: Path) -> None:
     work = work_of(planned_jobs(config), tmp_path, 7200.0)
     assert (work["fitting"].units, work["fitting"].weight) == (60, 0.25)
     assert work["comparing"].units == 2 * 3 * 2
+    assert work["under delays"].units == 2 * 6 * 2
+    assert work["late greens"].units == 2 * ugat.grounded_episodes
 
 
 def test_lessons_are_work(tmp_path: Path) -> None:
-    def lessons(budget: int, learner: str) -> int:
-        ugat = UgatConfig(iterations=2, street=StreetConfig(rule_budget=budget))
+    def lessons(budget: int, learner: str, rival: Any = "none") -> int:
+        ugat = UgatConfig(iterations=2, street=StreetConfig(rule_budget=budget, rival=rival))
         config = replace(SMALL, ugat=ugat, learner=learner, dqn=DQNConfig())
         return work_of(planned_jobs(config), tmp_path, 7200.0)["lessons"].units
 
@@ -54,6 +56,8 @@ def test_lessons_are_work(tmp_path: Path) -> None:
     assert lessons(0, UNIVERSAL_NAME) == 3 * (14 + 3 * 2 + 3)
     # where rules race in the fitted street anyway, only the shown ones
     assert lessons(4, UNIVERSAL_NAME) == (14 + 3 * 2 + 3) + 2 * 3
+    # the rival looks for the rule that is best with late greens
+    assert lessons(4, UNIVERSAL_NAME, "matched") == lessons(4, UNIVERSAL_NAME) + 2 * 23
     assert lessons(0, DQN_NAME) == 0
 
 

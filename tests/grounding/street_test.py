@@ -52,7 +52,7 @@ from ugat_marl.simulation import kept_warm
 
 SCENARIO = load_scenario("single-v1")
 LATE = "execution_delay=20+lost_commands=0.2"
-QUICK = StreetConfig(simulations=20, further=4, simulated_s=60.0, rule_budget=0)
+QUICK = StreetConfig(simulations=20, further=4, simulated_s=60.0, rule_budget=0, rival="none")
 
 
 def recorded(domain: str, seconds: float = 900.0, seed: int = 0) -> TransitionLog:

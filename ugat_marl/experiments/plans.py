@@ -7,7 +7,7 @@ from collections.abc import Sequence
 from pathlib import Path
 
 from ugat_marl.experiments.jobs import Job, Record
-from ugat_marl.grounding import UgatConfig
+from ugat_marl.grounding import ROLL_OUTS, UgatConfig
 from ugat_marl.policies import (
     STANDARD_RULES,
     TUNED_RULES,
@@ -97,6 +97,8 @@ def work_of(plan: Sequence[Job], folder: Path, episode_s: float) -> dict[str, Sh
             first = lessons if ugat.pretrain_episodes else 0
             later = lesson_episodes(learner.name, learner.dqn, known=known)
             add("lessons", first + ugat.iterations * later)
+            if ugat.grounding == "street" and ugat.street.has_rival:
+                add("lessons", ugat.iterations * lessons)
     return {name: Share(round(count), weights[name]) for name, count in units.items()}
 
 
@@ -130,6 +132,9 @@ def _grounded_work(
         work["fitting"] = (worlds if times else 0, short)
         work["fitted street"] = (times * ugat.grounded_episodes, 1.0)
         work["comparing"] = (2 * street.judged * times, 1.0)
+        if street.has_rival:
+            work["under delays"] = (times * ROLL_OUTS, 1.0)
+            work["late greens"] = (times * ugat.grounded_episodes, 1.0)
         if rule_budget:
             specs = [spec for name in TUNED_RULES for spec in rule_settings(name, rule_budget)]
             work["rules"] = (times * sum(race_fields(len(specs))), 1.0)

@@ -21,10 +21,12 @@ from ugat_marl.envs import AnyParallelEnv, TrafficEnv, parallel_env
 from ugat_marl.errors import OptionError
 from ugat_marl.grounding import (
     CHECKPOINT_EPISODES,
+    DIRECT_LEARNER,
     MATCHED_REWARDS,
     LaneView,
     NegativeControl,
     Probe,
+    Rival,
     RunState,
     ShuffledWorld,
     SimulatedWorld,
@@ -35,6 +37,7 @@ from ugat_marl.grounding import (
     UgatConfig,
     World,
     answer_with_noise,
+    is_kept,
     neighbours_of,
     street_prior,
 )
@@ -146,7 +149,8 @@ def train_grounded(
             )
         algorithm = street_training(make, workers, device=device, **common)
         residual = ugat.residual(env.recorded_layouts, seed, neighbours_of(env))
-        fitted: Any = StreetFit(street_prior(env, ugat.street), residual=residual)
+        rival = _rival(make, env, real, ugat, seed, start or run.directory / DIRECT_LEARNER)
+        fitted: Any = StreetFit(street_prior(env, ugat.street), residual=residual, rival=rival)
         renew = algorithm.renew
     else:
         fitted = ugat.transform(env.recorded_layouts, seed, neighbours_of(env))
@@ -161,6 +165,21 @@ def train_grounded(
     with contextlib.closing(sim), contextlib.closing(real):
         algorithm.train(state)
     return state
+
+
+def _rival(
+    make: LearnerFactory, env: TrafficEnv, real: World, config: UgatConfig, seed: int, start: Path
+) -> Rival | None:
+    """Return the second learner of a fitted street; None without one, and where none can be.
+
+    A learner that cannot be kept cannot begin where plain training ended. Rewards are matched only
+    where one policy acts in both worlds, and with rewards that fall with every delay.
+    """
+    matches = real.replay() is None and str(env.options.reward) in MATCHED_REWARDS
+    if not config.street.has_rival or not matches:
+        return None
+    learner = make(env, seed)
+    return Rival(learner, start) if is_kept(learner) else None
 
 
 def _policy_reader(make: LearnerFactory, env: TrafficEnv) -> Callable[[Path], Policy]:

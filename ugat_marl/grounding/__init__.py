@@ -17,7 +17,8 @@ paper. The modules, from data to the algorithm:
 - `channel`, `eyes`, `summaries`, `regression`, `posterior`: commands, detectors and worlds of a
   street, fitted from its log; `street` puts them together and draws the world of each episode.
 - `config`, `state`, `algorithm`: settings, checkpoint, plain training.
-- `ugat`, `street_training`: Algorithm 1; training in a fitted street.
+- `ugat`, `street_training`: Algorithm 1; training in a fitted street, and its `rival`, which
+  trains with late greens.
 """
 
 import lazy_loader

@@ -35,11 +35,14 @@ from .posterior import Worlds as Worlds
 from .reports import FitReport as FitReport
 from .residual import Residual as Residual
 from .residual import ResidualConfig as ResidualConfig
+from .rival import ROLL_OUTS as ROLL_OUTS
+from .rival import Rival as Rival
 from .stacked import Stack as Stack
 from .stacked import stack_log as stack_log
 from .state import RunState as RunState
 from .state import is_kept as is_kept
 from .street import PARTS as PARTS
+from .street import RIVALS as RIVALS
 from .street import DrawnEnv as DrawnEnv
 from .street import FittedStreet as FittedStreet
 from .street import Simulation as Simulation

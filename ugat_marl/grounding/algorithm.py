@@ -13,7 +13,7 @@ from ugat_marl.grounding.config import UgatConfig
 from ugat_marl.grounding.gate import Gate
 from ugat_marl.grounding.state import RunState, is_kept
 from ugat_marl.grounding.worlds import World
-from ugat_marl.policies import Policy, Taught
+from ugat_marl.policies import Learner, Policy, Taught
 
 CHECKPOINT_EPISODES = 10
 """Episodes of plain training between two checkpoints."""
@@ -49,11 +49,11 @@ class Algorithm:
         """Train in plain E_sim for M episodes; keep the policy as direct transfer (line 1)."""
         wanted = self.config.pretrain_episodes
         if state.pretrained == 0 < wanted:
-            self._attend(state, self.env, "plain sim")
+            self._attend(state.learner, self.env, "plain sim")
         while state.pretrained < wanted:
             episodes = min(CHECKPOINT_EPISODES, wanted - state.pretrained)
             numbers = f"{state.pretrained + 1}-{state.pretrained + episodes}"
-            self._learn(state, self.env, episodes, f"plain sim, episode {numbers}")
+            self._learn(state.learner, self.env, episodes, f"plain sim, episode {numbers}")
             state.pretrained += episodes
             if state.pretrained < wanted:
                 state.save(self.run)
@@ -67,7 +67,7 @@ class Algorithm:
 
     def _attend(
         self,
-        state: RunState[Any],
+        learner: Learner,
         env: AnyParallelEnv,
         title: str,
         best: str | None = None,
@@ -76,7 +76,7 @@ class Algorithm:
         """Let the learner watch the rule that is good in an environment, if it has a teacher.
 
         Args:
-            state: The state, with the learner.
+            learner: The learner.
             env: The environment.
             title: Name of the environment in messages.
             best: The best rule there, if it is known.
@@ -85,7 +85,6 @@ class Algorithm:
         Returns:
             The policy after the lessons; None without a teacher.
         """
-        learner = state.learner
         if not isinstance(learner, Taught) or not (number := learner.plays(env, best)):
             return None
         with (
@@ -94,17 +93,24 @@ class Algorithm:
         ):
             name = learner.attend(env, self.seed, lambda rule: advance(note=rule), best)
         self.run.reporter.say(f"{title}: {name} teaches")
-        return state.learner.policy()
+        return learner.policy()
 
-    def _learn(self, state: RunState[Any], env: AnyParallelEnv, episodes: int, title: str) -> None:
-        """Let the learner train in an environment; log every episode."""
+    def _learn(
+        self,
+        learner: Learner,
+        env: AnyParallelEnv,
+        episodes: int,
+        title: str,
+        stage: str = "episode",
+    ) -> None:
+        """Let the learner train in an environment; log every episode, under a stage."""
         with self.run.reporter.task(title, episodes) as advance:
 
             def on_episode(number: int, numbers: Mapping[str, float]) -> None:
-                self.run.log("episode", number, numbers)
+                self.run.log(stage, number, numbers)
                 advance(note=f"return {numbers['return']:.0f}" if "return" in numbers else "")
 
-            state.learner.learn(env, episodes, self.seed, on_episode)
+            learner.learn(env, episodes, self.seed, on_episode)
 
 
 def iteration_name(state: RunState[Any]) -> str:

@@ -23,7 +23,7 @@ import copy
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
 import numpy as np
 import torch
@@ -68,6 +68,9 @@ PARTS = ("channel", "eyes", "service", "effects")
 """Parts of a street, each of which can be left out."""
 
 
+RIVALS = ("none", "matched")
+"""Policies that may compete with the one that was trained in the fitted street."""
+
 RULE_BUDGET = 6
 """Budget of each rule in worlds of the fitted street, with a learner that rules teach."""
 
@@ -88,6 +91,8 @@ class StreetConfig:
             street. The best rule of all teaches the learner, and is kept if it is better than the
             trained policies. With 0 only trained policies are kept. None stands for `RULE_BUDGET`
             with a learner that rules teach, and for 0 with others.
+        rival: "matched": a second learner trains in the simulation with greens that are late until
+            rewards match, and its policy is compared with the others. "none" goes without.
         without: Effects left out of the library.
         channel: Numbers of the fit of the command channel.
         eyes: Numbers of the fit of the detectors.
@@ -98,8 +103,9 @@ class StreetConfig:
     simulations: int = 160
     further: int = 40
     simulated_s: float = 1800.0
-    judged: int = 4
+    judged: int = 8
     rule_budget: int | None = None
+    rival: Literal["none", "matched"] = "matched"
     without: tuple[str, ...] = ()
     channel: ChannelConfig = field(default_factory=ChannelConfig)
     eyes: EyesConfig = field(default_factory=EyesConfig)
@@ -111,6 +117,8 @@ class StreetConfig:
         for part in self.parts:
             if part not in PARTS:
                 raise UnknownNameError("part of a street", part, PARTS)
+        if self.rival not in RIVALS:
+            raise UnknownNameError("rival", self.rival, RIVALS)
         if self.simulations < 20:
             raise OptionError(f"street.simulations = {self.simulations}: must be at least 20")
         if self.further < 0:
@@ -133,6 +141,11 @@ class StreetConfig:
         if self.rule_budget is None:
             return RULE_BUDGET if taught else 0
         return self.rule_budget
+
+    @property
+    def has_rival(self) -> bool:
+        """True if a second learner competes with the first one."""
+        return self.rival != "none" and self.judged > 0
 
     def of_log(self, real: TransitionLog) -> StreetConfig:
         """Return the settings for a log; estimated vehicles are no readings of detectors."""

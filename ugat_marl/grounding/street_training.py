@@ -10,11 +10,12 @@
      6      find the rule that is best in worlds of the street; watch it, if the learner has a
             teacher; for e = 1, ..., E episodes: draw a world of the street, update pi in it; where
             f is trusted, ground its actions
-     7      keep the best of pi, pi after the lessons, the rule, and the policy kept so far, in the
-            same worlds of the street; training goes on from pi
+     7      train a rival in E_sim with late greens, which begins with pi of line 1 (`rival`)
+     8      keep the best of pi, pi after the lessons, the rival, the rule, and the policy kept so
+            far, in the same worlds of the street; training goes on from pi
 
 Line 5 is an option. Where commands are late, a grounded action would be late as well, and none is
-grounded.
+grounded. There is no rival then, nor where detectors are at fault.
 
 If commands are late or lost, the policy needs to see its own last commands. If detectors are at
 fault, the numbers that it learnt to read mean something else. A policy that did not see commands,
@@ -34,6 +35,7 @@ from ugat_marl.grounding.fitting import Fitter
 from ugat_marl.grounding.oversaturation import Oversaturation
 from ugat_marl.grounding.posterior import Worlds
 from ugat_marl.grounding.residual import Residual
+from ugat_marl.grounding.rival import ROLL_OUTS, Rival, late_world, matched_delays
 from ugat_marl.grounding.state import RunState
 from ugat_marl.grounding.street import (
     FittedStreet,
@@ -61,10 +63,14 @@ from ugat_marl.seeding import derive_seed
 RESIDUAL = "residual.pt"
 """File of the residual, beside that of the street."""
 
+RIVAL = "rival.pt"
+"""File of the rival, beside that of the street."""
+
 JUDGED = {
     "before": "the policy kept so far",
     "after_the_lessons": "the policy after the lessons",
     "after": "the policy after training",
+    "of_the_rival": "the policy of late greens",
     "of_the_rule": "the rule",
 }
 """Metrics ``judged/<name>`` of the policies that are compared in the fitted street, in words."""
@@ -79,12 +85,14 @@ class StreetFit:
         street: The street; None before the first fit.
         known: Results of earlier fits.
         residual: f, h and gate on top of the street; None without.
+        rival: A second learner, which trains with late greens; None without.
     """
 
     worlds: Worlds
     street: FittedStreet | None = None
     known: Known = field(default_factory=Known)
     residual: Residual | None = None
+    rival: Rival | None = None
 
     @property
     def view(self) -> tuple[int, bool]:
@@ -95,11 +103,13 @@ class StreetFit:
         return self.street.commands, eyes is not None and eyes.changes
 
     def save(self, path: Path) -> None:
-        """Write the street to a file, and the residual beside it; nothing before the first fit."""
+        """Write the street to a file, and the rest beside it; nothing before the first fit."""
         if self.street is not None:
             self.street.save(path, self.known.simulated)
             if self.residual is not None:
                 self.residual.save(path.with_name(RESIDUAL))
+            if self.rival is not None:
+                self.rival.save(path.with_name(RIVAL))
 
     def load(self, path: Path) -> None:
         """Restore a file of `save`; without one, nothing was fitted.
@@ -111,6 +121,8 @@ class StreetFit:
             self.street, self.known = FittedStreet.load(path, self.worlds)
             if self.residual is not None:
                 self.residual.load(path.with_name(RESIDUAL))
+            if self.rival is not None:
+                self.rival.load(path.with_name(RIVAL))
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -160,12 +172,13 @@ class StreetTraining(Algorithm):
                 grounded = env if residual is None else residual.around(env)
                 rule = self._best_rule(state, street)  # line 6
                 held = residual and residual.transform.gate
-                taught = self._attend(state, grounded, title, rule and rule.spec, held)
-                self._learn(state, grounded, episodes, title)
+                taught = self._attend(state.learner, grounded, title, rule and rule.spec, held)
+                self._learn(state.learner, grounded, episodes, title)
             if residual is not None and residual.acts:
                 gate = residual.end_iteration().as_dict()
                 numbers |= {f"residual/gate/{name}": value for name, value in gate.items()}
-            numbers |= self._keep_better(state, street, taught, rule)  # line 7
+            rival, told = self._train_rival(state, policy)  # line 7
+            numbers |= told | self._keep_better(state, street, taught, rival, rule)  # line 8
             if self.probe is not None:
                 numbers |= self.probe(state.policy())
             self.run.log("iteration", state.iteration + 1, numbers)
@@ -199,11 +212,42 @@ class StreetTraining(Algorithm):
 
             return rules[next(iter(race(list(rules), len(fields), play)))]
 
+    def _train_rival(
+        self, state: RunState[StreetFit], policy: Policy
+    ) -> tuple[Policy | None, dict[str, float]]:
+        """Train the rival for an iteration, with greens that are late (line 7).
+
+        Args:
+            state: The state, with the fitted street.
+            policy: The policy of the latest log.
+
+        Returns:
+            The rival's policy, and numbers for the metrics. The policy is None without a rival,
+            where commands are late or detectors at fault, and where no green has to be late.
+        """
+        rival, name = state.transform.rival, iteration_name(state)
+        if rival is None or self._begins_anew((0, False), state.transform.view):
+            return None, {}
+        with self.run.reporter.task(f"under delays, {name}", ROLL_OUTS) as advance:
+            seed = derive_seed(self.seed, "rival", state.iteration)
+            delay_s = matched_delays(state.real[-1], self.simulation, policy, seed, advance)
+        numbers = {f"rival/late_s/{agent}": late_s for agent, late_s in delay_s.items()}
+        if not any(delay_s.values()):
+            return None, numbers
+        learner, title = rival.begin(), f"late greens, {name}"
+        with contextlib.closing(self.simulation.plain(0)) as env:
+            world = late_world(delay_s, env.intersection_of)
+        with contextlib.closing(self.simulation.env(world)) as env:
+            self._attend(learner, env, title)
+            self._learn(learner, env, self.config.grounded_episodes, title, "rival episode")
+        return learner.policy(), numbers
+
     def _keep_better(
         self,
         state: RunState[StreetFit],
         street: FittedStreet,
         taught: Policy | None,
+        rival: Policy | None,
         rule: NamedRule | None,
     ) -> dict[str, float]:
         """Compare the new policies with the kept one in worlds of the street; keep the best.
@@ -212,6 +256,7 @@ class StreetTraining(Algorithm):
             state: The state, with the learner after its training.
             street: The fitted street.
             taught: Policy after the lessons; None if there were none.
+            rival: Policy of the rival; None without one.
             rule: The best rule; None if rules are left out.
 
         Returns:
@@ -222,7 +267,7 @@ class StreetTraining(Algorithm):
             return {}
         kept = state.best or state.direct
         assert kept is not None  # plain training comes first
-        known = (kept, taught, state.learner.policy(), rule)
+        known = (kept, taught, state.learner.policy(), rival, rule)
         policies = {
             name: policy for name, policy in zip(JUDGED, known, strict=True) if policy is not None
         }

@@ -97,8 +97,9 @@ class Ugat(Algorithm):
             report = self._fit(state, device, rewards)  # lines 5 and 6
             self._prepare_gate(state, report)  # input alpha, line 13
             title = f"grounded, {iteration_name(state)}"
-            self._attend(state, grounded_env, title, gate=state.transform.gate)
-            self._learn(state, grounded_env, self.config.grounded_episodes, title)  # lines 8 to 16
+            self._attend(state.learner, grounded_env, title, gate=state.transform.gate)
+            episodes = self.config.grounded_episodes
+            self._learn(state.learner, grounded_env, episodes, title)  # lines 8 to 16
             gate = self._update_alpha(state)  # line 17
             self._log(state, report, gate)
             state.iteration += 1

@@ -1,0 +1,147 @@
+"""The rival of a fitted street: its greens are as late as the street's, and it survives a stop."""
+
+from __future__ import annotations
+
+import contextlib
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+
+from tests.interrupts import KillAt
+from tests.runs import SMALL, checkpoint_of, numbers, play_nothing, weights
+from ugat_marl.data import TransitionLog
+from ugat_marl.effects import load_scenario
+from ugat_marl.envs import parallel_env
+from ugat_marl.errors import UnknownNameError
+from ugat_marl.experiments import transfer
+from ugat_marl.grounding import DIRECT_LEARNER, Simulation, StreetConfig, StreetTraining
+from ugat_marl.grounding.rival import ROLL_OUTS, late_world, matched_delays
+from ugat_marl.grounding.street import StreetWorld
+from ugat_marl.policies import EpsilonGreedy, make_rule, observer_of, roll_out
+
+QUICK = StreetConfig(simulations=20, further=4, simulated_s=60.0, judged=1, rule_budget=0)
+CONFIG = replace(
+    SMALL, ugat=replace(SMALL.ugat, grounding="street", street=QUICK, iterations=1)
+)  # fmt: skip
+LATE_S = 2.5
+
+
+def rivals_win(patch: pytest.MonkeyPatch) -> None:
+    """Let rewards ask for late greens, and the rival win each comparison without rules."""
+    compare = Simulation.compare
+
+    def matched(real: TransitionLog, *_: object) -> dict[str, float]:
+        return dict.fromkeys(real.provenance.layouts, LATE_S)
+
+    def compared(
+        self: Simulation, worlds: Any, policies: Any, seeds: Any, on_done: Any
+    ) -> NDArray[np.float64]:
+        times_s = compare(self, worlds, policies, seeds, on_done)
+        times_s[-1] = times_s.min() - 1.0  # the policies end with the rival's
+        return times_s
+
+    patch.setattr("ugat_marl.grounding.street_training.matched_delays", matched)
+    patch.setattr(Simulation, "compare", compared)
+
+
+@pytest.mark.parametrize(
+    ("domain", "least_s", "most_s"), [("late_green=*,3", 1.5, 4), ("sim", 0, 1)]
+)
+def test_greens_are_as_late_as_those_of_the_street(
+    domain: str, least_s: float, most_s: float
+) -> None:
+    scenario = load_scenario("single-v1")
+    options: dict[str, Any] = {"duration_s": 900.0, "observation": "movements"}
+    with contextlib.closing(parallel_env(scenario, domain, **options)) as env:
+        rule = EpsilonGreedy(make_rule("max-pressure:10", env), 0.3)
+        logs = [roll_out(env, rule, seed, record=observer_of(env)).log for seed in (1, 2, 3)]
+        street = TransitionLog.concatenate([log for log in logs if log is not None])
+        simulation = Simulation(scenario, "sim", options, epsilon=0.3, workers=1)
+        done: list[None] = []
+        acting = make_rule("max-pressure:10", env)
+    found = matched_delays(street, simulation, acting, 0, lambda: done.append(None))
+    assert list(found) == ["signal_0"]
+    assert least_s <= found["signal_0"] <= most_s
+    assert len(done) == ROLL_OUTS
+
+
+def test_each_light_is_late_by_its_own_delay() -> None:
+    world = late_world({"a": 2.5, "b": 0.0, "c": 1.0}, {"a": "A", "b": "B", "c": "C"})
+    assert [str(effect) for effect in world.effects] == ["late_green=A,2.5", "late_green=C,1"]
+    assert late_world({"b": 0.0}, {"b": "B"}) == StreetWorld()
+
+
+def test_the_rival_is_direct_transfer_trained_further_with_late_greens(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    play_nothing(monkeypatch)
+    rivals_win(monkeypatch)
+    trainings: list[StreetTraining] = []
+    train = StreetTraining.train
+
+    def seen(self: StreetTraining, state: Any) -> Any:
+        trainings.append(self)
+        return train(self, state)
+
+    monkeypatch.setattr(StreetTraining, "train", seen)
+    transfer(CONFIG, tmp_path, workers=1)
+    (direct,) = tmp_path.glob(f"trainings/*/{DIRECT_LEARNER}")
+    with contextlib.closing(
+        parallel_env(
+            load_scenario("single-v1"), f"late_green=*,{LATE_S}", duration_s=CONFIG.duration_s
+        )
+    ) as env:
+        learner = trainings[0].make(env, CONFIG.seed)
+        learner.load(direct)
+        learner.learn(env, CONFIG.ugat.grounded_episodes, CONFIG.seed)
+        policy: Any = learner.policy()
+    assert np.array_equal(weights(tmp_path, "fitted-street"), policy.parameters)
+    logged = numbers(tmp_path)
+    assert logged[1, "judged/of_the_rival"] < logged[1, "judged/after"]
+    assert logged[1, "rival/late_s/signal_0"] == LATE_S
+
+
+@pytest.mark.slow
+def test_an_interrupted_rival_ends_as_an_unbroken_one(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    play_nothing(monkeypatch)
+    rivals_win(monkeypatch)
+    config = replace(CONFIG, ugat=replace(CONFIG.ugat, iterations=2))
+    transfer(config, tmp_path / "whole", workers=1)
+    for task in ("late greens, iteration 1", "comparing, iteration 2"):
+        with pytest.raises(KeyboardInterrupt):
+            transfer(config, tmp_path / "broken", resume=True, reporter=KillAt(task), workers=1)
+    assert (checkpoint_of(tmp_path / "broken") / "rival.pt").exists()
+    transfer(config, tmp_path / "broken", resume=True, workers=1)
+    one, other = (weights(tmp_path / run, "fitted-street") for run in ("whole", "broken"))
+    assert np.array_equal(one, other)
+    assert numbers(tmp_path / "whole") == numbers(tmp_path / "broken")
+
+
+def test_late_commands_leave_no_rival(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    play_nothing(monkeypatch)
+    transfer(replace(CONFIG, real="execution_delay=20+lost_commands=0.2"), tmp_path, workers=1)
+    logged = numbers(tmp_path)
+    assert logged[1, "street/commands"] > 0
+    assert not [name for _, name in logged if "rival" in name]
+
+
+@pytest.mark.parametrize(
+    ("street", "has"),
+    [(QUICK, True), (replace(QUICK, rival="none"), False), (replace(QUICK, judged=0), False)],
+)
+def test_only_a_street_in_which_policies_are_compared_has_a_rival(
+    street: StreetConfig, has: bool
+) -> None:
+    assert street.has_rival == has
+
+
+def test_an_unknown_rival_is_refused() -> None:
+    other: Any = "phase"
+    with pytest.raises(UnknownNameError, match="rival"):
+        StreetConfig(rival=other)

@@ -1,0 +1,108 @@
+"""Rival of a policy that is trained in a fitted street: one that is trained with late greens.
+
+Each episode in a fitted street is in another world, and a few of them are not learnt from well. In
+the plain simulation a learner often gets farther. The rival trains there, with greens that are late
+until the rewards of the street match (`delays`). Worlds of the fitted street tell which of the two
+policies is better.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+from ugat_marl.data import TransitionLog
+from ugat_marl.effects import EVERYWHERE, Effect, LateGreen
+from ugat_marl.grounding.delays import episode_rewards, matching_delays
+from ugat_marl.grounding.street import Simulation, StreetWorld
+from ugat_marl.grounding.worlds import EPISODES_PER_DELAY
+from ugat_marl.policies import Learner, Policy
+from ugat_marl.seeding import derive_seed
+
+LONGEST_S = 5
+"""Longest delay of greens that is tried, in s."""
+
+ROLL_OUTS = EPISODES_PER_DELAY * (LONGEST_S + 1)
+"""Episodes of the simulation with which rewards are matched, per iteration."""
+
+
+@dataclass
+class Rival:
+    """A second learner of a training, as a part of a checkpoint.
+
+    Attributes:
+        learner: The learner.
+        start: File of the learner after plain training, with which it begins.
+        begun: True once it has begun.
+    """
+
+    learner: Learner
+    start: Path
+    begun: bool = False
+
+    def begin(self) -> Learner:
+        """Return the learner; it begins with what plain training taught."""
+        if not self.begun:
+            self.learner.load(self.start)
+            self.begun = True
+        return self.learner
+
+    def save(self, path: Path) -> None:
+        """Write the learner to a file; nothing if it has not begun."""
+        if self.begun:
+            self.learner.save(path)
+
+    def load(self, path: Path) -> None:
+        """Restore a file of `save`; without one, the learner has not begun."""
+        if path.exists():
+            self.learner.load(path)
+            self.begun = True
+
+
+def matched_delays(
+    real: TransitionLog,
+    simulation: Simulation,
+    policy: Policy,
+    seed: int,
+    on_done: Callable[[], object],
+) -> dict[str, float]:
+    """Return how late greens have to be for the policy to get the rewards of the street.
+
+    Whether chance explains the difference is not asked: worlds of the street judge the outcome.
+
+    Args:
+        real: Log of the street, in which the policy acted.
+        simulation: The simulation.
+        policy: The policy.
+        seed: Root of the seeds of the episodes.
+        on_done: Called after each of the `ROLL_OUTS` episodes.
+
+    Returns:
+        Agent to delay in s.
+    """
+    agents = list(real.provenance.layouts)
+    parts = [(s, k) for s in range(LONGEST_S + 1) for k in range(EPISODES_PER_DELAY)]
+    worlds = [StreetWorld(_late({EVERYWHERE: float(late_s)})) for late_s, _ in parts]
+    seeds = [derive_seed(seed, "late greens", *part) for part in parts]
+    logs = simulation.logs(worlds, policy, seeds, None, on_done)
+    each = [episode_rewards(log, agents).mean(0) for log in logs]
+    simulated = np.reshape(each, (LONGEST_S + 1, EPISODES_PER_DELAY, -1)).mean(1)
+    delay_s = matching_delays(episode_rewards(real, agents).mean(0), simulated)
+    return dict(zip(agents, delay_s.round(1).tolist(), strict=True))
+
+
+def late_world(delay_s: Mapping[str, float], intersection_of: Mapping[str, str]) -> StreetWorld:
+    """Return the simulation with late greens.
+
+    Args:
+        delay_s: Agent to delay in s.
+        intersection_of: Agent to its traffic light.
+    """
+    return StreetWorld(_late({intersection_of[agent]: s for agent, s in delay_s.items()}))
+
+
+def _late(delay_s: Mapping[str, float]) -> tuple[Effect, ...]:
+    return tuple(LateGreen(place, seconds) for place, seconds in delay_s.items() if seconds > 0)
