@@ -32,7 +32,7 @@ def test_the_work_of_a_run_is_counted_by_hand(tmp_path: Path) -> None:
     assert work["plain sim"].units == 2 and work["grounded"].units == 2 * 2
     assert work["training"].units == 3, "half of what it shares with direct transfer"
     assert work["best rule"].units == 2 * (14 + 7)
-    assert (work["roll-outs"].units, work["roll-outs"].weight) == (4, 2.0)
+    assert (work["roll-outs"].units, work["roll-outs"].weight) == (4, 2 * 2.0)
     assert work["fitting"].units == 3 * 2 * 2
 
 
@@ -40,7 +40,7 @@ def test_a_fitted_street_simulates_shorter_worlds(tmp_path: Path) -> None:
     ugat = UgatConfig(iterations=2, street=StreetConfig(simulations=50, further=10, judged=3))
     config = replace(SMALL, ugat=ugat)
     work = work_of(planned_jobs(config), tmp_path, 7200.0)
-    assert (work["fitting"].units, work["fitting"].weight) == (60, 0.25)
+    assert (work["fitting"].units, work["fitting"].weight) == (60, 0.25 * 1.5)
     assert work["comparing"].units == 2 * 3 * 2
     assert work["under delays"].units == 2 * 6 * 2
     assert work["late greens"].units == 2 * ugat.grounded_episodes

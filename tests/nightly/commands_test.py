@@ -50,6 +50,7 @@ SMALL = {
     "--sim-rollouts": "2",
     "--real-rollouts": "2",
     "--street.simulations": "20",
+    "--street.judged": "1",
     "--fit.epochs": "2",
     "--dqn.lesson-updates": "20",
     "--evaluation-seeds": "1",

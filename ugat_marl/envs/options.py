@@ -75,7 +75,8 @@ class EnvOptions:
         signals: ``"actions"``, or ``"programme"``: SUMO runs the network's own signal programme
             and actions are ignored. Agents see the phase with the same green links; while the green
             is none of their phases, they see no phase.
-        duration_s: Length of an episode in s; None for the scenario's own.
+        duration_s: Length of an episode in s; None for the scenario's own. An episode has whole
+            decision intervals: of 65 s, ten seconds each, it has 60.
         simulator: ``"process"`` (any number at once, exactly repeatable), ``"spawn"`` (the same
             without forking), or ``"inprocess"`` (one per process, a little faster).
         fitted: Fitted changes of sensors, commands and greens, beside those of the scenario's

@@ -20,6 +20,17 @@ from ugat_marl.progress import Share
 EPOCH = 0.05
 """Rough cost of an epoch of the fits of f and h, in episodes."""
 
+COSTS = {
+    "plain sim": 3.0, "training": 3.0, "grounded": 3.0, "fitted street": 3.0, "late greens": 3.0,
+    "roll-outs": 2.0, "under delays": 2.0,
+    "fitting": 1.5, "rules": 1.5, "comparing": 1.5, "lessons": 1.5,
+}  # fmt: skip
+"""Rough cost of an episode of each task, in episodes of an evaluation.
+
+Training also updates networks, roll-outs are recorded, and worlds of a fitted street are slower.
+Measured with `single-v1`, `arterial1x5-v1` and a drawn network of four lights.
+"""
+
 
 def _counted(count: int, noun: str) -> str:
     return f"{count} {noun}{'' if count == 1 else 's'}"
@@ -56,14 +67,14 @@ def described_plan(
             does = f"{setting.name}: {_counted(job.episodes, 'episode')}"
         lines.append(f"  {number}. {does}; {evaluated * len(job.rows)} to judge it")
     total = sum(share.units * share.weight for share in work_of(todo, folder, episode_s).values())
-    lines.append(f"  in all about {total:.0f} episodes; the bar says how long they take")
+    lines.append(f"  in all as long as about {total:.0f} episodes of evaluation")
     return lines
 
 
 def work_of(plan: Sequence[Job], folder: Path, episode_s: float) -> dict[str, Share]:
     """Return the expected work of the unfinished jobs, by the beginnings of the names of tasks.
 
-    The unit is an episode. Jobs that are half done count as a whole.
+    The unit is an episode of an evaluation. Jobs that are half done count as a whole.
 
     Args:
         plan: Jobs of the run.
@@ -99,7 +110,10 @@ def work_of(plan: Sequence[Job], folder: Path, episode_s: float) -> dict[str, Sh
             add("lessons", first + ugat.iterations * later)
             if ugat.grounding == "street" and ugat.street.has_rival:
                 add("lessons", ugat.iterations * lessons)
-    return {name: Share(round(count), weights[name]) for name, count in units.items()}
+    return {
+        name: Share(round(count), weights[name] * COSTS.get(name, 1.0))
+        for name, count in units.items()
+    }
 
 
 def _rule_episodes(job: Job) -> int:
