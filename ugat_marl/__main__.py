@@ -8,7 +8,7 @@ from collections.abc import Sequence
 from ugat_marl.cli import CommandLine, run
 
 COMMANDS: dict[str, tuple[str, str]] = {
-    "train": ("ugat_marl.cli.train:Train", "train by UGAT across the gap and compare"),
+    "train": ("ugat_marl.cli.train:Train", "train a policy across the gap and compare"),
     "report": ("ugat_marl.cli.report:Report", "show trainings on one page: tables, curves, maps"),
     "evaluate": (
         "ugat_marl.cli.evaluate:Evaluate",

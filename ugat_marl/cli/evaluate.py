@@ -44,9 +44,9 @@ class Evaluate:
         policies: Rules (such as fixed-time:30, actuated:40, largest-queue:20, max-pressure:10,
             programme; docs/reference/rules.md has them all), files of trained policies, and your
             own policies as my_module:my_policy.
-        domains: Domains; gaps are differences from the first. "all" is sim and every named domain.
-            "observation", "action", "transition" or "reward" is every domain of this gap; see
-            ugat-marl domains.
+        domains: Domains; gaps are differences from the first. "all" is sim and every named domain
+            but meso. "observation", "action", "transition" or "reward" is every domain of this
+            gap; see ugat-marl domains.
         seeds: Number of episodes of each policy in each domain.
         first_seed: Seed of the first episode.
         duration_s: Length of an episode in s; default: the scenario's own.

@@ -22,7 +22,7 @@ from ugat_marl.reporting import calibration_picture, transfer_picture, transfer_
 
 @dataclass(frozen=True)
 class Train:
-    """Train policies by UGAT; evaluate them in sim and in the real domain.
+    """Train a policy in sim for a real domain; compare it with others in both.
 
     Examples:
         ugat-marl train grid2x2-v1 --real V4
