@@ -15,6 +15,11 @@ LISTED = 32
 """Most names in one error message. If there are more, the message lists the nearest ones."""
 
 
+def first_line(error: BaseException) -> str:
+    """Return the first line of an error's text, or its type; libraries add stacks and hints."""
+    return (str(error).splitlines() or [type(error).__name__])[0][:200]
+
+
 class UgatMarlError(Exception):
     """Base of all errors a user of `ugat_marl` can provoke."""
 

@@ -384,6 +384,10 @@ WRONG: dict[str, tuple[dict[str, Change], str]] = {
     "decimal comma": ({"detectors.csv": replaced("40.0", '"40,5"')}, r"point, not a comma"),
     "semicolons": ({"detectors.csv": lambda text: text.replace(",", ";")}, r"semicolons"),
     "no detectors": ({"detectors.csv": lambda text: text.split("\n")[0] + "\n"}, r"no detectors"),
+    "column twice": (
+        {"detectors.csv": lambda text: text.replace("length_m", "lane_id ", 1)},
+        r"column 'lane_id' is there twice",
+    ),
     "column missing": (
         {"periods.csv": replaced("begin_s", "begins")},
         r"'begin_s' \(is it 'begins'",

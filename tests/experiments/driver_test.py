@@ -374,6 +374,15 @@ def test_what_a_killed_job_was_writing_is_cleared(tmp_path: Path) -> None:
     assert {path.name for path in tmp_path.iterdir()} == {SCORES, JOB}
 
 
+@pytest.mark.parametrize("content", ["", "[]", '{"scenario": "single-v1"}'])
+def test_a_broken_description_of_a_job_is_named(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], content: str
+) -> None:
+    (tmp_path / JOB).write_text(content)
+    assert perform_described(tmp_path) == 2
+    assert str(tmp_path / JOB) in capsys.readouterr().err
+
+
 @pytest.mark.parametrize(
     "content", ["", "[{}]", '{"episodes": [{"domain": "sim"}]}', '{"a": 1}', "[1]"]
 )

@@ -135,6 +135,9 @@ def test_controls_can_be_added_to_a_run_and_change_nothing_else(tmp_path: Path) 
     for name in policies:
         one, two = (weights(tmp_path / run, name) for run in ("run", "at once"))
         assert np.array_equal(one, two), name
+    transfer(SMALL, tmp_path / "run", resume=True)
+    left = {path.stem for path in (tmp_path / "run" / "policies").glob("*.pt")}
+    assert left == {"phase", "direct-transfer"}, "files of rows that the table has no more"
 
 
 def test_the_folder_is_locked_until_the_table_is_written(

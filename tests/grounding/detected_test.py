@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import tracemalloc
 from collections.abc import Sequence
 from dataclasses import replace
 
@@ -95,6 +96,18 @@ def test_a_jam_of_very_many_vehicles_has_times() -> None:
     mean, _, variance = staircase(np.full(300, 1e-6))
     assert np.isfinite(mean).all() and np.isfinite(variance).all()
     assert (np.diff(mean) > 0).all()
+
+
+def test_a_jam_of_an_hour_fits_into_memory() -> None:
+    """A matrix of chances for each moment took 7 GB."""
+    tracemalloc.start()
+    try:
+        mean, _, _ = staircase(np.linspace(0.0, 1.0, 600))
+        most = tracemalloc.get_traced_memory()[1]
+    finally:
+        tracemalloc.stop()
+    assert (np.diff(mean) > 0).all()
+    assert most < 100e6
 
 
 def test_exit_detectors_say_when_the_vehicles_of_a_jam_came() -> None:

@@ -123,6 +123,14 @@ def test_lanes_that_a_table_lacks_are_said_to_be_estimated(
     assert "eyes" in config.of_log(whole).parts
 
 
+def test_a_hole_in_a_table_of_lanes_is_refused(crossing: Scenario, measured: MeasuredData) -> None:
+    assert measured.lanes is not None
+    hole = measured.lanes.filter(~pl.col("time_s").is_between(60.0, 120.0))
+    given = replace(measured, lanes=hole, trajectories=None)
+    with pytest.raises(MeasuredDataError, match="lanes: nothing of lane .* at 70 s.*--vehicles"):
+        log_of_measured(given, crossing, Network.read(crossing), "street", "count", "best")
+
+
 def test_trajectories_between_whole_seconds_give_the_same_log(
     crossing: Scenario, measured: MeasuredData
 ) -> None:
@@ -267,11 +275,14 @@ def test_the_command_writes_a_log_that_can_be_read(
     tmp_path: Path, data: Path, measured: MeasuredData, capsys: pytest.CaptureFixture[str]
 ) -> None:
     write_measured(replace(measured, lanes=None, trajectories=None), tmp_path / "main-street")
+    periods = tmp_path / "main-street" / "periods.csv"
+    periods.write_text(periods.read_text().rstrip("\n"))
     out = tmp_path / "street.parquet"
     call = ["import-log", str(data / "crossing"), str(tmp_path / "main-street")]
     assert main([*call, "--out", str(out)]) == 0
     said = capsys.readouterr().out
     assert "vehicles on a lane are estimated" in said and "transitions of 1 periods" in said
+    assert "the last line has no end" in said, "findings of the reader"
     log = TransitionLog.read(out)
     assert log.provenance.domain == "main-street"
     assert log.provenance.observation == "movements"

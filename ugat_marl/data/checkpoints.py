@@ -11,7 +11,7 @@ from typing import Any
 
 import torch
 
-from ugat_marl.errors import CheckpointError
+from ugat_marl.errors import CheckpointError, first_line
 from ugat_marl.files import replacing, require_stored
 
 _UNREADABLE = (
@@ -59,9 +59,8 @@ def read_checkpoint(path: Path, kind: str) -> dict[str, Any]:
             warnings.simplefilter("ignore")
             content = torch.load(path, map_location="cpu", weights_only=True)
     except _UNREADABLE as error:
-        first_line = (str(error).splitlines() or [type(error).__name__])[0]
         raise CheckpointError(
-            f"{path}: not a readable checkpoint ({first_line[:200]}); it may have been cut short: "
+            f"{path}: not a readable checkpoint ({first_line(error)}); it may have been cut short: "
             "use an earlier one or train again"
         ) from None
     kind_read = content.get("kind") if isinstance(content, dict) else None

@@ -22,7 +22,7 @@ import polars as pl
 
 from ugat_marl.data.curves import CURVES_FILE, Curves
 from ugat_marl.data.row_hashes import damage, read_quietly, write_hashed
-from ugat_marl.errors import CheckpointError, OptionError
+from ugat_marl.errors import CheckpointError, OptionError, first_line
 from ugat_marl.files import read_json, replacing, require_writable, write_whole
 from ugat_marl.progress import Reporter
 
@@ -91,10 +91,9 @@ class Metrics:
         try:
             frame, metadata = read_quietly(path)
         except (OSError, pl.exceptions.PolarsError, pl.exceptions.PanicException) as error:
-            reason = str(error).splitlines()[0]
             raise CheckpointError(
-                f"{path}: cannot be read ({reason}); it may have been cut short. Remove the run "
-                "folder and start again"
+                f"{path}: cannot be read ({first_line(error)}); it may have been cut short. "
+                "Remove the run folder and start again"
             ) from None
         # Parquet allows an empty cell in every column; `write` leaves none.
         if frame.schema != pl.Schema(_SCHEMA) or any(frame.null_count().row(0)):

@@ -21,7 +21,7 @@ from numpy.typing import NDArray
 
 from ugat_marl.data.layouts import AgentLayout
 from ugat_marl.data.row_hashes import damage, is_hashed, read_quietly, write_hashed
-from ugat_marl.errors import LogError
+from ugat_marl.errors import LogError, first_line
 from ugat_marl.files import parse_json, replacing
 
 FORMAT = 2
@@ -481,7 +481,7 @@ def read_parquet(path: Path) -> tuple[pl.DataFrame, dict[str, str]]:
         return read_quietly(path)
     except (pl.exceptions.PolarsError, pl.exceptions.PanicException, OSError) as error:
         raise LogError(
-            f"{path}: damaged Parquet file ({_first_line(error)}); record or copy it again"
+            f"{path}: damaged Parquet file ({first_line(error)}); record or copy it again"
         ) from None
 
 
@@ -557,7 +557,7 @@ def _converted(frame: pl.DataFrame) -> pl.DataFrame:
             columns.append(column.cast(wanted))
         except pl.exceptions.PolarsError as error:
             raise LogError(
-                f"column {name!r} does not fit into {wanted}: {_first_line(error)}"
+                f"column {name!r} does not fit into {wanted}: {first_line(error)}"
             ) from None
     return pl.DataFrame(columns)
 
@@ -606,7 +606,3 @@ def _refuse_half_file(path: Path) -> None:
             f"{path}: the Parquet file is cut short ({size} bytes, no footer); "
             "record or copy it again"
         )
-
-
-def _first_line(error: BaseException) -> str:
-    return (str(error).splitlines() or [type(error).__name__])[0]

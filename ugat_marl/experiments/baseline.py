@@ -56,7 +56,7 @@ class BaselineArgs:
 
 
 class BaselineResult(NamedTuple):
-    """BaselineResult of a training.
+    """Result of a training.
 
     Attributes:
         policy: The trained policy.

@@ -81,8 +81,12 @@ def perform_all(
     running: dict[Future[None], Job] = {}
     failures: dict[str, str] = {}
     require_writable(folder / LOG)
-    lock, stop = lock_folder(folder), Stop()
-    with reporter.task(title, len(jobs)) as advance, executor_of(workers) as pool:
+    stop = Stop()
+    with (  # the lock is held until the last job has ended
+        contextlib.closing(lock_folder(folder)),
+        reporter.task(title, len(jobs)) as advance,
+        executor_of(workers) as pool,
+    ):
         for _ in range(len(jobs) - len(left)):
             advance()
         try:
@@ -108,7 +112,6 @@ def perform_all(
             stop.set()
             for future in running:
                 future.cancel()
-            lock.close()
     return failures
 
 

@@ -106,15 +106,16 @@ def train(
         seed: Root of every random choice.
         preset: "paper" for Algorithm 1 as published.
         real_log: Transition log in place of roll-outs in the real domain.
-        ugat: All settings of the algorithm, in place of the numbers above.
+        ugat: All settings of the algorithm, in place of grounding and numbers above.
         dqn: Settings of the learners universal and dqn.
         out: Folder of the run; None for runs/SCENARIO-REAL-sSEED.
         resume: Continue the run in that folder.
         workers: Simulations at a time, or an executor; None for one per core.
         reporter: Shows progress; None for the one of the program.
         callback: Called as ``callback(stage, step, numbers)`` for what the training across the gap
-            measures: stage "episode" with the number of the episode, "iteration" with that of the
-            iteration, and at the end "evaluation" with ``POLICY/DOMAIN/att_s`` in s. What it raises
+            measures: stage "episode" with the number of the episode, "rival episode" with that of
+            the second learner of a fitted street, "iteration" with that of the iteration, and at
+            the end "evaluation" with ``POLICY/DOMAIN/att_s`` in s. What it raises
             ends the run, which can be resumed.
 
     Returns:

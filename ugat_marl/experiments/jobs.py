@@ -19,7 +19,7 @@ from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import Any
 
-from pydantic import TypeAdapter
+from pydantic import TypeAdapter, ValidationError
 from rich.console import Console
 
 from ugat_marl.data import (
@@ -214,6 +214,20 @@ class Job:
     @property
     def _seed_word(self) -> str:
         return "" if self.seed is None else f"s{self.seed}"
+
+    @classmethod
+    def read(cls, folder: Path) -> Job:
+        """Read ``job.json``.
+
+        Raises:
+            CheckpointError: The file is missing, damaged, or of another form.
+        """
+        path = folder / JOB
+        try:
+            return TypeAdapter(cls).validate_json(json.dumps(read_json(path, CheckpointError)))
+        except ValidationError as error:
+            told = error.errors()[0]["msg"]
+            raise CheckpointError(f"{path}: not the description of a training ({told})") from None
 
     def write(self, folder: Path) -> None:
         """Write ``job.json``, whole or not at all."""
@@ -566,9 +580,7 @@ def _world(job: Job) -> AnyParallelEnv:
 def perform_described(folder: Path) -> int:
     """Perform the job that a folder describes; return the exit code and print what went wrong."""
     try:
-        described = read_json(folder / JOB, CheckpointError)
-        job = TypeAdapter(Job).validate_json(json.dumps(described))
-        perform(job, folder, Bars(Console(width=100)))
+        perform(Job.read(folder), folder, Bars(Console(width=100)))
     except (UgatMarlError, OSError) as error:
         print(" ".join(str(error).split()), file=sys.stderr)
         return 2

@@ -8,14 +8,14 @@ import re
 from pathlib import Path
 
 import numpy as np
-from pydantic import TypeAdapter, ValidationError
+from pydantic import TypeAdapter
 
 from ugat_marl.data import installed_versions
 from ugat_marl.effects import domain_label, load_scenario, scenario_in_domain
-from ugat_marl.errors import CheckpointError, OptionError
+from ugat_marl.errors import OptionError
 from ugat_marl.experiments.jobs import DIRECT_POLICY, JOB, POLICY, Job, Record, file_name, file_stem
 from ugat_marl.experiments.statistics import Interval
-from ugat_marl.files import read_json, write_whole
+from ugat_marl.files import write_whole
 from ugat_marl.policies import CardScores, NetworkPolicy, PolicyCard, is_own, rule_in
 
 _LIBRARIES = ("ugat-marl", "eclipse-sumo", "torch", "numpy")
@@ -40,6 +40,11 @@ def pack(training: Path, folder: Path, command: str = "") -> list[PolicyCard]:
     cards: dict[str, PolicyCard] = {}
     for place in sorted(path.parent for path in training.rglob(JOB)):
         for card, policy in _cards(place, command):
+            if card.id in cards:
+                raise OptionError(
+                    f"{training} holds two trainings of {card.id}, with other settings; name the "
+                    "folder of one of them"
+                )
             cards[card.id] = card
             write_whole(folder / f"{card.id}.pt", policy)
             card.write(folder / f"{card.id}.json")
@@ -53,12 +58,7 @@ def pack(training: Path, folder: Path, command: str = "") -> list[PolicyCard]:
 
 def _cards(place: Path, command: str) -> list[tuple[PolicyCard, bytes]]:
     """Return the cards of a training that is finished, and the content of their policies."""
-    try:
-        job = TypeAdapter(Job).validate_json(json.dumps(read_json(place / JOB, CheckpointError)))
-    except ValidationError as error:
-        raise CheckpointError(
-            f"{place / JOB}: not the description of a training ({error.errors()[0]['msg']})"
-        ) from None
+    job = Job.read(place)
     record = Record.read(place)
     if job.seed is None or not record.is_whole(job):
         return []

@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 
 from ugat_marl.data import damage, read_quietly, write_hashed
 from ugat_marl.envs import AnyParallelEnv
-from ugat_marl.errors import CheckpointError
+from ugat_marl.errors import CheckpointError, first_line
 from ugat_marl.files import replacing
 from ugat_marl.policies import StepCallback
 
@@ -170,8 +170,7 @@ def _batches(path: Path) -> pl.DataFrame:
     try:
         frame, metadata = read_quietly(path)
     except (FileNotFoundError, pl.exceptions.PolarsError, pl.exceptions.PanicException) as error:
-        reason = str(error).splitlines()[0]
-        raise CheckpointError(f"{path}: cannot be read ({reason})") from None
+        raise CheckpointError(f"{path}: cannot be read ({first_line(error)})") from None
     if frame.schema != pl.Schema(_SCHEMA):
         raise CheckpointError(f"{path}: not the queues of a run")
     if sum(frame.null_count().row(0)):

@@ -422,6 +422,8 @@ def _write_results(
                 name = f"rule {rules[domain_label(job.target or job.sim)]}"
             rows.setdefault(name, (job, mark, record))  # one rule may be the best of both domains
     trained = {name: row for name, row in rows.items() if row[0].seed is not None}
+    for path in (directory / "policies").glob("*.pt"):
+        path.unlink()  # one of a row that an earlier call asked for would stay
     for file, (job, mark, _) in zip(file_names(trained), trained.values(), strict=True):
         policy = folder / job.name / (POLICY if mark == job.episodes else DIRECT_POLICY)
         if not policy.exists():  # of a learner that cannot be kept

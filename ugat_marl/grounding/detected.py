@@ -30,7 +30,6 @@ from dataclasses import dataclass, field
 import numpy as np
 from numpy.typing import NDArray
 from scipy.integrate import trapezoid
-from scipy.linalg import toeplitz
 from scipy.special import gammaln
 from scipy.stats import norm
 
@@ -510,19 +509,17 @@ def staircase(latest: Floats) -> tuple[Floats, Floats, Floats]:
     due = np.searchsorted(latest, grid[:-1], side="right")
     more = np.arange(n + 1)
     factorial = gammaln(more + 1.0)
-    kernels: list[Floats] = []
-    for step in np.diff(grid):
-        weights = np.exp(more * np.log(n * step) - factorial)
-        kernels.append(toeplitz(weights, np.zeros(n + 1)))
+    # chances of so many arrivals in each step; a matrix for each would not fit for a long jam
+    arrive = np.exp(more * np.log(n * np.diff(grid))[:, None] - factorial)
     forward = np.zeros((len(grid), n + 1))
     backward = np.zeros((len(grid), n + 1))
     forward[0, 0] = backward[-1, n] = 1.0
     allowed = more[None, :] >= np.append(due, n)[:, None]
-    for k, kernel in enumerate(kernels):
-        ahead = (kernel @ forward[k]) * allowed[k + 1]
+    for k, weights in enumerate(arrive):
+        ahead = np.convolve(weights, forward[k])[: n + 1] * allowed[k + 1]
         forward[k + 1] = ahead / ahead.sum()
-    for k in range(len(kernels) - 1, -1, -1):
-        back = (kernels[k].T @ backward[k + 1]) * allowed[k]
+    for k in range(len(arrive) - 1, -1, -1):
+        back = np.convolve(arrive[k], backward[k + 1, ::-1])[n::-1] * allowed[k]
         backward[k] = back / back.sum()
     chance = forward * backward
     chance /= chance.sum(1, keepdims=True)
@@ -573,8 +570,8 @@ class LaneEstimate:
     def _rest(self, place: int, lane: Lane, own: _Seen) -> _Rest | None:
         """Return the vehicles of a lane's open jam, from what came on its road.
 
-        A vehicle that came on the road and is not seen on a lane without an open jam came on one
-        with. Two such lanes share them as they share those that leave.
+        Vehicles that came on the road, and were not seen on a lane without a jam, came on a jammed
+        one. Two jammed lanes share them as they share the vehicles that leave.
         """
         period = self.periods[place]
         entries = self._entries(period, lane)

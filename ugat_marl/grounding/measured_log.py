@@ -272,6 +272,13 @@ class _Street:
         if seen is not None and not seen.is_empty():
             at = seen["time_s"].to_numpy()
             rows = np.clip(np.searchsorted(at, times_s + 1e-6, side="right") - 1, 0, None)
+            most_s = max(COARSEST_S, self.interval_s / 2) + 1e-6
+            if (holes := np.abs(times_s - at[rows]) > most_s).any():
+                raise MeasuredDataError(
+                    f"lanes: nothing of lane {lane!r} in period {period.id!r} at "
+                    f"{times_s[holes][0]:g} s; a log needs the vehicles of every decision: end the "
+                    "period before the hole, or choose --vehicles detections"
+                )
             # Where nothing was seen the street counts as empty; `_unseen` reports it.
             known = seen.select(pl.col("vehicles", "halting").fill_null(0.0))
             vehicles, halting = (known[x].to_numpy()[rows] for x in ("vehicles", "halting"))

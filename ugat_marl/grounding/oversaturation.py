@@ -10,7 +10,6 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
 from ugat_marl.grounding.summaries import Floats, LaneRows, LaneView
 
@@ -28,15 +27,12 @@ class Oversaturation:
         full: Share at which a lane before the light is full.
         held: Share at which a green leads to a full lane.
         any: Share at which either is so.
-        growth: Vehicles on all lanes before the light, mean of the second half of an episode minus
-            that of the first.
     """
 
     agents: tuple[str, ...]
     full: Floats
     held: Floats
     any: Floats
-    growth: Floats
 
     @classmethod
     def of(cls, view: LaneView, rows: Sequence[LaneRows], agents: Sequence[str]) -> Oversaturation:
@@ -47,7 +43,7 @@ class Oversaturation:
             rows: Decisions of every lane (`LaneView.rows`).
             agents: Names of the intersections, in the order of the view.
         """
-        measured: list[tuple[float, float, float, float]] = []
+        measured: list[tuple[float, float, float]] = []
         begin = 0
         for scale in view.scale:
             own = rows[begin : begin + len(scale)]
@@ -55,7 +51,7 @@ class Oversaturation:
             full = np.any([row.full for row in own], axis=0)
             held = np.any([row.held & row.has for row in own], axis=0)
             both = float(np.logical_or(full, held).mean())
-            measured.append((float(full.mean()), float(held.mean()), both, _growth(own)))
+            measured.append((float(full.mean()), float(held.mean()), both))
         return cls(tuple(agents), *np.array(measured).T)
 
     def describe(self) -> list[str]:
@@ -69,21 +65,3 @@ class Oversaturation:
             )
             if share > TOLD
         ]
-
-    def as_dict(self) -> dict[str, float]:
-        """Return the numbers for the metrics."""
-        return {
-            f"oversaturation/{name}/{agent}": float(value)
-            for name in ("any", "full", "held", "growth")
-            for agent, value in zip(self.agents, getattr(self, name), strict=True)
-        }
-
-
-def _growth(rows: Sequence[LaneRows]) -> float:
-    """Return the rise of the vehicles on all lanes from the first half of the episodes on."""
-    total: NDArray[np.float64] = np.sum([row.before for row in rows], axis=0)
-    steps = rows[0].step
-    late = steps > steps.max() / 2
-    if not late.any() or late.all():
-        return 0.0
-    return float(total[late].mean() - total[~late].mean())

@@ -14,7 +14,7 @@ from torch import Tensor, nn
 
 from ugat_marl.data import read_checkpoint, write_checkpoint
 from ugat_marl.envs import Actions, AgentSet, Infos, Observations
-from ugat_marl.errors import CheckpointError
+from ugat_marl.errors import CheckpointError, first_line
 from ugat_marl.files import parse_json
 from ugat_marl.policies.devices import CPU
 from ugat_marl.policies.networks.q_network import Held, greedy_actions, q_network
@@ -128,8 +128,9 @@ class NetworkPolicy:
             arguments = (agents, hidden, parameters, env_options, shared, structure)
             return cls(*arguments, content.get("ceiling"))
         except (KeyError, TypeError, ValueError, RuntimeError, OverflowError) as error:
-            reason = (str(error).splitlines() or [type(error).__name__])[0]  # torch adds its stack
-            raise CheckpointError(f"{path}: not a whole policy ({reason}); save it again") from None
+            raise CheckpointError(
+                f"{path}: not a whole policy ({first_line(error)}); save it again"
+            ) from None
 
     def __reduce__(self) -> tuple[type[NetworkPolicy], tuple[Any, ...]]:
         # numpy, since torch would send tensors between processes through shared memory

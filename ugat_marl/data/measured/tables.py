@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from ugat_marl.data.measured.local_time import LocalClock
 from ugat_marl.data.measured.values import Finding
 from ugat_marl.data.row_hashes import csv_damage, csv_texts, damage, read_quietly
-from ugat_marl.errors import MeasuredDataError, nearest
+from ugat_marl.errors import MeasuredDataError, first_line, nearest
 from ugat_marl.scenarios import Period
 
 ROW = "row"
@@ -314,7 +314,7 @@ def _read_parquet(path: Path) -> pl.DataFrame:
         frame, metadata = read_quietly(io.BytesIO(content))
     except (pl.exceptions.PolarsError, pl.exceptions.PanicException, OSError, ValueError) as error:
         raise MeasuredDataError(
-            f"{path}: damaged Parquet file ({_first_line(error)}); copy or export it again"
+            f"{path}: damaged Parquet file ({first_line(error)}); copy or export it again"
         ) from None
     if wrong := damage(frame, metadata):  # tables of others carry no hashes
         raise MeasuredDataError(f"{path}: damaged, {wrong}; copy or export it again")
@@ -351,11 +351,14 @@ def _read_csv(path: Path, findings: list[Finding]) -> pl.DataFrame:
         frame = csv_texts(content)
     except (pl.exceptions.PolarsError, pl.exceptions.PanicException, OSError, ValueError) as error:
         raise MeasuredDataError(
-            f"{path}: not a table ({_first_line(error)}); every line needs the columns of line 1"
+            f"{path}: not a table ({first_line(error)}); every line needs the columns of line 1"
         ) from None
     if wrong := csv_damage(path, frame):  # tables of others carry no hashes
         raise MeasuredDataError(f"{path}: damaged, {wrong}")
-    return frame.rename({name: name.strip() for name in frame.columns}, strict=False)
+    names = [name.strip() for name in frame.columns]
+    if twice := sorted({name for name in names if names.count(name) > 1}):
+        raise MeasuredDataError(f"{path}: column {twice[0]!r} is there twice; keep one of them")
+    return frame.rename(dict(zip(frame.columns, names, strict=True)))
 
 
 def _bytes(path: Path) -> bytes:
@@ -411,13 +414,9 @@ def to_texts(path: Path, cells: pl.Series) -> pl.Series:
         texts = cells.cast(pl.String).str.strip_chars()
     except (pl.exceptions.PolarsError, pl.exceptions.PanicException) as error:
         raise MeasuredDataError(
-            f"{path}: column {cells.name!r} is damaged ({_first_line(error)}); export it again"
+            f"{path}: column {cells.name!r} is damaged ({first_line(error)}); export it again"
         ) from None
     return texts.set(texts == "", None)
-
-
-def _first_line(error: BaseException) -> str:
-    return (str(error).splitlines() or [type(error).__name__])[0][:200]
 
 
 def with_period(

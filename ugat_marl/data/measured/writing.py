@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-import os
+import secrets
 import shutil
 import tempfile
 from collections.abc import Sequence
@@ -53,7 +53,8 @@ def write_measured(measured: MeasuredData, directory: Path, *, csv: bool = False
     suffix = ".csv" if csv else ".parquet"
     try:
         directory.parent.mkdir(parents=True, exist_ok=True)
-        temporary = Path(tempfile.mkdtemp(dir=directory.parent, prefix=f".{directory.name}."))
+        temporary = directory.with_name(f".{directory.name}.{secrets.token_hex(8)}")
+        temporary.mkdir()
     except OSError as error:
         raise OutputError(
             f"{directory}: cannot be written ({error.strerror}); give another place"
@@ -118,9 +119,6 @@ def require_replaceable(directory: Path) -> None:
 
 def _put(temporary: Path, directory: Path) -> None:
     """Move the finished directory to its place, in place of an earlier one."""
-    umask = os.umask(0)
-    os.umask(umask)
-    temporary.chmod(0o777 & ~umask)
     if not directory.exists():
         temporary.rename(directory)
         return

@@ -7,10 +7,8 @@ The lights on the street may differ from them, as with late greens; only the veh
 
 from __future__ import annotations
 
-import concurrent.futures
 import math
 import tempfile
-import threading
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -45,7 +43,7 @@ from ugat_marl.experiments.recording.controller import (
     switches,
 )
 from ugat_marl.experiments.recording.tracks import tracks
-from ugat_marl.parallel import parts_at_a_time
+from ugat_marl.parallel import Stop, in_order, parts_at_a_time
 from ugat_marl.policies import PolicyFactory
 from ugat_marl.progress import Advance, Reporter, Silent
 from ugat_marl.scenarios import (
@@ -229,26 +227,12 @@ def _zone(detector: Detector, length_m: float) -> Detector:
 
 def _all_days(street: _Street, periods: int, workers: int, advance: Advance) -> list[_Day]:
     """Record all days. Threads suffice: each simulation runs in its own process."""
-    stop = threading.Event()
-    pool = concurrent.futures.ThreadPoolExecutor(workers)
-    splits = split_periods(periods)
-    try:
-        days = [pool.submit(_day, street, i, split, stop) for i, split in enumerate(splits)]
-        left = set(days)
-        while left:  # the timeout lets Ctrl-C interrupt the wait
-            done, left = concurrent.futures.wait(
-                left, timeout=0.2, return_when=concurrent.futures.FIRST_COMPLETED
-            )
-            for day in done:
-                day.result()
-                advance()
-    finally:
-        stop.set()
-        pool.shutdown(cancel_futures=True)
-    return [day.result() for day in days]
+    stop = Stop()
+    parts = [(street, i, split, stop) for i, split in enumerate(split_periods(periods))]
+    return in_order(workers, _day, parts, stop, lambda _: advance())
 
 
-def _day(street: _Street, index: int, split: Split, stop: threading.Event) -> _Day:
+def _day(street: _Street, index: int, split: Split, stop: Stop) -> _Day:
     """Record one day, from its vehicles to the measured data."""
     scenario = street.base
     if not street.same_demand:
