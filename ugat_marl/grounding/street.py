@@ -52,9 +52,10 @@ from ugat_marl.grounding.posterior import (
 )
 from ugat_marl.grounding.residual import ResidualConfig, of_one_street
 from ugat_marl.grounding.summaries import LaneView, Summary
+from ugat_marl.grounding.worlds import recorded
 from ugat_marl.grounding.wrappers import RandomDelays
 from ugat_marl.parallel import Stop, Workers, in_order, persistently
-from ugat_marl.policies import EpsilonGreedy, Policy, observer_of, roll_out, stop_callback
+from ugat_marl.policies import EpsilonGreedy, Policy, roll_out, stop_callback
 from ugat_marl.scenarios import Scenario
 from ugat_marl.seeding import derive_seed, numpy_generator
 
@@ -371,13 +372,8 @@ class Simulation:
         made = self.env(world, **policy.env_options, crossings=True)
         env = RandomDelays(made, self.most_delay_s) if self.most_delay_s else made
         exploring = EpsilonGreedy(copy.deepcopy(policy), self.epsilon)
-        observer = observer_of(env)
         try:
-            played = persistently(
-                lambda: roll_out(env, exploring, seed, record=observer, on_step=stop_callback(stop))
-            )
-            assert played.log is not None
-            return played.log
+            return recorded(env, exploring, seed, stop)
         finally:
             env.close()
 

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import copy
 from collections.abc import Callable, Mapping, Sequence
-from concurrent.futures import Executor
 from dataclasses import dataclass
 from functools import partial
 from typing import Any, Protocol
@@ -19,6 +18,7 @@ from ugat_marl.envs import (
     AnyParallelEnv,
     Infos,
     Observations,
+    Observer,
     TrafficEnv,
     parallel_env,
 )
@@ -72,8 +72,7 @@ class SimulatedWorld:
         episodes: Number of roll-outs per iteration.
         epsilon: Chance of a random phase.
         most_delay_s: Longest random delay of greens, in s; 0 for none.
-        workers: With an executor, each roll-out has its own environment. Otherwise `collect` runs
-            its roll-outs one after the other in one environment.
+        workers: Roll-outs at a time, or an executor; each roll-out has its own environment.
     """
 
     def __init__(
@@ -91,8 +90,6 @@ class SimulatedWorld:
         self._epsilon = epsilon
         self._most_delay_s = most_delay_s
         self._workers = workers
-        self._env: AnyParallelEnv | None = None
-        self._commands = 0
         self._stop = Stop()
 
     def collect(self, policy: Policy, iteration: int, seed: int) -> TransitionLog | None:
@@ -101,22 +98,8 @@ class SimulatedWorld:
             derive_seed(seed, "roll-out", self._name, iteration, episode)
             for episode in range(self._episodes)
         ]
-        if isinstance(self._workers, Executor):
-            logs = self._played_by(self._workers, policy, [(s, None) for s in seeds])
-            return TransitionLog.concatenate(logs)
-        own = copy.deepcopy(policy)  # another world may ask the same policy in another thread
-        exploring = EpsilonGreedy(own, self._epsilon)
-        env = self._env_of(policy)
-        return TransitionLog.concatenate([_recorded(env, exploring, s, self._stop) for s in seeds])
-
-    def _env_of(self, policy: Policy) -> AnyParallelEnv:
-        """Return the environment, with as many own commands in view as the policy needs."""
-        commands = int(policy.env_options.get("commands", 0))
-        if self._env is None or commands != self._commands:
-            self.close()
-            self._env = _delayed(_for_policy(self._make_env, policy), self._most_delay_s)
-            self._commands = commands
-        return self._env
+        parts: list[tuple[int, int | None]] = [(one, None) for one in seeds]
+        return TransitionLog.concatenate(self._played_by(policy, parts))
 
     def under_delays(
         self, policy: Policy, iteration: int, seed: int, on_done: Callable[[], object]
@@ -138,7 +121,7 @@ class SimulatedWorld:
             for late in lates
             for episode in range(EPISODES_PER_DELAY)
         ]
-        logs = self._played_by(self._workers, policy, parts, on_done)
+        logs = self._played_by(policy, parts, on_done)
         size = EPISODES_PER_DELAY
         return [TransitionLog.concatenate(logs[late * size : late * size + size]) for late in lates]
 
@@ -149,7 +132,6 @@ class SimulatedWorld:
 
     def _played_by(
         self,
-        workers: Workers,
         policy: Policy,
         parts: Sequence[tuple[int, int | None]],
         on_done: Callable[[], object] = lambda: None,
@@ -157,7 +139,7 @@ class SimulatedWorld:
         """Run a roll-out for each pair of seed and constant delay; return logs in this order."""
         alone = _RollOutAlone(self._make_env, self._most_delay_s, policy, self._epsilon)
         given = [(*part, self._stop) for part in parts]
-        logs = in_order(workers, alone.play, given, self._stop, lambda _: on_done())
+        logs = in_order(self._workers, alone.play, given, self._stop, lambda _: on_done())
         self._stop = Stop()  # the old one was set at the end
         return logs
 
@@ -170,10 +152,7 @@ class SimulatedWorld:
         self._stop.set()
 
     def close(self) -> None:
-        """End the simulation."""
-        if self._env is not None:
-            self._env.close()
-            self._env = None
+        """Do nothing; each roll-out ends its own simulation."""
 
 
 def _for_policy(make_env: Callable[..., TrafficEnv], policy: Policy) -> Callable[[], TrafficEnv]:
@@ -189,8 +168,23 @@ def _delayed(
     return RandomDelays(env, most_delay_s, always_s) if most_delay_s else env
 
 
-def _recorded(env: AnyParallelEnv, policy: Policy, seed: int, stop: Stop) -> TransitionLog:
-    observer = observer_of(env)
+def recorded(
+    env: AnyParallelEnv,
+    policy: Policy,
+    seed: int,
+    stop: Stop,
+    observer: Observer | None = None,
+) -> TransitionLog:
+    """Run an episode of a policy and return its transitions; a simulation that dies begins again.
+
+    Args:
+        env: The environment.
+        policy: The policy.
+        seed: Seed of the episode.
+        stop: Flag that ends the episode early.
+        observer: What is recorded; None for what agents observe.
+    """
+    observer = observer or observer_of(env)
     played = persistently(
         lambda: roll_out(env, policy, seed, record=observer, on_step=stop_callback(stop))
     )
@@ -222,7 +216,7 @@ class _RollOutAlone:
             self.policy
         )  # policies with memory must not share it between threads
         try:
-            return _recorded(env, EpsilonGreedy(policy, self.epsilon), seed, stop)
+            return recorded(env, EpsilonGreedy(policy, self.epsilon), seed, stop)
         finally:
             env.close()
 
@@ -258,11 +252,7 @@ class RollOutSettings:
         observer = observer_of(env, self.observation, self.neighbours)
         exploring = EpsilonGreedy(policy, self.epsilon)
         try:
-            played = persistently(
-                lambda: roll_out(env, exploring, seed, record=observer, on_step=stop_callback(stop))
-            )
-            assert played.log is not None
-            return played.log, env.scores()
+            return recorded(env, exploring, seed, stop, observer), env.scores()
         finally:
             env.close()
 
