@@ -2,7 +2,6 @@ from .checkpoints import checked_tensors as checked_tensors
 from .checkpoints import read_checkpoint as read_checkpoint
 from .checkpoints import write_checkpoint as write_checkpoint
 from .layouts import AgentLayout as AgentLayout
-from .level_of_service import LEVELS_S as LEVELS_S
 from .level_of_service import level_of_service as level_of_service
 from .level_of_service import mean_delay_s as mean_delay_s
 from .measured.atspm import import_atspm as import_atspm
@@ -31,7 +30,6 @@ from .row_hashes import with_hashes as with_hashes
 from .row_hashes import write_csv as write_csv
 from .row_hashes import write_hashed as write_hashed
 from .runs import CHECKPOINT_FOLDER as CHECKPOINT_FOLDER
-from .runs import IDENTITY_FILE as IDENTITY_FILE
 from .runs import METRICS_FILE as METRICS_FILE
 from .runs import SETTINGS_FILE as SETTINGS_FILE
 from .runs import LogCallback as LogCallback

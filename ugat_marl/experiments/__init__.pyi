@@ -62,11 +62,9 @@ from .settings import PHASE as PHASE
 from .settings import RULE as RULE
 from .settings import STREET as STREET
 from .settings import TIMED as TIMED
-from .settings import UNTRAINED as UNTRAINED
 from .settings import LearnerSpec as LearnerSpec
 from .settings import Setting as Setting
 from .settings import is_grounded as is_grounded
-from .sim_check import SimCheck as SimCheck
 from .sim_check import check_run as check_run
 from .sim_check import check_table as check_table
 from .standings import as_standings as as_standings
@@ -77,7 +75,6 @@ from .standings import shipped_standings as shipped_standings
 from .standings import standings_from as standings_from
 from .standings import standings_of as standings_of
 from .standings import with_standings as with_standings
-from .statistics import Floats as Floats
 from .statistics import Interval as Interval
 from .statistics import PairedTest as PairedTest
 from .statistics import student_p as student_p
@@ -93,7 +90,6 @@ from .transfers import TransferConfig as TransferConfig
 from .transfers import transfer as transfer
 from .tuning import BUDGET as BUDGET
 from .tuning import LEAST_BUDGET as LEAST_BUDGET
-from .tuning import VERSION as VERSION
 from .tuning import tune as tune
 from .tuning import tuned_rules as tuned_rules
 from .typical_plans import typical_plans as typical_plans

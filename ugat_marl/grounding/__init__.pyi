@@ -13,14 +13,11 @@ from .controls import ShuffledWorld as ShuffledWorld
 from .controls import answer_with_noise as answer_with_noise
 from .delays import MATCHED_REWARDS as MATCHED_REWARDS
 from .detected import DetectionConfig as DetectionConfig
-from .eyes import Eyes as Eyes
-from .eyes import fit_eyes as fit_eyes
 from .fitting import FitConfig as FitConfig
 from .fitting import Fitter as Fitter
 from .gate import GateConfig as GateConfig
 from .inverse import InverseConfig as InverseConfig
 from .inverse import InverseModel as InverseModel
-from .measured_log import MeasuredLog as MeasuredLog
 from .measured_log import MeasuredSource as MeasuredSource
 from .measured_log import log_of_measured as log_of_measured
 from .phase import PhaseTransform as PhaseTransform
@@ -32,7 +29,6 @@ from .posterior import Posterior as Posterior
 from .posterior import Simulated as Simulated
 from .posterior import Values as Values
 from .posterior import Worlds as Worlds
-from .reports import FitReport as FitReport
 from .residual import Residual as Residual
 from .residual import ResidualConfig as ResidualConfig
 from .rival import ROLL_OUTS as ROLL_OUTS
@@ -57,7 +53,6 @@ from .street_training import StreetTraining as StreetTraining
 from .summaries import LaneView as LaneView
 from .timed import TimedConfig as TimedConfig
 from .timed import TimedTransform as TimedTransform
-from .transform import Transform as Transform
 from .trust import TrustConfig as TrustConfig
 from .ugat import Ugat as Ugat
 from .uncertainty import UNCERTAINTY_METHODS as UNCERTAINTY_METHODS
