@@ -21,7 +21,7 @@ from ugat_marl.experiments import transfer
 from ugat_marl.grounding import DIRECT_LEARNER, Simulation, StreetConfig, StreetTraining
 from ugat_marl.grounding.rival import ROLL_OUTS, late_world, matched_delays
 from ugat_marl.grounding.street import StreetWorld
-from ugat_marl.policies import EpsilonGreedy, make_rule, observer_of, roll_out
+from ugat_marl.policies import DQNConfig, EpsilonGreedy, make_rule, observer_of, roll_out
 
 QUICK = StreetConfig(simulations=20, further=4, simulated_s=60.0, judged=1, rule_budget=0)
 CONFIG = replace(
@@ -124,8 +124,10 @@ def test_an_interrupted_rival_ends_as_an_unbroken_one(
 
 
 def test_late_commands_leave_no_rival(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Also with the learner that always sees its commands, and does not begin anew."""
     play_nothing(monkeypatch)
-    transfer(replace(CONFIG, real="execution_delay=20+lost_commands=0.2"), tmp_path, workers=1)
+    config = replace(CONFIG, learner="universal", dqn=DQNConfig(teacher=None))
+    transfer(replace(config, real="execution_delay=20+lost_commands=0.2"), tmp_path, workers=1)
     logged = numbers(tmp_path)
     assert logged[1, "street/commands"] > 0
     assert not [name for _, name in logged if "rival" in name]

@@ -226,7 +226,8 @@ class StreetTraining(Algorithm):
             where commands are late or detectors at fault, and where no green has to be late.
         """
         rival, name = state.transform.rival, iteration_name(state)
-        if rival is None or self._begins_anew((0, False), state.transform.view):
+        street, detectors_at_fault = state.transform.street, state.transform.view[1]
+        if rival is None or street is None or street.late or detectors_at_fault:
             return None, {}
         with self.run.reporter.task(f"under delays, {name}", ROLL_OUTS) as advance:
             seed = derive_seed(self.seed, "rival", state.iteration)
