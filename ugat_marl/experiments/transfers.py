@@ -422,13 +422,15 @@ def _write_results(
                 name = f"rule {rules[domain_label(job.target or job.sim)]}"
             rows.setdefault(name, (job, mark, record))  # one rule may be the best of both domains
     trained = {name: row for name, row in rows.items() if row[0].seed is not None}
-    for path in (directory / "policies").glob("*.pt"):
-        path.unlink()  # one of a row that an earlier call asked for would stay
+    policies: set[Path] = set()
     for file, (job, mark, _) in zip(file_names(trained), trained.values(), strict=True):
         policy = folder / job.name / (POLICY if mark == job.episodes else DIRECT_POLICY)
         if not policy.exists():  # of a learner that cannot be kept
             continue
+        policies.add(directory / "policies" / f"{file}.pt")
         write_whole(directory / "policies" / f"{file}.pt", policy.read_bytes())
+    for path in {*(directory / "policies").glob("*.pt")} - policies:
+        path.unlink()  # of a row that an earlier call asked for
     write_whole(directory / METRICS_FILE, (folder / plan[0].name / METRICS_FILE).read_bytes())
     write_queues(
         directory / QUEUES,

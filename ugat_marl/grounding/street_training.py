@@ -28,6 +28,7 @@ import contextlib
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
+from typing import Any
 
 from ugat_marl.data import TransitionLog
 from ugat_marl.grounding.algorithm import Algorithm, iteration_name
@@ -177,7 +178,7 @@ class StreetTraining(Algorithm):
             if residual is not None and residual.acts:
                 gate = residual.end_iteration().as_dict()
                 numbers |= {f"residual/gate/{name}": value for name, value in gate.items()}
-            rival, told = self._train_rival(state, policy)  # line 7
+            rival, told = self._train_rival(state, street, policy)  # line 7
             numbers |= told | self._keep_better(state, street, taught, rival, rule)  # line 8
             if self.probe is not None:
                 numbers |= self.probe(state.policy())
@@ -213,12 +214,13 @@ class StreetTraining(Algorithm):
             return rules[next(iter(race(list(rules), len(fields), play)))]
 
     def _train_rival(
-        self, state: RunState[StreetFit], policy: Policy
+        self, state: RunState[StreetFit], street: FittedStreet, policy: Policy
     ) -> tuple[Policy | None, dict[str, float]]:
         """Train the rival for an iteration, with greens that are late (line 7).
 
         Args:
-            state: The state, with the fitted street.
+            state: The state.
+            street: The fitted street.
             policy: The policy of the latest log.
 
         Returns:
@@ -226,8 +228,8 @@ class StreetTraining(Algorithm):
             where commands are late or detectors at fault, and where no green has to be late.
         """
         rival, name = state.transform.rival, iteration_name(state)
-        street, detectors_at_fault = state.transform.street, state.transform.view[1]
-        if rival is None or street is None or street.late or detectors_at_fault:
+        _, detectors_at_fault = state.transform.view
+        if rival is None or street.late or detectors_at_fault:
             return None, {}
         with self.run.reporter.task(f"under delays, {name}", ROLL_OUTS) as advance:
             seed = derive_seed(self.seed, "rival", state.iteration)
@@ -236,8 +238,8 @@ class StreetTraining(Algorithm):
         if not any(delay_s.values()):
             return None, numbers
         learner, title = rival.begin(), f"late greens, {name}"
-        with contextlib.closing(self.simulation.plain(0)) as env:
-            world = late_world(delay_s, env.intersection_of)
+        plain: Any = self.env.unwrapped
+        world = late_world(delay_s, plain.intersection_of)
         with contextlib.closing(self.simulation.env(world)) as env:
             self._attend(learner, env, title)
             self._learn(learner, env, self.config.grounded_episodes, title, "rival episode")
