@@ -2,17 +2,17 @@
 
     python -m studies.posterior_coverage single-v1 mixed-v1 --streets 60 --jobs 2
 
-Worlds are simulated once for each network, as a training does. Then streets are drawn and
-simulated, and the posterior is asked for the values of each. Half of the streets come from the
-prior of the worlds. The other half come from another distribution, so that the prior is wrong
-about them: each effect is there with a chance of a half, whatever the others, and a third of the
-lanes loses green at its beginning.
+Streets are drawn and simulated. Then each is fitted as a training does it, and the posterior is
+asked for its values. Worlds of the prior are simulated once and serve all streets; worlds that are
+aimed at a street are its own. Half of the streets come from the prior of the worlds. The other half
+come from another distribution, so that the prior is wrong about them: each effect is there with a
+chance of a half, whatever the others, and a third of the lanes loses green at its beginning.
 
 A value is covered if the 90 % interval of its draws holds it. A value at the end of its range is
 covered by an interval that ends there.
 
 The statistics of all episodes are kept in the folder ``--out`` and read again by the same command,
-unless the network, its library of effects or SUMO has changed.
+unless the network, its library of effects, the statistics or SUMO have changed.
 """
 
 from __future__ import annotations
@@ -47,7 +47,8 @@ from ugat_marl.grounding import (
     Worlds,
     street_prior,
 )
-from ugat_marl.grounding.summaries import Summary
+from ugat_marl.grounding.street import Known
+from ugat_marl.grounding.summaries import NAMES, Summary
 from ugat_marl.policies import Policy
 from ugat_marl.progress import Bars
 from ugat_marl.seeding import derive_seed, numpy_generator
@@ -152,64 +153,45 @@ def answers(
     return asked
 
 
-def study(network: Network, number: int, simulations: int, seed: int, kept: Path) -> list[Asked]:
+def study(network: Network, number: int, simulations: int, seed: int, folder: Path) -> list[Asked]:
     """Simulate worlds and streets of a network; return all answers.
 
     Args:
         network: The network, and who acts on it.
         number: Number of streets.
-        simulations: Number of worlds for the posterior.
+        simulations: Number of worlds for each posterior; those of the prior serve all streets.
         seed: Root of all random choices.
-        kept: File of the statistics of all episodes. They are read if it holds these worlds and
-            streets of this network; it is written anew otherwise.
+        folder: Folder of the statistics of all episodes.
     """
     worlds = network.worlds
+    ((prior, _), (_, aimed)) = Known().rounds(StreetConfig(simulations=simulations))
     streets = streets_of(worlds, number, seed)
-    values = [worlds.draw(derive_seed(seed, "world", k)) for k in range(simulations)]
-    played = _digest(network, [*values, *(value for _, value in streets)])
-    if not kept.exists() or _digest_of(kept) != played:
-        of_streets = [value for _, value in streets for _ in range(2)]  # two episodes of each
-        logs = network.play([*values, *of_streets], seed)
-        pairs = range(simulations, len(logs), 2)
-        logs = [*logs[:simulations], *(TransitionLog.concatenate(logs[k : k + 2]) for k in pairs)]
-        summaries = [network.view.summary(log) for log in logs]
-        every = np.ones_like(summaries[0].rows, dtype=np.bool_)
-        stacked = {
-            "played": np.array(played),
-            "values": np.stack([x.values for x in summaries]),
-            "rows": np.stack([x.rows for x in summaries]),
-            "usable": np.stack([every if x.usable is None else x.usable for x in summaries]),
-        }
-        with replacing(kept) as part, part.open("wb") as file:
-            np.savez(file, **stacked)
-    with np.load(kept, allow_pickle=False) as file:
-        columns = [file[name] for name in ("values", "rows", "usable")]
-    summaries = [Summary(*one) for one in zip(*columns, strict=True)]
-    known = [Simulated(v, x) for v, x in zip(values, summaries[:simulations], strict=True)]
+    values = [worlds.draw(derive_seed(seed, "world", k)) for k in range(prior)]
+    known = network.simulated(values, seed, folder, "prior")
+    seen = network.summaries([value for _, value in streets], seed, folder, "streets", episodes=2)
     several = [worlds.draw(derive_seed(seed, "blind", k)) for k in range(400)]
-    prior = (
+    blind = (
         np.stack([value.effects for value in several]),
         np.stack([value.service_s.mean(0) for value in several]),
     )
     asked: list[Asked] = []
-    for (kind, truth), summary in zip(streets, summaries[simulations:], strict=True):
-        asked += answers(Posterior.fit(worlds, known, summary), kind, truth, prior)
+    for k, ((kind, truth), summary) in enumerate(zip(streets, seen, strict=True)):
+        posterior = Posterior.fit(worlds, known, summary)
+        values = [posterior.draw(derive_seed(seed, "aimed", k, j)) for j in range(aimed)]
+        near = network.simulated(values, derive_seed(seed, k), folder, f"aimed at {k + 1}")
+        asked += answers(Posterior.fit(worlds, [*known, *near], summary), kind, truth, blind)
     return asked
 
 
-def _digest(network: Network, values: Sequence[Values]) -> str:
-    """Return a digest of the network, the worlds and the simulator of the episodes."""
+def _digest(network: Network, values: Sequence[Values], seed: int, episodes: int) -> str:
+    """Return a digest of the network, the episodes and the simulator."""
     names = [item.name for item in network.worlds.library]
-    told = [network.simulation.scenario.hash, names, installed_versions("eclipse-sumo")]
-    digest = hashlib.sha256(json.dumps(told).encode())
+    versions = installed_versions("eclipse-sumo")
+    told = [network.simulation.scenario.hash, network.policy, names, NAMES, versions]
+    digest = hashlib.sha256(json.dumps([*told, seed, episodes]).encode())
     for value in values:
         digest.update(value.effects.tobytes() + value.service_s.tobytes())
-    return digest.hexdigest()
-
-
-def _digest_of(kept: Path) -> str:
-    with np.load(kept, allow_pickle=False) as file:
-        return str(file["played"]) if "played" in file else ""
+    return digest.hexdigest()[:16]
 
 
 @dataclass(frozen=True)
@@ -220,13 +202,15 @@ class Network:
         name: The scenario.
         worlds: Prior of the worlds.
         view: Lanes of the network.
-        acting: Policy that acts in worlds and streets.
+        policy: Spelling of the rule that acts in worlds and streets.
+        acting: The rule.
         simulation: The simulation.
     """
 
     name: str
     worlds: Worlds
     view: LaneView
+    policy: str
     acting: Policy
     simulation: Simulation
 
@@ -238,9 +222,46 @@ class Network:
             worlds = street_prior(env, StreetConfig(parts=("service", "effects")))
             view, acting = LaneView.of(env.network, "movements"), policy_factory(policy)(env)
         simulation = Simulation(scenario, "sim", {"observation": "movements"}, EPSILON, jobs)
-        return cls(name, worlds, view, acting, simulation)
+        return cls(name, worlds, view, policy, acting, simulation)
 
-    def play(self, values: Sequence[Values], seed: int) -> list[TransitionLog]:
+    def simulated(
+        self, values: Sequence[Values], seed: int, folder: Path, title: str
+    ) -> list[Simulated]:
+        """Return the worlds of some values with the statistics of half an hour in each."""
+        summaries = self.summaries(values, seed, folder, title)
+        return [Simulated(*pair) for pair in zip(values, summaries, strict=True)]
+
+    def summaries(
+        self, values: Sequence[Values], seed: int, folder: Path, title: str, episodes: int = 1
+    ) -> list[Summary]:
+        """Return the statistics of each world; those that are kept in a folder are read.
+
+        Args:
+            values: Values of the worlds.
+            seed: Root of the seeds of the episodes.
+            folder: The folder.
+            title: Name of the progress bar.
+            episodes: Half hours in each world.
+        """
+        kept = folder / f"{self.name}-{_digest(self, values, seed, episodes)}.npz"
+        if not kept.exists():
+            logs = self._play([value for value in values for _ in range(episodes)], seed, title)
+            parts = range(0, len(logs), episodes)
+            logs = [TransitionLog.concatenate(logs[k : k + episodes]) for k in parts]
+            played = [self.view.summary(log) for log in logs]
+            every = np.ones_like(played[0].rows, dtype=np.bool_)
+            columns = {
+                "values": np.stack([x.values for x in played]),
+                "rows": np.stack([x.rows for x in played]),
+                "usable": np.stack([every if x.usable is None else x.usable for x in played]),
+            }
+            with replacing(kept) as part, part.open("wb") as file:
+                np.savez(file, **columns)
+        with np.load(kept, allow_pickle=False) as file:
+            read = [file[name] for name in ("values", "rows", "usable")]
+        return [Summary(*one) for one in zip(*read, strict=True)]
+
+    def _play(self, values: Sequence[Values], seed: int, title: str) -> list[TransitionLog]:
         """Return the log of half an hour in each world."""
         lanes = self.worlds.lanes
         drawn = [
@@ -248,7 +269,7 @@ class Network:
             for v in values
         ]
         seeds = [derive_seed(seed, "episode", k) for k in range(len(drawn))]
-        with Bars(Console(stderr=True)).task(self.name, len(drawn)) as advance:
+        with Bars(Console(stderr=True)).task(f"{self.name}, {title}", len(drawn)) as advance:
             return self.simulation.logs(drawn, self.acting, seeds, 1800.0, advance)
 
 
@@ -303,11 +324,9 @@ def main() -> None:
     parser.add_argument("--out", type=Path, default=Path("runs/posterior-coverage"))
     given = parser.parse_args()
     for name in given.scenarios:
-        stem = f"{name}-{given.policy.replace(':', '-')}-s{given.seed}"
-        kept = given.out / f"{stem}-{given.simulations}-{given.streets}.npz"
-        kept.parent.mkdir(parents=True, exist_ok=True)
+        given.out.mkdir(parents=True, exist_ok=True)
         network = Network.of(name, given.policy, given.jobs)
-        asked = study(network, given.streets, given.simulations, given.seed, kept)
+        asked = study(network, given.streets, given.simulations, given.seed, given.out)
         print(f"## {name}\n\n{table(asked)}\n", flush=True)
 
 

@@ -45,6 +45,8 @@ class Prior:
         nominal: Value that changes nothing.
         group: Effects of a group are present or absent together: vehicles differ as a whole.
         chance: Chance that the group is present; otherwise its values are nominal.
+        log: True to draw and to estimate the logarithm: half of a small value changes as much as
+            half of a large one.
     """
 
     name: str
@@ -53,6 +55,7 @@ class Prior:
     nominal: float
     group: str = ""
     chance: float = 0.35
+    log: bool = False
 
     def of(self, scenario: Scenario) -> Prior:
         """Return the prior with a scenario's nominal value, which its range includes."""
@@ -63,9 +66,9 @@ class Prior:
 
 
 LIBRARY = (
-    Prior("acceleration", 0.4, 3.0, 2.6, "vehicles", 0.65),
-    Prior("deceleration", 1.2, 5.0, 4.5, "vehicles", 0.65),
-    Prior("emergency_deceleration", 2.0, 9.0, 9.0, "vehicles", 0.65),
+    Prior("acceleration", 0.4, 3.0, 2.6, "vehicles", 0.65, log=True),
+    Prior("deceleration", 1.2, 5.0, 4.5, "vehicles", 0.65, log=True),
+    Prior("emergency_deceleration", 2.0, 9.0, 9.0, "vehicles", 0.65, log=True),
     Prior("startup_delay", 0.0, 1.0, 0.0, "vehicles", 0.65),
     Prior("headway", 0.8, 2.2, 1.0),
     Prior("desired_speed", 0.6, 1.1, 1.0),
@@ -154,12 +157,10 @@ class Worlds:
         generator = numpy_generator(seed, "worlds", "prior")
         chances = {item.group or item.name: item.chance for item in self.library}
         there = {name: generator.random() < chance for name, chance in chances.items()}
-        effects = np.array(
-            [
-                generator.uniform(x.low, x.high) if there[x.group or x.name] else x.nominal
-                for x in self.library
-            ]
-        )
+        ends = np.array([(x.low, x.high) for x in self.library]).reshape(-1, 2)
+        drawn = self.natural(generator.uniform(*self.scaled(ends.T)))
+        nominal = np.array([x.nominal for x in self.library])
+        effects = np.where([there[x.group or x.name] for x in self.library], drawn, nominal)
         service_s = np.zeros((len(self.lanes), len(SERVICE)))
         for column, prior in zip(service_s.T, SERVICE, strict=True):
             mean = (
@@ -169,6 +170,16 @@ class Worlds:
             spread = generator.uniform(0.0, prior.high_s / 2) if unequal else 0.0
             column += mean + spread * generator.standard_normal(len(self.lanes))
         return self.clipped(Values(effects, service_s * self.service))
+
+    def scaled(self, effects: Floats) -> Floats:
+        """Return values of the effects on the scale of the estimate, ``(..., effects)``."""
+        log = np.array([x.log for x in self.library], dtype=np.bool_)
+        return np.where(log, np.log(np.where(log, effects, 1.0)), effects)
+
+    def natural(self, scaled: Floats) -> Floats:
+        """Return the effects of which `scaled` gave the values."""
+        log = np.array([x.log for x in self.library], dtype=np.bool_)
+        return np.where(log, np.exp(np.where(log, scaled, 0.0)), scaled)
 
     def clipped(self, values: Values) -> Values:
         """Return the values within their ranges."""
@@ -240,8 +251,9 @@ class Posterior:
 
     Attributes:
         worlds: The prior.
-        effects: Regression's answer for the street, ``(effects,)``.
-        service_s: The same for the lanes, ``(lanes, 2)``.
+        effects: Regression's answer for the street, on the scale of `Worlds.scaled`,
+            ``(effects,)``.
+        service_s: The same for the lanes, in s, ``(lanes, 2)``.
         effect_errors: Residuals of the simulated worlds, ``(n, effects)``.
         service_errors_s: The same for the lanes, ``(n, lanes, 2)``.
         chances: Weights of the residuals, ``(n,)``.
@@ -270,7 +282,7 @@ class Posterior:
         network[:, unknown] = np.nan
         design = Design.of(network)
         x, x_street = design.inputs(network), design.inputs(street.network[None])
-        effects = np.stack([item.values.effects for item in simulated])
+        effects = worlds.scaled(np.stack([item.values.effects for item in simulated]))
         service_s = np.stack([item.values.service_s for item in simulated])
         mean_s = service_s.mean(1)
         wanted = np.concatenate([effects, mean_s], axis=1)
@@ -311,7 +323,7 @@ class Posterior:
     def drawn(self, generator: np.random.Generator) -> Values:
         """Draw the values of a world with a generator."""
         row = int(generator.choice(len(self.chances), p=self.chances))
-        effects = self.effects + self.effect_errors[row]
+        effects = self.worlds.natural(self.effects + self.effect_errors[row])
         service_s = at_least_0(self.service_s + self.service_errors_s[row])
         return self.worlds.clipped(Values(effects, service_s * self.worlds.service))
 

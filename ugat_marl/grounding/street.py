@@ -82,7 +82,8 @@ class StreetConfig:
 
     Attributes:
         parts: Parts that are fitted.
-        simulations: N, worlds that are simulated for the first posterior.
+        simulations: N, worlds that are simulated for the first fit, `AIMED` of them after a look at
+            the others.
         further: Worlds that each further iteration adds, half of them drawn from the posterior.
         simulated_s: Length of an episode in such a world, in s. Of longer episodes of the street
             only this first part is compared. Detectors are compared over whole episodes.
@@ -198,17 +199,23 @@ class FittedStreet:
 
     def world(self, seed: int) -> StreetWorld:
         """Draw the world of an episode."""
+        if self.posterior is None:
+            return StreetWorld(parts=self._parts(seed))
+        return self.around(self.posterior.worlds, self.posterior.draw(seed), seed)
+
+    def around(self, worlds: Worlds, values: Values, seed: int) -> StreetWorld:
+        """Draw the world of an episode, of which effects and service are given."""
+        service = FittedService(self.lanes, values.service_s)
+        return StreetWorld(worlds.effects(values), (*self._parts(seed), service))
+
+    def _parts(self, seed: int) -> tuple[ControllerPart, ...]:
+        """Draw what commands and detectors do in an episode."""
         parts: list[ControllerPart] = []
-        effects: tuple[Effect, ...] = ()
         if self.channel is not None and self.channel.changes:
             parts.append(self.channel)
         if self.eyes is not None:
             parts += self.eyes.parts(seed, self.lanes, self.interval_s)
-        if self.posterior is not None:
-            values = self.posterior.draw(seed)
-            effects = self.posterior.worlds.effects(values)
-            parts.append(FittedService(self.lanes, values.service_s))
-        return StreetWorld(effects, tuple(parts))
+        return tuple(parts)
 
     def describe(self) -> list[str]:
         """Return what was found, a line for each part."""
@@ -345,6 +352,11 @@ class Simulation:
     workers: Workers = None
     most_delay_s: int = 0
 
+    @property
+    def longest_s(self) -> float:
+        """Length of an episode in s."""
+        return self.options.get("duration_s") or self.scenario.settings.duration_s
+
     def env(self, world: StreetWorld, **options: Any) -> TrafficEnv:
         """Return an environment of a world."""
         fitted = (*self.options.get("fitted", ()), *world.parts)
@@ -414,12 +426,14 @@ class Simulation:
         stop = Stop()
         options = {**self.options}
         if duration_s is not None:
-            longest_s = self.options.get("duration_s") or self.scenario.settings.duration_s
-            options["duration_s"] = min(duration_s, longest_s)
+            options["duration_s"] = min(duration_s, self.longest_s)
         short = replace(self, options=options, workers=None)
         parts = [(world, policy, seed, stop) for world, seed in zip(worlds, seeds, strict=True)]
         return in_order(self.workers, short.play, parts, stop, lambda _: on_done())
 
+
+AIMED = 0.4
+"""Share of the worlds of a first fit that are drawn from the posterior of the others."""
 
 BASELINE_EPISODES = 2
 """Episodes of the plain simulation with which detectors are compared."""
@@ -437,12 +451,16 @@ class Known:
     simulated: tuple[Simulated, ...] = ()
     posterior: Posterior | None = None
 
-    def draw(self, worlds: Worlds, config: StreetConfig, seed: int) -> list[Values]:
-        """Draw the worlds to simulate next: from the prior, later half from the posterior."""
+    def rounds(self, config: StreetConfig) -> list[tuple[int, int]]:
+        """Return how many worlds of each round come from the prior and from the posterior so far.
+
+        Few worlds of the prior are near any one street. Those of the posterior are, and the
+        regression is most accurate where its worlds are.
+        """
         if self.posterior is None:
-            return [worlds.draw(derive_seed(seed, k)) for k in range(config.simulations)]
-        sources = (self.posterior, worlds)
-        return [sources[k % 2].draw(derive_seed(seed, k)) for k in range(config.further)]
+            aimed = int(AIMED * config.simulations)
+            return [(config.simulations - aimed, 0), (0, aimed)]
+        return [(config.further // 2, config.further - config.further // 2)]
 
 
 def fit_street(
@@ -492,23 +510,25 @@ def fit_street(
         street = FittedStreet(lanes, interval_s, channel, eyes)
     if not config.simulates:
         return street, known
-    values = known.draw(worlds, config, derive_seed(seed, "street", "values"))
-    seeds = [derive_seed(seed, "street", "world", k) for k in range(len(values))]
-    drawn: list[StreetWorld] = []
-    for one, value in zip(seeds, values, strict=True):
-        service = FittedService(lanes, value.service_s)
-        parts = (*street.world(one).parts, service)
-        drawn.append(StreetWorld(worlds.effects(value), parts))
     # Queues grow through a peak: worlds of half an hour tell nothing of an hour's second half.
-    decisions = min(real.decisions, max(1, int(config.simulated_s / interval_s)))
-    logs = simulation.logs(drawn, policy, seeds, decisions * interval_s, on_done)
-    added = [Simulated(value, view.summary(log)) for value, log in zip(values, logs, strict=True)]
-    simulated = (*known.simulated, *added)
-    # Episodes of the simulation may be shorter than those of the log.
-    seen = real.first(max(log.decisions for log in logs))
-    posterior = Posterior.fit(worlds, simulated, view.summary(seen))
+    compared_s = min(config.simulated_s, simulation.longest_s)
+    decisions = min(real.decisions, max(1, int(compared_s / interval_s)))
+    seen = view.summary(real.first(decisions))
+    simulated, posterior = list(known.simulated), known.posterior
+    for prior, aimed in known.rounds(config):
+        first, number = len(simulated) - len(known.simulated), prior + aimed
+        ids = [derive_seed(seed, "street", "values", first + k) for k in range(number)]
+        values = [worlds.draw(one) for one in ids[:prior]]
+        values += [] if posterior is None else [posterior.draw(one) for one in ids[prior:]]
+        seeds = [derive_seed(seed, "street", "world", first + k) for k in range(number)]
+        drawn = [street.around(worlds, *pair) for pair in zip(values, seeds, strict=True)]
+        logs = simulation.logs(drawn, policy, seeds, decisions * interval_s, on_done)
+        simulated += [
+            Simulated(*pair) for pair in zip(values, map(view.summary, logs), strict=True)
+        ]
+        posterior = Posterior.fit(worlds, simulated, seen)
     street = FittedStreet(lanes, interval_s, channel, street.eyes, posterior)
-    return street, Known(simulated, posterior)
+    return street, Known(tuple(simulated), posterior)
 
 
 def street_log(

@@ -37,7 +37,12 @@ LEAST_ROWS = 3
 COUNTED = ("count", "density", "movements", "queue")
 """Observations in vehicles; the others cannot be summarised."""
 
-GREENS = ("begins", "goes on")
+LONG_S = 15.0
+"""Age of a green, in s, from which it is long."""
+
+GREENS = ("begins", "goes on", "is long")
+"""Ages of a green. Seconds lost at its beginning, slow vehicles and a low flow are told apart by
+what passes later."""
 NAMES = (
     *(
         f"{what}, green {green}, {low:g} or more"
@@ -100,6 +105,7 @@ class LaneRows:
         before: Vehicles at the decision.
         after: Vehicles at the next decision.
         left: Mean number of vehicles that had left in between; NaN if it was not measured.
+        age_s: Seconds for which the lane had had green at the decision, or more.
         had: True if the lane had green at the decision.
         has: True if the lane has green afterwards.
         full: True if the lane is full at the decision or at the next one.
@@ -111,6 +117,7 @@ class LaneRows:
     before: Floats
     after: Floats
     left: Floats
+    age_s: Floats
     had: NDArray[np.bool_]
     has: NDArray[np.bool_]
     full: NDArray[np.bool_]
@@ -186,7 +193,9 @@ class LaneView:
         rows = [
             row
             for place, (agent, layout) in enumerate(log.provenance.layouts.items())
-            for row in self._rows_of(place, log.transitions(agent), layout)
+            for row in self._rows_of(
+                place, log.transitions(agent), layout, log.provenance.decision_interval_s
+            )
         ]
         limits = FULL * self.holds
         full = [
@@ -217,7 +226,9 @@ class LaneView:
         unsure = np.array([deviation.get(lane, 0.0) > MOST_DEVIATION for lane in self.lanes])
         return summary.where(~(unsure[:, None] & OF_COUNTS))
 
-    def _rows_of(self, place: int, rows: Transitions, layout: AgentLayout) -> Iterator[LaneRows]:
+    def _rows_of(
+        self, place: int, rows: Transitions, layout: AgentLayout, interval_s: float
+    ) -> Iterator[LaneRows]:
         """Return the decisions of the lanes of an intersection."""
         green, scale, first = self.green[place], self.scale[place], self.first[place]
         part = slice(first, first + len(scale))
@@ -228,6 +239,9 @@ class LaneView:
             left = before - rows.served_features[:, part] * scale
         phase = rows.observation[:, layout.features : layout.features + layout.phases].argmax(1)
         had, has = green[:, phase], green[:, rows.executed]
+        goes_on = np.zeros(len(phase), dtype=np.bool_)  # the decision follows the one before it
+        goes_on[1:] = (np.diff(rows.episode) == 0) & (np.diff(rows.step) == 1)
+        age_s = interval_s * _ages(had, goes_on)
         for k in range(len(scale)):
             none = np.zeros(len(before), dtype=np.bool_)
             yield LaneRows(
@@ -236,11 +250,26 @@ class LaneView:
                 _whole(before[:, k]),
                 _whole(after[:, k]),
                 left[:, k],
+                age_s[k],
                 had[k],
                 has[k],
                 none,
                 none,
             )
+
+
+def _ages(had: NDArray[np.bool_], goes_on: NDArray[np.bool_]) -> NDArray[np.int64]:
+    """Return for how many decisions in sequence each lane had green, ``(lanes, n)``.
+
+    Args:
+        had: True if a lane had green at a decision, ``(lanes, n)``.
+        goes_on: True if a decision follows the one before it, ``(n,)``.
+    """
+    place = np.arange(had.shape[1])
+    begins = had.copy()
+    begins[:, 1:] &= ~(had[:, :-1] & goes_on[1:])
+    begun = np.maximum.accumulate(np.where(begins, place, 0), axis=1)
+    return np.where(had, place - begun + 1, 0)
 
 
 def _whole(counts: Floats) -> Floats:
@@ -252,7 +281,8 @@ def _whole(counts: Floats) -> Floats:
 def _statistics(rows: LaneRows) -> tuple[Floats, Floats]:
     """Return the statistics of a lane, and the numbers of decisions behind them."""
     before, fall = rows.before, rows.before - rows.after
-    greens = (rows.has & ~rows.had, rows.has & rows.had)
+    goes_on, is_long = rows.has & rows.had, rows.age_s >= LONG_S
+    greens = (rows.has & ~rows.had, goes_on & ~is_long, goes_on & is_long)
     ends = (*CLASSES[1:], np.inf)
     cells = [
         (outcome, green & ~rows.held & (before >= low) & (before < end))
