@@ -89,6 +89,25 @@ def test_draws_keep_to_their_ranges_and_name_only_what_changes() -> None:
     assert "demand_level" not in names[1:]  # demand changes before vehicles do
 
 
+def test_low_accelerations_are_drawn_as_often_as_high_ones_of_the_same_ratio() -> None:
+    place = [item.name for item in WORLDS.library].index("acceleration")
+    item = WORLDS.library[place]
+    drawn = np.array([WORLDS.draw(seed).effects[place] for seed in range(2000)])
+    drawn = drawn[drawn != item.nominal]
+    assert drawn.min() >= item.low and drawn.max() <= item.high
+    below = [np.mean(drawn < item.low * (item.high / item.low) ** share) for share in (0.25, 0.5)]
+    assert below == pytest.approx([0.25, 0.5], abs=0.04)
+
+
+def test_what_is_estimated_as_a_logarithm_comes_back() -> None:
+    effects = np.stack([WORLDS.draw(seed).effects for seed in range(20)])
+    np.testing.assert_allclose(WORLDS.natural(WORLDS.scaled(effects)), effects, rtol=1e-12)
+    place = [item.name for item in WORLDS.library].index("deceleration")
+    np.testing.assert_allclose(WORLDS.scaled(effects)[:, place], np.log(effects[:, place]))
+    nothing = Worlds.of(LANES, without=[item.name for item in WORLDS.library])
+    assert nothing.draw(3).effects.shape == nothing.scaled(np.zeros((4, 0)))[0].shape == (0,)
+
+
 def test_an_effect_can_be_left_out() -> None:
     worlds = Worlds.of(LANES, without=["headway"])
     assert "headway" not in [item.name for item in worlds.library]

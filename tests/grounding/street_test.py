@@ -35,7 +35,7 @@ from ugat_marl.grounding import (
 )
 from ugat_marl.grounding.channel import ChannelConfig, CommandChannel
 from ugat_marl.grounding.eyes import Eyes, EyesConfig, fit_eyes
-from ugat_marl.grounding.posterior import Values
+from ugat_marl.grounding.posterior import Posterior, Values
 from ugat_marl.grounding.state import RunState
 from ugat_marl.grounding.street_training import StreetTraining
 from ugat_marl.grounding.summaries import NAMES
@@ -192,6 +192,38 @@ def test_each_part_can_be_fitted_alone(part: str) -> None:
         effects, service_s = street.posterior.sample(20)
         assert bool(effects.size) == (part == "effects")
         assert bool(service_s.any()) == (part == "service")
+
+
+def test_the_last_worlds_of_a_fit_are_drawn_from_the_posterior_of_the_others(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    config = replace(QUICK, parts=("effects",), simulations=20, further=4)
+    env = parallel_env(SCENARIO)
+    prior, view = street_prior(env, config), LaneView.of(env.network, "count")
+    rule = make_rule("fixed-time:20", env)
+    env.close()
+    fitted: list[int] = []
+    fit, draw = Posterior.fit, Posterior.draw
+
+    def counted(worlds: Any, simulated: Any, seen: Any) -> Posterior:
+        fitted.append(len(simulated))
+        return fit(worlds, simulated, seen)
+
+    def marked(self: Posterior, seed: int) -> Values:
+        values = draw(self, seed)
+        return replace(values, effects=np.append(values.effects[:-1], 1.0123))
+
+    monkeypatch.setattr(Posterior, "fit", counted)
+    monkeypatch.setattr(Posterior, "draw", marked)
+    known = None
+    for _ in range(2):
+        _, known = fit_street(
+            recorded("sim", 40.0), simulation(), rule, prior, view, config, seed=0, known=known
+        )
+    assert known is not None
+    aimed = [item.values.effects[-1] == 1.0123 for item in known.simulated]
+    assert aimed == [False] * 12 + [True] * 8 + [False] * 2 + [True] * 2
+    assert fitted == [12, 20, 24]
 
 
 @pytest.mark.parametrize(

@@ -1,0 +1,63 @@
+"""Statistics of lanes by hand: what leaves in greens of each age."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from ugat_marl.data import AgentLayout, Provenance, TransitionLog, TransitionRecorder
+from ugat_marl.grounding.summaries import NAMES, LaneView
+
+GREEN = np.array([[True, False]])
+VIEW = LaneView(("road_0",), (GREEN,), (np.full(1, 40.0),), (0,), np.full(1, 40.0), ((),))
+SERVED = (1.0, 2.0, 4.0, 4.0)
+"""Vehicles that leave in the first, second, ... decision of a green."""
+
+
+def log_of(interval_s: float, skipped: int = -1) -> TransitionLog:
+    """Return a log of greens of four decisions after reds of two; one decision may be missing."""
+    layouts = {"a_0": AgentLayout(1, 2)}
+    recorder = TransitionRecorder(
+        Provenance("by hand", "", "street", (), interval_s, "count", layouts)
+    )
+    count, before = 20.0, 1
+    for t in range(60):
+        age = t % 6
+        phase = 0 if age < 4 else 1
+        then = count - SERVED[age] if phase == 0 else count + 5.5
+        seen = [
+            {"a_0": np.array([vehicles / 40.0, *np.eye(2)[shown]])}
+            for vehicles, shown in ((count, before), (then, phase))
+        ]
+        if t != skipped:
+            did = {"a_0": phase}
+            recorder.record(0, t, seen[0], did, did, {"a_0": 0.0}, seen[1])
+        count, before = then, phase
+    return recorder.log()
+
+
+def fall(log: TransitionLog, age: str) -> tuple[float, float]:
+    """Return the mean fall of long queues in greens of an age, and its number of decisions."""
+    summary, column = VIEW.summary(log), NAMES.index(f"fall, green {age}, 9 or more")
+    return float(summary.values[0, column]), float(summary.rows[0, column])
+
+
+@pytest.mark.parametrize(
+    ("interval_s", "goes_on", "is_long"),
+    [(10.0, (2.0, 10.0), (4.0, 20.0)), (5.0, (3.0, 20.0), (4.0, 10.0))],
+)
+def test_greens_are_told_apart_by_their_age(
+    interval_s: float, goes_on: tuple[float, float], is_long: tuple[float, float]
+) -> None:
+    """A green of 15 s is long: of those of 10 s the third decision, of those of 5 s the fourth."""
+    log = log_of(interval_s)
+    assert fall(log, "begins") == pytest.approx((1.0, 10.0))
+    assert fall(log, "goes on") == pytest.approx(goes_on)
+    assert fall(log, "is long") == pytest.approx(is_long)
+
+
+def test_a_missing_decision_makes_no_green_older() -> None:
+    """Without its second decision nobody knows that a green went on."""
+    log = log_of(10.0, skipped=1)
+    assert fall(log, "goes on") == pytest.approx((22.0 / 10, 10.0))  # the third one took its place
+    assert fall(log, "is long") == pytest.approx((4.0, 19.0))
