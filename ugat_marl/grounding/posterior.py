@@ -5,6 +5,9 @@ do not use. The policy of the log acts in each. A regression from the statistics
 (`summaries`) to the drawn values, and its residuals on worlds left out, give draws of the worlds
 that the street's log leaves possible (`regression`).
 
+The prior gives each effect a chance to be absent; draws are without those that the log does not ask
+for (`presence`).
+
 All values are estimated together: one residual holds the errors of all effects and lanes of one
 simulated world. Lanes share the regression and the network's statistics, so where a lane's log says
 little its draws follow the network.
@@ -12,6 +15,7 @@ little its draws follow the network.
 
 from __future__ import annotations
 
+import functools
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import Any, ClassVar
@@ -28,6 +32,7 @@ from ugat_marl.effects import (
     nominal_number,
 )
 from ugat_marl.errors import CheckpointError, UnknownNameError
+from ugat_marl.grounding.presence import LEAST_SPREAD, Change, Presence, lanes_are_equal
 from ugat_marl.grounding.regression import Design, Floats, kernel, left_out, ridge
 from ugat_marl.grounding.summaries import Summary
 from ugat_marl.scenarios import Scenario
@@ -91,6 +96,11 @@ class ServicePrior:
     high_s: float
     unequal: float = 0.5
 
+    @property
+    def is_there(self) -> float:
+        """Chance that some lane has unused green."""
+        return 1.0 - (1.0 - self.chance) * (1.0 - self.unequal)
+
 
 SERVICE = (ServicePrior(0.5, 5.0), ServicePrior(0.35, 3.0))
 """Priors of the red at the beginning of a green, and of the red in each further decision."""
@@ -151,6 +161,14 @@ class Worlds:
         if scenario is not None:
             library = tuple(item.of(scenario) for item in library)
         return cls(library, tuple(lanes), service)
+
+    @property
+    def groups(self) -> list[tuple[tuple[int, ...], float]]:
+        """Places in the library of effects that come together, and their chance."""
+        places: dict[str, list[int]] = {}
+        for place, item in enumerate(self.library):
+            places.setdefault(item.group or item.name, []).append(place)
+        return [(tuple(some), self.library[some[0]].chance) for some in places.values()]
 
     def draw(self, seed: int) -> Values:
         """Draw a world from the prior."""
@@ -323,9 +341,44 @@ class Posterior:
     def drawn(self, generator: np.random.Generator) -> Values:
         """Draw the values of a world with a generator."""
         row = int(generator.choice(len(self.chances), p=self.chances))
-        effects = self.worlds.natural(self.effects + self.effect_errors[row])
-        service_s = at_least_0(self.service_s + self.service_errors_s[row])
-        return self.worlds.clipped(Values(effects, service_s * self.worlds.service))
+        service_s = self.service_s + self.service_errors_s[row]
+        mean_s, split = service_s.mean(0), len(self.effects)
+        drawn = np.concatenate((self.effects + self.effect_errors[row], mean_s))
+        drawn, absent = self.presence.drawn(drawn, generator)
+        service_s = service_s + drawn[split:] - mean_s
+        service_s[:, absent[absent >= split] - split] = 0.0
+        values = Values(self.worlds.natural(drawn[:split]), at_least_0(service_s))
+        return self.worlds.clipped(
+            replace(values, service_s=values.service_s * self.worlds.service)
+        )
+
+    @functools.cached_property
+    def presence(self) -> Presence:
+        """Chances that the effects, and the red of lanes, are there."""
+        worlds, split = self.worlds, len(self.effects)
+        mean_s = self.service_s.mean(0)
+        errors = np.concatenate((self.effect_errors, self.service_errors_s.mean(1)), axis=1)
+        bias = self.chances @ errors
+        spread = (errors - bias).T @ ((errors - bias) * self.chances[:, None])
+        unlike = self.service_errors_s - self.service_errors_s.mean(1, keepdims=True)
+        lanes_s = np.sqrt(np.einsum("n,nlc->lc", self.chances, unlike**2))
+        changes = [Change(columns, chance) for columns, chance in worlds.groups]
+        for column, prior in enumerate(SERVICE):
+            evidence = lanes_are_equal(
+                self.service_s[:, column] - mean_s[column],
+                lanes_s[:, column] + LEAST_SPREAD * prior.high_s,
+                prior.high_s / 2,
+                prior.unequal,
+            )
+            changes.append(Change((split + column,), prior.is_there, evidence))
+        ends = worlds.scaled(
+            np.array([(x.low, x.nominal, x.high) for x in worlds.library]).reshape(-1, 3).T
+        )
+        none_s = np.zeros(len(SERVICE))
+        low, nominal = (np.concatenate((end, none_s)) for end in ends[:2])
+        high = np.concatenate((ends[2], [prior.high_s for prior in SERVICE]))
+        mean = np.concatenate((self.effects, mean_s)) + bias
+        return Presence.of(changes, mean, spread, nominal, low, high)
 
     def sample(self, number: int, seed: int = 0) -> tuple[Floats, Floats]:
         """Return effects ``(number, effects)`` and service ``(number, lanes, 2)`` of draws."""

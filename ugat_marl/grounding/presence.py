@@ -1,0 +1,141 @@
+"""Which changes of a world are there at all: chances of each set, and draws without the others.
+
+In the prior of worlds a change is absent with some chance: a point of mass at the value that
+changes nothing. A regression spreads that mass, so that a street is given a little of everything.
+Here it is put back. With the normal distribution N(m, C) for what the regression says of all
+values, with A the values of absent changes and F those of present ones:
+
+    chance(A) ~ prior(A) N(nominal_A; m_A, C_AA) prod_F (share of F's range that N allows) / range_F
+    x_F | A   = x_F + C_FA C_AA^-1 (nominal_A - x_A)
+
+The first is the ratio of Dickey (1971), whose factors 1 / range are the price of a further value.
+The second turns a draw x into one in which the absent values are known (Matheron's rule).
+"""
+
+from __future__ import annotations
+
+import itertools
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.stats import norm
+
+Floats = NDArray[np.float64]
+
+LEAST_SPREAD = 0.02
+"""Share of a range that is added to the standard deviation of a value: by hand."""
+
+
+@dataclass(frozen=True)
+class Change:
+    """A change that is there or not.
+
+    Attributes:
+        columns: Places of its values.
+        chance: Prior chance that it is there.
+        evidence: Log of how much more likely other data are without it; 0 for none.
+    """
+
+    columns: tuple[int, ...]
+    chance: float
+    evidence: float = 0.0
+
+
+@dataclass(frozen=True)
+class Presence:
+    """Chances of every set of changes.
+
+    Attributes:
+        nominal: Values that change nothing, ``(k,)``.
+        chances: Chance of each set, ``(sets,)``.
+        absent: For each set, the places of the values of absent changes.
+        gains: For each set, how the other values follow the absent ones, ``(k, absent)``.
+    """
+
+    nominal: Floats
+    chances: Floats
+    absent: tuple[NDArray[np.int64], ...]
+    gains: tuple[Floats, ...]
+
+    @classmethod
+    def of(
+        cls, changes: Sequence[Change], mean: Floats, covariance: Floats, nominal: Floats,
+        low: Floats, high: Floats,
+    ) -> Presence:  # fmt: skip
+        """Return the chances of a normal distribution and a prior.
+
+        Args:
+            changes: The changes. A value of none of them is always there.
+            mean: Mean of the values, ``(k,)``.
+            covariance: Their covariance, ``(k, k)``.
+            nominal: Values that change nothing, ``(k,)``.
+            low: Lowest values, ``(k,)``.
+            high: Highest values, ``(k,)``.
+        """
+        every = np.arange(len(mean))
+        covariance = covariance + np.diag((LEAST_SPREAD * (high - low)) ** 2)
+        logs: list[float] = []
+        absent: list[NDArray[np.int64]] = []
+        gains: list[Floats] = []
+        for there in itertools.product((True, False), repeat=len(changes)):
+            pairs = list(zip(changes, there, strict=True))
+            gone = [column for x, is_there in pairs if not is_there for column in x.columns]
+            out = np.array(gone, dtype=np.int64)
+            left = np.setdiff1d(every, out)
+            off = nominal[out] - mean[out]
+            gain = np.zeros((len(every), len(out)))
+            log = sum(math.log(x.chance if is_there else 1.0 - x.chance) for x, is_there in pairs)
+            log += sum(x.evidence for x, is_there in pairs if not is_there)
+            if gone:
+                within = covariance[np.ix_(out, out)]
+                gain += np.linalg.solve(within, covariance[out]).T
+                distance = float(off @ np.linalg.solve(within, off))
+                log -= 0.5 * (distance + float(np.linalg.slogdet(2.0 * np.pi * within)[1]))
+            middle = (mean + gain @ off)[left]
+            spread = np.sqrt(np.diag(covariance - gain @ covariance[out])[left])
+            share = norm.cdf(high[left], middle, spread) - norm.cdf(low[left], middle, spread)
+            log += float(np.log(np.maximum(share, 1e-9) / (high - low)[left]).sum())
+            logs.append(log)
+            absent.append(out)
+            gains.append(gain)
+        weights = np.exp(np.array(logs) - max(logs))
+        return cls(nominal, weights / weights.sum(), tuple(absent), tuple(gains))
+
+    def drawn(
+        self, values: Floats, generator: np.random.Generator
+    ) -> tuple[Floats, NDArray[np.int64]]:
+        """Draw a set of changes; return the values of a draw given that set, and what is absent.
+
+        Args:
+            values: A draw of all values, ``(k,)``.
+            generator: Draws the set.
+        """
+        one = int(generator.choice(len(self.chances), p=self.chances))
+        out = self.absent[one]
+        return values + self.gains[one] @ (self.nominal[out] - values[out]), out
+
+    def chance_of(self, column: int) -> float:
+        """Return the chance that the change of a value is there."""
+        there = [column not in out for out in self.absent]
+        return float(self.chances[there].sum())
+
+
+def lanes_are_equal(offsets: Floats, spread: Floats, most: float, chance: float) -> float:
+    """Return the log of how much more likely offsets of lanes are if lanes do not differ.
+
+    If they differ, each is drawn from a normal distribution, whose standard deviation is somewhere
+    between 0 and `most`.
+
+    Args:
+        offsets: Estimated distance of each lane from the mean, ``(lanes,)``.
+        spread: Standard deviations of the estimates, ``(lanes,)``.
+        most: Largest standard deviation of the lanes.
+        chance: Prior chance that lanes differ.
+    """
+    tried = np.linspace(0.0, most, 12)[:, None]
+    logs = norm.logpdf(offsets, 0.0, np.hypot(spread, tried)).sum(1)
+    differ = np.log(np.mean(np.exp(logs - logs.max()))) + logs.max()
+    return float(logs[0] - np.logaddexp(np.log(1.0 - chance) + logs[0], np.log(chance) + differ))
