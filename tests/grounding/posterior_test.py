@@ -89,6 +89,20 @@ def test_draws_keep_to_their_ranges_and_name_only_what_changes() -> None:
     assert "demand_level" not in names[1:]  # demand changes before vehicles do
 
 
+def test_a_street_with_one_effect_is_given_no_others() -> None:
+    nominal = np.array([x.nominal for x in WORLDS.library])
+    place = [item.name for item in WORLDS.library].index("headway")
+    effects = nominal.copy()
+    effects[place] = 1.9
+    truth = Values(effects, np.zeros((len(LANES), 2)))
+    posterior = Posterior.fit(WORLDS, SIMULATED, summary(truth, 5))
+    assert posterior.presence.chance_of(place) > 0.9
+    drawn, service_s = posterior.sample(300)
+    assert (np.abs(np.delete(drawn - nominal, place, axis=1)) < 1e-9).mean() > 0.6
+    assert (service_s == 0.0).all((1, 2)).mean() > 0.5
+    assert np.quantile(drawn[:, place], (0.05, 0.95)) == pytest.approx(1.9, abs=0.4)
+
+
 def test_low_accelerations_are_drawn_as_often_as_high_ones_of_the_same_ratio() -> None:
     place = [item.name for item in WORLDS.library].index("acceleration")
     item = WORLDS.library[place]

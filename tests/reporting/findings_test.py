@@ -63,6 +63,7 @@ def test_effects_and_the_policy_that_was_kept(tmp_path: Path) -> None:
         "effects/acceleration/low": 0.4,
         "effects/acceleration/high": 0.9,
         "effects/acceleration/nominal": 2.6,
+        "effects/acceleration/chance": 0.97,
         "judged/before": 110.0,
         "judged/after": 102.0,
         "judged/of_the_rule": 99.0,
@@ -70,7 +71,7 @@ def test_effects_and_the_policy_that_was_kept(tmp_path: Path) -> None:
     section = found_on_street(record(tmp_path / "run", numbers))
     assert section is not None
     (effect,) = section["effects"].rows
-    assert effect == ["acceleration", "m/s^2", "2.6", "0.5", "0.4 to 0.9", "no"]
+    assert effect == ["acceleration", "m/s^2", "2.6", "0.5", "0.4 to 0.9", "97%"]
     assert section["kept"].endswith(
         "the policy kept so far 110 s, the policy after training 102 s, the rule 99 s. "
         "Kept was the rule."

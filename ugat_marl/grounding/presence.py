@@ -1,4 +1,4 @@
-"""Which changes of a world are there at all: chances of each set, and draws without the others.
+"""Chances of each set of changes of a world, and draws without the changes that are absent.
 
 In the prior of worlds a change is absent with some chance: a point of mass at the value that
 changes nothing. A regression spreads that mass, so that a street is given a little of everything.

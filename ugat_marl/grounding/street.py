@@ -65,6 +65,9 @@ KIND = "street"
 _DRAWS = 200
 """Draws from a fitted part, for its intervals."""
 
+NAMED = 0.1
+"""Least chance of an effect that is said."""
+
 PARTS = ("channel", "eyes", "service", "effects")
 """Parts of a street, each of which can be left out."""
 
@@ -224,8 +227,13 @@ class FittedStreet:
             effects, service_s = self.posterior.sample(_DRAWS)
             low, high = np.quantile(effects, (0.05, 0.95), axis=0)
             ranges = zip(self.posterior.worlds.library, low, high, strict=True)
-            named = (f"{x.name} {a:.2g} to {b:.2g}" for x, a, b in ranges)
-            lines.append("effects: " + ", ".join(named))
+            chance = self.posterior.presence.chance_of
+            named = [
+                f"{x.name} {a:.2g} to {b:.2g} ({chance(place):.0%})"
+                for place, (x, a, b) in enumerate(ranges)
+                if chance(place) >= NAMED
+            ]
+            lines.append(f"effects: {', '.join(named) or 'none'}")
             begin_s, each_s = service_s.mean(0).T
             lines.append(
                 f"greens: {begin_s.min():.1f} to {begin_s.max():.1f} s unused at their beginning, "
@@ -277,6 +285,7 @@ class FittedStreet:
                 numbers[f"effects/{item.name}/low"] = float(low)
                 numbers[f"effects/{item.name}/high"] = float(high)
                 numbers[f"effects/{item.name}/nominal"] = item.nominal
+                numbers[f"effects/{item.name}/chance"] = self.posterior.presence.chance_of(place)
             for lane, (begin_s, each_s) in zip(self.lanes, service_s.mean(0), strict=True):
                 numbers[f"service/begin_s/{lane}"] = float(begin_s)
                 numbers[f"service/each_s/{lane}"] = float(each_s)

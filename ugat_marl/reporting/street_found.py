@@ -80,7 +80,7 @@ def detectors_found(record: RunRecord) -> str:
 
 
 def _effects(record: RunRecord) -> Grid | None:
-    """Return the effects with their intervals; None if they were not fitted."""
+    """Return the effects with intervals and chances; None if they were not fitted."""
     rows: list[list[str]] = []
     for prior in LIBRARY:
         name = f"effects/{prior.name}"
@@ -89,15 +89,15 @@ def _effects(record: RunRecord) -> Grid | None:
         if middle is None or low is None or high is None or nominal is None:
             continue
         unit = next(iter(known_effects()[prior.name].ranges.values())).unit or "–"
-        usual = "yes" if low <= nominal <= high else "no"
+        chance = _last(record, f"{name}/chance")
         rows.append(
             [
                 prior.name.replace("_", " "), unit, number(nominal), number(middle),
-                f"{number(low)} to {number(high)}", usual,
+                f"{number(low)} to {number(high)}", "–" if chance is None else f"{chance:.0%}",
             ]
         )  # fmt: skip
-    headings = ["effect", "unit", "simulation", "street", "90 % interval", "simulation possible"]
-    return Grid(headings, rows, headings[2:5]) if rows else None
+    headings = ["effect", "unit", "simulation", "street", "90 % interval", "chance"]
+    return Grid(headings, rows, headings[2:]) if rows else None
 
 
 def _kept(record: RunRecord) -> str:
