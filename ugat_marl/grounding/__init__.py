@@ -14,8 +14,9 @@ paper. The modules, from data to the algorithm:
 - `worlds`, `controls`: sources of D_sim and D_real; negative controls.
 - `detected`, `measured_log`: vehicles on lanes from detections; measured data as a log.
 - `oversaturation`: decisions of a log at which lanes are full.
-- `channel`, `eyes`, `summaries`, `regression`, `posterior`: commands, detectors and worlds of a
-  street, fitted from its log; `street` puts them together and draws the world of each episode.
+- `channel`, `eyes`, `summaries`, `regression`, `presence`, `posterior`: commands, detectors and
+  worlds of a street, fitted from its log; `street` puts them together and draws the world of each
+  episode.
 - `config`, `state`, `algorithm`: settings, checkpoint, plain training.
 - `ugat`, `street_training`: Algorithm 1; training in a fitted street, and its `rival`, which
   trains with late greens.
