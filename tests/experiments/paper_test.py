@@ -206,7 +206,9 @@ def test_the_simulation_is_no_real_domain_of_its_own_table() -> None:
         PaperConfig(sim="light-loads").targets("alpha")
 
 
-@pytest.mark.parametrize("learner", [(), ("--learner", "ippo")])
+@pytest.mark.parametrize(
+    "learner", [pytest.param((), marks=pytest.mark.slow), ("--learner", "ippo")]
+)
 def test_a_table_from_the_command_line(
     learner: tuple[str, ...],
     tmp_path: Path,

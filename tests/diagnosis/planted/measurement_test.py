@@ -61,6 +61,7 @@ def test_splash_is_read_off_where_lanes_lie_side_by_side(street) -> None:
     assert float(share) == pytest.approx(0.15, abs=0.05)
 
 
+@pytest.mark.slow
 def test_drivers_are_found_behind_an_error_of_measurement(street, tmp_path: Path) -> None:
     domain = "headway=1.4+detector_extension=*,1,split"
     found = street.diagnose(street.measure(domain), tmp_path)

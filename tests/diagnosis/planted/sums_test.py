@@ -41,7 +41,7 @@ def test_a_long_headway_is_found_without_a_single_vehicle(street, tmp_path: Path
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("length_s", [60.0, 300.0])
+@pytest.mark.parametrize("length_s", [pytest.param(60.0, marks=pytest.mark.slow), 300.0])
 def test_a_slow_road_is_found_with_its_place(street, tmp_path: Path, length_s: float) -> None:
     found = of_sums(street, "local_speed=S_C,0.8", length_s, tmp_path)
     assert found["verdict"] == "explained", found["sentence"]
