@@ -163,6 +163,11 @@ class Worlds:
         return cls(library, tuple(lanes), service)
 
     @property
+    def ends(self) -> Floats:
+        """Lowest, nominal and highest values of the effects, ``(3, effects)``."""
+        return np.array([(x.low, x.nominal, x.high) for x in self.library]).reshape(-1, 3).T
+
+    @property
     def groups(self) -> list[tuple[tuple[int, ...], float]]:
         """Places in the library of effects that come together, and their chance."""
         places: dict[str, list[int]] = {}
@@ -173,12 +178,12 @@ class Worlds:
     def draw(self, seed: int) -> Values:
         """Draw a world from the prior."""
         generator = numpy_generator(seed, "worlds", "prior")
-        chances = {item.group or item.name: item.chance for item in self.library}
-        there = {name: generator.random() < chance for name, chance in chances.items()}
-        ends = np.array([(x.low, x.high) for x in self.library]).reshape(-1, 2)
-        drawn = self.natural(generator.uniform(*self.scaled(ends.T)))
-        nominal = np.array([x.nominal for x in self.library])
-        effects = np.where([there[x.group or x.name] for x in self.library], drawn, nominal)
+        there = np.zeros(len(self.library), dtype=np.bool_)
+        for places, chance in self.groups:
+            there[list(places)] = generator.random() < chance
+        low, nominal, high = self.ends
+        drawn = self.natural(generator.uniform(self.scaled(low), self.scaled(high)))
+        effects = np.where(there, drawn, nominal)
         service_s = np.zeros((len(self.lanes), len(SERVICE)))
         for column, prior in zip(service_s.T, SERVICE, strict=True):
             mean = (
@@ -201,8 +206,8 @@ class Worlds:
 
     def clipped(self, values: Values) -> Values:
         """Return the values within their ranges."""
-        low, high = (np.array([getattr(x, side) for x in self.library]) for side in ("low", "high"))
-        effects = np.clip(values.effects, low, high) if self.library else values.effects
+        low, _, high = self.ends
+        effects = np.clip(values.effects, low, high)
         names = [item.name for item in self.library]
         for hard, soft in NO_SOFTER.items():
             if hard in names and soft in names:
@@ -347,10 +352,8 @@ class Posterior:
         drawn, absent = self.presence.drawn(drawn, generator)
         service_s = service_s + drawn[split:] - mean_s
         service_s[:, absent[absent >= split] - split] = 0.0
-        values = Values(self.worlds.natural(drawn[:split]), at_least_0(service_s))
-        return self.worlds.clipped(
-            replace(values, service_s=values.service_s * self.worlds.service)
-        )
+        effects = self.worlds.natural(drawn[:split])
+        return self.worlds.clipped(Values(effects, at_least_0(service_s) * self.worlds.service))
 
     @functools.cached_property
     def presence(self) -> Presence:
@@ -371,12 +374,10 @@ class Posterior:
                 prior.unequal,
             )
             changes.append(Change((split + column,), prior.is_there, evidence))
-        ends = worlds.scaled(
-            np.array([(x.low, x.nominal, x.high) for x in worlds.library]).reshape(-1, 3).T
-        )
+        least, usual, most = worlds.scaled(worlds.ends)
         none_s = np.zeros(len(SERVICE))
-        low, nominal = (np.concatenate((end, none_s)) for end in ends[:2])
-        high = np.concatenate((ends[2], [prior.high_s for prior in SERVICE]))
+        low, nominal = (np.concatenate((values, none_s)) for values in (least, usual))
+        high = np.concatenate((most, [prior.high_s for prior in SERVICE]))
         mean = np.concatenate((self.effects, mean_s)) + bias
         return Presence.of(changes, mean, spread, nominal, low, high)
 

@@ -14,7 +14,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from ugat_marl.data import AgentLayout, TransitionLog, Transitions
+from ugat_marl.data import AgentLayout, TransitionLog, Transitions, consecutive
 from ugat_marl.envs import COUNT_SCALE
 from ugat_marl.errors import OptionError
 from ugat_marl.scenarios import GREEN, Intersection, Network
@@ -105,8 +105,7 @@ class LaneRows:
         before: Vehicles at the decision.
         after: Vehicles at the next decision.
         left: Mean number of vehicles that had left in between; NaN if it was not measured.
-        age_s: Seconds for which the lane had had green at the decision, or more.
-        had: True if the lane had green at the decision.
+        age_s: Seconds for which the lane had had green at the decision, or more; 0 in red.
         has: True if the lane has green afterwards.
         full: True if the lane is full at the decision or at the next one.
         held: True if a lane that its green leads to is full at either of them.
@@ -118,10 +117,14 @@ class LaneRows:
     after: Floats
     left: Floats
     age_s: Floats
-    had: NDArray[np.bool_]
     has: NDArray[np.bool_]
     full: NDArray[np.bool_]
     held: NDArray[np.bool_]
+
+    @property
+    def had(self) -> NDArray[np.bool_]:
+        """True if the lane had green at the decision."""
+        return self.age_s > 0.0
 
     @property
     def key(self) -> NDArray[np.int64]:
@@ -239,9 +242,7 @@ class LaneView:
             left = before - rows.served_features[:, part] * scale
         phase = rows.observation[:, layout.features : layout.features + layout.phases].argmax(1)
         had, has = green[:, phase], green[:, rows.executed]
-        goes_on = np.zeros(len(phase), dtype=np.bool_)  # the decision follows the one before it
-        goes_on[1:] = (np.diff(rows.episode) == 0) & (np.diff(rows.step) == 1)
-        age_s = interval_s * _ages(had, goes_on)
+        age_s = interval_s * _ages(had, consecutive(rows.episode, rows.step))
         for k in range(len(scale)):
             none = np.zeros(len(before), dtype=np.bool_)
             yield LaneRows(
@@ -251,23 +252,22 @@ class LaneView:
                 _whole(after[:, k]),
                 left[:, k],
                 age_s[k],
-                had[k],
                 has[k],
                 none,
                 none,
             )
 
 
-def _ages(had: NDArray[np.bool_], goes_on: NDArray[np.bool_]) -> NDArray[np.int64]:
+def _ages(had: NDArray[np.bool_], follows: NDArray[np.bool_]) -> NDArray[np.int64]:
     """Return for how many decisions in sequence each lane had green, ``(lanes, n)``.
 
     Args:
         had: True if a lane had green at a decision, ``(lanes, n)``.
-        goes_on: True if a decision follows the one before it, ``(n,)``.
+        follows: True if a decision but the first follows the one before it, ``(n - 1,)``.
     """
     place = np.arange(had.shape[1])
     begins = had.copy()
-    begins[:, 1:] &= ~(had[:, :-1] & goes_on[1:])
+    begins[:, 1:] &= ~(had[:, :-1] & follows)
     begun = np.maximum.accumulate(np.where(begins, place, 0), axis=1)
     return np.where(had, place - begun + 1, 0)
 
