@@ -28,6 +28,7 @@ from numpy.typing import NDArray
 from ugat_marl.data import AgentLayout, TransitionLog, Transitions, consecutive
 from ugat_marl.effects import Actuator, Commands, ControllerPart
 from ugat_marl.errors import CheckpointError, LogError, OptionError
+from ugat_marl.grounding.draws import DRAWS, with_intervals
 from ugat_marl.scenarios import Network, SignalState, SignalTiming
 from ugat_marl.seeding import numpy_generator
 
@@ -167,6 +168,25 @@ class CommandChannel(ControllerPart):
         parts += [f"{100 * self.lost:.0f} % lost"] if self.lost else []
         parts += ["some phases forbidden"] if self.forbids else []
         return "commands: " + ", ".join(parts)
+
+    def as_dict(self, interval_s: float) -> dict[str, float]:
+        """Return flat numbers for the metrics of a run.
+
+        Args:
+            interval_s: Seconds from one decision to the next.
+        """
+        lags = enumerate(self.network[:-1])
+        numbers = {f"channel/lag_{k}": float(w) for k, w in lags if w > 0}
+        numbers["channel/lost"] = self.lost
+        numbers["channel/forbids"] = float(self.forbids)
+        drawn = np.array([self.drawn(seed) for seed in range(DRAWS)])
+        if self.late:
+            arrive = drawn[:, :, :-1] / (1.0 - drawn[:, :, -1:]).clip(1e-9)
+            late_s = interval_s * arrive @ np.arange(arrive.shape[-1])
+            numbers |= with_intervals("channel/late_s", late_s.T, self.agents)
+        if self.lost:
+            numbers |= with_intervals("channel/missing", drawn[:, :, -1].T, self.agents)
+        return numbers
 
     def state_dict(self) -> dict[str, Any]:
         """Return the channel as plain values."""

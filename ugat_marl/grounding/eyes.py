@@ -38,6 +38,7 @@ from ugat_marl.effects import (
     Stage,
 )
 from ugat_marl.errors import CheckpointError, OptionError
+from ugat_marl.grounding.draws import DRAWS, with_intervals
 from ugat_marl.grounding.summaries import Floats, LaneRows, LaneView
 from ugat_marl.scenarios import Network
 from ugat_marl.seeding import numpy_generator
@@ -173,6 +174,27 @@ class Eyes:
             f"steps of {self.step:g} veh" if self.step else "",
         ]
         return "detectors: " + (", ".join(filter(None, words)) or "no fault found")
+
+    def as_dict(self, lanes_of: Mapping[str, Sequence[int]]) -> dict[str, float]:
+        """Return flat numbers for the metrics of a run.
+
+        Args:
+            lanes_of: Agent to the positions of its lanes.
+        """
+        numbers = {
+            "eyes/dead": float(self.dead.sum()),
+            "eyes/zone_m": self.zone_m[1],
+            "eyes/absolute": self.absolute,
+            "eyes/relative": self.relative,
+            "eyes/lag": float(self.lag),
+            "eyes/lost": self.lost,
+            "eyes/step": self.step,
+        }
+        if self.dead.any():
+            dead = numpy_generator(0, "eyes", "dead").random((DRAWS, len(self.dead))) < self.dead
+            unseen = [dead[:, list(places)].sum(1) for places in lanes_of.values()]
+            numbers |= with_intervals("eyes/unseen", np.array(unseen), lanes_of)
+        return numbers
 
     def state_dict(self) -> dict[str, Any]:
         """Return the faults as plain values."""

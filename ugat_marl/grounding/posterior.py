@@ -32,6 +32,7 @@ from ugat_marl.effects import (
     nominal_number,
 )
 from ugat_marl.errors import CheckpointError, UnknownNameError
+from ugat_marl.grounding.draws import DRAWS, with_intervals
 from ugat_marl.grounding.presence import LEAST_SPREAD, Change, Presence, lanes_are_equal
 from ugat_marl.grounding.regression import Design, Floats, kernel, left_out, ridge
 from ugat_marl.grounding.summaries import Summary
@@ -386,6 +387,30 @@ class Posterior:
         generator = numpy_generator(seed, "worlds", "sample")
         drawn = [self.drawn(generator) for _ in range(number)]
         return np.stack([v.effects for v in drawn]), np.stack([v.service_s for v in drawn])
+
+    def as_dict(self, lanes_of: Mapping[str, Sequence[int]]) -> dict[str, float]:
+        """Return flat numbers for the metrics of a run: medians and 90 % intervals.
+
+        Args:
+            lanes_of: Agent to the positions of its lanes.
+        """
+        effects, service_s = self.sample(DRAWS)
+        numbers: dict[str, float] = {}
+        for place, item in enumerate(self.worlds.library):
+            low, middle, high = np.quantile(effects[:, place], (0.05, 0.5, 0.95))
+            numbers[f"effects/{item.name}"] = float(middle)
+            numbers[f"effects/{item.name}/low"] = float(low)
+            numbers[f"effects/{item.name}/high"] = float(high)
+            numbers[f"effects/{item.name}/nominal"] = item.nominal
+            numbers[f"effects/{item.name}/chance"] = self.presence.chance_of(place)
+        for lane, (begin_s, each_s) in zip(self.worlds.lanes, service_s.mean(0), strict=True):
+            numbers[f"service/begin_s/{lane}"] = float(begin_s)
+            numbers[f"service/each_s/{lane}"] = float(each_s)
+        for column, name in enumerate(("unused/begin_s", "unused/each_s")):
+            unused_s = service_s[:, :, column]
+            means_s = [unused_s[:, list(places)].mean(1) for places in lanes_of.values()]
+            numbers |= with_intervals(name, np.array(means_s), lanes_of)
+        return numbers
 
     def state_dict(self) -> dict[str, Any]:
         """Return the posterior's numbers as plain values."""

@@ -20,7 +20,7 @@ from __future__ import annotations
 
 import contextlib
 import copy
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any, Literal
@@ -41,6 +41,7 @@ from ugat_marl.grounding.channel import (
     fit_channel,
     require_histories,
 )
+from ugat_marl.grounding.draws import DRAWS
 from ugat_marl.grounding.eyes import Eyes, EyesConfig, fit_eyes
 from ugat_marl.grounding.posterior import (
     LIBRARY,
@@ -61,9 +62,6 @@ from ugat_marl.seeding import derive_seed, numpy_generator
 
 KIND = "street"
 """Name of this kind of checkpoint, written into the file."""
-
-_DRAWS = 200
-"""Draws from a fitted part, for its intervals."""
 
 NAMED = 0.1
 """Least chance of an effect that is said."""
@@ -224,7 +222,7 @@ class FittedStreet:
         """Return what was found, a line for each part."""
         lines = [part.describe() for part in (self.channel, self.eyes) if part is not None]
         if self.posterior is not None:
-            effects, service_s = self.posterior.sample(_DRAWS)
+            effects, service_s = self.posterior.sample(DRAWS)
             low, high = np.quantile(effects, (0.05, 0.95), axis=0)
             ranges = zip(self.posterior.worlds.library, low, high, strict=True)
             chance = self.posterior.presence.chance_of
@@ -249,50 +247,11 @@ class FittedStreet:
         """
         numbers: dict[str, float] = {"street/commands": float(self.commands)}
         if self.channel is not None:
-            weights = self.channel.network
-            numbers |= {f"channel/lag_{k}": float(w) for k, w in enumerate(weights[:-1]) if w > 0}
-            numbers["channel/lost"] = self.channel.lost
-            numbers["channel/forbids"] = float(self.channel.forbids)
-            drawn = np.array([self.channel.drawn(seed) for seed in range(_DRAWS)])
-            if self.channel.late:
-                arrive = drawn[:, :, :-1] / (1.0 - drawn[:, :, -1:]).clip(1e-9)
-                late_s = self.interval_s * arrive @ np.arange(arrive.shape[-1])
-                numbers |= _with_intervals("channel/late_s", late_s.T, self.channel.agents)
-            if self.channel.lost:
-                numbers |= _with_intervals(
-                    "channel/missing", drawn[:, :, -1].T, self.channel.agents
-                )
+            numbers |= self.channel.as_dict(self.interval_s)
         if self.eyes is not None:
-            numbers |= {
-                "eyes/dead": float(self.eyes.dead.sum()),
-                "eyes/zone_m": self.eyes.zone_m[1],
-                "eyes/absolute": self.eyes.absolute,
-                "eyes/relative": self.eyes.relative,
-                "eyes/lag": float(self.eyes.lag),
-                "eyes/lost": self.eyes.lost,
-                "eyes/step": self.eyes.step,
-            }
-            if self.eyes.dead.any():
-                dead = numpy_generator(0, "eyes", "dead").random((_DRAWS, len(self.lanes)))
-                dead = dead < self.eyes.dead
-                draws = [dead[:, list(places)].sum(1) for places in lanes_of.values()]
-                numbers |= _with_intervals("eyes/unseen", np.array(draws), lanes_of)
+            numbers |= self.eyes.as_dict(lanes_of)
         if self.posterior is not None:
-            effects, service_s = self.posterior.sample(_DRAWS)
-            for place, item in enumerate(self.posterior.worlds.library):
-                low, middle, high = np.quantile(effects[:, place], (0.05, 0.5, 0.95))
-                numbers[f"effects/{item.name}"] = float(middle)
-                numbers[f"effects/{item.name}/low"] = float(low)
-                numbers[f"effects/{item.name}/high"] = float(high)
-                numbers[f"effects/{item.name}/nominal"] = item.nominal
-                numbers[f"effects/{item.name}/chance"] = self.posterior.presence.chance_of(place)
-            for lane, (begin_s, each_s) in zip(self.lanes, service_s.mean(0), strict=True):
-                numbers[f"service/begin_s/{lane}"] = float(begin_s)
-                numbers[f"service/each_s/{lane}"] = float(each_s)
-            for column, name in enumerate(("unused/begin_s", "unused/each_s")):
-                unused_s = service_s[:, :, column]
-                draws = [unused_s[:, list(places)].mean(1) for places in lanes_of.values()]
-                numbers |= _with_intervals(name, np.array(draws), lanes_of)
+            numbers |= self.posterior.as_dict(lanes_of)
         return numbers
 
     def save(self, path: Path, simulated: Sequence[Simulated] = ()) -> None:
@@ -628,19 +587,6 @@ def street_prior(env: TrafficEnv, config: StreetConfig) -> Worlds:
     everything = tuple(item.name for item in LIBRARY)
     left_out = config.without if "effects" in config.parts else everything
     return Worlds.of(view.lanes, left_out, "service" in config.parts, env.scenario)
-
-
-def _with_intervals(
-    name: str, draws: NDArray[np.floating] | NDArray[np.integer], agents: Iterable[str]
-) -> dict[str, float]:
-    """Return median and 90 % interval of a number of each agent, from draws ``(agents, n)``."""
-    ends = ("_low", "", "_high")
-    low_to_high = np.quantile(draws, (0.05, 0.5, 0.95), axis=1)
-    return {
-        f"{name}{end}/{agent}": float(value)
-        for end, row in zip(ends, low_to_high, strict=True)
-        for agent, value in zip(agents, row, strict=True)
-    }
 
 
 def _arrays(simulated: Sequence[Simulated]) -> dict[str, Tensor]:
