@@ -106,6 +106,7 @@ def play(
     env = parallel_env(scenario, domain, duration_s=duration_s)
     actor = _made(policy, env)
     if actor.env_options:
+        env.close()
         env = parallel_env(scenario, domain, duration_s=duration_s, **actor.env_options)
         actor = _made(policy, env)
     payers = [Rewarder(env.network, name) for name in REWARDS]

@@ -159,7 +159,6 @@ def test_a_planted_delay_is_found() -> None:
     env.close()
     sim = SimulatedWorld(make, "sim", 1, 0.3, 4)
     logs = sim.under_delays(policy, 0, 3, list)
-    sim.close()
     for late, log in enumerate(logs):
         assert set(log.frame["delay_s"].to_list()) == {0.0, float(late)} and log.episodes == 2
     simulated = np.array([episode_rewards(log, agents) for log in logs])
@@ -167,7 +166,6 @@ def test_a_planted_delay_is_found() -> None:
         street = partial(parallel_env, "single-v1", f"late_green=*,{planted_s}", **SIGHT)
         real = SimulatedWorld(street, "real", 2, 0.3)
         log = real.collect(policy, 0, 3)
-        real.close()
         assert log is not None
         paid = EpisodeRewards(episode_rewards(log, agents), simulated)
         found = match_delays(paid, np.zeros(1))  # where nothing is known of a lost time

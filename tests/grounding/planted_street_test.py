@@ -74,9 +74,6 @@ class ByHand:
     def stop(self) -> None:
         """Do nothing."""
 
-    def close(self) -> None:
-        """Do nothing."""
-
 
 class Idle:
     """A learner that learns nothing."""
@@ -188,8 +185,5 @@ def test_every_iteration_has_its_own_traffic() -> None:
             return dict.fromkeys(observations, 0)
 
     world = SimulatedWorld(make, "real", episodes=2, epsilon=0.0)
-    try:
-        seeds = [world.collect(Keep(), iteration, 5).provenance.seeds for iteration in (0, 1)]
-    finally:
-        world.close()
+    seeds = [world.collect(Keep(), iteration, 5).provenance.seeds for iteration in (0, 1)]
     assert len({*seeds[0], *seeds[1]}) == 4

@@ -168,8 +168,7 @@ def test_greens_that_begin_later_than_asked_are_not_delayed(
     scenario = load_scenario("grid2x2-v1").with_control(**control)
     with pytest.raises(OptionError, match="in the decision that asks for it"):
         simulated_worlds(scenario, "sim", real, TIMED, {})
-    for world in simulated_worlds(scenario, "sim", real, UgatConfig("phase"), {}):
-        world.close()
+    simulated_worlds(scenario, "sim", real, UgatConfig("phase"), {})
 
 
 @pytest.mark.parametrize("reward", ["waiting", "pressure"])
@@ -177,10 +176,7 @@ def test_rewards_that_say_nothing_of_a_delay_are_not_matched(reward: str) -> Non
     matching = UgatConfig("timed", timed=TimedConfig(match=True))
     with pytest.raises(OptionError, match=f"not '{reward}'"):
         simulated_worlds(load_scenario("grid2x2-v1"), "sim", "V4", matching, {"reward": reward})
-    for world in simulated_worlds(
-        load_scenario("grid2x2-v1"), "sim", "V4", TIMED, {"reward": reward}
-    ):
-        world.close()
+    simulated_worlds(load_scenario("grid2x2-v1"), "sim", "V4", TIMED, {"reward": reward})
 
 
 @pytest.mark.parametrize("most_s", [0, MOST_S])
@@ -191,7 +187,6 @@ def test_a_world_records_its_delays_and_crossings(most_s: int) -> None:
     world = SimulatedWorld(make, "sim", 2, 0.3, most_s)
     log, again = (world.collect(Alternating(), 0, seed=1) for _ in range(2))
     other = world.collect(Alternating(), 1, seed=1)
-    world.close()
     assert log is not None and again is not None and other is not None
     assert log.frame.equals(again.frame)
     rows = log.transitions("signal_0")
@@ -345,7 +340,6 @@ def test_a_log_of_the_street_without_crossings_will_do(
     play_nothing(monkeypatch)
     street = SimulatedWorld(lambda: parallel_env("single-v1", "V4", duration_s=150), "real", 2, 0.3)
     log = street.collect(Alternating(), 0, seed=1)
-    street.close()
     assert log is not None and not log.transitions("signal_0").served_features.size
     log.write(tmp_path / "log.parquet")
     ugat = replace(LATE.ugat, iterations=1, least_accuracy=0.2)

@@ -35,8 +35,6 @@ def test_an_executor_plays_the_same(most_delay_s: int, rule: str | None) -> None
         assert len(done) == 2 * here.roll_outs_under_delays == 4 * (most_delay_s + 1)
         logs = list(zip(*found, strict=True))
         assert [one.frame.equals(other.frame) for one, other in logs] == [True] * (most_delay_s + 1)
-    here.close()
-    there.close()
 
 
 def test_it_can_be_stopped() -> None:

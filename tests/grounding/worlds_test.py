@@ -77,9 +77,6 @@ class Counting:
     def stop(self) -> None:
         self.done.append("stop")
 
-    def close(self) -> None:
-        self.done.append("close")
-
 
 def test_a_shuffled_world_asks_the_other_one() -> None:
     world = Counting()
@@ -92,8 +89,7 @@ def test_a_shuffled_world_asks_the_other_one() -> None:
     assert made.collect(nobody, 2, 5) is None
     assert made.replay() is None
     made.stop()
-    made.close()
-    assert world.done == [*(f"collect nobody {i} 5" for i in range(3)), "replay", "stop", "close"]
+    assert world.done == [*(f"collect nobody {i} 5" for i in range(3)), "replay", "stop"]
 
 
 def commanded(commands: dict[str, dict[int, list[int]]]) -> TransitionLog:

@@ -7,7 +7,6 @@ paper, or in a fitted street.
 
 from __future__ import annotations
 
-import contextlib
 import time
 from collections.abc import Callable, Iterable, Iterator, Mapping
 from dataclasses import fields
@@ -162,8 +161,7 @@ def train_grounded(
         state.learner.load(start)
         state.direct, state.pretrained = state.learner.policy(), ugat.pretrain_episodes
     state.restore(run, _policy_reader(make, env), renew)
-    with contextlib.closing(sim), contextlib.closing(real):
-        algorithm.train(state)
+    algorithm.train(state)
     return state
 
 

@@ -74,10 +74,6 @@ class ShuffledWorld:
         """Stop the roll-outs of the other world."""
         self._world.stop()
 
-    def close(self) -> None:
-        """Close the other world."""
-        self._world.close()
-
 
 def shuffled(log: TransitionLog, seed: int) -> TransitionLog:
     """Return the log with the outcomes of each agent's rows in random order.

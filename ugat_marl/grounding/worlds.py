@@ -58,10 +58,6 @@ class World(Protocol):
         """End a `collect` that runs in another thread; it raises `RollOutStopped`."""
         ...
 
-    def close(self) -> None:
-        """Release the resources of the world."""
-        ...
-
 
 class SimulatedWorld:
     """Roll-outs in a domain.
@@ -150,9 +146,6 @@ class SimulatedWorld:
     def stop(self) -> None:
         """Stop the running roll-outs."""
         self._stop.set()
-
-    def close(self) -> None:
-        """Do nothing; each roll-out ends its own simulation."""
 
 
 def _for_policy(make_env: Callable[..., TrafficEnv], policy: Policy) -> Callable[[], TrafficEnv]:
@@ -389,6 +382,3 @@ class RecordedWorld:
 
     def stop(self) -> None:
         """Do nothing; `collect` returns at once."""
-
-    def close(self) -> None:
-        """Do nothing; a log holds no resources."""
