@@ -4,9 +4,10 @@
 
 Streets are drawn and simulated. Then each is fitted as a training does it, and the posterior is
 asked for its values. Worlds of the prior are simulated once and serve all streets; worlds that are
-aimed at a street are its own. Half of the streets come from the prior of the worlds. The other half
-come from another distribution, so that the prior is wrong about them: each effect is there with a
-chance of a half, whatever the others, and a third of the lanes loses green at its beginning.
+aimed at a street are its own. A third of the streets comes from the prior of the worlds. Of the
+others the prior is wrong: each effect is there with a chance of a half (``alone``), or those of
+vehicles change together, by one number (``together``), and a third of the lanes loses green at its
+beginning.
 
 A value is covered if the 90 % interval of its draws holds it. A value at the end of its range is
 covered by an interval that ends there.
@@ -47,7 +48,7 @@ from ugat_marl.grounding import (
     Worlds,
     street_prior,
 )
-from ugat_marl.grounding.street import Known
+from ugat_marl.grounding.street import LEARNT, Known
 from ugat_marl.grounding.summaries import NAMES, Summary
 from ugat_marl.policies import Policy
 from ugat_marl.progress import Bars
@@ -55,7 +56,7 @@ from ugat_marl.seeding import derive_seed, numpy_generator
 
 Floats = NDArray[np.float64]
 
-KINDS = ("prior", "other")
+KINDS = ("prior", "alone", "together")
 """Distributions from which streets are drawn."""
 
 INTERVAL = (0.05, 0.95)
@@ -93,20 +94,27 @@ class Asked:
         return self.low - 1e-9 <= self.truth <= self.high + 1e-9
 
 
-def draw_other(worlds: Worlds, seed: int) -> Values:
+VEHICLES = ("acceleration", "deceleration", "emergency_deceleration", "startup_delay")
+"""Effects that a wet or an icy road changes together."""
+
+
+def draw_other(worlds: Worlds, kind: str, seed: int) -> Values:
     """Draw a street from a distribution that is not the prior.
 
     Args:
         worlds: The prior; its ranges are kept.
+        kind: ``"alone"`` or ``"together"``.
         seed: Seed of the street.
     """
-    generator = numpy_generator(seed, "posterior coverage", "other")
-    effects = np.array(
-        [
-            generator.uniform(x.low, x.high) if generator.random() < 0.5 else x.nominal
-            for x in worlds.library
-        ]
-    )
+    generator = numpy_generator(seed, "posterior coverage", kind)
+    low, nominal, high = np.array([(x.low, x.nominal, x.high) for x in worlds.library]).T
+    there = generator.random(len(nominal)) < 0.5
+    effects = np.where(there, generator.uniform(low, high), nominal)
+    if kind == "together":
+        slower = np.array([x.name in VEHICLES for x in worlds.library])
+        farthest = np.where(nominal - low > high - nominal, low, high)
+        road = nominal + generator.uniform() * (farthest - nominal)
+        effects = np.where(slower, road, effects)
     service_s = np.zeros((len(worlds.lanes), 2))
     late = generator.random(len(worlds.lanes)) < 1 / 3
     service_s[late, 0] = generator.uniform(1.0, 6.0, int(late.sum()))
@@ -114,11 +122,11 @@ def draw_other(worlds: Worlds, seed: int) -> Values:
 
 
 def streets_of(worlds: Worlds, number: int, seed: int) -> list[tuple[str, Values]]:
-    """Return the streets, by turns from either distribution."""
+    """Return the streets, by turns from each distribution."""
     drawn: list[tuple[str, Values]] = []
     for k in range(number):
-        one, kind = derive_seed(seed, "street", k), KINDS[k % 2]
-        drawn.append((kind, worlds.draw(one) if kind == "prior" else draw_other(worlds, one)))
+        one, kind = derive_seed(seed, "street", k), KINDS[k % len(KINDS)]
+        drawn.append((kind, worlds.draw(one) if kind == "prior" else draw_other(worlds, kind, one)))
     return drawn
 
 
@@ -166,7 +174,7 @@ def study(network: Network, number: int, simulations: int, seed: int, folder: Pa
     worlds = network.worlds
     ((prior, _), (_, aimed)) = Known().rounds(StreetConfig(simulations=simulations))
     streets = streets_of(worlds, number, seed)
-    values = [worlds.draw(derive_seed(seed, "world", k)) for k in range(prior)]
+    values = [worlds.draw(derive_seed(seed, "world", k), LEARNT) for k in range(prior)]
     known = network.simulated(values, seed, folder, "prior")
     seen = network.summaries([value for _, value in streets], seed, folder, "streets", episodes=2)
     several = [worlds.draw(derive_seed(seed, "blind", k)) for k in range(400)]
@@ -177,7 +185,8 @@ def study(network: Network, number: int, simulations: int, seed: int, folder: Pa
     asked: list[Asked] = []
     for k, ((kind, truth), summary) in enumerate(zip(streets, seen, strict=True)):
         posterior = Posterior.fit(worlds, known, summary)
-        values = [posterior.draw(derive_seed(seed, "aimed", k, j)) for j in range(aimed)]
+        aimed_at = [derive_seed(seed, "aimed", k, j) for j in range(aimed)]
+        values = [posterior.draw(one, whole=True) for one in aimed_at]
         near = network.simulated(values, derive_seed(seed, k), folder, f"aimed at {k + 1}")
         asked += answers(Posterior.fit(worlds, [*known, *near], summary), kind, truth, blind)
     return asked

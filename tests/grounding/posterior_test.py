@@ -14,6 +14,7 @@ from ugat_marl.grounding.posterior import (
     Worlds,
     at_least_0,
 )
+from ugat_marl.grounding.street import LEARNT
 from ugat_marl.grounding.summaries import NAMES, Summary
 
 LANES = tuple(f"lane_{k}" for k in range(8))
@@ -35,7 +36,8 @@ def summary(values: Values, seed: int, silent: int | None = None) -> Summary:
     return Summary(known, rows)
 
 
-SIMULATED = [Simulated(v, summary(v, k)) for k, v in ((k, WORLDS.draw(k)) for k in range(300))]
+LEARNT_FROM = [WORLDS.draw(k, LEARNT) for k in range(300)]
+SIMULATED = [Simulated(values, summary(values, k)) for k, values in enumerate(LEARNT_FROM)]
 
 
 def interval(sample: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -101,6 +103,22 @@ def test_a_street_with_one_effect_is_given_no_others() -> None:
     assert (np.abs(np.delete(drawn - nominal, place, axis=1)) < 1e-9).mean() > 0.6
     assert (service_s == 0.0).all((1, 2)).mean() > 0.5
     assert np.quantile(drawn[:, place], (0.05, 0.95)) == pytest.approx(1.9, abs=0.4)
+
+
+def test_worlds_to_learn_from_have_most_effects() -> None:
+    nominal = np.array([x.nominal for x in WORLDS.library])
+    drawn = np.stack([WORLDS.draw(seed, LEARNT).effects for seed in range(1000)])
+    assert (drawn != nominal).mean(0) == pytest.approx(LEARNT, abs=0.05)
+    posterior = Posterior.fit(
+        WORLDS, SIMULATED, summary(Values(nominal, np.zeros((len(LANES), 2))), 5)
+    )
+    left_out, whole = (
+        np.stack([posterior.draw(seed, whole=whole).effects for seed in range(100)]) == nominal
+        for whole in (False, True)
+    )
+    # A draw beyond the end of its range is at the end, and that may be the nominal value.
+    inside = [x.low < x.nominal < x.high for x in WORLDS.library]
+    assert left_out[:, inside].mean() > 0.5 and not whole[:, inside].any()
 
 
 def test_low_accelerations_are_drawn_as_often_as_high_ones_of_the_same_ratio() -> None:

@@ -19,7 +19,7 @@ def with_floor(covariance: np.ndarray) -> np.ndarray:
 
 
 def presence(mean: list[float], covariance: np.ndarray, evidence: float = 0.0) -> Presence:
-    changes = [Change((0,), 0.3, evidence), Change((1,), 0.6)]
+    changes = [Change(0.3, evidence), Change(0.6)]
     return Presence.of(changes, np.array(mean), covariance, *ENDS)
 
 

@@ -209,8 +209,9 @@ def test_the_last_worlds_of_a_fit_are_drawn_from_the_posterior_of_the_others(
         fitted.append(len(simulated))
         return fit(worlds, simulated, seen)
 
-    def marked(self: Posterior, seed: int) -> Values:
-        values = draw(self, seed)
+    def marked(self: Posterior, seed: int, *, whole: bool) -> Values:
+        assert whole  # worlds to learn from leave nothing out
+        values = draw(self, seed, whole=whole)
         return replace(values, effects=np.append(values.effects[:-1], 1.0123))
 
     monkeypatch.setattr(Posterior, "fit", counted)

@@ -6,7 +6,8 @@ do not use. The policy of the log acts in each. A regression from the statistics
 that the street's log leaves possible (`regression`).
 
 The prior gives each effect a chance to be absent; draws are without those that the log does not ask
-for (`presence`).
+for (`presence`). Worlds to learn from have most effects, whatever their chance: a regression that
+seldom sees an effect says too little of it, and `presence` would count its chance twice.
 
 All values are estimated together: one residual holds the errors of all effects and lanes of one
 simulated world. Lanes share the regression and the network's statistics, so where a lane's log says
@@ -49,8 +50,7 @@ class Prior:
         low: Smallest value, in the effect's unit.
         high: Largest value.
         nominal: Value that changes nothing.
-        group: Effects of a group are present or absent together: vehicles differ as a whole.
-        chance: Chance that the group is present; otherwise its values are nominal.
+        chance: Chance that the effect is there; otherwise its value is nominal.
         log: True to draw and to estimate the logarithm: half of a small value changes as much as
             half of a large one.
     """
@@ -59,7 +59,6 @@ class Prior:
     low: float
     high: float
     nominal: float
-    group: str = ""
     chance: float = 0.35
     log: bool = False
 
@@ -72,10 +71,10 @@ class Prior:
 
 
 LIBRARY = (
-    Prior("acceleration", 0.4, 3.0, 2.6, "vehicles", 0.65, log=True),
-    Prior("deceleration", 1.2, 5.0, 4.5, "vehicles", 0.65, log=True),
-    Prior("emergency_deceleration", 2.0, 9.0, 9.0, "vehicles", 0.65, log=True),
-    Prior("startup_delay", 0.0, 1.0, 0.0, "vehicles", 0.65),
+    Prior("acceleration", 0.4, 3.0, 2.6, 0.5, log=True),
+    Prior("deceleration", 1.2, 5.0, 4.5, 0.5, log=True),
+    Prior("emergency_deceleration", 2.0, 9.0, 9.0, 0.5, log=True),
+    Prior("startup_delay", 0.0, 1.0, 0.0, 0.5),
     Prior("headway", 0.8, 2.2, 1.0),
     Prior("desired_speed", 0.6, 1.1, 1.0),
     Prior("demand_level", 0.8, 1.25, 1.0),
@@ -168,20 +167,16 @@ class Worlds:
         """Lowest, nominal and highest values of the effects, ``(3, effects)``."""
         return np.array([(x.low, x.nominal, x.high) for x in self.library]).reshape(-1, 3).T
 
-    @property
-    def groups(self) -> list[tuple[tuple[int, ...], float]]:
-        """Places in the library of effects that come together, and their chance."""
-        places: dict[str, list[int]] = {}
-        for place, item in enumerate(self.library):
-            places.setdefault(item.group or item.name, []).append(place)
-        return [(tuple(some), self.library[some[0]].chance) for some in places.values()]
+    def draw(self, seed: int, chance: float | None = None) -> Values:
+        """Draw a world from the prior.
 
-    def draw(self, seed: int) -> Values:
-        """Draw a world from the prior."""
+        Args:
+            seed: Seed of the world.
+            chance: Chance of each effect to be there, in place of the prior's.
+        """
         generator = numpy_generator(seed, "worlds", "prior")
-        there = np.zeros(len(self.library), dtype=np.bool_)
-        for places, chance in self.groups:
-            there[list(places)] = generator.random() < chance
+        chances = [item.chance if chance is None else chance for item in self.library]
+        there = [generator.random() < each for each in chances]
         low, nominal, high = self.ends
         drawn = self.natural(generator.uniform(self.scaled(low), self.scaled(high)))
         effects = np.where(there, drawn, nominal)
@@ -340,33 +335,38 @@ class Posterior:
             kernel(predicted, answer, errors),
         )
 
-    def draw(self, seed: int) -> Values:
-        """Draw the values of a world."""
-        return self.drawn(numpy_generator(seed, "worlds", "posterior"))
+    def draw(self, seed: int, *, whole: bool = False) -> Values:
+        """Draw the values of a world.
 
-    def drawn(self, generator: np.random.Generator) -> Values:
-        """Draw the values of a world with a generator."""
+        Args:
+            seed: Seed of the world.
+            whole: True to leave no effect out.
+        """
+        return self.drawn(numpy_generator(seed, "worlds", "posterior"), whole=whole)
+
+    def drawn(self, generator: np.random.Generator, *, whole: bool = False) -> Values:
+        """Draw the values of a world with a generator, see `draw`."""
         row = int(generator.choice(len(self.chances), p=self.chances))
         service_s = self.service_s + self.service_errors_s[row]
         mean_s, split = service_s.mean(0), len(self.effects)
         drawn = np.concatenate((self.effects + self.effect_errors[row], mean_s))
-        drawn, absent = self.presence.drawn(drawn, generator)
-        service_s = service_s + drawn[split:] - mean_s
-        service_s[:, absent[absent >= split] - split] = 0.0
+        if not whole:
+            drawn, absent = self.presence.drawn(drawn, generator)
+            service_s = service_s + drawn[split:] - mean_s
+            service_s[:, absent[absent >= split] - split] = 0.0
         effects = self.worlds.natural(drawn[:split])
         return self.worlds.clipped(Values(effects, at_least_0(service_s) * self.worlds.service))
 
     @functools.cached_property
     def presence(self) -> Presence:
         """Chances that the effects, and the red of lanes, are there."""
-        worlds, split = self.worlds, len(self.effects)
-        mean_s = self.service_s.mean(0)
+        worlds, mean_s = self.worlds, self.service_s.mean(0)
         errors = np.concatenate((self.effect_errors, self.service_errors_s.mean(1)), axis=1)
         bias = self.chances @ errors
         spread = (errors - bias).T @ ((errors - bias) * self.chances[:, None])
         unlike = self.service_errors_s - self.service_errors_s.mean(1, keepdims=True)
         lanes_s = np.sqrt(np.einsum("n,nlc->lc", self.chances, unlike**2))
-        changes = [Change(columns, chance) for columns, chance in worlds.groups]
+        changes = [Change(item.chance) for item in worlds.library]
         for column, prior in enumerate(SERVICE):
             evidence = lanes_are_equal(
                 self.service_s[:, column] - mean_s[column],
@@ -374,7 +374,7 @@ class Posterior:
                 prior.high_s / 2,
                 prior.unequal,
             )
-            changes.append(Change((split + column,), prior.is_there, evidence))
+            changes.append(Change(prior.is_there, evidence))
         least, usual, most = worlds.scaled(worlds.ends)
         none_s = np.zeros(len(SERVICE))
         low, nominal = (np.concatenate((values, none_s)) for values in (least, usual))

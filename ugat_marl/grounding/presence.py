@@ -15,7 +15,6 @@ The second turns a draw x into one in which the absent values are known (Mathero
 from __future__ import annotations
 
 import itertools
-import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 
@@ -34,12 +33,10 @@ class Change:
     """A change that is there or not.
 
     Attributes:
-        columns: Places of its values.
         chance: Prior chance that it is there.
         evidence: Log of how much more likely other data are without it; 0 for none.
     """
 
-    columns: tuple[int, ...]
     chance: float
     evidence: float = 0.0
 
@@ -68,37 +65,33 @@ class Presence:
         """Return the chances of a normal distribution and a prior.
 
         Args:
-            changes: The changes. A value of none of them is always there.
+            changes: The change of each value, ``k`` of them.
             mean: Mean of the values, ``(k,)``.
             covariance: Their covariance, ``(k, k)``.
             nominal: Values that change nothing, ``(k,)``.
             low: Lowest values, ``(k,)``.
             high: Highest values, ``(k,)``.
         """
-        every = np.arange(len(mean))
         covariance = covariance + np.diag((LEAST_SPREAD * (high - low)) ** 2)
+        chance = np.array([x.chance for x in changes])
+        evidence = np.array([x.evidence for x in changes])
+        if_there, if_absent = np.log(chance), np.log(1.0 - chance) + evidence
         logs: list[float] = []
         absent: list[NDArray[np.int64]] = []
         gains: list[Floats] = []
-        for there in itertools.product((True, False), repeat=len(changes)):
-            pairs = list(zip(changes, there, strict=True))
-            gone = [column for x, is_there in pairs if not is_there for column in x.columns]
-            out = np.array(gone, dtype=np.int64)
-            left = np.setdiff1d(every, out)
+        for each in itertools.product((True, False), repeat=len(changes)):
+            there = np.array(each, dtype=np.bool_)
+            out = np.flatnonzero(~there)
             off = nominal[out] - mean[out]
-            gain = np.zeros((len(every), len(out)))
-            log = sum(math.log(x.chance if is_there else 1.0 - x.chance) for x, is_there in pairs)
-            log += sum(x.evidence for x, is_there in pairs if not is_there)
-            if gone:
-                within = covariance[np.ix_(out, out)]
-                gain += np.linalg.solve(within, covariance[out]).T
-                distance = float(off @ np.linalg.solve(within, off))
-                log -= 0.5 * (distance + float(np.linalg.slogdet(2.0 * np.pi * within)[1]))
-            middle = (mean + gain @ off)[left]
-            spread = np.sqrt(np.diag(covariance - gain @ covariance[out])[left])
-            share = norm.cdf(high[left], middle, spread) - norm.cdf(low[left], middle, spread)
-            log += float(np.log(np.maximum(share, 1e-9) / (high - low)[left]).sum())
-            logs.append(log)
+            within = covariance[np.ix_(out, out)]
+            gain: Floats = np.linalg.solve(within, covariance[out]).T.astype(np.float64)
+            distance = off @ np.linalg.solve(within, off)
+            density = -0.5 * (distance + np.linalg.slogdet(2.0 * np.pi * within)[1])
+            middle = (mean + gain @ off)[there]
+            spread = np.sqrt(np.diag(covariance - gain @ covariance[out])[there])
+            share = norm.cdf(high[there], middle, spread) - norm.cdf(low[there], middle, spread)
+            slab = np.log(np.maximum(share, 1e-9) / (high - low)[there]).sum()
+            logs.append(float(np.where(there, if_there, if_absent).sum() + density + slab))
             absent.append(out)
             gains.append(gain)
         weights = np.exp(np.array(logs) - max(logs))

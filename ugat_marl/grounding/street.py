@@ -403,6 +403,10 @@ class Simulation:
 AIMED = 0.4
 """Share of the worlds of a first fit that are drawn from the posterior of the others."""
 
+LEARNT = 0.75
+"""Chance of each effect in worlds of the prior that are simulated: by hand, from tries on streets
+of `single-v1` (results/notes/how-often-does-the-posterior-hold-the-truth.md)."""
+
 BASELINE_EPISODES = 2
 """Episodes of the plain simulation with which detectors are compared."""
 
@@ -486,8 +490,9 @@ def fit_street(
     for prior, aimed in known.rounds(config):
         first, number = len(simulated) - len(known.simulated), prior + aimed
         ids = [derive_seed(seed, "street", "values", first + k) for k in range(number)]
-        values = [worlds.draw(one) for one in ids[:prior]]
-        values += [] if posterior is None else [posterior.draw(one) for one in ids[prior:]]
+        values = [worlds.draw(one, LEARNT) for one in ids[:prior]]
+        if posterior is not None:
+            values += [posterior.draw(one, whole=True) for one in ids[prior:]]
         seeds = [derive_seed(seed, "street", "world", first + k) for k in range(number)]
         drawn = [street.around(worlds, *pair) for pair in zip(values, seeds, strict=True)]
         logs = simulation.logs(drawn, policy, seeds, decisions * interval_s, on_done)
