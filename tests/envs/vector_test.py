@@ -376,6 +376,22 @@ def test_one_that_dies_each_time_is_given_up(module: Callable[[str], str]) -> No
             env.step(chosen(batch.masks, 0, 0))
 
 
+def test_one_that_cannot_be_replaced_is_over() -> None:
+    def none_left(*_: object) -> Any:
+        raise SimulatorCrashed("no process can be started")
+
+    with vector_env("single-v1", 2, duration_s=LENGTH_S) as env:
+        batch = env.reset(1)
+        dying = env._environments[1]
+        assert dying._worker is not None
+        os.kill(dying._worker._pid, signal.SIGKILL)  # type: ignore[arg-type]
+        dying._shared.start = none_left  # type: ignore[method-assign]
+        with pytest.raises(SimulatorCrashed, match="no process"):
+            env.step(chosen(batch.masks, 0, 0))
+        with pytest.raises(EpisodeError, match="no episode under way; call reset"):
+            env.step(chosen(batch.masks, 0, 0))
+
+
 def test_errors_of_the_users_own_functions_are_told_whole(module: Callable[[str], str]) -> None:
     own = module("def reward(before, after):\n    return 1 / 0\n")
     reward = __import__(own).reward
@@ -657,7 +673,7 @@ def test_wrong_calls(crossing: Crossing) -> None:
         for seed in (-1, [1], [1, 2, 3], [1, -2], 1.5, [1.5, 2.5], "ab"):
             with pytest.raises(OptionError, match="seed = .*from 0 on, or 2 of them"):
                 env.reset(seed)
-        for where in ([2], [0, 0], [], [False, False], 1):
+        for where in ([2], [-1], [0, 0], [], [False, False], 1):
             with pytest.raises(OptionError, match="where = .*different numbers below 2"):
                 env.reset(1, where)
         env.reset(1)

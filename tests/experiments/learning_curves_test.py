@@ -82,6 +82,8 @@ def test_all_learners_have_a_seed_before_one_has_two() -> None:
 def test_names_of_scenarios_are_parts_of_names_of_files() -> None:
     assert file_stem("resco:cologne3") == "resco-cologne3"
     assert file_stem("/there/mine.sumocfg") == "mine"
+    here = Path.cwd()
+    assert file_stem(".") == file_stem(str(here)) and file_stem("..") == file_stem(str(here.parent))
 
 
 def test_the_page_by_hand() -> None:

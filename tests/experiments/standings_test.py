@@ -107,7 +107,9 @@ def test_every_committed_table_can_be_read() -> None:
         assert ranked(table)["regret_s"].min() == 0
 
 
-def test_rules_are_put_into_a_table(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_rules_are_put_into_a_table(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
     """Counted against `evaluate`: the same episodes, so the same travel times."""
     out = tmp_path / "mine.csv"
     words = ["--duration-s", "300", "--evaluation-seeds", "2", "--workers", "2"]
@@ -132,4 +134,9 @@ def test_rules_are_put_into_a_table(tmp_path: Path, capsys: pytest.CaptureFixtur
         assert "one of the two" in capsys.readouterr().err
     for option, value in (("--seeds", "4"), ("--learner-settings", "a=1")):
         assert main([*call, option, value]) == 2
-        assert f"{option} is of a training" in capsys.readouterr().err
+        assert f"trained already; leave out {option}" in capsys.readouterr().err
+    # A row that would be lost is refused before any episode is played.
+    lost = [*call[:3], "direct transfer", *call[4:], "--domains", "V1", "--table", str(table)]
+    monkeypatch.setattr("ugat_marl.cli.compare.standings_of", None)
+    assert main(lost) == 2
+    assert "results in V4, which would be lost" in capsys.readouterr().err

@@ -199,13 +199,14 @@ def test_a_street_that_came_back_is_taken_over_from_what_it_shows() -> None:
     loop.drive(30.0)
     after.states[LIGHT] = "y" * len(PHASES[0])
     del after.states[SITE.lights[1]]  # its controller is still starting
+    after.states[SITE.lights[2]] = "nonsense"
     loop.take_over(after)
     made: list[Any] = []
     loop.drive(60.0, made.append)
     assert loop.summary.decisions == 9
     assert loop.driven_s == 90.0
     assert kinds(made)[0] == "beginning"
-    assert kinds(made, SITE.lights[1]) == ["unseen"] * 6
+    assert kinds(made, SITE.lights[1]) == kinds(made, SITE.lights[2]) == ["unseen"] * 6
     assert [states[LIGHT][0] for states in after.by_second[1:4]] == ["y"] * 3
     after.states = {}
     with pytest.raises(SimulatorError, match="does not say what"):

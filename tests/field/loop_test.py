@@ -143,6 +143,16 @@ def test_a_count_that_cannot_be_believed_sends_its_light_to_the_plan(
     assert all(np.isfinite(seen).all() for seen in policy.seen[-1].values())
 
 
+@pytest.mark.parametrize("count", [None, 3, LaneCount(NOW, "many", 0.0)])  # type: ignore[arg-type]
+def test_counts_of_lanes_that_nobody_asks_for_are_not_read(count: Any) -> None:
+    street = MadeUpStreet()
+    other = next(lane for lane in SITE.network.lanes if lane not in SITE.capacity)
+    loop = FieldLoop(SITE, Scripted(), street, QUICK)
+    street.spoil = lambda counts: {**counts, other: count}
+    (decision,) = decide(loop, street)
+    assert decision.source == "policy"
+
+
 @pytest.mark.parametrize(
     "count",
     [

@@ -99,6 +99,14 @@ def test_a_street_with_other_lights_is_no_street_to_wait_for() -> None:
         service(Coming(street), sleep=pytest.fail).run(100.0)
 
 
+def test_an_error_of_the_caller_is_not_taken_for_a_lost_street() -> None:
+    def full(_: Any) -> None:
+        raise OSError(28, "No space left on device")
+
+    with pytest.raises(OSError, match="No space left"):
+        service(Coming(MadeUpStreet()), sleep=pytest.fail).run(100.0, full)
+
+
 def test_a_log_that_cannot_be_completed_is_not_taken_for_a_lost_street(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

@@ -348,6 +348,8 @@ def test_a_stopped_command_leaves_its_log_and_nothing_else(
         (["--policy", "random", "--start", "--look-for-s", "9"], "opens no port"),
         (["--policy", "random", "--port", "1", "--look-for-s", "-1"], "--look-for-s"),
         (["--policy", "random", "--port", "1", "--sumo-answer-s", "inf"], "--sumo-answer-s"),
+        (["--policy", "random", "--port", "1", "--domain", "V4"], "leave out --domain"),
+        (["--policy", "random", "--port", "1", "--seed", "7"], "leave out --seed"),
         (["--policy", "random", "--start", "--seconds", "0"], "above 0"),
         (["--policy", "programme", "--start"], "programme"),
         (["--policy", "longest-waiting", "--start"], "waiting times"),

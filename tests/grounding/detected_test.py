@@ -2,17 +2,22 @@
 
 from __future__ import annotations
 
+import math
 import tracemalloc
 from collections.abc import Sequence
 from dataclasses import replace
 
 import numpy as np
 import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
 
 from ugat_marl.grounding.detected import (
     DetectionConfig,
     LaneCourse,
     LaneEstimate,
+    _aligned,
+    _Crossings,
     greens_of,
     staircase,
 )
@@ -52,6 +57,69 @@ def test_free_vehicles_are_on_the_lane_from_its_begin_to_its_end() -> None:
     assert found.vehicles(times).tolist() == [0, 1, 2, 1, 1, 0]
     assert found.unmatched == 0 and found.jams == ()
     assert found.blind_s == pytest.approx(25.0)
+
+
+def aligned_by_a_whole_table(
+    first: _Crossings, last: _Crossings, fastest_s: float, config: DetectionConfig
+) -> float:
+    """The least cost of all ways to match passages in order, from the table of all pairs."""
+    total = np.full((len(last) + 1, len(first) + 1), np.inf)
+    total[0] = config.unmatched * np.arange(len(first) + 1)
+    total[:, 0] = config.unmatched * np.arange(len(last) + 1)
+    for j in range(len(last)):
+        for i in range(len(first)):
+            cost = cost_of(first, last, i, j, fastest_s, config)
+            skipped = min(total[j, i + 1], total[j + 1, i]) + config.unmatched
+            total[j + 1, i + 1] = min(total[j, i] + cost, skipped)
+    return float(total[-1, -1])
+
+
+def cost_of(
+    first: _Crossings, last: _Crossings, i: int, j: int, fastest_s: float, config: DetectionConfig
+) -> float:
+    ride_s = last.on_s[j] - first.on_s[i]
+    if not fastest_s <= ride_s <= config.longest_s:
+        return math.inf
+    cost = 2.0 if abs(first.length_m[i] - last.length_m[j]) > 0.5 else 0.0
+    if min(first.speed_mps[i], last.speed_mps[j]) >= 7.0:
+        expected_s = 50.0 / (0.5 * (first.speed_mps[i] + last.speed_mps[j]))
+        off = abs(ride_s - expected_s) / (0.5 + 2.0 * config.speed_spread * expected_s)
+        cost += min(off, 2.0 * config.unmatched)
+    return cost
+
+
+@given(st.data())
+@settings(max_examples=60, deadline=None)
+def test_passages_are_matched_at_the_least_cost(data: st.DataObject) -> None:
+    config, fastest_s = DetectionConfig(longest_s=60.0), 2.0
+    times = st.lists(st.integers(0, 300), max_size=12).map(sorted)
+
+    def crossings() -> _Crossings:
+        on_s = np.array(data.draw(times), dtype=np.float64)
+        speed = data.draw(st.lists(st.sampled_from([3.0, 10.0]), min_size=12, max_size=12))
+        length = data.draw(st.lists(st.sampled_from([5.0, 12.0]), min_size=12, max_size=12))
+        cut = slice(len(on_s))
+        return _Crossings(on_s, on_s + 1.0, np.array(speed)[cut], np.array(length)[cut])
+
+    first, last = crossings(), crossings()
+    pairs = _aligned(first, last, 50.0, fastest_s, 10.0, config)
+    assert (np.diff(pairs, axis=0) > 0).all()
+    lone = len(first) + len(last) - 2 * len(pairs)
+    cost = sum(cost_of(first, last, i, j, fastest_s, config) for i, j in pairs.tolist())
+    cost += config.unmatched * lone
+    assert cost == pytest.approx(aligned_by_a_whole_table(first, last, fastest_s, config))
+
+
+def test_a_day_of_passages_needs_no_table_of_all_pairs() -> None:
+    on_s = np.cumsum(np.full(10_000, 8.0))
+    first = _Crossings(on_s, on_s + 0.5, np.full(10_000, 10.0), np.full(10_000, 5.0))
+    last = replace(first, on_s=on_s + 5.0, off_s=on_s + 5.5)
+    tracemalloc.start()
+    pairs = _aligned(first, last, 50.0, 2.0, 10.0, DetectionConfig())
+    most = tracemalloc.get_traced_memory()[1]
+    tracemalloc.stop()
+    assert (pairs[:, 0] == pairs[:, 1]).all() and len(pairs) == 10_000
+    assert most < 100e6
 
 
 def test_who_leaves_early_counts_for_longer() -> None:

@@ -27,8 +27,9 @@ from ugat_marl.grounding import (
 )
 from ugat_marl.grounding.fitting import PAIRS, EpochCallback, split
 from ugat_marl.grounding.forward import ForwardConfig, ForwardModel
-from ugat_marl.grounding.phase import PhaseReport, fit_forward
+from ugat_marl.grounding.phase import PhaseReport, _fit_forward
 from ugat_marl.grounding.reports import (
+    ForwardReport,
     auroc,
     expected_calibration_error,
     rate_by_quantile,
@@ -36,6 +37,11 @@ from ugat_marl.grounding.reports import (
     spearman,
 )
 from ugat_marl.seeding import torch_generator
+
+
+def fit_forward(model: ForwardModel, log: TransitionLog, fitter: Fitter) -> ForwardReport:
+    return _fit_forward(model, stack_log(log, model.stack), fitter)
+
 
 LAYOUTS = {"a_0": AgentLayout(6, 3), "b_0": AgentLayout(4, 2, 2)}
 STACK = Stack(LAYOUTS)

@@ -28,6 +28,7 @@ from ugat_marl.grounding.summaries import NAMES, OF_COUNTS
 from ugat_marl.grounding.worlds import Replay
 from ugat_marl.policies import observer_of, roll_out
 from ugat_marl.scenarios import Network, Scenario
+from ugat_marl.scenarios.junctions import Upstream
 from ugat_marl.seeding import derive_seed
 
 POLICY = "fixed-time:20"
@@ -121,6 +122,18 @@ def test_lanes_that_a_table_lacks_are_said_to_be_estimated(
     config = StreetConfig()
     assert "eyes" not in config.of_log(made.log).parts
     assert "eyes" in config.of_log(whole).parts
+
+
+def test_lanes_that_count_with_those_upstream_are_estimated(
+    crossing: Scenario, measured: MeasuredData
+) -> None:
+    """A table holds the vehicles of the lane alone, and agents would see too few."""
+    network = Network.read(crossing)
+    short = replace(network.lanes["S_C_0"], behind=Upstream({"W_C_0": 1.0}))
+    joined = replace(network, lanes={**network.lanes, "S_C_0": short})
+    made = log_of_measured(measured, crossing, joined, "street", "count", "best")
+    assert set(made.log.provenance.deviation) == {"S_C_0"}
+    assert "estimated from detections on 1 lane ('S_C_0')" in made.findings[-1]
 
 
 def test_a_hole_in_a_table_of_lanes_is_refused(crossing: Scenario, measured: MeasuredData) -> None:
@@ -283,6 +296,7 @@ def test_the_command_writes_a_log_that_can_be_read(
     said = capsys.readouterr().out
     assert "vehicles on a lane are estimated" in said and "transitions of 1 periods" in said
     assert "the last line has no end" in said, "findings of the reader"
+    assert "Finding(" not in said
     log = TransitionLog.read(out)
     assert log.provenance.domain == "main-street"
     assert log.provenance.observation == "movements"

@@ -175,6 +175,7 @@ def test_p_values_take_groups_for_independent_not_their_rows() -> None:
     assert _p(shared, group) == pytest.approx(float(stats.t.sf(eight.mean() / spread, 7)))
     assert _p(np.zeros(240), group) == 1.0
     assert _p(np.ones(240), group) == 0.0
+    assert _p(np.ones(240), np.zeros(240, dtype=np.int64)) == 1.0, "one group proves nothing"
 
 
 def test_f_is_trusted_by_chance_no_more_often_than_the_level_says() -> None:

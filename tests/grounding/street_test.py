@@ -475,3 +475,7 @@ def test_a_learner_begins_anew_when_late_commands_are_found_no_more(
     transfer(config, tmp_path, workers=1)
     assert views[0][0] > 0
     assert views[1][0] == 0
+    rows = pl.read_parquet(tmp_path / "metrics.parquet").filter(
+        pl.col("stage") == "episode", pl.col("name") == "return"
+    )
+    assert rows["step"].to_list() == list(range(rows.height)), "learners count on"

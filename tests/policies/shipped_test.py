@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import shutil
 from pathlib import Path
 
 import numpy as np
@@ -97,6 +98,15 @@ def test_a_packed_policy_that_was_changed_is_refused(training: Path, tmp_path: P
         file.write_text(json.dumps({**content, key: value}))
         with pytest.raises(CheckpointError, match=said):
             load_policy(card.id, folder=out)
+
+
+def test_two_trainings_of_one_name_are_packed_neither(training: Path, tmp_path: Path) -> None:
+    both = tmp_path / "both"
+    for name in ("one", "other"):
+        shutil.copytree(training, both / name)
+    with pytest.raises(OptionError, match="two trainings of"):
+        pack(both, tmp_path / "packed")
+    assert not (tmp_path / "packed").exists()
 
 
 def test_what_is_not_finished_is_not_packed(training: Path, tmp_path: Path) -> None:

@@ -582,7 +582,8 @@ def test_stretches_of_episodes_have_students_interval() -> None:
     two = means_by_stretch([[(k, 1.0) for k in range(8)], [(k, 3.0) for k in range(8)]])
     over = Interval.of(np.array([1.0, 3.0]))
     assert two[0][1:] == (over.mean, over.low, over.high)
-    assert means_by_stretch([]) == []
+    assert means_by_stretch([]) == means_by_stretch([[]]) == []
+    assert means_by_stretch([[], [(k, float(k)) for k in range(8)]]) == rows
 
 
 def test_steps_are_joined_over_series() -> None:

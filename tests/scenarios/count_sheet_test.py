@@ -154,6 +154,18 @@ def test_filled_sheets_are_never_lost(draft: Path, capsys: pytest.CaptureFixture
     assert made(draft, "--counts", draft / "counts.csv") == 0
     assert made(draft, "--vph", "300", "--force") == 2
     assert "would be lost" in capsys.readouterr().err
+    assert made(draft, "--force") == 2, "a blank sheet in place of a filled one"
+    assert "would be lost" in capsys.readouterr().err
+
+
+def test_a_draft_replaces_a_scenario_if_asked(
+    draft: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert made(draft, "--vph", "300") == 0
+    assert made(draft) == 2
+    assert "--force replaces it" in capsys.readouterr().err
+    assert made(draft, "--force") == 0
+    assert not (draft / "scenario.toml").exists()
 
 
 def test_a_folder_without_vehicles_says_what_is_missing(

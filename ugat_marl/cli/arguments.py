@@ -48,6 +48,26 @@ def option_text(name: str) -> str:
     return f"--{name.replace('_', '-')}"
 
 
+def given_words(command: Any, without: Collection[str] = ()) -> list[str]:
+    """Return the options of a command that differ from the default, as they are typed.
+
+    Args:
+        command: The command.
+        without: Names of fields to leave out.
+    """
+    words: list[str] = []
+    for name in given_options(command):
+        value = getattr(command, name)
+        if name in without:
+            continue
+        if isinstance(value, bool):
+            words.append(option_text(name if value else f"no_{name}"))
+        else:
+            values = value if isinstance(value, tuple) else (value,)
+            words += [option_text(name), *map(str, values)]
+    return words
+
+
 def refuse_options(command: Any, names: Collection[str], reason: str) -> None:
     """Refuse options that the command would ignore.
 

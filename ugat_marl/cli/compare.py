@@ -10,7 +10,7 @@ import polars as pl
 from rich.console import Console
 from tyro.conf import Positional, arg
 
-from ugat_marl.cli.arguments import RayAddress, workers_of
+from ugat_marl.cli.arguments import RayAddress, refuse_options, workers_of
 from ugat_marl.data import write_csv
 from ugat_marl.effects import domain_label, load_scenario
 from ugat_marl.errors import OptionError
@@ -20,6 +20,7 @@ from ugat_marl.experiments import (
     compare,
     policy_factory,
     read_standings,
+    require_room,
     shipped_standings,
     standings_from,
     standings_of,
@@ -101,7 +102,11 @@ class Compare:
         if bool(self.policies) == (self.learner is not None):
             raise OptionError("compare needs --policies or --learner, one of the two")
         if self.policies:
-            self._refuse_settings_of_trainings()
+            refuse_options(
+                self,
+                ("learner_settings", "seeds", "episodes", "runs"),
+                "--policies are trained already",
+            )
         if self.evaluation_seeds < 1 or (self.workers is not None and self.workers < 1):
             raise OptionError("--evaluation-seeds and --workers must be at least 1")
         if self.out is not None:
@@ -118,6 +123,7 @@ class Compare:
                     soft_wrap=True,
                 )
         domains = self._domains(table)
+        require_room(table, self.name, map(domain_label, domains))
         with workers_of(self.workers, self.ray) as workers:
             own = self._judged(scenario, domains, workers, Bars(console))
         whole = with_standings(table, own)
@@ -127,14 +133,6 @@ class Compare:
             write_csv(self.out, whole.write_csv())
             console.print(f"table: {self.out}", soft_wrap=True)
         return 0
-
-    def _refuse_settings_of_trainings(self) -> None:
-        for option in ("learner_settings", "seeds", "episodes", "runs"):
-            if getattr(self, option) != getattr(type(self), option):
-                raise OptionError(
-                    f"--{option.replace('_', '-')} is of a training, and --policies are trained "
-                    "already; leave it out, or give --learner instead"
-                )
 
     def _domains(self, table: pl.DataFrame) -> tuple[str, ...]:
         known = table["domain"].unique(maintain_order=True).to_list()

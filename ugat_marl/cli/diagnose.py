@@ -10,7 +10,7 @@ from typing import Annotated
 from rich.console import Console
 from tyro.conf import Positional, arg
 
-from ugat_marl.cli.arguments import RayAddress, Workers, workers_of
+from ugat_marl.cli.arguments import RayAddress, Workers, given_words, workers_of
 from ugat_marl.data import MeasuredData, read_measured
 from ugat_marl.diagnosis import (
     CORRECTED,
@@ -140,15 +140,8 @@ class Diagnose:
 
     def _commands(self, diagnosis: Diagnosis) -> list[str]:
         """Return the command line of this diagnosis and the next one."""
-        given = ["ugat-marl", "diagnose", self.scenario, str(self.measured), "--out", str(self.out)]
-        given += ["--budget-h", f"{self.budget_h:g}", "--alpha", f"{self.alpha:g}"]
-        given += [] if self.budget_s is None else ["--budget-s", f"{self.budget_s:g}"]
-        given += ["--correct-anyway"] if self.correct_anyway else []
-        given += ["--unnamed"] if self.unnamed else []
-        given += ["--seed", str(self.seed)]
-        if self.leave_out:
-            given += ["--leave-out", *self.leave_out]
-        return [shlex.join(given), *self._next(diagnosis)]
+        words = ["ugat-marl", "diagnose", self.scenario, str(self.measured), "--out", str(self.out)]
+        return [shlex.join([*words, *given_words(self)]), *self._next(diagnosis)]
 
     def _next(self, diagnosis: Diagnosis) -> list[str]:
         """Return the command that uses the corrected scenario; nothing if traffic is as before."""

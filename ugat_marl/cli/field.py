@@ -12,7 +12,7 @@ from typing import Annotated
 from rich.console import Console
 from tyro.conf import Positional, arg
 
-from ugat_marl.cli.arguments import LengthS
+from ugat_marl.cli.arguments import LengthS, refuse_options
 from ugat_marl.effects import load_scenario, scenario_in_domain
 from ugat_marl.envs import parallel_env
 from ugat_marl.errors import OptionError
@@ -115,6 +115,8 @@ class Field:
     def _check(self) -> None:
         if self.port is None and not self.start:
             raise OptionError("--port is missing: where SUMO listens; or let --start run one")
+        if not self.start:
+            refuse_options(self, ("domain", "seed"), "they are of the SUMO that --start runs")
         if self.start and self.host != "localhost":
             raise OptionError(f"--start runs SUMO here, and not at --host {self.host}")
         if self.start and (self.port is not None or self.look_for_s or self.detectors != "lanes"):

@@ -58,7 +58,7 @@ class ImportLog:
             measured, scenario, network, place, self.observation, self.vehicles, numbers
         )
         imported.log.write(self.out)
-        for finding in (*measured.findings, *imported.findings):
+        for finding in (*(finding.text for finding in measured.findings), *imported.findings):
             console.print(f"- {finding}", markup=False, soft_wrap=True)
         console.print(
             f"{len(imported.log)} transitions of {imported.log.episodes} periods: {self.out}",

@@ -12,7 +12,7 @@ from rich.console import Console
 from rich.table import Table
 from tyro.conf import Positional, arg
 
-from ugat_marl.cli.arguments import given_options, option_text, refuse_options
+from ugat_marl.cli.arguments import given_words, option_text, refuse_options
 from ugat_marl.errors import OptionError
 from ugat_marl.progress import Bars
 from ugat_marl.reporting import LIGHT, LightNames, counted, draw_network, titled_table
@@ -164,6 +164,7 @@ class ScenarioNew:
             roads,
             settings=self._settings(),
             command=self._command(),
+            force=self.force,
             draw=lambda scenario, out: draw_network(scenario, out, reporter),
             reporter=reporter,
         )
@@ -247,12 +248,7 @@ class ScenarioNew:
     def _command(self) -> str:
         """Return the command line that makes the same scenario again."""
         words = ["ugat-marl", "scenario", "new", str(self.name)]
-        for name in given_options(self):
-            value = getattr(self, name)
-            if name != "force":
-                values = value if isinstance(value, tuple) else () if value is True else (value,)
-                words += [option_text(name), *map(str, values)]
-        return shlex.join(words)
+        return shlex.join([*words, *given_words(self, without=("force",))])
 
 
 def _fit_table(fits: Sequence[CountFit], names: LightNames) -> Table:

@@ -1,6 +1,6 @@
 """A scenario with one intersection as an environment of Gymnasium.
 
-``gymnasium.make("ugat_marl:ugat_marl/single-v1")`` makes one (`ugat_marl.envs.registration`).
+``gymnasium.make("ugat_marl.envs.single:ugat_marl/single-v1")`` imports this module and makes one.
 Keywords are those of `ugat_marl.parallel_env`.
 """
 

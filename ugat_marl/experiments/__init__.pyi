@@ -71,6 +71,7 @@ from .standings import as_standings as as_standings
 from .standings import lost_rows as lost_rows
 from .standings import ranked as ranked
 from .standings import read_standings as read_standings
+from .standings import require_room as require_room
 from .standings import shipped_standings as shipped_standings
 from .standings import standings_from as standings_from
 from .standings import standings_of as standings_of

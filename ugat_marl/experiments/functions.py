@@ -19,7 +19,7 @@ from ugat_marl.effects import Domain, domain_label, load_scenario
 from ugat_marl.errors import OptionError
 from ugat_marl.experiments import evaluation
 from ugat_marl.experiments.evaluation import OwnPolicyFactory, policy_factory
-from ugat_marl.experiments.jobs import EVALUATION_SEED
+from ugat_marl.experiments.jobs import EVALUATION_SEED, file_stem
 from ugat_marl.experiments.scores import Evaluation
 from ugat_marl.experiments.transfers import TransferConfig, transfer
 from ugat_marl.grounding import UgatConfig
@@ -210,7 +210,7 @@ def evaluate(
 def run_folder(config: TransferConfig) -> Path:
     """Return the folder of a run that has been given none: runs/SCENARIO-REAL-sSEED."""
     scenario, real = config.scenario, domain_label(config.real)
-    parts = (Path(scenario).name.removesuffix(".sumocfg"), Path(real).name)
+    parts = (file_stem(scenario), Path(real).name)
     name = "-".join(re.sub(r"[^\w=+.]+", "-", part).strip("-.") for part in parts)
     return Path("runs") / f"{name}-s{config.seed}"
 

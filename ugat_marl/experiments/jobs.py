@@ -236,7 +236,10 @@ class Job:
 
 def file_stem(scenario: str) -> str:
     """Return the name of a scenario in the form of a file's name."""
-    return re.sub(r"[^\w.+-]+", "-", Path(scenario).name.removesuffix(".sumocfg")).strip("-")
+    name = Path(scenario).name
+    if name in ("", ".."):  # of ".", "..": the folder itself has a name
+        name = Path(scenario).resolve().name
+    return re.sub(r"[^\w.+-]+", "-", name.removesuffix(".sumocfg")).strip("-")
 
 
 def file_name(name: str) -> str:

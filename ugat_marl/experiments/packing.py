@@ -37,23 +37,24 @@ def pack(training: Path, folder: Path, command: str = "") -> list[PolicyCard]:
         OptionError: There is no finished training with a policy.
         CheckpointError: A file of a training is damaged.
     """
-    cards: dict[str, PolicyCard] = {}
+    found: dict[str, tuple[PolicyCard, bytes]] = {}
     for place in sorted(path.parent for path in training.rglob(JOB)):
         for card, policy in _cards(place, command):
-            if card.id in cards:
+            if card.id in found:
                 raise OptionError(
                     f"{training} holds two trainings of {card.id}, with other settings; name the "
                     "folder of one of them"
                 )
-            cards[card.id] = card
-            write_whole(folder / f"{card.id}.pt", policy)
-            card.write(folder / f"{card.id}.json")
-    if not cards:
+            found[card.id] = card, policy
+    if not found:
         raise OptionError(
             f"{training} holds no finished training with a policy; name the folder of a run of "
             "`ugat-marl train`, or of the trainings of `ugat-marl paper`"
         )
-    return list(cards.values())
+    for name, (card, policy) in found.items():
+        write_whole(folder / f"{name}.pt", policy)
+        card.write(folder / f"{name}.json")
+    return [card for card, _ in found.values()]
 
 
 def _cards(place: Path, command: str) -> list[tuple[PolicyCard, bytes]]:

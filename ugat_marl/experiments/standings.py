@@ -8,7 +8,7 @@ has: ``setting``, ``domain``, ``training_seed``, ``att_s`` (mean travel time in 
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -219,19 +219,33 @@ def standings_from(comparison: Comparison, setting: str, name: str) -> pl.DataFr
     return pl.DataFrame(rows, schema=SCHEMA)
 
 
-def with_standings(table: pl.DataFrame, own: pl.DataFrame) -> pl.DataFrame:
-    """Return a table with the rows of an algorithm; rows of the same name are replaced.
+def require_room(table: pl.DataFrame, name: str, domains: Iterable[str]) -> None:
+    """Refuse a name by which results of a table would be lost.
+
+    Args:
+        table: The table.
+        name: Name of the new rows.
+        domains: Domains of the new rows.
 
     Raises:
         OptionError: The name is that of a setting of the table which has other domains.
     """
-    (name,) = own["setting"].unique().to_list()
     before = table.filter(pl.col("setting") == name)
-    if lost := sorted({*before["domain"]} - {*own["domain"]}):
+    if lost := sorted({*before["domain"]} - {*domains}):
         raise OptionError(
             f"name = {name!r} is a row of the table with results in {', '.join(lost)}, which would "
             "be lost; give another name, or these domains as well"
         )
+
+
+def with_standings(table: pl.DataFrame, own: pl.DataFrame) -> pl.DataFrame:
+    """Return a table with the rows of an algorithm; rows of the same name are replaced.
+
+    Raises:
+        OptionError: As for `require_room`.
+    """
+    (name,) = own["setting"].unique().to_list()
+    require_room(table, name, own["domain"])
     return pl.concat([table.filter(pl.col("setting") != name), own])
 
 

@@ -23,6 +23,7 @@ def means_by_stretch(series: Sequence[Sequence[tuple[int, float]]]) -> list[Curv
 
     For one series, the interval is over the episodes of the stretch; for several, over the series.
     """
+    series = [points for points in series if points]
     if not series:
         return []
     last = max(points[-1][0] for points in series) + 1

@@ -204,7 +204,9 @@ class TransferConfig:
         if self.placebo not in NEGATIVE_CONTROLS:
             raise UnknownNameError("placebo", self.placebo, NEGATIVE_CONTROLS)
         if self.placebo == "same-world" and self.real_log is not None:
-            raise OptionError('the placebo "same-world" takes the place of a real_log; give one')
+            raise OptionError(
+                'the placebo "same-world" has no street, real_log is of one; leave out one of them'
+            )
         if self.random_delay_s is not None and self.random_delay_s < 1:
             raise OptionError(f"random_delay_s = {self.random_delay_s}: must be at least 1")
         continues = {

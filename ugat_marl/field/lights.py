@@ -67,8 +67,8 @@ class Lights:
         site: The intersections.
         street: The street.
         limits: `TrustLimits.obey_s` and `TrustLimits.look_every_s` are used.
-        all_seen: Whether a light that the street lacks is an error; else it is a fault of that
-            light.
+        all_seen: Whether it is an error that the street lacks a light, or that a light shows a
+            state that it cannot have; else it is a fault of that light.
 
     Attributes:
         machines: Traffic light to its signal machine.
@@ -83,7 +83,9 @@ class Lights:
     ) -> None:
         self._site, self._street, self._limits = site, street, limits
         self._phases = {item.id: item.phases for item in site.network.intersections}
-        shown = street.shown()
+        shown = dict(street.shown())
+        if not all_seen:
+            shown = {x: state for x, state in shown.items() if self._can_show(x, state)}
         lacking = [light for light in site.lights if light not in shown]
         if lacking and all_seen:
             raise OptionError(f"the street has no traffic light {lacking[0]!r}; it has {[*shown]}")
@@ -99,6 +101,14 @@ class Lights:
         self._commanded: set[str] = set()
         self._faults: dict[str, str] = {}
         self._seen_s = street.now_s()
+
+    def _can_show(self, light: str, state: str) -> bool:
+        """Return whether a light can have a state."""
+        try:
+            Light(self._phases.get(light, ()), self._site.timing, state)
+        except OptionError:
+            return False
+        return True
 
     def faults(self) -> dict[str, str]:
         """Return light to fault, ``<kind>: <details>``, since the last call; look once more."""

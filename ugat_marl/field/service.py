@@ -59,6 +59,7 @@ class FieldService:
         self._loop: FieldLoop | None = None
         self._lost: Exception | None = None
         self._losses = 0
+        self._of_caller: Exception | None = None
 
     def run(
         self, seconds: float, on_decision: Callable[[Decision], None] | None = None
@@ -72,6 +73,7 @@ class FieldService:
         Raises:
             SimulatorError: The street was gone for longer than `look_for_s`.
             OSError: The same, with an error of the street's driver.
+            Exception: What `on_decision` raises.
             OptionError: The street lacks a light, or a light shows a state that it cannot have.
             OutputError: The log cannot be written at the end.
         """
@@ -96,6 +98,8 @@ class FieldService:
             except OutputError:
                 raise
             except (SimulatorError, OSError) as error:
+                if error is self._of_caller:
+                    raise
                 if self._lost is None:
                     pause_s, until = FIRST_PAUSE_S, time.monotonic() + self._look_for_s
                     self._losses += 1
@@ -127,7 +131,11 @@ class FieldService:
             **self._facts(),
         )
         if on_decision is not None:
-            on_decision(decision)
+            try:
+                on_decision(decision)
+            except Exception as error:
+                self._of_caller = error  # it says nothing about the street
+                raise
 
     def _facts(self) -> dict[str, object]:
         summary = LoopSummary() if self._loop is None else self._loop.summary

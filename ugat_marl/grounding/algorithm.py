@@ -102,12 +102,22 @@ class Algorithm:
         episodes: int,
         title: str,
         stage: str = "episode",
+        earlier: int = 0,
     ) -> None:
-        """Let the learner train in an environment; log every episode, under a stage."""
+        """Let the learner train in an environment; log every episode.
+
+        Args:
+            learner: The learner.
+            env: The environment.
+            episodes: Number of episodes.
+            title: Name of the progress bar.
+            stage: Stage of the metrics.
+            earlier: Episodes in this stage before the learner's first one.
+        """
         with self.run.reporter.task(title, episodes) as advance:
 
             def on_episode(number: int, numbers: Mapping[str, float]) -> None:
-                self.run.log(stage, number, numbers)
+                self.run.log(stage, earlier + number, numbers)
                 advance(note=f"return {numbers['return']:.0f}" if "return" in numbers else "")
 
             learner.learn(env, episodes, self.seed, on_episode)

@@ -773,6 +773,32 @@ def _within(come: Floats, leave: Floats, capacity: float) -> Floats:
     return np.minimum(come, leave)
 
 
+@dataclass(frozen=True)
+class _Costs:
+    """Least costs of matching the first 0, 1, ... vehicles of one detector with some of another.
+
+    Attributes:
+        start: Number of vehicles of the first of `values`.
+        values: Costs from there on.
+        gap: Cost of each vehicle beyond them.
+    """
+
+    start: int
+    values: Floats
+    gap: float
+
+    def at(self, number: int) -> float:
+        """Return the cost of some vehicles, not fewer than `start`."""
+        beyond = max(number - self.start - len(self.values) + 1, 0)
+        return float(self.values[number - self.start - beyond]) + beyond * self.gap
+
+    def between(self, low: int, high: int) -> Floats:
+        """Return the costs of `low` to `high` vehicles."""
+        number = np.arange(low, high + 1) - self.start
+        beyond = np.maximum(number - len(self.values) + 1, 0)
+        return self.values[number - beyond] + beyond * self.gap
+
+
 def _aligned(
     first: _Crossings,
     last: _Crossings,
@@ -792,30 +818,44 @@ def _aligned(
     n, m = len(first), len(last)
     if not n or not m:
         return np.empty((0, 2), dtype=np.int64)
-    ride_s = last.on_s[None, :] - first.on_s[:, None]
-    mean = 0.5 * (first.speed_mps[:, None] + last.speed_mps[None, :])
-    free = np.minimum(first.speed_mps[:, None], last.speed_mps[None, :]) >= 0.7 * free_mps
-    expected_s = way_m / np.maximum(mean, 1.0)
-    off = np.abs(ride_s - expected_s) / (0.5 + 2.0 * config.speed_spread * expected_s)
-    cost = np.where(free, np.minimum(off, 2.0 * config.unmatched), 0.0)
-    cost += np.where(np.abs(first.length_m[:, None] - last.length_m[None, :]) > 0.5, 2.0, 0.0)
-    cost[(ride_s < fastest_s) | (ride_s > config.longest_s)] = np.inf
     gap = config.unmatched
-    total = np.empty((m + 1, n + 1))
-    total[0] = gap * np.arange(n + 1)
-    skipped = gap * np.arange(n + 1)
+    # Rows of the table of least costs hold only the vehicles that can have been each one: beyond
+    # them each further vehicle costs a gap. A whole table of a day needs gigabytes.
+    low = np.searchsorted(first.on_s, last.on_s - config.longest_s - 1e-6, side="left")
+    high = np.searchsorted(first.on_s, last.on_s - fastest_s + 1e-6, side="right")
+    costs: list[Floats] = []
+    totals = [_Costs(0, np.zeros(1), gap)]
     for j in range(m):
-        best = total[j] + gap
-        best[1:] = np.minimum(best[1:], total[j, :-1] + cost[:, j])
-        total[j + 1] = np.minimum.accumulate(best - skipped) + skipped
+        near = slice(int(low[j]), int(high[j]))
+        ride_s = last.on_s[j] - first.on_s[near]
+        speed = first.speed_mps[near]
+        mean = 0.5 * (speed + last.speed_mps[j])
+        free = np.minimum(speed, last.speed_mps[j]) >= 0.7 * free_mps
+        expected_s = way_m / np.maximum(mean, 1.0)
+        off = np.abs(ride_s - expected_s) / (0.5 + 2.0 * config.speed_spread * expected_s)
+        cost = np.where(free, np.minimum(off, 2.0 * gap), 0.0)
+        cost += np.where(np.abs(first.length_m[near] - last.length_m[j]) > 0.5, 2.0, 0.0)
+        cost[(ride_s < fastest_s) | (ride_s > config.longest_s)] = np.inf
+        costs.append(cost)
+        before = totals[-1].between(near.start, near.stop)
+        best = before + gap
+        best[1:] = np.minimum(best[1:], before[:-1] + cost)
+        skipped = gap * np.arange(near.start, near.stop + 1)
+        least: Floats = np.minimum.accumulate(best - skipped).astype(np.float64) + skipped
+        totals.append(_Costs(near.start, least, gap))
     pairs: list[tuple[int, int]] = []
     i, j = n, m
     while i and j:
-        here = total[j, i]
-        if np.isclose(here, total[j - 1, i - 1] + cost[i - 1, j - 1]):
+        here, start = totals[j], int(low[j - 1])
+        if i <= start:
+            j -= 1
+            continue
+        total = here.at(i)
+        matched = i <= int(high[j - 1])
+        if matched and np.isclose(total, totals[j - 1].at(i - 1) + costs[j - 1][i - 1 - start]):
             i, j = i - 1, j - 1
             pairs.append((i, j))
-        elif np.isclose(here, total[j - 1, i] + gap):
+        elif np.isclose(total, totals[j - 1].at(i) + gap):
             j -= 1
         else:
             i -= 1

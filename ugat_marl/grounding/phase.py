@@ -168,21 +168,6 @@ class PhaseTransform(Transform):
 
 
 @one_thread()
-def fit_forward(model: ForwardModel, log: TransitionLog, fitter: Fitter) -> ForwardReport:
-    """Fit f alone on a log of the real world, by least squares on the change of the features.
-
-    Args:
-        model: Forward model, changed in place.
-        log: Transitions with the outcomes of the *asked* actions.
-        fitter: Settings, seed and device of the training.
-
-    Raises:
-        LogError: The log has other agents, or is too short to be split.
-    """
-    return _fit_forward(model, stack_log(log, model.stack), fitter)
-
-
-@one_thread()
 def fit_inverse(model: InverseModel, log: TransitionLog, fitter: Fitter) -> PhaseInverseReport:
     """Fit h alone on a log of the simulation, with the loss of the fitter's method.
 

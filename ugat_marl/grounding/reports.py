@@ -130,7 +130,6 @@ class TrainingRecord:
         train_loss: Mean training loss of the last epoch, over agents.
         held_out_loss: Mean held-out loss of the kept weights.
         split: "episodes", or "steps" if the log has only one episode.
-        train_rows: Number of rows trained on, over all agents.
         held_out_rows: Number of rows held out, over all agents.
     """
 
@@ -138,7 +137,6 @@ class TrainingRecord:
     train_loss: float
     held_out_loss: float
     split: str
-    train_rows: int
     held_out_rows: int
 
     def as_dict(self, prefix: str) -> dict[str, float]:

@@ -34,6 +34,8 @@ def is_kept(learner_or_policy: Any) -> bool:
 
 _POLICIES = ("direct", "best")
 """Policies of a state; each has a file in a checkpoint."""
+_COUNTERS = ("pretrained", "iteration", "earlier")
+"""Counters of a state, in a checkpoint."""
 
 
 @dataclass
@@ -49,6 +51,7 @@ class RunState(Generic[Saved]):
         real: Logs of D_real.
         pretrained: Number of episodes of plain training so far.
         iteration: Number of completed iterations.
+        earlier: Episodes of learners that the present one replaced, for the numbers in the metrics.
     """
 
     learner: Learner
@@ -59,6 +62,7 @@ class RunState(Generic[Saved]):
     real: list[TransitionLog] = field(default_factory=list)
     pretrained: int = 0
     iteration: int = 0
+    earlier: int = 0
 
     def policy(self) -> Policy:
         """Return the result so far: the best policy, or that of the learner."""
@@ -84,7 +88,7 @@ class RunState(Generic[Saved]):
                 for number, log in enumerate(logs):
                     log.write(folder / f"{name}-{number:03}.parquet")
 
-        run.save({"pretrained": self.pretrained, "iteration": self.iteration}, write)
+        run.save({name: getattr(self, name) for name in _COUNTERS}, write)
 
     def restore(
         self,
@@ -118,8 +122,8 @@ class RunState(Generic[Saved]):
             self.real = _read_logs(folder, "real")
 
         counters = run.restore(read)
-        self.pretrained = int(counters["pretrained"])
-        self.iteration = int(counters["iteration"])
+        for name in _COUNTERS:
+            setattr(self, name, int(counters[name]))
 
 
 def _read_logs(folder: Path, name: str) -> list[TransitionLog]:

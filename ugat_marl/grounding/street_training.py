@@ -160,6 +160,7 @@ class StreetTraining(Algorithm):
             street = self._fit(state, policy)  # line 4
             episodes = self.config.grounded_episodes
             if self._begins_anew(before, state.transform.view):
+                state.earlier += state.learner.episodes
                 self._begin(state)
                 episodes += self.config.pretrain_episodes
             agents = list(state.real[0].provenance.layouts)
@@ -174,7 +175,7 @@ class StreetTraining(Algorithm):
                 rule = self._best_rule(state, street)  # line 6
                 held = residual and residual.transform.gate
                 taught = self._attend(state.learner, grounded, title, rule and rule.spec, held)
-                self._learn(state.learner, grounded, episodes, title)
+                self._learn(state.learner, grounded, episodes, title, earlier=state.earlier)
             if residual is not None and residual.acts:
                 gate = residual.end_iteration().as_dict()
                 numbers |= {f"residual/gate/{name}": value for name, value in gate.items()}

@@ -248,6 +248,8 @@ def _p(surplus: Floats, group: NDArray[np.int64]) -> float:
     are those of its linearisation.
     """
     sizes = np.bincount(group)
+    if (sizes > 0).sum() < 2:
+        return 1.0  # one group says nothing of how groups differ
     total, number = (np.bincount(group, weights=w)[sizes > 0] for w in (surplus, None))
     mean = float(surplus.mean())
     deviation = (total - mean * number) / number.mean()

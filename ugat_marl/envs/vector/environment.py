@@ -384,6 +384,8 @@ class VectorEnv:
             chosen = numbers[np.asarray(where)]
         except IndexError:
             chosen = numbers[:0]
+        if not np.array_equal(np.asarray(where), chosen) and np.asarray(where).dtype != np.bool_:
+            chosen = numbers[:0]  # negative numbers count from the end
         if chosen.ndim != 1 or not chosen.size or len(set(chosen.tolist())) < chosen.size:
             raise OptionError(
                 f"where = {where!r}: must be different numbers below {self.n}, or a mask of "

@@ -116,7 +116,7 @@ class GymnasiumVectorEnv(vector.VectorEnv[Any, Any, Any]):
         """Return final observations and infos in Gymnasium's form, None for running episodes."""
         observations = np.full(self.num_envs, None, dtype=object)
         masks = np.zeros((self.num_envs, self.env.agent_set.most_actions), dtype=np.int8)
-        travel_time_s = np.zeros(self.num_envs)
+        travel_time_s = np.full(self.num_envs, np.nan)
         for ended in batch.ended:
             first = ended.environment * len(self.env.agents)
             for row, (vector_seen, mask) in enumerate(

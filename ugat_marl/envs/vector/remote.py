@@ -10,8 +10,6 @@ import contextlib
 import os
 import shutil
 import sys
-import tempfile
-import weakref
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
@@ -25,6 +23,7 @@ from ugat_marl.envs.agents import AgentSet
 from ugat_marl.envs.vector.arrays import Arrays, Shape, shared_memory
 from ugat_marl.envs.vector.spec import DomainOf, Spec, Wraps, sent
 from ugat_marl.errors import EpisodeError, SimulatorCrashed
+from ugat_marl.files import OwnDirectory
 from ugat_marl.scenarios import Scenario
 from ugat_marl.seeding import derive_seed
 from ugat_marl.simulation import ChannelClosed, Host, Worker
@@ -97,7 +96,7 @@ class Shared:
         self._scenario = scenario
         self._spec = Spec.of(scenario, options, wraps)
         self._folder: Path | None = None
-        self._remove: weakref.finalize[..., Shared] | None = None
+        self._directory = OwnDirectory()
         self._memory = shared_memory(self.shape)
         self.arrays = Arrays.over(self._memory, self.shape)
 
@@ -130,13 +129,12 @@ class Shared:
         memory, self._memory = self._memory, -1
         if memory >= 0:
             os.close(memory)
-        if self._remove is not None:
-            self._remove()
+        self._directory.remove()
 
     def _own_folder(self) -> Path:
         if self._folder is None:
-            self._folder = Path(tempfile.mkdtemp(prefix="ugat_marl-"))
-            self._remove = weakref.finalize(self, _remove_tree, self._folder, os.getpid())
+            self._folder = self._directory.fresh()
+            self._folder.mkdir(mode=0o700)
             self._scenario.write(self._folder / self._scenario.id)
         return self._folder
 
@@ -291,15 +289,13 @@ class RemoteEnv:
             raise SimulatorCrashed(
                 f"{obituary}. It was replaced {DEATHS} times, and died each time"
             )
-        self._start()
+        try:
+            self._start()
+        except BaseException:  # there is no process to ask
+            self.close()
+            raise
 
     def _end(self) -> None:
         worker, self._worker = self._worker, None
         if worker is not None:
             worker.end()
-
-
-def _remove_tree(directory: Path, owner: int) -> None:
-    """Remove a folder, but only in the process that made it; forked children must not."""
-    if os.getpid() == owner:
-        shutil.rmtree(directory, ignore_errors=True)

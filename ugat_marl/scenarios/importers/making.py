@@ -176,6 +176,7 @@ def make_draft(
     *,
     settings: Mapping[str, Any],
     command: str,
+    force: bool,
     draw: Callable[[Scenario, Path], object],
     reporter: Reporter,
 ) -> Draft:
@@ -188,6 +189,7 @@ def make_draft(
         roads: Source of the roads.
         settings: Values for ``scenario.toml``; they override those of the source.
         command: Command that makes the folder again, for the README.
+        force: True to replace an existing scenario.
         draw: Function that draws the lights of a scenario, which has no vehicles, into a folder.
         reporter: Shows progress.
 
@@ -195,7 +197,7 @@ def make_draft(
         OutputError: The folder exists, or cannot be written.
         ScenarioError: The network cannot be controlled.
     """
-    with new_folder(target, force=False) as folder:
+    with new_folder(target, force=force) as folder:
         source = roads(folder, reporter)
         with _errors_about(source.copied, folder, source.network):
             content, notes = _settings(folder, source, ("none",), settings)
@@ -362,7 +364,9 @@ def _stopped_in_order() -> Iterator[None]:
 def _require_counts_kept(made: Path, target: Path) -> None:
     """Refuse to lose a sheet that was filled in, even with --force."""
     old, new = target / COUNT_SHEET, made / COUNT_SHEET
-    if not old.is_file() or (new.is_file() and (target / "scenario.toml").is_file()):
+    if not old.is_file():
+        return
+    if new.is_file() and is_filled(new) and (target / "scenario.toml").is_file():
         return
     if is_filled(old) and not (new.is_file() and new.read_bytes() == old.read_bytes()):
         raise OutputError(f"{old} would be lost; give it with --counts, or move it away first")
