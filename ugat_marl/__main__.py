@@ -111,7 +111,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
 
     Returns:
         The exit code: 0, 1 (a check or target failed), 2 (wrong call or input; one line names the
-        fault), 130 (interrupted).
+        fault), 130 (interrupted), 143 (terminated).
     """
     return run(LINE, sys.argv[1:] if arguments is None else arguments)
 

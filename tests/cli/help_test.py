@@ -63,6 +63,9 @@ def test_there_are_few_verbs(capsys: pytest.CaptureFixture[str]) -> None:
     assert 10 <= len(listed) <= 20
     assert {name.split()[0] for name in COMMANDS} | {"completion"} == set(listed)
     for group, text in GROUPS.items():
+        assert main([group, "--help"]) == main([group, "--help-all"]) == 0
+        lines = capsys.readouterr().out.splitlines()
+        assert lines[: len(lines) // 2] == lines[len(lines) // 2 :]
         members = {name.split()[1] for name in COMMANDS if name.startswith(f"{group} ")}
         assert members == set(text.partition(": ")[2].split(", "))
 

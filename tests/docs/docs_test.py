@@ -7,7 +7,7 @@ import shlex
 import tomllib
 from dataclasses import dataclass, fields, replace
 from pathlib import Path
-from typing import Any
+from typing import Any, get_args
 
 import numpy as np
 import pytest
@@ -16,6 +16,7 @@ from gymnasium.spaces import Box
 
 import ugat_marl
 from ugat_marl.__main__ import main
+from ugat_marl.data import Scores
 from ugat_marl.effects import (
     OBJECTIVES,
     BlockerPatience,
@@ -28,6 +29,9 @@ from ugat_marl.effects import (
 )
 from ugat_marl.effects.actuators import PHASE_ORDERS
 from ugat_marl.envs import OBJECTIVE_MEASURES
+from ugat_marl.envs.observations import OBSERVATION_UNITS
+from ugat_marl.envs.options import EnvOptions
+from ugat_marl.envs.rewards import RewardName
 from ugat_marl.files import xml_bytes
 from ugat_marl.grounding import UNCERTAINTY_METHODS, FitConfig
 from ugat_marl.scenarios import validate_settings
@@ -111,6 +115,29 @@ def test_the_example_of_drawn_networks_works(
     exec(example[1], names)  # the page's own words, in a namespace of their own
     assert [town.id for town in names["towns"]] == ["town0", "town1"]
     assert 0 < names["busiest"] < 0.8
+
+
+def test_the_page_of_the_environment_says_what_the_code_does() -> None:
+    page = (DOCS / "reference" / "environment.md").read_text()
+    observations, rewards, ends, options = (
+        page.partition(head)[2].partition("\n\n- ")[0].partition("\n## ")[0]
+        for head in ("## Observations", "## Rewards", "## Infos", "## Options")
+    )
+    assert dict(re.findall(r"^\| `(\w+)`[^|]* \| ([^|]+) \|", observations, re.MULTILINE)) == {
+        "observation": "features, one per lane",
+        **OBSERVATION_UNITS,
+    }
+    assert f"`{EnvOptions().observation}` (default)" in observations
+    named = re.findall(r"^\| `([\w-]+)`", rewards, re.MULTILINE)
+    assert sorted(named) == sorted(["reward", *get_args(RewardName)])
+    assert f"`{EnvOptions().reward}` (default)" in rewards
+    measured = set(re.findall(r"`(\w+)`", ends.partition("| field |")[2]))
+    assert measured == {field.name for field in fields(Scores)} - {"hidden"}
+    told = options.partition("| option |")[2].partition("\n\n")[0]
+    first = [row.split("|")[1] for row in told.splitlines()[2:]]
+    assert {name for cell in first for name in re.findall(r"`(\w+)`", cell)} == {
+        field.name for field in fields(EnvOptions)
+    }
 
 
 def test_every_uncertainty_is_documented() -> None:

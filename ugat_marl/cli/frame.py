@@ -201,7 +201,7 @@ def _deadline(seconds: str | None) -> Iterator[None]:
 
 def _dispatch(line: CommandLine, words: list[str], console: Console) -> int:
     """Print help or the version, or run the command that the words name."""
-    if not words or words[0] in (*HELP, "help"):
+    if not words or words[0] in (*HELP, HELP_ALL, "help"):
         _print_help(line, console)
         return 0 if words else USAGE_ERROR
     if words[0] == "--version":
@@ -214,7 +214,7 @@ def _dispatch(line: CommandLine, words: list[str], console: Console) -> int:
     words = [*line.short.get(words[0], (words[0],)), *words[1:]]
     name, rest = words[0], words[1:]
     if members := {key.split()[1] for key in line.commands if key.startswith(f"{name} ")}:
-        if not rest or rest[0] in HELP:
+        if not rest or rest[0] in (*HELP, HELP_ALL):
             _print_help(line, console, f"{name} ")
             return 0 if rest else USAGE_ERROR
         if rest[0] not in members:

@@ -289,6 +289,8 @@ class FittedStreet:
             raise CheckpointError(f"{path}: the street has other lanes than this network")
         if content.get("library") not in (None, [vars(item) for item in worlds.library]):
             raise CheckpointError(f"{path}: the street was fitted with another library of effects")
+        if "interval_s" not in content:
+            raise CheckpointError(f"{path}: the street in the checkpoint is damaged: no interval_s")
         channel, eyes, posterior = (content.get(x) for x in ("channel", "eyes", "posterior"))
         street = cls(
             worlds.lanes,
