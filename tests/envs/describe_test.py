@@ -193,6 +193,8 @@ def test_one_light_is_an_environment_of_gymnasium() -> None:
         'import gymnasium; light = gymnasium.make("ugat_marl:ugat_marl/single-v1")',
         'import gymnasium, ugat_marl; light = gymnasium.make("ugat_marl/single-v1")',
         'import gymnasium, ugat_marl; light = gymnasium.make("ugat_marl:ugat_marl/single-v1")',
+        "import ugat_marl, gymnasium; "
+        'light = gymnasium.make("ugat_marl.envs.single:ugat_marl/single-v1")',
         "import ugat_marl, gymnasium; ugat_marl.parallel_env; "
         'light = gymnasium.make("ugat_marl/single-v1")',
     ],

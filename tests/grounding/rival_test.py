@@ -123,6 +123,7 @@ def test_an_interrupted_rival_ends_as_an_unbroken_one(
     assert numbers(tmp_path / "whole") == numbers(tmp_path / "broken")
 
 
+@pytest.mark.slow
 def test_late_commands_leave_no_rival(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """Also with the learner that always sees its commands, and does not begin anew."""
     play_nothing(monkeypatch)
