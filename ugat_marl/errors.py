@@ -9,7 +9,7 @@ from __future__ import annotations
 import contextlib
 import difflib
 import re
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 
 LISTED = 32
 """Most names in one error message. If there are more, the message lists the nearest ones."""
@@ -126,6 +126,11 @@ def install_command(extra: str) -> str:
                 needed.append(f"'{library.strip()}'")
     libraries = " ".join(needed) or f"'.[{extra}]'"
     return f"pip install {libraries}"
+
+
+def first_names(names: Sequence[str]) -> str:
+    """Return the first four names, with dots for further ones."""
+    return ", ".join([*names[:4], *["..."] * (len(names) > 4)])
 
 
 def nearest(name: str, allowed: Iterable[str]) -> str | None:

@@ -571,7 +571,7 @@ def test_demand_that_does_not_reach_the_detectors_is_told(
         (("--budget-s", "0"), "budget_s = 0"),
         (("--budget-s", "nan"), "budget_s"),
         (("--seed", "-1"), "seed = -1"),
-        (("--workers", "0"), "workers = 0"),
+        (("--workers", "0"), "--workers 0: must be at least 1"),
         (("--budgets", "3"), "'--budget-s'"),
     ],
 )

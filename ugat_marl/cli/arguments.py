@@ -83,6 +83,17 @@ def refuse_options(command: Any, names: Collection[str], reason: str) -> None:
         raise OptionError(f"{reason}; leave out {', '.join(map(option_text, unused))}")
 
 
+def require_counts(**options: int | None) -> None:
+    """Refuse numbers below 1; None, for a default, is allowed.
+
+    Raises:
+        OptionError: A number is below 1.
+    """
+    for name, value in options.items():
+        if value is not None and value < 1:
+            raise OptionError(f"{option_text(name)} {value}: must be at least 1")
+
+
 @contextlib.contextmanager
 def workers_of(
     workers: int | None, ray: str | None, option: str = "--workers"

@@ -10,7 +10,7 @@ import polars as pl
 from rich.console import Console
 from tyro.conf import Positional, arg
 
-from ugat_marl.cli.arguments import RayAddress, refuse_options, workers_of
+from ugat_marl.cli.arguments import RayAddress, refuse_options, require_counts, workers_of
 from ugat_marl.data import write_csv
 from ugat_marl.effects import domain_label, load_scenario
 from ugat_marl.errors import OptionError
@@ -107,8 +107,7 @@ class Compare:
                 ("learner_settings", "seeds", "episodes", "runs"),
                 "--policies are trained already",
             )
-        if self.evaluation_seeds < 1 or (self.workers is not None and self.workers < 1):
-            raise OptionError("--evaluation-seeds and --workers must be at least 1")
+        require_counts(evaluation_seeds=self.evaluation_seeds, workers=self.workers)
         if self.out is not None:
             require_writable(self.out)
         scenario = load_scenario(self.scenario)

@@ -10,7 +10,13 @@ from typing import Annotated
 from rich.console import Console
 from tyro.conf import Positional, arg
 
-from ugat_marl.cli.arguments import RayAddress, Workers, given_words, workers_of
+from ugat_marl.cli.arguments import (
+    RayAddress,
+    Workers,
+    given_words,
+    require_counts,
+    workers_of,
+)
 from ugat_marl.data import MeasuredData, read_measured
 from ugat_marl.diagnosis import (
     CORRECTED,
@@ -105,8 +111,7 @@ class Diagnose:
         return 0
 
     def _config(self) -> DiagnosisConfig:
-        if self.workers is not None and self.workers < 1:
-            raise OptionError(f"workers = {self.workers} must be at least 1")
+        require_counts(workers=self.workers)
         return DiagnosisConfig(
             budget_h=self.budget_h,
             budget_s=self.budget_s,

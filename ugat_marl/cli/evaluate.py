@@ -10,7 +10,7 @@ from typing import Annotated
 from rich.console import Console
 from tyro.conf import Positional, arg
 
-from ugat_marl.cli.arguments import RayAddress, workers_of
+from ugat_marl.cli.arguments import RayAddress, require_counts, workers_of
 from ugat_marl.effects import NAMED_DOMAINS, expand_domains, load_scenario
 from ugat_marl.envs import parallel_env
 from ugat_marl.errors import OptionError, ScenarioError
@@ -76,8 +76,7 @@ class Evaluate:
             require_writable(self.out)
         if self.first_seed < 0:
             raise OptionError("--first-seed must not be negative")
-        if self.seeds < 1 or (self.workers is not None and self.workers < 1):
-            raise OptionError("--seeds and --workers must be at least 1")
+        require_counts(seeds=self.seeds, workers=self.workers)
         scenario = load_scenario(self.scenario)
         domains = self._domains(scenario, console)
         with workers_of(self.workers, self.ray) as workers:

@@ -9,7 +9,7 @@ from typing import Annotated
 from rich.console import Console
 from tyro.conf import Positional, arg
 
-from ugat_marl.cli.arguments import LengthS, Workers
+from ugat_marl.cli.arguments import LengthS, Workers, require_counts
 from ugat_marl.cli.diagnose import REPORT
 from ugat_marl.cli.evaluate import names_of
 from ugat_marl.diagnosis import FILE
@@ -62,8 +62,7 @@ class PolicyGap:
             raise OptionError("--policies needs at least one value")
         if len(set(self.policies)) < len(self.policies):
             raise OptionError(f"--policies holds one twice: {' '.join(self.policies)}")
-        if self.seeds < 1 or (self.workers is not None and self.workers < 1):
-            raise OptionError("--seeds and --workers must be at least 1")
+        require_counts(seeds=self.seeds, workers=self.workers)
         if self.first_seed < 0:
             raise OptionError("--first-seed must not be negative")
         scenario = load_scenario(self.scenario)

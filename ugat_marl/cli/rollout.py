@@ -10,7 +10,13 @@ from typing import Annotated, Any
 from rich.console import Console
 from tyro.conf import Positional, arg
 
-from ugat_marl.cli.arguments import RayAddress, Workers, refuse_options, workers_of
+from ugat_marl.cli.arguments import (
+    RayAddress,
+    Workers,
+    refuse_options,
+    require_counts,
+    workers_of,
+)
 from ugat_marl.cli.evaluate import names_of
 from ugat_marl.effects import domain_label, load_scenario
 from ugat_marl.envs import parallel_env
@@ -111,8 +117,7 @@ class Rollout:
         """Record, film and write."""
         if self.episodes < 1 or not 0 <= self.epsilon <= 1:
             raise OptionError("--episodes must be at least 1 and --epsilon from 0 to 1")
-        if self.workers is not None and self.workers < 1:
-            raise OptionError("--workers must be at least 1")
+        require_counts(workers=self.workers)
         if self.out is None and self.video is None:
             raise OptionError("nothing to write: give --out FILE.parquet, --video FILE, or both")
         if self.beside is not None and self.video is None:

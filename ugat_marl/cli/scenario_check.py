@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Annotated, Any
@@ -12,7 +11,7 @@ from rich.console import Console
 from rich.table import Table
 from tyro.conf import Positional, arg
 
-from ugat_marl.cli.arguments import LengthS, Workers, refuse_options
+from ugat_marl.cli.arguments import LengthS, Workers, refuse_options, require_counts
 from ugat_marl.effects import load_scenario, scenario_in_domain
 from ugat_marl.envs import TrafficEnv, parallel_env
 from ugat_marl.errors import OptionError
@@ -23,6 +22,7 @@ from ugat_marl.experiments import (
     RuleEpisode,
     as_json,
     best_phases,
+    degree_with,
     is_full,
     left_outside,
     measure_headroom,
@@ -104,6 +104,7 @@ class ScenarioCheck:
             )
             return self._kit(console)
         refuse_options(self, ("observation",), "only --conformance reads an observation")
+        require_counts(workers=self.workers)
         if self.headroom < 0:
             raise OptionError(f"--headroom {self.headroom}: give a number of seeds, or 0")
         if self.headroom and self.domain != "sim":
@@ -290,21 +291,16 @@ def _greens_of_file(agents: Sequence[IntersectionFacts], names: LightNames) -> l
 
 def _phase_sources(agents: Sequence[IntersectionFacts], names: LightNames) -> Table:
     """Return the degree of saturation of the fullest lights with each source of phases."""
-
-    def degree(light: IntersectionFacts, source: str) -> float:
-        value = light.degrees.get(source)
-        return math.inf if value is None else value
-
-    fullest = sorted(agents, key=lambda light: -degree(light, "now"))[:MOST_LIGHTS]
+    fullest = sorted(agents, key=lambda light: -degree_with(light, "now"))[:MOST_LIGHTS]
     title = "Demand as a share of capacity with other phases, busiest quarter of an hour"
     table = _table(title, LIGHT, "now", *PHASE_SOURCES, "best")
     for light in fullest:
         cells = [
-            "-" if light.degrees.get(source) is None else f"{degree(light, source):.0%}"
+            "-" if light.degrees.get(source) is None else f"{degree_with(light, source):.0%}"
             for source in ("now", *PHASE_SOURCES)
         ]
         source, least = best_phases(light)
-        best = source if least < MUCH_LESS * degree(light, "now") else "as now"
+        best = source if least < MUCH_LESS * degree_with(light, "now") else "as now"
         table.add_row(names.text(light.id), *cells, best)
     return table
 

@@ -10,7 +10,7 @@ from typing import Annotated
 from rich.console import Console
 from tyro.conf import Positional, arg
 
-from ugat_marl.cli.arguments import LengthS, RayAddress, Workers, workers_of
+from ugat_marl.cli.arguments import LengthS, RayAddress, Workers, require_counts, workers_of
 from ugat_marl.effects import domain_label, load_scenario
 from ugat_marl.errors import OptionError, UnknownNameError
 from ugat_marl.experiments import BUDGET, LEAST_BUDGET, tune
@@ -61,8 +61,7 @@ class Tune:
                 raise UnknownNameError("rule", name, RULE_NAMES)
         if self.budget < LEAST_BUDGET:
             raise OptionError(f"--budget {self.budget}: must be at least {LEAST_BUDGET}")
-        if self.workers is not None and self.workers < 1:
-            raise OptionError("--workers must be at least 1")
+        require_counts(workers=self.workers)
         if self.out is not None:
             require_writable(self.out)
         scenario, reporter = load_scenario(self.scenario), Bars(console)

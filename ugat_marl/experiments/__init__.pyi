@@ -45,6 +45,7 @@ from .scenario_check import MUCH_LESS as MUCH_LESS
 from .scenario_check import RuleEpisode as RuleEpisode
 from .scenario_check import as_json as as_json
 from .scenario_check import best_phases as best_phases
+from .scenario_check import degree_with as degree_with
 from .scenario_check import is_full as is_full
 from .scenario_check import left_outside as left_outside
 from .scenario_check import play_check_rules as play_check_rules

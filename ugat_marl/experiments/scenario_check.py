@@ -174,7 +174,7 @@ def problems(
 
 def _other_phases(light: IntersectionFacts) -> list[str]:
     """Return a message if the demand is too much for the phases and another source serves more."""
-    now, (source, degree) = _degree(light, "now"), best_phases(light)
+    now, (source, degree) = degree_with(light, "now"), best_phases(light)
     if now <= 1.0 or degree > MUCH_LESS * now:
         return []
     share = f"{now:.0%} of what its phases can serve" if now < math.inf else "not served by them"
@@ -192,12 +192,13 @@ def best_phases(light: IntersectionFacts) -> tuple[str, float]:
     """Return the source of phases with the least degree of saturation, and this degree."""
     sources = [source for source in BY_PREFERENCE if source in light.degrees]
     if not sources:
-        return "now", _degree(light, "now")
-    best = min(sources, key=lambda source: _degree(light, source))
-    return best, _degree(light, best)
+        return "now", degree_with(light, "now")
+    best = min(sources, key=lambda source: degree_with(light, source))
+    return best, degree_with(light, best)
 
 
-def _degree(light: IntersectionFacts, source: str) -> float:
+def degree_with(light: IntersectionFacts, source: str) -> float:
+    """Return an intersection's degree of saturation with some phases; inf if it is not known."""
     degree = light.degrees.get(source)
     return math.inf if degree is None else degree
 
@@ -236,7 +237,7 @@ def _compared(facts: Survey, runs: Sequence[RuleEpisode]) -> list[str]:
     if any(rule not in att_s for rule in RULES) or _unsuited(facts, runs):
         return []
     programme_s, rule_s = (att_s[rule] for rule in RULES)
-    most = max((_degree(light, "now") for light in facts.intersections), default=0.0)
+    most = max((degree_with(light, "now") for light in facts.intersections), default=0.0)
     busiest = f"{most:.0%} of their capacity" if most < math.inf else "more than they can serve"
     if programme_s > MUCH_WORSE * rule_s:
         suits = (

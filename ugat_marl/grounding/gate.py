@@ -20,6 +20,7 @@ import torch
 from numpy.typing import NDArray
 
 from ugat_marl.errors import CheckpointError, OptionError
+from ugat_marl.grounding.reports import complaint
 
 MODES = ("infinite", "static", "dynamic")
 SCOPES = ("intersection", "pooled")
@@ -243,9 +244,7 @@ class Gate:
         ):
             warned = everywhere & (decisions > 0) & self.trusted
             if warned.any():
-                names = [a for a, hit in zip(self.agents, warned, strict=True) if hit]
-                shown = ", ".join(names[:4]) + (", ..." if len(names) > 4 else "")
-                parts.append(f"{share} at {len(names)} of {len(self.agents)} ({shown})")
+                parts.append(complaint(share, warned, self.agents))
         if not parts:
             return ""
         return (

@@ -27,7 +27,7 @@ from ugat_marl.data import (
     traffic_of_lanes,
 )
 from ugat_marl.envs import OBSERVATION_UNITS, Observer, Rewarder
-from ugat_marl.errors import MeasuredDataError, OptionError
+from ugat_marl.errors import MeasuredDataError, OptionError, first_names
 from ugat_marl.grounding.detected import (
     DetectionConfig,
     LaneCourse,
@@ -515,5 +515,5 @@ def phases_shown(
 
 
 def _names(names: Sequence[str], title: str = "lane") -> str:
-    shown = ", ".join(map(repr, names[:4])) + (", ..." if len(names) > 4 else "")
+    shown = first_names([*map(repr, names)])
     return f"{len(names)} {title}{'s' if len(names) != 1 else ''} ({shown})"

@@ -17,6 +17,7 @@ from numpy.typing import NDArray
 from scipy import stats
 from torch import Tensor
 
+from ugat_marl.errors import first_names
 from ugat_marl.grounding.forward import ForwardModel
 from ugat_marl.grounding.uncertainty import InversePrediction, MethodName
 
@@ -108,8 +109,7 @@ def flat(name: str, values: Floats, agents: Sequence[str]) -> dict[str, float]:
 def complaint(text: str, where: NDArray[np.bool_], agents: Sequence[str]) -> str:
     """Return a sentence about the agents that `where`, ``(agents,)``, marks; empty if none."""
     names = [agent for agent, marked in zip(agents, where, strict=True) if marked]
-    shown = ", ".join(names[:4]) + (", ..." if len(names) > 4 else "")
-    return f"{text} at {len(names)} of {len(agents)} ({shown})" if names else ""
+    return f"{text} at {len(names)} of {len(agents)} ({first_names(names)})" if names else ""
 
 
 def mean_of_known(u: Floats) -> Floats:

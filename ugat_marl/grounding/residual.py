@@ -16,7 +16,7 @@ import numpy as np
 
 from ugat_marl.data import TransitionLog
 from ugat_marl.envs import AnyParallelEnv
-from ugat_marl.errors import OptionError, UnknownNameError
+from ugat_marl.errors import OptionError, UnknownNameError, first_names
 from ugat_marl.grounding.fitting import Fitter
 from ugat_marl.grounding.gate import GateReport
 from ugat_marl.grounding.reports import FitReport
@@ -78,8 +78,8 @@ class ResidualReport:
         told = f"residual: f predicts better than the fitted world at {better} of {len(agents)}"
         if not better:
             return f"{told} intersections; no action is grounded"
-        shown = ", ".join(self.acting[:4]) + (", ..." if len(self.acting) > 4 else "")
-        return f"{told} intersections; trusted at {len(self.acting)} ({shown or 'none'})"
+        shown = first_names(self.acting) or "none"
+        return f"{told} intersections; trusted at {len(self.acting)} ({shown})"
 
     def as_dict(self) -> dict[str, float]:
         """Return flat numbers, all named ``residual/...``."""

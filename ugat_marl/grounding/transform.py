@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 from torch import Tensor, nn
 
 from ugat_marl.data import AgentLayout, TransitionLog, read_checkpoint, write_checkpoint
-from ugat_marl.errors import CheckpointError, EpisodeError, OptionError
+from ugat_marl.errors import CheckpointError, EpisodeError, OptionError, first_names
 from ugat_marl.grounding.delays import EpisodeRewards
 from ugat_marl.grounding.fitting import Changes, Fitter
 from ugat_marl.grounding.forward import ForwardConfig, ForwardModel
@@ -224,7 +224,7 @@ class Transform(abc.ABC):
         if not isinstance(layouts, Mapping) or list(layouts.items()) != layout_sizes:
             raise CheckpointError(
                 "the grounding in the checkpoint belongs to other agents or another observation; "
-                f"this one has {len(layout_sizes)} agents ({', '.join(self.stack.agents[:4])} ...)"
+                f"this one has {len(layout_sizes)} agents ({first_names(self.stack.agents)})"
             )
         sights = _sights(self.inputs, self.local)
         if state.get("inputs") != sights:

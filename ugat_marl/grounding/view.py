@@ -18,7 +18,7 @@ import torch
 from torch import Tensor, nn
 
 from ugat_marl.envs import AnyParallelEnv
-from ugat_marl.errors import LogError, OptionError
+from ugat_marl.errors import LogError, OptionError, first_names
 from ugat_marl.grounding.stacked import Stack, StackedTransitions
 from ugat_marl.scenarios import within_hops
 
@@ -67,7 +67,7 @@ class InputsConfig:
         if foreign:
             raise OptionError(
                 f"neighbours and agents differ in {sorted(foreign)[:4]}; name the neighbours of "
-                f"every agent: {', '.join(agents[:4])}{', ...' * (len(agents) > 4)}"
+                f"every agent: {first_names(agents)}"
             )
         return within_hops(neighbours, self.hops)
 
