@@ -106,11 +106,8 @@ class Actuators:
 
     def _mask(self, place: int, state: SignalState) -> NDArray[np.int8]:
         phases = len(self._lights[place].phases)
-        if not signals.free_to_change(state, self._timing, self._interval_s):
-            mask = np.zeros(phases, dtype=np.int8)
-            mask[state.phase] = 1
-            return mask
-        mask = np.ones(phases, dtype=np.int8)
-        for actuator in self._chain:
-            actuator.restrict(mask, place, state)
+        mask = signals.free_phases(phases, state, self._timing, self._interval_s)
+        if signals.free_to_change(state, self._timing, self._interval_s):
+            for actuator in self._chain:
+                actuator.restrict(mask, place, state)
         return mask

@@ -357,10 +357,9 @@ class TrafficEnv(ParallelEnv[str, Any, Any]):
         self.layouts: dict[str, AgentLayout] = dict(zip(agents, observer.layouts, strict=True))
         self.recorded_layouts = dict(zip(agents, observer.recorded, strict=True))
         self.observation_spaces = dict(zip(agents, observer.spaces, strict=True))
-        phases = [len(intersection.phases) for intersection in items]
+        phases = self._phase_counts = [len(intersection.phases) for intersection in items]
         actions = {count: Discrete(count) for count in phases}
         self.action_spaces = {a: actions[count] for a, count in zip(agents, phases, strict=True)}
-        self._all_free = [np.ones(count, dtype=np.int8) for count in phases]
 
     def _start(self, seed: int) -> None:
         if self._simulator is None:
@@ -420,20 +419,16 @@ class TrafficEnv(ParallelEnv[str, Any, Any]):
         return dict(zip(self.agents, seen, strict=True))
 
     def _infos(self) -> dict[str, dict[str, Any]]:
-        infos: dict[str, dict[str, Any]] = {}
+        states, interval_s = self._states, self.decision_interval_s
         if self._actuators is not None:
-            masks = self._actuators.masks(self._states)
-            return {
-                agent: {"action_mask": mask, "executed_action": state.phase}
-                for agent, mask, state in zip(self.agents, masks, self._states, strict=True)
-            }
-        for agent, state, free in zip(self.agents, self._states, self._all_free, strict=True):
-            mask = free.copy()
-            if not signals.free_to_change(state, self._timing, self.decision_interval_s):
-                mask[:] = 0
-                mask[state.phase] = 1
-            infos[agent] = {"action_mask": mask, "executed_action": state.phase}
-        return infos
+            masks = self._actuators.masks(states)
+        else:
+            lights = zip(self._phase_counts, states, strict=True)
+            masks = [signals.free_phases(n, x, self._timing, interval_s) for n, x in lights]
+        return {
+            agent: {"action_mask": mask, "executed_action": state.phase}
+            for agent, mask, state in zip(self.agents, masks, states, strict=True)
+        }
 
     def _warn_if_empty(self) -> None:
         if self._decision == max(1, self.scenario.decisions // 10) and not self._snapshot.departed:

@@ -68,12 +68,10 @@ class Light:
         Returns:
             int8, ``(phases,)``.
         """
-        mask = np.ones(len(self.phases), dtype=np.int8)
-        left = within_s - self._ending_s
-        if self.taken_over and not signals.free_to_change(self._state, self._timing, left):
-            mask[:] = 0
-            mask[self.phase] = 1
-        return mask
+        phases, left = len(self.phases), within_s - self._ending_s
+        if not self.taken_over:
+            return np.ones(phases, dtype=np.int8)
+        return signals.free_phases(phases, self._state, self._timing, left)
 
     def advance(self, requested: int, seconds: float) -> list[Segment]:
         """Return the segments of the next `seconds`, if phase `requested` is asked for now."""

@@ -13,6 +13,9 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import NamedTuple
 
+import numpy as np
+from numpy.typing import NDArray
+
 from ugat_marl.errors import OptionError, ScenarioError
 
 GREEN = frozenset("Gg")
@@ -80,6 +83,27 @@ def free_to_change(state: SignalState, timing: SignalTiming, within_s: float) ->
     if state.clearing:
         wait = timing.clearance_s - state.elapsed_s + timing.min_green_s
     return wait < within_s - _INSTANT_S
+
+
+def free_phases(
+    phases: int, state: SignalState, timing: SignalTiming, within_s: float
+) -> NDArray[np.int8]:
+    """Return 1 for each phase that may be requested now, else 0.
+
+    Args:
+        phases: Number of phases of the light.
+        state: State of its machine.
+        timing: Minimum green and clearance, s.
+        within_s: Seconds within which a change has to begin.
+
+    Returns:
+        int8, ``(phases,)``: all ones, or one for the phase that runs.
+    """
+    if free_to_change(state, timing, within_s):
+        return np.ones(phases, dtype=np.int8)
+    mask = np.zeros(phases, dtype=np.int8)
+    mask[state.phase] = 1
+    return mask
 
 
 def green_begins_at_once(timing: SignalTiming, interval_s: float) -> bool:
