@@ -270,8 +270,7 @@ def test_both_worlds_have_the_same_reach(split: Scenario) -> None:
     for world in ("V1", "V1+reach=50"):
         with pytest.raises(OptionError, match="give both the same"):
             simulated_worlds(split, "reach=100", world, UgatConfig(), {})
-    for made in simulated_worlds(split, "reach=100", "V1+reach=100", UgatConfig(), {}):
-        made.close()
+    simulated_worlds(split, "reach=100", "V1+reach=100", UgatConfig(), {})
 
 
 def test_a_table_and_a_training_say_so_before_they_begin(
