@@ -287,10 +287,8 @@ def table(asked: Sequence[Asked]) -> str:
     groups: dict[tuple[str, str], list[Asked]] = {}
     for one in asked:
         groups.setdefault((one.kind, one.name), []).append(one)
-    for kind in KINDS:
-        groups[kind, "all effects"] = [
-            one for one in asked if one.kind == kind and "green" not in one.name
-        ]
+        if "green" not in one.name:
+            groups.setdefault((one.kind, "all effects"), []).append(one)
     lines = [
         "| streets from | value | cases | covered by 90 % | 95 % interval of that | "
         "width, share of the prior's | error, share of the prior's |",

@@ -192,7 +192,7 @@ def test_domain_randomisation_resumes(tmp_path: Path) -> None:
         ({"real": "sim"}, '"same-world"'),
         ({"real": "sim", "placebo": "noise"}, "is the simulation itself"),
         ({"real": "sim", "placebo": "same-world", "oracle": True}, "oracle needs a real domain"),
-        ({"placebo": "same-world", "real_log": Path("x")}, "takes the place of a real_log"),
+        ({"placebo": "same-world", "real_log": Path("x")}, "leave out one of them"),
     ],
 )
 def test_what_makes_no_sense_is_refused(options: dict[str, Any], complaint: str) -> None:

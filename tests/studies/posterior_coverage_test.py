@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 import numpy as np
+import pytest
 
-from studies.posterior_coverage import Asked, draw_other, streets_of, table
+from studies.posterior_coverage import VEHICLES, Asked, draw_other, streets_of, table
 from ugat_marl.grounding import Worlds
 
 WORLDS = Worlds.of(tuple(f"lane_{k}" for k in range(6)))
@@ -14,21 +15,36 @@ def test_table_by_hand() -> None:
     asked = [
         Asked("prior", "headway", 1.5, 1.0, 1.4, 2.0, 1.0, 2.0),  # covered, error 0.1 for 0.5
         Asked("prior", "headway", 2.1, 1.0, 1.4, 2.0, 1.1, 2.0),  # missed, error 0.7 for 1.0
-        Asked("other", "headway", 2.0, 1.0, 1.5, 2.0, 2.0, 2.0),  # the end of an interval is in
+        Asked("alone", "headway", 2.0, 1.0, 1.5, 2.0, 2.0, 2.0),  # the end of an interval is in
     ]
     lines = table(asked).splitlines()
     assert "| prior | headway | 2 | 0.50 | 0.09–0.91 | 0.50 | 0.63 |" in lines
-    assert "| other | headway | 1 | 1.00 | 0.21–1.00 | 0.50 | – |" in lines
+    assert "| alone | headway | 1 | 1.00 | 0.21–1.00 | 0.50 | – |" in lines
     assert (
         lines.index("| prior | headway | 2 | 0.50 | 0.09–0.91 | 0.50 | 0.63 |") < 4
     )  # worst first
 
 
-def test_half_of_the_streets_are_not_of_the_prior() -> None:
-    streets = streets_of(WORLDS, 400, 7)
-    assert [kind for kind, _ in streets[:4]] == ["prior", "other", "prior", "other"]
-    late_s = np.stack([values.service_s[:, 0] for kind, values in streets if kind == "other"])
+def test_two_thirds_of_the_streets_are_not_of_the_prior() -> None:
+    streets = streets_of(WORLDS, 600, 7)
+    assert [kind for kind, _ in streets[:4]] == ["prior", "alone", "together", "prior"]
+    late_s = np.stack([values.service_s[:, 0] for kind, values in streets if kind != "prior"])
     assert abs((late_s > 0).mean() - 1 / 3) < 0.05
     assert late_s[late_s > 0].min() >= 1.0
-    again = draw_other(WORLDS, 3)
-    assert np.array_equal(again.effects, draw_other(WORLDS, 3).effects)
+    again = draw_other(WORLDS, "alone", 3)
+    assert np.array_equal(again.effects, draw_other(WORLDS, "alone", 3).effects)
+
+
+def test_effects_alone_are_there_in_half_of_the_streets_and_together_change_by_one_number() -> None:
+    library = WORLDS.library
+    low, nominal, high = WORLDS.ends
+    apart, joined = (
+        np.stack([draw_other(WORLDS, kind, seed).effects for seed in range(400)])
+        for kind in ("alone", "together")
+    )
+    assert (apart != nominal).mean(0) == pytest.approx(0.5, abs=0.08)
+    places = [k for k, x in enumerate(library) if x.name in VEHICLES]
+    farthest = np.where(nominal - low > high - nominal, low, high)
+    shares = ((joined - nominal) / (farthest - nominal))[:, places]
+    assert np.ptp(shares, axis=1).max() < 1e-9
+    assert shares.min() >= 0.0 and shares.max() > 0.9
