@@ -176,7 +176,9 @@ def test_values_of_the_simulation_s_own_vehicles_change_nothing(
         assert prior.effects(prior.clipped(nominal)) == ()
 
 
-@pytest.mark.parametrize("part", ["channel", "eyes", "service", "effects"])
+@pytest.mark.parametrize(
+    "part", ["channel", "eyes", "service", pytest.param("effects", marks=pytest.mark.slow)]
+)
 def test_each_part_can_be_fitted_alone(part: str) -> None:
     config = replace(QUICK, parts=(part,))
     env = parallel_env(SCENARIO)
