@@ -93,6 +93,14 @@ def evaluate(
         notes: Further facts, kept with the result.
         watch: Makes callbacks that observe the environments; needs workers in this process.
         approaches: True to measure the control delay on every approach (`Scores.approaches`).
+
+    Returns:
+        The scores of all episodes, as policies and domains are given, then by seed.
+
+    Raises:
+        OptionError: A domain is listed twice, or `watch` is given with an executor.
+        UnknownNameError: There is no such domain or rule.
+        CheckpointError: The file of a policy is unreadable, or of another network.
     """
     names = [domain_label(domain) for domain in domains]
     if twice := sorted({name for name in names if names.count(name) > 1}):

@@ -222,7 +222,7 @@ class RollOutSettings:
         scenario: The network and its traffic.
         domain: Domain of the roll-outs.
         options: Options of the environment; those that the policy needs are added.
-        make: Function that makes the policy, a new one for each roll-out.
+        make: Function that makes the policy of a roll-out; policies without a memory may be shared.
         epsilon: Chance of a random phase.
         observation: Name of the recorded observation.
         neighbours: Distance in roads up to which other intersections are recorded, too.
