@@ -200,6 +200,7 @@ def test_a_street_that_came_back_is_taken_over_from_what_it_shows() -> None:
     after.states[LIGHT] = "y" * len(PHASES[0])
     del after.states[SITE.lights[1]]  # its controller is still starting
     after.states[SITE.lights[2]] = "nonsense"
+    after.states["a crossing for people on foot"] = "rG"  # of the street, and not of the site
     loop.take_over(after)
     made: list[Any] = []
     loop.drive(60.0, made.append)

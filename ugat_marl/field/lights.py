@@ -85,7 +85,8 @@ class Lights:
         self._phases = {item.id: item.phases for item in site.network.intersections}
         shown = dict(street.shown())
         if not all_seen:
-            shown = {x: state for x, state in shown.items() if self._can_show(x, state)}
+            own = {light: shown[light] for light in site.lights if light in shown}
+            shown = {light: state for light, state in own.items() if self._can_show(light, state)}
         lacking = [light for light in site.lights if light not in shown]
         if lacking and all_seen:
             raise OptionError(f"the street has no traffic light {lacking[0]!r}; it has {[*shown]}")
@@ -105,7 +106,7 @@ class Lights:
     def _can_show(self, light: str, state: str) -> bool:
         """Return whether a light can have a state."""
         try:
-            Light(self._phases.get(light, ()), self._site.timing, state)
+            Light(self._phases[light], self._site.timing, state)
         except OptionError:
             return False
         return True
