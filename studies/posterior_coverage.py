@@ -107,7 +107,7 @@ def draw_other(worlds: Worlds, kind: str, seed: int) -> Values:
         seed: Seed of the street.
     """
     generator = numpy_generator(seed, "posterior coverage", kind)
-    low, nominal, high = np.array([(x.low, x.nominal, x.high) for x in worlds.library]).T
+    low, nominal, high = worlds.ends
     there = generator.random(len(nominal)) < 0.5
     effects = np.where(there, generator.uniform(low, high), nominal)
     if kind == "together":

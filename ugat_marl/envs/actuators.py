@@ -106,8 +106,9 @@ class Actuators:
 
     def _mask(self, place: int, state: SignalState) -> NDArray[np.int8]:
         phases = len(self._lights[place].phases)
-        mask = signals.free_phases(phases, state, self._timing, self._interval_s)
-        if signals.free_to_change(state, self._timing, self._interval_s):
+        free = signals.free_to_change(state, self._timing, self._interval_s)
+        mask = signals.phase_mask(phases, state.phase, free=free)
+        if free:
             for actuator in self._chain:
                 actuator.restrict(mask, place, state)
         return mask

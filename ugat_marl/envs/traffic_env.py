@@ -423,8 +423,9 @@ class TrafficEnv(ParallelEnv[str, Any, Any]):
         if self._actuators is not None:
             masks = self._actuators.masks(states)
         else:
-            lights = zip(self._phase_counts, states, strict=True)
-            masks = [signals.free_phases(n, x, self._timing, interval_s) for n, x in lights]
+            free = [signals.free_to_change(x, self._timing, interval_s) for x in states]
+            lights = zip(self._phase_counts, states, free, strict=True)
+            masks = [signals.phase_mask(n, x.phase, free=may) for n, x, may in lights]
         return {
             agent: {"action_mask": mask, "executed_action": state.phase}
             for agent, mask, state in zip(self.agents, masks, states, strict=True)

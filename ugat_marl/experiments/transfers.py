@@ -479,7 +479,7 @@ def _check(config: TransferConfig, scenario: Scenario, env: TrafficEnv, reporter
             f"note: {config.learner} has no save(path) and load(path): an interrupted training "
             "begins anew with --resume, and no policies are written"
         )
-    worlds_of(_grounded_job(config), env, None)
+    worlds_of(_grounded_job(config), env, None)  # refuses now what the job would refuse later
     if config.real_log is not None:
         _say_if_from_elsewhere(TransitionLog.read(config.real_log), config, reporter)
     for option in ("corrected", *(["real"] if config.fine_tuned or config.oracle else [])):

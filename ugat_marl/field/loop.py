@@ -211,8 +211,8 @@ class FieldLoop:
                 faults[name] = reasons[0] + (f" (+{len(reasons) - 1})" if reasons[1:] else "")
             elif not light.taken_over:
                 faults[name] = "beginning: it shows what is none of its phases"
-        checked = {lane: counts[lane] for lane in self._site.capacity if lane in counts}
-        return {lane: count for lane, count in checked.items() if lane not in wrong}, faults
+        checked = [lane for lane in self._site.capacity if lane in counts and lane not in wrong]
+        return {lane: counts[lane] for lane in checked}, faults
 
     def _ask(
         self, counts: Mapping[str, LaneCount], now: float, begun: float

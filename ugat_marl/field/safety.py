@@ -68,10 +68,9 @@ class Light:
         Returns:
             int8, ``(phases,)``.
         """
-        phases, left = len(self.phases), within_s - self._ending_s
-        if not self.taken_over:
-            return np.ones(phases, dtype=np.int8)
-        return signals.free_phases(phases, self._state, self._timing, left)
+        left = within_s - self._ending_s
+        free = not self.taken_over or signals.free_to_change(self._state, self._timing, left)
+        return signals.phase_mask(len(self.phases), self.phase, free=free)
 
     def advance(self, requested: int, seconds: float) -> list[Segment]:
         """Return the segments of the next `seconds`, if phase `requested` is asked for now."""

@@ -851,8 +851,8 @@ def _aligned(
             j -= 1
             continue
         total = here.at(i)
-        matched = i <= int(high[j - 1])
-        if matched and np.isclose(total, totals[j - 1].at(i - 1) + costs[j - 1][i - 1 - start]):
+        possible = i <= int(high[j - 1])
+        if possible and np.isclose(total, totals[j - 1].at(i - 1) + costs[j - 1][i - 1 - start]):
             i, j = i - 1, j - 1
             pairs.append((i, j))
         elif np.isclose(total, totals[j - 1].at(i) + gap):

@@ -185,8 +185,9 @@ class _Street:
         """Return the log, and what it does not know."""
         courses = self._courses()
         table, observer = self.table, Observer(self.network, self.observation)
+        joined = self._joined()
         if table is not None:
-            table = table.filter(~pl.col("lane_id").is_in(self._joined))
+            table = table.filter(~pl.col("lane_id").is_in(joined))
         estimated = {x: own for x, own in courses.items() if x not in self._measured_lanes(table)}
         recorder = TransitionRecorder(self._provenance(observer, place))
         variances: dict[str, list[Floats]] = {}
@@ -222,9 +223,9 @@ class _Street:
         findings = self._findings(estimated, deviation, unlike)
         if table is not None:
             findings = (*_unseen(table), *findings)
-            if self._joined:
+            if joined:
                 findings += (
-                    f"vehicles of lanes are estimated from detections on {_names(self._joined)}: "
+                    f"vehicles of lanes are estimated from detections on {_names(joined)}: "
                     "agents count them together with lanes upstream, and the table does not",
                 )
         log = recorder.log()
@@ -232,9 +233,8 @@ class _Street:
             log = TransitionLog(replace(log.provenance, deviation=deviation), log.frame)
         return MeasuredLog(log, findings)
 
-    @property
     def _joined(self) -> list[str]:
-        """Lanes that are counted together with lanes upstream."""
+        """Return the lanes that are counted together with lanes upstream."""
         behind = {lane: self.network.lanes[lane].behind for lane in self._lanes}
         return [lane for lane, upstream in behind.items() if upstream.lanes or upstream.roads]
 

@@ -85,24 +85,21 @@ def free_to_change(state: SignalState, timing: SignalTiming, within_s: float) ->
     return wait < within_s - _INSTANT_S
 
 
-def free_phases(
-    phases: int, state: SignalState, timing: SignalTiming, within_s: float
-) -> NDArray[np.int8]:
+def phase_mask(phases: int, running: int, *, free: bool) -> NDArray[np.int8]:
     """Return 1 for each phase that may be requested now, else 0.
 
     Args:
         phases: Number of phases of the light.
-        state: State of its machine.
-        timing: Minimum green and clearance, s.
-        within_s: Seconds within which a change has to begin.
+        running: The phase that runs.
+        free: True if the light may change, see `free_to_change`.
 
     Returns:
         int8, ``(phases,)``: all ones, or one for the phase that runs.
     """
-    if free_to_change(state, timing, within_s):
+    if free:
         return np.ones(phases, dtype=np.int8)
     mask = np.zeros(phases, dtype=np.int8)
-    mask[state.phase] = 1
+    mask[running] = 1
     return mask
 
 

@@ -380,13 +380,17 @@ class VectorEnv:
         numbers = np.arange(self.n)
         if where is None:
             return numbers.tolist()
+        asked = np.asarray(where)
         try:
-            chosen = numbers[np.asarray(where)]
+            chosen = numbers[asked]
         except IndexError:
             chosen = numbers[:0]
-        if not np.array_equal(np.asarray(where), chosen) and np.asarray(where).dtype != np.bool_:
-            chosen = numbers[:0]  # negative numbers count from the end
-        if chosen.ndim != 1 or not chosen.size or len(set(chosen.tolist())) < chosen.size:
+        if (
+            chosen.ndim != 1
+            or not chosen.size
+            or len({*chosen.tolist()}) < chosen.size
+            or (asked < 0).any()  # numpy would count from the end
+        ):
             raise OptionError(
                 f"where = {where!r}: must be different numbers below {self.n}, or a mask of "
                 f"{self.n} truth values, at least one of them true"
