@@ -26,6 +26,7 @@ from ugat_marl.scenarios import (
     with_plans,
     write_plans,
 )
+from ugat_marl.scenarios.signal_plans import phase_times
 
 LEFTS_FIRST = (  # two rings, two barriers: lefts before through, of unequal length
     (1, 1, "EBL", 15), (1, 1, "WBT WBR", 35), (1, 2, "NBL", 15), (1, 2, "SBT SBR", 25),
@@ -224,6 +225,88 @@ def test_synchro_s_rings_and_barriers(single: Scenario, tmp_path: Path) -> None:
     planned = with_plans(single, [plan], "synchro.csv")
     assert green_at(planned, 25, "g") == {"EBL"}
     assert green_at(planned, 5, "G") == {"WBL", "EBL"}
+
+
+EMPTY = ",,,,,,,,"
+"""Phases 9 to 16 of a light that has eight."""
+SEDONA: dict[str, dict[str, str]] = {
+    "eight phases, the left turns unlike": {
+        "Phase1": "3,8,,7,4,,1,6,,5,2,",
+        "PermPhase1": "8,,8,4,,,6,,6,2,2,2",
+        "Cycle Length": "120.0",
+        "Offset": "58.1",
+        "BRP": "111,112,211,212,121,122,221,222,311,312,411,412,321,322,421,422",
+        "MaxGreen": "6.5,47.6,6.5,40,18.5,35.6,6.5,40" + EMPTY,
+        "Yellow": "3,3.9,3,3.2,3,3.9,3,3.2" + EMPTY,
+        "AllRed": "1,1.4,1,2.9,1,1.4,1,2.9" + EMPTY,
+        "Start": "0,10.5,63.4,73.9,0,22.5,63.4,73.9" + EMPTY,
+    },
+    "side streets one after the other": {
+        "Phase1": ",4,,,3,,1,6,,5,2,",
+        "PermPhase1": "4,,4,3,,3,6,,6,2,,2",
+        "Cycle Length": "140.0",
+        "Offset": "46.0",
+        "BRP": "111,112,211,212,121,122,,,311,312,411,412,321,322,421,422",
+        "MaxGreen": "11,41,34,33.3,11,41,," + EMPTY,
+        "Yellow": "3,3.6,3.3,3,3,3.6,," + EMPTY,
+        "AllRed": "1,1.4,2.7,2.7,1,1.4,," + EMPTY,
+        "Start": "130,5,51,91,130,5,," + EMPTY,
+    },
+    "rings that yield at different times": {
+        "Phase1": ",4,,,4,,1,6,,5,2,",
+        "PermPhase1": "4,,,4,,,6,,,2,,2",
+        "Cycle Length": "120.0",
+        "Offset": "61.0",
+        "BRP": "111,112,211,212,121,122,221,222,311,312,411,412,321,322,421,422",
+        "MaxGreen": "21.5,37,,47,21.5,35.5,," + EMPTY,
+        "Yellow": "3,3.7,,3,3,3.7,," + EMPTY,
+        "AllRed": "1,1.2,,2.6,1,2.7,," + EMPTY,
+        "Start": "0,25.5,,67.4,0,25.5,," + EMPTY,
+    },
+    "an offset to the later green": {
+        "Phase1": "7,4,,3,8,,1,6,,5,2,",  # not in the source: the usual numbers
+        "PermPhase1": ",,4,,,8,,,6,,,2",
+        "Cycle Length": "120.0",
+        "Offset": "70.0",
+        "Referenced To": "0",
+        "Reference Phase": "408",
+        "BRP": "111,112,211,212,121,122,221,222" + EMPTY,
+        "MaxGreen": "11,40.8,13,37.1,15,36.8,8,42.1" + EMPTY,
+        "Yellow": "3,3.6,3,3.6,3,3.6,3,3.6" + EMPTY,
+        "AllRed": "1,1.6,1,1.3,1,1.6,1,1.3" + EMPTY,
+        "Start": "112,7,53,70,112,11,53,65" + EMPTY,
+    },
+}
+"""Timings as Synchro wrote them: three lights of State Route 89A in Sedona, Arizona (2023), and one
+of McDowell Road in Phoenix (2018).
+"""
+
+
+@pytest.mark.parametrize("name", SEDONA)
+def test_phases_begin_when_synchro_says(name: str, single: Scenario, tmp_path: Path) -> None:
+    """``Start`` is Synchro's own begin of every phase, which the reader does not use."""
+    light = SEDONA[name]
+    head = "RECORDNAME,INTID"
+    lines = [
+        "[Lanes]", "Lane Group Data",
+        f"{head},NBL,NBT,NBR,SBL,SBT,SBR,EBL,EBT,EBR,WBL,WBT,WBR,NWL,NWR,PED,HOLD",
+        *(f"{record},31,{light[record]},,,," for record in ("Phase1", "PermPhase1")),
+        "SignControl,6,,,,0,,,0,,,,,,0,,,", "",
+        "[Timeplans]", "Timing Plan Settings", f"{head},DATA", "Control Type,31,3",
+        *(f"{record},31,{light[record]}" for record in ("Cycle Length", "Offset")),
+        f"Referenced To,31,{light.get('Referenced To', '1')}",
+        f"Reference Phase,31,{light.get('Reference Phase', '206')}", "Node 0,31,31", "",
+        "[Phases]", "Phasing Data", f"{head},{','.join(f'D{n}' for n in range(1, 17))}",
+        *(f"{record},31,{light[record]}" for record in ("BRP", "MaxGreen", "Yellow", "AllRed")),
+        f"Start,31,{light['Start']}", "", "",
+    ]  # fmt: skip
+    (tmp_path / "sedona.csv").write_text("\r\n".join(lines))
+    (plan,), _ = read_utdf(tmp_path / "sedona.csv", Network.read(single), {"31": "A1"})
+    begins = [(plan.offset_s + begin) % plan.cycle_s for begin, *_ in phase_times(plan)]
+    places = zip(light["BRP"].split(","), light["Start"].split(","), strict=True)
+    said = sorted((place, float(start)) for place, start in places if start)
+    assert begins == pytest.approx([start for _, start in said])
+    assert [f"{p.barrier}{p.ring}" for p in plan.phases] == [place[:2] for place, _ in said]
 
 
 @pytest.mark.parametrize(
