@@ -133,6 +133,16 @@ def first_names(names: Sequence[str]) -> str:
     return ", ".join([*names[:4], *["..."] * (len(names) > 4)])
 
 
+def counted(count: int, noun: str) -> str:
+    """Return a number with its noun, such as "1 seed" or "2 seeds"."""
+    return f"{count} {noun}{'' if count == 1 else 's'}"
+
+
+def listed(names: Sequence[str], noun: str) -> str:
+    """Return how many things there are with their first names, such as "2 lanes ('a', 'b')"."""
+    return f"{counted(len(names), noun)} ({first_names([*map(repr, names)])})"
+
+
 def nearest(name: str, allowed: Iterable[str]) -> str | None:
     """Return the name in `allowed` closest to `name`, or None if none is close.
 

@@ -6,6 +6,7 @@ import gzip
 import itertools
 import xml.etree.ElementTree as ET
 from collections.abc import Callable, Iterator
+from dataclasses import replace
 from pathlib import Path
 
 import libsumo
@@ -386,7 +387,7 @@ def test_trips_add_up_to_sumo_s_own_statistics(crossing: Crossing, tmp_path: Pat
     launch = launch_of(scenario, 3, own, ())
     statistics = tmp_path / "statistics.xml"
     arguments = (*launch.arguments, "--statistic-output", str(statistics))
-    simulator.start(type(launch)(arguments, launch.directory, launch.begin_s, ()))
+    simulator.start(replace(launch, arguments=arguments))
     simulator.advance(400, {})
     trips = simulator.finish()
     root = ET.parse(statistics).getroot()

@@ -15,7 +15,7 @@ from tyro.conf import Positional, arg
 from ugat_marl.cli.arguments import LengthS, refuse_options
 from ugat_marl.effects import load_scenario, scenario_in_domain
 from ugat_marl.envs import parallel_env
-from ugat_marl.errors import OptionError
+from ugat_marl.errors import OptionError, counted
 from ugat_marl.experiments import policy_factory
 from ugat_marl.field import (
     CountSource,
@@ -32,7 +32,6 @@ from ugat_marl.field import (
 from ugat_marl.files import require_writable
 from ugat_marl.policies import Policy
 from ugat_marl.progress import Bars, Silent
-from ugat_marl.reporting import counted
 
 Port = Annotated[int | None, arg(metavar="INT", help_behavior_hint="(or --start)")]
 Log = Annotated[Path | None, arg(metavar="FILE", help_behavior_hint="(default: nowhere)")]

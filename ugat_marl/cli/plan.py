@@ -15,11 +15,11 @@ from tyro.conf import Positional, arg
 
 from ugat_marl.cli.arguments import refuse_options
 from ugat_marl.effects import load_scenario, scenario_in_domain
-from ugat_marl.errors import OptionError
+from ugat_marl.errors import OptionError, counted
 from ugat_marl.experiments import policy_factory, typical_plans
 from ugat_marl.files import require_writable
 from ugat_marl.progress import Bars
-from ugat_marl.reporting import LIGHT, LightNames, counted, titled_table
+from ugat_marl.reporting import LIGHT, LightNames, titled_table
 from ugat_marl.scenarios import (
     Network,
     Scenario,

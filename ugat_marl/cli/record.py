@@ -67,7 +67,7 @@ class Record:
         """Record and write."""
         scenario = load_scenario(self.scenario)
         # a wrong name is an error before anything is written
-        scenario_in_domain(scenario, self.domain, recorded=True)
+        scenario_in_domain(scenario, self.domain, recorded=True, duration_s=self.duration_s)
         policy = policy_factory(self.policy)
         if self.counts_every_s is not None:
             require_interval(self.counts_every_s)

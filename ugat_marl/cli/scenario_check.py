@@ -14,7 +14,7 @@ from tyro.conf import Positional, arg
 from ugat_marl.cli.arguments import LengthS, Workers, refuse_options, require_counts
 from ugat_marl.effects import load_scenario, scenario_in_domain
 from ugat_marl.envs import TrafficEnv, parallel_env
-from ugat_marl.errors import OptionError
+from ugat_marl.errors import OptionError, counted
 from ugat_marl.experiments import (
     HOLDS_S,
     MUCH_LESS,
@@ -31,7 +31,7 @@ from ugat_marl.experiments import (
     remarks,
 )
 from ugat_marl.progress import Bars, Silent
-from ugat_marl.reporting import LIGHT, LightNames, approach_table, counted, titled_table
+from ugat_marl.reporting import LIGHT, LightNames, approach_table, titled_table
 from ugat_marl.scenarios import (
     PHASE_SOURCES,
     QUARTER_S,
@@ -109,9 +109,9 @@ class ScenarioCheck:
             raise OptionError(f"--headroom {self.headroom}: give a number of seeds, or 0")
         if self.headroom and self.domain != "sim":
             raise OptionError("--headroom plays sim and V1 to V4 by itself; leave out --domain")
-        scenario = scenario_in_domain(load_scenario(self.scenario), self.domain)
-        if self.duration_s is not None:
-            scenario = scenario.with_duration(self.duration_s)
+        scenario = scenario_in_domain(
+            load_scenario(self.scenario), self.domain, duration_s=self.duration_s
+        )
         reporter = Silent() if self.json else Bars(console)
         facts = survey(scenario, reporter)
         runs = (

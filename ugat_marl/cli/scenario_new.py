@@ -13,9 +13,9 @@ from rich.table import Table
 from tyro.conf import Positional, arg
 
 from ugat_marl.cli.arguments import given_words, option_text, refuse_options
-from ugat_marl.errors import OptionError
+from ugat_marl.errors import OptionError, counted
 from ugat_marl.progress import Bars
-from ugat_marl.reporting import LIGHT, LightNames, counted, draw_network, titled_table
+from ugat_marl.reporting import LIGHT, LightNames, draw_network, titled_table
 from ugat_marl.scenarios import (
     CountFit,
     RoadSource,

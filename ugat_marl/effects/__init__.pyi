@@ -51,7 +51,6 @@ from .domains import NAMED_DOMAINS as NAMED_DOMAINS
 from .domains import PAPER_WORLDS as PAPER_WORLDS
 from .domains import Domain as Domain
 from .domains import NamedDomain as NamedDomain
-from .domains import check_windows as check_windows
 from .domains import domain_label as domain_label
 from .domains import domain_path as domain_path
 from .domains import expand_domains as expand_domains

@@ -24,6 +24,7 @@ from ugat_marl.effects.base import (
     hashed_uniform,
 )
 from ugat_marl.effects.documents import (
+    FLOW_RATES,
     depart_s,
     edit_scenario,
     is_demand,
@@ -286,16 +287,13 @@ class _Regular:
     def written(self, element: ET.Element) -> ET.Element:
         """Return a copy of the element that is this flow."""
         flow = copy.deepcopy(element)
-        for key in _RATES:
+        for key in FLOW_RATES:
             flow.attrib.pop(key, None)
         flow.set("begin", seconds_text(self.begin_s))
         flow.set("number", str(self.number))
         if self.spacing_s > 0:
             flow.set("end", seconds_text(self.end_s))
         return flow
-
-
-_RATES = ("vehsPerHour", "perHour", "period", "probability")
 
 
 def _period_s(flow: ET.Element) -> float | None:

@@ -40,6 +40,8 @@ _AT_ONCE = 1000
 
 Root = ET.Element
 Change = Callable[[Root], bool]
+FLOW_RATES = ("vehsPerHour", "perHour", "period", "probability")
+"""Attributes that say how often a vehicle of a flow departs."""
 """Function that edits a part of a document's elements, below their root; True if it did."""
 
 
@@ -111,12 +113,28 @@ def edit_scenario(
         applied: Effect in text form, to add to `applied`.
         in_order: True to sort vehicles by departure, as for `edit`.
     """
+    begin_s = scenario.settings.begin_s
+    end_s = begin_s + scenario.settings.duration_s
+
+    def complete_and_change(root: Root) -> bool:
+        for element in root:
+            if element.tag.lower().endswith("flow"):
+                _complete_flow(element, begin_s, end_s)
+        return change(root)
+
     return replace(
         scenario,
-        additional=edit(scenario.additional, change, *texts, in_order=in_order),
-        routes=edit(scenario.routes, change, *texts, in_order=in_order),
+        additional=edit(scenario.additional, complete_and_change, *texts, in_order=in_order),
+        routes=edit(scenario.routes, complete_and_change, *texts, in_order=in_order),
         applied=(*scenario.applied, applied),
     )
+
+
+def _complete_flow(flow: ET.Element, begin_s: float, end_s: float) -> None:
+    """Write the times that SUMO takes from its own begin and end into a flow without them."""
+    flow.attrib.setdefault("begin", seconds_text(begin_s))
+    if "number" in flow.attrib and not {"end", *FLOW_RATES} & flow.attrib.keys():
+        flow.set("end", seconds_text(end_s))
 
 
 def with_default_types(scenario: Scenario) -> Scenario:

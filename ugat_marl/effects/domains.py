@@ -294,13 +294,21 @@ def domain_label(domain: Domain) -> str:
     return "+".join(map(str, domain)) or "sim"
 
 
-def scenario_in_domain(scenario: Scenario, domain: Domain, *, recorded: bool = False) -> Scenario:
+def scenario_in_domain(
+    scenario: Scenario,
+    domain: Domain,
+    *,
+    recorded: bool = False,
+    duration_s: float | None = None,
+) -> Scenario:
     """Return the scenario with the effects of `domain`.
 
     Args:
         scenario: Scenario from `load_scenario`.
         domain: Effects, a name of effects, or the path of another scenario on the same network.
         recorded: True if detectors are recorded there, so that effects on them are accepted.
+        duration_s: Length of episodes, s; None for that of the scenario. Effects on demand and
+            those with times need to know it.
 
     Raises:
         UnknownNameError: The domain or an effect does not exist.
@@ -317,22 +325,13 @@ def scenario_in_domain(scenario: Scenario, domain: Domain, *, recorded: bool = F
                 "a domain must be on the same network, or a policy means nothing in it"
             )
         _refuse_other_actions(scenario, other, domain)
-        return _checked(other)
+        return _checked(other.with_duration(duration_s))
     effects = parse_domain(domain)
     if not recorded:
         _refuse_detectors(domain, effects)
+    scenario = scenario.with_duration(duration_s)
     refuse_outside(scenario, effects)
     return _checked(apply_effects(scenario, effects))
-
-
-def check_windows(scenario: Scenario, domain: Domain) -> None:
-    """Refuse a domain with an effect whose times lie wholly outside of the scenario's.
-
-    Raises:
-        OptionError: The effect would change nothing.
-    """
-    if domain_path(domain) is None:
-        refuse_outside(scenario, parse_domain(domain))
 
 
 def _refuse_detectors(domain: Domain, effects: Iterable[Effect]) -> None:

@@ -40,8 +40,8 @@ class AgentSet:
         names = tuple(env.possible_agents)
         if not names:
             raise OptionError("the environment has no agents; nothing can be learned in it")
-        observed = tuple(_vector_length(a, env.observation_space(a)) for a in names)
-        return cls(names, observed, tuple(_action_count(a, env.action_space(a)) for a in names))
+        observed = tuple(int(vector_box(env, agent).shape[0]) for agent in names)
+        return cls(names, observed, tuple(int(discrete_actions(env, agent).n) for agent in names))
 
     def __len__(self) -> int:
         return len(self.names)
@@ -123,16 +123,28 @@ def agent_groups(agents: AgentSet) -> dict[str, str]:
     return {a: p if p and len(kinds[p]) == 1 else a for a, p in prefixes.items()}
 
 
-def _vector_length(agent: str, space: spaces.Space[Any]) -> int:
+def vector_box(env: AnyParallelEnv, agent: str) -> spaces.Box:
+    """Return an agent's space of observations.
+
+    Raises:
+        OptionError: It is not a box of one dimension.
+    """
+    space = env.observation_space(agent)
     if not isinstance(space, spaces.Box) or len(space.shape) != 1:
         raise OptionError(
-            f"agent {agent!r} observes {space}; this learner needs a Box of one dimension "
-            "(supersuit.flatten_v0 makes one)"
+            f"agent {agent!r} observes {space}; needed: a Box of one dimension (put "
+            "masked_observation last; supersuit.flatten_v0 makes vectors of other boxes)"
         )
-    return int(space.shape[0])
+    return space
 
 
-def _action_count(agent: str, space: spaces.Space[Any]) -> int:
+def discrete_actions(env: AnyParallelEnv, agent: str) -> spaces.Discrete:
+    """Return an agent's space of actions.
+
+    Raises:
+        OptionError: It is not ``Discrete(n)`` from 0.
+    """
+    space = env.action_space(agent)
     if not isinstance(space, spaces.Discrete) or space.start != 0:
-        raise OptionError(f"agent {agent!r} acts in {space}; this learner needs Discrete(n)")
-    return int(space.n)
+        raise OptionError(f"agent {agent!r} acts in {space}; needed: Discrete(n)")
+    return space

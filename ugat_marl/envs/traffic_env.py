@@ -16,7 +16,6 @@ from ugat_marl.data import AgentLayout, EpisodeRecorder, Scores
 from ugat_marl.effects import (
     ControllerPart,
     Domain,
-    check_windows,
     controller_effects,
     domain_label,
     late_greens,
@@ -85,10 +84,7 @@ class TrafficEnv(ParallelEnv[str, Any, Any]):
     }
 
     def __init__(self, scenario: Scenario, domain: Domain, options: EnvOptions) -> None:
-        self.scenario = scenario_in_domain(scenario, domain)
-        if options.duration_s is not None:
-            self.scenario = self.scenario.with_duration(options.duration_s)
-            check_windows(self.scenario, domain)
+        self.scenario = scenario_in_domain(scenario, domain, duration_s=options.duration_s)
         self.domain = domain_label(domain)
         self.options = options
         self.render_mode = options.render_mode

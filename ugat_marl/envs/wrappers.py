@@ -19,6 +19,7 @@ from numpy.typing import NDArray
 from pettingzoo.utils import BaseParallelWrapper
 
 from ugat_marl.envs.actions import checked_phases
+from ugat_marl.envs.agents import discrete_actions, vector_box
 from ugat_marl.envs.types import AnyParallelEnv, ResetResult, StepResult
 from ugat_marl.errors import ActionError, EpisodeError, OptionError
 
@@ -131,7 +132,7 @@ class Wrapper(BaseParallelWrapper[str, Any, Any]):
     def __init__(self, env: AnyParallelEnv) -> None:
         super().__init__(env)
         agents = env.possible_agents
-        self.observation_spaces = {agent: _box(env, agent) for agent in agents}
+        self.observation_spaces = {agent: vector_box(env, agent) for agent in agents}
         self.action_spaces = {agent: env.action_space(agent) for agent in agents}
 
     @property
@@ -222,7 +223,7 @@ class PaddedDiscrete(spaces.Discrete):
 class _Pad(Wrapper):
     def __init__(self, env: AnyParallelEnv) -> None:
         super().__init__(env)
-        self._own = {agent: _discrete(env, agent) for agent in self.action_spaces}
+        self._own = {agent: discrete_actions(env, agent) for agent in self.action_spaces}
         self._most = max(int(space.n) for space in self._own.values())
         padded = {size: PaddedDiscrete(self._most, size) for size in map(_size, self._own.values())}
         self.action_spaces = {agent: padded[_size(size)] for agent, size in self._own.items()}
@@ -320,7 +321,7 @@ class _Masking(Wrapper):
 
     def __init__(self, env: AnyParallelEnv) -> None:
         super().__init__(env)
-        self._sizes = {agent: _size(_discrete(env, agent)) for agent in self.action_spaces}
+        self._sizes = {agent: _size(discrete_actions(env, agent)) for agent in self.action_spaces}
 
     def _mask(self, agent: str, infos: Infos) -> NDArray[np.int8]:
         given = infos.get(agent, {}).get("action_mask")
@@ -454,23 +455,6 @@ class _MaskedObservation(_Masking):
             agent: {self._key: vector, "action_mask": self._mask(agent, infos)}
             for agent, vector in observations.items()
         }
-
-
-def _box(env: AnyParallelEnv, agent: str) -> spaces.Box:
-    space = env.observation_space(agent)
-    if not isinstance(space, spaces.Box) or len(space.shape) != 1:
-        raise OptionError(
-            f"agent {agent!r} observes {space}; wrappers need a Box of one dimension "
-            "(put masked_observation last; supersuit.flatten_v0 makes vectors of other boxes)"
-        )
-    return space
-
-
-def _discrete(env: AnyParallelEnv, agent: str) -> spaces.Discrete:
-    space = env.action_space(agent)
-    if not isinstance(space, spaces.Discrete) or space.start != 0:
-        raise OptionError(f"agent {agent!r} acts in {space}; this wrapper needs Discrete(n)")
-    return space
 
 
 def _longer(vector: NDArray[Any], width: int) -> NDArray[Any]:

@@ -161,7 +161,7 @@ class Job:
             "start": self.start,
             "every": self.every,
             "options": dict(self.options),
-            "worlds": {world: _hash(self.scenario, world) for world in worlds},
+            "worlds": {world: _hash(self.scenario, world, self.duration_s) for world in worlds},
             "versions": installed_versions("eclipse-sumo", "torch"),
         }
         if self.setting.recipe == "rule":
@@ -263,8 +263,8 @@ def file_names(names: Iterable[str]) -> list[str]:
 
 
 @functools.cache
-def _hash(scenario: str, domain: str) -> str:
-    return scenario_in_domain(load_scenario(scenario), domain).hash
+def _hash(scenario: str, domain: str, duration_s: float | None) -> str:
+    return scenario_in_domain(load_scenario(scenario), domain, duration_s=duration_s).hash
 
 
 @dataclass

@@ -56,9 +56,7 @@ class Curve:
         """
         (domain,) = job.domains
         assert job.seed is not None
-        if job.duration_s is not None:
-            scenario = scenario.with_duration(job.duration_s)
-        decisions = record.episodes * scenario.decisions
+        decisions = record.episodes * scenario.with_duration(job.duration_s).decisions
         return cls(
             job.setting.name,
             learner_library(job.setting.learner.name),

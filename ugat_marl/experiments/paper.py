@@ -485,7 +485,8 @@ def compare(
     config.spec.factory(config.device)  # a missing library is an error now, not in a job's log
     timed = any(row.ugat is not None and row.ugat.grounding == "timed" for row in rows)
     for target in config.targets(table):
-        check_worlds(loaded, config.sim, target, timed)  # an error now, not in an hour
+        # an error now, not in an hour
+        check_worlds(loaded.with_duration(config.duration_s), config.sim, target, timed)
     planner = Planner(table, scenario, config)
     plan = [job for row in rows for job in planner.jobs(row)]
     perform_all(planner.bases + plan, folder, workers, reporter, f"paper {table}")

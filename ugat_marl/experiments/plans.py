@@ -6,6 +6,7 @@ import math
 from collections.abc import Sequence
 from pathlib import Path
 
+from ugat_marl.errors import counted
 from ugat_marl.experiments.jobs import Job, Record
 from ugat_marl.grounding import ROLL_OUTS, UgatConfig
 from ugat_marl.policies import (
@@ -32,10 +33,6 @@ Measured with `single-v1`, `arterial1x5-v1` and a drawn network of four lights.
 """
 
 
-def _counted(count: int, noun: str) -> str:
-    return f"{count} {noun}{'' if count == 1 else 's'}"
-
-
 def described_plan(
     plan: Sequence[Job], directory: Path, folder: Path, episode_s: float
 ) -> list[str]:
@@ -58,13 +55,13 @@ def described_plan(
         elif setting.ugat is not None:
             times = setting.ugat.iterations
             does = (
-                f"{setting.name}: {_counted(setting.ugat.pretrain_episodes, 'episode')} in "
-                f"{job.sim}, then {_counted(times, 'iteration')} of "
+                f"{setting.name}: {counted(setting.ugat.pretrain_episodes, 'episode')} in "
+                f"{job.sim}, then {counted(times, 'iteration')} of "
                 f"{setting.ugat.grounded_episodes} "
                 f"for {job.target or 'the street of the log'}"
             )
         else:
-            does = f"{setting.name}: {_counted(job.episodes, 'episode')}"
+            does = f"{setting.name}: {counted(job.episodes, 'episode')}"
         lines.append(f"  {number}. {does}; {evaluated * len(job.rows)} to judge it")
     total = sum(share.units * share.weight for share in work_of(todo, folder, episode_s).values())
     lines.append(f"  in all as long as about {total:.0f} episodes of evaluation")

@@ -97,7 +97,7 @@ def randomised_env(
         options: Options of the environments, see `EnvOptions`.
         sim: The simulation, as a domain of the scenario.
     """
-    simulation = scenario_in_domain(scenario, sim)
+    simulation = scenario_in_domain(scenario, sim, duration_s=options.get("duration_s"))
 
     def make(effects: tuple[Effect, ...]) -> TrafficEnv:
         return parallel_env(simulation, effects, **options)

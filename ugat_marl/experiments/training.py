@@ -274,6 +274,7 @@ def simulated_worlds(
         OptionError: `check_worlds` fails, the rewards cannot be matched, or a domain is SUMO's
             queue model and the grounding needs crossings.
     """
+    scenario = scenario.with_duration(options.get("duration_s"))
     check_worlds(scenario, sim, real, ugat.grounding == "timed")
     # crossing vehicles show best when a green began, and how fast it serves
     crossings = ugat.most_delay_s > 0 or ugat.grounding == "street"

@@ -519,6 +519,7 @@ def _identity(config: TransferConfig, scenario: Scenario, env: TrafficEnv) -> di
     log = config.real_log  # identified by its content, so the file may be moved
     settings["real_log"] = file_hash(log) if log else None
     hashes = {"sim": env.scenario.hash}
+    scenario = scenario.with_duration(config.duration_s)
     if config.real != "none":
         hashes["real"] = scenario_in_domain(scenario, config.real).hash
     if config.corrected is not None:  # identified by its content, so the folder may be moved

@@ -172,9 +172,7 @@ def _place(
     specs: Sequence[str],
 ) -> Path:
     """Return the file that keeps a result; its name is a hash of all that decides the result."""
-    world = scenario_in_domain(scenario, domain)
-    if duration_s is not None:
-        world = world.with_duration(duration_s)
+    world = scenario_in_domain(scenario, domain, duration_s=duration_s)
     sumo = installed_version("eclipse-sumo")
     content = (VERSION, sumo, scenario.hash, world.hash, name, budget, TUNING_SEED, *specs)
     return user_cache("tuned") / f"{hashlib.sha256(repr(content).encode()).hexdigest()}.json"

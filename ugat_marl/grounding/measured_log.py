@@ -27,7 +27,7 @@ from ugat_marl.data import (
     traffic_of_lanes,
 )
 from ugat_marl.envs import OBSERVATION_UNITS, Observer, Rewarder
-from ugat_marl.errors import MeasuredDataError, OptionError, first_names
+from ugat_marl.errors import MeasuredDataError, OptionError, listed
 from ugat_marl.grounding.detected import (
     DetectionConfig,
     LaneCourse,
@@ -170,14 +170,14 @@ class _Street:
         blind = [lane for lane in incoming if seen[lane].stop is None]
         if blind:
             raise MeasuredDataError(
-                f"detectors.csv: no stop detector on {_names(blind)}, of {len(incoming)} incoming "
-                "lanes: when vehicles leave there stays unknown; add one, or leave the traffic "
-                "light out of the scenario"
+                f"detectors.csv: no stop detector on {listed(blind, 'lane')}, of {len(incoming)} "
+                "incoming lanes: when vehicles leave there stays unknown; add one, or leave the "
+                "traffic light out of the scenario"
             )
         ends = [lane for lane in self._lanes if lane not in incoming and seen[lane].exit is None]
         if ends and self.observation in WITH_OUTGOING:
             raise MeasuredDataError(
-                f"detectors.csv: no exit detector on {_names(ends)}, which the observation "
+                f"detectors.csv: no exit detector on {listed(ends, 'lane')}, which the observation "
                 f"{self.observation!r} reads; add one, or choose --observation count"
             )
 
@@ -225,7 +225,7 @@ class _Street:
             findings = (*_unseen(table), *findings)
             if joined:
                 findings += (
-                    f"vehicles of lanes are estimated from detections on {_names(joined)}: "
+                    f"vehicles of lanes are estimated from detections on {listed(joined, 'lane')}: "
                     "agents count them together with lanes upstream, and the table does not",
                 )
         log = recorder.log()
@@ -408,8 +408,8 @@ class _Street:
             ]
             if stuck:
                 found.append(
-                    f"{_names(stuck)}: a queue stood on the first detector to the end of a period, "
-                    "so how fast it grew stays unknown; the rate of free times is taken"
+                    f"{listed(stuck, 'lane')}: a queue stood on the first detector to the end of "
+                    "a period, so how fast it grew stays unknown; the rate of free times is taken"
                 )
             late = sum(c.unmatched for lane in deviation for c in courses[lane])
             total = sum(len(c.leave_s) for lane in deviation for c in courses[lane])
@@ -423,8 +423,8 @@ class _Street:
             ]
             if alone:
                 found.append(
-                    f"{_names(alone)}: no advance detector, so vehicles that wait are known only "
-                    "when they leave"
+                    f"{listed(alone, 'lane')}: no advance detector, so vehicles that wait are "
+                    "known only when they leave"
                 )
             blind_s = max(one.blind_s for own in courses.values() for one in own)
             found.append(
@@ -435,7 +435,7 @@ class _Street:
         if strange:
             light = max(strange, key=lambda x: strange[x])
             found.append(
-                f"{_names(list(strange), 'traffic light')}: greens of no phase of the scenario for "
+                f"{listed(list(strange), 'traffic light')}: greens of no phase of the scenario for "
                 f"up to {100 * strange[light]:.0f} % of the time; the most similar phase is taken"
             )
         found.append(
@@ -512,8 +512,3 @@ def phases_shown(
         )
     after = np.searchsorted(known, np.arange(len(shown)))
     return phases[known[np.minimum(after, len(known) - 1)]], strange / max(float(lengths.sum()), 1)
-
-
-def _names(names: Sequence[str], title: str = "lane") -> str:
-    shown = first_names([*map(repr, names)])
-    return f"{len(names)} {title}{'s' if len(names) != 1 else ''} ({shown})"

@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from ugat_marl.data import AgentLayout, TransitionLog
-from ugat_marl.errors import LogError
+from ugat_marl.errors import LogError, first_names
 from ugat_marl.policies import size_mask
 
 
@@ -120,9 +120,9 @@ def refuse_other_agents(log: TransitionLog, stack: Stack) -> None:
     if dict(log.provenance.layouts) != stack.layouts:
         raise LogError(
             f"the transition log of {log.provenance.scenario} "
-            f"({log.provenance.observation} observation, agents {_names(log.agents)}) does not fit "
-            f"the models, made for agents {_names(stack.agents)}; use the same scenario and "
-            "the same observation options"
+            f"({log.provenance.observation} observation, agents {first_names(log.agents)}) does "
+            f"not fit the models, made for agents {first_names(stack.agents)}; use the same "
+            "scenario and the same observation options"
         )
 
 
@@ -164,8 +164,3 @@ def stack_log(log: TransitionLog, stack: Stack) -> StackedTransitions:
     return StackedTransitions(
         observation, following, served, asked, executed, delay_s, episode, step, weight
     )
-
-
-def _names(agents: tuple[str, ...]) -> str:
-    shown = ", ".join(agents[:4])
-    return f"{shown}, ... ({len(agents)})" if len(agents) > 4 else shown

@@ -14,7 +14,7 @@ from collections.abc import Iterator
 import torch
 from torch import nn
 
-from ugat_marl.errors import OptionError
+from ugat_marl.errors import OptionError, counted
 
 CPU = torch.device("cpu")
 _NAMES = re.compile(r"cpu|cuda(?::(0|[1-9]\d*))?")
@@ -51,7 +51,7 @@ def device_of(name: str) -> torch.device:
     if number and int(number) >= count:
         known = ", ".join(f"cuda:{index}" for index in range(count))
         raise OptionError(
-            f"device = {name!r}: torch sees {count} GPU{'s' * (count > 1)} here; name {known}"
+            f"device = {name!r}: torch sees {counted(count, 'GPU')} here; name {known}"
         )
     return torch.device(name)
 

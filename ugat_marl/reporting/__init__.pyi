@@ -10,7 +10,6 @@ from .comparison_tables import terminal_tables as terminal_tables
 from .diagnosis_page import commands_on_page as commands_on_page
 from .diagnosis_page import write_diagnosis_page as write_diagnosis_page
 from .diagnosis_tables import diagnosis_summary as diagnosis_summary
-from .formats import counted as counted
 from .formats import number_text as number_text
 from .formats import percent_text as percent_text
 from .formats import share_text as share_text

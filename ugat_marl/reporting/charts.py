@@ -11,6 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ugat_marl.data import Metrics
+from ugat_marl.errors import counted
 from ugat_marl.experiments import (
     DIRECT,
     GROUNDED_NAME,
@@ -33,7 +34,7 @@ from ugat_marl.reporting.figures import (
     shortened,
     write_png,
 )
-from ugat_marl.reporting.formats import counted, tick_text
+from ugat_marl.reporting.formats import tick_text
 from ugat_marl.reporting.run_records import RunRecord
 from ugat_marl.reporting.style import LIGHT, curve_style, styled
 

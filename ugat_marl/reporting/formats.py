@@ -62,11 +62,6 @@ def number_text(value: float) -> str:
     return f"{value:.1f}" if abs(value) >= 0.9995 else f"{value:.2f}"
 
 
-def counted(count: int, noun: str) -> str:
-    """Return a number with its noun, such as "1 seed" or "2 seeds"."""
-    return f"{count} {noun}{'' if count == 1 else 's'}"
-
-
 def share_text(value: float) -> str:
     """Return a share of the regret with two decimals; a dash for nan."""
     return "–" if math.isnan(value) else f"{value:.2f}".replace("-", "−")

@@ -12,9 +12,9 @@ from typing import Any, Literal
 import numpy as np
 from numpy.typing import NDArray
 
+from ugat_marl.errors import counted
 from ugat_marl.progress import Reporter
 from ugat_marl.reporting.figures import NamedFigure, printable, shortened
-from ugat_marl.reporting.formats import counted
 from ugat_marl.reporting.style import LIGHT, styled
 from ugat_marl.scenarios import Intersection, Link, Network, Scenario, green_of_file
 

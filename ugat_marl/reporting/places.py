@@ -54,7 +54,5 @@ def places_of(record: RunRecord) -> Places | str:
 
 @functools.lru_cache(maxsize=8)
 def _network(scenario: str, sim: str, duration_s: float | None) -> tuple[Network, str]:
-    derived = scenario_in_domain(load_scenario(scenario), sim)
-    if duration_s is not None:
-        derived = derived.with_duration(duration_s)
+    derived = scenario_in_domain(load_scenario(scenario), sim, duration_s=duration_s)
     return Network.read(derived), derived.hash

@@ -8,6 +8,7 @@ from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
+from ugat_marl.errors import counted
 from ugat_marl.experiments import DIRECT, Comparison, Trial, is_grounded
 from ugat_marl.reporting.run_records import RunRecord
 
@@ -49,7 +50,7 @@ def groups(records: Sequence[RunRecord]) -> list[Group]:
         trials.sort(key=lambda trial: _rank(trial.setting))
         comparison = Comparison(first.scenario, "", first.sim, tuple(trials), {})
         count = len(comparison.training_seeds)
-        note = f"{count} training seed{'s' * (count != 1)}; "
+        note = f"{counted(count, 'training seed')}; "
         note += "intervals: 95 %, Student's, over them." if count > 1 else "no intervals over them."
         title = f"{first.scenario}, trained in {first.sim}"
         title += "" if first.job else f", {first.grounding or 'unknown'} grounding"

@@ -6,7 +6,7 @@ import contextlib
 from typing import Any
 
 from ugat_marl.effects import known_effects
-from ugat_marl.errors import CheckpointError
+from ugat_marl.errors import CheckpointError, counted
 from ugat_marl.grounding import JUDGED, LIBRARY
 from ugat_marl.policies import rule_in
 from ugat_marl.reporting.formats import number
@@ -46,7 +46,7 @@ def commands_found(record: RunRecord) -> str:
     """Return what became of commands, in a sentence."""
     shares = {lag: _last(record, f"channel/lag_{lag}") for lag in range(1, _LATEST + 1)}
     parts = [
-        f"{100 * share:.0f} % take effect {lag} decision{'s' * (lag > 1)} late"
+        f"{100 * share:.0f} % take effect {counted(lag, 'decision')} late"
         for lag, share in shares.items()
         if share
     ]

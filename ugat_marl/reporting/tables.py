@@ -10,8 +10,9 @@ from rich.text import Text
 
 from ugat_marl.data import MEASURES
 from ugat_marl.diagnosis import PolicyGap, TravelTimeEstimate
+from ugat_marl.errors import counted
 from ugat_marl.experiments import Estimate, Evaluation, Tuned, check_run
-from ugat_marl.reporting.formats import counted, number_text
+from ugat_marl.reporting.formats import number_text
 from ugat_marl.reporting.terminal import titled_table
 
 

@@ -82,7 +82,7 @@ def check_demand(
                     raise _unknown_edge(document, tag, edge, scenario)
             if tag.name in DEPARTING:
                 routed &= in_routes
-                depart = _depart_s(tag, document, max(begin, latest))
+                depart = _depart_s(tag, document, begin, max(begin, latest))
                 if depart < latest and in_routes:
                     raise _unsorted(document, tag, depart, latest)
                 latest = max(latest, depart)
@@ -137,11 +137,16 @@ def _unsorted(document: Document, tag: Tag, depart: float, latest: float) -> Sce
     )
 
 
-def _depart_s(tag: Tag, document: Document, triggered_s: float) -> float:
-    """Return the departure in s; `triggered_s` for one that something else triggers."""
-    key, default = ("begin", "0") if tag.name == "flow" else ("depart", "")
-    text = tag.attributes.get(key, default)
-    return triggered_s if text in _NO_TIME else _seconds(text, key, tag, document)
+def _depart_s(tag: Tag, document: Document, begin_s: float, triggered_s: float) -> float:
+    """Return the departure in s; `triggered_s` for one that something else triggers.
+
+    A flow without a begin starts with the simulation, at `begin_s`.
+    """
+    if tag.name == "flow":
+        text = tag.attributes.get("begin")
+        return begin_s if text is None else _seconds(text, "begin", tag, document)
+    text = tag.attributes.get("depart", "")
+    return triggered_s if text in _NO_TIME else _seconds(text, "depart", tag, document)
 
 
 def _end_s(tag: Tag, document: Document) -> float:

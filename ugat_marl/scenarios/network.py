@@ -10,7 +10,7 @@ from itertools import chain
 
 import numpy as np
 
-from ugat_marl.errors import ScenarioError
+from ugat_marl.errors import ScenarioError, counted
 from ugat_marl.files import parse_xml
 from ugat_marl.scenarios.junctions import (
     Link,
@@ -343,7 +343,7 @@ def _reason(
     """Return the reason why a light is no agent, and what would make it one."""
     own = _choices(programme_phases(programme), links, "programme")
     if source == "programme":
-        text = f"its programme has {own} green phase{'s' if own != 1 else ''}"
+        text = f"its programme has {counted(own, 'green phase')}"
         return f'{text}; phases = "conflict-free" or "permitted" may make more'
     more = f'; its programme has {own}: phases = "programme" makes it an agent' if own > 1 else ""
     if not isinstance(source, str):

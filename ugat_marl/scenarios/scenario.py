@@ -99,8 +99,10 @@ class Scenario:
         settings = {**self.settings.model_dump(), "control": control}
         return replace(self, settings=validate_settings(settings, f"scenario {self.id!r}"))
 
-    def with_duration(self, duration_s: float) -> Scenario:
-        """Return the scenario with another duration."""
+    def with_duration(self, duration_s: float | None) -> Scenario:
+        """Return the scenario with another duration, or itself without one."""
+        if duration_s is None:
+            return self
         settings = {**self.settings.model_dump(), "duration_s": duration_s}
         return replace(self, settings=validate_settings(settings, f"scenario {self.id!r}"))
 

@@ -53,6 +53,7 @@ class Launch:
         directory: Folder for this simulation's own files. The runner of the simulation may remove
             it afterwards.
         begin_s: Start of the simulation on the scenario's clock.
+        end_s: End of the episode on the same clock; flows without an end of their own end here.
         lanes: Lanes to measure.
         waiting: True to measure waiting times as well.
         crossings: True to look every second for vehicles that left a lane's road.
@@ -71,6 +72,7 @@ class Launch:
     arguments: tuple[str, ...]
     directory: str
     begin_s: float
+    end_s: float
     lanes: tuple[str, ...]
     waiting: bool = False
     crossings: bool = False
@@ -249,6 +251,7 @@ def launch_of(
         tuple(arguments),
         str(directory),
         settings.begin_s,
+        settings.begin_s + settings.duration_s,
         tuple(lanes),
         waiting,
         crossings,

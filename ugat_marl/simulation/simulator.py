@@ -79,7 +79,7 @@ class LibsumoSimulator:
         self._launch = launch
         self._reserve = bytearray(_RESERVE_BYTES)
         try:
-            libsumo.start([program, *launch.arguments])
+            libsumo.start([program, *launch.arguments, "--end", repr(launch.end_s)])
         except _FAULTS as error:
             self._fail("SUMO did not start", error)
         self._shown, self._on = {}, {}

@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 
 from ugat_marl.data.measured.values import Finding, MeasuredData
 from ugat_marl.effects import known_effects
+from ugat_marl.errors import listed
 from ugat_marl.scenarios import (
     GREEN,
     YELLOW,
@@ -40,8 +41,6 @@ MOST_ON_RED = 0.6
 probably wrong."""
 MANY_LENGTHS = 3
 """Number of different lengths of one green, in whole s, from which a programme is not fixed."""
-NAMED = 6
-"""Most names listed in one finding."""
 
 COUNTABLE = (
     "demand_level",
@@ -126,7 +125,7 @@ def _of_periods(measured: MeasuredData) -> Iterator[Finding]:
     short = [period.id for period in periods if period.end_s - period.begin_s < SHORT_S]
     if short:
         yield Finding(
-            f"periods.csv: {_list('period', short)} shorter than {SHORT_S:g} s; a few signal "
+            f"periods.csv: {listed(short, 'period')} shorter than {SHORT_S:g} s; a few signal "
             "cycles tell little"
         )
 
@@ -143,20 +142,20 @@ def _of_signals(measured: MeasuredData, scenario: Scenario, network: Network) ->
     never = [tls for tls in controlled if not any(tls in period.signals for period in periods)]
     if never:
         yield Finding(
-            f"signals: nothing of {_list('traffic light', never)}, of {len(controlled)}; "
+            f"signals: nothing of {listed(never, 'traffic light')}, of {len(controlled)}; "
             "in the simulation they run the network's programme"
         )
     for period in periods:
         gone = [tls for tls in controlled if tls not in period.signals and tls not in never]
         if gone:
             yield Finding(
-                f"signals: nothing of {_list('traffic light', gone)} in period {period.id!r}"
+                f"signals: nothing of {listed(gone, 'traffic light')} in period {period.id!r}"
             )
     if scenario.control.yellow_s > 0:
         bare = [tls for tls in controlled if tls not in never and not _has_yellow(periods, tls)]
         if bare:
             yield Finding(
-                f"signals: {_list('traffic light', bare)} never yellow, though the scenario has "
+                f"signals: {listed(bare, 'traffic light')} never yellow, though the scenario has "
                 f"{scenario.control.yellow_s:g} s of it; was the yellow left out of the log?",
                 NEEDS_YELLOW if len(bare) == len(controlled) - len(never) else (),
             )
@@ -164,7 +163,7 @@ def _of_signals(measured: MeasuredData, scenario: Scenario, network: Network) ->
     adaptive = [tls for tls in controlled if is_actuated(periods, tls)]
     if adaptive:
         yield Finding(
-            f"signals: {_list('traffic light', adaptive)} with greens of many lengths, as if they "
+            f"signals: {listed(adaptive, 'traffic light')} with greens of many lengths, as if they "
             "followed the traffic: "
             + (
                 "simulated days get the arrivals they answered, as the advance detectors saw them; "
@@ -204,7 +203,7 @@ def _of_kinds(measured: MeasuredData, network: Network) -> Iterator[Finding]:
     if silent:
         many = 2 * len(silent) >= len(measured.detectors)
         yield Finding(
-            f"detections: nothing of {_list('detector', silent)}, of {len(measured.detectors)}"
+            f"detections: nothing of {listed(silent, 'detector')}, of {len(measured.detectors)}"
             + ("; they are not used, and what happens there stays unknown" if many else ""),
             ("dropout", "swapped", "undercount") if many else (),
         )
@@ -306,9 +305,9 @@ def _of_clocks(measured: MeasuredData) -> Iterator[Finding]:
     silent = [detector.id for detector in measured.detectors if detector.clock is None]
     if silent and measured.has_events:
         yield Finding(
-            f"detectors.csv: no clock stated for {_list('detector', silent)}; the stamps are taken "
-            "for those of SUMO's output, one simulation step ahead of the signals. For a street, "
-            "add the column clock with signals in every row"
+            f"detectors.csv: no clock stated for {listed(silent, 'detector')}; the stamps are "
+            "taken for those of SUMO's output, one simulation step ahead of the signals. For a "
+            "street, add the column clock with signals in every row"
         )
 
 
@@ -322,14 +321,14 @@ def _of_places(detectors: Sequence[Detector], network: Network) -> Iterator[Find
     ]
     if wrong:
         yield Finding(
-            f"detectors.csv: {_list('detector', wrong)} not on a lane of that kind (advance and "
+            f"detectors.csv: {listed(wrong, 'detector')} not on a lane of that kind (advance and "
             "stop: leading to an intersection with signals, exit: leading away); not used"
         )
     seen = {lane for detector in detectors if detector.kind != "exit" for lane in detector.lanes}
     bare = sorted(into - seen)
     if bare:
         yield Finding(
-            f"detectors.csv: no detector on {_list('incoming lane', bare)}, of {len(into)}; "
+            f"detectors.csv: no detector on {listed(bare, 'incoming lane')}, of {len(into)}; "
             "what differs there stays unknown"
         )
 
@@ -410,7 +409,7 @@ def _of_silence(measured: MeasuredData) -> Iterator[Finding]:
     for (name, behaviour), silent_spans in silences.items():
         minutes = sorted(round(silent.length_s / 60) for silent in silent_spans)
         span = f"{minutes[0]}" if minutes[0] == minutes[-1] else f"{minutes[0]} to {minutes[-1]}"
-        where = f"in {_list('period', [silent.period for silent in silent_spans])}"
+        where = f"in {listed([silent.period for silent in silent_spans], 'period')}"
         if len(silent_spans) == 1:
             where = f"from {silent_spans[0].begin_s:g} s on in period {silent_spans[0].period!r}"
         yield Finding(
@@ -476,9 +475,3 @@ def _longest_gap(times: NDArray[np.float64], period: Period) -> tuple[float, flo
     gaps = np.diff(marks)
     longest = int(gaps.argmax())
     return float(marks[longest]), float(gaps[longest])
-
-
-def _list(title: str, names: Sequence[str]) -> str:
-    """Return names as a list, such as ``2 detectors ('a', 'b')``."""
-    shown = ", ".join(map(repr, names[:NAMED])) + (" ..." if len(names) > NAMED else "")
-    return f"{len(names)} {title}{'s' if len(names) != 1 else ''} ({shown})"

@@ -21,6 +21,7 @@ from gymnasium import spaces
 from numpy.typing import NDArray
 from stable_baselines3.common.vec_env import VecEnv
 
+from ugat_marl.envs.agents import discrete_actions, vector_box
 from ugat_marl.envs.types import AnyParallelEnv
 from ugat_marl.errors import ActionError, EpisodeError, OptionError
 
@@ -191,11 +192,7 @@ def _common_spaces(
     rows: Sequence[tuple[AnyParallelEnv, str]],
 ) -> tuple[spaces.Box, spaces.Discrete]:
     (env, first), *others = rows
-    box, actions = env.observation_space(first), env.action_space(first)
-    if not isinstance(box, spaces.Box) or len(box.shape) != 1:
-        raise OptionError(f"agent {first!r} observes {box}; needed: a Box of one dimension")
-    if not isinstance(actions, spaces.Discrete) or actions.start != 0:
-        raise OptionError(f"agent {first!r} acts in {actions}; needed: Discrete(n)")
+    box, actions = vector_box(env, first), discrete_actions(env, first)
     for other, agent in others:
         for space, common in (
             (other.observation_space(agent), box),

@@ -520,7 +520,7 @@ def vector_env(
         raise UnknownNameError("value of option 'autoreset':", str(autoreset), get_args(Autoreset))
     checked_options(options)
     loaded = load_scenario(scenario)
-    domain_of = domain_chooser(loaded, domains, n)
+    domain_of = domain_chooser(loaded, domains, n, options.get("duration_s"))
     plain: AnyParallelEnv = parallel_env(loaded, domain_of(0, 0), **options)
     for each in listed(wrap):
         plain = imported(spelling("wrap", each))(plain)

@@ -166,7 +166,10 @@ def received(domain: Any) -> Domain:
 
 
 def domain_chooser(
-    scenario: Scenario, domains: Domain | Sequence[Domain] | DomainOf, n: int
+    scenario: Scenario,
+    domains: Domain | Sequence[Domain] | DomainOf,
+    n: int,
+    duration_s: float | None = None,
 ) -> DomainOf:
     """Return the function that gives the domain of each episode.
 
@@ -174,6 +177,7 @@ def domain_chooser(
         scenario: Scenario of the environments.
         domains: One domain, a list of `n`, or a function.
         n: Number of environments.
+        duration_s: Length of their episodes, s; None for that of the scenario.
 
     Raises:
         OptionError: The list has another length.
@@ -183,7 +187,7 @@ def domain_chooser(
         return domains
     given: Any = domains
     if isinstance(given, str) or not any(map(_is_domain, given)):
-        scenario_in_domain(scenario, given)
+        scenario_in_domain(scenario, given, duration_s=duration_s)
         return lambda environment, episode: given
     listed: list[Any] = list(given)
     if effects := [choice for choice in listed if not _is_domain(choice)]:
@@ -197,7 +201,7 @@ def domain_chooser(
             "ugat_marl.envs.vector.spec.in_turn(domains), which goes through a list of any length"
         )
     for domain in {str(sent(domain)): domain for domain in listed}.values():
-        scenario_in_domain(scenario, domain)
+        scenario_in_domain(scenario, domain, duration_s=duration_s)
     return lambda environment, episode: listed[environment]
 
 

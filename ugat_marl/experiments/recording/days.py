@@ -164,11 +164,8 @@ def record(
         )
     if not 0 <= day_to_day < 1:
         raise OptionError(f"day_to_day = {day_to_day:g} must be from 0 to below 1")
-    if duration_s is not None:
-        scenario = scenario.with_duration(duration_s)
-    base, effects = _world(demand_as_vehicles(scenario), domain)
-    if duration_s is not None:  # the domain may be another scenario
-        base = base.with_duration(duration_s)
+    scenario = demand_as_vehicles(scenario.with_duration(duration_s))
+    base, effects = _world(scenario, domain, duration_s)
     network = Network.read(base)
     detectors = tuple(
         _zone(detector, detector_length_m) for detector in standard_detectors(network)
@@ -204,12 +201,15 @@ def record(
     )
 
 
-def _world(scenario: Scenario, domain: Domain) -> tuple[Scenario, tuple[Effect, ...]]:
+def _world(
+    scenario: Scenario, domain: Domain, duration_s: float | None
+) -> tuple[Scenario, tuple[Effect, ...]]:
     """Return the scenario from which days are drawn, and the effects to add to each day.
 
     A scenario's documents hold the effects of its file already, except those on detectors.
     """
-    changed = scenario_in_domain(scenario, domain, recorded=True)  # a wrong name is an error now
+    # a wrong name is an error now
+    changed = scenario_in_domain(scenario, domain, recorded=True, duration_s=duration_s)
     if domain_path(domain) is not None:
         return changed, detector_effects(changed)
     return scenario, (*detector_effects(scenario), *parse_domain(domain))
