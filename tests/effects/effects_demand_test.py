@@ -16,6 +16,7 @@ from ugat_marl.effects import (
     DemandLevel,
     DemandSurge,
     DemandTiming,
+    Effect,
     HeavyShare,
     LaneClosure,
     Parking,
@@ -191,6 +192,22 @@ def test_flows_are_scaled(crossing: Crossing) -> None:
     east = rates(sound(apply_effects(scenario, [DemandLevel("W_C", 0.5)])))
     assert east == pytest.approx({"a": 10, "b": 10, "c": 20, "d": 10, "e": 10, "f": 20})
     assert not rates(apply_effects(scenario, [DemandLevel("*", 0)]))
+
+
+@pytest.mark.parametrize(
+    ("flow", "vehicles"), [('number="100"', 100), ('end="1000" number="40"', 40)]
+)
+def test_a_flow_without_begin_or_end_has_those_of_the_episode(
+    flow: str, vehicles: int, crossing: Crossing
+) -> None:
+    scenario = load_scenario(crossing(vehicles=f'<flow id="f" {flow} route="east"/>'))
+    settings = scenario.settings.model_copy(update={"begin_s": 500.0, "duration_s": 250.0})
+    (found,) = departing(
+        apply_effects(replace(scenario, settings=settings), [DemandLevel("*", 0.5)])
+    ).values()
+    ends = {"number": "750", "end": "1000"}[flow.partition("=")[0]]
+    assert (found.get("begin"), found.get("end")) == ("500", ends)
+    assert found.get("number") == str(vehicles // 2)
 
 
 def test_a_surge_cuts_flows_into_parts(crossing: Crossing) -> None:
@@ -383,6 +400,24 @@ def test_where_nobody_turned_they_leave_the_network() -> None:
     assert not turns(elsewhere)[to]
     back = sound(apply_effects(elsewhere, [Turning(EDGE, to, 0.5)]))
     assert turns(back)[to] > 20
+
+
+@pytest.mark.parametrize(
+    "effects",
+    [
+        [HeavyShare(0.1), HeavyShare(0.2)],
+        [Turning("east1_A1", "A1_southA", 0.3), Turning("east1_A1", "A1_northA", 0.3)],
+    ],
+)
+def test_a_flow_can_be_parted_twice(effects: list[Effect]) -> None:
+    scenario = load_scenario("single-v1")
+    text = (
+        '<routes><route id="r" edges="east1_A1 A1_west1"/>'
+        '<flow id="f" route="r" begin="0" number="100" end="1000"/></routes>'
+    )
+    routes = Document(scenario.routes[0].name, None, text.encode())
+    twice = sound(apply_effects(replace(scenario, routes=(routes,)), effects))
+    assert sum(numbers(twice).values()) == 100 and len(numbers(twice)) in (3, 4)
 
 
 def test_flows_and_trips_turn_too() -> None:

@@ -20,6 +20,7 @@ from ugat_marl.effects import (
     NAMED_DOMAINS,
     PAPER_WORLDS,
     Effect,
+    StartupDelay,
     domain_label,
     effects_on_controllers,
     expand_domains,
@@ -31,7 +32,7 @@ from ugat_marl.effects.actuators import successors
 from ugat_marl.effects.sensors import DeadDetectors
 from ugat_marl.envs import OBJECTIVE_MEASURES, TrafficEnv
 from ugat_marl.envs.sensors import Sensors
-from ugat_marl.errors import ScenarioError, UnknownNameError
+from ugat_marl.errors import OptionError, ScenarioError, UnknownNameError
 from ugat_marl.scenarios import signals
 from ugat_marl.simulation import Snapshot
 from ugat_marl.testing import check_determinism, check_environment
@@ -451,3 +452,19 @@ def test_an_environment_with_gaps_is_conformant(domain: str) -> None:
         return ugat_marl.parallel_env("mixed-v1", domain, duration_s=60)
 
     assert all(found.passed for found in [*check_environment(make), *check_determinism(make)])
+
+
+@pytest.mark.parametrize("domain", [StartupDelay(0.5), None, 3])
+def test_a_domain_that_is_neither_text_nor_list(domain: Any) -> None:
+    with pytest.raises(OptionError, match="give a name such as 'V1', or a list of effects"):
+        ugat_marl.parallel_env("single-v1", domain)
+
+
+def test_times_of_effects_lie_in_the_episode_that_is_asked_for() -> None:
+    with pytest.raises(OptionError, match="incident"):
+        ugat_marl.parallel_env("grid2x2-v1", "incident=4000,900")
+    env = ugat_marl.parallel_env("grid2x2-v1", "incident=4000,900", duration_s=7200)
+    assert env.scenario.settings.duration_s == 7200
+    parked = ugat_marl.parallel_env("single-v1", "parking=northA_A1_0,60,30", duration_s=7200)
+    last = parked.scenario.routes[-1].parse()[-1]
+    assert float(last.get("depart", "0")) > 7000

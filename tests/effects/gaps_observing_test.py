@@ -19,6 +19,7 @@ from ugat_marl.effects import (
     Effect,
     apply_effects,
     controller_effects,
+    detector_effects,
     effects_on_controllers,
     known_effects,
     load_scenario,
@@ -185,7 +186,9 @@ def test_only_the_zone_before_a_stop_line_is_seen(network: Network) -> None:
         assert found == expected
 
 
-@pytest.mark.parametrize(("seconds", "decisions"), [(0, 0), (14, 1), (30, 3)])
+@pytest.mark.parametrize(
+    ("seconds", "decisions"), [(0, 0), (4, 0), (5, 1), (14, 1), (15, 2), (25, 3), (30, 3)]
+)
 def test_late_counts(seconds: int, decisions: int, network: Network) -> None:
     street = sensors(f"observation_delay={seconds}", network)
     found = [street.see(snapshot(network, n, n)).vehicles[0] for n in range(1, 9)]
@@ -200,6 +203,25 @@ def test_lost_readings_are_seen_again(network: Network) -> None:
     assert ((found[1:] == now[1:]) | kept).all()
     assert kept.mean() == pytest.approx(0.3, abs=0.01)
     assert not seen("lost_readings=1", network, 3.0, 3.0)[0].any()
+
+
+@pytest.mark.parametrize("text", ["observation_delay=30", "lost_readings=0.9"])
+def test_vehicles_that_left_are_as_late_as_the_counts(text: str) -> None:
+    env = ugat_marl.parallel_env("single-v1", domain=text, duration_s=600, crossings=True)
+    log = roll_out(env, _Nobody(), 1, record=observer_of(env)).log
+    env.close()
+    assert log is not None
+    for agent in log.agents:
+        served = log.transitions(agent).served_features
+        assert served.size and (served >= 0).all()
+
+
+def test_effects_on_detectors_keep_their_order_beside_one_on_controllers() -> None:
+    scenario = load_scenario("single-v1")
+    text = "undercount=*,0.5+stuck=d,0,100+dropout=d,50,60"
+    plain = detector_effects(scenario_in_domain(scenario, text, recorded=True))
+    other = scenario_in_domain(scenario, f"{text}+lost_readings=0.1", recorded=True)
+    assert [str(x) for x in detector_effects(other)] == [str(x) for x in plain]
 
 
 def test_counts_in_steps(network: Network) -> None:

@@ -216,6 +216,18 @@ def test_a_function_gets_the_views_before_and_after() -> None:
     assert after.time_s == 30.0 and after.mean_speed_mps.tolist() == [13.9, 13.9]
 
 
+def test_a_function_that_changes_its_length_is_told() -> None:
+    lengths = iter([2, 2, 2, 2, 2, 3])
+
+    def some(view: IntersectionView) -> list[float]:
+        return [0.0] * next(lengths)
+
+    with pytest.raises(OptionError, match="returned 3 numbers .* returned 2 before"):
+        Observer(NETWORK, some).observe(SEEN, PHASES)
+    with pytest.raises(OptionError, match=r"an array of shape \(0,\)"):
+        Observer(NETWORK, lambda view: [])
+
+
 def test_functions_and_waiting_need_waiting_times() -> None:
     assert Rewarder(NETWORK, lambda before, after: 0.0).needs_waiting
     assert Rewarder(NETWORK, "waiting").needs_waiting

@@ -558,11 +558,15 @@ def test_an_unused_one_starts_and_leaves_nothing(crossing: Crossing, temporary: 
 def test_halves_outlive_the_name_of_the_whole(crossing: Crossing, temporary: Path) -> None:
     first, second = vector_env(crossing(), 2, duration_s=20).halves()
     gc.collect()
+    with pytest.raises(EpisodeError, match=r"environment 0 has no episode.*where=\[0\]"):
+        second.step([[0]])
     for half in (first, second):
         half.reset(1)
         half.step([[0]])
     first.close()
     second.step([[0]])
+    with pytest.raises(ActionError, match=r"of shape \(0,\); allowed: integers of shape \(1, 1\)"):
+        second.step([[0], [0, 1]])
     del first, second, half
     gc.collect()
     assert list(temporary.iterdir()) == []

@@ -187,7 +187,7 @@ def test_frames_in_closed_form() -> None:
     assert env.observation_space("a_1").low.tolist() == [0, 0, 0, 0, 1, 0]
     one, _ = frame_stack(Steep(), 1).reset()
     assert is_list(one["a_1"], [1, 10])
-    with pytest.raises(OptionError, match="at least 1"):
+    with pytest.raises(OptionError, match="a whole number from 1"):
         frame_stack(Steep(), 0)
 
 

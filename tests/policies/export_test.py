@@ -187,6 +187,16 @@ def test_numpy_policies_do_not_load_torch(tmp_path: Path) -> None:
     assert subprocess.run([sys.executable, "-c", code], check=False).returncode == 0
 
 
+def test_two_formats_share_their_side_car(tmp_path: Path) -> None:
+    policy = policy_of(False)
+    path = exported(policy, ".npz", tmp_path)
+    exported(policy, ".ts", tmp_path)
+    assert NumpyPolicy.load(path).agents == AGENTS
+    exported(policy_of(False, agents=AgentSet.of(ToyTraffic())), ".ts", tmp_path)
+    with pytest.raises(CheckpointError, match="belongs to another model"):
+        NumpyPolicy.load(path)
+
+
 # --- the side-car -------------------------------------------------------------------------------
 
 
@@ -195,7 +205,9 @@ def test_the_side_car_says_what_the_rows_are(tmp_path: Path) -> None:
     policy = policy_of(False, agents=AgentSet.of(env))
     path = tmp_path / "deep" / "policy.npz"
     about = json.loads(export_policy(policy, path, env).read_text())
-    assert about.pop("kind") == "ugat_marl.exported_policy" and len(about.pop("sha256")) == 64
+    assert about.pop("kind") == "ugat_marl.exported_policy" and [
+        len(each) for each in about.pop("sha256").values()
+    ] == [64]
     assert about == {
         "network": "mlp",
         "agents": ["cross_0", "tee_0", "cross_1"],

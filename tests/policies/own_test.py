@@ -408,6 +408,20 @@ def test_a_class_of_policies_is_made(algorithm: Any) -> None:
     assert set(policy.act(observations, infos)) == set(observations)
 
 
+def test_a_class_with_settings_of_its_own_keeps_them() -> None:
+    class Held:
+        def __init__(self, threshold: int = 5) -> None:
+            self.threshold = threshold
+
+        def act(self, observations: Any) -> dict[str, float]:
+            return dict.fromkeys(observations, self.threshold - 4.1)
+
+    policy = own_policy(Held, "held", ToyTraffic())
+    observations, infos = ToyTraffic().reset(seed=0)
+    with pytest.raises(OptionError, match="dictionary from every agent to the number of a phase"):
+        policy.act(observations, infos)  # 0.9 is no phase
+
+
 @pytest.mark.usefixtures("algorithm")
 def test_a_learner_in_the_place_of_a_policy_is_refused_with_the_way_out() -> None:
     with pytest.raises(OptionError, match="'my_algo:Cycle' is a learner.*my_algo:Cycle@FILE"):

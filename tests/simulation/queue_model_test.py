@@ -471,7 +471,5 @@ def test_queues_are_about_those_of_car_following() -> None:
     ],
 )
 def test_what_needs_positions_is_refused(domain: str, options: dict[str, Any]) -> None:
-    env = ugat_marl.parallel_env("single-v1", domain, duration_s=60, **options)
     with pytest.raises(OptionError, match="mesoscopic model.*leave out queue_model"):
-        env.reset(seed=1)
-    env.close()
+        ugat_marl.parallel_env("single-v1", domain, duration_s=60, **options)

@@ -360,6 +360,18 @@ def test_trips_are_read_as_sumo_writes_them(tmp_path: Path) -> None:
     assert trips.finished.dtype == bool
 
 
+def test_emissions_of_a_blocker_are_nobody_else_s(tmp_path: Path) -> None:
+    file = tmp_path / "trips.xml"
+    emissions = '<emissions CO2_abs="{}"/></tripinfo>'
+    file.write_text(
+        f'<tripinfos><tripinfo id="a" depart="5" arrival="9">{emissions.format(1000)}'
+        f'<tripinfo id="parking.east.0" vType="parking.east" depart="5">{emissions.format(777000)}'
+        '<tripinfo id="b" depart="-1" arrival="-1"/></tripinfos>'
+    )
+    (tmp_path / "statistics.xml").write_text("<statistics/>")
+    assert read_trips(file, {"": 1.3}).co2_g.tolist() == [1, 0]
+
+
 def test_no_trips_are_empty_arrays(tmp_path: Path) -> None:
     file = tmp_path / "trips.xml"
     file.write_text("<tripinfos/>")

@@ -16,7 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ugat_marl.effects.base import ControllerEffect, Effect, NumberParameter, TextParameter
-from ugat_marl.effects.controllers import Actuator, Commands
+from ugat_marl.effects.controllers import Actuator, Commands, whole_decisions
 from ugat_marl.errors import ScenarioError
 from ugat_marl.scenarios import (
     Intersection,
@@ -48,7 +48,7 @@ class ExecutionDelay(ControllerEffect):
         """Make an actuator that delays commands by whole decisions."""
         del timing
         nothing = (None,) * len(network.intersections)
-        return _Late(nothing, round(self.seconds / decision_interval_s))
+        return _Late(nothing, whole_decisions(self.seconds, decision_interval_s))
 
 
 class _Late(Actuator):

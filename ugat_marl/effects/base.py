@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import hashlib
 import math
-from collections.abc import Collection, Iterable, Mapping, Sequence
+from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, fields, replace
 from numbers import Real
 from typing import Any, ClassVar, Literal
@@ -262,14 +262,27 @@ class ControllerEffect(Effect):
     apart_by: ClassVar[tuple[str, ...]] = ("name",)
 
     def apply(self, scenario: Scenario) -> Scenario:
-        """List the effect in the scenario; the last of two with the same identity counts."""
+        """List the effect in the scenario; the last of two with the same identity counts.
+
+        These effects stand in a fixed order behind those on detectors, whose order counts.
+        """
 
         def identity(record: Mapping[str, Any]) -> list[str]:
             return [str(record.get(name, "")) for name in self.apart_by]
 
         own = self.record()
         others = [item for item in scenario.settings.effects if identity(item) != identity(own)]
-        return with_listed_effects(scenario, self, sorted([*others, own], key=identity))
+        names = set(_names_below(ControllerEffect))
+        first = [item for item in others if item.get("name") not in names]
+        then = sorted([own, *(item for item in others if item.get("name") in names)], key=identity)
+        return with_listed_effects(scenario, self, [*first, *then])
+
+
+def _names_below(kind: type[Effect]) -> Iterator[str]:
+    """Yield the names of all effects of a kind."""
+    for each in kind.__subclasses__():
+        yield getattr(each, "name", "")
+        yield from _names_below(each)
 
 
 def with_listed_effects(

@@ -8,6 +8,7 @@ depend on the other effects.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from enum import IntEnum
@@ -53,6 +54,11 @@ class Reading:
     counts: NDArray[np.float64]
     near: NDArray[np.float64]
     mean_left: NDArray[np.float64]
+
+
+def whole_decisions(seconds: float, interval_s: float) -> int:
+    """Return a time as a number of decisions, to the nearest; halves are rounded up."""
+    return math.floor(seconds / interval_s + 0.5)
 
 
 class ControllerPart:

@@ -309,7 +309,10 @@ class DetectorSplash(_OfDetectors):
 
 
 def next_detectors(detectors: Sequence[Detector]) -> dict[str, tuple[str, ...]]:
-    """Return the nearest detector of the same kind on each lane beside, by detector."""
+    """Return the nearest detector of the same kind on each lane beside, by detector.
+
+    A lane whose id does not end in a number, as SUMO's do, has no lane beside.
+    """
     by_place: dict[tuple[str, str], list[Detector]] = {}
     for detector in detectors:
         by_place.setdefault((detector.lane, detector.kind), []).append(detector)
@@ -320,7 +323,8 @@ def next_detectors(detectors: Sequence[Detector]) -> dict[str, tuple[str, ...]]:
             return abs(other.position_m - here_m)
 
         edge, _, number = detector.lane.rpartition("_")
-        lanes = (f"{edge}_{int(number) + step}" for step in (-1, 1))
+        steps = (-1, 1) if number.isdigit() else ()
+        lanes = (f"{edge}_{int(number) + step}" for step in steps)
         there = [
             by_place[lane, detector.kind] for lane in lanes if (lane, detector.kind) in by_place
         ]

@@ -10,7 +10,7 @@ import tempfile
 import xml.etree.ElementTree as ET
 from collections.abc import Callable, Iterable, Iterator
 from dataclasses import replace
-from itertools import islice
+from itertools import chain, count, islice
 from typing import IO
 
 from ugat_marl.files import Draft, child_texts, scratch, xml_bytes
@@ -62,6 +62,13 @@ def mentions(document: Document, *texts: str) -> bool:
         or any(text in window for text in wanted)
         for window in windows(document)
     )
+
+
+def free_suffix(scenario: Scenario, suffix: str) -> str:
+    """Return a suffix for ids, with a number behind it where an id of the demand has it already."""
+    documents = (*scenario.additional, *scenario.routes)
+    candidates = chain([suffix], (f"{suffix}~{number}" for number in count(2)))
+    return next(x for x in candidates if not any(mentions(each, x) for each in documents))
 
 
 def edit(

@@ -241,6 +241,11 @@ def parse_domain(domain: Domain) -> tuple[Effect, ...]:
         given: Any = domain
         if isinstance(given, Path):
             raise OptionError(f"domain {given!r}: give a scenario directory as text, str(path)")
+        if not isinstance(given, Iterable):
+            raise OptionError(
+                f"domain {given!r}: give a name such as 'V1', or a list of effects such as "
+                "[StartupDelay(0.5)]"
+            )
         for part_or_effect in given:
             if not isinstance(part_or_effect, Effect):
                 raise OptionError(

@@ -14,6 +14,7 @@ from ugat_marl.effects.demand import TAGS, parted_flow
 from ugat_marl.effects.documents import (
     DEFAULT_TYPES,
     edit_scenario,
+    free_suffix,
     is_demand,
     mentions,
     with_default_types,
@@ -96,6 +97,7 @@ class HeavyShare(Effect):
         types, members = _types(scenario)
         cars = _cars(types, members)
         used: dict[str, ET.Element] = {}
+        suffix = free_suffix(scenario, "+heavy")
 
         def heavy(element: ET.Element) -> list[ET.Element]:
             kind = element.get("type", DEFAULT_TYPES[0])
@@ -111,7 +113,7 @@ class HeavyShare(Effect):
             used[truck] = cars[kind]
             part, rest = parted_flow(element, (self.share, 1 - self.share), over, self.name)
             if part is not None:
-                part.attrib |= {"id": f"{name}+heavy", "type": truck}
+                part.attrib |= {"id": f"{name}{suffix}", "type": truck}
             return [flow for flow in (rest, part) if flow is not None]
 
         def change(root: ET.Element) -> bool:

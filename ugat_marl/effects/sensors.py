@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ugat_marl.effects.base import ControllerEffect, NumberParameter
-from ugat_marl.effects.controllers import Reading, Sensor, Stage
+from ugat_marl.effects.controllers import Reading, Sensor, Stage, whole_decisions
 from ugat_marl.scenarios import Network
 from ugat_marl.seeding import numpy_generator
 
@@ -177,7 +177,7 @@ class ObservationDelay(ControllerEffect):
     def sensor(self, network: Network, decision_interval_s: float) -> Sensor:
         """Make a sensor that delays counts by whole decisions."""
         del network
-        return _Late(round(self.seconds / decision_interval_s))
+        return _Late(whole_decisions(self.seconds, decision_interval_s))
 
 
 class _Late(Sensor):
@@ -188,13 +188,15 @@ class _Late(Sensor):
 
     def reset(self, seed: int) -> None:
         del seed
-        self._under_way: deque[NDArray[np.float64]] = deque()
+        self._under_way: deque[tuple[NDArray[np.float64], NDArray[np.float64]]] = deque()
 
     def read(self, reading: Reading) -> Reading:
-        self._under_way.append(reading.counts)
+        self._under_way.append((reading.counts, reading.mean_left))
+        counts, left = np.zeros_like(reading.counts), np.zeros_like(reading.mean_left)
         if len(self._under_way) > self._decisions:
-            return replace(reading, counts=self._under_way.popleft())
-        return replace(reading, counts=np.zeros_like(reading.counts))
+            counts, before = self._under_way.popleft()
+            left = before if len(before) else left  # none is measured before the first decision
+        return replace(reading, counts=counts, mean_left=left)
 
 
 @dataclass(frozen=True)
@@ -220,12 +222,16 @@ class _Lossy(Sensor):
     def reset(self, seed: int) -> None:
         self._random = _stream(seed, LostReadings)
         self._last: NDArray[np.float64] | None = None
+        self._old: NDArray[np.bool_] | bool = False
 
     def read(self, reading: Reading) -> Reading:
         last = np.zeros_like(reading.counts) if self._last is None else self._last
         lost = self._random.random(reading.counts.shape[1]) < self._share
         self._last = np.where(lost, last, reading.counts)
-        return replace(reading, counts=self._last)
+        left = reading.mean_left  # of a lane that is seen late, it is not known when they left
+        left = np.where(lost | self._old, 0.0, left) if len(left) else left
+        self._old = lost
+        return replace(reading, counts=self._last, mean_left=left)
 
 
 @dataclass(frozen=True)

@@ -13,7 +13,7 @@ from typing import ClassVar
 
 from ugat_marl.effects.base import Effect, NumberParameter, TextParameter, hashed_uniform
 from ugat_marl.effects.demand import TAGS, Routes, parted_flow
-from ugat_marl.effects.documents import edit_scenario, is_demand, mentions
+from ugat_marl.effects.documents import edit_scenario, free_suffix, is_demand, mentions
 from ugat_marl.effects.places import Places, network_places
 from ugat_marl.errors import UnknownNameError
 from ugat_marl.scenarios import Scenario, edge_of_lane
@@ -63,11 +63,12 @@ class Turning(Effect):
 
         tails = self._tails(scenario, way, places)
         over = scenario.settings.begin_s + scenario.settings.duration_s
+        suffix = free_suffix(scenario, "+turning")
 
         def change(root: ET.Element) -> bool:
             children: list[ET.Element] = []
             for element in root:
-                children += self._turned(element, way, tails, over)
+                children += self._turned(element, way, tails, over, suffix)
             changed = len(children) != len(root) or any(
                 a is not b for a, b in zip(children, root, strict=True)
             )
@@ -101,6 +102,7 @@ class Turning(Effect):
         way: Callable[[ET.Element], Way],
         tails: Counter[Way],
         over_s: float,
+        suffix: str,
     ) -> list[ET.Element]:
         """Return the elements that replace one element of a route file."""
         if not is_demand(element):
@@ -121,7 +123,7 @@ class Turning(Effect):
         parts = [rest]
         for number, (part, tail) in enumerate(zip(turned, sorted(tails), strict=True)):
             if part is not None:
-                part.set("id", f"{name}+turning{number or ''}")
+                part.set("id", f"{name}{suffix}{number or ''}")
                 parts.append(_with_route(part, (*edges[: place + 1], *tail)))
         return [part for part in parts if part is not None]
 

@@ -202,7 +202,15 @@ class Observer:
 
     def _flat(self, snapshot: Snapshot) -> NDArray[np.float64]:
         if self._function is not None:
-            return np.concatenate([self._features(view) for view in self._views(snapshot)])
+            rows = [self._features(view) for view in self._views(snapshot)]
+            for row, layout in zip(rows, self.layouts, strict=True):
+                if len(row) != layout.features:
+                    raise OptionError(
+                        f"observation: the function returned {len(row)} numbers for an "
+                        f"intersection for which it returned {layout.features} before; it must "
+                        "return always as many"
+                    )
+            return np.concatenate(rows)
         capacity = self._lanes.capacity
         if self.name == "count":
             values = snapshot.vehicles[self._incoming] / COUNT_SCALE
@@ -225,7 +233,7 @@ class Observer:
         """Return the features that the user's function makes of an intersection."""
         assert self._function is not None
         values = np.asarray(self._function(view), dtype=np.float64)
-        if values.ndim != 1 or not np.isfinite(values).all():
+        if values.ndim != 1 or not values.size or not np.isfinite(values).all():
             raise OptionError(
                 f"observation: the function returned an array of shape {values.shape}"
                 f"{'' if np.isfinite(values).all() else ' that is not finite'}; it must return one "

@@ -5,7 +5,7 @@ from __future__ import annotations
 import warnings
 from collections.abc import Mapping
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Unpack
+from typing import TYPE_CHECKING, Any, SupportsIndex, Unpack
 
 import numpy as np
 from gymnasium.spaces import Box, Discrete
@@ -38,7 +38,13 @@ from ugat_marl.envs.types import StepResult
 from ugat_marl.errors import EpisodeError, OptionError
 from ugat_marl.files import OwnDirectory
 from ugat_marl.scenarios import Network, Scenario, check_demand, signals
-from ugat_marl.simulation import Simulator, Snapshot, launch_of, simulator_of
+from ugat_marl.simulation import (
+    Simulator,
+    Snapshot,
+    launch_of,
+    refuse_in_queues,
+    simulator_of,
+)
 
 if TYPE_CHECKING:
     from ugat_marl.envs.description import Description
@@ -101,6 +107,12 @@ class TrafficEnv(ParallelEnv[str, Any, Any]):
         effects = controller_effects(self.scenario)
         parts: tuple[ControllerPart, ...] = (*effects, *options.fitted)
         self._sensors = Sensors.of(parts, self.network, self.decision_interval_s)
+        refuse_in_queues(
+            self.scenario,
+            crossings=options.crossings,
+            zone=self._sensors is not None and self._sensors.zone_m > 0,
+            pictures=options.render_mode is not None,
+        )
         interval_s = self.decision_interval_s
         self._actuators = Actuators.of(parts, self.network, self._timing, interval_s)
         served = {lane: red for part in parts for lane, red in part.service().items()}
@@ -178,8 +190,9 @@ class TrafficEnv(ParallelEnv[str, Any, Any]):
                 drawn from `np_random`.
             options: Not used.
         """
-        if seed is not None and seed < 0:
-            raise OptionError(f"seed = {seed}: must not be negative")
+        given: Any = seed
+        if seed is not None and (not isinstance(given, SupportsIndex) or seed < 0):
+            raise OptionError(f"seed = {seed!r}: must be a whole number from 0 on")
         if seed is not None:
             self.np_random = np.random.default_rng(seed)
         self._scores, self.agents = None, []  # if SUMO does not start, no episode has begun

@@ -11,7 +11,7 @@ from __future__ import annotations
 
 from collections import deque
 from collections.abc import Mapping
-from typing import Any
+from typing import Any, SupportsIndex
 
 import numpy as np
 from gymnasium import spaces
@@ -294,8 +294,9 @@ class _SharedObservation(Wrapper):
 class _FrameStack(Wrapper):
     def __init__(self, env: AnyParallelEnv, k: int) -> None:
         super().__init__(env)
-        if k < 1:
-            raise OptionError(f"frame_stack of {k} observations: must be at least 1")
+        given: Any = k
+        if not isinstance(given, SupportsIndex) or k < 1:
+            raise OptionError(f"frame_stack of {k!r} observations: must be a whole number from 1")
         self._k = k
         self._frames: dict[str, deque[NDArray[np.float32]]] = {}
         self.observation_spaces = _each(self.observation_spaces, self._stacked_box)

@@ -13,7 +13,8 @@ holds:
 - ``env_options``: options of `ugat_marl.parallel_env` that the policy was trained with.
 - ``decision_interval_s``, ``intersections``: seconds between decisions, and agent to traffic light;
   null for an export without an environment.
-- ``sha256``: hash of the model; it shows whether the two files belong together.
+- ``sha256``: suffix of each format to the hash of its model; it shows which files belong
+  together.
 """
 
 from __future__ import annotations
@@ -80,9 +81,23 @@ def export_policy(policy: NetworkPolicy, path: Path, env: AnyParallelEnv | None 
     about = _about(policy, env)
     model = FORMATS[path.suffix][1](policy)
     write_whole(path, model)
-    about["sha256"] = hashlib.sha256(model).hexdigest()
+    about["sha256"] = _sums_beside(side_car, about) | {path.suffix: _sum(model)}
     write_whole(side_car, json.dumps(about, indent=1) + "\n")
     return side_car
+
+
+def _sum(model: bytes) -> str:
+    return hashlib.sha256(model).hexdigest()
+
+
+def _sums_beside(side_car: Path, about: Mapping[str, Any]) -> dict[str, str]:
+    """Return the check sums of the same policy's other formats; none if the file is another's."""
+    try:
+        held = read_json(side_car, CheckpointError)
+        sums = held.pop("sha256")
+        return dict(sums) if held == json.loads(json.dumps(about)) else {}
+    except (CheckpointError, AttributeError, KeyError, TypeError, ValueError):
+        return {}
 
 
 def portable_network(policy: NetworkPolicy) -> PortableNetwork:
@@ -159,7 +174,7 @@ class NumpyPolicy:
         try:
             about = read_json(path.with_suffix(".json"), CheckpointError)
             model = path.read_bytes()
-            if about["kind"] != _KIND or about["sha256"] != hashlib.sha256(model).hexdigest():
+            if about["kind"] != _KIND or about["sha256"].get(path.suffix) != _sum(model):
                 raise ValueError("the JSON file beside it belongs to another model")
             with zipfile.ZipFile(io.BytesIO(model)) as archive:
                 require_stored(archive)

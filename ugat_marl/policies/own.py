@@ -211,7 +211,7 @@ class OwnPolicy:
         act = getattr(self._given, "act", self._given)
         chosen = act(observations, infos) if self._sees_infos else act(observations)
         try:
-            return {agent: int(action) for agent, action in chosen.items()}
+            return {agent: _whole(action) for agent, action in chosen.items()}
         except (AttributeError, TypeError, ValueError):
             raise OptionError(
                 f"policy {self._name!r} returned a {type(chosen).__name__}; it must return a "
@@ -234,14 +234,15 @@ def own_policy(given: Any, name: str, env: AnyParallelEnv) -> Policy:
 
     Args:
         given: An object or a function as for `OwnPolicy`, or what makes one: a class, or a function
-            whose first argument is called ``env``.
+            whose first argument is called ``env``. A class is given the environment if its first
+            argument is called so, or has no default.
         name: Name for messages.
         env: The environment.
     """
     if inspect.isclass(given):
         if not (_takes(given, 1) or _takes(given, 0)):
             raise OptionError(_not_made(given, name))
-        given = given(*[env] if _takes(given, 1) else [])
+        given = given(*[env] if _wants_env(given) else [])
     elif inspect.isroutine(given) and _first_argument(given) == "env":
         given = given(env)
     return OwnPolicy(given, name, {})
@@ -552,6 +553,24 @@ def _sees_infos(act: Callable[..., Any]) -> bool:
         second = [*inspect.signature(act).parameters.values()][1:2]
         return all(one.default is one.empty or one.name == "infos" for one in second)
     return True
+
+
+def _wants_env(made: Callable[..., Any]) -> bool:
+    """Return True if a class is to be made with the environment as its first argument."""
+    if not _takes(made, 1):
+        return False
+    return not _takes(made, 0) or _first_argument(made) == "env"
+
+
+def _whole(action: Any) -> int:
+    """Return an action as a whole number.
+
+    Raises:
+        ValueError: It is none, such as 0.9.
+    """
+    if action != int(action):
+        raise ValueError(action)
+    return int(action)
 
 
 def _first_argument(function: Callable[..., Any]) -> str:

@@ -22,6 +22,7 @@ from .launch import SignalPlans as SignalPlans
 from .launch import Simulator as Simulator
 from .launch import VehiclePositions as VehiclePositions
 from .launch import launch_of as launch_of
+from .mesoscopic import refuse_in_queues as refuse_in_queues
 from .process import ProcessSimulator as ProcessSimulator
 from .process import simulator_of as simulator_of
 from .simulator import LibsumoSimulator as LibsumoSimulator

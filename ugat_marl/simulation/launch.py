@@ -211,10 +211,7 @@ def launch_of(
             them out.
     """
     settings = scenario.settings
-    if "mesosim" in settings.sumo:
-        refuse_in_queues(
-            scenario.id, crossings=crossings, zone=bool(zone_m), pictures=gui or pictures
-        )
+    refuse_in_queues(scenario, crossings=crossings, zone=bool(zone_m), pictures=gui or pictures)
     files = {
         "--net-file": [scenario.network],
         "--route-files": list(scenario.routes),

@@ -17,7 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ugat_marl.errors import OptionError
-from ugat_marl.scenarios import edge_of_lane
+from ugat_marl.scenarios import Scenario, edge_of_lane
 from ugat_marl.simulation.snapshots import HALTING_MPS
 
 
@@ -193,11 +193,11 @@ class MesoscopicLanes:
         return min(stay.lanes, key=lambda place: vehicles[place])
 
 
-def refuse_in_queues(scenario: str, **requested: bool) -> None:
-    """Refuse options that need positions on lanes.
+def refuse_in_queues(scenario: Scenario, **requested: bool) -> None:
+    """Refuse options that need positions on lanes if a scenario has SUMO's mesoscopic model.
 
     Args:
-        scenario: Id of the scenario.
+        scenario: The scenario.
         requested: ``crossings``, ``zone`` and ``pictures``: True if requested.
 
     Raises:
@@ -209,8 +209,8 @@ def refuse_in_queues(scenario: str, **requested: bool) -> None:
         "pictures": "pictures of vehicles (render_mode, films)",
     }
     for name, wanted in requested.items():
-        if wanted:
+        if wanted and "mesosim" in scenario.settings.sumo:
             raise OptionError(
-                f"scenario {scenario!r} runs in SUMO's mesoscopic model, in which vehicles have no "
-                f"position on a lane: it cannot tell {words[name]}; leave out queue_model"
+                f"scenario {scenario.id!r} runs in SUMO's mesoscopic model, in which vehicles have "
+                f"no position on a lane: it cannot tell {words[name]}; leave out queue_model"
             )

@@ -66,7 +66,8 @@ def _trips_in(path: Path, persons: Mapping[str, float]) -> Trips:
             if persons:
                 emitted_g.append(co2_mg / 1000.0)
                 carried.append(persons.get(element.get("vType", ""), persons[""]))
-                co2_mg = 0.0
+        if element.tag == "tripinfo":
+            co2_mg = 0.0  # SUMO tells no emissions of a vehicle that never entered
         element.clear()
     table = np.array(rows, dtype=np.float64).reshape(-1, 4)
     return Trips(

@@ -347,7 +347,7 @@ class VectorEnv:
             env = self._environments[index]
             idle[index] = env.over and not env.pending
             if not (anew and idle[index] and env.episode is not None):
-                env.require_running()
+                env.require_running(index)
             if index in self._sent:
                 raise EpisodeError(f"the step of environment {index} waits; call recv() first")
         stepped = [index for index in chosen if not idle[index]]
@@ -415,7 +415,10 @@ class VectorEnv:
         return {index: listed[index] for index in chosen}
 
     def _checked(self, actions: ArrayLike, chosen: list[int]) -> NDArray[np.int64]:
-        phases = np.asarray(actions)
+        try:
+            phases = np.asarray(actions)
+        except ValueError:  # rows of different lengths
+            phases = np.empty(0)
         wanted = (len(chosen), len(self.agents))
         if phases.shape != wanted or not np.issubdtype(phases.dtype, np.integer):
             raise ActionError(

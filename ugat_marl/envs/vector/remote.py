@@ -242,21 +242,23 @@ class RemoteEnv:
         self._history = []
         self._end()
 
-    def require_running(self) -> None:
+    def require_running(self, number: int) -> None:
         """Refuse a decision without an episode, or while an answer is missing.
+
+        Args:
+            number: Number of the environment in the vector that asks, for messages.
 
         Raises:
             EpisodeError: No episode is running, or an answer is missing.
         """
         if self.pending:
             raise EpisodeError(
-                f"environment {self.index} is in the middle of a step; call step_wait() or "
-                "recv() first"
+                f"environment {number} is in the middle of a step; call step_wait() or recv() first"
             )
         if self.over:
             raise EpisodeError(
-                f"environment {self.index} has no episode under way; call reset(), or "
-                f"reset(where=[{self.index}]) for it alone"
+                f"environment {number} has no episode under way; call reset(), or "
+                f"reset(where=[{number}]) for it alone"
             )
 
     def _start(self) -> None:
