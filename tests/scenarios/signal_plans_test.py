@@ -12,6 +12,7 @@ from ugat_marl.effects import load_scenario
 from ugat_marl.envs import parallel_env
 from ugat_marl.errors import ScenarioError
 from ugat_marl.experiments import rule_factory, typical_plans
+from ugat_marl.files import Document, xml_bytes
 from ugat_marl.progress import Silent
 from ugat_marl.scenarios import (
     Network,
@@ -127,6 +128,37 @@ def test_a_table_comes_back(single: Scenario, tmp_path: Path) -> None:
     assert own.cycle_s == sum(seconds for seconds, _ in light.programme)
     again = with_plans(single, [own], "plans.csv")
     assert Network.read(again).intersections[0].programme == light.programme
+
+
+@pytest.mark.parametrize(
+    ("offset", "additional", "expected_s"),
+    [
+        ("37", "", 37),
+        ("0:01:40", "", 10),
+        ("-10", "", 80),
+        ("begin", "", 30),
+        ("37", '<tlLogic id="A1" programID="0" offset="12"/>', 12),
+        ("37", '<tlLogic id="A1" programID="other" offset="12"/>', 37),
+    ],
+)
+def test_the_offset_of_a_programme_comes_back(
+    single: Scenario, offset: str, additional: str, expected_s: float, tmp_path: Path
+) -> None:
+    root = single.network.parse()
+    next(root.iter("tlLogic")).set("offset", offset)
+    more = Document("o.add.xml", None, f"<additional>{additional}</additional>".encode())
+    changed = replace(
+        single,
+        network=Document(single.network.name, None, xml_bytes(root)),
+        additional=(more,),
+        settings=single.settings.model_copy(update={"begin_s": 120.0}),
+    )
+    network = Network.read(changed)
+    write_plans(tmp_path / "p.csv", [programme_plan(network.intersections[0], network)], network)
+    (plan,) = read_plans(tmp_path / "p.csv")
+    assert (plan.cycle_s, plan.offset_s) == (90, expected_s)
+    (light,) = Network.read(with_plans(changed, [plan], "p.csv")).intersections
+    assert light.offset_s == expected_s
 
 
 HEAD = "light,cycle_s,offset_s,ring,barrier,movements,split_s,yellow_s,all_red_s\n"

@@ -32,6 +32,7 @@ from ugat_marl.scenarios.phases import (
     yielding,
 )
 from ugat_marl.scenarios.scenario import Scenario
+from ugat_marl.scenarios.settings import parse_time
 from ugat_marl.scenarios.signals import GREEN, SIGNAL_LETTERS, check_phases
 
 VEHICLE_SPACE_M = 7.5
@@ -82,6 +83,7 @@ class Intersection:
         neighbours: Other agents one road away, in either direction.
         position: Mean over the links of their junction's coordinates, m.
         crossings: Links for people on foot.
+        offset_s: Time on the scenario's clock at which the programme begins a cycle.
     """
 
     id: str
@@ -93,6 +95,7 @@ class Intersection:
     neighbours: tuple[str, ...]
     position: tuple[float, float]
     crossings: tuple[Link, ...] = ()
+    offset_s: float = 0.0
 
 
 @dataclass(frozen=True)
@@ -157,8 +160,9 @@ class Network:
         for tls in sorted(links):
             light_links = tuple(sorted(links[tls], key=lambda link: (link.index, link.to_lane)))
             walks = tuple(crossings.get(tls, ()))
+            own = programmes.get(tls, _NO_PROGRAMME)
             programme, width = _programme_of(
-                scenario, tls, programmes.get(tls, ()), (*light_links, *walks), rules, notes
+                scenario, tls, own.states, (*light_links, *walks), rules, notes
             )
             phases = _phases_of(scenario, tls, light_links, walks, programme, width, rules)
             source = _source_of(scenario, tls)
@@ -177,18 +181,10 @@ class Network:
                     neighbours=reachable[tls],
                     position=_centre([positions[link.junction] for link in light_links]),
                     crossings=walks,
+                    offset_s=own.offset_s,
                 )
             )
-        if not agents_found:
-            obstacle = (
-                "only traffic lights with fewer than two green phases"
-                if links
-                else "no traffic light"
-            )
-            raise ScenarioError(
-                f"{document.source}: {obstacle}; an environment needs at least one intersection "
-                "with two green phases (netconvert --tls.guess adds traffic lights)"
-            )
+        _require_agents(agents_found, links, document.source)
         agents = {intersection.id for intersection in agents_found}
         pruned = tuple(_with_neighbours(light, agents) for light in agents_found)
         reach_m = scenario.control.reach_m
@@ -251,7 +247,7 @@ def signal_widths(scenario: Scenario) -> dict[str, int]:
     root = parse_xml(scenario.network.read(), scenario.network.source)
     programmes = _programmes(root, scenario)
     return {
-        tls: len(programmes[tls][0][1])
+        tls: len(programmes[tls].states[0][1])
         if tls in programmes
         else max(link.index for link in links) + 1
         for tls, links in links_of(root).items()
@@ -381,6 +377,19 @@ def _check_greens(
         )
 
 
+def _require_agents(
+    agents: Sequence[Intersection], links: Mapping[str, Sequence[Link]], source: str
+) -> None:
+    if not agents:
+        obstacle = (
+            "only traffic lights with fewer than two green phases" if links else "no traffic light"
+        )
+        raise ScenarioError(
+            f"{source}: {obstacle}; an environment needs at least one intersection with two green "
+            "phases (netconvert --tls.guess adds traffic lights)"
+        )
+
+
 def _check_settings(scenario: Scenario, links: Mapping[str, Sequence[Link]]) -> None:
     if unknown := sorted(name for name in scenario.settings.intersections if name not in links):
         raise ScenarioError(
@@ -443,19 +452,50 @@ def _shape(text: str) -> tuple[tuple[float, float], ...]:
     return tuple((float(xyz[0]), float(xyz[1])) for xyz in points)
 
 
-def _programmes(root: ET.Element, scenario: Scenario) -> dict[str, tuple[tuple[float, str], ...]]:
-    """Return the programmes SUMO runs: the last definition, additional files after the network."""
-    programmes: dict[str, tuple[tuple[float, str], ...]] = {}
+@dataclass(frozen=True)
+class _Programme:
+    """Programme of a traffic light.
+
+    Attributes:
+        id: SUMO's programID.
+        states: ``(duration_s, state)`` of each phase.
+        offset_s: Time on the scenario's clock at which a cycle begins.
+    """
+
+    id: str
+    states: tuple[tuple[float, str], ...]
+    offset_s: float
+
+
+_NO_PROGRAMME = _Programme("", (), 0.0)
+
+
+def _programmes(root: ET.Element, scenario: Scenario) -> dict[str, _Programme]:
+    """Return the programmes SUMO runs: the last definition, additional files after the network.
+
+    A definition without phases gives a known programme another offset.
+    """
+    programmes: dict[str, _Programme] = {}
     parts = chain.from_iterable(document.parts() for document in scenario.additional)
     for tree in chain((root,), parts):
         for logic in tree.iter("tlLogic"):
-            phases = tuple(
+            tls, name = logic.get("id", ""), logic.get("programID", "")
+            states = tuple(
                 (float(phase.get("duration", "0")), phase.get("state", ""))
                 for phase in logic.iter("phase")
             )
-            if phases:
-                programmes[logic.get("id", "")] = phases
+            offset_s = _offset_s(logic, scenario)
+            if states:
+                programmes[tls] = _Programme(name, states, offset_s)
+            elif tls in programmes and programmes[tls].id == name:
+                programmes[tls] = replace(programmes[tls], offset_s=offset_s)
     return programmes
+
+
+def _offset_s(logic: ET.Element, scenario: Scenario) -> float:
+    """Return the offset, s; SUMO knows the begin of the episode as ``begin``."""
+    text = logic.get("offset", "0")
+    return scenario.settings.begin_s if text == "begin" else parse_time(text)
 
 
 def _turns(intersections: Sequence[Intersection], names: Sequence[str]) -> Turns:

@@ -346,7 +346,7 @@ def with_plans(scenario: Scenario, plans: Iterable[SignalPlan], source: str) -> 
     return replace(scenario, additional=(*others, Document(name, None, xml_bytes(top))))
 
 
-def programme_plan(light: Intersection, network: Network, offset_s: float = 0.0) -> SignalPlan:
+def programme_plan(light: Intersection, network: Network) -> SignalPlan:
     """Return the plan of a light's own programme, in one ring.
 
     Every state with green and without yellow begins a phase. The states until the next one are its
@@ -381,7 +381,7 @@ def programme_plan(light: Intersection, network: Network, offset_s: float = 0.0)
             )
     begins_s = sum(seconds for seconds, _ in states[:first])
     cycle_s = sum(phase.split_s for phase in phases)
-    return SignalPlan(light.id, cycle_s, (offset_s + begins_s) % cycle_s, tuple(phases))
+    return SignalPlan(light.id, cycle_s, (light.offset_s + begins_s) % cycle_s, tuple(phases))
 
 
 # --- tables ---------------------------------------------------------------------------------------
