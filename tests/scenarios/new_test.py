@@ -124,6 +124,33 @@ def test_walks_leave_the_network_and_pass_no_junction_twice(tmp_path: Path) -> N
             assert any(b in roads for roads in streets.ahead[a].values())
 
 
+@pytest.mark.parametrize(
+    ("closed", "ahead"),
+    [
+        ("", {"in": {"s": ("on",)}}),
+        ("from", {}),
+        ("to", {}),
+        ("connection", {}),
+    ],
+)
+def test_cars_need_both_lanes_and_the_connection(
+    closed: str, ahead: dict[str, dict[str, tuple[str, ...]]]
+) -> None:
+    shut = dict.fromkeys((closed,), ' disallow="passenger"')
+    root = ET.fromstring(
+        '<net><edge id="in" from="x" to="y">'
+        f'<lane id="in_0"{shut.get("from", "")}/><lane id="in_1"/></edge>'
+        '<edge id="on" from="y" to="z">'
+        f'<lane id="on_0"/><lane id="on_1"{shut.get("to", "")}/></edge>'
+        '<connection from="in" to="on" fromLane="0" toLane="1" dir="s"'
+        f"{shut.get('connection', '')}/></net>"
+    )
+    streets = Streets.of(root)
+    assert set(streets.start) == {"in", "on"}
+    assert streets.ahead == ahead
+    assert streets.entries == (("in",) if ahead else ())
+
+
 def test_turns_nobody_asked_for_are_taken_where_there_is_no_other_way() -> None:
     streets = Streets({"a": "x", "b": "y"}, {"a": "y", "b": "z"}, {"a": {"r": ("b",)}}, ("a",),
                       frozenset({"b"}))  # fmt: skip

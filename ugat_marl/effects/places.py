@@ -5,14 +5,13 @@ from __future__ import annotations
 import functools
 import heapq
 import math
-import xml.etree.ElementTree as ET
 from collections import defaultdict
 from collections.abc import Collection, Mapping
 from dataclasses import dataclass
 
 from ugat_marl.errors import UnknownNameError
 from ugat_marl.files import parse_xml
-from ugat_marl.scenarios import Scenario, rail_signals_of
+from ugat_marl.scenarios import Scenario, cars_may_use, rail_signals_of
 
 
 @dataclass(frozen=True)
@@ -120,7 +119,7 @@ def _places(content: bytes, source: str) -> Places:
                 index,
                 float(lane.get("length", "0")),
                 float(lane.get("speed", "0")),
-                _cars(lane),
+                cars_may_use(lane),
             )
     following: dict[str, dict[str, None]] = defaultdict(dict)
     lights = {element.get("id", ""): None for element in root.iter("tlLogic")}
@@ -150,13 +149,6 @@ def _places(content: bytes, source: str) -> Places:
         ends,
         begins,
     )
-
-
-def _cars(lane: ET.Element) -> bool:
-    allowed, forbidden = lane.get("allow"), lane.get("disallow", "")
-    if allowed is not None:
-        return bool({"passenger", "all"} & set(allowed.split()))
-    return not {"passenger", "all"} & set(forbidden.split())
 
 
 def _trace(before: Mapping[str, str], start: str, edge: str) -> tuple[str, ...]:

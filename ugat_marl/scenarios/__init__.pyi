@@ -49,6 +49,7 @@ from .inspection import Survey as Survey
 from .inspection import green_of_file as green_of_file
 from .inspection import survey as survey
 from .junctions import Link as Link
+from .junctions import cars_may_use as cars_may_use
 from .junctions import rail_signals_of as rail_signals_of
 from .lanes import NO_UPSTREAM_LANES as NO_UPSTREAM_LANES
 from .lanes import LaneTable as LaneTable

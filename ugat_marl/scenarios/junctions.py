@@ -53,6 +53,31 @@ class Link:
         return edge_of_lane(self.to_lane)
 
 
+def cars_may_use(element: ET.Element) -> bool:
+    """Return True if a lane or a connection admits passenger cars."""
+    allow, disallow = element.get("allow"), element.get("disallow", "")
+    if allow is not None:
+        return bool({"all", "passenger"} & set(allow.split()))
+    return not {"all", "passenger"} & set(disallow.split())
+
+
+def lanes_without_cars(root: ET.Element) -> frozenset[str]:
+    """Return the lanes that passenger cars may not use."""
+    return frozenset(lane.get("id", "") for lane in root.iter("lane") if not cars_may_use(lane))
+
+
+def leads_cars(connection: ET.Element, closed: Container[str]) -> bool:
+    """Return True if passenger cars may use a connection and both of its lanes.
+
+    Args:
+        connection: The ``<connection>``.
+        closed: The lanes of `lanes_without_cars`.
+    """
+    start = f"{connection.get('from')}_{connection.get('fromLane')}"
+    end = f"{connection.get('to')}_{connection.get('toLane')}"
+    return cars_may_use(connection) and start not in closed and end not in closed
+
+
 def rail_signals_of(root: ET.Element) -> frozenset[str]:
     """Return the signals that trains set: rail signals and level crossings.
 

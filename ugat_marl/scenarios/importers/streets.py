@@ -7,6 +7,8 @@ from collections import defaultdict
 from collections.abc import Mapping
 from dataclasses import dataclass
 
+from ugat_marl.scenarios.junctions import cars_may_use, lanes_without_cars, leads_cars
+
 TURNS = {"L": "l", "R": "r", "T": "t"}
 """SUMO's letters for partial turns and U-turns, to the letters used here."""
 
@@ -35,13 +37,14 @@ class Streets:
         start: dict[str, str] = {}
         end: dict[str, str] = {}
         for edge in root.iter("edge"):
-            if edge.get("function") is None and any(map(_for_cars, edge.iter("lane"))):
+            if edge.get("function") is None and any(map(cars_may_use, edge.iter("lane"))):
                 start[edge.get("id", "")] = edge.get("from", "")
                 end[edge.get("id", "")] = edge.get("to", "")
+        closed = lanes_without_cars(root)
         ahead: dict[str, dict[str, dict[str, None]]] = defaultdict(lambda: defaultdict(dict))
         for element in root.iter("connection"):
             here, there = element.get("from", ""), element.get("to", "")
-            if here in start and there in start:
+            if here in start and there in start and leads_cars(element, closed):
                 letter = element.get("dir", "s")
                 ahead[here][TURNS.get(letter, letter)][there] = None
         reached: set[str] = set()
@@ -61,10 +64,3 @@ class Streets:
             tuple(road for road in start if road not in reached and road in left),
             frozenset(road for road in start if road not in left),
         )
-
-
-def _for_cars(lane: ET.Element) -> bool:
-    allow, disallow = lane.get("allow"), lane.get("disallow")
-    if allow is not None:
-        return bool({"all", "passenger"} & set(allow.split()))
-    return not {"all", "passenger"} & set((disallow or "").split())
