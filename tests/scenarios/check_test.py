@@ -24,6 +24,7 @@ from ugat_marl.experiments import (
     problems,
     remarks,
 )
+from ugat_marl.files import xml_bytes
 from ugat_marl.progress import Silent
 from ugat_marl.reporting import draw_network
 from ugat_marl.reporting.phase_diagrams import STYLES
@@ -55,6 +56,34 @@ def test_an_intersection_is_counted(single: Scenario) -> None:
     assert both_through.permitted == ()
     assert {name.split()[1] for name in both_through.protected} == {"s", "r"}
     assert facts.vehicles == 2000 or 1900 < facts.vehicles < 2100
+
+
+def test_bus_lanes_add_no_capacity_for_cars(single: Scenario) -> None:
+    """Of two lanes for straight on, one is closed to cars: the other carries all of them."""
+    root = single.network.parse()
+    lane = next(item for item in root.iter("lane") if item.get("id") == "northA_A1_0")
+    way = next(
+        item
+        for item in root.iter("connection")
+        if item.get("from") == "northA_A1" and item.get("to") == "A1_southA"
+    )
+    way.set("fromLane", "0")  # lane 1 leads straight on as well
+
+    def written() -> Scenario:
+        return replace(single, network=Document(single.network.name, None, xml_bytes(root)))
+
+    both = written()
+    lane.set("allow", "bus bicycle")
+    closed = written()
+
+    def lanes_of(scenario: Scenario) -> int:
+        (item,) = survey(scenario).intersections
+        return next(road.lanes for road in item.approaches if road.edge == "northA_A1")
+
+    assert (lanes_of(both), lanes_of(closed)) == (3, 2)
+    flows = {("northA_A1", "A1_southA"): 900.0}
+    shared, alone = (degrees_of_saturation(scenario, flows)["A1"] for scenario in (both, closed))
+    assert alone == pytest.approx(2 * shared)
 
 
 def test_traffic_is_counted_by_approach(single: Scenario) -> None:

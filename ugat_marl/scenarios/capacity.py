@@ -22,7 +22,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy import optimize
 
-from ugat_marl.scenarios.junctions import Link, foes_of, yields_of
+from ugat_marl.scenarios.junctions import Link, foes_of, links_for_cars, yields_of
 from ugat_marl.scenarios.network import Intersection, Network
 from ugat_marl.scenarios.phases import RightOfWay, kerb_turn_of
 from ugat_marl.scenarios.routes import departures
@@ -67,6 +67,7 @@ def degrees_of_saturation(scenario: Scenario, flows_vph: Flows | None = None) ->
     - Lost time: yellow and all-red of the fewest phases that serve all lanes, once in `CYCLE_S`;
       the start-up loss and the use of yellow are assumed to cancel.
     - A lane is served by phases in which all its traffic has green.
+    - Lanes that cars may not use do not count, except where a movement has no other.
     - A turn that gives way (``g``) takes `PERMITTED_EQUIVALENT`. It shares the point of conflict
       with the traffic that it lets pass, and their flows add up there, 2 s for each of these cars
       (critical movements). All lanes opposite count: the turn needs a gap in all of them.
@@ -134,6 +135,7 @@ class _Loaded:
         for link in light.links:
             if flows_vph.get((link.from_edge, link.to_edge), 0.0) > 0:
                 movements[link.from_edge, link.to_edge].append(link)
+        movements = {name: [*links_for_cars(links)] for name, links in movements.items()}
         by_lane: dict[str, list[Link]] = defaultdict(list)
         for link in (link for links in movements.values() for link in links):
             by_lane[link.from_lane].append(link)

@@ -13,7 +13,7 @@ from ugat_marl.errors import ScenarioError
 from ugat_marl.progress import Reporter
 from ugat_marl.scenarios.capacity import SATURATION_VPH, Flows, degrees_of_saturation
 from ugat_marl.scenarios.demand import Demand, check_demand
-from ugat_marl.scenarios.junctions import Link, foes_of, yields_of
+from ugat_marl.scenarios.junctions import Link, foes_of, links_for_cars, yields_of
 from ugat_marl.scenarios.network import Intersection, Network
 from ugat_marl.scenarios.phases import RightOfWay, are_foes, programme_phases, turn_of
 from ugat_marl.scenarios.routes import departures
@@ -53,7 +53,7 @@ class ApproachFacts:
 
     Attributes:
         edge: SUMO id of the road.
-        lanes: Number of its lanes at the light.
+        lanes: Number of its lanes for cars at the light.
         vph: Vehicles per hour whose routes use the road, mean of the episode.
         worst_vph: The same in the worst quarter of an hour, by free flow to the light.
         worst_from_s: Begin of this quarter of an hour, s from the begin of the episode.
@@ -314,7 +314,7 @@ def _facts(
         ),
         clashes=tuple(_clashes(intersection, rules)),
         uncontrolled=sum(free.get(junction, 0) for junction in junctions),
-        approaches=tuple(_approaches(intersection, network, traffic)),
+        approaches=tuple(_approaches(intersection, traffic)),
         name=intersection_name(intersection.links, network.streets),
         file_yellow_s=_times_of(intersection, yellow=True),
         file_all_red_s=_times_of(intersection, yellow=False),
@@ -386,15 +386,14 @@ def green_of_file(intersection: Intersection, state: str) -> int | None:
     return next((n for n, green in enumerate(greens) if going(green) == going(state)), None)
 
 
-def _approaches(
-    intersection: Intersection, network: Network, traffic: _Traffic
-) -> Sequence[ApproachFacts]:
-    lanes: dict[str, list[str]] = defaultdict(list)
-    for lane in intersection.incoming_lanes:
-        lanes[network.lanes[lane].edge].append(lane)
+def _approaches(intersection: Intersection, traffic: _Traffic) -> Sequence[ApproachFacts]:
+    roads: dict[str, list[Link]] = defaultdict(list)
+    for link in intersection.links:
+        roads[link.from_edge].append(link)
     cycle_s = sum(seconds for seconds, _ in intersection.programme)
     approaches: list[ApproachFacts] = []
-    for edge, edge_lanes in lanes.items():
+    for edge, links in roads.items():
+        edge_lanes = tuple(dict.fromkeys(link.from_lane for link in links_for_cars(links)))
         vph, (worst_vph, worst_from_s) = traffic.vph[edge], traffic.worst(edge)
         capacity = SATURATION_VPH * len(edge_lanes)
         green = sum(_green_s(intersection, lane) for lane in edge_lanes) / len(edge_lanes)

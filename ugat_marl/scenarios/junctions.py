@@ -32,6 +32,7 @@ class Link:
         junction: Id of the junction.
         request: Row of the link in the junction's right-of-way matrix, or -1 if there is none.
         left_hand: True if traffic keeps to the left. Right turns then cross the opposite traffic.
+        cars: True if passenger cars may go this way.
     """
 
     index: int
@@ -41,6 +42,7 @@ class Link:
     junction: str = ""
     request: int = -1
     left_hand: bool = False
+    cars: bool = True
 
     @property
     def from_edge(self) -> str:
@@ -95,6 +97,7 @@ def links_of(root: ET.Element) -> dict[str, list[Link]]:
     links: dict[str, list[Link]] = defaultdict(list)
     left_hand = root.get("lefthand", "").lower() in ("true", "1")
     rails = rail_signals_of(root)
+    closed = lanes_without_cars(root)
     for element in root.iter("connection"):
         tls = element.get("tl")
         if tls is None or tls in rails or element.get("from", ":").startswith(":"):
@@ -109,9 +112,15 @@ def links_of(root: ET.Element) -> dict[str, list[Link]]:
                 junction=junction,
                 request=request,
                 left_hand=left_hand,
+                cars=leads_cars(element, closed),
             )
         )
     return links
+
+
+def links_for_cars(links: Sequence[Link]) -> Sequence[Link]:
+    """Return the links that passenger cars may use; all of them if there are none, as for buses."""
+    return [link for link in links if link.cars] or links
 
 
 def crossings_of(root: ET.Element) -> dict[str, list[Link]]:
