@@ -36,6 +36,17 @@ def test_counts_on_roads_are_met(tmp_path: Path) -> None:
     assert "3 of 3 counts of counts.csv are met" in (tmp_path / "city" / "README.md").read_text()
 
 
+def test_fractions_of_vehicles_are_driven_on_average(tmp_path: Path) -> None:
+    """In 100 intervals of 1.5 vehicles 150 are due: 100 surely and 100 / 2 +- 5 by chance."""
+    rows = "".join(f"west1_A1,1.5,{36 * i},{36 * (i + 1)}\n" for i in range(100))
+    (tmp_path / "c.csv").write_text(f"edge,count,begin_s,end_s\n{rows}")
+    assert made(tmp_path / "city", "--counts", tmp_path / "c.csv") == 0
+    assert len(drives(tmp_path / "city")) == pytest.approx(150, abs=20)
+    fits = (tmp_path / "city" / "counts-fit.csv").read_text(encoding="utf-8-sig").splitlines()
+    column = fits[0].split(",").index("counted")
+    assert {line.split(",")[column] for line in fits[1:]} == {"1.5"}
+
+
 def test_counts_of_turns_in_parts_of_the_day(tmp_path: Path) -> None:
     (tmp_path / "c ü.csv").write_text(
         "from;to;count;begin_s;end_s\nwest1_A1;A1_B1;100;0;900\nwest1_A1;A1_northA;40;900;1800\n",

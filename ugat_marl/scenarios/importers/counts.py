@@ -168,7 +168,7 @@ def from_counts(path: Path, begin_s: float, length_s: float, seed: int) -> Vehic
             drives = walked(streets, _CANDIDATES_VPH, (1.0, 1.0, 1.0), 3600.0, seed)
             _require_reached(rows, drives, path)
             write_drives(work / "candidates.rou.xml", drives)
-            options = _counts_for_sumo(rows, work)
+            options = _counts_for_sumo(rows, work, seed)
             out = work / "sampled.rou.xml"
             begin, end = min(row.begin_s for row in rows), max(row.end_s for row in rows)
             convert(
@@ -214,8 +214,8 @@ def _require_reached(rows: Iterable[Row], drives: Sequence[Drive], path: Path) -
             )
 
 
-def _counts_for_sumo(rows: Sequence[Row], work: Path) -> list[str]:
-    """Write the counts in routeSampler's format and return its options."""
+def _counts_for_sumo(rows: Sequence[Row], work: Path, seed: int) -> list[str]:
+    """Write the counts in routeSampler's format, as whole vehicles, and return its options."""
     turns = any(len(row.roads) > 1 for row in rows)
     by_time: dict[tuple[float, float], list[Row]] = defaultdict(list)
     for row in rows:
@@ -224,7 +224,7 @@ def _counts_for_sumo(rows: Sequence[Row], work: Path) -> list[str]:
     for (begin, end), interval_rows in sorted(by_time.items()):
         interval = ET.SubElement(root, "interval", id="counts", begin=f"{begin}", end=f"{end}")
         for row in interval_rows:
-            count = f"{row.count:g}"
+            count = str(_whole(row, numpy_generator(seed, "counts", *row.roads, row.line)))
             first, last = row.roads[0], row.roads[-1]
             if turns:
                 ends = {"from": first, "to": last, "count": count}
@@ -347,11 +347,16 @@ def _outside(rows: Iterable[Row], path: Path, begin_s: float, end_s: float) -> I
         )
 
 
+def _whole(row: Row, random: np.random.Generator) -> int:
+    """Round a count up or down at random, so that its expectation is the count."""
+    return int(row.count) + int(random.random() < row.count % 1)
+
+
 def _trips(rows: Iterable[Row], seed: int) -> bytes:
     trips: list[tuple[float, str, tuple[str, ...]]] = []
     for row in rows:
         random = numpy_generator(seed, "od", *row.roads, row.line)
-        whole = int(row.count) + int(random.random() < row.count % 1)
+        whole = _whole(row, random)
         departs = np.sort(row.begin_s + random.random(whole) * (row.end_s - row.begin_s))
         name = "_".join(row.roads)
         trips += [(float(t), f"{name}_{row.line}.{i}", row.roads) for i, t in enumerate(departs)]
