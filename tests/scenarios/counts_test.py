@@ -100,6 +100,17 @@ def test_origins_and_destinations(tmp_path: Path) -> None:
             "edge,count,begin_s,end_s\nwest1_A1,5,9,9\n",
             "end_s (9) is not after begin_s",
         ),
+        (
+            "--counts",
+            "edge,count\nwest1_A1,5\nA1_B1,5\nwest1_A1,7\n",
+            "line 4: begin_s = 0 is before the end of an earlier interval of west1_A1, 3600 s "
+            "(line 2); write intervals that do not overlap",
+        ),
+        (
+            "--counts",
+            "from,to,count,begin_s,end_s\nwest1_A1,A1_B1,5,600,1200\nwest1_A1,A1_B1,5,0,900\n",
+            "line 2: begin_s = 600 is before the end of an earlier interval of west1_A1 -> A1_B1",
+        ),
         ("--od", "from,to,count\nA1_west1,west1_A1,5\n", "line 2: there is no way from 'A1_west1'"),
         ("--od", "from,to,count\nwest1_A1,up,5\n", "line 2: 'up' is not a road for cars"),
     ],

@@ -163,6 +163,7 @@ def from_counts(path: Path, begin_s: float, length_s: float, seed: int) -> Vehic
         root = parse_xml(read_bytes(network), str(network))
         streets = Streets.of(root)
         _require_roads(rows, streets, path, network)
+        _refuse_overlaps(rows, path)
         with tempfile.TemporaryDirectory(prefix="ugat_marl-") as name:
             work = Path(name)
             drives = walked(streets, _CANDIDATES_VPH, (1.0, 1.0, 1.0), 3600.0, seed)
@@ -200,6 +201,21 @@ def _require_roads(rows: Iterable[Row], streets: Streets, path: Path, network: P
                 raise ScenarioError(
                     f"{path}, line {row.line}: {road!r} is not a road for cars of {network}; {hint}"
                 )
+
+
+def _refuse_overlaps(rows: Iterable[Row], path: Path) -> None:
+    """Refuse counts that begin before an earlier one has ended: vehicles would count twice."""
+    latest: dict[tuple[str, ...], Row] = {}
+    for row in sorted(rows, key=lambda row: (row.begin_s, row.line)):
+        before = latest.get(row.roads)
+        if before and row.begin_s < before.end_s - 1e-3:  # files hold milliseconds
+            raise ScenarioError(
+                f"{path}, line {row.line}: begin_s = {row.begin_s:g} is before the end of an "
+                f"earlier interval of {' -> '.join(row.roads)}, {before.end_s:g} s (line "
+                f"{before.line}); write intervals that do not overlap, and no totals of several "
+                "of them"
+            )
+        latest[row.roads] = row
 
 
 def _require_reached(rows: Iterable[Row], drives: Sequence[Drive], path: Path) -> None:
