@@ -148,6 +148,17 @@ def test_long_tables_are_read_row_by_row(tmp_path: Path, monkeypatch: pytest.Mon
         read_rows(tmp_path / "t.csv", 0, 60, Silent(), pairs=False)
 
 
+def test_a_decimal_comma_is_a_point_between_semicolons(tmp_path: Path) -> None:
+    path = tmp_path / "t.csv"
+    path.write_text('edge;count;begin_s;end_s\na;30,5;0,5;60;\nb;2;"100";200\n')
+    rows = read_rows(path, 0, 660, Silent(), pairs=False)
+    assert [(r.count, r.begin_s, r.end_s) for r in rows] == [(30.5, 0.5, 60), (2, 100, 200)]
+    for text in ("edge;count\na;1,234,5\n", 'edge,count\na,"30,5"\n', "edge;count\na;1.234,5\n"):
+        path.write_text(text)
+        with pytest.raises(ScenarioError, match=r"line 2: count = .* is not a number"):
+            read_rows(path, 0, 660, Silent(), pairs=False)
+
+
 def test_rows_are_for_the_episode_unless_they_say_more(tmp_path: Path) -> None:
     (tmp_path / "t.csv").write_text("edge,count,begin_s,end_s\na,1,,\nb,2,100,200\n")
     rows = read_rows(tmp_path / "t.csv", 60, 660, Silent(), pairs=False)

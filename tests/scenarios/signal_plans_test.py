@@ -124,6 +124,8 @@ def test_a_table_comes_back(single: Scenario, tmp_path: Path) -> None:
     text = (tmp_path / "p.csv").read_text(encoding="utf-8-sig").replace(",", ";")
     (tmp_path / "q.csv").write_text(text)
     assert read_plans(tmp_path / "q.csv") == plans
+    (tmp_path / "q.csv").write_text(text.replace("12.5", "12,5"))
+    assert read_plans(tmp_path / "q.csv") == plans
     own = programme_plan(light, network)
     assert own.cycle_s == sum(seconds for seconds, _ in light.programme)
     again = with_plans(single, [own], "plans.csv")

@@ -3,16 +3,27 @@
 from __future__ import annotations
 
 import csv
+import re
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
 from ugat_marl.errors import ScenarioError
 
+_DECIMAL_COMMA = re.compile(r"\s*[+-]?\d*,\d+\s*", re.ASCII)
+
 
 def delimiter_of(text: str) -> str:
     """Return what separates cells: a semicolon if the first line has one, else a comma."""
     return ";" if ";" in text.partition("\n")[0] else ","
+
+
+def with_point(cell: str) -> str:
+    """Return the text of a cell, with a point if it is a number with a decimal comma.
+
+    No other cell holds a comma between digits: names in SUMO have none.
+    """
+    return cell.replace(",", ".") if _DECIMAL_COMMA.fullmatch(cell) else cell
 
 
 def columns_of(reader: csv.DictReader[str], path: Path) -> list[str]:
@@ -34,17 +45,22 @@ def columns_of(reader: csv.DictReader[str], path: Path) -> list[str]:
 def rows_of(reader: csv.DictReader[str], path: Path) -> Iterator[dict[str, str]]:
     """Return the rows, with `reader.line_num` as their line.
 
+    Numbers have points: where no comma separates the cells, it is the decimal point.
+
     Raises:
         ScenarioError: A row is not CSV, or holds more cells than there are columns.
     """
+    comma_is_point = reader.reader.dialect.delimiter != ","
     try:
         for row in reader:
-            cells: dict[str | None, Any] = {**row}
+            cells: dict[Any, Any] = {**row}
             if more := [text for text in cells.get(None) or () if text.strip()]:
                 raise ScenarioError(
                     f"{path}, line {reader.line_num}: {more[0]!r} is beyond the last column; a "
                     "decimal comma needs semicolons between the columns"
                 )
+            if comma_is_point:
+                row = {k: with_point(v) if isinstance(v, str) else v for k, v in cells.items()}
             yield row
     except csv.Error as error:
         raise ScenarioError(f"{path}, line {reader.line_num + 1}: not CSV ({error})") from None
