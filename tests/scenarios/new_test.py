@@ -250,6 +250,24 @@ def test_other_vehicles_for_a_configuration(
     assert scenario.settings.sumo == {"lateral-resolution": "0.8"}  # SUMO drives as it did
 
 
+@pytest.mark.parametrize(
+    ("words", "begin_s", "duration_s"),
+    [((), 60, 900), (("--begin-s", "0"), 0, 900), (("--duration-s", "600"), 60, 600)],
+)
+def test_other_vehicles_drive_at_the_times_of_the_configuration(
+    words: tuple[str, ...], begin_s: float, duration_s: float, files: Path, tmp_path: Path
+) -> None:
+    table = tmp_path / "od.csv"
+    table.write_text("from,to,count\nwest1_A1,A1_east1,200\n")
+    assert made(tmp_path / "a", "--sumo", files / "city.sumocfg", "--od", table, *words) == 0
+    scenario = read_scenario(tmp_path / "a")
+    assert (scenario.settings.begin_s, scenario.settings.duration_s) == (begin_s, duration_s)
+    departs = [float(v.get("depart", "")) for v in scenario.routes[0].parse().iter("vehicle")]
+    assert len(departs) == 200
+    assert begin_s <= min(departs) < begin_s + 60
+    assert begin_s + duration_s - 60 < max(departs) < begin_s + duration_s
+
+
 # --- bad input ------------------------------------------------------------------------------------
 
 

@@ -22,6 +22,7 @@ from ugat_marl.scenarios import (
     VehicleSource,
     arterial_roads,
     drawn_sources,
+    episode_of,
     from_cityflow,
     from_counts,
     from_od,
@@ -229,14 +230,17 @@ class ScenarioNew:
             )
         if self.routes:
             return from_routes(self.routes, link=self.link)
-        begin_s, length_s = self.begin_s or 0.0, self.duration_s or 3600.0
+        if not given:
+            return None
+        begin_s, length_s = episode_of(self.sumo)
+        begin_s = begin_s if self.begin_s is None else self.begin_s
+        length_s = self.duration_s or length_s
         if self.vph is not None:
             return from_turning_shares(self.vph, self.turns, begin_s, length_s, self.seed)
         if self.counts is not None:
             return from_counts(self.counts, begin_s, length_s, self.seed)
-        if self.od is not None:
-            return from_od(self.od, begin_s, length_s, self.seed)
-        return None
+        assert self.od is not None
+        return from_od(self.od, begin_s, length_s, self.seed)
 
     def _settings(self) -> Mapping[str, Any]:
         times = {"begin_s": self.begin_s, "duration_s": self.duration_s}

@@ -34,6 +34,7 @@ from .importers.plan import build_network as build_network
 from .importers.plan import grid_roads as grid_roads
 from .importers.plan import netconvert_documents as netconvert_documents
 from .importers.plan import read_road_plan as read_road_plan
+from .importers.sumo_files import episode_of as episode_of
 from .importers.sumo_files import from_routes as from_routes
 from .importers.sumo_files import from_sumo as from_sumo
 from .importers.turning_shares import from_turning_shares as from_turning_shares

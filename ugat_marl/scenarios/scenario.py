@@ -243,6 +243,17 @@ class SumoConfiguration:
         except ValueError:
             raise ScenarioError(f"{self.path}: {key} = {text!r} is not a time in seconds") from None
 
+    def times(self) -> tuple[float, float]:
+        """Return begin and duration of an episode, s; an hour if there is no end.
+
+        Raises:
+            ScenarioError: A time is none, or the end is not after the begin.
+        """
+        begin, end = self.seconds("begin", "0"), self.seconds("end", "-1")
+        if 0 <= end <= begin:
+            raise ScenarioError(f"{self.path}: end ({end:g} s) is not after begin ({begin:g} s)")
+        return begin, end - begin if end >= 0 else 3600.0
+
     def physics(self) -> dict[str, Any]:
         """Return the step length and the options of SUMO, as in ``scenario.toml``."""
         options = {option: self.given[option] for option in self.given if option in OPTIONS}
@@ -251,7 +262,6 @@ class SumoConfiguration:
 
 def _load_sumocfg(path: Path, scenario_id: str) -> Scenario:
     configuration = SumoConfiguration(path)
-    seconds = configuration.seconds
 
     def documents(key: str, kind: str = "") -> tuple[Document, ...]:
         names = configuration.names(key)
@@ -264,9 +274,7 @@ def _load_sumocfg(path: Path, scenario_id: str) -> Scenario:
                 )
         return tuple(admitted(Document(Path(name).name, path.parent / name)) for name in names)
 
-    begin, end = seconds("begin", "0"), seconds("end", "-1")
-    if 0 <= end <= begin:
-        raise ScenarioError(f"{path}: end ({end:g} s) is not after begin ({begin:g} s)")
+    begin_s, duration_s = configuration.times()
     network = documents("net-file", "a network")[0]
     routes, additional = documents("route-files", "vehicles"), documents("additional-files")
     settings = validate_settings(
@@ -275,8 +283,8 @@ def _load_sumocfg(path: Path, scenario_id: str) -> Scenario:
             "network": network.name,
             "routes": [document.name for document in routes],
             "additional": [document.name for document in additional],
-            "begin_s": begin,
-            "duration_s": end - begin if end >= 0 else 3600.0,
+            "begin_s": begin_s,
+            "duration_s": duration_s,
             **configuration.physics(),
         },
         str(path),

@@ -14,6 +14,7 @@ from ugat_marl.scenarios.demand import edges_used
 from ugat_marl.scenarios.importers.long_files import scan
 from ugat_marl.scenarios.importers.making import RoadFiles, RoadSource, VehicleFiles, VehicleSource
 from ugat_marl.scenarios.scenario import Document, SumoConfiguration, read_scenario
+from ugat_marl.scenarios.settings import ScenarioFile
 
 _CONFIGURATIONS = (".sumocfg", ".sumocfg.xml")
 
@@ -48,6 +49,17 @@ def from_sumo(path: Path, *, link: bool, own_vehicles: bool) -> RoadSource:
     return roads
 
 
+def episode_of(path: Path | None) -> tuple[float, float]:
+    """Return begin and duration of an episode, s: of a configuration, else 0 and an hour.
+
+    Raises:
+        ScenarioError: The configuration cannot be read, or has impossible times.
+    """
+    if path is not None and path.name.endswith(_CONFIGURATIONS):
+        return SumoConfiguration(path).times()
+    return 0.0, 3600.0
+
+
 def from_routes(paths: Sequence[Path], *, link: bool) -> VehicleSource:
     """Return a source of vehicles from the user's route files."""
 
@@ -74,17 +86,21 @@ def _configured(
         settings = scenario.settings.model_dump(mode="json", exclude_defaults=True)
     else:
         configuration = SumoConfiguration(path)
-        network, settings = _network_of(configuration), configuration.physics()
+        network = _network_of(configuration)
+        begin_s, duration_s = configuration.times()
+        settings = {"begin_s": begin_s, "duration_s": duration_s, **configuration.physics()}
         routes = additional = ()
         if left_out := configuration.names("additional-files"):
             reporter.say(
                 f"note: {path.name}: its vehicles are replaced, so its additional files are left "
                 f"out, too ({', '.join(left_out)}); add those without vehicles to scenario.toml"
             )
-        if settings["step_length_s"] == 1:
-            del settings["step_length_s"]
-    times = ("begin_s", "duration_s", "step_length_s", "sumo")
-    kept = {key: settings[key] for key in times if settings.get(key)}
+    usual = ScenarioFile.model_fields
+    kept = {
+        key: settings[key]
+        for key in ("begin_s", "duration_s", "step_length_s", "sumo")
+        if key in settings and settings[key] != usual[key].default
+    }
 
     def placed(documents: Sequence[Document]) -> tuple[str, ...]:
         return tuple(_put(document, folder, link) for document in documents)
