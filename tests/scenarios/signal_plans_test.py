@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 
@@ -259,6 +260,18 @@ def test_synchro_s_rings_and_barriers(single: Scenario, tmp_path: Path) -> None:
     planned = with_plans(single, [plan], "synchro.csv")
     assert green_at(planned, 25, "g") == {"EBL"}
     assert green_at(planned, 5, "G") == {"WBL", "EBL"}
+
+
+@pytest.mark.parametrize("case", [str, str.upper, str.lower])
+def test_synchro_s_file_from_a_spreadsheet(
+    case: Callable[[str], str], single: Scenario, tmp_path: Path
+) -> None:
+    """A spreadsheet may save it with semicolons and decimal commas, and people retype headings."""
+    network = Network.read(single)
+    wanted = read_utdf(synchro(tmp_path), network, {})
+    text = (tmp_path / "synchro.csv").read_text()
+    (tmp_path / "s.csv").write_text(case(text.replace(",", ";").replace(".", ",")))
+    assert read_utdf(tmp_path / "s.csv", network, {}) == wanted
 
 
 EMPTY = ",,,,,,,,"

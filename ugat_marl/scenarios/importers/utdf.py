@@ -16,6 +16,7 @@ from dataclasses import dataclass, field, replace
 from pathlib import Path
 
 from ugat_marl.errors import ScenarioError
+from ugat_marl.scenarios.csv_tables import delimiter_of, with_point
 from ugat_marl.scenarios.network import Intersection, Network
 from ugat_marl.scenarios.settings import parse_decimal
 from ugat_marl.scenarios.signal_plans import (
@@ -27,7 +28,7 @@ from ugat_marl.scenarios.signal_plans import (
     text_of_table,
 )
 
-_SECTIONS = ("Lanes", "Timeplans", "Phases")
+_SECTIONS = ("lanes", "timeplans", "phases")
 _PHASE_RECORDS = tuple(f"{kind}{n}" for kind in ("Phase", "PermPhase") for n in (1, 2, 3, 4))
 _JOINED = {"R": "TL", "L": "TR", "T": "LR", "U": "LTR"}
 """Turn without a phase of its own to the turns of its approach whose phases it uses."""
@@ -86,21 +87,27 @@ def read_utdf(
 def _nodes(path: Path) -> dict[str, _Node]:
     nodes: dict[str, _Node] = defaultdict(_Node)
     section, columns = "", list[str]()
-    reader = csv.reader(io.StringIO(text_of_table(path), newline=""))
+    text = text_of_table(path)
+    lines = text.splitlines()
+    heads = (line for line in lines if line.strip(' "').upper().startswith("RECORDNAME"))
+    delimiter = delimiter_of(next(heads, ""))
+    reader = csv.reader(io.StringIO(text, newline=""), delimiter=delimiter)
     try:
         for row in reader:
             cells = [cell.strip() for cell in row]
+            if delimiter != ",":
+                cells = [with_point(cell) for cell in cells]
             if not any(cells):
                 continue
             if cells[0].startswith("["):
-                section, columns = cells[0].strip("[]"), []
+                section, columns = cells[0].strip("[]").lower(), []
             elif cells[0].upper() == "RECORDNAME":
                 columns = [cell.upper() for cell in cells]
             elif section in _SECTIONS and columns:
                 values = dict(zip(columns, ((c, reader.line_num) for c in cells), strict=False))
                 name = values.get("INTID", ("", 0))[0]
                 node = nodes[name]
-                records = {"Lanes": node.lanes, "Timeplans": node.timing, "Phases": node.phases}
+                records = {"lanes": node.lanes, "timeplans": node.timing, "phases": node.phases}
                 records[section][cells[0].lower()] = values
     except csv.Error as error:
         raise ScenarioError(f"{path}, line {reader.line_num + 1}: not CSV ({error})") from None
