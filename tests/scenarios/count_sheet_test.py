@@ -158,6 +158,20 @@ def test_filled_sheets_are_never_lost(draft: Path, capsys: pytest.CaptureFixture
     assert "would be lost" in capsys.readouterr().err
 
 
+@pytest.mark.parametrize("head", ["sep=,\n", " ", "my "])
+def test_sheets_with_another_head_are_never_lost(
+    head: str, draft: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    sheet = draft / "counts.csv"
+    fill_in(sheet)
+    text = sheet.read_text(encoding="utf-8-sig")
+    sheet.write_text(
+        head + text if head.startswith("sep") else text.replace("count", f"{head}count")
+    )
+    assert made(draft, "--force") == 2
+    assert f"{sheet} would be lost" in capsys.readouterr().err
+
+
 def test_a_draft_replaces_a_scenario_if_asked(
     draft: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:

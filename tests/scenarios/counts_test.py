@@ -85,6 +85,7 @@ def test_origins_and_destinations(tmp_path: Path) -> None:
         ("--counts", "edge,count\nwest1_A1,6e6\n", "line 2: more than 5000000 vehicles; keep"),
         ("--od", "from,to,count\nwest1_A1,B1_east1,1e18\n", "line 2: more than 5000000 veh"),
         ("--od", "edge,count\na,1\n", "t.csv, line 1: the columns from, to and count are needed"),
+        ("--counts", "sep=;\nedge;count\nwest1_A1;5\n", "line 1: 'sep=' is for a spreadsheet; del"),
         ("--counts", "edge,count\nwest1_A1,many\n", "line 2: count = 'many' is not a number"),
         ("--counts", "edge,count\nwest1_A1,-1\n", "line 2: count = '-1' is not a number of at"),
         ("--counts", "edge,count\nwest1_A1,1_000\n", "line 2: count = '1_000' is not a number"),
@@ -157,6 +158,22 @@ def test_a_decimal_comma_is_a_point_between_semicolons(tmp_path: Path) -> None:
         path.write_text(text)
         with pytest.raises(ScenarioError, match=r"line 2: count = .* is not a number"):
             read_rows(path, 0, 660, Silent(), pairs=False)
+
+
+@pytest.mark.parametrize(
+    "text",
+    [
+        'edge,count,"begin; in s"\na,5,x\n',
+        "edge\tcount\tend_s\na\t5\t60,5\n",
+        'edge;count;"x,y,z,u,v"\na;5;x\n',
+        "edge;count;begin_s;end_s\na;5; ;  \n",
+    ],
+)
+def test_what_separates_cells_is_counted_outside_of_quotes(text: str, tmp_path: Path) -> None:
+    (tmp_path / "t.csv").write_text(text)
+    (row,) = read_rows(tmp_path / "t.csv", 0, 660, Silent(), pairs=False)
+    assert (row.roads, row.count, row.begin_s) == (("a",), 5, 0)
+    assert row.end_s == (60.5 if "\t" in text else 660)
 
 
 def test_rows_are_for_the_episode_unless_they_say_more(tmp_path: Path) -> None:

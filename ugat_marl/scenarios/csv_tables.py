@@ -10,12 +10,15 @@ from typing import Any
 
 from ugat_marl.errors import ScenarioError
 
+_QUOTED = re.compile(r'"[^"]*"')
 _DECIMAL_COMMA = re.compile(r"\s*[+-]?\d*,\d+\s*", re.ASCII)
 
 
 def delimiter_of(text: str) -> str:
-    """Return what separates cells: a semicolon if the first line has one, else a comma."""
-    return ";" if ";" in text.partition("\n")[0] else ","
+    """Return what separates cells: what the first line has most of outside of quotes."""
+    head = _QUOTED.sub("", text.partition("\n")[0])
+    most = max(";\t,", key=head.count)
+    return most if most in head else ","
 
 
 def with_point(cell: str) -> str:
@@ -30,12 +33,17 @@ def columns_of(reader: csv.DictReader[str], path: Path) -> list[str]:
     """Read the first line; return the names without blanks, which then name the cells of rows.
 
     Raises:
-        ScenarioError: It is not CSV, or holds a name twice.
+        ScenarioError: It is not CSV, tells a spreadsheet its separator, or holds a name twice.
     """
     try:
         columns = [name.strip() for name in reader.fieldnames or ()]
     except csv.Error as error:
         raise ScenarioError(f"{path}, line 1: not CSV ({error})") from None
+    if columns and columns[0].startswith("sep="):
+        raise ScenarioError(
+            f"{path}, line 1: {columns[0]!r} is for a spreadsheet; delete this line, so that the "
+            "file begins with the names of its columns"
+        )
     if twice := [name for name in dict.fromkeys(columns) if name and columns.count(name) > 1]:
         raise ScenarioError(f"{path}, line 1: the column {twice[0]} is there twice; keep one")
     reader.fieldnames = columns

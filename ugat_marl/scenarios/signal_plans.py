@@ -409,8 +409,9 @@ def write_plans(path: Path, plans: Iterable[SignalPlan], network: Network) -> No
 
 
 def read_plans(path: Path) -> tuple[SignalPlan, ...]:
-    """Read plans from a CSV table with the columns `COLUMNS`, separated by commas or semicolons.
+    """Read plans from a CSV table with the columns `COLUMNS`.
 
+    Commas, semicolons or tabs separate the columns.
     ``intersection`` and ``phase`` are for the reader alone and may be missing, as may ``ring`` and
     ``barrier`` (1).
 
@@ -490,7 +491,7 @@ def _seconds(row: Mapping[str, str | None], key: str, where: str) -> float:
 
 
 def _whole(row: Mapping[str, str | None], key: str, where: str) -> int:
-    text = (row.get(key) or "1").strip()
+    text = (row.get(key) or "").strip() or "1"
     if not (text.isascii() and text.isdigit() and 1 <= int(text[:3]) <= 99 and len(text) < 3):
         raise ScenarioError(f"{where}: {key} = {text!r} is not a number of 1 to 99")
     return int(text)

@@ -14,8 +14,9 @@ from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
+from ugat_marl.errors import ScenarioError
 from ugat_marl.files import write_whole
-from ugat_marl.scenarios.csv_tables import delimiter_of
+from ugat_marl.scenarios.csv_tables import columns_of, delimiter_of
 from ugat_marl.scenarios.junctions import Link, links_of
 from ugat_marl.scenarios.network import lanes_of, streets_of
 from ugat_marl.scenarios.street_names import NamedTurn, intersection_name, named_turns
@@ -108,12 +109,14 @@ def write_template(path: Path, root: ET.Element) -> int:
 
 
 def is_filled(path: Path) -> bool:
-    """Return False if no count of a sheet has been filled in; True if it cannot be read."""
+    """Return False if no count of a sheet has been filled in; True if it is no such sheet."""
     try:
         text = path.read_text(encoding="utf-8-sig")
         reader = csv.DictReader(io.StringIO(text), delimiter=delimiter_of(text))
+        if "count" not in columns_of(reader, path):
+            return True
         return any((row.get("count") or "").strip() for row in reader)
-    except (OSError, ValueError, csv.Error):
+    except (OSError, ValueError, csv.Error, ScenarioError):
         return True
 
 

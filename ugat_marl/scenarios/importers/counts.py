@@ -114,8 +114,8 @@ def read_rows(
         row = Row(
             roads,
             count,
-            _number(values.get("begin_s") or f"{begin_s}", "begin_s", where),
-            _number(values.get("end_s") or f"{end_s}", "end_s", where),
+            _number((values.get("begin_s") or "").strip() or f"{begin_s}", "begin_s", where),
+            _number((values.get("end_s") or "").strip() or f"{end_s}", "end_s", where),
             reader.line_num,
         )
         if row.end_s <= row.begin_s:

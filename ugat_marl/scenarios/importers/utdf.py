@@ -48,7 +48,7 @@ class _Node:
 
 def is_utdf(path: Path) -> bool:
     """Return True if a table has the sections of UTDF."""
-    return any(line.strip(' ,;"').startswith("[") for line in text_of_table(path).splitlines())
+    return any(line.strip(' ,;\t"').startswith("[") for line in text_of_table(path).splitlines())
 
 
 def read_utdf(
