@@ -21,6 +21,7 @@ from ugat_marl.scenarios import (
     Scenario,
     SignalPlan,
     movement_codes,
+    programme_notes,
     programme_plan,
     read_plans,
     read_scenario,
@@ -162,6 +163,34 @@ def test_the_offset_of_a_programme_comes_back(
     assert (plan.cycle_s, plan.offset_s) == (90, expected_s)
     (light,) = Network.read(with_plans(changed, [plan], "p.csv")).intersections
     assert light.offset_s == expected_s
+
+
+def test_a_plan_that_differs_from_its_programme_is_noted() -> None:
+    """In the programmes of Q, T and V some right turns are yellow between two of their greens."""
+    mixed = load_scenario("mixed-v1")
+    network = Network.read(mixed)
+    plans = [programme_plan(light, network) for light in network.intersections]
+    (note,) = programme_notes(mixed, plans, "p.csv")
+    assert "than the programme at Q (EBR), T (WBR), V (WBR): in a plan" in note
+    short = replace(plans[0], phases=plans[0].phases[1:])
+    (note,) = programme_notes(mixed, [short], "p.csv")
+    assert note.startswith("--apply would refuse this plan, so change it first: p.csv: light 'P'")
+
+
+@pytest.mark.parametrize("later_s", [0.0, 37.0])
+def test_a_plan_that_is_its_programme_needs_no_note(later_s: float) -> None:
+    grid = load_scenario("grid2x2-v1")
+    root = grid.network.parse()
+    for logic in root.iter("tlLogic"):
+        logic.set("offset", str(later_s))
+        first = logic[0]  # the cycle then begins with the yellow after this green
+        logic.remove(first)
+        logic.append(first)
+    moved = replace(grid, network=Document(grid.network.name, None, xml_bytes(root)))
+    network = Network.read(moved)
+    plans = [programme_plan(light, network) for light in network.intersections]
+    assert all(plan.offset_s != later_s for plan in plans)
+    assert programme_notes(moved, plans, "p.csv") == []
 
 
 HEAD = "light,cycle_s,offset_s,ring,barrier,movements,split_s,yellow_s,all_red_s\n"

@@ -26,6 +26,7 @@ from ugat_marl.scenarios import (
     SignalPlan,
     is_utdf,
     new_folder,
+    programme_notes,
     read_plans,
     read_utdf,
     with_plans,
@@ -104,10 +105,14 @@ class Plan:
             range(self.first_seed, self.first_seed + self.seeds),
             Bars(console),
         )
-        network = Network.read(scenario_in_domain(scenario, self.domain))
+        played = scenario_in_domain(scenario, self.domain)
+        network = Network.read(played)
         write_plans(self.out, plans, network)
         console.print(plan_table(plans, LightNames.of(network)))
         out, name = shlex.quote(str(self.out)), shlex.quote(self.scenario)
+        if self.policy in (None, "programme"):
+            for note in programme_notes(played, plans, str(self.out)):
+                console.print(f"note: {note}", markup=False, soft_wrap=True)
         console.print(f"plans: {out}", markup=False, soft_wrap=True)
         console.print(
             f"next: ugat-marl plan {name} --apply {out} --out NEW, then ugat-marl evaluate NEW "

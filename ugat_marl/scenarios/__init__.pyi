@@ -100,6 +100,7 @@ from .settings import validate_settings as validate_settings
 from .signal_plans import PlanPhase as PlanPhase
 from .signal_plans import SignalPlan as SignalPlan
 from .signal_plans import movement_codes as movement_codes
+from .signal_plans import programme_notes as programme_notes
 from .signal_plans import programme_plan as programme_plan
 from .signal_plans import read_plans as read_plans
 from .signal_plans import with_plans as with_plans

@@ -15,7 +15,7 @@ import xml.etree.ElementTree as ET
 from collections import defaultdict
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
-from itertools import combinations, pairwise
+from itertools import accumulate, combinations, pairwise
 from pathlib import Path
 
 from ugat_marl.errors import ScenarioError, nearest
@@ -312,9 +312,7 @@ def with_plans(scenario: Scenario, plans: Iterable[SignalPlan], source: str) -> 
     Raises:
         ScenarioError: A plan is impossible, or names a light that is no agent.
     """
-    network = Network.read(scenario)
-    root = scenario.network.parse()
-    rules = RightOfWay(foes_of(root), yields_of(root), right_on_red_of(root))
+    network, rules = Network.read(scenario), _rules(scenario)
     lights = {light.id: light for light in network.intersections}
     top, planned = ET.Element("additional"), set[str]()
     for plan in plans:
@@ -382,6 +380,78 @@ def programme_plan(light: Intersection, network: Network) -> SignalPlan:
     begins_s = sum(seconds for seconds, _ in states[:first])
     cycle_s = sum(phase.split_s for phase in phases)
     return SignalPlan(light.id, cycle_s, (light.offset_s + begins_s) % cycle_s, tuple(phases))
+
+
+def programme_notes(scenario: Scenario, plans: Iterable[SignalPlan], source: str) -> list[str]:
+    """Return notes on plans of `programme_plan` that show other states than their programmes.
+
+    A plan says less than a programme: movements of a phase turn yellow together, and one of two
+    phases in turn stays green between them.
+
+    Args:
+        scenario: The scenario with the programmes.
+        plans: The plans, at most one for each light.
+        source: Name of their table.
+    """
+    network, rules = Network.read(scenario), _rules(scenario)
+    notes: list[str] = []
+    differing: list[str] = []
+    for plan in plans:
+        light = network.intersection(plan.light)
+        try:
+            check_plan(plan, source)
+            states = plan_states(plan, light, network, rules, source)
+        except ScenarioError as error:
+            notes.append(f"--apply would refuse this plan, so change it first: {error}")
+            continue
+        if others := _shown_otherwise(plan, states, light, movement_codes(light, network)):
+            differing.append(f"{plan.light} ({' '.join(others)})")
+    if differing:
+        notes.append(
+            f"the plan shows other green or yellow than the programme at {', '.join(differing)}: "
+            "in a plan all movements of a phase end together, and a movement of two phases in turn "
+            "stays green between them"
+        )
+    return notes
+
+
+def _rules(scenario: Scenario) -> RightOfWay:
+    root = scenario.network.parse()
+    return RightOfWay(foes_of(root), yields_of(root), right_on_red_of(root))
+
+
+_States = Sequence[tuple[float, str]]
+
+
+def _shown_otherwise(
+    plan: SignalPlan, states: _States, light: Intersection, codes: Mapping[Link, str]
+) -> list[str]:
+    """Return the movements whose green or yellow differs between a plan and the programme."""
+    cycle_s, later_s = plan.cycle_s, plan.offset_s - light.offset_s
+    times = {0.0, *accumulate(seconds for seconds, _ in states)}
+    times |= {(end - later_s) % cycle_s for end in accumulate(s for s, _ in light.programme)}
+    others: set[str] = set()
+    for begin, end in pairwise(sorted(times)):
+        if end - begin > _SAME_S:
+            middle = (begin + end) / 2
+            planned = _state_at(states, middle)
+            own = _state_at(light.programme, (middle + later_s) % cycle_s)
+            others |= {
+                code
+                for link, code in codes.items()
+                if any(
+                    (planned[link.index] in x) != (own[link.index] in x) for x in (GREEN, YELLOW)
+                )
+            }
+    return sorted(others)
+
+
+def _state_at(states: _States, time_s: float) -> str:
+    for seconds, state in states:
+        if time_s < seconds:
+            return state
+        time_s -= seconds
+    return states[-1][1]
 
 
 # --- tables ---------------------------------------------------------------------------------------
