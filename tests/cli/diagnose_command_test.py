@@ -542,7 +542,7 @@ def test_counts_alone_are_announced_before_anything_runs(
     (measured / DETECTIONS).unlink()
     assert main(street.arguments(tmp_path / "out", measured=measured)) == 0
     text = " ".join(capsys.readouterr().out.split())
-    assert text.startswith("Counts only: no more than demand_level, demand_surge,")
+    assert text.startswith("No single vehicles are seen: no more than demand_level, demand_surge,")
     assert "Ruled out: acceleration," in text
 
 

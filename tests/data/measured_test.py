@@ -146,6 +146,10 @@ def test_what_is_read_is_what_was_written(
     np.testing.assert_array_equal(one.off_s, other.off_s)
     np.testing.assert_array_equal(one.speed_mps, other.speed_mps)
     np.testing.assert_array_equal(one.length_m, other.length_m)
+    renamed = replace(before, lanes=lanes.with_columns(lane_id=pl.lit("S_C_7")))
+    write_measured(renamed, tmp_path / "wrong", csv=csv)
+    with pytest.raises(MeasuredDataError, match=r"lanes\..*'S_C_7', .* did you mean 'S_C_0'"):
+        read_measured(tmp_path / "wrong", crossing_scenario, network)
     assert after.lanes is not None and after.lanes["mean_speed_mps"].to_list() == [None, 3.5]
     assert [finding.text.split(" (")[0] for finding in after.findings] == [
         "periods.csv: 3 periods"  # of 200 s

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 import shutil
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any
 
@@ -314,3 +314,16 @@ def test_a_foreign_directory_is_refused_before_anything_is_measured(
         assert main(["record", *wrong, "--out", str(tmp_path / "new")]) == 2
         assert not (tmp_path / "new").exists()
     assert [path.name for path in tmp_path.iterdir()] == ["thesis.tex"]
+
+
+@pytest.mark.parametrize(
+    ("options", "says"),
+    [
+        ({"periods": 0}, "periods = 0: must be at least 1$"),
+        ({"workers": 0}, "workers = 0: must be at least 1, or None"),
+        ({"duration_s": 9000.0}, "duration_s = 9000: scenario 'single-v1' lasts 3600 s"),
+    ],
+)
+def test_impossible_days_are_refused(options: Mapping[str, Any], says: str) -> None:
+    with pytest.raises(OptionError, match=says):
+        record(load_scenario("single-v1"), "sim", policy_factory("fixed-time"), **options)

@@ -181,7 +181,10 @@ def _say_what_cannot_be_seen(measured: MeasuredData, console: Console) -> None:
     listed = ", ".join(sorted(ruled_out))
     if not measured.has_events:
         rest = ", ".join(sorted(set(known_effects()) - ruled_out))
-        text = f"Counts only: no more than {rest} can be examined. Ruled out: {listed}."
+        text = (
+            f"No single vehicles are seen: no more than {rest} can be examined. "
+            f"Ruled out: {listed}."
+        )
     else:
         text = f"Ruled out by what the data lack: {listed}."
     console.print(text, markup=False)

@@ -94,6 +94,8 @@ def read_measured(directory: Path, scenario: Scenario, network: Network) -> Meas
         )
         usable = tuple(detector for detector in detectors if detector.id not in broken)
     lanes = _of_moments(files, tables.LANES, periods)
+    for name in () if lanes is None else lanes["lane_id"].unique(maintain_order=True):
+        _lane_of(f"{files.path(tables.LANES)}: a row", name, network)
     trajectories = _of_moments(files, tables.TRAJECTORIES, periods)
     if trajectories is not None and files.seen_on_tracks:
         path = files.path(tables.TRAJECTORIES)
@@ -396,18 +398,20 @@ def _refuse_impossible_detectors(path: Path, frame: pl.DataFrame) -> None:
         )
 
 
+def _lane_of(where: str, name: str, network: Network) -> Lane:
+    lane = network.lanes.get(name)
+    if lane is None:
+        near = nearest(name, network.lanes)
+        raise MeasuredDataError(
+            f"{where} lies on lane {name!r}, which the network does not have"
+            + (f"; did you mean {near!r}?" if near else "; lanes are called <edge>_<number>")
+        )
+    return lane
+
+
 def _lanes_of(where: str, names: Sequence[str], network: Network) -> list[Lane]:
     """Return the lanes of a zone; refuse unknown ones, and lanes of several roads."""
-    lanes: list[Lane] = []
-    for name in names:
-        lane = network.lanes.get(name)
-        if lane is None:
-            near = nearest(name, network.lanes)
-            raise MeasuredDataError(
-                f"{where} lies on lane {name!r}, which the network does not have"
-                + (f"; did you mean {near!r}?" if near else "; lanes are called <edge>_<number>")
-            )
-        lanes.append(lane)
+    lanes = [_lane_of(where, name, network) for name in names]
     if not names:
         raise MeasuredDataError(f"{where} lies on no lane; lane_id is <edge>_<number>")
     if len(set(names)) < len(names) or len({lane.edge for lane in lanes}) > 1:

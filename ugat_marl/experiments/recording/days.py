@@ -156,8 +156,15 @@ def record(
         ScenarioError: The scenario cannot be simulated.
         SimulatorError: SUMO failed.
     """
-    if periods < 1 or (workers is not None and workers < 1):
-        raise OptionError(f"periods = {periods} and workers = {workers} must be at least 1")
+    if periods < 1:
+        raise OptionError(f"periods = {periods}: must be at least 1")
+    if workers is not None and workers < 1:
+        raise OptionError(f"workers = {workers}: must be at least 1, or None")
+    if duration_s is not None and duration_s > scenario.settings.duration_s:
+        raise OptionError(
+            f"duration_s = {duration_s:g}: scenario {scenario.id!r} lasts "
+            f"{scenario.settings.duration_s:g} s, and data of longer days would not fit it"
+        )
     if seed < 0 or not 0 <= detector_length_m < math.inf:
         raise OptionError(
             f"detector_length_m = {detector_length_m:g} and seed = {seed} must be 0 or more"
