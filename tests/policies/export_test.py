@@ -268,6 +268,8 @@ def test_damaged_files_are_refused(tmp_path: Path) -> None:
     refused("another model", about=about.replace("exported_policy", "network_policy"))
     for text in ("", "[]", "{", about.replace('"sha256"', '"sum"'), about[: len(about) // 2]):
         refused("export it again", about=text)
+    for sums in ('"0f"', "3", "null"):  # before each format had a sum of its own, it was text
+        refused("export it again", about=re.sub(r'"sha256": \{[^}]*\}', f'"sha256": {sums}', about))
     refused("inputs|outputs|agents", about=about.replace('"a_1",', ""))
     for name in ('"universal"', '"frap"', "null", "[]"):
         refused("export it again", about=about.replace('"mlp"', name))

@@ -174,7 +174,7 @@ class NumpyPolicy:
         try:
             about = read_json(path.with_suffix(".json"), CheckpointError)
             model = path.read_bytes()
-            if about["kind"] != _KIND or about["sha256"].get(path.suffix) != _sum(model):
+            if about["kind"] != _KIND or dict(about["sha256"]).get(path.suffix) != _sum(model):
                 raise ValueError("the JSON file beside it belongs to another model")
             with zipfile.ZipFile(io.BytesIO(model)) as archive:
                 require_stored(archive)

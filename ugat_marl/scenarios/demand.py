@@ -142,11 +142,9 @@ def _depart_s(tag: Tag, document: Document, begin_s: float, triggered_s: float) 
 
     A flow without a begin starts with the simulation, at `begin_s`.
     """
-    if tag.name == "flow":
-        text = tag.attributes.get("begin")
-        return begin_s if text is None else _seconds(text, "begin", tag, document)
-    text = tag.attributes.get("depart", "")
-    return triggered_s if text in _NO_TIME else _seconds(text, "depart", tag, document)
+    key, default = ("begin", repr(begin_s)) if tag.name == "flow" else ("depart", "")
+    text = tag.attributes.get(key, default)
+    return triggered_s if text in _NO_TIME else _seconds(text, key, tag, document)
 
 
 def _end_s(tag: Tag, document: Document) -> float:
