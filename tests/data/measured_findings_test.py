@@ -622,6 +622,31 @@ def test_wrong_counts_are_refused(
         read_measured(directory, scenario, network)
 
 
+def test_intervals_outside_of_a_shortened_period_are_left_out(
+    tmp_path: Path, scenario: Scenario, network: Network
+) -> None:
+    directory = counted(tmp_path)
+    periods = pl.read_csv(directory / "periods.csv")
+    length = 4500.0
+    periods = periods.with_columns(end_s=pl.col("begin_s") + length)
+    periods.write_csv(directory / "periods.csv")
+    counts().write_csv(directory / "counts.csv")
+    read = read_measured(directory, scenario, network)
+    assert read.counts is not None
+    assert read.counts["end_s"].max() == length
+    assert any("rows lie outside of their periods" in finding.text for finding in read.findings)
+
+
+def test_an_interval_partly_in_its_period_is_refused_with_the_way_out(
+    tmp_path: Path, scenario: Scenario, network: Network
+) -> None:
+    directory = counted(tmp_path)
+    periods = pl.read_csv(directory / "periods.csv")
+    periods.with_columns(end_s=pl.col("begin_s") + 4000.0).write_csv(directory / "periods.csv")
+    with pytest.raises(MeasuredDataError, match=r"begin and end the period in periods\.csv"):
+        read_measured(directory, scenario, network)
+
+
 def test_a_day_without_counts_is_no_day_without_vehicles(
     tmp_path: Path, scenario: Scenario, network: Network
 ) -> None:

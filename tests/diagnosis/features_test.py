@@ -34,17 +34,16 @@ def a_layout(kinds: Sequence[DetectorKind] = ("advance", "stop"), lanes: int = 1
     """Lanes of one approach side by side, all under the first letter of the light, and one exit."""
     inner = tuple(
         IncomingLane(
-            f"in_{i}", "in", 0, (0,), LIMIT_MPS, {kind: (f"{kind}:in_{i}",) for kind in kinds}
+            f"in_{i}", "in", 0, (0,), LIMIT_MPS, {kind: f"{kind}:in_{i}" for kind in kinds}
         )
         for i in range(lanes)
     )
     detectors = [
         Detector(name, lane.id, 90.0, 0.0, kind)
         for lane in inner
-        for kind, names in lane.detectors.items()
-        for name in names
+        for kind, name in lane.detectors.items()
     ]
-    exits = ((0, "out_0", ("exit:out_0",)),)
+    exits = ((0, "out_0", "exit:out_0"),)
     detectors.append(Detector("exit:out_0", "out_0", 10.0, 0.0, "exit"))
     owner = {item.id: "C" for item in detectors}
     return DetectorLayout(("C",), inner, exits, tuple(detectors), owner)
@@ -289,17 +288,6 @@ def test_a_detector_that_saw_nothing_counted_nothing() -> None:
         assert of(found, name, place) == (0, 2)
     assert of(found, "occupied_in_red") == (0, 44)
     assert of(found, "lost") == (0, 0)
-
-
-def test_two_detectors_of_a_kind_count_a_vehicle_once() -> None:
-    layout = a_layout()
-    lane = IncomingLane("in_0", "in", 0, (0,), LIMIT_MPS, {"stop": ("stop:in_0", "stop:b")})
-    double = DetectorLayout(
-        layout.intersections, (lane,), layout.exits, layout.detectors, layout.owner
-    )
-    both = {"stop:in_0": passages(ON, OFF), "stop:b": passages(ON, OFF)}
-    assert of(counted(both, double), "count_stop") == (7, 2)
-    assert of(counted({"stop:b": passages(ON, OFF)}, double), "count_stop") == (7, 2)
 
 
 def test_without_speeds_only_the_features_of_speed_are_empty() -> None:

@@ -14,7 +14,7 @@ DETECTORS = (
     Detector("far", "in_0", 100.0, 0.0, "advance"),
     Detector("line", "in_0", 128.0, 0.0, "stop"),
 )
-LANE = IncomingLane("in_0", "in", 0, (0,), 14.0, {"advance": ("far",), "stop": ("line",)})
+LANE = IncomingLane("in_0", "in", 0, (0,), 14.0, {"advance": "far", "stop": "line"})
 LAYOUT = DetectorLayout(("A",), (LANE,), (), DETECTORS, {})
 GREENS = Greens(
     np.array([30.0, 90.0]),

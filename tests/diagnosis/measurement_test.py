@@ -35,9 +35,7 @@ DETECTORS = (
     Detector("line left", "in_1", 150.0, 0.0, "stop"),
 )
 LANES = tuple(
-    IncomingLane(
-        f"in_{n}", "in", 0, (n,), 14.0, {"advance": (f"far{name}",), "stop": (f"line{name}",)}
-    )
+    IncomingLane(f"in_{n}", "in", 0, (n,), 14.0, {"advance": f"far{name}", "stop": f"line{name}"})
     for n, name in enumerate(("", " left"))
 )
 LAYOUT = DetectorLayout(("A",), LANES, (), DETECTORS, {})

@@ -33,7 +33,7 @@ LAYOUT = DetectorLayout(
     tuple(
         IncomingLane(
             lane, lane[:-2], 0, (n,), 14.0,
-            {"advance": (f"advance:{lane}",), "stop": (f"stop:{lane}",)},
+            {"advance": f"advance:{lane}", "stop": f"stop:{lane}"},
             directions=frozenset(move),
         )
         for n, (lane, move) in enumerate(MOVES.items())

@@ -44,11 +44,11 @@ def a_layout() -> DetectorLayout:
     kinds: tuple[DetectorKind, ...] = ("advance", "stop")
     lanes = tuple(
         IncomingLane(
-            f"{arm}_in_0", f"{arm}_in", 0, (index,), 14.0, {k: (f"{k}:{arm}",) for k in kinds}
+            f"{arm}_in_0", f"{arm}_in", 0, (index,), 14.0, {k: f"{k}:{arm}" for k in kinds}
         )
         for index, arm in enumerate(ARMS)
     )
-    exits = tuple((0, f"{arm}_out_0", (f"exit:{arm}",)) for arm in ARMS)
+    exits = tuple((0, f"{arm}_out_0", f"exit:{arm}") for arm in ARMS)
     detectors = [Detector(f"{k}:{arm}", f"{arm}_in_0", 1.0, 0.0, k) for arm in ARMS for k in kinds]
     detectors += [Detector(f"exit:{arm}", f"{arm}_out_0", 1.0, 0.0, "exit") for arm in ARMS]
     return DetectorLayout(

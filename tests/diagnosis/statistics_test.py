@@ -147,7 +147,7 @@ def test_lanes_pool_by_adding() -> None:
 def test_intersections_pool_only_where_there_are_several() -> None:
     def layout(lights: int) -> DetectorLayout:
         lanes = tuple(IncomingLane(f"in{i}_0", f"in{i}", i, (0,), 10.0, {}) for i in range(lights))
-        exits = ((0, "out_0", ("x",)),)
+        exits = ((0, "out_0", "x"),)
         return DetectorLayout(tuple(f"C{i}" for i in range(lights)), lanes, exits, (), {})
 
     assert set(Pools.of(layout(1), THRESHOLDS).blocks) == {"network", "lane"}

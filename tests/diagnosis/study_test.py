@@ -19,7 +19,7 @@ from ugat_marl.diagnosis import study as module
 from ugat_marl.diagnosis.engine import Engine
 from ugat_marl.diagnosis.features import BIN_FEATURES, FEATURES, INDEX
 from ugat_marl.diagnosis.statistics import Pools
-from ugat_marl.diagnosis.study import day_to_day_variation, effort_for, heard
+from ugat_marl.diagnosis.study import day_to_day_variation, doubled, effort_for, heard, one_of_each
 from ugat_marl.diagnosis.thresholds import Effort, Thresholds
 from ugat_marl.effects import Effect, Headway
 from ugat_marl.errors import MeasuredDataError
@@ -82,6 +82,29 @@ def test_counts_in_intervals_say_nothing_of_silence() -> None:
     counts = pl.DataFrame({"period_id": ["day0"], "detector_id": ["one"], "count": [3]})
     data = MeasuredData(DETECTORS, (Period("day0", 0.0, 100.0, "fit", {}, {}),), counts=counts)
     assert names(heard(data)) == NAMES
+
+
+def test_of_two_detectors_of_a_kind_on_a_lane_one_is_compared() -> None:
+    detectors = (
+        *(Detector(name, "in_0", 180.0, 0.0, "stop") for name in ("one", "two")),
+        Detector("three", "in_0", 90.0, 0.0, "advance"),
+        Detector("four", "in_1", 180.0, 0.0, "stop"),
+    )
+    both = replace(measured(NAMES), detectors=detectors)
+    assert names(one_of_each(both, detectors)) == ("one", "three", "four")
+    (finding,) = doubled(both, one_of_each(both, detectors))
+    assert "'two' is not compared; lane 'in_0' has 'one' as stop detector" in finding.text
+    oftener = replace(measured(("two",), NAMES), detectors=detectors)
+    assert names(one_of_each(oftener, detectors)) == ("two", "three", "four")
+
+
+def test_of_two_counting_detectors_the_one_with_vehicles_is_compared() -> None:
+    counts = pl.DataFrame(
+        {"period_id": ["day0"] * 3, "detector_id": ["one", "one", "two"], "count": [0, 0, 3]}
+    )
+    detectors = tuple(Detector(name, "in_0", 1.0, 0.0, "stop") for name in ("one", "two"))
+    data = MeasuredData(detectors, (Period("day0", 0.0, 9.0, "fit", {}, {}),), counts=counts)
+    assert names(one_of_each(data, detectors)) == ("two",)
 
 
 def test_larger_networks_are_simulated_for_fewer_days() -> None:

@@ -25,7 +25,7 @@ Counts = Mapping[str, tuple[float, float]]
 
 def a_layout(incoming: tuple[str, ...], outgoing: tuple[str, ...] = ()) -> DetectorLayout:
     lanes = tuple(IncomingLane(f"{edge}_0", edge, 0, (0,), 14.0, {}) for edge in incoming)
-    exits = tuple((0, f"{edge}_0", (f"exit:{edge}",)) for edge in outgoing)
+    exits = tuple((0, f"{edge}_0", f"exit:{edge}") for edge in outgoing)
     return DetectorLayout(("C",), lanes, exits, (), {})
 
 
@@ -138,9 +138,7 @@ def test_lanes_tell_from_where_vehicles_turn_elsewhere(origin: str) -> None:
         for edge in "ab"
         for i, target in enumerate("xy")
     )
-    layout = DetectorLayout(
-        ("C",), lanes, tuple((0, f"{x}_0", (f"exit:{x}",)) for x in "xy"), (), {}
-    )
+    layout = DetectorLayout(("C",), lanes, tuple((0, f"{x}_0", f"exit:{x}") for x in "xy"), (), {})
     ways: dict[Way, float] = {(edge, target): 200.0 for edge in "ab" for target in "xy"}
     distance = a_distance(layout, {"x": (80.0, 20.0), "y": (-80.0, 20.0)})
     row = INDEX["count_stop"]

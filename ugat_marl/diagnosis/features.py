@@ -57,9 +57,14 @@ class IncomingLane:
     intersection: int
     links: tuple[int, ...]
     speed_mps: float
-    detectors: Mapping[DetectorKind, tuple[str, ...]]
+    detectors: Mapping[DetectorKind, str]
     following: frozenset[str] = frozenset()
     directions: frozenset[str] = frozenset()
+
+    def passages(self, period: Period, kind: DetectorKind) -> Passages | None:
+        """Return the passages over the detector of a kind; None if the lane has no such one."""
+        name = self.detectors.get(kind)
+        return None if name is None else period.of_detector(name)
 
 
 @dataclass(frozen=True)
@@ -88,14 +93,14 @@ class DetectorLayout:
     Attributes:
         intersections: SUMO ids of the traffic lights.
         lanes: Incoming lanes.
-        exits: Outgoing lanes with an exit detector: index of the intersection, lane, detectors.
+        exits: Outgoing lanes with an exit detector: index of the intersection, lane, detector.
         detectors: All detectors.
         owner: SUMO id of the traffic light, by detector.
     """
 
     intersections: tuple[str, ...]
     lanes: tuple[IncomingLane, ...]
-    exits: tuple[tuple[int, str, tuple[str, ...]], ...]
+    exits: tuple[tuple[int, str, str], ...]
     detectors: tuple[Detector, ...]
     owner: Mapping[str, str]
 
@@ -106,17 +111,17 @@ class DetectorLayout:
         Raises:
             MeasuredDataError: No detector is at an intersection with signals.
         """
-        by_lane: dict[str, dict[DetectorKind, list[str]]] = {}
+        by_lane: dict[str, dict[DetectorKind, str]] = {}
         for detector in detectors:
-            by_lane.setdefault(detector.lane, {}).setdefault(detector.kind, []).append(detector.id)
+            by_lane.setdefault(detector.lane, {}).setdefault(detector.kind, detector.id)
         lanes: list[IncomingLane] = []
-        exits: list[tuple[int, str, tuple[str, ...]]] = []
+        exits: list[tuple[int, str, str]] = []
         owner: dict[str, str] = {}
         for index, intersection in enumerate(network.intersections):
             for lane in intersection.incoming_lanes:
-                by_kind = by_lane.get(lane, {})
-                kinds: dict[DetectorKind, tuple[str, ...]] = {
-                    kind: tuple(names) for kind, names in by_kind.items() if kind != "exit"
+                of_lane = by_lane.get(lane, {})
+                kinds: dict[DetectorKind, str] = {
+                    kind: name for kind, name in of_lane.items() if kind != "exit"
                 }
                 lanes.append(
                     IncomingLane(
@@ -130,11 +135,11 @@ class DetectorLayout:
                         _directions(intersection, lane),
                     )
                 )
-                owner |= {name: intersection.id for names in kinds.values() for name in names}
+                owner |= dict.fromkeys(kinds.values(), intersection.id)
             for lane in intersection.outgoing_lanes:
-                if names := tuple(by_lane.get(lane, {}).get("exit", ())):
-                    exits.append((index, lane, names))
-                    owner |= dict.fromkeys(names, intersection.id)
+                if name := by_lane.get(lane, {}).get("exit"):
+                    exits.append((index, lane, name))
+                    owner[name] = intersection.id
         if not owner:
             raise MeasuredDataError(
                 "no detector lies on a lane that leads to or from a traffic light of the network; "
@@ -152,13 +157,12 @@ class DetectorLayout:
 
     @functools.cached_property
     def counted(self) -> Mapping[str, tuple[str, int]]:
-        """Feature and place by detector, for the first detector of each kind on a lane."""
+        """Feature and place by detector."""
         rows: dict[str, tuple[str, int]] = {}
         for index, lane in enumerate(self.lanes):
-            for kind, names in lane.detectors.items():
-                rows |= dict.fromkeys(names[:1], (f"count_{kind}", index))
-        for index, (_, _, names) in enumerate(self.exits):
-            rows |= dict.fromkeys(names[:1], ("count_exit", len(self.lanes) + index))
+            rows |= {name: (f"count_{kind}", index) for kind, name in lane.detectors.items()}
+        for index, (_, _, name) in enumerate(self.exits):
+            rows[name] = ("count_exit", len(self.lanes) + index)
         return rows
 
     @functools.cached_property
@@ -180,7 +184,7 @@ class DetectorLayout:
         """Return the time from the advance to the stop detector of a lane at its limit, s."""
         of_lane = self.lanes[lane]
         zones = {detector.id: detector for detector in self.detectors}
-        begin, end = (zones[of_lane.detectors[kind][0]] for kind in ("advance", "stop"))
+        begin, end = (zones[of_lane.detectors[kind]] for kind in ("advance", "stop"))
         metres = end.position_m + end.length_m - begin.position_m
         return max(metres, 0.0) / of_lane.speed_mps
 
@@ -426,7 +430,7 @@ def tally(
     advances = np.zeros(len(layout.lanes))
     for index, (lane, green) in enumerate(zip(layout.lanes, greens, strict=True)):
         counter.place = index
-        stop, advance = _passages(period, lane, "stop"), _passages(period, lane, "advance")
+        stop, advance = lane.passages(period, "stop"), lane.passages(period, "advance")
         if stop is not None:
             stops[index] = counter.volume("count_stop", 1, stop)
             _discharge(counter, stop, green)
@@ -439,9 +443,9 @@ def tally(
             if stop is None:
                 _lengths(counter, advance)
     exits = np.zeros(len(layout.exits))
-    for index, (_, _, names) in enumerate(layout.exits):
+    for index, (_, _, name) in enumerate(layout.exits):
         counter.place = len(layout.lanes) + index
-        exits[index] = counter.volume("count_exit", 2, _recorded(period, names))
+        exits[index] = counter.volume("count_exit", 2, period.of_detector(name))
     _conserved(counter, layout, advances, stops, exits)
     journeys = _journeys(layout, period, greens, thresholds)
     return Tally(counter.sums, counter.bins, journeys=journeys, window=period.window)
@@ -479,18 +483,6 @@ class _Counter:
         self.ratio(name, len(times), (end - begin) / 60.0)
         self.bins[row, self.place] += np.histogram(times, self.bins.shape[2], (begin, end))[0]
         return float(len(times))
-
-
-def _passages(period: Period, lane: IncomingLane, kind: str) -> Passages | None:
-    """Return the passages over the lane's detector of a kind; None if it has none."""
-    names = lane.detectors.get(kind)  # pyright: ignore[reportArgumentType,reportCallIssue]
-    return None if not names else _recorded(period, names)
-
-
-def _recorded(period: Period, names: Sequence[str]) -> Passages:
-    """Return the passages of the first detector with a record, so that no vehicle counts twice."""
-    recorded = (period.passages[name] for name in names if name in period.passages)
-    return next(recorded, Passages.none())
 
 
 @dataclass(frozen=True, eq=False)
@@ -732,7 +724,7 @@ def _journeys(
         came: list[Array] = []
         crossed: list[Crossings] = []
         for lane in (layout.lanes[index] for index in lanes):
-            advance, stop = _passages(period, lane, "advance"), _passages(period, lane, "stop")
+            advance, stop = lane.passages(period, "advance"), lane.passages(period, "stop")
             assert advance is not None and stop is not None
             came.append(np.sort(advance.on_s[np.isfinite(advance.on_s)]))
             starts = greens[lanes[len(came) - 1]].start_s

@@ -35,7 +35,7 @@ from ugat_marl.diagnosis.features import (
     bins_of,
 )
 from ugat_marl.diagnosis.thresholds import DayThresholds, Thresholds
-from ugat_marl.scenarios import Passages, Period
+from ugat_marl.scenarios import Period
 
 Array = NDArray[np.float64]
 
@@ -91,7 +91,7 @@ def with_intervals(
     """
     sums = _widened(counted.sums)
     for name, (feature, place) in layout.counted.items():
-        seen = period.passages.get(name, Passages.none())
+        seen = period.of_detector(name)
         _enter(sums, feature, place, Intervals.of(seen, period, length_s), length_s)
     return replace(counted, sums=sums)
 
@@ -130,7 +130,7 @@ def reports_of_passages(
 ) -> Iterator[tuple[str, Intervals]]:
     """Yield kind and reports of each detector over which vehicles passed."""
     for name, (feature, _) in layout.counted.items():
-        seen = period.passages.get(name, Passages.none())
+        seen = period.of_detector(name)
         yield feature.removeprefix("count_"), Intervals.of(seen, period, length_s)
 
 

@@ -106,34 +106,33 @@ class Sightings:
         """
         number = {detector.id: index for index, detector in enumerate(layout.detectors)}
         tracks = {
-            detector.id: _Track.of(
-                period.passages.get(detector.id, Passages.none()), detector, thresholds
-            )
+            detector.id: _Track.of(period.of_detector(detector.id), detector, thresholds)
             for detector in layout.detectors
         }
         rows: list[Array] = []
         pairs: list[Array] = []
         for lane, green in zip(layout.lanes, greens, strict=True):
-            advance, stop = (lane.detectors.get(kind, ())[:1] for kind in ("advance", "stop"))
-            for name in advance:
-                track = tracks[name]
-                rows.append(track.rows(number[name], _regimes_at_advance(track, green, thresholds)))
-            for name in stop:
-                track = tracks[name]
-                rows.append(track.rows(number[name], _regimes_at_stop(track, green, thresholds)))
+            advance, stop = lane.detectors.get("advance"), lane.detectors.get("stop")
+            if advance:
+                track = tracks[advance]
+                regimes = _regimes_at_advance(track, green, thresholds)
+                rows.append(track.rows(number[advance], regimes))
+            if stop:
+                track = tracks[stop]
+                rows.append(track.rows(number[stop], _regimes_at_stop(track, green, thresholds)))
             if advance and stop:
                 pairs.append(
                     _pairs(
-                        number[advance[0]],
-                        tracks[advance[0]],
-                        tracks[stop[0]],
+                        number[advance],
+                        tracks[advance],
+                        tracks[stop],
                         green,
                         lane.speed_mps,
                         thresholds,
                     )
                 )
-        behind = [name for _, _, names in layout.exits for name in names[:1]]
-        rows += [tracks[name].rows(number[name], tracks[name].alone_only()) for name in behind]
+        for _, _, name in layout.exits:
+            rows.append(tracks[name].rows(number[name], tracks[name].alone_only()))
         beside = next_detectors(layout.detectors)
         return cls(
             np.concatenate([np.empty((0, 5)), *rows]),

@@ -80,18 +80,16 @@ def cells_of(
     }
     cells = {name: np.zeros(shape) for name, shape in shapes.items()}
     for index, (lane, green) in enumerate(zip(layout.lanes, greens, strict=True)):
-        for kind, names in lane.detectors.items():
-            seen = period.passages.get(names[0])
-            if seen is None:
-                continue
+        for kind, name in lane.detectors.items():
+            seen = period.of_detector(name)
             if kind == "stop":
                 _queue(cells["discharge"][index, 0], seen, green, period, thresholds)
             if kind == "advance":
                 _free(cells["free speed"][index, 0, 0, 0], seen, green, period, thresholds)
             _count(cells["count"][index, KINDS.index(kind), 0, 0, :, 0], seen, period)
-    for index, (_, _, names) in enumerate(layout.exits):
+    for index, (_, _, name) in enumerate(layout.exits):
         place = cells["count"][lanes + index, KINDS.index("exit"), 0, 0, :, 0]
-        _count(place, period.passages.get(names[0], Passages.none()), period)
+        _count(place, period.of_detector(name), period)
     return cells
 
 

@@ -258,10 +258,8 @@ class PlaceFinder:
     def _passages(self, period: Period, index: int, kind: str) -> Passages | None:
         lanes = self._layout.lanes
         if index >= len(lanes):
-            names = self._layout.exits[index - len(lanes)][2]
-        else:
-            names = lanes[index].detectors.get("stop" if kind == "count_stop" else "advance", ())
-        return next((period.passages[n] for n in names if n in period.passages), None)
+            return period.of_detector(self._layout.exits[index - len(lanes)][2])
+        return lanes[index].passages(period, "stop" if kind == "count_stop" else "advance")
 
     # --- places -------------------------------------------------------------------------------
 
@@ -838,7 +836,7 @@ def _silent(
     for name, expected in rate.items():
         begin, end = -np.inf, np.inf
         for period in periods:
-            seen = period.passages.get(name, Passages.none())
+            seen = period.of_detector(name)
             times = np.concatenate((seen.on_s, seen.off_s))
             times = np.sort(times[np.isfinite(times)])
             times = np.concatenate(([period.begin_s], times, [period.end_s]))

@@ -541,7 +541,7 @@ class Arrivals:
     def _came(self, edge: str, period: Period) -> list[tuple[float, frozenset[str]]]:
         """Return the arrival times at an approach, s, each with its possible next edges."""
         lanes = self._approaches[edge]
-        seen = [period.passages.get(lane.advance, Passages.none()) for lane in lanes]
+        seen = [period.of_detector(lane.advance) for lane in lanes]
         times = [
             unhindered(one, lane.speed_mps, period, self._thresholds, lane.zone_m)
             for one, lane in zip(seen, lanes, strict=True)
@@ -549,7 +549,7 @@ class Arrivals:
         crossed = [
             np.sort(seen_at_stop.off_s[np.isfinite(seen_at_stop.off_s)])
             for lane in lanes
-            for seen_at_stop in [period.passages.get(lane.stop or "", Passages.none())]
+            for seen_at_stop in [period.of_detector(lane.stop or "")]
         ]
         if any(lane.stop is None for lane in lanes):
             left = times
@@ -703,14 +703,14 @@ def _approaches(layout: DetectorLayout, thresholds: DayThresholds) -> dict[str, 
         if advance is None or known is None:
             lanes[lane.edge] = None
             continue
-        stop = lane.detectors.get("stop", (None,))[0]
-        zone = zones[advance[0]]
+        stop = lane.detectors.get("stop")
+        zone = zones[advance]
         begin = zone.position_m
         end = begin if stop is None else zones[stop].position_m
         travel = max(end - begin, 0.0) / (thresholds.fastest * lane.speed_mps)
         known.append(
             _Lane(
-                advance[0],
+                advance,
                 stop,
                 begin,
                 zone.length_m,

@@ -12,6 +12,7 @@ from dataclasses import dataclass, field, replace
 from pathlib import Path
 
 import numpy as np
+import polars as pl
 from scipy import stats
 
 from ugat_marl.data import Finding, MeasuredData, is_actuated
@@ -169,8 +170,10 @@ class Study:
                 reaches a measured lane.
         """
         network, thresholds = Network.read(scenario), config.thresholds
-        detectors = heard(measured)
-        measured = _noted(measured, unreached(scenario, measured, detectors))
+        detectors = one_of_each(measured, heard(measured))
+        measured = _noted(
+            measured, (*doubled(measured, detectors), *unreached(scenario, measured, detectors))
+        )
         layout = DetectorLayout.of(network, detectors)
         ruled_out = frozenset(name for finding in measured.findings for name in finding.rules_out)
         allowed = library(config.leave_out) - ruled_out
@@ -601,6 +604,35 @@ def heard(measured: MeasuredData) -> tuple[Detector, ...]:
         detectors
         if detectors and 2 * len(detectors) <= len(measured.detectors)
         else measured.detectors
+    )
+
+
+def one_of_each(measured: MeasuredData, detectors: Sequence[Detector]) -> tuple[Detector, ...]:
+    """Return one detector of each kind on a lane, so that no vehicle counts twice.
+
+    It is the one that saw vehicles in most periods, or in most intervals of counts. Among equals it
+    is the first.
+    """
+    if measured.has_events or measured.counts is None:
+        rows = Counter(name for period in measured.periods for name in period.passages)
+    else:
+        rows = Counter(measured.counts.filter(pl.col("count") > 0)["detector_id"].to_list())
+    kept: dict[tuple[str, str], Detector] = {}
+    for detector in sorted(detectors, key=lambda one: -rows[one.id]):
+        kept.setdefault((detector.lane, detector.kind), detector)
+    return tuple(detector for detector in detectors if detector in kept.values())
+
+
+def doubled(measured: MeasuredData, compared: Sequence[Detector]) -> tuple[Finding, ...]:
+    """Return a finding on each detector that is not compared beside another of its kind."""
+    used = {(detector.lane, detector.kind): detector.id for detector in compared}
+    return tuple(
+        Finding(
+            f"detectors.csv: {detector.id!r} is not compared; lane {detector.lane!r} has "
+            f"{used[detector.lane, detector.kind]!r} as {detector.kind} detector already"
+        )
+        for detector in measured.detectors
+        if used.get((detector.lane, detector.kind), detector.id) != detector.id
     )
 
 

@@ -291,7 +291,7 @@ class DetectorSplash(_OfDetectors):
         def splashed(name: str, passages: Passages) -> Passages:
             parts = [passages]
             for other in beside.get(name, ()):
-                seen = period.passages.get(other, Passages.none())
+                seen = period.of_detector(other)
                 parts.append(seen.at(self._chosen(name, other, seen)))
             return Passages.concatenated(parts)
 

@@ -264,7 +264,7 @@ def edited(
     """Return the period with other passages at some detectors; empty detectors are left out."""
     passages = dict(period.passages)
     for name in sorted(names):
-        changed = change(name, passages.get(name, Passages.none()))
+        changed = change(name, period.of_detector(name))
         if len(changed):
             passages[name] = changed
         else:

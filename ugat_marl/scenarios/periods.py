@@ -157,6 +157,10 @@ class Period:
         """Begin and end on the scenario's clock, s."""
         return self.begin_s, self.end_s
 
+    def of_detector(self, detector: str) -> Passages:
+        """Return the passages over a detector; none if it saw no vehicle."""
+        return self.passages.get(detector, Passages.none())
+
 
 def deciding_letter(states: Sequence[str]) -> str:
     """Return the letter that counts for a lane with several links: green, else yellow, else red."""

@@ -8,13 +8,26 @@ from pathlib import Path
 import polars as pl
 
 from ugat_marl.data.measured.passages import FASTEST_MPS
-from ugat_marl.data.measured.tables import COUNTS, ROW, TRAVEL_TIMES, TURNING, place, refuse
+from ugat_marl.data.measured.tables import (
+    COUNTS,
+    ROW,
+    TRAVEL_TIMES,
+    TURNING,
+    place,
+    refuse,
+    report_outside,
+)
+from ugat_marl.data.measured.values import Finding
 from ugat_marl.errors import MeasuredDataError, nearest
 from ugat_marl.scenarios import Detector, Network, Period
 
 
 def counts_of(
-    path: Path, frame: pl.DataFrame, periods: Sequence[Period], detectors: Sequence[Detector]
+    path: Path,
+    frame: pl.DataFrame,
+    periods: Sequence[Period],
+    detectors: Sequence[Detector],
+    findings: list[Finding],
 ) -> pl.DataFrame:
     """Return counts per detector and interval, with the optional columns that hold something.
 
@@ -23,6 +36,7 @@ def counts_of(
         frame: Its rows.
         periods: The periods.
         detectors: The detectors.
+        findings: Findings; intervals outside of their period are added to them.
 
     Raises:
         MeasuredDataError: A detector or period is unknown, an interval or a number impossible.
@@ -35,7 +49,7 @@ def counts_of(
         "is not listed in detectors.csv",
         "add it there, or leave the rows out",
     )
-    frame = _checked_intervals(path, frame, periods, ("detector_id",), "its detector")
+    frame = _checked_intervals(path, frame, periods, ("detector_id",), "its detector", findings)
     _refuse_units(path, frame)
     more = [name for name in COUNTS.optional if frame[name].count()]
     return frame.select(*COUNTS.columns, *more)
@@ -47,8 +61,9 @@ def _checked_intervals(
     periods: Sequence[Period],
     keys: tuple[str, ...],
     owner: str,
+    findings: list[Finding],
 ) -> pl.DataFrame:
-    """Return rows of counts; refuse unknown periods, wrong intervals and impossible numbers."""
+    """Return counts within their periods; refuse wrong intervals and impossible numbers."""
     for column, values in (
         ("begin_s", {period.id: period.begin_s for period in periods}),
         ("end_s", {period.id: period.end_s for period in periods}),
@@ -62,10 +77,10 @@ def _checked_intervals(
         "is not listed in periods.csv",
         "add it there, or leave the rows out",
     )
+    wrong = frame.filter(pl.col("end_s") <= pl.col("begin_s"))
+    refuse(path, wrong, "end_s", "is not after begin_s", "correct the row")
+    frame = _within_periods(path, frame, periods, findings)
     for bad, column, complaint in (
-        (pl.col("begin_s") < pl.col("period_begin_s"), "begin_s", "is before the period's begin"),
-        (pl.col("end_s") > pl.col("period_end_s"), "end_s", "is after the period's end"),
-        (pl.col("end_s") <= pl.col("begin_s"), "end_s", "is not after begin_s"),
         (pl.col("count") < 0, "count", "is negative"),
         (pl.col("count") % 1 != 0, "count", "is not a whole number"),
         (
@@ -76,6 +91,27 @@ def _checked_intervals(
     ):
         refuse(path, frame.filter(bad), column, complaint, "correct the row")
     _refuse_overlaps(path, frame, keys, owner)
+    return frame
+
+
+def _within_periods(
+    path: Path, frame: pl.DataFrame, periods: Sequence[Period], findings: list[Finding]
+) -> pl.DataFrame:
+    """Leave out intervals outside of their period; refuse those that lie partly in it."""
+    before = pl.col("end_s") <= pl.col("period_begin_s")
+    after = pl.col("begin_s") >= pl.col("period_end_s")
+    inside = frame.select(~(before | after)).to_series().to_numpy()
+    if not inside.all():
+        index = {period.id: i for i, period in enumerate(periods)}
+        which = frame["period_id"].replace_strict(index, return_dtype=pl.Int32).to_numpy()
+        report_outside(path, periods, which, frame["begin_s"].to_numpy(), inside, findings)
+        frame = frame.filter(pl.Series(inside))
+    for partly, column, complaint in (
+        (pl.col("begin_s") < pl.col("period_begin_s"), "begin_s", "is before the period's begin"),
+        (pl.col("end_s") > pl.col("period_end_s"), "end_s", "is after the period's end"),
+    ):
+        way_out = "begin and end the period in periods.csv where an interval does"
+        refuse(path, frame.filter(partly), column, complaint, way_out)
     return frame
 
 
@@ -120,7 +156,11 @@ def _refuse_units(path: Path, frame: pl.DataFrame) -> None:
 
 
 def turning_of(
-    path: Path, frame: pl.DataFrame, periods: Sequence[Period], network: Network
+    path: Path,
+    frame: pl.DataFrame,
+    periods: Sequence[Period],
+    network: Network,
+    findings: list[Finding],
 ) -> pl.DataFrame:
     """Return vehicles per interval that go from one edge to the next.
 
@@ -129,6 +169,7 @@ def turning_of(
         frame: Its rows.
         periods: The periods.
         network: Network of the scenario.
+        findings: Findings; intervals outside of their period are added to them.
 
     Raises:
         MeasuredDataError: A period is unknown, no vehicle can turn so, or an interval or a number
@@ -151,7 +192,8 @@ def turning_of(
                 f"{place(path, row[ROW])}: no vehicle can turn from {row['from_edge']!r} to "
                 f"{row['to_edge']!r} at a traffic light; {leads}"
             )
-    frame = _checked_intervals(path, frame, periods, ("from_edge", "to_edge"), "its turn")
+    keys = ("from_edge", "to_edge")
+    frame = _checked_intervals(path, frame, periods, keys, "its turn", findings)
     return frame.select(*TURNING.columns)
 
 

@@ -105,7 +105,7 @@ def as_counts(measured: MeasuredData, length_s: float) -> MeasuredData:
     parts: list[pl.DataFrame] = []
     for period in measured.periods:
         for detector in measured.detectors:
-            seen = period.passages.get(detector.id, Passages.none())
+            seen = period.of_detector(detector.id)
             of_detector = Intervals.of(seen, period, length_s)
             length = of_detector.end_s - of_detector.begin_s
             part = pl.DataFrame(

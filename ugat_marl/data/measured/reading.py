@@ -171,13 +171,13 @@ def _summed(
     counts = turning = times = None
     if files.has(tables.COUNTS):
         path, frame = files.rows(tables.COUNTS)
-        counts = counts_of(path, frame, periods, detectors)
+        counts = counts_of(path, frame, periods, detectors, files.findings)
         if files.counts_only:
             counted = set(counts["period_id"])
             missing = [period.id for period in periods if period.id not in counted]
             _refuse_empty(path, "counts", missing)
     if files.has(tables.TURNING):
-        turning = turning_of(*files.rows(tables.TURNING), periods, network)
+        turning = turning_of(*files.rows(tables.TURNING), periods, network, files.findings)
     if files.has(tables.TRAVEL_TIMES):
         path, frame = files.rows(tables.TRAVEL_TIMES)
         times = travel_times_of(path, with_period(path, frame, periods, files.findings), network)

@@ -467,12 +467,12 @@ def with_period(
     if not early:
         inside &= time >= begins[which]
     if not inside.all():
-        _report_outside(path, periods, which, time, inside, findings)
+        report_outside(path, periods, which, time, inside, findings)
     frame = frame.with_columns(pl.Series("time_s", time))
     return frame.filter(pl.Series(inside))
 
 
-def _report_outside(
+def report_outside(
     path: Path,
     periods: Sequence[Period],
     which: NDArray[np.int32],
@@ -480,6 +480,19 @@ def _report_outside(
     inside: NDArray[np.bool_],
     findings: list[Finding],
 ) -> None:
+    """Add a finding on rows outside of their periods.
+
+    Args:
+        path: File of the rows.
+        periods: The periods.
+        which: Index of the period of each row, ``(n,)``.
+        time: Time of each row, s, ``(n,)``.
+        inside: True for rows within their period, ``(n,)``.
+        findings: Findings.
+
+    Raises:
+        MeasuredDataError: Most rows of a period lie outside of it.
+    """
     total = np.bincount(which, minlength=len(periods))
     outside = np.bincount(which[~inside], minlength=len(periods))
     for period, rows, lost in zip(periods, total, outside, strict=True):
