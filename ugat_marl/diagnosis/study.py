@@ -170,10 +170,8 @@ class Study:
                 reaches a measured lane.
         """
         network, thresholds = Network.read(scenario), config.thresholds
-        detectors = one_of_each(measured, heard(measured))
-        measured = _noted(
-            measured, (*doubled(measured, detectors), *unreached(scenario, measured, detectors))
-        )
+        detectors, findings = _compared(scenario, measured)
+        measured = _noted(measured, findings)
         layout = DetectorLayout.of(network, detectors)
         ruled_out = frozenset(name for finding in measured.findings for name in finding.rules_out)
         allowed = library(config.leave_out) - ruled_out
@@ -586,6 +584,14 @@ def _pools(
 def effort_for(intersections: int) -> Effort:
     """Return the numbers of days that suit the size of a network."""
     return next((effort for most, effort in EFFORTS if intersections <= most), LEAST_EFFORT)
+
+
+def _compared(
+    scenario: Scenario, measured: MeasuredData
+) -> tuple[tuple[Detector, ...], tuple[Finding, ...]]:
+    """Return the detectors to compare, and findings on the others and on their roads."""
+    detectors = one_of_each(measured, heard(measured))
+    return detectors, doubled(measured, detectors) + unreached(scenario, measured, detectors)
 
 
 def heard(measured: MeasuredData) -> tuple[Detector, ...]:
