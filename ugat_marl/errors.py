@@ -128,6 +128,17 @@ def install_command(extra: str) -> str:
     return f"pip install {libraries}"
 
 
+def require_least(least: int, **values: int | None) -> None:
+    """Refuse numbers below a least one; None, for a default, is allowed.
+
+    Raises:
+        OptionError: A number is below `least`.
+    """
+    for name, value in values.items():
+        if value is not None and value < least:
+            raise OptionError(f"{name} = {value}: must be at least {least}")
+
+
 def first_names(names: Sequence[str]) -> str:
     """Return the first four names, with dots for further ones."""
     return ", ".join([*names[:4], *["..."] * (len(names) > 4)])

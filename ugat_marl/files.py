@@ -109,6 +109,24 @@ def write_whole(path: Path, content: bytes | str) -> None:
         temporary.write_bytes(content.encode() if isinstance(content, str) else content)
 
 
+def put_folder(made: Path, target: Path, before: Path) -> None:
+    """Move a finished folder to its place.
+
+    Args:
+        made: The finished folder, on the same file system.
+        target: Its place.
+        before: Where a folder at that place goes; it comes back if the move fails.
+    """
+    if target.exists():
+        target.rename(before)
+    try:
+        made.rename(target)
+    except BaseException:
+        if before.exists():
+            before.rename(target)
+        raise
+
+
 @contextlib.contextmanager
 def scratch() -> Iterator[None]:
     """Context for writing into the folder for temporary files.

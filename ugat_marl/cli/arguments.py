@@ -12,12 +12,16 @@ from tyro.conf import arg
 from ugat_marl import parallel
 from ugat_marl.errors import OptionError
 
+
+def unused(metavar: str) -> Any:
+    """Return the help of an option that is not used unless it is given."""
+    return arg(metavar=metavar, help_behavior_hint="(default: not used)")
+
+
 Workers = Annotated[int | None, arg(metavar="INT", help_behavior_hint="(default: one per core)")]
 """Simulations at a time."""
 
-RayAddress = Annotated[
-    str | None, arg(metavar="[ADDRESS]", help_behavior_hint="(default: not used)")
-]
+RayAddress = Annotated[str | None, unused("[ADDRESS]")]
 """Address of Ray: local (--ray without an address), auto, host:port, ray://host:port."""
 
 LengthS = Annotated[

@@ -11,7 +11,7 @@ from tyro.conf import arg
 
 from ugat_marl.cli.arguments import RayAddress, workers_of
 from ugat_marl.data import write_csv
-from ugat_marl.errors import OptionError, OutputError
+from ugat_marl.errors import OptionError, OutputError, require_least
 from ugat_marl.experiments import (
     DIRECT,
     Comparison,
@@ -79,8 +79,7 @@ class _Paper:
 
     def run(self, console: Console) -> int:
         """Train and evaluate; print the table and write it as Markdown, CSV and PNG."""
-        if self.jobs is not None and self.jobs < 1:
-            raise OptionError(f"jobs = {self.jobs}: must be at least 1")
+        require_least(1, jobs=self.jobs)
         if self.ray is not None and self.config.device != "cpu":
             raise OptionError(
                 f"device = {self.config.device!r}: trainings on Ray have a core each and no GPU; "

@@ -6,14 +6,14 @@ import shlex
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Annotated
 
 from rich.console import Console
 from rich.table import Table
 from rich.text import Text
 from tyro.conf import Positional, arg
 
-from ugat_marl.cli.arguments import refuse_options
+from ugat_marl.cli.arguments import refuse_options, unused
 from ugat_marl.effects import load_scenario, scenario_in_domain
 from ugat_marl.errors import OptionError, counted
 from ugat_marl.experiments import policy_factory, typical_plans
@@ -32,10 +32,6 @@ from ugat_marl.scenarios import (
     with_plans,
     write_plans,
 )
-
-
-def _none(metavar: str) -> Any:
-    return arg(metavar=metavar, help_behavior_hint="(default: not used)")
 
 
 @dataclass(frozen=True)
@@ -73,7 +69,7 @@ class Plan:
     domain: str = "sim"
     seeds: int = 3
     first_seed: int = 1000
-    apply: Annotated[Path | None, _none("FILE")] = None
+    apply: Annotated[Path | None, unused("FILE")] = None
     lights: tuple[str, ...] = ()
     force: bool = False
 

@@ -12,7 +12,7 @@ from rich.console import Console
 from rich.table import Table
 from tyro.conf import Positional, arg
 
-from ugat_marl.cli.arguments import given_words, option_text, refuse_options
+from ugat_marl.cli.arguments import given_words, option_text, refuse_options, unused
 from ugat_marl.errors import OptionError, counted
 from ugat_marl.progress import Bars
 from ugat_marl.reporting import LIGHT, LightNames, draw_network, titled_table
@@ -49,10 +49,6 @@ _ONLY_FOR = {
 }
 """Options that only some sources of roads or vehicles use."""
 _OWN = Annotated[float | None, arg(metavar="FLOAT", help_behavior_hint="(default: the source's)")]
-
-
-def _none(metavar: str) -> Any:
-    return arg(metavar=metavar, help_behavior_hint="(default: not used)")
 
 
 @dataclass(frozen=True)
@@ -103,20 +99,20 @@ class ScenarioNew:
     """
 
     name: Annotated[Positional[Path], arg(metavar="NAME")]
-    grid: Annotated[str | None, _none("RxC")] = None
-    arterial: Annotated[int | None, _none("N")] = None
-    osm: Annotated[Path | None, _none("FILE")] = None
+    grid: Annotated[str | None, unused("RxC")] = None
+    arterial: Annotated[int | None, unused("N")] = None
+    osm: Annotated[Path | None, unused("FILE")] = None
     guess_signals: bool = False
     left_hand: bool = False
-    sumo: Annotated[Path | None, _none("FILE")] = None
-    cityflow: Annotated[tuple[Path, Path] | None, _none("ROADNET FLOW")] = None
-    draw: Annotated[int | None, _none("SEED")] = None
+    sumo: Annotated[Path | None, unused("FILE")] = None
+    cityflow: Annotated[tuple[Path, Path] | None, unused("ROADNET FLOW")] = None
+    draw: Annotated[int | None, unused("SEED")] = None
     exact_drivers: bool = False
-    routes: Annotated[tuple[Path, ...], _none("FILE [FILE ...]")] = ()
-    vph: Annotated[float | None, _none("N")] = None
+    routes: Annotated[tuple[Path, ...], unused("FILE [FILE ...]")] = ()
+    vph: Annotated[float | None, unused("N")] = None
     turns: tuple[float, float, float] = (0.2, 0.65, 0.15)
-    counts: Annotated[Path | None, _none("FILE")] = None
-    od: Annotated[Path | None, _none("FILE")] = None
+    counts: Annotated[Path | None, unused("FILE")] = None
+    od: Annotated[Path | None, unused("FILE")] = None
     seed: int = 0
     spacing_m: float = 300.0
     speed_mps: float = 13.9

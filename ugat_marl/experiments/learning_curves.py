@@ -11,7 +11,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from statistics import fmean
 
-from ugat_marl.errors import OptionError, UgatMarlError
+from ugat_marl.errors import UgatMarlError, require_least
 from ugat_marl.experiments.driver import perform_all, record_of
 from ugat_marl.experiments.jobs import RULE_FILE, Job, Record, evaluation_seeds
 from ugat_marl.experiments.settings import RULE, LearnerSpec, Setting
@@ -134,11 +134,9 @@ class CurvesConfig:
     duration_s: float | None = None
 
     def __post_init__(self) -> None:
-        for name in ("seeds", "episodes", "evaluate_every", "evaluation_seeds"):
-            if getattr(self, name) < 1:
-                raise OptionError(f"{name} = {getattr(self, name)}: must be at least 1")
-        if self.rule_budget < LEAST_BUDGET:
-            raise OptionError(f"rule_budget = {self.rule_budget}: must be at least {LEAST_BUDGET}")
+        require_least(1, seeds=self.seeds, episodes=self.episodes)
+        require_least(1, evaluate_every=self.evaluate_every, evaluation_seeds=self.evaluation_seeds)
+        require_least(LEAST_BUDGET, rule_budget=self.rule_budget)
         _ = self.settings  # raises an error for an unknown learner
 
     @property

@@ -13,7 +13,7 @@ from pathlib import Path
 from typing import Any, Literal
 
 from ugat_marl.effects import domain_label, domain_path, load_scenario
-from ugat_marl.errors import OptionError, UnknownNameError
+from ugat_marl.errors import OptionError, UnknownNameError, require_least
 from ugat_marl.experiments.comparison import Comparison, Trial
 from ugat_marl.experiments.driver import perform_all, record_of
 from ugat_marl.experiments.jobs import LEARNER, Job, evaluation_seeds
@@ -363,11 +363,9 @@ class PaperConfig:
             self._take_published()
         if not self.learner:
             object.__setattr__(self, "learner", UNIVERSAL_NAME)
-        for name in ("seeds", "evaluation_seeds", "episodes"):
-            if getattr(self, name) < 1:
-                raise OptionError(f"{name} = {getattr(self, name)}: must be at least 1")
-        if self.rule_budget < LEAST_BUDGET:
-            raise OptionError(f"rule_budget = {self.rule_budget}: must be at least {LEAST_BUDGET}")
+        require_least(1, seeds=self.seeds, evaluation_seeds=self.evaluation_seeds)
+        require_least(1, episodes=self.episodes)
+        require_least(LEAST_BUDGET, rule_budget=self.rule_budget)
         require_device_name(self.device)
         if not self.scenario:
             raise OptionError("scenario is empty; name one, such as single-v1")

@@ -27,7 +27,7 @@ from ugat_marl.data import (
 )
 from ugat_marl.effects import domain_label, load_scenario, scenario_in_domain
 from ugat_marl.envs import AgentSet, TrafficEnv, parallel_env
-from ugat_marl.errors import OptionError, ScenarioError, UnknownNameError
+from ugat_marl.errors import OptionError, ScenarioError, UnknownNameError, require_least
 from ugat_marl.experiments.driver import perform_here
 from ugat_marl.experiments.jobs import (
     DIRECT_POLICY,
@@ -172,11 +172,8 @@ class TransferConfig:
         if not self.learner:
             usual = UNIVERSAL_NAME if self.preset is None else DQN_NAME
             object.__setattr__(self, "learner", usual)
-        for name in ("evaluation_seeds", "tuning_seeds"):
-            if getattr(self, name) < 1:
-                raise OptionError(f"{name} = {getattr(self, name)}: must be at least 1")
-        if self.rule_budget is not None and self.rule_budget < LEAST_BUDGET:
-            raise OptionError(f"rule_budget = {self.rule_budget}: must be at least {LEAST_BUDGET}")
+        require_least(1, evaluation_seeds=self.evaluation_seeds, tuning_seeds=self.tuning_seeds)
+        require_least(LEAST_BUDGET, rule_budget=self.rule_budget)
         if domain_label(self.real) == domain_label(self.sim) and self.placebo != "same-world":
             raise OptionError(
                 f"real = {self.real!r} is the simulation itself; name another domain, such as V4, "
@@ -207,8 +204,7 @@ class TransferConfig:
             raise OptionError(
                 'the placebo "same-world" has no street, real_log is of one; leave out one of them'
             )
-        if self.random_delay_s is not None and self.random_delay_s < 1:
-            raise OptionError(f"random_delay_s = {self.random_delay_s}: must be at least 1")
+        require_least(1, random_delay_s=self.random_delay_s)
         continues = {
             "further": bool(self.further),
             "random_delay_s": self.random_delay_s is not None,

@@ -18,7 +18,7 @@ from typing import Any
 
 from ugat_marl.data import installed_version, json_damage, with_hashes
 from ugat_marl.effects import Domain, domain_label, scenario_in_domain
-from ugat_marl.errors import CheckpointError, OptionError, UnknownNameError
+from ugat_marl.errors import CheckpointError, UnknownNameError, require_least
 from ugat_marl.experiments.evaluation import TUNING_SEED, best_rules, race_rules
 from ugat_marl.experiments.scores import RuleTrial, Tuned
 from ugat_marl.files import read_json, user_cache, write_whole
@@ -74,8 +74,7 @@ def tune(
     """
     if name not in RULES:
         raise UnknownNameError("controller", name, RULE_NAMES)
-    if budget < LEAST_BUDGET:
-        raise OptionError(f"budget = {budget}: must be at least {LEAST_BUDGET} episodes")
+    require_least(LEAST_BUDGET, budget=budget)
     specs = rule_settings(name, budget)
     place = _place(name, scenario, domain, budget, duration_s, specs)
     if not fresh and (trials := _recall(place, specs)):

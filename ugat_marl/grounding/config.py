@@ -7,7 +7,7 @@ from dataclasses import dataclass, field, replace
 from typing import Any, Literal
 
 from ugat_marl.data import AgentLayout
-from ugat_marl.errors import OptionError, UnknownNameError
+from ugat_marl.errors import OptionError, UnknownNameError, require_least
 from ugat_marl.grounding.delays import MATCHED_REWARDS
 from ugat_marl.grounding.fitting import FitConfig
 from ugat_marl.grounding.forward import ForwardConfig
@@ -151,15 +151,9 @@ class UgatConfig:
     def __post_init__(self) -> None:
         if self.grounding not in GROUNDINGS:
             raise UnknownNameError("grounding", self.grounding, GROUNDINGS)
-        for name, least in (
-            ("pretrain_episodes", 0),
-            ("iterations", 0),
-            ("grounded_episodes", 1),
-            ("sim_rollouts", 1),
-            ("real_rollouts", 1),
-        ):
-            if getattr(self, name) < least:
-                raise OptionError(f"{name} = {getattr(self, name)}: must be at least {least}")
+        require_least(0, pretrain_episodes=self.pretrain_episodes, iterations=self.iterations)
+        require_least(1, grounded_episodes=self.grounded_episodes)
+        require_least(1, sim_rollouts=self.sim_rollouts, real_rollouts=self.real_rollouts)
         for name in ("rollout_epsilon", "least_accuracy"):
             value = getattr(self, name)
             if value is not None and not 0 <= value <= 1:

@@ -34,7 +34,13 @@ from torch import Tensor
 from ugat_marl.data import TransitionLog, read_checkpoint, write_checkpoint
 from ugat_marl.effects import ControllerPart, Domain, Effect
 from ugat_marl.envs import AgentSet, ResetResult, TrafficEnv, parallel_env
-from ugat_marl.errors import CheckpointError, OptionError, ScenarioError, UnknownNameError
+from ugat_marl.errors import (
+    CheckpointError,
+    OptionError,
+    ScenarioError,
+    UnknownNameError,
+    require_least,
+)
 from ugat_marl.grounding.channel import (
     ChannelConfig,
     CommandChannel,
@@ -122,8 +128,7 @@ class StreetConfig:
                 raise UnknownNameError("part of a street", part, PARTS)
         if self.rival not in RIVALS:
             raise UnknownNameError("rival", self.rival, RIVALS)
-        if self.simulations < 20:
-            raise OptionError(f"street.simulations = {self.simulations}: must be at least 20")
+        require_least(20, **{"street.simulations": self.simulations})
         if self.further < 0:
             raise OptionError(f"further = {self.further}: must not be negative")
         if self.judged < 0:

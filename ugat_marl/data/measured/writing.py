@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import secrets
 import shutil
-import tempfile
 from collections.abc import Sequence
 from pathlib import Path
 
@@ -29,6 +28,7 @@ from ugat_marl.data.measured.tables import (
 from ugat_marl.data.measured.values import MeasuredData
 from ugat_marl.data.row_hashes import CSV_HASHES, write_csv_hashes, write_hashed
 from ugat_marl.errors import OutputError
+from ugat_marl.files import put_folder
 from ugat_marl.scenarios import Passages, Period
 
 
@@ -78,7 +78,9 @@ def write_measured(measured: MeasuredData, directory: Path, *, csv: bool = False
         if measured.travel_times is not None:
             _write(_ordered(measured.travel_times, TRAVEL_TIMES), temporary / "travel_times.csv")
         write_csv_hashes(temporary, sorted(path.name for path in temporary.glob("*.csv")))
-        _put(temporary, directory)
+        before = temporary.with_name(f"{temporary.name}.before")
+        put_folder(temporary, directory, before)
+        shutil.rmtree(before, ignore_errors=True)
     except OSError as error:
         raise OutputError(
             f"{directory}: cannot be written ({error.strerror}); give another place"
@@ -115,20 +117,6 @@ def require_replaceable(directory: Path) -> None:
             f"{directory}: is not empty and has no periods.csv, so it is no measured data to "
             "replace; give another directory"
         )
-
-
-def _put(temporary: Path, directory: Path) -> None:
-    """Move the finished directory to its place, in place of an earlier one."""
-    if not directory.exists():
-        temporary.rename(directory)
-        return
-    with tempfile.TemporaryDirectory(dir=directory.parent, prefix=f".{directory.name}.") as aside:
-        old = directory.rename(Path(aside) / "old")
-        try:
-            temporary.rename(directory)
-        except OSError:
-            old.rename(directory)
-            raise
 
 
 def _write(frame: pl.DataFrame, path: Path) -> None:

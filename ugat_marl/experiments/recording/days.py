@@ -35,7 +35,7 @@ from ugat_marl.effects import (
     scenario_in_domain,
     shift_parking,
 )
-from ugat_marl.errors import OptionError
+from ugat_marl.errors import OptionError, require_least
 from ugat_marl.experiments.recording.controller import (
     own_programmes,
     play,
@@ -156,10 +156,7 @@ def record(
         ScenarioError: The scenario cannot be simulated.
         SimulatorError: SUMO failed.
     """
-    if periods < 1:
-        raise OptionError(f"periods = {periods}: must be at least 1")
-    if workers is not None and workers < 1:
-        raise OptionError(f"workers = {workers}: must be at least 1, or None")
+    require_least(1, periods=periods, workers=workers)
     if duration_s is not None and duration_s > scenario.settings.duration_s:
         raise OptionError(
             f"duration_s = {duration_s:g}: scenario {scenario.id!r} lasts "

@@ -15,7 +15,7 @@ from pathlib import Path
 from typing import Any
 
 from ugat_marl.errors import OutputError, ScenarioError
-from ugat_marl.files import write_whole
+from ugat_marl.files import put_folder, write_whole
 from ugat_marl.progress import Reporter
 from ugat_marl.scenarios.admission import admitted
 from ugat_marl.scenarios.demand import Demand, check_demand
@@ -326,7 +326,7 @@ def new_folder(target: Path, *, force: bool) -> Iterator[Path]:
             require_free(target, force=force)  # it may have appeared meanwhile
             _require_counts_kept(made, target)
             _keep_pictures(made, target)
-            _put(made, target, folder / "before")
+            put_folder(made, target, folder / "before")
     except ScenarioError as error:
         # Files are checked in the temporary folder, but errors should name the final one.
         if str(made) not in str(error):
@@ -379,17 +379,6 @@ def _keep_pictures(made: Path, target: Path) -> None:
         return
     if all(map(Path.is_file, networks)) and filecmp.cmp(*networks, shallow=False):
         shutil.copytree(pictures, made / PICTURES)
-
-
-def _put(made: Path, target: Path, before: Path) -> None:
-    if target.exists():
-        target.rename(before)
-    try:
-        made.rename(target)
-    except BaseException:
-        if before.exists():
-            before.rename(target)
-        raise
 
 
 def require_free(target: Path, *, force: bool) -> None:
