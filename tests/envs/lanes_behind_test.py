@@ -15,7 +15,7 @@ from ugat_marl.__main__ import main
 from ugat_marl.effects import load_scenario, scenario_in_domain
 from ugat_marl.errors import OptionError, ScenarioError
 from ugat_marl.experiments.training import simulated_worlds
-from ugat_marl.field import Site
+from ugat_marl.field import LaneCount, Site
 from ugat_marl.files import Document
 from ugat_marl.grounding import UgatConfig
 from ugat_marl.policies import make_rule
@@ -73,6 +73,31 @@ def test_who_waits_behind_is_counted(split: Scenario) -> None:
         env.step({agent: green})
     assert env.snapshot.vehicles[lane] == 0
     assert env.snapshot.mean_speed_mps[lane] == pytest.approx(13)
+    env.close()
+
+
+def test_the_field_loop_counts_them_as_the_environment_does(split: Scenario) -> None:
+    site = Site.of(split, {"observation": "count"})
+    assert {"wM_0", "Ww_0"} <= set(site.capacity)
+    assert site.capacity["Ww_0"] == pytest.approx(site.network.lanes["Ww_0"].length_m / 7.5)
+    env = ugat_marl.parallel_env(split, observation="count")
+    (item,) = env.network.intersections
+    env.reset(seed=1)
+    (agent,) = env.agents
+    lane = env.network.lane_table().ids.index("wM_0")
+    red = next(
+        place
+        for place, state in enumerate(item.phases)
+        if all(state[link.index] == "r" for link in item.links if link.from_lane == "wM_0")
+    )
+    for _ in range(6):
+        seen, *_ = env.step({agent: red})
+    standing = env.snapshot.vehicles[lane]
+    counts = {name: LaneCount(60.0, 0.0, 0.0) for name in site.capacity}
+    counts["Ww_0"] = LaneCount(60.0, standing - 1, standing - 1)
+    counts["wM_0"] = LaneCount(60.0, 1.0, 1.0)
+    assert standing == 8
+    assert site.observe(counts, 60.0, [red])[agent] == pytest.approx(seen[agent])
     env.close()
 
 

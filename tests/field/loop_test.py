@@ -395,6 +395,27 @@ def test_a_slow_policy_misses_its_deadline_and_is_not_asked_while_it_is_busy() -
     assert sources == ["fallback", "fallback", "policy"], "a late answer was taken for a new one"
 
 
+def test_a_policy_that_was_busy_is_reset_before_it_decides_for_a_street_that_came_back() -> None:
+    street, policy = MadeUpStreet(), Scripted()
+    loop = FieldLoop(SITE, policy, street, QUICK)
+    released = threading.Event()
+
+    def slow(actions: dict[str, int]) -> dict[str, int]:
+        released.wait(60)
+        return actions
+
+    policy.does = slow
+    decide(loop, street)
+    returned = MadeUpStreet()
+    loop.take_over(returned)  # the policy is still at the decision before
+    policy.does = lambda actions: actions
+    released.set()
+    time.sleep(0.2)
+    (decision,) = decide(loop, returned)
+    assert not decision.fallback or "late" not in str(decision.fallback)
+    assert len(policy.seen) == 1, "it remembers the street before"
+
+
 def test_slow_detectors_leave_the_policy_no_time() -> None:
     street = MadeUpStreet()
     loop = FieldLoop(SITE, Scripted(), street, TrustLimits(answer_ms=50, reserve_ms=10))

@@ -194,6 +194,12 @@ def test_weights_of_a_short_log_follow_the_network() -> None:
     assert drawn[:, 1].std(0).max() > 1.5 * drawn[:, 0].std(0).max()
 
 
+def test_the_largest_weight_stays_however_large_a_weight_must_be() -> None:
+    channel = fit_channel(log_of(lag=2, lost=0.4), ChannelConfig(least_share=0.9))
+    assert channel.network[2] == 1.0
+    assert channel.lag == 2
+
+
 def test_a_channel_survives_its_checkpoint() -> None:
     channel = fit_channel(log_of(lag=1, lost=0.1))
     again = CommandChannel.from_state(channel.state_dict())

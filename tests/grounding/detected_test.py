@@ -12,6 +12,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from ugat_marl.errors import OptionError
 from ugat_marl.grounding.detected import (
     DetectionConfig,
     LaneCourse,
@@ -166,6 +167,24 @@ def test_a_jam_of_very_many_vehicles_has_times() -> None:
     assert (np.diff(mean) > 0).all()
 
 
+@pytest.mark.parametrize("last", [0.05, 1.0])
+def test_a_jam_whose_vehicles_came_early_in_a_long_span_has_times(last: float) -> None:
+    """All but the last were due in a twentieth of the span: 700 vehicles, then a dead detector."""
+    latest = np.append(np.linspace(0.0, 0.05, 699), last)
+    mean, _, variance = staircase(latest)
+    assert np.isfinite(mean).all() and np.isfinite(variance).all()
+    assert (np.diff(mean) >= 0).all()
+    assert (mean[:-1] <= 0.1).all() and mean[-1] <= last + 0.05
+
+
+def test_early_latest_times_give_the_mean_of_drawn_arrivals() -> None:
+    latest = np.array([0.12, 0.2, 0.25, 0.25, 0.9])
+    drawn = np.sort(np.random.default_rng(2).random((4_000_000, 5)), axis=1)
+    drawn = drawn[(drawn <= latest).all(1)]
+    mean, _, _ = staircase(latest)
+    assert mean == pytest.approx(drawn.mean(0), abs=0.005)
+
+
 def test_a_jam_of_an_hour_fits_into_memory() -> None:
     """A matrix of chances for each moment took 7 GB."""
     tracemalloc.start()
@@ -298,6 +317,12 @@ def test_late_stamps_are_put_right() -> None:
     config = DetectionConfig(latency_s=2.0)
     (found,) = LaneEstimate([period], {"W_0": LANE}, [ADVANCE, STOP], config).incoming("W_0")
     assert found.leave_s == pytest.approx([40, 50])
+
+
+@pytest.mark.parametrize("latency_s", [np.nan, np.inf, 2000.0])
+def test_a_latency_of_no_detector_is_refused(latency_s: float) -> None:
+    with pytest.raises(OptionError, match=r"latency_s = .*: must be from -60 to 60 s"):
+        DetectionConfig(latency_s=latency_s)
 
 
 def test_stamps_of_sumos_output_are_a_step_early() -> None:

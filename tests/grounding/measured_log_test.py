@@ -182,7 +182,8 @@ def test_a_learner_and_a_fit_take_the_log(crossing: Scenario, measured: Measured
     log = imported(measured, crossing, "movements")
     env = parallel_env(crossing, observation="movements")
     world = RecordedWorld(log, env)
-    assert world.collect(Replay(log), 0, 0) is log
+    taken = world.collect(Replay(log), 0, 0)
+    assert taken is not None and taken.frame.equals(log.frame)
     summary = LaneView.of(Network.read(crossing), "movements").summary(log)
     assert np.isfinite(summary.values[:, NAMES.index("mean")]).all()
 
@@ -200,6 +201,16 @@ def test_a_replay_repeats_the_commands_of_the_street(
     found = again.transitions(again.agents[0]).executed
     assert found[: len(wanted)].tolist() == wanted.tolist()
     assert set(found[len(wanted) :]) == {wanted[-1]}
+
+
+def test_a_log_whose_steps_count_from_midnight_is_the_same_log(
+    crossing: Scenario, measured: MeasuredData
+) -> None:
+    log = imported(measured, crossing)
+    late = TransitionLog(log.provenance, log.frame.with_columns(step=pl.col("step") + 2520))
+    world = RecordedWorld(late, parallel_env(crossing, observation="count"))
+    taken = world.collect(Replay(log), 0, 0)
+    assert taken is not None and taken.frame.equals(log.frame)
 
 
 def test_of_a_lane_with_a_guessed_queue_only_the_service_is_used(

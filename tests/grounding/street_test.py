@@ -4,8 +4,10 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 from typing import Any
+from unittest.mock import Mock
 
 import numpy as np
 import polars as pl
@@ -32,6 +34,7 @@ from ugat_marl.grounding import (
     require_histories,
     street_env,
     street_prior,
+    street_training,
 )
 from ugat_marl.grounding.channel import ChannelConfig, CommandChannel
 from ugat_marl.grounding.eyes import Eyes, EyesConfig, fit_eyes
@@ -48,6 +51,7 @@ from ugat_marl.policies import (
     roll_out,
     rule_in,
 )
+from ugat_marl.progress import Silent
 from ugat_marl.simulation import kept_warm
 
 SCENARIO = load_scenario("single-v1")
@@ -322,6 +326,26 @@ def test_an_interrupted_training_ends_as_an_unbroken_one(
     assert logged == numbers(tmp_path / "broken")
     assert logged[1, "channel/lag_2"] > 0.5
     assert logged[2, "street/commands"] >= 2.0
+
+
+def test_worlds_beside_a_log_of_other_commands_get_these_commands(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """Else f and its rival of the fitted worlds would differ where the worlds do not."""
+    acted: list[tuple[float, object]] = []
+
+    def listening(_street: object, simulation: Simulation, policy: object, *_rest: object) -> None:
+        acted.append((simulation.epsilon, policy))
+
+    monkeypatch.setattr(street_training, "street_log", listening)
+    simulation = Simulation(load_scenario("single-v1"), "sim", {}, epsilon=0.3)
+    for replay, expected in (("the log", (0.0, "the log")), (None, (0.3, "the policy"))):
+        training = Mock(spec=StreetTraining)
+        training.simulation, training.config = simulation, Mock(residual_delay_s=0)
+        training.run, training.real = Mock(reporter=Silent()), Mock(replay=lambda r=replay: r)
+        training._as_recorded = partial(StreetTraining._as_recorded, training)
+        StreetTraining._street_logs(training, Mock(iteration=0), "the policy", Mock(), 2, 0)
+        assert acted.pop() == expected
 
 
 def test_the_kept_policy_is_the_one_on_the_street(

@@ -11,9 +11,12 @@ from gymnasium.spaces import Box, Discrete
 from pettingzoo import ParallelEnv
 from pettingzoo.test import parallel_api_test
 
+import ugat_marl
 from ugat_marl.data import AgentLayout
+from ugat_marl.envs.commands import memory_size
 from ugat_marl.errors import ActionError, OptionError
 from ugat_marl.grounding import GateConfig, GroundedEnv, PhaseTransform
+from ugat_marl.grounding.transform import Grounding
 
 LAYOUTS = {"a_0": AgentLayout(3, 4), "b_0": AgentLayout(2, 2, 1)}
 KEYS = {"grounded_action", "uncertainty", "accepted"}
@@ -90,6 +93,30 @@ def transform(mode: str = "infinite", **options: Any) -> PhaseTransform:
     made.forward.fitted.fill_(True)
     made.inverse.fitted.fill_(True)
     return made
+
+
+def test_a_policy_sees_the_commands_it_gave_and_not_the_grounded_ones() -> None:
+    class Other(PhaseTransform):
+        """Always answers phase 3."""
+
+        def __call__(self, observations, actions, permitted=None, earlier=()):
+            threes = np.full(len(actions), 3)
+            zeros = np.zeros(len(actions), np.float32)
+            return Grounding(threes, threes, zeros, np.ones(len(actions), bool), zeros)
+
+    inner = ugat_marl.parallel_env("single-v1", commands=2, duration_s=100.0)
+    try:
+        env = GroundedEnv(inner, Other(inner.recorded_layouts, 0))
+        env.reset(seed=0)
+        (agent,) = env.agents
+        phases = inner.action_space(agent).n
+        for command in (0, 1, 2):
+            observations, _, _, _, infos = env.step({agent: command})
+            memory = observations[agent][-memory_size(phases, 2) :]
+            assert memory[:phases].argmax() == command
+            assert infos[agent]["grounded_action"] == 3
+    finally:
+        inner.close()
 
 
 def test_the_grounded_action_is_executed_and_told_in_the_infos() -> None:

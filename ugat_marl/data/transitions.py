@@ -221,6 +221,11 @@ class TransitionLog:
             return self
         return TransitionLog(self.provenance, self.frame.filter(pl.col("step") < decisions))
 
+    def from_step_0(self) -> TransitionLog:
+        """Return the log with the steps of each episode counted from 0."""
+        since = pl.col("step") - pl.col("step").min().over("episode")
+        return TransitionLog(self.provenance, self.frame.with_columns(step=since))
+
     def transitions(self, agent: str) -> Transitions:
         """Return the rows of one agent, ordered by episode and step.
 

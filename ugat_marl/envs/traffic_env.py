@@ -198,7 +198,7 @@ class TrafficEnv(ParallelEnv[str, Any, Any]):
         self._scores, self.agents = None, []  # if SUMO does not start, no episode has begun
         self._start(int(self.np_random.integers(2**31)))
         self.agents = self.possible_agents[:]
-        self._decision = 0
+        self._decision, self._remembered = 0, None
         self._states = [signals.initial_state(self._timing) for _ in self.agents]
         if self._programmes is not None:
             self._programmes.reset()
@@ -258,7 +258,8 @@ class TrafficEnv(ParallelEnv[str, Any, Any]):
         before = self._snapshot
         self._advance(requested)
         if self._memory is not None:
-            self._memory.add(asked, self.phases)
+            self._memory.add(self._remembered or asked, self.phases)
+            self._remembered = None
         rewards = self._rewarder.rewards(before, self._snapshot)
         self._recorder.add(self._snapshot, sum(rewards) / len(rewards))
         self._decision += 1
@@ -279,6 +280,20 @@ class TrafficEnv(ParallelEnv[str, Any, Any]):
     def measure_for(self, *observers: Observer) -> None:
         """Measure from the next episode on what these observers read, too; none measures less."""
         self._recorded = observers
+
+    def remember(self, commands: Mapping[str, int]) -> None:
+        """Let observations show these commands for the next step, and not the actions of `step`.
+
+        A wrapper that executes other phases than the policy asked for calls this, because a policy
+        sees its own commands (`commands`).
+
+        Args:
+            commands: A green phase for every agent.
+
+        Raises:
+            ActionError: A command is missing, unknown or out of range.
+        """
+        self._remembered = checked_phases(commands, self.agents, self.action_spaces)
 
     def delay_greens(self, seconds: Mapping[str, float]) -> None:
         """Delay the greens that begin in the next step; ends of greens do not change.

@@ -225,13 +225,17 @@ class FieldLoop:
         phases = [light.phase for light in self._lights.machines.values()]
         observations = self._site.observe(counts, now, phases, self._memory)
         within_ms = limits.answer_ms - limits.reserve_ms
-        left_ms = within_ms - _ms_since(begun)
-        if left_ms <= 0:
+        if _ms_since(begun) >= within_ms:
             return [], f"late: {within_ms:g} ms were over before the policy could be asked"
+
+        def left_s() -> float:
+            return (within_ms - _ms_since(begun)) / 1e3
+
         try:
-            return self._asked.ask(
-                self._answer, observations, self._infos(), within_s=left_ms / 1e3
-            ), ""
+            if self._reset_due:
+                self._asked.ask(self._policy.reset, 0, within_s=left_s())
+                self._reset_due = False
+            return self._asked.ask(self._answer, observations, self._infos(), within_s=left_s()), ""
         except Late as late:
             return [], f"late: {late}"
         except NoAnswer as error:
@@ -247,6 +251,7 @@ class FieldLoop:
 
     def _warm_up(self, policy: Policy) -> None:
         """Ask the policy once before the first decision: a network's first answer takes longest."""
+        self._reset_due = True  # a policy that is still busy with another street is reset later
         try:
             now, phases = self._street.now_s(), [0] * len(self._lights.machines)
             nothing = self._site.observe({}, now, phases, self._memory)
@@ -256,6 +261,7 @@ class FieldLoop:
                 (policy.reset, (0,)),
             ):
                 self._asked.ask(function, *arguments, within_s=_WARM_UP_S)
+            self._reset_due = False
         except NoAnswer:
             return  # the first decision meets the same failure and reports it
 

@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
-from dataclasses import dataclass
+from collections.abc import Iterable, Mapping
+from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import Any
 
@@ -84,8 +84,8 @@ class Site:
             scenario.timing,
             control.decision_interval_s,
             {
-                light: tuple(
-                    dict.fromkeys(lane for one in (light, *near[light]) for lane in sees[one])
+                light: _with_those_behind(
+                    network, (lane for one in (light, *near[light]) for lane in sees[one])
                 )
                 for light in sees
             },
@@ -99,9 +99,9 @@ class Site:
 
     @cached_property
     def capacity(self) -> dict[str, float]:
-        """Lane that must be counted to the number of vehicles that fit on it."""
+        """Lane that must be counted to the number of vehicles that fit on it alone."""
         lanes = dict.fromkeys(lane for seen_lanes in self.sees.values() for lane in seen_lanes)
-        return {lane: self.network.lanes[lane].capacity for lane in lanes}
+        return {lane: replace(self.network.lanes[lane], room_m=0.0).capacity for lane in lanes}
 
     @cached_property
     def spaces(self) -> dict[str, Discrete]:
@@ -128,10 +128,17 @@ class Site:
         lanes = self._lanes.ids
         nobody = LaneCount(now_s, 0.0, 0.0)
         rows = [counts.get(lane, nobody) for lane in lanes]
+        vehicles = np.array([row.vehicles for row in rows])
+        halting = np.array([row.halting for row in rows])
+        for place, shares in enumerate(self._lanes.behind.lanes):  # of lanes too short for a car
+            for lane, share in shares:
+                behind = counts.get(lane, nobody)
+                vehicles[place] += share * behind.vehicles
+                halting[place] += share * behind.halting
         snapshot = Snapshot(
             time_s=now_s,
-            vehicles=np.array([row.vehicles for row in rows]),
-            halting=np.array([row.halting for row in rows]),
+            vehicles=vehicles,
+            halting=halting,
             mean_speed_mps=np.full(len(lanes), np.nan),  # no observation reads it
             waiting_s=np.empty(0),
             departed=0,
@@ -143,3 +150,12 @@ class Site:
     @cached_property
     def _lanes(self) -> Any:
         return self.network.lane_table()
+
+
+def _with_those_behind(network: Network, lanes: Iterable[str]) -> tuple[str, ...]:
+    """Return lanes, each once, with the upstream lanes that count with short ones.
+
+    Lanes inside of junctions are left out: no detector lies there.
+    """
+    found = (one for lane in lanes for one in (lane, *network.lanes[lane].behind.lanes))
+    return tuple(lane for lane in dict.fromkeys(found) if lane in network.lanes)

@@ -509,7 +509,7 @@ def _mixture(
         best, weights, support = likelihood, found, support | {lag}
         if len(support) == kinds:
             break
-    weights = np.where(weights >= config.least_share, weights, 0.0)
+    weights = np.where(weights >= min(config.least_share, weights.max()), weights, 0.0)
     weights /= weights.sum()
     return weights, _shares(explains, weights)
 

@@ -33,6 +33,7 @@ from scipy.integrate import trapezoid
 from scipy.special import gammaln
 from scipy.stats import norm
 
+from ugat_marl.errors import OptionError
 from ugat_marl.scenarios import GREEN, Detector, Lane, Passages, Period, deciding_letter
 
 Floats = NDArray[np.float64]
@@ -44,6 +45,8 @@ GRID = 129
 STAIRS = 0.1
 """Least distance of the latest times of two vehicles of a jam, in mean distances. A span may begin
 late, by the error of a free ride, and would then leave no time for them."""
+MOST_LATENCY_S = 60.0
+"""Longest delay of stamps; a longer one is a clock that was set wrong."""
 LONG_S = 300.0
 """Length from which an open jam is no queue of the last cycle."""
 
@@ -93,6 +96,13 @@ class DetectionConfig:
     unmatched: float = 3.0
     missed: float = 0.05
     longest_s: float = 900.0
+
+    def __post_init__(self) -> None:
+        if not abs(self.latency_s) <= MOST_LATENCY_S:
+            raise OptionError(
+                f"latency_s = {self.latency_s:g}: must be from -{MOST_LATENCY_S:g} to "
+                f"{MOST_LATENCY_S:g} s"
+            )
 
 
 @dataclass(frozen=True)
@@ -508,18 +518,26 @@ def staircase(latest: Floats) -> tuple[Floats, Floats, Floats]:
     grid = np.unique(np.concatenate([np.linspace(0.0, 1.0, GRID), latest]))
     due = np.searchsorted(latest, grid[:-1], side="right")
     more = np.arange(n + 1)
-    factorial = gammaln(more + 1.0)
+    # Early latest times make every allowed course of N all but impossible, and its chance 0 in
+    # floating point. So N gets the rate of the straightest allowed course, and each change of the
+    # rate a weight that makes up for it.
+    course = _straightest(grid, np.append(due, n))
+    rate = np.maximum(np.diff(course), 1e-3 * n * np.diff(grid))
+    change = np.diff(np.log(rate / np.diff(grid)))[:, None]
+    weight = np.exp(np.clip(change * (more - course[1:-1, None]), -700.0, 700.0))
     # chances of so many arrivals in each step; a matrix for each would not fit for a long jam
-    arrive = np.exp(more * np.log(n * np.diff(grid))[:, None] - factorial)
+    arrive = np.exp(more * np.log(rate)[:, None] - rate[:, None] - gammaln(more + 1.0))
     forward = np.zeros((len(grid), n + 1))
     backward = np.zeros((len(grid), n + 1))
     forward[0, 0] = backward[-1, n] = 1.0
     allowed = more[None, :] >= np.append(due, n)[:, None]
-    for k, weights in enumerate(arrive):
-        ahead = np.convolve(weights, forward[k])[: n + 1] * allowed[k + 1]
+    weight = np.concatenate((weight, np.ones((1, n + 1))))
+    for k, chances in enumerate(arrive):
+        ahead = np.convolve(chances, forward[k])[: n + 1] * allowed[k + 1] * weight[k]
         forward[k + 1] = ahead / ahead.sum()
     for k in range(len(arrive) - 1, -1, -1):
-        back = np.convolve(arrive[k], backward[k + 1, ::-1])[n::-1] * allowed[k]
+        after = (backward[k + 1] * weight[k])[::-1]
+        back = np.convolve(arrive[k], after)[n::-1] * allowed[k]
         backward[k] = back / back.sum()
     chance = forward * backward
     chance /= chance.sum(1, keepdims=True)
@@ -528,6 +546,21 @@ def staircase(latest: Floats) -> tuple[Floats, Floats, Floats]:
     # E t_i is the integral of P(N(t) < i), here by the trapezoidal rule
     mean = trapezoid(chance.cumsum(1)[:, :-1], grid, axis=0)
     return mean, grid, np.maximum(variance, 0.0)
+
+
+def _straightest(grid: Floats, least: NDArray[np.int64]) -> Floats:
+    """Return the least concave course from 0 that is nowhere below `least`, ``(times,)``."""
+    kept = [0]
+    for k in range(1, len(grid)):
+        while len(kept) > 1:
+            i, j = kept[-2:]
+            if (least[j] - least[i]) * (grid[k] - grid[i]) > (least[k] - least[i]) * (
+                grid[j] - grid[i]
+            ):
+                break
+            kept.pop()
+        kept.append(k)
+    return np.interp(grid, grid[kept], least[kept].astype(np.float64))
 
 
 @dataclass(frozen=True)

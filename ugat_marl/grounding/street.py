@@ -307,6 +307,10 @@ class FittedStreet:
         return street, Known(_simulated(content.get("simulated")), street.posterior)
 
 
+ENOUGH = 100
+"""Simulations below which the errors of a fit are known from too few worlds: by hand."""
+
+
 @dataclass(frozen=True)
 class Simulation:
     """The simulation in which worlds are drawn, and its settings.

@@ -39,6 +39,7 @@ from ugat_marl.grounding.residual import Residual
 from ugat_marl.grounding.rival import ROLL_OUTS, Rival, late_world, matched_delays
 from ugat_marl.grounding.state import RunState
 from ugat_marl.grounding.street import (
+    ENOUGH,
     FittedStreet,
     Known,
     Simulation,
@@ -321,14 +322,16 @@ class StreetTraining(Algorithm):
         real, known = TransitionLog.concatenate(state.real), state.transform.known
         config = self.config.street.of_log(real)
         number = episodes_of_fit(config, known)
+        if config.simulations < ENOUGH:
+            self.run.reporter.say(
+                f"{iteration_name(state)}: {config.simulations} simulations are few, so chances "
+                f"and intervals of effects are too sure; --street.simulations {ENOUGH} or more"
+            )
         agents = list(real.provenance.layouts)
         jams = Oversaturation.of(self.view, self.view.rows(real), agents)
         for line in jams.describe():
             self.run.reporter.say(f"{iteration_name(state)}: {line}")
-        simulation, acting = self.simulation, policy
-        if (replay := self.real.replay()) is not None:
-            # a log of someone else's commands tells of the street only beside worlds that got them
-            simulation, acting = replace(simulation, epsilon=0.0), replay
+        simulation, acting = self._as_recorded(policy)
         with self.run.reporter.task(f"fitting, {iteration_name(state)}", number) as advance:
             street, state.transform.known = fit_street(
                 real,
@@ -345,6 +348,15 @@ class StreetTraining(Algorithm):
         for line in street.describe():
             self.run.reporter.say(f"{iteration_name(state)}: {line}")
         return street
+
+    def _as_recorded(self, policy: Policy) -> tuple[Simulation, Policy]:
+        """Return how simulated worlds are driven, so that their logs compare with the street's.
+
+        A log of someone else's commands tells of the street only beside worlds that got them.
+        """
+        if (replay := self.real.replay()) is None:
+            return self.simulation, policy
+        return replace(self.simulation, epsilon=0.0), replay
 
     def _fit_residual(
         self, state: RunState[StreetFit], policy: Policy, street: FittedStreet, residual: Residual
@@ -389,13 +401,14 @@ class StreetTraining(Algorithm):
         """Roll the policy out in worlds of the street; for timed grounding, with delays, too."""
         longest_s = self.config.residual_delay_s
         delays_s = (0, longest_s) if longest_s else (0,)
+        simulation, acting = self._as_recorded(policy)
         title = f"roll-outs in the street, {iteration_name(state)}"
         with self.run.reporter.task(title, worlds * len(delays_s)) as advance:
             return [
                 street_log(
                     street,
-                    replace(self.simulation, most_delay_s=most_s),
-                    policy,
+                    replace(simulation, most_delay_s=most_s),
+                    acting,
                     [derive_seed(seed, "world", most_s, k) for k in range(worlds)],
                     advance,
                 )

@@ -367,7 +367,7 @@ class RecordedWorld:
                     f"{env.scenario.id!r} with the same options, or train with those of the log "
                     "(--observation count --learner dqn, for example)"
                 )
-        stack = Stack(env.recorded_layouts)
+        stack, log = Stack(env.recorded_layouts), log.from_step_0()
         split(stack_log(log, stack), held_out_every, stack)  # raises now instead of after hours
         self._log = log
 

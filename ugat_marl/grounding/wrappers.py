@@ -75,10 +75,11 @@ class GroundedEnv(BaseParallelWrapper[str, Any, Any]):
             self._seen, requested, self._allowed, self._earlier
         )  # lines 11 to 13 and 15
         executed = dict(zip(stack.agents, outcome.executed.tolist(), strict=True))
+        env: Any = self.env
+        if hasattr(env, "remember"):  # one of the suite: its agents see their own commands
+            env.remember(dict(zip(stack.agents, requested.tolist(), strict=True)))
         if outcome.delay_s.any():
-            delays = dict(zip(stack.agents, outcome.delay_s.tolist(), strict=True))
-            env: Any = self.env
-            env.delay_greens(delays)
+            env.delay_greens(dict(zip(stack.agents, outcome.delay_s.tolist(), strict=True)))
         observations, rewards, terminations, truncations, infos = self.env.step(executed)  # line 14
         if self.env.agents:
             ran = [infos.get(a, {}).get("executed_action", executed[a]) for a in stack.agents]
