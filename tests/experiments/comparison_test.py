@@ -64,6 +64,22 @@ def test_regret_won_back_by_hand(found: Comparison) -> None:
     )
 
 
+def test_settings_are_compared_by_the_seeds_that_both_have(found: Comparison) -> None:
+    """Tables are looked at while their trainings are under way."""
+    rows = [*found.trials, *trials("fitted street", {1: (71.0, 100.0)})]
+    begun = replace(found, trials=tuple(rows))
+    assert begun.best("V4") == "fitted street"
+    assert begun.regret_s("direct transfer", "V4").tolist() == [240.0 - 100.0]
+    assert begun.regret_s("best rule, tuned there", "V4").tolist() == [20.0]
+    test = begun.test("fitted street", "direct transfer", "V4")
+    assert (test.difference.mean, test.count) == (-140.0, 1)
+    row = next(r for r in begun.rows() if r["setting"] == "direct transfer")
+    assert math.isnan(row["regret_s_low"])
+    apart = replace(begun, trials=(*trials("one", {0: (1.0, 2.0)}), *trials("two", {1: (1, 3)})))
+    assert apart.regret_s("two", "V4").size == 0
+    assert math.isnan(apart.won_back("two", "V4", "two"))
+
+
 def test_nothing_to_win_has_no_share() -> None:
     rows = trials("direct transfer", {0: (70.0, 80.0)}) + trials(
         "phase (the paper's UGAT)", {0: (70.0, 90.0)}

@@ -6,6 +6,7 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import polars as pl
 import pytest
 
@@ -64,12 +65,13 @@ def test_a_run_has_a_folder_of_its_own(scenario: str, real: str, folder: str) ->
 
 
 def test_one_domain_may_be_a_text() -> None:
-    frame = ugat_marl.evaluate("single-v1", "random", "V1", seeds=1, duration_s=100, workers=1)
+    one = np.int64(1)
+    frame = ugat_marl.evaluate("single-v1", "random", "V1", seeds=one, duration_s=100, workers=1)
     assert frame["domain"].to_list() == ["V1"]
 
 
 def test_wrong_calls_are_refused() -> None:
-    for policies in (["random", "random"], []):
+    for policies in (["random", "random"], [], {}):
         with pytest.raises(OptionError, match="policies"):
             ugat_marl.evaluate("single-v1", policies, ["sim"])
     with pytest.raises(OptionError, match="settings dqn are of the learners dqn and universal"):

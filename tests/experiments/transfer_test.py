@@ -126,9 +126,12 @@ def test_domains_whose_names_differ_by_a_sign_are_trained_in_one_by_one(tmp_path
 
 def test_controls_can_be_added_to_a_run_and_change_nothing_else(tmp_path: Path) -> None:
     transfer(SMALL, tmp_path / "run")
-    policies = ("phase", "direct-transfer", "trained-in-real", "random-delay-0-5-s")
+    policies = (
+        "phase", "direct-transfer", "trained-in-real", "random-delay-0-5-s",
+        "corrected-sim",
+    )  # fmt: skip
     before = weights(tmp_path / "run", "phase")
-    more = replace(SMALL, oracle=True, random_delay_s=5)
+    more = replace(SMALL, oracle=True, random_delay_s=5, corrected="V2")
     transfer(more, tmp_path / "run", resume=True)
     transfer(more, tmp_path / "at once")
     assert np.array_equal(before, weights(tmp_path / "run", "phase"))

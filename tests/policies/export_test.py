@@ -197,6 +197,15 @@ def test_two_formats_share_their_side_car(tmp_path: Path) -> None:
         NumpyPolicy.load(path)
 
 
+def test_a_format_that_knows_the_site_leaves_the_others_readable(tmp_path: Path) -> None:
+    env = ToyTraffic()
+    env.decision_interval_s = 10.0
+    policy = policy_of(False, agents=AgentSet.of(env))
+    path = exported(policy, ".npz", tmp_path)
+    export_policy(policy, path.with_suffix(".ts"), env)
+    assert NumpyPolicy.load(path).agents == policy.agents
+
+
 # --- the side-car -------------------------------------------------------------------------------
 
 

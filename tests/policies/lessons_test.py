@@ -63,6 +63,20 @@ def test_a_best_rule_that_is_known_teaches_where_the_best_one_is_asked_for(
     assert named.attend(env, 0, best="max-pressure:10") == RULE
 
 
+def test_where_no_rule_reads_the_observations_there_are_no_lessons() -> None:
+    """All standard rules read `movements`, and the default learner other observations as well."""
+    options = observed_options(UNIVERSAL_NAME) | {"observation": "count"}
+    with contextlib.closing(parallel_env("single-v1", duration_s=100, **options)) as env:
+        learner = DQN.of(env, replace(SETTINGS, teacher=BEST), 0)
+        assert learner.plays(env) == 0
+        assert learner.attend(env, 0) is None
+        learner.learn(env, 1, 0)
+        assert learner.episodes == 1
+        named = DQN.of(env, SETTINGS, 0)
+        with pytest.raises(OptionError, match="train in such ones, or leave the teacher out"):
+            named.attend(env, 0)
+
+
 def test_a_learner_acts_as_its_teacher_before_its_first_episode(env: TrafficEnv) -> None:
     learner = DQN.of(env, SETTINGS, 0)
     assert isinstance(learner, Taught)

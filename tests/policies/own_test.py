@@ -23,6 +23,7 @@ from ugat_marl.policies import (
     OwnLearnerFactory,
     OwnPolicy,
     check_own_learner,
+    is_own,
     load_own,
     own_name,
     own_policy,
@@ -369,6 +370,12 @@ def test_files_of_one_name_in_two_folders_are_two_modules(
 def test_a_name_that_leads_nowhere_is_refused(name: str, error: type[Exception], says: str) -> None:
     with pytest.raises(error, match=says):
         load_own(name, "learner")
+
+
+def test_a_function_without_a_name_has_one() -> None:
+    made = lambda env, seed: env  # noqa: E731 - as a notebook's first cell has it
+    made.__qualname__ = "<lambda>"
+    assert is_own(own_name(made))
 
 
 @pytest.mark.usefixtures("algorithm")

@@ -9,12 +9,14 @@ from ugat_marl.reporting.run_groups import job_labels, seeds_of_one
 from ugat_marl.reporting.run_records import RunRecord
 
 
-def job(seed: int, learner: str = "dqn", episodes: int = 40, **options: Any) -> RunRecord:
+def job(
+    seed: int, learner: str = "dqn", episodes: int = 40, hidden: int = 48, **options: Any
+) -> RunRecord:
     settings = {
         "scenario": "single-v1",
         "seed": seed,
         "name": "direct transfer",
-        "learner": {"name": learner, "settings": []},
+        "learner": {"name": learner, "settings": [], "dqn": {"hidden": [hidden]}},
         "episodes": episodes,
         "options": options,
     }
@@ -37,3 +39,9 @@ def test_learner_episodes_and_options_part_trainings() -> None:
     assert labels[2] == "direct transfer (learner sb3-ppo)"
     assert labels[3] == "direct transfer (episodes 200)"
     assert labels[4] == "direct transfer (options.duration_s 600)"
+
+
+def test_settings_of_the_suites_learners_part_trainings() -> None:
+    records = [job(0), job(1), job(0, hidden=8)]
+    assert [len(part) for part in seeds_of_one(records)] == [2, 1]
+    assert job_labels(records)[2] == "direct transfer (dqn.hidden [8])"

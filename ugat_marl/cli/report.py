@@ -13,10 +13,10 @@ from typing import Annotated, Any
 from rich.console import Console
 from tyro.conf import Positional, arg
 
-from ugat_marl.errors import OptionError
+from ugat_marl.errors import OptionError, UgatMarlError
 from ugat_marl.experiments import TransferConfig
 from ugat_marl.files import require_writable, write_whole
-from ugat_marl.policies import is_own
+from ugat_marl.policies import is_own, rule_in
 from ugat_marl.reporting import RunRecord, TableRecord, read_records, runs_page, write_pictures
 
 PAGE = "report.html"
@@ -89,15 +89,28 @@ def again(record: RunRecord | TableRecord) -> list[str]:
         return []
     lines = _train(record, folder)
     if record.finished and (record.directory / "policies").is_dir():
-        policies = sorted(str(path) for path in (record.directory / "policies").glob("*.pt"))
+        policies = sorted((record.directory / "policies").glob("*.pt"))
         domains = record.evaluation.domains if record.evaluation is not None else []
         judge = ["ugat-marl", "evaluate", record.scenario, "--domains", *domains]
-        lines.append(shlex.join([*judge, "--policies", *policies]))
+        if (length_s := record.settings.get("duration_s")) is not None:
+            judge += ["--duration-s", str(length_s)]
+        named = [_policy(path, record.settings.get("learner")) for path in policies]
+        lines.append(shlex.join([*judge, "--policies", *named]))
     return [*lines, shlex.join(["tensorboard", "--logdir", folder])]
 
 
+def _policy(path: Path, learner: object) -> str:
+    """Return the name of a kept policy; the state of a user's learner needs that learner's name."""
+    if isinstance(learner, str) and is_own(learner) and rule_in(path) is None:
+        return f"{learner}@{path}"
+    return str(path)
+
+
 def _train(record: RunRecord, folder: str) -> list[str]:
-    options = train_options(record.settings)
+    try:
+        options = train_options(record.settings)
+    except (UgatMarlError, TypeError, ValueError):
+        return []  # of a damaged file, or of a learner that this version does not have
     place = ["--out", f"{folder}-again"] if record.finished else ["--out", folder, "--resume"]
     return [shlex.join(["ugat-marl", "train", record.scenario, *options, *place])]
 

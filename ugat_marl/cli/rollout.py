@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterator
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -52,6 +53,9 @@ class VideoConfig:
     size: int = 800
 
     def __post_init__(self) -> None:
+        for name in ("from_s", "length_s"):
+            if not math.isfinite(getattr(self, name)):
+                raise OptionError(f"film.{name} = {getattr(self, name)}: must be a finite number")
         if not 1 <= self.speed <= 100:
             raise OptionError(f"film.speed = {self.speed}: must be from 1 to 100")
         if not 200 <= self.size <= 4000:

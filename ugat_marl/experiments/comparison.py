@@ -105,14 +105,27 @@ class Comparison:
             measure: A field of `Scores`.
             domain: Domain of the episodes; default: the target.
         """
+        means = self._by_seed(setting, target, measure, domain)
+        return np.array([means[seed] for seed in sorted(means, key=lambda s: s or 0)])
+
+    def _by_seed(
+        self, setting: str, target: str, measure: str, domain: str | None = None
+    ) -> Mapping[int | None, float]:
+        """Return means over the episodes by training seed, as `values` does."""
         played = self._scores.get((setting, target, target if domain is None else domain), {})
         means = {
             seed: float(np.mean([getattr(scores, measure) for scores in played[seed]]))
             for seed in played
         }
-        if None in means:
-            return np.full(max(len(self.training_seeds), 1), means[None])
-        return np.array([means[seed] for seed in sorted(means, key=lambda s: s or 0)])
+        if None not in means:
+            return means
+        return dict.fromkeys(self.training_seeds or [None], means[None])
+
+    def _paired(self, one: str, other: str, target: str, measure: str) -> tuple[Floats, Floats]:
+        """Return the values of two settings for the training seeds that both have, ``(n,)``."""
+        first, second = (self._by_seed(name, target, measure) for name in (one, other))
+        both = sorted(first.keys() & second.keys(), key=lambda s: s or 0)
+        return np.array([first[s] for s in both]), np.array([second[s] for s in both])
 
     def episodes(self, setting: str, target: str) -> list[Scores]:
         """Return every episode in the target, of all training seeds."""
@@ -141,8 +154,8 @@ class Comparison:
         return there - self.values(setting, target, measure, self.sim)
 
     def test(self, one: str, other: str, target: str, measure: str = "att_s") -> PairedTest:
-        """Compare two settings in a domain, by the same training seeds."""
-        return PairedTest.of(self.values(one, target, measure), self.values(other, target, measure))
+        """Compare two settings in a domain, by the training seeds that both have."""
+        return PairedTest.of(*self._paired(one, other, target, measure))
 
     def best(self, target: str, among: Sequence[str] | None = None) -> str:
         """Return the setting with the lowest mean ATT in a domain."""
@@ -150,9 +163,9 @@ class Comparison:
         return min(names, key=lambda name: float(self.values(name, target, "att_s").mean()))
 
     def regret_s(self, setting: str, target: str) -> Floats:
-        """Return the ATT minus that of the best setting there, in s, one per training seed."""
-        best = self.values(self.best(target), target, "att_s")
-        return self.values(setting, target, "att_s") - best
+        """Return the ATT minus that of the best setting there, in s, one per common seed."""
+        mine, best = self._paired(setting, self.best(target), target, "att_s")
+        return mine - best
 
     def won_back(self, setting: str, target: str, direct: str) -> float:
         """Return the share of the regret of `direct` that a setting removes.
@@ -160,8 +173,8 @@ class Comparison:
         1 - regret(setting) / regret(direct), both means over training seeds. The best setting has
         1. The share is nan where direct transfer has no regret.
         """
-        start = float(self.regret_s(direct, target).mean())
-        mine = float(self.regret_s(setting, target).mean())
+        start = Interval.of(self.regret_s(direct, target)).mean
+        mine = Interval.of(self.regret_s(setting, target)).mean
         return 1.0 - mine / start if start > 0 else math.nan
 
     def reduction(self, setting: str, target: str, direct: str, measure: str = "att_s") -> float:

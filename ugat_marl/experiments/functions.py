@@ -12,6 +12,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Literal
 
+import numpy as np
 import polars as pl
 
 from ugat_marl.data import LogCallback
@@ -192,7 +193,10 @@ def evaluate(
     Raises:
         UgatMarlError: A name or an option is at fault; the message names it.
     """
-    numbers = range(EVALUATION_SEED, EVALUATION_SEED + seeds) if isinstance(seeds, int) else seeds
+    if isinstance(seeds, int | np.integer):
+        numbers: Sequence[int] = range(EVALUATION_SEED, EVALUATION_SEED + int(seeds))
+    else:
+        numbers = seeds
     if not numbers or not domains:
         raise OptionError("seeds and domains need at least one each")
     played = evaluation.evaluate(
@@ -217,6 +221,8 @@ def run_folder(config: TransferConfig) -> Path:
 
 def _factories(policies: Any) -> Mapping[str, PolicyFactory]:
     """Return makers of policies by name."""
+    if isinstance(policies, Mapping | list | tuple) and not policies:
+        raise OptionError("policies needs at least one")
     if isinstance(policies, Mapping):
         return {str(name): _factory(given, str(name)) for name, given in policies.items()}
     several = policies if isinstance(policies, list | tuple) else [policies]
@@ -226,8 +232,6 @@ def _factories(policies: Any) -> Mapping[str, PolicyFactory]:
             f"policies holds a name twice: {', '.join(name for name, _ in named)}; give a "
             "dictionary from names to policies"
         )
-    if not named:
-        raise OptionError("policies needs at least one")
     return {name: _factory(given, name) for name, given in named}
 
 

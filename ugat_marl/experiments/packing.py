@@ -14,6 +14,7 @@ from ugat_marl.data import installed_versions
 from ugat_marl.effects import domain_label, load_scenario, scenario_in_domain
 from ugat_marl.errors import OptionError
 from ugat_marl.experiments.jobs import DIRECT_POLICY, JOB, POLICY, Job, Record, file_name, file_stem
+from ugat_marl.experiments.settings import DIRECT
 from ugat_marl.experiments.statistics import Interval
 from ugat_marl.files import write_whole
 from ugat_marl.policies import CardScores, NetworkPolicy, PolicyCard, is_own, rule_in
@@ -78,7 +79,7 @@ def _card(
     job: Job, record: Record, mark: int, setting: str, command: str, content: bytes
 ) -> PolicyCard:
     scenario = load_scenario(job.scenario)
-    knows = job.setting.knows_target and mark == job.episodes
+    knows = job.setting.knows_target and mark == job.episodes and setting != DIRECT
     real = domain_label(job.target) if knows and job.target is not None else None
     assert job.seed is not None
     return PolicyCard(

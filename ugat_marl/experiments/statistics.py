@@ -14,7 +14,7 @@ Floats = NDArray[np.float64]
 
 @dataclass(frozen=True)
 class Interval:
-    """A mean with Student's 95 % interval; its ends are nan for a single value."""
+    """A mean with Student's 95 % interval; its ends are nan for one value, all is for none."""
 
     mean: float
     low: float
@@ -26,7 +26,8 @@ class Interval:
 
         mean ± t(0.975, n - 1) · s / √n, where s is the standard deviation of the sample.
         """
-        mean, count = float(values.mean()), values.size
+        count = values.size
+        mean = float(values.mean()) if count else math.nan
         if count < 2:
             return cls(mean, math.nan, math.nan)
         # The mean of equal values may differ from them by rounding; their spread is set to 0.

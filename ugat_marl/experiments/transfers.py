@@ -69,14 +69,12 @@ from ugat_marl.parallel import Workers
 from ugat_marl.policies import (
     DQN_NAME,
     STANDARD_RULES,
-    SUITE_LEARNERS,
     TUNED_RULES,
     UNIVERSAL_NAME,
     DQNConfig,
     check_own_learner,
     is_own,
     require_device_name,
-    require_known_learner,
 )
 from ugat_marl.progress import Reporter, Silent
 from ugat_marl.scenarios import Scenario
@@ -191,12 +189,7 @@ class TransferConfig:
         self._refuse_impossible_controls()
 
     def _refuse_impossible_controls(self) -> None:
-        require_known_learner(self.learner)
-        if self.learner not in SUITE_LEARNERS and self.dqn != DQNConfig():
-            raise OptionError(
-                f"settings dqn are of the learners {' and '.join(SUITE_LEARNERS)}, not of "
-                f"{self.learner!r}; give those of yours as learner_settings"
-            )
+        _ = self.spec  # raises an error for an unknown learner, or settings of another one
         require_device_name(self.device)
         if self.placebo not in NEGATIVE_CONTROLS:
             raise UnknownNameError("placebo", self.placebo, NEGATIVE_CONTROLS)
@@ -518,8 +511,6 @@ def _identity(config: TransferConfig, scenario: Scenario, env: TrafficEnv) -> di
     scenario = scenario.with_duration(config.duration_s)
     if config.real != "none":
         hashes["real"] = scenario_in_domain(scenario, config.real).hash
-    if config.corrected is not None:  # identified by its content, so the folder may be moved
-        hashes["corrected"] = scenario_in_domain(scenario, config.corrected).hash
     return {
         **settings,
         "scenario_hash": hashes,

@@ -90,14 +90,22 @@ def _sum(model: bytes) -> str:
     return hashlib.sha256(model).hexdigest()
 
 
+_OF_THE_SITE = ("decision_interval_s", "intersections")
+"""What a side-car tells only if the environment was given."""
+
+
 def _sums_beside(side_car: Path, about: Mapping[str, Any]) -> dict[str, str]:
     """Return the check sums of the same policy's other formats; none if the file is another's."""
+
+    def of_the_policy(content: Mapping[str, Any]) -> dict[str, Any]:
+        return {k: v for k, v in content.items() if k not in (*_OF_THE_SITE, "sha256")}
+
     try:
-        held = read_json(side_car, CheckpointError)
-        sums = held.pop("sha256")
-        return dict(sums) if held == json.loads(json.dumps(about)) else {}
-    except (CheckpointError, AttributeError, KeyError, TypeError, ValueError):
+        held = dict(read_json(side_car, CheckpointError))
+        sums = dict(held["sha256"])
+    except (CheckpointError, KeyError, TypeError, ValueError):
         return {}
+    return sums if of_the_policy(held) == json.loads(json.dumps(of_the_policy(about))) else {}
 
 
 def portable_network(policy: NetworkPolicy) -> PortableNetwork:

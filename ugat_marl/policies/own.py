@@ -48,7 +48,7 @@ from ugat_marl.seeding import derive_seed
 NEEDED = {"learn": ("env", "episodes"), "policy": ()}
 """Methods that a learner must have, and their arguments."""
 
-_NAME = re.compile(r"[\w./\\-]+:[A-Za-z_][\w.<>]*")
+_NAME = re.compile(r"[\w./\\-]+:[A-Za-z_<][\w.<>]*")
 _STATE, _COUNTERS = "learner.pt", "counters.json"
 
 _given: dict[str, Any] = {}

@@ -145,7 +145,8 @@ def load_policy(name: str | Path, *, folder: Path = FOLDER) -> NetworkPolicy:
     if path.suffix == ".pt" or path.is_file():
         if (spec := rule_in(path)) is not None:
             raise CheckpointError(
-                f"{path}: holds the rule {spec}, which has no network; give {spec} in its place"
+                f"{path}: holds the rule {spec}, which has no network to load or to export; "
+                f"commands that play policies take {spec} itself"
             )
         return NetworkPolicy.load(path)
     card = policy_card(str(name), folder=folder)

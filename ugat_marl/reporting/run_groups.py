@@ -168,6 +168,7 @@ def _trained(record: RunRecord) -> dict[str, str]:
     if isinstance(learner, Mapping):
         own = learner.get("settings")
         told["learner"] = " ".join(map(str, [learner.get("name"), *(own or ())]))
+        told |= dict(_flat({"dqn": learner.get("dqn") or {}}))
     if isinstance(options, Mapping):
         told |= dict(_flat(options, "options."))
     return told

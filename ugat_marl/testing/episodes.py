@@ -304,5 +304,6 @@ def different(a: Any, b: Any, path: str = "") -> str:
         return ""
     if not first.ndim:
         return f"{path} was {a!r} and became {b!r}"
-    index = tuple(int(i) for i in np.argwhere(first != second)[0])
+    unlike = (first != second) & ~((first != first) & (second != second))  # nan equals nan
+    index = tuple(int(i) for i in np.argwhere(unlike)[0])
     return f"{path}[{', '.join(map(str, index))}] was {first[index]} and became {second[index]}"

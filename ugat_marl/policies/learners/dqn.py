@@ -296,7 +296,9 @@ class DQN:
         if not self.config.teacher:
             return None
         root = derive_seed(seed, "dqn", "lessons", self.taught)
-        name, teacher = find_teacher(env, self._teacher(best), root, on_play)
+        if (found := find_teacher(env, self._teacher(best), root, on_play)) is None:
+            return None
+        name, teacher = found
         self._replay.forget_teacher()
         for lesson in range(self.config.lessons):
             self._watch(env, teacher, derive_seed(root, "shown", lesson))

@@ -33,11 +33,12 @@ OnPlay = Callable[[str], None]
 
 def find_teacher(
     env: AnyParallelEnv, name: str, seed: int, on_play: OnPlay | None = None
-) -> tuple[str, Policy]:
-    """Return the rule that teaches in an environment, and its spelling.
+) -> tuple[str, Policy] | None:
+    """Return the rule that teaches in an environment, and its spelling; None if none can.
 
     For `BEST` all standard rules that read this environment's observations play one episode, and
-    the best of them play again. The greatest mean reward wins. All play the same seeds.
+    the best of them play again. The greatest mean reward wins. All play the same seeds. Most rules
+    read `movements`, so that other observations may leave none.
 
     Args:
         env: The environment; it is reset.
@@ -53,11 +54,12 @@ def find_teacher(
         rule = NamedRule(name, env.unwrapped)
         if not rule.reads(env):
             raise OptionError(
-                f"teacher {name}: it needs environments with {dict(rule.env_options)}; give one of "
-                f"{', '.join(spec for spec, _ in _candidates(env))}, or {BEST}"
+                f"teacher {name}: it needs environments with {dict(rule.env_options)}; train in "
+                f"such ones, or leave the teacher out"
             )
         return name, rule
-    rules = dict(_candidates(env))
+    if not (rules := dict(_candidates(env))):
+        return None
     rewards: dict[str, list[float]] = {spec: [] for spec in rules}
     running = list(rules)
     for first, episodes in ((0, 1), (1, FINAL_EPISODES)):
@@ -81,7 +83,10 @@ def plays(env: AnyParallelEnv, name: str, shown: int) -> int:
         name: Spelling of a rule, or `BEST`.
         shown: Episodes that the teacher shows.
     """
-    return most_plays(name, shown, len(_candidates(env))) if name == BEST else shown
+    if name != BEST:
+        return shown
+    candidates = len(_candidates(env))
+    return most_plays(name, shown, candidates) if candidates else 0
 
 
 def most_plays(name: str, shown: int, candidates: int | None = None) -> int:
