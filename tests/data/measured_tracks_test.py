@@ -11,6 +11,7 @@ import pytest
 
 from ugat_marl.data import MeasuredData, read_measured, traffic_of_lanes, write_measured
 from ugat_marl.data.measured.tracks import passages_of_tracks
+from ugat_marl.data.row_hashes import CSV_HASHES
 from ugat_marl.errors import MeasuredDataError
 from ugat_marl.experiments import policy_factory, record
 from ugat_marl.scenarios import Detector, Network, Passages, Period, read_scenario
@@ -73,6 +74,27 @@ def test_a_vehicle_that_changes_lanes_behind_a_detector_was_not_on_it() -> None:
     assert set(passages(rows, *detectors)) == {"0"}
 
 
+@pytest.mark.parametrize("share", [0.2, 0.5, 0.8])
+def test_a_vehicle_that_changes_lanes_over_a_detector_is_seen_once(share: float) -> None:
+    """It is on the first lane at 10 m and on the second at 20 m, and the detectors lie between."""
+    rows = track(["a_0", "a_0", "a_1", "a_1"], [0.0, 10.0, 20.0, 30.0], 10.0)
+    at_m = 10.0 + 10.0 * share
+    detectors = [Detector(f"{x}", f"a_{x}", at_m, 0.0, "advance") for x in (0, 1)]
+    seen = passages(rows, *detectors)
+    assert set(seen) == {"0"}
+    assert seen["0"].on_s.tolist() == pytest.approx([11.0 + share])
+
+
+def test_positions_that_jitter_do_not_move_a_standing_vehicle() -> None:
+    """Ten positions a second with an error of 0.3 m: a minute of standing would add 200 m."""
+    time = np.arange(0.0, 90.0, 0.1)
+    true = np.where(time < 15.0, 10.0 * time, np.where(time < 75.0, 150.0, 10.0 * (time - 60.0)))
+    position = true + np.random.default_rng(0).normal(0.0, 0.3, len(time))
+    rows = track(["a_0"] * len(time), position.tolist(), 10.0).with_columns(time_s=pl.Series(time))
+    seen = passages(rows, Detector("d", "a_0", 170.0, 0.0, "stop"))["d"]
+    assert seen.on_s.tolist() == pytest.approx([77.0], abs=0.2)
+
+
 def test_a_standing_vehicle_is_on_until_it_drives() -> None:
     rows = track(["a_0"] * 6, [0.0, 10.0, 10.0, 10.0, 20.0, 30.0], 0.0)
     seen = passages(rows, Detector("d", "a_0", 8.0, 0.0, "stop"))["d"]
@@ -120,6 +142,16 @@ def test_tracks_give_what_loops_give(data: Path, tmp_path: Path) -> None:
         # SUMO changes speeds at once, and tracks between two positions: half a second's worth.
         assert np.nanmax(np.abs(seen.off_s - loop.off_s)) < 0.5, name
         assert np.nanmedian(np.abs(seen.speed_mps - loop.speed_mps)) < 1.5, name
+    (written / CSV_HASHES).unlink()  # the table is edited by hand
+    rows = pl.read_csv(written / "trajectories.csv")
+    pl.concat((rows, rows.head(7))).write_csv(written / "trajectories.csv")
+    twice = read_measured(written, scenario, network)
+    assert twice.trajectories is not None and twice.trajectories.height == rows.height
+    assert any("7 rows are there twice" in finding.text for finding in twice.findings)
+    elsewhere = pl.col("lane_id").replace("W_C_0", "W_C_7")
+    rows.with_columns(elsewhere).write_csv(written / "trajectories.csv")
+    with pytest.raises(MeasuredDataError, match="'W_C_7', which the network does not have"):
+        read_measured(written, scenario, network)
 
 
 # --- vehicles on lanes ----------------------------------------------------------------------------

@@ -166,6 +166,15 @@ def test_lanes_are_means_over_moments_and_vehicles() -> None:
         MeasuredDataError, match=r"'[ab]_0' was observed for 12 of 15 min of period"
     ):
         Between.of(MeasuredData((), PERIODS, lanes=part))
+    ends = pl.DataFrame({"time_s": [*range(30), *range(870, 900)]}).select(
+        pl.lit("one").alias("period_id"),
+        pl.col("time_s").cast(pl.Float64),
+        pl.lit("a_0").alias("lane_id"),
+        pl.lit(5.0).alias("vehicles"),
+        pl.lit(2.0).alias("halting"),
+    )
+    with pytest.raises(MeasuredDataError, match="'a_0' was observed for 1 of 15 min"):
+        Between.of(MeasuredData((), PERIODS, lanes=ends))
     simulated = found.simulated(PERIODS[0], [], np.array([[1800.0, 90.0, 9000.0], [0.0, 0.0, 0.0]]))
     assert simulated[LANES].tolist() == [
         [[1800.0, 900.0], [90.0, 900.0], [9000.0, 1800.0]],

@@ -41,7 +41,11 @@ def test_hourly_counts_are_those_of_stop_and_exit_detectors() -> None:
     sums[INDEX["count_stop"], 0] = 30.0, 10.0
     sums[INDEX["count_exit"], 0] = 5.0, 10.0
     sums[INDEX["count_advance"], 0] = 99.0, 10.0
-    assert hourly(Tally(sums, np.zeros((len(BIN_FEATURES), 1, 1)))) == pytest.approx([180.0, 30.0])
+    bins = np.zeros((len(BIN_FEATURES), 1, 1))
+    assert hourly(Tally(sums, bins)) == pytest.approx([180.0, 30.0])
+    sums[INDEX["count_stop"], 0] = 0.0, 0.0
+    assert np.isnan(hourly(Tally(sums, bins))[0]), "an interval was not counted"
+    assert geh(hourly(Tally(sums, bins)), np.array([180.0, 30.0])).tolist() == [0.0]
 
 
 def test_the_typical_day_is_the_one_nearest_to_the_mean() -> None:

@@ -183,7 +183,9 @@ def test_bins_without_data_are_no_stretch() -> None:
     used = z != 0.0
     site = replace(SITE, lanes=SITE.lanes[:1], exits=())
     pools: Any = SimpleNamespace(thresholds=THRESHOLDS, grouped_s=lambda length_s: length_s)
-    reference: Any = SimpleNamespace(pools=pools, blocks={"time": SimpleNamespace(used=used)})
     distance: Any = SimpleNamespace(z={"time": z}, difference={"time": z})
-    (found,) = _stretches(site, reference, distance, SPAN)
-    assert abs(found.z) < 0.5
+    for of_the_model in (used, np.ones_like(used)):  # which has days with all intervals
+        block = SimpleNamespace(used=of_the_model)
+        reference: Any = SimpleNamespace(pools=pools, blocks={"time": block})
+        (found,) = _stretches(site, reference, distance, SPAN)
+        assert abs(found.z) < 0.5

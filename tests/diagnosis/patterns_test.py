@@ -207,6 +207,7 @@ def test_patterns_become_service_and_demand_without_a_name() -> None:
         replace(slow, quantity="free speed"),
         replace(more, place="elsewhere"),
         replace(more, detectors="stop"),
+        replace(more, movement="l"),
     ]
     effects = unnamed_effects(
         [slow, start, more, surge, *hidden], LAYOUT, ("north", "south"), decision_s=10.0

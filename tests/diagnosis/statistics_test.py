@@ -10,6 +10,7 @@ import pytest
 from numpy.typing import NDArray
 
 from ugat_marl.diagnosis import Reference, Tally, change_between, sum_of
+from ugat_marl.diagnosis.between import TRAVEL_TIME, Label
 from ugat_marl.diagnosis.features import (
     BIN_FEATURES,
     FEATURES,
@@ -122,6 +123,21 @@ def test_means_are_ratios_and_their_variance_is_that_of_ratios() -> None:
     assert block.weight[0, row] == pytest.approx(4.0)
     assert block.variance[0, row] == pytest.approx(((2 / 4) ** 2 + (2 / 4) ** 2) / 2)
     assert block.error[0, row] == pytest.approx(0.25 / 3)
+
+
+@pytest.mark.parametrize("probes", [3, 30, 300])
+def test_a_few_probes_are_as_often_off_as_their_number_says(probes: int) -> None:
+    generator = np.random.default_rng(probes)
+    (plain,) = days_of(np.full((1, len(USED), 1), 10.0))
+
+    def day(count: int) -> Tally:
+        total_s = generator.normal(60.0, 20.0, count).sum()
+        return replace(plain, between={TRAVEL_TIME: np.array([[[total_s, count]]])})
+
+    pools = Pools(NETWORK.blocks, THRESHOLDS, 1, {TRAVEL_TIME: (Label("a", "b"),)})
+    reference = Reference(pools, [day(300) for _ in range(100)])
+    found = [reference.distance([day(probes)]).z[TRAVEL_TIME][0, 0] for _ in range(300)]
+    assert 0.75 < np.std(found) < 1.25
 
 
 def test_data_with_fewer_observations_are_noisier() -> None:

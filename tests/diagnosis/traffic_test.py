@@ -61,6 +61,17 @@ def test_a_correction_that_brings_travel_times_nearer_passes() -> None:
     assert 0.0 < check.noise < 0.1
 
 
+def test_greens_without_vehicles_are_no_journeys() -> None:
+    """An advance detector was dead on the held-out days, and its lanes had greens all the same."""
+
+    def dead(tallies: list[Tally]) -> list[Tally]:
+        return [replace(day, journeys=day.journeys * [[[0.0]], [[1.0]]]) for day in tallies]
+
+    real, old, new = days(1, 2, 25, 5), days(2, 16, 20, 4), days(3, 16, 25, 5)
+    check = traffic_check(dead(real), old, new, THRESHOLDS)
+    assert check is not None and check.measure != "travel time and queue"
+
+
 def test_a_correction_that_makes_waiting_worse_is_refused() -> None:
     check = traffic_check(days(1, 2, 20, 4), days(2, 16, 20, 4), days(3, 16, 22, 5), THRESHOLDS)
     assert check is not None and not check.better

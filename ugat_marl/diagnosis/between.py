@@ -231,7 +231,7 @@ def _states(lanes: pl.DataFrame, period: Period, names: Sequence[str]) -> Array:
         pl.col("halting").sum().alias("halting"),
         (pl.col("vehicles") * speed).sum().alias("metres"),
         pl.len().alias("moments"),
-        (pl.col("time_s").max() - pl.col("time_s").min()).alias("between_s"),
+        pl.col("time_s").sort().diff().median().alias("step_s"),
         known.sum().alias("moving"),
     )
     found = {row["lane_id"]: row for row in sums.iter_rows(named=True)}
@@ -239,8 +239,7 @@ def _states(lanes: pl.DataFrame, period: Period, names: Sequence[str]) -> Array:
     for number, name in enumerate(names):
         if (row := found.get(name)) is not None:
             seen, whole_s = float(row["moments"]), period.end_s - period.begin_s
-            # n moments have n - 1 times between them
-            observed_s = float(row["between_s"]) * seen / max(seen - 1.0, 1.0)
+            observed_s = float(row["step_s"] or 0.0) * seen
             if observed_s < LEAST_OBSERVED * whole_s:
                 raise MeasuredDataError(
                     f"lanes: {name!r} was observed for {observed_s / 60:.0f} of "

@@ -171,7 +171,7 @@ def _stretches(
     """Find the most unusual stretch of every kind of count at every place."""
     thresholds = reference.pools.thresholds
     z, difference = distance.z["time"], distance.difference["time"]
-    used = reference.blocks["time"].used
+    used = reference.blocks["time"].used & (z != 0.0)  # an interval without a count has z = 0
     places = len(layout.places)
     bins = z.shape[1]
     width = reference.pools.grouped_s(span[1] - span[0]) / bins

@@ -525,6 +525,7 @@ def unnamed_effects(
             one.quantity == "count"
             and one.place
             and one.place in origins
+            and one.movement is None
             and one.detectors != "stop"
         ):
             factor = max(1.0 + one.change, 0.0)

@@ -14,13 +14,14 @@ measured and simulated days alike. Otherwise they would count as chance and hide
 from __future__ import annotations
 
 import functools
+import math
 from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 
 import numpy as np
 from numpy.typing import NDArray
 
-from ugat_marl.diagnosis.between import LANES, Label
+from ugat_marl.diagnosis.between import LANES, TRAVEL_TIME, Label
 from ugat_marl.diagnosis.features import (
     ALL_FEATURES,
     EVENT_FEATURES,
@@ -258,7 +259,10 @@ class Reference:
         else:
             correlation = prior.correlation
             used &= prior.used
-        return Block(mean, variance, weight, error, used, correlation, self._thresholds.thinning)
+        least, most = self._thresholds.thinning
+        if name == TRAVEL_TIME:  # probes may be a few of all vehicles
+            most = math.inf
+        return Block(mean, variance, weight, error, used, correlation, (least, most))
 
     def distance(
         self,

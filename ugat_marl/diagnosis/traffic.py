@@ -120,7 +120,7 @@ def traffic_check(
         sides = [sums(days) for days in (measured, before, after)]
         if all(side is not None and side.shape[-2] for side in sides):
             real, old, new = (side for side in sides if side is not None)
-            if real[..., 1].sum() >= thresholds.least_journeys:
+            if real[:, 0, :, 1].sum() >= thresholds.least_journeys:  # of the first measure
                 return _check(measure, real, old, new, thresholds)
     return None
 

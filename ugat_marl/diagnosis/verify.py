@@ -229,19 +229,23 @@ class Criteria:
 
 
 def hourly(tally: Tally) -> Array:
-    """Return vehicles per hour at every stop and exit detector, 0 without one; ``(2 places,)``."""
+    """Return vehicles per hour at every stop and exit detector, ``(2 places,)``.
+
+    It is nan where nothing was counted: without a detector, or if a day lacks an interval.
+    """
     sums = tally.sums[[INDEX[name] for name in SERVICE_COUNTS]].reshape(-1, 2)
-    return 60.0 * sums[:, 0] / np.maximum(sums[:, 1], 1e-9)
+    counted = sums[:, 1] > 0
+    return np.where(counted, 60.0 * sums[:, 0] / np.where(counted, sums[:, 1], 1.0), np.nan)
 
 
 def geh(measured: Array, simulated: Array) -> Array:
-    """Return the GEH of hourly counts, without empty pairs.
+    """Return the GEH of hourly counts, without empty pairs and those that were not counted.
 
     Args:
         measured: Counts, vehicles per hour.
         simulated: Counts, vehicles per hour.
     """
-    some = measured + simulated > 1.0
+    some = measured + simulated > 1.0  # False for nan
     return geh_of(measured[some], simulated[some])
 
 

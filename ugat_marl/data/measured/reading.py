@@ -97,6 +97,9 @@ def read_measured(directory: Path, scenario: Scenario, network: Network) -> Meas
     for name in () if lanes is None else lanes["lane_id"].unique(maintain_order=True):
         _lane_of(f"{files.path(tables.LANES)}: a row", name, network)
     trajectories = _of_moments(files, tables.TRAJECTORIES, periods)
+    for name in () if trajectories is None else trajectories["lane_id"].unique():
+        if not name.startswith(":"):  # not inside of a junction
+            _lane_of(f"{files.path(tables.TRAJECTORIES)}: a row", name, network)
     if trajectories is not None and files.seen_on_tracks:
         path = files.path(tables.TRAJECTORIES)
         passages = passages_of_tracks(path, trajectories, periods, usable, files.findings)
@@ -267,6 +270,13 @@ def _of_moments(files: _Files, table: Table, periods: tuple[Period, ...]) -> pl.
             refuse(
                 path, frame.filter(pl.col(column) < 0), column, "is negative", "correct the rows"
             )
+    what = "vehicle_id" if table is tables.TRAJECTORIES else "lane_id"
+    once = frame.unique(["period_id", what, "time_s"], keep="first", maintain_order=True)
+    if twice := frame.height - once.height:
+        files.findings.append(
+            Finding(f"{path.name}: {twice} rows are there twice; the first ones are taken")
+        )
+    frame = once
     lengths = ("length_m",) if "length_m" in frame.columns and frame["length_m"].count() else ()
     optional = lengths if table is tables.TRAJECTORIES else table.optional
     return frame.select(*table.columns, *optional)

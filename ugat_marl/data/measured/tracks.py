@@ -56,9 +56,13 @@ class _Track:
         )
         lane = rows["lane_id"].to_list()
         same = np.array([a == b for a, b in zip(lane, lane[1:], strict=False)], np.bool_)
+        # Positions of cameras jitter, and a vehicle that stands must not drive by that.
+        ahead = position.copy()
+        for part in np.split(ahead, np.flatnonzero(~same) + 1):
+            np.maximum.accumulate(part, out=part)
         # Between two lanes, and on the junction between them, only the speed tells the distance.
         driven = 0.5 * (speed[1:] + speed[:-1]) * np.diff(time)
-        step = np.where(same, np.diff(position), driven)
+        step = np.where(same, np.diff(ahead), driven)
         total = np.concatenate(([0.0], np.cumsum(np.maximum(step, 0.0))))
         known = rows["length_m"].drop_nulls() if "length_m" in rows.columns else []
         length = float(known[0]) if len(known) else USUAL_LENGTH_M
@@ -82,10 +86,11 @@ class _Track:
         """
         start = self.driven_m[begin] - self.position_m[begin]  # distance at the start of the lane
         first, last = begin, end - 1
-        # A vehicle that comes from another road entered the lane between two positions.
+        # A vehicle that comes from another road entered the lane between two positions. One that
+        # changes lanes is on the old one until its first position on the new one.
         if begin and self._turned(begin):
             first = begin - 1
-        if end < len(self.lane) and self._turned(end):
+        if end < len(self.lane):
             last = end
         on = self._when(start + detector.position_m, first, last)
         if on is None:
