@@ -368,12 +368,16 @@ def test_training_in_the_corrected_sim_resumes(repaired: Path, tmp_path: Path) -
 
 
 @pytest.mark.usefixtures("unjudged")
-def test_another_correction_is_another_run(repaired: Path, tmp_path: Path) -> None:
-    config = replace(SHORT, corrected=str(repaired))
-    transfer(config, tmp_path / "run")
-    for other in ("acceleration=0.7", None):
-        with pytest.raises(CheckpointError, match="its scenario_hash"):
-            transfer(replace(config, corrected=other), tmp_path / "run", resume=True)
+def test_another_correction_is_trained_for_itself(repaired: Path, tmp_path: Path) -> None:
+    """It is a control: one may be added to a finished run, and each has its own training."""
+    found = []
+    for corrected in (None, str(repaired), "acceleration=0.7", str(repaired)):
+        config = replace(SHORT, corrected=corrected)
+        transfer(config, tmp_path / "run", resume=bool(found))
+        kept = tmp_path / "run" / "policies" / "corrected-sim.pt"
+        found.append(kept.read_bytes() if kept.exists() else None)
+    assert found[0] is None
+    assert found[1] == found[3] != found[2]
 
 
 def test_a_correction_that_cannot_be_trained_in_is_refused_at_once(
