@@ -13,7 +13,7 @@ from typing import Annotated, Any
 from rich.console import Console
 from tyro.conf import Positional, arg
 
-from ugat_marl.errors import OptionError, UgatMarlError
+from ugat_marl.errors import CheckpointError, OptionError, UgatMarlError
 from ugat_marl.experiments import TransferConfig
 from ugat_marl.files import require_writable, write_whole
 from ugat_marl.policies import is_own, rule_in
@@ -101,9 +101,13 @@ def again(record: RunRecord | TableRecord) -> list[str]:
 
 def _policy(path: Path, learner: object) -> str:
     """Return the name of a kept policy; the state of a user's learner needs that learner's name."""
-    if isinstance(learner, str) and is_own(learner) and rule_in(path) is None:
-        return f"{learner}@{path}"
-    return str(path)
+    if not isinstance(learner, str) or not is_own(learner):
+        return str(path)
+    try:
+        kept_rule = rule_in(path) is not None
+    except CheckpointError:  # a rule that this version does not have
+        kept_rule = True
+    return str(path) if kept_rule else f"{learner}@{path}"
 
 
 def _train(record: RunRecord, folder: str) -> list[str]:

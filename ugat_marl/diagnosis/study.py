@@ -623,10 +623,10 @@ def one_of_each(measured: MeasuredData, detectors: Sequence[Detector]) -> tuple[
         rows = Counter(name for period in measured.periods for name in period.passages)
     else:
         rows = Counter(measured.counts.filter(pl.col("count") > 0)["detector_id"].to_list())
-    kept: dict[tuple[str, str], Detector] = {}
+    kept: dict[tuple[str, str], str] = {}
     for detector in sorted(detectors, key=lambda one: -rows[one.id]):
-        kept.setdefault((detector.lane, detector.kind), detector)
-    return tuple(detector for detector in detectors if detector in kept.values())
+        kept.setdefault((detector.lane, detector.kind), detector.id)
+    return tuple(one for one in detectors if kept[one.lane, one.kind] == one.id)
 
 
 def doubled(measured: MeasuredData, compared: Sequence[Detector]) -> tuple[Finding, ...]:

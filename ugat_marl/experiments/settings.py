@@ -101,13 +101,13 @@ class LearnerSpec:
 
     def __post_init__(self) -> None:
         require_known_learner(self.name)
-        if self.name not in SUITE_LEARNERS and self.dqn != DQNConfig():
+        if self.name in SUITE_LEARNERS:
+            object.__setattr__(self, "dqn", suite_config(self.name, self.dqn))
+        elif self.dqn != DQNConfig():
             raise OptionError(
                 f"settings dqn are of the learners {' and '.join(SUITE_LEARNERS)}, not of "
                 f"{self.name!r}; give those of yours as learner_settings"
             )
-        if self.name in SUITE_LEARNERS:
-            object.__setattr__(self, "dqn", suite_config(self.name, self.dqn))
 
     def factory(self, device: str = "cpu") -> LearnerFactory:
         """Return a factory of fresh learners.

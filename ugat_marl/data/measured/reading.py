@@ -93,13 +93,8 @@ def read_measured(directory: Path, scenario: Scenario, network: Network) -> Meas
             *files.rows(tables.DETECTIONS), periods, detectors, files.findings
         )
         usable = tuple(detector for detector in detectors if detector.id not in broken)
-    lanes = _of_moments(files, tables.LANES, periods)
-    for name in () if lanes is None else lanes["lane_id"].unique(maintain_order=True):
-        _lane_of(f"{files.path(tables.LANES)}: a row", name, network)
-    trajectories = _of_moments(files, tables.TRAJECTORIES, periods)
-    for name in () if trajectories is None else trajectories["lane_id"].unique():
-        if not name.startswith(":"):  # not inside of a junction
-            _lane_of(f"{files.path(tables.TRAJECTORIES)}: a row", name, network)
+    lanes = _of_moments(files, tables.LANES, periods, network)
+    trajectories = _of_moments(files, tables.TRAJECTORIES, periods, network)
     if trajectories is not None and files.seen_on_tracks:
         path = files.path(tables.TRAJECTORIES)
         passages = passages_of_tracks(path, trajectories, periods, usable, files.findings)
@@ -257,7 +252,9 @@ def _passages(
     return passages, broken
 
 
-def _of_moments(files: _Files, table: Table, periods: tuple[Period, ...]) -> pl.DataFrame | None:
+def _of_moments(
+    files: _Files, table: Table, periods: tuple[Period, ...], network: Network
+) -> pl.DataFrame | None:
     """Return the table of lanes or of trajectories; None without one."""
     if not files.has(table):
         return None
@@ -270,7 +267,11 @@ def _of_moments(files: _Files, table: Table, periods: tuple[Period, ...]) -> pl.
             refuse(
                 path, frame.filter(pl.col(column) < 0), column, "is negative", "correct the rows"
             )
-    what = "vehicle_id" if table is tables.TRAJECTORIES else "lane_id"
+    tracks = table is tables.TRAJECTORIES
+    for name in frame["lane_id"].unique(maintain_order=True):
+        if not (tracks and name.startswith(":")):  # a vehicle may be inside of a junction
+            _lane_of(f"{path}: a row", name, network)
+    what = "vehicle_id" if tracks else "lane_id"
     once = frame.unique(["period_id", what, "time_s"], keep="first", maintain_order=True)
     if twice := frame.height - once.height:
         files.findings.append(
@@ -278,7 +279,7 @@ def _of_moments(files: _Files, table: Table, periods: tuple[Period, ...]) -> pl.
         )
     frame = once
     lengths = ("length_m",) if "length_m" in frame.columns and frame["length_m"].count() else ()
-    optional = lengths if table is tables.TRAJECTORIES else table.optional
+    optional = lengths if tracks else table.optional
     return frame.select(*table.columns, *optional)
 
 
