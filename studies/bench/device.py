@@ -68,7 +68,7 @@ class DeviceBench:
             )
 
     def run(self, reporter: Reporter | None = None) -> Report:
-        """Measure, and write `out` if it is given.
+        """Measure size after size, and write `out`, if it is given, after each.
 
         Args:
             reporter: Reporter of the progress.
@@ -78,13 +78,22 @@ class DeviceBench:
             MeasurementError: The measured process failed.
         """
         device_of(self.device)
-        asked = {**asdict(self), "out": None, "sizes": sorted(set(self.sizes))}
-        with (reporter or Silent()).task(f"updates and fits on cpu and {self.device}", 1):
-            found = in_fresh_process(_PROGRAM, asked, timeout_s=6 * 3600.0)
-        report = compared(found, asked)
-        if self.out is not None:
-            report.write(self.out)
-        return report
+        asked = {**asdict(self), "out": None}
+        sizes = sorted(set(self.sizes))
+        found: dict[str, Any] = {}
+        task = (reporter or Silent()).task(f"updates and fits, cpu and {self.device}", len(sizes))
+        with task as advance:
+            for number, size in enumerate(sizes, 1):
+                of_size = in_fresh_process(
+                    _PROGRAM, {**asked, "sizes": [size]}, timeout_s=6 * 3600.0
+                )
+                found["name"] = of_size["name"]
+                for what, times in of_size["times"].items():
+                    found.setdefault("times", {}).setdefault(what, {}).update(times)
+                if self.out is not None:
+                    compared(found, {**asked, "sizes": sizes[:number]}).write(self.out)
+                advance(f"{size} intersections")
+        return compared(found, {**asked, "sizes": sizes})
 
 
 def compared(found: dict[str, Any], settings: dict[str, Any]) -> Report:

@@ -11,7 +11,7 @@ import pytest
 import studies.bench.device as device_module
 from studies.bench.device import DeviceBench, compared, pays_from
 from studies.bench.device_program import LAYOUT, measure, random_log
-from ugat_marl.errors import OptionError
+from ugat_marl.errors import MeasurementError, OptionError
 
 
 @pytest.mark.parametrize(
@@ -83,9 +83,25 @@ def test_the_command_measures_and_writes(tmp_path: Path, monkeypatch: pytest.Mon
     out = tmp_path / "device.json"
     tiny = {"rounds": 1, "updates": 1, "batch_size": 4, "epochs": 1, "steps": 4}
     report = DeviceBench("cuda", sizes=(2, 1, 2), out=out, **tiny).run()
-    assert asked[0]["sizes"] == [1, 2] and asked[0]["device"] == "cuda"
+    assert [one["sizes"] for one in asked] == [[1], [2]] and asked[0]["device"] == "cuda"
     assert [row["intersections"] for row in report.rows] == [1, 2, 1, 2]
     assert len(json.loads(out.read_text())["rows"]) == 4
+
+
+def test_sizes_that_were_measured_are_kept(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(device_module, "device_of", lambda _name: None)
+
+    def measured(_program: Any, request: dict[str, Any], **_: Any) -> dict[str, Any]:
+        if request["sizes"] == [2]:
+            raise MeasurementError("took too long")
+        return measure({**request, "device": "cpu"})
+
+    monkeypatch.setattr(device_module, "in_fresh_process", measured)
+    out = tmp_path / "device.json"
+    tiny = {"rounds": 1, "updates": 1, "batch_size": 4, "epochs": 1, "steps": 4}
+    with pytest.raises(MeasurementError):
+        DeviceBench("cuda", sizes=(1, 2), out=out, **tiny).run()
+    assert [row["intersections"] for row in json.loads(out.read_text())["rows"]] == [1, 1]
 
 
 def test_what_cannot_be_compared_is_refused() -> None:
