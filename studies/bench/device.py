@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
@@ -80,36 +80,36 @@ class DeviceBench:
         device_of(self.device)
         asked = {**asdict(self), "out": None}
         sizes = sorted(set(self.sizes))
-        found: dict[str, Any] = {}
+        found: dict[int, dict[str, Any]] = {}
         task = (reporter or Silent()).task(f"updates and fits, cpu and {self.device}", len(sizes))
         with task as advance:
-            for number, size in enumerate(sizes, 1):
-                of_size = in_fresh_process(
-                    _PROGRAM, {**asked, "sizes": [size]}, timeout_s=6 * 3600.0
+            for size in sizes:
+                found[size] = in_fresh_process(
+                    _PROGRAM, {**asked, "size": size}, timeout_s=6 * 3600.0
                 )
-                found["name"] = of_size["name"]
-                for what, times in of_size["times"].items():
-                    found.setdefault("times", {}).setdefault(what, {}).update(times)
                 if self.out is not None:
-                    compared(found, {**asked, "sizes": sizes[:number]}).write(self.out)
+                    compared(found, asked).write(self.out)
                 advance(f"{size} intersections")
-        return compared(found, {**asked, "sizes": sizes})
+        return compared(found, asked)
 
 
-def compared(found: dict[str, Any], settings: dict[str, Any]) -> Report:
+def compared(found: Mapping[int, Mapping[str, Any]], settings: dict[str, Any]) -> Report:
     """Tabulate the times of both devices, and note from which size on the device is faster.
 
     Args:
-        found: Result of `device_program.measure`.
-        settings: Options of the bench.
+        found: Result of `device_program.measure` for each size, in ascending order.
+        settings: Options of the bench; of the sizes, those found are told.
     """
-    sizes, device = settings["sizes"], settings["device"]
+    sizes, device = list(found), settings["device"]
+    settings = {**settings, "sizes": sizes}
     rows: list[dict[str, Any]] = []
-    notes = [f"{device}: {found['name']}. Medians of {settings['rounds']} rounds, wall time."]
+    notes = [
+        f"{device}: {found[sizes[0]]['name']}. Medians of {settings['rounds']} rounds, wall time."
+    ]
     for what, unit in (("update of DQN", "ms"), ("fit of f and h", "s")):
         ratios: list[float] = []
         for size in sizes:
-            own = found["times"][what][str(size)]
+            own = found[size]["times"][what]
             ratio = Spread.of_ratios(own["cpu"], own["device"])
             ratios.append(ratio.median)
             rows.append(

@@ -85,24 +85,23 @@ class Fits:
 
 
 def measure(request: Mapping[str, Any]) -> dict[str, Any]:
-    """Measure all sizes on both devices, round by round, after a first fit that is not counted."""
+    """Measure one size on both devices, round by round, after a first fit that is not counted."""
     torch.set_num_threads(1)
     there = device_of(request["device"])
     devices = {"cpu": CPU, "device": there}
-    times: dict[str, dict[str, dict[str, list[float]]]] = {}
-    for agents in request["sizes"]:
-        log = random_log(agents, request["steps"], request["seed"])
-        for place in devices.values():
-            Fits({**request, "epochs": 1}, log, place).time()
-        measured = {
-            "update of DQN": {d: Updates(request, agents, place) for d, place in devices.items()},
-            "fit of f and h": {d: Fits(request, log, place) for d, place in devices.items()},
-        }
-        for _ in range(request["rounds"]):
-            for what, both in measured.items():
-                own = times.setdefault(what, {}).setdefault(str(agents), {})
-                for name, one in both.items():
-                    own.setdefault(name, []).append(one.time())
+    agents = request["size"]
+    log = random_log(agents, request["steps"], request["seed"])
+    for place in devices.values():
+        Fits({**request, "epochs": 1}, log, place).time()
+    measured = {
+        "update of DQN": {d: Updates(request, agents, place) for d, place in devices.items()},
+        "fit of f and h": {d: Fits(request, log, place) for d, place in devices.items()},
+    }
+    times = {what: {name: list[float]() for name in both} for what, both in measured.items()}
+    for _ in range(request["rounds"]):
+        for what, both in measured.items():
+            for name, one in both.items():
+                times[what][name].append(one.time())
     known = torch.cuda.get_device_name(there) if there.type == "cuda" else there.type
     return {"name": known, "times": times}
 

@@ -29,18 +29,17 @@ def test_the_size_from_which_on_it_pays(ratios: list[float], first: int | None) 
 
 
 def test_times_become_ratios_of_the_same_round_and_a_sentence() -> None:
-    def times(*ratios: float) -> dict[str, Any]:
+    def times(ratio: float) -> dict[str, list[float]]:
         device = [2.0, 4.0, 8.0]
-        return {
-            str(size): {"cpu": [ratio * x for x in device], "device": device}
-            for size, ratio in zip((1, 16), ratios, strict=True)
-        }
+        return {"cpu": [ratio * x for x in device], "device": device}
 
-    found = {
-        "name": "Some GPU",
-        "times": {"update of DQN": times(0.25, 0.5), "fit of f and h": times(0.5, 3.0)},
-    }
-    report = compared(found, {"sizes": [1, 16], "device": "cuda", "rounds": 3})
+    def of_size(update: float, fit: float) -> dict[str, Any]:
+        own = {"update of DQN": times(update), "fit of f and h": times(fit)}
+        return {"name": "Some GPU", "times": own}
+
+    found = {1: of_size(0.25, 0.5), 16: of_size(0.5, 3.0)}
+    report = compared(found, {"sizes": [1, 16, 64], "device": "cuda", "rounds": 3})
+    assert report.settings["sizes"] == [1, 16]
     shown = {(row["what"], row["intersections"]): row for row in report.rows}
     assert shown["update of DQN [ms]", 16]["cpu / cuda"].median == 0.5
     assert shown["fit of f and h [s]", 16]["cpu / cuda"].values == (3.0, 3.0, 3.0)
@@ -61,12 +60,11 @@ def test_the_log_has_the_form_of_a_recorded_one() -> None:
 
 
 def test_every_size_is_measured_on_both_in_every_round() -> None:
-    asked = {"device": "cpu", "sizes": [1, 2], "rounds": 2, "updates": 2, "batch_size": 4}
-    found = measure({**asked, "epochs": 1, "steps": 6, "seed": 1})
-    assert set(found["times"]) == {"update of DQN", "fit of f and h"}
-    for sizes in found["times"].values():
-        assert set(sizes) == {"1", "2"}
-        for own in sizes.values():
+    asked = {"device": "cpu", "rounds": 2, "updates": 2, "batch_size": 4}
+    for size in (1, 2):
+        found = measure({**asked, "size": size, "epochs": 1, "steps": 6, "seed": 1})
+        assert set(found["times"]) == {"update of DQN", "fit of f and h"}
+        for own in found["times"].values():
             assert set(own) == {"cpu", "device"}
             assert all(len(times) == 2 and min(times) > 0 for times in own.values())
 
@@ -83,7 +81,7 @@ def test_the_command_measures_and_writes(tmp_path: Path, monkeypatch: pytest.Mon
     out = tmp_path / "device.json"
     tiny = {"rounds": 1, "updates": 1, "batch_size": 4, "epochs": 1, "steps": 4}
     report = DeviceBench("cuda", sizes=(2, 1, 2), out=out, **tiny).run()
-    assert [one["sizes"] for one in asked] == [[1], [2]] and asked[0]["device"] == "cuda"
+    assert [one["size"] for one in asked] == [1, 2] and asked[0]["device"] == "cuda"
     assert [row["intersections"] for row in report.rows] == [1, 2, 1, 2]
     assert len(json.loads(out.read_text())["rows"]) == 4
 
@@ -92,7 +90,7 @@ def test_sizes_that_were_measured_are_kept(tmp_path: Path, monkeypatch: pytest.M
     monkeypatch.setattr(device_module, "device_of", lambda _name: None)
 
     def measured(_program: Any, request: dict[str, Any], **_: Any) -> dict[str, Any]:
-        if request["sizes"] == [2]:
+        if request["size"] == 2:
             raise MeasurementError("took too long")
         return measure({**request, "device": "cpu"})
 
