@@ -2,12 +2,15 @@
 
 from __future__ import annotations
 
+import math
+
 import numpy as np
 import pytest
 from scipy.integrate import quad
 from scipy.stats import norm
 
-from ugat_marl.grounding.presence import LEAST_SPREAD, Change, Presence, lanes_are_equal
+from ugat_marl.grounding.posterior import ServicePrior
+from ugat_marl.grounding.presence import LEAST_SPREAD, Presence, lanes_differ
 
 ENDS = (np.zeros(2), np.full(2, -3.0), np.full(2, 5.0))
 """Nominal, lowest and highest values of two changes."""
@@ -18,19 +21,19 @@ def with_floor(covariance: np.ndarray) -> np.ndarray:
     return covariance + np.eye(2) * (LEAST_SPREAD * 8.0) ** 2
 
 
-def presence(mean: list[float], covariance: np.ndarray, evidence: float = 0.0) -> Presence:
-    changes = [Change(0.3, evidence), Change(0.6)]
-    return Presence.of(changes, np.array(mean), covariance, *ENDS)
+def presence(mean: list[float], covariance: np.ndarray, chance: float = 0.3) -> Presence:
+    log_odds = [math.log(chance / (1.0 - chance)), math.log(1.5)]
+    return Presence.of(log_odds, np.array(mean), covariance, *ENDS)
 
 
 @pytest.mark.parametrize("at", [0.0, 0.4, 1.0, 4.8])
-@pytest.mark.parametrize("evidence", [0.0, 2.0])
-def test_the_chance_is_that_of_a_prior_with_a_point_of_mass(at: float, evidence: float) -> None:
+@pytest.mark.parametrize("chance", [0.3, 0.05])
+def test_the_chance_is_that_of_a_prior_with_a_point_of_mass(at: float, chance: float) -> None:
     """Of values that do not depend on each other, each has the chance of its own integral."""
-    given = presence([at, 3.0], np.diag([0.25, 0.25]), evidence)
+    given = presence([at, 3.0], np.diag([0.25, 0.25]), chance)
     spread = float(np.sqrt(with_floor(np.diag([0.25, 0.25]))[0, 0]))
-    absent = 0.7 * norm.pdf(0.0, at, spread) * np.exp(evidence)
-    present = 0.3 * quad(lambda x: norm.pdf(x, at, spread) / 8.0, -3.0, 5.0, points=[at])[0]
+    absent = (1.0 - chance) * norm.pdf(0.0, at, spread)
+    present = chance * quad(lambda x: norm.pdf(x, at, spread) / 8.0, -3.0, 5.0, points=[at])[0]
     assert given.chance_of(0) == pytest.approx(present / (present + absent), rel=1e-6)
     assert given.chance_of(1) > 0.999
     assert given.chances.sum() == pytest.approx(1.0)
@@ -69,6 +72,27 @@ def test_a_value_that_explains_alone_leaves_the_other_out() -> None:
 def test_lanes_that_differ_are_seen() -> None:
     spread = np.full(12, 0.2)
     near = 0.2 * np.random.default_rng(1).standard_normal(12)
-    assert lanes_are_equal(near, spread, 2.5, 0.5) > 0.3
+    assert lanes_differ(near, spread, 2.5) < -0.5
     one_is_slow = near + np.eye(12)[3] * 3.0
-    assert lanes_are_equal(one_is_slow, spread, 2.5, 0.5) < -5.0
+    assert lanes_differ(one_is_slow, spread, 2.5) > 5.0
+
+
+@pytest.mark.parametrize("ratio", [1e-9, 0.3, 1.0, 40.0])
+def test_the_odds_of_unused_green_count_every_case(ratio: float) -> None:
+    """The mean is above 0 or not, lanes differ or not: three of four cases have unused green."""
+    prior = ServicePrior(chance=0.3, high_s=5.0, unequal=0.2)
+    cases = {
+        (mean, differ): (0.3 if mean else 0.7) * (0.2 * ratio if differ else 0.8)
+        for mean in (True, False)
+        for differ in (True, False)
+    }
+    none = cases.pop((False, False))
+    odds = math.exp(prior.log_odds(math.log(ratio)))
+    assert odds == pytest.approx(sum(cases.values()) / none)
+
+
+def test_lanes_that_are_seen_to_be_equal_speak_for_no_unused_green() -> None:
+    """Then what is left is the chance of a mean above 0, whatever the chance that lanes differ."""
+    for unequal in (0.1, 0.5, 0.9):
+        prior = ServicePrior(chance=0.35, high_s=3.0, unequal=unequal)
+        assert prior.log_odds(-50.0) == pytest.approx(math.log(0.35 / 0.65))

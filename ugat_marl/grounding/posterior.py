@@ -17,6 +17,7 @@ little its draws follow the network.
 from __future__ import annotations
 
 import functools
+import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import Any, ClassVar
@@ -34,7 +35,7 @@ from ugat_marl.effects import (
 )
 from ugat_marl.errors import CheckpointError, UnknownNameError
 from ugat_marl.grounding.draws import DRAWS, with_intervals
-from ugat_marl.grounding.presence import LEAST_SPREAD, Change, Presence, lanes_are_equal
+from ugat_marl.grounding.presence import LEAST_SPREAD, Presence, lanes_differ
 from ugat_marl.grounding.regression import Design, Floats, kernel, left_out, ridge
 from ugat_marl.grounding.summaries import Summary
 from ugat_marl.scenarios import Scenario
@@ -96,10 +97,17 @@ class ServicePrior:
     high_s: float
     unequal: float = 0.5
 
-    @property
-    def is_there(self) -> float:
-        """Chance that some lane has unused green."""
-        return 1.0 - (1.0 - self.chance) * (1.0 - self.unequal)
+    def log_odds(self, differ: float) -> float:
+        """Return the log of the odds that some lane has unused green.
+
+        It has none if the mean is 0 and lanes do not differ.
+
+        Args:
+            differ: Log of how much more likely the lanes' data are if lanes differ.
+        """
+        equal = np.log(self.chance * (1.0 - self.unequal))
+        there = np.logaddexp(equal, np.log(self.unequal) + differ)
+        return float(there - np.log((1.0 - self.chance) * (1.0 - self.unequal)))
 
 
 SERVICE = (ServicePrior(0.5, 5.0), ServicePrior(0.35, 3.0))
@@ -366,21 +374,20 @@ class Posterior:
         spread = (errors - bias).T @ ((errors - bias) * self.chances[:, None])
         unlike = self.service_errors_s - self.service_errors_s.mean(1, keepdims=True)
         lanes_s = np.sqrt(np.einsum("n,nlc->lc", self.chances, unlike**2))
-        changes = [Change(item.chance) for item in worlds.library]
+        log_odds = [math.log(item.chance / (1.0 - item.chance)) for item in worlds.library]
         for column, prior in enumerate(SERVICE):
-            evidence = lanes_are_equal(
+            differ = lanes_differ(
                 self.service_s[:, column] - mean_s[column],
                 lanes_s[:, column] + LEAST_SPREAD * prior.high_s,
                 prior.high_s / 2,
-                prior.unequal,
             )
-            changes.append(Change(prior.is_there, evidence))
+            log_odds.append(prior.log_odds(differ))
         least, usual, most = worlds.scaled(worlds.ends)
         none_s = np.zeros(len(SERVICE))
         low, nominal = (np.concatenate((values, none_s)) for values in (least, usual))
         high = np.concatenate((most, [prior.high_s for prior in SERVICE]))
         mean = np.concatenate((self.effects, mean_s)) + bias
-        return Presence.of(changes, mean, spread, nominal, low, high)
+        return Presence.of(log_odds, mean, spread, nominal, low, high)
 
     def sample(self, number: int, seed: int = 0) -> tuple[Floats, Floats]:
         """Return effects ``(number, effects)`` and service ``(number, lanes, 2)`` of draws."""

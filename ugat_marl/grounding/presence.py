@@ -29,19 +29,6 @@ LEAST_SPREAD = 0.02
 
 
 @dataclass(frozen=True)
-class Change:
-    """A change that is there or not.
-
-    Attributes:
-        chance: Prior chance that it is there.
-        evidence: Log of how much more likely other data are without it; 0 for none.
-    """
-
-    chance: float
-    evidence: float = 0.0
-
-
-@dataclass(frozen=True)
 class Presence:
     """Chances of every set of changes.
 
@@ -59,13 +46,14 @@ class Presence:
 
     @classmethod
     def of(
-        cls, changes: Sequence[Change], mean: Floats, covariance: Floats, nominal: Floats,
+        cls, log_odds: Sequence[float], mean: Floats, covariance: Floats, nominal: Floats,
         low: Floats, high: Floats,
     ) -> Presence:  # fmt: skip
         """Return the chances of a normal distribution and a prior.
 
         Args:
-            changes: The change of each value, ``k`` of them.
+            log_odds: For the change of each value, the log of its odds to be there, before the
+                mean and the covariance are known, ``(k,)``.
             mean: Mean of the values, ``(k,)``.
             covariance: Their covariance, ``(k, k)``.
             nominal: Values that change nothing, ``(k,)``.
@@ -73,13 +61,11 @@ class Presence:
             high: Highest values, ``(k,)``.
         """
         covariance = covariance + np.diag((LEAST_SPREAD * (high - low)) ** 2)
-        chance = np.array([x.chance for x in changes])
-        evidence = np.array([x.evidence for x in changes])
-        if_there, if_absent = np.log(chance), np.log(1.0 - chance) + evidence
+        odds = np.array(log_odds)
         logs: list[float] = []
         absent: list[NDArray[np.int64]] = []
         gains: list[Floats] = []
-        for each in itertools.product((True, False), repeat=len(changes)):
+        for each in itertools.product((True, False), repeat=len(odds)):
             there = np.array(each, dtype=np.bool_)
             out = np.flatnonzero(~there)
             off = nominal[out] - mean[out]
@@ -91,7 +77,7 @@ class Presence:
             spread = np.sqrt(np.diag(covariance - gain @ covariance[out])[there])
             share = norm.cdf(high[there], middle, spread) - norm.cdf(low[there], middle, spread)
             slab = np.log(np.maximum(share, 1e-9) / (high - low)[there]).sum()
-            logs.append(float(np.where(there, if_there, if_absent).sum() + density + slab))
+            logs.append(float(odds[there].sum() + density + slab))
             absent.append(out)
             gains.append(gain)
         weights = np.exp(np.array(logs) - max(logs))
@@ -116,8 +102,8 @@ class Presence:
         return float(self.chances[there].sum())
 
 
-def lanes_are_equal(offsets: Floats, spread: Floats, most: float, chance: float) -> float:
-    """Return the log of how much more likely offsets of lanes are if lanes do not differ.
+def lanes_differ(offsets: Floats, spread: Floats, most: float) -> float:
+    """Return the log of how much more likely offsets of lanes are if lanes differ.
 
     If they differ, each is drawn from a normal distribution, whose standard deviation is somewhere
     between 0 and `most`.
@@ -126,9 +112,8 @@ def lanes_are_equal(offsets: Floats, spread: Floats, most: float, chance: float)
         offsets: Estimated distance of each lane from the mean, ``(lanes,)``.
         spread: Standard deviations of the estimates, ``(lanes,)``.
         most: Largest standard deviation of the lanes.
-        chance: Prior chance that lanes differ.
     """
     tried = np.linspace(0.0, most, 12)[:, None]
     logs = norm.logpdf(offsets, 0.0, np.hypot(spread, tried)).sum(1)
     differ = np.log(np.mean(np.exp(logs - logs.max()))) + logs.max()
-    return float(logs[0] - np.logaddexp(np.log(1.0 - chance) + logs[0], np.log(chance) + differ))
+    return float(differ - logs[0])
