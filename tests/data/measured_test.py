@@ -418,6 +418,14 @@ WRONG: dict[str, tuple[dict[str, Change], str]] = {
         {"detections.csv": lambda text: text[: text.index("day1")]},  # cut short, at a row's end
         r"no detections in period 'day1', 'day2'.*cut short.*leave the period out",
     ),
+    "ons alone": (
+        {
+            "detections.csv": lambda text: "".join(
+                line for line in text.splitlines(keepends=True) if ",off," not in line
+            )
+        },
+        r"no detector can be used: of each, more than 50%.*every on and for every off",
+    ),
     "unknown event": ({"detections.csv": replaced(",on,", ",enter,")}, r"'enter' is unknown"),
     "negative speed": ({"detections.csv": added("day0,100,s,off,-3,")}, r"-3.0' is negative"),
     "no time": ({"detections.csv": added("day0,,s,off,,")}, r"time_s is empty"),

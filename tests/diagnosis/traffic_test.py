@@ -185,10 +185,20 @@ class Told:
 
 
 @pytest.mark.parametrize(
-    ("asked", "travel_s", "corrected"), [(True, 25, True), (True, 20, False), (False, 25, False)]
+    ("asked", "travel_s", "base_days", "corrected"),
+    [
+        (True, 25, 16, True),
+        (True, 25, 12, True),  # fewer days of the scenario as it is than are compared usually
+        (True, 20, 16, False),
+        (False, 25, 16, False),
+    ],
 )
 def test_an_unnamed_correction_is_asked_for_and_has_to_help(
-    asked: bool, travel_s: float, corrected: bool, monkeypatch: pytest.MonkeyPatch
+    asked: bool,
+    travel_s: float,
+    base_days: int,
+    corrected: bool,
+    monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     tried: list[tuple[Effect, ...]] = []
     after = days(3, 16, travel_s, travel_s / 5)
@@ -209,7 +219,7 @@ def test_an_unnamed_correction_is_asked_for_and_has_to_help(
         layout=LAYOUT,
     )
     base: Any = SimpleNamespace(
-        model=SimpleNamespace(days=dict(enumerate(days(2, 16, 20, 4))), effects=())
+        model=SimpleNamespace(days=dict(enumerate(days(2, base_days, 20, 4))), effects=())
     )
     best: Any = SimpleNamespace(model=SimpleNamespace(effects=(Headway(1.4),)))
     reporter: Any = SimpleNamespace(task=lambda name, total: nullcontext(lambda: None))

@@ -205,7 +205,8 @@ def _unnamed(
     effects = unnamed_effects(diagnosis.patterns, study.layout, origins, decision_s)
     if not effects:
         return None
-    numbers = study.engine.first(study.config.thresholds.settling_days)
+    wanted = study.engine.first(study.config.thresholds.settling_days)
+    numbers = [number for number in wanted if number in base.model.days]
     try:
         with reporter.task("unnamed correction", len(numbers)) as advance:
             days = study.engine.ordinary((*named, *effects), numbers, advance)

@@ -15,7 +15,7 @@ from ugat_marl.data.measured import tables
 from ugat_marl.data.measured.counts import counts_of, travel_times_of, turning_of
 from ugat_marl.data.measured.coverage import coverage
 from ugat_marl.data.measured.local_time import LocalClock, local_times, require_time_zone
-from ugat_marl.data.measured.passages import passages_of
+from ugat_marl.data.measured.passages import MOST_UNPAIRED, passages_of
 from ugat_marl.data.measured.tables import (
     PERIOD,
     ROW,
@@ -247,6 +247,11 @@ def _passages(
         raise MeasuredDataError(f"{path}: no detections; write one row per on and off")
     frame = with_period(path, frame, periods, findings)
     passages, broken = passages_of(path, frame, periods, detectors, findings)
+    if broken and not any(passages):
+        raise MeasuredDataError(
+            f"{path}: no detector can be used: of each, more than {MOST_UNPAIRED:.0%} of the "
+            "events have no partner; write a row for every on and for every off"
+        )
     empty = [p.id for p, seen in zip(periods, passages, strict=True) if not seen]
     _refuse_empty(path, "detections", empty)
     return passages, broken
