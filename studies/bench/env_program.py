@@ -6,6 +6,7 @@ import json
 import shutil
 import sys
 import time
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -48,7 +49,9 @@ class RecordingSimulator:
         shutil.copytree(launch.directory, self._folder, dirs_exist_ok=True)
         return snapshot
 
-    def advance(self, seconds: float, plans: SignalPlans) -> Snapshot:
+    def advance(
+        self, seconds: float, plans: SignalPlans, meanwhile: Callable[[], object] | None = None
+    ) -> Snapshot:
         """Simulate `seconds` and note every change of a signal."""
         changes: dict[float, list[tuple[str, str]]] = {}
         for light, segments in plans.items():
@@ -60,7 +63,7 @@ class RecordingSimulator:
                 when += duration
         self.switches += sorted(changes.items())
         self._now += seconds
-        return self._simulator.advance(seconds, plans)
+        return self._simulator.advance(seconds, plans, meanwhile)
 
     def vehicles(self) -> VehiclePositions:
         """Return the current positions of all vehicles."""

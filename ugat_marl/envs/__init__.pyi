@@ -20,6 +20,7 @@ from .single import SingleEnv as SingleEnv
 from .traffic_env import TrafficEnv as TrafficEnv
 from .traffic_env import env as env
 from .traffic_env import parallel_env as parallel_env
+from .traffic_env import step_meanwhile as step_meanwhile
 from .types import Actions as Actions
 from .types import AnyParallelEnv as AnyParallelEnv
 from .types import Infos as Infos

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import warnings
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, SupportsIndex, Unpack
 
@@ -34,7 +34,7 @@ from ugat_marl.envs.registration import register_single
 from ugat_marl.envs.rendering import NetworkRenderer
 from ugat_marl.envs.rewards import Rewarder
 from ugat_marl.envs.sensors import Sensors
-from ugat_marl.envs.types import StepResult
+from ugat_marl.envs.types import AnyParallelEnv, StepResult
 from ugat_marl.errors import EpisodeError, OptionError
 from ugat_marl.files import OwnDirectory
 from ugat_marl.scenarios import Network, Scenario, check_demand, signals
@@ -130,6 +130,7 @@ class TrafficEnv(ParallelEnv[str, Any, Any]):
         self._scores: Scores | None = None
         self._renderer: NetworkRenderer | None = None
         self._recorded: tuple[Observer, ...] = ()
+        self._meanwhile: Callable[[], object] | None = None
 
     # --- spaces -------------------------------------------------------------------------------
 
@@ -295,6 +296,14 @@ class TrafficEnv(ParallelEnv[str, Any, Any]):
         """
         self._remembered = checked_phases(commands, self.agents, self.action_spaces)
 
+    def do_meanwhile(self, work: Callable[[], object] | None) -> None:
+        """Do some work in the next step while SUMO simulates; `step_meanwhile` uses this.
+
+        Args:
+            work: Called once, before the step has its results; None for no work.
+        """
+        self._meanwhile = work
+
     def delay_greens(self, seconds: Mapping[str, float]) -> None:
         """Delay the greens that begin in the next step; ends of greens do not change.
 
@@ -422,7 +431,8 @@ class TrafficEnv(ParallelEnv[str, Any, Any]):
         if self._programmes is not None:
             plans = {}
         plans = self._delays.hold(plans)
-        self._look(self._simulator.advance(self.decision_interval_s, plans))
+        work, self._meanwhile = self._meanwhile, None
+        self._look(self._simulator.advance(self.decision_interval_s, plans, work))
         self._states = states
         self._look_at_programmes()
 
@@ -472,6 +482,38 @@ class TrafficEnv(ParallelEnv[str, Any, Any]):
         trips = self._simulator.finish()
         scores = self._recorder.scores(trips)
         self._scores = self._objectives.judged(scores, trips) if self._objectives else scores
+
+
+def step_meanwhile(
+    env: AnyParallelEnv, actions: Mapping[str, int], work: Callable[[], object]
+) -> StepResult:
+    """Step an environment, and do some work while SUMO simulates.
+
+    The work is done at the same time where the environment, below its wrappers, is a `TrafficEnv`
+    whose SUMO has its own process. Everywhere else it is done before or after.
+
+    Args:
+        env: Any parallel environment.
+        actions: A green phase for every agent.
+        work: Called once, unless the step is refused. It cannot know the results of the step.
+    """
+    left = [work]
+
+    def once() -> None:
+        if left:
+            left.pop()()
+
+    inner = env.unwrapped
+    if not isinstance(inner, TrafficEnv):
+        result = env.step(dict(actions))
+    else:
+        inner.do_meanwhile(once)
+        try:
+            result = env.step(dict(actions))
+        finally:
+            inner.do_meanwhile(None)
+    once()
+    return result
 
 
 @with_env_keywords

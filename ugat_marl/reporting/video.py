@@ -93,16 +93,22 @@ class Filmed:
         self.scenes = []
         return self._inner.start(launch)
 
-    def advance(self, seconds: float, plans: SignalPlans) -> Snapshot:
-        """Simulate `seconds`: in one call outside of the stretch, second by second inside."""
+    def advance(
+        self, seconds: float, plans: SignalPlans, meanwhile: Callable[[], object] | None = None
+    ) -> Snapshot:
+        """Simulate `seconds`: in one call outside of the stretch, second by second inside.
+
+        See `Simulator`.
+        """
         begin_s, end_s = (self._start_s + edge for edge in self._stretch)
         if self._now_s + seconds <= begin_s or self._now_s >= end_s:
             self._now_s += seconds
-            return self._inner.advance(seconds, plans)
+            return self._inner.advance(seconds, plans, meanwhile)
         done = 0.0
         while True:
             length = min(1.0, seconds - done)
-            snapshot = self._inner.advance(length, between(plans, done, done + length))
+            plan = between(plans, done, done + length)
+            snapshot = self._inner.advance(length, plan, None if done else meanwhile)
             done += length
             self._now_s += length
             if begin_s < self._now_s <= end_s:

@@ -6,7 +6,7 @@ The module does not load libsumo, so that a process whose simulations run elsewh
 from __future__ import annotations
 
 import re
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any, Protocol
@@ -156,8 +156,16 @@ class Simulator(Protocol):
         """Start a simulation; end a running one first."""
         ...
 
-    def advance(self, seconds: float, plans: SignalPlans) -> Snapshot:
-        """Simulate `seconds` under the given signals."""
+    def advance(
+        self, seconds: float, plans: SignalPlans, meanwhile: Callable[[], object] | None = None
+    ) -> Snapshot:
+        """Simulate `seconds` under the given signals.
+
+        Args:
+            seconds: Length of the interval, in s.
+            plans: Segments of each light.
+            meanwhile: Called once; at the same time, where the simulation has its own process.
+        """
         ...
 
     def vehicles(self) -> VehiclePositions:

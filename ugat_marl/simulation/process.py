@@ -58,8 +58,10 @@ class ProcessSimulator:
         launch.write()
         return _snapshot(self._ask("start", launch=launch.as_dict()))
 
-    def advance(self, seconds: float, plans: SignalPlans) -> Snapshot:
-        """Simulate `seconds` under the given signals, in one round trip.
+    def advance(
+        self, seconds: float, plans: SignalPlans, meanwhile: Callable[[], object] | None = None
+    ) -> Snapshot:
+        """Simulate `seconds` under the given signals, in one round trip; see `Simulator`.
 
         Raises:
             SimulatorError: SUMO failed; its own words are in the message.
@@ -70,7 +72,7 @@ class ProcessSimulator:
             if any(state != self._shown.get(light) for _, state in plan):
                 changes[light] = plan
                 self._shown[light] = plan[-1][1]
-        return _snapshot(self._ask("advance", seconds=seconds, plans=changes))
+        return _snapshot(self._ask("advance", meanwhile, seconds=seconds, plans=changes))
 
     def vehicles(self) -> VehiclePositions:
         """Return the positions of all vehicles now."""
@@ -101,7 +103,9 @@ class ProcessSimulator:
         if worker is not None:
             worker.end()
 
-    def _ask(self, request: str, **arguments: Any) -> Message:
+    def _ask(
+        self, request: str, meanwhile: Callable[[], object] | None = None, **arguments: Any
+    ) -> Message:
         worker = self._worker
         if worker is None or not worker.running:
             raise SimulatorError(
@@ -109,6 +113,8 @@ class ProcessSimulator:
             )
         try:
             worker.ask(request, **arguments)
+            if meanwhile is not None:
+                _do(meanwhile, worker)
             return worker.answer()
         except ChannelClosed:
             self._worker = None
@@ -127,6 +133,15 @@ def simulator_of(option: str, deadline_s: float | None = None) -> Simulator:
 
         return LibsumoSimulator()
     return ProcessSimulator("spawn" if option == "spawn" else None, deadline_s)
+
+
+def _do(work: Callable[[], object], asked: Worker) -> None:
+    """Do the work; if it fails, end the worker, whose answer nobody would read."""
+    try:
+        work()
+    except BaseException:
+        asked.end(patience_s=0.0)
+        raise
 
 
 def _snapshot(reply: Message) -> Snapshot:

@@ -95,13 +95,17 @@ class LibsumoSimulator:
             self._upstream = UpstreamQueues(libsumo, launch.lanes, launch.turns, launch.behind)
         return self._snapshot()
 
-    def advance(self, seconds: float, plans: SignalPlans) -> Snapshot:
-        """Simulate `seconds` and show the planned signal states.
+    def advance(
+        self, seconds: float, plans: SignalPlans, meanwhile: Callable[[], object] | None = None
+    ) -> Snapshot:
+        """Simulate `seconds` and show the planned signal states; see `Simulator`.
 
         Raises:
             SimulatorError: SUMO failed; its own words are in the message.
         """
         assert self._launch is not None, "advance before start"
+        if meanwhile is not None:
+            meanwhile()
         changes: dict[float, list[tuple[str, str]]] = defaultdict(list)
         for tls, segments in plans.items():
             offset = 0.0

@@ -3,6 +3,9 @@
 The learner follows Mnih et al. 2015, with double Q-learning (van Hasselt et al. 2016), a softly
 updated target network and exploration in bouts. It is stronger than the DQN of the UGAT paper,
 because a policy of a weak learner loses travel time that looks like a gap between domains.
+
+An update after a decision is made while SUMO simulates the next one, whose action is that of the
+weights before it.
 """
 
 from __future__ import annotations
@@ -19,7 +22,7 @@ from numpy.typing import NDArray
 from torch import Tensor, nn
 
 from ugat_marl.data import checked_tensors, read_checkpoint, write_checkpoint
-from ugat_marl.envs import ActionMask, AgentSet, AnyParallelEnv
+from ugat_marl.envs import ActionMask, AgentSet, AnyParallelEnv, step_meanwhile
 from ugat_marl.errors import CheckpointError, EpisodeError, OptionError
 from ugat_marl.policies.devices import CPU
 from ugat_marl.policies.learners.dqn_config import CEILING_DECISIONS, DQNConfig
@@ -60,6 +63,12 @@ class _Tally:
     q: float = 0.0
     decisions: int = 0
     updates: int = 0
+
+    def add(self, loss: float, q: float) -> None:
+        """Add the mean loss and the mean Q of an update."""
+        self.loss += loss
+        self.q += q
+        self.updates += 1
 
 
 class StickyExploration:
@@ -371,6 +380,12 @@ class DQN:
         )
         sampling = torch_generator(seed, "dqn", "replay", number)
         tally = _Tally()
+        is_due = False
+
+        def learn() -> None:
+            if is_due:
+                tally.add(*self.update(sampling))
+
         observations, infos = env.reset(seed=derive_seed(seed, "dqn", "episode", number))
         now, allowed = self.agents.stack(observations), self.agents.masks(infos)
         while env.agents:
@@ -379,7 +394,8 @@ class DQN:
             seen = torch.from_numpy(now) * self._inputs[:, 0]
             greedy = greedy_actions(acting, seen, torch.from_numpy(allowed))
             actions = explore.choose(greedy, allowed, epsilon)
-            observations, rewards, terminated, _, infos = env.step(self.agents.actions(actions))
+            asked = self.agents.actions(actions)
+            observations, rewards, terminated, _, infos = step_meanwhile(env, asked, learn)
             self._require_all_or_none(env)
             then, allowed = self.agents.stack(observations), self.agents.masks(infos)
             reward = self._finite(self.agents.values(rewards))
@@ -389,11 +405,8 @@ class DQN:
             self.decisions += 1
             tally.decisions += 1
             tally.reward += float(reward.mean())
-            if self._is_time_to_update():
-                loss, q = self.update(sampling)
-                tally.loss += loss
-                tally.q += q
-                tally.updates += 1
+            is_due = self._is_time_to_update()
+        learn()
         self.episodes += 1
         updates = max(1, tally.updates)
         return {
