@@ -42,13 +42,13 @@ help:
 
 demo: environment
 	rm -rf runs/demo
-	OMP_NUM_THREADS=1 $(BIN)/ugat-marl train single-v1 --real V4 --out runs/demo --duration-s 1800 \
-		--iterations 1 --street.simulations 60 --street.rule-budget 3 --street.rival none --street.judged 4 \
+	OMP_NUM_THREADS=1 $(BIN)/ugat-marl train single-v1 --real V4 --out runs/demo --duration-s 1200 \
+		--iterations 1 --street.simulations 40 --street.rule-budget 3 --street.rival none --street.judged 4 \
 		--tuning-seeds 1 $(ARGS)
 	OMP_NUM_THREADS=1 $(BIN)/ugat-marl report runs/demo
 	OMP_NUM_THREADS=1 $(BIN)/ugat-marl rollout single-v1 --domain V4 --policy runs/demo/policies/direct-transfer.pt \
 		--beside runs/demo/policies/fitted-street.pt --video runs/demo/before-after.gif \
-		--film.from-s 1500 --film.length-s 60 --film.size 400
+		--film.from-s 1000 --film.length-s 60 --film.size 400
 
 test: environment-dev
 	UGAT_MARL_TEST_INSTALLED=1 OMP_NUM_THREADS=1 $(BIN)/python -m pytest -q -n $(JOBS) --dist worksteal $(TESTS) $(ARGS)
