@@ -8,6 +8,7 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import polars as pl
@@ -350,6 +351,30 @@ def test_one_recording_in_two_periods_counts_twice(read: Read) -> None:
     assert not any("same" in text for text in findings)
 
 
+def test_one_recording_of_lanes_or_vehicles_in_two_periods_counts_twice(read: Read) -> None:
+    times = [60.0 * i for i in range(1, 40)]
+    tables: dict[str, dict[str, Any]] = {
+        "lanes": {"lane_id": "S_C_0", "vehicles": 4, "halting": 2, "mean_speed_mps": 3.0},
+        "trajectories": {
+            "vehicle_id": "a", "lane_id": "S_C_0", "position_m": 20.0, "speed_mps": 3.0,
+        },
+    }  # fmt: skip
+    for name, values in tables.items():
+        rows: list[dict[str, Any]] = [
+            {"period_id": day, "time_s": time, **values}
+            for day in ("day0", "day1")
+            for time in times
+        ]
+        for change, complaint in ((0.0, "'day0' and 'day1' share 39 rows"), (1.0, None)):
+            rows[0][("vehicles" if name == "lanes" else "position_m")] += change
+            table = recording(2, **{name: pl.DataFrame(rows)})
+            if complaint is None:
+                read(table)
+                continue
+            with pytest.raises(MeasuredDataError, match=complaint):
+                read(table)
+
+
 def test_one_period_holds_nothing_out(read: Read) -> None:
     _, findings = read(recording(1))
     assert only(findings, "only one period", "judged on the data that were fitted") == ()
@@ -531,7 +556,7 @@ def test_lanes_that_are_mixed_up_show_in_who_leaves_on_red(read: Read) -> None:
 
 def counts() -> pl.DataFrame:
     rows = [
-        (f"day{i}", 900.0 * k, 900.0 * (k + 1), d.id, 40 + k)
+        (f"day{i}", 900.0 * k, 900.0 * (k + 1), d.id, 40 + k + i)
         for i in range(3)
         for d in DETECTORS
         for k in range(8)

@@ -7,6 +7,7 @@ from pathlib import Path
 
 import polars as pl
 
+from ugat_marl.data.measured.copies import refuse_copies
 from ugat_marl.data.measured.passages import FASTEST_MPS
 from ugat_marl.data.measured.tables import (
     COUNTS,
@@ -39,7 +40,8 @@ def counts_of(
         findings: Findings; intervals outside of their period are added to them.
 
     Raises:
-        MeasuredDataError: A detector or period is unknown, an interval or a number impossible.
+        MeasuredDataError: A detector or period is unknown, an interval or a number impossible,
+            or two periods hold one recording.
     """
     names = [detector.id for detector in detectors]
     refuse(
@@ -91,6 +93,7 @@ def _checked_intervals(
     ):
         refuse(path, frame.filter(bad), column, complaint, "correct the row")
     _refuse_overlaps(path, frame, keys, owner)
+    refuse_copies(path, frame, periods, (*keys, "begin_s", "end_s"), "count")
     return frame
 
 

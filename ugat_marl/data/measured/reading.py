@@ -12,6 +12,7 @@ import numpy as np
 import polars as pl
 
 from ugat_marl.data.measured import tables
+from ugat_marl.data.measured.copies import refuse_copies
 from ugat_marl.data.measured.counts import counts_of, travel_times_of, turning_of
 from ugat_marl.data.measured.coverage import coverage
 from ugat_marl.data.measured.local_time import LocalClock, local_times, require_time_zone
@@ -283,6 +284,8 @@ def _of_moments(
             Finding(f"{path.name}: {twice} rows are there twice; the first ones are taken")
         )
     frame = once
+    number = "position_m" if tracks else "vehicles"
+    refuse_copies(path, frame, periods, (what, "time_s"), number)
     lengths = ("length_m",) if "length_m" in frame.columns and frame["length_m"].count() else ()
     optional = lengths if tracks else table.optional
     return frame.select(*table.columns, *optional)
