@@ -479,3 +479,12 @@ def test_vehicles_that_hold_each_other_on_a_junction_let_go() -> None:
         arrived[domain] = found.results[0].scores.throughput / found.results[0].scores.due
     assert arrived["V1"] < 0.6
     assert arrived["V1+blocker_patience=60"] > 0.8
+
+
+@pytest.mark.parametrize("later", ["yellow_time=4", "all_red_time=1"])
+def test_a_clearance_behind_the_queue_model_is_refused(later: str) -> None:
+    """The queue model has made red of the yellow by then."""
+    with pytest.raises(ScenarioError, match="put .* before it"):
+        scenario_in_domain(load_scenario("single-v1"), f"meso+{later}")
+    changed = scenario_in_domain(load_scenario("single-v1"), f"{later}+meso")
+    assert changed.timing.yellow_s == 0

@@ -39,6 +39,16 @@ def actuators(domain: str, name: str = "single-v1", seed: int = 1) -> Actuators:
     return made
 
 
+def test_a_longest_green_below_the_minimum_green_is_refused() -> None:
+    with pytest.raises(ScenarioError, match="max_green=40: the minimum green is 60 s"):
+        Actuators.of(
+            parse_domain("max_green=40"),
+            NETWORKS["single-v1"],
+            signals.SignalTiming(3.0, 2.0, 60.0),
+            10.0,
+        )
+
+
 class Light:
     """One intersection behind its actuators and its signal machine, second by second."""
 

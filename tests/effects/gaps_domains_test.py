@@ -132,10 +132,10 @@ class Trace:
         simulator: Any = env._simulator
         advance = simulator.advance
 
-        def recording(seconds: float, plans: Mapping[str, Any]) -> Snapshot:
+        def recording(seconds: float, plans: Mapping[str, Any], meanwhile: Any) -> Snapshot:
             for length, state in plans["A1"]:
                 self.plan += [state] * round(length)
-            return advance(seconds, plans)
+            return advance(seconds, plans, meanwhile)
 
         simulator.advance = recording
         try:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+from collections.abc import Callable
 from typing import Any
 
 import numpy as np
@@ -10,8 +11,14 @@ import pytest
 from pettingzoo.test.example_envs import generated_agents_parallel_v0
 
 from ugat_marl import parallel_env
-from ugat_marl.envs import TrafficEnv, frame_stack, step_meanwhile
-from ugat_marl.errors import ActionError
+from ugat_marl.envs import (
+    AnyParallelEnv,
+    TrafficEnv,
+    frame_stack,
+    pad_spaces,
+    step_meanwhile,
+)
+from ugat_marl.errors import ActionError, SimulatorError
 from ugat_marl.policies.learners.dqn import DQN
 from ugat_marl.policies.learners.dqn_config import DQNConfig
 from ugat_marl.simulation.host import Worker
@@ -59,11 +66,12 @@ def test_work_is_done_once_and_changes_no_episode(simulator: str) -> None:
     env.close()
 
 
+@pytest.mark.parametrize("wrapped", [lambda env: env, lambda env: pad_spaces(frame_stack(env, 2))])
 def test_the_process_is_asked_before_the_work_and_read_after(
-    monkeypatch: pytest.MonkeyPatch,
+    wrapped: Callable[[TrafficEnv], AnyParallelEnv], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """Only then does SUMO simulate during the work."""
-    env = made()
+    env = wrapped(made())
     env.reset(seed=1)
     order: list[str] = []
     for name in ("ask", "answer"):
@@ -88,6 +96,17 @@ def test_work_that_fails_ends_the_episode_and_no_later_one_reads_its_answer(simu
         step_meanwhile(env, first(env), lambda: 1 / 0)
     assert not env.agents
     assert played(env, 5) == wanted
+    env.close()
+
+
+@pytest.mark.parametrize("simulator", ["process", "spawn"])
+def test_work_that_asks_the_simulation_is_told_that_it_cannot(simulator: str) -> None:
+    env = parallel_env("single-v1", duration_s=60, simulator=simulator, render_mode="rgb_array")
+    env.reset(seed=1)
+    with pytest.raises(SimulatorError, match="in the middle of a step; work that is done mean"):
+        step_meanwhile(env, first(env), env.render)
+    env.reset(seed=1)
+    env.step(first(env))
     env.close()
 
 

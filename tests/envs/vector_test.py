@@ -849,3 +849,9 @@ def test_wrong_calls_of_send_and_recv(crossing: Crossing) -> None:
         with pytest.raises(EpisodeError, match=r"recv\(1\): 0 environments"):
             env.recv()
         env.step(actions)
+
+
+def test_domains_that_are_none_are_an_error_of_the_suite() -> None:
+    given: Any = None
+    with pytest.raises(OptionError, match="domain None"):
+        vector_env("single-v1", 2, given, duration_s=60)

@@ -9,10 +9,11 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+import ugat_marl
 from ugat_marl.data import Scores
 from ugat_marl.effects import load_scenario
 from ugat_marl.envs import parallel_env
-from ugat_marl.errors import CheckpointError, UnknownNameError
+from ugat_marl.errors import CheckpointError, OptionError, UnknownNameError
 from ugat_marl.experiments import Evaluation, best_rules, evaluate, policy_factory, rule_factory
 from ugat_marl.experiments.evaluation import Result
 from ugat_marl.policies import DQN
@@ -114,3 +115,15 @@ def test_a_trained_policy_is_played_from_its_file(tmp_path: Path) -> None:
         [1], duration_s=100,
     )  # fmt: skip
     assert found.results[0].scores.due > 0
+
+
+def test_a_seed_that_is_given_twice_is_refused() -> None:
+    with pytest.raises(OptionError, match="a seed is given twice"):
+        ugat_marl.evaluate("single-v1", ["random"], ["sim"], seeds=[5, 6, 5], duration_s=60)
+
+
+def test_seeds_may_be_an_array() -> None:
+    table = ugat_marl.evaluate(
+        "single-v1", ["random"], ["sim"], seeds=np.arange(5, 7), duration_s=60, workers=1
+    )
+    assert table["episodes"].to_list() == [2]

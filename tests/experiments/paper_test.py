@@ -238,3 +238,11 @@ def test_a_table_from_the_command_line(
     assert main(call) == 0  # nothing is trained again
     assert [path.joinpath(SCORES).stat().st_mtime_ns for path in trained] == times
     assert (folder / "table.csv").read_bytes() == before
+
+
+def test_options_that_a_table_does_not_have_are_refused() -> None:
+    with pytest.raises(OptionError, match="table 'alpha' has no constants"):
+        PaperConfig(constants=(9,)).settings("alpha")
+    with pytest.raises(OptionError, match="table 'gap' has no grounding"):
+        PaperConfig(groundings=("timed",)).settings("gap")
+    assert PaperConfig(groundings=("phase",)).settings("gap")

@@ -327,3 +327,8 @@ def test_a_foreign_directory_is_refused_before_anything_is_measured(
 def test_impossible_days_are_refused(options: Mapping[str, Any], says: str) -> None:
     with pytest.raises(OptionError, match=says):
         record(load_scenario("single-v1"), "sim", policy_factory("fixed-time"), **options)
+
+
+def test_days_of_the_same_demand_do_not_vary(data: Path) -> None:
+    with pytest.raises(OptionError, match="leave day_to_day out"):
+        measure(data / "crossing", same_demand=True, day_to_day=0.2)

@@ -135,6 +135,12 @@ def test_rules_are_put_into_a_table(
     for option, value in (("--seeds", "4"), ("--learner-settings", "a=1")):
         assert main([*call, option, value]) == 2
         assert f"trained already; leave out {option}" in capsys.readouterr().err
+    assert main([*call, "random", "--table", str(table)]) == 2
+    assert "--policies has random twice" in capsys.readouterr().err
+    table.with_name("table.csv").write_text("scenario,setting\ngrid4x4-v1,fast\n")
+    assert main([*call, "--table", str(table)]) == 2
+    assert "a table of grid4x4-v1, not of single-v1" in capsys.readouterr().err
+    table.with_name("table.csv").write_text("scenario,setting\nsingle-v1,fast\n")
     # A row that would be lost is refused before any episode is played.
     lost = [*call[:3], "direct transfer", *call[4:], "--domains", "V1", "--table", str(table)]
     monkeypatch.setattr("ugat_marl.cli.compare.standings_of", None)

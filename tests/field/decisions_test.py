@@ -228,3 +228,18 @@ def test_no_flipped_bit_of_a_log_is_read_as_another_decision(tmp_path: Path) -> 
             read.extend(read_decisions(path))
         path.write_bytes(whole)
     assert [*read_decisions(path)] == lines
+
+
+def test_a_log_that_is_renamed_goes_on_under_its_name(tmp_path: Path) -> None:
+    """As logrotate does it: what came before is in the renamed file, the rest under the name."""
+    path = tmp_path / "field.jsonl"
+    log = filled(path, 100)
+    old = path.rename(tmp_path / "field.jsonl.1")
+    for number in range(100, 230):
+        log.add(decision(number))
+    with pytest.raises(OptionError, match="another loop writes"):
+        DecisionLog(path)
+    log.close()
+    before = numbers(old)
+    assert before and before + numbers(path) == [*range(230)]
+    assert names(tmp_path) == ["field.jsonl", "field.jsonl.1"]

@@ -343,6 +343,8 @@ def test_a_stopped_command_leaves_its_log_and_nothing_else(
     ("arguments", "says"),
     [
         (["--policy", "random"], "--port is missing"),
+        (["--policy", "random", "--port", "70000"], "--port 70000: a port is a number from 1"),
+        (["--policy", "random", "--port", "-1"], "--port -1: a port is a number from 1"),
         (["--policy", "random", "--start", "--host", "far"], "--host far"),
         (["--policy", "random", "--start", "--port", "8813"], "opens no port"),
         (["--policy", "random", "--start", "--look-for-s", "9"], "opens no port"),

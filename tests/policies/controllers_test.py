@@ -10,6 +10,8 @@ from typing import Any
 import numpy as np
 import pytest
 
+from ugat_marl import parallel_env
+from ugat_marl.envs import frame_stack, pad_spaces
 from ugat_marl.errors import OptionError, UnknownNameError
 from ugat_marl.policies import (
     RULE_NAMES,
@@ -21,6 +23,7 @@ from ugat_marl.policies import (
     format_rule,
     make_rule,
     parse_rule,
+    roll_out,
 )
 from ugat_marl.policies.rules.approaches import covering_phases
 from ugat_marl.policies.rules.catalogue import example_of
@@ -266,3 +269,25 @@ def test_several_intersections_are_held_apart():
     assert rule.act(both({"n_0": 1}, {"w_0": 1}), {}) == {AGENT: 0, "signal_1": 2}
     assert rule.act(both({"w_0": 1}, {"n_0": 1}), {}) == {AGENT: 0, "signal_1": 2}
     assert rule.act(both({"w_0": 1}, {"n_0": 1}), {}) == {AGENT: 2, "signal_1": 0}
+
+
+@pytest.mark.parametrize("spec", ["largest-queue", "max-pressure", "max-pressure-loss", "sotl"])
+def test_rules_act_behind_padded_spaces(spec: str) -> None:
+    """As without them: the phases of padding are none of the light's."""
+    played: list[float] = []
+    for wrap in (lambda env: env, pad_spaces):
+        env = wrap(parallel_env("mixed-v1", duration_s=60, observation="movements"))
+        roll_out(env, make_rule(spec, env), 1)
+        played.append(env.scores().att_s)
+        env.close()
+    assert played[0] == played[1]
+
+
+def test_a_rule_refuses_stacked_observations() -> None:
+    """It would read the oldest one."""
+    env = parallel_env("single-v1", duration_s=60, observation="movements")
+    make_rule("max-pressure", frame_stack(env, 1))
+    for wrapped in (frame_stack(env, 3), pad_spaces(frame_stack(env, 3))):
+        with pytest.raises(OptionError, match="frame_stack shows 3; give the rule the env"):
+            make_rule("max-pressure", wrapped)
+    env.close()

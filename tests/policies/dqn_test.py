@@ -690,3 +690,23 @@ def test_the_policy_acts_by_the_target_networks():
     _constant(learner, online=[0.0, 1.0], target=[9.0, 2.0])
     seen = {"signal_0": np.eye(4, dtype=np.float32)[0]}
     assert learner.policy().act(seen, {}) == {"signal_0": 0}
+
+
+def test_returns_stop_where_an_episode_was_broken_off() -> None:
+    """Else the rewards of the next episode would count for the decisions of the broken one."""
+
+    class Breaking(CueEnv):
+        steps = 0
+
+        def step(self, actions: dict[str, int]):
+            self.steps += 1
+            if self.steps == 3:
+                raise KeyboardInterrupt
+            return super().step(actions)
+
+    env = Breaking()
+    learner = DQN.of(env, DQNConfig(steps=3, warmup_decisions=1_000))
+    with pytest.raises(KeyboardInterrupt):
+        learner.learn(env, 1, seed=0)
+    learner.learn(env, 1, seed=0)
+    assert learner._replay._last[0, : len(learner._replay)].tolist()[1] is True

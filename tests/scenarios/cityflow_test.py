@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import copy
 import json
+import xml.etree.ElementTree as ET
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -367,3 +368,17 @@ def test_hangzhou_travel_times_agree(hangzhou: Path, tmp_path: Path) -> None:
     ]
     assert att_s[0] == pytest.approx(att_s[1], rel=0.03)
     assert att_s[0] > 100
+
+
+def test_a_flow_without_an_end_lasts_as_long_as_the_episode_of_the_others(tmp_path: Path) -> None:
+    flows = [flow(["wm", "me"], 0, 7000, 10.0), flow(["sm", "mn"], 0, -1, 10.0)]
+    words = write(tmp_path, crossroads(), flows)
+    assert main(["scenario", "new", str(tmp_path / "city"), *words]) == 0
+    scenario = read_scenario(tmp_path / "city")
+    assert scenario.settings.duration_s == 7200.0
+    routes = ET.parse(tmp_path / "city" / "demand.rou.xml").getroot()
+    last_s = {
+        vehicle.get("id", "").split(".")[0]: float(vehicle.get("depart", "0"))
+        for vehicle in routes.iter("vehicle")
+    }
+    assert last_s == {"0": 7000.0, "1": 6990.0}

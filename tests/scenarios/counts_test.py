@@ -91,6 +91,8 @@ def test_origins_and_destinations(tmp_path: Path) -> None:
         ("--counts", "edge,count\nwest1_A1,1_000\n", "line 2: count = '1_000' is not a number"),
         ("--counts", "edge,count\nwest1_A1,١٢\n", "line 2: count = '١٢' is not a number"),
         ("--counts", "edge,count\nwest1_A1,true\n", "line 2: count = 'true' is not a number"),
+        ("--counts", "edge,count,begin,end\nwest1_A1,5,0,60\n", "line 1: column 'begin' is not kn"),
+        ("--od", "from,to,count,Start\nwest1_A1,B1_east1,5,0\n", "is begin_s to end_s, in seconds"),
         ("--counts", "edge,count\nwest1_A1,inf\n", "line 2: count = 'inf' is not a number"),
         ("--counts", "edge,count\nwest1_A1\n", "line 2: count = None is not a number"),
         ("--counts", "edge,count\nwest1_A1,5\nhere,5\n", "line 3: 'here' is not a road for cars"),
@@ -208,3 +210,24 @@ def test_intervals_are_on_the_clock_of_the_begin(
     assert within == pytest.approx(inside, abs=2 if lost in (0, 100) else 20)
     note = f"{lost} of the 160 vehicles of c.csv are outside of the episode (25200 to 28800 s)"
     assert (note in (tmp_path / "city" / "README.md").read_text()) is (lost > 0)
+
+
+@pytest.mark.parametrize(
+    ("rows", "length_s"),
+    [
+        (["west1_A1,400,0,3600", "southA_A1,600,,"], 5400),
+        (["west1_A1,100,0,900", "southA_A1,360,,"], 3000),
+        (["west1_A1,40,0,600", "west1_A1,60,1000,1900", "southA_A1,80,0,1800"], 1900),
+    ],
+)
+def test_intervals_that_do_not_divide_each_other_lose_no_vehicle(
+    rows: list[str], length_s: int, tmp_path: Path
+) -> None:
+    (tmp_path / "t.csv").write_text("\n".join(["edge,count,begin_s,end_s", *rows, ""]))
+    words = ["--grid", "1x1", "--counts", tmp_path / "t.csv", "--duration-s", str(length_s)]
+    assert main(["scenario", "new", str(tmp_path / "city"), *map(str, words)]) == 0
+    driven = drives(tmp_path / "city")
+    assert max(depart for depart, _ in driven) < length_s
+    for road in {row.split(",")[0] for row in rows}:
+        wanted = sum(int(row.split(",")[1]) for row in rows if row.startswith(road))
+        assert sum(edges[0] == road for _, edges in driven) == pytest.approx(wanted, rel=0.03)

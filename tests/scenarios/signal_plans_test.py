@@ -78,6 +78,21 @@ def test_rings_run_side_by_side_and_meet_at_the_barrier(single: Scenario) -> Non
     assert all("g" not in state for _, state in light.programme)  # nobody gives way
 
 
+def test_a_ring_that_sits_a_barrier_out_clears_before_it(single: Scenario) -> None:
+    """Else its green would end at the instant at which the cross street's begins."""
+    phases = (
+        PlanPhase(1, 1, ("EBT", "EBR", "EBL"), 45, 3, 2),
+        PlanPhase(2, 1, ("WBT", "WBR", "WBL"), 45, 3, 2),
+        PlanPhase(1, 2, ("NBT", "NBR", "NBL", "SBT", "SBR", "SBL"), 45, 3, 2),
+    )
+    scenario = with_plans(single, [SignalPlan("A1", 90, 0, phases)], "plans.csv")
+    assert {"WBT", "EBT"} <= green_at(scenario, 39)
+    assert {"WBT", "EBT"} <= green_at(scenario, 41, "y")
+    assert not green_at(scenario, 44, "Ggy")
+    assert {"NBT", "SBT"} <= green_at(scenario, 46)
+    assert {"NBT", "SBT"} <= green_at(scenario, 86, "y")
+
+
 def test_a_movement_of_two_phases_in_turn_stays_green(single: Scenario) -> None:
     phases = (
         PlanPhase(1, 1, ("EBL", "EBT", "EBR"), 25, 3, 2),

@@ -101,6 +101,8 @@ class Compare:
         """Judge, print the table, write it."""
         if bool(self.policies) == (self.learner is not None):
             raise OptionError("compare needs --policies or --learner, one of the two")
+        if twice := [each for each in self.policies if self.policies.count(each) > 1]:
+            raise OptionError(f"--policies has {twice[0]} twice: it would count as two trainings")
         if self.policies:
             refuse_options(
                 self,
@@ -112,7 +114,7 @@ class Compare:
             require_writable(self.out)
         scenario = load_scenario(self.scenario)
         if self.table is not None:
-            table = read_standings(self.table)
+            table = read_standings(self.table, scenario.id)
         else:
             table = shipped_standings(scenario, self.evaluation_seeds, self.duration_s)
             if table.is_empty():

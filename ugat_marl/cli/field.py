@@ -114,6 +114,8 @@ class Field:
     def _check(self) -> None:
         if self.port is None and not self.start:
             raise OptionError("--port is missing: where SUMO listens; or let --start run one")
+        if self.port is not None and not 1 <= self.port <= 65535:
+            raise OptionError(f"--port {self.port}: a port is a number from 1 to 65535")
         if not self.start:
             refuse_options(self, ("domain", "seed"), "they are of the SUMO that --start runs")
         if self.start and self.host != "localhost":

@@ -143,8 +143,17 @@ class MaxGreen(ControllerEffect):
     def actuator(
         self, network: Network, timing: SignalTiming, decision_interval_s: float
     ) -> Actuator:
-        """Make an actuator that ends greens before they are too long."""
+        """Make an actuator that ends greens before they are too long.
+
+        Raises:
+            ScenarioError: The minimum green is longer.
+        """
         del network
+        if timing.min_green_s > self.seconds:
+            raise ScenarioError(
+                f"max_green={self.seconds:g}: the minimum green is {timing.min_green_s:g} s; give "
+                "at least as many"
+            )
         return _Bounded(self.seconds, timing.clearance_s, decision_interval_s)
 
 

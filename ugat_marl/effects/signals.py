@@ -140,6 +140,10 @@ def with_late_green_programmes(scenario: Scenario) -> Scenario:
 
 
 def _with_control(scenario: Scenario, effect: Effect, key: str, seconds: float) -> Scenario:
+    if "mesosim" in scenario.settings.sumo:
+        raise ScenarioError(
+            f"{effect}: the queue model shows its clearance as red; put {effect.name} before it"
+        )
     step = scenario.settings.step_length_s
     changed = scenario.with_control(**{key: round(seconds / step) * step})
     return replace(changed, applied=(*scenario.applied, str(effect)))

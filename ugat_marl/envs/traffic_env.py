@@ -300,7 +300,8 @@ class TrafficEnv(ParallelEnv[str, Any, Any]):
         """Do some work in the next step while SUMO simulates; `step_meanwhile` uses this.
 
         Args:
-            work: Called once, before the step has its results; None for no work.
+            work: Called once, before the step has its results, and cannot ask the environment
+                anything; None for no work.
         """
         self._meanwhile = work
 
@@ -495,7 +496,8 @@ def step_meanwhile(
     Args:
         env: Any parallel environment.
         actions: A green phase for every agent.
-        work: Called once, unless the step is refused. It cannot know the results of the step.
+        work: Called once, unless the step is refused. It cannot know the results of the step, and
+            cannot ask the environment anything.
     """
     left = [work]
 
@@ -503,7 +505,8 @@ def step_meanwhile(
         if left:
             left.pop()()
 
-    inner = env.unwrapped
+    inner: Any = env.unwrapped
+    inner = getattr(inner, "base", inner)  # wrappers of the suite are their own `unwrapped`
     if not isinstance(inner, TrafficEnv):
         result = env.step(dict(actions))
     else:

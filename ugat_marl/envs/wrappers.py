@@ -292,12 +292,14 @@ class _SharedObservation(Wrapper):
 
 
 class _FrameStack(Wrapper):
+    """Attribute `frames`: number of observations that one shows."""
+
     def __init__(self, env: AnyParallelEnv, k: int) -> None:
         super().__init__(env)
         given: Any = k
         if not isinstance(given, SupportsIndex) or k < 1:
             raise OptionError(f"frame_stack of {k!r} observations: must be a whole number from 1")
-        self._k = k
+        self._k = self.frames = int(k)
         self._frames: dict[str, deque[NDArray[np.float32]]] = {}
         self.observation_spaces = _each(self.observation_spaces, self._stacked_box)
 

@@ -98,13 +98,15 @@ def evaluate(
         The scores of all episodes, as policies and domains are given, then by seed.
 
     Raises:
-        OptionError: A domain is listed twice, or `watch` is given with an executor.
+        OptionError: A domain or a seed is listed twice, or `watch` is given with an executor.
         UnknownNameError: There is no such domain or rule.
         CheckpointError: The file of a policy is unreadable, or of another network.
     """
     names = [domain_label(domain) for domain in domains]
     if twice := sorted({name for name in names if names.count(name) > 1}):
         raise OptionError(f"domain {twice[0]!r} is listed twice (rain is V3, snow is V4, ...)")
+    if len(set(seeds)) < len(seeds):
+        raise OptionError("a seed is given twice: its episode would count twice in the intervals")
     # Made once for all policies. A wrong name is an error now, not in an hour.
     worlds = [parallel_env(scenario, domain, duration_s=duration_s) for domain in domains]
     for make in policies.values():

@@ -196,7 +196,7 @@ def evaluate(
     if isinstance(seeds, int | np.integer):
         numbers: Sequence[int] = range(EVALUATION_SEED, EVALUATION_SEED + int(seeds))
     else:
-        numbers = seeds
+        numbers = [int(seed) for seed in seeds]
     if not numbers or not domains:
         raise OptionError("seeds and domains need at least one each")
     played = evaluation.evaluate(

@@ -449,6 +449,10 @@ class PaperConfig:
         Raises:
             UnknownNameError: The table has no row of that name.
         """
+        if table == "gap" and {*self.groundings} - {"phase"}:  # which the preset "paper" sets
+            raise OptionError("table 'gap' has no grounding; leave groundings out")
+        if table != "main" and tuple(self.constants) != PaperConfig.constants:
+            raise OptionError(f"table {table!r} has no constants, only 'main' has; leave them out")
         rows = settings_of(table, self.ugat, self.sim, self.groundings, self.constants, self.spec)
         if self.reward not in MATCHED_REWARDS:
             rows = [setting for setting in rows if not setting.matches]

@@ -41,11 +41,17 @@ SCHEMA = pl.Schema(
 """Columns of a table of standings."""
 
 
-def read_standings(path: Path) -> pl.DataFrame:
+def read_standings(path: Path, scenario: str | None = None) -> pl.DataFrame:
     """Read a table of standings, such as ``results/single-v1/main/seeds.csv``.
+
+    Args:
+        path: The file.
+        scenario: Id of the scenario that it should be of; the ``table.csv`` beside it tells. None
+            for any.
 
     Raises:
         CheckpointError: The file is missing or damaged, or a column or number is.
+        OptionError: It is a table of another scenario.
     """
     try:
         content = path.read_bytes()
@@ -54,7 +60,19 @@ def read_standings(path: Path) -> pl.DataFrame:
     texts = _texts(content)
     if damaged := csv_damage(path, pl.DataFrame() if texts is None else texts):
         raise CheckpointError(f"{path}: {damaged}")
-    return _standings_in(texts, str(path))
+    rows = _standings_in(texts, str(path))
+    known = _scenarios_of(path.with_name("table.csv"))
+    if scenario is not None and known and scenario not in known:
+        raise OptionError(f"{path}: a table of {', '.join(known)}, not of {scenario}")
+    return rows
+
+
+def _scenarios_of(path: Path) -> list[str]:
+    """Return the scenarios of the table of a folder; none if there is none that names them."""
+    texts = _texts(path.read_bytes()) if path.is_file() else None
+    if texts is None or "scenario" not in texts.columns:
+        return []
+    return texts["scenario"].drop_nulls().unique(maintain_order=True).to_list()
 
 
 def as_standings(content: bytes, name: str) -> pl.DataFrame:

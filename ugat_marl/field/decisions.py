@@ -149,7 +149,7 @@ class DecisionLog:
 
     def _write(self) -> None:
         """Write some of the waiting lines to the segment."""
-        if self._segment < 0 or os.fstat(self._segment).st_nlink == 0:  # nobody can see it any more
+        if not _is_at(self._segment, self._part):
             self._begin()
         lines = b"".join(self._waiting[:_AT_ONCE])
         # A write that fails in its middle is repeated at the same place.
@@ -161,9 +161,7 @@ class DecisionLog:
     def _begin(self) -> None:
         """Begin a segment behind the file and the segments that are still to be added to it."""
         self.path.parent.mkdir(parents=True, exist_ok=True)
-        if self._file < 0 or os.fstat(self._file).st_nlink == 0:
-            self._release()
-            self._open_file()
+        self._find_file()
         end = os.fstat(self._file).st_size + sum(part.stat().st_size for _, part in self._parts())
         self._part = self.path.with_name(f"{self.path.name}.{end:015d}.part")
         if self._segment >= 0:
@@ -183,6 +181,7 @@ class DecisionLog:
 
     def _merge(self) -> None:
         """Add all segments to the file. A merge that was killed at any point is completed."""
+        self._find_file()
         for offset, part in self._parts():
             lines = _whole_lines(part)
             size = os.fstat(self._file).st_size
@@ -193,6 +192,12 @@ class DecisionLog:
                 raise
             os.fsync(self._file)  # before the only other copy goes
             part.unlink()
+
+    def _find_file(self) -> None:
+        """Open the file again if it was deleted or renamed, as a rotation of logs does."""
+        if not _is_at(self._file, self.path):
+            self._release()
+            self._open_file()
 
     def _overlap(self, offset: int, lines: bytes) -> int:
         """Return the number of bytes at the begin of a segment that the file ends with."""
@@ -266,6 +271,14 @@ def _whole_lines(part: Path) -> bytes:
     """Return a segment without a last line that was not written to its end."""
     content = part.read_bytes()
     return content[: content.rfind(b"\n") + 1]
+
+
+def _is_at(descriptor: int, path: Path) -> bool:
+    """Return True if a path leads to an open file; a descriptor of -1 is none."""
+    try:
+        return descriptor >= 0 and os.path.samestat(os.fstat(descriptor), path.stat())
+    except FileNotFoundError:
+        return False
 
 
 def _write_at(descriptor: int, content: bytes, offset: int) -> None:

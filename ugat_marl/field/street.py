@@ -48,7 +48,10 @@ class Street(Protocol):
     """Interface of a street. The loop survives an error of `read`, but of no other method."""
 
     def now_s(self) -> float:
-        """Return the street's clock, s."""
+        """Return the street's clock, s.
+
+        It runs on evenly and is never set, like `time.monotonic`: the loop times yellow by it.
+        """
         ...
 
     def shown(self) -> Mapping[str, str]:

@@ -13,7 +13,7 @@ from ugat_marl.experiments import DIRECT, Comparison, Trial, is_grounded
 from ugat_marl.reporting.run_records import RunRecord
 
 _APART = (
-    "seed", "real", "real_log", "evaluation_seeds", "tuning_seeds", "rule_budget", "control",
+    "seed", "real", "evaluation_seeds", "tuning_seeds", "rule_budget", "control",
     "further", "corrected", "randomised", "random_delay_s", "fine_tuned", "oracle",
     "scenario_hash", "domains",
 )  # fmt: skip

@@ -215,10 +215,11 @@ def _times(plan: SignalPlan) -> tuple[list[float], _Shown]:
         ]
         own.sort(key=lambda pair: pair[1][0])
         for place, (phase, (begin, green_end, yellow_end)) in enumerate(own):
-            following = own[(place + 1) % len(own)][0]
+            following, (following_begin, *_) = own[(place + 1) % len(own)]
             movements = frozenset(phase.movements)
-            stays = movements & frozenset(following.movements)
             end = begin + phase.split_s
+            pause = (following_begin - end + 1e-6) % plan.cycle_s  # a ring may sit a barrier out
+            stays = movements & frozenset(following.movements) if pause < 2e-6 else frozenset()
             shown.append((begin, green_end, yellow_end, movements, stays))
             if stays:
                 shown.append((green_end, end, end, stays, stays))

@@ -43,6 +43,7 @@ class ProcessSimulator:
         self._host = Host(SERVICE, start_method, deadline_s=deadline_s)
         self._worker: Worker | None = None
         self._shown: dict[str, str] = {}
+        self._busy = False
 
     def start(self, launch: Launch) -> Snapshot:
         """Start a simulation in a fresh process; end a running one first.
@@ -107,6 +108,11 @@ class ProcessSimulator:
         self, request: str, meanwhile: Callable[[], object] | None = None, **arguments: Any
     ) -> Message:
         worker = self._worker
+        if self._busy:
+            raise SimulatorError(
+                f"{request}: the simulation is in the middle of a step; work that is done "
+                "meanwhile cannot ask it"
+            )
         if worker is None or not worker.running:
             raise SimulatorError(
                 f"{request}: no simulation is under way in this process; start one"
@@ -114,11 +120,22 @@ class ProcessSimulator:
         try:
             worker.ask(request, **arguments)
             if meanwhile is not None:
-                _do(meanwhile, worker)
+                self._do(meanwhile, worker)
             return worker.answer()
         except ChannelClosed:
             self._worker = None
             raise SimulatorCrashed(worker.obituary(request)) from None
+
+    def _do(self, work: Callable[[], object], asked: Worker) -> None:
+        """Do the work; if it fails, end the worker, whose answer nobody would read."""
+        self._busy = True
+        try:
+            work()
+        except BaseException:
+            asked.end(patience_s=0.0)
+            raise
+        finally:
+            self._busy = False
 
 
 def simulator_of(option: str, deadline_s: float | None = None) -> Simulator:
@@ -133,15 +150,6 @@ def simulator_of(option: str, deadline_s: float | None = None) -> Simulator:
 
         return LibsumoSimulator()
     return ProcessSimulator("spawn" if option == "spawn" else None, deadline_s)
-
-
-def _do(work: Callable[[], object], asked: Worker) -> None:
-    """Do the work; if it fails, end the worker, whose answer nobody would read."""
-    try:
-        work()
-    except BaseException:
-        asked.end(patience_s=0.0)
-        raise
 
 
 def _snapshot(reply: Message) -> Snapshot:

@@ -186,7 +186,8 @@ def domain_chooser(
     if callable(domains):
         return domains
     given: Any = domains
-    if isinstance(given, str) or not any(map(_is_domain, given)):
+    is_one = isinstance(given, str) or not isinstance(given, Sequence)
+    if is_one or not any(map(_is_domain, given)):
         scenario_in_domain(scenario, given, duration_s=duration_s)
         return lambda environment, episode: given
     listed: list[Any] = list(given)

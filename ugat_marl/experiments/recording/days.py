@@ -166,6 +166,8 @@ def record(
         raise OptionError(
             f"detector_length_m = {detector_length_m:g} and seed = {seed} must be 0 or more"
         )
+    if same_demand and day_to_day:
+        raise OptionError("same_demand keeps the demand of every day; leave day_to_day out")
     if not 0 <= day_to_day < 1:
         raise OptionError(f"day_to_day = {day_to_day:g} must be from 0 to below 1")
     scenario = demand_as_vehicles(scenario.with_duration(duration_s))

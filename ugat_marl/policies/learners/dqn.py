@@ -334,6 +334,7 @@ class DQN:
 
     def _watch(self, env: AnyParallelEnv, teacher: Policy, seed: int) -> None:
         """Let the teacher play an episode, and store its decisions."""
+        self._replay.end()
         observations, infos = env.reset(seed=seed)
         teacher.reset(seed)
         now = self.agents.stack(observations)
@@ -386,6 +387,7 @@ class DQN:
             if is_due:
                 tally.add(*self.update(sampling))
 
+        self._replay.end()
         observations, infos = env.reset(seed=derive_seed(seed, "dqn", "episode", number))
         now, allowed = self.agents.stack(observations), self.agents.masks(infos)
         while env.agents:

@@ -112,6 +112,11 @@ class Replay:
         self._shown[:, at] = shown
         self.added += 1
 
+    def end(self) -> None:
+        """End the episode of the newest decision, which may have been broken off."""
+        if self.added:
+            self._last[:, (self.added - 1) % self.capacity] = True
+
     def sample(
         self, size: int, generator: torch.Generator, discount: float = 1.0, steps: int = 1
     ) -> Batch:

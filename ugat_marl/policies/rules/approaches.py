@@ -155,7 +155,9 @@ def check_length(agent: str, observation: NDArray[np.float32], least: int, name:
 def allowed_phases(infos: Infos, agent: str, phases: int) -> NDArray[np.bool_]:
     """Return a mask of the phases that an agent may choose, ``(phases,)``; all without a mask."""
     mask = infos.get(agent, {}).get("action_mask")
-    return np.ones(phases, np.bool_) if mask is None else np.asarray(mask, dtype=np.bool_)
+    if mask is None:
+        return np.ones(phases, np.bool_)
+    return np.asarray(mask, dtype=np.bool_)[:phases]  # behind the light's own ones is padding
 
 
 def green_indices(intersection: Intersection, phase: str) -> frozenset[int]:

@@ -8,6 +8,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
+from typing import Any
 
 from ugat_marl.envs import AnyParallelEnv
 from ugat_marl.errors import OptionError, UnknownNameError
@@ -139,9 +140,16 @@ def make_rule(spec: str, env: AnyParallelEnv) -> Policy:
 
     Raises:
         UnknownNameError: No rule has this name.
-        OptionError: A parameter is not a number above 0, or there are too many.
+        OptionError: A parameter is not a number above 0, or there are too many. Or the environment
+            stacks observations, of which a rule would read the oldest.
     """
     name, values = parse_rule(spec)
+    inner: Any = env.unwrapped
+    if getattr(inner, "frames", 1) > 1:
+        raise OptionError(
+            f"controller {spec!r}: a rule reads one observation, and frame_stack shows "
+            f"{inner.frames}; give the rule the environment without frame_stack"
+        )
     return RULES[name].make(ControlledNetwork.of(env), *values)
 
 

@@ -21,7 +21,7 @@ from typing import Any
 
 from ugat_marl.errors import ScenarioError
 from ugat_marl.files import parse_xml, read_bytes, write_whole, xml_bytes
-from ugat_marl.progress import Reporter
+from ugat_marl.progress import Reporter, Silent
 from ugat_marl.scenarios.importers.cityflow_roadnet import (
     Crossing,
     Point,
@@ -349,7 +349,8 @@ def write_routes(
         path: File with the flows.
         net: Roads and intersections that they use.
         out: The file to write.
-        duration_s: End of the episode, s, for flows without an end; None for one hour.
+        duration_s: End of the episode, s, for flows without an end; None for the end of the last
+            flow that has one, and at least one hour.
         reporter: Shows progress if the file is long.
         exact: True for CityFlow's headways and driving without randomness.
 
@@ -360,13 +361,14 @@ def write_routes(
     routes = _Routes(net)
     types: dict[str, dict[str, str]] = {}
     drives: list[Drive] = []
+    end_s = duration_s or _end_s(path)
     for number, (flow, line) in enumerate(objects(path, reporter)):
         where = f"{path}, line {line}: flow {number}"
         kind = types.setdefault(json.dumps(flow.get("vehicle"), sort_keys=True), {})
         if not kind:
             kind |= _vehicle_type(flow.get("vehicle"), f"car{len(types)}", where, exact=exact)
         route = routes.through(flow.get("route"), where)
-        for i, depart_s in enumerate(_departures(flow, duration_s or 3600.0, where)):
+        for i, depart_s in enumerate(_departures(flow, end_s, where)):
             drives.append(Drive(f"{number}.{i}", depart_s, route, kind["id"], "0"))
         if len(drives) > MOST_VEHICLES:
             raise ScenarioError(f"{where}: more than {MOST_VEHICLES} vehicles")
@@ -375,6 +377,12 @@ def write_routes(
     drives.sort(key=lambda drive: drive.depart_s)  # stable: equal times keep the file's order
     write_drives(out, drives, types.values())
     return Flows(len(drives), drives[-1].depart_s)
+
+
+def _end_s(path: Path) -> float:
+    """Return the end of the last flow that has one, s, and at least one hour."""
+    ends = (flow.get("endTime") for flow, _ in objects(path, Silent()))
+    return max([3600.0, *(float(end) for end in ends if isinstance(end, int | float))])
 
 
 def _departures(flow: Mapping[str, Any], end_s: float, where: str) -> Iterator[float]:

@@ -71,6 +71,12 @@ class Row:
     line: int
 
 
+_NOT_OURS = frozenset(
+    {"begin", "start", "start_s", "from_s", "end", "stop", "stop_s", "to_s", "time"}
+)
+"""Names under which other programs write the times of an interval."""
+
+
 def read_rows(
     path: Path, begin_s: float, end_s: float, reporter: Reporter, *, pairs: bool
 ) -> list[Row]:
@@ -95,6 +101,11 @@ def read_rows(
     reader = csv.DictReader(chain((first,), texts), delimiter=delimiter_of(first))
     columns = columns_of(reader, path)
     turns = {"from", "to"} <= set(columns)
+    if times := [name for name in columns if name.strip().lower() in _NOT_OURS]:
+        raise ScenarioError(
+            f"{path}, line 1: column {times[0]!r} is not known; the interval of a row is begin_s "
+            "to end_s, in seconds"
+        )
     if "count" not in columns or not (turns or ("edge" in columns and not pairs)):
         wanted = "from, to and count" if pairs else "count and edge, or count, from and to"
         raise ScenarioError(
@@ -169,13 +180,15 @@ def from_counts(path: Path, begin_s: float, length_s: float, seed: int) -> Vehic
             drives = walked(streets, _CANDIDATES_VPH, (1.0, 1.0, 1.0), 3600.0, seed)
             _require_reached(rows, drives, path)
             write_drives(work / "candidates.rou.xml", drives)
-            options = _counts_for_sumo(rows, work, seed)
+            grid_s = _grid_s(rows)
+            options = _counts_for_sumo(rows, grid_s, work, seed)
             out = work / "sampled.rou.xml"
             begin, end = min(row.begin_s for row in rows), max(row.end_s for row in rows)
             convert(
                 "routeSampler.py",
                 ["-r", str(work / "candidates.rou.xml"), *options, "-o", str(out),
-                 "--begin", str(begin), "--end", str(end), "--seed", str(seed & 0x7FFFFFFF)],
+                 "--begin", str(begin), "--end", str(end), "--interval", f"{grid_s}",
+                 "--seed", str(seed & 0x7FFFFFFF)],
                 work,
             )  # fmt: skip
             sampled = list(_sampled(out))
@@ -230,17 +243,35 @@ def _require_reached(rows: Iterable[Row], drives: Sequence[Drive], path: Path) -
             )
 
 
-def _counts_for_sumo(rows: Sequence[Row], work: Path, seed: int) -> list[str]:
-    """Write the counts in routeSampler's format, as whole vehicles, and return its options."""
+def _grid_s(rows: Sequence[Row]) -> float:
+    """Return the longest interval, in s, into which all intervals of rows divide.
+
+    By itself routeSampler takes the shortest interval, and loses what does not divide into it.
+    """
+    begin_s = min(row.begin_s for row in rows)
+    times = {round(1000 * (time - begin_s)) for row in rows for time in (row.begin_s, row.end_s)}
+    return math.gcd(*times) / 1000
+
+
+def _counts_for_sumo(rows: Sequence[Row], grid_s: float, work: Path, seed: int) -> list[str]:
+    """Write the counts in routeSampler's format, as whole vehicles, and return its options.
+
+    A row is parted into intervals of `grid_s` here: routeSampler would round each part down.
+    """
     turns = any(len(row.roads) > 1 for row in rows)
-    by_time: dict[tuple[float, float], list[Row]] = defaultdict(list)
+    by_time: dict[tuple[float, float], list[tuple[Row, int]]] = defaultdict(list)
     for row in rows:
-        by_time[row.begin_s, row.end_s].append(row)
+        whole = _whole(row, numpy_generator(seed, "counts", *row.roads, row.line))
+        parts = round((row.end_s - row.begin_s) / grid_s)
+        edges = [row.begin_s + part * grid_s for part in range(parts)] + [row.end_s]
+        for part, span in enumerate(pairwise(edges)):
+            in_part = (part + 1) * whole // parts - part * whole // parts
+            by_time[span].append((row, in_part))
     root = ET.Element("data")
     for (begin, end), interval_rows in sorted(by_time.items()):
         interval = ET.SubElement(root, "interval", id="counts", begin=f"{begin}", end=f"{end}")
-        for row in interval_rows:
-            count = str(_whole(row, numpy_generator(seed, "counts", *row.roads, row.line)))
+        for row, in_part in interval_rows:
+            count = str(in_part)
             first, last = row.roads[0], row.roads[-1]
             if turns:
                 ends = {"from": first, "to": last, "count": count}
