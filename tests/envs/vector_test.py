@@ -855,3 +855,31 @@ def test_domains_that_are_none_are_an_error_of_the_suite() -> None:
     given: Any = None
     with pytest.raises(OptionError, match="domain None"):
         vector_env("single-v1", 2, given, duration_s=60)
+
+
+@pytest.mark.parametrize("autoreset", ["same-step", "next-step"])
+def test_a_function_of_domains_that_fails_leaves_environments_that_can_begin_again(
+    autoreset: Any,
+) -> None:
+    def domains(environment: int, episode: int) -> str:
+        if episode and environment == 1 and fails:
+            raise LookupError("no more domains")
+        return "sim"
+
+    fails = True
+    number: Any = np.int64(3)
+    envs = vector_env("single-v1", number, domains, duration_s=20, autoreset=autoreset)
+    zeros = np.zeros((3, 1), dtype=np.int64)
+    envs.reset(seed=5)
+    envs.step(zeros)
+    if autoreset == "next-step":
+        envs.step(zeros)
+    with pytest.raises(LookupError):
+        envs.step(zeros)
+    fails = False
+    if autoreset == "same-step":
+        with pytest.raises(EpisodeError, match="no episode under way; call reset"):
+            envs.step(zeros)
+        envs.reset(seed=5)
+    envs.step(zeros)
+    envs.close()

@@ -5,7 +5,7 @@ from __future__ import annotations
 import contextlib
 import operator
 import warnings
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Literal, Unpack, get_args
@@ -355,8 +355,7 @@ class VectorEnv:
         for index, actions in zip(chosen, requested, strict=True):
             if not idle[index]:
                 self._environments[index].act(actions.copy())
-        for index in begun:
-            self._environments[index].begin(None, self._domains)
+        self._begin_each(dict.fromkeys(begun), stepped)
         return stepped, begun
 
     def _receive(self, index: int) -> Sequence[str]:
@@ -435,9 +434,25 @@ class VectorEnv:
             )
         return phases.astype(np.int64)
 
+    def _begin_each(self, seeds: Mapping[int, int | None], stepped: Sequence[int] = ()) -> None:
+        """Begin an episode in some environments; if the user's `domains` fails, end all of these.
+
+        Args:
+            seeds: Environment to its seed; None for the next episode.
+            stepped: Environments that were asked for a step in the same call.
+        """
+        asked = [*stepped]
+        try:
+            for index, seed in seeds.items():
+                self._environments[index].begin(seed, self._domains)
+                asked.append(index)
+        except BaseException:
+            for index in asked:  # nobody would wait for their answers
+                self._environments[index].close()
+            raise
+
     def _begin(self, chosen: list[int], seeds: dict[int, int | None]) -> None:
-        for index in chosen:
-            self._environments[index].begin(seeds[index], self._domains)
+        self._begin_each({index: seeds[index] for index in chosen})
         _, failed = self._arrived(chosen)
         if failed:
             raise failed[0]
@@ -517,8 +532,9 @@ def vector_env(
         ScenarioError: The scenario's files are missing or contradict each other.
     """
     count: Any = n
-    if isinstance(count, bool) or not isinstance(count, int) or count < 1:
+    if isinstance(count, bool) or not isinstance(count, int | np.integer) or count < 1:
         raise OptionError(f"n = {n!r}: must be a number of environments, at least 1")
+    n = int(count)
     if autoreset not in get_args(Autoreset):
         raise UnknownNameError("value of option 'autoreset':", str(autoreset), get_args(Autoreset))
     checked_options(options)
