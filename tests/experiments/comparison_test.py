@@ -80,6 +80,21 @@ def test_settings_are_compared_by_the_seeds_that_both_have(found: Comparison) ->
     assert math.isnan(apart.won_back("two", "V4", "two"))
 
 
+def test_a_setting_of_an_easy_seed_alone_is_not_the_best_one() -> None:
+    """Of the seed that both have, the other one is faster."""
+    easy_seed_only = trials("trained in real", {0: (80.0, 140.0)})
+    both = trials("fitted street", {0: (70.0, 100.0), 1: (70.0, 300.0)})
+    direct = trials("direct transfer", {0: (70.0, 150.0), 1: (70.0, 400.0)})
+    found = Comparison("toy", "0" * 8, "sim", (*direct, *both, *easy_seed_only), {})
+    assert found.best("V4") == "fitted street"
+    assert found.regret_s("trained in real", "V4").tolist() == [40.0]
+    assert found.won_back("fitted street", "V4", "direct transfer") == 1.0
+    without_common = trials("trained in real", {2: (80.0, 140.0)})
+    assert Comparison("toy", "0" * 8, "sim", (*both, *without_common), {}).best("V4") == (
+        "trained in real"
+    )
+
+
 def test_nothing_to_win_has_no_share() -> None:
     rows = trials("direct transfer", {0: (70.0, 80.0)}) + trials(
         "phase (the paper's UGAT)", {0: (70.0, 90.0)}

@@ -18,6 +18,7 @@ from ugat_marl.reporting import (
     calibration_picture,
     measures_table,
     service_tables,
+    training_page,
     transfer_picture,
     transfer_table,
 )
@@ -141,3 +142,13 @@ def test_levels_of_service_of_policies_and_approaches(found: Evaluation) -> None
     assert grid is not None
     assert grid.rows[0] == ["B1 (signal_2)", "eastbound", "A1_B1", "100 F"]
     assert service_grid(found, ["phase (the paper's UGAT)"], None) is None
+
+
+def test_settings_of_fewer_trainings_are_named() -> None:
+    """Their means are over other seeds than those beside them."""
+    rows = [
+        {"setting": "direct transfer", "domain": "V4", "training_seeds": 2},
+        {"setting": "trained in real", "domain": "V4", "training_seeds": 1},
+    ]
+    assert training_page._fewer_seeds(rows) == " Of fewer than 2 trainings: trained in real (1)."
+    assert training_page._fewer_seeds(rows[:1]) == ""

@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import functools
 import math
+import operator
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
@@ -158,9 +159,20 @@ class Comparison:
         return PairedTest.of(*self._paired(one, other, target, measure))
 
     def best(self, target: str, among: Sequence[str] | None = None) -> str:
-        """Return the setting with the lowest mean ATT in a domain."""
+        """Return the setting with the lowest mean ATT in a domain.
+
+        The means are over the training seeds that all settings have, if there are such seeds: one
+        seed may be better than another for every setting.
+        """
         names = [name for name in among or self.settings if self.has(name, target)]
-        return min(names, key=lambda name: float(self.values(name, target, "att_s").mean()))
+        values = {name: self._by_seed(name, target, "att_s") for name in names}
+        shared = functools.reduce(operator.and_, (each.keys() for each in values.values()))
+
+        def mean(name: str) -> float:
+            own = values[name]
+            return float(np.mean([own[seed] for seed in shared or own.keys()]))
+
+        return min(names, key=mean)
 
     def regret_s(self, setting: str, target: str) -> Floats:
         """Return the ATT minus that of the best setting there, in s, one per common seed."""

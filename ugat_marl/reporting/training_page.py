@@ -225,6 +225,17 @@ def _table(page: Page, record: TableRecord, commands: Commands) -> dict[str, Any
     }
 
 
+def _fewer_seeds(rows: Sequence[Mapping[str, Any]]) -> str:
+    """Return a sentence on settings with fewer training seeds than others; "" without any."""
+    counts: dict[str, int] = {}
+    for row in rows:
+        if (seeds := row.get("training_seeds")) is not None:
+            counts[str(row["setting"])] = max(int(seeds), counts.get(str(row["setting"]), 0))
+    most = max(counts.values(), default=0)
+    fewer = [f"{setting} ({count})" for setting, count in counts.items() if count < most]
+    return f" Of fewer than {most} trainings: {', '.join(fewer)}." if fewer else ""
+
+
 def _settings(page: Page, title: str, rows: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
     """Return tables and pictures of settings in several real domains."""
     labels = list(dict.fromkeys(str(row["setting"]) for row in rows))
@@ -257,7 +268,7 @@ def _settings(page: Page, title: str, rows: Sequence[Mapping[str, Any]]) -> dict
         )
         for domain in domains
     ]
-    caption = "Mean over training seeds with its 95 % interval."
+    caption = f"Mean over training seeds with its 95 % interval.{_fewer_seeds(rows)}"
     return {
         "att": grid("att_s"),
         "gap": grid("att_s_gap", sign=True),
