@@ -477,3 +477,16 @@ def test_a_number_that_is_none_is_told_with_the_effect(flow: str, domain: str) -
     scenario = replace(scenario, routes=(Document("d.rou.xml", None, routes.encode()),))
     with pytest.raises(ScenarioError, match=r"demand_level=.*cannot be applied, since a number"):
         apply_effects(scenario, parse_domain(domain))
+
+
+def test_a_flow_that_draws_its_way_cannot_turn() -> None:
+    """It used to be passed over, so that the share was not met."""
+    scenario = load_scenario("single-v1")
+    text = (
+        '<routes><routeDistribution id="rd">'
+        '<route id="a" edges="east1_A1 A1_west1"/><route id="b" edges="east1_A1 A1_southA"/>'
+        '</routeDistribution><flow id="f" route="rd" begin="0" end="1000" period="10"/></routes>'
+    )
+    made = replace(scenario, routes=(scenario.routes[0].edited(text.encode()),))
+    with pytest.raises(ScenarioError, match="flow 'f' draws its way from 'rd'; give it a route"):
+        apply_effects(made, [Turning(EDGE, "A1_northA", 0.25)])

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import subprocess
 from collections import Counter
+from itertools import pairwise
 from pathlib import Path
 
 import pytest
@@ -10,7 +12,7 @@ import pytest
 from ugat_marl.__main__ import main
 from ugat_marl.errors import ScenarioError
 from ugat_marl.progress import Silent
-from ugat_marl.scenarios import read_scenario
+from ugat_marl.scenarios import read_scenario, sumo_program
 from ugat_marl.scenarios.importers.counts import read_rows
 
 
@@ -231,3 +233,20 @@ def test_intervals_that_do_not_divide_each_other_lose_no_vehicle(
     for road in {row.split(",")[0] for row in rows}:
         wanted = sum(int(row.split(",")[1]) for row in rows if row.startswith(road))
         assert sum(edges[0] == road for _, edges in driven) == pytest.approx(wanted, rel=0.03)
+
+
+def test_counted_u_turns_are_driven(tmp_path: Path) -> None:
+    """The sheet lists them, so that their counts are no mistake."""
+    net = tmp_path / "u.net.xml"
+    words = ["--grid", "--grid.number", "2", "--grid.length", "200", "--grid.attach-length", "100"]
+    subprocess.run(
+        [str(sumo_program("netgenerate")), *words, "--tls.set", "A0", "-o", str(net)],
+        check=True, capture_output=True,
+    )  # fmt: skip
+    table = "from,to,count\nbottom0A0,A0A1,50\nbottom0A0,A0bottom0,20\n"
+    (tmp_path / "t.csv").write_text(table)
+    words = ["--sumo", str(net), "--counts", str(tmp_path / "t.csv")]
+    assert main(["scenario", "new", str(tmp_path / "city"), *words]) == 0
+    turned = [edges for _, edges in drives(tmp_path / "city") if "A0bottom0" in edges]
+    back = [edges for edges in turned if ("bottom0A0", "A0bottom0") in pairwise(edges)]
+    assert len(back) == pytest.approx(20, abs=1)

@@ -15,7 +15,7 @@ from ugat_marl.effects.base import Effect, NumberParameter, TextParameter, hashe
 from ugat_marl.effects.demand import TAGS, Routes, parted_flow
 from ugat_marl.effects.documents import edit_scenario, free_suffix, is_demand, mentions
 from ugat_marl.effects.places import Places, network_places
-from ugat_marl.errors import UnknownNameError
+from ugat_marl.errors import ScenarioError, UnknownNameError
 from ugat_marl.scenarios import Scenario, edge_of_lane
 
 Way = tuple[str, ...]
@@ -46,6 +46,7 @@ class Turning(Effect):
 
         Raises:
             UnknownNameError: No such edge, or no way from the one to the other.
+            ScenarioError: A vehicle or flow draws its way from a distribution of routes.
         """
         places = network_places(scenario)
         places.check(self.name, "edge", self.from_edge, places.edges)
@@ -59,7 +60,13 @@ class Turning(Effect):
         routes = Routes.of(scenario)
 
         def way(element: ET.Element) -> Way:
-            return routes.edges_of(element) or _fastest(element, places)
+            edges = routes.edges_of(element) or _fastest(element, places)
+            if not edges and (drawn := element.get("route")) is not None:
+                raise ScenarioError(
+                    f"effect {self.name!r}: {element.tag} {element.get('id')!r} draws its way from "
+                    f"{drawn!r}; give it a route of its own, or from and to"
+                )
+            return edges
 
         tails = self._tails(scenario, way, places)
         over = scenario.settings.begin_s + scenario.settings.duration_s

@@ -178,6 +178,7 @@ def from_counts(path: Path, begin_s: float, length_s: float, seed: int) -> Vehic
         with tempfile.TemporaryDirectory(prefix="ugat_marl-") as name:
             work = Path(name)
             drives = walked(streets, _CANDIDATES_VPH, (1.0, 1.0, 1.0), 3600.0, seed)
+            drives += _turning_back(rows, drives, streets)
             _require_reached(rows, drives, path)
             write_drives(work / "candidates.rou.xml", drives)
             grid_s = _grid_s(rows)
@@ -229,6 +230,21 @@ def _refuse_overlaps(rows: Iterable[Row], path: Path) -> None:
                 "of them"
             )
         latest[row.roads] = row
+
+
+def _turning_back(rows: Iterable[Row], drives: Sequence[Drive], streets: Streets) -> list[Drive]:
+    """Return a way for each counted U-turn: none of `drives` turns back."""
+    made: list[Drive] = []
+    for row in rows:
+        if not row.count or len(row.roads) < 2:
+            continue
+        here, there = row.roads
+        before = next((drive.route for drive in drives if here in drive.route), None)
+        after = next((drive.route for drive in drives if there in drive.route), None)
+        if there in streets.ahead.get(here, {}).get("t", ()) and before and after:
+            route = (*before[: before.index(here) + 1], *after[after.index(there) :])
+            made.append(Drive(f"back{row.line}", 0.0, route))
+    return made
 
 
 def _require_reached(rows: Iterable[Row], drives: Sequence[Drive], path: Path) -> None:
