@@ -284,10 +284,11 @@ def test_rules_act_behind_padded_spaces(spec: str) -> None:
 
 
 def test_a_rule_refuses_stacked_observations() -> None:
-    """It would read the oldest one."""
+    """It would read the oldest one; a rule that reads none may have them."""
     env = parallel_env("single-v1", duration_s=60, observation="movements")
     make_rule("max-pressure", frame_stack(env, 1))
     for wrapped in (frame_stack(env, 3), pad_spaces(frame_stack(env, 3))):
         with pytest.raises(OptionError, match="frame_stack shows 3; give the rule the env"):
             make_rule("max-pressure", wrapped)
+        make_rule("fixed-time", wrapped)
     env.close()

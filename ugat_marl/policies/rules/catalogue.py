@@ -144,13 +144,14 @@ def make_rule(spec: str, env: AnyParallelEnv) -> Policy:
             stacks observations, of which a rule would read the oldest.
     """
     name, values = parse_rule(spec)
+    rule = RULES[name].make(ControlledNetwork.of(env), *values)
     inner: Any = env.unwrapped
-    if getattr(inner, "frames", 1) > 1:
+    if "observation" in rule.env_options and getattr(inner, "frames", 1) > 1:
         raise OptionError(
             f"controller {spec!r}: a rule reads one observation, and frame_stack shows "
             f"{inner.frames}; give the rule the environment without frame_stack"
         )
-    return RULES[name].make(ControlledNetwork.of(env), *values)
+    return rule
 
 
 def parse_rule(spec: str) -> tuple[str, tuple[float, ...]]:
