@@ -299,14 +299,14 @@ class _FrameStack(Wrapper):
         given: Any = k
         if not isinstance(given, SupportsIndex) or k < 1:
             raise OptionError(f"frame_stack of {k!r} observations: must be a whole number from 1")
-        self._k = self.frames = int(k)
+        self.frames = int(k)
         self._frames: dict[str, deque[NDArray[np.float32]]] = {}
         self.observation_spaces = _each(self.observation_spaces, self._stacked_box)
 
     def _stacked_box(self, box: spaces.Box) -> spaces.Box:
         """Return the box of k frames; all but the newest may also be zeros."""
         zeros = spaces.Box(np.minimum(box.low, 0), np.maximum(box.high, 0), dtype=_dtype(box))
-        return _joined([*[zeros] * (self._k - 1), box])
+        return _joined([*[zeros] * (self.frames - 1), box])
 
     def _begin(self) -> None:
         self._frames.clear()
@@ -314,7 +314,7 @@ class _FrameStack(Wrapper):
     def _seen(self, observations: Vectors, infos: Infos) -> dict[str, Any]:
         for agent, vector in observations.items():
             if agent not in self._frames:
-                self._frames[agent] = deque([np.zeros_like(vector)] * self._k, self._k)
+                self._frames[agent] = deque([np.zeros_like(vector)] * self.frames, self.frames)
             self._frames[agent].append(vector)
         return {agent: np.concatenate(self._frames[agent]) for agent in observations}
 

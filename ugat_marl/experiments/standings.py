@@ -61,8 +61,8 @@ def read_standings(path: Path, scenario: str | None = None) -> pl.DataFrame:
     if damaged := csv_damage(path, pl.DataFrame() if texts is None else texts):
         raise CheckpointError(f"{path}: {damaged}")
     rows = _standings_in(texts, str(path))
-    known = _scenarios_of(path.with_name("table.csv"))
-    if scenario is not None and known and scenario not in known:
+    known = [] if scenario is None else _scenarios_of(path.with_name("table.csv"))
+    if known and scenario not in known:
         raise OptionError(f"{path}: a table of {', '.join(known)}, not of {scenario}")
     return rows
 

@@ -1,9 +1,9 @@
-"""Check that no two periods hold one recording of counts or of lanes and vehicles at instants."""
+"""Checks that no two periods hold one recording."""
 
 from __future__ import annotations
 
 import itertools
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from pathlib import Path
 
 import polars as pl
@@ -12,7 +12,19 @@ from ugat_marl.errors import MeasuredDataError
 from ugat_marl.scenarios import Period
 
 FEWEST = 20
-"""Number of equal rows with vehicles from which on they are one recording."""
+"""Number of equal rows with vehicles, or of detections, from which on they are one recording."""
+TWICE = (
+    "one recording would count twice; let periods of one day not overlap, and give each day its "
+    "own rows"
+)
+"""End of the errors."""
+
+
+def overlapping(periods: Sequence[Period]) -> Iterator[tuple[Period, Period]]:
+    """Yield the pairs of periods that share some times of the day."""
+    for one, other in itertools.combinations(periods, 2):
+        if one.begin_s < other.end_s and other.begin_s < one.end_s:
+            yield one, other
 
 
 def refuse_copies(
@@ -33,9 +45,7 @@ def refuse_copies(
         MeasuredDataError: Two periods hold one recording.
     """
     parts = frame.select("period_id", *keys, values).partition_by("period_id", as_dict=True)
-    for one, other in itertools.combinations(periods, 2):
-        if one.begin_s >= other.end_s or other.begin_s >= one.end_s:
-            continue
+    for one, other in overlapping(periods):
         if (one.id,) not in parts or (other.id,) not in parts:
             continue
         both = parts[one.id,].join(parts[other.id,], on=[*keys])
@@ -44,6 +54,5 @@ def refuse_copies(
         if told.height >= FEWEST and told.select((pl.col(values) == twin).all()).item():
             raise MeasuredDataError(
                 f"{path}: the periods {one.id!r} and {other.id!r} share {told.height} rows with "
-                "vehicles, and all of them are the same: one recording would count twice; let "
-                "periods of one day not overlap, and give each day its own rows"
+                f"vehicles, and all of them are the same: {TWICE}"
             )

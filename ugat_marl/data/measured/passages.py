@@ -10,6 +10,7 @@ import numpy as np
 import polars as pl
 from numpy.typing import NDArray
 
+from ugat_marl.data.measured.copies import FEWEST, TWICE, overlapping
 from ugat_marl.data.measured.tables import PERIOD, ROW, in_order, refuse, refuse_set_back
 from ugat_marl.data.measured.values import Finding
 from ugat_marl.errors import MeasuredDataError, nearest
@@ -270,24 +271,22 @@ def _refuse_copies(path: Path, stream: _Stream, periods: Sequence[Period], detec
     code = code * 2 + stream.is_on
     period = stream.key // detectors
     bounds = np.searchsorted(period, np.arange(len(periods) + 1))
-    events = [np.sort(code[a:b]) for a, b in zip(bounds, bounds[1:], strict=False)]
-    for i, one in enumerate(periods):
-        for j in range(i + 1, len(periods)):
-            other = periods[j]
-            begin, end = max(one.begin_s, other.begin_s), min(one.end_s, other.end_s)
-            if begin >= end:
-                continue
-            a, b = (_between(events[k], begin, end, detectors) for k in (i, j))
-            few, many = (a, b) if len(a) <= len(b) else (b, a)
-            sample = few[:: max(len(few) // 200, 1)]
-            if len(few) < 20 or _share(sample, many) < MOST_SHARED:
-                continue
-            if (share := _share(few, many)) >= MOST_SHARED:
-                raise MeasuredDataError(
-                    f"{path}: {share:.0%} of the detections from {begin:g} s to {end:g} s are the "
-                    f"same in the periods {one.id!r} and {other.id!r}: one recording would count "
-                    "twice; let periods of one day not overlap, and give each day its own rows"
-                )
+    events = {
+        one.id: np.sort(code[a:b])
+        for one, a, b in zip(periods, bounds[:-1], bounds[1:], strict=True)
+    }
+    for one, other in overlapping(periods):
+        begin, end = max(one.begin_s, other.begin_s), min(one.end_s, other.end_s)
+        a, b = (_between(events[each.id], begin, end, detectors) for each in (one, other))
+        few, many = (a, b) if len(a) <= len(b) else (b, a)
+        sample = few[:: max(len(few) // 200, 1)]
+        if len(few) < FEWEST or _share(sample, many) < MOST_SHARED:
+            continue
+        if (share := _share(few, many)) >= MOST_SHARED:
+            raise MeasuredDataError(
+                f"{path}: {share:.0%} of the detections from {begin:g} s to {end:g} s are the "
+                f"same in the periods {one.id!r} and {other.id!r}: {TWICE}"
+            )
 
 
 def _between(

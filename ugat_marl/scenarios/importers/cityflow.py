@@ -7,12 +7,13 @@ road's line. Stop lines keep their distance from the centre.
 
 from __future__ import annotations
 
+import functools
 import heapq
 import json
 import math
 import tempfile
 import xml.etree.ElementTree as ET
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from itertools import pairwise
@@ -361,7 +362,7 @@ def write_routes(
     routes = _Routes(net)
     types: dict[str, dict[str, str]] = {}
     drives: list[Drive] = []
-    end_s = duration_s or _end_s(path)
+    end_s = functools.cache(lambda: duration_s or _end_s(path))  # most files need no second reading
     for number, (flow, line) in enumerate(objects(path, reporter)):
         where = f"{path}, line {line}: flow {number}"
         kind = types.setdefault(json.dumps(flow.get("vehicle"), sort_keys=True), {})
@@ -385,13 +386,13 @@ def _end_s(path: Path) -> float:
     return max([3600.0, *(float(end) for end in ends if isinstance(end, int | float))])
 
 
-def _departures(flow: Mapping[str, Any], end_s: float, where: str) -> Iterator[float]:
+def _departures(flow: Mapping[str, Any], end_s: Callable[[], float], where: str) -> Iterator[float]:
     """Yield a flow's departures in s, ``startTime`` to ``endTime`` (-1 is the episode's end)."""
     start, end, interval = (
         _number(flow, key, where, least=least)
         for key, least in (("startTime", 0.0), ("endTime", -1.0), ("interval", 0.0))
     )
-    last = end_s if end < 0 else end
+    last = end_s() if end < 0 else end
     if end >= 0 and last < start:
         raise ScenarioError(f"{where}: endTime ({end:g}) is before startTime ({start:g})")
     if last > start and interval <= 0:

@@ -236,12 +236,12 @@ def _turning_back(rows: Iterable[Row], drives: Sequence[Drive], streets: Streets
     """Return a way for each counted U-turn: none of `drives` turns back."""
     made: list[Drive] = []
     for row in rows:
-        if not row.count or len(row.roads) < 2:
+        here, there = row.roads[0], row.roads[-1]
+        if not row.count or there not in streets.ahead.get(here, {}).get("t", ()):
             continue
-        here, there = row.roads
         before = next((drive.route for drive in drives if here in drive.route), None)
         after = next((drive.route for drive in drives if there in drive.route), None)
-        if there in streets.ahead.get(here, {}).get("t", ()) and before and after:
+        if before and after:
             route = (*before[: before.index(here) + 1], *after[after.index(there) :])
             made.append(Drive(f"back{row.line}", 0.0, route))
     return made
