@@ -288,6 +288,7 @@ def test_the_learner_of_that_name_serves_any_shipped_network(tmp_path: Path):
         env.close()
     assert suite_config(UNIVERSAL_NAME, DQNConfig(discount=0.9)).discount == 0.9
     assert suite_config(UNIVERSAL_NAME, DQNConfig(discount=0.9)).network == "universal"
+    assert suite_config(UNIVERSAL_NAME, DQNConfig(network="mlp")).network == "mlp"
 
 
 def test_rewards_are_not_centred_so_that_equal_states_are_worth_the_same_everywhere():

@@ -540,6 +540,7 @@ def test_the_command_writes_page_and_pictures(run: Path, tmp_path: Path) -> None
         {"learner": "dqn"},
         {"learner": "ippo"},
         {"dqn": DQNConfig(hidden=(48, 48), steps=1)},  # given, though they are those of "dqn"
+        {"dqn": DQNConfig(network="mlp")},
     ],
 )
 def test_the_command_on_the_page_makes_the_same_run(change: dict[str, Any], tmp_path: Path) -> None:

@@ -26,7 +26,7 @@ from pydantic import TypeAdapter, ValidationError
 from ugat_marl.data import installed_version
 from ugat_marl.envs import AnyParallelEnv
 from ugat_marl.errors import OptionError, UnknownNameError, install_command
-from ugat_marl.policies.learners.dqn_config import DQNConfig, Usual, UsualSizes
+from ugat_marl.policies.learners.dqn_config import DQNConfig, Usual, UsualName, UsualSizes
 from ugat_marl.policies.own import OwnLearnerFactory, is_own, load_own, own_learner_options
 from ugat_marl.policies.protocols import Learner
 
@@ -193,12 +193,12 @@ def lesson_episodes(name: str, given: DQNConfig | None = None, *, known: bool = 
     return config.lessons if known else most_plays(config.teacher, config.lessons)
 
 
-_OF_THE_NAME = ("hidden", "steps", "warmup_decisions", "epsilon_decay_decisions")
+_OF_THE_NAME = ("hidden", "network", "steps", "warmup_decisions", "epsilon_decay_decisions")
 """Settings that the name of a learner decides, unless they are given, even as DQN's defaults."""
 
 
 def _is_usual(value: object) -> bool:
-    return isinstance(value, Usual | UsualSizes)
+    return isinstance(value, Usual | UsualName | UsualSizes)
 
 
 def observed_options(name: str) -> dict[str, Any]:

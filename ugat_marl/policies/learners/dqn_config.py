@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import get_args
+from typing import Any, get_args
 
 from ugat_marl.errors import OptionError
 from ugat_marl.policies.networks.structure import NetworkName
@@ -28,6 +28,18 @@ class UsualSizes(tuple[int, ...]):
 
     def __hash__(self) -> int:
         return hash((UsualSizes, tuple(self)))
+
+
+class UsualName(str):
+    """Default of a name; a learner's own name replaces it, unless the same name is given."""
+
+    __slots__ = ()
+
+    def __hash__(self) -> int:
+        return hash((UsualName, str(self)))
+
+
+_MLP: Any = UsualName("mlp")
 
 
 @dataclass(frozen=True)
@@ -79,7 +91,8 @@ class DQNConfig:
             attention to the neighbours (Wei et al. 2019), one network for all intersections;
             `hidden` is the size of an embedding and that of the layer after the attention.
             "universal": one network for all intersections of any road network; `hidden` is the size
-            of a movement's embedding and that of the other hidden layers.
+            of a movement's embedding and that of the other hidden layers. Unless given, it is the
+            one of the learner: "universal" with "universal", "mlp" with "dqn".
         start: File of weights to begin with, for "universal", such as `studies.pretraining` writes.
             None draws them.
         ceiling: Quantile at which policies cut each number of an observation. It is measured over
@@ -112,7 +125,7 @@ class DQNConfig:
     reward_scale: float | None = None
     scale_inputs: bool = True
     shared: bool = False
-    network: NetworkName = "mlp"
+    network: NetworkName = _MLP
     start: str | None = None
     steps: int = Usual(1)
     ceiling: float | None = None
