@@ -226,6 +226,9 @@ GOOD = "A1,60,0,1,1,NBT NBR SBT SBR NBL SBL,30,3,2\nA1,60,0,1,1,EBT EBR WBT WBR 
         (HEAD + GOOD.replace("NBT NBR", "NBT NXR"), "it has no movement 'NXR'; it has EBL"),
         (HEAD + GOOD.replace("NBL SBL", ""), "NBL SBL are in no phase, and"),
         (HEAD + GOOD.replace("NBL SBL", "NBL SBL WBT"), "are green together and cross"),
+        (HEAD + GOOD.replace("NBL SBL", "NBL SBL EBL"), "EBL are green together and cross"),
+        (HEAD + (GOOD + "A1,60,0,1,1,NBL WBT,30,3,2\n").replace("A1,60", "A1,90"),
+         "WBT and NBL are green together and cross or merge"),
         (HEAD + GOOD.replace("A1", "B7"), "light 'B7' is no agent of scenario"),
         (HEAD + GOOD.replace("A1,60,0,1,1,EBT", "A1,60,0,2,1,EBT").replace("WBL,30", "WBL,20"),
          "the rings differ before the end of barrier 1 (ring 1 30 s, ring 2 20 s)"),
@@ -241,6 +244,15 @@ def test_plans_that_are_wrong(
     assert says in err
     assert len(err.strip().splitlines()) == 1
     assert not (tmp_path / "x").exists()
+
+
+def test_a_short_yellow_is_noted(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    (tmp_path / "t.csv").write_text(HEAD + GOOD.replace("30,3,2", "30,0,2", 1))
+    words = ["plan", "single-v1", "--apply", str(tmp_path / "t.csv"), "--out", str(tmp_path / "x")]
+    assert main(words) == 0
+    assert (
+        "note: yellow is short at A1 (phase 1: 0 s); 3 to 6 s are usual" in capsys.readouterr().out
+    )
 
 
 UTDF = """[Network]

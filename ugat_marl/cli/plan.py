@@ -31,6 +31,7 @@ from ugat_marl.scenarios import (
     read_utdf,
     with_plans,
     write_plans,
+    yellow_notes,
 )
 
 
@@ -131,7 +132,7 @@ class Plan:
         with new_folder(self.out, force=self.force) as folder:
             planned.write(folder)
         console.print(plan_table(plans, LightNames.of(network)))
-        for note in notes:
+        for note in (*notes, *yellow_notes(plans)):
             console.print(f"note: {note}", markup=False, soft_wrap=True)
         name = shlex.quote(str(self.out))
         console.print(

@@ -105,6 +105,7 @@ from .signal_plans import programme_plan as programme_plan
 from .signal_plans import read_plans as read_plans
 from .signal_plans import with_plans as with_plans
 from .signal_plans import write_plans as write_plans
+from .signal_plans import yellow_notes as yellow_notes
 from .signals import GREEN as GREEN
 from .signals import SIGNAL_LETTERS as SIGNAL_LETTERS
 from .signals import YELLOW as YELLOW

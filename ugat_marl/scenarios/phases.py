@@ -166,23 +166,31 @@ def conflict_free_phases(
 
 def permitted_clash(links: Sequence[Link], rules: RightOfWay) -> Clash:
     """Return a conflict test that allows left turns that wait for opposite traffic."""
+    opposite = opposite_approaches(links, rules)
+
+    def clash(a: Link, b: Link) -> bool:
+        if not are_foes(a, b, rules.foes):
+            return False
+        return not opposite(a, b) or not any(
+            kerb_turn_of(x) == "l" and rules.waits(x, y) for x, y in ((a, b), (b, a))
+        )
+
+    return clash
+
+
+def opposite_approaches(links: Sequence[Link], rules: RightOfWay) -> Clash:
+    """Return a test if links have opposite approaches: both go straight on and do not cross."""
     through = [link for link in links if link.direction == "s"]
     crossing = {
         (a.from_edge, b.from_edge) for a in through for b in through if are_foes(a, b, rules.foes)
     }
     straight = {link.from_edge for link in through}
 
-    def clash(a: Link, b: Link) -> bool:
-        if not are_foes(a, b, rules.foes):
-            return False
-        opposite = {a.from_edge, b.from_edge} <= straight and not (
-            {(a.from_edge, b.from_edge), (b.from_edge, a.from_edge)} & crossing
-        )
-        return not opposite or not any(
-            kerb_turn_of(x) == "l" and rules.waits(x, y) for x, y in ((a, b), (b, a))
-        )
+    def opposite(a: Link, b: Link) -> bool:
+        approaches = (a.from_edge, b.from_edge)
+        return set(approaches) <= straight and not {approaches, approaches[::-1]} & crossing
 
-    return clash
+    return opposite
 
 
 def _with_crossings(

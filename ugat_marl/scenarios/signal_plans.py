@@ -23,7 +23,15 @@ from ugat_marl.files import Document, read_bytes, write_whole, xml_bytes
 from ugat_marl.scenarios.csv_tables import columns_of, delimiter_of, rows_of
 from ugat_marl.scenarios.junctions import Link, foes_of, right_on_red_of, yields_of
 from ugat_marl.scenarios.network import Intersection, Network
-from ugat_marl.scenarios.phases import RightOfWay, are_foes, permitted_clash, state_of, turn_of
+from ugat_marl.scenarios.phases import (
+    RightOfWay,
+    are_foes,
+    kerb_turn_of,
+    opposite_approaches,
+    permitted_clash,
+    state_of,
+    turn_of,
+)
 from ugat_marl.scenarios.scenario import Scenario
 from ugat_marl.scenarios.settings import parse_decimal
 from ugat_marl.scenarios.signals import GREEN, YELLOW
@@ -44,6 +52,8 @@ COLUMNS = ("light", "intersection", "cycle_s", "offset_s", "ring", "barrier", "p
 _SAME_S = 0.05
 """Largest difference of times that count as equal, s: tables round to tenths."""
 _MOST_S = 3600.0
+_LEAST_YELLOW_S = 3.0
+"""Shortest usual yellow, s (MUTCD 2009, section 4D.26)."""
 _PROGRAM = "plan"
 _NOBODY = "-"
 """Movements of a phase in which no vehicle goes."""
@@ -170,7 +180,7 @@ def plan_states(
         if pair := _crossing([link for link in light.links if codes[link] in green], light, rules):
             raise ScenarioError(
                 f"{source}: light {plan.light!r}: {codes[pair[0]]} and {codes[pair[1]]} are green "
-                "together and cross; give them phases of their own"
+                "together and cross or merge; give them phases of their own"
             )
         if states and states[-1][1] == state:
             states[-1] = (states[-1][0] + end - begin, state)
@@ -234,19 +244,25 @@ def _times(plan: SignalPlan) -> tuple[list[float], _Shown]:
 def _crossing(
     going: Sequence[Link], light: Intersection, rules: RightOfWay
 ) -> tuple[Link, Link] | None:
-    """Return two greens that cross, unless one is a left turn that lets opposite traffic pass.
+    """Return two greens that cross or merge and must not be green together.
 
-    As in `conflicting_greens`, one of them drives straight on, and merging is no crossing.
+    Left turns may let opposite traffic pass, and opposite left turns may be drawn so tightly that
+    they touch. A right turn may merge. `conflicting_greens` permits more, as networks that somebody
+    made are to be taken as they are.
     """
     clash = permitted_clash(light.links, rules)
+    opposite = opposite_approaches(light.links, rules)
+
+    def may_go(a: Link, b: Link) -> bool:
+        turns = kerb_turn_of(a), kerb_turn_of(b)
+        merging = a.to_edge == b.to_edge and "r" in turns
+        return merging or (turns == ("l", "l") and opposite(a, b)) or not clash(a, b)
+
     return next(
         (
             (a, b)
             for a, b in combinations(going, 2)
-            if a.from_edge != b.from_edge
-            and a.to_edge != b.to_edge
-            and "s" in (a.direction, b.direction)
-            and clash(a, b)
+            if a.from_edge != b.from_edge and not may_go(a, b)
         ),
         None,
     )
@@ -414,6 +430,18 @@ def programme_notes(scenario: Scenario, plans: Iterable[SignalPlan], source: str
             "stays green between them"
         )
     return notes
+
+
+def yellow_notes(plans: Iterable[SignalPlan]) -> list[str]:
+    """Return a note on phases whose yellow is shorter than practice has it, or none."""
+    short = [
+        f"{plan.light} (phase {number}: {phase.yellow_s:g} s)"
+        for plan in plans
+        for number, phase in enumerate(plan.phases, 1)
+        if phase.movements and phase.yellow_s < _LEAST_YELLOW_S
+    ]
+    usual = f"{_LEAST_YELLOW_S:g} to 6 s are usual"
+    return [f"yellow is short at {', '.join(short)}; {usual}"] if short else []
 
 
 def _rules(scenario: Scenario) -> RightOfWay:
