@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import pickle
 from collections.abc import Iterator
 from dataclasses import replace
@@ -13,7 +14,7 @@ import pytest
 
 import ugat_marl
 from ugat_marl.effects import StartupDelay
-from ugat_marl.envs import TrafficEnv, parallel_env, rewards
+from ugat_marl.envs import EnvOptions, TrafficEnv, parallel_env, rewards
 from ugat_marl.errors import (
     ActionError,
     EpisodeError,
@@ -280,6 +281,12 @@ def test_the_domain_decides_the_scenario() -> None:
     listed = ugat_marl.parallel_env("single-v1", [StartupDelay(2.0)])
     assert listed.domain == "startup_delay=2"
     assert listed.scenario.applied == ("startup_delay=2",)
+
+
+def test_integers_of_numpy_become_plain_ones() -> None:
+    one: Any = np.int64(1)
+    options = EnvOptions(neighbours=one, commands=one)
+    assert json.dumps([options.neighbours, options.commands]) == "[1, 1]"
 
 
 def test_neighbours_are_seen_by_those_who_have_any() -> None:

@@ -97,7 +97,7 @@ class AllRedTime(Effect):
 
 def late_greens(scenario: Scenario) -> dict[str, float]:
     """Return the late green of traffic lights in s, without those that have none."""
-    start_s = QUEUE_START_S if "mesosim" in scenario.settings.sumo else 0.0
+    start_s = QUEUE_START_S if scenario.settings.is_mesoscopic else 0.0
     general = scenario.control.late_green_s + start_s
     tables = scenario.settings.intersections
     if not general and not tables:
@@ -122,7 +122,7 @@ def with_late_green_programmes(scenario: Scenario) -> Scenario:
     if not late:
         return scenario
     step = scenario.settings.step_length_s
-    queues = QUEUE_START_S if "mesosim" in scenario.settings.sumo else 0.0
+    queues = QUEUE_START_S if scenario.settings.is_mesoscopic else 0.0
 
     def change(root: ET.Element) -> bool:
         logics = [element for element in root.iter("tlLogic") if element.get("id") in late]
@@ -140,7 +140,7 @@ def with_late_green_programmes(scenario: Scenario) -> Scenario:
 
 
 def _with_control(scenario: Scenario, effect: Effect, key: str, seconds: float) -> Scenario:
-    if "mesosim" in scenario.settings.sumo:
+    if scenario.settings.is_mesoscopic:
         raise ScenarioError(
             f"{effect}: the queue model shows its clearance as red; put {effect.name} before it"
         )

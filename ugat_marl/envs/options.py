@@ -5,6 +5,7 @@ from __future__ import annotations
 import inspect
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, fields
+from numbers import Integral
 from typing import Any, Literal, TypedDict, TypeVar, get_args
 
 from ugat_marl.effects import ControllerPart
@@ -117,6 +118,9 @@ class EnvOptions:
         commands: Any = self.commands
         if not _is_count(commands):
             raise OptionError(f"commands = {commands!r}: must be 0 or a number of decisions")
+        # Checkpoints are JSON, which has no integers of NumPy
+        object.__setattr__(self, "neighbours", int(roads))
+        object.__setattr__(self, "commands", int(commands))
         require_deadline(self.deadline_s)
         if self.deadline_s is not None and self.simulator == "inprocess":
             raise OptionError(
@@ -139,4 +143,4 @@ class EnvOptions:
 
 
 def _is_count(value: Any) -> bool:
-    return isinstance(value, int) and not isinstance(value, bool) and value >= 0
+    return isinstance(value, Integral) and not isinstance(value, bool) and int(value) >= 0

@@ -279,7 +279,7 @@ def simulated_worlds(
     # crossing vehicles show best when a green began, and how fast it serves
     crossings = ugat.most_delay_s > 0 or ugat.grounding == "street"
     for domain in (sim, real) if crossings and ugat.iterations else ():
-        if "mesosim" in scenario_in_domain(scenario, domain).settings.sumo:
+        if scenario_in_domain(scenario, domain).settings.is_mesoscopic:
             raise OptionError(
                 f"the grounding {ugat.grounding} needs to know when vehicles cross the stop lines, "
                 f"and SUMO's queue model ({domain_label(domain)!r}) cannot tell; use the grounding "

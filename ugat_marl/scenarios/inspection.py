@@ -246,7 +246,7 @@ def _degrees(scenario: Scenario, flows_vph: Flows) -> dict[str, dict[str, float]
 
 def _short(scenario: Scenario, network: Network) -> set[str]:
     """Return the lanes that would get more upstream lanes with a reach of `SHORT_LANE_M`."""
-    if scenario.control.reach_m >= SHORT_LANE_M or "mesosim" in scenario.settings.sumo:
+    if scenario.control.reach_m >= SHORT_LANE_M or scenario.settings.is_mesoscopic:
         return set()
     farther = Network.read(scenario.with_control(reach_m=SHORT_LANE_M))
     return {

@@ -72,6 +72,11 @@ class ScenarioFile(pydantic.BaseModel):
     effects: tuple[dict[str, Any], ...] = ()
     sumo: dict[str, str] = {}
 
+    @property
+    def is_mesoscopic(self) -> bool:
+        """True if SUMO's mesoscopic model (``queue_model``) takes the place of car following."""
+        return "mesosim" in self.sumo
+
 
 def validate_settings(raw: Mapping[str, Any], source: str) -> ScenarioFile:
     """Check the content of a scenario file.
@@ -112,7 +117,7 @@ def validate_settings(raw: Mapping[str, Any], source: str) -> ScenarioFile:
                 f"{source}: {key} = {value:g} is not a multiple of step_length_s = {step:g}; "
                 "SUMO would cut it short"
             )
-    if control.reach_m and "mesosim" in settings.sumo:
+    if control.reach_m and settings.is_mesoscopic:
         raise ScenarioError(
             f"{source}: control.reach_m = {control.reach_m:g}, but in SUMO's mesoscopic model "
             "(queue_model) it is not counted who is upstream of a lane; leave out one of the two"

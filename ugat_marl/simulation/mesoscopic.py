@@ -209,7 +209,7 @@ def refuse_in_queues(scenario: Scenario, **requested: bool) -> None:
         "pictures": "pictures of vehicles (render_mode, films)",
     }
     for name, wanted in requested.items():
-        if wanted and "mesosim" in scenario.settings.sumo:
+        if wanted and scenario.settings.is_mesoscopic:
             raise OptionError(
                 f"scenario {scenario.id!r} runs in SUMO's mesoscopic model, in which vehicles have "
                 f"no position on a lane: it cannot tell {words[name]}; leave out queue_model"
