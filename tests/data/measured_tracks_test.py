@@ -95,6 +95,23 @@ def test_positions_that_jitter_do_not_move_a_standing_vehicle() -> None:
     assert seen.on_s.tolist() == pytest.approx([77.0], abs=0.2)
 
 
+def test_passages_over_a_long_zone_follow_each_other_as_in_a_log() -> None:
+    first = track(["a_0"] * 6, [0.0, 10.0, 20.0, 30.0, 40.0, 50.0], 10.0)
+    second = first.with_columns(
+        pl.lit("w").alias("vehicle_id"), (pl.col("time_s") + 1.5).alias("time_s")
+    )
+    seen = passages(pl.concat((first, second)), Detector("d", "a_0", 15.0, 15.0, "stop"))["d"]
+    assert seen.on_s.tolist() == [11.5, 13.0]
+    assert seen.off_s.tolist() == [13.0, 15.0], "the first one's rear leaves at 13.5 s"
+
+
+def test_a_vehicle_that_drove_farther_than_its_speeds_tell_is_seen_all_the_same() -> None:
+    """It is 12 m on lane b a second after it was on lane a, and its speed says 5 m."""
+    rows = track(["a_0", "b_0", "b_0", "b_0"], [25.0, 12.0, 27.0, 42.0], 5.0)
+    seen = passages(rows, Detector("exit", "b_0", 2.0, 0.0, "exit"))["exit"]
+    assert seen.on_s.tolist() == [10.0]
+
+
 def test_a_standing_vehicle_is_on_until_it_drives() -> None:
     rows = track(["a_0"] * 6, [0.0, 10.0, 10.0, 10.0, 20.0, 30.0], 0.0)
     seen = passages(rows, Detector("d", "a_0", 8.0, 0.0, "stop"))["d"]

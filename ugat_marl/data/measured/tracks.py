@@ -14,6 +14,7 @@ import numpy as np
 import polars as pl
 from numpy.typing import NDArray
 
+from ugat_marl.data.measured.passages import passages_as_written
 from ugat_marl.data.measured.values import Finding
 from ugat_marl.errors import MeasuredDataError
 from ugat_marl.scenarios import Detector, Passages, Period, edge_of_lane
@@ -90,6 +91,8 @@ class _Track:
         # changes lanes is on the old one until its first position on the new one.
         if begin and self._turned(begin):
             first = begin - 1
+            # The speed may tell less of the way than the place on the new lane does.
+            start = max(start, self.driven_m[first] + 1e-6 - detector.position_m)
         if end < len(self.lane):
             last = end
         on = self._when(start + detector.position_m, first, last)
@@ -182,7 +185,11 @@ def passages_of_tracks(
         }
         found.append(
             {
-                name: lanes[0] if len(lanes) == 1 else Passages.together(lanes)
+                name: passages_as_written(
+                    lanes[0] if len(lanes) == 1 else Passages.together(lanes),
+                    period.begin_s,
+                    period.end_s,
+                )
                 for name, lanes in seen.items()
                 if lanes
             }
