@@ -63,7 +63,7 @@ LOG = [
     (52.1, 43, 4),
 ]
 SIGNALS = (
-    (0.0, "Gr"),
+    (-10.0, "Gr"),
     (20.0, "yr"),
     (23.5, "rr"),
     (25.0, "rG"),
@@ -141,7 +141,7 @@ def test_what_was_shown_before_the_log_begins_follows_from_its_first_events(
     imported: Import,
 ) -> None:
     read = imported(log(LOG[1:]))
-    assert read.periods[0].signals == {"C": SIGNALS}
+    assert read.periods[0].signals == {"C": ((0.0, "Gr"), *SIGNALS[1:])}
 
 
 def test_names_of_columns_and_times_in_other_spellings(imported: Import) -> None:
@@ -231,7 +231,7 @@ split = "heldout"
         ("wed", 0.0, 100.0, "fit"),
         ("thu", 30.0, 200.0, "heldout"),
     ]
-    assert read.periods[1].signals["C"][0] == (30.0, "rG")
+    assert read.periods[1].signals["C"][0] == (25.0, "rG")
     overlapping = MAPPING.replace("07:00:00]", "07:00:00, 2024-03-05T07:01:00]")
     with pytest.raises(MeasuredDataError, match="overlap by 140 s"):
         imported(frame, overlapping)
@@ -293,7 +293,7 @@ def test_overlaps_arrows_and_links_that_yield(imported: Import) -> None:
     states = dict(read.periods[0].signals["A1"])
     through, rest = "GGGG", "g" + "rrrr"
     assert states == {
-        0.0: through + "g" + rest + "GGGG" + "r" + "r" + "rrrr",
+        -4.0: through + "g" + rest + "GGGG" + "r" + "r" + "rrrr",
         10.0: through + "r" + rest + "GGGG" + "r" + "r" + "rrrr",
         12.0: through + "G" + rest + "GGGG" + "r" + "r" + "rrrr",
         14.0: through + "G" + rest + "yyyy" + "r" + "r" + "rrrr",

@@ -7,6 +7,7 @@ import errno
 import json
 import os
 import re
+from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 
 import numpy as np
@@ -284,3 +285,11 @@ def test_the_damaged_row_of_a_json_table_is_named() -> None:
     assert json_damage(table, "rows").startswith("what stands beside its rows")
     del table["row_hashes"]
     assert json_damage(table, "rows") == ""
+
+
+def test_threads_that_read_leave_the_standard_error_alone(tmp_path: Path) -> None:
+    write_hashed(every_kind(50), tmp_path / "t.parquet")
+    before = os.fstat(2)
+    with ThreadPoolExecutor(8) as pool:
+        list(pool.map(lambda _: read_quietly(tmp_path / "t.parquet"), range(100)))
+    assert os.path.samestat(before, os.fstat(2))

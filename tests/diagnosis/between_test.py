@@ -182,6 +182,25 @@ def test_lanes_are_means_over_moments_and_vehicles() -> None:
     ]
 
 
+def test_a_lane_left_out_of_a_period_is_left_out_of_its_simulated_days() -> None:
+    def rows(period: str, lane: str, vehicles: float) -> pl.DataFrame:
+        moments = {"time_s": np.arange(600.0), "mean_speed_mps": [10.0] * 600}
+        same = {"vehicles": [vehicles] * 600, "halting": [0.0] * 600}
+        return pl.DataFrame(
+            {"period_id": [period] * 600, "lane_id": [lane] * 600, **moments, **same}
+        )
+
+    periods = tuple(Period(name, 0.0, 600.0, "fit", {}, {}) for name in "ab")
+    lanes = pl.concat([rows("a", "m_0", 20.0), rows("a", "s_0", 0.0), rows("b", "m_0", 20.0)])
+    between = Between.of(MeasuredData((), periods, lanes=lanes))
+    assert between is not None
+    simulated = np.array([[20.0 * 600, 0.0, 20.0 * 600 * 10], [0.0, 0.0, 0.0]])
+    for period in periods:
+        seen = between.measured(period.id)[EVERY_LANE][0]
+        same = between.simulated(period, [], simulated)[EVERY_LANE][0]
+        np.testing.assert_allclose(same, seen)
+
+
 def test_simulated_lanes_are_those_of_positions_second_by_second(data: Path) -> None:
     scenario = demand_as_vehicles(load_scenario(data / "crossing"))
     network = Network.read(scenario)

@@ -15,7 +15,14 @@ import pytest
 
 from ugat_marl.diagnosis import Tally, default_cache
 from ugat_marl.diagnosis import engine as module
-from ugat_marl.diagnosis.engine import Budget, Engine, OutOfTime, Replicate, _signals_hash
+from ugat_marl.diagnosis.engine import (
+    Budget,
+    Engine,
+    OutOfTime,
+    Replicate,
+    _signals_hash,
+    locked_up,
+)
 from ugat_marl.diagnosis.features import BIN_FEATURES, FEATURES, DetectorLayout
 from ugat_marl.diagnosis.replay import Day, Replay, Unmeasured
 from ugat_marl.diagnosis.thresholds import Thresholds
@@ -499,3 +506,19 @@ def test_measured_speeds_decide_arrivals_and_so_the_day() -> None:
     quick, slow = period([13.0, 13.0, 13.0, 13.0]), period([13.0, 3.0, 3.0, 13.0])
     assert _signals_hash(quick, True) != _signals_hash(slow, True)
     assert _signals_hash(quick, False) == _signals_hash(slow, False)
+
+
+def test_days_of_another_stretch_are_no_standstill(layout: DetectorLayout) -> None:
+    generator = np.random.default_rng(1)
+    lanes = len(layout.places)
+
+    def day(rate: float, window: tuple[float, float]) -> Tally:
+        bins = np.zeros((len(BIN_FEATURES), lanes, 6))
+        bins[0] = generator.poisson(rate, (lanes, 6))
+        return Tally(np.zeros((len(FEATURES), lanes, 2)), bins, window=window)
+
+    mornings = [day(40.0, (25_200.0, 27_000.0)) for _ in range(55)]
+    nights = [day(4.0, (0.0, 1_800.0)) for _ in range(5)]
+    assert locked_up([*mornings, *nights], THRESHOLDS) == []
+    still = day(4.0, (25_200.0, 27_000.0))
+    assert locked_up([*mornings, still, *nights], THRESHOLDS) == [55]

@@ -166,6 +166,11 @@ def test_a_pattern_of_the_fitted_periods_alone_is_not_told(
     assert told == ()
 
 
+def test_a_whole_day_has_no_more_bins_than_can_be_compared() -> None:
+    long = replace(day(0), end_s=86_400.0)
+    assert cells(long)["count"].shape[4] == THRESHOLDS.most_pattern_bins
+
+
 def test_the_sets_of_every_axis() -> None:
     sets = dict(zip(AXES, sets_of(LAYOUT, (4, 3, 5, 5, 3, 2)), strict=True))
     assert ("north", "s") in sets["place"].names

@@ -209,6 +209,8 @@ def test_counts_come_later() -> None:
     assert _later(counts, 0.5).tolist() == [[2.0, 6.0, 5.0, 4.0]]
     assert _later(counts, -1.0).tolist() == [[8.0, 2.0, 6.0, 0.0]]
     assert _later(counts, -1.5).tolist() == [[5.0, 4.0, 3.0, 0.0]]
+    for bins in (4.0, 4.5, 9.0, -4.0, -4.5, -9.0):  # a quarter of an hour in a short period
+        assert _later(counts, bins).tolist() == [[0.0] * 4], bins
 
 
 def test_vehicles_that_turn_elsewhere(reference: Reference) -> None:

@@ -11,7 +11,8 @@ import pytest
 
 from ugat_marl.data import MeasuredData
 from ugat_marl.diagnosis import DiagnosisConfig, Study
-from ugat_marl.diagnosis.study import unreached
+from ugat_marl.diagnosis.study import interrupted, unreached
+from ugat_marl.diagnosis.thresholds import Thresholds
 from ugat_marl.effects import load_scenario
 from ugat_marl.errors import MeasuredDataError
 from ugat_marl.scenarios import Detector, Passages, Period, Scenario
@@ -74,3 +75,20 @@ def test_demand_that_reaches_no_measured_lane_is_refused_before_anything_runs(
     west = MeasuredData((WEST,), (replace(DAY, passages={"w": SEEN}),))
     with pytest.raises(MeasuredDataError, match=r"no vehicle .* \(W_C\); check lane_id"):
         Study.of(northbound, west, DiagnosisConfig())
+
+
+def test_counts_with_missing_intervals_are_told() -> None:
+    rows = [
+        ("day1", begin, begin + 100.0, name, 5)
+        for name in ("s", "w")
+        for begin in (0.0, 100.0)
+        if (name, begin) != ("w", 0.0)
+    ]
+    names = ("period_id", "begin_s", "end_s", "detector_id", "count")
+    counts = pl.DataFrame(rows, schema=names, orient="row")
+    some = replace(BOTH, counts=counts, periods=(replace(DAY, passages={}),))
+    (finding,) = interrupted(some, some.detectors, Thresholds())
+    assert "intervals are missing at 1 of 2 detectors (w);" in finding.text
+    whole = replace(some, counts=counts.filter(pl.col("detector_id") == "s"))
+    assert interrupted(whole, [SOUTH], Thresholds()) == ()
+    assert interrupted(BOTH, BOTH.detectors, Thresholds()) == ()

@@ -119,6 +119,22 @@ def test_the_networks_own_programme_is_no_control(scenario: Scenario, network: N
     assert found(scenario, network, log) == []
 
 
+@pytest.mark.parametrize(("longer_s", "named"), [(0.0, []), (2.0, ["yellow_time=5"])])
+def test_other_yellow_in_the_states_of_the_own_programme_is_read_off(
+    longer_s: float, named: list[str]
+) -> None:
+    grid = load_scenario("grid2x2-v1")
+    network = Network.read(grid)
+    light = network.intersections[0]
+    rows: list[tuple[float, str]] = []
+    time = 0.0
+    for _ in range(12):
+        for seconds, state in light.programme:
+            rows.append((time, state))
+            time += seconds + (longer_s if "y" in state else 0.0)
+    assert found(grid, network, tuple(rows), tls=light.id) == named
+
+
 def test_traffic_lights_that_nobody_controls_tell_nothing(
     scenario: Scenario, network: Network
 ) -> None:

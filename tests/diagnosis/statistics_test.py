@@ -20,7 +20,7 @@ from ugat_marl.diagnosis.features import (
     IncomingLane,
 )
 from ugat_marl.diagnosis.residual import Null
-from ugat_marl.diagnosis.statistics import Pools, Whitener
+from ugat_marl.diagnosis.statistics import Pools, Whitener, of_the_same_stretches
 from ugat_marl.diagnosis.thresholds import Thresholds
 
 THRESHOLDS = Thresholds()
@@ -98,6 +98,20 @@ def test_each_stretch_of_the_day_is_compared_with_its_own() -> None:
     alone = [day for day in stretches(8, 8, 10.0) if day.window == (1800.0, 3600.0)]
     assert apart.distance(alone).total < 20.0
     assert apart.distance(days_of(gaussian(8, 4) + 10.0)).total > 300.0  # of no known stretch
+
+
+def test_days_of_the_same_stretches_have_the_datas_proportions() -> None:
+    """Simulated days are under five periods in turn, and two of them are held out."""
+    peak, noon = (25200.0, 27000.0), (43200.0, 45000.0)
+    order = [(peak, noon)[k % 5 % 2] for k in range(20)]
+    model = [replace(day, window=w) for day, w in zip(days_of(gaussian(1, 20)), order, strict=True)]
+    both = [replace(day, window=w) for day, w in zip(model, (noon, peak), strict=False)]
+    chosen = of_the_same_stretches(model, both)
+    assert [day.window for day in chosen].count(peak) == 8 == len(chosen) / 2
+    kept = {id(day) for day in chosen}
+    assert [id(day) for day in chosen] == [id(day) for day in model if id(day) in kept]
+    assert len(of_the_same_stretches(model, both[1:])) == 12, "of one stretch all days"
+    assert len(of_the_same_stretches(model, [replace(model[0], window=(0.0, 1.0))])) == 20
 
 
 def test_other_stretches_are_no_chance() -> None:

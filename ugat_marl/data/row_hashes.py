@@ -21,6 +21,7 @@ import os
 import re
 import sys
 import tempfile
+import threading
 from collections.abc import Iterable, Iterator, Mapping
 from pathlib import Path
 from typing import Any
@@ -236,7 +237,7 @@ def read_quietly(source: Path | io.BytesIO) -> tuple[pl.DataFrame, dict[str, str
         polars.exceptions.PolarsError: The file is damaged, or has more rows than bytes; also
             `PanicException` and ``OSError``.
     """
-    with _without_standard_error():
+    with _ONE_AT_A_TIME, _without_standard_error():
         _refuse_repeated_rows(source)
         frame = pl.read_parquet(_again(source))
         return frame, pl.read_parquet_metadata(_again(source))
@@ -259,6 +260,10 @@ def _again(source: Path | io.BytesIO) -> Path | io.BytesIO:
     if isinstance(source, io.BytesIO):
         source.seek(0)
     return source
+
+
+_ONE_AT_A_TIME = threading.Lock()
+"""A process has one standard error, and threads may read tables at the same time."""
 
 
 @contextlib.contextmanager

@@ -164,8 +164,15 @@ class Between:
             length = np.full(len(lanes), period.end_s - period.begin_s)
             weights = np.stack([length, length, lanes[:, 0]], axis=-1)
             states = np.stack([lanes, weights], axis=-1)
+            states[self._unobserved(period.id)] = 0.0
         times = np.array([(x[:, 1].sum(), len(x)) for x in timed], np.float64).reshape(-1, 2)
         return self._blocks(np.array(counts), self._minutes(period.id), times, states)
+
+    def _unobserved(self, period: str) -> list[int]:
+        """Return the indices of lanes that nobody watched in a period, which others have."""
+        if period not in self.states:
+            return []
+        return np.flatnonzero(self.states[period][:, 0, 1] == 0).tolist()
 
     def _minutes(self, period: str) -> Array:
         return np.array(
@@ -186,7 +193,11 @@ class Between:
 
     def __repr__(self) -> str:
         """Return everything that simulated days depend on, for the key of the cache."""
-        return repr((self.turns, self.ways, sorted(self.spans.items()), self.lanes))
+        gone = [
+            (period, own) for period in sorted(self.states) if (own := self._unobserved(period))
+        ]
+        key = (self.turns, self.ways, sorted(self.spans.items()), self.lanes)
+        return repr((*key, gone) if gone else key)
 
 
 def _turn(turning: pl.DataFrame, turn: tuple[str, str]) -> tuple[tuple[Span, ...], float]:

@@ -66,8 +66,7 @@ class Usual:
 
 def day_to_day(tallies: Sequence[Tally]) -> float:
     """Return the robust standard deviation of the vehicles counted per day."""
-    counts = _counts(tallies)
-    return 1.4826 * float(np.median(np.abs(counts - np.median(counts)))) + 1e-9
+    return 1.4826 * float(np.median(np.abs(_counts(tallies)))) + 1e-9
 
 
 def locked_up(tallies: Sequence[Tally], thresholds: Thresholds, usual: float = 0.0) -> list[int]:
@@ -84,14 +83,18 @@ def locked_up(tallies: Sequence[Tally], thresholds: Thresholds, usual: float = 0
     Returns:
         Indices into `tallies`.
     """
-    counts = _counts(tallies)
     spread = max(day_to_day(tallies), usual)
-    unusual = np.flatnonzero(np.abs(counts - np.median(counts)) > thresholds.locked_up * spread)
+    unusual = np.flatnonzero(np.abs(_counts(tallies)) > thresholds.locked_up * spread)
     return unusual.tolist() if len(unusual) <= max(1.0, thresholds.rare * len(tallies)) else []
 
 
 def _counts(tallies: Sequence[Tally]) -> NDArray[np.float64]:
-    return np.array([day.bins[:3].sum() for day in tallies])
+    """Return the vehicles counted on each day, from the median of days of the same stretch on."""
+    counts = np.array([day.bins[:3].sum() for day in tallies])
+    for window in {day.window for day in tallies}:
+        own = np.array([day.window == window for day in tallies])
+        counts[own] -= np.median(counts[own])
+    return counts
 
 
 # --- simulated days -------------------------------------------------------------------------------

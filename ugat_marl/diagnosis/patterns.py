@@ -72,7 +72,8 @@ def cells_of(
         position, age, time, length of vehicle: ``(places, kinds, positions, ages, bins, 2, 3)``.
     """
     places, lanes = len(layout.lanes) + len(layout.exits), len(layout.lanes)
-    bins = max(1, round((period.end_s - period.begin_s) / thresholds.pattern_bin_s))
+    wished = round((period.end_s - period.begin_s) / thresholds.pattern_bin_s)
+    bins = min(max(1, wished), thresholds.most_pattern_bins)
     shapes = {
         "discharge": (lanes, 1, len(POSITIONS), len(AGES_S), bins, 2, 3),
         "free speed": (lanes, 1, 1, 1, bins, 2, 3),
@@ -174,8 +175,10 @@ class Sets:
         """
         names: list[tuple[object, ...] | None] = [None]
         masks, limits = [np.ones(width, np.bool_)], [0]
+        known = {masks[0].tobytes()}
         for name, (mask, count) in named.items():
-            if mask.any() and not any((mask == other).all() for other in masks):
+            if mask.any() and mask.tobytes() not in known:
+                known.add(mask.tobytes())
                 names.append(name)
                 masks.append(mask)
                 limits.append(count)

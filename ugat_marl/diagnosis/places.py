@@ -388,6 +388,8 @@ def _later(counts: Array, bins: float) -> Array:
     moved = np.zeros_like(counts)
     whole = int(np.floor(bins))
     for part, step in ((1.0 - (bins - whole), whole), (bins - whole, whole + 1)):
+        if abs(step) >= counts.shape[1]:
+            continue
         if step >= 0:
             moved[:, step:] += part * counts[:, : counts.shape[1] - step]
         else:

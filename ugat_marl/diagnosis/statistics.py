@@ -15,6 +15,7 @@ from __future__ import annotations
 
 import functools
 import math
+from collections import Counter
 from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 
@@ -360,9 +361,24 @@ def by_turns(tallies: Sequence[Tally]) -> list[Tally]:
 
 
 def of_the_same_stretches(days: Sequence[Tally], data: Sequence[Tally]) -> list[Tally]:
-    """Return the days of the stretches of measured data; all days if there are none."""
-    windows = {day.window for day in data}
-    return [day for day in days if day.window in windows] or list(days)
+    """Return the days of the stretches of measured data, in the data's proportions.
+
+    Days of a stretch that has too many are left out, the last ones first. If a stretch has no day,
+    proportions are left as they are; without any day of the stretches all days are returned.
+    """
+    wanted = Counter(day.window for day in data)
+    found = [day for day in days if day.window in wanted]
+    there = Counter(day.window for day in found)
+    times = min(there[window] // number for window, number in wanted.items())
+    if not times or len(wanted) == 1:
+        return found or list(days)
+    left = {window: times * number for window, number in wanted.items()}
+    kept: list[Tally] = []
+    for day in found:
+        if left[day.window]:
+            left[day.window] -= 1
+            kept.append(day)
+    return kept
 
 
 def sum_of(tallies: Sequence[Tally]) -> Tally:

@@ -48,7 +48,7 @@ from ugat_marl.diagnosis.select import MOVES_OF_A_VALUE, Selector
 from ugat_marl.diagnosis.statistics import Array, Distance, Pools, Reference, change_between, sum_of
 from ugat_marl.diagnosis.thresholds import EFFORTS, LEAST_EFFORT, Effort, Thresholds
 from ugat_marl.effects import Effect, effect_from_record
-from ugat_marl.errors import MeasuredDataError, OptionError
+from ugat_marl.errors import MeasuredDataError, OptionError, counted
 from ugat_marl.parallel import Workers
 from ugat_marl.progress import Reporter, Share
 from ugat_marl.scenarios import (
@@ -170,7 +170,7 @@ class Study:
                 reaches a measured lane.
         """
         network, thresholds = Network.read(scenario), config.thresholds
-        detectors, findings = _compared(scenario, measured)
+        detectors, findings = _compared(scenario, measured, thresholds)
         measured = _noted(measured, findings)
         layout = DetectorLayout.of(network, detectors)
         ruled_out = frozenset(name for finding in measured.findings for name in finding.rules_out)
@@ -587,11 +587,12 @@ def effort_for(intersections: int) -> Effort:
 
 
 def _compared(
-    scenario: Scenario, measured: MeasuredData
+    scenario: Scenario, measured: MeasuredData, thresholds: Thresholds
 ) -> tuple[tuple[Detector, ...], tuple[Finding, ...]]:
     """Return the detectors to compare, and findings on the others and on their roads."""
     detectors = one_of_each(measured, heard(measured))
-    return detectors, doubled(measured, detectors) + unreached(scenario, measured, detectors)
+    findings = doubled(measured, detectors) + unreached(scenario, measured, detectors)
+    return detectors, findings + interrupted(measured, detectors, thresholds)
 
 
 def heard(measured: MeasuredData) -> tuple[Detector, ...]:
@@ -757,6 +758,26 @@ _NAMED = 6
 """Largest number of edges that a message names."""
 
 
+def interrupted(
+    measured: MeasuredData, compared: Sequence[Detector], thresholds: Thresholds
+) -> tuple[Finding, ...]:
+    """Return a finding on the detectors whose counts lack intervals."""
+    if measured.has_events or measured.counts is None:
+        return ()
+    whole = without_gaps(measured.counts, measured.periods, thresholds)
+    others = {detector.id for detector in compared} - whole
+    if not others:
+        return ()
+    return (
+        Finding(
+            f"counts.csv: intervals are missing at {len(others)} of "
+            f"{counted(len(compared), 'detector')} ({_few(others)}); there only bins of "
+            "time are compared, and no means over periods. Fill the gaps, or leave the periods "
+            "with gaps out"
+        ),
+    )
+
+
 def unreached(
     scenario: Scenario, measured: MeasuredData, detectors: Sequence[Detector]
 ) -> tuple[Finding, ...]:
@@ -820,14 +841,14 @@ def timing_effects(
 ) -> tuple[Effect, ...]:
     """Return effects for yellow and all-red times of the log that differ from the scenario's.
 
-    Logs with only states of the network's own programme are left out.
+    Logs that show the network's own programme, its states and its clearances, are left out.
     """
     yellow: Counter[float] = Counter()
     red: Counter[float] = Counter()
     controlled = {intersection.id: intersection for intersection in network.intersections}
     for period in measured.periods:
         for tls, log in period.signals.items():
-            if tls in controlled and not _own(log, controlled[tls].programme):
+            if tls in controlled and not _own(log, controlled[tls].programme, thresholds):
                 for kind, duration in _clearances(log):
                     (yellow if kind == "y" else red)[round(duration, 1)] += 1
     effects: list[Effect] = []
@@ -845,9 +866,19 @@ def timing_effects(
     return tuple(effects)
 
 
-def _own(log: SignalLog, programme: tuple[tuple[float, str], ...]) -> bool:
-    """Return True if a log shows only states of the network's own programme."""
-    return {state for _, state in log} <= {state for _, state in programme}
+def _own(log: SignalLog, programme: tuple[tuple[float, str], ...], thresholds: Thresholds) -> bool:
+    """Return True if a log shows the states and clearances of the network's own programme."""
+    if not {state for _, state in log} <= {state for _, state in programme}:
+        return False
+    twice = (*programme, *programme)
+    begins = itertools.accumulate((seconds for seconds, _ in twice), initial=0.0)
+    own = _clearances(tuple(zip(begins, (state for _, state in twice), strict=False)))
+    shown = _clearances(log[1:])  # the first state may have begun before the log
+    alike = sum(
+        any(kind == k and abs(duration - d) <= thresholds.least_timing_s for k, d in own)
+        for kind, duration in shown
+    )
+    return alike >= thresholds.usual_share * len(shown)
 
 
 def _clearances(log: SignalLog) -> list[tuple[str, float]]:

@@ -732,6 +732,9 @@ class Thresholds(DayThresholds):
     pattern_bin_s: float = 300.0
     """Bins of time of the cells, s. By hand; patterns may fill several. Halved: windows are found
     more exactly, and slower."""
+    most_pattern_bins: int = 24
+    """Most of these bins: windows of time are all pairs of them, so that a day of 300 s would fill
+    the memory. By hand. Halved: periods of more than an hour have coarser windows."""
     pattern_days: int = 24
     """Simulated days with which single vehicles are compared. By hand. Halved: the chance of a
     pattern is known 1.4 times less exactly."""

@@ -436,7 +436,8 @@ def _states(
             letters[link] = letters[link].replace("r", "s")
         return "".join(letters)
 
-    log = [(period.begin_s, state())]
+    earlier = [event.time_s for event in events if event.time_s <= period.begin_s]
+    log = [(max(earlier, default=period.begin_s), state())]
     for index, event in enumerate(later):
         colours[event.source] = event.colour
         if index + 1 < len(later) and later[index + 1].time_s == event.time_s:

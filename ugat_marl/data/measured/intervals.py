@@ -72,10 +72,15 @@ def occupied_between(on: Array, off: Array, edges: Array) -> Array:
         off: Ends of occupation, s.
         edges: Bounds of the intervals, s.
     """
-    filled = np.zeros(len(edges))
-    for index, edge in enumerate(edges):
-        filled[index] = np.clip(np.minimum(off, edge) - on, 0.0, None).sum()
-    return np.diff(filled)
+
+    def passed(times: Array) -> Array:
+        """Return the seconds from all earlier times to each edge, summed."""
+        times = np.sort(times)
+        until = np.concatenate(([0.0], np.cumsum(times)))
+        before = np.searchsorted(times, edges)
+        return before * edges - until[before]
+
+    return np.diff(passed(on) - passed(np.maximum(off, on)))
 
 
 def require_interval(length_s: float) -> None:

@@ -576,9 +576,9 @@ def refuse_set_back(
         if jump > CLOCK_JUMP_S and clock[end - 1] > clock[begin]:
             raise MeasuredDataError(
                 f"{place(path, int(row[as_found[step]]))}: the clock of {name(int(stream[begin]))} "
-                f"steps back by {jump:g} s, so some time is there twice (daylight saving, or a "
-                "clock that was set?); end the period before the step, or correct the times "
-                "behind it"
+                f"steps back by {jump:g} s, so some time is there twice (daylight saving, a "
+                "clock that was set, or a log that was appended twice?); end the period before the "
+                "step, correct the times behind it, or leave the copy out"
             )
 
 
