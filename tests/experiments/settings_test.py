@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
+from functools import partial
 from pathlib import Path
 
 import pytest
@@ -40,3 +42,37 @@ def test_missing_weights_are_one_line() -> None:
     spec = LearnerSpec("universal", (), DQNConfig(network="universal", start="no.pt"))
     with pytest.raises(OptionError, match=r"no\.pt: No such file"):
         _ = spec.identity
+
+
+class Held:
+    """A learner's class; only its name and values count here."""
+
+    def __init__(self, env: object = None, seed: int = 0, phase: int = 0) -> None:
+        self.phase = phase
+
+
+class Other(Held):
+    """Another class of the same file."""
+
+
+def within(phase: int) -> Callable[[object, int], Held]:
+    def make(env: object, seed: int) -> Held:
+        return Held(env, seed, phase)
+
+    return make
+
+
+def test_learners_with_other_values_are_other_learners() -> None:
+    def identity(given: object) -> object:
+        return LearnerSpec(own_name(given), (), DQNConfig()).identity
+
+    for one, other in (
+        (partial(Held, phase=0), partial(Held, phase=1)),
+        (partial(Held, phase=0), partial(Other, phase=0)),
+        (within(0), within(1)),
+    ):
+        assert identity(one) != identity(other)
+    assert identity(within(1)) == identity(within(1))
+    assert identity(partial(Held, phase=1)) == identity(partial(Held, phase=1))
+    held = LearnerSpec(own_name(partial(Held, phase=0)), (), DQNConfig()).identity
+    assert held["source"] == LearnerSpec(own_name(Held), (), DQNConfig()).identity["source"]

@@ -340,6 +340,16 @@ def test_split_is_by_episode_and_stable_when_the_log_grows() -> None:
     assert two.held_out[0].tolist() == [0.0] * 10 + [1.0] * 10
 
 
+def test_an_agent_that_is_missing_in_held_out_episodes_is_split_in_time() -> None:
+    data = stack_log(planted(0.3, episodes=3, steps=8), STACK)
+    weight = data.weight.clone()
+    weight[0, data.episode[0] == 1] = 0.0  # the one that is held out
+    parts = split(dataclasses.replace(data, weight=weight), 4, STACK)
+    late = (data.step[0] > 5) & (data.episode[0] != 1)
+    assert parts.held_out[0].tolist() == late.double().tolist()
+    assert parts.held_out[1].tolist() == (data.episode[1] == 1).double().tolist()
+
+
 def test_one_episode_is_split_in_time() -> None:
     data = stack_log(planted(0.3, episodes=1, steps=20), STACK)
     parts = split(data, 4, STACK)

@@ -171,5 +171,5 @@ def test_margin_losses_are_those_of_the_paper(env: TrafficEnv) -> None:
 
 
 def test_exploration_begins_at_its_end_with_a_teacher() -> None:
-    assert DQNConfig(teacher=BEST).epsilon(0) == DQNConfig().epsilon_end
-    assert DQNConfig().epsilon(0) == DQNConfig().epsilon_start
+    assert DQNConfig(teacher=BEST).epsilon(0, taught=True) == DQNConfig().epsilon_end
+    assert DQNConfig(teacher=BEST).epsilon(0, taught=False) == DQNConfig().epsilon_start

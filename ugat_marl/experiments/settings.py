@@ -22,6 +22,7 @@ from ugat_marl.policies import (
     load_own,
     observed_options,
     own_source,
+    own_values,
     require_known_learner,
     suite_config,
 )
@@ -153,7 +154,9 @@ class LearnerSpec:
             return {"name": self.name, "settings": settings}
         if is_own(self.name):
             source = own_source(self.name, "learner")
-            return {"name": self.name, "settings": list(self.settings), "source": source}
+            identity = {"name": self.name, "settings": list(self.settings), "source": source}
+            values = own_values(self.name)
+            return {**identity, "values": values} if values else identity
         settings = baseline_settings(self.name, self.settings)
         return {"name": self.name, "settings": settings, "library": learner_library(self.name)}
 

@@ -581,6 +581,9 @@ class LaneEstimate:
     detectors: Sequence[Detector]
     config: DetectionConfig = field(default_factory=DetectionConfig)
     step_s: float = 1.0
+    _known: dict[str, tuple[list[_Seen], _Rate]] = field(
+        default_factory=dict[str, tuple[list["_Seen"], "_Rate"]], compare=False, repr=False
+    )
 
     def incoming(self, name: str) -> list[LaneCourse]:
         """Return the courses of a lane that ends at a light and has a stop detector, by period."""
@@ -595,6 +598,11 @@ class LaneEstimate:
 
     def _all_seen(self, lane: Lane) -> tuple[list[_Seen], _Rate]:
         """Return what the first detector of a lane saw, by period, and the rate of free times."""
+        if lane.id not in self._known:  # lanes with open jams ask for it in every period
+            self._known[lane.id] = self._seen_anew(lane)
+        return self._known[lane.id]
+
+    def _seen_anew(self, lane: Lane) -> tuple[list[_Seen], _Rate]:
         own = LaneDetectors.of(self.detectors, lane.id)
         seen = [self._seen(period, lane, own) for period in self.periods]
         rates = [one.rate(period) for one, period in zip(seen, self.periods, strict=True)]

@@ -126,14 +126,18 @@ class Split:
 def split(data: StackedTransitions, every: int, stack: Stack) -> Split:
     """Hold out episodes 1, 1 + every, ...; of a single episode, the last of `every` parts.
 
+    An agent that is missing in all episodes on one of the sides is split as if there were one
+    episode.
+
     Raises:
         LogError: An agent would have nothing to train on or nothing held out.
     """
+    last = torch.where(data.weight.bool(), data.step, 0).amax(1, keepdim=True)
+    held, kind = data.step > last * (1 - 1 / every), "steps"
     if int(data.episode.max()) > 0:
-        held, kind = data.episode % every == 1 % every, "episodes"
-    else:
-        last = torch.where(data.weight.bool(), data.step, 0).amax(1, keepdim=True)
-        held, kind = data.step > last * (1 - 1 / every), "steps"
+        whole, kind = data.episode % every == 1 % every, "episodes"
+        both = ((data.weight * whole).sum(1) > 0) & ((data.weight * ~whole).sum(1) > 0)
+        held = torch.where(both[:, None], whole, held)
     train, held_out = data.weight * ~held, data.weight * held
     for agent, rows, others in zip(stack.agents, train.sum(1), held_out.sum(1), strict=True):
         if not rows or not others:

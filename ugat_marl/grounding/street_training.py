@@ -238,6 +238,7 @@ class StreetTraining(Algorithm):
             delay_s = matched_delays(state.real[-1], self.simulation, policy, seed, advance)
         numbers = {f"rival/late_s/{agent}": late_s for agent, late_s in delay_s.items()}
         if not any(delay_s.values()):
+            self.run.reporter.say(f"{name}: no green has to be late, so there is no rival")
             return None, numbers
         learner, title = rival.begin(), f"late greens, {name}"
         plain: Any = self.env.unwrapped
@@ -322,10 +323,11 @@ class StreetTraining(Algorithm):
         real, known = TransitionLog.concatenate(state.real), state.transform.known
         config = self.config.street.of_log(real)
         number = episodes_of_fit(config, known)
-        if config.simulations < ENOUGH:
+        worlds = len(known.simulated) + sum(map(sum, known.rounds(config)))
+        if config.simulates and worlds < ENOUGH:
             self.run.reporter.say(
-                f"{iteration_name(state)}: {config.simulations} simulations are few, so chances "
-                f"and intervals of effects are too sure; --street.simulations {ENOUGH} or more"
+                f"{iteration_name(state)}: {worlds} simulations are few, so chances and "
+                f"intervals of effects are too sure; --street.simulations {ENOUGH} or more"
             )
         agents = list(real.provenance.layouts)
         jams = Oversaturation.of(self.view, self.view.rows(real), agents)

@@ -53,6 +53,7 @@ from .own import load_own as load_own
 from .own import own_name as own_name
 from .own import own_policy as own_policy
 from .own import own_source as own_source
+from .own import own_values as own_values
 from .protocols import EpisodeCallback as EpisodeCallback
 from .protocols import Learner as Learner
 from .protocols import Policy as Policy

@@ -14,6 +14,7 @@ from __future__ import annotations
 import ast
 import contextlib
 import copy
+import functools
 import importlib.util
 import inspect
 import io
@@ -25,7 +26,7 @@ import warnings
 import zipfile
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
-from types import ModuleType
+from types import FunctionType, MethodType, ModuleType
 from typing import Any, get_type_hints
 
 from pettingzoo.utils import BaseParallelWrapper
@@ -113,7 +114,34 @@ def load_own(name: str, what: str) -> Any:
 
 def _named(given: Any) -> Any:
     """Return the class or function by whose name an object is known."""
+    if isinstance(given, functools.partial):
+        return _named(given.func)
     return given if hasattr(given, "__qualname__") else type(given)
+
+
+def own_values(name: str) -> list[str]:
+    """Return what an object that was given in Python holds beside its source, as text.
+
+    These are arguments of a `functools.partial`, values that an inner function took with it, and
+    attributes of an instance. Two objects of one name and source differ in nothing else.
+    """
+    return _values(_given[name]) if name in _given else []
+
+
+def _values(given: Any) -> list[str]:
+    if isinstance(given, functools.partial):
+        keywords = [f"{key}={value!r}" for key, value in sorted(given.keywords.items())]
+        return [*_values(given.func), *map(repr, given.args), *keywords]
+    if isinstance(given, FunctionType):
+        if "<" not in given.__qualname__:  # neither <locals> nor <lambda>: its source says all
+            return []
+        inside = inspect.getclosurevars(given).nonlocals
+        taken = [f"{key}={value!r}" for key, value in sorted(inside.items())]
+        return [*taken, *map(repr, given.__defaults__ or ())]
+    if isinstance(given, MethodType):
+        return [repr(given.__self__), *_values(given.__self__)]
+    held = {} if hasattr(given, "__qualname__") else getattr(given, "__dict__", {})
+    return [repr(held)] if held else []
 
 
 def own_source(name: str, what: str) -> str | None:

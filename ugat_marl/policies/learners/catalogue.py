@@ -174,7 +174,8 @@ def suite_config(name: str, given: DQNConfig | None = None) -> DQNConfig:
         for key, value in values.items()
         if value != getattr(usual, key) or (key in _OF_THE_NAME and not _is_usual(value))
     }
-    return replace(own, **{"teacher": own.teacher or None, **changed})
+    settled = {"teacher": own.teacher or None, "network": str(own.network)}
+    return replace(own, **{**settled, **changed})
 
 
 def lesson_episodes(name: str, given: DQNConfig | None = None, *, known: bool = False) -> int:

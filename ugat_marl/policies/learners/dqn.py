@@ -391,7 +391,7 @@ class DQN:
         observations, infos = env.reset(seed=derive_seed(seed, "dqn", "episode", number))
         now, allowed = self.agents.stack(observations), self.agents.masks(infos)
         while env.agents:
-            epsilon = self.config.epsilon(self.decisions)
+            epsilon = self.config.epsilon(self.decisions, taught=self.taught > 0)
             acting = self._acting.network(self.updates)
             seen = torch.from_numpy(now) * self._inputs[:, 0]
             greedy = greedy_actions(acting, seen, torch.from_numpy(allowed))
@@ -415,7 +415,7 @@ class DQN:
             "return": tally.reward,
             "loss": tally.loss / updates,
             "q": tally.q / updates,
-            "epsilon": self.config.epsilon(self.decisions),
+            "epsilon": self.config.epsilon(self.decisions, taught=self.taught > 0),
         }
 
     def _is_time_to_update(self) -> bool:

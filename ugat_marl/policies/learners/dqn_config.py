@@ -100,8 +100,8 @@ class DQNConfig:
             acts as in the fullest street it knows. None cuts nothing.
         teacher: Rule that shows the learner its first episodes, such as "max-pressure:20". "best"
             takes the best of the standard rules in the environment of the training. None for none;
-            "" for "best" with the learner "universal", and for none with others. With a teacher,
-            exploration begins at `epsilon_end`.
+            "" for "best" with the learner "universal", and for none with others. After its
+            lessons exploration begins at `epsilon_end`.
         lessons: Episodes that the teacher shows.
         lesson_updates: Updates after them, before the learner acts.
         margin: Q of an action that the teacher did not choose should be lower than that of its own
@@ -184,9 +184,15 @@ class DQNConfig:
         if not holds:
             raise OptionError(f"DQNConfig.{name} = {getattr(self, name)!r}: must be {allowed}")
 
-    def epsilon(self, decisions: int) -> float:
-        """Return the share of exploratory decisions after `decisions` decisions."""
-        if self.teacher:
+    def epsilon(self, decisions: int, *, taught: bool) -> float:
+        """Return the share of exploratory decisions.
+
+        Args:
+            decisions: Own decisions so far.
+            taught: True if a teacher showed episodes before. There may be none for a teacher: rules
+                need observations of movements.
+        """
+        if taught:
             return self.epsilon_end
         progress = min(1.0, decisions / self.epsilon_decay_decisions)
         return self.epsilon_start + progress * (self.epsilon_end - self.epsilon_start)
