@@ -61,6 +61,7 @@ def complaint(capsys: pytest.CaptureFixture[str], *arguments: str) -> str:
         (["train", "single-v1", "--fit.learning-rate", "inf"], "finite"),
         (["train", "single-v1", "--fit.uncertainty", "ensembel"], "ensemble"),
         (["train", "single-v1", "--fit.members", "0"], "1 to 100"),
+        (["train", "single-v1", "--workers", "0"], "--workers 0: must be at least 1"),
     ],
 )
 def test_a_wrong_call_is_one_line_with_the_nearest_name(

@@ -12,7 +12,7 @@ from rich.console import Console
 from rich.text import Text
 from tyro.conf import arg
 
-from ugat_marl.cli.arguments import RayAddress, workers_of
+from ugat_marl.cli.arguments import RayAddress, Workers, require_counts, workers_of
 from ugat_marl.data import METRICS_FILE, Metrics
 from ugat_marl.errors import OptionError
 from ugat_marl.experiments import TransferConfig, outcome_of, run_folder, transfer
@@ -36,6 +36,7 @@ class Train:
         config: Settings of the training and of the evaluation.
         out: Folder of the run; default: runs/SCENARIO-REAL-sSEED.
         resume: Continue the run in that folder.
+        workers: Simulations at a time; no number depends on it.
         ray: Play roll-outs and search for the best rule on Ray; learning stays on this machine.
     """
 
@@ -59,6 +60,7 @@ class Train:
     config: Annotated[TransferConfig, arg(name="")]
     out: Path | None = None
     resume: bool = False
+    workers: Workers = None
     ray: RayAddress = None
 
     def run(self, console: Console) -> int:
@@ -66,9 +68,10 @@ class Train:
         config = self.config
         if self.out == Path():
             raise OptionError("--out is the working folder itself, or empty; name a folder")
+        require_counts(workers=self.workers)
         directory = self.out or run_folder(config)
         try:
-            with workers_of(None, self.ray) as workers:
+            with workers_of(self.workers, self.ray) as workers:
                 table = transfer(
                     config, directory, resume=self.resume, reporter=Bars(console), workers=workers
                 )
