@@ -9,7 +9,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ugat_marl.envs import Actions, Infos, Observations
-from ugat_marl.policies.rules.approaches import Approach, ControlledNetwork, allowed_phases
+from ugat_marl.policies.rules.approaches import (
+    Approach,
+    ControlledNetwork,
+    allowed_phases,
+    permitted,
+)
 
 
 class _Extended:
@@ -78,7 +83,7 @@ class _Extended:
         chosen = following[0]
         self._age[agent] = age + 1 if chosen == place else 1
         self._place[agent] = chosen
-        return cycle[chosen] if allowed[cycle[chosen]] else int(allowed.argmax())
+        return permitted(cycle[chosen], allowed)
 
 
 class Actuated(_Extended):

@@ -160,6 +160,11 @@ def allowed_phases(infos: Infos, agent: str, phases: int) -> NDArray[np.bool_]:
     return np.asarray(mask, dtype=np.bool_)[:phases]  # behind the light's own ones is padding
 
 
+def permitted(wanted: int, allowed: NDArray[np.bool_]) -> int:
+    """Return the wanted phase; if it is masked, the first allowed one."""
+    return wanted if allowed[wanted] else int(allowed.argmax())
+
+
 def green_indices(intersection: Intersection, phase: str) -> frozenset[int]:
     """Return the indices of the links that are green in a phase."""
     return frozenset(link.index for link in intersection.links if phase[link.index] in GREEN)

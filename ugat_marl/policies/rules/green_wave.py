@@ -7,7 +7,12 @@ from dataclasses import dataclass
 from typing import Any
 
 from ugat_marl.envs import Actions, Infos, Observations
-from ugat_marl.policies.rules.approaches import ControlledNetwork, allowed_phases, green_indices
+from ugat_marl.policies.rules.approaches import (
+    ControlledNetwork,
+    allowed_phases,
+    green_indices,
+    permitted,
+)
 from ugat_marl.scenarios import Intersection, Link, edge_of_lane
 
 
@@ -118,7 +123,7 @@ class GreenWave:
             turns = self._turns[agent]
             wanted = turns[(self._time - self._offsets[agent]) % len(turns)]
             allowed = allowed_phases(infos, agent, phases)
-            actions[agent] = wanted if allowed[wanted] else int(allowed.argmax())
+            actions[agent] = permitted(wanted, allowed)
         self._time += 1
         return actions
 

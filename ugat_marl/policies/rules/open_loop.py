@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 
 from ugat_marl.envs import Actions, Infos, Observations
-from ugat_marl.policies.rules.approaches import ControlledNetwork, allowed_phases
+from ugat_marl.policies.rules.approaches import ControlledNetwork, allowed_phases, permitted
 from ugat_marl.seeding import numpy_generator
 
 
@@ -43,7 +43,7 @@ class FixedTime:
         for agent, cycle in self._cycle.items():
             wanted = cycle[turn % len(cycle)]
             allowed = allowed_phases(infos, agent, self._phases[agent])
-            actions[agent] = wanted if allowed[wanted] else int(allowed.argmax())
+            actions[agent] = permitted(wanted, allowed)
         return actions
 
 

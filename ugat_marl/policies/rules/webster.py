@@ -10,7 +10,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ugat_marl.envs import Actions, Infos, Observations
-from ugat_marl.policies.rules.approaches import Approach, ControlledNetwork, allowed_phases
+from ugat_marl.policies.rules.approaches import (
+    Approach,
+    ControlledNetwork,
+    allowed_phases,
+    permitted,
+)
 
 LONGEST_CYCLE_S = 180.0
 """Longest cycle in seconds; near saturation the formula has no bound."""
@@ -90,7 +95,7 @@ class Webster:
                 ]
             wanted = self._left[agent].pop(0)
             allowed = allowed_phases(infos, agent, len(approach.served))
-            actions[agent] = wanted if allowed[wanted] else int(allowed.argmax())
+            actions[agent] = permitted(wanted, allowed)
         return actions
 
     def plan(self, agent: str) -> list[int]:
