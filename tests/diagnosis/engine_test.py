@@ -23,7 +23,7 @@ from ugat_marl.diagnosis.engine import (
     _signals_hash,
     locked_up,
 )
-from ugat_marl.diagnosis.features import BIN_FEATURES, FEATURES, DetectorLayout
+from ugat_marl.diagnosis.features import BIN_FEATURES, FEATURES, DetectorLayout, tally
 from ugat_marl.diagnosis.replay import Day, Replay, Unmeasured
 from ugat_marl.diagnosis.thresholds import Thresholds
 from ugat_marl.effects import Effect, apply_detector_effects, load_scenario, parse_domain
@@ -171,7 +171,7 @@ def test_simulated_days_tell_no_more_than_the_measured_ones(
         scenario, layout, SameDay(layout), [measured], 3, THRESHOLDS, cache=tmp_path, workers=1
     )
     (simulated,) = made.replicates((), [0])
-    (seen,) = made.measured([measured])
+    seen = tally(made.layout, measured, made.layout.greens(measured), THRESHOLDS)
     assert np.allclose(simulated.tally.sums, seen.sums)
     with_all = Engine(
         scenario, layout, SameDay(layout), [day], 3, THRESHOLDS, cache=tmp_path, workers=1
@@ -401,7 +401,7 @@ def test_measured_periods_are_tallied_under_their_own_signals(
     streets = Streets(layout)
     streets.simulate((), PERIODS[0], 0)
     seen = streets.simulate((), PERIODS[0], 5).period
-    (counted,) = made.measured([seen])
+    counted = tally(made.layout, seen, made.layout.greens(seen), THRESHOLDS)
     assert counted.sums.shape == day.tally.sums.shape
     assert counted.days == 1
 

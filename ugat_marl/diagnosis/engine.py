@@ -318,13 +318,6 @@ class Engine:
         """Number of simulated days used so far, with days from the cache."""
         return len(self._known)
 
-    def measured(self, periods: Sequence[Period]) -> list[Tally]:
-        """Return the tallies of measured periods."""
-        return [
-            tally(self.layout, period, self.layout.greens(period), self._thresholds)
-            for period in periods
-        ]
-
     @contextlib.contextmanager
     def watched(self, advance: Callable[[], None], most: int) -> Iterator[None]:
         """Report new days, for work that needs an unknown number of days.

@@ -582,7 +582,7 @@ class LaneEstimate:
     config: DetectionConfig = field(default_factory=DetectionConfig)
     step_s: float = 1.0
     _known: dict[str, tuple[list[_Seen], _Rate]] = field(
-        default_factory=dict[str, tuple[list["_Seen"], "_Rate"]], compare=False, repr=False
+        default_factory=dict[str, tuple[list[_Seen], _Rate]], compare=False, repr=False
     )
 
     def incoming(self, name: str) -> list[LaneCourse]:
