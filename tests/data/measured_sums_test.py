@@ -149,6 +149,14 @@ def test_findings_say_what_one_more_kind_of_data_would_decide(
     assert set(SUMMED) <= ruled_out(only)
     text = next(x.text for x in only.findings if x.text.startswith("counts only"))
     assert "with occupancy or mean_speed_mps in counts.csv also" in text
+    probes = sums().travel_times
+    assert probes is not None
+    columns = (
+        pl.lit(None, pl.Float64).alias("occupancy"),
+        pl.lit(None, pl.Float64).alias("mean_speed_mps"),
+    )
+    blank = replace(bare, counts=given.counts.with_columns(columns), travel_times=probes.clear())
+    assert ruled_out(read(blank, "blank")) == ruled_out(only), "tables without a value tell nothing"
     half = read(replace(given, counts=given.counts.drop(missing)), "half")
     word = missing.removesuffix("_mps").replace("_", " ")
     assert any(f"counts.csv: no {word};" in x.text for x in half.findings)

@@ -7,6 +7,7 @@ from collections.abc import Collection, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
+import polars as pl
 from numpy.typing import NDArray
 
 from ugat_marl.data.measured.values import Finding, MeasuredData
@@ -214,10 +215,10 @@ def _of_kinds(measured: MeasuredData, network: Network) -> Iterator[Finding]:
 def _of_counts(measured: MeasuredData, network: Network) -> Iterator[Finding]:
     """Yield findings on data without single vehicles, and what one more kind would show."""
     counts = measured.counts
-    columns = () if counts is None else counts.columns
+    columns = () if counts is None else [name for name in counts.columns if counts[name].count()]
     more = {"occupancy": "occupancy", "mean speed": "mean_speed_mps"}
     missing = [name for name, column in more.items() if column not in columns]
-    others = measured.travel_times is not None or measured.lanes is not None
+    others = _has_rows(measured.travel_times) or _has_rows(measured.lanes)
     summed = len(missing) < len(more) or others
     shown = {*COUNTABLE, *(SUMMED if summed else ())}
     hidden = tuple(sorted(set(known_effects()) - shown))
@@ -244,12 +245,16 @@ def _of_counts(measured: MeasuredData, network: Network) -> Iterator[Finding]:
         )
 
 
+def _has_rows(table: pl.DataFrame | None) -> bool:
+    return table is not None and not table.is_empty()
+
+
 def _of_each_kind(
     measured: MeasuredData, network: Network, seen: Collection[str]
 ) -> Iterator[Finding]:
     """Yield findings on kinds of detectors of which none is among those that saw vehicles."""
     kinds = {detector.kind for detector in measured.detectors if detector.id in seen}
-    turns = measured.turning is not None
+    turns = _has_rows(measured.turning)
     shared = any(
         len({link.to_edge for link in intersection.links if link.from_lane == lane}) > 1
         for intersection in network.intersections
