@@ -132,7 +132,7 @@ def test_the_page_of_the_environment_says_what_the_code_does() -> None:
     assert sorted(named) == sorted(["reward", *get_args(RewardName)])
     assert f"`{EnvOptions().reward}` (default)" in rewards
     measured = set(re.findall(r"`(\w+)`", ends.partition("| field |")[2]))
-    assert measured == {field.name for field in fields(Scores)} - {"hidden"}
+    assert measured == {field.name for field in fields(Scores)}
     told = options.partition("| option |")[2].partition("\n\n")[0]
     first = [row.split("|")[1] for row in told.splitlines()[2:]]
     assert {name for cell in first for name in re.findall(r"`(\w+)`", cell)} == {

@@ -42,7 +42,7 @@ def play(page: str, python: list[str], tmp_path: Path) -> Path:
 
 def test_from_clone_to_own_city(python: list[str], tmp_path: Path) -> None:
     clone = play("first-city.md", python, tmp_path)
-    for left in ("runs/first/report.html", "runs/first/before-after.gif", "both.html",
+    for left in ("runs/snow/report.html", "runs/snow/before-after.gif", "both.html",
                  "my-city/scenario.toml", "my-city-pictures"):  # fmt: skip
         assert (clone / left).exists(), left
     assert "Missing here" not in (clone / "both.html").read_text(encoding="utf-8")
