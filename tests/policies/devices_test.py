@@ -191,7 +191,7 @@ def test_tensors_of_both_devices_do_not_meet(standin: torch.device) -> None:
 
 SIZES = [(7, 3), (5, 2), (6, 2)]
 """Numbers observed and phases of each intersection: four lanes or three, and which phase is on."""
-SETTINGS = {"hidden": (16, 16), "batch_size": 8, "warmup_decisions": 10, "replay_capacity": 40}
+SETTINGS = {"hidden": (16, 16), "batch_size": 8, "warmup_decisions": 10, "replay_capacity": 20}
 KINDS = {
     "independent": DQNConfig(**SETTINGS),
     "shared": DQNConfig(**SETTINGS, shared=True),
@@ -211,8 +211,8 @@ def junction(width: int, phases: int) -> Junction:
 
 def learner(kind: str, device: torch.device, *, greedy: bool, seed: int = 0) -> tuple[DQN, Noise]:
     """A learner and where it learns; unless `greedy`, no action depends on what was learnt."""
-    env = Noise(SIZES, decisions=30)
-    end = {"epsilon_end": 0.1, "epsilon_decay_decisions": 30} if greedy else {"epsilon_end": 1.0}
+    env = Noise(SIZES, decisions=16)
+    end = {"epsilon_end": 0.1, "epsilon_decay_decisions": 16} if greedy else {"epsilon_end": 1.0}
     structure = None
     if kind == "frap":
         structure = Structure("frap", tuple(junction(*sizes) for sizes in SIZES))
@@ -238,7 +238,7 @@ def test_dqn_learns_the_same_elsewhere(kind: str, device: torch.device) -> None:
     one, told, values = trained(kind, CPU, greedy)
     other, told_there, values_there = trained(kind, device, greedy)
     assert other._weights.device.type == device.type and one._weights.device == CPU
-    assert one.updates == other.updates > 40
+    assert one.updates == other.updates > 20
     for numbers, there in zip(told, told_there, strict=True):
         assert_same(list(numbers.values()), list(there.values()), device)
     for agent, own in values.items():
