@@ -10,7 +10,7 @@ import pytest
 
 from ugat_marl.errors import OptionError
 from ugat_marl.experiments.settings import LearnerSpec
-from ugat_marl.policies import DQNConfig, own_name
+from ugat_marl.policies import DQNConfig, is_own, own_name
 
 
 def test_weights_to_begin_with_count_by_their_content(tmp_path: Path) -> None:
@@ -74,5 +74,7 @@ def test_learners_with_other_values_are_other_learners() -> None:
         assert identity(one) != identity(other)
     assert identity(within(1)) == identity(within(1))
     assert identity(partial(Held, phase=1)) == identity(partial(Held, phase=1))
-    held = LearnerSpec(own_name(partial(Held, phase=0)), (), DQNConfig()).identity
+    named = own_name(partial(Held, phase=0))
+    assert is_own(named) and named != own_name(Held)
+    held = LearnerSpec(named, (), DQNConfig()).identity
     assert held["source"] == LearnerSpec(own_name(Held), (), DQNConfig()).identity["source"]

@@ -65,6 +65,8 @@ def own_name(given: Any) -> str:
     """Return the name ``module:name`` of an object, under which `load_own` finds it here."""
     kind = _named(given)
     name = f"{kind.__module__}:{kind.__qualname__}"
+    if isinstance(given, functools.partial):
+        name += ".<partial>"  # without its arguments no other process may take the class for it
     _given[name] = given
     return name
 
