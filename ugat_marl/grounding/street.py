@@ -434,16 +434,21 @@ class Known:
     simulated: tuple[Simulated, ...] = ()
     posterior: Posterior | None = None
 
+    def new_worlds(self, config: StreetConfig) -> int:
+        """Return how many worlds the next fit simulates."""
+        return config.simulations if self.posterior is None else config.further
+
     def rounds(self, config: StreetConfig) -> list[tuple[int, int]]:
         """Return how many worlds of each round come from the prior and from the posterior so far.
 
         Few worlds of the prior are near any one street. Those of the posterior are, and the
         regression is most accurate where its worlds are.
         """
+        worlds = self.new_worlds(config)
         if self.posterior is None:
-            aimed = int(AIMED * config.simulations)
-            return [(config.simulations - aimed, 0), (0, aimed)]
-        return [(config.further // 2, config.further - config.further // 2)]
+            aimed = int(AIMED * worlds)
+            return [(worlds - aimed, 0), (0, aimed)]
+        return [(worlds // 2, worlds - worlds // 2)]
 
 
 def fit_street(
@@ -538,8 +543,7 @@ def street_log(
 def episodes_of_fit(config: StreetConfig, known: Known) -> int:
     """Return the number of episodes that `fit_street` simulates."""
     baseline = BASELINE_EPISODES if "eyes" in config.parts else 0
-    worlds = config.simulations if known.posterior is None else config.further
-    return baseline + worlds * config.simulates
+    return baseline + known.new_worlds(config) * config.simulates
 
 
 class DrawnEnv(BaseParallelWrapper[str, Any, Any]):

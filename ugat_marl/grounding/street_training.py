@@ -323,7 +323,7 @@ class StreetTraining(Algorithm):
         real, known = TransitionLog.concatenate(state.real), state.transform.known
         config = self.config.street.of_log(real)
         number = episodes_of_fit(config, known)
-        worlds = len(known.simulated) + sum(map(sum, known.rounds(config)))
+        worlds = len(known.simulated) + known.new_worlds(config)
         if config.simulates and worlds < ENOUGH:
             self.run.reporter.say(
                 f"{iteration_name(state)}: {worlds} simulations are few, so chances and "

@@ -24,6 +24,7 @@ from ugat_marl.scenarios.csv_tables import columns_of, delimiter_of, rows_of
 from ugat_marl.scenarios.junctions import Link, foes_of, right_on_red_of, yields_of
 from ugat_marl.scenarios.network import Intersection, Network
 from ugat_marl.scenarios.phases import (
+    Clash,
     RightOfWay,
     are_foes,
     kerb_turn_of,
@@ -174,10 +175,12 @@ def plan_states(
     width = max([width, *(len(state) for _, state in light.programme)])
     times, shown = _times(plan)
     states: list[tuple[float, str]] = []
+    clash = _plan_clash(light, rules)
     for begin, end in pairwise(times):
         green, yellow = _signals((begin + end) / 2, shown)
         state = _state(green, yellow, light, codes, rules, width)
-        if pair := _crossing([link for link in light.links if codes[link] in green], light, rules):
+        going = [link for link in light.links if codes[link] in green]
+        if pair := next((pair for pair in combinations(going, 2) if clash(*pair)), None):
             raise ScenarioError(
                 f"{source}: light {plan.light!r}: {codes[pair[0]]} and {codes[pair[1]]} are green "
                 "together and cross or merge; give them phases of their own"
@@ -241,31 +244,23 @@ def _times(plan: SignalPlan) -> tuple[list[float], _Shown]:
     return kept, shown
 
 
-def _crossing(
-    going: Sequence[Link], light: Intersection, rules: RightOfWay
-) -> tuple[Link, Link] | None:
-    """Return two greens that cross or merge and must not be green together.
+def _plan_clash(light: Intersection, rules: RightOfWay) -> Clash:
+    """Return a test if two links cross or merge and must not be green together.
 
     Left turns may let opposite traffic pass, and opposite left turns may be drawn so tightly that
     they touch. A right turn may merge. `conflicting_greens` permits more, as networks that somebody
     made are to be taken as they are.
     """
-    clash = permitted_clash(light.links, rules)
+    permitted = permitted_clash(light.links, rules)
     opposite = opposite_approaches(light.links, rules)
 
-    def may_go(a: Link, b: Link) -> bool:
+    def clash(a: Link, b: Link) -> bool:
         turns = kerb_turn_of(a), kerb_turn_of(b)
-        merging = a.to_edge == b.to_edge and "r" in turns
-        return merging or (turns == ("l", "l") and opposite(a, b)) or not clash(a, b)
+        if a.from_edge == b.from_edge or (a.to_edge == b.to_edge and "r" in turns):
+            return False
+        return permitted(a, b) and not (turns == ("l", "l") and opposite(a, b))
 
-    return next(
-        (
-            (a, b)
-            for a, b in combinations(going, 2)
-            if a.from_edge != b.from_edge and not may_go(a, b)
-        ),
-        None,
-    )
+    return clash
 
 
 def _signals(time_s: float, shown: _Shown) -> tuple[set[str], set[str]]:

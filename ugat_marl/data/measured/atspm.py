@@ -414,9 +414,11 @@ def _states(
     colours = {source: RED for link_sources in links for source, _ in link_sources}
     later: list[_Event] = []
     seen: set[Source] = set()
+    since = period.begin_s
     for event in events:
         if event.time_s <= period.begin_s:
             colours[event.source] = event.colour
+            since = event.time_s
             continue
         if event.source not in seen:
             # The log may have a gap before the period. This event shows the colour until now.
@@ -436,8 +438,7 @@ def _states(
             letters[link] = letters[link].replace("r", "s")
         return "".join(letters)
 
-    earlier = [event.time_s for event in events if event.time_s <= period.begin_s]
-    log = [(max(earlier, default=period.begin_s), state())]
+    log = [(since, state())]
     for index, event in enumerate(later):
         colours[event.source] = event.colour
         if index + 1 < len(later) and later[index + 1].time_s == event.time_s:

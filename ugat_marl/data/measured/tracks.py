@@ -175,23 +175,12 @@ def passages_of_tracks(
         rows: dict[tuple[str, str], list[tuple[float, ...]]] = {}
         for part in own.partition_by("vehicle_id", maintain_order=True):
             _collect(_Track.of(part), by_lane, rows)
-        seen = {
-            detector.id: [
-                _passages(rows[key])
-                for lane in detector.lanes
-                if (key := (detector.id, lane)) in rows
-            ]
-            for detector in detectors
-        }
+        seen = {detector.id: _over(detector, rows) for detector in detectors}
         found.append(
             {
-                name: passages_as_written(
-                    lanes[0] if len(lanes) == 1 else Passages.together(lanes),
-                    period.begin_s,
-                    period.end_s,
-                )
-                for name, lanes in seen.items()
-                if lanes
+                name: passages_as_written(passages, period.begin_s, period.end_s)
+                for name, passages in seen.items()
+                if passages is not None
             }
         )
     if not any(found):
@@ -221,6 +210,17 @@ def _collect(
         for detector in by_lane.get(lane, ()):
             if (passage := track.passage(detector, begin, end)) is not None:
                 rows.setdefault((detector.id, lane), []).append(passage)
+
+
+def _over(
+    detector: Detector, rows: Mapping[tuple[str, str], list[tuple[float, ...]]]
+) -> Passages | None:
+    """Return the passages over a detector, from those over each of its lanes; None without any."""
+    keys = [(detector.id, lane) for lane in detector.lanes]
+    lanes = [_passages(rows[key]) for key in keys if key in rows]
+    if len(lanes) > 1:
+        return Passages.together(lanes)
+    return lanes[0] if lanes else None
 
 
 def _passages(rows: list[tuple[float, ...]]) -> Passages:

@@ -26,7 +26,7 @@ from pydantic import TypeAdapter, ValidationError
 from ugat_marl.data import installed_version
 from ugat_marl.envs import AnyParallelEnv
 from ugat_marl.errors import OptionError, UnknownNameError, install_command
-from ugat_marl.policies.learners.dqn_config import DQNConfig, Usual, UsualName, UsualSizes
+from ugat_marl.policies.learners.dqn_config import DQNConfig, UsualValue
 from ugat_marl.policies.own import OwnLearnerFactory, is_own, load_own, own_learner_options
 from ugat_marl.policies.protocols import Learner
 
@@ -172,7 +172,8 @@ def suite_config(name: str, given: DQNConfig | None = None) -> DQNConfig:
     changed = {
         key: value
         for key, value in values.items()
-        if value != getattr(usual, key) or (key in _OF_THE_NAME and not _is_usual(value))
+        if value != getattr(usual, key)
+        or (key in _OF_THE_NAME and not isinstance(value, UsualValue))
     }
     settled = {"teacher": own.teacher or None, "network": str(own.network)}
     return replace(own, **{**settled, **changed})
@@ -196,10 +197,6 @@ def lesson_episodes(name: str, given: DQNConfig | None = None, *, known: bool = 
 
 _OF_THE_NAME = ("hidden", "network", "steps", "warmup_decisions", "epsilon_decay_decisions")
 """Settings that the name of a learner decides, unless they are given, even as DQN's defaults."""
-
-
-def _is_usual(value: object) -> bool:
-    return isinstance(value, Usual | UsualName | UsualSizes)
 
 
 def observed_options(name: str) -> dict[str, Any]:

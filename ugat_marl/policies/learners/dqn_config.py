@@ -15,28 +15,28 @@ They are enough for a quantile, and too few to reach back to the exploration at 
 """
 
 
-class Usual(int):
-    """Default of a number; a preset replaces it, unless the same number is given."""
-
-    # A cache of defaults, such as the command line's, has to tell it from the number it equals
-    def __hash__(self) -> int:
-        return hash((Usual, int(self)))
-
-
-class UsualSizes(tuple[int, ...]):
-    """Default of sizes; a learner's own sizes replace it, unless the same sizes are given."""
-
-    def __hash__(self) -> int:
-        return hash((UsualSizes, tuple(self)))
-
-
-class UsualName(str):
-    """Default of a name; a learner's own name replaces it, unless the same name is given."""
+class UsualValue:
+    """Default that a preset or a learner replaces, unless the same value is given."""
 
     __slots__ = ()
 
+    # A cache of defaults, such as the command line's, has to tell it from the value it equals
     def __hash__(self) -> int:
-        return hash((UsualName, str(self)))
+        return hash((type(self), super().__hash__()))
+
+
+class Usual(UsualValue, int):
+    """Default of a number."""
+
+
+class UsualSizes(UsualValue, tuple[int, ...]):
+    """Default of sizes."""
+
+
+class UsualName(UsualValue, str):
+    """Default of a name."""
+
+    __slots__ = ()
 
 
 _MLP: Any = UsualName("mlp")
