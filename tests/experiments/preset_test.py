@@ -79,6 +79,10 @@ def test_the_preset_is_paid_by_the_queue_at_the_light() -> None:
     assert TransferConfig("single-v1").reward == "total-queue"
     assert TransferConfig("single-v1", preset="paper").reward == "queue"
     assert TransferConfig("single-v1", preset="paper", reward="queue").reward == "queue"
+    with pytest.raises(OptionError, match="'queue', not 'total-queue'"):
+        TransferConfig("single-v1", preset="paper", reward="total-queue")
+    with pytest.raises(SystemExit):
+        command(TransferConfig, "single-v1", "--reward", "total-queue")
     with pytest.raises(OptionError, match="not 'pressure'"):
         TransferConfig("single-v1", preset="paper", reward="pressure")
 

@@ -23,7 +23,7 @@ from ugat_marl.experiments.evaluation import OwnPolicyFactory, policy_factory
 from ugat_marl.experiments.jobs import EVALUATION_SEED, file_stem
 from ugat_marl.experiments.scores import Evaluation
 from ugat_marl.experiments.transfers import TransferConfig, transfer
-from ugat_marl.grounding import UgatConfig
+from ugat_marl.grounding import USUAL_REWARD, UgatConfig
 from ugat_marl.parallel import Workers
 from ugat_marl.policies import DQNConfig, PolicyFactory, own_name
 from ugat_marl.progress import Reporter, usual
@@ -70,7 +70,7 @@ def train(
     grounded_episodes: int = UgatConfig.grounded_episodes,
     real_rollouts: int = UgatConfig.real_rollouts,
     observation: str | None = None,
-    reward: str = "total-queue",
+    reward: str = USUAL_REWARD,
     control: bool = True,
     evaluation_seeds: int = 5,
     duration_s: float | None = None,

@@ -41,6 +41,7 @@ from ugat_marl.experiments.tuning import BUDGET, LEAST_BUDGET
 from ugat_marl.grounding import (
     MATCHED_REWARDS,
     PARTS,
+    USUAL_REWARD,
     FitConfig,
     GateConfig,
     InputsConfig,
@@ -345,7 +346,7 @@ class PaperConfig:
     evaluation_seeds: int = 5
     rule_budget: int = BUDGET
     observation: str | None = None
-    reward: str = "total-queue"
+    reward: str = USUAL_REWARD
     neighbours: int = 0
     duration_s: float | None = None
     learner: str = ""

@@ -60,6 +60,7 @@ from ugat_marl.files import file_hash, require_writable, write_whole
 from ugat_marl.grounding import (
     DIRECT_LEARNER,
     NEGATIVE_CONTROLS,
+    USUAL_REWARD,
     NegativeControl,
     UgatConfig,
     as_published,
@@ -143,7 +144,7 @@ class TransferConfig:
     real_log: Path | None = None
     seed: int = 0
     observation: str | None = None
-    reward: str = "total-queue"
+    reward: str = USUAL_REWARD
     neighbours: int = 0
     duration_s: float | None = None
     evaluation_seeds: int = 5

@@ -4,6 +4,7 @@ from .algorithm import Probe as Probe
 from .channel import CommandChannel as CommandChannel
 from .channel import fit_channel as fit_channel
 from .channel import require_histories as require_histories
+from .config import USUAL_REWARD as USUAL_REWARD
 from .config import UgatConfig as UgatConfig
 from .config import as_published as as_published
 from .config import published_reward as published_reward

@@ -8,7 +8,6 @@ from typing import Any, Literal
 
 from ugat_marl.data import AgentLayout
 from ugat_marl.errors import OptionError, UnknownNameError, require_least
-from ugat_marl.grounding.delays import MATCHED_REWARDS
 from ugat_marl.grounding.fitting import FitConfig
 from ugat_marl.grounding.forward import ForwardConfig
 from ugat_marl.grounding.gate import GateConfig
@@ -19,7 +18,7 @@ from ugat_marl.grounding.street import StreetConfig
 from ugat_marl.grounding.timed import TimedConfig, TimedTransform
 from ugat_marl.grounding.transform import Transform
 from ugat_marl.grounding.view import InputsConfig, Neighbours
-from ugat_marl.policies import Usual
+from ugat_marl.policies import Usual, UsualName
 
 GROUNDINGS = ("phase", "timed", "street")
 
@@ -210,12 +209,16 @@ def as_published(config: UgatConfig) -> UgatConfig:
     return published
 
 
+USUAL_REWARD: str = UsualName("total-queue")
+"""Default reward of a training."""
+
+
 def published_reward(reward: str) -> str:
     """Return the reward of Algorithm 1 as published, in place of the default.
 
     Raises:
         OptionError: Another reward was given.
     """
-    if reward not in MATCHED_REWARDS:
+    if reward != "queue" and not isinstance(reward, UsualName):
         raise OptionError(f"preset paper trains with the reward 'queue', not {reward!r}")
     return "queue"
