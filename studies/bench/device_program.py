@@ -61,7 +61,7 @@ class Updates:
         began = time.perf_counter()
         for _ in range(self._updates):
             self._learner.update(self._generator)
-            self._learner._acting.network(self._learner.updates)
+            self._learner._acting.network()
         return 1e3 * (time.perf_counter() - began) / self._updates
 
 

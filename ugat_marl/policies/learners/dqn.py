@@ -125,7 +125,7 @@ class Acting:
     """Networks that choose the actions of a training, always on the CPU.
 
     If the learning networks are on the CPU, they also choose. If they are on a GPU, a copy on the
-    CPU chooses, and takes over their weights after updates.
+    CPU chooses, which takes over their weights before every decision.
 
     Args:
         online: The learning networks.
@@ -134,21 +134,15 @@ class Acting:
 
     def __init__(self, online: nn.Module, weights: nn.Parameter) -> None:
         self._network, self._weights, self._online_weights = online, weights, weights
-        self._updates = -1
         if weights.device != CPU:
             self._network = copy.deepcopy(online).to(CPU)
             self._weights = flatten_parameters(self._network)
 
-    def network(self, updates: int) -> nn.Module:
-        """Return networks with the weights after `updates` updates."""
-        if self._weights is not self._online_weights and self._updates != updates:
+    def network(self) -> nn.Module:
+        """Return networks with the weights that the learning networks have now."""
+        if self._weights is not self._online_weights:
             self._weights.data.copy_(self._online_weights.data)
-            self._updates = updates
         return self._network
-
-    def forget(self) -> None:
-        """Copy the weights at the next call, also without a new update."""
-        self._updates = -1
 
 
 class DQN:
@@ -392,7 +386,7 @@ class DQN:
         now, allowed = self.agents.stack(observations), self.agents.masks(infos)
         while env.agents:
             epsilon = self.config.epsilon(self.decisions, taught=self.taught > 0)
-            acting = self._acting.network(self.updates)
+            acting = self._acting.network()
             seen = torch.from_numpy(now) * self._inputs[:, 0]
             greedy = greedy_actions(acting, seen, torch.from_numpy(allowed))
             actions = explore.choose(greedy, allowed, epsilon)
@@ -529,7 +523,6 @@ class DQN:
         weights = start.weights_for(self._online)
         self._weights.data.copy_(weights)
         self._target_weights.data.copy_(weights)
-        self._acting.forget()
 
     def set_learning_rate(self, rate: float) -> None:
         """Change the step size of Adam."""
@@ -619,7 +612,6 @@ class DQN:
         if moments:  # Adam reads them on the device of the weights, contiguous
             placed = {name: moments[name].contiguous().to(self.device) for name in _MOMENTS}
             self._adam.state[self._weights] = placed
-        self._acting.forget()
 
     def _moments(self) -> dict[str, Tensor]:
         weights = self._weights.data
