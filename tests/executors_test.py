@@ -340,7 +340,7 @@ def test_ray_replaces_a_worker_that_is_stopped(
 
 
 def test_what_is_watched_is_played_here(ray: Executor) -> None:
-    with pytest.raises(OptionError, match="must be played here"):
+    with pytest.raises(OptionError, match="needs workers in this process"):
         evaluate(
             load_scenario("single-v1"), {"r": rule_factory("random")}, ["sim"], [1],
             workers=ray, watch=lambda name, env: lambda step: None,

@@ -46,7 +46,7 @@ exhaust the stack of whatever walks through them."""
 _LONGEST = 64 << 20
 """Most bytes of a JSON or TOML file; those of the suite have less than a hundredth of it."""
 _LARGEST = 1 << 256
-"""Largest integer of a JSON or TOML file. One beyond 2^1024 is no float; the state of a random
+"""Largest integer of a JSON or TOML file. One beyond 2^1024 is not a float; the state of a random
 generator has 128 bits."""
 _TOO_DEEP = f"more than {_DEEPEST} tables or lists inside each other, which no such file needs"
 _TOO_LONG = "a number is far too long, which no such file needs"

@@ -54,7 +54,7 @@ class FieldSoakBench:
         """
         network = load_scenario(self.scenario).network.path
         if network is None or not (network.parent / "scenario.toml").exists():
-            raise MeasurementError(f"{self.scenario}: is no directory; take a shipped scenario")
+            raise MeasurementError(f"{self.scenario}: is not a directory; take a shipped scenario")
         asked = {
             "directory": str(network.parent),
             "seconds": 3600 * self.hours,

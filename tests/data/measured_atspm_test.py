@@ -375,7 +375,7 @@ def test_a_recording_that_became_a_log_is_the_same_recording(
 @pytest.mark.parametrize(
     ("old", "new", "message"),
     [
-        ('tls = "C"', 'tls = "D"', "'D' is no traffic light of the network; it has C"),
+        ('tls = "C"', 'tls = "D"', "'D' is not a traffic light of the network; it has C"),
         ("4 = [1]", "4 = []", r"nothing says what the links 1 of 'C' show.*devices.constant"),
         ("4 = [1]", "4 = [1, 2]", "link 2 does not exist; 'C' has the links 0 to 1"),
         ("channel = 6", "channel = 5", "channel 5 is mapped twice"),
@@ -387,7 +387,7 @@ def test_a_recording_that_became_a_log_is_the_same_recording(
         ("position_m = 487", 'position_m = "487"', r"detectors.0.position_m: Input should be a v"),
         ("channel = 5", "channel = true", r"detectors.0.channel: Input should be a valid integer"),
         ("4 = [1]", "4 = [true]", r"phases.4.green.0: Input should be a valid integer"),
-        ("4 = [1]", "0_4 = [1]", r"'0_4' is no number; write plain digits"),
+        ("4 = [1]", "0_4 = [1]", r"'0_4' is not a number; write plain digits"),
         ("zero =", "zeros =", "zeros: Extra inputs are not permitted"),
         ("zero = [2024-03-05T07:00:00]", "", "give zero .* or .*periods"),
         ("07:00:00]", "07:00:00Z]", "write local time without one"),

@@ -146,7 +146,7 @@ def test_rows_in_any_order_are_sorted(read: Read) -> None:
         changes={"detections": lambda f: f.sample(fraction=1, shuffle=True, seed=1)}
     )
     assert found.hash == recording().hash
-    only(findings, "detections.parquet", "come before an earlier one; they were sorted")
+    only(findings, "detections.parquet", "are earlier than the row before them; they were sorted")
 
 
 def test_detectors_one_after_the_other_are_in_order(read: Read) -> None:
@@ -180,7 +180,7 @@ def test_a_clock_set_back_is_an_error(read: Read, jump: float) -> None:
             pl.when(late).then(pl.col("time_s") - jump).otherwise("time_s").alias("time_s")
         )
 
-    with pytest.raises(MeasuredDataError, match=r"steps back by [\d.]+ s.*there twice"):
+    with pytest.raises(MeasuredDataError, match=r"steps back by [\d.]+ s.*occur twice"):
         read(changes={"detections": back})
     with pytest.raises(MeasuredDataError, match=r"traffic light 'C'.* steps back"):
         read(changes={"signals": back})

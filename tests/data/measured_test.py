@@ -404,7 +404,10 @@ WRONG: dict[str, tuple[dict[str, Change], str]] = {
     "all held out": ({"periods.csv": replaced("fit", "heldout", 9)}, r"every period is held out"),
     "no periods": ({"periods.csv": lambda text: text.split("\n")[0] + "\n"}, r"no periods"),
     "empty file": ({"periods.csv": lambda _: ""}, r"empty"),
-    "unknown traffic light": ({"signals.csv": replaced(",C,", ",D,")}, r"'D' is no traffic light"),
+    "unknown traffic light": (
+        {"signals.csv": replaced(",C,", ",D,")},
+        r"'D' is not a traffic light",
+    ),
     "state of another length": (
         {"signals.csv": replaced("Gr", "Grr")},
         r"3 letters, but.* 2 links",

@@ -164,7 +164,7 @@ def test_crossings_in_yellow_and_in_red() -> None:
     found = counted({"stop:in_0": passages([t - 0.5 for t in off], off)})
     assert of(found, "yellow_crossings") == (2, 2)  # 41, 92
     assert of(found, "late_crossings") == (1, 2)  # 44: at most 2 s of red
-    assert of(found, "red_crossings") == (1, 2)  # 47: 4 s; 52 is no clearance any more
+    assert of(found, "red_crossings") == (1, 2)  # 47: 4 s; 52 is not a clearance any more
     assert of(found, "last_crossing") == (1.0 + 4.0 + 2.0, 3)
 
 
@@ -245,7 +245,10 @@ def test_moving_platoons_at_the_advance_detector() -> None:
     on = (20.0, 21.5, 23.5, 33.5, 35.0)
     seen = {"advance:in_0": passages(on, speed=(12.0, 12.0, 12.0, 12.0, 5.0))}
     found = counted(seen)
-    assert of(found, "platoon_gap") == (1.5 + 2.0, 2)  # 10 s is no platoon, 5 m/s is no motion
+    assert of(found, "platoon_gap") == (
+        1.5 + 2.0,
+        2,
+    )  # 10 s is not a platoon, 5 m/s is not a motion
     assert of(found, "platoon_short") == (1, 2)
     assert of(found, "platoon_middle") == (2, 2)
     assert of(found, "platoon_time") == (1.0, 2)

@@ -310,7 +310,7 @@ def test_a_further_effect_is_compared_on_equal_numbers_of_days() -> None:
     found = selector._fitted(start, [(DEMAND,)], 1, "candidates")
     assert found.model.members == (HEADWAY, DEMAND)
     ledger.costs[both] = 1000.0 - THRESHOLDS.price / 2
-    selector.test = lambda model: pytest.fail("half a price is no gain")
+    selector.test = lambda model: pytest.fail("half a price is not a gain")
     assert selector._fitted(start, [(DEMAND,)], 1, "candidates") is None
 
 

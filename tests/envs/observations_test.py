@@ -182,7 +182,7 @@ def test_queue_is_minus_the_halting_vehicles_on_incoming_lanes() -> None:
 
 def test_total_queue_adds_the_vehicles_that_queue_upstream() -> None:
     upstream = np.zeros(len(LANES))
-    upstream[[LANES.index("n"), LANES.index("y")]] = 2.5, 9.0  # y is no incoming lane
+    upstream[[LANES.index("n"), LANES.index("y")]] = 2.5, 9.0  # y is not an incoming lane
     longer = replace(SEEN, queued_upstream=upstream)
     assert Rewarder(NETWORK, "total-queue").rewards(BEFORE, longer) == [-26.5, -45.0, -8.0]
 

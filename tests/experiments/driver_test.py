@@ -211,7 +211,7 @@ def test_more_episodes_train_only_those_and_fewer_are_refused(tmp_path: Path) ->
     parts = perform(PLAIN, tmp_path / "parts", Silent())
     whole = perform(PLAIN, tmp_path / "whole", Silent())
     assert parts.scores == whole.scores and parts.episodes == whole.episodes == 4
-    with pytest.raises(OptionError, match="is beyond it"):
+    with pytest.raises(OptionError, match="was trained past episode"):
         perform(replace(PLAIN, episodes=3), tmp_path / "parts", Silent())
     more = replace(PLAIN, episodes=4, every=0, evaluation_seeds=evaluation_seeds(3))
     assert len(perform(more, tmp_path / "parts", Silent()).scores) == 2 * 2 * 2 + 2

@@ -117,7 +117,7 @@ def run(folder: Path, *words: str) -> None:
         text=True,
         check=False,
     )
-    problems = ("scenario", "check")  # exit code 1 says that something has to be mended
+    problems = ("scenario", "check")  # exit code 1 says that something has to be fixed
     fine = (0, 1) if tuple(words[:2]) == problems and "Traceback" not in done.stderr else (0,)
     assert done.returncode in fine, f"{words}\n{done.stdout[-1000:]}\n{done.stderr[-2000:]}"
 

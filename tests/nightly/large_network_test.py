@@ -22,5 +22,5 @@ def test_a_grid_of_64_is_made_checked_and_trained_on(
     learner = DQN.of(env, DQNConfig(warmup_decisions=10), 0)
     learner.learn(env, 1, 0)
     env.close()
-    assert "nothing to mend" in capsys.readouterr().out
+    assert "nothing to fix" in capsys.readouterr().out
     assert learner.updates > 0

@@ -240,7 +240,7 @@ def test_every_format_is_on_the_page() -> None:
 
 def test_what_cannot_be_exported_is_refused(tmp_path: Path) -> None:
     policy = policy_of(False)
-    with pytest.raises(OptionError, match=r"'\.pt2' is no format.*\.onnx"):
+    with pytest.raises(OptionError, match=r"'\.pt2' is not a format.*\.onnx"):
         export_policy(policy, tmp_path / "policy.pt2")
     with pytest.raises(OptionError, match=r"a_0 \(7 numbers, 3 actions\).*cross_0"):
         export_policy(policy, tmp_path / "policy.npz", ToyTraffic())

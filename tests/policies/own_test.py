@@ -426,7 +426,7 @@ def test_a_class_with_settings_of_its_own_keeps_them() -> None:
     policy = own_policy(Held, "held", ToyTraffic())
     observations, infos = ToyTraffic().reset(seed=0)
     with pytest.raises(OptionError, match="dictionary from every agent to the number of a phase"):
-        policy.act(observations, infos)  # 0.9 is no phase
+        policy.act(observations, infos)  # 0.9 is not a phase
 
 
 @pytest.mark.usefixtures("algorithm")

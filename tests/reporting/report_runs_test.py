@@ -425,7 +425,7 @@ def test_domains_stand_in_columns_and_what_differs_stays_apart(tmp_path: Path) -
     make_run(tmp_path / "snow", real="V4")
     make_run(tmp_path / "other", duration_s=600.0)
     _, page = page_of(tmp_path / "rain", tmp_path / "snow", tmp_path / "other")
-    assert page.text.count("Over training seeds") == 1  # one of its own is no group
+    assert page.text.count("Over training seeds") == 1  # one of its own is not a group
     row = next(
         row for row in page.cells if row[:1] == ["phase (the paper's UGAT)"] and len(row) == 3
     )
@@ -590,7 +590,7 @@ def test_stretches_of_episodes_have_students_interval() -> None:
 def test_steps_are_joined_over_series() -> None:
     rows = means_by_step([[(0, 1.0), (1, np.inf)], [(0, 3.0)]])
     assert rows[0][1] == 2.0 and rows[0][2] < 1.0
-    assert np.isnan(rows[1][1])  # what is infinite once is no mean
+    assert np.isnan(rows[1][1])  # what is infinite once is not a mean
 
 
 def test_the_rim_of_a_radar_is_the_best_value() -> None:

@@ -308,7 +308,7 @@ def test_the_command_prints_tables(
     assert main(["scenario", "check", "single-v1", "--duration-s", "600"]) == 0
     text = capsys.readouterr().out
     for word in ("1 agent, 8 green phases", "Saturation by approach", "largest-queue:20",
-                 "left outside", "headroom: not measured", "nothing to mend"):  # fmt: skip
+                 "left outside", "headroom: not measured", "nothing to fix"):  # fmt: skip
         assert word in text
     assert max(len(line) for line in text.splitlines()) <= 80
 
@@ -317,7 +317,7 @@ def test_turns_that_yield_are_said_to_count_whole(capsys: pytest.CaptureFixture[
     said: list[bool] = []
     for scenario in ("single-v1", "mixed-v1"):  # of the two only the second has such turns
         assert main(["scenario", "check", scenario, "--no-simulate"]) == 0
-        said.append("Permitted greens count whole" in capsys.readouterr().out)
+        said.append("Permitted greens are counted in full" in capsys.readouterr().out)
     assert said == [False, True]
 
 
@@ -338,9 +338,9 @@ def test_an_approach_that_nobody_passed_has_no_delay_in_json(single: Scenario) -
     assert told["approaches"] == {"a": [3.0, 12.5], "b": [0.0, None], "c": [0.0, None]}
 
 
-def test_a_scenario_to_mend_is_an_exit_code(capsys: pytest.CaptureFixture[str]) -> None:
+def test_a_scenario_to_fix_is_an_exit_code(capsys: pytest.CaptureFixture[str]) -> None:
     assert main(["scenario", "check", "single-v1", "--no-simulate", "--duration-s", "60"]) == 1
-    assert "to mend: an episode of 60 s" in capsys.readouterr().out
+    assert "to fix: an episode of 60 s" in capsys.readouterr().out
 
 
 def test_headroom_is_measured_on_request(

@@ -298,7 +298,7 @@ def test_phases_that_never_end_are_refused(shortest: str, crossing: Crossing) ->
     (directory / "extra.add.xml").write_text(f"<additional>{logic}</additional>")
     settings_file = directory / "scenario.toml"
     settings_file.write_text(f'additional = ["extra.add.xml"]\n{settings_file.read_text()}')
-    with pytest.raises(UgatMarlError, match=rf"<phase minDur='{shortest}'> is no time above 0"):
+    with pytest.raises(UgatMarlError, match=rf"<phase minDur='{shortest}'> is not a time above 0"):
         read_scenario(directory)
 
 

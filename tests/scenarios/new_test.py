@@ -389,7 +389,7 @@ def test_nothing_is_overwritten_by_accident(
     assert "exists and is not a scenario" in error
     assert left_over(tmp_path / "photos") == ["one.jpg"]
     assert "is the name of a scenario of the suite" in refused(capsys, "single-v1", *words)
-    assert "is no name for a scenario" in refused(capsys, "..", *words)
+    assert "is not a name for a scenario" in refused(capsys, "..", *words)
     assert left_over(tmp_path) == ["a", "photos"]
 
 

@@ -495,7 +495,7 @@ def test_a_node_without_a_place_is_named(
     (tmp_path / "bad.osm").write_text(re.sub(r'(<node id="6") lat="[^"]*"', r"\1", crossroads()))
     assert made(tmp_path / "a", tmp_path / "bad.osm") == 2
     assert "line 1: the node '6' has no lon and lat" in capsys.readouterr().err
-    for lat in ("999", "north", "nan"):  # of a node that is no crossing, only part of a road
+    for lat in ("999", "north", "nan"):  # of a node that is not a crossing, only part of a road
         text = re.sub(r'(<node id="4") lat="[^"]*"', rf'\1 lat="{lat}"', TOWN.read_text())
         (tmp_path / "bad.osm").write_text(text)
         assert made(tmp_path / "a", tmp_path / "bad.osm") == 2

@@ -229,7 +229,7 @@ GOOD = "A1,60,0,1,1,NBT NBR SBT SBR NBL SBL,30,3,2\nA1,60,0,1,1,EBT EBR WBT WBR 
         (HEAD + GOOD.replace("NBL SBL", "NBL SBL EBL"), "EBL are green together and cross"),
         (HEAD + (GOOD + "A1,60,0,1,1,NBL WBT,30,3,2\n").replace("A1,60", "A1,90"),
          "WBT and NBL are green together and cross or merge"),
-        (HEAD + GOOD.replace("A1", "B7"), "light 'B7' is no agent of scenario"),
+        (HEAD + GOOD.replace("A1", "B7"), "light 'B7' is not an agent of scenario"),
         (HEAD + GOOD.replace("A1,60,0,1,1,EBT", "A1,60,0,2,1,EBT").replace("WBL,30", "WBL,20"),
          "the rings differ before the end of barrier 1 (ring 1 30 s, ring 2 20 s)"),
     ],
@@ -431,7 +431,7 @@ def test_offsets_refer_to_parts_of_phases(
         ({"d1": "ten"}, (), "maxgreen = 'ten' is not a number"),
         ({"referenced": 4}, (), "Referenced To = 4: offsets are read that refer to"),
         ({}, ("8=A1",), "has no plan for an intersection '8'; it has 7"),
-        ({}, ("7=B1",), "'B1' is no agent of the scenario; its agents are A1"),
+        ({}, ("7=B1",), "'B1' is not an agent of the scenario; its agents are A1"),
         ({}, ("7",), "--lights 7: give INTID=LIGHT"),
     ],
 )

@@ -1,7 +1,7 @@
 """Scripts that let a shell complete commands, options and their values.
 
-The scripts hold all words, so that a key press starts no program. They are printed anew after an
-update of the package.
+The scripts hold all words, so that a key press starts no program. Print the script
+again after an update of the package.
 """
 
 from __future__ import annotations

@@ -139,8 +139,7 @@ class Diagnose:
             require_writable(place / "writable")
         except OutputError:
             raise OutputError(
-                f"{place}: simulated days cannot be remembered there; give another folder by "
-                "--cache"
+                f"{place}: simulated days cannot be cached there; name another folder with --cache"
             ) from None
 
     def _commands(self, diagnosis: Diagnosis) -> list[str]:

@@ -17,8 +17,8 @@ from ugat_marl.reporting import titled_table
 
 _TITLES = {
     "observation": "observation gap: controllers see something else",
-    "action": "action gap: commands are executed otherwise",
-    "transition": "transition gap: traffic behaves otherwise",
+    "action": "action gap: commands are executed differently",
+    "transition": "transition gap: traffic behaves differently",
     "reward": "reward gap: the objective is another one",
 }
 

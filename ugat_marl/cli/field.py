@@ -117,7 +117,7 @@ class Field:
         if self.port is not None and not 1 <= self.port <= 65535:
             raise OptionError(f"--port {self.port}: a port is a number from 1 to 65535")
         if not self.start:
-            refuse_options(self, ("domain", "seed"), "they are of the SUMO that --start runs")
+            refuse_options(self, ("domain", "seed"), "only --start uses these options")
         if self.start and self.host != "localhost":
             raise OptionError(f"--start runs SUMO here, and not at --host {self.host}")
         if self.start and (self.port is not None or self.look_for_s or self.detectors != "lanes"):

@@ -54,7 +54,7 @@ class ImportAtspm:
         passages = sum(len(p) for period in measured.periods for p in period.passages.values())
         console.print(
             f"{len(measured.periods)} periods, {len(measured.detectors)} detectors, "
-            f"{passages} vehicles: {self.out}",
+            f"{passages} passages over detectors: {self.out}",
             soft_wrap=True,
         )
         return 0

@@ -26,7 +26,7 @@ _FLAT = ("ugat",)
 
 @dataclass(frozen=True)
 class Report:
-    """Write one HTML page about trainings, which needs no network connection.
+    """Write one self-contained HTML page about trainings.
 
     It reads folders of `ugat-marl train`, jobs and tables of `ugat-marl paper`, or folders of
     these. A training may be unfinished or broken; the page lists the missing parts.

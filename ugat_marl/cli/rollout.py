@@ -83,7 +83,7 @@ class Rollout:
             take.
         observation: Observation to record: movements, count, queue, pressure, waiting, density. The
             learner universal reads movements by default.
-        neighbours: Distance in roads up to which other intersections are observed too.
+        neighbours: Agents also observe intersections up to this many roads away.
         duration_s: Length of an episode in s; default: the scenario's own.
         crossings: Also record when vehicles cross the stop lines, which groundings of greens read.
         workers: Simulations at a time.

@@ -58,7 +58,7 @@ MOST_LIGHTS = 8
 
 @dataclass(frozen=True)
 class ScenarioCheck:
-    """Show facts about a scenario; exit with 1 if something has to be mended.
+    """Show facts about a scenario; exit with 1 if something has to be fixed.
 
     It plays an episode under the network's own programme and one under a good rule.
 
@@ -220,9 +220,9 @@ def show(
     for text in remarks(facts, runs):
         say(f"note: {text}")
     for text in wrong:
-        say(f"to mend: {text}")
+        say(f"to fix: {text}")
     if not wrong:
-        say("nothing to mend")
+        say("nothing to fix")
 
 
 def _table(title: str, *columns: str) -> Table:
@@ -278,12 +278,12 @@ def _greens_of_file(agents: Sequence[IntersectionFacts], names: LightNames) -> l
         kinds.setdefault(greens, []).append(names.text(light.id))
     parts: list[str] = []
     for greens, lights in list(kinds.items())[:MOST_LIGHTS]:
-        known = [f"{n} is green {g}" for n, g in enumerate(greens) if g is not None]
+        known = [f"{n} matches green {g}" for n, g in enumerate(greens) if g is not None]
         if greens == tuple(range(len(greens))):
-            known = ["n is green n"]
-        text = f"phase {', '.join(known)}" if known else "no phase is one of its greens"
+            known = ["n matches green n"]
+        text = f"phase {', '.join(known)}" if known else "no phase matches one of its greens"
         if known and None in greens:
-            text += ", the others are none of its greens"
+            text += ", the others match none of them"
         listed = f"{lights[0]} and {len(lights) - 1} more" if len(lights) > 1 else lights[0]
         parts.append(f"{listed}: {text}")
     return [f"in the file's programme, {part}" for part in parts]
@@ -316,7 +316,7 @@ def _approaches(agents: Sequence[IntersectionFacts], names: LightNames) -> Table
     if any(phase.permitted for light in agents for phase in light.phases):
         table.caption_justify = "left"
         table.caption = (
-            "Permitted greens count whole: where turns wait for others, an approach is fuller."
+            "Permitted greens are counted in full: saturation is higher where turns have to yield."
         )
     for name, road in shown:
         saturation = "no green" if road.saturation is None else f"{road.saturation:.0%}"
@@ -340,7 +340,7 @@ def _headroom(rows: Sequence[HeadroomRow]) -> Table:
     """Return the table of headroom: in each domain, the loss of the rule that is best in sim."""
     holds = [f"{hold_s} s" for hold_s in HOLDS_S]
     table = _table(
-        "Headroom: ATT in s of the largest-queue rule held so long", "domain", *holds,
+        "Headroom: ATT in s of the largest-queue rule, by hold time", "domain", *holds,
         "programme", "lost", "arrived",
     )  # fmt: skip
     for row in rows:

@@ -33,7 +33,7 @@ def write_checkpoint(path: Path, kind: str, content: Mapping[str, Any]) -> None:
         CheckpointError: A number in `content` is not finite. The file at `path` stays unchanged.
         OSError: The disk is full.
     """
-    require_finite(content, str(path), "was not written over")
+    require_finite(content, str(path), "was not overwritten")
     # torch writes the name of a path into the archive, which then differs from run to run.
     with replacing(path) as temporary, temporary.open("wb") as file:
         try:
@@ -71,8 +71,8 @@ def read_checkpoint(path: Path, kind: str) -> dict[str, Any]:
     for name, tensor in _tensors("", content):
         if not _is_plain(tensor):
             raise CheckpointError(
-                f"{path}: {name} is no plain tensor of its size ({tensor.layout}, "
-                f"{tensor.dtype}, {tensor.device}); save it with write_checkpoint"
+                f"{path}: {name} is not a dense tensor that stores all its elements "
+                f"({tensor.layout}, {tensor.dtype}, {tensor.device}); save it with write_checkpoint"
             )
     require_finite(content, str(path), "cannot be used: take an earlier checkpoint or train again")
     return content

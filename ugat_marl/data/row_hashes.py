@@ -153,7 +153,7 @@ def csv_texts(content: bytes) -> pl.DataFrame:
     """Return the cells of a CSV file as text.
 
     Raises:
-        polars.exceptions.PolarsError: The content is no table.
+        polars.exceptions.PolarsError: The content is not a table.
     """
     return pl.read_csv(io.BytesIO(content), infer_schema=False)
 
@@ -330,7 +330,7 @@ def _head(frame: pl.DataFrame, metadata: Mapping[str, str]) -> str:
 
 
 def _groups(frame: pl.DataFrame, rows: int) -> Iterator[str]:
-    """Yield the hash of each group of so many rows."""
+    """Yield the hash of each group of rows."""
     for start in range(0, frame.height, rows):
         digest = hashlib.blake2b(digest_size=16)
         for column in frame.slice(start, rows):

@@ -127,13 +127,15 @@ class Provenance:
             layouts = {name: AgentLayout(**part) for name, part in content.pop("layouts").items()}
             for name, layout in layouts.items():
                 if not all(type(size) is int for size in dataclasses.astuple(layout)):
-                    raise LogError(f"provenance: the sizes of agent {name!r} are no whole numbers")
+                    raise LogError(f"provenance: the sizes of agent {name!r} are not whole numbers")
             for seed in content["seeds"]:
                 if type(seed) is not int or not 0 <= seed < 1 << 63:
-                    raise LogError(f"provenance: {seed!r} among the seeds is no seed of an episode")
+                    raise LogError(
+                        f"provenance: {seed!r} among the seeds is not a seed of an episode"
+                    )
             for told in (*content["versions"].values(), *content["units"].values()):
                 if not isinstance(told, str):
-                    raise LogError(f"provenance: {told!r} is no version and no unit")
+                    raise LogError(f"provenance: {told!r} is neither a version nor a unit")
             return cls(seeds=tuple(content.pop("seeds")), layouts=layouts, **content)
         except (ValueError, TypeError, KeyError, AttributeError) as error:
             raise LogError(f"provenance cannot be understood ({error!r})") from None
@@ -529,10 +531,10 @@ def checked(
         _refuse_rows(frame, bad, column, "holds a number that is not finite")
     for column in CHOICES:
         bad = (pl.col(column) < 0) | (pl.col(column) >= limit)
-        _refuse_rows(frame, bad, column, "is no phase of its agent")
+        _refuse_rows(frame, bad, column, "is not a phase of its agent")
     _refuse_rows(frame, ~pl.col("reward").is_finite(), "reward", "is not finite")
     delay = pl.col("delay_s")
-    _refuse_rows(frame, ~delay.is_finite() | (delay < 0), "delay_s", "is no time to wait")
+    _refuse_rows(frame, ~delay.is_finite() | (delay < 0), "delay_s", "is not a time to wait")
     key = ["episode", "step", "agent"]
     _refuse_rows(frame, pl.struct(key).is_duplicated(), "step", "occurs twice in its episode")
     return frame

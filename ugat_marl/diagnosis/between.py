@@ -85,7 +85,7 @@ class Between:
 
     @classmethod
     def of(cls, measured: MeasuredData) -> Between | None:
-        """Collect the measured data; None if they hold no kind.
+        """Collect turning counts, travel times and lane states; None if the data hold none of them.
 
         Raises:
             MeasuredDataError: A lane was observed in a part of a period only.
@@ -169,7 +169,7 @@ class Between:
         return self._blocks(np.array(counts), self._minutes(period.id), times, states)
 
     def _unobserved(self, period: str) -> list[int]:
-        """Return the indices of lanes that nobody watched in a period, which others have."""
+        """Return the indices of lanes that were observed in other periods, but not in this one."""
         if period not in self.states:
             return []
         return np.flatnonzero(self.states[period][:, 0, 1] == 0).tolist()

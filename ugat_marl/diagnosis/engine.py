@@ -89,7 +89,7 @@ def locked_up(tallies: Sequence[Tally], thresholds: Thresholds, usual: float = 0
 
 
 def _counts(tallies: Sequence[Tally]) -> NDArray[np.float64]:
-    """Return the vehicles counted on each day, from the median of days of the same stretch on."""
+    """Return the vehicles counted on each day, minus the median of days with the same window."""
     counts = np.array([day.bins[:3].sum() for day in tallies])
     for window in {day.window for day in tallies}:
         own = np.array([day.window == window for day in tallies])

@@ -1,8 +1,8 @@
-"""Choice of the detectors that err, and of their numbers: as few as the data ask for.
+"""Sparse selection of detector errors: which detectors err, and by how much.
 
-Every group of detectors gives linear equations ``value = coefficients . numbers + doubt``. A number
-belongs to all detectors, to those of a kind, or to a group; each one costs a price. What drivers do
-differently is doubt that all groups of a kind share, so that it cannot make one of them stand out.
+Every group of detectors gives linear equations ``value = coefficients . numbers + error``. A number
+belongs to all detectors, to those of a kind, or to a group; each one costs a price. Differences
+between drivers are an error that all groups of a kind share, so they cannot single out a group.
 """
 
 from __future__ import annotations
@@ -31,8 +31,8 @@ class Equation:
         value: Measured minus expected.
         coefficients: One for each number, such as extension and zone.
         error: Standard error of `value`, of this equation alone.
-        shared: Cause to the change of `value` by one standard deviation of it. All equations with
-            this cause change together; those with the other sign in the other direction.
+        shared: Cause to the change of `value` per standard deviation of the cause. All equations
+            with this cause change together, in the direction of their sign.
         other_end: Change of `value` if speeds are measured at the other end of a passage.
     """
 
@@ -78,12 +78,12 @@ class ErrorPlaces:
     Args:
         equations: Equations by group.
         priors: Prior standard deviation of each number; the mean is 0.
-        price: Price of a number, in squared deviations; the chance of its place is added.
+        price: Price of a number, in squared deviations; `multiplicity` of its place is added.
 
     Attributes:
         places: All detectors, kinds and groups, the larger places first.
-        chances: For each place, twice the logarithm of the number of places of its size: one of
-            many differs by chance.
+        multiplicity: Penalty of each place, twice the logarithm of the number of places of its
+            size: of many places, one differs by chance.
     """
 
     def __init__(
@@ -98,8 +98,8 @@ class ErrorPlaces:
         self._below = _places_below(list(equations))
         self.places = [place for size in _SIZES for place in self._below if _size(place) == size]
         sizes = Counter(map(_size, self.places))
-        self.chances = {p: 2.0 * math.log(sizes[_size(p)]) for p in self.places}
-        self._prices = {place: price + chance for place, chance in self.chances.items()}
+        self.multiplicity = {p: 2.0 * math.log(sizes[_size(p)]) for p in self.places}
+        self._prices = {place: price + more for place, more in self.multiplicity.items()}
         self._white = _whitening([one for _, one in rows])
         self._value = self._white @ np.array([one.value for _, one in rows])
         self._other_end = np.array([one.other_end for _, one in rows])
@@ -151,7 +151,7 @@ class ErrorPlaces:
         return self._white @ (share * self._other_end)
 
     def _next_to(self, numbers: Sequence[Number]) -> Iterator[tuple[Number, ...]]:
-        """Yield the sets with one more in place of others there, one less, or one in parts."""
+        """Yield the neighbouring sets: one number added, replaced, removed or split into parts."""
         for number in self._columns:
             if number in numbers:
                 continue

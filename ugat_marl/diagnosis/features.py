@@ -345,7 +345,7 @@ class Tally:
         days: Number of periods that were added up.
         known: Number of periods in which each bin was counted, shape of `bins`; None if all were.
         journeys: Sums and numbers of observations of `JOURNEYS`, ``(measures, places, 2)``. No
-            distance contains them. None without single vehicles.
+            distance uses them. None without single vehicles.
         between: Turning counts, travel times between places and states of lanes: sums and numbers
             of observations, ``(members, measures, 2)``, by block; see `between`.
         window: Begin and end of the period, s; None if unknown, or for sums of different ones.

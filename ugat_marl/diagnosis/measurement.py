@@ -603,7 +603,7 @@ class Measurement:
                 else:
                     tried = (s.solved(some, here) for s in searches for some in ((), numbers))
                     choice = min(tried, key=lambda one: one.cost)
-                cost = choice.cost + searches[0].chances[place]
+                cost = choice.cost + searches[0].multiplicity[place]
                 if cost < least - (limit.narrower_place if points else 0.0):
                     least, best = cost, choice
                     points, there = {place: point}, here

@@ -779,7 +779,7 @@ class Diagnosis:
 
         Raises:
             OptionError: There is no such file, or it is no JSON.
-            ValueError: The file is no diagnosis of this version.
+            ValueError: The file is not a diagnosis of this version.
         """
         return cls.from_json(read_json(directory / FILE, OptionError))
 

@@ -75,7 +75,7 @@ class DiagnosisConfig:
         alpha: Level of the tests: chance of naming an effect where there is none.
         seed: Root seed of the simulated days.
         leave_out: Names of effects that are not examined.
-        cache: Folder of the remembered days; None for the user's cache folder.
+        cache: Folder of cached days; None for the user's cache folder.
         workers: Simulations at a time, None for one per core; or an executor.
         effort: Numbers of simulated days; None for those that suit the size of the network.
         correct_anyway: Write ``corrected`` also if its effects explain only a part, or bring

@@ -36,7 +36,7 @@ _INSTANT_S = 1e-6
 
 @dataclass(frozen=True)
 class ExecutionDelay(ControllerEffect):
-    """Commands take effect after so many s, rounded to decisions; until then the light stays."""
+    """Commands take effect after `seconds`, rounded to decisions; until then the light stays."""
 
     name: ClassVar[str] = "execution_delay"
     ranges: ClassVar[dict[str, NumberParameter]] = {"seconds": NumberParameter("s", 0.0, 600.0)}
@@ -134,7 +134,7 @@ class _Ordered(Actuator):
 
 @dataclass(frozen=True)
 class MaxGreen(ControllerEffect):
-    """No green lasts longer than so many s, in whole decisions; then the next phase follows."""
+    """No green lasts longer than `seconds`, in whole decisions; then the next phase follows."""
 
     name: ClassVar[str] = "max_green"
     ranges: ClassVar[dict[str, NumberParameter]] = {"seconds": NumberParameter("s", 10.0, 600.0)}
@@ -172,7 +172,7 @@ class _Bounded(Actuator):
 
 @dataclass(frozen=True)
 class MinGreen(Effect):
-    """Greens of controlled signals last at least so many s, in whole simulation steps."""
+    """Greens of controlled signals last at least `seconds`, in whole simulation steps."""
 
     name: ClassVar[str] = "min_green"
     ranges: ClassVar[dict[str, NumberParameter]] = {"seconds": NumberParameter("s", 0.0, 120.0)}

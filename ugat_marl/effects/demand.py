@@ -152,7 +152,7 @@ class DemandSurge(Effect):
 
 @dataclass(frozen=True)
 class DemandTiming(Effect):
-    """Vehicles that start on an edge (``"*"``: all) depart so many s later.
+    """Vehicles that start on an edge (``"*"``: all) depart `seconds` later.
 
     Vehicles that would depart before the scenario begins are left out.
     """
@@ -232,7 +232,7 @@ def replace_departing(
 
 @dataclass(frozen=True)
 class _Regular:
-    """A flow of so many vehicles at equal distances in time.
+    """Vehicles that depart at equal distances in time.
 
     Attributes:
         begin_s: First departure, s.

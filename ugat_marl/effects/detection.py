@@ -95,7 +95,7 @@ class _OfDetectors(DetectorEffect):
 
 @dataclass(frozen=True)
 class DetectorOffset(_OfDetectors):
-    """Detectors lie so many m farther downstream than stated; negative means upstream."""
+    """Detectors lie `metres` farther downstream than stated; negative means upstream."""
 
     name: ClassVar[str] = "detector_offset"
     on_installation: ClassVar[bool] = True
@@ -123,7 +123,7 @@ class DetectorOffset(_OfDetectors):
 
 @dataclass(frozen=True)
 class DetectorZone(_OfDetectors):
-    """Zones of detectors are so many m longer than stated, at their downstream end."""
+    """Zones of detectors are `metres` longer than stated, at their downstream end."""
 
     name: ClassVar[str] = "detector_zone"
     on_installation: ClassVar[bool] = True
@@ -178,9 +178,9 @@ class DetectorSpeeds(_OfDetectors):
 
 @dataclass(frozen=True)
 class DetectorExtension(_OfDetectors):
-    """Detectors stay on for so many s after the rear has left.
+    """Detectors stay on for `seconds` after the rear has left.
 
-    A negative number is a delay: detectors go on only when a vehicle has been there for so long.
+    A negative number is a delay: detectors go on only when a vehicle has been there that long.
     A vehicle that leaves earlier is not reported.
 
     Controllers and detector units can do both. NTCIP 1202, objects 2.3.2.6 (vehicleDetectorExtend,
@@ -247,7 +247,7 @@ def _merged(passages: Passages) -> Passages:
 
 @dataclass(frozen=True)
 class DetectorPulse(_OfDetectors):
-    """Detectors report a pulse of so many s per vehicle, not its presence."""
+    """Detectors report a pulse of `seconds` per vehicle instead of its presence."""
 
     name: ClassVar[str] = "detector_pulse"
     ranges: ClassVar[dict[str, NumberParameter]] = {"seconds": NumberParameter("s", 0.01, 2.0)}

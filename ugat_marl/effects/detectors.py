@@ -104,7 +104,7 @@ class Undercount(DetectorEffect):
 
 @dataclass(frozen=True)
 class SignalClock(DetectorEffect):
-    """Times of the detectors at a traffic light are so many s ahead of the clock of its signals."""
+    """Times of the detectors at a traffic light are `seconds` ahead of the clock of its signals."""
 
     name: ClassVar[str] = "signal_clock"
     ranges: ClassVar[dict[str, NumberParameter]] = {"seconds": NumberParameter("s", -60.0, 60.0)}
@@ -124,7 +124,7 @@ class SignalClock(DetectorEffect):
 
 @dataclass(frozen=True)
 class ClockDrift(DetectorEffect):
-    """The clock of the detectors at a traffic light gains so many s per hour of a period."""
+    """The clock of the detectors at a traffic light gains `seconds_per_hour`."""
 
     name: ClassVar[str] = "clock_drift"
     ranges: ClassVar[dict[str, NumberParameter]] = {

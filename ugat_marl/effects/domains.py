@@ -398,7 +398,7 @@ def domain_path(domain: Domain) -> Path | None:
     path = with_home(domain)
     try:
         named = path.suffix == ".sumocfg" or (path / "scenario.toml").is_file()
-    except OSError:  # a long list of effects is no possible path
+    except OSError:  # a long list of effects is not a possible path
         return None
     return path if named else None
 

@@ -20,7 +20,7 @@ saturated lane.
 
 @dataclass(frozen=True)
 class QueueModel(Effect):
-    """Vehicles wait in queues at the ends of segments of so many metres (SUMO's mesoscopic model).
+    """Vehicles wait in queues at the ends of segments `metres` long (SUMO's mesoscopic model).
 
     Vehicles have no position within a segment and no acceleration. They react to signals and to the
     room in the next segment. Only the last segment of an edge has one queue for each direction; in
@@ -57,7 +57,7 @@ class QueueModel(Effect):
 
 @dataclass(frozen=True)
 class BlockerPatience(Effect):
-    """A vehicle that has stood on a junction for so many seconds is no obstacle any more.
+    """A vehicle that has stood on a junction for `seconds` is no longer an obstacle.
 
     Vehicles in the middle of a junction can block each other for ever, above all slow ones that
     started late. SUMO solves this only by teleporting, which is switched off here, so the network
@@ -76,7 +76,7 @@ class BlockerPatience(Effect):
 
 @dataclass(frozen=True)
 class Reach(Effect):
-    """Vehicles are counted up to so many metres upstream of stop lines, across short roads.
+    """Vehicles are counted up to `metres` upstream of stop lines, across short roads.
 
     Networks from maps are cut into short roads. Without a reach, no agent sees vehicles before the
     last road, and a policy learns that they cost nothing. With it, observations, rewards and the

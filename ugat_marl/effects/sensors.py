@@ -56,7 +56,7 @@ class _Noise(Sensor):
 
 @dataclass(frozen=True)
 class CountingError(ControllerEffect):
-    """Vehicles and halting vehicles have a normal error of so many, also on an empty lane."""
+    """Counts have a normal error with a deviation of `vehicles`, also on an empty lane."""
 
     name: ClassVar[str] = "counting_error"
     ranges: ClassVar[dict[str, NumberParameter]] = {"vehicles": NumberParameter("veh", 0.0, 100.0)}
@@ -135,7 +135,7 @@ class DeadDetectors(Sensor):
 
 @dataclass(frozen=True)
 class DetectionZone(ControllerEffect):
-    """Only vehicles within so many metres before a stop line are seen."""
+    """Only vehicles within `metres` of a stop line are seen."""
 
     name: ClassVar[str] = "detection_zone"
     ranges: ClassVar[dict[str, NumberParameter]] = {"metres": NumberParameter("m", 1.0, 1000.0)}
@@ -168,7 +168,7 @@ class _Zone(Sensor):
 
 @dataclass(frozen=True)
 class ObservationDelay(ControllerEffect):
-    """Counts arrive after so many s, rounded to decisions; phases are known at once."""
+    """Counts arrive after `seconds`, rounded to decisions; phases are known at once."""
 
     name: ClassVar[str] = "observation_delay"
     ranges: ClassVar[dict[str, NumberParameter]] = {"seconds": NumberParameter("s", 0.0, 600.0)}
@@ -236,7 +236,7 @@ class _Lossy(Sensor):
 
 @dataclass(frozen=True)
 class QuantisedCounts(ControllerEffect):
-    """Vehicles and halting vehicles are multiples of so many, rounded to the nearest."""
+    """Counts are rounded to the nearest multiple of `vehicles`."""
 
     name: ClassVar[str] = "quantised_counts"
     ranges: ClassVar[dict[str, NumberParameter]] = {"vehicles": NumberParameter("veh", 1.0, 100.0)}

@@ -25,7 +25,7 @@ QUEUE_START_S = 2.0
 
 @dataclass(frozen=True)
 class LateGreen(Effect):
-    """Every link that turns green stays red for so many s first: start-up lost time.
+    """Every link that turns green stays red for `seconds` first: start-up lost time.
 
     Controllers do not see it: they command and observe the full green. The scenario has it as
     `late_green_s`, and the environment applies it to the signals it sends to SUMO.
@@ -71,7 +71,7 @@ class LateGreen(Effect):
 
 @dataclass(frozen=True)
 class YellowTime(Effect):
-    """The yellow of controlled signals lasts so many s, in whole simulation steps."""
+    """The yellow of controlled signals lasts `seconds`, in whole simulation steps."""
 
     name: ClassVar[str] = "yellow_time"
     ranges: ClassVar[dict[str, NumberParameter]] = {"seconds": NumberParameter("s", 0.0, 20.0)}
@@ -84,7 +84,7 @@ class YellowTime(Effect):
 
 @dataclass(frozen=True)
 class AllRedTime(Effect):
-    """The all-red of controlled signals lasts so many s, in whole simulation steps."""
+    """The all-red of controlled signals lasts `seconds`, in whole simulation steps."""
 
     name: ClassVar[str] = "all_red_time"
     ranges: ClassVar[dict[str, NumberParameter]] = {"seconds": NumberParameter("s", 0.0, 20.0)}

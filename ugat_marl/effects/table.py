@@ -172,7 +172,7 @@ def apply_effects(scenario: Scenario, effects: Iterable[Effect]) -> Scenario:
                 raise
             raise ScenarioError(
                 f"scenario {scenario.id!r}: {' + '.join(map(str, applied))} cannot be applied, "
-                f"since a number in its files is none, or 0 where it must not be ({error}); "
+                f"because a value in its files is missing, not a number, or zero ({error}); "
                 "correct the file"
             ) from error
     return scenario

@@ -214,7 +214,7 @@ class Imperfection(VehicleEffect):
 
 @dataclass(frozen=True)
 class ReactionStep(VehicleEffect):
-    """Drivers decide only every so many s (`actionStepLength`), rounded to simulation steps.
+    """Drivers decide only every `seconds` (`actionStepLength`), rounded to simulation steps.
 
     Their time gap grows with it where it was shorter, see `Headway`.
     """
@@ -234,7 +234,7 @@ class ReactionStep(VehicleEffect):
 
 @dataclass(frozen=True)
 class YellowRunning(VehicleEffect):
-    """Drivers pass a light that has been yellow for at most so many s though they could stop.
+    """Drivers pass a light that has been yellow for at most `seconds` though they could stop.
 
     SUMO's `jmDriveAfterYellowTime`; by default nobody does.
     """
@@ -248,7 +248,7 @@ class YellowRunning(VehicleEffect):
 
 @dataclass(frozen=True)
 class RedRunning(VehicleEffect):
-    """Drivers pass a light that has been red for at most so many s.
+    """Drivers pass a light that has been red for at most `seconds`.
 
     SUMO's `jmDriveAfterRedTime`; by default nobody does.
     """

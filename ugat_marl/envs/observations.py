@@ -28,7 +28,7 @@ ObservationFunction = Callable[[IntersectionView], Any]
 """Function from the view of an intersection to its features, a row of numbers."""
 
 COUNT_SCALE = 40.0
-"""Number of vehicles for a count of 1; so many fit on a lane of 300 m."""
+"""Number of vehicles for a count of 1; about as many fit on a lane of 300 m."""
 
 WAITING_SCALE_S = 100.0
 """Mean waiting time per storage place that makes `waiting` 1."""

@@ -1,6 +1,6 @@
 """Command line of a baseline's file: train its learner on one scenario and judge it.
 
-This training is no job of the driver. A job names its learner in the catalogue, so that another
+This training is not a job of the driver. A job names its learner in the catalogue, so that another
 process can make it from the job's description. A file of baselines/ makes its learner by a function
 of its own, so that a copy of the file, changed, trains without a row in the catalogue. Both run the
 same loop (`training.train_through`) and the same evaluation. ``ugat-marl train --learner`` and the

@@ -112,7 +112,9 @@ def evaluate(
     for make in policies.values():
         make(worlds[0])  # a wrong policy is an error now, too
     if watch is not None and not in_this_process(workers):
-        raise OptionError("what is watched must be played here; give a number of workers")
+        raise OptionError(
+            "watch needs workers in this process; give a number of workers, not an executor"
+        )
     episodes = len(seeds) * len(policies) * len(domains)
     per_task = max(1, episodes // (4 * parts_at_a_time(workers)))
     tasks = [

@@ -458,8 +458,8 @@ def _plain(
         marks = [mark for mark in job.marks if record.missing(job, mark) or mark == job.episodes]
         if marks[0] < learner.episodes:
             raise OptionError(
-                f"{folder} has no evaluation of {len(job.evaluation_seeds)} episodes after "
-                f"{marks[0]} of training and is beyond it; remove it, or name another --runs"
+                f"{folder} was trained past episode {marks[0]} without the evaluation of "
+                f"{len(job.evaluation_seeds)} episodes there; remove it, or name another --runs"
             )
 
         def keep(effort: Effort) -> None:

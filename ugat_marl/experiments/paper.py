@@ -312,7 +312,7 @@ class PaperConfig:
         rule_budget: Most episodes to tune one rule in one domain.
         observation: Kind of observation; default: the one that the learner needs, or count.
         reward: Kind of reward.
-        neighbours: Agents also see the intersections up to so many roads away.
+        neighbours: Agents also observe intersections up to this many roads away.
         duration_s: Length of an episode in s; default: the scenario's own.
         learner: Learner of all rows: universal or dqn, the suite's own, or a baseline
             (docs/how-to/learners.md), or your own as my_module:MyLearner; default: universal, and
@@ -441,7 +441,8 @@ class PaperConfig:
         if left := [domain for domain in domains if domain != domain_label(self.sim)]:
             return left
         raise OptionError(
-            f"table {table!r} has {self.sim} alone, to which sim is set; name domains"
+            f"every domain of table {table!r} is the simulation itself (sim = {self.sim!r}); "
+            "name other domains"
         )
 
     def settings(self, table: str) -> list[Setting]:

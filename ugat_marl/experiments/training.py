@@ -140,11 +140,11 @@ def train_grounded(
     algorithm: Ugat | StreetTraining
     if ugat.grounding == "street":
         if placebo == "noise":
-            raise OptionError('the control "noise" needs f; grounding "street" has none')
+            raise OptionError('placebo "noise" needs f; grounding "street" has none')
         if placebo == "shuffled":
             raise OptionError(
-                'the control "shuffled" leaves no histories, from which grounding "street" is '
-                'read; use the control "same-world"'
+                'placebo "shuffled" leaves no histories, from which grounding "street" is read; '
+                'use placebo "same-world"'
             )
         algorithm = street_training(make, workers, device=device, **common)
         residual = ugat.residual(env.recorded_layouts, seed, neighbours_of(env))

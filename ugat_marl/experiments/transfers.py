@@ -105,7 +105,7 @@ class TransferConfig:
         observation: Kind of observation: count, queue, pressure, waiting, density, movements;
             default: movements for the learner universal, and count for others.
         reward: Kind of reward: total-queue, queue, pressure, waiting.
-        neighbours: Agents also see the intersections up to so many roads away.
+        neighbours: Agents also observe intersections up to this many roads away.
         duration_s: Length of an episode in s; default: the scenario's own.
         evaluation_seeds: Number of evaluation episodes of each policy in each domain.
         tuning_seeds: Number of episodes on which the best rule is chosen.
@@ -116,14 +116,15 @@ class TransferConfig:
             one policy each. "late_green=*,3" delays all greens by 3 s; "V4" fine-tunes in the real
             domain itself.
         corrected: A corrected scenario of `ugat-marl diagnose`, or any other domain: also train
-            there from scratch, for as many episodes as UGAT in all.
-        randomised: Also train from scratch, for as many episodes as UGAT in all. Each episode is in
-            another world, drawn from the ranges of the effects.
+            there from scratch, for as many episodes as the method in all.
+        randomised: Also train from scratch, for as many episodes as the method in all. Each
+            episode is in another world, drawn from the ranges of the effects.
         random_delay_s: Also train direct transfer further, as long as the control, while greens
             begin late by random whole seconds up to this value.
         fine_tuned: Also train direct transfer further in the real domain, for as many episodes as
-            UGAT records there.
-        oracle: Also train from scratch in the real domain, for as many episodes as UGAT in all.
+            the method records there.
+        oracle: Also train from scratch in the real domain, for as many episodes as the method in
+            all.
         placebo: A negative control; grounding must win nothing with it. "same-world" records D_real
             in the simulation, "shuffled" permutes the outcomes in D_real, "noise" replaces f by
             noise; the last two with phase or timed.

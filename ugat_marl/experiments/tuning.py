@@ -73,7 +73,7 @@ def tune(
         OptionError: The budget is below `LEAST_BUDGET`.
     """
     if name not in RULES:
-        raise UnknownNameError("controller", name, RULE_NAMES)
+        raise UnknownNameError("rule", name, RULE_NAMES)
     require_least(LEAST_BUDGET, budget=budget)
     specs = rule_settings(name, budget)
     place = _place(name, scenario, domain, budget, duration_s, specs)

@@ -109,7 +109,7 @@ class Watchdog:
         try:
             return self._absurd(count, capacity) or self._stale(count, now_s)
         except (TypeError, ValueError, AttributeError):  # a driver may return anything
-            return f"absurd: {count!r} is no count"
+            return f"absurd: {count!r} is not a count"
 
     def _absurd(self, count: LaneCount, capacity: float) -> str:
         vehicles, halting = count.vehicles, count.halting

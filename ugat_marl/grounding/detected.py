@@ -48,7 +48,7 @@ late, by the error of a free ride, and would then leave no time for them."""
 MOST_LATENCY_S = 60.0
 """Longest delay of stamps; a longer one is a clock that was set wrong."""
 LONG_S = 300.0
-"""Length from which an open jam is no queue of the last cycle."""
+"""Length from which an open jam is not a queue of the last cycle."""
 
 
 @dataclass(frozen=True)

@@ -9,7 +9,7 @@ those of the simulation keep, a detector is at fault. Each fault is estimated fr
   itself is often reached;
 - noise: counts fall in red, as far and as often as those of the simulation do with the same noise;
 - coarse counts: all counts are multiples of a number;
-- lag: counts go on falling so many decisions into the red;
+- lag: the number of decisions for which counts go on falling in the red;
 - dropout: a count stays the same while a long queue is served.
 """
 
@@ -442,7 +442,7 @@ def _fall_in_red(rows: Sequence[LaneRows], lag: int, config: EyesConfig) -> floa
 
 
 def _fall_in_green(rows: Sequence[LaneRows], lag: int, config: EyesConfig) -> float:
-    """Return the mean fall of long queues, so many decisions after a green; NaN without many."""
+    """Return the mean fall of long queues, `lag` decisions after a green; NaN if there are few."""
     falls: list[Floats] = []
     for own in rows:
         green = own.has.copy()

@@ -326,8 +326,8 @@ class StreetTraining(Algorithm):
         worlds = len(known.simulated) + known.new_worlds(config)
         if config.simulates and worlds < ENOUGH:
             self.run.reporter.say(
-                f"{iteration_name(state)}: {worlds} simulations are few, so chances and "
-                f"intervals of effects are too sure; --street.simulations {ENOUGH} or more"
+                f"{iteration_name(state)}: {worlds} simulations are few, so chances are "
+                f"overconfident and intervals too narrow; --street.simulations {ENOUGH} or more"
             )
         agents = list(real.provenance.layouts)
         jams = Oversaturation.of(self.view, self.view.rows(real), agents)

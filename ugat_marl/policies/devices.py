@@ -21,7 +21,7 @@ _NAMES = re.compile(r"cpu|cuda(?::(0|[1-9]\d*))?")
 
 
 def require_device_name(name: str) -> None:
-    """Refuse a name that is no device's; this machine need not have the device.
+    """Refuse a name that is not a device's; this machine need not have the device.
 
     Raises:
         OptionError: The name is neither "cpu", "cuda" nor "cuda:N".
@@ -37,7 +37,7 @@ def device_of(name: str) -> torch.device:
         name: "cpu", "cuda" (torch's current GPU) or "cuda:N".
 
     Raises:
-        OptionError: The name is no device's, or torch finds no such GPU.
+        OptionError: The name is not a device's, or torch finds no such GPU.
     """
     require_device_name(name)
     if name == "cpu":

@@ -74,7 +74,9 @@ def export_policy(policy: NetworkPolicy, path: Path, env: AnyParallelEnv | None 
     """
     if path.suffix not in FORMATS:
         known = ", ".join(f"{suffix} ({name})" for suffix, (name, _) in FORMATS.items())
-        raise OptionError(f"{path}: the suffix {path.suffix!r} is no format; choose from {known}")
+        raise OptionError(
+            f"{path}: the suffix {path.suffix!r} is not a format; choose from {known}"
+        )
     side_car = path.with_suffix(".json")
     for place in (path, side_car):
         require_writable(place)

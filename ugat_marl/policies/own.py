@@ -565,7 +565,7 @@ def _require_methods(given: Any, name: str) -> None:
 
 
 def _takes(function: Callable[..., Any], number: int) -> bool:
-    """Return True if a function can be called with so many positional arguments."""
+    """Return True if a function can be called with this number of positional arguments."""
     try:
         inspect.signature(function).bind(*range(number))
     except TypeError:

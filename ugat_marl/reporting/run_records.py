@@ -188,7 +188,7 @@ def read_records(paths: Sequence[Path]) -> list[RunRecord | TableRecord]:
     """Return the records of all folders, in their order, each once.
 
     Raises:
-        OptionError: A path is no folder, or it contains no file of the suite.
+        OptionError: A path is not a folder, or it contains no file of the suite.
     """
     by_place: dict[Path, Path] = {}
     for path in paths:

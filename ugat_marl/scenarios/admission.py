@@ -297,7 +297,9 @@ def option_fault(option: str, value: str) -> str:
     if not re.fullmatch(r"[-+\d.:eE]+", value, re.ASCII):
         return "is not a number"
     if option in _TIMES and ":" in value:
-        return "" if re.fullmatch(r"-?\d+(:\d\d?){2,3}(\.\d*)?", value, re.ASCII) else "is no time"
+        return (
+            "" if re.fullmatch(r"-?\d+(:\d\d?){2,3}(\.\d*)?", value, re.ASCII) else "is not a time"
+        )
     try:
         number = float(value)
     except ValueError:
@@ -351,7 +353,7 @@ def _fault(tag: Tag) -> str:
             return "<include> reads another file; name that file in the scenario instead"
         guess = nearest(name, _ELEMENTS)
         hint = f"did you mean <{guess}>?" if guess else "leave it out"
-        return f"<{name}> is no element that a scenario may have; {hint}"
+        return f"<{name}> is not an element that a scenario may have; {hint}"
     for attribute, value in tag.attributes.items():
         if attribute in _ATTRIBUTES:
             continue
@@ -360,8 +362,8 @@ def _fault(tag: Tag) -> str:
                 return f"{attribute} = {value!r} is not a schema of SUMO; leave it out"
         elif name not in _OUTPUTS.get(attribute, ()) and attribute not in _PICTURES:
             return (
-                f"<{name} {attribute}={value[:80]!r}> is no attribute that a scenario may have; "
-                "leave it out"
+                f"<{name} {attribute}={value[:80]!r}> is not an attribute that a scenario may "
+                "have; leave it out"
             )
     check = _CHECKS.get(name)
     return (check(tag) if check is not None else "") or _number_fault(tag)
@@ -374,7 +376,7 @@ def _number_fault(tag: Tag) -> str:
             return f"<{tag.name} {attribute}={value[:40]!r}> is not a finite number in plain digits"
     if tag.name == "phase" and _never_ends(tag.attributes.get("minDur", "1")):
         return (
-            f"<phase minDur={tag.attributes['minDur'][:40]!r}> is no time above 0; SUMO would "
+            f"<phase minDur={tag.attributes['minDur'][:40]!r}> is not a time above 0; SUMO would "
             "change between such phases without end"
         )
     for attribute in _MOST_OF.keys() & tag.attributes.keys():
@@ -398,7 +400,7 @@ def _parameter_fault(tag: Tag) -> str:
         known = device[1] in _DEVICES or tag.attributes.get("value", "").lower() in ("false", "0")
         return "" if known else f"the device {device[1]!r} writes files; leave it out"
     if _TO_FILES.search(key) or key.startswith(("device.", "person-device.")):
-        return f"<param key={key[:80]!r}> is no parameter that a scenario may set; leave it out"
+        return f"<param key={key[:80]!r}> is not a parameter that a scenario may set; leave it out"
     return ""
 
 

@@ -107,7 +107,7 @@ class Network:
         intersections: Traffic lights with at least two green phases, in the order of their ids.
         uncontrolled: Traffic lights with fewer than two green phases; they run their own programme.
         streets: Road (SUMO's edge) to the name of its street; roads without a name are left out.
-        reasons: Light of `uncontrolled` to the reason why it is no agent.
+        reasons: Light of `uncontrolled` to the reason why it is not an agent.
         notes: Changes to the programmes of the file, for the user.
     """
 
@@ -123,7 +123,7 @@ class Network:
         """Read and check the network of a scenario.
 
         Raises:
-            ScenarioError: The file is no network or has no traffic light to control. Or phases
+            ScenarioError: The file is not a network or has no traffic light to control. Or phases
                 cannot be shown or have conflicting greens. Or settings name an unknown traffic
                 light.
         """
@@ -336,7 +336,7 @@ def _reason(
     links: Sequence[Link],
     programme: Sequence[tuple[float, str]],
 ) -> str:
-    """Return the reason why a light is no agent, and what would make it one."""
+    """Return the reason why a light is not an agent, and what would make it one."""
     own = _choices(programme_phases(programme), links, "programme")
     if source == "programme":
         text = f"its programme has {counted(own, 'green phase')}"

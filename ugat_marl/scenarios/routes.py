@@ -30,7 +30,7 @@ _ROUTED = "routed.rou.xml"
 
 
 def is_blocker(vehicle: str, vehicle_type: str) -> bool:
-    """Return True for a vehicle that blocks a lane and is no part of the demand.
+    """Return True for a vehicle that blocks a lane and is not part of the demand.
 
     Args:
         vehicle: Id of the vehicle.
@@ -91,7 +91,7 @@ def demand_scale(scenario: Scenario) -> float:
 
 
 def scaled_number(vehicles: int, scale: float) -> int:
-    """Return the number of vehicles that SUMO makes of so many with its option ``scale``."""
+    """Return the number of vehicles that SUMO makes of `vehicles` with its option ``scale``."""
     return math.ceil(round(vehicles * scale, 9))
 
 

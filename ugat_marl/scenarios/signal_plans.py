@@ -322,7 +322,7 @@ def with_plans(scenario: Scenario, plans: Iterable[SignalPlan], source: str) -> 
         source: Name of their file in errors.
 
     Raises:
-        ScenarioError: A plan is impossible, or names a light that is no agent.
+        ScenarioError: A plan is impossible, or names a light that is not an agent.
     """
     network, rules = Network.read(scenario), _rules(scenario)
     lights = {light.id: light for light in network.intersections}
@@ -330,7 +330,7 @@ def with_plans(scenario: Scenario, plans: Iterable[SignalPlan], source: str) -> 
     for plan in plans:
         if plan.light not in lights:
             raise ScenarioError(
-                f"{source}: light {plan.light!r} is no agent of scenario {scenario.id!r}; its "
+                f"{source}: light {plan.light!r} is not an agent of scenario {scenario.id!r}; its "
                 f"agents are {', '.join(lights)}"
             )
         if plan.light in planned:

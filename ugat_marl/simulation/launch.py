@@ -114,7 +114,7 @@ class Launch:
         needs the display.
 
         Raises:
-            OptionError: The limit of the memory that the user gave is no number.
+            OptionError: The limit of the memory that the user gave is not a number.
         """
         if not self.gui:
             try:

@@ -30,7 +30,7 @@ def _name(value: Any) -> Any:
 def _digits(value: Any) -> Any:
     """Refuse a key such as ``1_0``, which Python would read as 10."""
     if isinstance(value, str) and not (value.isascii() and value.isdecimal()):
-        raise ValueError(f"{value[:40]!r} is no number; write plain digits")
+        raise ValueError(f"{value[:40]!r} is not a number; write plain digits")
     return value
 
 
@@ -187,7 +187,7 @@ def _check_devices(
         where = f"{path}: device {device.id!r}"
         if device.tls not in widths:
             raise MeasuredDataError(
-                f"{where}: {device.tls!r} is no traffic light of the network; it has "
+                f"{where}: {device.tls!r} is not a traffic light of the network; it has "
                 f"{', '.join(sorted(widths)[:12])}"
             )
         if [other.tls for other in devices].count(device.tls) > 1:

@@ -144,13 +144,13 @@ def _refuse_units(path: Path, frame: pl.DataFrame) -> None:
         (
             (occupancy < 0) | (occupancy > 1),
             "occupancy",
-            "is no share of time from 0 to 1",
+            "is not a share of time from 0 to 1",
             "divide percents by 100, and leave the cell empty where it was not measured",
         ),
         (
             (speed < 0) | (speed > FASTEST_MPS),
             "mean_speed_mps",
-            f"is no speed from 0 to {FASTEST_MPS:g} m/s",
+            f"is not a speed from 0 to {FASTEST_MPS:g} m/s",
             "multiply miles per hour by 0.44704, divide km/h by 3.6, and leave the cell empty "
             "where it was not measured",
         ),
@@ -245,6 +245,6 @@ def _refuse_edges(
                 path,
                 unknown,
                 column,
-                "is no edge of the network" + (f"; did you mean {near!r}?" if near else ""),
+                "is not an edge of the network" + (f"; did you mean {near!r}?" if near else ""),
                 "write the id of a SUMO edge",
             )

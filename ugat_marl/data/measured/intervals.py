@@ -94,7 +94,7 @@ def require_interval(length_s: float) -> None:
 
 
 def as_counts(measured: MeasuredData, length_s: float) -> MeasuredData:
-    """Return the data as detectors report them that add up intervals and log no single vehicle.
+    """Return the data as detectors report them that count per interval and log no single vehicle.
 
     Args:
         measured: Data with passages.

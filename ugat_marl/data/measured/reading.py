@@ -540,7 +540,7 @@ def _check_states(path: Path, frame: pl.DataFrame, widths: Mapping[str, int]) ->
             path,
             unknown,
             "tls_id",
-            "is no traffic light of the network" + (f"; did you mean {near!r}?" if near else ""),
+            "is not a traffic light of the network" + (f"; did you mean {near!r}?" if near else ""),
             f"it has: {', '.join(sorted(widths)[:12]) or 'none'}",
         )
     for tls, state in frame.select("tls_id", "state").unique(maintain_order=True).iter_rows():

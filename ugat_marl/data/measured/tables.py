@@ -533,7 +533,7 @@ def in_order(
     if not back:
         return as_found
     findings.append(
-        Finding(f"{path.name}: {back} rows come before an earlier one; they were sorted")
+        Finding(f"{path.name}: {back} rows are earlier than the row before them; they were sorted")
     )
     return np.lexsort((time, key))
 
@@ -576,7 +576,7 @@ def refuse_set_back(
         if jump > CLOCK_JUMP_S and clock[end - 1] > clock[begin]:
             raise MeasuredDataError(
                 f"{place(path, int(row[as_found[step]]))}: the clock of {name(int(stream[begin]))} "
-                f"steps back by {jump:g} s, so some time is there twice (daylight saving, a "
+                f"steps back by {jump:g} s, so some times occur twice (daylight saving, a "
                 "clock that was set, or a log that was appended twice?); end the period before the "
                 "step, correct the times behind it, or leave the copy out"
             )

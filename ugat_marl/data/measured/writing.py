@@ -114,7 +114,7 @@ def require_replaceable(directory: Path) -> None:
         )
     if there and "periods.csv" not in there:
         raise OutputError(
-            f"{directory}: is not empty and has no periods.csv, so it is no measured data to "
+            f"{directory}: is not empty and has no periods.csv, so it is not measured data to "
             "replace; give another directory"
         )
 

@@ -162,9 +162,10 @@ def record(
             f"duration_s = {duration_s:g}: scenario {scenario.id!r} lasts "
             f"{scenario.settings.duration_s:g} s, and data of longer days would not fit it"
         )
-    if seed < 0 or not 0 <= detector_length_m < math.inf:
+    require_least(0, seed=seed)
+    if not 0 <= detector_length_m < math.inf:
         raise OptionError(
-            f"detector_length_m = {detector_length_m:g} and seed = {seed} must be 0 or more"
+            f"detector_length_m = {detector_length_m:g}: must be 0 or more, and finite"
         )
     if same_demand and day_to_day:
         raise OptionError("same_demand keeps the demand of every day; leave day_to_day out")

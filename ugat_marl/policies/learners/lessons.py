@@ -90,7 +90,7 @@ def plays(env: AnyParallelEnv, name: str, shown: int) -> int:
 
 
 def most_plays(name: str, shown: int, candidates: int | None = None) -> int:
-    """Return the number of episodes of lessons with so many candidates for `BEST`; None: all."""
+    """Return the number of episodes of lessons; with `BEST` it depends on `candidates`."""
     if name != BEST:
         return shown
     candidates = len(STANDARD_RULES) if candidates is None else candidates

@@ -63,6 +63,6 @@ class Start:
             raise OptionError(
                 f"the start holds {self.weights.numel()} weights, this network has {needed}; the "
                 f"start was learned with {options}: use the same observation and sizes, or "
-                "leave the start away"
+                "leave out the start"
             )
         return self.weights

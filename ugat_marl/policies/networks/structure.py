@@ -101,7 +101,7 @@ class Structure:
                 raise OptionError(
                     f"the observation of agent {name!r} has {size} numbers, its intersection's has "
                     f"{layout.size if layout else 0}: network {network!r} cannot tell what they "
-                    "are; leave wrappers of observations away, or use the network 'mlp'"
+                    "are; leave out wrappers of observations, or use the network 'mlp'"
                 )
         kind, commands = str(observation["observation"]), int(observation.get("commands", 0))
         junctions: list[Junction] = []
@@ -193,7 +193,7 @@ def _neighbours(
     if {*light_of} != {*agents.names}:
         raise OptionError(
             f"network 'colight' does not know the intersections of {', '.join(agents.names[:4])}; "
-            "leave wrappers that rename agents away, or use the network 'mlp'"
+            "leave out wrappers that rename agents, or use the network 'mlp'"
         )
     at = {light_of[name]: position for position, name in enumerate(agents.names)}
     items = [roads.intersection(light_of[name]) for name in agents.names]

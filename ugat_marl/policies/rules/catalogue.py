@@ -148,7 +148,7 @@ def make_rule(spec: str, env: AnyParallelEnv) -> Policy:
     inner: Any = env.unwrapped
     if "observation" in rule.env_options and getattr(inner, "frames", 1) > 1:
         raise OptionError(
-            f"controller {spec!r}: a rule reads one observation, and frame_stack shows "
+            f"rule {spec!r}: a rule reads one observation, and frame_stack shows "
             f"{inner.frames}; give the rule the environment without frame_stack"
         )
     return rule
@@ -163,11 +163,11 @@ def parse_rule(spec: str) -> tuple[str, tuple[float, ...]]:
     """
     name, *texts = spec.split(":")
     if name not in RULES:
-        raise UnknownNameError("controller", name, RULE_NAMES)
+        raise UnknownNameError("rule", name, RULE_NAMES)
     parameters = RULES[name].parameters
     if len(texts) > len(parameters):
         takes = ", ".join(f"{p.name} in {p.unit}" for p in parameters) or "no number"
-        raise OptionError(f"controller {spec!r}: {name} takes {takes}; write {example_of(name)!r}")
+        raise OptionError(f"rule {spec!r}: {name} takes {takes}; write {example_of(name)!r}")
     values = [parameter.default for parameter in parameters]
     for place, text in enumerate(texts):
         try:
@@ -176,7 +176,7 @@ def parse_rule(spec: str) -> tuple[str, tuple[float, ...]]:
             values[place] = math.nan
         if not 0 < values[place] < math.inf:
             raise OptionError(
-                f"controller {spec!r}: {text!r} is not a number of {parameters[place].unit} "
+                f"rule {spec!r}: {text!r} is not a number of {parameters[place].unit} "
                 f"above 0 ({parameters[place].name}); write for example {example_of(name)!r}"
             )
     return name, tuple(values)

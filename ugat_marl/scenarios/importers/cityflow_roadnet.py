@@ -81,7 +81,7 @@ def read_roadnet(path: Path) -> Roadnet:
     """Read and check a ``roadnet.json``.
 
     Raises:
-        ScenarioError: The file is no road network, or it refers to something that does not exist;
+        ScenarioError: The file is not a road network, or refers to something that does not exist;
             the message names the line if it can.
     """
     raw, text = read_json(path)

@@ -388,7 +388,7 @@ def require_free(target: Path, *, force: bool) -> None:
         OutputError: As for `new_folder`.
     """
     if not target.name or target.name in (".", ".."):
-        raise OutputError(f"{str(target)!r} is no name for a scenario; give one, as in my-city")
+        raise OutputError(f"{str(target)!r} is not a name for a scenario; give one, as in my-city")
     if str(target) in dict(shipped_scenarios()):
         raise OutputError(
             f"{str(target)!r} is the name of a scenario of the suite; choose another one"

@@ -250,7 +250,7 @@ def grid_roads(text: str, spacing_m: float, speed_mps: float) -> RoadSource:
         speed_mps: Speed limit.
 
     Raises:
-        OptionError: The text is no size, or a value is out of range.
+        OptionError: The text is not a size, or a value is out of range.
     """
     match = re.fullmatch(r"(\d{1,4})[x×X](\d{1,4})", text.strip())
     rows, columns = (int(match[1]), int(match[2])) if match else (0, 0)

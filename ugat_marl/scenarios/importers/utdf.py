@@ -135,8 +135,8 @@ def _matched(
             )
         if light not in known:
             raise ScenarioError(
-                f"--lights {name}={light}: {light!r} is no agent of the scenario; its agents are "
-                f"{', '.join(known)}"
+                f"--lights {name}={light}: {light!r} is not an agent of the scenario; its agents "
+                f"are {', '.join(known)}"
             )
     if lights:
         return dict(lights)
