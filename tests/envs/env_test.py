@@ -177,13 +177,15 @@ def test_a_delay_at_every_decision_is_late_green() -> None:
 
 def test_impossible_delays_are_refused(mixed: TrafficEnv) -> None:
     mixed.close()
-    with pytest.raises(EpisodeError, match="call reset"):
-        mixed.delay_greens({})
+    for call in (mixed.delay_greens, mixed.remember):
+        with pytest.raises(EpisodeError, match="call reset"):
+            call({})
     mixed.reset(seed=1)
     agent = mixed.agents[0]
-    with pytest.raises(ActionError, match="unknown agents \\['nobody'\\]"):
-        mixed.delay_greens({"nobody": 1.0})
-    for delay in (-1.0, float("nan"), float("inf")):
+    with pytest.raises(ActionError, match="unknown agents \\[3, 'nobody'\\]"):
+        mixed.delay_greens({"nobody": 1.0, 3: 1.0})  # type: ignore[dict-item]
+    delays: list[Any] = [-1.0, float("nan"), float("inf"), "1", None]
+    for delay in delays:
         with pytest.raises(ActionError, match="0 or more"):
             mixed.delay_greens({agent: delay})
 
@@ -283,10 +285,35 @@ def test_the_domain_decides_the_scenario() -> None:
     assert listed.scenario.applied == ("startup_delay=2",)
 
 
-def test_integers_of_numpy_become_plain_ones() -> None:
+def test_numbers_of_numpy_become_plain_ones() -> None:
     one: Any = np.int64(1)
-    options = EnvOptions(neighbours=one, commands=one)
-    assert json.dumps([options.neighbours, options.commands]) == "[1, 1]"
+    options = EnvOptions(
+        neighbours=one, commands=one, duration_s=np.float32(20), deadline_s=one,  # type: ignore[arg-type]
+        crossings=np.bool_(True),  # type: ignore[arg-type]
+    )  # fmt: skip
+    named = [options.neighbours, options.commands, options.duration_s, options.deadline_s]
+    assert json.dumps([*named, options.crossings]) == "[1, 1, 20.0, 1, true]"
+
+
+def test_an_observation_that_fails_begins_no_episode() -> None:
+    fails = False
+
+    def watched(view: Any) -> Any:
+        if fails:
+            raise ValueError("planted")
+        return view.vehicles
+
+    env = ugat_marl.parallel_env("single-v1", observation=watched, duration_s=20)
+    fails = True
+    with pytest.raises((ValueError, OptionError), match="planted"):
+        env.reset(seed=1)
+    assert env.agents == []
+    with pytest.raises(EpisodeError, match="call reset"):
+        env.step({"signal_0": 0})
+    fails = False
+    env.reset(seed=1)
+    assert env.agents == ["signal_0"]
+    env.close()
 
 
 def test_neighbours_are_seen_by_those_who_have_any() -> None:

@@ -37,6 +37,7 @@ from ugat_marl.errors import (
     ScenarioError,
     SimulatorCrashed,
     SimulatorError,
+    UgatMarlError,
     UnknownNameError,
     WorkerError,
 )
@@ -278,6 +279,43 @@ def test_what_ends_beside_an_error_is_handed_over_with_the_next_step(
         assert len(env.step(nothing).ended) == 2
 
 
+class UnknownOnce:
+    """Domains of which that of environment 0, episode 1 is unknown at first."""
+
+    def __init__(self) -> None:
+        self.asked = 0
+
+    def __call__(self, environment: int, episode: int) -> str:
+        if (environment, episode) == (0, 1):
+            self.asked += 1
+            if self.asked == 1:
+                return "nowhere"
+        return "sim"
+
+
+def test_an_episode_is_handed_over_though_the_next_one_cannot_begin() -> None:
+    nothing = np.zeros((2, 1), dtype=np.int64)
+    with vector_env("single-v1", 2, UnknownOnce(), duration_s=10) as env:
+        env.reset(seed=1)
+        with pytest.raises(UgatMarlError, match="nowhere"):
+            env.step(nothing)
+        env.reset(where=[0, 1])
+        ended = env.step(nothing).ended
+        assert [(e.environment, e.episode.number) for e in ended[:2]] == [(0, 0), (1, 0)]
+        assert all(each.scores is not None for each in ended)
+
+
+def test_an_episode_is_received_though_the_next_one_cannot_begin() -> None:
+    with vector_env("single-v1", 2, UnknownOnce(), duration_s=10) as env:
+        env.reset(seed=1)
+        env.send(np.zeros((1, 1), dtype=np.int64), [0])
+        with pytest.raises(UgatMarlError, match="nowhere"):
+            env.recv()
+        env.send(np.zeros((1, 1), dtype=np.int64), [1])
+        ended = env.recv().ended
+        assert [(e.environment, e.episode.number) for e in ended] == [(0, 0), (1, 0)]
+
+
 def test_two_halves_are_the_whole() -> None:
     with vector_env("single-v1", 3, duration_s=LENGTH_S) as env:
         whole = together(env, 5)
@@ -293,6 +331,36 @@ def test_two_halves_are_the_whole() -> None:
         assert second.step_wait().rewards[0] == first.step_wait().rewards[0]
         with pytest.raises(EpisodeError, match="step_wait\\(\\) without step_async"):
             first.step_wait()
+
+
+DECORATED = """
+import functools
+
+def base(before, after):
+    return -1.0
+
+def twice_of(function):
+    @functools.wraps(function)
+    def inner(*views):
+        return 2 * function(*views)
+    return inner
+
+twice = twice_of(base)
+
+class Weighted:
+    def reward(self, before, after):
+        return 3.0
+"""
+
+
+def test_a_reward_whose_name_leads_to_another_one_is_refused(module: Callable[[str], str]) -> None:
+    own = importlib.import_module(module(DECORATED))
+    for reward in (own.twice, own.Weighted().reward):
+        with pytest.raises(OptionError, match="which is another function"):
+            vector_env("single-v1", 1, reward=reward)
+    with vector_env("single-v1", 1, duration_s=20, reward=own.base) as env:
+        env.reset(seed=1)
+        assert env.step([[0]]).rewards == -1.0
 
 
 def test_wrappers_rewards_and_effects_reach_the_workers(module: Callable[[str], str]) -> None:
@@ -671,6 +739,9 @@ def test_wrong_calls(crossing: Crossing) -> None:
             vector_env(directory, 2, **options)
     with pytest.raises(OptionError, match="at least one domain"):
         in_turn([])
+    numbers: dict[str, Any] = {"neighbours": np.int64(0), "duration_s": np.float32(20)}
+    with vector_env(directory, 1, **numbers) as env:
+        assert env.reset(1).observations.shape[0] == 1
     with vector_env(directory, 2, duration_s=20) as env:
         with pytest.raises(EpisodeError, match="no episode under way; call reset"):
             env.step([[0], [0]])

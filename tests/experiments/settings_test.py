@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from functools import partial
+from functools import partial, wraps
 from pathlib import Path
 
 import pytest
@@ -11,6 +11,7 @@ import pytest
 from ugat_marl.errors import OptionError
 from ugat_marl.experiments.settings import LearnerSpec
 from ugat_marl.policies import DQNConfig, is_own, own_name
+from ugat_marl.policies.own import load_own
 
 
 def test_weights_to_begin_with_count_by_their_content(tmp_path: Path) -> None:
@@ -55,6 +56,22 @@ class Other(Held):
     """Another class of the same file."""
 
 
+def plain(env: object, seed: int) -> Held:
+    """A learner's maker."""
+    return Held(env, seed)
+
+
+def renamed(make: Callable[[object, int], Held]) -> Callable[[object, int], Held]:
+    @wraps(make)
+    def inner(env: object, seed: int) -> Held:
+        return make(env, seed + 1)
+
+    return inner
+
+
+decorated = renamed(plain)
+
+
 def within(phase: int) -> Callable[[object, int], Held]:
     def make(env: object, seed: int) -> Held:
         return Held(env, seed, phase)
@@ -74,6 +91,8 @@ def test_learners_with_other_values_are_other_learners() -> None:
         assert identity(one) != identity(other)
     assert identity(within(1)) == identity(within(1))
     assert identity(partial(Held, phase=1)) == identity(partial(Held, phase=1))
+    assert own_name(decorated) != own_name(plain)
+    assert load_own(own_name(decorated), "learner") is decorated
     named = own_name(partial(Held, phase=0))
     assert is_own(named) and named != own_name(Held)
     held = LearnerSpec(named, (), DQNConfig()).identity

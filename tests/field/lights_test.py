@@ -53,7 +53,7 @@ def driven(street: MadeUpStreet, seconds: float = 400.0, seed: int = 1) -> list[
     drawn = random.Random(seed)
     policy = Scripted(lambda asked: {agent: drawn.randrange(n + 1) for agent, n in asked.items()})
     loop, made = FieldLoop(SITE, policy, street, QUICK), []
-    loop.run(seconds, made.append)
+    loop.drive(seconds, made.append)
     loop.close()
     return made
 
@@ -144,7 +144,7 @@ def test_a_light_that_follows_its_own_plan_is_followed() -> None:
     street = Overridden()
     policy = Scripted(lambda asked: dict.fromkeys(asked, 0))
     loop, made = FieldLoop(SITE, policy, street, QUICK), []
-    loop.run(250.0, made.append)
+    loop.drive(250.0, made.append)
     found = kinds(made)
     assert set(found[:11]) == {""}
     assert "disobeys" in found[11:14]

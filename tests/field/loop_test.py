@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+import gc
 import json
 import math
 import shutil
 import threading
 import time
 from collections.abc import Callable, Mapping
+from decimal import Decimal
 from itertools import pairwise
 from pathlib import Path
 from typing import Any
@@ -104,7 +106,7 @@ def replaced(count: LaneCount | None) -> Callable[[Counts], Counts]:
 def decide(loop: FieldLoop, street: MadeUpStreet, times: int = 1) -> list[Any]:
     """The next decisions, carried out."""
     made: list[Any] = []
-    loop.run(times * 10.0, made.append)
+    loop.drive(times * 10.0, made.append)
     assert len(made) == times
     return made
 
@@ -120,6 +122,8 @@ DATA_FAULTS: list[tuple[str, LaneCount | None]] = [
     ("absurd", LaneCount(NOW, -1.0, 0.0)),
     ("absurd", LaneCount(NOW, None, 0.0)),  # type: ignore[arg-type]
     ("absurd", LaneCount("now", 1.0, 0.0)),  # type: ignore[arg-type]
+    ("absurd", LaneCount(NOW, "2", 0.0)),  # type: ignore[arg-type]
+    ("absurd", LaneCount(NOW, 10**400, 0.0)),
     ("absurd", 3),  # type: ignore[list-item]
     ("absurd", LaneCount(NOW, 2.01 * SITE.capacity[LANE], 0.0)),
 ]
@@ -160,6 +164,8 @@ def test_counts_of_lanes_that_nobody_asks_for_are_not_read(count: Any) -> None:
         LaneCount(NOW, 1.9 * SITE.capacity[LANE]),
         LaneCount(NOW, 0.0, math.nan),
         LaneCount(NOW, 2.0, 3.0),  # nobody asks for the standing ones
+        LaneCount(Decimal(0), Decimal(2), None),  # type: ignore[arg-type]
+        LaneCount(np.float32(NOW), np.int64(3), "?"),  # type: ignore[arg-type]
     ],
 )
 def test_a_count_that_can_be_believed_is_used(count: LaneCount) -> None:
@@ -168,16 +174,18 @@ def test_a_count_that_can_be_believed_is_used(count: LaneCount) -> None:
     street.spoil = replaced(count)
     (decision,) = decide(loop, street)
     assert decision.source == "policy"
-    assert policy.seen[-1][SITE.observer.agents[0]][0] == pytest.approx(min(count.vehicles / 40, 1))
+    assert policy.seen[-1][SITE.observer.agents[0]][0] == pytest.approx(
+        min(float(count.vehicles) / 40, 1)
+    )
 
 
 def test_standing_vehicles_are_checked_where_the_policy_sees_them() -> None:
     site = Site.of(GRID, {"observation": "queue"})
     for halting in (math.nan, -1.0, 2.5):
         watchdog = Watchdog({LANE: 10.0}, site.halting, TrustLimits())
-        (reason,) = watchdog.faults({LANE: LaneCount(0.0, 2.0, halting)}, 0.0).values()
+        (reason,) = watchdog.check({LANE: LaneCount(0.0, 2.0, halting)}, 0.0)[1].values()
         assert reason.startswith("absurd: ")
-    assert not watchdog.faults({LANE: LaneCount(0.0, 2.0, 2.0)}, 0.0)
+    assert not watchdog.check({LANE: LaneCount(0.0, 2.0, 2.0)}, 0.0)[1]
 
 
 def failing(_counts: Counts) -> Counts:
@@ -245,7 +253,7 @@ def held(
     found: dict[int, dict[str, str]] = {}
     for now in range(0, 3600, 10):
         read = {lane: LaneCount(now, value) for lane, value in counts(now).items()}
-        if faults := watchdog.faults(read, float(now), red(now)):
+        if faults := watchdog.check(read, float(now), red(now))[1]:
             found[now] = faults
     return found
 
@@ -515,7 +523,7 @@ def test_a_street_that_is_late_shortens_nothing() -> None:
 
     street = Late()
     loop = FieldLoop(SITE, Scripted(), street, QUICK)
-    loop.run(100.0)
+    loop.drive(100.0)
     shown = [states[LIGHT] for states in street.by_second]
     yellows = [
         len(run)
@@ -526,6 +534,22 @@ def test_a_street_that_is_late_shortens_nothing() -> None:
     assert min(yellows) >= SITE.timing.yellow_s
 
 
+def test_a_loop_that_is_gone_leaves_no_thread() -> None:
+    def threads() -> int:
+        return sum(thread.name == "policy" for thread in threading.enumerate())
+
+    before = threads()
+    loop = FieldLoop(SITE, Scripted(), MadeUpStreet(), QUICK)
+    loop.drive(20.0)
+    assert threads() == before + 1
+    del loop
+    gc.collect()
+    until = time.monotonic() + 10.0
+    while threads() > before and time.monotonic() < until:
+        time.sleep(0.01)
+    assert threads() == before
+
+
 # --- records --------------------------------------------------------------------------------------
 
 
@@ -533,10 +557,10 @@ def test_every_decision_is_a_line_and_a_second_run_adds_its_own(tmp_path: Path) 
     path = tmp_path / "field.jsonl"
     street = MadeUpStreet()
     street.spoil = replaced(None)
-    loop = FieldLoop(SITE, Scripted(), street, QUICK, DecisionLog(path))
-    loop.run(30.0)
-    loop = FieldLoop(SITE, Scripted(), street, QUICK, DecisionLog(path))
-    loop.run(20.0)
+    for seconds in (30.0, 20.0):
+        log = DecisionLog(path)
+        FieldLoop(SITE, Scripted(), street, QUICK, log).drive(seconds)
+        log.close()
     rows = [json.loads(line) for line in path.read_text().splitlines()]
     assert [row["time_s"] for row in rows] == [0, 10, 20, 30, 40]
     assert {row["source"] for row in rows} == {"both"}
@@ -567,13 +591,14 @@ def test_a_log_that_cannot_be_written_for_a_while_does_not_stop_the_lights(tmp_p
         if decision.time_s == 40:
             folder.unlink()
 
-    loop.run(60.0, disturb)
+    loop.drive(60.0, disturb)
+    log.close()
     rows = [json.loads(line) for line in log.path.read_text().splitlines()]
     assert [row["time_s"] for row in rows] == [20, 30, 40, 50]
     assert [entry.name for entry in folder.iterdir()] == ["field.jsonl"]
 
 
-def test_a_street_that_is_gone_ends_the_loop_with_its_log_written(tmp_path: Path) -> None:
+def test_a_street_that_is_gone_ends_the_loop_with_its_decisions_kept(tmp_path: Path) -> None:
     class Gone(MadeUpStreet):
         def show(self, states: Mapping[str, str]) -> None:
             if self.time_s >= 20:
@@ -583,7 +608,8 @@ def test_a_street_that_is_gone_ends_the_loop_with_its_log_written(tmp_path: Path
     log = DecisionLog(tmp_path / "field.jsonl")
     loop = FieldLoop(SITE, Scripted(), Gone(), QUICK, log)
     with pytest.raises(SimulatorError):
-        loop.run(100.0)
+        loop.drive(100.0)
+    log.close()
     assert len((tmp_path / "field.jsonl").read_text().splitlines()) == 2
 
 
@@ -593,7 +619,7 @@ def test_the_summary_adds_up() -> None:
     street.spoil = replaced(None)
     decide(loop, street)
     street.spoil = lambda counts: counts
-    summary = loop.run(40.0)
+    summary = loop.drive(40.0)
     assert (summary.decisions, summary.light_decisions) == (5, 20)
     assert dict(summary.reasons) == {"missing": 1, "returning": 2}
     assert summary.fallback_share == 3 / 20
@@ -634,7 +660,7 @@ def test_a_network_answers_for_sixteen_lights() -> None:
     site = Site.of(scenario, policy.env_options)
     street = MadeUpStreet(site)
     loop = FieldLoop(site, policy, street)
-    summary = loop.run(1000.0)
+    summary = loop.drive(1000.0)
     assert len(summary.latencies_ms) == 100
 
 
@@ -670,7 +696,7 @@ def test_the_street_of_the_page_is_driven() -> None:
     street = names["CabinetStreet"](
         cabinet, clock=made_up.now_s, sleep=lambda s: made_up.wait(made_up.time_s + s)
     )
-    summary = FieldLoop(SITE, Scripted(), street, QUICK).run(60.0)
+    summary = FieldLoop(SITE, Scripted(), street, QUICK).drive(60.0)
     assert (summary.decisions, summary.fallback_share, cabinet.polled) == (6, 0, 6)
     assert made_up.states[LIGHT] == SITE.network.intersections[0].phases[-1]
     assert not broken_rules(made_up.by_second)

@@ -17,7 +17,7 @@ import pytest
 from tests.field.loop_test import LIGHT, QUICK, SITE, MadeUpStreet, Scripted
 from tests.field.street_test import SumoServer
 from ugat_marl.effects import load_scenario
-from ugat_marl.errors import OptionError, OutputError, SimulatorError
+from ugat_marl.errors import EpisodeError, OptionError, OutputError, SimulatorError
 from ugat_marl.field import DecisionLog, FieldService, Health, TraciStreet
 from ugat_marl.field.service import FIRST_PAUSE_S, LONGEST_PAUSE_S
 
@@ -237,3 +237,10 @@ def test_a_sumo_that_stops_counts_as_gone(tmp_path: Path) -> None:
     street.close()
     assert time.monotonic() - begun < 5.0
     sumo.end()
+
+
+def test_a_service_runs_once() -> None:
+    once = service(Coming(MadeUpStreet(), MadeUpStreet()))
+    assert once.run(20.0).decisions == 2
+    with pytest.raises(EpisodeError, match="make another one"):
+        once.run(20.0)

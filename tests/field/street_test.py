@@ -109,7 +109,7 @@ def test_minutes_of_single_v1_in_snow(running: Callable[..., Any]) -> None:
     site = Site.of(scenario, policy.env_options)
     sumo, street = running(scenario, site)
     loop = FieldLoop(site, policy, street)
-    summary = loop.run(240.0)
+    summary = loop.drive(240.0)
     assert (summary.decisions, summary.fallback_share) == (24, 0)
     assert street.now_s() == 240
     assert len(street.by_second) == 241
@@ -151,7 +151,7 @@ def test_a_policy_sees_in_the_field_what_it_sees_in_an_environment(
     here, there = Remembering(make(env)), Remembering(make(env))
     site = Site.of(scenario, options)
     _, street = running(scenario, site)
-    FieldLoop(site, there, street).run(200.0)
+    FieldLoop(site, there, street).drive(200.0)
     observations, infos = env.reset(seed=3)
     here.reset(0)
     while env.agents:
@@ -187,7 +187,7 @@ def test_areas_count_where_they_lie_and_other_lanes_are_missing(
     loop = FieldLoop(site, policy, street)
     (light,) = site.lights
     reasons: list[str] = []
-    loop.run(60.0, lambda decision: reasons.append(decision.fallback[light]))
+    loop.drive(60.0, lambda decision: reasons.append(decision.fallback[light]))
     assert all("missing: no count of lane W_C_0" in reason for reason in reasons)
 
 
@@ -217,7 +217,7 @@ def test_a_street_that_goes_away_is_told(running: Callable[..., Any]) -> None:
             sumo.end()
 
     with pytest.raises(SimulatorError, match="Connection closed by SUMO"):
-        loop.run(100.0, end)
+        loop.drive(100.0, end)
     assert loop.summary.decisions == 3
     assert street.now_s() == 30
 
@@ -257,7 +257,7 @@ def test_the_own_sumo_of_a_demonstration_is_the_same_street(
     with SimulatedStreet(scenario, 3, tuple(site.capacity)) as own:
         for street in (own, over_traci):
             made: list[Any] = []
-            FieldLoop(site, policy, street, TrustLimits(answer_ms=5000)).run(240.0, made.append)
+            FieldLoop(site, policy, street, TrustLimits(answer_ms=5000)).drive(240.0, made.append)
             seen.append([(d.time_s, d.phases, d.fallback) for d in made])
         trips.append(own.trips())
     over_traci.close()

@@ -53,6 +53,13 @@ def test_one_episode_is_played_and_recorded(env: TrafficEnv) -> None:
     assert played.mean_reward == pytest.approx(env.scores().reward)
 
 
+def test_a_recorded_episode_leaves_no_measurement_for_the_next_one(env: TrafficEnv) -> None:
+    roll_out(env, Always(), 1, record=observer_of(env, "waiting"))
+    assert len(env.snapshot.waiting_s) > 0
+    roll_out(env, Always(), 1)
+    assert len(env.snapshot.waiting_s) == 0
+
+
 def test_what_is_recorded_can_differ_from_what_the_policy_sees() -> None:
     rule = make_rule("largest-queue:20", parallel_env("grid2x2-v1", duration_s=100))
     env = parallel_env("grid2x2-v1", duration_s=100, **rule.env_options)

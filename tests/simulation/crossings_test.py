@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Mapping
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -42,9 +43,11 @@ def simulator() -> Iterator[LibsumoSimulator]:
 def start(simulator: LibsumoSimulator, crossing: Crossing, tmp_path: Path) -> Callable[..., Any]:
     """Starts the crossing with some vehicles; crossings are looked for unless told otherwise."""
 
-    def begin(vehicles: str, crossings: bool = True) -> Snapshot:
+    def begin(vehicles: str, crossings: bool = True, step_s: float = 1.0) -> Snapshot:
+        scenario = load_scenario(crossing(vehicles=vehicles))
+        settings = scenario.settings.model_copy(update={"step_length_s": step_s})
         launch = launch_of(
-            load_scenario(crossing(vehicles=vehicles)),
+            replace(scenario, settings=settings),
             1,
             tmp_path / "own",
             LANES,
@@ -89,6 +92,22 @@ def test_a_vehicle_counts_in_all_the_seconds_after_it_has_left(
     # The next interval begins at nothing: what left before is not counted again.
     later = simulator.advance(10, {"C": [(10.0, "rG")]}).mean_left
     np.testing.assert_allclose(later, [0, float(red_s == 10), 0, 0])
+
+
+@pytest.mark.parametrize(
+    ("red_s", "share"),
+    [(1.0, 1.5 / 2.5), (2.0, 0.5 / 2.5)],  # of 2.5 s, gone in the second 2 or 3
+)
+def test_a_part_of_a_second_counts_as_a_part(
+    red_s: float, share: float, simulator: LibsumoSimulator, start: Any
+) -> None:
+    start(ONE_WAITS, step_s=0.5)
+    simulator.advance(10, {"C": [(10.0, "Gr")]})
+    snapshot = simulator.advance(2.5, {"C": [(red_s, "Gr"), (2.5 - red_s, "rG")]})
+    assert snapshot.mean_left[WEST] == pytest.approx(share)
+    # nothing of the part is left for the next interval
+    later = simulator.advance(0.5, {"C": [(0.5, "rG")]}).mean_left
+    assert later.tolist() == [0, 0, 0, 0]
 
 
 def test_several_vehicles_add_up_as_counts_by_the_second_do(

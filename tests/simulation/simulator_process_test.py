@@ -35,6 +35,7 @@ from ugat_marl.simulation import (
     kept_warm,
     launch_of,
 )
+from ugat_marl.simulation.host import _WarmParent
 
 Crossing = Callable[..., Path]
 
@@ -147,6 +148,21 @@ def test_resets_leak_nothing(crossing: Crossing, temporary: Path) -> None:
     assert len(counts) == 1
     env.close()
     assert list(temporary.iterdir()) == []
+
+
+@needs_proc
+def test_a_killed_parent_of_workers_leaves_no_descriptor(crossing: Crossing) -> None:
+    env = parallel_env(crossing())
+    counts: list[int] = []
+    for number in range(4):
+        env.reset(seed=number)
+        for parent in _WarmParent._current.values():
+            parent._process.kill()
+            parent._process.wait()
+        gc.collect()
+        counts.append(len(list(Path("/proc/self/fd").iterdir())))
+    assert len({*counts[1:]}) == 1
+    env.close()
 
 
 def test_a_forgotten_environment_cleans_up(crossing: Crossing, temporary: Path) -> None:

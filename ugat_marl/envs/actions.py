@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping, Sequence
+from numbers import Real
 from typing import Any
 
 from gymnasium.spaces import Discrete
@@ -39,17 +40,17 @@ def checked_delays(seconds: Mapping[str, float], agents: Sequence[str]) -> dict[
     """Return the delays of the greens of some agents, in s.
 
     Raises:
-        ActionError: A delay is of an unknown agent, negative or not finite.
+        ActionError: A delay is of an unknown agent, not a number, negative or not finite.
     """
     _refuse_unknown("delays", seconds, agents)
     for agent, delay in seconds.items():
-        if not 0 <= delay < math.inf:
+        if not isinstance(delay, Real) or not 0 <= delay < math.inf:
             raise ActionError(f"delay of agent {agent!r} is {delay!r} s; allowed: 0 or more")
     return {agent: float(delay) for agent, delay in seconds.items()}
 
 
 def _refuse_unknown(kind: str, given: Mapping[str, Any], agents: Sequence[str]) -> None:
-    if unknown := sorted(set(given) - set(agents)):
+    if unknown := sorted(set(given) - set(agents), key=str):
         raise ActionError(f"{kind} for unknown agents {unknown}; agents: {[*agents]}")
 
 

@@ -8,6 +8,8 @@ from dataclasses import dataclass, fields
 from numbers import Integral
 from typing import Any, Literal, TypedDict, TypeVar, get_args
 
+import numpy as np
+
 from ugat_marl.effects import ControllerPart
 from ugat_marl.errors import OptionError, UnknownNameError
 from ugat_marl.parallel import require_deadline
@@ -103,6 +105,10 @@ class EnvOptions:
     deadline_s: float | None = None
 
     def __post_init__(self) -> None:
+        for option in fields(self):  # checkpoints are JSON, which has no scalars of NumPy
+            value: Any = getattr(self, option.name)
+            if isinstance(value, np.generic):
+                object.__setattr__(self, option.name, value.item())
         for name, allowed in (
             ("signals", ("actions", "programme")),
             ("simulator", ("process", "spawn", "inprocess")),
@@ -118,9 +124,6 @@ class EnvOptions:
         commands: Any = self.commands
         if not _is_count(commands):
             raise OptionError(f"commands = {commands!r}: must be 0 or a number of decisions")
-        # Checkpoints are JSON, which has no integers of NumPy
-        object.__setattr__(self, "neighbours", int(roads))
-        object.__setattr__(self, "commands", int(commands))
         require_deadline(self.deadline_s)
         if self.deadline_s is not None and self.simulator == "inprocess":
             raise OptionError(

@@ -34,7 +34,7 @@ from ugat_marl.envs.registration import register_single
 from ugat_marl.envs.rendering import NetworkRenderer
 from ugat_marl.envs.rewards import Rewarder
 from ugat_marl.envs.sensors import Sensors
-from ugat_marl.envs.types import AnyParallelEnv, StepResult
+from ugat_marl.envs.types import AnyParallelEnv, ResetResult, StepResult
 from ugat_marl.errors import EpisodeError, OptionError
 from ugat_marl.files import OwnDirectory
 from ugat_marl.scenarios import Network, Scenario, check_demand, signals
@@ -198,6 +198,14 @@ class TrafficEnv(ParallelEnv[str, Any, Any]):
             self.np_random = np.random.default_rng(seed)
         self._scores, self.agents = None, []  # if SUMO does not start, no episode has begun
         self._start(int(self.np_random.integers(2**31)))
+        try:
+            return self._begun()
+        except BaseException:  # of an observation of the user
+            self.agents = []
+            raise
+
+    def _begun(self) -> ResetResult:
+        """Prepare for an episode whose simulation has started; return the results of `reset`."""
         self.agents = self.possible_agents[:]
         self._decision, self._remembered = 0, None
         self._states = [signals.initial_state(self._timing) for _ in self.agents]
@@ -293,7 +301,10 @@ class TrafficEnv(ParallelEnv[str, Any, Any]):
 
         Raises:
             ActionError: A command is missing, unknown or out of range.
+            EpisodeError: The episode has not begun or is over.
         """
+        if not self.agents:
+            raise EpisodeError("remember() needs a running episode; call reset() first")
         self._remembered = checked_phases(commands, self.agents, self.action_spaces)
 
     def do_meanwhile(self, work: Callable[[], object] | None) -> None:

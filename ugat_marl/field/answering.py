@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import queue
 import threading
+import weakref
 from collections.abc import Callable
 from typing import Any, TypeVar
 
@@ -26,7 +27,7 @@ class Answering:
 
     A thread cannot be ended from outside. A late function therefore runs to its end, and its answer
     is thrown away. No other function is called before that end. The thread does not keep the
-    program alive.
+    program alive, and ends with this object.
     """
 
     def __init__(self) -> None:
@@ -35,6 +36,7 @@ class Answering:
         self._owed = 0
         arguments = (self._questions, self._answers)
         threading.Thread(target=_serve, args=arguments, daemon=True, name="policy").start()
+        self._end = weakref.finalize(self, self._questions.put, None)
 
     def ask(self, function: Callable[..., Answer], *arguments: Any, within_s: float) -> Answer:
         """Call a function and return its answer.
@@ -61,7 +63,7 @@ class Answering:
 
     def close(self) -> None:
         """Let the thread end as soon as it is free."""
-        self._questions.put(None)
+        self._end()
 
 
 def _serve(questions: _Questions, answers: _Answers) -> None:

@@ -74,7 +74,7 @@ class FieldLoop:
         policy: The policy; it runs in a thread of its own.
         street: The street whose counts are read and whose lights are set.
         limits: Limits of trust; None for the default values.
-        log: Log of the decisions; None for no log.
+        log: Log of the decisions, which the caller closes; None for no log.
 
     Attributes:
         summary: Counts of all decisions.
@@ -118,28 +118,14 @@ class FieldLoop:
         if self._memory is not None:
             self._memory.reset([light.phase for light in lights.machines.values()])
         self._watchdog = Watchdog(self._site.capacity, self._site.halting, self._limits)
-        self._held: frozenset[str] = frozenset()
+        self._without_green: frozenset[str] = frozenset()
         self._trust = Trust(self._site.lights, self._limits.return_after)
         self._warm_up(self._policy)
 
-    def run(
+    def drive(
         self, seconds: float, on_decision: Callable[[Decision], None] | None = None
     ) -> LoopSummary:
-        """Drive the street for `seconds`, rounded up to whole decisions, and close the log.
-
-        Raises:
-            SimulatorError: The connection to the street is lost; no light can be set any more.
-            OutputError: The log cannot be written at the end.
-        """
-        try:
-            self.drive(seconds, on_decision)
-        finally:
-            if self._log is not None:
-                self._log.close()
-        return self.summary
-
-    def drive(self, seconds: float, on_decision: Callable[[Decision], None] | None = None) -> None:
-        """Drive the street for `seconds`, rounded up to whole decisions.
+        """Drive the street for `seconds`, rounded up to whole decisions; return `summary`.
 
         Raises:
             SimulatorError: The connection to the street is lost; no light can be set any more.
@@ -151,6 +137,7 @@ class FieldLoop:
             self.driven_s += self._street.now_s() - now
             if on_decision is not None:
                 on_decision(decision)
+        return self.summary
 
     def decide(self) -> tuple[Decision, dict[str, list[Segment]]]:
         """Read the counts, check them and decide; no light is set yet.
@@ -187,7 +174,7 @@ class FieldLoop:
         self.summary.add(decision)
         if self._log is not None:
             self._log.add(decision)
-        self._held = _without_green(self._site, plans)
+        self._without_green = _without_green(self._site, plans)
 
     def close(self) -> None:
         """Let the policy's thread end; the lights keep their states."""
@@ -199,8 +186,7 @@ class FieldLoop:
         A light is at fault if it needs a count that is not trusted, or if it is not taken over yet.
         """
         try:
-            counts = dict(self._street.read())
-            wrong = self._watchdog.faults(counts, now, self._held)
+            counts, wrong = self._watchdog.check(self._street.read(), now, self._without_green)
         except (Exception, SystemExit) as error:  # noqa: BLE001 - whatever a detector's driver raises
             reason = f"missing: no counts at all, {type(error).__name__}: {error}"
             return {}, dict.fromkeys(self._lights.machines, reason)
@@ -211,8 +197,7 @@ class FieldLoop:
                 faults[name] = reasons[0] + (f" (+{len(reasons) - 1})" if reasons[1:] else "")
             elif not light.taken_over:
                 faults[name] = "beginning: it shows what is none of its phases"
-        checked = [lane for lane in self._site.capacity if lane in counts and lane not in wrong]
-        return {lane: counts[lane] for lane in checked}, faults
+        return counts, faults
 
     def _ask(
         self, counts: Mapping[str, LaneCount], now: float, begun: float

@@ -6,7 +6,7 @@ import math
 import time
 from collections.abc import Callable
 
-from ugat_marl.errors import OutputError, SimulatorError
+from ugat_marl.errors import EpisodeError, OutputError, SimulatorError
 from ugat_marl.field.decisions import Decision, DecisionLog
 from ugat_marl.field.health import Health
 from ugat_marl.field.loop import FieldLoop, LoopSummary
@@ -60,11 +60,14 @@ class FieldService:
         self._lost: Exception | None = None
         self._losses = 0
         self._of_caller: Exception | None = None
+        self._has_run = False
 
     def run(
         self, seconds: float, on_decision: Callable[[Decision], None] | None = None
     ) -> LoopSummary:
         """Drive the street for `seconds`, not counting the time without it, and close the log.
+
+        A service runs once.
 
         Args:
             seconds: Time to drive, s; inf for ever.
@@ -76,7 +79,11 @@ class FieldService:
             Exception: What `on_decision` raises.
             OptionError: The street lacks a light, or a light shows a state that it cannot have.
             OutputError: The log cannot be written at the end.
+            EpisodeError: The service has run before.
         """
+        if self._has_run:
+            raise EpisodeError("this FieldService has run; make another one to go on")
+        self._has_run = True
         try:
             return self._driven(seconds, on_decision)
         finally:
@@ -93,8 +100,9 @@ class FieldService:
         while True:
             try:
                 loop = self._reached()
-                loop.drive(seconds - loop.driven_s, lambda made: self._tell(made, on_decision))
-                return loop.summary
+                return loop.drive(
+                    seconds - loop.driven_s, lambda made: self._tell(made, on_decision)
+                )
             except OutputError:
                 raise
             except (SimulatorError, OSError) as error:

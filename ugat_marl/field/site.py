@@ -17,6 +17,7 @@ from ugat_marl.field.street import LaneCount
 from ugat_marl.scenarios import Network, Scenario, SignalTiming, within_hops
 from ugat_marl.simulation import Snapshot
 
+_COUNTED = ("count", "queue", "density", "pressure", "movements")
 _INCOMING_ONLY = ("count", "queue", "density")
 _HALTING = ("queue", "movements")
 
@@ -50,10 +51,11 @@ class Site:
                 phases, or the scenario counts vehicles upstream of the lanes at the lights.
         """
         name, hops = env_options.get("observation", "count"), env_options.get("neighbours", 0)
-        if name == "waiting":
+        if name not in _COUNTED:
+            seen = "waiting times" if name == "waiting" else repr(name)
             raise OptionError(
-                "the policy observes waiting times, which detectors do not count; in the field: "
-                "count, queue, density, pressure or movements"
+                f"the policy observes {seen}, which detectors do not count; in the field: "
+                f"{', '.join(_COUNTED)}"
             )
         if env_options.get("signals", "actions") != "actions":
             raise OptionError(

@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Collection, Mapping
 from dataclasses import dataclass, fields
+from typing import Any
 
 from ugat_marl.errors import OptionError
 from ugat_marl.field.street import LaneCount
@@ -80,36 +81,44 @@ class Watchdog:
         self._looked_s = self._moved_s = 0.0
         self._counted: set[str] = set()
 
-    def faults(
-        self, counts: Mapping[str, LaneCount], now_s: float, held: Collection[str] = ()
-    ) -> dict[str, str]:
-        """Return lane to fault, ``<kind>: <details>``, for the lanes whose count is not trusted.
+    def check(
+        self, counts: Mapping[str, LaneCount], now_s: float, without_green: Collection[str] = ()
+    ) -> tuple[dict[str, LaneCount], dict[str, str]]:
+        """Return the trusted counts, and lane to fault, ``<kind>: <details>``, for the others.
 
         Args:
-            counts: Lane to its count.
+            counts: Lane to its count, whose numbers may be of any type.
             now_s: Time on the street's clock, s.
-            held: Lanes without green since the last call; no vehicle could leave them.
+            without_green: Lanes without green since the last call; no vehicle could leave them.
         """
+        trusted: dict[str, LaneCount] = {}
         lane_faults: dict[str, str] = {}
         elapsed, self._looked_s = now_s - self._looked_s, now_s
         for lane, capacity in self._capacity.items():
-            count = counts.get(lane)
-            if count is None:
-                lane_faults[lane] = f"missing: no count of lane {lane}"
-            elif wrong := self._wrong(count, capacity, now_s):
-                lane_faults[lane] = f"{wrong} on lane {lane}"
-            else:
-                waits = lane in held or count.vehicles >= _FULL * capacity
+            count, wrong = counts.get(lane), f"missing: no count of lane {lane}"
+            if count is not None:
+                count, wrong = self._checked(count, capacity, now_s)
+                wrong = wrong and f"{wrong} on lane {lane}"
+            if count is not None and not wrong:
+                waits = lane in without_green or count.vehicles >= _FULL * capacity
                 self._note(lane, count, now_s, 0.0 if waits else elapsed)
-                continue
-            self._value.pop(lane, None)  # the lane's next good count is a change
-        return self._stuck(now_s) | lane_faults
+                trusted[lane] = count
+            else:
+                lane_faults[lane] = wrong
+                self._value.pop(lane, None)  # the lane's next good count is a change
+        lane_faults = self._stuck(now_s) | lane_faults
+        return {lane: n for lane, n in trusted.items() if lane not in lane_faults}, lane_faults
 
-    def _wrong(self, count: LaneCount, capacity: float, now_s: float) -> str:
+    def _checked(
+        self, count: LaneCount, capacity: float, now_s: float
+    ) -> tuple[LaneCount | None, str]:
+        """Return a count with numbers of Python, and what is wrong with it, or ""."""
         try:
-            return self._absurd(count, capacity) or self._stale(count, now_s)
-        except (TypeError, ValueError, AttributeError):  # a driver may return anything
-            return f"absurd: {count!r} is not a count"
+            halting = _number(count.halting) if self._halting else math.nan
+            plain = LaneCount(_number(count.time_s), _number(count.vehicles), halting)
+        except (TypeError, ValueError, AttributeError, ArithmeticError):  # drivers return anything
+            return None, f"absurd: {count!r:.200} is not a count"
+        return plain, self._absurd(plain, capacity) or self._stale(plain, now_s)
 
     def _absurd(self, count: LaneCount, capacity: float) -> str:
         vehicles, halting = count.vehicles, count.halting
@@ -158,3 +167,9 @@ class Watchdog:
             ):
                 stuck[lane] = f"silent: nobody for {silent:g} s on lane {lane}"
         return stuck
+
+
+def _number(value: Any) -> float:
+    if isinstance(value, str | bytes):
+        raise TypeError(f"{value!r:.200} is text")
+    return float(value)

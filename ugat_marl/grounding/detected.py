@@ -35,6 +35,7 @@ from scipy.stats import norm
 
 from ugat_marl.errors import OptionError
 from ugat_marl.scenarios import GREEN, Detector, Lane, Passages, Period, deciding_letter
+from ugat_marl.simulation import seconds_of
 
 Floats = NDArray[np.float64]
 
@@ -173,11 +174,12 @@ class LaneCourse:
     def mean_left(self, times_s: Floats, interval_s: float) -> Floats:
         """Return the vehicles that left after each time, averaged over an interval, ``(times,)``.
 
-        The mean is over the whole seconds of the interval, as in `Snapshot.mean_left`.
+        The mean is over the seconds of the interval, as in `Snapshot.mean_left`.
         """
-        seconds = np.arange(1, int(interval_s) + 1)
+        seconds = seconds_of(interval_s)
         after = np.stack([_passed(self.leave_s, times_s + second) for second in seconds])
-        return after.mean(0) - _passed(self.leave_s, times_s)
+        widths = np.diff(seconds, prepend=0.0)[:, None]
+        return (after * widths).sum(0) / interval_s - _passed(self.leave_s, times_s)
 
     def deviation(self, times_s: Floats) -> Floats:
         """Return the standard deviation of `vehicles`, ``(times,)``.

@@ -65,10 +65,24 @@ def own_name(given: Any) -> str:
     """Return the name ``module:name`` of an object, under which `load_own` finds it here."""
     kind = _named(given)
     name = f"{kind.__module__}:{kind.__qualname__}"
-    if isinstance(given, functools.partial):
-        name += ".<partial>"  # without its arguments no other process may take the class for it
+    if not _is_found(kind, given):
+        name += ".<given>"  # no other process may take what it finds by the name for it
     _given[name] = given
     return name
+
+
+def _is_found(kind: Any, given: Any) -> bool:
+    """Return False if the name of `kind` leads to another object than was given.
+
+    It does so for a `functools.partial`, a bound method, and a function or class in a decorator
+    that copied its name.
+    """
+    found: Any = sys.modules.get(kind.__module__)
+    for part in kind.__qualname__.split("."):
+        found = getattr(found, part, None)
+    if hasattr(given, "__qualname__") or isinstance(given, functools.partial):
+        return found is given or "<" in kind.__qualname__
+    return found is kind
 
 
 def load_own(name: str, what: str) -> Any:

@@ -72,8 +72,8 @@ def roll_out(
             those that the policy reads. It needs an environment of the suite.
         on_step: Function called after every decision.
     """
+    base: Any = env.unwrapped
     if record is not None:
-        base: Any = env.unwrapped
         base.measure_for(record)
     observations, infos = env.reset(seed=seed)
     policy.reset(seed)
@@ -89,6 +89,8 @@ def roll_out(
         steps += 1
         if on_step is not None:
             on_step(steps)
+    if record is not None:
+        base.measure_for()
     return Episode(steps, total / max(steps, 1), recording.log() if recording else None)
 
 
@@ -126,9 +128,9 @@ class _Recording:
         then = self._look()
         self._refuse_other_greens()
         executed = {agent: int(infos[agent]["executed_action"]) for agent in self._names}
-        held = {agent: float(infos[agent].get("delay_s", 0.0)) for agent in self._names}
-        acted, served, got, held = map(self._renamed, (actions, executed, rewards, held))
-        row = self._seen, acted, served, got, then, held, self._served(), self._masks
+        delay_s = {agent: float(infos[agent].get("delay_s", 0.0)) for agent in self._names}
+        acted, served, got, delay_s = map(self._renamed, (actions, executed, rewards, delay_s))
+        row = self._seen, acted, served, got, then, delay_s, self._served(), self._masks
         self._recorder.record(0, self._step, *row)
         self._seen = then
         if self._base.agents:

@@ -30,5 +30,6 @@ from .simulator import simulation_runs_here as simulation_runs_here
 from .snapshots import HALTING_MPS as HALTING_MPS
 from .snapshots import Snapshot as Snapshot
 from .snapshots import Trips as Trips
+from .snapshots import seconds_of as seconds_of
 from .trips import read_trips as read_trips
 from .worker import exit_when_input_ends as exit_when_input_ends

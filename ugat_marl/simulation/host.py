@@ -425,7 +425,10 @@ class _WarmParent:
             cls._told_of_forks = True
         with cls._lock:
             parent = cls._current.get(service)
-            if parent is None or not parent.alive:
+            if parent is not None and not parent.alive:
+                parent.end()
+                parent = None
+            if parent is None:
                 parent = cls._current[service] = cls(service, defaults)
             parent._users += 1
             return parent

@@ -22,7 +22,7 @@ from ugat_marl.scenarios import UpstreamLanes, edge_of_lane
 from ugat_marl.simulation.host import one_line_message, too_much_memory
 from ugat_marl.simulation.launch import ERRORS, TRIPS, Launch, SignalPlans, VehiclePositions
 from ugat_marl.simulation.mesoscopic import MesoscopicLanes
-from ugat_marl.simulation.snapshots import HALTING_MPS, Snapshot, Trips
+from ugat_marl.simulation.snapshots import HALTING_MPS, Snapshot, Trips, seconds_of
 from ugat_marl.simulation.trips import read_trips
 from ugat_marl.simulation.upstream import UpstreamQueues
 
@@ -113,16 +113,17 @@ class LibsumoSimulator:
                 changes[offset].append((tls, state))
                 offset += duration
         begin = self._time_s
-        instants = [float(k) for k in range(1, int(seconds) + 1)] if self._launch.crossings else []
+        instants = seconds_of(seconds).tolist() if self._launch.crossings else []
+        widths = dict(zip(instants, np.diff(instants, prepend=0.0), strict=True))
         left = np.zeros(len(self._launch.lanes))
         mean_left = left.copy()
         try:
             for offset in sorted({*changes, *instants}):
                 if offset > 0:
                     libsumo.simulation.step(begin + offset)
-                if offset in instants:
+                if offset in widths:
                     self._count_left(left)
-                    mean_left += left / len(instants)
+                    mean_left += left * widths[offset] / seconds
                 for tls, state in changes.get(offset, ()):
                     if self._shown.get(tls) != state:
                         libsumo.trafficlight.setRedYellowGreenState(tls, state)

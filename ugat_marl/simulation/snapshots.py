@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass, field, replace
 
 import numpy as np
@@ -9,6 +10,11 @@ from numpy.typing import NDArray
 
 HALTING_MPS = 0.1
 """Speed in m/s below which a vehicle halts (SUMO's definition)."""
+
+
+def seconds_of(interval_s: float) -> NDArray[np.float64]:
+    """Return the ends of the seconds of an interval, s; the last second may be a part of one."""
+    return np.append(np.arange(1.0, math.ceil(interval_s)), interval_s)
 
 
 @dataclass(frozen=True)
@@ -26,9 +32,9 @@ class Snapshot:
         departed: Vehicles that entered the network since the start of the episode.
         backlog: Vehicles that are due but found no space to enter the network.
         mean_left: Number of vehicles that had left the lane's road from this lane, averaged over
-            the seconds since the last snapshot, ``(lanes,)``. It is larger if vehicles leave
-            earlier. Empty unless the simulator was started with `crossings`, and in the first
-            snapshot.
+            the interval since the last snapshot (see `seconds_of`), ``(lanes,)``. It is larger if
+            vehicles leave earlier. Empty unless the simulator was started with `crossings`, and in
+            the first snapshot.
         near: Vehicles, halting vehicles, waiting time and m/s of the mean speed below the limit, in
             the last `zone_m` metres of each lane, ``(4, lanes)``. Empty unless the simulator was
             started with `zone_m`.

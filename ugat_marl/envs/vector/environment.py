@@ -153,7 +153,7 @@ class VectorEnv:
         self._shared = shared
         self._counts = np.array(self.agent_set.action_counts)
         self._begun: list[int] = []
-        self._owed: tuple[Ended, ...] = ()  # of a step in which another environment failed
+        self._owed: tuple[Ended, ...] = ()  # of steps behind which something failed
         self._stepped: list[int] = []
         self._sent: dict[int, _Sent] = {}
 
@@ -209,7 +209,6 @@ class VectorEnv:
         gone = set(chosen)
         self._stepped = [index for index in self._stepped if index not in gone]
         self._begun = [index for index in self._begun if index not in gone]
-        self._owed = tuple(each for each in self._owed if each.environment not in gone)
         self._begin(chosen, seeds)
         self._memory.rewards[chosen] = 0.0
         return self._batch(np.zeros(self.n, dtype=np.bool_), ())
@@ -224,8 +223,8 @@ class VectorEnv:
             ActionError: The shape is wrong, or an agent does not have the phase; nothing was
                 simulated.
             EpisodeError: An environment has no running episode.
-            SimulatorError: SUMO failed. The other environments have made their step; what ended
-                there is handed over with the next step.
+            SimulatorError: SUMO failed. The other environments have made their step. Episodes that
+                ended in it are handed over with the next step, also after a `reset`.
         """
         self.step_async(actions)
         return self.step_wait()
@@ -290,7 +289,7 @@ class VectorEnv:
         Raises:
             EpisodeError: So many steps are not under way.
             SimulatorError: SUMO failed in one environment, which has no episode now. The steps of
-                the others can still be received.
+                the others can still be received, with the episode that it had ended before.
         """
         if not 1 <= count <= len(self._sent):
             raise EpisodeError(
@@ -308,7 +307,8 @@ class VectorEnv:
         numbers = sorted(ready[:count])
         steps = [self._sent.pop(index) for index in numbers]
         truncated = np.array([step.truncated for step in steps])
-        ended = tuple(step.ended for step in steps if step.ended is not None)
+        ended = (*self._owed, *(step.ended for step in steps if step.ended is not None))
+        self._owed = ()
         return self._batch(truncated, ended, numbers)
 
     def close(self) -> None:
@@ -360,20 +360,29 @@ class VectorEnv:
 
     def _receive(self, index: int) -> Sequence[str]:
         """Take the answer of an environment whose step was sent; return its warnings."""
-        step, memory = self._sent.pop(index), self._memory
-        answer = self._environments[index].answer_or_replace()
-        if answer is not None:  # else it died, and another process repeats its episode
-            step.arrived = True
-            if answer.over:
-                step.truncated, step.ended = True, self._ended(index, answer)
-            if answer.over and self.autoreset == "same-step":
-                step.arrived = False
-                step.last = memory.rewards[index].copy(), memory.executed[index].copy()
-                self._environments[index].begin(None, self._domains)
-            elif step.last is not None:
-                memory.rewards[index], memory.executed[index] = step.last
+        step = self._sent.pop(index)
+        try:
+            answer = self._environments[index].answer_or_replace()
+            if answer is not None:  # else it died, and another process repeats its episode
+                self._note(index, step, answer)
+        except BaseException:  # of the next episode: the one that has ended is whole
+            self._owed += () if step.ended is None else (step.ended,)
+            raise
         self._sent[index] = step
         return () if answer is None else answer.warnings
+
+    def _note(self, index: int, step: _Sent, answer: Answer) -> None:
+        """Note an answer to a step that was sent; begin the next episode if this one is over."""
+        memory = self._memory
+        step.arrived = True
+        if answer.over:
+            step.truncated, step.ended = True, self._ended(index, answer)
+        if answer.over and self.autoreset == "same-step":
+            step.arrived = False
+            step.last = memory.rewards[index].copy(), memory.executed[index].copy()
+            self._environments[index].begin(None, self._domains)
+        elif step.last is not None:
+            memory.rewards[index], memory.executed[index] = step.last
 
     def _chosen(self, where: ArrayLike | None) -> list[int]:
         numbers = np.arange(self.n)
@@ -537,13 +546,12 @@ def vector_env(
     n = int(count)
     if autoreset not in get_args(Autoreset):
         raise UnknownNameError("value of option 'autoreset':", str(autoreset), get_args(Autoreset))
-    checked_options(options)
+    given = checked_options(options)
     loaded = load_scenario(scenario)
-    domain_of = domain_chooser(loaded, domains, n, options.get("duration_s"))
-    plain: AnyParallelEnv = parallel_env(loaded, domain_of(0, 0), **options)
+    domain_of = domain_chooser(loaded, domains, n, given.get("duration_s"))
+    plain: AnyParallelEnv = parallel_env(loaded, domain_of(0, 0), **given)
     for each in listed(wrap):
         plain = imported(spelling("wrap", each))(plain)
-    given: dict[str, Any] = {**options}
     shared = Shared(loaded, given, wrap, AgentSet.of(plain), n)
     environments = [RemoteEnv(shared, index, shared.arrays.part(index)) for index in range(n)]
     return VectorEnv(environments, shared.arrays, plain, domain_of, autoreset, shared)

@@ -91,20 +91,21 @@ class Spec:
         return env
 
 
-def checked_options(options: Mapping[str, Any]) -> None:
-    """Refuse options that have no meaning in a vector.
+def checked_options(options: Mapping[str, Any]) -> dict[str, Any]:
+    """Return options as plain values; refuse those that have no meaning in a vector.
 
     Raises:
         UnknownNameError: An option does not exist.
         OptionError: An option chooses the simulator or a render mode.
     """
-    EnvOptions.of(options)
+    checked = EnvOptions.of(options)
     for name in ("simulator", "render_mode"):
         if options.get(name) is not None:
             raise OptionError(
                 f"{name} = {options[name]!r}: the simulations of a vector_env run in processes of "
                 "their own and draw nothing; use parallel_env for that"
             )
+    return {name: getattr(checked, name) for name in options}
 
 
 def listed(wraps: Wraps) -> list[Wrap]:
@@ -130,7 +131,14 @@ def spelling(option: str, function: Callable[..., Any] | str) -> str:
             "lambda, an inner function and one of the program itself do not have; move it to a "
             "module, at its top level"
         )
-    return f"{module}:{name}"
+    text = f"{module}:{name}"
+    if imported(text) != function:  # such as a decorated one that has the name of the original
+        raise OptionError(
+            f"{option} = {function!r}: the workers of a vector_env import it as {text!r}, which is "
+            "another function; give it a name of its own at the top level of a module (a decorator "
+            "with functools.wraps copies the name of what it decorates)"
+        )
+    return text
 
 
 def imported(text: str) -> Any:
