@@ -612,5 +612,5 @@ def test_a_cache_that_cannot_be_written_is_named_before_anything_runs(
     arguments = [*street.arguments(tmp_path / "out"), "--cache", str(tmp_path / "file" / "cache")]
     assert main(arguments) == 2
     said = capsys.readouterr()
-    assert "by --cache" in " ".join(said.err.split())
+    assert "with --cache" in " ".join(said.err.split())
     assert "measured" not in said.out

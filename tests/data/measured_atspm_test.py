@@ -367,7 +367,7 @@ def test_a_recording_that_became_a_log_is_the_same_recording(
     console = Console(record=True, width=400, quiet=False, file=(tmp_path / "said").open("w"))
     assert command.run(console) == 0
     said = console.export_text()
-    assert "3 periods, 2 detectors, 198 vehicles" in said
+    assert "3 periods, 2 detectors, 198 passages over detectors" in said
     assert "no speeds" in said and "rules out: speed_spread" in said
     assert read_measured(directory, scenario, network).hash == street.hash
 
@@ -439,7 +439,7 @@ def test_a_summer_night_that_is_there_twice_is_an_error(imported: Import) -> Non
     steps = [(float(t), code, 5) for t in range(1, 190, 4) for code in (82, 81)]
     steps = [(t + 0.5 * (code == 81), code, n) for t, code, n in steps]
     again = [(t - 90 if t > 120 else t, code, n) for t, code, n in LOG[:6] + steps]
-    with pytest.raises(MeasuredDataError, match=r"steps back by [\d.]+ s, so some time is there"):
+    with pytest.raises(MeasuredDataError, match=r"steps back by [\d.]+ s, so some times occur"):
         imported(log(again))
 
 

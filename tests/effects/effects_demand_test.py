@@ -475,7 +475,7 @@ def test_a_number_that_is_none_is_told_with_the_effect(flow: str, domain: str) -
     routes = f'<routes><flow id="f" begin="0" end="900" {flow} from="a" to="b"/></routes>'
     scenario = load_scenario("single-v1")
     scenario = replace(scenario, routes=(Document("d.rou.xml", None, routes.encode()),))
-    with pytest.raises(ScenarioError, match=r"demand_level=.*cannot be applied, since a number"):
+    with pytest.raises(ScenarioError, match=r"demand_level=.*cannot be applied, because a value"):
         apply_effects(scenario, parse_domain(domain))
 
 
