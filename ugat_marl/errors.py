@@ -149,6 +149,11 @@ def counted(count: int, noun: str) -> str:
     return f"{count} {noun}{'' if count == 1 else 's'}"
 
 
+def joined(texts: Sequence[str]) -> str:
+    """Join texts: ``a``, ``a and b``, ``a, b and c``."""
+    return " and ".join(filter(None, (", ".join(texts[:-1]), *texts[-1:])))
+
+
 def listed(names: Sequence[str], noun: str) -> str:
     """Return how many things there are with their first names, such as "2 lanes ('a', 'b')"."""
     return f"{counted(len(names), noun)} ({first_names([*map(repr, names)])})"

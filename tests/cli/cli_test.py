@@ -54,7 +54,7 @@ def complaint(capsys: pytest.CaptureFixture[str], *arguments: str) -> str:
         (["rollout", "single-v1"], "--out"),
         (["rollout", "single-v1", "--out", "."], "is a folder"),
         (["evaluate", "single-v1", "--out", "/dev/null/x.json"], "cannot be written"),
-        (["evaluate", "single-v1", "--first-seed", "-5"], "negative"),
+        (["evaluate", "single-v1", "--first-seed", "-5"], "--first-seed -5: must be at least 0"),
         (["evaluate", "single-v1", "--policies", "."], "is a folder"),
         (["train", "single-v1", "--out", "/dev/null/run"], "cannot be written"),
         (["train", "single-v1", "--out", ""], "empty"),

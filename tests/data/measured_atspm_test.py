@@ -364,7 +364,9 @@ def test_a_recording_that_became_a_log_is_the_same_recording(
         tmp_path / "mapping.toml",
         directory,
     )
-    console = Console(record=True, width=400, quiet=False, file=(tmp_path / "said").open("w"))
+    console = Console(
+        markup=False, record=True, width=400, quiet=False, file=(tmp_path / "said").open("w")
+    )
     assert command.run(console) == 0
     said = console.export_text()
     assert "3 periods, 2 detectors, 198 passages over detectors" in said

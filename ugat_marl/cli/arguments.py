@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import contextlib
-from collections.abc import Collection, Iterator
+from collections.abc import Collection, Iterator, Sequence
 from dataclasses import MISSING, Field, fields
 from typing import Annotated, Any
 
@@ -87,15 +87,28 @@ def refuse_options(command: Any, names: Collection[str], reason: str) -> None:
         raise OptionError(f"{reason}; leave out {', '.join(map(option_text, unused))}")
 
 
-def require_counts(**options: int | None) -> None:
-    """Refuse numbers below 1; None, for a default, is allowed.
+def require_numbers(least: int, **options: int | None) -> None:
+    """Refuse numbers below a least one; None, for a default, is allowed.
 
     Raises:
-        OptionError: A number is below 1.
+        OptionError: A number is below `least`.
     """
     for name, value in options.items():
-        if value is not None and value < 1:
-            raise OptionError(f"{option_text(name)} {value}: must be at least 1")
+        if value is not None and value < least:
+            raise OptionError(f"{option_text(name)} {value}: must be at least {least}")
+
+
+def require_names(**options: Sequence[str]) -> None:
+    """Refuse options without a value, or with one twice.
+
+    Raises:
+        OptionError: A value is missing, or given twice.
+    """
+    for name, values in options.items():
+        if not values:
+            raise OptionError(f"{option_text(name)} needs at least one value")
+        if len(set(values)) < len(values):
+            raise OptionError(f"{option_text(name)} holds one twice: {' '.join(values)}")
 
 
 @contextlib.contextmanager

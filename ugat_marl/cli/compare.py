@@ -10,7 +10,7 @@ import polars as pl
 from rich.console import Console
 from tyro.conf import Positional, arg
 
-from ugat_marl.cli.arguments import RayAddress, refuse_options, require_counts, workers_of
+from ugat_marl.cli.arguments import RayAddress, refuse_options, require_numbers, workers_of
 from ugat_marl.data import write_csv
 from ugat_marl.effects import domain_label, load_scenario
 from ugat_marl.errors import OptionError
@@ -109,7 +109,7 @@ class Compare:
                 ("learner_settings", "seeds", "episodes", "runs"),
                 "--policies are trained already",
             )
-        require_counts(evaluation_seeds=self.evaluation_seeds, workers=self.workers)
+        require_numbers(1, evaluation_seeds=self.evaluation_seeds, workers=self.workers)
         if self.out is not None:
             require_writable(self.out)
         scenario = load_scenario(self.scenario)

@@ -14,7 +14,7 @@ from ugat_marl.cli.arguments import (
     RayAddress,
     Workers,
     given_words,
-    require_counts,
+    require_numbers,
     workers_of,
 )
 from ugat_marl.data import MeasuredData, read_measured
@@ -111,7 +111,7 @@ class Diagnose:
         return 0
 
     def _config(self) -> DiagnosisConfig:
-        require_counts(workers=self.workers)
+        require_numbers(1, workers=self.workers)
         return DiagnosisConfig(
             budget_h=self.budget_h,
             budget_s=self.budget_s,
@@ -169,7 +169,7 @@ class Diagnose:
             lines.append("The effects are faults of detectors; the simulation stays as it is.")
         if diagnosis.not_corrected is not None:
             lines.append(f"{diagnosis.not_corrected} --correct-anyway does it all the same.")
-        console.print("\n" + "\n".join(lines), soft_wrap=True, markup=False)
+        console.print("\n" + "\n".join(lines), soft_wrap=True)
 
 
 def _say_what_cannot_be_seen(measured: MeasuredData, console: Console) -> None:
@@ -186,7 +186,7 @@ def _say_what_cannot_be_seen(measured: MeasuredData, console: Console) -> None:
         )
     else:
         text = f"Ruled out by what the data lack: {listed}."
-    console.print(text, markup=False)
+    console.print(text)
 
 
 def _in_the_model(effect: NamedEffect) -> bool:

@@ -63,7 +63,6 @@ class Domains:
         console.print(
             f"{len(listed)} domains, {theirs} with a counterpart in Sim2Signal (arXiv:2609.01676). "
             "Effects and their units: docs/reference/effects.md, docs/reference/domains.md",
-            markup=False,
         )
         return 0
 

@@ -10,7 +10,7 @@ from typing import Annotated
 from rich.console import Console
 from tyro.conf import Positional, arg
 
-from ugat_marl.cli.arguments import RayAddress, require_counts, workers_of
+from ugat_marl.cli.arguments import RayAddress, require_names, require_numbers, workers_of
 from ugat_marl.effects import NAMED_DOMAINS, expand_domains, load_scenario
 from ugat_marl.envs import parallel_env
 from ugat_marl.errors import OptionError, ScenarioError
@@ -67,16 +67,11 @@ class Evaluate:
 
     def run(self, console: Console) -> int:
         """Evaluate and print."""
-        for name in ("policies", "domains"):
-            if not getattr(self, name):
-                raise OptionError(f"--{name} needs at least one value")
-        if len(set(self.policies)) < len(self.policies):
-            raise OptionError(f"--policies holds one twice: {' '.join(self.policies)}")
+        require_names(policies=self.policies, domains=self.domains)
         if self.out is not None:
             require_writable(self.out)
-        if self.first_seed < 0:
-            raise OptionError("--first-seed must not be negative")
-        require_counts(seeds=self.seeds, workers=self.workers)
+        require_numbers(0, first_seed=self.first_seed)
+        require_numbers(1, seeds=self.seeds, workers=self.workers)
         scenario = load_scenario(self.scenario)
         domains = self._domains(scenario, console)
         with workers_of(self.workers, self.ray) as workers:
@@ -111,7 +106,7 @@ class Evaluate:
                 try:
                     parallel_env(scenario, name, duration_s=self.duration_s)
                 except (OptionError, ScenarioError) as error:
-                    console.print(f"{name} is left out: {error}", style="dim", markup=False)
+                    console.print(f"{name} is left out: {error}", style="dim")
                     continue
             names.append(name)
         return names

@@ -46,11 +46,9 @@ class ImportAtspm:
         measured = import_atspm(self.events, self.mapping, scenario, Network.read(scenario))
         write_measured(measured, self.out, csv=self.csv)
         for finding in measured.findings:
-            console.print(f"- {finding.text}", markup=False, soft_wrap=True)
+            console.print(f"- {finding.text}", soft_wrap=True)
             if finding.rules_out:
-                console.print(
-                    f"  rules out: {', '.join(finding.rules_out)}", markup=False, soft_wrap=True
-                )
+                console.print(f"  rules out: {', '.join(finding.rules_out)}", soft_wrap=True)
         passages = sum(len(p) for period in measured.periods for p in period.passages.values())
         console.print(
             f"{len(measured.periods)} periods, {len(measured.detectors)} detectors, "

@@ -59,7 +59,7 @@ class ImportLog:
         )
         imported.log.write(self.out)
         for finding in (*(finding.text for finding in measured.findings), *imported.findings):
-            console.print(f"- {finding}", markup=False, soft_wrap=True)
+            console.print(f"- {finding}", soft_wrap=True)
         console.print(
             f"{len(imported.log)} transitions of {imported.log.episodes} periods: {self.out}",
             soft_wrap=True,

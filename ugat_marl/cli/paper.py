@@ -9,9 +9,9 @@ from typing import Annotated, ClassVar
 from rich.console import Console
 from tyro.conf import arg
 
-from ugat_marl.cli.arguments import RayAddress, workers_of
+from ugat_marl.cli.arguments import RayAddress, require_numbers, workers_of
 from ugat_marl.data import write_csv
-from ugat_marl.errors import OptionError, OutputError, require_least
+from ugat_marl.errors import OptionError, OutputError
 from ugat_marl.experiments import (
     DIRECT,
     Comparison,
@@ -79,7 +79,7 @@ class _Paper:
 
     def run(self, console: Console) -> int:
         """Train and evaluate; print the table and write it as Markdown, CSV and PNG."""
-        require_least(1, jobs=self.jobs)
+        require_numbers(1, jobs=self.jobs)
         if self.ray is not None and self.config.device != "cpu":
             raise OptionError(
                 f"device = {self.config.device!r}: trainings on Ray have a core each and no GPU; "

@@ -109,12 +109,11 @@ class Plan:
         out, name = shlex.quote(str(self.out)), shlex.quote(self.scenario)
         if self.policy in (None, "programme"):
             for note in programme_notes(played, plans, str(self.out)):
-                console.print(f"note: {note}", markup=False, soft_wrap=True)
-        console.print(f"plans: {out}", markup=False, soft_wrap=True)
+                console.print(f"note: {note}", soft_wrap=True)
+        console.print(f"plans: {out}", soft_wrap=True)
         console.print(
             f"next: ugat-marl plan {name} --apply {out} --out NEW, then ugat-marl evaluate NEW "
             "--policies programme",
-            markup=False,
             soft_wrap=True,
         )
         return 0
@@ -133,12 +132,11 @@ class Plan:
             planned.write(folder)
         console.print(plan_table(plans, LightNames.of(network)))
         for note in (*notes, *yellow_notes(plans)):
-            console.print(f"note: {note}", markup=False, soft_wrap=True)
+            console.print(f"note: {note}", soft_wrap=True)
         name = shlex.quote(str(self.out))
         console.print(
             f"{self.out}: {scenario.id} with programmes from {counted(len(plans), 'plan')}\n"
             f"next: ugat-marl evaluate {name} --policies programme --domains sim",
-            markup=False,
             soft_wrap=True,
         )
         return 0

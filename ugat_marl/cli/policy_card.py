@@ -47,5 +47,5 @@ class PolicyCardCommand:
             "SHA-256": card.sha256,
         }
         for name, text in rows.items():
-            console.print(f"{name}: {text}", markup=False, soft_wrap=True)
+            console.print(f"{name}: {text}", soft_wrap=True)
         return 0

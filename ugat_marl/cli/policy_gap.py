@@ -9,12 +9,11 @@ from typing import Annotated
 from rich.console import Console
 from tyro.conf import Positional, arg
 
-from ugat_marl.cli.arguments import LengthS, Workers, require_counts
+from ugat_marl.cli.arguments import LengthS, Workers, require_names, require_numbers
 from ugat_marl.cli.diagnose import REPORT
 from ugat_marl.cli.evaluate import names_of
 from ugat_marl.diagnosis import FILE
 from ugat_marl.effects import domain_label, load_scenario, same_for_agents
-from ugat_marl.errors import OptionError
 from ugat_marl.experiments import policy_factory, policy_gap, read_diagnosis, write_policy_gap
 from ugat_marl.files import require_writable
 from ugat_marl.progress import Bars
@@ -58,13 +57,9 @@ class PolicyGap:
 
     def run(self, console: Console) -> int:
         """Play, write and print."""
-        if not self.policies:
-            raise OptionError("--policies needs at least one value")
-        if len(set(self.policies)) < len(self.policies):
-            raise OptionError(f"--policies holds one twice: {' '.join(self.policies)}")
-        require_counts(seeds=self.seeds, workers=self.workers)
-        if self.first_seed < 0:
-            raise OptionError("--first-seed must not be negative")
+        require_names(policies=self.policies)
+        require_numbers(1, seeds=self.seeds, workers=self.workers)
+        require_numbers(0, first_seed=self.first_seed)
         scenario = load_scenario(self.scenario)
         diagnosis, corrected = read_diagnosis(self.directory, scenario)
         require_writable(self.directory / FILE)

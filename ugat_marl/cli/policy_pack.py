@@ -37,5 +37,5 @@ class PolicyPack:
         """Pack, and print the ids."""
         require_writable(self.out / "card.json")
         for card in pack(self.training, self.out, self.command):
-            console.print(f"{self.out / card.id}.pt", markup=False, soft_wrap=True)
+            console.print(f"{self.out / card.id}.pt", soft_wrap=True)
         return 0

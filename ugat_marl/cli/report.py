@@ -69,12 +69,12 @@ class Report:
         write_whole(out, page.text)
         for record in records:
             for text in record.missing:
-                console.print(f"{record.name}: {text}", soft_wrap=True, markup=False)
+                console.print(f"{record.name}: {text}", soft_wrap=True)
         lines = [f"page: {out}"]
         if self.pictures is not None:
             write_pictures(page.pictures, self.pictures)
             lines.append(f"{len(page.pictures)} pictures, as SVG and PNG: {self.pictures}")
-        console.print("\n".join(lines), soft_wrap=True, markup=False)
+        console.print("\n".join(lines), soft_wrap=True)
         return 0
 
 

@@ -15,7 +15,7 @@ from ugat_marl.cli.arguments import (
     RayAddress,
     Workers,
     refuse_options,
-    require_counts,
+    require_numbers,
     workers_of,
 )
 from ugat_marl.cli.evaluate import names_of
@@ -121,7 +121,7 @@ class Rollout:
         """Record, film and write."""
         if self.episodes < 1 or not 0 <= self.epsilon <= 1:
             raise OptionError("--episodes must be at least 1 and --epsilon from 0 to 1")
-        require_counts(workers=self.workers)
+        require_numbers(1, workers=self.workers)
         if self.out is None and self.video is None:
             raise OptionError("nothing to write: give --out FILE.parquet, --video FILE, or both")
         if self.beside is not None and self.video is None:

@@ -11,7 +11,7 @@ from rich.console import Console
 from rich.table import Table
 from tyro.conf import Positional, arg
 
-from ugat_marl.cli.arguments import LengthS, Workers, refuse_options, require_counts
+from ugat_marl.cli.arguments import LengthS, Workers, refuse_options, require_numbers
 from ugat_marl.effects import load_scenario, scenario_in_domain
 from ugat_marl.envs import TrafficEnv, parallel_env
 from ugat_marl.errors import OptionError, counted
@@ -104,7 +104,7 @@ class ScenarioCheck:
             )
             return self._kit(console)
         refuse_options(self, ("observation",), "only --conformance reads an observation")
-        require_counts(workers=self.workers)
+        require_numbers(1, workers=self.workers)
         if self.headroom < 0:
             raise OptionError(f"--headroom {self.headroom}: give a number of seeds, or 0")
         if self.headroom and self.domain != "sim":
@@ -173,7 +173,7 @@ def show(
     """Print everything as tables that fit 80 columns."""
 
     def say(text: str) -> None:
-        console.print(text, markup=False, soft_wrap=True)
+        console.print(text, soft_wrap=True)
 
     agents, names = facts.intersections, LightNames.of(network)
     say(
@@ -201,7 +201,7 @@ def show(
     for light in [light for light in agents if light.name][:MOST_LIGHTS]:
         say(f"{names.text(light.id)}: {light.name}")
     for text in _greens_of_file(agents, names):
-        console.print(text, markup=False)
+        console.print(text)
     console.print(_approaches(agents, names))
     console.print(_phase_sources(agents, names))
     if short := sum(len(light.short_lanes) for light in agents):

@@ -35,5 +35,5 @@ class ScenarioDraw:
         scenario = load_scenario(self.scenario)
         require_writable(self.out / "network.svg")
         files = draw_network(scenario, self.out, Bars(console))
-        console.print(f"{len(files)} pictures: {self.out}", markup=False, soft_wrap=True)
+        console.print(f"{len(files)} pictures: {self.out}", soft_wrap=True)
         return 0

@@ -32,7 +32,7 @@ class ScenarioList:
             table.add_row(name, *_facts(name))
         console.print(table)
         if not maps:
-            console.print(f"RESCO networks: {install_command('resco')}", markup=False)
+            console.print(f"RESCO networks: {install_command('resco')}")
         aliases = {setting: alias for alias, setting in DOMAIN_ALIASES.items()}
         for setting, effects in PAPER_WORLDS.items():
             values = ", ".join(map(str, effects))

@@ -142,15 +142,14 @@ class ScenarioNew:
             f"{self.name}: {counted(agents, 'intersection')} with {phases} green phases, "
             f"{made.demand.vehicles} vehicles"
             + (f" and {made.demand.flows} flows" if made.demand.flows else ""),
-            markup=False,
             soft_wrap=True,
         )
         if made.fits:
             console.print(_fit_table(made.fits, LightNames.of(made.network)))
         for note in made.notes:
-            console.print(f"note: {note}", markup=False, soft_wrap=True)
+            console.print(f"note: {note}", soft_wrap=True)
         where = shlex.quote(str(self.name))
-        console.print(f"next: ugat-marl scenario check {where}", markup=False, soft_wrap=True)
+        console.print(f"next: ugat-marl scenario check {where}", soft_wrap=True)
         return 0
 
     def _draft(self, roads: RoadSource, console: Console) -> int:
@@ -173,7 +172,7 @@ class ScenarioNew:
             f"fill in: {sheet}, {draft.turns} turns; {self.name}/pictures shows the lights",
             f"next: {self._command()} --counts {sheet} (or --vph N, --routes FILE, --od FILE)",
         ):
-            console.print(text, markup=False, soft_wrap=True)
+            console.print(text, soft_wrap=True)
         return 0
 
     def _sources(self) -> tuple[RoadSource, VehicleSource | None]:

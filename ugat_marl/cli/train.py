@@ -12,7 +12,7 @@ from rich.console import Console
 from rich.text import Text
 from tyro.conf import arg
 
-from ugat_marl.cli.arguments import RayAddress, Workers, require_counts, workers_of
+from ugat_marl.cli.arguments import RayAddress, Workers, require_numbers, workers_of
 from ugat_marl.data import METRICS_FILE, Metrics
 from ugat_marl.errors import OptionError
 from ugat_marl.experiments import TransferConfig, outcome_of, run_folder, transfer
@@ -68,7 +68,7 @@ class Train:
         config = self.config
         if self.out == Path():
             raise OptionError("--out is the working folder itself, or empty; name a folder")
-        require_counts(workers=self.workers)
+        require_numbers(1, workers=self.workers)
         directory = self.out or run_folder(config)
         try:
             with workers_of(self.workers, self.ray) as workers:
@@ -96,7 +96,7 @@ class Train:
         if not (directory / "policies").exists():  # of a learner that cannot be kept
             del places["policies"]
         for name, place in places.items():
-            console.print(f"{name}: {place}", soft_wrap=True, markup=False)
+            console.print(f"{name}: {place}", soft_wrap=True)
         return 0
 
     def _call(self, directory: Path) -> str:

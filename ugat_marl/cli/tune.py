@@ -10,9 +10,16 @@ from typing import Annotated
 from rich.console import Console
 from tyro.conf import Positional, arg
 
-from ugat_marl.cli.arguments import LengthS, RayAddress, Workers, require_counts, workers_of
+from ugat_marl.cli.arguments import (
+    LengthS,
+    RayAddress,
+    Workers,
+    require_names,
+    require_numbers,
+    workers_of,
+)
 from ugat_marl.effects import domain_label, load_scenario
-from ugat_marl.errors import OptionError, UnknownNameError
+from ugat_marl.errors import UnknownNameError
 from ugat_marl.experiments import BUDGET, LEAST_BUDGET, tune
 from ugat_marl.files import require_writable, write_whole
 from ugat_marl.policies import RULE_NAMES, RULES, TUNED_RULES
@@ -52,16 +59,12 @@ class Tune:
 
     def run(self, console: Console) -> int:
         """Tune and print."""
-        if not self.rules:
-            raise OptionError("--rules needs at least one value")
-        if len(set(self.rules)) < len(self.rules):
-            raise OptionError(f"--rules holds one twice: {' '.join(self.rules)}")
+        require_names(rules=self.rules)
         for name in self.rules:
             if name not in RULES:
                 raise UnknownNameError("rule", name, RULE_NAMES)
-        if self.budget < LEAST_BUDGET:
-            raise OptionError(f"--budget {self.budget}: must be at least {LEAST_BUDGET}")
-        require_counts(workers=self.workers)
+        require_numbers(LEAST_BUDGET, budget=self.budget)
+        require_numbers(1, workers=self.workers)
         if self.out is not None:
             require_writable(self.out)
         scenario, reporter = load_scenario(self.scenario), Bars(console)

@@ -33,7 +33,7 @@ def write_checkpoint(path: Path, kind: str, content: Mapping[str, Any]) -> None:
         CheckpointError: A number in `content` is not finite. The file at `path` stays unchanged.
         OSError: The disk is full.
     """
-    require_finite(content, str(path), "was not overwritten")
+    _require_finite(content, path, "was not overwritten")
     # torch writes the name of a path into the archive, which then differs from run to run.
     with replacing(path) as temporary, temporary.open("wb") as file:
         try:
@@ -74,7 +74,7 @@ def read_checkpoint(path: Path, kind: str) -> dict[str, Any]:
                 f"{path}: {name} is not a dense tensor that stores all its elements "
                 f"({tensor.layout}, {tensor.dtype}, {tensor.device}); save it with write_checkpoint"
             )
-    require_finite(content, str(path), "cannot be used: take an earlier checkpoint or train again")
+    _require_finite(content, path, "cannot be used: take an earlier checkpoint or train again")
     return content
 
 
@@ -91,12 +91,12 @@ def _require_sums(path: Path) -> None:
         raise ValueError(f"check sum of {damaged} is wrong")
 
 
-def require_finite(content: Mapping[str, Any], name: str, consequence: str) -> None:
+def _require_finite(content: Mapping[str, Any], path: Path, consequence: str) -> None:
     """Refuse NaN and infinity anywhere below `content`.
 
     Args:
         content: Tensors and plain values, nested.
-        name: Name of the file in errors.
+        path: The file.
         consequence: End of the message: what this means for the file.
 
     Raises:
@@ -104,7 +104,7 @@ def require_finite(content: Mapping[str, Any], name: str, consequence: str) -> N
     """
     for key, tensor in _tensors("", content):
         if not bool(torch.isfinite(tensor).all()):
-            raise CheckpointError(f"{name}: {key} holds NaN or infinity; the file {consequence}")
+            raise CheckpointError(f"{path}: {key} holds NaN or infinity; the file {consequence}")
 
 
 def checked_tensors(

@@ -67,7 +67,7 @@ def relative_slowness(
     speed_mps: NDArray[np.float64], limit_mps: NDArray[np.float64]
 ) -> NDArray[np.float64]:
     """Return 1 - v / v_max of each lane, clipped to [0, 1] because vehicles may exceed v_max."""
-    return np.minimum(np.maximum(1.0 - speed_mps / limit_mps, 0.0), 1.0)
+    return np.clip(1.0 - speed_mps / limit_mps, 0.0, 1.0)
 
 
 @dataclass

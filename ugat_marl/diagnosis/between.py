@@ -161,7 +161,7 @@ class Between:
         ]
         states = np.zeros((0, 3, 2))
         if lanes is not None:
-            length = np.full(len(lanes), period.end_s - period.begin_s)
+            length = np.full(len(lanes), period.length_s)
             weights = np.stack([length, length, lanes[:, 0]], axis=-1)
             states = np.stack([lanes, weights], axis=-1)
             states[self._unobserved(period.id)] = 0.0
@@ -249,7 +249,7 @@ def _states(lanes: pl.DataFrame, period: Period, names: Sequence[str]) -> Array:
     states = np.zeros((len(names), 3, 2))
     for number, name in enumerate(names):
         if (row := found.get(name)) is not None:
-            seen, whole_s = float(row["moments"]), period.end_s - period.begin_s
+            seen, whole_s = float(row["moments"]), period.length_s
             observed_s = float(row["step_s"] or 0.0) * seen
             if observed_s < LEAST_OBSERVED * whole_s:
                 raise MeasuredDataError(

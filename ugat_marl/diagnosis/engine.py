@@ -147,7 +147,7 @@ class Budget:
             late = self._deadline is not None and time.monotonic() > self._deadline
             if late or self.spent_h >= self._hours:
                 raise OutOfTime("the budget is spent")
-            self.spent_h += (period.end_s - period.begin_s) / 3600.0
+            self.spent_h += period.length_s / 3600.0
             self.days += 1
 
 

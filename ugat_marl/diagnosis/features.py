@@ -23,7 +23,6 @@ from ugat_marl.scenarios import (
     YELLOW,
     Detector,
     DetectorKind,
-    Intersection,
     Network,
     Passages,
     Period,
@@ -119,6 +118,7 @@ class DetectorLayout:
         owner: dict[str, str] = {}
         for index, intersection in enumerate(network.intersections):
             for lane in intersection.incoming_lanes:
+                links = [link for link in intersection.links if link.from_lane == lane]
                 of_lane = by_lane.get(lane, {})
                 kinds: dict[DetectorKind, str] = {
                     kind: name for kind, name in of_lane.items() if kind != "exit"
@@ -128,11 +128,11 @@ class DetectorLayout:
                         lane,
                         network.lanes[lane].edge,
                         index,
-                        _links(intersection, lane),
+                        tuple(sorted({link.index for link in links})),
                         network.lanes[lane].speed_mps,
                         kinds,
-                        _following(intersection, lane),
-                        _directions(intersection, lane),
+                        frozenset(link.to_edge for link in links),
+                        frozenset({link.direction.lower() for link in links} - {"t"}),
                     )
                 )
                 owner |= dict.fromkeys(kinds.values(), intersection.id)
@@ -195,19 +195,6 @@ class DetectorLayout:
             log = period.signals.get(self.intersections[lane.intersection], ())
             greens_of_lanes.append(_greens(log, lane.links, period))
         return tuple(greens_of_lanes)
-
-
-def _links(intersection: Intersection, lane: str) -> tuple[int, ...]:
-    return tuple(sorted({link.index for link in intersection.links if link.from_lane == lane}))
-
-
-def _following(intersection: Intersection, lane: str) -> frozenset[str]:
-    return frozenset(link.to_edge for link in intersection.links if link.from_lane == lane)
-
-
-def _directions(intersection: Intersection, lane: str) -> frozenset[str]:
-    letters = {x.direction.lower() for x in intersection.links if x.from_lane == lane}
-    return frozenset(letters - {"t"})
 
 
 def _greens(log: SignalLog, links: tuple[int, ...], period: Period) -> Greens:
@@ -396,11 +383,6 @@ class Tally:
         )
 
 
-def bins_of(period: Period, thresholds: DayThresholds) -> int:
-    """Return the number of bins of time in a period."""
-    return bins_in(period.end_s - period.begin_s, thresholds)
-
-
 def bins_in(length_s: float, thresholds: DayThresholds) -> int:
     """Return the number of bins of time in a period of some length in s."""
     return max(1, round(length_s / thresholds.bin_s))
@@ -419,7 +401,7 @@ def tally(
         thresholds: Numbers of the method.
     """
     places = len(layout.lanes) + len(layout.exits)
-    bins = bins_of(period, thresholds)
+    bins = bins_in(period.length_s, thresholds)
     counter = _Counter(
         np.zeros((len(FEATURES), places, 2)),
         np.zeros((len(BIN_FEATURES), places, bins)),
@@ -432,12 +414,12 @@ def tally(
         counter.place = index
         stop, advance = lane.passages(period, "stop"), lane.passages(period, "advance")
         if stop is not None:
-            stops[index] = counter.volume("count_stop", 1, stop)
+            stops[index] = counter.volume("count_stop", stop)
             _discharge(counter, stop, green)
             _clearance(counter, stop, green)
             _lengths(counter, stop)
         if advance is not None:
-            advances[index] = counter.volume("count_advance", 0, advance)
+            advances[index] = counter.volume("count_advance", advance)
             _approach(counter, advance, green, lane.speed_mps)
             _storage(counter, advance, green)
             if stop is None:
@@ -445,7 +427,7 @@ def tally(
     exits = np.zeros(len(layout.exits))
     for index, (_, _, name) in enumerate(layout.exits):
         counter.place = len(layout.lanes) + index
-        exits[index] = counter.volume("count_exit", 2, period.of_detector(name))
+        exits[index] = counter.volume("count_exit", period.of_detector(name))
     _conserved(counter, layout, advances, stops, exits)
     journeys = _journeys(layout, period, greens, thresholds)
     return Tally(counter.sums, counter.bins, journeys=journeys, window=period.window)
@@ -476,12 +458,12 @@ class _Counter:
     def ratio(self, name: str, total: float, weight: float) -> None:
         self.sums[INDEX[name], self.place] += (total, weight)
 
-    def volume(self, name: str, row: int, passages: Passages) -> float:
-        begin, end = self.period.begin_s, self.period.end_s
+    def volume(self, name: str, passages: Passages) -> float:
         times = np.where(np.isfinite(passages.on_s), passages.on_s, passages.off_s)
         times = times[np.isfinite(times)]
-        self.ratio(name, len(times), (end - begin) / 60.0)
-        self.bins[row, self.place] += np.histogram(times, self.bins.shape[2], (begin, end))[0]
+        self.ratio(name, len(times), self.period.length_s / 60.0)
+        counts, _ = np.histogram(times, self.bins.shape[2], self.period.window)
+        self.bins[COUNT_FEATURES.index(name), self.place] += counts
         return float(len(times))
 
 
@@ -550,7 +532,7 @@ def _discharge(counter: _Counter, stop: Passages, greens: Greens) -> None:
     counter.add("lost", lost)
     # trend = mean of lost * t, with t from -1 at the begin of the period to 1 at its end
     middle = 0.5 * (counter.period.begin_s + counter.period.end_s)
-    half = 0.5 * (counter.period.end_s - counter.period.begin_s)
+    half = 0.5 * (counter.period.length_s)
     counter.add("lost_trend", lost * (start[protected & (number == 0)] - middle) / half)
     for name, low, high in (
         ("gap2", 1, 1), ("gap3", 2, 2), ("gap4-5", 3, 4), ("gap6-8", 5, 7), ("gap9+", 8, 14),

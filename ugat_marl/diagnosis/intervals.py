@@ -32,7 +32,7 @@ from ugat_marl.diagnosis.features import (
     INDEX,
     DetectorLayout,
     Tally,
-    bins_of,
+    bins_in,
 )
 from ugat_marl.diagnosis.thresholds import DayThresholds, Thresholds
 from ugat_marl.scenarios import Period
@@ -230,7 +230,7 @@ def without_gaps(
     for period in periods:
         of_period = counts.filter(pl.col("period_id") == period.id)
         times = dict(of_period.group_by("detector_id").agg(length.sum()).iter_rows())
-        least = thresholds.whole * (period.end_s - period.begin_s)
+        least = thresholds.whole * (period.length_s)
         whole = {name for name in whole if times.get(name, 0.0) >= least}
     return frozenset(whole)
 
@@ -254,7 +254,7 @@ def counts_tally(
         thresholds: Numbers of the method.
     """
     places = len(layout.lanes) + len(layout.exits)
-    bins = np.zeros((len(BIN_FEATURES), places, bins_of(period, thresholds)))
+    bins = np.zeros((len(BIN_FEATURES), places, bins_in(period.length_s, thresholds)))
     covered = np.zeros_like(bins)
     edges = np.linspace(period.begin_s, period.end_s, bins.shape[-1] + 1)
     length_s = usual_length(counts)

@@ -72,7 +72,7 @@ def cells_of(
         position, age, time, length of vehicle: ``(places, kinds, positions, ages, bins, 2, 3)``.
     """
     places, lanes = len(layout.lanes) + len(layout.exits), len(layout.lanes)
-    wished = round((period.end_s - period.begin_s) / thresholds.pattern_bin_s)
+    wished = round(period.length_s / thresholds.pattern_bin_s)
     bins = min(max(1, wished), thresholds.most_pattern_bins)
     shapes = {
         "discharge": (lanes, 1, len(POSITIONS), len(AGES_S), bins, 2, 3),
@@ -139,7 +139,7 @@ def _add(cells: Array, where: tuple[NDArray[np.int64], ...], values: Array) -> N
 
 
 def _bins(times: Array, period: Period, bins: int) -> NDArray[np.int64]:
-    share = (times - period.begin_s) / (period.end_s - period.begin_s)
+    share = (times - period.begin_s) / (period.length_s)
     return np.clip((share * bins).astype(np.int64), 0, bins - 1)
 
 

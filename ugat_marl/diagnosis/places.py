@@ -250,7 +250,7 @@ class PlaceFinder:
                 on = np.where(np.isfinite(passages.on_s), passages.on_s, passages.off_s)
                 if kind == "occupied":
                     off = np.where(np.isfinite(passages.off_s), passages.off_s, period.end_s)
-                    total += occupied_between(on, np.maximum(off, on), edges)
+                    total += occupied_between(on, off, edges)
                 else:
                     total += np.histogram(on[np.isfinite(on)], edges)[0]
         return total / len(periods)

@@ -36,7 +36,7 @@ from ugat_marl.diagnosis.features import (
     Array,
     DetectorLayout,
     Tally,
-    bins_of,
+    bins_in,
 )
 from ugat_marl.diagnosis.journeys import Crossings, matched
 from ugat_marl.diagnosis.thresholds import DayThresholds
@@ -567,7 +567,7 @@ class Arrivals:
 
     def _by_edge(self, vehicles: Iterable[ET.Element], period: Period) -> dict[str, Array]:
         """Count vehicles that would reach the end of each counted edge, ``(bins,)``."""
-        bins = bins_of(period, self._thresholds)
+        bins = bins_in(period.length_s, self._thresholds)
         times: dict[str, list[float]] = {edge: [] for edge in self._counted}
         for element in vehicles:
             if element.tag == "vehicle":
@@ -647,7 +647,7 @@ def _filled(
 
         def waiting(name: str | None) -> float:
             rounds = turns[name] // sizes[name]
-            return queues[name][0].time_s + rounds * (period.end_s - period.begin_s)
+            return queues[name][0].time_s + rounds * (period.length_s)
 
         name = min(fitting, key=waiting)
         queue = queues[name]
@@ -803,7 +803,7 @@ def missed(times: Array, crossed: Array, period: Period, thresholds: DayThreshol
     """
     if len(crossed) - len(times) <= thresholds.missing + thresholds.missing_share * len(times):
         return np.empty(0)
-    count = max(1, round((period.end_s - period.begin_s) / thresholds.missed_window_s))
+    count = max(1, round(period.length_s / thresholds.missed_window_s))
     edges = np.linspace(period.begin_s, period.end_s, count + 1)
     lacking = np.histogram(crossed, edges)[0] - np.histogram(times, edges)[0]
     lacking = np.maximum(lacking, 0)

@@ -559,7 +559,7 @@ def _refuse_lengths(periods: Sequence[Period]) -> None:
     Raises:
         MeasuredDataError: The periods have different lengths.
     """
-    lengths = {period.id: period.end_s - period.begin_s for period in periods}
+    lengths = {period.id: period.length_s for period in periods}
     shortest, longest = min(lengths, key=lengths.__getitem__), max(lengths, key=lengths.__getitem__)
     if lengths[longest] - lengths[shortest] > 0.5:
         raise MeasuredDataError(

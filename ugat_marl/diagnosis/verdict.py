@@ -25,6 +25,7 @@ from ugat_marl.diagnosis.records import (
 from ugat_marl.diagnosis.select import Selector
 from ugat_marl.diagnosis.study import DiagnosisConfig
 from ugat_marl.effects import Effect, known_effects
+from ugat_marl.errors import joined
 
 NOUNS = {"swapped": "swapped detectors", "stuck": "a stuck detector"}
 """Nouns for effects whose names are no nouns, for sentences."""
@@ -252,7 +253,7 @@ def _separating(best: Fitted, rival: Fitted, held: Collection[int], deciding_z: 
 
 def describe_members(members: Members) -> str:
     """Describe effects by name, place, window and values."""
-    return listed([describe_effect(hypothesis, values) for hypothesis, values in members])
+    return joined([describe_effect(hypothesis, values) for hypothesis, values in members])
 
 
 def describe_effect(hypothesis: Hypothesis, values: tuple[float, ...]) -> str:
@@ -275,7 +276,7 @@ def describe_effect(hypothesis: Hypothesis, values: tuple[float, ...]) -> str:
 
 def describe_errors(errors: Sequence[DetectorError]) -> str:
     """Describe errors of measurement as a part of a sentence, such as ``all detectors ...``."""
-    return listed([describe_error(error.effect, error.rival) for error in errors])
+    return joined([describe_error(error.effect, error.rival) for error in errors])
 
 
 def describe_error(error: Effect, rival: Effect | None = None) -> str:
@@ -466,8 +467,3 @@ def amount(field: str, value: float, unit: str) -> str:
     if field == "share":
         return f" of {100 * value:.3g} %"
     return f" of {value:.3g} {unit.replace('^2', '²')}".rstrip()
-
-
-def listed(items: Sequence[str]) -> str:
-    """Join texts: ``a``, ``a and b``, ``a, b and c``."""
-    return " and ".join(filter(None, (", ".join(items[:-1]), *items[-1:])))

@@ -65,6 +65,17 @@ class _Task:
 
 
 @kept_warm()
+def require_distinct_domains(domains: Sequence[Domain]) -> None:
+    """Refuse domains of which two are the same.
+
+    Raises:
+        OptionError: A domain is listed twice.
+    """
+    names = [domain_label(domain) for domain in domains]
+    if twice := sorted({name for name in names if names.count(name) > 1}):
+        raise OptionError(f"domain {twice[0]!r} is listed twice (rain is V3, snow is V4, ...)")
+
+
 def evaluate(
     scenario: Scenario,
     policies: Mapping[str, PolicyFactory],
@@ -102,9 +113,7 @@ def evaluate(
         UnknownNameError: There is no such domain or rule.
         CheckpointError: The file of a policy is unreadable, or of another network.
     """
-    names = [domain_label(domain) for domain in domains]
-    if twice := sorted({name for name in names if names.count(name) > 1}):
-        raise OptionError(f"domain {twice[0]!r} is listed twice (rain is V3, snow is V4, ...)")
+    require_distinct_domains(domains)
     if len(set(seeds)) < len(seeds):
         raise OptionError("a seed is given twice: its episode would count twice in the intervals")
     # Made once for all policies. A wrong name is an error now, not in an hour.

@@ -16,6 +16,7 @@ from ugat_marl.effects import domain_label, domain_path, load_scenario
 from ugat_marl.errors import OptionError, UnknownNameError, require_least
 from ugat_marl.experiments.comparison import Comparison, Trial
 from ugat_marl.experiments.driver import perform_all, record_of
+from ugat_marl.experiments.evaluation import require_distinct_domains
 from ugat_marl.experiments.jobs import LEARNER, Job, evaluation_seeds
 from ugat_marl.experiments.settings import (
     CONTROL,
@@ -370,10 +371,8 @@ class PaperConfig:
         require_device_name(self.device)
         if not self.scenario:
             raise OptionError("scenario is empty; name one, such as single-v1")
-        names = [domain_label(domain) for domain in self.domains]
-        if twice := sorted({name for name in names if names.count(name) > 1}):
-            raise OptionError(f"domain {twice[0]!r} is listed twice (rain is V3, snow is V4, ...)")
-        if domain_label(self.sim) in names:
+        require_distinct_domains(self.domains)
+        if domain_label(self.sim) in map(domain_label, self.domains):
             raise OptionError(f"domain {self.sim!r} is the simulation itself; name real ones")
         if self.timed.match:
             raise OptionError("rewards are matched in a row of its own; leave timed.match out")

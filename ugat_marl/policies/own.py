@@ -633,21 +633,42 @@ def _converted(make: Callable[..., Any], settings: Sequence[str], name: str) -> 
     hints: dict[str, Any] = {}
     if settings:
         hints = get_type_hints(make.__init__ if inspect.isclass(make) else make)
+    return parsed_settings(settings, names, hints, name)
+
+
+def parsed_settings(
+    settings: Sequence[str], names: Sequence[str], hints: Mapping[str, Any], learner: str
+) -> dict[str, Any]:
+    """Return settings of a learner, given as ``NAME=VALUE``, in their types.
+
+    Args:
+        settings: The settings; a name may have ``-`` for ``_``.
+        names: Known names.
+        hints: Name to type. A value without a type becomes a literal of Python, or text.
+        learner: Name of the learner for messages.
+
+    Raises:
+        OptionError: A setting has another form, or a value another type.
+        UnknownNameError: A name is unknown.
+    """
     values: dict[str, Any] = {}
     for setting in settings:
-        key, equals, text = setting.partition("=")
+        name, equals, text = setting.partition("=")
+        name = name.replace("-", "_")
         if not equals or not text:
             raise OptionError(f"learner setting {setting!r}: must be NAME=VALUE")
-        if key not in names:
-            raise UnknownNameError(f"setting of {name}", key, names)
-        values[key] = _plain_value(text)
-        if key in hints:
-            whole = text.split(",") if "tuple" in str(hints[key]) else text
-            try:
-                values[key] = TypeAdapter(hints[key]).validate_python(whole)
-            except ValidationError as error:
-                reason = error.errors()[0]["msg"]
-                raise OptionError(f"learner setting {setting!r}: {reason}") from None
+        if name not in names:
+            raise UnknownNameError(f"setting of {learner}", name, names)
+        if name not in hints:
+            values[name] = _plain_value(text)
+            continue
+        whole = text.split(",") if "tuple" in str(hints[name]) else text
+        value = None if text.lower() == "none" else whole
+        try:
+            values[name] = TypeAdapter(hints[name]).validate_python(value)
+        except ValidationError as error:
+            reason = error.errors()[0]["msg"]
+            raise OptionError(f"learner setting {setting!r}: {reason}") from None
     return values
 
 

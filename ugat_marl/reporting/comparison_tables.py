@@ -14,6 +14,7 @@ from rich.console import Group, RenderableType
 from rich.text import Text
 
 from ugat_marl.data import MEASURES
+from ugat_marl.errors import joined
 from ugat_marl.experiments import (
     LEAST_SHARE_ARRIVED,
     Comparison,
@@ -24,7 +25,6 @@ from ugat_marl.experiments import (
 from ugat_marl.reporting.formats import (
     PAGE_WIDTH,
     command_block,
-    listed,
     made_with,
     number_text,
     percent_text,
@@ -239,10 +239,10 @@ def _meaning(comparison: Comparison, direct: str) -> list[str]:
     lowest: dict[str, list[str]] = {}
     for target in comparison.targets:
         lowest.setdefault(comparison.best(target), []).append(target)
-    best = listed([f"`{setting}` in {listed(targets)}" for setting, targets in lowest.items()])
+    best = joined([f"`{setting}` in {joined(targets)}" for setting, targets in lowest.items()])
     first = (
         f"Better than direct transfer in every domain, with p < {CERTAIN:g} in each: "
-        f"{listed([f'`{setting}`' for setting in better])}."
+        f"{joined([f'`{setting}`' for setting in better])}."
         if better
         else f"No setting is better than direct transfer in every domain with p < {CERTAIN:g}."
     )

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import math
 import re
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from typing import Any
 
 
@@ -83,11 +83,6 @@ PAGE_WIDTH = 140
 """Longest line of prose in Markdown, in characters."""
 COMMAND_WIDTH = 100
 """Longest line of a command in Markdown, in characters."""
-
-
-def listed(names: Sequence[str]) -> str:
-    """Return names as a list in a sentence."""
-    return " and ".join(part for part in (", ".join(names[:-1]), *names[-1:]) if part)
 
 
 def command_block(command: str) -> list[str]:

@@ -52,6 +52,7 @@ from .inspection import survey as survey
 from .junctions import Link as Link
 from .junctions import cars_may_use as cars_may_use
 from .junctions import rail_signals_of as rail_signals_of
+from .junctions import start_lane as start_lane
 from .lanes import NO_UPSTREAM_LANES as NO_UPSTREAM_LANES
 from .lanes import LaneTable as LaneTable
 from .lanes import Turns as Turns

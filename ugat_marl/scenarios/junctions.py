@@ -75,9 +75,18 @@ def leads_cars(connection: ET.Element, closed: Container[str]) -> bool:
         connection: The ``<connection>``.
         closed: The lanes of `lanes_without_cars`.
     """
-    start = f"{connection.get('from')}_{connection.get('fromLane')}"
-    end = f"{connection.get('to')}_{connection.get('toLane')}"
-    return cars_may_use(connection) and start not in closed and end not in closed
+    ends = {start_lane(connection), end_lane(connection)}
+    return cars_may_use(connection) and not any(lane in closed for lane in ends)
+
+
+def start_lane(connection: ET.Element) -> str:
+    """Return the lane from which a ``<connection>`` leads."""
+    return f"{connection.get('from', ':')}_{connection.get('fromLane')}"
+
+
+def end_lane(connection: ET.Element) -> str:
+    """Return the lane to which a ``<connection>`` leads."""
+    return f"{connection.get('to', ':')}_{connection.get('toLane')}"
 
 
 def rail_signals_of(root: ET.Element) -> frozenset[str]:
@@ -85,11 +94,7 @@ def rail_signals_of(root: ET.Element) -> frozenset[str]:
 
     SUMO gives them the id of their junction, and no programme. They are no traffic lights.
     """
-    return frozenset(
-        element.get("id", "")
-        for element in root.iter("junction")
-        if element.get("type") in ("rail_signal", "rail_crossing")
-    )
+    return _junctions_of(root, "rail_signal", "rail_crossing")
 
 
 def links_of(root: ET.Element) -> dict[str, list[Link]]:
@@ -106,8 +111,8 @@ def links_of(root: ET.Element) -> dict[str, list[Link]]:
         links[tls].append(
             Link(
                 index=int(element.get("linkIndex", "0")),
-                from_lane=f"{element.get('from')}_{element.get('fromLane')}",
-                to_lane=f"{element.get('to')}_{element.get('toLane')}",
+                from_lane=start_lane(element),
+                to_lane=end_lane(element),
                 direction=element.get("dir", "s"),
                 junction=junction,
                 request=request,
@@ -147,9 +152,10 @@ def crossings_of(root: ET.Element) -> dict[str, list[Link]]:
         if junction in numbers and number.isdigit():
             first = rows.get(junction, 0) - len(numbers[junction])
             row = first + sorted(numbers[junction]).index(int(number))
-            start = f"{connection.get('from')}_{connection.get('fromLane')}"
             index = int(connection.get("linkIndex", "0"))
-            crossings[tls].append(Link(index, start, f"{target}_0", CROSSING, junction, row))
+            crossings[tls].append(
+                Link(index, start_lane(connection), f"{target}_0", CROSSING, junction, row)
+            )
     return crossings
 
 
@@ -191,11 +197,12 @@ def neighbours_of(
 
 def right_on_red_of(root: ET.Element) -> frozenset[str]:
     """Return the junctions where vehicles may turn right on red after a stop."""
-    return frozenset(
-        element.get("id", "")
-        for element in root.iter("junction")
-        if element.get("type") == "traffic_light_right_on_red"
-    )
+    return _junctions_of(root, "traffic_light_right_on_red")
+
+
+def _junctions_of(root: ET.Element, *types: str) -> frozenset[str]:
+    junctions = root.iter("junction")
+    return frozenset(each.get("id", "") for each in junctions if each.get("type") in types)
 
 
 def has_bit(a: Link, b: Link, matrix: Matrix) -> bool:
@@ -305,7 +312,7 @@ def _ways(root: ET.Element, lights: Container[str]) -> _Ways:
     for element in root.iter("connection"):
         start, end, via = element.get("from", ":"), element.get("to", ":"), element.get("via", "")
         ends_at_light = element.get("tl", "") in lights
-        lane = f"{start}_{element.get('fromLane')}"
+        lane = start_lane(element)
         if start.startswith(":"):
             onward[lane] = via
             continue
@@ -316,7 +323,7 @@ def _ways(root: ET.Element, lights: Container[str]) -> _Ways:
         if element.get("dir") != "t":
             number[lane] += 1
             if not ends_at_light:
-                feeds[f"{end}_{element.get('toLane')}"].append((lane, [via] if via else []))
+                feeds[end_lane(element)].append((lane, [via] if via else []))
     for ways in feeds.values():
         for _, inside in ways:
             while inside and (following := onward.get(inside[-1])) and following not in inside:

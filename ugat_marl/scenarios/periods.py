@@ -157,6 +157,11 @@ class Period:
         """Begin and end on the scenario's clock, s."""
         return self.begin_s, self.end_s
 
+    @property
+    def length_s(self) -> float:
+        """Length, s."""
+        return self.end_s - self.begin_s
+
     def of_detector(self, detector: str) -> Passages:
         """Return the passages over a detector; none if it saw no vehicle."""
         return self.passages.get(detector, Passages.none())

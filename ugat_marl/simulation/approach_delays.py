@@ -20,7 +20,7 @@ from pathlib import Path
 
 from ugat_marl.errors import SimulatorError
 from ugat_marl.files import xml_bytes
-from ugat_marl.scenarios import Document, Network, Scenario, edge_of_lane
+from ugat_marl.scenarios import Document, Network, Scenario, edge_of_lane, start_lane
 
 ApproachDelays = Mapping[str, tuple[float, float]]
 """Approach (SUMO's edge at a light) to the number of vehicles that passed the light in an episode,
@@ -112,7 +112,7 @@ def approach_roads(root: ET.Element, network: Network) -> dict[str, frozenset[st
     before: dict[str, set[str]] = defaultdict(set)
     inside: dict[tuple[str, str], set[str]] = defaultdict(set)
     further = {
-        f"{element.get('from')}_{element.get('fromLane')}": element.get("via", "")
+        start_lane(element): element.get("via", "")
         for element in root.iter("connection")
         if element.get("from", "").startswith(":")
     }

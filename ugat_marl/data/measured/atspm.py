@@ -24,6 +24,7 @@ from ugat_marl.data.measured.tables import (
     DETECTORS,
     PERIODS,
     ROW,
+    first_row,
     frame_of,
     in_order,
     read_raw,
@@ -482,7 +483,7 @@ def read_log(path: Path, time_zone: str, findings: list[Finding]) -> pl.DataFram
     raw = raw.select(*names).rename(names)
     if raw.is_empty():
         raise MeasuredDataError(f"{path}: no events")
-    start = 1 if path.suffix == ".parquet" else 2
+    start = first_row(path)
     frame = pl.DataFrame(
         [
             pl.int_range(start, raw.height + start, dtype=pl.Int64, eager=True).alias(ROW),

@@ -123,7 +123,7 @@ def _of_periods(measured: MeasuredData) -> Iterator[Finding]:
             f"periods.csv: {why}, so none is held out: a verdict can only be judged on the data "
             "that were fitted"
         )
-    short = [period.id for period in periods if period.end_s - period.begin_s < SHORT_S]
+    short = [period.id for period in periods if period.length_s < SHORT_S]
     if short:
         yield Finding(
             f"periods.csv: {listed(short, 'period')} shorter than {SHORT_S:g} s; a few signal "
@@ -434,7 +434,7 @@ def _is_hole(times: NDArray[np.float64], begin_s: float, length_s: float) -> boo
 def _usual_rates(measured: MeasuredData) -> dict[str, float]:
     """Return the vehicles per second at each detector over all periods."""
     counts: dict[str, float] = {}
-    seconds = sum(period.end_s - period.begin_s for period in measured.periods)
+    seconds = sum(period.length_s for period in measured.periods)
     for period in measured.periods:
         for name in period.passages:
             counts[name] = counts.get(name, 0.0) + len(_times(period, name)) / 2
@@ -452,7 +452,7 @@ def _silent(
         begin, length = _longest_gap(times.get(detector.id, np.empty(0)), period)
         if usual.get(detector.id, 0.0) * length < EXPECTED:
             continue  # few vehicles use this lane
-        if length <= min(SILENT_S, period.end_s - period.begin_s - 1e-6):
+        if length <= min(SILENT_S, period.length_s - 1e-6):
             continue
         others = [times[other.id] for other in group if other.id in times and other is not detector]
         busy = max(

@@ -49,7 +49,7 @@ class Intervals:
         edges = np.append(np.arange(begin, end - 1e-6, length_s), end)
         count = len(edges) - 1
         on = np.where(np.isfinite(seen.on_s), seen.on_s, begin)
-        off = np.maximum(np.where(np.isfinite(seen.off_s), seen.off_s, end), on)
+        off = np.where(np.isfinite(seen.off_s), seen.off_s, end)
         came = np.where(np.isfinite(seen.on_s), seen.on_s, seen.off_s)
         which = np.clip(np.searchsorted(edges, came, "right") - 1, 0, count - 1)
         timed = np.isfinite(seen.speed_mps)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import io
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Literal
@@ -61,7 +61,8 @@ class Table:
         Raises:
             MeasuredDataError: The directory has the file in two types.
         """
-        existing = [path for path in self._paths(directory) if path.exists()]
+        paths = (directory / name for name in self.names())
+        existing = [path for path in paths if path.exists()]
         if len(existing) > 1:
             raise MeasuredDataError(
                 f"{directory}: both {existing[0].name} and {existing[1].name} are there; remove one"
@@ -71,9 +72,6 @@ class Table:
     def names(self) -> tuple[str, ...]:
         """Return the names the file may have."""
         return tuple(self.stem + suffix for suffix in self.suffixes)
-
-    def _paths(self, directory: Path) -> Iterator[Path]:
-        return (directory / name for name in self.names())
 
 
 PERIODS = Table(
@@ -192,7 +190,7 @@ def read_table(
     wanted = {**table.columns, **table.optional}
     raw = _in_seconds(path, table, raw, clock)
     _check_columns(path, table, raw.columns, findings)
-    start = 1 if path.suffix == ".parquet" else 2  # line 1 of a CSV file is its header
+    start = first_row(path)
     columns = [pl.int_range(start, raw.height + start, dtype=pl.Int64, eager=True).alias(ROW)]
     for name, kind in wanted.items():
         if name not in raw.columns:
@@ -229,7 +227,7 @@ def _in_seconds(
         )
     if "period_id" not in raw.columns:
         return raw  # refused as a missing column
-    start = 1 if path.suffix == ".parquet" else 2
+    start = first_row(path)
     periods = to_texts(path, raw["period_id"])
     seconds = [clock.seconds(path, raw[name], periods, start) for name in local]
     return raw.drop(*local).with_columns(seconds)
@@ -253,6 +251,11 @@ def frame_of(table: Table, rows: Sequence[tuple[object, ...]]) -> pl.DataFrame:
         name: pl.Float64() if kind == "number" else pl.String() for name, kind in kinds.items()
     }
     return pl.DataFrame(rows, schema=schema, orient="row")
+
+
+def first_row(path: Path) -> int:
+    """Return the number of the first row of a table; line 1 of a CSV file is its header."""
+    return 1 if path.suffix == ".parquet" else 2
 
 
 def place(path: Path, row: int) -> str:
@@ -376,7 +379,7 @@ def to_numbers(path: Path, cells: pl.Series) -> pl.Series:
     Raises:
         MeasuredDataError: A cell is text or infinite, or the column has another type.
     """
-    name, start = cells.name, 1 if path.suffix == ".parquet" else 2
+    name, start = cells.name, first_row(path)
     if cells.dtype == pl.String:
         cells = cells.str.strip_chars()
         cells = cells.set(cells == "", None)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import hashlib
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 
 import numpy as np
 import polars as pl
@@ -57,7 +57,7 @@ class MeasuredData:
     counts: pl.DataFrame | None = None
     turning: pl.DataFrame | None = None
     travel_times: pl.DataFrame | None = None
-    findings: tuple[Finding, ...] = field(default=())
+    findings: tuple[Finding, ...] = ()
 
     def of(self, split: Split) -> tuple[Period, ...]:
         """Return the periods of one split."""

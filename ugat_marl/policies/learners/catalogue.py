@@ -21,13 +21,17 @@ from pathlib import Path
 from types import ModuleType
 from typing import Any, get_type_hints
 
-from pydantic import TypeAdapter, ValidationError
-
 from ugat_marl.data import installed_version
 from ugat_marl.envs import AnyParallelEnv
 from ugat_marl.errors import OptionError, UnknownNameError, install_command
 from ugat_marl.policies.learners.dqn_config import DQNConfig, UsualValue
-from ugat_marl.policies.own import OwnLearnerFactory, is_own, load_own, own_learner_options
+from ugat_marl.policies.own import (
+    OwnLearnerFactory,
+    is_own,
+    load_own,
+    own_learner_options,
+    parsed_settings,
+)
 from ugat_marl.policies.protocols import Learner
 
 LearnerFactory = Callable[[AnyParallelEnv, int], Learner]
@@ -298,21 +302,5 @@ def baselines_folder() -> Path:
 
 def _configured(kind: Any, preset: Mapping[str, Any], given: Sequence[str], name: str) -> Any:
     """Make the settings of a learner from those that its name fixes and those of the user."""
-    hints = get_type_hints(kind)
     names = [option.name for option in fields(kind) if option.name not in preset]
-    values = dict(preset)
-    for assignment in given:
-        key, equals, text = assignment.partition("=")
-        key = key.replace("-", "_")
-        if not equals or not text:
-            raise OptionError(f"learner setting {assignment!r}: must be NAME=VALUE")
-        if key not in names:
-            raise UnknownNameError(f"setting of {name}", key, names)
-        whole = text.split(",") if "tuple" in str(hints[key]) else text
-        value = None if text.lower() == "none" else whole
-        try:
-            values[key] = TypeAdapter(hints[key]).validate_python(value)
-        except ValidationError as error:
-            reason = error.errors()[0]["msg"]
-            raise OptionError(f"learner setting {assignment!r}: {reason}") from None
-    return kind(**values)
+    return kind(**preset, **parsed_settings(given, names, get_type_hints(kind), name))
