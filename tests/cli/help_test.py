@@ -104,6 +104,10 @@ def test_bash_completes(capsys: pytest.CaptureFixture[str], tmp_path: Path) -> N
     assert completed("evaluate", "single-v1", "--policies", "max-pressure-") == [
         "max-pressure-loss"
     ]
+    networks = ["grid2x2-v1", "grid4x4-v1"]
+    assert completed("train", "--real", "V4", "gr") == networks, "a value has been given"
+    assert completed("train", "--no-control", "gr") == networks, "it takes no value"
+    assert completed("scenario", "check", "--workers", "2", "gr") == networks
     assert completed("paper", "main", "--no-dqn") == []
     assert "--no-control" in completed("train", "single-v1", "--no")
     assert completed("report", "--ru") == [], "an argument without a name"

@@ -33,11 +33,15 @@ class Verb:
         purpose: One line of help.
         options: Option to its values; empty for a file or a number.
         arguments: Values of the positional arguments.
+        flags: Options without a value.
+        lists: Options that take several values.
     """
 
     purpose: str
     options: Mapping[str, tuple[str, ...]]
     arguments: tuple[str, ...]
+    flags: tuple[str, ...]
+    lists: tuple[str, ...]
 
 
 def completion_script(program: str, commands: Mapping[str, tuple[str, str]], shell: str) -> str:
@@ -64,6 +68,8 @@ def _verb(place: str, purpose: str) -> Verb:
     known = _known_values()
     options: dict[str, tuple[str, ...]] = {}
     arguments: tuple[str, ...] = ()
+    flags, lists = ["--help", "--quiet", "--verbose"], list[str]()
+    flags += [HELP_ALL] * bool(getattr(command, "FIRST", ()))
     for option, hint in options_of(command).items():
         extras = getattr(hint, "__metadata__", ())
         metavars = {getattr(extra, "metavar", None) for extra in extras}
@@ -73,10 +79,11 @@ def _verb(place: str, purpose: str) -> Verb:
             options[option] = known.get(option, _choices(hint))
         if hint is bool:
             *path, last = option.removeprefix("--").split(".")
-            options["--" + ".".join([*path, f"no-{last}"])] = ()
-    helps = ["--help", "--quiet", "--verbose", DEADLINE]
-    helps += [HELP_ALL] * bool(getattr(command, "FIRST", ()))
-    return Verb(purpose, {**options, **dict.fromkeys(helps, ())}, arguments)
+            flags += [option, "--" + ".".join([*path, f"no-{last}"])]
+        elif _takes_several(hint):
+            lists.append(option)
+    options |= dict.fromkeys([*flags, DEADLINE], ())
+    return Verb(purpose, options, arguments, tuple(flags), tuple(lists))
 
 
 def _known_values() -> dict[str, tuple[str, ...]]:
@@ -105,6 +112,12 @@ def _choices(hint: Any) -> tuple[str, ...]:
     return tuple(word for part in parts if part is not hint for word in _choices(part))
 
 
+def _takes_several(hint: Any) -> bool:
+    """Return True if a type is a tuple, or may be one."""
+    parts = get_args(hint) if get_origin(hint) is not Literal else ()
+    return get_origin(hint) is tuple or any(map(_takes_several, parts))
+
+
 def _groups(verbs: Mapping[str, Verb]) -> dict[str, list[str]]:
     """Return the members of commands of two words by their first."""
     groups: dict[str, list[str]] = {}
@@ -120,13 +133,20 @@ def _bash(program: str, verbs: Mapping[str, Verb]) -> str:
     function = "_" + program.replace("-", "_")
     groups = _groups(verbs)
     two = "|".join(name for name, members in groups.items() if members)
+    flags = "|".join(_place(name, x) for name, verb in verbs.items() for x in verb.flags)
+    lists = "|".join(_place(name, x) for name, verb in verbs.items() for x in verb.lists)
     lines = [
         f"{function}() {{",
         '    local current="${COMP_WORDS[COMP_CWORD]}" verb="${COMP_WORDS[1]}" last="" words="" i',
-        "    for ((i = 2; i < COMP_CWORD; i++)); do",
-        '        case "${COMP_WORDS[i]}" in --*) last="${COMP_WORDS[i]}" ;; esac',
-        "    done",
         f'    case "$verb" in {two}) verb="$verb ${{COMP_WORDS[2]}}" ;; esac',
+        "    # last: the option to which the current word belongs",
+        "    for ((i = 2; i < COMP_CWORD; i++)); do",
+        '        case "${COMP_WORDS[i]}" in',
+        '            --*) last="${COMP_WORDS[i]}"',
+        f'                case "$verb,$last" in {flags}) last="" ;; esac ;;',
+        f'            *) case "$verb,$last" in {lists}) ;; *) last="" ;; esac ;;',
+        "        esac",
+        "    done",
         '    case "$COMP_CWORD,$verb" in',
         f'        1,*) words="{" ".join(groups)} completion" ;;',
     ]
@@ -137,15 +157,14 @@ def _bash(program: str, verbs: Mapping[str, Verb]) -> str:
     ]
     lines += ['        *) case "$verb,$last,$current" in']
     for name, verb in verbs.items():
-        place = name.replace(" ", "\\ ")
-        lines.append(f'            {place},*,-*) words="{" ".join(verb.options)}" ;;')
+        lines.append(f'            {_place(name, "*")},-*) words="{" ".join(verb.options)}" ;;')
         lines += [
-            f'            {place},{option},*) words="{" ".join(values)}" ;;'
+            f'            {_place(name, option)},*) words="{" ".join(values)}" ;;'
             for option, values in verb.options.items()
             if values
         ]
         if verb.arguments:
-            lines.append(f'            {place},,*) words="{" ".join(verb.arguments)}" ;;')
+            lines.append(f'            {_place(name, "")},*) words="{" ".join(verb.arguments)}" ;;')
     lines += [
         "        esac ;;",
         "    esac",
@@ -154,6 +173,11 @@ def _bash(program: str, verbs: Mapping[str, Verb]) -> str:
         f"complete -o default -F {function} {program}",
     ]
     return "\n".join(lines) + "\n"
+
+
+def _place(verb: str, option: str) -> str:
+    """Return the pattern of a word after an option of a command."""
+    return f"{verb},{option}".replace(" ", "\\ ")
 
 
 def _zsh(program: str, verbs: Mapping[str, Verb]) -> str:
