@@ -113,6 +113,8 @@ def test_the_page_by_hand() -> None:
     ]
     assert [row[6] for row in cells[3:]] == ["200", "150", "125"]
     assert "results.py --seeds 2" in lines
+    failed = curves_page(Curves("single-v1", "sim", curves, {}, "", {}), CONFIG, FACTS)
+    assert "| - | - | - |" in failed, "no rule was played to its end"
     rows = curves_as_csv(curves).splitlines()
     assert len(rows) == 1 + 3 * 2 and rows[2] == "ippo,wonder 1.0,3,4,120.0,10.0,5.0"
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import csv
 import io
+import math
 from collections.abc import Mapping, Sequence
 from typing import Any
 
@@ -22,9 +23,10 @@ def curves_page(study: Curves, config: CurvesConfig, facts: Mapping[str, Any]) -
         config: Settings of training and evaluation.
         facts: Command, versions and processor (`experiments.machine_facts`).
     """
-    fixed = min(
+    times = [
         att_s for rule, att_s in study.rules.items() if rule.startswith(("programme", "fixed-time"))
-    )
+    ]
+    fixed, best = min(times, default=math.nan), study.rules.get(study.best, math.nan)
     by_learner: dict[str, list[Curve]] = {}
     for curve in study.curves:
         by_learner.setdefault(curve.learner, []).append(curve)
@@ -57,7 +59,7 @@ def curves_page(study: Curves, config: CurvesConfig, facts: Mapping[str, Any]) -
         "| learner | library | seeds | decisions/s | ms/decision | best | last | last − fixed time "
         "| last below fixed time | last below the best rule |",
         "|---|---|---:|---:|---:|---:|---:|---:|---:|---:|",
-        *(_row(curves, fixed, study.rules[study.best]) for curves in by_learner.values()),
+        *(_row(curves, fixed, best) for curves in by_learner.values()),
     ]
     for rule, att_s in study.rules.items():
         mark = " (best tuned rule)" if rule == study.best else ""
@@ -76,7 +78,10 @@ def _row(curves: Sequence[Curve], fixed_s: float, best_rule_s: float) -> str:
         with_interval(Interval.of(np.array([curve.best_s for curve in curves]))),
         with_interval(Interval.of(last)),
         number_text(float(last.mean() - fixed_s)),
-        *(f"{(last < rule_s).sum()} of {len(last)}" for rule_s in (fixed_s, best_rule_s)),
+        *(
+            "-" if math.isnan(rule_s) else f"{(last < rule_s).sum()} of {len(last)}"
+            for rule_s in (fixed_s, best_rule_s)
+        ),
     ]
     return f"| {' | '.join(cells)} |"
 
