@@ -12,15 +12,23 @@ import stat
 import subprocess
 import time
 import weakref
+import xml.etree.ElementTree as ET
 from pathlib import Path
 
 import pytest
-from hypothesis import given
+from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from ugat_marl import files
 from ugat_marl.errors import LogError, MeasuredDataError, OutputError, ScenarioError
-from ugat_marl.files import parse_xml, read_bytes, replacing, write_whole, xml_bytes
+from ugat_marl.files import (
+    child_texts,
+    parse_xml,
+    read_bytes,
+    replacing,
+    write_whole,
+    xml_bytes,
+)
 
 
 def test_write_whole_writes_and_leaves_nothing_else(tmp_path: Path) -> None:
@@ -309,3 +317,34 @@ def test_a_cache_without_a_home(monkeypatch: pytest.MonkeyPatch) -> None:
         files.user_cache("x")
     monkeypatch.setenv("XDG_CACHE_HOME", "/cache")
     assert files.user_cache("x") == Path("/cache/ugat_marl/x")
+
+
+XML_NAMES, XML_VALUES = (
+    st.sampled_from(["a", "b:c", "vType"]),
+    st.text("a1 <>&\"'\n\r\té", max_size=5),
+)
+XML_TEXTS = st.none() | st.sampled_from(["", " ", "\n  ", 'te<x&t>"é', " x "])
+
+
+@st.composite
+def elements(draw: st.DrawFn, depth: int = 3) -> ET.Element:
+    """Any element, as a parser of XML without namespaces may return it."""
+    made = ET.Element(draw(XML_NAMES), draw(st.dictionaries(XML_NAMES, XML_VALUES, max_size=3)))
+    made.text = draw(XML_TEXTS)
+    for child in draw(st.lists(elements(depth - 1), max_size=3)) if depth else ():
+        child.tail = draw(XML_TEXTS)
+        made.append(child)
+    return made
+
+
+@settings(deadline=None)
+@given(elements())
+def test_texts_of_children_are_those_of_elementtree(root: ET.Element) -> None:
+    end = "\0"
+    texts = child_texts(root)
+    root.text = None
+    for child in root:
+        child.tail = end
+    ET.indent(root, "    ")
+    whole = ET.tostring(root, "unicode")
+    assert texts == (whole[whole.index(">") + 1 :].lstrip().split(end)[:-1] if len(root) else [])

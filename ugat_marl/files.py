@@ -14,6 +14,7 @@ import hashlib
 import io
 import json
 import os
+import re
 import secrets
 import shutil
 import stat
@@ -51,8 +52,12 @@ generator has 128 bits."""
 _TOO_DEEP = f"more than {_DEEPEST} tables or lists inside each other, which no such file needs"
 _TOO_LONG = "a number is far too long, which no such file needs"
 _NO_ROOM = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG)
-_END = "\0"
-"""Mark after each child of an element during writing. XML cannot contain this character."""
+_SPECIAL = re.compile('[&<>"\\r\\n\\t]')
+_IN_TEXT = str.maketrans({"&": "&amp;", "<": "&lt;", ">": "&gt;"})
+_IN_ATTRIBUTE = _IN_TEXT | str.maketrans(
+    {'"': "&quot;", "\r": "&#13;", "\n": "&#10;", "\t": "&#09;"}
+)
+"""Characters of XML that stand for others in values of attributes, and in texts."""
 
 
 @contextlib.contextmanager
@@ -543,13 +548,31 @@ def xml_bytes(root: ET.Element) -> bytes:
 
 
 def child_texts(root: ET.Element) -> list[str]:
-    """Return each child of an element as text, indented as in `xml_bytes`."""
-    root.text = None
-    for child in root:
-        child.tail = _END
-    ET.indent(root, _INDENT)
-    text = ET.tostring(root, "unicode")
-    return text[text.index(">") + 1 :].lstrip().split(_END)[:-1]
+    """Return each child of an element as text, indented as in `xml_bytes`.
+
+    Elements have names without namespaces, as those of `parse_xml`. This is twice as fast as
+    ElementTree, in which a third of the time to apply effects would go.
+    """
+    return [_element_text(child, f"\n{_INDENT}") for child in root]
+
+
+def _element_text(element: ET.Element, margin: str) -> str:
+    """Return an element as text; its lines begin with `margin`, a line break and spaces."""
+    given = element.attrib
+    if _SPECIAL.search("".join(given.values())):
+        given = {name: value.translate(_IN_ATTRIBUTE) for name, value in given.items()}
+    attributes = "".join([f' {name}="{value}"' for name, value in given.items()])
+    tag, text = element.tag, element.text or ""
+    if not len(element):
+        inside = f">{text.translate(_IN_TEXT)}</{tag}>" if text else " />"
+        return f"<{tag}{attributes}{inside}"
+    inner = margin + _INDENT
+    parts = [f"<{tag}{attributes}>", text.translate(_IN_TEXT) if text.strip() else inner]
+    for number, child in enumerate(element, 1):
+        after = inner if number < len(element) else margin
+        tail = child.tail or ""
+        parts += [_element_text(child, inner), tail.translate(_IN_TEXT) if tail.strip() else after]
+    return f"{''.join(parts)}</{tag}>"
 
 
 @dataclass(frozen=True)

@@ -52,7 +52,8 @@ class LibsumoSimulator:
         self._has_behind = False
         self._mesoscopic: MesoscopicLanes | None = None
         self._upstream: UpstreamQueues | None = None
-        self._on: dict[str, tuple[int, str]] = {}
+        self._on: list[tuple[str, ...]] = []
+        self._beside: list[list[int]] = []
         self._owner = 0
 
     def start(self, launch: Launch) -> Snapshot:
@@ -82,10 +83,11 @@ class LibsumoSimulator:
             libsumo.start([program, *launch.arguments, "--end", repr(launch.end_s)])
         except _FAULTS as error:
             self._fail("SUMO did not start", error)
-        self._shown, self._on = {}, {}
+        self._shown, self._on = {}, []
         self._time_s = launch.begin_s
         self._limits = np.array([libsumo.lane.getMaxSpeed(lane) for lane in launch.lanes])
         lanes, roads = launch.behind
+        self._beside = _beside(launch.lanes)
         self._has_behind = any(lanes) or any(roads)
         self._mesoscopic = None
         if launch.segment_m:
@@ -169,13 +171,14 @@ class LibsumoSimulator:
     def _count_left(self, left: NDArray[np.float64]) -> None:
         """Add to `left`, ``(lanes,)``, the vehicles that left a lane's road since the last call."""
         assert self._launch is not None
-        now: dict[str, tuple[int, str]] = {}
-        for index, lane in enumerate(self._launch.lanes):
-            place = index, edge_of_lane(lane)
-            now.update(dict.fromkeys(libsumo.lane.getLastStepVehicleIDs(lane), place))
+        now = [libsumo.lane.getLastStepVehicleIDs(lane) for lane in self._launch.lanes]
         before, self._on = self._on, now
-        for name, (index, road) in before.items():
-            if now.get(name, (0, ""))[1] != road:
+        gone: dict[str, int] = {}
+        for index, (earlier, later) in enumerate(zip(before, now, strict=False)):
+            if earlier != later:  # the same in most seconds
+                gone.update(dict.fromkeys(set(earlier).difference(later), index))
+        for name, index in gone.items():
+            if not any(name in now[lane] for lane in self._beside[index]):
                 left[index] += 1.0
 
     def _snapshot(self) -> Snapshot:
@@ -315,3 +318,11 @@ def _errors_of(directory: Path) -> str:
 def simulation_runs_here() -> bool:
     """Return True if libsumo runs a simulation in this process."""
     return bool(libsumo.simulation.isLoaded())
+
+
+def _beside(lanes: Sequence[str]) -> list[list[int]]:
+    """Return for each lane the indices of the lanes of its road."""
+    of_road: dict[str, list[int]] = defaultdict(list)
+    for index, lane in enumerate(lanes):
+        of_road[edge_of_lane(lane)].append(index)
+    return [of_road[edge_of_lane(lane)] for lane in lanes]
