@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import replace
 from pathlib import Path
 
@@ -54,6 +55,20 @@ def shown(*tables: object) -> str:
         for table in tables:
             console.print(table)
     return capture.get()
+
+
+def test_a_percentage_of_no_cost_is_not_told() -> None:
+    nothing = {("a", "want-safety"): 3.0, ("b", "want-safety"): 0.0}
+    results = tuple(
+        replace(r, scores=scores(50.0, nothing[r.policy, r.domain]))
+        if (r.policy, r.domain) in nothing
+        else r
+        for r in planted().results
+    )
+    cells = gap_matrix(Evaluation("here", "0", results, {}))
+    by_policy = {policy: cells[policy]["reward"] for policy in ("a", "b")}
+    assert math.isnan(by_policy["a"].cost.mean)
+    assert by_policy["b"].cost.mean == 0.0
 
 
 def test_each_cell_is_the_mean_over_domains_and_seeds() -> None:

@@ -202,7 +202,7 @@ def test_greens_are_late_in_the_simulation_that_is_trained_in(tmp_path: Path) ->
 
 def test_the_simulation_is_no_real_domain_of_its_own_table() -> None:
     assert PaperConfig(sim="V1").targets("main") == ["V2", "V3", "V4"]
-    with pytest.raises(OptionError, match="name domains"):
+    with pytest.raises(OptionError, match="is the simulation itself"):
         PaperConfig(sim="light-loads").targets("alpha")
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import replace
 
 import pytest
@@ -52,6 +53,11 @@ def test_chance_is_no_difference() -> None:
 def test_one_episode_has_no_interval() -> None:
     text = outcome([120.0], [100.0]).sentence()
     assert "-20 s against direct transfer in a single episode" in text
+
+
+def test_an_episode_without_a_travel_time_is_told() -> None:
+    text = outcome([120.0, math.nan, 110.0], [100.0, 100.0, 100.0]).sentence()
+    assert "some of the 3 episodes have no travel time" in text and "single" not in text
 
 
 def test_a_run_without_grounding_has_no_outcome() -> None:

@@ -103,10 +103,17 @@ def test_a_packed_policy_that_was_changed_is_refused(training: Path, tmp_path: P
 def test_two_trainings_of_one_name_are_packed_neither(training: Path, tmp_path: Path) -> None:
     both = tmp_path / "both"
     for name in ("one", "other"):
-        shutil.copytree(training, both / name)
+        shutil.copytree(training, both / name / training.name)
     with pytest.raises(OptionError, match="two trainings of"):
         pack(both, tmp_path / "packed")
     assert not (tmp_path / "packed").exists()
+
+
+def test_a_training_of_another_version_is_not_packed(training: Path, tmp_path: Path) -> None:
+    older = training.with_name(f"{training.name[:-10]}0123456789")
+    training.rename(older)
+    with pytest.raises(OptionError, match="trained with another version"):
+        pack(older, tmp_path / "packed")
 
 
 def test_what_is_not_finished_is_not_packed(training: Path, tmp_path: Path) -> None:

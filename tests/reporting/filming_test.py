@@ -80,6 +80,20 @@ def test_two_policies_stand_side_by_side(tmp_path: Path) -> None:
             assert video.info["duration"] % 100 == 0
 
 
+@pytest.mark.parametrize(("per_second", "frames"), [(30, 60), (50, 60), (60, 30), (7, 60)])
+def test_a_gif_lasts_as_long_as_its_pictures(per_second: int, frames: int, tmp_path: Path) -> None:
+    pictures = [np.full((8, 8, 3), 4 * k, np.uint8) for k in range(60)]
+    write_video(iter(pictures), tmp_path / "a.gif", per_second)
+    with Image.open(tmp_path / "a.gif") as video:
+        assert getattr(video, "n_frames", 1) == frames
+        shown = []
+        for number in range(frames):
+            video.seek(number)
+            shown.append(video.info["duration"])
+    assert sum(shown) == pytest.approx(1000 * 60 / per_second, abs=5)
+    assert min(shown) >= 20
+
+
 def test_what_cannot_be_filmed_is_said_first() -> None:
     env, policy = made()
     for begin_s, length_s in ((250, 100), (-1, 10), (0, 0)):

@@ -480,6 +480,20 @@ def test_a_job_shows_its_worst_minutes(tmp_path: Path) -> None:
     assert "direct transfer in V4" in page.text
 
 
+def test_a_minute_is_that_of_the_episode_where_decisions_are_rare(tmp_path: Path) -> None:
+    make_job(tmp_path, "direct-0", ("sim", "V4"), Setting("direct transfer", "direct"))
+    rows = [
+        ("direct transfer", d, 0, minute, "A1", queue, 6)
+        for d in ("sim", "V4")
+        for minute, queue in ((1, 2.0), (4, 9.0), (7, 1.0))
+    ]
+    pl.DataFrame(rows, schema=queues().schema, orient="row").write_parquet(
+        tmp_path / "direct-0" / "queues.parquet"
+    )
+    _, page = page_of(tmp_path / "direct-0")
+    assert page.row("A1")[-2:] == ["9.0", "minute 4"]
+
+
 def test_a_command_is_read_as_it_was_written() -> None:
     command = "ugat-marl paper main --rows 'direct transfer' 'timed' " + "--seeds 5 " * 20
     lines = command_block(command.strip())

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import math
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -10,7 +12,12 @@ from ugat_marl.reporting.run_records import RunRecord
 
 
 def job(
-    seed: int, learner: str = "dqn", episodes: int = 40, hidden: int = 48, **options: Any
+    seed: int,
+    learner: str = "dqn",
+    episodes: int = 40,
+    hidden: int = 48,
+    digest: str = "0123456789",
+    **options: Any,
 ) -> RunRecord:
     settings = {
         "scenario": "single-v1",
@@ -21,7 +28,7 @@ def job(
         "options": options,
     }
     return RunRecord(
-        "job", Path(), True, settings, {}, {}, None, None, None, None, (), float("nan")
+        f"job-{digest}", Path(), True, settings, {}, {}, None, None, None, None, (), math.nan
     )
 
 
@@ -45,3 +52,29 @@ def test_settings_of_the_suites_learners_part_trainings() -> None:
     records = [job(0), job(1), job(0, hidden=8)]
     assert [len(part) for part in seeds_of_one(records)] == [2, 1]
     assert job_labels(records)[2] == "direct transfer (dqn.hidden [8])"
+
+
+def test_trainings_of_two_versions_are_not_one_setting() -> None:
+    labels = job_labels([job(0), job(0, digest="abcdefabcd"), job(1)])
+    assert labels == [
+        "direct transfer (0123456789)", "direct transfer (abcdefabcd)", "direct transfer",
+    ]  # fmt: skip
+
+
+def a_run(seed: int, **changes: Any) -> RunRecord:
+    settings = {"scenario": "single-v1", "seed": seed, "real": "V4", "evaluation_seeds": 5}
+    hashes, versions = {"sim": "aaa"}, {"libsumo": "1.28.0", "numpy": "2.0"}
+    record = RunRecord(
+        f"s{seed}", Path(), False, settings, hashes, versions, None, None, None, None, (), math.nan
+    )
+    return replace(record, **changes)
+
+
+def test_runs_in_other_worlds_are_not_seeds_of_one() -> None:
+    first, second = a_run(0), a_run(1)
+    longer = a_run(2, settings={**first.settings, "seed": 2, "evaluation_seeds": 20})
+    newer = a_run(3, versions={"libsumo": "1.29.0", "numpy": "2.0"})
+    other = a_run(4, hashes={"sim": "bbb"})
+    numpy = a_run(5, versions={"libsumo": "1.28.0", "numpy": "2.1"})
+    found = seeds_of_one([first, second, longer, newer, other, numpy])
+    assert found == [[first, second, numpy], [longer], [newer], [other]]

@@ -13,7 +13,7 @@ from tyro.conf import Positional, arg
 from ugat_marl.cli.arguments import RayAddress, refuse_options, require_numbers, workers_of
 from ugat_marl.data import write_csv
 from ugat_marl.effects import domain_label, load_scenario
-from ugat_marl.errors import OptionError
+from ugat_marl.errors import OptionError, counted
 from ugat_marl.experiments import (
     DIRECT,
     PaperConfig,
@@ -115,6 +115,13 @@ class Compare:
         scenario = load_scenario(self.scenario)
         if self.table is not None:
             table = read_standings(self.table, scenario.id)
+            length = self.duration_s or scenario.settings.duration_s
+            console.print(
+                f"note: {self.table} does not say in which episodes its rows were judged; ranks "
+                f"mean something only if it was {counted(self.evaluation_seeds, 'episode')} of "
+                f"{length:g} s, as the new row is (--evaluation-seeds, --duration-s)",
+                soft_wrap=True,
+            )
         else:
             table = shipped_standings(scenario, self.evaluation_seeds, self.duration_s)
             if table.is_empty():

@@ -145,7 +145,7 @@ class Alpha(_Paper):
 class Uncertainty(_Paper):
     """Compare evidential, Concrete Dropout, Deep Ensembles and none (paper, Fig. 4).
 
-    The gaps are drawn as bars.
+    The gaps are drawn as dots with intervals.
 
     Examples:
         ugat-marl paper uncertainty --domains V1 V2 V3 V4

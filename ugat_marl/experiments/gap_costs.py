@@ -70,9 +70,15 @@ def _above_first(evaluation: Evaluation, policy: str, domain: str) -> NDArray[np
 
 
 def _above_best(evaluation: Evaluation, policy: str, domain: str) -> NDArray[np.float64]:
-    """Return 100 · (cost / cost of the best controller there - 1), seed by seed, in %."""
+    """Return 100 · (cost / cost of the best controller there - 1), seed by seed, in %.
+
+    Where the best controller has no cost at all, it is nan for the others.
+    """
     best = min(
         evaluation.policies, key=lambda name: float(evaluation.values(name, domain, "cost").mean())
     )
     least = evaluation.values(best, domain, "cost")
-    return 100.0 * (evaluation.values(policy, domain, "cost") / np.maximum(least, 1e-9) - 1.0)
+    own = evaluation.values(policy, domain, "cost")
+    nothing = least < 1e-9
+    ratio = own / np.where(nothing, 1.0, least)
+    return 100.0 * (np.where(nothing, np.where(own < 1e-9, 1.0, np.nan), ratio) - 1.0)

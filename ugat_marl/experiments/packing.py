@@ -64,6 +64,12 @@ def _cards(place: Path, command: str) -> list[tuple[PolicyCard, bytes]]:
     record = Record.read(place)
     if job.seed is None or not record.is_whole(job):
         return []
+    if not place.name.endswith(job.digest):
+        raise OptionError(
+            f"{place}: it was trained with another version of the scenario, of a file or of a "
+            f"library (now it would be called {job.name}); a card would state the wrong ones, so "
+            "train again, or pack it with the versions of its training"
+        )
     cards: list[tuple[PolicyCard, bytes]] = []
     for mark, setting in job.rows.items():
         file = place / (POLICY if mark == job.episodes else DIRECT_POLICY)

@@ -54,8 +54,10 @@ class TransferOutcome:
                 f"{begin}; no difference from direct transfer is shown ({change.low:+.2g} to "
                 f"{change.high:+.2g} s, {n} episodes with the same vehicles)"
             )
-        else:
+        elif n == 1:
             text = f"{begin}, {change.mean:+.3g} s against direct transfer in a single episode"
+        else:
+            text = f"{begin}; some of the {n} episodes have no travel time, so no test is possible"
         if self.rule:
             text += f"; the best rule there, {self.rule}, needs {self.rule_s:.3g} s"
         return f"{text}."

@@ -296,9 +296,9 @@ def transfer_picture(evaluation: Evaluation, metrics: Metrics, path: Path) -> No
             right.axhline(level, color=colour, linestyle=(0, (1, 2)), linewidth=1)
             # at the left, where direct transfer is far from the rule, and not where curves meet it
             right.annotate(
-                printable(f"best rule in {domain}"), (0.12, level), (0, 3), color=colour,
-                xycoords=("axes fraction", "data"), textcoords="offset points", ha="left",
-                fontsize=10,
+                printable(shortened(f"best rule in {domain}", 34)), (0.12, level), (0, 3),
+                color=colour, xycoords=("axes fraction", "data"), textcoords="offset points",
+                ha="left", fontsize=10,
             )  # fmt: skip
     add_legend(picture, labels)
     write_png(picture, path)
@@ -428,7 +428,7 @@ def comparison_radar(
     wide, high = 440.0, 310.0
     width = max(wide * columns, 560.0)
     below = legend_height(legend, width) + 12
-    title = f"{rows[0]['scenario']}: simulation against real domain; the rim is the best"
+    title = f"{rows[0]['scenario']}: sim and real; the rim is the best"
     picture = new_picture("radar", title, TOP + high * lines + below, width)
     by_cell = {(row["setting"], row["domain"]): row for row in rows}
     for place, target in enumerate(targets):
@@ -444,7 +444,7 @@ def comparison_radar(
             for cell, end in drawn
         ]
         _draw_radar(axes, table)
-        axes.set_title(printable(target), x=-0.6, y=1.24, fontweight="bold")
+        axes.set_title(printable(shortened(target, 48)), x=-0.6, y=1.24, fontweight="bold")
     add_legend(picture, legend)
     write_png(picture, path)
 

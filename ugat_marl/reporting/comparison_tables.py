@@ -46,7 +46,7 @@ def terminal_tables(comparison: Comparison, direct: str) -> RenderableType:
         table = titled_table(f"{comparison.scenario}: {title}")
         table.add_column("policy", max_width=28, overflow="fold")
         for target in comparison.targets:
-            table.add_column(target, justify="right", no_wrap=True)
+            table.add_column(target, justify="right")
         for setting in comparison.settings:
             row = [
                 cell(setting, t) if comparison.has(setting, t) else "" for t in comparison.targets

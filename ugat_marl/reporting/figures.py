@@ -172,9 +172,13 @@ def add_axes(
     return picture.figure.add_axes(box, **more)
 
 
+_LETTERS = 60
+"""Longest label of a legend, in letters; a longer one would leave the picture."""
+
+
 def legend_columns(labels: Sequence[str], width: float = WIDTH) -> int:
     """Return the number of labels that fit side by side."""
-    longest = max(map(len, labels), default=1)
+    longest = min(max(map(len, labels), default=1), _LETTERS)
     return max(1, min(len(labels), int((width - 16) / (46 + 6.9 * longest))))
 
 
@@ -195,8 +199,9 @@ def add_legend(picture: NamedFigure, labels: Sequence[str], *, lines: bool = Tru
             style["linestyle"] = "none"
         handles.append(Line2D([], [], **style))
     picture.figure.legend(
-        handles, [printable(label) for label in labels], loc="lower left", fontsize=12,
-        bbox_to_anchor=(12 / width, 5 / height), ncols=legend_columns(labels, width),
+        handles, [printable(shortened(label, _LETTERS)) for label in labels],
+        loc="lower left", fontsize=12, bbox_to_anchor=(12 / width, 5 / height),
+        ncols=legend_columns(labels, width),
         labelspacing=0.35, columnspacing=1.4,
     )  # fmt: skip
 

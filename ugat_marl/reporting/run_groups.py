@@ -13,11 +13,13 @@ from ugat_marl.experiments import DIRECT, Comparison, Trial, is_grounded
 from ugat_marl.reporting.run_records import RunRecord
 
 _APART = (
-    "seed", "real", "evaluation_seeds", "tuning_seeds", "rule_budget", "control",
+    "seed", "real", "tuning_seeds", "rule_budget", "control",
     "further", "corrected", "randomised", "random_delay_s", "fine_tuned", "oracle",
     "scenario_hash", "domains",
 )  # fmt: skip
 """Settings in which trainings of one group may differ, since they do not change UGAT itself."""
+_SIMULATING = ("ugat-marl", "eclipse-sumo", "libsumo")
+"""Packages whose versions decide how vehicles move."""
 RULE = "best rule there"
 """Name of the best rule of the real domain, as a setting."""
 
@@ -72,6 +74,7 @@ def _common(record: RunRecord) -> tuple[Any, ...]:
     if record.job:
         return True, record.scenario, record.sim
     settings = {k: v for k, v in record.settings.items() if k not in _APART}
+    settings["world"] = record.hashes.get("sim"), *map(record.versions.get, _SIMULATING)
     return False, record.scenario, record.sim, json.dumps(settings, sort_keys=True, default=str)
 
 
@@ -155,7 +158,18 @@ def job_labels(records: Sequence[RunRecord]) -> list[str]:
         usual = {key: Counter(o.get(key) for o in others).most_common(1)[0][0] for key in varied}
         unusual = [f"{key} {settings[key]}" for key in varied if settings[key] != usual[key]]
         labels.append(f"{name} ({', '.join(unusual)})" if record.job and unusual else name)
-    return labels
+    # Jobs that still have one name differ in a version or a file, which only the digest tells
+    same = Counter(map(_identity, records, labels))
+    pairs = zip(records, labels, strict=True)
+    return [
+        f"{label} ({record.name[-10:]})" if record.job and same[_identity(record, label)] > 1
+        else label
+        for record, label in pairs
+    ]  # fmt: skip
+
+
+def _identity(record: RunRecord, label: str) -> tuple[str, str, str]:
+    return label, record.seed, str(record.settings.get("target"))
 
 
 def _trained(record: RunRecord) -> dict[str, str]:
@@ -164,7 +178,7 @@ def _trained(record: RunRecord) -> dict[str, str]:
         return {}
     learner = record.settings.get("learner")
     options = record.settings.get("options")
-    told: dict[str, str] = {"episodes": str(record.settings.get("episodes", ""))}
+    told = {key: str(record.settings.get(key, "")) for key in ("episodes", "rule_budget")}
     if isinstance(learner, Mapping):
         own = learner.get("settings")
         told["learner"] = " ".join(map(str, [learner.get("name"), *(own or ())]))

@@ -298,9 +298,10 @@ def _texts(value: Any) -> dict[str, str]:
 
 
 def _checkpoint_of_run(directory: Path) -> str:
-    """Return the folder of the checkpoint of the grounded training, relative to the run's."""
-    places = sorted(directory.glob(f"{TRAININGS}/*/{CHECKPOINT_FOLDER}"))
-    return str(places[0].relative_to(directory)) if places else CHECKPOINT_FOLDER
+    """Return the folder of the newest checkpoint of the training, relative to the run's."""
+    places = directory.glob(f"{TRAININGS}/*/{CHECKPOINT_FOLDER}")
+    newest = max(places, key=lambda place: (place.stat().st_mtime, place), default=None)
+    return CHECKPOINT_FOLDER if newest is None else str(newest.relative_to(directory))
 
 
 def _metrics(reader: _Reader, checkpoint: str) -> Metrics | None:

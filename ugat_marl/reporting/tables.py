@@ -118,7 +118,7 @@ def policy_gap_table(title: str, gaps: Mapping[str, PolicyGap], seeds: int) -> R
 def _limits(time: TravelTimeEstimate) -> str:
     if time.low is None or time.high is None:
         return "-"
-    return f"{number_text(time.low)}-{number_text(time.high)}"
+    return _between(time.low, time.high)
 
 
 def _backlog(evaluation: Evaluation, domain: str) -> list[str]:
@@ -179,9 +179,12 @@ def _dim(*cells: str) -> list[Text]:
 def _with_interval(estimate: Estimate) -> str:
     if math.isnan(estimate.low):
         return number_text(estimate.mean)
-    return (
-        f"{number_text(estimate.mean)} ({number_text(estimate.low)}-{number_text(estimate.high)})"
-    )
+    return f"{number_text(estimate.mean)} ({_between(estimate.low, estimate.high)})"
+
+
+def _between(low: float, high: float) -> str:
+    """Return both ends of an interval; a dash between them would make a negative one unclear."""
+    return f"{number_text(low)}{' to ' if low < 0 else '-'}{number_text(high)}"
 
 
 def _half(estimate: Estimate) -> str:

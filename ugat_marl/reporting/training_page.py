@@ -15,6 +15,7 @@ from typing import Any
 
 from ugat_marl.data import MEASURES
 from ugat_marl.envs import OBJECTIVE_MEASURES
+from ugat_marl.errors import counted
 from ugat_marl.experiments import PHASE, Estimate, Evaluation, check_run, is_grounded, outcome_of
 from ugat_marl.reporting import charts
 from ugat_marl.reporting.figures import NamedFigure, printable
@@ -109,9 +110,12 @@ def _title(records: Sequence[RunRecord | TableRecord]) -> str:
 
 def _heading(runs: Sequence[RunRecord], tables: Sequence[TableRecord]) -> tuple[str, str]:
     """Return heading and note of a page of several trainings."""
-    counted = [f"{len(runs)} trainings" * bool(runs), f"{len(tables)} tables" * bool(tables)]
+    parts = [
+        counted(len(runs), "training") * bool(runs),
+        counted(len(tables), "table") * bool(tables),
+    ]
     scenarios = list(dict.fromkeys(r.scenario for r in runs if r.scenario))
-    text = " and ".join(filter(None, counted))
+    text = " and ".join(filter(None, parts))
     text += f" on {', '.join(scenarios)}" if scenarios else ""
     unfinished = sum(not record.finished for record in runs)
     return text, f"{unfinished} of them are not finished." if unfinished else ""
@@ -361,12 +365,14 @@ def _boxes(record: RunRecord) -> list[tuple[str, str]]:
     if grounded is not None:
         start, now = (evaluation.gap(p, real, "att_s").mean for p in (direct, grounded))
         if start > 0 and math.isfinite(now):
-            boxes.append((share(1 - now / start), f"of the gap Δ is gone with {grounded}"))
-        saved = Estimate.of(
-            evaluation.values(direct, real, "att_s") - evaluation.values(grounded, real, "att_s")
-        )
+            gone, word = 1 - now / start, "gone" if now <= start else "added"
+            boxes.append((share(abs(gone)), f"of the gap Δ is {word} with {grounded}"))
+        times = [evaluation.values(policy, real, "att_s") for policy in (direct, grounded)]
+        saved, word = Estimate.of(times[0] - times[1]), "less"
+        if saved.mean < 0:
+            saved, word = Estimate.of(times[1] - times[0]), "more"
         boxes.append(
-            (f"{number(saved.mean)} s", f"less in {real} with {grounded}{_between(saved)}")
+            (f"{number(saved.mean)} s", f"{word} in {real} with {grounded}{_between(saved)}")
         )
         regret = evaluation.regret(grounded, real)
         boxes.append((f"{number(regret.mean)} s", f"regret of {grounded}{_between(regret)}"))
@@ -516,9 +522,12 @@ def _worst(page: Page, record: RunRecord, places: Places | None) -> dict[str, An
     policies = [p for p in known if is_grounded(p)]
     policies = [*policies, *(p for p in known[:1] if p not in policies)]
     by_policy: dict[str, dict[str, list[float]]] = {}
-    for policy, where, _, tls, queue, _ in record.queues.sort("minute").rows():
+    for policy, where, minute, tls, queue, _ in record.queues.sort("minute").rows():
         if where == domain and policy in policies:
-            by_policy.setdefault(policy, {}).setdefault(tls, []).append(queue)
+            row = by_policy.setdefault(policy, {}).setdefault(tls, [])
+            # a minute without a decision has the queue of the decision before it
+            row += [row[-1] if row else queue] * (minute - len(row))
+            row.append(queue)
     by_policy = {policy: by_policy[policy] for policy in policies if policy in by_policy}
     if not by_policy:
         return None

@@ -5,6 +5,8 @@ from __future__ import annotations
 import contextlib
 import importlib
 import importlib.util
+import itertools
+import math
 import shutil
 import subprocess
 import threading
@@ -36,6 +38,7 @@ Frame = NDArray[np.uint8]
 _PILLOW = {".gif": "GIF", ".webp": "WEBP"}
 _FFMPEG = {".mp4": "mp4", ".mkv": "matroska", ".mov": "mov"}
 _CAPTION_PX = 46
+_GIF_PER_S = 50
 _WIDE = 1.6
 """Ratio of width to height above which pictures stand below each other, not side by side."""
 
@@ -272,14 +275,26 @@ class _Captions:
 def _by_pillow(pictures: Iterable[Frame], path: Path, form: str, per_second: float) -> None:
     from PIL import Image
 
+    duration: dict[str, int] = {"duration": round(1000 / per_second)}
     images = (Image.fromarray(picture) for picture in pictures)
-    if form == "GIF":  # the pictures have few colours; dithering would make them flicker
-        images = (i.quantize(256, dither=Image.Dither.NONE) for i in images)
+    if form == "GIF":
+        images, duration = _timed(images, per_second), {}
     first = next(images)
-    first.save(
-        path, format=form, save_all=True, append_images=images, loop=0,
-        duration=round(1000 / per_second),
-    )  # fmt: skip
+    first.save(path, format=form, save_all=True, append_images=images, loop=0, **duration)
+
+
+def _timed(images: Iterable[Any], per_second: float) -> Iterator[Any]:
+    """Yield pictures of a GIF, which counts in 10 ms; players show each for 20 ms or longer."""
+    from PIL import Image
+
+    every = math.ceil(per_second / _GIF_PER_S)
+    shown = 0
+    for number, image in enumerate(itertools.islice(images, 0, None, every), 1):
+        # the pictures have few colours; dithering would make them flicker
+        picture = image.quantize(256, dither=Image.Dither.NONE)
+        ended = 10 * round(100 * number * every / per_second)
+        picture.info["duration"], shown = ended - shown, ended
+        yield picture
 
 
 def _by_ffmpeg(pictures: Iterable[Frame], path: Path, form: str, per_second: float) -> None:
