@@ -25,7 +25,7 @@ from ugat_marl.effects import (
     load_scenario,
     parse_domain,
 )
-from ugat_marl.errors import ScenarioError, UnknownNameError
+from ugat_marl.errors import OptionError, ScenarioError, UnknownNameError
 from ugat_marl.scenarios import Document, Network, Scenario, check_demand
 
 Crossing = Callable[..., Path]
@@ -490,3 +490,68 @@ def test_a_flow_that_draws_its_way_cannot_turn() -> None:
     made = replace(scenario, routes=(scenario.routes[0].edited(text.encode()),))
     with pytest.raises(ScenarioError, match="flow 'f' draws its way from 'rd'; give it a route"):
         apply_effects(made, [Turning(EDGE, "A1_northA", 0.25)])
+
+
+# --- demand of another form
+
+
+def with_routes(text: str, begin_s: float = 0.0, duration_s: float = 3600.0) -> Scenario:
+    """single-v1 with these vehicles, trips and flows."""
+    scenario = load_scenario("single-v1")
+    changes = {"begin_s": begin_s, "duration_s": duration_s}
+    return replace(
+        scenario,
+        settings=scenario.settings.model_copy(update=changes),
+        routes=(Document("own.rou.xml", None, f"<routes>{text}</routes>".encode()),),
+    )
+
+
+def vehicles(departs: list[float]) -> str:
+    route = '<route edges="west1_A1 A1_east1"/>'
+    return "".join(
+        f'<vehicle id="v{n}" depart="{t:g}">{route}</vehicle>' for n, t in enumerate(departs)
+    )
+
+
+@pytest.mark.parametrize("effect", [DemandLevel("*", 2.0), DemandSurge("*", 0.0, 7200.0, 2.0)])
+def test_vehicles_from_before_the_episode_have_no_twins_in_it(effect: Effect) -> None:
+    scenario = with_routes(vehicles([10.0 * n for n in range(720)]), begin_s=3600.0)
+    grown = apply_effects(scenario, [effect])
+    times = [float(item.get("depart", "")) for item in departing(grown).values()]
+    assert sum(3600 <= time < 7200 for time in times) == 720
+    assert times.count(3600.0) <= 2
+
+
+def test_a_short_surge_stays_in_its_window() -> None:
+    scenario = with_routes(vehicles([600 + 0.1 * n for n in range(100)]))
+    grown = apply_effects(scenario, [DemandSurge("*", 600.0, 610.0, 2.0)])
+    times = [float(item.get("depart", "")) for item in departing(grown).values()]
+    assert len(times) == 200 and min(times) >= 600 and max(times) < 610
+
+
+def test_demand_that_starts_in_a_district_has_no_first_edge() -> None:
+    scenario = with_routes('<trip id="t" depart="1" fromTaz="a" toTaz="b"/>')
+    with pytest.raises(OptionError, match="trip 't' starts at fromTaz = 'a'"):
+        apply_effects(scenario, [DemandLevel(EDGE, 2.0)])
+    assert len(departing(apply_effects(scenario, [DemandLevel("*", 2.0)]))) == 2
+
+
+def test_parking_rounds_half_a_vehicle_up() -> None:
+    scenario = with_routes(vehicles([1.0]), duration_s=1800.0)
+    for per_hour, number in ((1.0, 1), (3.0, 2), (0.9, 0)):
+        parked = apply_effects(scenario, [Parking("west1_A1_0", per_hour, 60.0)])
+        text = b"".join(document.read() for document in (*parked.routes, *parked.additional))
+        assert text.count(b'<vehicle id="parking.') == number
+
+
+def test_a_truck_is_no_faster_than_the_car_it_replaces() -> None:
+    types = '<vType id="slow" maxSpeed="8"/><vType id="car" maxSpeed="55.55"/>'
+    both = '<flow id="{0}" type="{0}" begin="0" end="10" number="5" from="west1_A1" to="A1_east1"/>'
+    scenario = with_routes(types + both.format("slow") + both.format("car"))
+    changed = apply_effects(scenario, [HeavyShare(1.0)])
+    speeds = {
+        item.get("id"): item.get("maxSpeed")
+        for document in (*changed.additional, *changed.routes)
+        for item in document.parse().iter("vType")
+    }
+    assert speeds["heavy.slow"] == "8" and speeds["heavy.car"] == "36.11"

@@ -175,6 +175,16 @@ def test_left_turns_against_traffic_wait(tmp_path: Path) -> None:
     assert item.phases == ("GGrrr", "rrGgG")
 
 
+def test_a_light_whose_phases_have_no_time_is_refused(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    net = crossroads()
+    for phase in net["intersections"][0]["trafficLight"]["lightphases"]:
+        phase["time"] = 0
+    assert main(["scenario", "new", str(tmp_path / "city"), *write(tmp_path, net)]) == 2
+    assert "no light phase has a time above 0" in " ".join(capsys.readouterr().err.split())
+
+
 def test_without_time_between_greens_some_is_put_in(tmp_path: Path) -> None:
     net = crossroads()
     del net["intersections"][0]["trafficLight"]["lightphases"][0]

@@ -13,7 +13,7 @@ from ugat_marl.__main__ import main
 from ugat_marl.errors import ScenarioError
 from ugat_marl.progress import Silent
 from ugat_marl.scenarios import read_scenario, sumo_program
-from ugat_marl.scenarios.importers.counts import read_rows
+from ugat_marl.scenarios.importers.counts import Row, _closed, read_rows
 
 
 def made(target: Path, *words: str | Path) -> int:
@@ -250,3 +250,12 @@ def test_counted_u_turns_are_driven(tmp_path: Path) -> None:
     turned = [edges for _, edges in drives(tmp_path / "city") if "A0bottom0" in edges]
     back = [edges for edges in turned if ("bottom0A0", "A0bottom0") in pairwise(edges)]
     assert len(back) == pytest.approx(20, abs=1)
+
+
+def test_intervals_with_inclusive_ends_touch() -> None:
+    def rows(*spans: tuple[float, float]) -> list[Row]:
+        return [Row(("a",), 5.0, begin, end, line) for line, (begin, end) in enumerate(spans, 2)]
+
+    assert _closed(rows((0, 899), (900, 1799), (0, 899))) == rows((0, 900), (900, 1800), (0, 900))
+    for spans in (((0, 900), (900, 1800)), ((0, 600), (900, 1800)), ((0, 3600),)):
+        assert _closed(rows(*spans)) == rows(*spans)

@@ -212,6 +212,13 @@ HEAD = "light,cycle_s,offset_s,ring,barrier,movements,split_s,yellow_s,all_red_s
 GOOD = "A1,60,0,1,1,NBT NBR SBT SBR NBL SBL,30,3,2\nA1,60,0,1,1,EBT EBR WBT WBR EBL WBL,30,3,2\n"
 
 
+def test_blank_rows_of_a_spreadsheet_are_left_out(tmp_path: Path) -> None:
+    plain, blank = tmp_path / "plain.csv", tmp_path / "blank.csv"
+    plain.write_text(HEAD + GOOD)
+    blank.write_text(HEAD + GOOD + ",,,,,,,,\n , ,,,,,,,\n")
+    assert read_plans(blank) == read_plans(plain)
+
+
 @pytest.mark.parametrize(
     ("text", "says"),
     [

@@ -33,6 +33,7 @@ from ugat_marl.effects.documents import (
     windows,
 )
 from ugat_marl.effects.places import network_places
+from ugat_marl.errors import OptionError
 from ugat_marl.scenarios import Scenario, parse_time
 
 TAGS = ("<vehicle", "<trip", "<flow")
@@ -192,6 +193,21 @@ class DemandTiming(Effect):
         return replace_departing(scenario, self, self.edge, shifted)
 
 
+def _refuse_district(effect: Effect, element: ET.Element) -> None:
+    """Refuse demand that starts in a district, whose first edge only SUMO decides.
+
+    Raises:
+        OptionError: The element starts in a district or at a junction.
+    """
+    for attribute in ("fromTaz", "fromJunction"):
+        if attribute in element.attrib:
+            raise OptionError(
+                f"{effect}: {element.tag} {element.get('id')!r} starts at {attribute} = "
+                f"{element.get(attribute)!r}, so its first edge is not known; give it the "
+                "attribute from, or take every edge (*)"
+            )
+
+
 def replace_departing(
     scenario: Scenario,
     effect: Effect,
@@ -219,6 +235,8 @@ def replace_departing(
         children: list[ET.Element] = []
         any_changed = False
         for element in root:
+            if edge != EVERYWHERE and is_demand(element):
+                _refuse_district(effect, element)
             if is_demand(element) and (edge == EVERYWHERE or routes.origin(element) == edge):
                 any_changed = True
                 children += becomes(element)
@@ -401,8 +419,8 @@ def _scaled(
         if element.tag == "flow":
             return _scaled_window(element, window, factor, over, mark, salt)
         depart = depart_s(element)
-        if not (math.isnan(depart) or begin <= depart < end):
-            return [element]
+        if not (math.isnan(depart) or least <= depart < end):
+            return [element]  # one from before the episode takes no part in it
         name = element.get("id", "")
         count = math.floor(factor) + (hashed_uniform(salt, name) < factor - math.floor(factor))
         copies = [element] if count else []
@@ -411,10 +429,9 @@ def _scaled(
             twin.set("id", f"{name}{mark}{number}")
             if not math.isnan(depart):
                 shift = TWIN_S * (2 * hashed_uniform(salt, "when", name, str(number)) - 1)
-                time = depart + shift
-                if not least <= time < end:
-                    time = depart - shift
-                twin.set("depart", seconds_text(round(max(time, least), 2)))
+                times = (depart + shift, depart - shift, depart)
+                time = next(time for time in times if least <= time < end)
+                twin.set("depart", seconds_text(round(time, 2)))
             copies.append(twin)
         return copies
 

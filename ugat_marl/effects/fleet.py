@@ -208,9 +208,10 @@ def _truck(car: ET.Element, name: str) -> ET.Element:
     for model in truck:
         for key in ("accel", "decel"):
             model.attrib.pop(key, None)
+    fastest = min(float(car.get("maxSpeed", "inf")), 36.11)
     truck.attrib |= {
         "id": name, "length": "12", "accel": "1", "decel": "3.5", "guiShape": "truck",
-        "maxSpeed": "36.11",
+        "maxSpeed": f"{fastest:g}",
     }  # fmt: skip
     return truck
 

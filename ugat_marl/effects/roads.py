@@ -6,6 +6,7 @@ departures in order. Effects on the demand ignore it.
 
 from __future__ import annotations
 
+import math
 import re
 import xml.etree.ElementTree as ET
 from collections.abc import Sequence
@@ -119,7 +120,7 @@ class Parking(Effect):
             OptionError: The lane is too short to stand on.
         """
         settings = scenario.settings
-        number = round(self.per_hour * settings.duration_s / 3600.0)
+        number = math.floor(self.per_hour * settings.duration_s / 3600.0 + 0.5)
         parts = [(n + hashed_uniform(self.name, self.lane, str(n))) / number for n in range(number)]
         departs = [settings.begin_s + part * settings.duration_s for part in parts]
         stand = {"duration": seconds_text(self.dwell_s)}

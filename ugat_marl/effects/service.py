@@ -38,10 +38,10 @@ class LaneService(ControllerEffect):
         """List the effect in the scenario; the last of two of the same lane counts.
 
         Raises:
-            UnknownNameError: No such lane.
+            UnknownNameError: No such lane at a traffic light.
         """
         places = network_places(scenario)
-        places.check(self.name, "lane", self.lane, places.lanes)
+        places.check(self.name, "lane", self.lane, places.ends)
         return super().apply(scenario)
 
     def service(self) -> Mapping[str, Seconds]:

@@ -65,7 +65,8 @@ def draw_day(scenario: Scenario, seed: int, day_to_day: float = 0.0) -> Scenario
     change them, so two models can be compared on the same day. Vehicles that depart before the
     scenario's begin are left out, as SUMO leaves them out. A shift across the begin or the end of
     the scenario is mirrored there, so the mean number of vehicles within it is that of the demand.
-    Persons, and vehicles that block a lane or wait for a person, are the same every day.
+    Persons, and vehicles that block a lane or wait for a person, are the same every day. A vehicle
+    with a speedFactor of its own keeps it; others draw it from that of their type.
 
     Args:
         scenario: Any scenario; `demand_as_vehicles` turns its trips and flows into vehicles.
@@ -150,6 +151,7 @@ def _vehicles(
     heads: list[str] = []
     tails: list[str] = []
     kinds: list[str] = []
+    own_speeds: list[str | None] = []
     for number, content in enumerate(routes):
         rest = ET.Element("routes")
         for element in parse_xml(content, "routes"):
@@ -159,6 +161,7 @@ def _vehicles(
                 names.append(element.get("id", ""))
                 depart.append(time)
                 kinds.append(element.get("type", ""))
+                own_speeds.append(element.get("speedFactor"))
                 heads.append(_attributes(element))
                 tails.append("".join(ET.tostring(part, "unicode").strip() for part in element))
             else:
@@ -172,7 +175,10 @@ def _vehicles(
         for element in root.iter("vType")
     }
     known.setdefault(_DEFAULT, _speed_of({}, options))
-    speeds = [known.get(kind or _DEFAULT, _LEFT_TO_SUMO) for kind in kinds]
+    speeds = [
+        known.get(kind or _DEFAULT, _LEFT_TO_SUMO) if own is None else _own_speed(own, options)
+        for kind, own in zip(kinds, own_speeds, strict=True)
+    ]
     return _Vehicles(
         Document(_TYPES, None, xml_bytes(types)),
         tuple(others),
@@ -197,6 +203,14 @@ def _drawn_depart_s(element: ET.Element) -> float | None:
 def _attributes(element: ET.Element) -> str:
     left = {k: v for k, v in element.attrib.items() if k not in ("id", "depart", "speedFactor")}
     return "".join(f" {key}={quoteattr(value)}" for key, value in left.items()) + ">"
+
+
+def _own_speed(text: str, sumo: Mapping[str, str]) -> _Speed:
+    """Return the speedFactor of a vehicle, a number or a distribution, as `_speed_of` does."""
+    try:
+        return float(text), 0.0, -np.inf, np.inf
+    except ValueError:
+        return _speed_of({"speedFactor": text}, sumo)
 
 
 def _speed_of(attributes: Mapping[str, str], sumo: Mapping[str, str]) -> _Speed:

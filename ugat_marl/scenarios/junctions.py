@@ -132,7 +132,7 @@ def crossings_of(root: ET.Element) -> dict[str, list[Link]]:
     """Return the crossings for people on foot of every traffic light.
 
     Crossings have the last rows of the junction's matrix, in the order of their numbers. A crossing
-    with a light at each end gives one link, with the letter of its first end.
+    with a light at each end (``linkIndex2``) gives two links, one for each letter.
     """
     numbers: dict[str, list[int]] = defaultdict(list)
     for edge in root.iter("edge"):
@@ -145,8 +145,9 @@ def crossings_of(root: ET.Element) -> dict[str, list[Link]]:
     }
     crossings: dict[str, list[Link]] = defaultdict(list)
     for connection in root.iter("connection"):
-        tls, target = connection.get("tl"), connection.get("to", "")
-        if tls is None or not target.startswith(":") or "_c" not in target:
+        tls, ends = connection.get("tl"), (connection.get("to", ""), connection.get("from", ""))
+        target = next((end for end in ends if end.startswith(":") and "_c" in end), None)
+        if tls is None or target is None:
             continue
         junction, number = target[1:].rsplit("_c", 1)
         if junction in numbers and number.isdigit():

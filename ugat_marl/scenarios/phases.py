@@ -229,7 +229,8 @@ def state_of(green: Sequence[Link], links: Sequence[Link], rules: RightOfWay, wi
     for link in green:
         letters[link.index] = "G"
     for link in green:
-        if any(link.from_edge != b.from_edge and rules.waits(link, b) for b in green):
+        # lanes of one road too: who turns across a bicycle lane beside waits for those on it
+        if any(link.from_lane != b.from_lane and rules.waits(link, b) for b in green):
             letters[link.index] = "g"
     return "".join(letters)
 

@@ -6,7 +6,7 @@ import functools
 import math
 import tempfile
 import xml.etree.ElementTree as ET
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from dataclasses import replace
 from pathlib import Path
 
@@ -236,11 +236,12 @@ def _routed_by_duarouter(scenario: Scenario) -> tuple[Document, ...]:
         settings = scenario.settings
         arguments = [
             "--net-file", files((scenario.network,)),
-            "--route-files", files(scenario.routes),
+            "--route-files", files(_from_begin(scenario.routes, settings.begin_s)),
             "--output-file", str(out),
             "--vtype-output", str(directory / "types.xml"),
             "--begin", repr(settings.begin_s),
             "--end", repr(settings.begin_s + settings.duration_s),
+            "--ptline-routing", "true",  # else vehicles with a line, such as buses, are left out
             "--ignore-errors", "true",
             "--no-warnings", "true",
             "--no-step-log", "true",
@@ -281,6 +282,41 @@ def _children(document: Document, tags: frozenset[str]) -> Iterator[list[str]]:
     for part in document.parts():
         part[:] = [element for element in part if element.tag in tags]
         yield child_texts(part) if len(part) else []
+
+
+def _from_begin(documents: Iterable[Document], begin_s: float) -> tuple[Document, ...]:
+    """Return route files whose flows with a probability begin in the episode.
+
+    duarouter never ends with one that begins earlier. Its seconds are independent, so that those
+    before the episode decide nothing in it.
+    """
+    return tuple(
+        _later(document, begin_s)
+        if any(_is_early(tag.name, tag.attributes, begin_s) for tag in document.scan())
+        else document
+        for document in documents
+    )
+
+
+def _is_early(name: str, attributes: Mapping[str, str], begin_s: float) -> bool:
+    if name != "flow" or "probability" not in attributes:
+        return False
+    try:
+        return parse_time(attributes.get("begin", "0")) < begin_s
+    except ValueError:  # begins with another vehicle
+        return False
+
+
+def _later(document: Document, begin_s: float) -> Document:
+    draft = None
+    for part in document.parts():
+        for element in part:
+            if _is_early(element.tag, element.attrib, begin_s):
+                element.set("begin", f"{begin_s:g}")
+        draft = draft or Draft(document.name.removesuffix(".gz"), part)
+        draft.add(*child_texts(part))
+    assert draft is not None
+    return draft.document()
 
 
 def _for_sumo(document: Document, directory: Path) -> Path:

@@ -527,6 +527,8 @@ def read_plans(path: Path) -> tuple[SignalPlan, ...]:
     frames: dict[str, tuple[float, float]] = {}
     for row in rows_of(reader, path):
         where = f"{path}, line {reader.line_num}"
+        if not any((row[name] or "").strip() for name in columns):
+            continue  # as a spreadsheet writes below its table
         light = (row["light"] or "").strip()
         frame = _seconds(row, "cycle_s", where), _seconds(row, "offset_s", where)
         if frames.setdefault(light, frame) != frame:

@@ -288,6 +288,11 @@ def _split(
     In it only links that are always green may go.
     """
     phases = [(seconds, frozenset(links)) for seconds, links in crossing.phases if seconds > 0]
+    if not phases:
+        raise ScenarioError(
+            f"intersection {crossing.id!r}: no light phase has a time above 0; give each its "
+            "seconds"
+        )
     greens = [
         phase
         for phase in phases

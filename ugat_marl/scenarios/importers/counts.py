@@ -10,7 +10,7 @@ import xml.etree.ElementTree as ET
 from bisect import bisect_left
 from collections import defaultdict, deque
 from collections.abc import Iterable, Iterator, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import partial
 from itertools import chain, pairwise
 from pathlib import Path
@@ -181,6 +181,7 @@ def from_counts(path: Path, begin_s: float, length_s: float, seed: int) -> Vehic
             drives += _turning_back(rows, drives, streets)
             _require_reached(rows, drives, path)
             write_drives(work / "candidates.rou.xml", drives)
+            rows = _closed(rows)
             grid_s = _grid_s(rows)
             options = _counts_for_sumo(rows, grid_s, work, seed)
             out = work / "sampled.rou.xml"
@@ -257,6 +258,22 @@ def _require_reached(rows: Iterable[Row], drives: Sequence[Drive], path: Path) -
                 f"{path}, line {row.line}: no way through the network comes by "
                 f"{' -> '.join(row.roads)}; leave the row out, or give routes (--routes)"
             )
+
+
+def _closed(rows: Sequence[Row]) -> list[Row]:
+    """Return rows whose intervals touch, where all of them end one second early (0 to 899).
+
+    routeSampler would be given intervals of one second, and would not end.
+    """
+    begins = sorted({row.begin_s for row in rows})
+    gaps = {
+        begins[place] - row.end_s
+        for row in rows
+        if (place := bisect_left(begins, row.end_s)) < len(begins)
+    }
+    if gaps != {1.0}:
+        return list(rows)
+    return [replace(row, end_s=row.end_s + 1.0) for row in rows]
 
 
 def _grid_s(rows: Sequence[Row]) -> float:

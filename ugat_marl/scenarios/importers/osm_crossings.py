@@ -49,6 +49,8 @@ def has_light(tags: Mapping[str, str]) -> bool:
         tags: Tags of the node.
     """
     highway, kind = tags.get("highway"), tags.get("crossing")
+    if tags.get("crossing:signals") == "no":
+        return False
     if kind == "traffic_signals" or tags.get("crossing:signals") == "yes":
         return True
     if highway == "traffic_signals":

@@ -1,0 +1,91 @@
+"""Demand in forms that routing alone can lose: buses with a line, early flows, own speeds."""
+
+from __future__ import annotations
+
+import xml.etree.ElementTree as ET
+from collections import Counter
+from dataclasses import replace
+
+import pytest
+
+from ugat_marl.effects import LateGreen, apply_effects, load_scenario, parse_domain
+from ugat_marl.errors import UnknownNameError
+from ugat_marl.parallel import DEADLINE_VARIABLE
+from ugat_marl.scenarios import (
+    Document,
+    Scenario,
+    degrees_of_saturation,
+    demand_as_vehicles,
+    draw_day,
+)
+from ugat_marl.scenarios.importers.osm_crossings import has_light
+
+
+def with_routes(text: str, begin_s: float = 0.0, duration_s: float = 3600.0) -> Scenario:
+    scenario = load_scenario("single-v1")
+    changes = {"begin_s": begin_s, "duration_s": duration_s}
+    return replace(
+        scenario,
+        settings=scenario.settings.model_copy(update=changes),
+        routes=(Document("own.rou.xml", None, f"<routes>{text}</routes>".encode()),),
+    )
+
+
+def vehicles(scenario: Scenario) -> list[ET.Element]:
+    return [item for document in scenario.routes for item in document.parse().iter("vehicle")]
+
+
+def test_buses_with_a_line_stay_in_the_demand() -> None:
+    flow = '<flow id="{0}" begin="0" end="600" number="60" from="west1_A1" to="A1_east1"{1}/>'
+    scenario = with_routes(flow.format("bus", ' line="7"') + flow.format("car", ""))
+    named = Counter(
+        item.get("id", "").partition(".")[0] for item in vehicles(demand_as_vehicles(scenario))
+    )
+    assert named == {"bus": 60, "car": 60}
+
+
+def test_a_flow_by_chance_may_begin_before_the_episode(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv(DEADLINE_VARIABLE, "60")
+    scenario = with_routes(
+        '<flow id="f" begin="0" end="7200" probability="0.05" from="west1_A1" to="A1_east1"/>',
+        begin_s=3600.0,
+    )
+    departs = [float(item.get("depart", "")) for item in vehicles(demand_as_vehicles(scenario))]
+    assert 120 < len(departs) < 250 and min(departs) >= 3600  # 180 of 3600 s
+
+
+def test_a_vehicle_keeps_its_own_speed_factor_on_a_drawn_day() -> None:
+    route = '<route edges="west1_A1 A1_east1"/>'
+    text = "".join(
+        f'<vehicle id="v{n}" depart="{n}" type="car"{own}>{route}</vehicle>'
+        for n, own in enumerate([' speedFactor="0.4"', ""] * 50)
+    )
+    types = '<vType id="car" speedFactor="normc(1,0.1,0.2,2)"/>'
+    drawn = vehicles(draw_day(with_routes(types + text), 1))
+    factors = {
+        item.get("id", "").partition("~")[0]: float(item.get("speedFactor", "")) for item in drawn
+    }
+    own = set(range(0, 100, 2))
+    assert {f for n, f in factors.items() if int(n[1:]) in own} == {0.4}
+    assert len({f for n, f in factors.items() if int(n[1:]) not in own}) > 10
+
+
+def test_late_greens_count_in_the_degree_of_saturation() -> None:
+    scenario = load_scenario("single-v1").with_control(phases="conflict-free")
+    flows = {("southA_A1", "A1_northA"): 900.0, ("west1_A1", "A1_east1"): 600.0}
+    late = apply_effects(scenario, [LateGreen("*", 5.0)])
+    longer = scenario.with_control(all_red_s=scenario.control.all_red_s + 5.0)
+    found = degrees_of_saturation(late, flows)
+    assert found == degrees_of_saturation(longer, flows) != degrees_of_saturation(scenario, flows)
+
+
+def test_service_is_that_of_a_lane_at_a_light() -> None:
+    scenario = load_scenario("single-v1")
+    apply_effects(scenario, parse_domain("lane_service=west1_A1_0,4,0"))
+    with pytest.raises(UnknownNameError, match="lane"):
+        apply_effects(scenario, parse_domain("lane_service=A1_east1_0,4,0"))
+
+
+def test_a_crossing_without_signals_has_no_light() -> None:
+    assert not has_light({"highway": "crossing", "crossing:signals": "no"})
+    assert has_light({"highway": "crossing", "crossing:signals": "yes"})
