@@ -312,7 +312,7 @@ def _later(document: Document, begin_s: float) -> Document:
     for part in document.parts():
         for element in part:
             if _is_early(element.tag, element.attrib, begin_s):
-                element.set("begin", f"{begin_s:g}")
+                element.set("begin", f"{begin_s:.3f}")
         draft = draft or Draft(document.name.removesuffix(".gz"), part)
         draft.add(*child_texts(part))
     assert draft is not None
