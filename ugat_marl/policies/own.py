@@ -81,7 +81,7 @@ def _is_found(kind: Any, given: Any) -> bool:
     for part in kind.__qualname__.split("."):
         found = getattr(found, part, None)
     if hasattr(given, "__qualname__") or isinstance(given, functools.partial):
-        return found is given or "<" in kind.__qualname__
+        return found == given or "<" in kind.__qualname__
     return found is kind
 
 
