@@ -532,7 +532,7 @@ def _discharge(counter: _Counter, stop: Passages, greens: Greens) -> None:
     counter.add("lost", lost)
     # trend = mean of lost * t, with t from -1 at the begin of the period to 1 at its end
     middle = 0.5 * (counter.period.begin_s + counter.period.end_s)
-    half = 0.5 * (counter.period.length_s)
+    half = 0.5 * counter.period.length_s
     counter.add("lost_trend", lost * (start[protected & (number == 0)] - middle) / half)
     for name, low, high in (
         ("gap2", 1, 1), ("gap3", 2, 2), ("gap4-5", 3, 4), ("gap6-8", 5, 7), ("gap9+", 8, 14),

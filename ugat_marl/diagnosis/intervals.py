@@ -230,7 +230,7 @@ def without_gaps(
     for period in periods:
         of_period = counts.filter(pl.col("period_id") == period.id)
         times = dict(of_period.group_by("detector_id").agg(length.sum()).iter_rows())
-        least = thresholds.whole * (period.length_s)
+        least = thresholds.whole * period.length_s
         whole = {name for name in whole if times.get(name, 0.0) >= least}
     return frozenset(whole)
 

@@ -139,7 +139,7 @@ def _add(cells: Array, where: tuple[NDArray[np.int64], ...], values: Array) -> N
 
 
 def _bins(times: Array, period: Period, bins: int) -> NDArray[np.int64]:
-    share = (times - period.begin_s) / (period.length_s)
+    share = (times - period.begin_s) / period.length_s
     return np.clip((share * bins).astype(np.int64), 0, bins - 1)
 
 

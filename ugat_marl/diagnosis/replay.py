@@ -647,7 +647,7 @@ def _filled(
 
         def waiting(name: str | None) -> float:
             rounds = turns[name] // sizes[name]
-            return queues[name][0].time_s + rounds * (period.length_s)
+            return queues[name][0].time_s + rounds * period.length_s
 
         name = min(fitting, key=waiting)
         queue = queues[name]
