@@ -44,7 +44,7 @@ from ugat_marl.policies import DQNConfig
 from ugat_marl.reporting import RunRecord, read_records, runs_page, style, write_pictures
 from ugat_marl.reporting import formats as words
 from ugat_marl.reporting.charts import radar_picture
-from ugat_marl.reporting.figures import NamedFigure
+from ugat_marl.reporting.figures import NamedFigure, shortened_apart
 from ugat_marl.reporting.formats import command_block, commands_in
 from ugat_marl.reporting.network_maps import minutes_picture, node_map
 from ugat_marl.reporting.page import Page as MadePage
@@ -605,6 +605,16 @@ def test_steps_are_joined_over_series() -> None:
     rows = means_by_step([[(0, 1.0), (1, np.inf)], [(0, 3.0)]])
     assert rows[0][1] == 2.0 and rows[0][2] < 1.0
     assert np.isnan(rows[1][1])  # what is infinite once is not a mean
+
+
+def test_labels_that_would_be_cut_to_the_same_are_cut_in_the_middle() -> None:
+    ends = ("all parts and residual, phase", "all parts and residual, timed", "short")
+    texts = shortened_apart([f"fitted street: {end}" for end in ends], 34)
+    assert texts == [
+        "fitted street: al… residual, phase", "fitted street: al… residual, timed",
+        "fitted street: short",
+    ]  # fmt: skip
+    assert shortened_apart(["a", "a"], 34) == ["a", "a"]
 
 
 def test_the_rim_of_a_radar_is_the_best_value() -> None:

@@ -32,6 +32,7 @@ from ugat_marl.reporting.figures import (
     new_picture,
     printable,
     shortened,
+    shortened_apart,
     write_png,
 )
 from ugat_marl.reporting.formats import tick_text
@@ -256,7 +257,7 @@ def _draw_estimates(
             (dot,) = axes.plot(mean, place + shift, **style, markersize=8, zorder=3)
             add_tip(dot, f"{label}, {group}: {tick_text(mean)} {unit}")
     axes.set_ylim(len(labels) - 0.5, -0.5)
-    texts = [printable(shortened(label, letters)) if letters else "" for label in labels]
+    texts = [printable(text) if letters else "" for text in shortened_apart(labels, letters)]
     axes.set_yticks(range(len(labels)), texts, color=LIGHT["ink"])
     axes.grid(visible=False, axis="y")
     axes.xaxis.set_major_locator(MaxNLocator(5))

@@ -9,6 +9,7 @@ from __future__ import annotations
 import io
 import re
 import xml.etree.ElementTree as ET
+from collections import Counter
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -220,3 +221,15 @@ def printable(text: str) -> str:
 def shortened(text: str, most: int) -> str:
     """Return a text of `most` characters at most, cut with an ellipsis."""
     return text if len(text) <= most else f"{text[: most - 1]}…"
+
+
+def shortened_apart(texts: Sequence[str], most: int) -> list[str]:
+    """Return texts as `shortened`, or cut in the middle where two would be the same."""
+    short = [shortened(text, most) for text in texts]
+    counts, begin = Counter(short), most // 2
+    return [
+        label
+        if counts[label] == 1 or len(text) <= most
+        else f"{text[:begin]}…{text[begin + 1 - most :]}"
+        for text, label in zip(texts, short, strict=True)
+    ]
