@@ -179,7 +179,9 @@ def test_what_cannot_be_read_is_refused_with_the_way_out():
     with pytest.raises(OptionError, match=r"network = 'colight' with the structure of 'frap'"):
         DQN(AGENTS, QUICK, structure=Structure("frap"))
     agents = AgentSet(("a",), (3,), (2,))
-    with pytest.raises(OptionError, match=r"does not know the intersections of a; leave out wrappers"):
+    with pytest.raises(
+        OptionError, match=r"does not know the intersections of a; leave out wrappers"
+    ):
         _neighbours(agents, {"b": "J"}, Network({}, (), ()))
     cases: dict[str, dict[str, Any]] = {
         "hidden = .*two sizes": {"hidden": (8,)},

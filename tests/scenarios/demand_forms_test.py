@@ -4,16 +4,19 @@ from __future__ import annotations
 
 import xml.etree.ElementTree as ET
 from collections import Counter
+from contextlib import nullcontext
 from dataclasses import replace
 
 import pytest
 
 from ugat_marl.effects import LateGreen, apply_effects, load_scenario, parse_domain
-from ugat_marl.errors import UnknownNameError
+from ugat_marl.errors import ScenarioError, UnknownNameError
 from ugat_marl.parallel import DEADLINE_VARIABLE
 from ugat_marl.scenarios import (
     Document,
+    Network,
     Scenario,
+    check_demand,
     degrees_of_saturation,
     demand_as_vehicles,
     draw_day,
@@ -89,3 +92,20 @@ def test_service_is_that_of_a_lane_at_a_light() -> None:
 def test_a_crossing_without_signals_has_no_light() -> None:
     assert not has_light({"highway": "crossing", "crossing:signals": "no"})
     assert has_light({"highway": "crossing", "crossing:signals": "yes"})
+
+
+def test_a_scale_of_a_type_is_refused() -> None:
+    route = '<route edges="west1_A1 A1_east1"/>'
+    for scale, refused in (("2", True), ("1", False)):
+        text = (
+            f'<vType id="t" scale="{scale}"/><vehicle id="v" type="t" depart="1">{route}</vehicle>'
+        )
+        scenario = with_routes(text)
+        with pytest.raises(ScenarioError, match="scale of its own") if refused else nullcontext():
+            check_demand(scenario, Network.read(scenario))
+
+
+def test_a_turn_of_demand_between_districts_is_not_known() -> None:
+    scenario = with_routes('<trip id="t" depart="1" fromTaz="a" toTaz="b"/>')
+    with pytest.raises(ScenarioError, match="has fromTaz = 'a'"):
+        apply_effects(scenario, parse_domain("turning=west1_A1,A1_northA,1"))

@@ -46,7 +46,8 @@ class Turning(Effect):
 
         Raises:
             UnknownNameError: No such edge, or no way from the one to the other.
-            ScenarioError: A vehicle or flow draws its way from a distribution of routes.
+            ScenarioError: A vehicle or flow draws its way from a distribution of routes, or goes
+                between districts.
         """
         places = network_places(scenario)
         places.check(self.name, "edge", self.from_edge, places.edges)
@@ -61,6 +62,12 @@ class Turning(Effect):
 
         def way(element: ET.Element) -> Way:
             edges = routes.edges_of(element) or _fastest(element, places)
+            for end in ("fromTaz", "toTaz", "fromJunction", "toJunction"):
+                if not edges and (district := element.get(end)) is not None:
+                    raise ScenarioError(
+                        f"effect {self.name!r}: {element.tag} {element.get('id')!r} has {end} = "
+                        f"{district!r}, so its way is not known; give it a route, or from and to"
+                    )
             if not edges and (drawn := element.get("route")) is not None:
                 raise ScenarioError(
                     f"effect {self.name!r}: {element.tag} {element.get('id')!r} draws its way from "

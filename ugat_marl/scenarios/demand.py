@@ -75,6 +75,12 @@ def check_demand(
         for tag in document.scan(reporter):
             if in_routes:
                 singles.read(tag)
+            if tag.name == "vType" and tag.attributes.get("scale", "1") not in ("1", "1.0"):
+                raise ScenarioError(
+                    f"{_at(document, tag)}: {_who(tag)} has a scale of its own, which counts of "
+                    'the demand would miss; repeat its vehicles, or set "scale" under [sumo] in '
+                    "scenario.toml for all"
+                )
             if tag.name in ("vehicle", "trip", "flow", "route"):
                 used = edges_used(tag)
                 if not edges.issuperset(used):
