@@ -99,6 +99,8 @@ def small(command: str) -> list[str]:
             continue  # the preset decides
         if given is None and (name.startswith(("scenario", "plan")) and option == "--duration-s"):
             continue
+        if name == "plan" and "--policy" not in words:
+            continue  # no episode is played
         if given is None:
             words += [option, value]
         else:
