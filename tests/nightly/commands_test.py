@@ -101,6 +101,8 @@ def small(command: str) -> list[str]:
             continue
         if name == "plan" and "--policy" not in words:
             continue  # no episode is played
+        if name == "compare" and "--policies" in words and option in ("--seeds", "--episodes"):
+            continue  # nothing is trained
         if given is None:
             words += [option, value]
         else:
