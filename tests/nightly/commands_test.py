@@ -103,6 +103,8 @@ def small(command: str) -> list[str]:
             continue  # no episode is played
         if name == "compare" and "--policies" in words and option in ("--seeds", "--episodes"):
             continue  # nothing is trained
+        if "--learner" in words and option.startswith("--dqn."):
+            continue  # settings of another learner
         if given is None:
             words += [option, value]
         else:
