@@ -87,7 +87,7 @@ class LibsumoSimulator:
         self._time_s = launch.begin_s
         self._limits = np.array([libsumo.lane.getMaxSpeed(lane) for lane in launch.lanes])
         lanes, roads = launch.behind
-        self._beside = _beside(launch.lanes)
+        self._beside = _beside(launch.lanes) if launch.crossings else []
         self._has_behind = any(lanes) or any(roads)
         self._mesoscopic = None
         if launch.segment_m:
@@ -115,12 +115,14 @@ class LibsumoSimulator:
                 changes[offset].append((tls, state))
                 offset += duration
         begin = self._time_s
-        instants = seconds_of(seconds).tolist() if self._launch.crossings else []
-        widths = dict(zip(instants, np.diff(instants, prepend=0.0), strict=True))
+        widths: dict[float, float] = {}  # of the seconds at whose ends crossings are counted
+        if self._launch.crossings:
+            ends = seconds_of(seconds)
+            widths = dict(zip(ends.tolist(), np.diff(ends, prepend=0.0).tolist(), strict=True))
         left = np.zeros(len(self._launch.lanes))
         mean_left = left.copy()
         try:
-            for offset in sorted({*changes, *instants}):
+            for offset in sorted({*changes, *widths}):
                 if offset > 0:
                     libsumo.simulation.step(begin + offset)
                 if offset in widths:
@@ -135,7 +137,7 @@ class LibsumoSimulator:
             self._fail(f"SUMO failed after {begin:g} s", error)
         self._time_s = begin + seconds
         snapshot = self._snapshot()
-        return replace(snapshot, mean_left=mean_left) if instants else snapshot
+        return replace(snapshot, mean_left=mean_left) if widths else snapshot
 
     def vehicles(self) -> VehiclePositions:
         """Return the positions of all vehicles now."""
