@@ -638,6 +638,16 @@ class Document:
         """Yield the document as trees (see `parts_of_xml`); show progress if it is a long file."""
         return parts_of_xml(self.pieces(usual()), self.source)
 
+    def changed(self, change: Callable[[ET.Element], object]) -> Document:
+        """Return a document whose parts (see `parts`) a function has changed, in little memory."""
+        draft = None
+        for part in self.parts():
+            change(part)
+            draft = draft or Draft(self.name.removesuffix(".gz"), part)
+            draft.add(*child_texts(part))
+        assert draft is not None
+        return draft.document()
+
     def edited(self, content: bytes) -> Document:
         """Return a document with the same name and other content."""
         return Document(self.name.removesuffix(".gz"), None, content)

@@ -5,15 +5,14 @@ from __future__ import annotations
 import xml.etree.ElementTree as ET
 from collections import Counter
 from contextlib import nullcontext
-from dataclasses import replace
 
 import pytest
 
+from tests.effects.effects_demand_test import with_routes
 from ugat_marl.effects import LateGreen, apply_effects, load_scenario, parse_domain
 from ugat_marl.errors import ScenarioError, UnknownNameError
 from ugat_marl.parallel import DEADLINE_VARIABLE
 from ugat_marl.scenarios import (
-    Document,
     Network,
     Scenario,
     check_demand,
@@ -22,16 +21,6 @@ from ugat_marl.scenarios import (
     draw_day,
 )
 from ugat_marl.scenarios.importers.osm_crossings import has_light
-
-
-def with_routes(text: str, begin_s: float = 0.0, duration_s: float = 3600.0) -> Scenario:
-    scenario = load_scenario("single-v1")
-    changes = {"begin_s": begin_s, "duration_s": duration_s}
-    return replace(
-        scenario,
-        settings=scenario.settings.model_copy(update=changes),
-        routes=(Document("own.rou.xml", None, f"<routes>{text}</routes>".encode()),),
-    )
 
 
 def vehicles(scenario: Scenario) -> list[ET.Element]:

@@ -16,7 +16,7 @@ import xml.etree.ElementTree as ET
 from collections.abc import Callable, Mapping
 
 from ugat_marl.errors import ScenarioError, nearest
-from ugat_marl.files import Document, Draft, Tag, child_texts
+from ugat_marl.files import Document, Tag
 
 
 def _words(text: str) -> frozenset[str]:
@@ -464,14 +464,12 @@ def _outputs(name: str, attributes: Mapping[str, str], parent: str) -> list[str]
 
 def _without_outputs(document: Document) -> Document:
     """Return the document with its outputs discarded; SUMO would write them beside user files."""
-    draft = None
-    for part in document.parts():
+
+    def discard(part: ET.Element) -> None:
         for child in part:
             _discard_outputs(child, part.tag)
-        draft = draft or Draft(document.name.removesuffix(".gz"), part)
-        draft.add(*child_texts(part))
-    assert draft is not None
-    return draft.document()
+
+    return document.changed(discard)
 
 
 def _discard_outputs(element: ET.Element, parent: str) -> None:

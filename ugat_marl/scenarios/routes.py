@@ -207,13 +207,11 @@ def _holds_demand(document: Document) -> bool:
 
 def _without_demand(document: Document) -> Document:
     """Return an additional file without its vehicles, trips and flows."""
-    draft = None
-    for part in document.parts():
+
+    def drop(part: ET.Element) -> None:
         part[:] = [element for element in part if element.tag not in DEPARTING]
-        draft = draft or Draft(document.name.removesuffix(".gz"), part)
-        draft.add(*child_texts(part))
-    assert draft is not None
-    return draft.document()
+
+    return document.changed(drop)
 
 
 def _routed_by_duarouter(scenario: Scenario) -> tuple[Document, ...]:
@@ -290,8 +288,14 @@ def _from_begin(documents: Iterable[Document], begin_s: float) -> tuple[Document
     duarouter never ends with one that begins earlier. Its seconds are independent, so that those
     before the episode decide nothing in it.
     """
+
+    def delay(part: ET.Element) -> None:
+        for element in part:
+            if _is_early(element.tag, element.attrib, begin_s):
+                element.set("begin", f"{begin_s:.3f}")
+
     return tuple(
-        _later(document, begin_s)
+        document.changed(delay)
         if any(_is_early(tag.name, tag.attributes, begin_s) for tag in document.scan())
         else document
         for document in documents
@@ -305,18 +309,6 @@ def _is_early(name: str, attributes: Mapping[str, str], begin_s: float) -> bool:
         return parse_time(attributes.get("begin", "0")) < begin_s
     except ValueError:  # begins with another vehicle
         return False
-
-
-def _later(document: Document, begin_s: float) -> Document:
-    draft = None
-    for part in document.parts():
-        for element in part:
-            if _is_early(element.tag, element.attrib, begin_s):
-                element.set("begin", f"{begin_s:.3f}")
-        draft = draft or Draft(document.name.removesuffix(".gz"), part)
-        draft.add(*child_texts(part))
-    assert draft is not None
-    return draft.document()
 
 
 def _for_sumo(document: Document, directory: Path) -> Path:
