@@ -142,6 +142,7 @@ class Bars:
             if whole is not None:
                 whole.lines.print_at_times()
 
+        outer = whole.step if whole is not None else None  # a task may hold others
         with contextlib.nullcontext() if whole is not None else progress:
             if whole is not None:
                 whole.step = progress
@@ -154,7 +155,7 @@ class Bars:
                     whole.lines.print_at_times()
             finally:
                 if whole is not None:
-                    whole.step = None
+                    whole.step = outer
 
     @contextlib.contextmanager
     def whole(self, name: str, shares: Mapping[str, Share]) -> Iterator[None]:

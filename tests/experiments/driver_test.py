@@ -21,7 +21,7 @@ from pydantic import TypeAdapter
 
 from tests.interrupts import KillAfter, few_descriptors
 from ugat_marl.data import Scores, lock_folder
-from ugat_marl.errors import MeasurementError, OptionError
+from ugat_marl.errors import MeasurementError, OptionError, UnknownNameError
 from ugat_marl.experiments import (
     Job,
     LearnerSpec,
@@ -69,6 +69,14 @@ PLAIN = Job(
     options={"duration_s": 100.0},
     domains=("sim", "V4"),
     evaluation_seeds=evaluation_seeds(2),
+)
+RULE = replace(
+    PLAIN,
+    setting=Setting("rule", "rule", rules=("fixed-time:30", "largest-queue:20")),
+    seed=None,
+    target="V4",
+    episodes=0,
+    every=0,
 )
 UGAT = UgatConfig(
     grounding="phase",
@@ -148,14 +156,7 @@ def test_jobs_here_and_in_processes_have_the_same_numbers(tmp_path: Path) -> Non
         PLAIN,
         after(PLAIN, Setting("UGAT", "grounded", learner=QUICK, ugat=UGAT)),
         after(PLAIN, Setting("fine-tuned", "further", learner=QUICK)),
-        replace(
-            PLAIN,
-            setting=Setting("rule", "rule", rules=("fixed-time:30", "largest-queue:20")),
-            seed=None,
-            target="V4",
-            episodes=0,
-            every=0,
-        ),
+        RULE,
     ]
     here = perform_here(plan, tmp_path / "here", Silent())
     assert perform_all(plan[::-1], tmp_path / "apart", 2, Silent(), "test") == {}
@@ -243,6 +244,44 @@ def test_a_failed_job_says_why_and_the_others_go_on_if_they_shall(tmp_path: Path
     failures = perform_all([broken, fine], tmp_path, 1, Silent(), "test", keep_going=True)
     assert list(failures) == [broken.name] and "conut" in failures[broken.name]
     assert record_of(fine, tmp_path) is not None
+
+
+@needs_forks
+def test_jobs_beside_others_have_the_same_numbers(tmp_path: Path) -> None:
+    """The grounded job is begun beside plain training, and waits for the learner of that."""
+    plan = [PLAIN, after(PLAIN, Setting("UGAT", "grounded", learner=QUICK, ugat=UGAT)), RULE]
+    one = perform_here(plan, tmp_path / "one", Silent())
+    two = perform_here(plan, tmp_path / "two", Silent(), 2, beside=plan[1:])
+    assert [record.scores for record in one] == [record.scores for record in two]
+    logs = [(tmp_path / "two" / job.name / LOG).exists() for job in plan]
+    assert logs[0] is False and logs[2] is True, "the first is done here, the last one beside it"
+
+
+@needs_forks
+def test_a_job_that_fails_beside_others_says_why(tmp_path: Path) -> None:
+    broken = replace(PLAIN, options={"observation": "conut"})
+    with pytest.raises(UnknownNameError, match="conut"):
+        perform_here([RULE, broken], tmp_path, Silent(), 2, beside=[broken])
+    assert "conut" in (tmp_path / broken.name / LOG).read_text()
+    assert record_of(RULE, tmp_path) is not None
+
+
+@needs_forks
+def test_jobs_beside_others_end_with_them(tmp_path: Path) -> None:
+    long = replace(RULE, evaluation_seeds=evaluation_seeds(500))
+    waits = after(long, Setting("fine-tuned", "further", learner=QUICK))
+    begun = time.monotonic()
+    with pytest.raises(KeyboardInterrupt):
+        perform_here(
+            [PLAIN, long, waits],
+            tmp_path,
+            KillAfter("training: direct transfer", 2),
+            3,
+            beside=[long, waits],
+        )
+    assert time.monotonic() - begun < 60
+    assert record_of(long, tmp_path) is None
+    lock_folder(tmp_path).close()  # nobody works there any more
 
 
 def test_two_drivers_do_not_train_in_one_folder(tmp_path: Path) -> None:

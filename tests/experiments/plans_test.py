@@ -5,6 +5,7 @@ from __future__ import annotations
 import contextlib
 import math
 import sys
+from collections.abc import Mapping
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -16,12 +17,18 @@ from tensorboard.util import tensor_util
 from tests.runs import SMALL, play_nothing
 from ugat_marl.__main__ import main
 from ugat_marl.data import Run
-from ugat_marl.experiments import transfer
-from ugat_marl.experiments.plans import described_plan, work_of
+from ugat_marl.experiments import LearnerSpec, transfer
+from ugat_marl.experiments.driver import OTHER_PARTS
+from ugat_marl.experiments.plans import described_plan, jobs_beside, work_of
 from ugat_marl.experiments.transfers import TRAININGS, planned_jobs
 from ugat_marl.grounding import StreetConfig, UgatConfig
+from ugat_marl.parallel import LocalProcesses
 from ugat_marl.policies import DQN_NAME, UNIVERSAL_NAME, DQNConfig
-from ugat_marl.progress import Silent
+from ugat_marl.progress import Share, Silent
+
+
+class Mine:
+    """A learner of a user's own."""
 
 
 def test_the_work_of_a_run_is_counted_by_hand(tmp_path: Path) -> None:
@@ -59,6 +66,39 @@ def test_lessons_are_work(tmp_path: Path) -> None:
     # the rival looks for the rule that is best with late greens
     assert lessons(4, UNIVERSAL_NAME, "matched") == lessons(4, UNIVERSAL_NAME) + 2 * 23
     assert lessons(0, DQN_NAME) == 0
+
+
+def test_the_control_has_lessons_too(tmp_path: Path) -> None:
+    config = replace(SMALL, control=True, learner=UNIVERSAL_NAME, dqn=DQNConfig())
+    with_control = work_of(planned_jobs(config), tmp_path, 100.0)["lessons"].units
+    without = work_of(planned_jobs(replace(config, control=False)), tmp_path, 100.0)
+    assert with_control == without["lessons"].units + 14 + 3 * 2 + 3
+
+
+def test_parts_are_done_beside_the_first_where_that_is_worth_it(tmp_path: Path) -> None:
+    config = replace(SMALL, control=True, evaluation_seeds=20)
+    plan = planned_jobs(config)
+    beside = jobs_beside(plan, tmp_path, 100.0, 2)
+    assert beside == plan[1:] and len(beside) == 3
+    assert jobs_beside(plan, tmp_path, 100.0, 1) == [], "one core"
+    assert jobs_beside(planned_jobs(replace(SMALL, evaluation_seeds=1)), tmp_path, 100.0, 2) == []
+    with LocalProcesses(2) as elsewhere:
+        assert jobs_beside(plan, tmp_path, 100.0, elsewhere) == []
+    mine = LearnerSpec(f"{__name__}:Mine")
+    own = [replace(job, setting=replace(job.setting, learner=mine)) for job in plan]
+    assert jobs_beside(own, tmp_path, 100.0, 2) == []
+
+    alone = work_of(plan, tmp_path, 100.0)
+    work = work_of(plan, tmp_path, 100.0, beside)
+    assert "training" in alone and "training" not in work
+    assert work[OTHER_PARTS].units == 3
+
+    def total(shares: Mapping[str, Share]) -> float:
+        return sum(share.units * share.weight for share in shares.values())
+
+    assert total(work) == pytest.approx(total(alone))
+    lines = described_plan(plan, tmp_path, tmp_path, 100.0, beside)
+    assert [line.endswith(", meanwhile") for line in lines[1:5]] == [False, True, True, True]
 
 
 @pytest.mark.parametrize(

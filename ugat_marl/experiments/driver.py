@@ -1,7 +1,8 @@
 """Driver: performs many jobs, several at a time, and resumes them.
 
 Jobs are forked from a warm parent where that is possible. Where it is not, and with an executor,
-each job gets a new interpreter.
+each job gets a new interpreter. The jobs of one run are performed in this process, and others
+beside it as far as cores are left.
 
 A job's folder holds its description and its results. Workers on other machines therefore need a
 shared file system.
@@ -13,8 +14,8 @@ import contextlib
 import os
 import subprocess
 import sys
-from collections.abc import Sequence
-from concurrent.futures import FIRST_COMPLETED, Future, wait
+from collections.abc import Callable, Iterator, Sequence
+from concurrent.futures import FIRST_COMPLETED, Future, ThreadPoolExecutor, wait
 from pathlib import Path
 from typing import IO
 
@@ -29,11 +30,21 @@ from ugat_marl.experiments.forked import (
 )
 from ugat_marl.experiments.jobs import Job, Record, perform
 from ugat_marl.files import require_writable
-from ugat_marl.parallel import RETRIES, Stop, Workers, executor_of, in_this_process
-from ugat_marl.progress import Reporter
+from ugat_marl.parallel import (
+    RETRIES,
+    Stop,
+    Workers,
+    executor_of,
+    in_this_process,
+    parts_at_a_time,
+)
+from ugat_marl.progress import Advance, Reporter
 from ugat_marl.simulation import kept_warm
 
 LOG = "job.log"
+OTHER_PARTS = "other parts"
+"""Title of the progress bar of jobs beside others."""
+
 _TAIL = 400
 """Number of characters shown from the end of a failed job's log."""
 
@@ -121,6 +132,7 @@ def perform_here(
     reporter: Reporter,
     workers: Workers = 1,
     on_log: LogCallback | None = None,
+    beside: Sequence[Job] = (),
 ) -> list[Record]:
     """Perform jobs one after another in this process and return their records.
 
@@ -130,18 +142,73 @@ def perform_here(
         reporter: Shows progress.
         workers: Simulations at a time, or an executor, see `perform`.
         on_log: See `perform`.
+        beside: Jobs of the plan that may be performed meanwhile in processes of their own, one
+            less at a time than `workers`. What they say is in their logs.
 
     Raises:
         OptionError: Another process performs jobs in that folder.
     """
     records: list[Record] = []
     require_writable(folder / LOG)
-    with contextlib.closing(lock_folder(folder)):
+    with (  # the lock is held until the last job has ended
+        contextlib.closing(lock_folder(folder)),
+        _performed_beside(beside, folder, workers, reporter) as settle,
+    ):
         for job in plan:
+            settle(job)
             place = folder / job.name
             job.write(place)
             records.append(perform(job, place, reporter, workers, on_log))
     return records
+
+
+@contextlib.contextmanager
+def _performed_beside(
+    jobs: Sequence[Job], folder: Path, workers: Workers, reporter: Reporter
+) -> Iterator[Callable[[Job], None]]:
+    """Perform jobs in processes of their own inside the block.
+
+    Yield a function that waits for a job which has begun, and withdraws one which has not. Whoever
+    calls it performs the job afterwards: a finished job costs nothing, and one that failed tells
+    why. The last jobs come first, because the block itself comes to them last.
+    """
+    if not jobs:
+        yield lambda job: None
+        return
+    stop, running = Stop(), dict[str, Future[None]]()
+    order = jobs[::-1]
+    order = sorted(order, key=lambda job: job.start is not None)  # those wait for others
+    with (
+        reporter.task(OTHER_PARTS, len(jobs)) as advance,
+        ThreadPoolExecutor(max(1, parts_at_a_time(workers) - 1)) as pool,
+    ):
+
+        def settle(job: Job) -> None:
+            future = running.get(job.name)
+            if future is not None and not future.cancel():
+                while not future.done():  # the timeout lets Ctrl-C interrupt the wait
+                    wait([future], timeout=0.2)
+
+        for job in order:
+            running[job.name] = pool.submit(_perform_when_ready, job, folder, stop, advance)
+        try:
+            yield settle
+        finally:
+            stop.set()
+            for future in running.values():
+                future.cancel()
+
+
+def _perform_when_ready(job: Job, folder: Path, stop: Stop, advance: Advance) -> None:
+    """Perform a job in another process as soon as the learner it starts from is there."""
+    start = None if job.start is None else folder / job.start
+    while start is not None and not start.exists():
+        if stop.wait(0.5):
+            return
+    place = folder.resolve() / job.name
+    job.write(place)
+    _perform_apart(str(place), stop, forked=True)
+    advance(note=job.short)
 
 
 def _perform_apart(folder: str, stop: Stop, forked: bool) -> None:

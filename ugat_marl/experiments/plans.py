@@ -3,15 +3,19 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 
 from ugat_marl.errors import counted
+from ugat_marl.experiments.driver import OTHER_PARTS, record_of
+from ugat_marl.experiments.forked import jobs_fork_on
 from ugat_marl.experiments.jobs import Job, Record
 from ugat_marl.grounding import ROLL_OUTS, UgatConfig
+from ugat_marl.parallel import Workers, in_this_process, parts_at_a_time
 from ugat_marl.policies import (
     STANDARD_RULES,
     TUNED_RULES,
+    is_own,
     lesson_episodes,
     race_fields,
     rule_settings,
@@ -20,6 +24,9 @@ from ugat_marl.progress import Share
 
 EPOCH = 0.05
 """Rough cost of an epoch of the fits of f and h, in episodes."""
+
+WORTH = 50
+"""Least work of other parts, in episodes of an evaluation, that is worth a new interpreter."""
 
 COSTS = {
     "plain sim": 3.0, "training": 3.0, "grounded": 3.0, "fitted street": 3.0, "late greens": 3.0,
@@ -33,8 +40,37 @@ Measured with `single-v1`, `arterial1x5-v1` and a drawn network of four lights.
 """
 
 
+def jobs_beside(plan: Sequence[Job], folder: Path, episode_s: float, workers: Workers) -> list[Job]:
+    """Return the unfinished jobs that are performed beside the first one.
+
+    There is none if one core is used, if an executor does the work elsewhere, or if the others are
+    too little to load torch again for them. A learner of the user's own may exist in this process
+    alone.
+
+    Args:
+        plan: Jobs of the run.
+        folder: Folder that holds the jobs' folders.
+        episode_s: Length of an episode, in s.
+        workers: Simulations at a time, or an executor.
+    """
+    if not in_this_process(workers) or parts_at_a_time(workers) == 1:
+        return []
+    jobs = [
+        job
+        for job in plan[1:]
+        if jobs_fork_on(job.device)
+        and not is_own(job.setting.learner.name)
+        and record_of(job, folder) is None
+    ]
+    return jobs if _total(work_of(jobs, folder, episode_s)) >= WORTH else []
+
+
 def described_plan(
-    plan: Sequence[Job], directory: Path, folder: Path, episode_s: float
+    plan: Sequence[Job],
+    directory: Path,
+    folder: Path,
+    episode_s: float,
+    beside: Sequence[Job] = (),
 ) -> list[str]:
     """Return the folder and the plan of a run, as lines.
 
@@ -43,6 +79,7 @@ def described_plan(
         directory: Folder of the run.
         folder: Folder that holds the jobs' folders.
         episode_s: Length of an episode, in s.
+        beside: Jobs of the plan that are performed beside the others.
     """
     todo = [job for job in plan if not Record.read(folder / job.name).is_whole(job)]
     lines = [f"run: {directory}"]
@@ -62,13 +99,20 @@ def described_plan(
             )
         else:
             does = f"{setting.name}: {counted(job.episodes, 'episode')}"
-        lines.append(f"  {number}. {does}; {evaluated * len(job.rows)} to judge it")
-    total = sum(share.units * share.weight for share in work_of(todo, folder, episode_s).values())
+        meanwhile = ", meanwhile" if job in beside else ""
+        lines.append(f"  {number}. {does}; {evaluated * len(job.rows)} to judge it{meanwhile}")
+    total = _total(work_of(todo, folder, episode_s))
     lines.append(f"  in all as long as about {total:.0f} episodes of evaluation")
     return lines
 
 
-def work_of(plan: Sequence[Job], folder: Path, episode_s: float) -> dict[str, Share]:
+def _total(work: Mapping[str, Share]) -> float:
+    return sum(share.units * share.weight for share in work.values())
+
+
+def work_of(
+    plan: Sequence[Job], folder: Path, episode_s: float, beside: Sequence[Job] = ()
+) -> dict[str, Share]:
     """Return the expected work of the unfinished jobs, by the beginnings of the names of tasks.
 
     The unit is an episode of an evaluation. Jobs that are half done count as a whole.
@@ -77,7 +121,12 @@ def work_of(plan: Sequence[Job], folder: Path, episode_s: float) -> dict[str, Sh
         plan: Jobs of the run.
         folder: Folder that holds the jobs' folders.
         episode_s: Length of an episode, in s.
+        beside: Jobs of the plan that are performed beside the others; their tasks are not shown.
     """
+    if beside:
+        here = work_of([job for job in plan if job not in beside], folder, episode_s)
+        other = _total(work_of(beside, folder, episode_s)) / len(beside)
+        return {**here, OTHER_PARTS: Share(len(beside), other)}
     units: dict[str, float] = {}
     weights: dict[str, float] = {}
 
@@ -93,11 +142,14 @@ def work_of(plan: Sequence[Job], folder: Path, episode_s: float) -> dict[str, Sh
             add("evaluating", sum(map(len, record.missing(job, mark).values())))
         if job.setting.recipe == "rule":
             add("tuning" if job.rule_budget else "best rule", _rule_episodes(job))
-        elif (ugat := job.setting.ugat) is None:
+            continue
+        learner = job.setting.learner
+        lessons = lesson_episodes(learner.name, learner.dqn)
+        if (ugat := job.setting.ugat) is None:
+            if lessons:
+                add("lessons", lessons)
             add("training", job.episodes if job.start is None else job.episodes // 2)
         else:
-            learner = job.setting.learner
-            lessons = lesson_episodes(learner.name, learner.dqn)
             budget = ugat.street.budget_of_rules(taught=lessons > 0)
             for name, (count, weight) in _grounded_work(ugat, episode_s, budget).items():
                 add(name, count, weight)

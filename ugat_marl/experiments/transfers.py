@@ -40,7 +40,7 @@ from ugat_marl.experiments.jobs import (
     file_names,
     worlds_of,
 )
-from ugat_marl.experiments.plans import described_plan, work_of
+from ugat_marl.experiments.plans import described_plan, jobs_beside, work_of
 from ugat_marl.experiments.queues import QUEUES, write_queues
 from ugat_marl.experiments.scores import Evaluation, Result
 from ugat_marl.experiments.settings import (
@@ -320,10 +320,11 @@ def transfer(
         write_identity(directory, identity, begun=begun)
         write_settings(directory, config.as_dict())
         episode_s = config.duration_s or scenario.settings.duration_s
-        for line in described_plan(plan, directory, folder, episode_s):
+        beside = jobs_beside(plan, folder, episode_s, workers)
+        for line in described_plan(plan, directory, folder, episode_s, beside):
             reporter.say(line)
-        with reporter.whole("whole run", work_of(plan, folder, episode_s)):
-            records = perform_here(plan, folder, reporter, workers, on_log)
+        with reporter.whole("whole run", work_of(plan, folder, episode_s, beside)):
+            records = perform_here(plan, folder, reporter, workers, on_log, beside)
         table = _write_results(config, scenario, directory, plan, records)
     if on_log is not None:
         on_log("evaluation", config.episodes, _means(table))
