@@ -167,7 +167,10 @@ def test_findings_say_what_one_more_kind_of_data_would_decide(
     assert any(f"counts.csv: no {word};" in x.text for x in half.findings)
     assert "desired_speed" not in ruled_out(half)
     assert "turning" not in ruled_out(half), "turning counts stand where exit detectors would"
-    assert set(known_effects()) - {*COUNTABLE, *SUMMED} <= ruled_out(half)
+    read_off_signals = {"yellow_time", "all_red_time"}
+    examined = {*COUNTABLE, *SUMMED, *read_off_signals}
+    assert set(known_effects()) - examined <= ruled_out(half)
+    assert not read_off_signals & ruled_out(half)
 
 
 def test_mistaken_hours_of_probes_are_seen(

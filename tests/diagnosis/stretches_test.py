@@ -77,7 +77,7 @@ def scan(
     measured = plain.copy()
     for (first, last), rate in changed.items():
         measured[first:last] = rate
-    return most_unusual(measured, plain, plain, begin_s, THRESHOLDS, side)
+    return most_unusual(measured, plain, plain, begin_s, 60.0, THRESHOLDS, side)
 
 
 @pytest.mark.parametrize("side", [0, 1])
@@ -109,8 +109,8 @@ def test_a_closure_is_found_and_not_the_queue_that_is_let_go() -> None:
 
 def test_a_period_shorter_than_any_stretch_is_not_scanned() -> None:
     rows = np.full(4, 10.0)
-    assert most_unusual(3 * rows, rows, rows, 0.0, THRESHOLDS) is None
-    assert most_unusual(rows, 0 * rows, rows, 0.0, THRESHOLDS) is None
+    assert most_unusual(3 * rows, rows, rows, 0.0, 60.0, THRESHOLDS) is None
+    assert most_unusual(rows, 0 * rows, rows, 0.0, 60.0, THRESHOLDS) is None
 
 
 def test_occupied_seconds_are_shared_among_minutes() -> None:

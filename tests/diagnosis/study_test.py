@@ -222,7 +222,7 @@ def test_periods_of_different_lengths_are_refused_by_name() -> None:
     periods = measured(NAMES, NAMES).periods
     longer = replace(periods[1], end_s=160.0)
     with pytest.raises(MeasuredDataError, match="'day1' is 160 s long, and 'day0' only 100 s"):
-        module._refuse_lengths((periods[0], longer))
+        module._refuse_lengths((periods[0], longer), Thresholds())
 
 
 def test_demand_that_varies_from_day_to_day_is_told_from_chance() -> None:

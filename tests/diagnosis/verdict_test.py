@@ -166,7 +166,7 @@ def test_what_to_measure_next_is_said_in_words() -> None:
 def test_only_a_search_that_ended_says_that_the_library_lacks_it(
     complete: bool, tried: Any
 ) -> None:
-    distance = SimpleNamespace(z={"network": np.zeros((1, len(FEATURES)))})
+    distance = SimpleNamespace(z={"network": np.eye(1, len(FEATURES))})
     residual = SimpleNamespace(p=0.0, distance=900.0)
     best: Any = SimpleNamespace(
         model=SimpleNamespace(members=tried, distance=distance), residual=residual

@@ -23,6 +23,7 @@ from ugat_marl.diagnosis import (
     FILE,
     Diagnosis,
     DiagnosisConfig,
+    LogGrounds,
     NamedEffect,
     default_cache,
     diagnose,
@@ -105,6 +106,7 @@ class Diagnose:
         except KeyboardInterrupt as interrupt:
             raise type(interrupt)("the same command goes on where it stopped") from None
         console.print(diagnosis_summary(diagnosis, LightNames.of(network)))
+        (self.out / REPORT).unlink(missing_ok=True)  # of an earlier diagnosis
         if self.report:
             write_diagnosis_page(diagnosis, network, self.out / REPORT, self._commands(diagnosis))
         self._say_where(diagnosis, console)
@@ -124,8 +126,18 @@ class Diagnose:
         )
 
     def _check_out(self) -> None:
-        """Refuse an output directory inside the measured data, which must not change."""
+        """Refuse an output directory whose results would replace what is read.
+
+        Raises:
+            OptionError: It lies in the measured data, or the scenario is its corrected scenario.
+        """
         out, measured = self.out.resolve(), self.measured.resolve()
+        scenario, corrected = Path(self.scenario).resolve(), out / CORRECTED
+        if scenario == corrected or corrected in scenario.parents:
+            raise OptionError(
+                f"{self.scenario}: is the corrected scenario of --out {str(self.out)!r}, which "
+                "this diagnosis replaces; give another directory"
+            )
         if out == measured or measured in out.parents:
             raise OptionError(
                 f"--out {str(self.out)!r} lies in the measured data, which are never written to; "
@@ -149,7 +161,12 @@ class Diagnose:
 
     def _next(self, diagnosis: Diagnosis) -> list[str]:
         """Return the command that uses the corrected scenario; nothing if traffic is as before."""
-        changed = diagnosis.unnamed or any(map(_in_the_model, diagnosis.effects))
+        used = [
+            effect
+            for effect in diagnosis.effects
+            if diagnosis.not_corrected is None or isinstance(effect.evidence, LogGrounds)
+        ]
+        changed = diagnosis.unnamed or any(map(_in_the_model, used))
         if diagnosis.corrected is None or not changed:
             return []
         corrected = str(self.out / CORRECTED)

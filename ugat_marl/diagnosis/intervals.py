@@ -166,15 +166,19 @@ def implausible(
         for kind, sums in street.items()
         if sums[1] >= least and kind in model and model[kind][1] >= least
     }
-    usual = float(np.median([here - there for here, there in lengths.values()])) if lengths else 0.0
-    if abs(usual) > thresholds.most_longer_m:
-        usual = 0.0
-    return {
-        kind: (here, there)
-        for kind, (here, there) in lengths.items()
-        if min(abs(here - there - usual), abs(here - there)) > thresholds.most_unlike_m
-        or abs(here - there) > thresholds.most_longer_m
+    longer = {kind: here - there for kind, (here, there) in lengths.items()}
+    possible = {
+        kind: more for kind, more in longer.items() if abs(more) <= thresholds.most_longer_m
     }
+
+    def alone(kind: str) -> bool:
+        """Return True if vehicles seem longer at this kind than elsewhere, and than simulated."""
+        own = longer[kind]
+        others = [more for other, more in possible.items() if len(possible) > 2 or other != kind]
+        usual = float(np.median(others)) if others else own
+        return min(abs(own - usual), abs(own)) > thresholds.most_unlike_m
+
+    return {kind: found for kind, found in lengths.items() if kind not in possible or alone(kind)}
 
 
 def without_occupancies(counted: Tally, kinds: Collection[str]) -> Tally:

@@ -26,7 +26,7 @@ from numpy.typing import NDArray
 
 from ugat_marl.diagnosis.features import DetectorLayout, Discharge, Greens, free_vehicles
 from ugat_marl.diagnosis.records import Pattern
-from ugat_marl.diagnosis.residual import log_normal_tail
+from ugat_marl.diagnosis.residual import drawn_days, log_normal_tail
 from ugat_marl.diagnosis.thresholds import DayThresholds, Thresholds
 from ugat_marl.effects import DemandLevel, DemandSurge, Effect, LaneService
 from ugat_marl.scenarios import DetectorKind, Passages, Period
@@ -443,9 +443,8 @@ def _by_chance(
     for half in (0, 1):
         model = Regression(sets, cells[half::2], thresholds, counts=counts)
         others = cells[1 - half :: 2]
-        size = min(periods, max(len(others) - 1, 1))
         for _ in range(thresholds.pattern_draws):
-            days = generator.choice(len(others), size, replace=False)
+            days = drawn_days(generator, len(others), periods, thresholds)
             drawn = np.sum([others[int(day)] for day in days], axis=0)
             yield model.best(*model.pulls(drawn)).gain
 

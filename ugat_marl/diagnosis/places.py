@@ -229,10 +229,12 @@ class PlaceFinder:
         variance = (block.variance[rows].sum(axis=0) / np.maximum(per_bin, 1))[which] / len(periods)
         if any(period.passages for period in periods):
             measured = self._minutes(periods, members, kind, other, minutes)
+            length_s = end - begin
         else:  # without passages only the counts of whole bins are known
             more = distance.difference["time"][rows].sum(axis=0) / np.maximum(per_bin, 1)
             measured = expected + more[which]
-        return most_unusual(measured, expected, variance, begin, self._thresholds, side)
+        width_s = length_s / minutes
+        return most_unusual(measured, expected, variance, begin, width_s, self._thresholds, side)
 
     def _minutes(
         self, periods: Sequence[Period], members: Sequence[int], kind: str, other: str, minutes: int
@@ -725,6 +727,7 @@ def most_unusual(
     expected: Array,
     variance: Array,
     begin_s: float,
+    width_s: float,
     thresholds: Thresholds,
     side: int = 0,
 ) -> tuple[float, float, float, float] | None:
@@ -737,6 +740,7 @@ def most_unusual(
         expected: Expected values per minute.
         variance: Variances of the expected values per minute.
         begin_s: Begin of the first minute, s.
+        width_s: Length of a minute, s; periods are no whole minutes long.
         thresholds: Numbers of the method.
         side: -1 or 1 to find only smaller or only larger values; 0 for both.
 
@@ -765,7 +769,7 @@ def most_unusual(
     if best is None or best[0] < thresholds.unusual_stretch:
         return None
     z, first, last, ratio = best
-    return z, begin_s + thresholds.scan_s * first, begin_s + thresholds.scan_s * last, ratio
+    return z, begin_s + width_s * first, begin_s + width_s * last, ratio
 
 
 # --- faults of detectors --------------------------------------------------------------------------

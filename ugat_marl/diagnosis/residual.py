@@ -32,6 +32,7 @@ from ugat_marl.diagnosis.statistics import (
     whitened,
     without_noise,
 )
+from ugat_marl.diagnosis.thresholds import Thresholds
 
 Array = NDArray[np.float64]
 
@@ -78,9 +79,8 @@ class Null:
             model = Reference(pools, tallies[half::2], speeds=speeds)
             directed_of_half = directed(model) if directed else None
             others = tallies[1 - half :: 2]
-            size = min(periods, max(len(others) - 1, 1))
             for _ in range(thresholds.null_draws):
-                chosen = generator.choice(len(others), size, replace=False)
+                chosen = drawn_days(generator, len(others), periods, thresholds)
                 distance = model.distance([others[int(i)] for i in chosen])
                 for name, value in _statistics(
                     distance, directed_of_half, thresholds.added_distance
@@ -138,6 +138,24 @@ class Null:
 
     def _chance(self, name: str, value: float) -> float:
         return log_normal_tail(value, *self._moments[name])
+
+
+def drawn_days(
+    generator: np.random.Generator, days: int, size: int, thresholds: Thresholds
+) -> NDArray[np.int64]:
+    """Draw the days of a data set from the days of a model, by number.
+
+    Large sets repeat days. Without that they would all be nearly the same one, and their spread
+    would not be that of chance.
+
+    Args:
+        generator: Source of the draw.
+        days: Number of days of the model.
+        size: Number of days of the data set.
+        thresholds: Numbers of the method.
+    """
+    repeats = size > thresholds.drawn_once * days
+    return generator.choice(days, size, replace=repeats)
 
 
 def log_normal_tail(value: float, mean: float, deviation: float) -> float:

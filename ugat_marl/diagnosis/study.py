@@ -23,6 +23,7 @@ from ugat_marl.diagnosis.features import (
     DetectorLayout,
     Greens,
     Tally,
+    bins_in,
     tally,
 )
 from ugat_marl.diagnosis.fit import Fitter
@@ -175,7 +176,7 @@ class Study:
         layout = DetectorLayout.of(network, detectors)
         ruled_out = frozenset(name for finding in measured.findings for name in finding.rules_out)
         allowed = library(config.leave_out) - ruled_out
-        periods = _fitted_periods(measured)
+        periods = _fitted_periods(measured, config.thresholds)
         answering = _answering(measured, layout.intersections)
         effort = config.effort or effort_for(len(layout.intersections))
         budget = config.budget()
@@ -546,14 +547,14 @@ def _noted(measured: MeasuredData, findings: Sequence[Finding]) -> MeasuredData:
     return replace(measured, findings=(*measured.findings, *findings))
 
 
-def _fitted_periods(measured: MeasuredData) -> tuple[Period, ...]:
+def _fitted_periods(measured: MeasuredData, thresholds: Thresholds) -> tuple[Period, ...]:
     if not (periods := measured.of("fit")):
         raise MeasuredDataError("no period has the split 'fit'; there is nothing to fit")
-    _refuse_lengths(measured.periods)
+    _refuse_lengths(measured.periods, thresholds)
     return periods
 
 
-def _refuse_lengths(periods: Sequence[Period]) -> None:
+def _refuse_lengths(periods: Sequence[Period], thresholds: Thresholds) -> None:
     """Refuse periods of different lengths: their statistics are not of one kind.
 
     Raises:
@@ -561,7 +562,8 @@ def _refuse_lengths(periods: Sequence[Period]) -> None:
     """
     lengths = {period.id: period.length_s for period in periods}
     shortest, longest = min(lengths, key=lengths.__getitem__), max(lengths, key=lengths.__getitem__)
-    if lengths[longest] - lengths[shortest] > 0.5:
+    bins = {bins_in(length, thresholds) for length in lengths.values()}
+    if lengths[longest] - lengths[shortest] > 0.5 or len(bins) > 1:
         raise MeasuredDataError(
             f"periods.csv: {longest!r} is {lengths[longest]:g} s long, and {shortest!r} only "
             f"{lengths[shortest]:g} s; a diagnosis needs periods of one length, so cut the longer "
@@ -615,32 +617,44 @@ def heard(measured: MeasuredData) -> tuple[Detector, ...]:
 
 
 def one_of_each(measured: MeasuredData, detectors: Sequence[Detector]) -> tuple[Detector, ...]:
-    """Return one detector of each kind on a lane, so that no vehicle counts twice.
+    """Return detectors of which no two of a kind lie on one lane, so that no vehicle counts twice.
 
-    It is the one that saw vehicles in most periods, or in most intervals of counts. Among equals it
-    is the first.
+    Those that saw vehicles in most periods, or in most intervals of counts, are kept; of equals the
+    first.
     """
     if measured.has_events or measured.counts is None:
         rows = Counter(name for period in measured.periods for name in period.passages)
     else:
         rows = Counter(measured.counts.filter(pl.col("count") > 0)["detector_id"].to_list())
-    kept: dict[tuple[str, str], str] = {}
+    taken: set[tuple[str, str]] = set()
+    kept: set[str] = set()
     for detector in sorted(detectors, key=lambda one: -rows[one.id]):
-        kept.setdefault((detector.lane, detector.kind), detector.id)
-    return tuple(one for one in detectors if kept[one.lane, one.kind] == one.id)
+        if taken.isdisjoint(places := _places(detector)):
+            taken |= places
+            kept.add(detector.id)
+    return tuple(detector for detector in detectors if detector.id in kept)
+
+
+def _places(detector: Detector) -> set[tuple[str, str]]:
+    """Return lane and kind of a detector, for each lane that it lies on."""
+    return {(lane, detector.kind) for lane in detector.lanes}
 
 
 def doubled(measured: MeasuredData, compared: Sequence[Detector]) -> tuple[Finding, ...]:
     """Return a finding on each detector that is not compared beside another of its kind."""
-    used = {(detector.lane, detector.kind): detector.id for detector in compared}
-    return tuple(
-        Finding(
-            f"detectors.csv: {detector.id!r} is not compared; lane {detector.lane!r} has "
-            f"{used[detector.lane, detector.kind]!r} as {detector.kind} detector already"
-        )
-        for detector in measured.detectors
-        if used.get((detector.lane, detector.kind), detector.id) != detector.id
-    )
+    used = {place: detector.id for detector in compared for place in _places(detector)}
+    findings: list[Finding] = []
+    for detector in measured.detectors:
+        others = [place for place in sorted(_places(detector)) if place in used]
+        if others and used[others[0]] != detector.id:
+            lane, kind = others[0]
+            findings.append(
+                Finding(
+                    f"detectors.csv: {detector.id!r} is not compared; lane {lane!r} has "
+                    f"{used[lane, kind]!r} as {kind} detector already"
+                )
+            )
+    return tuple(findings)
 
 
 def _tallies(

@@ -120,7 +120,10 @@ def traffic_check(
         sides = [sums(days) for days in (measured, before, after)]
         if all(side is not None and side.shape[-2] for side in sides):
             real, old, new = (side for side in sides if side is not None)
-            if real[:, 0, :, 1].sum() >= thresholds.least_journeys:  # of the first measure
+            seen = real[..., 1].sum(
+                axis=(0, 2)
+            )  # of queues there is one per green, vehicles or not
+            if (seen[0] if sums is _journeys else seen.max()) >= thresholds.least_journeys:
                 return _check(measure, real, old, new, thresholds)
     return None
 

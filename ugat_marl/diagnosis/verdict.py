@@ -24,6 +24,7 @@ from ugat_marl.diagnosis.records import (
 )
 from ugat_marl.diagnosis.select import Selector
 from ugat_marl.diagnosis.study import DiagnosisConfig
+from ugat_marl.diagnosis.thresholds import Thresholds
 from ugat_marl.effects import Effect, known_effects
 from ugat_marl.errors import joined
 
@@ -41,6 +42,8 @@ def conclude(
     verification: Verified,
     config: DiagnosisConfig,
     layout: DetectorLayout,
+    *,
+    held_out: bool = True,
 ) -> Conclusion:
     """Draw the conclusion of a search.
 
@@ -51,11 +54,14 @@ def conclude(
         verification: Tests on the held-out periods.
         config: Level of the tests and numbers of the method.
         layout: Lanes and detectors.
+        held_out: False if no period is held out, and the fitted ones were tested twice.
     """
     base, best = located.base, selection.best
     alpha, thresholds = config.alpha, config.thresholds
     confirmed = verification.before.distance - verification.after.distance >= thresholds.confirmed
-    chance = combined(base.residual.p, verification.before.p)
+    chance = base.residual.p
+    if held_out:
+        chance = combined(chance, verification.before.p)
     if chance > alpha and not confirmed and selection.complete:
         sentence = (
             f"The fitted periods hint at something (p = {base.residual.p:.2g}), but the held-out "
@@ -73,6 +79,8 @@ def conclude(
     if not confirmed:
         sentence = (
             f"The fitted periods hint at {names}, but the held-out periods do not confirm it."
+            if held_out
+            else f"The periods hint at {names}, but a simulation with that is hardly nearer."
         )
         return Conclusion("unknown", best, (), sentence, "more periods")
     if chance_only:
@@ -89,14 +97,20 @@ def conclude(
 
 def unchallenged(
     located: Located,
+    verification: Verified,
+    thresholds: Thresholds,
     ruled_out: Collection[str],
     timing: Sequence[Effect],
     detection: Sequence[DetectorError] = (),
 ) -> Conclusion:
-    """Conclude that the scenario as it is could have made the data.
+    """Conclude that the scenario as it is could have made the fitted periods.
+
+    If the held-out periods contradict it, the verdict is "unknown".
 
     Args:
         located: Comparison of the scenario as it is with the data.
+        verification: Test on the held-out periods.
+        thresholds: Numbers of the method.
         ruled_out: Names of effects that the data cannot show.
         timing: Effects that are read off the signal log.
         detection: Errors of measurement.
@@ -107,8 +121,19 @@ def unchallenged(
         known = [f"the signal log has {' and '.join(map(str, timing))}"] if timing else []
         known += [describe_errors(detection)] if detection else []
         sentence = f"{capitalised('; '.join(known))}; with that, nothing contradicts the scenario."
+    if verification.before.p < thresholds.fit_level:
+        sentence = (
+            "The scenario agrees with the fitted periods, but not with the held-out ones (p = "
+            f"{verification.before.p:.2g}): did something change between them?"
+        )
+        wanted = "what differs between the fitted and the held-out periods"
+        return Conclusion("unknown", located.base, (), sentence, wanted)
     if not located.complete:
-        sentence += " The budget ended before single effects were looked for."
+        sentence += (
+            " That is provisional: the budget ended before single effects were looked for. Run the "
+            "same command again to go on."
+        )
+        return Conclusion("provisional", located.base, (), sentence, None)
     verdict = "explained" if timing or detection else "no_discrepancy"
     return Conclusion(verdict, located.base, (), sentence, None)
 
@@ -123,7 +148,11 @@ def unverified(selected: Selected, verified: Verified | None = None) -> Conclusi
     members = selected.best.model.members
     if members:
         shrink = None if verified is None else verified.shrink
-        gone = "" if shrink is None else f", which takes off {100 * shrink:.0f} % of the gap"
+        gone = ""
+        if shrink is not None and shrink > 0:
+            gone = f", which takes off {100 * shrink:.0f} % of the gap"
+        elif shrink is not None:
+            gone = ", which brings the held-out periods no nearer"
         named = f"{describe_members(members)}{gone}"
         nearest = f"The nearest explanation so far, not verified, is {named}."
     else:
@@ -216,10 +245,12 @@ def _kinds(members: Members) -> set[str]:
     return {hypothesis.name for hypothesis, _ in members}
 
 
-def _look_at(selection: Selected) -> str:
-    """Suggest a measurement where most is left."""
+def _look_at(selection: Selected) -> str | None:
+    """Suggest a measurement where most is left; None if no statistic of the network is known."""
     z = selection.best.model.distance.z["network"][0]
     strongest = [ALL_FEATURES[int(i)][:2] for i in np.argsort(-np.abs(z))[:3] if z[int(i)]]
+    if not strongest:
+        return None
     told = ", ".join(f"{statistic(name)} ({regime})" for name, regime in strongest)
     return f"trajectories or video where most is left over: {told}"
 
@@ -240,7 +271,7 @@ def _separating(best: Fitted, rival: Fitted, held: Collection[int], deciding_z: 
     block, other = best.reference.blocks["network"], rival.reference.blocks["network"]
     difference = (block.mean - other.mean)[0]
     deviation = np.sqrt(block.variance[0])
-    z = np.where(block.used[0], difference / deviation, 0.0)
+    z = np.nan_to_num(np.where(block.used[0], difference / deviation, 0.0))
     index = int(np.argmax(np.abs(z)))
     name, regime, _ = ALL_FEATURES[index]
     periods = int(np.ceil((deciding_z / max(abs(float(z[index])), 0.05)) ** 2))

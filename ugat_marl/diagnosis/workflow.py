@@ -58,6 +58,7 @@ from ugat_marl.diagnosis.verdict import (
 )
 from ugat_marl.diagnosis.verify import judged, tables_of, verify_model
 from ugat_marl.effects import Effect, apply_effects
+from ugat_marl.files import put_folder
 from ugat_marl.progress import Reporter, Silent
 from ugat_marl.scenarios import Scenario
 
@@ -98,19 +99,36 @@ def diagnose(
     timing = tuple(effect for effect in read if effect.name not in config.leave_out)
     with reporter.whole("diagnosis", study.work()):
         diagnosis, named = _diagnosed(study, timing, reporter)
-    place = directory / CORRECTED
-    if (place / "scenario.toml").is_file():  # written by an earlier diagnosis
-        shutil.rmtree(place)
     named = (*timing, *named)
-    if named:
-        # errors of this street's detectors are no part of the model of its traffic
-        traffic = [effect for effect in named if not effect.on_detectors]
-        apply_effects(scenario, traffic).write(place)
+    # errors of this street's detectors are no part of the model of its traffic
+    traffic = [effect for effect in named if not effect.on_detectors]
+    refused = diagnosis.not_corrected is not None and not traffic
+    corrected = None if refused or not named else apply_effects(scenario, traffic)
+    _put_corrected(corrected, directory / CORRECTED)
+    if corrected is not None:
         diagnosis = replace(diagnosis, corrected=CORRECTED)
     written = Diagnosis.from_json(diagnosis.to_json())  # numbers rounded like those of the file
     written = replace(written, policy_gap=_known_gap(directory, written))
     written.write(directory)
     return written
+
+
+def _put_corrected(corrected: Scenario | None, place: Path) -> None:
+    """Write the corrected scenario; the one of an earlier diagnosis goes when the new one is there.
+
+    Args:
+        corrected: The scenario; None for no correction.
+        place: Its folder.
+    """
+    made, before = (place.with_name(f".{place.name}.{word}") for word in ("new", "before"))
+    for rest in (made, before):  # of a diagnosis that was killed here
+        shutil.rmtree(rest, ignore_errors=True)
+    if corrected is not None:
+        corrected.write(made)
+        put_folder(made, place, before)
+        shutil.rmtree(before, ignore_errors=True)
+    elif (place / "scenario.toml").is_file():
+        shutil.rmtree(place)
 
 
 def _diagnosed(
@@ -146,7 +164,7 @@ def _compared(
     located = locate_gap(study, base, selector)
     if located.base.residual.p > study.config.alpha:
         verified = verify_model(study, located.base, located.base)
-        conclusion = unchallenged(located, study.ruled_out, timing, study.detection)
+        conclusion = _unchallenged(study, located, verified, timing)
         return _record(study, timing, located, None, verified, conclusion), ()
     selected = selector.select(located)
 
@@ -160,11 +178,19 @@ def _compared(
     try:
         verified = verify_model(study, located.base, selected.best)
         conclusion = told(
-            conclude(located, selected, selector, verified, study.config, study.layout)
+            conclude(
+                located,
+                selected,
+                selector,
+                verified,
+                study.config,
+                study.layout,
+                held_out=bool(study.measured.of("heldout")),
+            )
         )
         if conclusion.verdict == "no_discrepancy":
             verified = Verified(verified.before, verified.before, None)
-            conclusion = _beside_the_log(study, located, conclusion, timing)
+            conclusion = _beside_the_log(study, located, verified, conclusion, timing)
         diagnosis = _record(study, timing, located, selected, verified, conclusion)
     except OutOfTime:
         selected = replace(selected, complete=False)
@@ -178,7 +204,8 @@ def _compared(
     if conclusion.verdict == "unknown" or not conclusion.best.model.members:
         return diagnosis, ()
     check = judged(study, located.base, conclusion.best)
-    reason = None if study.config.correct_anyway else _reason_against(conclusion, check)
+    judged_by = "held-out" if study.measured.of("heldout") else "fitted"
+    reason = None if study.config.correct_anyway else _reason_against(conclusion, check, judged_by)
     diagnosis = replace(diagnosis, traffic_check=check, not_corrected=reason)
     return diagnosis, () if reason else conclusion.best.model.effects
 
@@ -243,8 +270,16 @@ def _with_patterns(
     return replace(diagnosis, patterns=patterns, sentence=f"{diagnosis.sentence} {told}")
 
 
-def _reason_against(conclusion: Conclusion, check: TrafficCheck | None) -> str | None:
-    """Return why the effects of a conclusion are not put into the scenario; None if they are."""
+def _reason_against(
+    conclusion: Conclusion, check: TrafficCheck | None, judged_by: str
+) -> str | None:
+    """Return why the effects of a conclusion are not put into the scenario; None if they are.
+
+    Args:
+        conclusion: The conclusion.
+        check: Comparison of traffic before and after.
+        judged_by: Kind of the periods of that comparison, "held-out" or "fitted".
+    """
     if conclusion.verdict == "partially_explained":
         return (
             "Something besides the effects named may be behind the difference, so the scenario is "
@@ -253,10 +288,12 @@ def _reason_against(conclusion: Conclusion, check: TrafficCheck | None) -> str |
     if check is None or check.better:
         return None
     if check.undecided:
-        does = f"bring {check.measure} nearer to the held-out periods, by no more than chance could"
+        does = (
+            f"bring {check.measure} nearer to the {judged_by} periods, by no more than chance could"
+        )
         way_out = "; more or longer periods can tell"
     else:
-        does = f"do not bring {check.measure} near to the held-out periods"
+        does = f"do not bring {check.measure} near to the {judged_by} periods"
         way_out = ""
     return (
         f"The effects named {does}: the sum of relative errors is {100 * check.error_before:.1f} % "
@@ -265,13 +302,25 @@ def _reason_against(conclusion: Conclusion, check: TrafficCheck | None) -> str |
     )
 
 
+def _unchallenged(
+    study: Study, located: Located, verified: Verified, timing: tuple[Effect, ...]
+) -> Conclusion:
+    """Conclude that the scenario as it is could have made the fitted periods."""
+    thresholds = study.config.thresholds
+    return unchallenged(located, verified, thresholds, study.ruled_out, timing, study.detection)
+
+
 def _beside_the_log(
-    study: Study, located: Located, conclusion: Conclusion, timing: tuple[Effect, ...]
+    study: Study,
+    located: Located,
+    verified: Verified,
+    conclusion: Conclusion,
+    timing: tuple[Effect, ...],
 ) -> Conclusion:
     """Add effects that need no search to a conclusion that names no effects."""
     if not timing and not study.detection:
         return conclusion
-    alone = unchallenged(located, study.ruled_out, timing, study.detection)
+    alone = _unchallenged(study, located, verified, timing)
     sentence = f"{alone.sentence} {conclusion.sentence}"
     return replace(conclusion, verdict=alone.verdict, sentence=sentence)
 
@@ -323,9 +372,9 @@ def _record(
 def _nothing_simulated(study: Study, timing: tuple[Effect, ...]) -> Diagnosis:
     """Make the record for a budget that ended before the scenario as it is was simulated."""
     sentence = (
-        f"The budget ended after {study.engine.known} of {study.effort.base} simulated days of the "
-        "scenario as it is, before anything could be compared. Run the same command again to go "
-        "on, or give a larger budget."
+        f"The budget ended before anything could be compared: {study.engine.known} of "
+        f"{study.effort.base} simulated days of the scenario as it is are there. Run the same "
+        "command again to go on, or give a larger budget."
     )
     return _unsearched(study, timing, "provisional", sentence, ())
 

@@ -176,6 +176,8 @@ def traffic_check_line(diagnosis: Diagnosis) -> str | None:
         nearer = "come nearer, by no more than chance could do,"
     unfitted = check.measure == "travel time and queue"
     apart = "which no fit used" if unfitted else "of periods that no fit used"
+    if diagnosis.verified_on_fitted_periods:
+        apart = "of the fitted periods, as none is held out"
     before, after = share(check.error_before), share(check.error_after)
     return (
         f"By the effects named, simulated {check.measure} {nearer} to the data, {apart}: "
@@ -224,7 +226,7 @@ def _usual(row: CriteriaRow) -> str:
         text += f" ({'met' if below >= GEH_SHARE else 'not met'}, usual: {share(GEH_SHARE)})"
     met = _fhwa(row)
     if not met:
-        return f"{text}, FHWA not known (it needs three measured days)"
+        return f"{text}, FHWA not known (it needs three whole days of counts at one time of day)"
     return f"{text}, FHWA {sum(met)} of {len(met)} criteria met"
 
 

@@ -36,7 +36,15 @@ from ugat_marl.data.measured.tables import (
 )
 from ugat_marl.data.measured.values import Finding, MeasuredData
 from ugat_marl.errors import MeasuredDataError
-from ugat_marl.scenarios import Network, Period, Scenario, SignalLog, deciding_letter, signal_widths
+from ugat_marl.scenarios import (
+    Network,
+    Passages,
+    Period,
+    Scenario,
+    SignalLog,
+    deciding_letter,
+    signal_widths,
+)
 
 GREEN, YELLOW, RED = "G", "y", "r"
 
@@ -153,6 +161,7 @@ def import_atspm(events: Path, mapping: Path, scenario: Scenario, network: Netwo
     passages, broken = passages_of(
         events, with_period(events, stamps, periods, findings), periods, detectors, findings
     )
+    _require_each(events, mapping, periods, signals, passages)
     measured = MeasuredData(
         tuple(detector for detector in detectors if detector.id not in broken),
         tuple(
@@ -162,6 +171,27 @@ def import_atspm(events: Path, mapping: Path, scenario: Scenario, network: Netwo
     )
     findings += coverage(measured, scenario, network)
     return replace(measured, findings=tuple(findings))
+
+
+def _require_each(
+    events: Path,
+    mapping: Path,
+    periods: Sequence[Period],
+    signals: Sequence[Mapping[str, SignalLog]],
+    passages: Sequence[Mapping[str, Passages]],
+) -> None:
+    """Refuse a period of which the log has nothing, as reading the result would.
+
+    Raises:
+        MeasuredDataError: A period has no detections, or no signals where others have some.
+    """
+    for what, parts in (("detector", passages), ("signal", signals)):
+        for period, part in zip(periods, parts, strict=True):
+            if not part and any(parts):
+                raise MeasuredDataError(
+                    f"{events}: no {what} event in period {period.id!r}; leave this period out of "
+                    f"{mapping.name}"
+                )
 
 
 def _periods(path: Path, spans: Sequence[Span], scenario: Scenario) -> tuple[Period, ...]:
@@ -250,7 +280,7 @@ def _in_periods(
 
 def _report(path: Path, rows: pl.DataFrame, table: AtspmMapping, findings: list[Finding]) -> None:
     """Add findings on faults that the log reports: clocks that were set, and broken detectors."""
-    updates = rows.filter(pl.col("event") == CLOCK_UPDATED)
+    updates = rows.filter(pl.col("event") == CLOCK_UPDATED, pl.col("begin_s") <= pl.col("time_s"))
     if updates.height:
         names = ", ".join(map(repr, updates["device"].unique().sort().to_list()[:6]))
         findings.append(

@@ -221,6 +221,8 @@ def _of_counts(measured: MeasuredData, network: Network) -> Iterator[Finding]:
     others = _has_rows(measured.travel_times) or _has_rows(measured.lanes)
     summed = len(missing) < len(more) or others
     shown = {*COUNTABLE, *(SUMMED if summed else ())}
+    if any(period.signals for period in measured.periods):
+        shown |= {"yellow_time", "all_red_time"}  # they are read off the signals
     hidden = tuple(sorted(set(known_effects()) - shown))
     if not summed:
         yield Finding(

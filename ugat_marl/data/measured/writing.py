@@ -96,6 +96,8 @@ def require_replaceable(directory: Path) -> None:
     Raises:
         OutputError: The directory holds other files, or is a file.
     """
+    if directory.name in ("", ".."):
+        raise OutputError(f"{directory}: is a folder in use; give the name of a new one")
     if not directory.exists():
         return
     if not directory.is_dir():
