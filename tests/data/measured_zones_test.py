@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 
 from ugat_marl.data import CSV_HASHES, read_measured, write_measured
+from ugat_marl.data.measured.passages import passages_as_written
 from ugat_marl.diagnosis.features import DetectorLayout
 from ugat_marl.effects import load_scenario
 from ugat_marl.errors import MeasuredDataError
@@ -35,10 +36,44 @@ def test_vehicles_side_by_side_are_one_passage() -> None:
 
 
 def test_a_vehicle_that_stays_until_the_end_hides_all_behind_it() -> None:
-    both = Passages.together([seen((5.0, NAN, 1.0, 5.0)), seen((7.0, 8.0, 3.0, 5.0))])
+    last, other = seen((5.0, NAN, 1.0, 5.0)), seen((7.0, 8.0, 3.0, 5.0))
+    both = Passages.together([last.staying(), other])
     np.testing.assert_array_equal(both.on_s, [5.0])
-    np.testing.assert_array_equal(both.off_s, [NAN])
+    np.testing.assert_array_equal(both.off_s, [np.inf])
     assert not len(Passages.together([Passages.none(), Passages.none()]))
+
+
+def test_a_vehicle_that_changes_lanes_over_a_zone_hides_nobody() -> None:
+    """One leaves unseen, another comes unseen; the rest is as it was."""
+    times = np.arange(10.0, 610.0, 10.0)
+    lane = seen(*((t, t + 0.5, 9.0, 5.0) for t in times))
+    left, came = seen((203.0, NAN, 9.0, 5.0)), seen((-np.inf, 405.0, 9.0, NAN))
+    both = Passages.together([lane, left, came])
+    assert len(both) == 62
+    assert both.on_s[[20, 41]].tolist() == [203.0, -np.inf]
+    assert np.isnan(both.off_s[20]) and both.off_s[41] == 405.0
+    inside = Passages.together([lane, seen((200.2, NAN, 9.0, 5.0))])
+    assert len(inside) == 60, "within another's time it is the same event"
+
+
+def test_loops_know_who_left_unseen_and_who_is_still_there(tmp_path: Path) -> None:
+    def event(loop: str, time: float, state: str, vehicle: str) -> str:
+        return (
+            f'<instantOut id="{loop}" time="{time:.2f}" state="{state}" vehID="{vehicle}" '
+            'speed="5.00" length="5.00" type="car"/>'
+        )
+
+    rows = [
+        event("wide", 10.0, "enter", "leaves its lane"),
+        event("wide@1@end", 12.0, "leave", "leaves its lane"),
+        event("wide@1", 20.0, "enter", "b"), event("wide@1@end", 21.0, "leave", "b"),
+        event("wide", 30.0, "enter", "stays"),
+        event("wide@1", 40.0, "enter", "c"), event("wide@1@end", 41.0, "leave", "c"),
+    ]  # fmt: skip
+    (tmp_path / "loops.xml").write_text("\n".join(rows))
+    found = read_passages(tmp_path / "loops.xml", [ZONE], 0.0, 100.0, 0.0)["wide"]
+    np.testing.assert_array_equal(found.on_s, [10.0, NAN, 20.0, 30.0])
+    np.testing.assert_array_equal(found.off_s, [NAN, 12.0, 21.0, NAN])
 
 
 ZONE = Detector("wide", "a_0", 20.0, 4.0, "stop", None, "signals", ("a_1",))
@@ -86,8 +121,9 @@ def test_a_zone_is_written_read_and_simulated(wide: Scenario, tmp_path: Path) ->
     zone = replace(first, id="zone", beside=tuple(lanes[1:]))
     (day,) = measured.periods
     union = Passages.together(
-        [day.passages[by_lane[x].id] for x in lanes if by_lane[x].id in day.passages]
+        [day.passages[by_lane[x].id].staying() for x in lanes if by_lane[x].id in day.passages]
     )
+    union = passages_as_written(union, *day.window)
     others = tuple(d for d in measured.detectors if d.lane not in lanes or d.kind != "stop")
     passages = {d.id: day.passages[d.id] for d in others if d.id in day.passages}
     given = replace(

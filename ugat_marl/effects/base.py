@@ -294,6 +294,22 @@ def with_listed_effects(
     return replace(scenario, settings=settings, applied=(*scenario.applied, *known))
 
 
+def salt_of(scenario: Scenario, effect: Effect, *places: str) -> str:
+    """Return the name of an effect's decisions about vehicles, for `hashed_uniform`.
+
+    Where the same effect was applied before, its decisions have another name. With the same one, a
+    share of 0.8 would keep all vehicles that a share of 0.8 has left.
+
+    Args:
+        scenario: The scenario without the effect.
+        effect: The effect.
+        *places: Where it acts, as its first parameters.
+    """
+    begin = f"{effect.name}=" + "".join(f"{place}," for place in places)
+    earlier = sum(text.startswith(begin) for text in scenario.applied)
+    return " ".join((effect.name, *places, *([str(earlier)] if earlier else ())))
+
+
 def hashed_uniform(salt: str, *names: str) -> float:
     """Return a number in [0, 1) that belongs to a vehicle, or to anything else with a name.
 

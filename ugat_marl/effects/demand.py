@@ -10,7 +10,7 @@ import copy
 import math
 import re
 import xml.etree.ElementTree as ET
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Collection, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from itertools import accumulate, pairwise
 from typing import ClassVar
@@ -22,6 +22,7 @@ from ugat_marl.effects.base import (
     NumberParameter,
     TextParameter,
     hashed_uniform,
+    salt_of,
 )
 from ugat_marl.effects.documents import (
     FLOW_RATES,
@@ -55,10 +56,12 @@ class Routes:
     Attributes:
         edges: Route to its edges.
         first: Route, or distribution of routes, to its first edge.
+        several: Distribution of routes that begin on several edges, to these edges.
     """
 
     edges: dict[str, tuple[str, ...]] = field(default_factory=dict)
     first: dict[str, str] = field(default_factory=dict)
+    several: dict[str, set[str]] = field(default_factory=dict)
 
     @classmethod
     def of(cls, scenario: Scenario) -> Routes:
@@ -70,7 +73,7 @@ class Routes:
         distributions: list[ET.Element] = []
         shared: dict[tuple[str, ...], tuple[str, ...]] = {}  # many routes go the same way
         for document in documents:
-            if not mentions(document, "<route "):
+            if not mentions(document, *(f"<route{space}" for space in " \n\t\r")):
                 continue
             for part in document.parts():
                 for element in part.iter("route"):
@@ -83,8 +86,11 @@ class Routes:
             inner = [_edges(x) for x in element.iter("route")]
             inner += [routes.edges.get(x, ()) for x in element.get("routes", "").split()]
             first = {edges[0] for edges in inner if edges}
+            name = element.get("id", "")
             if len(first) == 1:
-                routes.first[element.get("id", "")] = next(iter(first))
+                routes.first[name] = next(iter(first))
+            elif first:
+                routes.several[name] = first
         return routes
 
     def edges_of(self, element: ET.Element) -> tuple[str, ...]:
@@ -193,12 +199,21 @@ class DemandTiming(Effect):
         return replace_departing(scenario, self, self.edge, shifted)
 
 
-def _refuse_district(effect: Effect, element: ET.Element) -> None:
-    """Refuse demand that starts in a district, whose first edge only SUMO decides.
+def _refuse_unknown_origin(
+    effect: Effect, element: ET.Element, several: Mapping[str, Collection[str]]
+) -> None:
+    """Refuse demand whose first edge only SUMO decides.
 
     Raises:
-        OptionError: The element starts in a district or at a junction.
+        OptionError: The element starts in a district or at a junction, or draws its route from a
+            distribution of routes that begin on several edges.
     """
+    if element.find("route") is None and (drawn := element.get("route", "")) in several:
+        raise OptionError(
+            f"{effect}: {element.tag} {element.get('id')!r} draws its route from {drawn!r}, whose "
+            f"routes begin on {', '.join(sorted(several[drawn]))}, so its first edge is not known; "
+            "give it a route of its own, or take every edge (*)"
+        )
     for attribute in ("fromTaz", "fromJunction"):
         if attribute in element.attrib:
             raise OptionError(
@@ -236,7 +251,7 @@ def replace_departing(
         any_changed = False
         for element in root:
             if edge != EVERYWHERE and is_demand(element):
-                _refuse_district(effect, element)
+                _refuse_unknown_origin(effect, element, routes.several)
             if is_demand(element) and (edge == EVERYWHERE or routes.origin(element) == edge):
                 any_changed = True
                 children += becomes(element)
@@ -395,7 +410,11 @@ def _shifted_flow(
         later = replace(present, begin_s=present.begin_s + seconds)
         kept = later.cut(later.before(earliest_s), later.number)
         return [kept.written(element)] if kept.number else []
-    begin, end = max(depart_s(element), earliest_s) + seconds, element.get("end")
+    begin = max(depart_s(element), earliest_s) + seconds
+    if begin < earliest_s and (number := element.attrib.pop("number", None)):
+        over = depart_s(element) + float(number) * _mean_period_s(element)
+        element.attrib.setdefault("end", seconds_text(over))
+    end = element.get("end")
     if end is not None:
         until = parse_time(end) + seconds
         if until <= earliest_s:
@@ -411,7 +430,7 @@ def _scaled(
     begin, end = window
     settings = scenario.settings
     over = settings.begin_s + settings.duration_s
-    salt = f"{effect.name} {edge}"
+    salt = salt_of(scenario, effect, edge)
     least = max(settings.begin_s, begin)
     mark = _mark(scenario)
 
@@ -419,6 +438,8 @@ def _scaled(
         if element.tag == "flow":
             return _scaled_window(element, window, factor, over, mark, salt)
         depart = depart_s(element)
+        if math.isnan(depart) and not math.isinf(end):
+            return [element]  # only SUMO knows whether it departs in the window
         if not (math.isnan(depart) or least <= depart < end):
             return [element]  # one from before the episode takes no part in it
         name = element.get("id", "")

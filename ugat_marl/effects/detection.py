@@ -236,13 +236,13 @@ def _merged(passages: Passages) -> Passages:
     """
     if not len(passages):
         return passages
-    on = np.where(np.isnan(passages.on_s), -np.inf, passages.on_s)
-    off = np.where(np.isnan(passages.off_s), np.inf, passages.off_s)
-    latest = np.maximum.accumulate(off)
-    first = np.append(True, on[1:] > latest[:-1])
+    begin, end = passages.spans()
+    latest = np.maximum.accumulate(end)
+    first = np.append(True, begin[1:] > latest[:-1])
     last = np.append(first[1:], True)
-    ends = latest[last]
-    return replace(passages.at(first), off_s=np.where(np.isfinite(ends), ends, np.nan))
+    alone = first & last
+    ends = np.where(np.isfinite(latest), latest, np.nan)
+    return replace(passages.at(first), off_s=np.where(alone, passages.off_s, ends)[last])
 
 
 @dataclass(frozen=True)

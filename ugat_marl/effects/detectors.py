@@ -280,6 +280,5 @@ def _moved(
 
 def _within(passages: Passages, begin_s: float, end_s: float) -> NDArray[np.bool_]:
     """Return True for each passage that overlaps the window."""
-    on = np.where(np.isnan(passages.on_s), -np.inf, passages.on_s)
-    off = np.where(np.isnan(passages.off_s), np.inf, passages.off_s)
-    return (on < end_s) & (off > begin_s)
+    begin, end = passages.spans()
+    return (begin < end_s) & (end > begin_s)

@@ -40,9 +40,10 @@ _AT_ONCE = 1000
 
 Root = ET.Element
 Change = Callable[[Root], bool]
+"""Function that edits a part of a document's elements, below their root; True if it did."""
+
 FLOW_RATES = ("vehsPerHour", "perHour", "period", "probability")
 """Attributes that say how often a vehicle of a flow departs."""
-"""Function that edits a part of a document's elements, below their root; True if it did."""
 
 
 def windows(document: Document) -> Iterator[bytes]:

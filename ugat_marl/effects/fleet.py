@@ -9,7 +9,13 @@ from dataclasses import dataclass, replace
 from statistics import NormalDist, fmean
 from typing import ClassVar
 
-from ugat_marl.effects.base import Effect, ExaminedStrengths, NumberParameter, hashed_uniform
+from ugat_marl.effects.base import (
+    Effect,
+    ExaminedStrengths,
+    NumberParameter,
+    hashed_uniform,
+    salt_of,
+)
 from ugat_marl.effects.demand import TAGS, parted_flow
 from ugat_marl.effects.documents import (
     DEFAULT_TYPES,
@@ -92,6 +98,7 @@ class HeavyShare(Effect):
 
     def apply(self, scenario: Scenario) -> Scenario:
         """Give vehicles chosen by a hash of their ids, and a part of each flow, truck types."""
+        salt = salt_of(scenario, self)
         scenario = with_default_types(scenario)
         over = scenario.settings.begin_s + scenario.settings.duration_s
         types, members = _types(scenario)
@@ -106,12 +113,12 @@ class HeavyShare(Effect):
             name = element.get("id", "")
             truck = f"{_HEAVY}{cars[kind].get('id')}"
             if element.tag != "flow":
-                if hashed_uniform(self.name, name) < self.share:
+                if hashed_uniform(salt, name) < self.share:
                     used[truck] = cars[kind]
                     element.set("type", truck)
                 return [element]
             used[truck] = cars[kind]
-            part, rest = parted_flow(element, (self.share, 1 - self.share), over, self.name)
+            part, rest = parted_flow(element, (self.share, 1 - self.share), over, salt)
             if part is not None:
                 part.attrib |= {"id": f"{name}{suffix}", "type": truck}
             return [flow for flow in (rest, part) if flow is not None]

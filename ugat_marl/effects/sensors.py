@@ -56,7 +56,10 @@ class _Noise(Sensor):
 
 @dataclass(frozen=True)
 class CountingError(ControllerEffect):
-    """Counts have a normal error with a deviation of `vehicles`, also on an empty lane."""
+    """Numbers of vehicles, halting ones too, have a normal error, also on an empty lane.
+
+    Its deviation is `vehicles`.
+    """
 
     name: ClassVar[str] = "counting_error"
     ranges: ClassVar[dict[str, NumberParameter]] = {"vehicles": NumberParameter("veh", 0.0, 100.0)}
@@ -236,7 +239,7 @@ class _Lossy(Sensor):
 
 @dataclass(frozen=True)
 class QuantisedCounts(ControllerEffect):
-    """Counts are rounded to the nearest multiple of `vehicles`."""
+    """Numbers of vehicles, halting ones too, are rounded to the nearest multiple of `vehicles`."""
 
     name: ClassVar[str] = "quantised_counts"
     ranges: ClassVar[dict[str, NumberParameter]] = {"vehicles": NumberParameter("veh", 1.0, 100.0)}

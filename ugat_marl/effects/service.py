@@ -2,11 +2,12 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 from typing import ClassVar
 
 from ugat_marl.effects.base import ControllerEffect, NumberParameter, TextParameter
+from ugat_marl.effects.controllers import ControllerPart
 from ugat_marl.effects.places import network_places
 from ugat_marl.scenarios import Intersection, Network, Scenario, Withheld
 
@@ -47,6 +48,23 @@ class LaneService(ControllerEffect):
     def service(self) -> Mapping[str, Seconds]:
         """Return the lane and its seconds."""
         return {self.lane: (self.begin_s, self.each_s)}
+
+
+def service_of(
+    effects: Iterable[ControllerPart], fitted: Iterable[ControllerPart]
+) -> dict[str, Seconds]:
+    """Return lane to its seconds of red in all.
+
+    Args:
+        effects: Effects of the scenario; the last one of a lane counts.
+        fitted: What was fitted beside these effects, and is added to them.
+    """
+    seconds = {lane: red for effect in effects for lane, red in effect.service().items()}
+    for part in fitted:
+        for lane, (begin_s, each_s) in part.service().items():
+            begins_s, eaches_s = seconds.get(lane, (0.0, 0.0))
+            seconds[lane] = (begins_s + begin_s, eaches_s + each_s)
+    return seconds
 
 
 def withheld(network: Network, lanes: Mapping[str, Seconds]) -> dict[str, Withheld]:

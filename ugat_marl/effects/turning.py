@@ -11,7 +11,13 @@ from dataclasses import dataclass
 from itertools import accumulate, chain, pairwise
 from typing import ClassVar
 
-from ugat_marl.effects.base import Effect, NumberParameter, TextParameter, hashed_uniform
+from ugat_marl.effects.base import (
+    Effect,
+    NumberParameter,
+    TextParameter,
+    hashed_uniform,
+    salt_of,
+)
 from ugat_marl.effects.demand import TAGS, Routes, parted_flow
 from ugat_marl.effects.documents import edit_scenario, free_suffix, is_demand, mentions
 from ugat_marl.effects.places import Places, network_places
@@ -78,11 +84,12 @@ class Turning(Effect):
         tails = self._tails(scenario, way, places)
         over = scenario.settings.begin_s + scenario.settings.duration_s
         suffix = free_suffix(scenario, "+turning")
+        salt = salt_of(scenario, self, self.from_edge, self.to_edge)
 
         def change(root: ET.Element) -> bool:
             children: list[ET.Element] = []
             for element in root:
-                children += self._turned(element, way, tails, over, suffix)
+                children += self._turned(element, way, tails, over, suffix, salt)
             changed = len(children) != len(root) or any(
                 a is not b for a, b in zip(children, root, strict=True)
             )
@@ -117,6 +124,7 @@ class Turning(Effect):
         tails: Counter[Way],
         over_s: float,
         suffix: str,
+        salt: str,
     ) -> list[ET.Element]:
         """Return the elements that replace one element of a route file."""
         if not is_demand(element):
@@ -126,7 +134,6 @@ class Turning(Effect):
         if place is None or edges[place + 1] == self.to_edge:
             return [element]
         name = element.get("id", "")
-        salt = f"{self.name} {self.from_edge} {self.to_edge}"
         if element.tag != "flow":
             if hashed_uniform(salt, name) >= self.share:
                 return [element]

@@ -248,9 +248,9 @@ class YellowRunning(VehicleEffect):
 
 @dataclass(frozen=True)
 class RedRunning(VehicleEffect):
-    """Drivers pass a light that has been red for at most `seconds`.
+    """Drivers pass a light that has been red for at most `seconds`; they never stop at yellow.
 
-    SUMO's `jmDriveAfterRedTime`; by default nobody does.
+    SUMO's `jmDriveAfterRedTime`; by default nobody does. It overrules `yellow_running`.
     """
 
     name: ClassVar[str] = "red_running"
@@ -258,6 +258,13 @@ class RedRunning(VehicleEffect):
     ranges: ClassVar[dict[str, NumberParameter]] = {"seconds": NumberParameter("s", 0.0, 10.0)}
     examined: ClassVar[ExaminedStrengths] = ExaminedStrengths((2.0,), 0.0, 0.3)
     seconds: float
+
+    def _write(self, element: ET.Element, number: float, settings: ScenarioFile) -> None:
+        if number:
+            super()._write(element, number, settings)
+            return
+        for part in (element, *element):  # with 0, SUMO's drivers would still never stop at yellow
+            part.attrib.pop(self.attribute, None)
 
 
 @dataclass(frozen=True)

@@ -21,6 +21,7 @@ from ugat_marl.effects import (
     late_greens,
     load_scenario,
     scenario_in_domain,
+    service_of,
     with_late_green_programmes,
     withheld,
 )
@@ -115,8 +116,7 @@ class TrafficEnv(ParallelEnv[str, Any, Any]):
         )
         interval_s = self.decision_interval_s
         self._actuators = Actuators.of(parts, self.network, self._timing, interval_s)
-        served = {lane: red for part in parts for lane, red in part.service().items()}
-        self._withheld = withheld(self.network, served)
+        self._withheld = withheld(self.network, service_of(effects, options.fitted))
         self._objectives = Objectives.of(effects, self.scenario)
         self._name_agents()
         self._states = [signals.initial_state(self._timing) for _ in self.possible_agents]

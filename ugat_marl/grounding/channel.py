@@ -240,7 +240,9 @@ class FittedActuator(Actuator):
 
     def reset(self, seed: int) -> None:
         """Draw the weights of the episode."""
+        nothing: Commands = [None] * len(self._channel.tables)
         self._given.clear()
+        self._given.extend([nothing] * self._channel.lag)
         self._chances = self._channel.drawn(seed).cumsum(1)
         self._generator = numpy_generator(seed, "channel", "commands")
 

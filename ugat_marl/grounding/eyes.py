@@ -272,7 +272,7 @@ def fit_eyes(
     config = config or EyesConfig()
     rows, perfect = view.rows(street), view.rows(simulated)
     lag = _lag(rows, perfect, config)
-    noisy, step = _fraction(rows) > config.fraction, _step(rows)
+    noisy, step = _fraction(rows) - _fraction(perfect) > config.fraction, _step(rows)
     absolute, relative = _noise(rows, perfect, config) if noisy else (0.0, 0.0)
     return Eyes(
         dead=_dead(rows, perfect, config),

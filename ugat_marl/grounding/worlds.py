@@ -135,9 +135,10 @@ class SimulatedWorld:
         """Run a roll-out for each pair of seed and constant delay; return logs in this order."""
         alone = _RollOutAlone(self._make_env, self._most_delay_s, policy, self._epsilon)
         given = [(*part, self._stop) for part in parts]
-        logs = in_order(self._workers, alone.play, given, self._stop, lambda _: on_done())
-        self._stop = Stop()  # the old one was set at the end
-        return logs
+        try:
+            return in_order(self._workers, alone.play, given, self._stop, lambda _: on_done())
+        finally:
+            self._stop = Stop()  # the old one was set at the end
 
     def replay(self) -> Policy | None:
         """Return None: the policy that is given to `collect` acts."""

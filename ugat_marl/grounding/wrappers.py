@@ -18,7 +18,7 @@ from ugat_marl.seeding import numpy_generator
 Infos = dict[str, dict[str, Any]]
 
 LEAST_CHANCE = 0.5
-"""Smallest share of greens that are delayed in an episode."""
+"""Smallest chance of a green, in an episode, to begin late by a random time, which may be 0."""
 
 
 class GroundedEnv(BaseParallelWrapper[str, Any, Any]):

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Literal
 
 import numpy as np
@@ -102,13 +102,15 @@ class Passages:
         """Return the passages over a zone on several lanes, from those over each of its lanes.
 
         Vehicles that are on the zone at the same time are one passage: from the first front to the
-        last rear, with their mean speed, and without a length.
+        last rear, with their mean speed, and without a length. A vehicle that changes lanes over
+        the zone may come or leave unseen: then ``on_s`` is not finite, or ``off_s`` is NaN, and it
+        was there at its other time only. With an infinite ``off_s`` it stays.
         """
         if not any(len(lane) for lane in lanes):
             return cls.none()
         rows = np.concatenate([[x.on_s, x.off_s, x.speed_mps, x.length_m] for x in lanes], axis=1)
-        begin = np.where(np.isfinite(rows[0]), rows[0], -np.inf)
-        end = np.where(np.isfinite(rows[1]), rows[1], np.inf)
+        begin = np.where(np.isfinite(rows[0]), rows[0], rows[1])
+        end = np.where(np.isnan(rows[1]), begin, rows[1])
         order = np.argsort(begin, kind="stable")
         begin, end, rows = begin[order], end[order], rows[:, order]
         latest = np.maximum.accumulate(end)
@@ -118,12 +120,29 @@ class Passages:
         timed = np.add.reduceat(known.astype(np.float64), starts)
         speed = np.add.reduceat(np.where(known, rows[2], 0.0), starts)
         last = np.maximum.reduceat(end, starts)
-        return cls(
-            np.where(np.isfinite(begin[starts]), begin[starts], np.nan),
-            np.where(np.isfinite(last), last, np.nan),
+        return cls(  # who comes or leaves unseen is alone, or inside of another's time
+            np.where(count == 1, rows[0][starts], begin[starts]),
+            np.where(count == 1, rows[1][starts], last),
             np.where(timed > 0, speed / np.maximum(timed, 1.0), np.nan),
             np.where(count == 1, rows[3][starts], np.nan),
         )
+
+    def staying(self) -> Passages:
+        """Return the passages of a period; the last one, if it has no off, is on for ever."""
+        off = self.off_s.copy()
+        if len(self) and np.isnan(off[-1]):
+            off[-1] = np.inf
+        return replace(self, off_s=off)
+
+    def spans(self) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+        """Return begin and end of each passage, ``(passages,)``, without NaN.
+
+        If a vehicle comes or leaves unseen, its other time is both. Only the last one may stay to
+        the end of the period; its end is infinite.
+        """
+        begin = np.where(np.isnan(self.on_s), self.off_s, self.on_s)
+        off = self.staying().off_s
+        return begin, np.where(np.isnan(off), begin, off)
 
     def at(self, chosen: NDArray[np.bool_] | NDArray[np.int64]) -> Passages:
         """Return the chosen passages."""

@@ -131,15 +131,18 @@ def read_passages(
     """
     content = events_in(file, "detections")
     rows: dict[bytes, list[tuple[float, bool, bytes, float, float]]] = defaultdict(list)
+    last_seen: dict[bytes, float] = {}  # the events are in the order of time
     for name, time, state, vehicle, speed, length in _EVENT.findall(content):
         rows[name].append((float(time), state == b"enter", vehicle, float(speed), float(length)))
+        last_seen[vehicle] = float(time)
     by_detector: dict[str, Passages] = {}
     for detector in detectors:
         by_lane: list[Passages] = []
         for number in range(len(detector.lanes)):
             first = _loop(detector, number).encode()
             last = first + _END.encode() if detector.length_m > 0 else first
-            by_lane.append(_passages(rows[first], rows[last], detector.speed_at or "rear"))
+            speed_at = detector.speed_at or "rear"
+            by_lane.append(_passages(rows[first], rows[last], speed_at, last_seen))
         passages = by_lane[0] if len(by_lane) == 1 else Passages.together(by_lane)
         passages = _clipped(delayed(passages, (1 - detector.steps_early) * step_s), begin_s, end_s)
         if len(passages):
@@ -151,11 +154,16 @@ def _passages(
     front: list[tuple[float, bool, bytes, float, float]],
     rear: list[tuple[float, bool, bytes, float, float]],
     speed_at: SpeedPoint,
+    last_seen: Mapping[bytes, float],
 ) -> Passages:
     """Pair each entry at the upstream end with the exit of the same visit at the downstream end.
 
     The exit of a visit is the first one at or after its entry, and before the next entry of the
     vehicle. The speed of a visit without an entry is that of the rear, whatever `speed_at` says.
+
+    Returns:
+        Passages, sorted by time. A visit without an entry is on since minus infinity. One without
+        an exit is on for ever, or has no off (NaN) if the vehicle was seen elsewhere later.
     """
     left: dict[bytes, list[tuple[float, float]]] = defaultdict(list)
     for time, enters, vehicle, speed, _ in rear:
@@ -166,9 +174,10 @@ def _passages(
     strays: list[tuple[float, float]] = []
     for time, enters, vehicle, speed, length in reversed(front):  # so that the last entry is first
         if enters:
-            off, speed_off, exits = np.inf, speed, left[vehicle]
+            exits, speed_off = left[vehicle], speed
+            off = np.nan if last_seen[vehicle] > time else np.inf
             while exits and exits[-1][0] >= time:
-                if off < np.inf:
+                if np.isfinite(off):
                     strays.append((off, speed_off))
                 off, speed_off = exits.pop()
             seen = {"front": speed, "rear": speed_off, "mean": 0.5 * (speed + speed_off)}[speed_at]
@@ -178,7 +187,8 @@ def _passages(
         rows += [(-np.inf, time, speed, np.nan) for time, speed in exits]
     if not rows:
         return Passages.none()
-    table = np.array(sorted(rows, key=lambda row: min(row[0], row[1])), dtype=np.float64)
+    rows.sort(key=lambda row: row[0] if np.isfinite(row[0]) else row[1])
+    table = np.array(rows, dtype=np.float64)
     return Passages(table[:, 0], table[:, 1], table[:, 2], table[:, 3])
 
 
@@ -197,8 +207,9 @@ def _clipped(passages: Passages, begin_s: float, end_s: float) -> Passages:
     if not len(passages):
         return passages
     inside = (passages.off_s >= begin_s) & (passages.on_s < end_s)
-    # An exit without an entry counts by its own time.
+    # An exit without an entry, or an entry without an exit, counts by its own time.
     inside &= np.isfinite(passages.on_s) | (passages.off_s < end_s)
+    inside |= np.isnan(passages.off_s) & (passages.on_s >= begin_s) & (passages.on_s < end_s)
     kept = passages.at(inside)
     return Passages(
         _known(kept.on_s, kept.on_s >= begin_s),

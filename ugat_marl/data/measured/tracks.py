@@ -80,6 +80,8 @@ class _Track:
     def passage(self, detector: Detector, begin: int, end: int) -> tuple[float, ...] | None:
         """Return on and off in s, speed in m/s and length in m; None if it does not come over.
 
+        A vehicle that is on the zone when it is first seen has no on (NaN).
+
         Args:
             detector: A detector on the lane.
             begin: Index of the first position on the lane.
@@ -96,10 +98,13 @@ class _Track:
         if end < len(self.lane):
             last = end
         on = self._when(start + detector.position_m, first, last)
-        if on is None:
-            return None
         rear = start + detector.position_m + detector.length_m + self.length_m
         off = self._when(rear, first, len(self.lane) - 1)
+        on_it = start + detector.position_m < self.driven_m[0]
+        if on is None and first == 0 and on_it and off is not None:
+            on = np.nan
+        if on is None:
+            return None
         at = {"front": (on,), "mean": (on, off or on)}.get(
             detector.speed_at or "rear", (off or on,)
         )
@@ -219,7 +224,7 @@ def _over(
     keys = [(detector.id, lane) for lane in detector.lanes]
     lanes = [_passages(rows[key]) for key in keys if key in rows]
     if len(lanes) > 1:
-        return Passages.together(lanes)
+        return Passages.together([passages.staying() for passages in lanes])
     return lanes[0] if lanes else None
 
 
