@@ -447,8 +447,37 @@ def test_a_summer_night_that_is_there_twice_is_an_error(imported: Import) -> Non
 
 def test_what_a_controller_says_of_itself_is_passed_on(imported: Import) -> None:
     read = imported(log([*LOG, (60.0, 181, 3), (61.0, 84, 5), (62.0, 87, 50)]))
-    assert "the clock of '7' was set 1 times (event 181)" in texts(read)
+    assert "the clock of '7' was set once (event 181)" in texts(read)
     assert "device '7' reports faults (events 84 to 88) of its channels 5" in texts(read)
+
+
+def test_a_clock_that_was_set_once_was_set_once(imported: Import) -> None:
+    """The hour before a period is read too, for the state of its signals."""
+    rows = """
+[[periods]]
+id = "first"
+zero = 2024-03-05T07:00:00
+end_s = 100
+[[periods]]
+id = "second"
+zero = 2024-03-05T07:00:00
+begin_s = 100
+end_s = 200
+"""
+    mapping = MAPPING.replace("zero = [2024-03-05T07:00:00]", rows)
+    more = [(time + 100.0, code, number) for time, code, number in LOG if 0 <= time < 90]
+    said = texts(imported(log([*LOG, (60.0, 181, 3), *more]), mapping))
+    assert "the clock of '7' was set once (event 181)" in said
+
+
+@pytest.mark.parametrize("kept", ["signal", "detector"])
+def test_a_period_without_events_is_to_be_left_out(imported: Import, kept: str) -> None:
+    seen = [row for row in LOG if (row[1] in (81, 82)) == (kept == "detector")]
+    days = [ZERO, ZERO + dt.timedelta(days=1)]
+    frame = pl.concat([log(LOG, zero=days[0]), log(seen, zero=days[1])])
+    dates = ", ".join(day.isoformat() for day in days)
+    with pytest.raises(MeasuredDataError, match="event in period '2024-03-06T0700'; leave this"):
+        imported(frame, MAPPING.replace("2024-03-05T07:00:00", dates))
 
 
 def test_damaged_logs_never_end_in_a_traceback(

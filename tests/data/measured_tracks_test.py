@@ -85,6 +85,16 @@ def test_a_vehicle_that_changes_lanes_over_a_detector_is_seen_once(share: float)
     assert seen["0"].on_s.tolist() == pytest.approx([11.0 + share])
 
 
+def test_a_vehicle_that_stands_on_a_zone_at_the_begin_is_seen_to_leave() -> None:
+    rows = track(["a_0"] * 4, [28.0, 28.0, 38.0, 48.0], 10.0, length_m=[5.0] * 4)
+    zone, behind = (
+        Detector(x, "a_0", at, 10.0, "stop") for x, at in (("zone", 20.0), ("far", 30.0))
+    )
+    seen = passages(rows, zone, behind)
+    assert np.isnan(seen["zone"].on_s).all() and seen["zone"].off_s.tolist() == [11.7]
+    assert seen["far"].on_s.tolist() == [11.2], "it was not on that one"
+
+
 def test_positions_that_jitter_do_not_move_a_standing_vehicle() -> None:
     """Ten positions a second with an error of 0.3 m: a minute of standing would add 200 m."""
     time = np.arange(0.0, 90.0, 0.1)

@@ -11,9 +11,10 @@ import pytest
 
 from ugat_marl.data import CSV_HASHES, read_measured, write_measured
 from ugat_marl.data.measured.passages import passages_as_written
+from ugat_marl.data.measured.writing import require_replaceable
 from ugat_marl.diagnosis.features import DetectorLayout
 from ugat_marl.effects import load_scenario
-from ugat_marl.errors import MeasuredDataError
+from ugat_marl.errors import MeasuredDataError, OutputError
 from ugat_marl.experiments import policy_factory, record
 from ugat_marl.scenarios import Detector, Network, Passages, Scenario
 from ugat_marl.simulation import detectors_document, read_passages
@@ -74,6 +75,13 @@ def test_loops_know_who_left_unseen_and_who_is_still_there(tmp_path: Path) -> No
     found = read_passages(tmp_path / "loops.xml", [ZONE], 0.0, 100.0, 0.0)["wide"]
     np.testing.assert_array_equal(found.on_s, [10.0, NAN, 20.0, 30.0])
     np.testing.assert_array_equal(found.off_s, [NAN, 12.0, 21.0, NAN])
+
+
+@pytest.mark.parametrize("name", ["", ".."])
+def test_the_folder_in_use_is_not_replaced(name: str, tmp_path: Path) -> None:
+    del tmp_path
+    with pytest.raises(OutputError, match="is a folder in use"):
+        require_replaceable(Path(name))
 
 
 ZONE = Detector("wide", "a_0", 20.0, 4.0, "stop", None, "signals", ("a_1",))

@@ -177,6 +177,8 @@ def test_longer_vehicles_are_not_put_on_detectors_and_extensions_are() -> None:
     assert set(found) == {"advance"}
     two = {kind: sums for kind, sums in free_traffic(0.5).items() if kind != "stop"}
     assert set(implausible(two, model, THRESHOLDS)) == {"advance"}, "of two kinds only the one"
+    near = {kind: sums for kind, sums in free_traffic(0.2).items() if kind != "stop"}
+    assert set(implausible(near, model, THRESHOLDS)) == {"advance"}, "2.3 m off the other kind"
     here, there = found["advance"]
     assert here - there == pytest.approx(0.5 * 11.5, rel=0.05)
     assert set(implausible(free_traffic(0.0, 5.0), model, THRESHOLDS)) == set(model)

@@ -98,6 +98,15 @@ def test_of_two_detectors_of_a_kind_on_a_lane_one_is_compared() -> None:
     assert names(one_of_each(oftener, detectors)) == ("two", "three", "four")
 
 
+def test_a_zone_beside_a_detector_on_one_of_its_lanes_is_not_compared() -> None:
+    wide = Detector("wide", "in_0", 180.0, 2.0, "stop", beside=("in_1",))
+    detectors = (Detector("one", "in_1", 180.0, 0.0, "stop"), wide)
+    both = replace(measured(("one", "wide")), detectors=detectors)
+    assert names(one_of_each(both, detectors)) == ("one",)
+    (finding,) = doubled(both, one_of_each(both, detectors))
+    assert "'wide' is not compared; lane 'in_1' has 'one' as stop detector" in finding.text
+
+
 def test_of_two_counting_detectors_the_one_with_vehicles_is_compared() -> None:
     counts = pl.DataFrame(
         {"period_id": ["day0"] * 3, "detector_id": ["one", "one", "two"], "count": [0, 0, 3]}
@@ -223,6 +232,11 @@ def test_periods_of_different_lengths_are_refused_by_name() -> None:
     longer = replace(periods[1], end_s=160.0)
     with pytest.raises(MeasuredDataError, match="'day1' is 160 s long, and 'day0' only 100 s"):
         module._refuse_lengths((periods[0], longer), Thresholds())
+    ends = (0.4999, 0.5001)  # of a bin more: nearly one length, and another number of bins
+    bin_s = Thresholds().bin_s
+    near = tuple(replace(periods[0], id=str(x), end_s=(3 + x) * bin_s) for x in ends)
+    with pytest.raises(MeasuredDataError, match="periods of one length"):
+        module._refuse_lengths(near, Thresholds())
 
 
 def test_demand_that_varies_from_day_to_day_is_told_from_chance() -> None:

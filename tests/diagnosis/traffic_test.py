@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 
 from ugat_marl.diagnosis import TrafficCheck, workflow
-from ugat_marl.diagnosis.features import BIN_FEATURES, FEATURES, INDEX, Tally
+from ugat_marl.diagnosis.features import ALL_FEATURES, BIN_FEATURES, FEATURES, INDEX, Tally
 from ugat_marl.diagnosis.thresholds import Thresholds
 from ugat_marl.diagnosis.traffic import approach_table, traffic_check
 from ugat_marl.diagnosis.workflow import _reason_against as reason_against
@@ -108,6 +108,22 @@ def test_without_travel_times_counts_decide() -> None:
         without_journeys(street), without_journeys(sim), without_journeys(right), THRESHOLDS
     )
     assert check is not None and check.better
+
+
+def test_occupied_times_judge_where_no_speeds_are_known() -> None:
+    def of_counts(occupied_s: float, count: int) -> list[Tally]:
+        rows: list[Tally] = []
+        for number in range(count):
+            sums = np.zeros((len(ALL_FEATURES), 2, 2))
+            sums[INDEX["over_stop"]] = (40 * (occupied_s + 0.01 * (number % 3)), 40)
+            rows.append(Tally(sums, np.ones((len(BIN_FEATURES), 2, 4))))
+        return rows
+
+    street, sim, repaired = of_counts(1.5, 2), of_counts(1.0, 16), of_counts(1.5, 16)
+    check = traffic_check(street, sim, repaired, THRESHOLDS)
+    assert check is not None and check.better
+    assert check.measure == "speed and occupancy"
+    assert check.error_before == pytest.approx(1 / 3, abs=0.02)
 
 
 def test_without_anything_to_judge_by_there_is_no_judgement() -> None:

@@ -15,6 +15,7 @@ from ugat_marl.diagnosis import DiagnosisConfig, Hypothesis
 from ugat_marl.diagnosis.features import FEATURES
 from ugat_marl.diagnosis.places import one_behind_the_other
 from ugat_marl.diagnosis.records import EffectRecord, Located, Parameter, Selected
+from ugat_marl.diagnosis.thresholds import Thresholds
 from ugat_marl.diagnosis.verdict import (
     _rivals,
     combined,
@@ -23,6 +24,8 @@ from ugat_marl.diagnosis.verdict import (
     describe_members,
     effect_record,
     place_and_window,
+    unchallenged,
+    unverified,
 )
 from ugat_marl.scenarios import Detector
 
@@ -159,6 +162,34 @@ def test_what_to_measure_next_is_said_in_words() -> None:
     assert found.verdict == "partially_explained"
     assert found.next_measurement is not None
     assert "time over detector, 2nd and 3rd (discharge)" in found.next_measurement
+
+
+@pytest.mark.parametrize(
+    ("heldout_p", "complete", "verdict", "said"),
+    [
+        (0.5, True, "no_discrepancy", "Nothing in the data contradicts"),
+        (0.5, False, "provisional", "Run the same command again"),
+        (0.001, True, "unknown", "but not with the held-out ones (p = 0.001)"),
+    ],
+)
+def test_nothing_is_found_where_held_out_periods_say_so_too(
+    heldout_p: float, complete: bool, verdict: str, said: str
+) -> None:
+    agrees: Any = SimpleNamespace(residual=SimpleNamespace(p=0.6))
+    verified: Any = SimpleNamespace(before=SimpleNamespace(p=heldout_p))
+    here = Located(agrees, (), complete=complete, examined=frozenset())
+    found = unchallenged(here, verified, Thresholds(), (), ())
+    assert found.verdict == verdict
+    assert said in found.sentence
+
+
+@pytest.mark.parametrize("shrink", [0.3, -0.42])
+def test_an_explanation_that_makes_it_worse_takes_nothing_off(shrink: float) -> None:
+    best: Any = SimpleNamespace(model=SimpleNamespace(members=((HEADWAY, (1.4,)),)))
+    verified: Any = SimpleNamespace(shrink=shrink)
+    said = unverified(selected(best, False), verified).sentence
+    assert ("takes off 30 % of the gap" in said) == (shrink > 0)
+    assert ("brings the held-out periods no nearer" in said) == (shrink < 0)
 
 
 @pytest.mark.parametrize("complete", [True, False])

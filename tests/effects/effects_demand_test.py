@@ -118,6 +118,49 @@ def test_two_decisions_about_a_vehicle_are_independent() -> None:
     assert len(of_edge(both)) == pytest.approx(count * 0.216, abs=bounds(count, 0.216))
 
 
+def test_the_same_share_twice_is_a_share_of_the_rest() -> None:
+    scenario = load_scenario("single-v1")
+    everybody = len(departing(scenario))
+    twice = apply_effects(scenario, parse_domain("demand_level=*,0.8+demand_level=*,0.8"))
+    assert len(departing(twice)) / everybody == pytest.approx(0.64, abs=bounds(everybody, 0.64))
+    elsewhere = apply_effects(scenario, parse_domain(f"demand_level=*,0.8+demand_level={EDGE},0.8"))
+    alone = apply_effects(scenario, parse_domain(f"demand_level={EDGE},0.8+demand_level=*,0.8"))
+    assert departing(elsewhere).keys() == departing(alone).keys(), "other places, other decisions"
+
+
+def test_turning_twice_turns_more() -> None:
+    scenario, turn = load_scenario("single-v1"), f"turning={EDGE},A1_southA,0.5"
+    once, twice = (
+        turns(apply_effects(scenario, parse_domain("+".join([turn] * count)))) for count in (1, 2)
+    )
+    assert twice["A1_southA"] > 1.2 * once["A1_southA"]
+
+
+@pytest.mark.parametrize("space", [" ", "\n", "\t"])
+def test_routes_may_be_written_over_several_lines(space: str) -> None:
+    route = f'<route{space}id="r" edges="{EDGE} A1_southA"/>'
+    scenario = with_routes(route + '<vehicle id="v" route="r" depart="1"/>')
+    assert not departing(apply_effects(scenario, [DemandLevel(EDGE, 0.0)]))
+
+
+def test_who_draws_a_route_of_several_edges_has_no_first_one() -> None:
+    routes = (
+        f'<routeDistribution id="d"><route edges="{EDGE} A1_southA" probability="1"/>'
+        '<route edges="southA_A1 A1_east1" probability="1"/></routeDistribution>'
+        '<vehicle id="v" route="d" depart="1"/>'
+    )
+    with pytest.raises(OptionError, match="'v' draws its route from 'd', whose routes begin on"):
+        apply_effects(with_routes(routes), [DemandLevel(EDGE, 0.5)])
+
+
+def test_who_waits_for_a_person_is_in_no_window() -> None:
+    scenario = with_routes(
+        f'<vehicle id="v" depart="triggered"><route edges="{EDGE} A1_southA"/></vehicle>'
+    )
+    assert departing(apply_effects(scenario, [DemandSurge("*", 10.0, 20.0, 0.0)]))
+    assert not departing(apply_effects(scenario, [DemandLevel("*", 0.0)]))
+
+
 def test_a_surge_stays_in_its_window() -> None:
     scenario = load_scenario("single-v1")
     surge = sound(apply_effects(scenario, [DemandSurge(EDGE, 600, 1200, 1.8)]))

@@ -373,6 +373,17 @@ def test_a_part_of_each_flow_is_heavy(crossing: Crossing) -> None:
     assert found == {"f": (None, "30"), "f+heavy": ("heavy.DEFAULT_VEHTYPE", "10")}
 
 
+def test_red_running_of_no_second_is_none(crossing: Crossing) -> None:
+    """SUMO's drivers never stop at yellow if the attribute is there, even as 0."""
+    runs = apply_effects(load_scenario(crossing(vehicles=CARS)), [RedRunning(2.0)])
+    for seconds, expected in ((1.0, {"1"}), (0.0, {None})):
+        changed = apply_effects(runs, [RedRunning(seconds)])
+        kinds_there = [
+            x for d in (*changed.additional, *changed.routes) for x in d.parse().iter("vType")
+        ]
+        assert {kind.get("jmDriveAfterRedTime") for kind in kinds_there} == expected
+
+
 def test_buses_stay_buses(crossing: Crossing) -> None:
     types = '<vType id="bus" vClass="bus"/>'
     vehicles = '<vehicle id="v" type="bus" route="east" depart="0"/>'

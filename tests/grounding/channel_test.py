@@ -200,6 +200,17 @@ def test_the_largest_weight_stays_however_large_a_weight_must_be() -> None:
     assert channel.lag == 2
 
 
+def test_masks_are_those_of_the_known_lag_from_the_first_decision_on() -> None:
+    channel = fit_channel(log_of(lag=2, lost=0.2))
+    actuator = channel.actuator(None, TIMING, INTERVAL_S)  # type: ignore[arg-type]
+    assert actuator is not None
+    actuator.reset(3)
+    nothing = [None] * len(channel.agents)
+    assert list(actuator.under_way) == [nothing, nothing]
+    actuator.send([1] * len(channel.agents))
+    assert list(actuator.under_way) == [nothing, [1] * len(channel.agents)]
+
+
 def test_a_channel_survives_its_checkpoint() -> None:
     channel = fit_channel(log_of(lag=1, lost=0.1))
     again = CommandChannel.from_state(channel.state_dict())

@@ -271,7 +271,7 @@ def _with_patterns(
 
 
 def _reason_against(
-    conclusion: Conclusion, check: TrafficCheck | None, judged_by: str
+    conclusion: Conclusion, check: TrafficCheck | None, judged_by: str = "held-out"
 ) -> str | None:
     """Return why the effects of a conclusion are not put into the scenario; None if they are.
 

@@ -283,10 +283,11 @@ def _report(path: Path, rows: pl.DataFrame, table: AtspmMapping, findings: list[
     updates = rows.filter(pl.col("event") == CLOCK_UPDATED, pl.col("begin_s") <= pl.col("time_s"))
     if updates.height:
         names = ", ".join(map(repr, updates["device"].unique().sort().to_list()[:6]))
+        times = "once" if updates.height == 1 else f"{updates.height} times"
         findings.append(
             Finding(
-                f"{path.name}: the clock of {names} was set {updates.height} times (event 181); "
-                "times around it may jump by seconds"
+                f"{path.name}: the clock of {names} was set {times} (event 181); times around it "
+                "may jump by seconds"
             )
         )
     faults = rows.filter(pl.col("event").is_in(DETECTOR_FAULTS))
