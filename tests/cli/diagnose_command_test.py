@@ -605,16 +605,26 @@ def test_nothing_is_written_among_the_measured_data(
     assert hashes(street.measured) == before
 
 
-@pytest.mark.parametrize("below", [".", "network.net.xml"])
 def test_the_corrected_scenario_is_not_replaced_while_it_is_diagnosed(
-    below: str, found: tuple[Path, str, str], street: Street, capsys: pytest.CaptureFixture[str]
+    found: tuple[Path, str, str], street: Street, capsys: pytest.CaptureFixture[str]
 ) -> None:
     out, _, _ = found
     before = hashes(out)
-    scenario = str(out / "corrected" / below)
+    scenario = str(out / "corrected")
     assert main(["diagnose", scenario, str(street.measured), "--out", str(out)]) == 2
     assert "give another directory" in " ".join(capsys.readouterr().err.split())
     assert hashes(out) == before
+
+
+def test_a_folder_that_no_diagnosis_wrote_is_not_replaced(
+    street: Street, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    notes = tmp_path / "corrected" / "notes.txt"
+    notes.parent.mkdir()
+    notes.write_text("mine")
+    assert main(street.arguments(tmp_path)) == 2
+    assert "is no scenario" in " ".join(capsys.readouterr().err.split())
+    assert notes.read_text() == "mine"
 
 
 def test_a_cache_that_cannot_be_written_is_named_before_anything_runs(

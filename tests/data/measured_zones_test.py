@@ -37,8 +37,7 @@ def test_vehicles_side_by_side_are_one_passage() -> None:
 
 
 def test_a_vehicle_that_stays_until_the_end_hides_all_behind_it() -> None:
-    last, other = seen((5.0, NAN, 1.0, 5.0)), seen((7.0, 8.0, 3.0, 5.0))
-    both = Passages.together([last.staying(), other])
+    both = Passages.together([seen((5.0, np.inf, 1.0, 5.0)), seen((7.0, 8.0, 3.0, 5.0))])
     np.testing.assert_array_equal(both.on_s, [5.0])
     np.testing.assert_array_equal(both.off_s, [np.inf])
     assert not len(Passages.together([Passages.none(), Passages.none()]))
@@ -129,7 +128,7 @@ def test_a_zone_is_written_read_and_simulated(wide: Scenario, tmp_path: Path) ->
     zone = replace(first, id="zone", beside=tuple(lanes[1:]))
     (day,) = measured.periods
     union = Passages.together(
-        [day.passages[by_lane[x].id].staying() for x in lanes if by_lane[x].id in day.passages]
+        [day.passages[by_lane[x].id] for x in lanes if by_lane[x].id in day.passages]
     )
     union = passages_as_written(union, *day.window)
     others = tuple(d for d in measured.detectors if d.lane not in lanes or d.kind != "stop")

@@ -181,6 +181,7 @@ def test_nothing_is_found_where_held_out_periods_say_so_too(
     found = unchallenged(here, verified, Thresholds(), (), ())
     assert found.verdict == verdict
     assert said in found.sentence
+    assert unchallenged(here, None, Thresholds(), (), ()).verdict != "unknown", "none is held out"
 
 
 @pytest.mark.parametrize("shrink", [0.3, -0.42])

@@ -118,11 +118,14 @@ def test_two_decisions_about_a_vehicle_are_independent() -> None:
     assert len(of_edge(both)) == pytest.approx(count * 0.216, abs=bounds(count, 0.216))
 
 
-def test_the_same_share_twice_is_a_share_of_the_rest() -> None:
+def test_the_same_share_twice_is_a_share_of_the_rest(tmp_path: Path) -> None:
     scenario = load_scenario("single-v1")
     everybody = len(departing(scenario))
     twice = apply_effects(scenario, parse_domain("demand_level=*,0.8+demand_level=*,0.8"))
     assert len(departing(twice)) / everybody == pytest.approx(0.64, abs=bounds(everybody, 0.64))
+    once = apply_effects(scenario, [DemandLevel("*", 0.8)]).write(tmp_path / "once")
+    later = apply_effects(load_scenario(once), [DemandLevel("*", 0.8)])
+    assert departing(later).keys() == departing(twice).keys()
     elsewhere = apply_effects(scenario, parse_domain(f"demand_level=*,0.8+demand_level={EDGE},0.8"))
     alone = apply_effects(scenario, parse_domain(f"demand_level={EDGE},0.8+demand_level=*,0.8"))
     assert departing(elsewhere).keys() == departing(alone).keys(), "other places, other decisions"
@@ -149,8 +152,16 @@ def test_who_draws_a_route_of_several_edges_has_no_first_one() -> None:
         '<route edges="southA_A1 A1_east1" probability="1"/></routeDistribution>'
         '<vehicle id="v" route="d" depart="1"/>'
     )
-    with pytest.raises(OptionError, match="'v' draws its route from 'd', whose routes begin on"):
-        apply_effects(with_routes(routes), [DemandLevel(EDGE, 0.5)])
+    inner = (
+        '<vehicle id="v" depart="1"><routeDistribution>'
+        f'<route edges="{EDGE} A1_southA" probability="1"/>'
+        '<route edges="southA_A1 A1_east1" probability="1"/></routeDistribution></vehicle>'
+    )
+    for text in (routes, inner):
+        with pytest.raises(OptionError, match="'v' draws one of several routes, which begin on"):
+            apply_effects(with_routes(text), [DemandLevel(EDGE, 0.5)])
+        elsewhere = apply_effects(with_routes(text), [DemandLevel("northA_A1", 0.0)])
+        assert departing(elsewhere).keys() == {"v"}
 
 
 def test_who_waits_for_a_person_is_in_no_window() -> None:

@@ -21,7 +21,7 @@ from pydantic import TypeAdapter
 
 from tests.interrupts import KillAfter, few_descriptors
 from ugat_marl.data import Scores, lock_folder
-from ugat_marl.errors import MeasurementError, OptionError, UnknownNameError
+from ugat_marl.errors import CheckpointError, MeasurementError, OptionError, UnknownNameError
 from ugat_marl.experiments import (
     Job,
     LearnerSpec,
@@ -251,10 +251,19 @@ def test_jobs_beside_others_have_the_same_numbers(tmp_path: Path) -> None:
     """The grounded job is begun beside plain training, and waits for the learner of that."""
     plan = [PLAIN, after(PLAIN, Setting("UGAT", "grounded", learner=QUICK, ugat=UGAT)), RULE]
     one = perform_here(plan, tmp_path / "one", Silent())
-    two = perform_here(plan, tmp_path / "two", Silent(), 2, beside=plan[1:])
+    two = perform_here(plan, tmp_path / "two", Silent(), 3, beside=plan[1:])
     assert [record.scores for record in one] == [record.scores for record in two]
     logs = [(tmp_path / "two" / job.name / LOG).exists() for job in plan]
-    assert logs[0] is False and logs[2] is True, "the first is done here, the last one beside it"
+    assert logs == [False, True, True], "the first is done here, the others beside it"
+
+
+@needs_forks
+def test_a_job_beside_does_not_wait_for_a_learner_that_is_lost(tmp_path: Path) -> None:
+    perform_here([PLAIN], tmp_path, Silent())
+    (tmp_path / PLAIN.name / LEARNER).unlink()
+    waits = after(PLAIN, Setting("fine-tuned", "further", learner=QUICK))
+    with pytest.raises(CheckpointError, match="no such"):
+        perform_here([PLAIN, waits], tmp_path, Silent(), 2, beside=[waits])
 
 
 @needs_forks

@@ -82,6 +82,8 @@ def test_parts_are_done_beside_the_first_where_that_is_worth_it(tmp_path: Path) 
     assert beside == plan[1:] and len(beside) == 3
     assert jobs_beside(plan, tmp_path, 100.0, 1) == [], "one core"
     assert jobs_beside(planned_jobs(replace(SMALL, evaluation_seeds=1)), tmp_path, 100.0, 2) == []
+    longer = [plan[0], *(replace(job, rule_budget=10_000) for job in plan[1:])]
+    assert jobs_beside(longer, tmp_path, 100.0, 2) == [], "on one core it would be the longest"
     with LocalProcesses(2) as elsewhere:
         assert jobs_beside(plan, tmp_path, 100.0, elsewhere) == []
     mine = LearnerSpec(f"{__name__}:Mine")

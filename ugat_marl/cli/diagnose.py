@@ -126,18 +126,8 @@ class Diagnose:
         )
 
     def _check_out(self) -> None:
-        """Refuse an output directory whose results would replace what is read.
-
-        Raises:
-            OptionError: It lies in the measured data, or the scenario is its corrected scenario.
-        """
+        """Refuse an output directory inside the measured data, which must not change."""
         out, measured = self.out.resolve(), self.measured.resolve()
-        scenario, corrected = Path(self.scenario).resolve(), out / CORRECTED
-        if scenario == corrected or corrected in scenario.parents:
-            raise OptionError(
-                f"{self.scenario}: is the corrected scenario of --out {str(self.out)!r}, which "
-                "this diagnosis replaces; give another directory"
-            )
         if out == measured or measured in out.parents:
             raise OptionError(
                 f"--out {str(self.out)!r} lies in the measured data, which are never written to; "

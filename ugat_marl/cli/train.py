@@ -36,7 +36,8 @@ class Train:
         config: Settings of the training and of the evaluation.
         out: Folder of the run; default: runs/SCENARIO-REAL-sSEED.
         resume: Continue the run in that folder.
-        workers: Simulations at a time; results do not depend on it.
+        workers: Simulations at a time; with two or more, the other rows of the table are trained
+            beside the first. Results do not depend on it.
         ray: Play roll-outs and search for the best rule on Ray; learning stays on this machine.
     """
 

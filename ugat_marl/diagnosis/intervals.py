@@ -172,7 +172,7 @@ def implausible(
     }
 
     def alone(kind: str) -> bool:
-        """Return True if vehicles seem longer at this kind than elsewhere, and than simulated."""
+        """Return True if the length differs from the one elsewhere, and from the simulated one."""
         own = longer[kind]
         others = [more for other, more in possible.items() if len(possible) > 2 or other != kind]
         usual = float(np.median(others)) if others else own

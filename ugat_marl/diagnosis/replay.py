@@ -47,6 +47,7 @@ from ugat_marl.effects import (
     detector_effects,
     installed_detectors,
     late_greens,
+    service_of,
     shift_parking,
     sort_departures,
     withheld,
@@ -275,8 +276,7 @@ class Replay:
         step = settings.step_length_s
         loops = directory / "loops.xml"
         true = installed_detectors((*self._own, *effects), self._detectors)
-        served = [effect.service() for effect in controller_effects(scenario)]
-        red = withheld(self._network, {lane: red for each in served for lane, red in each.items()})
+        red = withheld(self._network, service_of(controller_effects(scenario), ()))
         signals = replay_document(scenario, period, begin, red)
         detectors = detectors_document(true, self._network.lanes, loops)
         more = [signals, detectors]

@@ -394,15 +394,20 @@ class Study:
         reporter.say(f"note: {finding.text}")
         return replace(self, measured=_noted(self.measured, (finding,)))
 
+    @property
+    def shows_patterns(self) -> bool:
+        """True if single vehicles were detected, always at one time of day."""
+        windows = {period.window for period in self.measured.periods}
+        return self.measured.has_events and len(windows) == 1
+
     def left_over(self, model: Tested, reporter: Reporter) -> tuple[Pattern, ...]:
-        """Find patterns in what a model leaves; none if single vehicles were not detected.
+        """Find patterns in what a model leaves; none if the data cannot show any.
 
         Raises:
             OutOfTime: The budget does not suffice for days of the model to compare with.
         """
         fit, heldout = self.measured.of("fit"), self.measured.of("heldout")
-        spans = {(period.begin_s, period.end_s) for period in (*fit, *heldout)}
-        if not self.measured.has_events or len(spans) > 1:
+        if not self.shows_patterns:
             return ()
         thresholds, effects = self.config.thresholds, model.model.effects
 
@@ -422,7 +427,7 @@ class Study:
             [cells(period, self.layout.greens(period)) for period in heldout],
             simulated,
             quantities,
-            spans.pop(),
+            fit[0].window,
             thresholds,
             self.config.alpha,
         )

@@ -646,9 +646,9 @@ class Thresholds(DayThresholds):
     """Data sets drawn from each half of a model's days. By hand. Halved: the distribution of chance
     is known 1.4 times less exactly."""
     drawn_once: float = 0.25
-    """Largest share of these days in a data set that has each day once at most. Measured on data of
-    the model itself: with 30 of 30 days, the test at 5 % rejected 56 %; with 3 of 30, none. 1:
-    large data sets are held unusual that are not."""
+    """Data sets of at most this share of these days are drawn without repetition, larger ones with.
+    Measured on data of the model itself: 30 of 30 days without repetition, and the test at 5 %
+    rejected 56 %; 3 of 30, none. 1: large data sets are held unusual that are not."""
     least_log_spread: float = 0.02
     """Least standard deviation of the logarithm of a tested statistic. By hand: 80 draws may be
     equal by chance. Halved: tiny differences count as unusual."""

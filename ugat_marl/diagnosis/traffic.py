@@ -120,9 +120,8 @@ def traffic_check(
         sides = [sums(days) for days in (measured, before, after)]
         if all(side is not None and side.shape[-2] for side in sides):
             real, old, new = (side for side in sides if side is not None)
-            seen = real[..., 1].sum(
-                axis=(0, 2)
-            )  # of queues there is one per green, vehicles or not
+            # of queues there is one per green, vehicles or not
+            seen = real[..., 1].sum(axis=(0, 2))
             if (seen[0] if sums is _journeys else seen.max()) >= thresholds.least_journeys:
                 return _check(measure, real, old, new, thresholds)
     return None

@@ -97,7 +97,7 @@ def conclude(
 
 def unchallenged(
     located: Located,
-    verification: Verified,
+    verification: Verified | None,
     thresholds: Thresholds,
     ruled_out: Collection[str],
     timing: Sequence[Effect],
@@ -109,7 +109,7 @@ def unchallenged(
 
     Args:
         located: Comparison of the scenario as it is with the data.
-        verification: Test on the held-out periods.
+        verification: Test on the held-out periods; None without such periods.
         thresholds: Numbers of the method.
         ruled_out: Names of effects that the data cannot show.
         timing: Effects that are read off the signal log.
@@ -117,14 +117,19 @@ def unchallenged(
     """
     blind = f"; {len(ruled_out)} effects could not be examined" if ruled_out else ""
     sentence = f"Nothing in the data contradicts the scenario as it is{blind}."
-    if timing or detection:
-        known = [f"the signal log has {' and '.join(map(str, timing))}"] if timing else []
-        known += [describe_errors(detection)] if detection else []
+    known = [f"the signal log has {' and '.join(map(str, timing))}"] if timing else []
+    known += [describe_errors(detection)] if detection else []
+    if known:
         sentence = f"{capitalised('; '.join(known))}; with that, nothing contradicts the scenario."
-    if verification.before.p < thresholds.fit_level:
-        sentence = (
-            "The scenario agrees with the fitted periods, but not with the held-out ones (p = "
-            f"{verification.before.p:.2g}): did something change between them?"
+    if verification is not None and verification.before.p < thresholds.fit_level:
+        sentence = capitalised(
+            "; ".join(
+                [
+                    *known,
+                    "the scenario agrees with the fitted periods, but not with the held-out ones "
+                    f"(p = {verification.before.p:.2g}): did something change between them?",
+                ]
+            )
         )
         wanted = "what differs between the fitted and the held-out periods"
         return Conclusion("unknown", located.base, (), sentence, wanted)

@@ -58,6 +58,7 @@ from ugat_marl.diagnosis.verdict import (
 )
 from ugat_marl.diagnosis.verify import judged, tables_of, verify_model
 from ugat_marl.effects import Effect, apply_effects
+from ugat_marl.errors import OutputError
 from ugat_marl.files import put_folder
 from ugat_marl.progress import Reporter, Silent
 from ugat_marl.scenarios import Scenario
@@ -89,12 +90,20 @@ def diagnose(
 
     Raises:
         MeasuredDataError: The data hold nothing to compare.
+        OutputError: The scenario is the corrected one in `directory`, which would be replaced; or
+            the folder of that name there holds something else.
     """
+    require_replaceable_correction(scenario, directory / CORRECTED)
     config = config or DiagnosisConfig()
     reporter = reporter or Silent()
     study = Study.of(scenario, measured, config)
     for finding in study.measured.findings:
         reporter.say(f"note: {finding.text}")
+    if config.unnamed and not study.shows_patterns:
+        reporter.say(
+            "note: no unnamed correction will be tried; it needs detections of single vehicles, of "
+            "periods at one time of day"
+        )
     read = timing_effects(scenario, study.network, measured, config.thresholds)
     timing = tuple(effect for effect in read if effect.name not in config.leave_out)
     with reporter.whole("diagnosis", study.work()):
@@ -111,6 +120,30 @@ def diagnose(
     written = replace(written, policy_gap=_known_gap(directory, written))
     written.write(directory)
     return written
+
+
+def require_replaceable_correction(scenario: Scenario, place: Path) -> None:
+    """Refuse a folder for the corrected scenario that may not be replaced.
+
+    Args:
+        scenario: The scenario that is read.
+        place: The folder.
+
+    Raises:
+        OutputError: The scenario lies in it, or it is no scenario.
+    """
+    folder = place.resolve()
+    paths = [document.path for document in scenario.documents if document.path is not None]
+    if any(folder in path.resolve().parents for path in paths):
+        raise OutputError(
+            f"{place}: holds the scenario itself, and the corrected one would replace it; give "
+            "another directory"
+        )
+    if place.exists() and not (place / "scenario.toml").is_file():
+        raise OutputError(
+            f"{place}: is no scenario, and the corrected one would replace it; move it away, or "
+            "give another directory"
+        )
 
 
 def _put_corrected(corrected: Scenario | None, place: Path) -> None:
@@ -307,7 +340,14 @@ def _unchallenged(
 ) -> Conclusion:
     """Conclude that the scenario as it is could have made the fitted periods."""
     thresholds = study.config.thresholds
-    return unchallenged(located, verified, thresholds, study.ruled_out, timing, study.detection)
+    return unchallenged(
+        located,
+        verified if study.measured.of("heldout") else None,
+        thresholds,
+        study.ruled_out,
+        timing,
+        study.detection,
+    )
 
 
 def _beside_the_log(

@@ -10,7 +10,7 @@ import copy
 import math
 import re
 import xml.etree.ElementTree as ET
-from collections.abc import Callable, Collection, Mapping, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
 from itertools import accumulate, pairwise
 from typing import ClassVar
@@ -83,15 +83,19 @@ class Routes:
                 distributions += part.iter("routeDistribution")
         routes.first = {name: edges[0] for name, edges in routes.edges.items() if edges}
         for element in distributions:
-            inner = [_edges(x) for x in element.iter("route")]
-            inner += [routes.edges.get(x, ()) for x in element.get("routes", "").split()]
-            first = {edges[0] for edges in inner if edges}
+            first = routes.begins(element)
             name = element.get("id", "")
             if len(first) == 1:
                 routes.first[name] = next(iter(first))
             elif first:
                 routes.several[name] = first
         return routes
+
+    def begins(self, distribution: ET.Element) -> set[str]:
+        """Return the first edges of the routes of a distribution."""
+        inner = [_edges(x) for x in distribution.iter("route")]
+        inner += [self.edges.get(x, ()) for x in distribution.get("routes", "").split()]
+        return {edges[0] for edges in inner if edges}
 
     def edges_of(self, element: ET.Element) -> tuple[str, ...]:
         """Return the edges of a vehicle or flow; none if SUMO still has to find its way."""
@@ -199,20 +203,23 @@ class DemandTiming(Effect):
         return replace_departing(scenario, self, self.edge, shifted)
 
 
-def _refuse_unknown_origin(
-    effect: Effect, element: ET.Element, several: Mapping[str, Collection[str]]
-) -> None:
-    """Refuse demand whose first edge only SUMO decides.
+def _refuse_unknown_origin(effect: Effect, element: ET.Element, edge: str, routes: Routes) -> None:
+    """Refuse demand of which only SUMO decides whether it starts on an edge.
 
     Raises:
         OptionError: The element starts in a district or at a junction, or draws its route from a
-            distribution of routes that begin on several edges.
+            distribution of routes that begin on that edge and on others.
     """
-    if element.find("route") is None and (drawn := element.get("route", "")) in several:
+    inner = element.find("routeDistribution")
+    if inner is not None:
+        drawn = routes.begins(inner)
+    else:
+        drawn = routes.several.get(element.get("route", ""), set())
+    if element.find("route") is None and edge in drawn:
         raise OptionError(
-            f"{effect}: {element.tag} {element.get('id')!r} draws its route from {drawn!r}, whose "
-            f"routes begin on {', '.join(sorted(several[drawn]))}, so its first edge is not known; "
-            "give it a route of its own, or take every edge (*)"
+            f"{effect}: {element.tag} {element.get('id')!r} draws one of several routes, which "
+            f"begin on {', '.join(sorted(drawn))}, so its first edge is not known; give it a route "
+            "of its own, or take every edge (*)"
         )
     for attribute in ("fromTaz", "fromJunction"):
         if attribute in element.attrib:
@@ -251,7 +258,7 @@ def replace_departing(
         any_changed = False
         for element in root:
             if edge != EVERYWHERE and is_demand(element):
-                _refuse_unknown_origin(effect, element, routes.several)
+                _refuse_unknown_origin(effect, element, edge, routes)
             if is_demand(element) and (edge == EVERYWHERE or routes.origin(element) == edge):
                 any_changed = True
                 children += becomes(element)

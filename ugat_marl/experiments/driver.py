@@ -14,6 +14,7 @@ import contextlib
 import os
 import subprocess
 import sys
+import threading
 from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import FIRST_COMPLETED, Future, ThreadPoolExecutor, wait
 from pathlib import Path
@@ -38,7 +39,7 @@ from ugat_marl.parallel import (
     in_this_process,
     parts_at_a_time,
 )
-from ugat_marl.progress import Advance, Reporter
+from ugat_marl.progress import Reporter
 from ugat_marl.simulation import kept_warm
 
 LOG = "job.log"
@@ -142,8 +143,8 @@ def perform_here(
         reporter: Shows progress.
         workers: Simulations at a time, or an executor, see `perform`.
         on_log: See `perform`.
-        beside: Jobs of the plan that may be performed meanwhile in processes of their own, one
-            less at a time than `workers`. What they say is in their logs.
+        beside: Jobs of the plan that may be performed meanwhile, each in a process and on a core
+            of its own, at most ``workers - 1`` at a time. What they say is in their logs.
 
     Raises:
         OptionError: Another process performs jobs in that folder.
@@ -166,49 +167,59 @@ def perform_here(
 def _performed_beside(
     jobs: Sequence[Job], folder: Path, workers: Workers, reporter: Reporter
 ) -> Iterator[Callable[[Job], None]]:
-    """Perform jobs in processes of their own inside the block.
+    """Perform jobs in processes of their own inside the block, the last ones first.
 
-    Yield a function that waits for a job which has begun, and withdraws one which has not. Whoever
-    calls it performs the job afterwards: a finished job costs nothing, and one that failed tells
-    why. The last jobs come first, because the block itself comes to them last.
+    Yield a function ``settle(job)``. It waits for a job that is running, and cancels one that is
+    not. `perform` then returns at once for a finished job, and raises the error of a failed one.
     """
     if not jobs:
         yield lambda job: None
         return
-    stop, running = Stop(), dict[str, Future[None]]()
-    order = jobs[::-1]
-    order = sorted(order, key=lambda job: job.start is not None)  # those wait for others
+    last_first = jobs[::-1]
+    stop, order = Stop(), sorted(last_first, key=lambda job: job.start is not None)
+    running: dict[str, tuple[Future[None], threading.Event]] = {}
     with (
         reporter.task(OTHER_PARTS, len(jobs)) as advance,
         ThreadPoolExecutor(max(1, parts_at_a_time(workers) - 1)) as pool,
     ):
 
         def settle(job: Job) -> None:
-            future = running.get(job.name)
-            if future is not None and not future.cancel():
+            if job.name not in running:
+                return
+            future, wanted = running[job.name]
+            wanted.set()
+            if not future.cancel():
                 while not future.done():  # the timeout lets Ctrl-C interrupt the wait
                     wait([future], timeout=0.2)
 
-        for job in order:
-            running[job.name] = pool.submit(_perform_when_ready, job, folder, stop, advance)
+        def perform_it(job: Job, wanted: threading.Event) -> None:
+            if _is_ready(job, folder, stop, wanted):
+                place = folder.resolve() / job.name
+                job.write(place)
+                _perform_apart(str(place), stop, forked=True)
+                if record_of(job, folder) is not None:
+                    advance(note=job.short)
+                elif not stop.is_set():
+                    reporter.say(f"note: {_failure(place)}")
+
         try:
+            for job in order:
+                wanted = threading.Event()
+                running[job.name] = pool.submit(perform_it, job, wanted), wanted
             yield settle
         finally:
             stop.set()
-            for future in running.values():
+            for future, _ in running.values():
                 future.cancel()
 
 
-def _perform_when_ready(job: Job, folder: Path, stop: Stop, advance: Advance) -> None:
-    """Perform a job in another process as soon as the learner it starts from is there."""
+def _is_ready(job: Job, folder: Path, stop: Stop, wanted: threading.Event) -> bool:
+    """Wait for the learner that a job starts from; False if somebody wants the job before."""
     start = None if job.start is None else folder / job.start
     while start is not None and not start.exists():
-        if stop.wait(0.5):
-            return
-    place = folder.resolve() / job.name
-    job.write(place)
-    _perform_apart(str(place), stop, forked=True)
-    advance(note=job.short)
+        if wanted.is_set() or stop.wait(0.5):
+            return False
+    return True
 
 
 def _perform_apart(folder: str, stop: Stop, forked: bool) -> None:

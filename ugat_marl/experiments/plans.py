@@ -7,7 +7,7 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 
 from ugat_marl.errors import counted
-from ugat_marl.experiments.driver import OTHER_PARTS, record_of
+from ugat_marl.experiments.driver import OTHER_PARTS
 from ugat_marl.experiments.forked import jobs_fork_on
 from ugat_marl.experiments.jobs import Job, Record
 from ugat_marl.grounding import ROLL_OUTS, UgatConfig
@@ -43,9 +43,10 @@ Measured with `single-v1`, `arterial1x5-v1` and a drawn network of four lights.
 def jobs_beside(plan: Sequence[Job], folder: Path, episode_s: float, workers: Workers) -> list[Job]:
     """Return the unfinished jobs that are performed beside the first one.
 
-    There is none if one core is used, if an executor does the work elsewhere, or if the others are
-    too little to load torch again for them. A learner of the user's own may exist in this process
-    alone.
+    Each has one core, so a job that is longer than the first one is not among them. There is none
+    if the first job is finished, if one core is used, if an executor does the work elsewhere, or if
+    the others are too little to load torch again for them. A learner of the user's own may exist in
+    this process alone.
 
     Args:
         plan: Jobs of the run.
@@ -55,14 +56,18 @@ def jobs_beside(plan: Sequence[Job], folder: Path, episode_s: float, workers: Wo
     """
     if not in_this_process(workers) or parts_at_a_time(workers) == 1:
         return []
+
+    def work(*jobs: Job) -> float:
+        return _total(work_of(jobs, folder, episode_s))
+
     jobs = [
         job
         for job in plan[1:]
         if jobs_fork_on(job.device)
         and not is_own(job.setting.learner.name)
-        and record_of(job, folder) is None
+        and 0 < work(job) <= work(plan[0])
     ]
-    return jobs if _total(work_of(jobs, folder, episode_s)) >= WORTH else []
+    return jobs if work(*jobs) >= WORTH else []
 
 
 def described_plan(

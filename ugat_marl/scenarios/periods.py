@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import Literal
 
 import numpy as np
@@ -127,22 +127,18 @@ class Passages:
             np.where(count == 1, rows[3][starts], np.nan),
         )
 
-    def staying(self) -> Passages:
-        """Return the passages of a period; the last one, if it has no off, is on for ever."""
-        off = self.off_s.copy()
-        if len(self) and np.isnan(off[-1]):
-            off[-1] = np.inf
-        return replace(self, off_s=off)
-
     def spans(self) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
         """Return begin and end of each passage, ``(passages,)``, without NaN.
 
-        If a vehicle comes or leaves unseen, its other time is both. Only the last one may stay to
-        the end of the period; its end is infinite.
+        If a vehicle comes or leaves unseen, its other time is both. The last ones without an off
+        stay to the end of the period and are on for ever. One without any time is on throughout.
         """
         begin = np.where(np.isnan(self.on_s), self.off_s, self.on_s)
-        off = self.staying().off_s
-        return begin, np.where(np.isnan(off), begin, off)
+        begin = np.where(np.isnan(begin), -np.inf, begin)
+        end = np.where(np.isnan(self.off_s), begin, self.off_s)
+        left = np.flatnonzero(~np.isnan(self.off_s))
+        end[left[-1] + 1 if len(left) else 0 :] = np.inf
+        return begin, end
 
     def at(self, chosen: NDArray[np.bool_] | NDArray[np.int64]) -> Passages:
         """Return the chosen passages."""

@@ -14,6 +14,7 @@ import json
 import re
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
+from itertools import takewhile
 from pathlib import Path
 from typing import Any
 
@@ -181,6 +182,8 @@ def shipped_scenarios() -> Iterator[tuple[str, Path]]:
 def _load_directory(directory: Path) -> Scenario:
     file = directory / "scenario.toml"
     settings = validate_settings(read_toml(file, ScenarioError), str(file))
+    lines = file.read_text(encoding="utf-8").splitlines()
+    first = takewhile(lambda line: line.startswith(_MADE_BY), lines)
 
     def document(name: str, key: str) -> Document:
         path = directory / name
@@ -194,8 +197,12 @@ def _load_directory(directory: Path) -> Scenario:
         routes=tuple(document(name, "routes") for name in settings.routes),
         additional=tuple(document(name, "additional") for name in settings.additional),
         settings=settings,
+        applied=tuple(line.removeprefix(_MADE_BY) for line in first),
     )
 
+
+_MADE_BY = "# made by applying "
+"""Begin of a comment in ``scenario.toml`` that names an effect."""
 
 _SYNONYMS = {
     "net-file": ("net-file", "net", "n"),
@@ -345,9 +352,10 @@ def scenario_toml(settings: Mapping[str, Any], applied: Sequence[str] = ()) -> s
 
     Args:
         settings: Keys and values; nested mappings become tables.
-        applied: Descriptions of the effects that made the scenario, written as comments.
+        applied: Descriptions of the effects that made the scenario: comments at the beginning, from
+            which `read_scenario` reads them.
     """
-    lines = [f"# made by applying {text}" for text in applied]
+    lines = [f"{_MADE_BY}{text}" for text in applied]
     tables: list[str] = []
     for key, value in settings.items():
         if isinstance(value, dict):

@@ -105,11 +105,12 @@ class _Track:
             on = np.nan
         if on is None:
             return None
-        at = {"front": (on,), "mean": (on, off or on)}.get(
-            detector.speed_at or "rear", (off or on,)
-        )
+        if off is None:  # still there at the end, or gone to another lane
+            off = np.inf if end == len(self.lane) else np.nan
+        last = off if np.isfinite(off) else on
+        at = {"front": (on,), "mean": (on, last)}.get(detector.speed_at or "rear", (last,))
         speed = float(np.mean(np.interp(at, self.time_s, self.speed_mps)))
-        return on, np.nan if off is None else off, speed, self.length_m
+        return on, off, speed, self.length_m
 
     def _turned(self, index: int) -> bool:
         """Return True if a position is on another road than the one before."""
@@ -224,10 +225,11 @@ def _over(
     keys = [(detector.id, lane) for lane in detector.lanes]
     lanes = [_passages(rows[key]) for key in keys if key in rows]
     if len(lanes) > 1:
-        return Passages.together([passages.staying() for passages in lanes])
+        return Passages.together(lanes)
     return lanes[0] if lanes else None
 
 
 def _passages(rows: list[tuple[float, ...]]) -> Passages:
-    table = np.array(sorted(rows), dtype=np.float64)
+    rows = sorted(rows, key=lambda row: row[1] if np.isnan(row[0]) else row[0])
+    table = np.array(rows, dtype=np.float64)
     return Passages(*np.round(table.T, 3))
