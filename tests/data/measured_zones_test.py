@@ -67,7 +67,7 @@ def test_loops_know_who_left_unseen_and_who_is_still_there(tmp_path: Path) -> No
         event("wide", 10.0, "enter", "leaves its lane"),
         event("wide@1@end", 12.0, "leave", "leaves its lane"),
         event("wide@1", 20.0, "enter", "b"), event("wide@1@end", 21.0, "leave", "b"),
-        event("wide", 30.0, "enter", "stays"),
+        event("wide", 30.0, "enter", "stays"), event("wide", 31.0, "leave", "stays"),
         event("wide@1", 40.0, "enter", "c"), event("wide@1@end", 41.0, "leave", "c"),
     ]  # fmt: skip
     (tmp_path / "loops.xml").write_text("\n".join(rows))

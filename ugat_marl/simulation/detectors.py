@@ -5,7 +5,7 @@ from __future__ import annotations
 import re
 import xml.etree.ElementTree as ET
 from collections import defaultdict
-from collections.abc import Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
 
@@ -131,10 +131,10 @@ def read_passages(
     """
     content = events_in(file, "detections")
     rows: dict[bytes, list[tuple[float, bool, bytes, float, float]]] = defaultdict(list)
-    last_seen: dict[bytes, float] = {}  # the events are in the order of time
+    last_at: dict[bytes, bytes] = {}  # vehicle to the loop of its last event
     for name, time, state, vehicle, speed, length in _EVENT.findall(content):
         rows[name].append((float(time), state == b"enter", vehicle, float(speed), float(length)))
-        last_seen[vehicle] = float(time)
+        last_at[vehicle] = name
     by_detector: dict[str, Passages] = {}
     for detector in detectors:
         by_lane: list[Passages] = []
@@ -142,7 +142,8 @@ def read_passages(
             first = _loop(detector, number).encode()
             last = first + _END.encode() if detector.length_m > 0 else first
             speed_at = detector.speed_at or "rear"
-            by_lane.append(_passages(rows[first], rows[last], speed_at, last_seen))
+            gone = {row[2] for row in rows[first] if last_at[row[2]] not in (first, last)}
+            by_lane.append(_passages(rows[first], rows[last], speed_at, gone))
         passages = by_lane[0] if len(by_lane) == 1 else Passages.together(by_lane)
         passages = _clipped(delayed(passages, (1 - detector.steps_early) * step_s), begin_s, end_s)
         if len(passages):
@@ -154,16 +155,22 @@ def _passages(
     front: list[tuple[float, bool, bytes, float, float]],
     rear: list[tuple[float, bool, bytes, float, float]],
     speed_at: SpeedPoint,
-    last_seen: Mapping[bytes, float],
+    gone: Collection[bytes],
 ) -> Passages:
     """Pair each entry at the upstream end with the exit of the same visit at the downstream end.
 
     The exit of a visit is the first one at or after its entry, and before the next entry of the
     vehicle. The speed of a visit without an entry is that of the rear, whatever `speed_at` says.
 
+    Args:
+        front: Events at the upstream end: time, True for an entry, vehicle, speed and length.
+        rear: Events at the downstream end.
+        speed_at: Where the speed is measured.
+        gone: Vehicles that were seen elsewhere last.
+
     Returns:
         Passages, sorted by time. A visit without an entry is on since minus infinity. One without
-        an exit is on for ever, or has no off (NaN) if the vehicle was seen elsewhere later.
+        an exit is on for ever, or has no off (NaN) if the vehicle is gone.
     """
     left: dict[bytes, list[tuple[float, float]]] = defaultdict(list)
     for time, enters, vehicle, speed, _ in rear:
@@ -175,7 +182,7 @@ def _passages(
     for time, enters, vehicle, speed, length in reversed(front):  # so that the last entry is first
         if enters:
             exits, speed_off = left[vehicle], speed
-            off = np.nan if last_seen[vehicle] > time else np.inf
+            off = np.nan if vehicle in gone else np.inf
             while exits and exits[-1][0] >= time:
                 if np.isfinite(off):
                     strays.append((off, speed_off))
