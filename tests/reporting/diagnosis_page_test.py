@@ -362,7 +362,8 @@ def test_the_usual_criteria_stand_first_and_ours_beside_them() -> None:
         "As it is: GEH < 5 on 100 % of counts (met, usual: 85 %), FHWA 1 of 4 criteria met; our "
         "test not met, p < 0.001. Corrected: GEH < 5 on 100 % of counts (met, usual: 85 %), FHWA "
         "not known (it needs three whole days of counts at one time of day); our test met, p = "
-        "0.33. GEH does not see this gap. Ours is stricter than GEH, which sees how many vehicles pass"
+        "0.33. GEH does not see this gap. Ours is stricter than GEH, which sees how many vehicles "
+        "pass"
     )
     assert "whose own chance can fail a model" not in text  # where FHWA failed, so did ours
     same = " ".join(printed(diagnosis_of("no_discrepancy")).split())
