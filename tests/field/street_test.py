@@ -335,7 +335,8 @@ def test_a_stopped_command_leaves_its_log_and_nothing_else(
     assert [row["time_s"] for row in rows] == [10.0 * n for n in range(len(rows))]
     told = json.loads(health.read_text())
     assert (told["state"], told["times_gone"]) == ("ended", 0)
-    assert told["decisions"] == len(rows)
+    # the signal may have come between the last line and its count
+    assert told["decisions"] in (len(rows) - 1, len(rows))
     assert sorted(entry.name for entry in tmp_path.iterdir()) == ["field.jsonl", "health.json"]
 
 

@@ -170,10 +170,13 @@ class FieldLoop:
         return decision, plans
 
     def _record(self, decision: Decision, plans: Mapping[str, list[Segment]]) -> None:
-        """Count and log a decision, after its first states are set: no light waits for a disk."""
-        self.summary.add(decision)
+        """Log and count a decision, after its first states are set: no light waits for a disk.
+
+        A signal may end the loop in between. So every decision that is counted is in the log.
+        """
         if self._log is not None:
             self._log.add(decision)
+        self.summary.add(decision)
         self._without_green = _without_green(self._site, plans)
 
     def close(self) -> None:
