@@ -120,3 +120,15 @@ def test_quiet_says_nothing_and_verbose_all() -> None:
     with loudness("verbose"):
         assert Bars(console).verbose
     assert not Bars(console).verbose
+
+
+@pytest.mark.parametrize("terminal", [True, False])
+def test_a_task_inside_of_another_leaves_its_line_too(terminal: bool) -> None:
+    out = io.StringIO()
+    bars = Bars(Console(file=out, force_terminal=terminal, width=80, color_system=None))
+    with bars.task("other parts", 1) as outer, bars.task("training", 2) as inner:
+        for _ in range(2):
+            inner()
+        outer()
+    for line in ("training", "other parts"):
+        assert any(text.count(line) and "left 00:00" in text for text in out.getvalue().split("\n"))

@@ -118,6 +118,7 @@ class Bars:
         self._quiet = _loudness[-1] == "quiet"
         self.verbose = _loudness[-1] == "verbose"
         self._whole: _Whole | None = None
+        self._is_live = False
 
     @contextlib.contextmanager
     def task(self, name: str, total: int) -> Iterator[Advance]:
@@ -143,7 +144,10 @@ class Bars:
                 whole.lines.print_at_times()
 
         outer = whole.step if whole is not None else None  # a task may hold others
-        with contextlib.nullcontext() if whole is not None else progress:
+        # rich before 14 refuses a second live display; a bar inside another is printed at its end
+        is_shown = whole is None and not self._is_live
+        with progress if is_shown else contextlib.nullcontext():
+            self._is_live |= is_shown
             if whole is not None:
                 whole.step = progress
             try:
@@ -151,9 +155,12 @@ class Bars:
                 progress.update(bar, completed=total)  # the work may end early by its own rule
                 if whole is not None:
                     whole.advance(name, max(left, 0))
+                if not is_shown:
                     lines.print()
+                if whole is not None:
                     whole.lines.print_at_times()
             finally:
+                self._is_live &= not is_shown
                 if whole is not None:
                     whole.step = outer
 
