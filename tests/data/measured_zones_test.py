@@ -26,6 +26,22 @@ def seen(*rows: tuple[float, float, float, float]) -> Passages:
     return Passages(*np.array(rows, dtype=np.float64).T)
 
 
+ZONE = Detector("wide", "a_0", 20.0, 4.0, "stop", None, "signals", ("a_1",))
+
+
+def event(loop: str, time: float, state: str, vehicle: str) -> str:
+    return (
+        f'<instantOut id="{loop}" time="{time:.2f}" state="{state}" vehID="{vehicle}" '
+        'speed="5.00" length="5.00" type="car"/>'
+    )
+
+
+def over_the_zone(folder: Path, rows: list[str]) -> Passages:
+    """What is read of events at the loops of `ZONE`."""
+    (folder / "loops.xml").write_text("\n".join(rows))
+    return read_passages(folder / "loops.xml", [ZONE], 0.0, 100.0, 0.0)["wide"]
+
+
 def test_vehicles_side_by_side_are_one_passage() -> None:
     left = seen((NAN, 3.0, 4.0, 5.0), (10.0, 12.0, 8.0, 5.0), (30.0, 31.0, 9.0, 6.0))
     right = seen((11.0, 14.0, 12.0, 4.0), (14.0, 15.0, NAN, 4.0), (40.0, NAN, 7.0, 4.0))
@@ -57,12 +73,6 @@ def test_a_vehicle_that_changes_lanes_over_a_zone_hides_nobody() -> None:
 
 
 def test_loops_know_who_left_unseen_and_who_is_still_there(tmp_path: Path) -> None:
-    def event(loop: str, time: float, state: str, vehicle: str) -> str:
-        return (
-            f'<instantOut id="{loop}" time="{time:.2f}" state="{state}" vehID="{vehicle}" '
-            'speed="5.00" length="5.00" type="car"/>'
-        )
-
     rows = [
         event("wide", 10.0, "enter", "leaves its lane"),
         event("wide@1@end", 12.0, "leave", "leaves its lane"),
@@ -70,20 +80,15 @@ def test_loops_know_who_left_unseen_and_who_is_still_there(tmp_path: Path) -> No
         event("wide", 30.0, "enter", "stays"), event("wide", 31.0, "leave", "stays"),
         event("wide@1", 40.0, "enter", "c"), event("wide@1@end", 41.0, "leave", "c"),
     ]  # fmt: skip
-    (tmp_path / "loops.xml").write_text("\n".join(rows))
-    found = read_passages(tmp_path / "loops.xml", [ZONE], 0.0, 100.0, 0.0)["wide"]
+    found = over_the_zone(tmp_path, rows)
     np.testing.assert_array_equal(found.on_s, [10.0, NAN, 20.0, 30.0])
     np.testing.assert_array_equal(found.off_s, [NAN, 12.0, 21.0, NAN])
 
 
 @pytest.mark.parametrize("name", ["", ".."])
-def test_the_folder_in_use_is_not_replaced(name: str, tmp_path: Path) -> None:
-    del tmp_path
+def test_the_folder_in_use_is_not_replaced(name: str) -> None:
     with pytest.raises(OutputError, match="is a folder in use"):
         require_replaceable(Path(name))
-
-
-ZONE = Detector("wide", "a_0", 20.0, 4.0, "stop", None, "signals", ("a_1",))
 
 
 def test_a_zone_has_loops_on_each_of_its_lanes(tmp_path: Path) -> None:
@@ -95,19 +100,12 @@ def test_a_zone_has_loops_on_each_of_its_lanes(tmp_path: Path) -> None:
 
 
 def test_events_of_both_lanes_are_one_stream(tmp_path: Path) -> None:
-    def event(loop: str, time: float, state: str, vehicle: str) -> str:
-        return (
-            f'<instantOut id="{loop}" time="{time:.2f}" state="{state}" vehID="{vehicle}" '
-            'speed="5.00" length="5.00" type="car"/>'
-        )
-
     rows = [
         event("wide", 10.0, "enter", "a"), event("wide@end", 12.0, "leave", "a"),
         event("wide@1", 11.0, "enter", "b"), event("wide@1@end", 13.0, "leave", "b"),
         event("wide@1", 20.0, "enter", "c"), event("wide@1@end", 21.0, "leave", "c"),
     ]  # fmt: skip
-    (tmp_path / "loops.xml").write_text("\n".join(rows))
-    found = read_passages(tmp_path / "loops.xml", [ZONE], 0.0, 100.0, 0.0)["wide"]
+    found = over_the_zone(tmp_path, rows)
     assert found.on_s.tolist() == [10.0, 20.0]
     assert found.off_s.tolist() == [13.0, 21.0]
 

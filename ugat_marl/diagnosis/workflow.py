@@ -93,7 +93,7 @@ def diagnose(
         OutputError: The scenario is the corrected one in `directory`, which would be replaced; or
             the folder of that name there holds something else.
     """
-    require_replaceable_correction(scenario, directory / CORRECTED)
+    _require_replaceable(scenario, directory / CORRECTED)
     config = config or DiagnosisConfig()
     reporter = reporter or Silent()
     study = Study.of(scenario, measured, config)
@@ -122,7 +122,7 @@ def diagnose(
     return written
 
 
-def require_replaceable_correction(scenario: Scenario, place: Path) -> None:
+def _require_replaceable(scenario: Scenario, place: Path) -> None:
     """Refuse a folder for the corrected scenario that may not be replaced.
 
     Args:

@@ -97,6 +97,15 @@ class Routes:
         inner += [self.edges.get(x, ()) for x in distribution.get("routes", "").split()]
         return {edges[0] for edges in inner if edges}
 
+    def drawn(self, element: ET.Element) -> set[str]:
+        """Return the edges of which a vehicle or flow draws its first one; none if it does not."""
+        if element.find("route") is not None:
+            return set()
+        inner = element.find("routeDistribution")
+        if inner is not None:
+            return self.begins(inner)
+        return self.several.get(element.get("route", ""), set())
+
     def edges_of(self, element: ET.Element) -> tuple[str, ...]:
         """Return the edges of a vehicle or flow; none if SUMO still has to find its way."""
         inner = element.find("route")
@@ -210,12 +219,8 @@ def _refuse_unknown_origin(effect: Effect, element: ET.Element, edge: str, route
         OptionError: The element starts in a district or at a junction, or draws its route from a
             distribution of routes that begin on that edge and on others.
     """
-    inner = element.find("routeDistribution")
-    if inner is not None:
-        drawn = routes.begins(inner)
-    else:
-        drawn = routes.several.get(element.get("route", ""), set())
-    if element.find("route") is None and edge in drawn:
+    drawn = routes.drawn(element)
+    if edge in drawn:
         raise OptionError(
             f"{effect}: {element.tag} {element.get('id')!r} draws one of several routes, which "
             f"begin on {', '.join(sorted(drawn))}, so its first edge is not known; give it a route "

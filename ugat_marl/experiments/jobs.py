@@ -59,7 +59,7 @@ from ugat_marl.grounding import (
     require_histories,
 )
 from ugat_marl.parallel import Workers, in_this_process, show_life
-from ugat_marl.policies import STANDARD_RULES, TUNED_RULES, Learner, Policy, PolicyFactory, Taught
+from ugat_marl.policies import STANDARD_RULES, TUNED_RULES, Policy, PolicyFactory, attended
 from ugat_marl.progress import Bars, Reporter
 from ugat_marl.simulation import exit_when_input_ends, kept_warm
 
@@ -454,7 +454,7 @@ def _plain(
         else:
             if before is not None:
                 learner.load(before)  # its world may have had another teacher
-            _attend(learner, env, job, reporter)
+            attended(learner, env, job.seed, reporter, f"lessons: {job.setting.name}")
         marks = [mark for mark in job.marks if record.missing(job, mark) or mark == job.episodes]
         if marks[0] < learner.episodes:
             raise OptionError(
@@ -476,14 +476,6 @@ def _plain(
             ):
                 _save(policy, folder / POLICY)
                 yield mark, policy
-
-
-def _attend(learner: Learner, env: AnyParallelEnv, job: Job, reporter: Reporter) -> None:
-    """Let a learner watch the rule that is good in an environment, if it has a teacher."""
-    if isinstance(learner, Taught) and (number := learner.plays(env)):
-        assert job.seed is not None
-        with reporter.task(f"lessons: {job.setting.name}", number) as advance:
-            learner.attend(env, job.seed, lambda rule: advance(note=rule))
 
 
 def _grounded(

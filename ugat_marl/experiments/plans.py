@@ -60,12 +60,13 @@ def jobs_beside(plan: Sequence[Job], folder: Path, episode_s: float, workers: Wo
     def work(*jobs: Job) -> float:
         return _total(work_of(jobs, folder, episode_s))
 
+    longest = work(plan[0])
     jobs = [
         job
         for job in plan[1:]
         if jobs_fork_on(job.device)
         and not is_own(job.setting.learner.name)
-        and 0 < work(job) <= work(plan[0])
+        and 0 < work(job) <= longest
     ]
     return jobs if work(*jobs) >= WORTH else []
 

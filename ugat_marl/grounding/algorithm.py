@@ -13,7 +13,7 @@ from ugat_marl.grounding.config import UgatConfig
 from ugat_marl.grounding.gate import Gate
 from ugat_marl.grounding.state import RunState, is_kept
 from ugat_marl.grounding.worlds import World
-from ugat_marl.policies import Learner, Policy, Taught
+from ugat_marl.policies import Learner, Policy, attended
 
 CHECKPOINT_EPISODES = 10
 """Episodes of plain training between two checkpoints."""
@@ -85,14 +85,12 @@ class Algorithm:
         Returns:
             The policy after the lessons; None without a teacher.
         """
-        if not isinstance(learner, Taught) or not (number := learner.plays(env, best)):
+        reporter = self.run.reporter
+        with contextlib.nullcontext() if gate is None else gate.uncounted():
+            name = attended(learner, env, self.seed, reporter, f"lessons, {title}", best)
+        if name is None:
             return None
-        with (
-            self.run.reporter.task(f"lessons, {title}", number) as advance,
-            contextlib.nullcontext() if gate is None else gate.uncounted(),
-        ):
-            name = learner.attend(env, self.seed, lambda rule: advance(note=rule), best)
-        self.run.reporter.say(f"{title}: {name} teaches")
+        reporter.say(f"{title}: {name} teaches")
         return learner.policy()
 
     def _learn(

@@ -22,6 +22,7 @@ from .learners.dqn import DQN as DQN
 from .learners.dqn_config import DQNConfig as DQNConfig
 from .learners.dqn_config import Usual as Usual
 from .learners.dqn_config import UsualName as UsualName
+from .learners.lessons import attended as attended
 from .learners.library import LibraryLearner as LibraryLearner
 from .learners.library import TrainingEnv as TrainingEnv
 from .learners.library import check_settings as check_settings

@@ -12,10 +12,11 @@ import numpy as np
 
 from ugat_marl.envs import AnyParallelEnv
 from ugat_marl.errors import OptionError
-from ugat_marl.policies.protocols import Policy
+from ugat_marl.policies.protocols import Learner, Policy, Taught
 from ugat_marl.policies.rollout import roll_out
 from ugat_marl.policies.rules.catalogue import STANDARD_RULES
 from ugat_marl.policies.rules.named import NamedRule
+from ugat_marl.progress import Reporter
 from ugat_marl.seeding import derive_seed
 
 BEST = "best"
@@ -29,6 +30,33 @@ FINAL_EPISODES = 2
 
 OnPlay = Callable[[str], None]
 """Called after an episode with the rule that played it."""
+
+
+def attended(
+    learner: Learner,
+    env: AnyParallelEnv,
+    seed: int,
+    reporter: Reporter,
+    title: str,
+    best: str | None = None,
+) -> str | None:
+    """Let a learner watch the rule that is good in an environment, with a progress bar.
+
+    Args:
+        learner: The learner.
+        env: The environment.
+        seed: Root of the seeds of the episodes.
+        reporter: Shows progress.
+        title: Name of the progress bar.
+        best: The best rule there, if it is known.
+
+    Returns:
+        Spelling of the rule; None if the learner has no teacher.
+    """
+    if not isinstance(learner, Taught) or not (number := learner.plays(env, best)):
+        return None
+    with reporter.task(title, number) as advance:
+        return learner.attend(env, seed, lambda rule: advance(note=rule), best)
 
 
 def find_teacher(
