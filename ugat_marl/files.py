@@ -24,7 +24,7 @@ import weakref
 import xml.etree.ElementTree as ET
 import zipfile
 import zlib
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, BinaryIO, NamedTuple
@@ -37,6 +37,8 @@ _PIECE = 1 << 20
 _KEPT = 8 << 20
 """Bytes of an edited document above which it is kept in a file instead of in memory."""
 _INDENT = "    "
+_BEGINS_ROW = re.compile(rf"\n{_INDENT}(?=<[^/])")
+"""Where a child begins in a document that `Draft` wrote."""
 _UNPACKED = 256 << 20
 """Unpacked bytes from which the ratio of an archive counts."""
 _MOST_RATIO = 100
@@ -405,7 +407,7 @@ def scan_xml(pieces: Iterable[bytes], name: str) -> Iterator[Tag]:
     def start(tag: str, attributes: dict[str, str]) -> None:
         tags.append(Tag(tag, attributes, parser.CurrentLineNumber, around[-1]))
         around.append(tag)
-        if len(around) > _DEEPEST:
+        if len(around) > _DEEPEST + 1:  # with the text around the root
             _refuse_depth(parser, name)
 
     def end(tag: str) -> None:
@@ -432,9 +434,10 @@ def parse_xml(content: bytes, name: str) -> ET.Element:
         ScenarioError: The document is not well-formed (perhaps cut short), or declares a document
             type or an entity.
     """
-    parser, builder = _building_parser(name)
-    _parse(parser, content, True, name)
-    return builder.close()
+    growing = _GrowingTree(name)
+    for begin in range(0, len(content), _PIECE):
+        growing.read(content[begin : begin + _PIECE])
+    return growing.ended()
 
 
 def parts_of_xml(pieces: Iterable[bytes], name: str) -> Iterator[ET.Element]:
@@ -449,51 +452,83 @@ def parts_of_xml(pieces: Iterable[bytes], name: str) -> Iterator[ET.Element]:
     Raises:
         ScenarioError: As for `parse_xml`.
     """
-    parser, builder = _building_parser(name)
-    root: list[ET.Element] = []
-
-    def first(tag: str, attributes: dict[str, str]) -> None:
-        root.append(builder.start(tag, attributes))
-        parser.StartElementHandler = builder.start
-
-    parser.StartElementHandler = first
+    growing = _GrowingTree(name)
     for piece in pieces:
-        _parse(parser, piece, False, name)
-        if root and len(root[0]) > 1:  # the last child may go on
-            part = ET.Element(root[0].tag, root[0].attrib)
-            part[:] = root[0][:-1]
-            del root[0][:-1]
+        growing.read(piece)
+        if (part := growing.whole_children()) is not None:
             yield part
-    _parse(parser, b"", True, name)
-    yield builder.close()
+    yield growing.ended()
 
 
-def _building_parser(name: str) -> tuple[expat.XMLParserType, ET.TreeBuilder]:
-    builder = _BoundedBuilder()
-    parser = _refusing_parser(name)
-    builder.too_deep = lambda: _refuse_depth(parser, name)
-    parser.buffer_text = True
-    parser.StartElementHandler = builder.start
-    parser.EndElementHandler = builder.end
-    parser.CharacterDataHandler = builder.data
-    return parser, builder
+class _GrowingTree:
+    """A tree that grows with the pieces of its document, and is not deeper than `_DEEPEST`.
+
+    Expat calls the builder without Python in between: a method of ours for each element would take
+    a third of the time.
+
+    Args:
+        name: Name of the document in errors.
+    """
+
+    def __init__(self, name: str) -> None:
+        self._name = name
+        self._root: ET.Element | None = None
+        self._shallow = 0  # children that are whole, and were looked through
+        self._builder = ET.TreeBuilder()
+        self._parser = _refusing_parser(name)
+        self._parser.buffer_text = True
+        self._parser.StartElementHandler = self._first
+        self._parser.EndElementHandler = self._builder.end
+        self._parser.CharacterDataHandler = self._builder.data
+
+    def _first(self, tag: str, attributes: dict[str, str]) -> None:
+        self._root = self._builder.start(tag, attributes)
+        self._parser.StartElementHandler = self._builder.start
+
+    def read(self, piece: bytes) -> None:
+        """Read the next piece.
+
+        Raises:
+            ScenarioError: As for `parse_xml`.
+        """
+        _parse(self._parser, piece, False, self._name)
+        if self._root is None:
+            return
+        if _are_deep(self._root[self._shallow :]):
+            _refuse_depth(self._parser, self._name)
+        self._shallow = max(0, len(self._root) - 1)
+
+    def whole_children(self) -> ET.Element | None:
+        """Take all children but the last, which may go on, and return them in a copy of the root.
+
+        Return None if there are none.
+        """
+        if self._root is None or len(self._root) < 2:
+            return None
+        part = ET.Element(self._root.tag, self._root.attrib)
+        part[:] = self._root[:-1]
+        del self._root[:-1]
+        self._shallow = 0
+        return part
+
+    def ended(self) -> ET.Element:
+        """Return the tree, or what is left of it, behind the last piece.
+
+        Raises:
+            ScenarioError: As for `parse_xml`.
+        """
+        _parse(self._parser, b"", True, self._name)
+        return self._builder.close()
 
 
-class _BoundedBuilder(ET.TreeBuilder):
-    """Builder of a tree that is not deeper than `_DEEPEST`."""
-
-    too_deep: Callable[[], None]
-    _depth = 0
-
-    def start(self, tag: str, attrs: dict[str, str], /) -> ET.Element:
-        self._depth += 1
-        if self._depth > _DEEPEST:
-            self.too_deep()
-        return super().start(tag, attrs)
-
-    def end(self, tag: str, /) -> ET.Element:
-        self._depth -= 1
-        return super().end(tag)
+def _are_deep(children: list[ET.Element]) -> bool:
+    """Return True if more than `_DEEPEST` elements lie inside each other, with the root."""
+    level = children
+    for _ in range(1, _DEEPEST):
+        if not level:
+            return False
+        level = [inner for element in level for inner in element]
+    return bool(level)
 
 
 def _refuse_depth(parser: expat.XMLParserType, name: str) -> None:
@@ -585,17 +620,19 @@ class Document:
         content: The edited bytes, or None if the file on disk is used.
         home: Folder of an edited document that is too long for memory. The folder is removed with
             this object.
+        in_rows: True if the content is known to be as `Draft` writes it.
     """
 
     name: str
     path: Path | None = None
     content: bytes | None = None
     home: OwnDirectory | None = field(default=None, compare=False, repr=False)
+    in_rows: bool = field(default=False, compare=False, repr=False)
 
     def __reduce__(self) -> tuple[Any, ...]:
-        if self.home is None:
-            return Document, (self.name, self.path, self.content)
-        return Document, (self.name, None, self.read())  # a copy may outlive the file
+        content = self.content if self.home is None else self.read()  # a copy may outlive the file
+        path = self.path if self.home is None else None
+        return Document, (self.name, path, content, None, self.in_rows)
 
     @property
     def source(self) -> str:
@@ -638,6 +675,29 @@ class Document:
         """Yield the document as trees (see `parts_of_xml`); show progress if it is a long file."""
         return parts_of_xml(self.pieces(usual()), self.source)
 
+    def rows(self) -> Rows | None:
+        """Return the texts of the children, to read or change few of them; None if it is long.
+
+        They are kept with an unchanged document, because many scenarios are made of one.
+        """
+        if not self.in_rows:
+            # Edited documents do not change; a file may, between two episodes.
+            stat = self.path.stat() if self.content is None and self.path is not None else None
+            state = stat and (stat.st_mtime_ns, stat.st_size)
+            if stat is not None and stat.st_size > _KEPT:
+                return None
+            kept: tuple[Any, Document] | None = self.__dict__.get("_in_rows")
+            if kept is None or kept[0] != state:
+                kept = state, self.changed(lambda _: None)
+                self.__dict__["_in_rows"] = kept
+            return kept[1].rows() if kept[1].in_rows else None
+        assert self.content is not None
+        start, *children = _BEGINS_ROW.split(self.content.decode())
+        if not children:
+            return Rows(self.name, start, (), "")
+        children[-1], tag, end = children[-1].rpartition("\n</")
+        return Rows(self.name, start, tuple(children), f"{tag}{end}")
+
     def changed(self, change: Callable[[ET.Element], object]) -> Document:
         """Return a document whose parts (see `parts`) a function has changed, in little memory."""
         draft = None
@@ -662,6 +722,45 @@ class Document:
                 shutil.copyfile(self.path, temporary)
 
 
+@dataclass(frozen=True)
+class Rows:
+    """A document as the texts of its children, each with its place.
+
+    Attributes:
+        name: File name.
+        start: Text before the first child.
+        children: Texts of the children, as from `child_texts`.
+        end: Text behind the last child.
+    """
+
+    name: str
+    start: str
+    children: tuple[str, ...]
+    end: str
+
+    def with_any(self, texts: Iterable[str]) -> list[int]:
+        """Return the numbers of the children in which a text occurs."""
+        wanted = tuple(texts)
+        return [
+            number
+            for number, child in enumerate(self.children)
+            if any(text in child for text in wanted)
+        ]
+
+    def parse(self, numbers: Iterable[int]) -> ET.Element:
+        """Return a tree with some of the children."""
+        return parse_xml(self._with(self.children[number] for number in numbers), self.name)
+
+    def replaced(self, children: Mapping[int, str]) -> Document:
+        """Return the document with other texts of some children, by their numbers."""
+        texts = (children.get(number, text) for number, text in enumerate(self.children))
+        return Document(self.name, None, self._with(texts), None, in_rows=True)
+
+    def _with(self, children: Iterable[str]) -> bytes:
+        rows = (f"\n{_INDENT}{child}" for child in children)
+        return "".join((self.start, *rows, self.end)).encode()
+
+
 class Draft:
     """An XML document under construction: in memory, or in a file once it is long.
 
@@ -673,7 +772,7 @@ class Draft:
     def __init__(self, name: str, root: ET.Element) -> None:
         self._name, self._tag = name, root.tag
         self._start = ET.tostring(ET.Element(root.tag, root.attrib), "unicode")
-        self._empty = True
+        self._children = 0
         self._home: OwnDirectory | None = None
         self._path: Path | None = None
         self._file: BinaryIO = io.BytesIO()
@@ -683,8 +782,8 @@ class Draft:
         """Write children, given as texts from `child_texts`."""
         if not children:
             return
-        start = f"{self._start.removesuffix(' />')}>" if self._empty else ""
-        self._empty = False
+        start = "" if self._children else f"{self._start.removesuffix(' />')}>"
+        self._children += len(children)
         with scratch():
             self._file.write("".join((start, *(f"\n{_INDENT}{x}" for x in children))).encode())
             if isinstance(self._file, io.BytesIO) and self._file.tell() > _KEPT:
@@ -696,12 +795,18 @@ class Draft:
 
     def document(self) -> Document:
         """Return the text written so far as a document."""
-        end = self._start if self._empty else f"\n</{self._tag}>"
+        end = f"\n</{self._tag}>" if self._children else self._start
         with scratch():
             self._file.write(f"{end}\n".encode())
             content = self._file.getvalue() if isinstance(self._file, io.BytesIO) else None
             self._file.close()
-        return Document(self._name, self._path, content, self._home)
+        # A text between elements may look as if a child began there.
+        in_rows = content is not None and _rows_in(content) == self._children
+        return Document(self._name, self._path, content, self._home, in_rows)
+
+
+def _rows_in(content: bytes) -> int:
+    return sum(1 for _ in _BEGINS_ROW.finditer(content.decode()))
 
 
 class OwnDirectory:

@@ -13,7 +13,7 @@ from dataclasses import replace
 from itertools import chain, count, islice
 from typing import IO
 
-from ugat_marl.files import Draft, child_texts, scratch, xml_bytes
+from ugat_marl.files import Draft, Rows, child_texts, scratch, xml_bytes
 from ugat_marl.scenarios import (
     DEPARTING,
     TRAVELLERS,
@@ -30,6 +30,9 @@ DEFAULT_TYPES = (
     "DEFAULT_VEHTYPE", "DEFAULT_TAXITYPE", "DEFAULT_BIKETYPE", "DEFAULT_RAILTYPE",
 )  # fmt: skip
 """SUMO's default vehicle types. Vehicles without a type use the first one."""
+
+FLOWS = ("<flow", "<personFlow", "<containerFlow")
+"""Beginnings of flows."""
 
 _SORTED = DEPARTING | TRAVELLERS
 _OVERLAP = 256
@@ -72,8 +75,26 @@ def free_suffix(scenario: Scenario, suffix: str) -> str:
     return next(x for x in candidates if not any(mentions(each, x) for each in documents))
 
 
+def parts_with(document: Document, *texts: str) -> Iterator[Root]:
+    """Yield the document as trees, as `Document.parts` does.
+
+    Children in which none of the texts occurs may be left out.
+    """
+    if not mentions(document, *texts):
+        return
+    rows = document.rows()
+    if rows is None:
+        yield from document.parts()
+    else:
+        yield rows.parse(rows.with_any(texts))
+
+
 def edit(
-    documents: Iterable[Document], change: Change, *texts: str, in_order: bool = False
+    documents: Iterable[Document],
+    change: Change,
+    *texts: str,
+    in_order: bool = False,
+    in_place: bool = False,
 ) -> tuple[Document, ...]:
     """Apply `change` to every document that mentions one of `texts`.
 
@@ -83,11 +104,30 @@ def edit(
         *texts: Searched texts; documents without any of them are not parsed.
         in_order: True to sort vehicles by departure after the change, because SUMO drops vehicles
             that come after a later one.
+        in_place: True if the change neither adds, removes nor moves elements, and needs only those
+            with one of the texts: the others are then left alone, which takes little time.
     """
-    return tuple(
-        _edited(document, change, in_order) if mentions(document, *texts) else document
-        for document in documents
-    )
+
+    def edited(document: Document) -> Document:
+        if not mentions(document, *texts):
+            return document
+        rows = document.rows() if in_place else None
+        if rows is not None:
+            return _edited_in_place(document, rows, change, texts)
+        return _edited(document, change, in_order)
+
+    return tuple(map(edited, documents))
+
+
+def _edited_in_place(
+    document: Document, rows: Rows, change: Change, texts: Iterable[str]
+) -> Document:
+    # `edit_scenario` completes the flows of each document that it changes.
+    chosen = rows.with_any((*texts, *FLOWS))
+    part = rows.parse(chosen)
+    if not change(part):
+        return document
+    return rows.replaced(dict(zip(chosen, child_texts(part), strict=True)))
 
 
 def _edited(document: Document, change: Change, in_order: bool) -> Document:
@@ -110,7 +150,12 @@ def _edited(document: Document, change: Change, in_order: bool) -> Document:
 
 
 def edit_scenario(
-    scenario: Scenario, change: Change, *texts: str, applied: str, in_order: bool = False
+    scenario: Scenario,
+    change: Change,
+    *texts: str,
+    applied: str,
+    in_order: bool = False,
+    in_place: bool = False,
 ) -> Scenario:
     """Apply `change` to additional files and routes, as `edit` does.
 
@@ -120,6 +165,7 @@ def edit_scenario(
         *texts: Searched texts; documents without any of them are not parsed.
         applied: Effect in text form, to add to `applied`.
         in_order: True to sort vehicles by departure, as for `edit`.
+        in_place: True if the change is one in place, as for `edit`.
     """
     begin_s = scenario.settings.begin_s
     end_s = begin_s + scenario.settings.duration_s
@@ -130,10 +176,13 @@ def edit_scenario(
                 _complete_flow(element, begin_s, end_s)
         return change(root)
 
+    def edited(documents: tuple[Document, ...]) -> tuple[Document, ...]:
+        return edit(documents, complete_and_change, *texts, in_order=in_order, in_place=in_place)
+
     return replace(
         scenario,
-        additional=edit(scenario.additional, complete_and_change, *texts, in_order=in_order),
-        routes=edit(scenario.routes, complete_and_change, *texts, in_order=in_order),
+        additional=edited(scenario.additional),
+        routes=edited(scenario.routes),
         applied=(*scenario.applied, applied),
     )
 

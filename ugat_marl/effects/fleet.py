@@ -22,7 +22,7 @@ from ugat_marl.effects.documents import (
     edit_scenario,
     free_suffix,
     is_demand,
-    mentions,
+    parts_with,
     with_default_types,
 )
 from ugat_marl.effects.vehicles import driven_types
@@ -145,9 +145,7 @@ def _types(scenario: Scenario) -> tuple[dict[str, ET.Element], dict[str, list[st
     types: dict[str, ET.Element] = {}
     members: dict[str, list[str]] = {}
     for document in (*scenario.additional, *scenario.routes):
-        if not mentions(document, "<vType"):
-            continue
-        for part in document.parts():
+        for part in parts_with(document, "<vType"):
             types |= {element.get("id", ""): element for element in part.iter("vType")}
             for distribution in part.iter("vTypeDistribution"):
                 inner = [x.get("id", "") for x in distribution.iter("vType")]
@@ -246,7 +244,9 @@ def _with_speeds(
             element.set("speedFactor", f"{value:.6g}")
         return bool(types or with_factor)
 
-    return edit_scenario(scenario, change, "<vType", "speedFactor", applied=str(effect))
+    return edit_scenario(
+        scenario, change, "<vType", "speedFactor", applied=str(effect), in_place=True
+    )
 
 
 def _speeds(scenario: Scenario) -> dict[str, SpeedFactors]:

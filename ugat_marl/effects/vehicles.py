@@ -13,7 +13,7 @@ from statistics import fmean
 from typing import ClassVar
 
 from ugat_marl.effects.base import Effect, ExaminedStrengths, NumberParameter, TextParameter
-from ugat_marl.effects.documents import edit_scenario, mentions, with_default_types
+from ugat_marl.effects.documents import edit_scenario, parts_with, with_default_types
 from ugat_marl.scenarios import Scenario, ScenarioFile
 
 _NOT_DRIVEN = frozenset(
@@ -40,9 +40,8 @@ def type_values(scenario: Scenario, attribute: str) -> set[str]:
     """Return the values of an attribute in the driven vehicle types of a scenario."""
     texts: set[str] = set()
     for document in (*scenario.additional, *scenario.routes):
-        if mentions(document, "<vType"):
-            for part in document.parts():
-                texts |= {_text(kind, attribute) for kind in driven_types(part)}
+        for part in parts_with(document, "<vType"):
+            texts |= {_text(kind, attribute) for kind in driven_types(part)}
     return texts - {""}
 
 
@@ -91,7 +90,8 @@ class VehicleEffect(Effect):
                     effect.write(element, settings)
             return bool(types)
 
-        edited = edit_scenario(with_default_types(scenario), change, "<vType", applied="")
+        scenario = with_default_types(scenario)
+        edited = edit_scenario(scenario, change, "<vType", applied="", in_place=True)
         return replace(edited, applied=(*scenario.applied, *map(str, effects)))
 
     def write(self, element: ET.Element, settings: ScenarioFile) -> None:

@@ -116,7 +116,8 @@ def check_demand(
 
 def edges_used(tag: Tag) -> list[str]:
     """Return the edges that a vehicle, trip, flow or route names."""
-    return " ".join(tag.attributes.get(key, "") for key in _ROUTED).split()
+    given = tag.attributes
+    return [edge for key in _ROUTED if key in given for edge in given[key].split()]
 
 
 def _who(tag: Tag) -> str:

@@ -156,6 +156,8 @@ def parse_time(text: str) -> float:
     Raises:
         ValueError: Not a time, or one too large.
     """
+    if ":" not in text:  # as in nearly every file
+        return parse_decimal(text) + 0.0  # "-0" is 0
     parts = [parse_decimal(part) for part in text.split(":")]
     if len(parts) not in (1, 3, 4):
         raise ValueError(text)
