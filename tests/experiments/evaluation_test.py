@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -17,6 +18,7 @@ from ugat_marl.errors import CheckpointError, OptionError, UnknownNameError
 from ugat_marl.experiments import Evaluation, best_rules, evaluate, policy_factory, rule_factory
 from ugat_marl.experiments.evaluation import Result
 from ugat_marl.policies import DQN
+from ugat_marl.simulation import host
 
 BASE = Scores(100.0, 90.0, 500.0, -3.0, 3.0, 0.4, 50.0, 520.0, 515.0, 5.0)
 
@@ -81,6 +83,39 @@ def test_how_many_run_at_once_changes_nothing() -> None:
     )
     assert one.results == two.results
     assert one.domains == ["sim", "V4"]
+
+
+class Remembering:
+    """A policy that goes on counting where nothing tells it that an episode begins."""
+
+    def __init__(self) -> None:
+        self.decisions = 0
+
+    def act(self, observations: dict[str, Any]) -> dict[str, int]:
+        self.decisions += 1
+        return dict.fromkeys(observations, self.decisions // 7 % 4)
+
+
+def test_a_policy_with_a_memory_plays_the_same_however_many_run_at_once() -> None:
+    one, two = (
+        ugat_marl.evaluate(
+            "single-v1", {"own": Remembering()}, ["sim"], seeds=4, duration_s=150, workers=workers
+        )
+        for workers in (1, 2)
+    )
+    assert one.equals(two)
+
+
+def test_simulations_of_an_evaluation_have_one_warm_parent() -> None:
+    """Without it each episode loads SUMO again, which takes as long as the episode."""
+    before, blocks = host._WarmParent._blocks, list[int]()
+
+    def make(env: Any) -> Any:
+        blocks.append(host._WarmParent._blocks)
+        return rule_factory("random")(env)
+
+    evaluate(load_scenario("single-v1"), {"own": make}, ["sim"], [1], duration_s=20, workers=1)
+    assert blocks and min(blocks) == before + 1
 
 
 def test_the_best_rule_is_the_one_with_the_smallest_travel_time() -> None:

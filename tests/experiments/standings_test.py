@@ -72,6 +72,7 @@ def test_a_row_is_added_and_an_own_row_replaced(tmp_path: Path) -> None:
         (TABLE.replace("att_s_sim", "att"), "'att_s_sim'"),
         (TABLE.replace("V4,2,140", "V4,two,140"), "row 4: training_seed = 'two'"),
         (TABLE.replace("140", "nan"), "row 4: att_s = 'nan'"),
+        (TABLE + "fast,V4,2,84,62,952\n", "training_seed 2 of 'fast' in V4 is there twice"),
         ("", "not a table"),
     ],
 )  # fmt: skip
@@ -141,6 +142,17 @@ def test_rules_are_put_into_a_table(
     assert main([*call, "--table", str(table)]) == 2
     assert "a table of grid4x4-v1, not of single-v1" in capsys.readouterr().err
     table.with_name("table.csv").write_text("scenario,setting\nsingle-v1,fast\n")
+    # The table that was written says how it was judged.
+    assert main([*call, *words, "--table", str(out)]) == 0
+    assert "note:" not in capsys.readouterr().out
+    for changed, said in (
+        (["--duration-s", "240"], "duration_s = 300.0, not 240.0; give --duration-s 300.0"),
+        (["--evaluation-seeds", "1"], "episodes = 2, not 1; give --evaluation-seeds 2"),
+    ):
+        assert main([*call, *words, *changed, "--table", str(out)]) == 2
+        assert said in capsys.readouterr().err
+    assert main(["compare", "grid2x2-v1", *call[2:], *words, "--table", str(out)]) == 2
+    assert "a table of single-v1, not of grid2x2-v1" in capsys.readouterr().err
     # A row that would be lost is refused before any episode is played.
     lost = [*call[:3], "direct transfer", *call[4:], "--domains", "V1", "--table", str(table)]
     monkeypatch.setattr("ugat_marl.cli.compare.standings_of", None)

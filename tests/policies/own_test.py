@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
+import copy
 import importlib
 import json
 import re
 import sys
 from pathlib import Path
-from typing import Any
+from typing import Any, ClassVar
 
 import polars as pl
 import pytest
@@ -27,6 +28,7 @@ from ugat_marl.policies import (
     load_own,
     own_name,
     own_policy,
+    own_values,
 )
 from ugat_marl.testing import ToyTraffic
 
@@ -314,6 +316,84 @@ def test_later_learning_does_not_change_a_policy(algorithm: Any) -> None:
         policy.reset(0)
         shown = [set(policy.act(observations, infos).values()) for _ in range(5)]
         assert shown.index({1}) + 1 == changes_at
+
+
+class Closing:
+    """A learner whose policy is a function with the learner in its closure."""
+
+    def __init__(self, rate: float = 0.5, double: Any = True) -> None:
+        self.rate, self.double, self.learnt = rate, double, 0
+
+    def learn(self, env: Any, episodes: int) -> None:
+        for _ in range(episodes):
+            env.reset()
+            while env.agents:
+                env.step(dict.fromkeys(env.agents, 0))
+            self.learnt += 1
+
+    def policy(self) -> Any:
+        def chosen(observations: Any, table: list[int] = [self.learnt]) -> Any:  # noqa: B006
+            assert table == [self.learnt]
+            return dict.fromkeys(observations, self.learnt % 2)
+
+        return lambda observations: chosen(observations)
+
+
+def test_later_learning_does_not_change_a_policy_that_is_a_function() -> None:
+    env = ToyTraffic()
+    learner = OwnLearnerFactory(own_name(Closing))(env, 0)
+    before = learner.policy()
+    after = learner.learn(env, 1, 0)
+    observations, infos = env.reset(seed=0)
+    for policy, phase in ((before, 0), (after, 1), (copy.deepcopy(before), 0)):
+        assert set(policy.act(observations, infos).values()) == {phase}
+
+
+def test_what_a_class_of_a_function_holds_is_part_of_its_identity() -> None:
+    def made(phase: int, table: Any = None) -> type:
+        class Learner:
+            spread = table
+
+            def policy(self) -> Any:
+                return lambda observations: dict.fromkeys(observations, phase)
+
+        return Learner
+
+    kinds = [made(1), made(1), made(3), made(1, table=2)]
+    first, same, other, also_other = (own_values(own_name(kind)) for kind in kinds)
+    assert first == same and other not in (first, also_other) and also_other != first
+
+
+def test_settings_without_usable_types_are_literals() -> None:
+    for text in ("false", "False"):
+        learner: Any = OwnLearnerFactory(own_name(Closing), [f"double={text}"])(ToyTraffic(), 0)
+        assert learner._given.double is False
+
+    def make(env: Absent, rate: float = 0.5) -> Any:  # type: ignore[name-defined]  # noqa: F821
+        del env
+        return Closing(rate)
+
+    learner = OwnLearnerFactory(own_name(make), ["rate=0.2"])(ToyTraffic(), 0)
+    assert learner._given.rate == 0.2
+    with pytest.raises(OptionError, match="number"):
+        OwnLearnerFactory(own_name(make), ["rate=high"])
+
+
+def test_a_class_of_policies_is_made_for_the_environment_it_asks_for() -> None:
+    class Sized:
+        env_options: ClassVar[dict[str, Any]] = {"observation": "movements"}
+
+        def __init__(self, env: Any) -> None:
+            self.sizes = {agent: env.observation_space(agent).shape for agent in env.agents}
+            self.names = env.possible_agents
+            self.shapes = {agent: env.observation_space(agent).shape for agent in self.names}
+
+        def act(self, observations: Any) -> Any:
+            assert all(observations[x].shape == self.shapes[x] for x in observations)
+            return dict.fromkeys(observations, 0)
+
+    table = ugat_marl.evaluate("single-v1", {"sized": Sized}, ["sim"], seeds=1, duration_s=60)
+    assert table.height == 1
 
 
 def test_a_training_with_the_same_seed_is_the_same(algorithm: Any) -> None:

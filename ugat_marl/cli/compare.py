@@ -16,6 +16,7 @@ from ugat_marl.effects import domain_label, load_scenario
 from ugat_marl.errors import OptionError, counted
 from ugat_marl.experiments import (
     DIRECT,
+    Judging,
     PaperConfig,
     compare,
     policy_factory,
@@ -113,15 +114,18 @@ class Compare:
         if self.out is not None:
             require_writable(self.out)
         scenario = load_scenario(self.scenario)
+        length_s = self.duration_s or scenario.settings.duration_s
+        judging = Judging(scenario.id, self.evaluation_seeds, float(length_s))
         if self.table is not None:
-            table = read_standings(self.table, scenario.id)
-            length = self.duration_s or scenario.settings.duration_s
-            console.print(
-                f"note: {self.table} does not say in which episodes its rows were judged; ranks "
-                f"mean something only if it was {counted(self.evaluation_seeds, 'episode')} of "
-                f"{length:g} s, as the new row is (--evaluation-seeds, --duration-s)",
-                soft_wrap=True,
-            )
+            table = read_standings(self.table)
+            if not judging.require_in(self.table):
+                console.print(
+                    f"note: {self.table} does not say in which episodes its rows were judged; "
+                    "ranks mean something only if it was "
+                    f"{counted(self.evaluation_seeds, 'episode')} of {length_s:g} s, as the new "
+                    "row is (--evaluation-seeds, --duration-s)",
+                    soft_wrap=True,
+                )
         else:
             table = shipped_standings(scenario, self.evaluation_seeds, self.duration_s)
             if table.is_empty():
@@ -138,7 +142,7 @@ class Compare:
         shown = whole.filter(pl.col("domain").is_in([*map(domain_label, domains)]))
         console.print(standings_table(scenario.id, shown, self.name))
         if self.out is not None:
-            write_csv(self.out, whole.write_csv())
+            write_csv(self.out, judging.written_to(whole).write_csv())
             console.print(f"table: {self.out}", soft_wrap=True)
         return 0
 

@@ -64,7 +64,6 @@ class _Task:
     approaches: bool
 
 
-@kept_warm()
 def require_distinct_domains(domains: Sequence[Domain]) -> None:
     """Refuse domains of which two are the same.
 
@@ -76,6 +75,7 @@ def require_distinct_domains(domains: Sequence[Domain]) -> None:
         raise OptionError(f"domain {twice[0]!r} is listed twice (rain is V3, snow is V4, ...)")
 
 
+@kept_warm()
 def evaluate(
     scenario: Scenario,
     policies: Mapping[str, PolicyFactory],
@@ -322,7 +322,10 @@ class OwnPolicyFactory:
     name: str
 
     def __call__(self, env: TrafficEnv) -> Policy:
-        """Return the policy for an environment."""
+        """Return the policy for an environment, whose options are those that it asks for."""
+        options = getattr(self.given, "env_options", None)
+        if options:
+            env = parallel_env(env.scenario, **options)
         return copy.deepcopy(own_policy(self.given, self.name, env))
 
 
@@ -373,7 +376,10 @@ def _episodes(
 
     try:
         for seed in task.seeds:
-            persistently(lambda seed=seed: roll_out(env, policy, seed, on_step=on_step))
+            # A user's policy may remember earlier episodes, whose number depends on the workers.
+            persistently(
+                lambda seed=seed: roll_out(env, copy.deepcopy(policy), seed, on_step=on_step)
+            )
             scores = replace(env.scores(), approaches=read())
             results.append(Result(task.name, task.world.domain, seed, scores))
     finally:

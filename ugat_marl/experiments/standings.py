@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterable, Sequence
+from dataclasses import dataclass, fields
 from pathlib import Path
 from typing import Any
 
@@ -40,18 +41,16 @@ SCHEMA = pl.Schema(
 )
 """Columns of a table of standings."""
 
+_TRAINING = ["setting", "domain", "training_seed"]
+"""Columns by which a row is known."""
 
-def read_standings(path: Path, scenario: str | None = None) -> pl.DataFrame:
+
+def read_standings(path: Path) -> pl.DataFrame:
     """Read a table of standings, such as ``results/single-v1/main/seeds.csv``.
 
-    Args:
-        path: The file.
-        scenario: Id of the scenario that it should be of; the ``table.csv`` beside it tells. None
-            for any.
-
     Raises:
-        CheckpointError: The file is missing or damaged, or a column or number is.
-        OptionError: It is a table of another scenario.
+        CheckpointError: The file is missing or damaged, a column or number is, or a training is
+            there twice.
     """
     try:
         content = path.read_bytes()
@@ -60,19 +59,65 @@ def read_standings(path: Path, scenario: str | None = None) -> pl.DataFrame:
     texts = _texts(content)
     if damaged := csv_damage(path, pl.DataFrame() if texts is None else texts):
         raise CheckpointError(f"{path}: {damaged}")
-    rows = _standings_in(texts, str(path))
-    known = [] if scenario is None else _scenarios_of(path.with_name("table.csv"))
-    if known and scenario not in known:
-        raise OptionError(f"{path}: a table of {', '.join(known)}, not of {scenario}")
-    return rows
+    return _standings_in(texts, str(path))
 
 
-def _scenarios_of(path: Path) -> list[str]:
-    """Return the scenarios of the table of a folder; none if there is none that names them."""
+@dataclass(frozen=True)
+class Judging:
+    """How the policies of a table were judged; `compare` writes it into each row.
+
+    Attributes:
+        scenario: Id of the scenario.
+        episodes: Number of episodes of each policy in each domain.
+        duration_s: Length of an episode in s.
+    """
+
+    scenario: str
+    episodes: int
+    duration_s: float
+
+    def written_to(self, table: pl.DataFrame) -> pl.DataFrame:
+        """Return a table with columns that say this."""
+        columns = {field.name: getattr(self, field.name) for field in fields(self)}
+        return table.with_columns(**{name: pl.lit(value) for name, value in columns.items()})
+
+    def require_in(self, path: Path) -> bool:
+        """Refuse the file of a table that was judged otherwise.
+
+        The ``table.csv`` beside a table of `paper` tells its scenario.
+
+        Returns:
+            True if the file tells episodes and their length.
+
+        Raises:
+            OptionError: Scenario, number or length of the episodes is another one.
+        """
+        own, beside = (_cells(file) for file in (path, path.with_name("table.csv")))
+        scenarios = _values_in(own, "scenario") or _values_in(beside, "scenario")
+        if scenarios and self.scenario not in scenarios:
+            raise OptionError(f"{path}: a table of {', '.join(scenarios)}, not of {self.scenario}")
+        for name, option in (("episodes", "evaluation-seeds"), ("duration_s", "duration-s")):
+            wanted = str(getattr(self, name))
+            for given in _values_in(own, name):
+                if given != wanted:
+                    raise OptionError(
+                        f"{path}: judged with {name} = {given}, not {wanted}; "
+                        f"give --{option} {given}"
+                    )
+        return bool(_values_in(own, "episodes"))
+
+
+def _cells(path: Path) -> pl.DataFrame:
+    """Return the cells of a file of CSV as texts; none if it is missing or no CSV."""
     texts = _texts(path.read_bytes()) if path.is_file() else None
-    if texts is None or "scenario" not in texts.columns:
+    return pl.DataFrame() if texts is None else texts
+
+
+def _values_in(texts: pl.DataFrame, column: str) -> list[str]:
+    """Return the different texts of a column; none without the column."""
+    if column not in texts.columns:
         return []
-    return texts["scenario"].drop_nulls().unique(maintain_order=True).to_list()
+    return texts[column].drop_nulls().unique(maintain_order=True).to_list()
 
 
 def as_standings(content: bytes, name: str) -> pl.DataFrame:
@@ -114,6 +159,13 @@ def _standings_in(texts: pl.DataFrame | None, name: str) -> pl.DataFrame:
                 raise CheckpointError(
                     f"{name}: row {number}: {column} = {text!r} is no {_kind(column)}; correct it"
                 )
+    twice = rows.filter(rows.select(_TRAINING).is_duplicated())
+    if not twice.is_empty():
+        setting, domain, seed = twice.select(_TRAINING).row(0)
+        raise CheckpointError(
+            f"{name}: training_seed {seed} of {setting!r} in {domain} is there twice: it would "
+            "count as two trainings; leave one out"
+        )
     return rows
 
 

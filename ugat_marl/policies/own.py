@@ -26,7 +26,7 @@ import warnings
 import zipfile
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
-from types import FunctionType, MethodType, ModuleType
+from types import CellType, FunctionType, MethodType, ModuleType
 from typing import Any, get_type_hints
 
 from pettingzoo.utils import BaseParallelWrapper
@@ -154,10 +154,24 @@ def _values(given: Any) -> list[str]:
         inside = inspect.getclosurevars(given).nonlocals
         taken = [f"{key}={value!r}" for key, value in sorted(inside.items())]
         return [*taken, *map(repr, given.__defaults__ or ())]
+    if inspect.isclass(given):
+        return _values_of_class(given) if "<" in given.__qualname__ else []
     if isinstance(given, MethodType):
         return [repr(given.__self__), *_values(given.__self__)]
     held = {} if hasattr(given, "__qualname__") else getattr(given, "__dict__", {})
     return [repr(held)] if held else []
+
+
+def _values_of_class(given: type) -> list[str]:
+    """Return what a class that a function made holds: attributes, and values in its methods."""
+    held: list[str] = []
+    for name, member in sorted(vars(given).items()):
+        function = getattr(member, "__func__", member)  # of a static method or a class method
+        if isinstance(function, FunctionType):
+            held += [f"{name}: {value}" for value in _values(function)]
+        elif not name.startswith("__") and not hasattr(member, "__get__"):
+            held.append(f"{name}={member!r}")
+    return held
 
 
 def own_source(name: str, what: str) -> str | None:
@@ -632,8 +646,21 @@ def _converted(make: Callable[..., Any], settings: Sequence[str], name: str) -> 
     names = [key for key in parameters if key not in ("env", "seed")]
     hints: dict[str, Any] = {}
     if settings:
-        hints = get_type_hints(make.__init__ if inspect.isclass(make) else make)
+        function: Any = make.__init__ if inspect.isclass(make) else make
+        for key, hint in getattr(function, "__annotations__", {}).items():
+            with contextlib.suppress(NameError):  # a name that only checkers of types import
+                hints |= _resolved(function, key, hint)
     return parsed_settings(settings, names, hints, name)
+
+
+def _resolved(function: Any, key: str, hint: Any) -> dict[str, Any]:
+    """Return the type of one argument of a function by its name.
+
+    Raises:
+        NameError: The hint is a text with unknown names.
+    """
+    holder = type("holder", (), {"__annotations__": {key: hint}})
+    return get_type_hints(holder, getattr(function, "__globals__", {}))
 
 
 def parsed_settings(
@@ -659,7 +686,7 @@ def parsed_settings(
             raise OptionError(f"learner setting {setting!r}: must be NAME=VALUE")
         if name not in names:
             raise UnknownNameError(f"setting of {learner}", name, names)
-        if name not in hints:
+        if hints.get(name, Any) is Any:
             values[name] = _plain_value(text)
             continue
         whole = text.split(",") if "tuple" in str(hints[name]) else text
@@ -673,7 +700,13 @@ def parsed_settings(
 
 
 def _plain_value(text: str) -> Any:
-    """Return a number, a tuple or another literal of Python; other words stay text."""
+    """Return a number, a tuple or another literal of Python; other words stay text.
+
+    Truth values and none may have any case, as in other settings.
+    """
+    word = text.capitalize()
+    if word in ("True", "False", "None"):
+        return ast.literal_eval(word)
     try:
         return ast.literal_eval(text)
     except (ValueError, SyntaxError):
@@ -682,10 +715,44 @@ def _plain_value(text: str) -> Any:
 
 def _copied(given: Any, shared: Sequence[Any], name: str, memo: dict[int, Any]) -> Any:
     """Return a deep copy of a user's policy in which the shared objects stay the same."""
+    kept = {**memo, **{id(item): item for item in shared}}
     try:
-        return copy.deepcopy(given, {**memo, **{id(item): item for item in shared}})
+        return _copied_function(given, kept) if _captures(given) else copy.deepcopy(given, kept)
     except Exception as error:
         raise OptionError(
             f"policy of {name!r} cannot be copied ({type(error).__name__}: {error}); let policy() "
             "return an object that holds only what it needs to act"
         ) from error
+
+
+def _captures(given: Any) -> bool:
+    """Return True for a function that holds values: those of a closure, or defaults."""
+    if not isinstance(given, FunctionType):
+        return False
+    return bool(given.__closure__ or given.__defaults__ or given.__kwdefaults__)
+
+
+def _copied_function(given: FunctionType, memo: dict[int, Any]) -> FunctionType:
+    """Return a copy of a function that holds copies of its values.
+
+    `copy.deepcopy` returns functions themselves, so that a policy would go on learning with its
+    learner.
+    """
+    if id(given) in memo:
+        return memo[id(given)]
+
+    def copied(value: Any) -> Any:
+        return _copied_function(value, memo) if _captures(value) else copy.deepcopy(value, memo)
+
+    cells = tuple(CellType() for _ in given.__closure__ or ())
+    made = FunctionType(given.__code__, given.__globals__, given.__name__, None, cells)
+    memo[id(given)] = made  # before its values, which may hold the function itself
+    for cell, old in zip(cells, given.__closure__ or (), strict=True):
+        with contextlib.suppress(ValueError):  # an empty cell
+            cell.cell_contents = copied(old.cell_contents)
+    made.__defaults__ = given.__defaults__ and tuple(map(copied, given.__defaults__))
+    made.__kwdefaults__ = given.__kwdefaults__ and {
+        key: copied(value) for key, value in given.__kwdefaults__.items()
+    }
+    made.__dict__.update(given.__dict__)
+    return made
