@@ -8,7 +8,7 @@ from pathlib import Path
 import pytest
 
 from ugat_marl.effects import load_scenario
-from ugat_marl.scenarios import Network, sumo_program
+from ugat_marl.scenarios import Network, programme_notes, programme_plan, sumo_program
 from ugat_marl.scenarios.junctions import crossings_of, foes_of, yields_of
 from ugat_marl.scenarios.phases import RightOfWay
 
@@ -78,3 +78,16 @@ def test_both_lights_of_a_crossing_are_green_together(phases: str, tmp_path: Pat
         letters = [(phase[first], phase[first + 1]) for phase in light.phases]
         assert all(a == b for a, b in letters)
         assert ("G", "G") in letters or ("g", "g") in letters
+
+
+def test_a_plan_that_shows_crossings_longer_is_noted(tmp_path: Path) -> None:
+    """netconvert gives people on foot 5 s of red before vehicles get yellow; a plan has none."""
+    crossings = "".join(
+        f'<crossing node="C" edges="{arm}C C{arm}" priority="true"/>' for arm in ARMS
+    )
+    lanes = 'numLanes="1" sidewalkWidth="2"/>'
+    scenario = load_scenario(four_arms(tmp_path / "walks-v1", lanes, crossings))
+    network = Network.read(scenario)
+    (light,) = network.intersections
+    (note,) = programme_notes(scenario, [programme_plan(light, network)], "p.csv")
+    assert "C (crossings" in note

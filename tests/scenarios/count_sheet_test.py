@@ -257,6 +257,15 @@ def test_approaches_are_named_together(degrees: tuple[float, ...], names: object
         assert found == names
 
 
+def test_names_do_not_depend_on_the_order_of_links() -> None:
+    """The sheet reads links as the file has them, and plans in the order of their indices."""
+    links, lanes = arms(90, 90, 0, 180, 270)
+    for order in (links, links[::-1]):
+        named = approach_directions(order, lanes)
+        assert named["e0"] == approach_directions(links, lanes)["e0"]
+        assert len(set(named.values())) == 5
+
+
 def test_the_last_metres_of_a_road_count() -> None:
     assert heading_rad(((0, 0), (100, 0), (100, 29), (101, 40))) == pytest.approx(0, abs=0.05)
     assert math.degrees(heading_rad(((0, 0), (5, 0)))) == pytest.approx(90)

@@ -259,3 +259,18 @@ def test_intervals_with_inclusive_ends_touch() -> None:
     assert _closed(rows((0, 899), (900, 1799), (0, 899))) == rows((0, 900), (900, 1800), (0, 900))
     for spans in (((0, 900), (900, 1800)), ((0, 600), (900, 1800)), ((0, 3600),)):
         assert _closed(rows(*spans)) == rows(*spans)
+    # a count of the whole episode beside them keeps its end
+    assert _closed(rows((0, 899), (900, 1799), (0, 1800))) == rows((0, 900), (900, 1800), (0, 1800))
+
+
+def test_intervals_with_a_common_step_of_less_than_seconds_are_refused(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    (tmp_path / "c.csv").write_text(
+        "edge,count,begin_s,end_s\nwest1_A1,100,0,900\nwest1_A1,60,900.5,1800\n"
+    )
+    words = ["--grid", "1x1", "--counts", str(tmp_path / "c.csv"), "--duration-s", "1800"]
+    assert main(["scenario", "new", str(tmp_path / "city"), *words]) == 2
+    said = " ".join(capsys.readouterr().err.split())
+    assert "c.csv, line 3: the interval 900.5 to 1800 s" in said
+    assert "no common step longer than 0.5 s" in said

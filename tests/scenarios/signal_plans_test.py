@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+import copy
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import pytest
 
@@ -28,6 +30,7 @@ from ugat_marl.scenarios import (
     read_utdf,
     with_plans,
     write_plans,
+    yellow_notes,
 )
 from ugat_marl.scenarios.signal_plans import phase_times
 
@@ -208,6 +211,46 @@ def test_a_plan_that_is_its_programme_needs_no_note(later_s: float) -> None:
     assert programme_notes(moved, plans, "p.csv") == []
 
 
+def changed_programmes(name: str, change: Callable[[Any], object]) -> Scenario:
+    scenario = load_scenario(name)
+    root = scenario.network.parse()
+    for logic in root.iter("tlLogic"):
+        change(logic)
+    return replace(scenario, network=Document(scenario.network.name, None, xml_bytes(root)))
+
+
+@pytest.mark.parametrize(
+    ("kind", "said"), [("actuated", "follows the traffic (actuated)"), ("NEMA", "rings of its own")]
+)
+def test_a_programme_with_other_times_than_its_file_is_noted(kind: str, said: str) -> None:
+    varying = changed_programmes("single-v1", lambda logic: logic.set("type", kind))
+    network = Network.read(varying)
+    plans = [programme_plan(light, network) for light in network.intersections]
+    (note,) = programme_notes(varying, plans, "p.csv")
+    assert said in note and "SUMO shows other times" in note
+
+
+def test_red_amber_is_no_yellow() -> None:
+    """As in Austria, Germany and the United Kingdom: 2 s of it before each green."""
+
+    def change(logic: Any) -> None:
+        for phase in list(logic):
+            if "G" in phase.get("state") and "y" not in phase.get("state"):
+                amber = copy.deepcopy(phase)
+                amber.set("duration", "2")
+                amber.set("state", phase.get("state").replace("G", "u").replace("g", "u"))
+                logic.insert(list(logic).index(phase), amber)
+
+    plain, amber = load_scenario("single-v1"), changed_programmes("single-v1", change)
+    (light,), (changed,) = Network.read(plain).intersections, Network.read(amber).intersections
+    before = programme_plan(light, Network.read(plain))
+    after = programme_plan(changed, Network.read(amber))
+    assert [phase.yellow_s for phase in after.phases] == [x.yellow_s for x in before.phases]
+    assert [
+        p.all_red_s - q.all_red_s for p, q in zip(after.phases, before.phases, strict=True)
+    ] == [2.0] * len(before.phases)
+
+
 HEAD = "light,cycle_s,offset_s,ring,barrier,movements,split_s,yellow_s,all_red_s\n"
 GOOD = "A1,60,0,1,1,NBT NBR SBT SBR NBL SBL,30,3,2\nA1,60,0,1,1,EBT EBR WBT WBR EBL WBL,30,3,2\n"
 
@@ -260,6 +303,10 @@ def test_a_short_yellow_is_noted(tmp_path: Path, capsys: pytest.CaptureFixture[s
     assert (
         "note: yellow is short at A1 (phase 1: 0 s); 3 to 6 s are usual" in capsys.readouterr().out
     )
+    stays = PlanPhase(1, 1, ("NBT", "SBT"), 30.0, 0.0, 0.0)
+    more = PlanPhase(1, 1, ("NBT", "SBT", "NBL"), 30.0, 3.0, 2.0)
+    assert not yellow_notes([SignalPlan("A1", 60.0, 0.0, (stays, more))])  # none of them ends
+    assert yellow_notes([SignalPlan("A1", 60.0, 0.0, (replace(more, yellow_s=1.0), stays))])
 
 
 UTDF = """[Network]

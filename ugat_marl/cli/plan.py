@@ -29,6 +29,7 @@ from ugat_marl.scenarios import (
     programme_notes,
     read_plans,
     read_utdf,
+    refusal_notes,
     with_plans,
     write_plans,
     yellow_notes,
@@ -107,9 +108,9 @@ class Plan:
         write_plans(self.out, plans, network)
         console.print(plan_table(plans, LightNames.of(network)))
         out, name = shlex.quote(str(self.out)), shlex.quote(self.scenario)
-        if self.policy in (None, "programme"):
-            for note in programme_notes(played, plans, str(self.out)):
-                console.print(f"note: {note}", soft_wrap=True)
+        notes = programme_notes if self.policy in (None, "programme") else refusal_notes
+        for note in notes(played, plans, str(self.out)):
+            console.print(f"note: {note}", soft_wrap=True)
         console.print(f"plans: {out}", soft_wrap=True)
         console.print(
             f"next: ugat-marl plan {name} --apply {out} --out NEW, then ugat-marl evaluate NEW "

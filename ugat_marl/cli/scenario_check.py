@@ -187,8 +187,8 @@ def show(
         f"episode {facts.duration_s:g} s, {facts.decisions} decisions; shortest useful "
         f"{facts.shortest_episode_s:g} s (the network fills in {facts.fill_s:g} s)"
     )
-    flows = f" and {facts.flows} flows" if facts.flows else ""
-    say(f"demand {facts.vehicles} vehicles{flows}, the first after {facts.first_s:g} s")
+    flows = f" and {counted(facts.flows, 'flow')}" if facts.flows else ""
+    say(f"demand {counted(facts.vehicles, 'vehicle')}{flows}, the first after {facts.first_s:g} s")
     say(
         f"they depart until {facts.last_s:g} s, most from {facts.busiest_s:g} s on: "
         f"{facts.busiest} within {min(QUARTER_S, facts.duration_s) / 60:g} min"

@@ -140,8 +140,8 @@ class ScenarioNew:
         phases = sum(len(light.phases) for light in made.network.intersections)
         console.print(
             f"{self.name}: {counted(agents, 'intersection')} with {phases} green phases, "
-            f"{made.demand.vehicles} vehicles"
-            + (f" and {made.demand.flows} flows" if made.demand.flows else ""),
+            f"{counted(made.demand.vehicles, 'vehicle')}"
+            + (f" and {counted(made.demand.flows, 'flow')}" if made.demand.flows else ""),
             soft_wrap=True,
         )
         if made.fits:

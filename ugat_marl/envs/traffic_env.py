@@ -479,10 +479,11 @@ class TrafficEnv(ParallelEnv[str, Any, Any]):
 
     def _warn_if_empty(self) -> None:
         if self._decision == max(1, self.scenario.decisions // 10) and not self._snapshot.departed:
+            due = self._snapshot.backlog
+            reason = f"{due} are waiting to; check routes" if due else "none is due yet"
             warnings.warn(
                 f"scenario {self.scenario.id!r}: no vehicle has entered the network in the first "
-                f"{self._decision * self.decision_interval_s:g} s "
-                f"({self._snapshot.backlog} are waiting to); check departures and routes",
+                f"{self._decision * self.decision_interval_s:g} s ({reason}); check departures",
                 stacklevel=3,
             )
 

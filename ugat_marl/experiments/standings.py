@@ -64,7 +64,7 @@ def read_standings(path: Path) -> pl.DataFrame:
 
 @dataclass(frozen=True)
 class Judging:
-    """How the policies of a table were judged; `compare` writes it into each row.
+    """Conditions under which a table was judged; `compare` writes them into each row.
 
     Attributes:
         scenario: Id of the scenario.

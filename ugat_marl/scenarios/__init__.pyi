@@ -104,6 +104,7 @@ from .signal_plans import movement_codes as movement_codes
 from .signal_plans import programme_notes as programme_notes
 from .signal_plans import programme_plan as programme_plan
 from .signal_plans import read_plans as read_plans
+from .signal_plans import refusal_notes as refusal_notes
 from .signal_plans import with_plans as with_plans
 from .signal_plans import write_plans as write_plans
 from .signal_plans import yellow_notes as yellow_notes

@@ -108,6 +108,9 @@ _WORDS = _words(
     railsignal.moving-block.default-classes routing-algorithm scale-suffix
     """
 )
+_OUTPUT_SWITCH = "whetherOutputState"
+"""Parameter by which a NEMA light writes its state."""
+
 OPTIONS = _SWITCHES | _NUMBERS | _TIMES | _WORDS
 """Options of SUMO that a scenario may set: they shape the traffic and name no file or port.
 
@@ -447,8 +450,8 @@ _CHECKS: Mapping[str, Callable[[Tag], str]] = {
 
 
 def _is_output(attributes: Mapping[str, str], parent: str) -> bool:
-    """Return True for a parameter that names the file of an actuated light's detectors."""
-    return parent == "tlLogic" and attributes.get("key") == "file"
+    """Return True for a parameter of a light that names a file to write, or asks for one."""
+    return parent == "tlLogic" and attributes.get("key") in ("file", _OUTPUT_SWITCH)
 
 
 def _outputs(name: str, attributes: Mapping[str, str], parent: str) -> list[str]:
@@ -476,6 +479,8 @@ def _discard_outputs(element: ET.Element, parent: str) -> None:
     for attribute in _outputs(element.tag, element.attrib, parent):
         if attribute in _PICTURES:
             del element.attrib[attribute]
+        elif element.get("key") == _OUTPUT_SWITCH:
+            element.set(attribute, "false")
         else:
             element.set(attribute, _DISCARD)
     for child in element:

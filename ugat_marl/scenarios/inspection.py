@@ -18,7 +18,7 @@ from ugat_marl.scenarios.network import Intersection, Network
 from ugat_marl.scenarios.phases import RightOfWay, are_foes, programme_phases, turn_of
 from ugat_marl.scenarios.routes import departures
 from ugat_marl.scenarios.scenario import Scenario
-from ugat_marl.scenarios.signals import GREEN, YELLOW
+from ugat_marl.scenarios.signals import AMBER, GREEN, YELLOW
 from ugat_marl.scenarios.street_names import intersection_name
 
 SHORT_LANE_M = 50.0
@@ -335,7 +335,7 @@ def _times_of(intersection: Intersection, *, yellow: bool) -> tuple[float, ...]:
     wanted = [
         seconds
         for seconds, state in intersection.programme
-        if (bool(set(state) & YELLOW) if yellow else not set(state) & (YELLOW | GREEN))
+        if (bool(set(state) & AMBER) if yellow else not set(state) & (YELLOW | GREEN))
     ]
     return tuple(sorted(set(wanted)))
 

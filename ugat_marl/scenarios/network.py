@@ -84,6 +84,8 @@ class Intersection:
         position: Mean over the links of their junction's coordinates, m.
         crossings: Links for people on foot.
         offset_s: Time on the scenario's clock at which the programme begins a cycle.
+        times_vary: Why SUMO's times of the programme differ from those in `programme`; "" if they
+            do not.
     """
 
     id: str
@@ -96,6 +98,7 @@ class Intersection:
     position: tuple[float, float]
     crossings: tuple[Link, ...] = ()
     offset_s: float = 0.0
+    times_vary: str = ""
 
 
 @dataclass(frozen=True)
@@ -182,6 +185,7 @@ class Network:
                     position=_centre([positions[link.junction] for link in light_links]),
                     crossings=walks,
                     offset_s=own.offset_s,
+                    times_vary=own.times_vary,
                 )
             )
         _require_agents(agents_found, links, document.source)
@@ -460,11 +464,13 @@ class _Programme:
         id: SUMO's programID.
         states: ``(duration_s, state)`` of each phase.
         offset_s: Time on the scenario's clock at which a cycle begins.
+        times_vary: As in `Intersection`.
     """
 
     id: str
     states: tuple[tuple[float, str], ...]
     offset_s: float
+    times_vary: str = ""
 
 
 _NO_PROGRAMME = _Programme("", (), 0.0)
@@ -486,10 +492,22 @@ def _programmes(root: ET.Element, scenario: Scenario) -> dict[str, _Programme]:
             )
             offset_s = _offset_s(logic, scenario)
             if states:
-                programmes[tls] = _Programme(name, states, offset_s)
+                programmes[tls] = _Programme(name, states, offset_s, _times_vary(logic))
             elif tls in programmes and programmes[tls].id == name:
                 programmes[tls] = replace(programmes[tls], offset_s=offset_s)
     return programmes
+
+
+def _times_vary(logic: ET.Element) -> str:
+    """Return why SUMO's times of a programme differ from its durations; "" if they do not."""
+    kind = logic.get("type", "static")
+    if kind == "NEMA":
+        return "it has rings of its own (NEMA)"
+    if kind != "static":
+        return f"it follows the traffic ({kind})"
+    if any("next" in phase.attrib for phase in logic.iter("phase")):
+        return "its phases name the next one"
+    return ""
 
 
 def _offset_s(logic: ET.Element, scenario: Scenario) -> float:

@@ -215,6 +215,10 @@ _SYNONYMS = {
 """Names that SUMO allows for the elements of a configuration."""
 
 
+_IGNORED = ("time-to-teleport", "max-depart-delay", "random", "seed", "max-num-vehicles")
+"""Settings of SUMO that change traffic and are the same in all scenarios."""
+
+
 class SumoConfiguration:
     """Values of a ``.sumocfg``, under any of the names that SUMO allows for them.
 
@@ -265,6 +269,10 @@ class SumoConfiguration:
         """Return the step length and the options of SUMO, as in ``scenario.toml``."""
         options = {option: self.given[option] for option in self.given if option in OPTIONS}
         return {"step_length_s": self.seconds("step-length", "1"), "sumo": options}
+
+    def ignored(self) -> list[str]:
+        """Return the settings that change traffic and that no scenario has, as ``name = value``."""
+        return [f"{name} = {self.given[name]}" for name in _IGNORED if self.given.get(name)]
 
 
 def _load_sumocfg(path: Path, scenario_id: str) -> Scenario:

@@ -35,7 +35,7 @@ from ugat_marl.scenarios.phases import (
 )
 from ugat_marl.scenarios.scenario import Scenario
 from ugat_marl.scenarios.settings import parse_decimal
-from ugat_marl.scenarios.signals import GREEN, YELLOW
+from ugat_marl.scenarios.signals import AMBER, GREEN, YELLOW
 from ugat_marl.scenarios.street_names import (
     ALL_DIRECTIONS,
     TURN_NAMES,
@@ -182,14 +182,27 @@ def plan_states(
         going = [link for link in light.links if codes[link] in green]
         if pair := next((pair for pair in combinations(going, 2) if clash(*pair)), None):
             raise ScenarioError(
-                f"{source}: light {plan.light!r}: {codes[pair[0]]} and {codes[pair[1]]} are green "
-                "together and cross or merge; give them phases of their own"
+                f"{source}: light {plan.light!r}: {_told(pair[0], codes)} and "
+                f"{_told(pair[1], codes)} are green together and cross or merge; give them phases "
+                "of their own"
             )
         if states and states[-1][1] == state:
             states[-1] = (states[-1][0] + end - begin, state)
         else:
             states.append((end - begin, state))
     return tuple((round(seconds, 3), state) for seconds, state in states)
+
+
+def _told(link: Link, codes: Mapping[Link, str]) -> str:
+    """Return the code of a movement, with its roads where it stands for several ways."""
+    ways = {
+        (other.from_edge, other.to_edge) for other, code in codes.items() if code == codes[link]
+    }
+    if len(ways) < 2:
+        return codes[link]
+    return (
+        f"{codes[link]} (here {link.from_edge} -> {link.to_edge}; it stands for {len(ways)} ways)"
+    )
 
 
 _Shown = Sequence[tuple[float, float, float, frozenset[str], frozenset[str]]]
@@ -360,7 +373,7 @@ def programme_plan(light: Intersection, network: Network) -> SignalPlan:
     """Return the plan of a light's own programme, in one ring.
 
     Every state with green and without yellow begins a phase. The states until the next one are its
-    yellow, as long as some light is yellow, and its all-red.
+    yellow, as long as some light is yellow, and its all-red. Red-amber is part of the all-red.
 
     Raises:
         ScenarioError: The light has no programme with two greens, or a phase without clearance.
@@ -382,7 +395,7 @@ def programme_plan(light: Intersection, network: Network) -> SignalPlan:
             phases.append(PlanPhase(1, 1, tuple(served), seconds, 0.0, 0.0))
         else:
             last = phases[-1]
-            yellow = seconds if set(state) & YELLOW else 0.0
+            yellow = seconds if set(state) & AMBER else 0.0
             phases[-1] = replace(
                 last,
                 split_s=last.split_s + seconds,
@@ -406,24 +419,49 @@ def programme_notes(scenario: Scenario, plans: Iterable[SignalPlan], source: str
         source: Name of their table.
     """
     network, rules = Network.read(scenario), _rules(scenario)
-    notes: list[str] = []
+    plans = list(plans)
+    notes = refusal_notes(scenario, plans, source)
     differing: list[str] = []
     for plan in plans:
         light = network.intersection(plan.light)
-        try:
-            check_plan(plan, source)
-            states = plan_states(plan, light, network, rules, source)
-        except ScenarioError as error:
-            notes.append(f"--apply would refuse this plan, so change it first: {error}")
+        if light.times_vary:
+            notes.append(
+                f"light {plan.light!r}: {light.times_vary}; the plan has the durations of its "
+                "phases, and SUMO shows other times"
+            )
             continue
+        try:
+            states = plan_states(plan, light, network, rules, source)
+        except ScenarioError:
+            continue  # told above
         if others := _shown_otherwise(plan, states, light, movement_codes(light, network)):
             differing.append(f"{plan.light} ({' '.join(others)})")
     if differing:
         notes.append(
             f"the plan shows other green or yellow than the programme at {', '.join(differing)}: "
-            "in a plan all movements of a phase end together, and a movement of two phases in turn "
-            "stays green between them"
+            "in a plan all movements of a phase end together, a movement of two phases in turn "
+            "stays green between them, red-amber is red, and crossings are green as long as the "
+            "phase"
         )
+    return notes
+
+
+def refusal_notes(scenario: Scenario, plans: Iterable[SignalPlan], source: str) -> list[str]:
+    """Return a note on each plan that `with_plans` would refuse.
+
+    Args:
+        scenario: The scenario.
+        plans: The plans, at most one for each light.
+        source: Name of their table.
+    """
+    network, rules = Network.read(scenario), _rules(scenario)
+    notes: list[str] = []
+    for plan in plans:
+        try:
+            check_plan(plan, source)
+            plan_states(plan, network.intersection(plan.light), network, rules, source)
+        except ScenarioError as error:
+            notes.append(f"--apply would refuse this plan, so change it first: {error}")
     return notes
 
 
@@ -433,10 +471,18 @@ def yellow_notes(plans: Iterable[SignalPlan]) -> list[str]:
         f"{plan.light} (phase {number}: {phase.yellow_s:g} s)"
         for plan in plans
         for number, phase in enumerate(plan.phases, 1)
-        if phase.movements and phase.yellow_s < _LEAST_YELLOW_S
+        if phase.yellow_s < _LEAST_YELLOW_S and _ending(plan, number - 1)
     ]
     usual = f"{_LEAST_YELLOW_S:g} to 6 s are usual"
     return [f"yellow is short at {', '.join(short)}; {usual}"] if short else []
+
+
+def _ending(plan: SignalPlan, place: int) -> set[str]:
+    """Return the movements that end with a phase: those that the next one of its ring lacks."""
+    phase = plan.phases[place]
+    ring = [other for other in plan.phases if other.ring == phase.ring]
+    following = ring[(ring.index(phase) + 1) % len(ring)]
+    return set(phase.movements) - set(following.movements)
 
 
 def _rules(scenario: Scenario) -> RightOfWay:
@@ -450,7 +496,10 @@ _States = Sequence[tuple[float, str]]
 def _shown_otherwise(
     plan: SignalPlan, states: _States, light: Intersection, codes: Mapping[Link, str]
 ) -> list[str]:
-    """Return the movements whose green or yellow differs between a plan and the programme."""
+    """Return the movements whose green or yellow differs between a plan and the programme.
+
+    "crossings" stands for those of people on foot.
+    """
     cycle_s, later_s = plan.cycle_s, plan.offset_s - light.offset_s
     times = {0.0, *accumulate(seconds for seconds, _ in states)}
     times |= {(end - later_s) % cycle_s for end in accumulate(s for s, _ in light.programme)}
@@ -467,6 +516,8 @@ def _shown_otherwise(
                     (planned[link.index] in x) != (own[link.index] in x) for x in (GREEN, YELLOW)
                 )
             }
+            if any((planned[x.index] in GREEN) != (own[x.index] in GREEN) for x in light.crossings):
+                others.add("crossings")
     return sorted(others)
 
 

@@ -19,7 +19,9 @@ from numpy.typing import NDArray
 from ugat_marl.errors import OptionError, ScenarioError
 
 GREEN = frozenset("Gg")
-YELLOW = frozenset("yYu")
+AMBER = frozenset("yY")
+"""Yellow after a green. Red-amber (u) comes before one."""
+YELLOW = AMBER | {"u"}
 SIGNAL_LETTERS = frozenset("rugGyYoOs")
 """SUMO's letters: red, red-yellow, green (minor g, major G), yellow, off, right on red (s)."""
 

@@ -136,7 +136,9 @@ def approach_directions(links: Iterable[Link], lanes: Mapping[str, Lane]) -> dic
         links: Links for vehicles of the traffic light.
         lanes: Lanes of the network.
     """
-    first_lane = {link.from_edge: link.from_lane for link in links}
+    # In order of their ids: of two roads with one heading the same one gets the better name always.
+    first_lane = dict(sorted({(link.from_edge, link.from_lane) for link in links}, reverse=True))
+    first_lane = dict(sorted(first_lane.items()))
     headings = [heading_rad(lanes[lane].shape) for lane in first_lane.values()]
     names = MAIN_DIRECTIONS if len(headings) <= len(MAIN_DIRECTIONS) else ALL_DIRECTIONS
     places = [2 * math.pi * place / len(names) for place in range(len(names))]

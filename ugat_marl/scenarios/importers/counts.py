@@ -182,7 +182,7 @@ def from_counts(path: Path, begin_s: float, length_s: float, seed: int) -> Vehic
             _require_reached(rows, drives, path)
             write_drives(work / "candidates.rou.xml", drives)
             rows = _closed(rows)
-            grid_s = _grid_s(rows)
+            grid_s = _grid_s(rows, path)
             options = _counts_for_sumo(rows, grid_s, work, seed)
             out = work / "sampled.rou.xml"
             begin, end = min(row.begin_s for row in rows), max(row.end_s for row in rows)
@@ -261,7 +261,7 @@ def _require_reached(rows: Iterable[Row], drives: Sequence[Drive], path: Path) -
 
 
 def _closed(rows: Sequence[Row]) -> list[Row]:
-    """Return rows whose intervals touch, where all of them end one second early (0 to 899).
+    """Return rows whose intervals touch, where those of one length end a second early (0 to 899).
 
     routeSampler would be given intervals of one second, and would not end.
     """
@@ -273,17 +273,41 @@ def _closed(rows: Sequence[Row]) -> list[Row]:
     }
     if gaps != {1.0}:
         return list(rows)
-    return [replace(row, end_s=row.end_s + 1.0) for row in rows]
+    lengths = {row.end_s - row.begin_s for row in rows if row.end_s + 1.0 in begins}
+    return [
+        replace(row, end_s=row.end_s + 1.0) if row.end_s - row.begin_s in lengths else row
+        for row in rows
+    ]
 
 
-def _grid_s(rows: Sequence[Row]) -> float:
+_FINEST_S = 5.0
+"""Shortest interval, s, into which counts are divided: routeSampler takes hours for less."""
+
+
+def _grid_s(rows: Sequence[Row], path: Path) -> float:
     """Return the longest interval, in s, into which all intervals of rows divide.
 
     By itself routeSampler takes the shortest interval, and loses what does not divide into it.
+
+    Raises:
+        ScenarioError: It is shorter than `_FINEST_S`.
     """
     begin_s = min(row.begin_s for row in rows)
     times = {round(1000 * (time - begin_s)) for row in rows for time in (row.begin_s, row.end_s)}
-    return math.gcd(*times) / 1000
+    grid_s = math.gcd(*times) / 1000
+    if grid_s < _FINEST_S:
+        step = round(1000 * _FINEST_S)
+        odd = next(
+            row
+            for row in rows
+            if any(round(1000 * (time - begin_s)) % step for time in (row.begin_s, row.end_s))
+        )
+        raise ScenarioError(
+            f"{path}, line {odd.line}: the interval {odd.begin_s:g} to {odd.end_s:g} s and the "
+            f"others have no common step longer than {grid_s:g} s, and {_FINEST_S:g} s are the "
+            "least; write begins and ends in whole minutes"
+        )
+    return grid_s
 
 
 def _counts_for_sumo(rows: Sequence[Row], grid_s: float, work: Path, seed: int) -> list[str]:

@@ -80,6 +80,11 @@ def from_routes(paths: Sequence[Path], *, link: bool) -> VehicleSource:
 def _configured(
     path: Path, folder: Path, link: bool, own_vehicles: bool, reporter: Reporter
 ) -> RoadFiles:
+    if ignored := SumoConfiguration(path).ignored():
+        reporter.say(
+            f"note: {path.name}: {', '.join(ignored)} left out: vehicles are never teleported or "
+            "given up, and the seed is that of the episode; traffic may differ from SUMO's own"
+        )
     if own_vehicles:
         scenario = read_scenario(path)
         network, routes, additional = scenario.network, scenario.routes, scenario.additional
