@@ -204,7 +204,7 @@ def test_a_day_of_a_diagnosis_whose_simulator_dies_is_simulated_again(
         end = ends.pop(0) if simulates else 0
         return subprocess.CompletedProcess(command, end, "", "") if end else run(command, **given)
 
-    monkeypatch.setattr("ugat_marl.scenarios.programs.subprocess.run", killed)
+    monkeypatch.setattr("ugat_marl.scenarios.sumo_tools.subprocess.run", killed)
     (found,) = engine_of(data, 1).replicates([], [0])
     assert (found.tally.sums == expected.tally.sums).all()
     assert len(ends) == 100

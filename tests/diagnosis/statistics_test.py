@@ -10,7 +10,6 @@ import pytest
 from numpy.typing import NDArray
 
 from ugat_marl.diagnosis import Reference, Tally, change_between, sum_of
-from ugat_marl.diagnosis.between import TRAVEL_TIME, Label
 from ugat_marl.diagnosis.features import (
     BIN_FEATURES,
     FEATURES,
@@ -21,6 +20,7 @@ from ugat_marl.diagnosis.features import (
 )
 from ugat_marl.diagnosis.residual import Null
 from ugat_marl.diagnosis.statistics import Pools, Whitener, of_the_same_stretches
+from ugat_marl.diagnosis.supplementary_data import TRAVEL_TIME, Label
 from ugat_marl.diagnosis.thresholds import Thresholds
 
 THRESHOLDS = Thresholds()
@@ -146,7 +146,7 @@ def test_a_few_probes_are_as_often_off_as_their_number_says(probes: int) -> None
 
     def day(count: int) -> Tally:
         total_s = generator.normal(60.0, 20.0, count).sum()
-        return replace(plain, between={TRAVEL_TIME: np.array([[[total_s, count]]])})
+        return replace(plain, supplementary={TRAVEL_TIME: np.array([[[total_s, count]]])})
 
     pools = Pools(NETWORK.blocks, THRESHOLDS, 1, {TRAVEL_TIME: (Label("a", "b"),)})
     reference = Reference(pools, [day(300) for _ in range(100)])

@@ -9,7 +9,7 @@ import pytest
 
 from ugat_marl.errors import ScenarioError
 from ugat_marl.scenarios.confinement import confinement_missing
-from ugat_marl.scenarios.programs import convert, run_program, sumo_program
+from ugat_marl.scenarios.sumo_tools import convert, run_program, sumo_program
 
 confined = pytest.mark.skipif(bool(confinement_missing()), reason=confinement_missing())
 NETWORK = Path(__file__).parents[1] / "fixtures" / "crossing" / "network.net.xml"

@@ -10,7 +10,7 @@ content of ``diagnosis.json``.
     records     the records of the stages, and the form of ``diagnosis.json``
     features    measured lanes, and the features of one period there
     intervals   counts, occupancies and mean speeds per interval
-    between     turning counts, travel times of probes and states of lanes
+    supplementary_data  turning counts, travel times of probes and states of lanes
     journeys    travel times and queues between detectors, which no fit uses
     statistics  statistics of several periods, their noise, distances, whitening
     measurement errors of the detectors, read off single vehicles before all else

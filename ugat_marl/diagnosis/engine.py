@@ -24,11 +24,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ugat_marl.data import installed_version
-from ugat_marl.diagnosis.between import Between
 from ugat_marl.diagnosis.features import FEATURES, DetectorLayout, Greens, Tally, tally
 from ugat_marl.diagnosis.intervals import with_intervals
 from ugat_marl.diagnosis.measurement import Sightings
 from ugat_marl.diagnosis.replay import Day, Due, Replay, Unmeasured, corrected
+from ugat_marl.diagnosis.supplementary_data import SupplementaryData
 from ugat_marl.diagnosis.thresholds import Thresholds
 from ugat_marl.effects import Effect
 from ugat_marl.errors import OptionError, ScenarioError, SimulatorError, UgatMarlError
@@ -102,8 +102,8 @@ def _counts(tallies: Sequence[Tally]) -> NDArray[np.float64]:
 VERSION = 8
 """Version of features and replays; tallies cached under another version are not used."""
 
-_BETWEEN = "between "
-"""Begin of the names of `Tally.between` in the cache."""
+_SUPPLEMENTARY = "between "
+"""Begin of the names of `Tally.supplementary` in the cache."""
 
 _KEPT_DAYS = 40
 """Largest number of simulated days that are kept in memory with their passages."""
@@ -185,7 +185,7 @@ class Engine:
         base_days: Number of days of the scenario as it is that decide which days are ordinary; 0 if
             all days are.
         interval_s: Length of the intervals whose features are compared, s; None for none.
-        between: Measured turning counts, travel times and states of lanes; None without any.
+        supplementary: Measured turning counts, travel times and states of lanes; None without any.
     """
 
     def __init__(
@@ -202,11 +202,11 @@ class Engine:
         workers: Workers = None,
         base_days: int = 0,
         interval_s: float | None = None,
-        between: Between | None = None,
+        supplementary: SupplementaryData | None = None,
     ) -> None:
         self._base_days = base_days
         self._interval_s = interval_s
-        self._between = between
+        self._supplementary = supplementary
         self.layout = layout
         self.periods = tuple(periods)
         self._budget = budget or Budget()
@@ -234,7 +234,7 @@ class Engine:
         head += (self._unmeasured,) if self._unmeasured else ()
         head += (replay.day_to_day,) if replay.day_to_day else ()
         head += ("intervals", interval_s) if interval_s else ()
-        head += (between,) if between else ()
+        head += (supplementary,) if supplementary else ()
         self._root = hashlib.sha256(repr(head).encode()).hexdigest()
         self._edges = sorted({edge for _, edge, _ in layout.places})
         self._signals = [_signals_hash(period, replay.answering) for period in periods]
@@ -473,10 +473,12 @@ class Engine:
         )
         if self._interval_s is not None:
             counted = with_intervals(counted, self.layout, period, self._interval_s)
-        if self._between is not None:
+        if self._supplementary is not None:
             measured = self.periods[number % len(self.periods)]
-            between = self._between.simulated(measured, day.between, day.lane_states)
-            counted = replace(counted, between=between)
+            supplementary = self._supplementary.simulated(
+                measured, day.point_to_point, day.lane_states
+            )
+            counted = replace(counted, supplementary=supplementary)
         # The cache holds float32, so round here: the result must not depend on the cache.
         counted = replace(counted, bins=counted.bins.astype(np.float32).astype(np.float64))
         return self._with_due(counted, day.travel_time_s, day.due)
@@ -543,10 +545,10 @@ class Engine:
                 stored["sums"].astype(np.float64),
                 stored["bins"].astype(np.float64),
                 journeys=stored["journeys"],
-                between={
-                    name.removeprefix(_BETWEEN): sums
+                supplementary={
+                    name.removeprefix(_SUPPLEMENTARY): sums
                     for name, sums in stored.items()
-                    if name.startswith(_BETWEEN)
+                    if name.startswith(_SUPPLEMENTARY)
                 },
                 window=self.periods[number % len(self.periods)].window,
             )
@@ -567,7 +569,7 @@ class Engine:
             "bins": counted.bins.astype(np.float32),
             "travel_time_s": np.float64(day.travel_time_s),
             "journeys": counted.journeys,
-            **{f"{_BETWEEN}{name}": sums for name, sums in counted.between.items()},
+            **{f"{_SUPPLEMENTARY}{name}": sums for name, sums in counted.supplementary.items()},
         }
         if day.due is not None:
             for name, of_edge in (("asked", day.due.asked), ("given", day.due.given)):

@@ -333,8 +333,8 @@ class Tally:
         known: Number of periods in which each bin was counted, shape of `bins`; None if all were.
         journeys: Sums and numbers of observations of `JOURNEYS`, ``(measures, places, 2)``. No
             distance uses them. None without single vehicles.
-        between: Turning counts, travel times between places and states of lanes: sums and numbers
-            of observations, ``(members, measures, 2)``, by block; see `between`.
+        supplementary: Turning counts, travel times between places and states of lanes: sums and
+            numbers of observations, ``(members, measures, 2)``, by block; see `supplementary_data`.
         window: Begin and end of the period, s; None if unknown, or for sums of different ones.
     """
 
@@ -343,7 +343,7 @@ class Tally:
     days: int = 1
     known: Array | None = None
     journeys: Array | None = None
-    between: Mapping[str, Array] = field(default_factory=dict)
+    supplementary: Mapping[str, Array] = field(default_factory=dict)
     window: tuple[float, float] | None = None
 
     @property
@@ -378,7 +378,7 @@ class Tally:
             self.days + other.days,
             None if every else self.counted[..., :bins] + other.counted[..., :bins],
             None if mine is None or others is None else mine + others,
-            {name: sums + other.between[name] for name, sums in self.between.items()},
+            {name: sums + other.supplementary[name] for name, sums in self.supplementary.items()},
             self.window if self.window == other.window else None,
         )
 

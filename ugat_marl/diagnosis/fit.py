@@ -9,13 +9,13 @@ from dataclasses import replace
 import numpy as np
 from numpy.typing import NDArray
 
-from ugat_marl.diagnosis.between import EVERY_LANE, TRAVEL_TIME
 from ugat_marl.diagnosis.engine import Engine
 from ugat_marl.diagnosis.features import Tally
 from ugat_marl.diagnosis.hypotheses import WINDOW, Hypothesis, Members, effects_of
 from ugat_marl.diagnosis.propose import Direction
 from ugat_marl.diagnosis.records import Fitted
 from ugat_marl.diagnosis.statistics import Array, Pools, Reference, Whitener, change_between, shrunk
+from ugat_marl.diagnosis.supplementary_data import EVERY_LANE, TRAVEL_TIME
 from ugat_marl.effects import EVERYWHERE, NO_SOFTER
 
 Change = tuple[dict[str, Array], float]

@@ -9,13 +9,13 @@ from typing import Any
 import numpy as np
 from scipy import special, stats
 
-from ugat_marl.diagnosis.between import MEASURES
 from ugat_marl.diagnosis.engine import OutOfTime
 from ugat_marl.diagnosis.features import ALL_FEATURES, BIN_FEATURES, DetectorLayout
 from ugat_marl.diagnosis.records import Disagreement, Located, Tested
 from ugat_marl.diagnosis.select import Selector
 from ugat_marl.diagnosis.statistics import Array, Distance, Reference
 from ugat_marl.diagnosis.study import Study
+from ugat_marl.diagnosis.supplementary_data import MEASURES
 from ugat_marl.diagnosis.thresholds import Thresholds
 
 SHOWN = 40
@@ -67,7 +67,7 @@ def locate(
     """
     candidates: list[Disagreement] = []
     for name, z in distance.z.items():
-        if name in reference.pools.between:
+        if name in reference.pools.supplementary:
             candidates += _between(layout, reference, name, z, distance.difference[name])
         elif name != "time":
             candidates += _statistics(
@@ -140,7 +140,7 @@ def _between(
     owner = {edge: layout.intersections[index] for index, edge, _ in layout.places}
     rows: list[Disagreement] = []
     for member, feature in zip(*np.nonzero(z), strict=True):
-        label = reference.pools.between[block][int(member)]
+        label = reference.pools.supplementary[block][int(member)]
         name, unit = MEASURES[block][int(feature)]
         value, size = float(z[member, feature]), float(difference[member, feature])
         p = two_sided(value, reference.pools.thresholds.heavy_tail)

@@ -16,10 +16,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ugat_marl.data import occupied_between
-from ugat_marl.diagnosis.between import TURNING
 from ugat_marl.diagnosis.features import BIN_FEATURES, INDEX, DetectorLayout, bins_in
 from ugat_marl.diagnosis.hypotheses import Hypothesis, Members, examined
 from ugat_marl.diagnosis.statistics import Distance, Reference
+from ugat_marl.diagnosis.supplementary_data import TURNING
 from ugat_marl.diagnosis.thresholds import Thresholds
 from ugat_marl.effects import ExaminedStrengths
 from ugat_marl.scenarios import Passages, Period, Scenario, driven_routes, edge_of_lane
@@ -648,7 +648,7 @@ def turned(reference: Reference, distance: Distance) -> list[Hypothesis]:
     share m and the share k in the model, ``m = k + s (1 - k)``.
     """
     thresholds = reference.pools.thresholds
-    labels = reference.pools.between.get(TURNING, ())
+    labels = reference.pools.supplementary.get(TURNING, ())
     if not labels:
         return []
     mean = reference.blocks[TURNING].mean[:, 0]

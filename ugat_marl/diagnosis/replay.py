@@ -97,15 +97,15 @@ class Day:
         period: The period with the passages that the detectors saw.
         travel_time_s: Mean time in the network of the vehicles due, with the wait to enter, s.
         due: Vehicles that the demand asked for; None if the day did not get measured arrivals.
-        between: Times at the first place and travel times, s, ``(vehicles, 2)``, for each of the
-            ways that are followed.
+        point_to_point: Times at the first place and travel times, s, ``(vehicles, 2)``, for each of
+            the ways that are followed.
         lane_states: State of the watched lanes, see `read_lane_states`; None if there are none.
     """
 
     period: Period
     travel_time_s: float
     due: Due | None = None
-    between: tuple[Array, ...] = ()
+    point_to_point: tuple[Array, ...] = ()
     lane_states: Array | None = None
 
 
@@ -305,11 +305,16 @@ class Replay:
         trips = read_trips(directory / "trips.xml")
         seen = read_passages(loops, true, period.begin_s, period.end_s, step)
         travel = float(np.mean(trips.travel_time_s)) if len(trips.travel_time_s) else np.nan
-        between: tuple[Array, ...] = ()
+        point_to_point: tuple[Array, ...] = ()
         if self.followed:
-            between = read_between(places, self.followed, period.begin_s, period.end_s)
+            point_to_point = read_between(places, self.followed, period.begin_s, period.end_s)
         watched = read_lane_states(states, self.watched) if self.watched else None
-        return Day(replace(period, passages=seen), travel, between=between, lane_states=watched)
+        return Day(
+            replace(period, passages=seen),
+            travel,
+            point_to_point=point_to_point,
+            lane_states=watched,
+        )
 
 
 def _with(scenario: Scenario, effects: Sequence[Effect]) -> Scenario:

@@ -22,7 +22,6 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from ugat_marl.diagnosis.between import LANES, TRAVEL_TIME, Label
 from ugat_marl.diagnosis.features import (
     ALL_FEATURES,
     EVENT_FEATURES,
@@ -32,6 +31,7 @@ from ugat_marl.diagnosis.features import (
     Tally,
     bins_in,
 )
+from ugat_marl.diagnosis.supplementary_data import LANES, TRAVEL_TIME, Label
 from ugat_marl.diagnosis.thresholds import Thresholds
 
 Array = NDArray[np.float64]
@@ -52,13 +52,13 @@ class Pools:
         thresholds: Numbers of the method.
         together: Number of bins of time that are joined to one; leftover bins at the end are not
             used.
-        between: Members of the blocks of `Tally.between`.
+        supplementary: Members of the blocks of `Tally.supplementary`.
     """
 
     blocks: dict[str, Array]
     thresholds: Thresholds
     together: int = 1
-    between: Mapping[str, tuple[Label, ...]] = field(default_factory=dict)
+    supplementary: Mapping[str, tuple[Label, ...]] = field(default_factory=dict)
 
     @classmethod
     def of(
@@ -66,7 +66,7 @@ class Pools:
         layout: DetectorLayout,
         thresholds: Thresholds,
         together: int = 1,
-        between: Mapping[str, tuple[Label, ...]] | None = None,
+        supplementary: Mapping[str, tuple[Label, ...]] | None = None,
     ) -> Pools:
         """Pool the network, every intersection if there are several, every lane."""
         places = len(layout.places)
@@ -80,7 +80,7 @@ class Pools:
                 ]
             )
         blocks["lane"] = np.eye(places)
-        return cls(blocks, thresholds, together, between or {})
+        return cls(blocks, thresholds, together, supplementary or {})
 
     def grouped_s(self, length_s: float) -> float:
         """Return how much of a period lies in groups of bins, from its begin on.
@@ -107,7 +107,7 @@ class Pools:
         bins, counted = tally.gathered(self.together)
         time = np.stack([bins, counted], axis=-1)
         pooled["time"] = time.reshape(-1, *time.shape[2:])
-        return pooled | dict(tally.between)
+        return pooled | dict(tally.supplementary)
 
 
 @dataclass(frozen=True, eq=False)

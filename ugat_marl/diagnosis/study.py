@@ -16,7 +16,6 @@ import polars as pl
 from scipy import stats
 
 from ugat_marl.data import Finding, MeasuredData, is_actuated
-from ugat_marl.diagnosis.between import Between
 from ugat_marl.diagnosis.engine import Budget, Engine, default_cache
 from ugat_marl.diagnosis.features import (
     BIN_FEATURES,
@@ -47,6 +46,7 @@ from ugat_marl.diagnosis.replay import Replay
 from ugat_marl.diagnosis.residual import Directed, Directions, Null
 from ugat_marl.diagnosis.select import MOVES_OF_A_VALUE, Selector
 from ugat_marl.diagnosis.statistics import Array, Distance, Pools, Reference, change_between, sum_of
+from ugat_marl.diagnosis.supplementary_data import SupplementaryData
 from ugat_marl.diagnosis.thresholds import EFFORTS, LEAST_EFFORT, Effort, Thresholds
 from ugat_marl.effects import Effect, effect_from_record
 from ugat_marl.errors import MeasuredDataError, OptionError, counted
@@ -180,9 +180,9 @@ class Study:
         answering = _answering(measured, layout.intersections)
         effort = config.effort or effort_for(len(layout.intersections))
         budget = config.budget()
-        between = Between.of(measured)
-        fit = _tallies(layout, measured, periods, thresholds, between)
-        heldout = _tallies(layout, measured, measured.of("heldout"), thresholds, between)
+        supplementary = SupplementaryData.of(measured)
+        fit = _tallies(layout, measured, periods, thresholds, supplementary)
+        heldout = _tallies(layout, measured, measured.of("heldout"), thresholds, supplementary)
         variation = _variation(layout, measured, (*fit, *heldout), thresholds)
         measured = _noted(measured, _of_variation(variation))
 
@@ -198,8 +198,8 @@ class Study:
                     thresholds,
                     answering=answering,
                     day_to_day=variation,
-                    followed=between.followed if between else (),
-                    watched=between.lanes if between else (),
+                    followed=supplementary.followed if supplementary else (),
+                    watched=supplementary.lanes if supplementary else (),
                 ),
                 [*periods, *measured.of("heldout")],
                 config.seed,
@@ -209,7 +209,7 @@ class Study:
                 workers=config.workers,
                 base_days=base_days,
                 interval_s=None if measured.has_events else usual_length(measured.counts),
-                between=between,
+                supplementary=supplementary,
             )
 
         engine = simulating(answering, effort.base)
@@ -220,7 +220,7 @@ class Study:
             config,
             layout,
             engine,
-            _pools(layout, measured, between, thresholds),
+            _pools(layout, measured, supplementary, thresholds),
             allowed,
             tuple(global_hypotheses(scenario, allowed)),
             effort,
@@ -460,7 +460,7 @@ class Study:
                 day.sums * counted,
                 day.bins[..., :width] * known[..., :width],
                 day.days,
-                between=day.between,
+                supplementary=day.supplementary,
                 window=day.window,
             )
             for day in tallies
@@ -582,10 +582,13 @@ def _answering(measured: MeasuredData, lights: Sequence[str]) -> bool:
 
 
 def _pools(
-    layout: DetectorLayout, measured: MeasuredData, between: Between | None, thresholds: Thresholds
+    layout: DetectorLayout,
+    measured: MeasuredData,
+    supplementary: SupplementaryData | None,
+    thresholds: Thresholds,
 ) -> Pools:
     together = 1 if measured.has_events else bins_together(measured.counts, thresholds)
-    return Pools.of(layout, thresholds, together, between.labels if between else None)
+    return Pools.of(layout, thresholds, together, supplementary.labels if supplementary else None)
 
 
 def effort_for(intersections: int) -> Effort:
@@ -667,7 +670,7 @@ def _tallies(
     measured: MeasuredData,
     periods: Sequence[Period],
     thresholds: Thresholds,
-    between: Between | None,
+    supplementary: SupplementaryData | None,
 ) -> tuple[Tally, ...]:
     if measured.has_events or measured.counts is None:
         days = [tally(layout, period, layout.greens(period), thresholds) for period in periods]
@@ -676,9 +679,9 @@ def _tallies(
         days = [
             counts_tally(layout, period, measured.counts, whole, thresholds) for period in periods
         ]
-    if between is not None:
+    if supplementary is not None:
         days = [
-            replace(day, between=between.measured(period.id))
+            replace(day, supplementary=supplementary.measured(period.id))
             for day, period in zip(days, periods, strict=True)
         ]
     return tuple(days)

@@ -10,7 +10,6 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from ugat_marl.diagnosis.between import TRAVEL_TIME
 from ugat_marl.diagnosis.features import (
     ALL_FEATURES,
     BIN_FEATURES,
@@ -22,6 +21,7 @@ from ugat_marl.diagnosis.features import (
 )
 from ugat_marl.diagnosis.records import ApproachRow, Sides, TrafficCheck
 from ugat_marl.diagnosis.statistics import Array, sum_of
+from ugat_marl.diagnosis.supplementary_data import TRAVEL_TIME
 from ugat_marl.diagnosis.thresholds import Thresholds
 
 _SERVED = [BIN_FEATURES.index(name) for name in SERVICE_COUNTS]
@@ -173,9 +173,9 @@ def _journeys(days: Sequence[Tally]) -> Array | None:
 
 def _timed(days: Sequence[Tally]) -> Array | None:
     """Return sums of travel times between places, ``(days, 1, ways, 2)``; None without any."""
-    if any(TRAVEL_TIME not in day.between for day in days):
+    if any(TRAVEL_TIME not in day.supplementary for day in days):
         return None
-    return np.stack([day.between[TRAVEL_TIME].swapaxes(0, 1) for day in days])
+    return np.stack([day.supplementary[TRAVEL_TIME].swapaxes(0, 1) for day in days])
 
 
 def _passing(days: Sequence[Tally]) -> Array | None:

@@ -7,7 +7,8 @@
 - `wrappers`: other observations and equal spaces for learners; `agents` makes padded arrays.
 - `vector`: many environments in worker processes, stepped together.
 - `adapters`: environments in the form of other libraries.
-- `commands`: memory of an agent's own commands; `programmes`: phases of SUMO's own programmes.
+- `commands`: memory of an agent's own commands; `signal_programmes`: phases of lights that run
+  SUMO's own programmes.
 - `single`, `registration`: one light as an environment of Gymnasium, and the names there.
 - `description`: tables of what agents see and choose; `rendering`: pictures of the network.
 - `types`: types of arguments and results, by agent.

@@ -30,11 +30,11 @@ from ugat_marl.envs.actuators import Actuators
 from ugat_marl.envs.objectives import Objectives
 from ugat_marl.envs.observations import Observer, joint_space
 from ugat_marl.envs.options import EnvKeywords, EnvOptions, with_env_keywords
-from ugat_marl.envs.programmes import ProgrammePhases
 from ugat_marl.envs.registration import register_single
 from ugat_marl.envs.rendering import NetworkRenderer
 from ugat_marl.envs.rewards import Rewarder
 from ugat_marl.envs.sensors import Sensors
+from ugat_marl.envs.signal_programmes import ProgrammePhases
 from ugat_marl.envs.types import AnyParallelEnv, ResetResult, StepResult
 from ugat_marl.errors import EpisodeError, OptionError
 from ugat_marl.files import OwnDirectory

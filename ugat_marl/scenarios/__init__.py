@@ -13,7 +13,7 @@ hashes it. It also derives the static network. Nothing here runs a simulation of
 - `periods`: detectors, and the recordings of detectors and signals.
 - `inspection`: facts about a scenario.
 - `capacity`: demand as a share of capacity.
-- `programs`: SUMO's programs.
+- `sumo_tools`: SUMO's programs and tools.
 - `admission`, `confinement`: limits of what a scenario's files may say, and of what the processes
   of SUMO may read and write.
 - `importers`: scenarios from a seed, grids, OpenStreetMap, SUMO, CityFlow and counts.

@@ -79,9 +79,6 @@ from .periods import deciding_letter as deciding_letter
 from .phases import conflicting_greens as conflicting_greens
 from .phases import kerb_turn_of as kerb_turn_of
 from .phases import turn_of as turn_of
-from .programs import finished as finished
-from .programs import run_program as run_program
-from .programs import sumo_program as sumo_program
 from .routes import DEPARTING as DEPARTING
 from .routes import TRAVELLERS as TRAVELLERS
 from .routes import demand_as_vehicles as demand_as_vehicles
@@ -127,3 +124,6 @@ from .street_names import approach_directions as approach_directions
 from .street_names import intersection_name as intersection_name
 from .street_names import named_approaches as named_approaches
 from .street_names import named_turns as named_turns
+from .sumo_tools import finished as finished
+from .sumo_tools import run_program as run_program
+from .sumo_tools import sumo_program as sumo_program

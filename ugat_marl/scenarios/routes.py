@@ -13,9 +13,9 @@ from pathlib import Path
 from ugat_marl.errors import ScenarioError
 from ugat_marl.files import Draft, Tag, child_texts, replacing
 from ugat_marl.progress import Reporter
-from ugat_marl.scenarios.programs import convert
 from ugat_marl.scenarios.scenario import Document, Scenario
 from ugat_marl.scenarios.settings import parse_time
+from ugat_marl.scenarios.sumo_tools import convert
 
 BLOCKERS = ("closure.", "parking.")
 """Beginnings of the ids of vehicles that effects add to block a lane."""

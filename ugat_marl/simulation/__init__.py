@@ -10,7 +10,7 @@ returns a `Snapshot`. At the end of an episode it returns `Trips`.
 - `host`: start and end of processes, for `process` and for vectors of environments.
 - `worker`: the program of these processes.
 - `channel`: messages to and from a worker.
-- `snapshots`, `trips`, `detectors`, `between`, `lane_states`, `upstream`, `approach_delays`:
+- `snapshots`, `trips`, `detectors`, `point_to_point`, `lane_states`, `upstream`, `approach_delays`:
   measurements.
 """
 

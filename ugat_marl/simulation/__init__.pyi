@@ -1,9 +1,5 @@
 from .approach_delays import ApproachDelays as ApproachDelays
 from .approach_delays import measured_approaches as measured_approaches
-from .between import Place as Place
-from .between import Way as Way
-from .between import places_document as places_document
-from .between import read_between as read_between
 from .channel import Channel as Channel
 from .channel import ChannelClosed as ChannelClosed
 from .channel import Message as Message
@@ -23,6 +19,10 @@ from .launch import Simulator as Simulator
 from .launch import VehiclePositions as VehiclePositions
 from .launch import launch_of as launch_of
 from .mesoscopic import refuse_in_queues as refuse_in_queues
+from .point_to_point import Place as Place
+from .point_to_point import Way as Way
+from .point_to_point import places_document as places_document
+from .point_to_point import read_between as read_between
 from .process import ProcessSimulator as ProcessSimulator
 from .process import simulator_of as simulator_of
 from .simulator import LibsumoSimulator as LibsumoSimulator

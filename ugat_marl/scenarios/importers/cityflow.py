@@ -35,7 +35,7 @@ from ugat_marl.scenarios.importers.making import NETWORK, ROUTES, RoadFiles, Roa
 from ugat_marl.scenarios.importers.turning_shares import MOST_VEHICLES, Drive, write_drives
 from ugat_marl.scenarios.junctions import foes_of, links_of, yields_of
 from ugat_marl.scenarios.phases import RightOfWay, state_of
-from ugat_marl.scenarios.programs import netconvert
+from ugat_marl.scenarios.sumo_tools import netconvert
 
 YELLOW_S, ALL_RED_S = 3.0, 2.0
 LONGEST_CLEARANCE_S = 10.0

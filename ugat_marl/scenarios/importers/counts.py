@@ -38,9 +38,9 @@ from ugat_marl.scenarios.importers.turning_shares import (
     walked,
     write_drives,
 )
-from ugat_marl.scenarios.programs import convert
 from ugat_marl.scenarios.scenario import COUNT_SHEET
 from ugat_marl.scenarios.settings import parse_decimal
+from ugat_marl.scenarios.sumo_tools import convert
 from ugat_marl.seeding import numpy_generator
 
 _CANDIDATES_VPH = 400.0

@@ -24,8 +24,8 @@ from ugat_marl.scenarios.importers.making import NETWORK, RoadFiles, RoadSource
 from ugat_marl.scenarios.importers.osm_crossings import crossings_for, has_light
 from ugat_marl.scenarios.junctions import crossings_of, foes_of, links_of
 from ugat_marl.scenarios.phases import are_foes
-from ugat_marl.scenarios.programs import netconvert, sumo_program
 from ugat_marl.scenarios.settings import parse_decimal
+from ugat_marl.scenarios.sumo_tools import netconvert, sumo_program
 
 _ENDINGS = (".osm", ".osm.xml", ".osm.gz", ".osm.xml.gz", ".pbf")
 _FOR_CARS = frozenset(

@@ -20,7 +20,7 @@ from ugat_marl.errors import OptionError, ScenarioError
 from ugat_marl.files import write_whole, xml_bytes
 from ugat_marl.progress import Reporter
 from ugat_marl.scenarios.importers.making import NETWORK, RoadFiles, RoadSource
-from ugat_marl.scenarios.programs import netconvert
+from ugat_marl.scenarios.sumo_tools import netconvert
 
 TURNS = {"l": "left", "s": "straight", "r": "right"}
 STRAIGHT_WITHIN_DEG = 45.0

@@ -1,4 +1,4 @@
-"""Turning counts, travel times of probes and states of lanes: what lies between detectors.
+"""Turning counts, travel times of probes and states of lanes: data besides detectors.
 
 Simulated vehicles are followed over the same places. Turning counts are compared in the stretches
 of time that were counted, and as vehicles per minute. Travel times are compared as means: probes
@@ -60,7 +60,7 @@ class Label:
 
 
 @dataclass(frozen=True, eq=False)
-class Between:
+class SupplementaryData:
     """Measured turning counts, travel times and states of lanes.
 
     Attributes:
@@ -84,7 +84,7 @@ class Between:
     states: Mapping[str, Array] = field(default_factory=dict)
 
     @classmethod
-    def of(cls, measured: MeasuredData) -> Between | None:
+    def of(cls, measured: MeasuredData) -> SupplementaryData | None:
         """Collect turning counts, travel times and lane states; None if the data hold none of them.
 
         Raises:

@@ -11,11 +11,17 @@ import polars as pl
 import pytest
 
 from ugat_marl.data import MeasuredData
-from ugat_marl.diagnosis.between import EVERY_LANE, LANES, TRAVEL_TIME, TURNING, Between
 from ugat_marl.diagnosis.features import BIN_FEATURES, FEATURES, DetectorLayout, IncomingLane, Tally
 from ugat_marl.diagnosis.places import turned
 from ugat_marl.diagnosis.replay import Replay
 from ugat_marl.diagnosis.statistics import Pools, Reference
+from ugat_marl.diagnosis.supplementary_data import (
+    EVERY_LANE,
+    LANES,
+    TRAVEL_TIME,
+    TURNING,
+    SupplementaryData,
+)
 from ugat_marl.diagnosis.thresholds import Thresholds
 from ugat_marl.effects import load_scenario
 from ugat_marl.errors import MeasuredDataError
@@ -55,7 +61,7 @@ MEASURED = MeasuredData(
 
 
 def test_measured_sums_are_vehicles_and_minutes_and_seconds() -> None:
-    found = Between.of(MEASURED)
+    found = SupplementaryData.of(MEASURED)
     assert found is not None
     assert found.turns == (("a", "x"), ("a", "y"))
     assert found.ways == ((Place("a", 5.0), Place("x", 80.0)), (Place("b", 0.0), Place("x", 80.0)))
@@ -68,7 +74,7 @@ def test_measured_sums_are_vehicles_and_minutes_and_seconds() -> None:
 
 
 def test_simulated_vehicles_count_where_the_street_was_counted() -> None:
-    found = Between.of(MEASURED)
+    found = SupplementaryData.of(MEASURED)
     assert found is not None
     came = np.array([[10.0, 4.0], [299.0, 5.0], [300.0, 4.0], [700.0, 3.0], [900.0, 3.0]])
     seen = [came, came, np.array([[5.0, 44.0], [6.0, 46.0]]), np.empty((0, 2))]
@@ -91,15 +97,15 @@ def test_probes_that_arrive_after_the_period_are_not_compared(data: Path) -> Non
     replay = Replay(scenario, network, detectors, owner, THRESHOLDS, followed=ways)
     signals = {"C": tuple((25.0 * i, ("Gr", "rG")[i % 2]) for i in range(8))}
     short = Period("one", 0.0, 140.0, "fit", signals, {})
-    longer = replay.simulate((), replace(short, end_s=200.0), 3).between
+    longer = replay.simulate((), replace(short, end_s=200.0), 3).point_to_point
     measured = [
         ("one", began, first.edge, first.position_m, last.edge, last.position_m, took)
         for (first, last), seen in zip(ways, longer, strict=True)
         for began, took in seen[seen[:, 0] < short.end_s].tolist()
     ]
-    found = Between.of(MeasuredData((), (short,), travel_times=probes(*measured)))
+    found = SupplementaryData.of(MeasuredData((), (short,), travel_times=probes(*measured)))
     assert found is not None and set(found.ways) == set(ways)
-    by_way = dict(zip(ways, replay.simulate((), short, 3).between, strict=True))
+    by_way = dict(zip(ways, replay.simulate((), short, 3).point_to_point, strict=True))
     simulated = found.simulated(short, [by_way[way] for way in found.ways], None)[TRAVEL_TIME]
     assert simulated[:, 0, 1].sum() < len(measured), "some arrive after the period"
     assert simulated[:, 0, 1].all()
@@ -107,20 +113,22 @@ def test_probes_that_arrive_after_the_period_are_not_compared(data: Path) -> Non
 
 
 def test_without_either_kind_there_is_nothing() -> None:
-    assert Between.of(MeasuredData((), PERIODS)) is None
+    assert SupplementaryData.of(MeasuredData((), PERIODS)) is None
 
 
-def a_reference(rates: np.ndarray, between: Between) -> tuple[Reference, list[Tally]]:
+def a_reference(
+    rates: np.ndarray, supplementary: SupplementaryData
+) -> tuple[Reference, list[Tally]]:
     """A model whose turns are Poisson, on an intersection without detectors, 30 min a day."""
     lane = IncomingLane("a_0", "a", 0, (0,), 14.0, {})
     layout = DetectorLayout(("C",), (lane,), (), (), {})
-    pools = Pools.of(layout, THRESHOLDS, 1, between.labels)
+    pools = Pools.of(layout, THRESHOLDS, 1, supplementary.labels)
     generator = np.random.default_rng(4)
 
     def day() -> Tally:
         sums = np.stack([generator.poisson(30.0 * rates), np.full(len(rates), 30.0)], -1)
         empty = np.zeros((len(FEATURES), 1, 2)), np.zeros((len(BIN_FEATURES), 1, 6))
-        return Tally(*empty, between={TURNING: sums[:, None].astype(np.float64)})
+        return Tally(*empty, supplementary={TURNING: sums[:, None].astype(np.float64)})
 
     return Reference(pools, [day() for _ in range(60)]), [day() for _ in range(3)]
 
@@ -128,13 +136,13 @@ def a_reference(rates: np.ndarray, between: Between) -> tuple[Reference, list[Ta
 def test_a_planted_turn_is_proposed_with_its_share_and_no_other() -> None:
     ways = [("a", "x"), ("a", "y"), ("b", "x"), ("b", "y")]
     rows = [("one", 0.0, 900.0, *way, 1.0) for way in ways]
-    between = Between.of(MeasuredData((), PERIODS[:1], turning=turning(*rows)))
-    assert between is not None and between.turns == tuple(ways)
+    supplementary = SupplementaryData.of(MeasuredData((), PERIODS[:1], turning=turning(*rows)))
+    assert supplementary is not None and supplementary.turns == tuple(ways)
     rates = np.array([8.0, 2.0, 5.0, 5.0])
-    reference, same = a_reference(rates, between)
+    reference, same = a_reference(rates, supplementary)
     assert turned(reference, reference.distance(same)) == []
     # A quarter of those who went to x now go to y: of 8 vehicles 2.
-    _, other = a_reference(np.array([6.0, 4.0, 5.0, 5.0]), between)
+    _, other = a_reference(np.array([6.0, 4.0, 5.0, 5.0]), supplementary)
     (found,) = turned(reference, reference.distance(other))
     assert found.fixed == (("from_edge", "a"), ("to_edge", "y"))
     assert found.levels[0][0] == pytest.approx(0.25, abs=0.05)
@@ -152,7 +160,7 @@ def test_lanes_are_means_over_moments_and_vehicles() -> None:
     ]
     names = ("period_id", "time_s", "lane_id", "vehicles", "halting", "mean_speed_mps")
     lanes = pl.DataFrame(rows, schema=names, orient="row")
-    found = Between.of(MeasuredData((), PERIODS, lanes=lanes))
+    found = SupplementaryData.of(MeasuredData((), PERIODS, lanes=lanes))
     assert found is not None and found.lanes == ("a_0", "b_0")
     blocks = found.measured("one")
     means = blocks[LANES][..., 0] / blocks[LANES][..., 1]
@@ -165,7 +173,7 @@ def test_lanes_are_means_over_moments_and_vehicles() -> None:
     with pytest.raises(
         MeasuredDataError, match=r"'[ab]_0' was observed for 12 of 15 min of period"
     ):
-        Between.of(MeasuredData((), PERIODS, lanes=part))
+        SupplementaryData.of(MeasuredData((), PERIODS, lanes=part))
     ends = pl.DataFrame({"time_s": [*range(30), *range(870, 900)]}).select(
         pl.lit("one").alias("period_id"),
         pl.col("time_s").cast(pl.Float64),
@@ -174,7 +182,7 @@ def test_lanes_are_means_over_moments_and_vehicles() -> None:
         pl.lit(2.0).alias("halting"),
     )
     with pytest.raises(MeasuredDataError, match="'a_0' was observed for 1 of 15 min"):
-        Between.of(MeasuredData((), PERIODS, lanes=ends))
+        SupplementaryData.of(MeasuredData((), PERIODS, lanes=ends))
     simulated = found.simulated(PERIODS[0], [], np.array([[1800.0, 90.0, 9000.0], [0.0, 0.0, 0.0]]))
     assert simulated[LANES].tolist() == [
         [[1800.0, 900.0], [90.0, 900.0], [9000.0, 1800.0]],
@@ -192,12 +200,12 @@ def test_a_lane_left_out_of_a_period_is_left_out_of_its_simulated_days() -> None
 
     periods = tuple(Period(name, 0.0, 600.0, "fit", {}, {}) for name in "ab")
     lanes = pl.concat([rows("a", "m_0", 20.0), rows("a", "s_0", 0.0), rows("b", "m_0", 20.0)])
-    between = Between.of(MeasuredData((), periods, lanes=lanes))
-    assert between is not None
+    supplementary = SupplementaryData.of(MeasuredData((), periods, lanes=lanes))
+    assert supplementary is not None
     simulated = np.array([[20.0 * 600, 0.0, 20.0 * 600 * 10], [0.0, 0.0, 0.0]])
     for period in periods:
-        seen = between.measured(period.id)[EVERY_LANE][0]
-        same = between.simulated(period, [], simulated)[EVERY_LANE][0]
+        seen = supplementary.measured(period.id)[EVERY_LANE][0]
+        same = supplementary.simulated(period, [], simulated)[EVERY_LANE][0]
         np.testing.assert_allclose(same, seen)
 
 
@@ -208,7 +216,7 @@ def test_simulated_lanes_are_those_of_positions_second_by_second(data: Path) -> 
         scenario, "sim", policy_factory("fixed-time:30"), periods=1, seed=3, lanes=True,
         same_demand=True,
     )  # fmt: skip
-    found = Between.of(measured)
+    found = SupplementaryData.of(measured)
     assert found is not None
     (period,) = measured.periods
     layout = DetectorLayout.of(network, measured.detectors)
