@@ -40,15 +40,15 @@ from ugat_marl.grounding import (
     FittedService,
     LaneView,
     Posterior,
-    Simulated,
+    SimulatedLog,
     Simulation,
     StreetConfig,
     StreetWorld,
-    Values,
-    Worlds,
+    WorldPrior,
+    WorldValues,
     street_prior,
 )
-from ugat_marl.grounding.street import LEARNT, Known
+from ugat_marl.grounding.street import LEARNT, FitHistory
 from ugat_marl.grounding.summaries import NAMES, Summary
 from ugat_marl.policies import Policy
 from ugat_marl.progress import Bars
@@ -98,7 +98,7 @@ VEHICLES = ("acceleration", "deceleration", "emergency_deceleration", "startup_d
 """Effects that a wet or an icy road changes together."""
 
 
-def draw_other(worlds: Worlds, kind: str, seed: int) -> Values:
+def draw_other(worlds: WorldPrior, kind: str, seed: int) -> WorldValues:
     """Draw a street from a distribution that is not the prior.
 
     Args:
@@ -118,12 +118,12 @@ def draw_other(worlds: Worlds, kind: str, seed: int) -> Values:
     service_s = np.zeros((len(worlds.lanes), 2))
     late = generator.random(len(worlds.lanes)) < 1 / 3
     service_s[late, 0] = generator.uniform(1.0, 6.0, int(late.sum()))
-    return worlds.clipped(Values(effects, service_s))
+    return worlds.clipped(WorldValues(effects, service_s))
 
 
-def streets_of(worlds: Worlds, number: int, seed: int) -> list[tuple[str, Values]]:
+def streets_of(worlds: WorldPrior, number: int, seed: int) -> list[tuple[str, WorldValues]]:
     """Return the streets, by turns from each distribution."""
-    drawn: list[tuple[str, Values]] = []
+    drawn: list[tuple[str, WorldValues]] = []
     for k in range(number):
         one, kind = derive_seed(seed, "street", k), KINDS[k % len(KINDS)]
         drawn.append((kind, worlds.draw(one) if kind == "prior" else draw_other(worlds, kind, one)))
@@ -131,7 +131,7 @@ def streets_of(worlds: Worlds, number: int, seed: int) -> list[tuple[str, Values
 
 
 def answers(
-    posterior: Posterior, kind: str, truth: Values, prior: tuple[Floats, Floats]
+    posterior: Posterior, kind: str, truth: WorldValues, prior: tuple[Floats, Floats]
 ) -> list[Asked]:
     """Return the posterior's answers for a street.
 
@@ -172,7 +172,7 @@ def study(network: Network, number: int, simulations: int, seed: int, folder: Pa
         folder: Folder of the statistics of all episodes.
     """
     worlds = network.worlds
-    ((prior, _), (_, aimed)) = Known().rounds(StreetConfig(simulations=simulations))
+    ((prior, _), (_, aimed)) = FitHistory().rounds(StreetConfig(simulations=simulations))
     streets = streets_of(worlds, number, seed)
     values = [worlds.draw(derive_seed(seed, "world", k), LEARNT) for k in range(prior)]
     known = network.simulated(values, seed, folder, "prior")
@@ -192,7 +192,7 @@ def study(network: Network, number: int, simulations: int, seed: int, folder: Pa
     return asked
 
 
-def _digest(network: Network, values: Sequence[Values], seed: int, episodes: int) -> str:
+def _digest(network: Network, values: Sequence[WorldValues], seed: int, episodes: int) -> str:
     """Return a digest of the network, the episodes and the simulator."""
     names = [item.name for item in network.worlds.library]
     versions = installed_versions("eclipse-sumo")
@@ -217,7 +217,7 @@ class Network:
     """
 
     name: str
-    worlds: Worlds
+    worlds: WorldPrior
     view: LaneView
     policy: str
     acting: Policy
@@ -234,14 +234,14 @@ class Network:
         return cls(name, worlds, view, policy, acting, simulation)
 
     def simulated(
-        self, values: Sequence[Values], seed: int, folder: Path, title: str
-    ) -> list[Simulated]:
+        self, values: Sequence[WorldValues], seed: int, folder: Path, title: str
+    ) -> list[SimulatedLog]:
         """Return the worlds of some values with the statistics of half an hour in each."""
         summaries = self.summaries(values, seed, folder, title)
-        return [Simulated(*pair) for pair in zip(values, summaries, strict=True)]
+        return [SimulatedLog(*pair) for pair in zip(values, summaries, strict=True)]
 
     def summaries(
-        self, values: Sequence[Values], seed: int, folder: Path, title: str, episodes: int = 1
+        self, values: Sequence[WorldValues], seed: int, folder: Path, title: str, episodes: int = 1
     ) -> list[Summary]:
         """Return the statistics of each world; those that are kept in a folder are read.
 
@@ -270,7 +270,7 @@ class Network:
             read = [file[name] for name in ("values", "rows", "usable")]
         return [Summary(*one) for one in zip(*read, strict=True)]
 
-    def _play(self, values: Sequence[Values], seed: int, title: str) -> list[TransitionLog]:
+    def _play(self, values: Sequence[WorldValues], seed: int, title: str) -> list[TransitionLog]:
         """Return the log of half an hour in each world."""
         lanes = self.worlds.lanes
         drawn = [

@@ -18,7 +18,7 @@ from ugat_marl.grounding.uncertainty import (
     DropoutNet,
     EnsembleNet,
     EvidentialNet,
-    Lesson,
+    LossArguments,
     Method,
     MethodName,
     NetShape,
@@ -37,9 +37,9 @@ SHAPE = NetShape((4, 6), (8, 8), 5, STACK.valid_actions[:, None, :])
 ALONE = NetShape((4,), (8, 8), 5, STACK.valid_actions[:1, None, :])
 
 
-def lesson(held_out: bool = False) -> Lesson:
+def loss_arguments(held_out: bool = False) -> LossArguments:
     """Nothing off the data; 90 and 70 rows."""
-    return Lesson(
+    return LossArguments(
         held_out,
         torch_generator(3),
         torch.tensor([90.0, 70.0]),
@@ -54,7 +54,7 @@ def test_members_trained_at_once_are_each_trained_for_themselves() -> None:
     together = EnsembleNet(SHAPE, torch_generator(0), members=3)
     inputs = torch.randn(2, 3, 11, 6, generator=torch_generator(1))
     target = torch.randint(2, (2, 3, 11), generator=torch_generator(2))
-    loss = together.loss(inputs, target, lesson())
+    loss = together.loss(inputs, target, loss_arguments())
     assert loss.shape == (2, 3, 11)
     loss.sum().backward()
     for m in range(3):
@@ -62,7 +62,7 @@ def test_members_trained_at_once_are_each_trained_for_themselves() -> None:
         parts = dict(together.named_parameters())
         for name, part in alone.named_parameters():
             part.data.copy_(parts[name].detach().view(3, *part.shape)[m])
-        own = alone.loss(inputs[:, m], target[:, m], lesson())
+        own = alone.loss(inputs[:, m], target[:, m], loss_arguments())
         assert torch.allclose(own, loss[:, m], atol=1e-6)
         own.sum().backward()
         for name, part in alone.named_parameters():
@@ -81,10 +81,12 @@ def test_one_pass_claims_and_errs_as_two_would(members: int) -> None:
     inputs = torch.randn(*own, 11, 6, generator=generator)
     target = torch.randint(2, (*own, 11), generator=generator)
     off = torch.randn(2, 6, 6, generator=generator)
-    asked = dataclasses.replace(lesson(), off_data_weight=0.3, invent=lambda count: off[:, :count])
+    asked = dataclasses.replace(
+        loss_arguments(), off_data_weight=0.3, invent=lambda count: off[:, :count]
+    )
     everyones = off[:, None].expand(-1, members, -1, -1) if members > 1 else off
     claimed = net.certainty(net.outputs(everyones, asked)).mean(-1, keepdim=True)
-    expected = net.loss(inputs, target, lesson()) + 0.3 * claimed
+    expected = net.loss(inputs, target, loss_arguments()) + 0.3 * claimed
     assert claimed.abs().min() > 1e-5
     assert torch.allclose(net.loss(inputs, target, asked), expected, atol=1e-6)
 
@@ -120,8 +122,10 @@ def test_an_intersection_learns_the_same_in_company_as_alone(method: MethodName)
     target = torch.randint(2, (2, 9), generator=torch_generator(3))
     if method == "ensemble":
         target = target[:, None].expand(-1, 2, -1)
-    together = both.net.loss(taking(inputs, method), target, lesson(held_out=True))
-    apart = alone.net.loss(taking(inputs[:1, :, :8], method), target[:1], lesson(held_out=True))
+    together = both.net.loss(taking(inputs, method), target, loss_arguments(held_out=True))
+    apart = alone.net.loss(
+        taking(inputs[:1, :, :8], method), target[:1], loss_arguments(held_out=True)
+    )
     assert torch.allclose(together[:1], apart, atol=1e-6)
     together[0].sum().backward()
     apart.sum().backward()

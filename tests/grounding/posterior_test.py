@@ -9,19 +9,19 @@ from ugat_marl.errors import CheckpointError, UnknownNameError
 from ugat_marl.grounding.posterior import (
     FittedService,
     Posterior,
-    Simulated,
-    Values,
-    Worlds,
+    SimulatedLog,
+    WorldPrior,
+    WorldValues,
     at_least_0,
 )
 from ugat_marl.grounding.street import LEARNT
 from ugat_marl.grounding.summaries import NAMES, Summary
 
 LANES = tuple(f"lane_{k}" for k in range(8))
-WORLDS = Worlds.of(LANES)
+WORLDS = WorldPrior.of(LANES)
 
 
-def summary(values: Values, seed: int, silent: int | None = None) -> Summary:
+def summary(values: WorldValues, seed: int, silent: int | None = None) -> Summary:
     """Return statistics that the values decide, with noise; one lane may say nothing."""
     generator = np.random.default_rng(seed)
     scaled = (values.effects - 1.0) / 2.0
@@ -37,7 +37,7 @@ def summary(values: Values, seed: int, silent: int | None = None) -> Summary:
 
 
 LEARNT_FROM = [WORLDS.draw(k, LEARNT) for k in range(300)]
-SIMULATED = [Simulated(values, summary(values, k)) for k, values in enumerate(LEARNT_FROM)]
+SIMULATED = [SimulatedLog(values, summary(values, k)) for k, values in enumerate(LEARNT_FROM)]
 
 
 def interval(sample: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -63,14 +63,16 @@ def test_ninety_percent_intervals_hold_the_truth_as_often_as_they_say() -> None:
 def test_service_of_one_lane_is_found_at_this_lane() -> None:
     service_s = np.zeros((len(LANES), 2))
     service_s[3] = (4.0, 0.0)
-    truth = Values(np.array([x.nominal for x in WORLDS.library]), service_s)
+    truth = WorldValues(np.array([x.nominal for x in WORLDS.library]), service_s)
     found = Posterior.fit(WORLDS, SIMULATED, summary(truth, 5)).sample(300)[1].mean(0)
     assert found[3, 0] == pytest.approx(4.0, abs=1.0)
     assert np.delete(found[:, 0], 3).max() < 1.0
 
 
 def test_a_lane_without_data_follows_the_network_and_is_less_certain() -> None:
-    truth = Values(np.array([x.nominal for x in WORLDS.library]), np.full((len(LANES), 2), 2.0))
+    truth = WorldValues(
+        np.array([x.nominal for x in WORLDS.library]), np.full((len(LANES), 2), 2.0)
+    )
     sample_s = Posterior.fit(WORLDS, SIMULATED, summary(truth, 5, silent=2)).sample(400)[1]
     middle = sample_s.mean(0)
     assert middle[2, 0] == pytest.approx(np.delete(middle[:, 0], 2).mean(), abs=0.8)
@@ -84,7 +86,7 @@ def test_draws_keep_to_their_ranges_and_name_only_what_changes() -> None:
         for item, value in zip(WORLDS.library, values.effects, strict=True):
             assert item.low <= value <= item.high
         assert values.service_s.min() >= 0.0
-    nominal = Values(np.array([x.nominal for x in WORLDS.library]), np.zeros((len(LANES), 2)))
+    nominal = WorldValues(np.array([x.nominal for x in WORLDS.library]), np.zeros((len(LANES), 2)))
     assert WORLDS.effects(nominal) == ()
     assert FittedService(LANES, nominal.service_s).service() == {}
     names = [effect.name for effect in WORLDS.effects(posterior.draw(0))]
@@ -96,7 +98,7 @@ def test_a_street_with_one_effect_is_given_no_others() -> None:
     place = [item.name for item in WORLDS.library].index("headway")
     effects = nominal.copy()
     effects[place] = 1.9
-    truth = Values(effects, np.zeros((len(LANES), 2)))
+    truth = WorldValues(effects, np.zeros((len(LANES), 2)))
     posterior = Posterior.fit(WORLDS, SIMULATED, summary(truth, 5))
     assert posterior.presence.chance_of(place) > 0.9
     drawn, service_s = posterior.sample(300)
@@ -110,7 +112,7 @@ def test_worlds_to_learn_from_have_most_effects() -> None:
     drawn = np.stack([WORLDS.draw(seed, LEARNT).effects for seed in range(1000)])
     assert (drawn != nominal).mean(0) == pytest.approx(LEARNT, abs=0.05)
     posterior = Posterior.fit(
-        WORLDS, SIMULATED, summary(Values(nominal, np.zeros((len(LANES), 2))), 5)
+        WORLDS, SIMULATED, summary(WorldValues(nominal, np.zeros((len(LANES), 2))), 5)
     )
     left_out, whole = (
         np.stack([posterior.draw(seed, whole=whole).effects for seed in range(100)]) == nominal
@@ -136,15 +138,15 @@ def test_what_is_estimated_as_a_logarithm_comes_back() -> None:
     np.testing.assert_allclose(WORLDS.natural(WORLDS.scaled(effects)), effects, rtol=1e-12)
     place = [item.name for item in WORLDS.library].index("deceleration")
     np.testing.assert_allclose(WORLDS.scaled(effects)[:, place], np.log(effects[:, place]))
-    nothing = Worlds.of(LANES, without=[item.name for item in WORLDS.library])
+    nothing = WorldPrior.of(LANES, without=[item.name for item in WORLDS.library])
     assert nothing.draw(3).effects.shape == nothing.scaled(np.zeros((4, 0)))[0].shape == (0,)
 
 
 def test_an_effect_can_be_left_out() -> None:
-    worlds = Worlds.of(LANES, without=["headway"])
+    worlds = WorldPrior.of(LANES, without=["headway"])
     assert "headway" not in [item.name for item in worlds.library]
     with pytest.raises(UnknownNameError, match="headwya"):
-        Worlds.of(LANES, without=["headwya"])
+        WorldPrior.of(LANES, without=["headwya"])
 
 
 def test_a_posterior_survives_its_checkpoint_and_refuses_another_network() -> None:
@@ -152,7 +154,7 @@ def test_a_posterior_survives_its_checkpoint_and_refuses_another_network() -> No
     again = Posterior.from_state(WORLDS, posterior.state_dict())
     assert np.array_equal(again.draw(4).effects, posterior.draw(4).effects)
     with pytest.raises(CheckpointError, match="another network"):
-        Posterior.from_state(Worlds.of(LANES[:3]), posterior.state_dict())
+        Posterior.from_state(WorldPrior.of(LANES[:3]), posterior.state_dict())
 
 
 def test_values_at_least_0_by_hand() -> None:
@@ -166,6 +168,6 @@ def test_values_at_least_0_by_hand() -> None:
 
 def test_a_street_without_unused_green_is_given_none_on_average() -> None:
     """Noise of single lanes cancels: set to 0 one by one, it would add a third of its size."""
-    truth = Values(np.array([x.nominal for x in WORLDS.library]), np.zeros((len(LANES), 2)))
+    truth = WorldValues(np.array([x.nominal for x in WORLDS.library]), np.zeros((len(LANES), 2)))
     sample_s = Posterior.fit(WORLDS, SIMULATED, summary(truth, 5)).sample(400)[1]
     assert np.quantile(sample_s[:, :, 0].mean(1), 0.05) == 0.0

@@ -38,7 +38,7 @@ from ugat_marl.grounding import (
 )
 from ugat_marl.grounding.channel import ChannelConfig, CommandChannel
 from ugat_marl.grounding.eyes import Eyes, EyesConfig, fit_eyes
-from ugat_marl.grounding.posterior import Posterior, Values
+from ugat_marl.grounding.posterior import Posterior, WorldValues
 from ugat_marl.grounding.state import RunState
 from ugat_marl.grounding.street_training import StreetTraining
 from ugat_marl.grounding.summaries import NAMES
@@ -176,7 +176,7 @@ def test_values_of_the_simulation_s_own_vehicles_change_nothing(
         headway = found["headway"]  # its range grows to hold it
         assert (headway.nominal, headway.high) == (3.0, 3.0)
         assert found["startup_delay"].nominal == 0.0
-        nominal = Values(np.array([x.nominal for x in prior.library]), np.zeros((2, 2)))
+        nominal = WorldValues(np.array([x.nominal for x in prior.library]), np.zeros((2, 2)))
         assert prior.effects(prior.clipped(nominal)) == ()
 
 
@@ -215,20 +215,20 @@ def test_the_last_worlds_of_a_fit_are_drawn_from_the_posterior_of_the_others(
         fitted.append(len(simulated))
         return fit(worlds, simulated, seen)
 
-    def marked(self: Posterior, seed: int, *, whole: bool) -> Values:
+    def marked(self: Posterior, seed: int, *, whole: bool) -> WorldValues:
         assert whole  # worlds to learn from leave nothing out
         values = draw(self, seed, whole=whole)
         return replace(values, effects=np.append(values.effects[:-1], 1.0123))
 
     monkeypatch.setattr(Posterior, "fit", counted)
     monkeypatch.setattr(Posterior, "draw", marked)
-    known = None
+    history = None
     for _ in range(2):
-        _, known = fit_street(
-            recorded("sim", 40.0), simulation(), rule, prior, view, config, seed=0, known=known
+        _, history = fit_street(
+            recorded("sim", 40.0), simulation(), rule, prior, view, config, seed=0, history=history
         )
-    assert known is not None
-    aimed = [item.values.effects[-1] == 1.0123 for item in known.simulated]
+    assert history is not None
+    aimed = [item.values.effects[-1] == 1.0123 for item in history.simulated]
     assert aimed == [False] * 12 + [True] * 8 + [False] * 2 + [True] * 2
     assert fitted == [12, 20, 24]
 
@@ -252,9 +252,9 @@ def test_a_street_is_compared_with_worlds_of_the_same_length(
     env.close()
     log = recorded("sim", recorded_s)
     shown = simulation(simulated_s)
-    street, known = fit_street(log, shown, rule, prior, view, config, seed=0)
+    street, history = fit_street(log, shown, rule, prior, view, config, seed=0)
     decisions = compared_s / log.provenance.decision_interval_s
-    seen = {float(item.summary.rows[0, NAMES.index("mean")]) for item in known.simulated}
+    seen = {float(item.summary.rows[0, NAMES.index("mean")]) for item in history.simulated}
     assert seen == {decisions}
     begun = log.first(int(decisions))
     if begun.decisions == log.decisions:

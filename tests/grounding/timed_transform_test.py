@@ -25,7 +25,7 @@ from ugat_marl.grounding import (
 from ugat_marl.grounding.forward import DelayedForward, ForwardConfig
 from ugat_marl.grounding.inverse import DelayModel
 from ugat_marl.grounding.timed import likely_delay
-from ugat_marl.grounding.transform import Grounding
+from ugat_marl.grounding.transform import GroundedActions
 from ugat_marl.grounding.uncertainty import Method, MethodName
 from ugat_marl.seeding import torch_generator
 
@@ -54,8 +54,8 @@ def state(phases: tuple[int, int] = (0, 0), seed: int = 0) -> torch.Tensor:
     return STACK.observations(rows)
 
 
-def same(one: Grounding, two: Grounding) -> bool:
-    names = [field.name for field in dataclasses.fields(Grounding)]
+def same(one: GroundedActions, two: GroundedActions) -> bool:
+    names = [field.name for field in dataclasses.fields(GroundedActions)]
     return all(np.array_equal(getattr(one, name), getattr(two, name)) for name in names)
 
 

@@ -16,7 +16,7 @@ from ugat_marl.data import AgentLayout
 from ugat_marl.envs.commands import memory_size
 from ugat_marl.errors import ActionError, OptionError
 from ugat_marl.grounding import GateConfig, GroundedEnv, PhaseTransform
-from ugat_marl.grounding.transform import Grounding
+from ugat_marl.grounding.transform import GroundedActions
 
 LAYOUTS = {"a_0": AgentLayout(3, 4), "b_0": AgentLayout(2, 2, 1)}
 KEYS = {"grounded_action", "uncertainty", "accepted"}
@@ -102,7 +102,7 @@ def test_a_policy_sees_the_commands_it_gave_and_not_the_grounded_ones() -> None:
         def __call__(self, observations, actions, permitted=None, earlier=()):
             threes = np.full(len(actions), 3)
             zeros = np.zeros(len(actions), np.float32)
-            return Grounding(threes, threes, zeros, np.ones(len(actions), bool), zeros)
+            return GroundedActions(threes, threes, zeros, np.ones(len(actions), bool), zeros)
 
     inner = ugat_marl.parallel_env("single-v1", commands=2, duration_s=100.0)
     try:

@@ -6,9 +6,9 @@ import numpy as np
 import pytest
 
 from studies.posterior_coverage import VEHICLES, Asked, draw_other, streets_of, table
-from ugat_marl.grounding import Worlds
+from ugat_marl.grounding import WorldPrior
 
-WORLDS = Worlds.of(tuple(f"lane_{k}" for k in range(6)))
+WORLDS = WorldPrior.of(tuple(f"lane_{k}" for k in range(6)))
 
 
 def test_table_by_hand() -> None:

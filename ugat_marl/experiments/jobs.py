@@ -54,7 +54,7 @@ from ugat_marl.grounding import (
     RandomDelays,
     RecordedWorld,
     SimulatedWorld,
-    World,
+    TransitionSource,
     is_kept,
     require_histories,
 )
@@ -509,7 +509,9 @@ def _grounded(
         yield mark, policies[mark]
 
 
-def worlds_of(job: Job, env: TrafficEnv, workers: Workers) -> tuple[SimulatedWorld, World]:
+def worlds_of(
+    job: Job, env: TrafficEnv, workers: Workers
+) -> tuple[SimulatedWorld, TransitionSource]:
     """Return the sources of D_sim and D_real of a grounded job.
 
     Args:

@@ -32,9 +32,9 @@ from ugat_marl.grounding import (
     Simulation,
     StreetFit,
     StreetTraining,
+    TransitionSource,
     Ugat,
     UgatConfig,
-    World,
     answer_with_noise,
     is_kept,
     neighbours_of,
@@ -104,7 +104,7 @@ def train_grounded(
     ugat: UgatConfig,
     make: LearnerFactory,
     env: TrafficEnv,
-    worlds: tuple[SimulatedWorld, World],
+    worlds: tuple[SimulatedWorld, TransitionSource],
     seed: int,
     run: Run,
     *,
@@ -166,7 +166,12 @@ def train_grounded(
 
 
 def _rival(
-    make: LearnerFactory, env: TrafficEnv, real: World, config: UgatConfig, seed: int, start: Path
+    make: LearnerFactory,
+    env: TrafficEnv,
+    real: TransitionSource,
+    config: UgatConfig,
+    seed: int,
+    start: Path,
 ) -> Rival | None:
     """Return the second learner of a fitted street; None without one, and where none can be.
 

@@ -27,9 +27,9 @@ from .phase import inverse_accuracy as inverse_accuracy
 from .posterior import LIBRARY as LIBRARY
 from .posterior import FittedService as FittedService
 from .posterior import Posterior as Posterior
-from .posterior import Simulated as Simulated
-from .posterior import Values as Values
-from .posterior import Worlds as Worlds
+from .posterior import SimulatedLog as SimulatedLog
+from .posterior import WorldPrior as WorldPrior
+from .posterior import WorldValues as WorldValues
 from .residual import Residual as Residual
 from .residual import ResidualConfig as ResidualConfig
 from .rival import ROLL_OUTS as ROLL_OUTS
@@ -62,7 +62,7 @@ from .view import neighbours_of as neighbours_of
 from .worlds import RecordedWorld as RecordedWorld
 from .worlds import RollOutSettings as RollOutSettings
 from .worlds import SimulatedWorld as SimulatedWorld
-from .worlds import World as World
+from .worlds import TransitionSource as TransitionSource
 from .worlds import roll_outs as roll_outs
 from .wrappers import ChangePenalty as ChangePenalty
 from .wrappers import GroundedEnv as GroundedEnv

@@ -12,7 +12,7 @@ from ugat_marl.envs import AnyParallelEnv
 from ugat_marl.grounding.config import UgatConfig
 from ugat_marl.grounding.gate import Gate
 from ugat_marl.grounding.state import RunState, is_kept
-from ugat_marl.grounding.worlds import World
+from ugat_marl.grounding.worlds import TransitionSource
 from ugat_marl.policies import Learner, Policy, attended
 
 CHECKPOINT_EPISODES = 10
@@ -39,7 +39,7 @@ class Algorithm:
     """
 
     env: AnyParallelEnv
-    real: World
+    real: TransitionSource
     config: UgatConfig
     seed: int
     run: Run

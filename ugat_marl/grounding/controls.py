@@ -17,7 +17,7 @@ from torch import Tensor
 
 from ugat_marl.data import TransitionLog
 from ugat_marl.grounding.forward import ForwardModel
-from ugat_marl.grounding.worlds import World
+from ugat_marl.grounding.worlds import TransitionSource
 from ugat_marl.policies import Policy
 from ugat_marl.seeding import derive_seed, numpy_generator, torch_generator
 
@@ -49,7 +49,7 @@ def answer_with_noise(model: ForwardModel, seed: int) -> None:
 
 
 class ShuffledWorld:
-    """World that returns the transitions of another world with permuted outcomes.
+    """Source that returns the transitions of another source with permuted outcomes.
 
     Outcomes are permuted among the rows of an agent. The frequencies of states and of outcomes stay
     the same, but outcomes do not depend on their states.
@@ -58,7 +58,7 @@ class ShuffledWorld:
         world: Source of the transitions.
     """
 
-    def __init__(self, world: World) -> None:
+    def __init__(self, world: TransitionSource) -> None:
         self._world = world
 
     def collect(self, policy: Policy, iteration: int, seed: int) -> TransitionLog | None:

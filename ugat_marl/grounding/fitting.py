@@ -25,7 +25,7 @@ from ugat_marl.grounding.inverse import AnswerModel
 from ugat_marl.grounding.networks import TrainableModel, full_width, rows_at_once
 from ugat_marl.grounding.reports import ForwardReport, TrainingRecord, forward_report
 from ugat_marl.grounding.stacked import Stack, StackedTransitions
-from ugat_marl.grounding.uncertainty import Lesson, Method, MethodName, annealing
+from ugat_marl.grounding.uncertainty import LossArguments, Method, MethodName, annealing
 from ugat_marl.grounding.view import View
 from ugat_marl.policies import CPU, on_device
 from ugat_marl.seeding import torch_generator
@@ -298,22 +298,26 @@ class Fitter:
         """Hold out episodes as `split` does, with the settings of this fit."""
         return split(data, self.config.held_out_every, stack)
 
-    def fit_changes(self, model: ForwardModel, lesson: Changes, rows: Split) -> ForwardReport:
+    def fit_changes(
+        self, model: ForwardModel, training_data: Changes, rows: Split
+    ) -> ForwardReport:
         """Fit a model of changes by least squares, each agent on its own rows.
 
         The loss of a row is the mean over outputs of (prediction - change / scale)^2.
 
         Args:
             model: Model of changes, changed in place.
-            lesson: Data of the fit.
+            training_data: Data of the fit.
             rows: Rows to train on and to hold out.
         """
-        change = model.change(lesson.observation, lesson.outcome)
+        change = model.change(training_data.observation, training_data.outcome)
         if not (bool(model.fitted) and self.config.warm_start):
-            model.renew(torch_generator(self.seed, lesson.name, "weights"))
-            model.fit_scale(lesson.observation, change, rows.train)
+            model.renew(torch_generator(self.seed, training_data.name, "weights"))
+            model.fit_scale(training_data.observation, change, rows.train)
         outputs = model.valid_outputs.sum(-1).to(self.device)
-        inputs = model.inputs(lesson.observation, lesson.action, lesson.extra).to(self.device)
+        inputs = model.inputs(
+            training_data.observation, training_data.action, training_data.extra
+        ).to(self.device)
         truth = (change / model.scale).to(self.device)
 
         def loss(columns: Tensor, _epoch: int) -> Tensor:
@@ -321,33 +325,35 @@ class Fitter:
             squares = (error**2).sum(-1)
             return squares / outputs.view(-1, *[1] * (squares.dim() - 1))
 
-        generator = torch_generator(self.seed, lesson.name, "batches")
+        generator = torch_generator(self.seed, training_data.name, "batches")
         with on_device(self.device, model):
-            record = self._train(lesson.name, model, loss, rows.to(self.device), generator)
+            record = self._train(training_data.name, model, loss, rows.to(self.device), generator)
             with torch.no_grad():
                 predicted = (model.read_all(inputs) * model.scale).to(CPU)
-        followed = lesson.observation[..., : change.shape[-1]] * model.valid_outputs + change
+        followed = training_data.observation[..., : change.shape[-1]] * model.valid_outputs + change
         share = (rows.train / rows.train.sum(1, keepdim=True))[..., None]
         off_mean = followed - (followed * share).sum(1, keepdim=True)
         return forward_report(model, predicted, change, off_mean, rows.held_out, record)
 
-    def fit_answers(self, model: AnswerModel, lesson: Questions, rows: Split) -> TrainingRecord:
+    def fit_answers(
+        self, model: AnswerModel, training_data: Questions, rows: Split
+    ) -> TrainingRecord:
         """Fit a model that answers with a class, with the loss of its method of uncertainty.
 
         Args:
             model: Inverse model, changed in place; its head learns from all agents at once.
-            lesson: Data of the fit.
+            training_data: Data of the fit.
             rows: Rows to train on and to hold out.
         """
         config = self.config
         fresh = not (bool(model.fitted) and config.warm_start and model.method == config.method)
         if fresh:
             model.renew(config.method, torch_generator(self.seed, "inverse", "weights"))
-            model.standardise.fit(lesson.inputs, rows.train)
+            model.standardise.fit(training_data.inputs, rows.train)
         generator = torch_generator(self.seed, "inverse", "batches")
-        inputs = model.standardise(lesson.inputs).to(self.device)
-        answers = lesson.answers.to(self.device)
-        rows, off_data = rows.to(self.device), lesson.off_data.to(self.device)
+        inputs = model.standardise(training_data.inputs).to(self.device)
+        answers = training_data.answers.to(self.device)
+        rows, off_data = rows.to(self.device), training_data.off_data.to(self.device)
         count = rows.train.sum(1)
 
         def invent(number: int) -> Tensor:
@@ -356,7 +362,7 @@ class Fitter:
         def loss(columns: Tensor, epoch: int) -> Tensor:
             # A fresh model has to gather evidence first; misleading evidence is punished later.
             share = annealing(epoch, config.kl_epochs) if fresh and epoch >= 0 else 1.0
-            about = Lesson(
+            about = LossArguments(
                 held_out=epoch < 0,
                 generator=generator,
                 rows=count,

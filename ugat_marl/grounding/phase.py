@@ -30,7 +30,7 @@ from ugat_marl.grounding.reports import (
     flat,
 )
 from ugat_marl.grounding.stacked import StackedTransitions, stack_log
-from ugat_marl.grounding.transform import Grounding, Transform
+from ugat_marl.grounding.transform import GroundedActions, Transform
 from ugat_marl.grounding.uncertainty import Method
 from ugat_marl.grounding.view import InputsConfig, Moment, Neighbours
 from ugat_marl.policies import one_thread
@@ -114,7 +114,7 @@ class PhaseTransform(Transform):
             accuracy_on_means=accuracy_on_means,
         )
 
-    def lesson(self, data: StackedTransitions) -> tuple[Changes, Tensor]:
+    def training_data(self, data: StackedTransitions) -> tuple[Changes, Tensor]:
         """Return the outcomes of what was asked; every decision can be grounded."""
         seen = self.forward.view.of(data)
         return Changes("forward", seen, data.next_observation, data.asked), data.weight
@@ -124,8 +124,8 @@ class PhaseTransform(Transform):
         f = self.forward
         generator = torch_generator(fitter.seed, "world")
         model = ForwardModel(self.stack, f.config, generator, view=f.view)
-        lesson = Changes("world", f.view.of(data), data.next_observation, data.asked)
-        fitter.fit_changes(model, lesson, fitter.split(data, self.stack))
+        training_data = Changes("world", f.view.of(data), data.next_observation, data.asked)
+        fitter.fit_changes(model, training_data, fitter.split(data, self.stack))
         return model
 
     def ground(
@@ -134,7 +134,7 @@ class PhaseTransform(Transform):
         actions: NDArray[np.int64],
         permitted: NDArray[np.bool_] | None,
         earlier: Sequence[Moment],
-    ) -> Grounding:
+    ) -> GroundedActions:
         """Ask f, then h, then the gate; models that see neighbours are asked several times.
 
         `joint` repeats the questions until the answers of all agents agree. Line numbers are those
@@ -157,7 +157,7 @@ class PhaseTransform(Transform):
         grounded, u = settled.grounded, settled.u
         accepted = self.gate.decide(u, actions, grounded, settled.allowed)  # lines 13 and 15
         executed = np.where(accepted, grounded, actions)
-        return Grounding(executed, grounded, u, accepted, np.zeros_like(u))
+        return GroundedActions(executed, grounded, u, accepted, np.zeros_like(u))
 
     def fresh_inverse(self, method: Method) -> InverseModel:
         """Return an unfitted h of the same shape with this method of uncertainty."""
@@ -184,8 +184,8 @@ def fit_inverse(model: InverseModel, log: TransitionLog, fitter: Fitter) -> Phas
 
 
 def _fit_forward(model: ForwardModel, data: StackedTransitions, fitter: Fitter) -> ForwardReport:
-    lesson = Changes("forward", model.view.of(data), data.next_observation, data.asked)
-    return fitter.fit_changes(model, lesson, fitter.split(data, model.stack))
+    training_data = Changes("forward", model.view.of(data), data.next_observation, data.asked)
+    return fitter.fit_changes(model, training_data, fitter.split(data, model.stack))
 
 
 def _expected(forward: ForwardModel, data: StackedTransitions, fitter: Fitter) -> Tensor:
@@ -195,8 +195,8 @@ def _expected(forward: ForwardModel, data: StackedTransitions, fitter: Fitter) -
     """
     generator, seen = torch_generator(fitter.seed, "simulated"), forward.view.of(data)
     model = ForwardModel(forward.stack, forward.config, generator, view=forward.view)
-    lesson = Changes("simulated", seen, data.next_observation, data.executed)
-    fitter.fit_changes(model, lesson, fitter.split(data, forward.stack))
+    training_data = Changes("simulated", seen, data.next_observation, data.executed)
+    fitter.fit_changes(model, training_data, fitter.split(data, forward.stack))
     with torch.no_grad():
         return model.predict(seen, data.executed)
 

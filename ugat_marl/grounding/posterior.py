@@ -43,7 +43,7 @@ from ugat_marl.seeding import numpy_generator
 
 
 @dataclass(frozen=True)
-class Prior:
+class EffectPrior:
     """Prior of an effect with one number for the whole network.
 
     Attributes:
@@ -63,7 +63,7 @@ class Prior:
     chance: float = 0.35
     log: bool = False
 
-    def of(self, scenario: Scenario) -> Prior:
+    def of(self, scenario: Scenario) -> EffectPrior:
         """Return the prior with a scenario's nominal value, which its range includes."""
         kind = known_effects()[self.name]
         nominal = nominal_number(scenario, kind.attribute, self.nominal)
@@ -72,13 +72,13 @@ class Prior:
 
 
 LIBRARY = (
-    Prior("acceleration", 0.4, 3.0, 2.6, 0.5, log=True),
-    Prior("deceleration", 1.2, 5.0, 4.5, 0.5, log=True),
-    Prior("emergency_deceleration", 2.0, 9.0, 9.0, 0.5, log=True),
-    Prior("startup_delay", 0.0, 1.0, 0.0, 0.5),
-    Prior("headway", 0.8, 2.2, 1.0),
-    Prior("desired_speed", 0.6, 1.1, 1.0),
-    Prior("demand_level", 0.8, 1.25, 1.0),
+    EffectPrior("acceleration", 0.4, 3.0, 2.6, 0.5, log=True),
+    EffectPrior("deceleration", 1.2, 5.0, 4.5, 0.5, log=True),
+    EffectPrior("emergency_deceleration", 2.0, 9.0, 9.0, 0.5, log=True),
+    EffectPrior("startup_delay", 0.0, 1.0, 0.0, 0.5),
+    EffectPrior("headway", 0.8, 2.2, 1.0),
+    EffectPrior("desired_speed", 0.6, 1.1, 1.0),
+    EffectPrior("demand_level", 0.8, 1.25, 1.0),
 )
 """Effects whose values are estimated, with wide ranges around those of V1 to V4."""
 
@@ -115,7 +115,7 @@ SERVICE = (ServicePrior(0.5, 5.0), ServicePrior(0.35, 3.0))
 
 
 @dataclass(frozen=True)
-class Values:
+class WorldValues:
     """Values of one world.
 
     Attributes:
@@ -128,7 +128,7 @@ class Values:
 
 
 @dataclass(frozen=True)
-class Worlds:
+class WorldPrior:
     """Prior of the worlds of a network.
 
     Attributes:
@@ -137,7 +137,7 @@ class Worlds:
         service: True to estimate the service of lanes.
     """
 
-    library: tuple[Prior, ...]
+    library: tuple[EffectPrior, ...]
     lanes: tuple[str, ...]
     service: bool = True
 
@@ -148,7 +148,7 @@ class Worlds:
         without: Sequence[str] = (),
         service: bool = True,
         scenario: Scenario | None = None,
-    ) -> Worlds:
+    ) -> WorldPrior:
         """Return the prior of a network.
 
         Args:
@@ -175,7 +175,7 @@ class Worlds:
         """Lowest, nominal and highest values of the effects, ``(3, effects)``."""
         return np.array([(x.low, x.nominal, x.high) for x in self.library]).reshape(-1, 3).T
 
-    def draw(self, seed: int, chance: float | None = None) -> Values:
+    def draw(self, seed: int, chance: float | None = None) -> WorldValues:
         """Draw a world from the prior.
 
         Args:
@@ -196,7 +196,7 @@ class Worlds:
             unequal = generator.random() < prior.unequal
             spread = generator.uniform(0.0, prior.high_s / 2) if unequal else 0.0
             column += mean + spread * generator.standard_normal(len(self.lanes))
-        return self.clipped(Values(effects, service_s * self.service))
+        return self.clipped(WorldValues(effects, service_s * self.service))
 
     def scaled(self, effects: Floats) -> Floats:
         """Return values of the effects on the scale of the estimate, ``(..., effects)``."""
@@ -208,7 +208,7 @@ class Worlds:
         log = np.array([x.log for x in self.library], dtype=np.bool_)
         return np.where(log, np.exp(np.where(log, scaled, 0.0)), scaled)
 
-    def clipped(self, values: Values) -> Values:
+    def clipped(self, values: WorldValues) -> WorldValues:
         """Return the values within their ranges."""
         low, _, high = self.ends
         effects = np.clip(values.effects, low, high)
@@ -218,9 +218,9 @@ class Worlds:
                 least = effects[names.index(soft)]
                 effects[names.index(hard)] = max(effects[names.index(hard)], least)
         most_s = np.array([2.0 * prior.high_s for prior in SERVICE])
-        return Values(effects, np.clip(values.service_s, 0.0, most_s))
+        return WorldValues(effects, np.clip(values.service_s, 0.0, most_s))
 
-    def effects(self, values: Values) -> tuple[Effect, ...]:
+    def effects(self, values: WorldValues) -> tuple[Effect, ...]:
         """Return the effects of a world that change something; those on demand come first."""
         made: list[Effect] = []
         for item, value in zip(self.library, values.effects, strict=True):
@@ -238,7 +238,7 @@ class FittedService(ControllerPart):
 
     Args:
         lanes: Ids of the lanes.
-        service_s: ``(lanes, 2)``, as in `Values`.
+        service_s: ``(lanes, 2)``, as in `WorldValues`.
     """
 
     name: ClassVar[str] = "fitted service"
@@ -265,10 +265,10 @@ class FittedService(ControllerPart):
 
 
 @dataclass(frozen=True)
-class Simulated:
+class SimulatedLog:
     """A simulated world and the statistics of its log."""
 
-    values: Values
+    values: WorldValues
     summary: Summary
 
 
@@ -278,7 +278,7 @@ class Posterior:
 
     Attributes:
         worlds: The prior.
-        effects: Regression's answer for the street, on the scale of `Worlds.scaled`,
+        effects: Regression's answer for the street, on the scale of `WorldPrior.scaled`,
             ``(effects,)``.
         service_s: The same for the lanes, in s, ``(lanes, 2)``.
         effect_errors: Residuals of the simulated worlds, ``(n, effects)``.
@@ -286,7 +286,7 @@ class Posterior:
         chances: Weights of the residuals, ``(n,)``.
     """
 
-    worlds: Worlds
+    worlds: WorldPrior
     effects: Floats
     service_s: Floats
     effect_errors: Floats
@@ -294,7 +294,9 @@ class Posterior:
     chances: Floats
 
     @classmethod
-    def fit(cls, worlds: Worlds, simulated: Sequence[Simulated], street: Summary) -> Posterior:
+    def fit(
+        cls, worlds: WorldPrior, simulated: Sequence[SimulatedLog], street: Summary
+    ) -> Posterior:
         """Fit the regression to simulated worlds and apply it to the street.
 
         Args:
@@ -343,7 +345,7 @@ class Posterior:
             kernel(predicted, answer, errors),
         )
 
-    def draw(self, seed: int, *, whole: bool = False) -> Values:
+    def draw(self, seed: int, *, whole: bool = False) -> WorldValues:
         """Draw the values of a world.
 
         Args:
@@ -352,7 +354,7 @@ class Posterior:
         """
         return self.drawn(numpy_generator(seed, "worlds", "posterior"), whole=whole)
 
-    def drawn(self, generator: np.random.Generator, *, whole: bool = False) -> Values:
+    def drawn(self, generator: np.random.Generator, *, whole: bool = False) -> WorldValues:
         """Draw the values of a world with a generator, see `draw`."""
         row = int(generator.choice(len(self.chances), p=self.chances))
         service_s = self.service_s + self.service_errors_s[row]
@@ -363,7 +365,9 @@ class Posterior:
             service_s = service_s + drawn[split:] - mean_s
             service_s[:, absent[absent >= split] - split] = 0.0
         effects = self.worlds.natural(drawn[:split])
-        return self.worlds.clipped(Values(effects, at_least_0(service_s) * self.worlds.service))
+        return self.worlds.clipped(
+            WorldValues(effects, at_least_0(service_s) * self.worlds.service)
+        )
 
     @functools.cached_property
     def presence(self) -> Presence:
@@ -424,7 +428,7 @@ class Posterior:
         return {name: getattr(self, name).tolist() for name in _NUMBERS}
 
     @classmethod
-    def from_state(cls, worlds: Worlds, state: Mapping[str, Any]) -> Posterior:
+    def from_state(cls, worlds: WorldPrior, state: Mapping[str, Any]) -> Posterior:
         """Restore `state_dict`.
 
         Raises:

@@ -53,9 +53,9 @@ from ugat_marl.grounding.posterior import (
     LIBRARY,
     FittedService,
     Posterior,
-    Simulated,
-    Values,
-    Worlds,
+    SimulatedLog,
+    WorldPrior,
+    WorldValues,
 )
 from ugat_marl.grounding.residual import ResidualConfig, of_one_street
 from ugat_marl.grounding.summaries import LaneView, Summary
@@ -209,7 +209,7 @@ class FittedStreet:
             return StreetWorld(parts=self._parts(seed))
         return self.around(self.posterior.worlds, self.posterior.draw(seed), seed)
 
-    def around(self, worlds: Worlds, values: Values, seed: int) -> StreetWorld:
+    def around(self, worlds: WorldPrior, values: WorldValues, seed: int) -> StreetWorld:
         """Draw the world of an episode, of which effects and service are given."""
         service = FittedService(self.lanes, values.service_s)
         return StreetWorld(worlds.effects(values), (*self._parts(seed), service))
@@ -259,7 +259,7 @@ class FittedStreet:
             numbers |= self.posterior.as_dict(lanes_of)
         return numbers
 
-    def save(self, path: Path, simulated: Sequence[Simulated] = ()) -> None:
+    def save(self, path: Path, simulated: Sequence[SimulatedLog] = ()) -> None:
         """Write the street to a file, whole or not at all.
 
         Args:
@@ -276,7 +276,7 @@ class FittedStreet:
         write_checkpoint(path, KIND, content)
 
     @classmethod
-    def load(cls, path: Path, worlds: Worlds) -> tuple[FittedStreet, Known]:
+    def load(cls, path: Path, worlds: WorldPrior) -> tuple[FittedStreet, FitHistory]:
         """Read a file of `save`.
 
         Args:
@@ -304,7 +304,7 @@ class FittedStreet:
             None if eyes is None else Eyes.from_state(eyes),
             None if posterior is None else Posterior.from_state(worlds, posterior),
         )
-        return street, Known(_simulated(content.get("simulated")), street.posterior)
+        return street, FitHistory(_simulated(content.get("simulated")), street.posterior)
 
 
 ENOUGH = 100
@@ -423,7 +423,7 @@ BASELINE_EPISODES = 2
 
 
 @dataclass(frozen=True)
-class Known:
+class FitHistory:
     """Results of earlier fits, which a further fit continues.
 
     Attributes:
@@ -431,7 +431,7 @@ class Known:
         posterior: The last posterior; None before the first one.
     """
 
-    simulated: tuple[Simulated, ...] = ()
+    simulated: tuple[SimulatedLog, ...] = ()
     posterior: Posterior | None = None
 
     def new_worlds(self, config: StreetConfig) -> int:
@@ -455,13 +455,13 @@ def fit_street(
     real: TransitionLog,
     simulation: Simulation,
     policy: Policy,
-    worlds: Worlds,
+    worlds: WorldPrior,
     view: LaneView,
     config: StreetConfig,
     seed: int,
     on_done: Callable[[], object] = lambda: None,
-    known: Known | None = None,
-) -> tuple[FittedStreet, Known]:
+    history: FitHistory | None = None,
+) -> tuple[FittedStreet, FitHistory]:
     """Fit the parts of a street to its log (lines 1 to 4).
 
     Args:
@@ -473,7 +473,7 @@ def fit_street(
         config: Settings.
         seed: Root of every random choice.
         on_done: Called after each simulated episode.
-        known: Results of earlier fits to the same street.
+        history: Results of earlier fits to the same street.
 
     Returns:
         The street, and the results for a further fit.
@@ -482,7 +482,7 @@ def fit_street(
         LogError: Too many decisions are missing in the log, or they are not in sequence.
     """
     require_histories(real)
-    known = known or Known()
+    history = history or FitHistory()
     lanes, interval_s = worlds.lanes, real.provenance.decision_interval_s
     timing = simulation.scenario.timing
     held_s = timing.clearance_s + timing.min_green_s
@@ -497,14 +497,14 @@ def fit_street(
         eyes = fit_eyes(real.first(baseline.decisions), baseline, view, config.eyes)
         street = FittedStreet(lanes, interval_s, channel, eyes)
     if not config.simulates:
-        return street, known
+        return street, history
     # Queues grow through a peak: worlds of half an hour tell nothing of an hour's second half.
     compared_s = min(config.simulated_s, simulation.longest_s)
     decisions = min(real.decisions, max(1, int(compared_s / interval_s)))
     seen = view.summary(real.first(decisions))
-    simulated, posterior = list(known.simulated), known.posterior
-    for prior, aimed in known.rounds(config):
-        first, number = len(simulated) - len(known.simulated), prior + aimed
+    simulated, posterior = list(history.simulated), history.posterior
+    for prior, aimed in history.rounds(config):
+        first, number = len(simulated) - len(history.simulated), prior + aimed
         ids = [derive_seed(seed, "street", "values", first + k) for k in range(number)]
         values = [worlds.draw(one, LEARNT) for one in ids[:prior]]
         if posterior is not None:
@@ -513,11 +513,11 @@ def fit_street(
         drawn = [street.around(worlds, *pair) for pair in zip(values, seeds, strict=True)]
         logs = simulation.logs(drawn, policy, seeds, decisions * interval_s, on_done)
         simulated += [
-            Simulated(*pair) for pair in zip(values, map(view.summary, logs), strict=True)
+            SimulatedLog(*pair) for pair in zip(values, map(view.summary, logs), strict=True)
         ]
         posterior = Posterior.fit(worlds, simulated, seen)
     street = FittedStreet(lanes, interval_s, channel, street.eyes, posterior)
-    return street, Known(tuple(simulated), posterior)
+    return street, FitHistory(tuple(simulated), posterior)
 
 
 def street_log(
@@ -540,10 +540,10 @@ def street_log(
     return of_one_street(simulation.logs(worlds, policy, seeds, None, on_done))
 
 
-def episodes_of_fit(config: StreetConfig, known: Known) -> int:
+def episodes_of_fit(config: StreetConfig, history: FitHistory) -> int:
     """Return the number of episodes that `fit_street` simulates."""
     baseline = BASELINE_EPISODES if "eyes" in config.parts else 0
-    return baseline + known.new_worlds(config) * config.simulates
+    return baseline + history.new_worlds(config) * config.simulates
 
 
 class DrawnEnv(BaseParallelWrapper[str, Any, Any]):
@@ -601,15 +601,15 @@ def street_env(street: FittedStreet, simulation: Simulation, commands: int) -> D
     )
 
 
-def street_prior(env: TrafficEnv, config: StreetConfig) -> Worlds:
+def street_prior(env: TrafficEnv, config: StreetConfig) -> WorldPrior:
     """Return the prior of the worlds of an environment's network."""
     view = LaneView.of(env.network, str(env.options.observation))
     everything = tuple(item.name for item in LIBRARY)
     left_out = config.without if "effects" in config.parts else everything
-    return Worlds.of(view.lanes, left_out, "service" in config.parts, env.scenario)
+    return WorldPrior.of(view.lanes, left_out, "service" in config.parts, env.scenario)
 
 
-def _arrays(simulated: Sequence[Simulated]) -> dict[str, Tensor]:
+def _arrays(simulated: Sequence[SimulatedLog]) -> dict[str, Tensor]:
     """Return simulated worlds as tensors; statistics of too few decisions become 0."""
     if not simulated:
         return {}
@@ -622,7 +622,7 @@ def _arrays(simulated: Sequence[Simulated]) -> dict[str, Tensor]:
     }
 
 
-def _simulated(arrays: Any) -> tuple[Simulated, ...]:
+def _simulated(arrays: Any) -> tuple[SimulatedLog, ...]:
     """Restore `_arrays`.
 
     Raises:
@@ -634,7 +634,7 @@ def _simulated(arrays: Any) -> tuple[Simulated, ...]:
         names = ("effects", "service_s", "values", "rows")
         columns = [arrays[name].numpy() for name in names]
         return tuple(
-            Simulated(Values(effects, service_s), Summary.of(values, rows))
+            SimulatedLog(WorldValues(effects, service_s), Summary.of(values, rows))
             for effects, service_s, values, rows in zip(*columns, strict=True)
         )
     except (KeyError, TypeError, ValueError, AttributeError) as error:

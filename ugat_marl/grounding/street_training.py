@@ -34,14 +34,14 @@ from ugat_marl.data import TransitionLog
 from ugat_marl.grounding.algorithm import Algorithm, iteration_name
 from ugat_marl.grounding.fitting import Fitter
 from ugat_marl.grounding.oversaturation import Oversaturation
-from ugat_marl.grounding.posterior import Worlds
+from ugat_marl.grounding.posterior import WorldPrior
 from ugat_marl.grounding.residual import Residual
 from ugat_marl.grounding.rival import ROLL_OUTS, Rival, late_world, matched_delays
 from ugat_marl.grounding.state import RunState
 from ugat_marl.grounding.street import (
     ENOUGH,
+    FitHistory,
     FittedStreet,
-    Known,
     Simulation,
     episodes_of_fit,
     fit_street,
@@ -85,14 +85,14 @@ class StreetFit:
     Attributes:
         worlds: Prior of worlds.
         street: The street; None before the first fit.
-        known: Results of earlier fits.
+        history: Results of earlier fits.
         residual: f, h and gate on top of the street; None without.
         rival: A second learner, which trains with late greens; None without.
     """
 
-    worlds: Worlds
+    worlds: WorldPrior
     street: FittedStreet | None = None
-    known: Known = field(default_factory=Known)
+    history: FitHistory = field(default_factory=FitHistory)
     residual: Residual | None = None
     rival: Rival | None = None
 
@@ -107,7 +107,7 @@ class StreetFit:
     def save(self, path: Path) -> None:
         """Write the street to a file, and the rest beside it; nothing before the first fit."""
         if self.street is not None:
-            self.street.save(path, self.known.simulated)
+            self.street.save(path, self.history.simulated)
             if self.residual is not None:
                 self.residual.save(path.with_name(RESIDUAL))
             if self.rival is not None:
@@ -120,7 +120,7 @@ class StreetFit:
             CheckpointError: A file is unreadable, or of another network.
         """
         if path.exists():
-            self.street, self.known = FittedStreet.load(path, self.worlds)
+            self.street, self.history = FittedStreet.load(path, self.worlds)
             if self.residual is not None:
                 self.residual.load(path.with_name(RESIDUAL))
             if self.rival is not None:
@@ -320,10 +320,10 @@ class StreetTraining(Algorithm):
 
     def _fit(self, state: RunState[StreetFit], policy: Policy) -> FittedStreet:
         """Fit the street to D_real, and say what was found (line 4)."""
-        real, known = TransitionLog.concatenate(state.real), state.transform.known
+        real, history = TransitionLog.concatenate(state.real), state.transform.history
         config = self.config.street.of_log(real)
-        number = episodes_of_fit(config, known)
-        worlds = len(known.simulated) + known.new_worlds(config)
+        number = episodes_of_fit(config, history)
+        worlds = len(history.simulated) + history.new_worlds(config)
         if config.simulates and worlds < ENOUGH:
             self.run.reporter.say(
                 f"{iteration_name(state)}: {worlds} simulations are few, so chances are "
@@ -335,7 +335,7 @@ class StreetTraining(Algorithm):
             self.run.reporter.say(f"{iteration_name(state)}: {line}")
         simulation, acting = self._as_recorded(policy)
         with self.run.reporter.task(f"fitting, {iteration_name(state)}", number) as advance:
-            street, state.transform.known = fit_street(
+            street, state.transform.history = fit_street(
                 real,
                 simulation,
                 acting,
@@ -344,7 +344,7 @@ class StreetTraining(Algorithm):
                 config,
                 derive_seed(self.seed, "fit", state.iteration),
                 advance,
-                known,
+                history,
             )
         state.transform.street = street
         for line in street.describe():

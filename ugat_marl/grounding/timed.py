@@ -43,7 +43,7 @@ from ugat_marl.grounding.reports import (
     flat,
 )
 from ugat_marl.grounding.stacked import Stack, StackedTransitions, alike, stack_log
-from ugat_marl.grounding.transform import Grounding, Transform
+from ugat_marl.grounding.transform import GroundedActions, Transform
 from ugat_marl.grounding.uncertainty import Method
 from ugat_marl.grounding.view import InputsConfig, Moment, Neighbours
 from ugat_marl.policies import one_thread
@@ -198,13 +198,13 @@ class TimedTransform(Transform):
         view = self.forward.view
         rows = fitter.split(data, stack)
         extra = model.extra(data.delay_s)
-        lesson = Changes("simulated", view.of(data), data.outcome, data.executed, extra)
-        g = fitter.fit_changes(model, lesson, rows)
+        training_data = Changes("simulated", view.of(data), data.outcome, data.executed, extra)
+        g = fitter.fit_changes(model, training_data, rows)
         if on_top:
             self.forward.begin_as(model)
         own = fitter.further() if on_top else fitter
-        lesson = Changes("forward", view.of(street), street.outcome, street.asked)
-        f = own.fit_changes(self.forward, lesson, fitter.split(street, stack))
+        training_data = Changes("forward", view.of(street), street.outcome, street.asked)
+        f = own.fit_changes(self.forward, training_data, fitter.split(street, stack))
         begins = _begins(data, stack)
         known = ModelErrors.of(model, replace(data, weight=rows.train * begins))
         street = replace(street, weight=street.weight * _begins(street, stack))
@@ -217,11 +217,11 @@ class TimedTransform(Transform):
         mean_u = self._mean_u(street)
         return TimedReport(stack.agents, f, h, mean_u, g, lost, self.timed.most_s, matched)
 
-    def lesson(self, data: StackedTransitions) -> tuple[Changes, Tensor]:
+    def training_data(self, data: StackedTransitions) -> tuple[Changes, Tensor]:
         """Return the outcomes of what was asked; only greens that begin can be grounded."""
-        lesson = Changes("forward", self.forward.view.of(data), data.outcome, data.asked)
+        training_data = Changes("forward", self.forward.view.of(data), data.outcome, data.asked)
         begins = self.stack.current_phase(data.observation) != data.asked
-        return lesson, data.weight * begins
+        return training_data, data.weight * begins
 
     @property
     def acting(self) -> NDArray[np.bool_]:
@@ -269,35 +269,37 @@ class TimedTransform(Transform):
             change = (change + self.timed.target_noise * noise) * simulated.scale
         inputs = model.inputs(seen, data.executed, change)
         off_data = OffData.around(inputs, rows.train, model.view, model.action_columns)
-        lesson = Questions(inputs, answers, off_data)
-        record = fitter.fit_answers(model, lesson, rows)
-        return self._inverse_report(data, rows, lesson, record, torch_generator(seed, "off data"))
+        training_data = Questions(inputs, answers, off_data)
+        record = fitter.fit_answers(model, training_data, rows)
+        return self._inverse_report(
+            data, rows, training_data, record, torch_generator(seed, "off data")
+        )
 
     @torch.no_grad()
     def _inverse_report(
         self,
         data: StackedTransitions,
         rows: Split,
-        lesson: Questions,
+        training_data: Questions,
         record: TrainingRecord,
         generator: torch.Generator,
     ) -> TimedInverseReport:
         """Measure h on its held-out questions and on single transitions."""
         model = self.inverse
         seconds = torch.arange(model.most_s + 1, dtype=torch.float32)
-        answer = model.answer(lesson.inputs)
+        answer = model.answer(training_data.inputs)
         happened = self.simulated.change(data.observation, data.outcome)
         single = model.predict(model.view.of(data), data.executed, happened)
         held = rows.held_out * data.weight  # 0 for agents that had to train without such rows
         count = int(held.sum(1).max().clamp(min=1))
-        drawn = lesson.off_data.draw(count, generator, state_share=1.0)
-        missed = answer.action != lesson.answers
+        drawn = training_data.off_data.draw(count, generator, state_share=1.0)
+        missed = answer.action != training_data.answers
         return TimedInverseReport(
             training=record,
             calibration=Calibration.of(answer, missed, held.bool(), model.answer(drawn)),
             uncertainty=model.method.name,
             error_s=mean_error(
-                (answer.probability * seconds).sum(-1), lesson.answers.float(), held
+                (answer.probability * seconds).sum(-1), training_data.answers.float(), held
             ),
             error_on_transitions_s=mean_error(
                 (single.probability * seconds).sum(-1), data.delay_s, held
@@ -319,7 +321,7 @@ class TimedTransform(Transform):
         actions: NDArray[np.int64],
         permitted: NDArray[np.bool_] | None,
         earlier: Sequence[Moment],
-    ) -> Grounding:
+    ) -> GroundedActions:
         """Return the policy's phases, with a delay where they change.
 
         Line numbers are those of Algorithm 1 (`ugat`). The gate gets delays in whole seconds. An
@@ -330,7 +332,9 @@ class TimedTransform(Transform):
         switched = (self.stack.current_phase(observations) != asked)[:, 0].numpy()
         if self.timed.answer == "constant":
             delay = np.where(switched, usual[:, 0].numpy(), 0.0).astype(np.float32)
-            return Grounding(actions, actions, np.zeros_like(delay), np.ones_like(switched), delay)
+            return GroundedActions(
+                actions, actions, np.zeros_like(delay), np.ones_like(switched), delay
+            )
         # Grounding keeps all phases, so those of the neighbours are known in advance.
         phases = torch.from_numpy(running(actions, permitted))[:, None]
         delays_s, u = self.delays(  # lines 11 and 12
@@ -346,7 +350,7 @@ class TimedTransform(Transform):
         )
         delay = np.where(accepted, delays_s[:, 0].numpy(), usual[:, 0].numpy())
         delay = np.where(switched, delay, 0.0).astype(np.float32)
-        return Grounding(actions, actions, u[:, 0].numpy(), accepted, delay)
+        return GroundedActions(actions, actions, u[:, 0].numpy(), accepted, delay)
 
     def delays(self, seen: Tensor, local: Tensor, actions: Tensor) -> tuple[Tensor, Tensor]:
         """Return the delays of h in s, pulled to the constant delays, and u: ``(agents, batch)``.

@@ -37,7 +37,7 @@ KIND = "grounding"
 
 
 @dataclass(frozen=True)
-class Grounding:
+class GroundedActions:
     """Grounded actions of all agents at one step; arrays ``(agents,)``.
 
     Attributes:
@@ -139,7 +139,7 @@ class Transform(abc.ABC):
         """
 
     @abc.abstractmethod
-    def lesson(self, data: StackedTransitions) -> tuple[Changes, Tensor]:
+    def training_data(self, data: StackedTransitions) -> tuple[Changes, Tensor]:
         """Return what f learns from transitions, and the decisions that can be grounded.
 
         The second part is ``(agents, n)``, 1 for such a decision and 0 for others and for padding.
@@ -165,7 +165,7 @@ class Transform(abc.ABC):
         actions: NDArray[np.int64],
         permitted: NDArray[np.bool_] | None,
         earlier: Sequence[Moment],
-    ) -> Grounding:
+    ) -> GroundedActions:
         """Ground one action per agent with fitted models; the arguments are those of `__call__`."""
 
     @abc.abstractmethod
@@ -180,7 +180,7 @@ class Transform(abc.ABC):
         actions: NDArray[np.int64],
         permitted: NDArray[np.bool_] | None = None,
         earlier: Sequence[Moment] = (),
-    ) -> Grounding:
+    ) -> GroundedActions:
         """Ground one action per agent, all of them together.
 
         Args:

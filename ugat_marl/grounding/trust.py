@@ -109,13 +109,13 @@ class _Part:
     """Data of a fit, in blocks.
 
     Attributes:
-        lesson: Data from which a model learns.
+        training_data: Data from which a model learns.
         rows: ``(agents, n)`` 1 for a row, 0 for padding.
         weight: ``(agents, n)`` 1 for decisions that are compared.
         block: ``(agents, n)`` int64, number of the row's block; -1 in padding.
     """
 
-    lesson: Changes
+    training_data: Changes
     rows: Tensor
     weight: Tensor
     block: Tensor
@@ -161,7 +161,7 @@ def compare(
     """
     stack = transform.stack
     street, simulated = (
-        _part(transform.lesson(data), data.weight)
+        _part(transform.training_data(data), data.weight)
         for data in alike(stack_log(real, stack), stack_log(world, stack))
     )
     if min(int(street.blocks.min()), int(simulated.blocks.min()) // 2) < LEAST_BLOCKS:
@@ -174,16 +174,16 @@ def compare(
 
     def errors(fitted: ForwardModel) -> Tensor:
         """Return mean squared errors on the street, ``(agents, n)``."""
-        lesson = street.lesson
+        training_data = street.training_data
         with torch.no_grad():
-            inputs = fitted.inputs(lesson.observation, lesson.action)
+            inputs = fitted.inputs(training_data.observation, training_data.action)
             predicted = fitted.read_all(inputs) * fitted.scale
-        happened = fitted.change(lesson.observation, lesson.outcome)
+        happened = fitted.change(training_data.observation, training_data.outcome)
         return ((predicted - happened) ** 2).sum(-1) / fitted.valid_outputs.sum(-1)
 
     first = simulated.block < simulated.blocks // 2
     start, every = model(), simulated.blocks
-    fitter.fit_changes(start, simulated.lesson, simulated.split(first, every))
+    fitter.fit_changes(start, simulated.training_data, simulated.split(first, every))
     of_street = _folds(street.block, torch.zeros_like(street.blocks), config.folds)
     of_world = _folds(simulated.block, simulated.blocks // 2, config.folds)
     found = torch.zeros(2, *street.rows.shape)
@@ -193,17 +193,17 @@ def compare(
         for place, (part, use) in enumerate(((street, ~test), (simulated, ~first & ~left))):
             fitted = model()
             fitted.begin_as(start)
-            own.fit_changes(fitted, part.lesson, part.split(use, most))
+            own.fit_changes(fitted, part.training_data, part.split(use, most))
             found[place] = torch.where(test, errors(fitted), found[place])
     fold = torch.stack([test * number for number, test in enumerate(of_street)]).sum(0)
     return _tested(stack.agents, found, street, fold, config)
 
 
-def _part(lesson: tuple[Changes, Tensor], rows: Tensor) -> _Part:
+def _part(training_data: tuple[Changes, Tensor], rows: Tensor) -> _Part:
     """Return the data of a fit in blocks; the last block of an agent takes the rest."""
     block = torch.arange(rows.shape[1]).expand(rows.shape) // BLOCK
     last = (rows.sum(1, keepdim=True).long() // BLOCK - 1).clamp(min=0)
-    learnt, weight = lesson
+    learnt, weight = training_data
     return _Part(learnt, rows, weight, torch.where(rows.bool(), block.minimum(last), -1))
 
 

@@ -60,7 +60,7 @@ from ugat_marl.grounding.gate import GateReport
 from ugat_marl.grounding.reports import FitReport
 from ugat_marl.grounding.state import RunState
 from ugat_marl.grounding.transform import Transform
-from ugat_marl.grounding.worlds import SimulatedWorld, World
+from ugat_marl.grounding.worlds import SimulatedWorld, TransitionSource
 from ugat_marl.grounding.wrappers import GroundedEnv
 from ugat_marl.policies import Policy, device_of
 from ugat_marl.seeding import derive_seed
@@ -108,7 +108,7 @@ class Ugat(Algorithm):
 
     def _roll_out(self, state: RunState[Transform], policy: Policy) -> None:
         """Roll the policy out in both worlds at the same time (lines 3 and 4)."""
-        worlds: tuple[World, World] = (self.sim, self.real)
+        worlds: tuple[TransitionSource, TransitionSource] = (self.sim, self.real)
         with (
             self.run.reporter.task(f"roll-outs, {iteration_name(state)}", len(worlds)) as advance,
             concurrent.futures.ThreadPoolExecutor(len(worlds)) as pool,

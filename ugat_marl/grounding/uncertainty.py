@@ -91,7 +91,7 @@ class InversePrediction:
 
 
 @dataclass(frozen=True)
-class Lesson:
+class LossArguments:
     """Arguments of a loss beside the rows; every method takes what it needs.
 
     Attributes:
@@ -159,11 +159,11 @@ class AnswerNet(nn.Module, abc.ABC):
         self.register_buffer("valid_actions", shape.valid_actions, persistent=False)
 
     @abc.abstractmethod
-    def outputs(self, inputs: Tensor, lesson: Lesson) -> Tensor:
+    def outputs(self, inputs: Tensor, arguments: LossArguments) -> Tensor:
         """Return the tensor that `row_loss` and `certainty` read, ``(agents, ..., rows, K)``."""
 
     @abc.abstractmethod
-    def row_loss(self, outputs: Tensor, target: Tensor, lesson: Lesson) -> Tensor:
+    def row_loss(self, outputs: Tensor, target: Tensor, arguments: LossArguments) -> Tensor:
         """Return the loss of every row, in the shape of `target`."""
 
     @abc.abstractmethod
@@ -173,7 +173,7 @@ class AnswerNet(nn.Module, abc.ABC):
         The shape is ``(agents, count)`` or ``(agents, members, count)``.
         """
 
-    def loss(self, inputs: Tensor, target: Tensor, lesson: Lesson) -> Tensor:
+    def loss(self, inputs: Tensor, target: Tensor, arguments: LossArguments) -> Tensor:
         """Return the loss of every row, in the shape of `target`, with the certainty off the data.
 
             loss = row loss + off_data_weight * share * mean certainty on invented inputs
@@ -182,19 +182,19 @@ class AnswerNet(nn.Module, abc.ABC):
             inputs: ``(agents, batch, width)`` standardised, or ``(agents, members, batch, width)``
                 if every member has its own rows.
             target: ``(agents, batch)`` or ``(agents, members, batch)`` int64, the true actions.
-            lesson: Further arguments of a loss.
+            arguments: Further arguments of the loss.
         """
-        if not lesson.off_data_weight:
-            return self.row_loss(self.outputs(inputs, lesson), target, lesson)
+        if not arguments.off_data_weight:
+            return self.row_loss(self.outputs(inputs, arguments), target, arguments)
         rows = target.shape[-1]
-        invented = lesson.invent(rows // 2 + 1)
+        invented = arguments.invent(rows // 2 + 1)
         if inputs.dim() > invented.dim():
             invented = invented[:, None].expand(-1, self.members, -1, -1)
         # One pass for both, because two would read all weights and sum their gradients twice.
-        outputs = self.outputs(torch.cat([inputs, invented], -2), lesson)
-        error = self.row_loss(outputs[..., :rows, :], target, lesson)
+        outputs = self.outputs(torch.cat([inputs, invented], -2), arguments)
+        error = self.row_loss(outputs[..., :rows, :], target, arguments)
         certain = self.certainty(outputs[..., rows:, :])
-        return error + lesson.off_data_weight * lesson.share * certain.mean(-1, keepdim=True)
+        return error + arguments.off_data_weight * arguments.share * certain.mean(-1, keepdim=True)
 
     @abc.abstractmethod
     def answer(self, inputs: Tensor) -> InversePrediction:
@@ -385,14 +385,14 @@ class EvidentialNet(AnswerNet):
         embedding = torch.relu(self.encoders(inputs))
         return concentration(self.head(embedding), self.valid_actions)
 
-    def outputs(self, inputs: Tensor, lesson: Lesson) -> Tensor:
+    def outputs(self, inputs: Tensor, arguments: LossArguments) -> Tensor:
         """Return the concentrations."""
-        del lesson
+        del arguments
         return self(inputs)
 
-    def row_loss(self, outputs: Tensor, target: Tensor, lesson: Lesson) -> Tensor:
+    def row_loss(self, outputs: Tensor, target: Tensor, arguments: LossArguments) -> Tensor:
         """Return the evidential loss with the current weight of the divergence."""
-        weight = lesson.kl_weight * lesson.share
+        weight = arguments.kl_weight * arguments.share
         return evidential_loss(outputs, target, self.valid_actions, weight)
 
     def certainty(self, outputs: Tensor) -> Tensor:
@@ -516,13 +516,13 @@ class DropoutNet(AnswerNet):
         """Learned dropout rates of each layer: ``(agents,)``, and ``(1,)`` for a shared head."""
         return [torch.sigmoid(logit.detach()).flatten() for logit in self._logits()]
 
-    def row_loss(self, outputs: Tensor, target: Tensor, lesson: Lesson) -> Tensor:
+    def row_loss(self, outputs: Tensor, target: Tensor, arguments: LossArguments) -> Tensor:
         """Return the cross-entropy of one thinned network per row, plus divergence / rows.
 
         The loss of held-out rows is the cross-entropy of the whole network alone.
         """
         likelihood = negative_log_likelihood(outputs, target, self.valid_actions)
-        return likelihood if lesson.held_out else likelihood + self._divergence(lesson.rows)
+        return likelihood if arguments.held_out else likelihood + self._divergence(arguments.rows)
 
     def certainty(self, outputs: Tensor) -> Tensor:
         """Return the divergence from equal probabilities, with one thinned network per row."""
@@ -537,13 +537,13 @@ class DropoutNet(AnswerNet):
         """Return the log odds of every rate, ``(agents, 1, 1)``; ``(1, 1, 1)`` if shared."""
         return [RATE_SPEED * logit for logit in self.slow_logits]
 
-    def outputs(self, inputs: Tensor, lesson: Lesson) -> Tensor:
+    def outputs(self, inputs: Tensor, arguments: LossArguments) -> Tensor:
         """Return logits ``(agents, batch, actions)``, each row from a newly thinned network."""
-        if lesson.held_out:
+        if arguments.held_out:
             return self.head(torch.relu(self.encoders(inputs)))
         x = inputs
         for k, (layer, logit) in enumerate(zip(self._maps(), self._logits(), strict=True)):
-            draw = torch.rand(x.shape, generator=lesson.generator).to(x.device)
+            draw = torch.rand(x.shape, generator=arguments.generator).to(x.device)
             x = layer(thinned(x if k == 0 else torch.relu(x), logit, draw))
         return x
 
@@ -603,14 +603,14 @@ class EnsembleNet(AnswerNet):
         out = torch.baddbmm(bias, embedding, weight.transpose(1, 2))
         return out.view(members, agents, rows, -1).transpose(0, 1)
 
-    def outputs(self, inputs: Tensor, lesson: Lesson) -> Tensor:
+    def outputs(self, inputs: Tensor, arguments: LossArguments) -> Tensor:
         """Return the logits."""
-        del lesson
+        del arguments
         return self.logits(inputs)
 
-    def row_loss(self, outputs: Tensor, target: Tensor, lesson: Lesson) -> Tensor:
+    def row_loss(self, outputs: Tensor, target: Tensor, arguments: LossArguments) -> Tensor:
         """Return the cross-entropy, member by member."""
-        del lesson
+        del arguments
         member_target = target.reshape(outputs.shape[:3])
         return negative_log_likelihood(outputs, member_target, self.valid_actions[:, None]).view(
             target.shape
@@ -633,9 +633,9 @@ class PlainNet(EnsembleNet):
     This is grounded action transformation without a gate (GAT; Hanna and Stone, AAAI 2017).
     """
 
-    def loss(self, inputs: Tensor, target: Tensor, lesson: Lesson) -> Tensor:
+    def loss(self, inputs: Tensor, target: Tensor, arguments: LossArguments) -> Tensor:
         """Return the cross-entropy alone; without u no training off the data is needed."""
-        return self.row_loss(self.outputs(inputs, lesson), target, lesson)
+        return self.row_loss(self.outputs(inputs, arguments), target, arguments)
 
     def answer(self, inputs: Tensor) -> InversePrediction:
         """Return the likeliest action with u = 0."""

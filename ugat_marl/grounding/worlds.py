@@ -43,7 +43,7 @@ EPISODES_PER_DELAY = 2
 """Roll-outs for each delay; at least two are needed to measure their scatter."""
 
 
-class World(Protocol):
+class TransitionSource(Protocol):
     """A source of transitions."""
 
     def collect(self, policy: Policy, iteration: int, seed: int) -> TransitionLog | None:
