@@ -39,7 +39,7 @@ from ugat_marl.parallel import (
     as_done,
     executor_of,
     parts_at_a_time,
-    persistently,
+    retry_on_crash,
     usable_cores,
 )
 from ugat_marl.policies import Policy
@@ -282,7 +282,7 @@ def test_other_errors_are_not_tried_again() -> None:
         raise OptionError("no")
 
     with pytest.raises(OptionError, match="no"):
-        persistently(play)
+        retry_on_crash(play)
     assert tried == [1]
 
 

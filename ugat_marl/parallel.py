@@ -52,15 +52,15 @@ RETRIES = 3
 """Number of times work is repeated if its process died."""
 
 
-def persistently(work: Callable[[], Done], death: type[Exception] = SimulatorCrashed) -> Done:
+def retry_on_crash(work: Callable[[], Done], crash: type[Exception] = SimulatorCrashed) -> Done:
     """Call a function, and repeat the call if a process it needs died.
 
     Args:
         work: The function, such as one episode.
-        death: Exception that means the process died. It is raised if every call fails so.
+        crash: Exception that means the process died. It is raised if every call fails so.
     """
     for _ in range(RETRIES):
-        with contextlib.suppress(death):
+        with contextlib.suppress(crash):
             return work()
     return work()
 
@@ -120,7 +120,7 @@ def _seconds(value: Any, place: str) -> float:
     return value
 
 
-def show_life(sign: Callable[[], object]) -> None:
+def send_heartbeats(sign: Callable[[], object]) -> None:
     """Give a sign of life every second, in a thread, as long as this process runs on.
 
     A process that is stopped gives none, and one that is busy does: its thread needs the
@@ -136,14 +136,14 @@ def show_life(sign: Callable[[], object]) -> None:
     threading.Thread(target=beat, daemon=True).start()
 
 
-class Pulse:
+class Heartbeat:
     """The signs of life of a process, as its starter sees them.
 
     No limit of time could tell a long piece of work from one that never ends; a process that does
     not run on can be told.
 
     Args:
-        sign: Returns a number that differs after every sign of `show_life`.
+        sign: Returns a number that differs after every sign of `send_heartbeats`.
         deadline_s: Seconds without a sign after which the process counts as dead; None for
             `usual_deadline_s`.
     """
@@ -278,7 +278,7 @@ class LocalProcesses(Executor):
         The part raises `BrokenProcessPool` if its process died each time.
         """
         part = functools.partial(fn, *args, **kwargs)
-        return self._threads.submit(persistently, lambda: self._done(part), BrokenProcessPool)
+        return self._threads.submit(retry_on_crash, lambda: self._done(part), BrokenProcessPool)
 
     def shutdown(self, wait: bool = True, *, cancel_futures: bool = False) -> None:
         """End the processes after the submitted parts, or after the running ones if cancelled."""
@@ -320,9 +320,9 @@ class _Process(ProcessPoolExecutor):
             BrokenProcessPool: The process died, or was stopped and killed.
         """
         future = self.submit(part)
-        pulse = Pulse(lambda: self._beats.value)
+        heartbeat = Heartbeat(lambda: self._beats.value)
         while not wait([future], timeout=_BEAT_S).done:
-            if pulse.is_lost():
+            if heartbeat.is_lost():
                 for each in [*self._processes.values()]:  # the pool has no method for it
                     each.kill()
         return future.result()
@@ -332,7 +332,7 @@ def _beat(beats: Any) -> None:
     def add() -> None:
         beats.value += 1
 
-    show_life(add)
+    send_heartbeats(add)
 
 
 class RayExecutor(Executor):
@@ -448,7 +448,7 @@ class RayExecutor(Executor):
 
         kill = self._ray.remote(num_cpus=0, max_retries=0)(_kill)
         counts: dict[_Place, int] = {}
-        pulses: dict[_Place, Pulse] = {}
+        heartbeats: dict[_Place, Heartbeat] = {}
         while not self._closed.wait(_BEAT_S) and self._ray.is_initialized():
             with self._lock:
                 parts = {reference.task_id().hex() for reference in self._running.values()}
@@ -458,12 +458,13 @@ class RayExecutor(Executor):
                 continue
             counts.clear()
             counts.update(now)
-            pulses = {
-                place: pulses.get(place) or Pulse(functools.partial(counts.__getitem__, place))
+            heartbeats = {
+                place: heartbeats.get(place)
+                or Heartbeat(functools.partial(counts.__getitem__, place))
                 for place in counts
             }
-            for place, pulse in pulses.items():
-                if pulse.is_lost():
+            for place, heartbeat in heartbeats.items():
+                if heartbeat.is_lost():
                     there = NodeAffinitySchedulingStrategy(place.node, soft=False)
                     kill.options(scheduling_strategy=there).remote(place.process)
                     self._signs.forget.remote(place.part)
@@ -498,14 +499,14 @@ class _Signs:
         return dict(self._counts.values())
 
 
-class _Life:
+class _RayHeartbeat:
     """Part of this process of Ray, and the counter of its signs of life."""
 
     signs: Any = None
     place: _Place
 
     @classmethod
-    def show(cls) -> None:
+    def send(cls) -> None:
         """Give a sign of life."""
         cls.signs.add.remote(cls.place)
 
@@ -514,14 +515,14 @@ def _call(signs: Any, fn: Callable[..., Any], args: tuple[Any, ...], kwargs: dic
     import ray  # pyright: ignore[reportMissingImports]
 
     here: Any = ray.get_runtime_context()
-    is_first = _Life.signs is None
-    _Life.place = _Place(here.get_task_id(), here.get_node_id(), os.getpid())
-    _Life.signs = signs
+    is_first = _RayHeartbeat.signs is None
+    _RayHeartbeat.place = _Place(here.get_task_id(), here.get_node_id(), os.getpid())
+    _RayHeartbeat.signs = signs
     if is_first:
-        show_life(_Life.show)
+        send_heartbeats(_RayHeartbeat.send)
     failures: Any = ray.exceptions  # pyright: ignore[reportAttributeAccessIssue]
     with contextlib.suppress(failures.RayError):  # a part without a sign is never missed
-        ray.get(signs.add.remote(_Life.place), timeout=_PATIENCE_S)
+        ray.get(signs.add.remote(_RayHeartbeat.place), timeout=_PATIENCE_S)
     return fn(*args, **kwargs)
 
 

@@ -45,7 +45,7 @@ from ugat_marl.experiments.jobs import (
 )
 from ugat_marl.experiments.paper import TABLES, settings_of
 from ugat_marl.grounding import FitConfig, UgatConfig
-from ugat_marl.parallel import DEADLINE_VARIABLE, Pulse, Stop
+from ugat_marl.parallel import DEADLINE_VARIABLE, Heartbeat, Stop
 from ugat_marl.policies import (
     BASELINES,
     DQN_NAME,
@@ -380,11 +380,11 @@ def test_a_stopped_job_is_killed_and_taken_up_again_with_the_same_numbers(
 def test_a_job_that_is_stopped_again_and_again_is_reported(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    class Still(Pulse):
+    class Still(Heartbeat):
         def is_lost(self) -> bool:
             return True
 
-    monkeypatch.setattr(forked, "Pulse", Still)
+    monkeypatch.setattr(forked, "Heartbeat", Still)
     with pytest.raises(MeasurementError, match=r"did not run on for 900 s .* was killed"):
         perform_all([PLAIN], tmp_path, 1, Silent(), "test")
 
@@ -396,7 +396,7 @@ def test_a_forked_job_ends_with_a_killed_driver(python: list[str], tmp_path: Pat
 import sys
 from pathlib import Path
 from ugat_marl.experiments.forked import perform_forked
-from ugat_marl.parallel import DEADLINE_VARIABLE, Pulse, Stop
+from ugat_marl.parallel import DEADLINE_VARIABLE, Heartbeat, Stop
 with Path(sys.argv[2]).open("wb") as log:
     perform_forked(Path(sys.argv[1]), log, Stop())
 """

@@ -162,7 +162,7 @@ def test_a_worker_that_stops_in_the_middle_of_a_message_counts_as_dead(
     with pytest.raises(ChannelClosed):
         go_on()
     assert 2.5 < time.monotonic() - begun < 10.0
-    assert "did not answer 'large' within 3 s and was killed" in worker.obituary("large")
+    assert "did not answer 'large' within 3 s and was killed" in worker.crash_message("large")
     host.close()
 
 

@@ -54,7 +54,7 @@ from ugat_marl.effects import (
 )
 from ugat_marl.errors import MeasuredDataError, SimulatorCrashed, SimulatorError
 from ugat_marl.files import xml_bytes
-from ugat_marl.parallel import persistently
+from ugat_marl.parallel import retry_on_crash
 from ugat_marl.scenarios import (
     Detector,
     Document,
@@ -205,7 +205,7 @@ class Replay:
         scenario = shift_parking(scenario, derive_seed(seed, "parking"))
         with tempfile.TemporaryDirectory(prefix="ugat_marl-") as name:
             directory = Path(name)
-            done = persistently(lambda: self._run(scenario, effects, period, seed, directory))
+            done = retry_on_crash(lambda: self._run(scenario, effects, period, seed, directory))
         seen = done.period
         for effect in (*self._own, *effects):
             seen = effect.observe(seen, self._detectors, self._owner)

@@ -24,9 +24,9 @@ from ugat_marl.data import LogCallback, lock_folder
 from ugat_marl.errors import MeasurementError
 from ugat_marl.experiments.forked import (
     ONE_CORE,
+    heartbeat_of,
     jobs_fork_on,
     perform_forked,
-    pulse_of,
     say_stopped,
 )
 from ugat_marl.experiments.jobs import Job, Record, perform
@@ -245,10 +245,10 @@ def _perform_in_new_interpreter(folder: Path, log: IO[bytes], stop: Stop) -> boo
         start_new_session=True,  # Ctrl-C reaches this process only; it ends the jobs itself
     )
     try:
-        pulse = pulse_of(log)
+        heartbeat = heartbeat_of(log)
         while process.poll() is None and not stop.wait(0.1):
-            if pulse.is_lost():
-                say_stopped(log, pulse)
+            if heartbeat.is_lost():
+                say_stopped(log, heartbeat)
                 process.kill()
                 return False
         return True

@@ -21,7 +21,7 @@ from ugat_marl.parallel import (
     as_done,
     in_this_process,
     parts_at_a_time,
-    persistently,
+    retry_on_crash,
 )
 from ugat_marl.policies import (
     RULES,
@@ -377,7 +377,7 @@ def _episodes(
     try:
         for seed in task.seeds:
             # A user's policy may remember earlier episodes, whose number depends on the workers.
-            persistently(
+            retry_on_crash(
                 lambda seed=seed: roll_out(env, copy.deepcopy(policy), seed, on_step=on_step)
             )
             scores = replace(env.scores(), approaches=read())

@@ -16,7 +16,7 @@ from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import IO, Any
 
-from ugat_marl.parallel import DEADLINE_VARIABLE, Pulse, Stop, show_life
+from ugat_marl.parallel import DEADLINE_VARIABLE, Heartbeat, Stop, send_heartbeats
 from ugat_marl.simulation import ChannelClosed, Host, Message
 
 PRELOADED = ("torch", "torch._dynamo", "scipy.stats", "libsumo", "pydantic", "rich.progress")
@@ -40,7 +40,7 @@ def jobs_fork_on(device: str) -> bool:
 def perform_forked(folder: Path, log: IO[bytes], stop: Stop) -> bool:
     """Perform the job in a folder in a forked process; end it when `stop` is set.
 
-    Return False if the process was stopped and has been killed, see `pulse_of`.
+    Return False if the process was stopped and has been killed, see `heartbeat_of`.
 
     Args:
         folder: Folder of the job.
@@ -52,10 +52,10 @@ def perform_forked(folder: Path, log: IO[bytes], stop: Stop) -> bool:
         patience_s = 0.0  # a job that is stopped would train on
         try:
             worker.ask("perform")
-            pulse = pulse_of(log)
+            heartbeat = heartbeat_of(log)
             while not (answered := worker.has_answered(0.1)) and not stop.is_set():
-                if pulse.is_lost():
-                    say_stopped(log, pulse)
+                if heartbeat.is_lost():
+                    say_stopped(log, heartbeat)
                     return False
             if answered:
                 worker.answer()
@@ -67,19 +67,19 @@ def perform_forked(folder: Path, log: IO[bytes], stop: Stop) -> bool:
     return True
 
 
-def pulse_of(log: IO[bytes]) -> Pulse:
+def heartbeat_of(log: IO[bytes]) -> Heartbeat:
     """Return the signs of life of the process of a job, which sets the time of its log anew.
 
     A job may take days, so it has no deadline of its own. The simulations for which it waits have.
     """
-    return Pulse(lambda: os.fstat(log.fileno()).st_mtime_ns)
+    return Heartbeat(lambda: os.fstat(log.fileno()).st_mtime_ns)
 
 
-def say_stopped(log: IO[bytes], pulse: Pulse) -> None:
+def say_stopped(log: IO[bytes], heartbeat: Heartbeat) -> None:
     """Write into the log of a job that its process was stopped."""
     log.write(
-        f"\nthe process of this job did not run on for {pulse.deadline_s:g} s (stopped?) and was "
-        f"killed; {DEADLINE_VARIABLE} sets other seconds\n".encode()
+        f"\nthe process of this job did not run on for {heartbeat.deadline_s:g} s (stopped?) and "
+        f"was killed; {DEADLINE_VARIABLE} sets other seconds\n".encode()
     )
     log.flush()
 
@@ -100,7 +100,7 @@ class Jobs:
         folder, (log,) = Path(order["folder"]), descriptors
         os.dup2(log, 1)
         os.dup2(log, 2)
-        show_life(lambda: os.utime(log))  # see `pulse_of`
+        send_heartbeats(lambda: os.utime(log))  # see `heartbeat_of`
 
         def perform(_: Message) -> Message:
             try:

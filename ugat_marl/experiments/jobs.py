@@ -58,7 +58,7 @@ from ugat_marl.grounding import (
     is_kept,
     require_histories,
 )
-from ugat_marl.parallel import Workers, in_this_process, show_life
+from ugat_marl.parallel import Workers, in_this_process, send_heartbeats
 from ugat_marl.policies import STANDARD_RULES, TUNED_RULES, Policy, PolicyFactory, attended
 from ugat_marl.progress import Bars, Reporter
 from ugat_marl.simulation import exit_when_input_ends, kept_warm
@@ -594,5 +594,5 @@ def perform_described(folder: Path) -> int:
 
 if __name__ == "__main__":
     exit_when_input_ends()
-    show_life(lambda: os.utime(sys.stdout.fileno()))  # its starter looks at the log's time
+    send_heartbeats(lambda: os.utime(sys.stdout.fileno()))  # its starter looks at the log's time
     sys.exit(perform_described(Path(sys.argv[1])))

@@ -61,7 +61,7 @@ from ugat_marl.grounding.residual import ResidualConfig, of_one_street
 from ugat_marl.grounding.summaries import LaneView, Summary
 from ugat_marl.grounding.worlds import recorded
 from ugat_marl.grounding.wrappers import RandomDelays
-from ugat_marl.parallel import Stop, Workers, in_order, persistently
+from ugat_marl.parallel import Stop, Workers, in_order, retry_on_crash
 from ugat_marl.policies import EpsilonGreedy, Policy, roll_out, stop_callback
 from ugat_marl.scenarios import Scenario
 from ugat_marl.seeding import derive_seed, numpy_generator
@@ -372,7 +372,7 @@ class Simulation:
         """Run one episode in a world; return the average travel time in s."""
         with contextlib.closing(self.env(world, **policy.env_options)) as env:
             acting, check = copy.deepcopy(policy), stop_callback(stop)
-            persistently(lambda: roll_out(env, acting, seed, on_step=check))
+            retry_on_crash(lambda: roll_out(env, acting, seed, on_step=check))
             return env.scores().att_s
 
     def compare(

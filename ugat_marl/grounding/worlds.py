@@ -26,7 +26,7 @@ from ugat_marl.errors import LogError
 from ugat_marl.grounding.fitting import FitConfig, split
 from ugat_marl.grounding.stacked import Stack, stack_log
 from ugat_marl.grounding.wrappers import RandomDelays
-from ugat_marl.parallel import Stop, Workers, in_order, persistently
+from ugat_marl.parallel import Stop, Workers, in_order, retry_on_crash
 from ugat_marl.policies import (
     EpsilonGreedy,
     Policy,
@@ -179,7 +179,7 @@ def recorded(
         observer: What is recorded; None for what agents observe.
     """
     observer = observer or observer_of(env)
-    played = persistently(
+    played = retry_on_crash(
         lambda: roll_out(env, policy, seed, record=observer, on_step=stop_callback(stop))
     )
     assert played.log is not None

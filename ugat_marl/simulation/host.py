@@ -183,7 +183,7 @@ class Worker:
 
     Args:
         channel: The connection to the worker.
-        said: File with everything the worker prints.
+        output: File with everything the worker prints.
         pid: Process number of the worker.
         deadline_s: Seconds within which the worker has to answer.
         process: The process, if it is a child of this one.
@@ -192,13 +192,13 @@ class Worker:
     def __init__(
         self,
         channel: Channel,
-        said: IO[bytes],
+        output: IO[bytes],
         pid: int,
         deadline_s: float,
         process: subprocess.Popen[bytes] | None = None,
     ) -> None:
         self._channel = channel
-        self._said = said
+        self._output = output
         self._pid = pid
         self._deadline_s = deadline_s
         self._late = False
@@ -212,7 +212,7 @@ class Worker:
         cls, service: str, order: Order, defaults: Mapping[str, str], deadline_s: float
     ) -> Worker:
         """Start a new interpreter; messages use its standard input and output."""
-        said = tempfile.TemporaryFile()  # noqa: SIM115 - stays open as long as the worker
+        output = tempfile.TemporaryFile()  # noqa: SIM115 - stays open as long as the worker
         command = _command("spawned", service, str(os.getpid()), json.dumps(order))
         variables = _environment(defaults)
         process: subprocess.Popen[bytes]
@@ -221,24 +221,24 @@ class Worker:
                 command,
                 stdin=subprocess.PIPE,
                 stdout=subprocess.PIPE,
-                stderr=said,
+                stderr=output,
                 env=variables,
             )
             assert process.stdin is not None
             assert process.stdout is not None
             channel = Channel(process.stdout, process.stdin, process.stdin.close)
-            return cls(channel, said, process.pid, deadline_s, process)
+            return cls(channel, output, process.pid, deadline_s, process)
         mine, its = socket.socketpair()
         with its:
             process = subprocess.Popen(
                 command,
                 stdin=its.fileno(),
                 stdout=its.fileno(),
-                stderr=said,
+                stderr=output,
                 env=variables,
                 start_new_session=True,  # so Ctrl-C reaches only the user's process
             )
-        return cls(_channel_of(mine, deadline_s), said, process.pid, deadline_s, process)
+        return cls(_channel_of(mine, deadline_s), output, process.pid, deadline_s, process)
 
     @property
     def running(self) -> bool:
@@ -249,7 +249,7 @@ class Worker:
         """Send a question; `answer` waits for its answer.
 
         Raises:
-            ChannelClosed: The process died or does not read, see `obituary`.
+            ChannelClosed: The process died or does not read, see `crash_message`.
         """
         self._asked_s = time.monotonic()
         try:
@@ -267,7 +267,7 @@ class Worker:
         """Wait for the answer to a question, until the deadline.
 
         Raises:
-            ChannelClosed: The process died or did not answer in time, see `obituary`.
+            ChannelClosed: The process died or did not answer in time, see `crash_message`.
             UgatMarlError: The service raised this error; the process has been ended.
             WorkerError: The service raised another exception; the process has been ended.
         """
@@ -344,9 +344,9 @@ class Worker:
             except subprocess.TimeoutExpired:
                 self._process.kill()
                 self._process.wait()
-        self._said.close()
+        self._output.close()
 
-    def obituary(self, doing: str) -> str:
+    def crash_message(self, doing: str) -> str:
         """Return a message about a process that died, and release its resources.
 
         Args:
@@ -356,7 +356,7 @@ class Worker:
         if self._process is not None:
             with contextlib.suppress(subprocess.TimeoutExpired):
                 status = f" with status {self._process.wait(timeout=PATIENCE_S)}"
-        words = self._words()
+        words = self._output_tail()
         self.end()
         if self._late:
             return (
@@ -379,7 +379,7 @@ class Worker:
             kind = getattr(errors, name, None)
             if kind is not None and name != "UnknownNameError":
                 # SUMO's error log may hold only the end of SUMO's output.
-                words, error = self._words(), reply["error"]
+                words, error = self._output_tail(), reply["error"]
                 if _FULL_MEMORY.search(words) and too_much_memory() not in error:
                     return kind(f"{error.partition(':')[0]}: {too_much_memory()}")
                 return kind(error if words in error else f"{error} {words}")
@@ -388,9 +388,9 @@ class Worker:
             f"by the reward or the wrapper if there is one:\n{reply['error']}"
         )
 
-    def _words(self) -> str:
-        self._said.seek(0)
-        return one_line_message(self._said.read().decode(errors="replace"))[-2000:]
+    def _output_tail(self) -> str:
+        self._output.seek(0)
+        return one_line_message(self._output.read().decode(errors="replace"))[-2000:]
 
 
 class _WarmParent:
@@ -478,12 +478,12 @@ class _WarmParent:
     def fork(self, order: Order, descriptors: Sequence[int], deadline_s: float) -> Worker | None:
         """Return a fresh worker, or None if the parent has ended or does not answer in time."""
         mine, its = socket.socketpair()
-        said = tempfile.TemporaryFile()  # noqa: SIM115 - stays open as long as the worker
+        output = tempfile.TemporaryFile()  # noqa: SIM115 - stays open as long as the worker
         pid = b""
         with its, self._lock:
             self._socket.settimeout(deadline_s)
             try:
-                socket.send_fds(self._socket, [b"f"], [its.fileno(), said.fileno(), *descriptors])
+                socket.send_fds(self._socket, [b"f"], [its.fileno(), output.fileno(), *descriptors])
                 self._socket.sendall(_framed({"what": "fork", "order": order}))
                 pid = self._socket.recv(8)
             except OSError:
@@ -493,10 +493,10 @@ class _WarmParent:
                 raise
         if not pid:
             mine.close()
-            said.close()
+            output.close()
             return None
         number = int.from_bytes(pid, "little")
-        return Worker(_channel_of(mine, deadline_s), said, number, deadline_s)
+        return Worker(_channel_of(mine, deadline_s), output, number, deadline_s)
 
     def end(self) -> None:
         """End the process; its workers continue. A second call does nothing."""

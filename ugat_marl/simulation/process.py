@@ -124,7 +124,7 @@ class ProcessSimulator:
             return worker.answer()
         except ChannelClosed:
             self._worker = None
-            raise SimulatorCrashed(worker.obituary(request)) from None
+            raise SimulatorCrashed(worker.crash_message(request)) from None
 
     def _do(self, work: Callable[[], object], asked: Worker) -> None:
         """Do the work; if it fails, end the worker, whose answer nobody would read."""

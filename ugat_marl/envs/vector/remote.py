@@ -284,12 +284,12 @@ class RemoteEnv:
     def _replace(self) -> None:
         assert self._worker is not None
         worker, self._worker = self._worker, None
-        obituary = worker.obituary(f"decision {len(self._history)} of {self.episode}")
+        crash_message = worker.crash_message(f"decision {len(self._history)} of {self.episode}")
         self._deaths += 1
         if self._deaths > DEATHS:
             self.close()
             raise SimulatorCrashed(
-                f"{obituary}. It was replaced {DEATHS} times, and died each time"
+                f"{crash_message}. It was replaced {DEATHS} times, and died each time"
             )
         try:
             self._start()
