@@ -13,7 +13,14 @@ from ugat_marl.data import is_actuated
 from ugat_marl.diagnosis import Reference, Tally
 from ugat_marl.diagnosis.engine import Engine
 from ugat_marl.diagnosis.features import BIN_FEATURES, FEATURES, INDEX, DetectorLayout
-from ugat_marl.diagnosis.replay import Arrivals, Due, Replay, by_lane_left, corrected, unhindered
+from ugat_marl.diagnosis.replay import (
+    Arrivals,
+    DemandBalance,
+    Replay,
+    by_lane_left,
+    corrected,
+    unhindered,
+)
 from ugat_marl.diagnosis.statistics import Pools
 from ugat_marl.diagnosis.thresholds import Thresholds
 from ugat_marl.effects import Effect, load_scenario, parse_domain
@@ -214,7 +221,7 @@ def test_counts_are_those_asked_for(crossing: tuple[Scenario, Network, DetectorL
     sums[INDEX["platoon_gap"], place] = (8.0, 10.0)
     bins[BIN_FEATURES.index("count_stop"), place] = (6.0, 2.0)
     none = {edge: np.zeros(2) for _, edge, _ in layout.places}
-    due = Due(none | {"S_C": np.array([9.0, 3.0])}, none | {"S_C": np.array([5.0, 5.0])})
+    due = DemandBalance(none | {"S_C": np.array([9.0, 3.0])}, none | {"S_C": np.array([5.0, 5.0])})
     found = corrected(Tally(sums, bins), layout, due)
     # 8 of 10 that came were counted, so 8 of 10 of the two more that were due would have been.
     assert found.sums[INDEX["count_stop"], place].tolist() == pytest.approx([9.6, 10.0])

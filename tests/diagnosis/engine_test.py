@@ -431,8 +431,8 @@ def test_days_on_which_traffic_stood_still_are_passed_over(
 
     made, _ = an_engine(scenario, layout, None, base_days=20)
     monkeypatch.setattr(made, "replicates", counted)
-    assert made.usual.set_aside == {0, 3}
-    assert made.usual.day_to_day == pytest.approx(1.4826)
+    assert made.ordinary_days.set_aside == {0, 3}
+    assert made.ordinary_days.day_to_day == pytest.approx(1.4826)
     assert made.first(4) == [1, 2, 4, 5]
 
 

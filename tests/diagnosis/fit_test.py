@@ -10,7 +10,7 @@ import pytest
 from numpy.typing import NDArray
 
 from ugat_marl.diagnosis import Hypothesis, Reference, Tally
-from ugat_marl.diagnosis.engine import Engine, Replicate, Usual
+from ugat_marl.diagnosis.engine import Engine, OrdinaryDays, Replicate
 from ugat_marl.diagnosis.features import BIN_FEATURES, FEATURES
 from ugat_marl.diagnosis.fit import Fitter, _may_move, uncertainty
 from ugat_marl.diagnosis.hypotheses import Members
@@ -48,7 +48,7 @@ def day(number: int, values: dict[str, float], street: int = 0) -> Tally:
 class World(Engine):
     """Simulates by a formula."""
 
-    usual = Usual()
+    ordinary_days = OrdinaryDays()
 
     def __init__(self) -> None:
         self._thresholds = THRESHOLDS
@@ -271,7 +271,7 @@ def test_a_fit_that_stopped_early_takes_a_last_step() -> None:
 class LocksUp(World):
     """Traffic stands still on one day of every model but the scenario as it is."""
 
-    usual = Usual(day_to_day=10.0)
+    ordinary_days = OrdinaryDays(day_to_day=10.0)
 
     def played(self, number: int, effects: Sequence[Effect]) -> Tally:
         found = super().played(number, effects)

@@ -11,7 +11,7 @@ import pytest
 
 from ugat_marl.data import MeasuredData
 from ugat_marl.diagnosis import DiagnosisConfig, Study
-from ugat_marl.diagnosis.study import interrupted, unreached
+from ugat_marl.diagnosis.study import missing_interval_findings, unreached_edge_findings
 from ugat_marl.diagnosis.thresholds import Thresholds
 from ugat_marl.effects import load_scenario
 from ugat_marl.errors import MeasuredDataError
@@ -43,11 +43,11 @@ def northbound(data: Path, tmp_path_factory: pytest.TempPathFactory) -> Scenario
 
 
 def test_where_demand_comes_everywhere_there_is_nothing_to_say(scenario: Scenario) -> None:
-    assert unreached(scenario, BOTH, BOTH.detectors) == ()
+    assert unreached_edge_findings(scenario, BOTH, BOTH.detectors) == ()
 
 
 def test_edges_without_demand_are_named_with_what_was_counted(northbound: Scenario) -> None:
-    (finding,) = unreached(northbound, BOTH, BOTH.detectors)
+    (finding,) = unreached_edge_findings(northbound, BOTH, BOTH.detectors)
     assert "no vehicle of its demand comes over W_C, where detectors counted 5" in finding.text
     assert not finding.rules_out
     study = Study.of(northbound, BOTH, DiagnosisConfig())
@@ -57,7 +57,7 @@ def test_edges_without_demand_are_named_with_what_was_counted(northbound: Scenar
 
 def test_edges_on_which_nobody_was_counted_need_no_demand(northbound: Scenario) -> None:
     quiet = replace(BOTH, periods=(replace(DAY, passages={"s": SEEN}),))
-    assert unreached(northbound, quiet, BOTH.detectors) == ()
+    assert unreached_edge_findings(northbound, quiet, BOTH.detectors) == ()
 
 
 def test_counts_in_intervals_count_as_well(northbound: Scenario) -> None:
@@ -65,7 +65,7 @@ def test_counts_in_intervals_count_as_well(northbound: Scenario) -> None:
         {"period_id": ["day1"] * 2, "detector_id": ["w", "s"], "count": [7.0, 3.0]}
     )
     alone = MeasuredData((SOUTH, WEST), (replace(DAY, passages={}),), counts=counts)
-    (finding,) = unreached(northbound, alone, alone.detectors)
+    (finding,) = unreached_edge_findings(northbound, alone, alone.detectors)
     assert "W_C, where detectors counted 7;" in finding.text
 
 
@@ -87,8 +87,8 @@ def test_counts_with_missing_intervals_are_told() -> None:
     names = ("period_id", "begin_s", "end_s", "detector_id", "count")
     counts = pl.DataFrame(rows, schema=names, orient="row")
     some = replace(BOTH, counts=counts, periods=(replace(DAY, passages={}),))
-    (finding,) = interrupted(some, some.detectors, Thresholds())
+    (finding,) = missing_interval_findings(some, some.detectors, Thresholds())
     assert "intervals are missing at 1 of 2 detectors (w);" in finding.text
     whole = replace(some, counts=counts.filter(pl.col("detector_id") == "s"))
-    assert interrupted(whole, [SOUTH], Thresholds()) == ()
-    assert interrupted(BOTH, BOTH.detectors, Thresholds()) == ()
+    assert missing_interval_findings(whole, [SOUTH], Thresholds()) == ()
+    assert missing_interval_findings(BOTH, BOTH.detectors, Thresholds()) == ()

@@ -19,7 +19,13 @@ from ugat_marl.diagnosis import study as module
 from ugat_marl.diagnosis.engine import Engine
 from ugat_marl.diagnosis.features import BIN_FEATURES, FEATURES, INDEX
 from ugat_marl.diagnosis.statistics import Pools
-from ugat_marl.diagnosis.study import day_to_day_variation, doubled, effort_for, heard, one_of_each
+from ugat_marl.diagnosis.study import (
+    day_to_day_variation,
+    detectors_to_compare,
+    duplicate_detector_findings,
+    effort_for,
+    one_of_each,
+)
 from ugat_marl.diagnosis.thresholds import Effort, Thresholds
 from ugat_marl.effects import Effect, Headway
 from ugat_marl.errors import MeasuredDataError
@@ -61,27 +67,30 @@ def names(found: tuple[Detector, ...]) -> tuple[str, ...]:
 def test_of_detectors_of_which_half_are_silent_only_the_others_are_compared(
     silent: Passages | None,
 ) -> None:
-    assert names(heard(measured(("one", "three"), silent=silent))) == ("one", "three")
-    assert names(heard(measured(("two",), ("two",), silent=silent))) == ("two",)
+    assert names(detectors_to_compare(measured(("one", "three"), silent=silent))) == (
+        "one",
+        "three",
+    )
+    assert names(detectors_to_compare(measured(("two",), ("two",), silent=silent))) == ("two",)
 
 
 def test_a_single_silent_detector_is_compared_like_any_other() -> None:
-    assert names(heard(measured(("one", "two", "three")))) == NAMES
-    assert names(heard(measured(NAMES))) == NAMES
+    assert names(detectors_to_compare(measured(("one", "two", "three")))) == NAMES
+    assert names(detectors_to_compare(measured(NAMES))) == NAMES
 
 
 def test_a_detector_that_saw_something_on_one_day_is_not_silent() -> None:
-    assert names(heard(measured(("one", "two"), ("three",)))) == NAMES
+    assert names(detectors_to_compare(measured(("one", "two"), ("three",)))) == NAMES
 
 
 def test_where_nobody_saw_anything_all_are_kept() -> None:
-    assert names(heard(measured((), (), silent=Passages.none()))) == NAMES
+    assert names(detectors_to_compare(measured((), (), silent=Passages.none()))) == NAMES
 
 
 def test_counts_in_intervals_say_nothing_of_silence() -> None:
     counts = pl.DataFrame({"period_id": ["day0"], "detector_id": ["one"], "count": [3]})
     data = MeasuredData(DETECTORS, (Period("day0", 0.0, 100.0, "fit", {}, {}),), counts=counts)
-    assert names(heard(data)) == NAMES
+    assert names(detectors_to_compare(data)) == NAMES
 
 
 def test_of_two_detectors_of_a_kind_on_a_lane_one_is_compared() -> None:
@@ -92,7 +101,7 @@ def test_of_two_detectors_of_a_kind_on_a_lane_one_is_compared() -> None:
     )
     both = replace(measured(NAMES), detectors=detectors)
     assert names(one_of_each(both, detectors)) == ("one", "three", "four")
-    (finding,) = doubled(both, one_of_each(both, detectors))
+    (finding,) = duplicate_detector_findings(both, one_of_each(both, detectors))
     assert "'two' is not compared; lane 'in_0' has 'one' as stop detector" in finding.text
     oftener = replace(measured(("two",), NAMES), detectors=detectors)
     assert names(one_of_each(oftener, detectors)) == ("two", "three", "four")
@@ -103,7 +112,7 @@ def test_a_zone_beside_a_detector_on_one_of_its_lanes_is_not_compared() -> None:
     detectors = (Detector("one", "in_1", 180.0, 0.0, "stop"), wide)
     both = replace(measured(("one", "wide")), detectors=detectors)
     assert names(one_of_each(both, detectors)) == ("one",)
-    (finding,) = doubled(both, one_of_each(both, detectors))
+    (finding,) = duplicate_detector_findings(both, one_of_each(both, detectors))
     assert "'wide' is not compared; lane 'in_1' has 'one' as stop detector" in finding.text
 
 
@@ -174,7 +183,7 @@ def test_what_measured_arrivals_leave_open_is_a_matter_of_the_model() -> None:
     without, within = found.doubt(), found.doubt((Headway(1.5),))
     assert without is not None and within is not None
     assert without["lane"][place] == 0.0
-    assert within["lane"][place] == pytest.approx((THRESHOLDS.left_open * 3.0) ** 2)
+    assert within["lane"][place] == pytest.approx((THRESHOLDS.arrivals_error_share * 3.0) ** 2)
     found.doubt((Headway(1.5),))
     assert own.asked == other.asked == [(), (Headway(1.5),)]
 
@@ -223,7 +232,7 @@ def test_a_street_that_is_fuller_than_an_empty_beginning_is_noted(
         measured=measured(NAMES, NAMES),
         fit=tuple(day(first) for _ in range(8)),
     )
-    found = here.begun(cast(Any, base), Silent()).measured.findings
+    found = here.with_empty_start_finding(cast(Any, base), Silent()).measured.findings
     assert ["begin empty with period 'day0'" in each.text for each in found] == [True] * noted
 
 

@@ -27,7 +27,7 @@ from ugat_marl.data import installed_version
 from ugat_marl.diagnosis.features import FEATURES, DetectorLayout, Greens, Tally, tally
 from ugat_marl.diagnosis.intervals import with_intervals
 from ugat_marl.diagnosis.measurement import Sightings
-from ugat_marl.diagnosis.replay import Day, Due, Replay, Unmeasured, corrected
+from ugat_marl.diagnosis.replay import Day, DemandBalance, Replay, Unmeasured, corrected
 from ugat_marl.diagnosis.supplementary_data import SupplementaryData
 from ugat_marl.diagnosis.thresholds import Thresholds
 from ugat_marl.effects import Effect
@@ -41,7 +41,7 @@ from ugat_marl.seeding import derive_seed
 
 
 @dataclass(frozen=True)
-class Usual:
+class OrdinaryDays:
     """Ordinary days of the scenario as it is.
 
     Attributes:
@@ -53,7 +53,7 @@ class Usual:
     day_to_day: float = 0.0
 
     @classmethod
-    def of(cls, tallies: Sequence[Tally], thresholds: Thresholds) -> Usual:
+    def of(cls, tallies: Sequence[Tally], thresholds: Thresholds) -> OrdinaryDays:
         """Separate ordinary days from days of standstill.
 
         Args:
@@ -165,7 +165,7 @@ class Replicate:
     tally: Tally
     travel_time_s: float
     counted: Tally | None = None
-    due: Due | None = None
+    due: DemandBalance | None = None
 
 
 class Engine:
@@ -250,7 +250,7 @@ class Engine:
         if not errors:
             return self
         other = copy.copy(self)
-        other.__dict__.pop("usual", None)
+        other.__dict__.pop("ordinary_days", None)
         other._detection = tuple(errors)
         other._replay = self._replay.detecting(errors)
         return other
@@ -339,18 +339,20 @@ class Engine:
             self._known_by = None
 
     @functools.cached_property
-    def usual(self) -> Usual:
+    def ordinary_days(self) -> OrdinaryDays:
         """Ordinary days of the scenario as it is; the first access simulates unknown days.
 
         Raises:
             OutOfTime: The budget does not suffice for these days.
         """
         days = self.replicates([], range(self._base_days))
-        return Usual.of([day.tally for day in days], self._thresholds) if days else Usual()
+        if not days:
+            return OrdinaryDays()
+        return OrdinaryDays.of([day.tally for day in days], self._thresholds)
 
     def first(self, count: int) -> list[int]:
         """Return the numbers of the first days that are ordinary under the scenario as it is."""
-        numbers = (number for number in itertools.count() if number not in self.usual.set_aside)
+        numbers = (n for n in itertools.count() if n not in self.ordinary_days.set_aside)
         return list(itertools.islice(numbers, count))
 
     def ordinary(
@@ -367,7 +369,9 @@ class Engine:
             advance: Function to call after each day.
         """
         days = self.replicates(effects, numbers, advance)
-        aside = locked_up([day.tally for day in days], self._thresholds, self.usual.day_to_day)
+        aside = locked_up(
+            [day.tally for day in days], self._thresholds, self.ordinary_days.day_to_day
+        )
         known = enumerate(zip(numbers, days, strict=True))
         return {number: day for place, (number, day) in known if place not in aside}
 
@@ -490,10 +494,12 @@ class Engine:
         physics = [effect for effect in effects if not effect.on_detectors]
         period = self.periods[number % len(self.periods)]
         seed = derive_seed(self._seed, "replicate", number)
-        due = Due(self._replay.asked(physics, period, seed), given.due.given)
+        due = DemandBalance(self._replay.asked(physics, period, seed), given.due.given)
         return self._with_due(given.counted, given.travel_time_s, due)
 
-    def _with_due(self, counted: Tally, travel_time_s: float, due: Due | None) -> Replicate:
+    def _with_due(
+        self, counted: Tally, travel_time_s: float, due: DemandBalance | None
+    ) -> Replicate:
         if due is None:
             return Replicate(counted, travel_time_s)
         return Replicate(corrected(counted, self.layout, due), travel_time_s, counted, due)
@@ -557,7 +563,7 @@ class Engine:
                 asked, given = (
                     dict(zip(self._edges, stored[name], strict=True)) for name in ("asked", "given")
                 )
-                due = Due(asked, given)
+                due = DemandBalance(asked, given)
             return self._with_due(counted, float(stored["travel_time_s"]), due)
         except (ValueError, KeyError):
             return None  # damaged: simulated again

@@ -152,7 +152,7 @@ def _long(seen: Passages, thresholds: DayThresholds) -> NDArray[np.int64]:
 
 
 @dataclass(frozen=True, eq=False)
-class Sets:
+class AxisSets:
     """Sets of values along one axis: all of them, and those that a sentence can name.
 
     Attributes:
@@ -166,7 +166,7 @@ class Sets:
     limits: tuple[int, ...]
 
     @classmethod
-    def of(cls, width: int, named: Named) -> Sets:
+    def of(cls, width: int, named: Named) -> AxisSets:
         """Make the sets of an axis; sets that are empty, whole or repeated are left out.
 
         Args:
@@ -185,7 +185,7 @@ class Sets:
         return cls(tuple(names), np.stack(masks), tuple(limits))
 
 
-def place_sets(layout: DetectorLayout, width: int) -> Sets:
+def place_sets(layout: DetectorLayout, width: int) -> AxisSets:
     """Return sets of lanes: approaches, movements of all and of single approaches, single lanes."""
     places = layout.places[:width]
     turns = [lane.directions for lane in layout.lanes]
@@ -203,10 +203,10 @@ def place_sets(layout: DetectorLayout, width: int) -> Sets:
         named[edge, letter] = on[edge] & moving[letter], 2
     for index, (_, _, lane) in enumerate(places):
         named[lane, "lane"] = np.arange(len(places)) == index, 2
-    return Sets.of(len(places), named)
+    return AxisSets.of(len(places), named)
 
 
-def sets_of(layout: DetectorLayout, shape: Sequence[int]) -> tuple[Sets, ...]:
+def sets_of(layout: DetectorLayout, shape: Sequence[int]) -> tuple[AxisSets, ...]:
     """Return the sets along every axis of cells of this shape, in the order of `AXES`."""
     _, kinds, positions, ages, bins, lengths = shape
     windows: Named = {
@@ -218,11 +218,11 @@ def sets_of(layout: DetectorLayout, shape: Sequence[int]) -> tuple[Sets, ...]:
     long: Named = {("long",): (np.arange(lengths) == 1, 1)} if lengths > 1 else {}
     return (
         place_sets(layout, shape[0]),
-        Sets.of(kinds, of_kinds if kinds > 1 else {}),
-        Sets.of(positions, _sides(positions, POSITIONS, 1)),
-        Sets.of(ages, _sides(ages, AGES_S, 0.0)),
-        Sets.of(bins, windows),
-        Sets.of(lengths, long),
+        AxisSets.of(kinds, of_kinds if kinds > 1 else {}),
+        AxisSets.of(positions, _sides(positions, POSITIONS, 1)),
+        AxisSets.of(ages, _sides(ages, AGES_S, 0.0)),
+        AxisSets.of(bins, windows),
+        AxisSets.of(lengths, long),
     )
 
 
@@ -249,7 +249,7 @@ def _between(width: int, first: int, last: int) -> Mask:
 
 
 @dataclass(frozen=True)
-class Term:
+class PatternTerm:
     """One set of cells with its share.
 
     Attributes:
@@ -277,7 +277,7 @@ class Regression:
 
     def __init__(
         self,
-        sets: Sequence[Sets],
+        sets: Sequence[AxisSets],
         simulated: Sequence[Array],
         thresholds: Thresholds,
         *,
@@ -315,7 +315,7 @@ class Regression:
         apart = np.where(used, sums / np.maximum(number, 1e-9) - mean, 0.0)
         return weight * mean * apart, weight * mean**2
 
-    def best(self, pull: Array, size: Array) -> Term:
+    def best(self, pull: Array, size: Array) -> PatternTerm:
         """Return the set of cells that explains most for its number of limits."""
         a, v = self._summed(pull), self._summed(size)
         gain = np.where(v > 0, a**2 / np.maximum(v, 1e-12), 0.0)
@@ -325,13 +325,13 @@ class Regression:
         chosen = np.unravel_index(int(np.argmax(gain - self._price * limits)), gain.shape)
         share, own = float(a[chosen] / max(v[chosen], 1e-12)), float(v[chosen])
         place = tuple(int(index) for index in chosen)
-        return Term(place, share, 1.0 / math.sqrt(max(own, 1e-12)), float(gain[chosen]))
+        return PatternTerm(place, share, 1.0 / math.sqrt(max(own, 1e-12)), float(gain[chosen]))
 
-    def taken_off(self, pull: Array, size: Array, term: Term) -> Array:
+    def taken_off(self, pull: Array, size: Array, term: PatternTerm) -> Array:
         """Return the pulls that are left once the share of a term is expected."""
         return pull - term.share * size * self.mask(term)
 
-    def of(self, term: Term, measured: Array) -> tuple[float, float]:
+    def of(self, term: PatternTerm, measured: Array) -> tuple[float, float]:
         """Return share and standard error of data in the set of cells of a term.
 
         Slower vehicles are in later cells of green, among those that are always late there. So the
@@ -345,14 +345,14 @@ class Regression:
         own = max(float((size * mask).sum()), 1e-12)
         return float((pull * mask).sum()) / own, 1.0 / math.sqrt(own)
 
-    def mask(self, term: Term) -> Array:
+    def mask(self, term: PatternTerm) -> Array:
         """Return 1 for the cells of a term, else 0."""
         mask = np.ones(())
         for sets, index in zip(self._sets, term.chosen, strict=True):
             mask = mask[..., None] * sets.masks[index]
         return mask
 
-    def names(self, term: Term) -> list[tuple[object, ...] | None]:
+    def names(self, term: PatternTerm) -> list[tuple[object, ...] | None]:
         """Return what the set is along every axis; None for all values."""
         return [sets.names[index] for sets, index in zip(self._sets, term.chosen, strict=True)]
 
@@ -412,7 +412,7 @@ def _terms(
     chance: Callable[[float], float],
     thresholds: Thresholds,
     alpha: float,
-) -> Iterator[tuple[Term, float, float | None]]:
+) -> Iterator[tuple[PatternTerm, float, float | None]]:
     """Yield terms with their p value and their share on the held-out periods."""
     pull, size = regression.pulls(measured)
     for _ in range(thresholds.most_patterns):
@@ -431,7 +431,7 @@ def _terms(
 
 
 def _by_chance(
-    sets: Sequence[Sets],
+    sets: Sequence[AxisSets],
     cells: Sequence[Array],
     periods: int,
     thresholds: Thresholds,
@@ -458,7 +458,7 @@ def _tail(gain: float, drawn: Sequence[float]) -> float:
 def _pattern(
     quantity: str,
     regression: Regression,
-    term: Term,
+    term: PatternTerm,
     p: float,
     again: float | None,
     span: tuple[float, float],

@@ -104,7 +104,7 @@ class Day:
 
     period: Period
     travel_time_s: float
-    due: Due | None = None
+    due: DemandBalance | None = None
     point_to_point: tuple[Array, ...] = ()
     lane_states: Array | None = None
 
@@ -237,7 +237,9 @@ class Replay:
         return settings.begin_s + step_s * round((begin_s - settings.begin_s) / step_s)
 
     def asked(self, effects: Sequence[Effect], period: Period, seed: int) -> Mapping[str, Array]:
-        """Return the vehicles that a day of a model asks for, without a simulation; see `Due`.
+        """Return the vehicles that a day of a model asks for, without a simulation.
+
+        They are `DemandBalance.asked`.
 
         Raises:
             ValueError: The days get no measured arrivals.
@@ -442,7 +444,7 @@ class _Lane:
 
 
 @dataclass(frozen=True, eq=False)
-class Due:
+class DemandBalance:
     """Vehicles that the model's demand asks for, and vehicles that the simulated day got.
 
     Attributes:
@@ -472,7 +474,9 @@ class Arrivals:
         self._approaches = _approaches(layout, thresholds)
         self._counted = frozenset(edge for _, edge, _ in layout.places)
 
-    def given(self, asked: Scenario, drivers: Scenario, period: Period) -> tuple[Scenario, Due]:
+    def given(
+        self, asked: Scenario, drivers: Scenario, period: Period
+    ) -> tuple[Scenario, DemandBalance]:
         """Give a day the measured arrivals.
 
         Args:
@@ -505,7 +509,7 @@ class Arrivals:
         changed = Document(document.name, None, xml_bytes(root))
         return (
             replace(drivers, routes=(changed, *drivers.routes[1:])),
-            Due(due, self._by_edge(root, period)),
+            DemandBalance(due, self._by_edge(root, period)),
         )
 
     def asked(self, day: Scenario, period: Period) -> dict[str, Array]:
@@ -668,7 +672,7 @@ def _filled(
     return vehicles
 
 
-def corrected(counted: Tally, layout: DetectorLayout, due: Due) -> Tally:
+def corrected(counted: Tally, layout: DetectorLayout, due: DemandBalance) -> Tally:
     """Return the tally of a day, with counts corrected to the model's demand.
 
     Corrected count = count + share * (asked - given), where the share of a lane is its part of the

@@ -217,7 +217,8 @@ class Selector:
         enough = chance + self._thresholds.look_elsewhere * max(gap - chance, 0.0)
         proposals = propose(directions, whitener, self._thresholds)
         chosen = [proposal.members for proposal in promising(proposals, self._thresholds)]
-        little = gap < self._thresholds.little * chance  # the difference is then in single places
+        # If the distance is small, the difference is in single places.
+        little = gap < self._thresholds.small_distance * chance
         # Sums of intervals leave few statistics of the network. Effects on the whole network
         # imitate those at places there, so places are always examined too.
         summed = len(self._fitter.data[0].sums) > len(FEATURES)
@@ -227,7 +228,9 @@ class Selector:
         if number == 0:
             chosen += self._nearest()
             chosen += (
-                cautious_drivers(self._library) if gap > self._thresholds.huge * chance else []
+                cautious_drivers(self._library)
+                if gap > self._thresholds.large_distance * chance
+                else []
             )
         else:
             chosen += self._nearer(start.model, number)
@@ -254,7 +257,7 @@ class Selector:
             return self.test(best)
         # An effect may be clear along its own direction although the total distance hardly changes.
         if (
-            start.residual.p < self._alpha / self._thresholds.plain
+            start.residual.p < self._alpha / self._thresholds.small_p_factor
             and gain > -self._thresholds.price
         ):
             tested = self.test(best)
@@ -404,7 +407,8 @@ class Selector:
         best: Fitted | None = None
         with self._reporter.task("fitting", len(ranked)) as advance:
             for model in ranked:
-                won = 0.0 if best is None else self._thresholds.hopeful * (cost_before - best.cost)
+                share = self._thresholds.candidate_gain_share
+                won = 0.0 if best is None else share * (cost_before - best.cost)
                 if best is None or cost_before - model.cost > won:
                     fitted = self._kept(self._fitter.fitted(model, directions))
                     best = fitted if best is None or fitted.cost < best.cost else best

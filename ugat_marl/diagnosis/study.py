@@ -346,7 +346,7 @@ class Study:
             numbers = range(min(self.config.thresholds.doubt_days, self.effort.base))
             with reporter.task("the same with other vehicles", len(numbers)) as advance:
                 self.other_days.replicates([], numbers, advance)  # `doubt` takes them from memory
-        aside = self.engine.usual.set_aside
+        aside = self.engine.ordinary_days.set_aside
         known = {number: day.tally for number, day in enumerate(days) if number not in aside}
         tallies = list(known.values())
         reference = Reference(self.pools, tallies, speeds=self.speeds, doubt=self.doubt())
@@ -361,7 +361,7 @@ class Study:
         residual = self.null(tallies, len(self.fit)).test(self.fit)
         return Tested(model, residual, np.empty(0), {})
 
-    def begun(self, base: Tested, reporter: Reporter) -> Study:
+    def with_empty_start_finding(self, base: Tested, reporter: Reporter) -> Study:
         """Note it if simulated days begin on an empty network, and those of the street do not.
 
         Args:
@@ -510,7 +510,7 @@ class Study:
             days = [[model[number].tally for number in both] for model in (replayed, other)]
             apart, _ = change_between(self.pools, *days)
             self._doubts[effects] = {
-                name: (self.config.thresholds.left_open * values) ** 2
+                name: (self.config.thresholds.arrivals_error_share * values) ** 2
                 for name, values in apart.items()
             }
         return self._doubts[effects]
@@ -600,12 +600,16 @@ def _compared(
     scenario: Scenario, measured: MeasuredData, thresholds: Thresholds
 ) -> tuple[tuple[Detector, ...], tuple[Finding, ...]]:
     """Return the detectors to compare, and findings on the others and on their roads."""
-    detectors = one_of_each(measured, heard(measured))
-    findings = doubled(measured, detectors) + unreached(scenario, measured, detectors)
-    return detectors, findings + interrupted(measured, detectors, thresholds)
+    detectors = one_of_each(measured, detectors_to_compare(measured))
+    findings = (
+        *duplicate_detector_findings(measured, detectors),
+        *unreached_edge_findings(scenario, measured, detectors),
+        *missing_interval_findings(measured, detectors, thresholds),
+    )
+    return detectors, findings
 
 
-def heard(measured: MeasuredData) -> tuple[Detector, ...]:
+def detectors_to_compare(measured: MeasuredData) -> tuple[Detector, ...]:
     """Return the detectors to compare.
 
     If at least half of the detectors never saw a vehicle, they count as missing from the recording,
@@ -648,7 +652,9 @@ def _places(detector: Detector) -> set[tuple[str, str]]:
     return {(lane, detector.kind) for lane in detector.lanes}
 
 
-def doubled(measured: MeasuredData, compared: Sequence[Detector]) -> tuple[Finding, ...]:
+def duplicate_detector_findings(
+    measured: MeasuredData, compared: Sequence[Detector]
+) -> tuple[Finding, ...]:
     """Return a finding on each detector that is not compared beside another of its kind."""
     used = {place: detector.id for detector in compared for place in _places(detector)}
     findings: list[Finding] = []
@@ -780,7 +786,7 @@ _NAMED = 6
 """Largest number of edges that a message names."""
 
 
-def interrupted(
+def missing_interval_findings(
     measured: MeasuredData, compared: Sequence[Detector], thresholds: Thresholds
 ) -> tuple[Finding, ...]:
     """Return a finding on the detectors whose counts lack intervals."""
@@ -800,7 +806,7 @@ def interrupted(
     )
 
 
-def unreached(
+def unreached_edge_findings(
     scenario: Scenario, measured: MeasuredData, detectors: Sequence[Detector]
 ) -> tuple[Finding, ...]:
     """Return a finding on edges where detectors counted vehicles but no route of the demand leads.

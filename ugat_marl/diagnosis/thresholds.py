@@ -246,7 +246,7 @@ class Thresholds(DayThresholds):
     doubt_days: int = 24
     """Days simulated with the model's own arrivals, beside the measured ones. By hand. Halved:
     errors of the measured arrivals are known 1.4 times less exactly."""
-    left_open: float = 0.6
+    arrivals_error_share: float = 0.6
     """Standard deviation of the error by measured arrivals, as a share of the change from the
     model's own arrivals to the measured ones. Set on cases without effects, with two seeds that no
     blind test uses. Halved: too many such cases are contradicted."""
@@ -688,17 +688,17 @@ class Thresholds(DayThresholds):
     look_elsewhere: float = 0.25
     """Share of the gap that effects on the whole network must leave before places are examined. By
     hand. Halved: more simulations."""
-    little: float = 2.0
+    small_distance: float = 2.0
     """Distance per statistic of the network below which the pools show nothing, so that places are
     examined. By hand. Halved: places are examined less often."""
-    hopeful: float = 0.6
+    candidate_gain_share: float = 0.6
     """Share of the best candidate's gain that another candidate must reach to be fitted. By hand:
     its gain is that before its fit, the other's that after it. Halved: more candidates are
     fitted."""
-    huge: float = 20.0
+    large_distance: float = 20.0
     """Distance per statistic beyond which several effects at once are likely from the start. By
     hand. Halved: cautious drivers are tried more often."""
-    plain: float = 100.0
+    small_p_factor: float = 100.0
     """Factor below the level of the tests from which a small p value alone justifies a test of a
     model that gains less than its price. By hand. Halved: more such models are tested."""
     negligible: float = 150.0

@@ -177,7 +177,7 @@ def _diagnosed(
         study = study.detectors_as_they_are(reporter)
         errors = tuple(error.effect for error in study.detection)
         base = study.base(reporter)
-        study = study.begun(base, reporter)
+        study = study.with_empty_start_finding(base, reporter)
     except OutOfTime:
         return _nothing_simulated(study, timing), errors
     diagnosis, searched = _compared(study, base, timing, reporter)
