@@ -19,9 +19,9 @@ from ugat_marl.policies import (
     DQN,
     UNIVERSAL_NAME,
     DQNConfig,
+    InitialWeights,
     NetworkPolicy,
     Pretraining,
-    Start,
     export_policy,
     observed_options,
     roll_out,
@@ -221,7 +221,9 @@ def test_learns_toy_traffic_and_its_weights_serve_as_a_start(tmp_path: Path):
     learner.learn(env, 20, seed=0)
     trained = played(env, learner.policy())
     assert trained > -3  # the rule that knows the game has -2.71, random phases -8.85
-    Start(learner.running_weights, {"observation": "toy"}, "a test").save(tmp_path / "start.pt")
+    InitialWeights(learner.running_weights, {"observation": "toy"}, "a test").save(
+        tmp_path / "start.pt"
+    )
     begun = toy_learner(5, replace(QUICK, start=str(tmp_path / "start.pt")))
     assert played(env, begun.policy()) == trained
     wider = replace(QUICK, hidden=(13, 16), start=str(tmp_path / "start.pt"))
@@ -265,7 +267,7 @@ def test_pretraining_learns_on_several_networks_and_keeps_a_memory_of_each():
     start = pretraining.start("a test")
     assert start.env_options["commands"] == OBSERVED["commands"]
     elsewhere = DQN.of(parallel_env("mixed-v1", **OBSERVED), QUICK)
-    elsewhere.begin_with(start)
+    elsewhere.load_initial_weights(start)
     assert torch.equal(elsewhere.running_weights, start.weights)
     for env in envs.values():
         env.close()

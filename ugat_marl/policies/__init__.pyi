@@ -22,6 +22,7 @@ from .learners.dqn import DQN as DQN
 from .learners.dqn_config import DQNConfig as DQNConfig
 from .learners.dqn_config import Usual as Usual
 from .learners.dqn_config import UsualName as UsualName
+from .learners.initial_weights import InitialWeights as InitialWeights
 from .learners.lessons import attended as attended
 from .learners.library import LibraryLearner as LibraryLearner
 from .learners.library import TrainingEnv as TrainingEnv
@@ -36,7 +37,6 @@ from .learners.library import seed_generators as seed_generators
 from .learners.pretraining import Pretraining as Pretraining
 from .learners.scaling import InputScale as InputScale
 from .learners.scaling import observation_mask as observation_mask
-from .learners.start import Start as Start
 from .network_policy import NetworkPolicy as NetworkPolicy
 from .network_policy import checkpoint_header as checkpoint_header
 from .networks.batched import BatchedLinear as BatchedLinear

@@ -26,10 +26,10 @@ from ugat_marl.envs import ActionMask, AgentSet, AnyParallelEnv, step_meanwhile
 from ugat_marl.errors import CheckpointError, EpisodeError, OptionError
 from ugat_marl.policies.devices import CPU
 from ugat_marl.policies.learners.dqn_config import CEILING_DECISIONS, DQNConfig
+from ugat_marl.policies.learners.initial_weights import InitialWeights
 from ugat_marl.policies.learners.lessons import BEST, OnPlay, find_teacher, plays
 from ugat_marl.policies.learners.replay import Replay
 from ugat_marl.policies.learners.scaling import ceilings, input_factors
-from ugat_marl.policies.learners.start import Start
 from ugat_marl.policies.network_policy import NetworkPolicy, checkpoint_header, parse_header
 from ugat_marl.policies.networks.batched import one_thread, size_mask
 from ugat_marl.policies.networks.q_network import (
@@ -207,7 +207,7 @@ class DQN:
         self._steps = max(1, round(self.config.steps / tens))
         self._acting = Acting(self._online, self._weights)
         if self.config.start is not None:
-            self.begin_with(Start.load(Path(self.config.start)))
+            self.load_initial_weights(InitialWeights.load(Path(self.config.start)))
 
     @classmethod
     def of(
@@ -512,15 +512,15 @@ class DQN:
         """Running mean of the learned weights, with which `policy` acts (a copy)."""
         return self._target_weights.detach().cpu().clone()
 
-    def begin_with(self, start: Start) -> None:
-        """Take the weights of a start.
+    def load_initial_weights(self, initial: InitialWeights) -> None:
+        """Take weights that were learned elsewhere.
 
         Raises:
             OptionError: The network is not "universal", or has another number of weights.
         """
         if not self._is_universal:
             raise OptionError('only a network "universal" begins with the weights of another')
-        weights = start.weights_for(self._online)
+        weights = initial.weights_for(self._online)
         self._weights.data.copy_(weights)
         self._target_weights.data.copy_(weights)
 

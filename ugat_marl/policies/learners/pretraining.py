@@ -15,7 +15,7 @@ from dataclasses import replace
 from ugat_marl.envs import AnyParallelEnv
 from ugat_marl.policies.learners.dqn import DQN
 from ugat_marl.policies.learners.dqn_config import DQNConfig
-from ugat_marl.policies.learners.start import Start
+from ugat_marl.policies.learners.initial_weights import InitialWeights
 from ugat_marl.policies.network_policy import NetworkPolicy
 from ugat_marl.policies.networks.batched import one_thread
 from ugat_marl.seeding import derive_seed, numpy_generator, torch_generator
@@ -69,20 +69,20 @@ class Pretraining:
             self._update(updates)
         self.episodes += len(playing)
 
-    def start(self, origin: str) -> Start:
+    def start(self, origin: str) -> InitialWeights:
         """Return the weights so far.
 
         Args:
             origin: How they were learned.
         """
         learner = next(iter(self.learners.values()))
-        return Start(learner.running_weights, learner.env_options, origin)
+        return InitialWeights(learner.running_weights, learner.env_options, origin)
 
     def policy(self, env: AnyParallelEnv) -> NetworkPolicy:
         """Return the greedy policy of the weights so far, for any road network."""
         learner = DQN.of(env, self._config, self._seed)
         if self.learners:
-            learner.begin_with(self.start(""))
+            learner.load_initial_weights(self.start(""))
         return learner.policy()
 
     def set_learning_rate(self, rate: float) -> None:

@@ -16,7 +16,7 @@ _KIND = "ugat_marl.start"
 
 
 @dataclass(frozen=True)
-class Start:
+class InitialWeights:
     """Weights of a network "universal", and where they come from.
 
     Attributes:
@@ -31,11 +31,11 @@ class Start:
     origin: str = ""
 
     @classmethod
-    def load(cls, path: Path) -> Start:
+    def load(cls, path: Path) -> InitialWeights:
         """Read a file of `save`.
 
         Raises:
-            CheckpointError: The file is missing, cut short or not finite, or not a start.
+            CheckpointError: The file is missing, cut short or not finite, or of another kind.
         """
         content = read_checkpoint(path, _KIND)
         weights = content["weights"]
@@ -43,7 +43,7 @@ class Start:
         return cls(weights, dict(content["env_options"]), str(content["origin"]))
 
     def save(self, path: Path) -> None:
-        """Write the start to a file, whole or not at all."""
+        """Write the weights to a file, whole or not at all."""
         content = {
             "weights": self.weights.detach().clone(),
             "env_options": dict(self.env_options),
