@@ -95,9 +95,9 @@ class IntersectionFacts:
         always_green: Number of links that are green in every phase.
         right_on_red: Number of links that may go on red after a stop.
         u_turns: Number of links that turn around.
-        crossings: Number of links for people on foot.
+        crossings: Number of links for pedestrians.
         unserved_crossings: Number of crossings that are green in no phase.
-        foot_phases: Number of phases with green for people on foot only. A controller that sees
+        foot_phases: Number of phases with green for pedestrians only. A controller that sees
             vehicles alone has no reason to choose them.
         clashes: Protected greens of vehicles across a crossing with green, as ``phase n: edge
             turn``.

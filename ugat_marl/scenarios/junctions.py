@@ -11,7 +11,7 @@ from dataclasses import dataclass, field
 from ugat_marl.scenarios.naming import edge_of_lane
 
 CROSSING = "c"
-"""Direction of a link for people on foot."""
+"""Direction of a link for pedestrians."""
 
 _ROUNDS = 50
 """Rounds of the iteration for roundabouts. Each round shrinks the error by a factor."""
@@ -129,7 +129,7 @@ def links_for_cars(links: Sequence[Link]) -> Sequence[Link]:
 
 
 def crossings_of(root: ET.Element) -> dict[str, list[Link]]:
-    """Return the crossings for people on foot of every traffic light.
+    """Return the pedestrian crossings of every traffic light.
 
     Crossings have the last rows of the junction's matrix, in the order of their numbers. A crossing
     with a light at each end (``linkIndex2``) gives two links, one for each letter.

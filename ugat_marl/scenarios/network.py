@@ -82,7 +82,7 @@ class Intersection:
         programme: The network's own programme, ``(duration_s, state)``.
         neighbours: Other agents one road away, in either direction.
         position: Mean over the links of their junction's coordinates, m.
-        crossings: Links for people on foot.
+        crossings: Links for pedestrians.
         offset_s: Time on the scenario's clock at which the programme begins a cycle.
         times_vary: Why SUMO's times of the programme differ from those in `programme`; "" if they
             do not.

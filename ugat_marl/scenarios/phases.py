@@ -126,14 +126,14 @@ def conflict_free_phases(
 
     A crossing is green in every phase in which only turning vehicles cross it; these wait (``g``).
     Phases with right turns only are preferred, else left turns count too. Crossings that no phase
-    can serve get green in a phase for people on foot alone.
+    can serve get green in a phase for pedestrians alone.
 
     Args:
         links: Links of one traffic light.
         rules: Right of way at its junctions.
         width: Number of letters of a state.
         source: Name of the traffic light in errors.
-        crossings: Links for people on foot.
+        crossings: Links for pedestrians.
         permitted: True if left turns may go together with opposite traffic, to which they give way
             (``g``).
 

@@ -157,7 +157,7 @@ def plan_states(
     - A link is green if its movement is green in some ring. It stays green from one phase of a ring
       to the next if both have it.
     - It gives way (``g``) to other greens that go first by the junction's rules.
-    - Crossings for people on foot are green with a phase if only turning vehicles cross them.
+    - Pedestrian crossings are green with a phase if only turning vehicles cross them.
 
     Args:
         plan: The plan; `check_plan` has accepted it.

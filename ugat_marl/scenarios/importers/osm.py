@@ -59,7 +59,7 @@ class _Extract:
     Attributes:
         roads: Number of ways for cars.
         signals: Number of nodes with a traffic light.
-        walks: Ids of nodes that are a traffic light at a crossing for people on foot.
+        walks: Ids of nodes that are a traffic light at a pedestrian crossing.
         crossings: Longitude and latitude of crossings that may have a light, degrees.
         unlit: Number of crossings without a light.
         nodes: Ids of the nodes of roads and railways.
@@ -166,7 +166,7 @@ def _convert(
     made = work / "made.net.xml"
     netconvert(arguments, made)
     # Lights on plain roads, far from their junction, separate no conflicting streams and are
-    # removed. Lights at crossings stay: they stop traffic for people on foot.
+    # removed. Lights at crossings stay: they stop traffic for pedestrians.
     if idle := _idle_lights(made, extract.walks):
         netconvert([*arguments, "--tls.unset", ",".join(idle)], made)
     if extract.crossings:
