@@ -60,7 +60,7 @@ def test_lanes_stand_where_their_numbers_are() -> None:
     for row in described.observation.to_dicts():
         if row["shows"] in counts:
             (place,) = lanes.indices([row["name"]])
-            expected = counts[row["shows"]][place] / lanes.capacity[place]
+            expected = counts[row["shows"]][place] / lanes.storage_veh[place]
             assert seen[row["agent"]][row["entry"]] == pytest.approx(min(expected, 1.0), abs=1e-6)
             compared += expected > 0
     assert compared > 20

@@ -48,7 +48,7 @@ def test_a_short_lane_has_the_lane_behind(split: Scenario) -> None:
     assert list(short.behind.lanes)[-1] == "Ww_0"
     assert set(short.behind.lanes.values()) == {1.0}
     assert short.room_m == pytest.approx(short.length_m + network.lanes["Ww_0"].length_m)
-    assert short.capacity == pytest.approx(short.room_m / 7.5)
+    assert short.storage_veh == pytest.approx(short.room_m / 7.5)
     assert network.lanes["NM_0"].behind == Upstream()
     (item,) = survey(split).intersections
     assert item.lanes_behind == ("wM_0",)
@@ -239,7 +239,7 @@ def test_whose_waiting_vehicles_are_counted() -> None:
 def test_other_networks_are_measured_as_before() -> None:
     table = Network.read(load_scenario("single-v1")).lane_table()
     assert table.behind == NO_UPSTREAM_LANES
-    assert np.all(table.capacity > 1)
+    assert np.all(table.storage_veh > 1)
 
 
 # --- a reach that is asked for
@@ -258,7 +258,7 @@ def test_who_waits_to_enter_is_counted_within_the_reach(split: Scenario) -> None
         world = scenario_in_domain(full, f"reach={reach_m:g}")
         env = ugat_marl.parallel_env(world, reward="waiting", observation="waiting")
         (item,) = env.network.intersections
-        assert env.network.lanes["wM_0"].capacity >= reach_m / 7.5
+        assert env.network.lanes["wM_0"].storage_veh >= reach_m / 7.5
         letter = next(link.index for link in item.links if link.from_lane == "wM_0")
         red = next(i for i, state in enumerate(item.phases) if state[letter] == "r")
         env.reset(seed=1)

@@ -226,7 +226,7 @@ def test_a_jam_that_never_ends_grows_at_the_rate_of_free_times() -> None:
         found = course({"advance": advance, "stop": stop})
         assert found.jams[-1].open
         (deviation,) = found.deviation(np.array([400.0]))
-        true = min((starts < 400.0).sum() - (found.leave_s <= 400.0).sum(), LANE.capacity)
+        true = min((starts < 400.0).sum() - (found.leave_s <= 400.0).sum(), LANE.storage_veh)
         errors.append((found.vehicles(np.array([400.0]))[0] - true) / deviation)
         rates.append(found.jams[-1].error * np.sqrt(first.sum()))
     assert np.abs(errors).mean() < 1.5
@@ -273,8 +273,8 @@ def test_a_lane_never_holds_more_than_fit_on_it() -> None:
     stop = crossed([*(head + 4.75), *(slow + 35.0)], [10.0] * 40 + [4.0] * 45)
     found = course({"advance": advance, "stop": stop})
     held = found.vehicles(np.arange(0.0, 600.0, 5.0))
-    assert held.max() <= LANE.capacity
-    assert held[-1] > 0.8 * LANE.capacity
+    assert held.max() <= LANE.storage_veh
+    assert held[-1] > 0.8 * LANE.storage_veh
 
 
 def test_a_missed_vehicle_and_a_change_of_lanes_do_not_shift_the_others() -> None:

@@ -181,7 +181,7 @@ def test_structure_of_shipped_networks_holds_commands_age_and_times():
         assert junction.clearance_s == env.scenario.timing.clearance_s
         item = next(i for i in env.network.intersections if i.id == env.intersection_of[name])
         lanes = env.network.lane_table()
-        capacity = lanes.capacity[lanes.indices(item.incoming_lanes)]
+        capacity = lanes.storage_veh[lanes.indices(item.incoming_lanes)]
         assert np.array_equal(junction.vehicles[: len(capacity)], capacity)
 
 

@@ -192,17 +192,17 @@ def test_the_crossing_as_drawn(crossing: Callable[..., Path]) -> None:
     lane = network.lanes["W_C_0"]
     assert (lane.edge, lane.length_m, lane.speed_mps) == ("W_C", 490.0, 10.0)
     assert lane.shape == ((0.0, 500.0), (490.0, 500.0))
-    assert lane.capacity == pytest.approx(490 / 7.5)
+    assert lane.storage_veh == pytest.approx(490 / 7.5)
     table = network.lane_table()
     assert table.ids == ("S_C_0", "W_C_0", "C_N_0", "C_E_0")
     assert table.indices(["C_E_0", "S_C_0"]).tolist() == [3, 0]
-    np.testing.assert_allclose(table.capacity, 490 / 7.5)
+    np.testing.assert_allclose(table.storage_veh, 490 / 7.5)
     np.testing.assert_allclose(table.speed_mps, 10)
 
 
 def test_a_short_lane_has_room_for_one(crossing: Callable[..., Path]) -> None:
     directory = crossing(edit=lambda text: text.replace('length="490.00"', 'length="4.00"'))
-    assert Network.read(load_scenario(directory)).lanes["W_C_0"].capacity == 1.0
+    assert Network.read(load_scenario(directory)).lanes["W_C_0"].storage_veh == 1.0
 
 
 def test_derived_phases_are_the_programme_s(crossing: Callable[..., Path]) -> None:

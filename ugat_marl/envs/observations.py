@@ -211,7 +211,7 @@ class Observer:
                         "return always as many"
                     )
             return np.concatenate(rows)
-        capacity = self._lanes.capacity
+        capacity = self._lanes.storage_veh
         if self.name == "count":
             values = snapshot.vehicles[self._incoming] / COUNT_SCALE
         elif self.name == "queue":

@@ -137,7 +137,7 @@ def fixed_time(
     """
     streets = ControlledNetwork(
         {intersection.id: intersection for intersection in network.intersections},
-        {name: lane.capacity for name, lane in network.lanes.items()},
+        {name: lane.storage_veh for name, lane in network.lanes.items()},
         {name: lane.length_m / lane.speed_mps for name, lane in network.lanes.items()},
         decision_interval_s,
         clearance_s,

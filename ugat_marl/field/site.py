@@ -103,7 +103,7 @@ class Site:
     def capacity(self) -> dict[str, float]:
         """Lane that must be counted to the number of vehicles that fit on it alone."""
         lanes = dict.fromkeys(lane for seen_lanes in self.sees.values() for lane in seen_lanes)
-        return {lane: replace(self.network.lanes[lane], room_m=0.0).capacity for lane in lanes}
+        return {lane: replace(self.network.lanes[lane], room_m=0.0).storage_veh for lane in lanes}
 
     @cached_property
     def spaces(self) -> dict[str, Discrete]:

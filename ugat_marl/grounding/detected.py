@@ -708,12 +708,12 @@ class LaneEstimate:
         sigma = np.concatenate([sigma, np.zeros(len(beyond))])
         order = np.lexsort((come, leave))
         come, leave, arrive, sigma = (x[order] for x in (come, leave, arrive, sigma))
-        come = _within(np.minimum(come, leave), leave, lane.capacity)
+        come = _within(np.minimum(come, leave), leave, lane.storage_veh)
         there = np.isfinite(come)
         come, leave, arrive, sigma = (x[there] for x in (come, leave, arrive, sigma))
         blind_s = seen.upstream_m / seen.free_mps
         return LaneCourse(
-            come, leave, arrive, sigma, jams, seen.free_mps, lane.capacity, unmatched, blind_s,
+            come, leave, arrive, sigma, jams, seen.free_mps, lane.storage_veh, unmatched, blind_s,
             merging_s,
         )  # fmt: skip
 
@@ -730,7 +730,7 @@ class LaneEstimate:
         leave = seen.on_s + (lane.length_m - own.exit.position_m) / free_mps
         spread = self.config.speed_spread * lane.length_m / free_mps
         return LaneCourse(
-            come, leave, leave, np.full(len(come), spread), (), free_mps, lane.capacity
+            come, leave, leave, np.full(len(come), spread), (), free_mps, lane.storage_veh
         )
 
     def _crossings(self, period: Period, detector: Detector | None) -> _Crossings:

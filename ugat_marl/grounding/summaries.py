@@ -173,7 +173,7 @@ class LaneView:
             own = item.incoming_lanes
             lanes += own
             green.append(_greens(item))
-            capacity = np.array([network.lanes[lane].capacity for lane in own])
+            capacity = np.array([network.lanes[lane].storage_veh for lane in own])
             fixed = observation in ("count", "queue")
             scale.append(np.full(len(own), COUNT_SCALE) if fixed else capacity)
             holds += np.minimum(capacity, scale[-1]).tolist()

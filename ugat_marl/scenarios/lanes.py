@@ -43,14 +43,14 @@ class LaneTable:
 
     Attributes:
         ids: Lane ids of SUMO.
-        capacity: Number of vehicles that fit on the lane, ``(lanes,)``, float64.
+        storage_veh: Number of vehicles that fit on the lane, ``(lanes,)``, float64.
         speed_mps: Speed limit, ``(lanes,)``, float64.
         behind: Upstream lanes and roads counted with short lanes.
         turns: Ways across the agents' lights, for the queues of `Snapshot.queued_upstream`.
     """
 
     ids: tuple[str, ...]
-    capacity: NDArray[np.float64]
+    storage_veh: NDArray[np.float64]
     speed_mps: NDArray[np.float64]
     behind: UpstreamLanes = NO_UPSTREAM_LANES
     turns: Turns = ()

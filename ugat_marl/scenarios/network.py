@@ -64,7 +64,7 @@ class Lane:
     room_m: float = 0.0
 
     @property
-    def capacity(self) -> float:
+    def storage_veh(self) -> float:
         """Number of default vehicles that fit on the lane and its upstream lanes, at least one."""
         return max(1.0, max(self.length_m, self.room_m) / VEHICLE_SPACE_M)
 
@@ -215,7 +215,7 @@ class Network:
         behind = [self.lanes[name].behind for name in names]
         return LaneTable(
             names,
-            np.array([self.lanes[name].capacity for name in names]),
+            np.array([self.lanes[name].storage_veh for name in names]),
             np.array([self.lanes[name].speed_mps for name in names]),
             UpstreamLanes(
                 tuple(tuple(upstream.lanes.items()) for upstream in behind),

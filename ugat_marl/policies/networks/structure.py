@@ -266,9 +266,9 @@ def _vehicles(intersection: Intersection, lanes: LaneTable, observation: str) ->
     if observation in ("count", "queue"):
         return (COUNT_SCALE,) * len(intersection.incoming_lanes)
     if observation == "density":
-        return tuple(lanes.capacity[lanes.indices(intersection.incoming_lanes)].tolist())
+        return tuple(lanes.storage_veh[lanes.indices(intersection.incoming_lanes)].tolist())
     if observation == "movements":
-        incoming = lanes.capacity[lanes.indices(intersection.incoming_lanes)].tolist()
-        outgoing = lanes.capacity[lanes.indices(intersection.outgoing_lanes)].tolist()
+        incoming = lanes.storage_veh[lanes.indices(intersection.incoming_lanes)].tolist()
+        outgoing = lanes.storage_veh[lanes.indices(intersection.outgoing_lanes)].tolist()
         return (*incoming, *incoming, *outgoing)
     return ()

@@ -50,7 +50,7 @@ class ControlledNetwork:
         tls_of: Mapping[str, str] = base.intersection_of
         return cls(
             {agent: network.intersection(tls_of[agent]) for agent in base.possible_agents},
-            {name: lane.capacity for name, lane in network.lanes.items()},
+            {name: lane.storage_veh for name, lane in network.lanes.items()},
             {name: lane.length_m / lane.speed_mps for name, lane in network.lanes.items()},
             base.decision_interval_s,
             base.scenario.timing.clearance_s,
