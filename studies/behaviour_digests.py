@@ -1,4 +1,4 @@
-"""Digests of behaviour, which must stay equal to the bit while the package is rearranged.
+"""Digests of behaviour, which must stay equal bit for bit while the package is rearranged.
 
     python -m studies.behaviour_digests write FILE     # plays every part twice
     python -m studies.behaviour_digests check FILE     # one line per part

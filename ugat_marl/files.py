@@ -229,7 +229,9 @@ def _bounded(pieces: Iterator[bytes], path: Path, packed: int) -> Iterator[bytes
 
 
 def require_stored(archive: zipfile.ZipFile) -> None:
-    """Refuse an archive with packed entries: those of the suite have none, and a bomb needs them.
+    """Refuse an archive with packed entries.
+
+    The suite writes none, and a decompression bomb needs them.
 
     Raises:
         ValueError: An entry is packed.

@@ -88,7 +88,7 @@ def deadline_of(place: str, text: str) -> float:
     """Return the seconds of a text.
 
     Args:
-        place: Begin of the message, which names the text.
+        place: Start of the message, which names the text.
         text: The text.
 
     Raises:

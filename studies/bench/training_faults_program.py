@@ -62,7 +62,7 @@ class Steps(Silent):
 
     @contextlib.contextmanager
     def task(self, name: str, total: int) -> Iterator[Any]:
-        """Count the begin of a task and its steps."""
+        """Count the start of a task and its steps."""
         del name, total
         self._add()
         yield lambda note="": self._add()

@@ -187,8 +187,8 @@ def test_detectors_that_are_stamped_late(imported: Import) -> None:
 def test_a_late_stamp_belongs_to_the_period_in_which_it_happened(imported: Import) -> None:
     late = MAPPING.replace("channel = 5", "channel = 5\nlatency_s = 2.0")
     around = [
-        (-1.0, 82, 5), (0.5, 81, 5),  # before the begin
-        (1.5, 82, 5), (2.5, 81, 5),  # on before the begin, off in the period
+        (-1.0, 82, 5), (0.5, 81, 5),  # before the start
+        (1.5, 82, 5), (2.5, 81, 5),  # on before the start, off in the period
         (199.0, 82, 5), (201.5, 81, 5),  # off in the period, though stamped after it
         (201.9, 82, 5), (203.0, 81, 5),  # off after the end
         (201.0, 8, 2), (201.0, 82, 6),  # without a delay, so of the time after the end

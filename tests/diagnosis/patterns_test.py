@@ -67,9 +67,9 @@ def day(
         seed: Seed of the day.
         slower: Share by which gaps are longer, from `since_s` on, from this vehicle on, on lanes
             whose names begin so and go straight on.
-        since_s: Begin of what is planted, s.
+        since_s: Start of what is planted, s.
         vehicle: First vehicle of the queue.
-        lanes: Begin of the names of the lanes.
+        lanes: Start of the names of the lanes.
         pace: Factor of the speeds of long vehicles.
         more: Factor of the number of free vehicles on these lanes.
         missed: Share of vehicles that the stop detectors miss.

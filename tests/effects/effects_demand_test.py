@@ -352,7 +352,7 @@ def test_flows_that_are_shifted_before_the_begin_lose_their_first_vehicles(
         name: (flow.get("begin"), flow.get("end"), flow.get("number"))
         for name, flow in shifted.items()
     }
-    # 20 vehicles from -42 s, 10 s apart: five of them before the begin
+    # 20 vehicles from -42 s, 10 s apart: five of them before the start
     assert times == {"e": ("8", "158", "15"), "f": ("8", "158", "15")}
 
 

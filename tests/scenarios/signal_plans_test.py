@@ -130,7 +130,7 @@ def test_sumo_shows_the_plan_at_its_offset(
         shown = {
             c for link, c in movement_codes(light, network).items() if state[link.index] in "Gg"
         }
-        # SUMO shows a state from the second after its begin on.
+        # SUMO shows a state from the second after its start on.
         assert shown in (green_at(scenario, time_s - offset_s - d) for d in (0.0, 1.0))
     env.close()
 
@@ -365,7 +365,7 @@ def test_synchro_s_rings_and_barriers(single: Scenario, tmp_path: Path) -> None:
     assert served[1] == {"EBT", "EBR", "EBL"}  # phase 2, right turns with it, left permitted
     assert served[2] == {"EBL"} and served[3] == {"WBT", "WBR"}  # phases 5 and 6
     assert (plan.phases[3].yellow_s, plan.phases[3].all_red_s) == (3.5, 1.5)
-    # Phases 2 and 6 turn green 15 s after the begin of the cycle, which is what offset 30 is for.
+    # Phases 2 and 6 turn green 15 s after the start of the cycle, which is what offset 30 is for.
     assert plan.offset_s == 15
     planned = with_plans(single, [plan], "synchro.csv")
     assert green_at(planned, 25, "g") == {"EBL"}

@@ -41,7 +41,7 @@ class VideoConfig:
     """Part of an episode to film, and the form of the video.
 
     Attributes:
-        from_s: Begin of the film, in s from the begin of the episode.
+        from_s: Start of the film, in s from the start of the episode.
         length_s: Length of the film, in s of traffic.
         speed: Seconds of traffic per second of video. Each frame is one second of traffic.
         size: Longer side of the picture of a network, in pixels.

@@ -93,7 +93,7 @@ def write_csv_hashes(directory: Path, names: Iterable[str]) -> None:
 
 
 def write_csv(path: Path, text: str) -> None:
-    """Write a CSV table, whole or not at all, and the hashes of its rows beside it.
+    """Write a CSV table atomically, and the hashes of its rows beside it.
 
     A run that is killed between the two leaves a table without hashes.
     """
@@ -256,7 +256,7 @@ def _refuse_repeated_rows(source: Path | io.BytesIO) -> None:
 
 
 def _again(source: Path | io.BytesIO) -> Path | io.BytesIO:
-    """Return the source, at its begin if it is a stream."""
+    """Return the source, at its start if it is a stream."""
     if isinstance(source, io.BytesIO):
         source.seek(0)
     return source

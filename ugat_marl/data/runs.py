@@ -76,7 +76,7 @@ class Metrics:
         self.rows += [(stage, step, name, float(value)) for name, value in numbers.items()]
 
     def write(self, path: Path) -> None:
-        """Write all rows as Parquet, whole or not at all."""
+        """Write all rows as Parquet atomically."""
         frame = pl.DataFrame(self.rows, schema=_SCHEMA, orient="row")
         with replacing(path) as temporary:
             write_hashed(frame, temporary)

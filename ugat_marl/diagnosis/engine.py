@@ -103,7 +103,7 @@ VERSION = 8
 """Version of features and replays; tallies cached under another version are not used."""
 
 _SUPPLEMENTARY = "between "
-"""Begin of the names of `Tally.supplementary` in the cache."""
+"""Start of the names of `Tally.supplementary` in the cache."""
 
 _KEPT_DAYS = 40
 """Largest number of simulated days that are kept in memory with their passages."""

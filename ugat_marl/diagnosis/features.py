@@ -71,10 +71,10 @@ class Greens:
     """The greens of one lane in one period; all arrays ``(greens,)``, times in s.
 
     Attributes:
-        start_s: Begin of green.
-        end_s: End of green and begin of yellow.
-        red_s: Begin of red.
-        next_s: Begin of the next green, or end of the period.
+        start_s: Start of green.
+        end_s: End of green and start of yellow.
+        red_s: Start of red.
+        next_s: Start of the next green, or end of the period.
         protected: True if the green gives right of way.
     """
 
@@ -474,9 +474,9 @@ class Discharge:
     Attributes:
         stop: Their passages over the stop detector.
         number: Place in their green, 0 for the first.
-        start_s: Begin of their green, s.
+        start_s: Start of their green, s.
         gap_s: Time since the vehicle before, or since green began for the first, s.
-        alive: True for those of the queue at the begin of green, before its first long gap.
+        alive: True for those of the queue at the start of green, before its first long gap.
         protected: The same, where green gives right of way.
     """
 
@@ -530,7 +530,7 @@ def _discharge(counter: _Counter, stop: Passages, greens: Greens) -> None:
     counter.add("gap_permitted", gap[alive & ~protected & (number >= 1)])
     lost = gap[protected & (number == 0)]
     counter.add("lost", lost)
-    # trend = mean of lost * t, with t from -1 at the begin of the period to 1 at its end
+    # trend = mean of lost * t, with t from -1 at the start of the period to 1 at its end
     middle = 0.5 * (counter.period.begin_s + counter.period.end_s)
     half = 0.5 * counter.period.length_s
     counter.add("lost_trend", lost * (start[protected & (number == 0)] - middle) / half)
@@ -657,7 +657,7 @@ def _storage(counter: _Counter, advance: Passages, greens: Greens) -> None:
     steps = np.concatenate(([0.0], np.ones(len(on)), -np.ones(len(off)), [0.0]))
     order = np.argsort(times, kind="stable")
     times, present = times[order], np.minimum(np.cumsum(steps[order]), 1.0)
-    # occupied seconds from the begin of the period up to each time
+    # occupied seconds from the start of the period up to each time
     filled = np.append(0.0, np.cumsum(np.diff(times) * present[:-1]))
 
     def occupied(when: Array) -> Array:

@@ -207,7 +207,7 @@ class Fitter:
         return best
 
     def _windows(self, best: Fitted) -> Fitted:
-        """Move begin and end of windows in ever smaller steps, as long as the cost falls.
+        """Move start and end of windows in ever smaller steps, as long as the cost falls.
 
         The same few days are simulated before and after a move.
         """
@@ -284,7 +284,7 @@ class Fitter:
         ) or 1.0
 
     def window_changes(self, model: Fitted) -> list[Change]:
-        """Move begin and end of windows a minute inwards, for effects with free values.
+        """Move start and end of windows a minute inwards, for effects with free values.
 
         Strength and duration of an effect are estimated together, so their errors are correlated.
         """
@@ -366,7 +366,7 @@ def _shifted(hypothesis: Hypothesis, move: tuple[float, float], shortest_s: floa
 
     Args:
         hypothesis: The hypothesis.
-        move: Moves of begin and end, s.
+        move: Moves of start and end, s.
         shortest_s: Shortest window, s.
     """
     known = dict(hypothesis.fixed)

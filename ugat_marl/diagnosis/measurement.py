@@ -181,8 +181,8 @@ class _Track:
         over: Time over the zone, s.
         speed: Speed, m/s.
         reach: Length of the vehicle and of the zone, m.
-        before: Time since the begin of the passage before, s.
-        after: Time until the begin of the next passage, s.
+        before: Time since the start of the passage before, s.
+        after: Time until the start of the next passage, s.
         free: True if the passage ended before the next one began.
         gaps: Numbers of passages by the time without a vehicle after them, see `Sightings`.
     """

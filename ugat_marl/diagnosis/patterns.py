@@ -231,7 +231,7 @@ def _sides(width: int, begins: Sequence[float], before: float) -> Named:
 
     Args:
         width: Number of values.
-        begins: Begin of each.
+        begins: Start of each.
         before: Distance from a begin to the end of the value before.
     """
     sides: Named = {}
@@ -506,7 +506,7 @@ def unnamed_effects(
     """Return changes of service and demand that imitate patterns, whatever their cause.
 
     Slower discharge becomes seconds of green that a lane does not use, in every decision or at the
-    begin of green. Counts of whole entries become demand. Patterns of some hours of the discharge,
+    start of green. Counts of whole entries become demand. Patterns of some hours of the discharge,
     of long vehicles, of single kinds of detectors behind an entry, and of speeds are left out.
 
     Args:
@@ -545,7 +545,7 @@ def unnamed_effects(
 
 
 def _lost_s(pattern: Pattern, decision_s: float) -> tuple[float, float]:
-    """Return unused seconds at the begin of green and in each further decision."""
+    """Return unused seconds at the start of green and in each further decision."""
     share = max(-pattern.change, 0.0)
     _, until_s = pattern.green_s or (None, None)
     _, until = pattern.vehicles or (None, None)

@@ -207,7 +207,7 @@ class PlaceFinder:
             side: -1 or 1 to find only fewer or only more counts; 0 for both.
 
         Returns:
-            Standardised size, begin and end in s, ratio to the expected; None if all is chance.
+            Standardised size, start and end in s, ratio to the expected; None if all is chance.
         """
         block = reference.blocks["time"]
         places = len(self._edges)
@@ -739,13 +739,13 @@ def most_unusual(
         measured: Measured values per minute, ``(minutes,)``.
         expected: Expected values per minute.
         variance: Variances of the expected values per minute.
-        begin_s: Begin of the first minute, s.
+        begin_s: Start of the first minute, s.
         width_s: Length of a minute, s; periods are no whole minutes long.
         thresholds: Numbers of the method.
         side: -1 or 1 to find only smaller or only larger values; 0 for both.
 
     Returns:
-        Standardised size, begin and end in s, ratio to the rest; None if all is chance.
+        Standardised size, start and end in s, ratio to the rest; None if all is chance.
     """
     minutes = len(measured)
     if expected.sum() <= 0 or minutes * thresholds.scan_s <= thresholds.shortest_stretch_s:

@@ -253,7 +253,7 @@ class Parameter:
 
     Attributes:
         value: The value.
-        low: Begin of its 95 % interval; None if it was not estimated.
+        low: Lower end of its 95 % interval; None if it was not estimated.
         high: End of its 95 % interval; None if it was not estimated.
         unit: Unit of all three.
     """
@@ -633,7 +633,7 @@ class TravelTimeEstimate:
 
     Attributes:
         mean: The mean, s.
-        low: Begin of the interval, s; None for a single episode.
+        low: Lower end of the interval, s; None for a single episode.
         high: End of the interval, s; None for a single episode.
     """
 
@@ -769,7 +769,7 @@ class Diagnosis:
         return _adapter(cls).validate_json(json.dumps(content))
 
     def write(self, directory: Path) -> None:
-        """Write the file into a directory, whole or not at all."""
+        """Write the file into a directory atomically."""
         text = json.dumps(self.to_json(), indent=1, sort_keys=True, allow_nan=False)
         write_whole(directory / FILE, text + "\n")
 

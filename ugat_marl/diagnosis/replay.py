@@ -186,7 +186,7 @@ class Replay:
         Args:
             effects: Effects, applied to the day in this order; faults of detectors are applied to
                 the passages.
-            period: Measured period: its begin, end and signals, and its passages if the days get
+            period: Measured period: its start, end and signals, and its passages if the days get
                 measured arrivals.
             seed: Number that selects the day; also SUMO's seed.
 
@@ -230,7 +230,7 @@ class Replay:
         return replace(period, signals=signals)
 
     def _begin_s(self, period: Period) -> float:
-        """Return the begin of the simulation of a period, s: a step of the scenario."""
+        """Return the start of the simulation of a period, s: a step of the scenario."""
         settings = self._scenario.settings
         begin_s = max(settings.begin_s, period.begin_s - self._thresholds.warm_up_s)
         step_s = settings.step_length_s
@@ -348,7 +348,7 @@ def replay_document(
     Args:
         scenario: The scenario.
         period: The measured period.
-        begin_s: Begin of the simulation, s.
+        begin_s: Start of the simulation, s.
         red: Red of single links by traffic light, in decisions of the scenario's own length.
 
     Raises:
@@ -427,7 +427,7 @@ class _Lane:
     Attributes:
         advance: Id of the advance detector.
         stop: Id of the stop detector; None if there is none.
-        position_m: Begin of the advance detector's zone on the lane, m.
+        position_m: Start of the advance detector's zone on the lane, m.
         zone_m: Length of this zone, m.
         speed_mps: Speed limit, m/s.
         travel_s: Least time from the advance detector to the stop detector, s.

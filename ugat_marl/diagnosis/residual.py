@@ -145,8 +145,8 @@ def drawn_days(
 ) -> NDArray[np.int64]:
     """Draw the days of a data set from the days of a model, by number.
 
-    Large sets repeat days. Without that they would all be nearly the same one, and their spread
-    would not be that of chance.
+    Large sets are drawn with replacement. Otherwise all would hold nearly the same days, and their
+    spread would be too small.
 
     Args:
         generator: Source of the draw.

@@ -83,7 +83,7 @@ class Pools:
         return cls(blocks, thresholds, together, supplementary or {})
 
     def grouped_s(self, length_s: float) -> float:
-        """Return how much of a period lies in groups of bins, from its begin on.
+        """Return how much of a period lies in groups of bins, from its start on.
 
         Bins left over at the end are in no group, as in `Tally.gathered`.
 

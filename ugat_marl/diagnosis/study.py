@@ -701,8 +701,8 @@ def day_to_day_variation(counts: Array, thresholds: Thresholds) -> float:
 
     The mean square of a day's counts around their mean has the expectation ``m + (s m)^2``, for a
     mean m and a variation s. No variation at all, as in a simulation, and a variation with a
-    half-normal distribution are equally likely before. The likelier of the two is taken; if it is
-    the second one, its posterior root mean square.
+    half-normal distribution are equally likely before the counts are seen. If no variation is
+    likelier afterwards, it is taken; otherwise the posterior root mean square of the variation is.
 
     Args:
         counts: Vehicles per day at places that no vehicle passes twice, ``(places, days)``. The

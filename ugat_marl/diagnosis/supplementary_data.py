@@ -66,7 +66,7 @@ class SupplementaryData:
     Attributes:
         turns: Pairs of edges whose turning vehicles were counted.
         ways: Pairs of places between which probes were timed.
-        spans: For each period, begin and end of the counted intervals of each turn, s.
+        spans: For each period, start and end of the counted intervals of each turn, s.
         counts: For each period, vehicles of each turn, ``(turns,)``.
         times: For each period, sum and number of travel times of each way, ``(ways, 2)``, of the
             probes that arrived within the period.

@@ -111,10 +111,10 @@ class DayThresholds:
     """Longest time on the detector of a vehicle that approaches a red, s. By hand: longer ones
     stand. Halved: drivers who brake early are left out."""
     cut_occupation_s: float = 30.0
-    """Longest occupation from the begin of a period by a vehicle whose arrival was not seen, s. By
+    """Longest occupation from the start of a period by a vehicle whose arrival was not seen, s. By
     hand: longer ones are faults. Halved: queues that stood there already are left out."""
     standing_s: float = 1.9
-    """Occupied time within one second of the begin of green from which a queue stands on the
+    """Occupied time within one second of the start of green from which a queue stands on the
     detector, s (of 2 s). By hand. Halved: moving vehicles count as queues."""
     whole: float = 0.99
     """Share of a bin or of a period that must have been counted. By hand: only rounding may be
@@ -624,7 +624,7 @@ class Thresholds(DayThresholds):
     """Largest error of a value without a last step, in standard errors. By hand. Halved: more last
     steps."""
     window_steps_s: tuple[float, ...] = (120.0, 60.0, 30.0)
-    """Steps for begin and end of a window, s. By hand. Halved: windows are known to a quarter of a
+    """Steps for start and end of a window, s. By hand. Halved: windows are known to a quarter of a
     minute, but the search stops at a wrong place more often."""
     window_days: int = 4
     """Days for each such step. By hand, to save time. Halved: chance moves windows."""

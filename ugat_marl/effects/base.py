@@ -137,7 +137,7 @@ class Effect(ControllerPart):
         raise NotImplementedError(f"{type(self).__name__} has no apply()")
 
     def window(self, scenario: Scenario) -> tuple[float, float] | None:
-        """Return the begin and end of the effect on the scenario's clock, in s.
+        """Return the start and end of the effect on the scenario's clock, in s.
 
         Return None for an effect without times.
         """

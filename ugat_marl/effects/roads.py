@@ -93,7 +93,7 @@ class Incident(Effect):
         return LaneClosure(lane, *self.window(scenario)).apply(scenario)
 
     def window(self, scenario: Scenario) -> tuple[float, float]:
-        """Return the begin and end of the incident on the scenario's clock, in s."""
+        """Return the start and end of the incident on the scenario's clock, in s."""
         begin = scenario.settings.begin_s + self.after_s
         return begin, begin + self.lasts_s
 

@@ -31,8 +31,8 @@ SERVICE = "ugat_marl.experiments.forked:Jobs"
 def jobs_fork_on(device: str) -> bool:
     """Return True if jobs on a device can be forked here.
 
-    Only Linux can: on macOS, torch's libraries do not bear a fork. Devices other than the
-    processor get a new interpreter, because their drivers do not bear one either.
+    Only Linux can: on macOS, torch's libraries do not survive a fork. Devices other than the
+    processor get a new interpreter, because their drivers do not survive one either.
     """
     return sys.platform == "linux" and device == "cpu"
 

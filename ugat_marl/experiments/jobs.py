@@ -230,7 +230,7 @@ class Job:
             raise CheckpointError(f"{path}: not the description of a training ({told})") from None
 
     def write(self, folder: Path) -> None:
-        """Write ``job.json``, whole or not at all."""
+        """Write ``job.json`` atomically."""
         write_whole(folder / JOB, json.dumps(asdict(self), indent=1) + "\n")
 
 
@@ -248,7 +248,7 @@ def file_name(name: str) -> str:
 
 
 def _cut(name: str) -> str:
-    """Return the begin of a name that file systems take, with room for a digest and an ending."""
+    """Return the start of a name that file systems take, with room for a digest and an ending."""
     return name.encode()[:_MOST_NAME_BYTES].decode(errors="ignore")
 
 
@@ -309,7 +309,7 @@ class Record:
             return cls()
 
     def write(self, folder: Path) -> None:
-        """Write the record, whole or not at all."""
+        """Write the record atomically."""
         rows = [
             {"trained": trained, "domain": domain, "seed": seed, **asdict(scores)}
             for (trained, domain, seed), scores in self.scores.items()

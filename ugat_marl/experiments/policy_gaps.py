@@ -156,7 +156,7 @@ def read_diagnosis(directory: Path, scenario: Scenario) -> tuple[Diagnosis, Scen
 def write_policy_gap(
     directory: Path, diagnosis: Diagnosis, gap: Mapping[str, PolicyGap]
 ) -> Diagnosis:
-    """Write a diagnosis with its policy gap, whole or not at all; return it."""
+    """Write a diagnosis with its policy gap atomically; return it."""
     measured = replace(diagnosis, policy_gap=dict(gap))
     measured.write(directory)
     return measured

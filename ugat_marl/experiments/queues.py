@@ -107,7 +107,7 @@ class QueueRecord:
         return pl.DataFrame(rows, schema=schema, orient="row")
 
     def write(self, path: Path, *, keep: bool = False, batch: int = 0) -> None:
-        """Write the record as Parquet, whole or not at all.
+        """Write the record as Parquet atomically.
 
         Args:
             path: The file.
@@ -131,7 +131,7 @@ def write_queues(path: Path, sources: Mapping[str, tuple[Path, str]]) -> None:
     """Write the queues of several policies into one file; missing and damaged files are left out.
 
     Args:
-        path: File to write, whole or not at all.
+        path: File to write, atomically.
         sources: For the name of each policy, a file that `QueueRecord.write` wrote and the name of
             the policy in it.
 

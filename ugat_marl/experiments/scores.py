@@ -192,7 +192,7 @@ class Evaluation:
         return pl.DataFrame(rows, infer_schema_length=None)
 
     def write(self, path: Path) -> None:
-        """Write `as_dict` as JSON, whole or not at all; nan becomes null."""
+        """Write `as_dict` as JSON atomically; nan becomes null."""
         hashed = with_hashes(_without_nan(self.as_dict()), "episodes")
         content = json.dumps(hashed, indent=1, allow_nan=False)
         write_whole(path, content + "\n")

@@ -217,7 +217,7 @@ def _order(kept: Sequence[int], shown: _Shown) -> list[int]:
 
 
 def _offset_s(begins_s: Sequence[float], cycle_s: float) -> float:
-    """Return the usual begin of a cycle, whole s; 0 if the begins are spread over the cycle."""
+    """Return the usual start of a cycle, whole s; 0 if the begins are spread over the cycle."""
     if not begins_s:
         return 0.0
     mean = sum(cmath.rect(1, 2 * math.pi * t / cycle_s) for t in begins_s) / len(begins_s)

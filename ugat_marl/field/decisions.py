@@ -200,7 +200,7 @@ class DecisionLog:
             self._open_file()
 
     def _overlap(self, offset: int, lines: bytes) -> int:
-        """Return the number of bytes at the begin of a segment that the file ends with."""
+        """Return the number of bytes at the start of a segment that the file ends with."""
         length = os.fstat(self._file).st_size - offset
         if 0 < length <= len(lines) and os.pread(self._file, length, offset) == lines[:length]:
             return length

@@ -29,7 +29,7 @@ class Light:
         phases: The green phases that the light may show, in SUMO's letters.
         timing: Minimum green and clearance, s.
         shown: State of the light when it is taken over, in SUMO's letters. A state that is none of
-            the phases is held for the minimum green, because its begin is unknown. Then it is
+            the phases is held for the minimum green, because its start is unknown. Then it is
             cleared like a phase.
 
     Raises:

@@ -266,7 +266,7 @@ class SimulatedStreet:
         return {lane: LaneCount(seen.time_s, *row) for lane, *row in rows}
 
     def show(self, states: Mapping[str, str]) -> None:
-        """Set the lights from the begin of the next step."""
+        """Set the lights from the start of the next step."""
         self._asked |= states
 
     def wait(self, until_s: float) -> None:

@@ -251,7 +251,7 @@ class LaneDetectors:
     Attributes:
         stop: At the stop line; None without.
         advance: Upstream of it; None without.
-        exit: At the begin of a lane that leads away from a light; None without.
+        exit: At the start of a lane that leads away from a light; None without.
     """
 
     stop: Detector | None = None
@@ -415,7 +415,7 @@ class _Seen:
     clock: _Clock
 
     def jams(self) -> list[tuple[int, int]]:
-        """Return begin and end of each jam, as positions in the arrays."""
+        """Return start and end of each jam, as positions in the arrays."""
         edges = np.diff(np.concatenate([[True], self.free, [True]]).astype(np.int64))
         return list(
             zip(
@@ -436,7 +436,7 @@ class _Seen:
         return _Rate(float(max(count, 0)), max(span, 0.0))
 
     def open_since(self, period: Period) -> float:
-        """Return the begin of a long jam that does not end within the period; infinite without."""
+        """Return the start of a long jam that does not end within the period; infinite without."""
         jams = self.jams()
         if jams and jams[-1][1] == len(self.come_s):
             first, last = self._ends(*jams[-1], period)
@@ -795,7 +795,7 @@ def _unseen(entries: Floats, known: Floats, begin_s: float) -> Floats:
 
 
 def greens_of(period: Period, tls: str, links: Sequence[int]) -> list[tuple[float, float]]:
-    """Return begins and ends of the greens of a lane's links."""
+    """Return starts and ends of the greens of a lane's links."""
     spans: list[tuple[float, float]] = []
     log = (*period.signals.get(tls, ()), (period.end_s, ""))
     for (begin, state), (end, _) in itertools.pairwise(log):

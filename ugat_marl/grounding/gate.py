@@ -192,7 +192,7 @@ class Gate:
 
     @contextlib.contextmanager
     def uncounted(self) -> Iterator[None]:
-        """Forget the decisions of a block: alpha follows those of the learner alone."""
+        """Leave the decisions of a block out: alpha follows those of the learner alone."""
         state = self.state_dict()
         try:
             yield

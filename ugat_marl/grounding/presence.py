@@ -1,8 +1,8 @@
 """Chances of each set of changes of a world, and draws without the changes that are absent.
 
 In the prior of worlds a change is absent with some chance: a point of mass at the value that
-changes nothing. A regression spreads that mass, so that a street is given a little of everything.
-Here it is put back. With the normal distribution N(m, C) for what the regression says of all
+changes nothing. A regression spreads that mass: it estimates a small amount of every effect. This
+module restores it. With the normal distribution N(m, C) for what the regression says of all
 values, with A the values of absent changes and F those of present ones:
 
     chance(A) ~ prior(A) N(nominal_A; m_A, C_AA) prod_F (share of F's range that N allows) / range_F

@@ -154,7 +154,7 @@ class Residual:
             return self.transform.gate.update()
 
     def save(self, path: Path) -> None:
-        """Write models and gate to a file, whole or not at all."""
+        """Write models and gate to a file atomically."""
         self.transform.save(path)
 
     def load(self, path: Path) -> None:

@@ -1,7 +1,7 @@
 """Rival of a policy that is trained in a fitted street: one that is trained with late greens.
 
-Each episode in a fitted street is in another world, and a few of them are not learnt from well. In
-the plain simulation a learner often gets farther. The rival trains there, with greens that are late
+Each episode of a fitted street is another simulation, and a few such episodes are hard to learn
+from. In the plain simulation a learner often gets farther. The rival trains there, with greens that are late
 until the rewards of the street match (`delays`). Worlds of the fitted street tell which of the two
 policies is better.
 """

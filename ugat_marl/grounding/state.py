@@ -16,7 +16,7 @@ class Savable(Protocol):
     """Models or other fitted numbers that a checkpoint holds."""
 
     def save(self, path: Path) -> None:
-        """Write everything to a file, whole or not at all."""
+        """Write everything to a file atomically."""
         ...
 
     def load(self, path: Path) -> None:

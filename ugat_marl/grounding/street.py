@@ -260,7 +260,7 @@ class FittedStreet:
         return numbers
 
     def save(self, path: Path, simulated: Sequence[SimulatedLog] = ()) -> None:
-        """Write the street to a file, whole or not at all.
+        """Write the street to a file atomically.
 
         Args:
             path: The file.

@@ -243,7 +243,7 @@ class Transform(abc.ABC):
             model.load_state_dict(dict(state[name]))
 
     def save(self, path: Path) -> None:
-        """Write `state_dict` to a file, whole or not at all.
+        """Write `state_dict` to a file atomically.
 
         Raises:
             CheckpointError: A weight is not finite; an existing file at `path` stays unchanged.

@@ -138,8 +138,9 @@ def _named(given: Any) -> Any:
 def own_values(name: str) -> list[str]:
     """Return what an object that was given in Python holds beside its source, as text.
 
-    These are arguments of a `functools.partial`, values that an inner function took with it, and
-    attributes of an instance. Two objects of one name and source differ in nothing else.
+    These are arguments of a `functools.partial`, values captured by an inner function or by the
+    methods of an inner class, and attributes of such a class or of an instance. Two objects of one
+    name and source differ in nothing else.
     """
     return _values(_given[name]) if name in _given else []
 
@@ -277,7 +278,7 @@ class OwnPolicy:
             ) from None
 
     def save(self, path: Path) -> None:
-        """Write the state of the learner that made the policy, whole or not at all."""
+        """Write the state of the learner that made the policy atomically."""
         assert self._state is not None, "ask savable first"
         write_whole(path, self._state)
 

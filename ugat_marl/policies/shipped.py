@@ -89,7 +89,7 @@ class PolicyCard:
     version: int = VERSION
 
     def write(self, path: Path) -> None:
-        """Write the card as JSON, whole or not at all."""
+        """Write the card as JSON atomically."""
         write_whole(path, json.dumps(asdict(self), indent=1, allow_nan=False) + "\n")
 
     @classmethod

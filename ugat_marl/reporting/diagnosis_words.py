@@ -72,7 +72,7 @@ def place(effect: EffectRecord, names: LightNames) -> str:
 
 
 def window(span: tuple[float, float] | None) -> str:
-    """Return begin and end of a window on the scenario's clock; "" for None."""
+    """Return start and end of a window on the scenario's clock; "" for None."""
     return "" if span is None else f"{clock(span[0])} – {clock(span[1])}"
 
 

@@ -80,7 +80,7 @@ class Filmed:
 
     Args:
         inner: Simulator that does the work.
-        begin_s: Begin of the stretch, in s from the beginning of the episode.
+        begin_s: Start of the stretch, in s from the beginning of the episode.
         end_s: End of the stretch, in s from the beginning of the episode.
     """
 
@@ -160,7 +160,7 @@ def film_episode(
         env: An environment made with the policy's `env_options`, not yet reset.
         policy: Policy that acts.
         seed: Seed of the episode.
-        begin_s: Begin of the stretch, in s from the beginning of the episode.
+        begin_s: Start of the stretch, in s from the beginning of the episode.
         length_s: Length of the stretch, s.
         title: Name of the policy in the caption.
 
@@ -226,7 +226,7 @@ def require_video(path: Path) -> None:
 
 
 def write_video(pictures: Iterable[Frame], path: Path, per_second: float) -> None:
-    """Write frames of one size as a video, whole or not at all.
+    """Write frames of one size as a video atomically.
 
     Args:
         pictures: Frames, uint8 ``(height, width, 3)``; height and width are even.

@@ -63,7 +63,7 @@ def draw_day(scenario: Scenario, seed: int, day_to_day: float = 0.0) -> Scenario
 
     The same seed gives the same vehicles, names and speedFactors. Effects applied afterwards do not
     change them, so two models can be compared on the same day. Vehicles that depart before the
-    scenario's begin are left out, as SUMO leaves them out. A shift across the begin or the end of
+    scenario's begin are left out, as SUMO leaves them out. A shift across the start or the end of
     the scenario is mirrored there, so the mean number of vehicles within it is that of the demand.
     Persons, and vehicles that block a lane or wait for a person, are the same every day. A vehicle
     with a speedFactor of its own keeps it; others draw it from that of their type.
@@ -89,7 +89,7 @@ def draw_day(scenario: Scenario, seed: int, day_to_day: float = 0.0) -> Scenario
         shape = day_to_day**-2.0
         level = float(numpy_generator(seed, "level of the day").gamma(shape, 1.0 / shape))
     copies = generator.poisson(level, count)
-    copies[vehicles.depart_s < begin] = 0  # SUMO leaves out what departs before the begin
+    copies[vehicles.depart_s < begin] = 0  # SUMO leaves out what departs before the start
     most = 8
     shifts = generator.uniform(-JITTER_S, JITTER_S, (most, count))
     draws = generator.standard_normal((most, count))

@@ -56,11 +56,11 @@ class ApproachFacts:
         lanes: Number of its lanes for cars at the light.
         vph: Vehicles per hour whose routes use the road, mean of the episode.
         worst_vph: The same in the worst quarter of an hour, by free flow to the light.
-        worst_from_s: Begin of this quarter of an hour, s from the begin of the episode.
+        worst_from_s: Start of this quarter of an hour, s from the start of the episode.
         flow_ratio: `worst_vph` divided by the flow its lanes would discharge in permanent green.
         saturation: `worst_vph` divided by the flow its lanes discharge under the network's own
             programme. Above 1 the queue grows. None if there is no programme or no green.
-        first_s: Time at which the first vehicle can be there, s from the begin of the episode; None
+        first_s: Time at which the first vehicle can be there, s from the start of the episode; None
             if no route uses the road, or none can be there before the end.
     """
 
@@ -156,7 +156,7 @@ class Survey:
         uncontrolled: Traffic lights with fewer than two green phases; they are no agents.
         reasons: Light of `uncontrolled` to the reason why.
         last_s: Seconds until the last vehicle of the episode departs.
-        busiest_s: Begin of the quarter of an hour with the most departures, s from the begin.
+        busiest_s: Start of the quarter of an hour with the most departures, s from the start.
         busiest: Number of vehicles that depart in it.
         yellow_s: Yellow that the environment shows, s.
         all_red_s: Red that the environment shows after it, s.
@@ -450,7 +450,7 @@ class _Traffic:
         passes: Road and quarter of an hour to the vehicles that reach its end.
         turns: Quarter of an hour to the vehicles from road to road.
         departing: Quarter of an hour to the vehicles that depart.
-        first_at_s: Road to the time at which the first vehicle reaches its end, s from the begin.
+        first_at_s: Road to the time at which the first vehicle reaches its end, s from the start.
         first_s: Seconds until the first vehicle departs.
         last_s: Seconds until the last vehicle departs.
         fill_s: Driving time that 95 % of the routes do not exceed at the speed limits, s.
@@ -471,7 +471,7 @@ class _Traffic:
         return min(QUARTER_S, self.duration_s)
 
     def worst(self, edge: str) -> tuple[float, float]:
-        """Return the flow in the worst quarter of an hour, vehicles per hour, and its begin, s."""
+        """Return the flow in the worst quarter of an hour, vehicles per hour, and its start, s."""
         quarters = self.passes.get(edge)
         if not quarters:
             return 0.0, 0.0
@@ -480,7 +480,7 @@ class _Traffic:
 
     @property
     def busiest_s(self) -> float:
-        """Begin of the quarter of an hour with the most departures, s."""
+        """Start of the quarter of an hour with the most departures, s."""
         if not self.departing:
             return 0.0
         most = max(sorted(self.departing), key=lambda quarter: self.departing[quarter])

@@ -511,7 +511,7 @@ def _times_vary(logic: ET.Element) -> str:
 
 
 def _offset_s(logic: ET.Element, scenario: Scenario) -> float:
-    """Return the offset, s; SUMO knows the begin of the episode as ``begin``."""
+    """Return the offset, s; SUMO knows the start of the episode as ``begin``."""
     text = logic.get("offset", "0")
     return scenario.settings.begin_s if text == "begin" else parse_time(text)
 

@@ -128,7 +128,7 @@ class Passages:
         )
 
     def spans(self) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-        """Return begin and end of each passage, ``(passages,)``, without NaN.
+        """Return start and end of each passage, ``(passages,)``, without NaN.
 
         If a vehicle comes or leaves unseen, its other time is both. The last ones without an off
         stay to the end of the period and are on for ever. One without any time is on throughout.

@@ -202,7 +202,7 @@ def _load_directory(directory: Path) -> Scenario:
 
 
 _MADE_BY = "# made by applying "
-"""Begin of a comment in ``scenario.toml`` that names an effect."""
+"""Start of a comment in ``scenario.toml`` that names an effect."""
 
 _SYNONYMS = {
     "net-file": ("net-file", "net", "n"),
@@ -258,7 +258,7 @@ class SumoConfiguration:
         """Return begin and duration of an episode, s; an hour if there is no end.
 
         Raises:
-            ScenarioError: A time is none, or the end is not after the begin.
+            ScenarioError: A time is none, or the end is not after the start.
         """
         begin, end = self.seconds("begin", "0"), self.seconds("end", "-1")
         if 0 <= end <= begin:

@@ -93,7 +93,7 @@ class SignalPlan:
     Attributes:
         light: SUMO id of the traffic light.
         cycle_s: Length of the cycle, s.
-        offset_s: Begin of a cycle on the scenario's clock, s.
+        offset_s: Start of a cycle on the scenario's clock, s.
         phases: Phases, in the order of each ring.
     """
 
@@ -206,11 +206,11 @@ def _told(link: Link, codes: Mapping[Link, str]) -> str:
 
 
 _Shown = Sequence[tuple[float, float, float, frozenset[str], frozenset[str]]]
-"""Begin, end of green, end of yellow, movements, and movements that stay green after it."""
+"""Start, end of green, end of yellow, movements, and movements that stay green after it."""
 
 
 def phase_times(plan: SignalPlan) -> list[tuple[float, float, float]]:
-    """Return begin, end of green and end of yellow of each phase, s from the begin of the cycle."""
+    """Return start, end of green and end of yellow of each phase, s from the start of the cycle."""
     rings: dict[int, dict[int, float]] = defaultdict(lambda: defaultdict(float))
     for phase in plan.phases:
         rings[phase.barrier][phase.ring] += phase.split_s
@@ -229,7 +229,7 @@ def phase_times(plan: SignalPlan) -> list[tuple[float, float, float]]:
 
 
 def _times(plan: SignalPlan) -> tuple[list[float], _Shown]:
-    """Return the times of changes, s from the begin of the cycle, and the phases."""
+    """Return the times of changes, s from the start of the cycle, and the phases."""
     spans = phase_times(plan)
     shown: list[tuple[float, float, float, frozenset[str], frozenset[str]]] = []
     times = {0.0, plan.cycle_s}

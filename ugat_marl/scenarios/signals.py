@@ -439,7 +439,7 @@ def withheld_log(
         red: Red of single links.
         late_s: Delay of each green, s.
         step_s: Length of a simulation step, s.
-        decision_s: Time between two decisions, s; the first one is at the begin of the log.
+        decision_s: Time between two decisions, s; the first one is at the start of the log.
         end_s: End of the log, s.
     """
     if not log:

@@ -35,7 +35,7 @@ def measured_approaches(
 ) -> Iterator[tuple[Scenario, Callable[[], ApproachDelays]]]:
     """Let simulations of a scenario measure the delay on the approaches of its agents.
 
-    The traffic is the same to the bit. Simulations must come one after the other.
+    The traffic is the same bit for bit. Simulations must come one after the other.
 
     Args:
         scenario: The scenario.

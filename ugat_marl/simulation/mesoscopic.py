@@ -26,7 +26,7 @@ class _Stay:
     """A vehicle in one segment.
 
     Attributes:
-        position_m: Begin of the segment on its edge.
+        position_m: Start of the segment on its edge.
         since_s: Estimated time at which the vehicle entered the segment.
         lanes: Indices of the lanes that lead to the vehicle's next edge.
         lane: Index of the lane on which the vehicle counts; -1 if not known yet.

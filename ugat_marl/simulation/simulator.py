@@ -39,7 +39,7 @@ _RESERVE_BYTES = 32 << 20
 class LibsumoSimulator:
     """SUMO inside this process.
 
-    A second simulation in one process is not always equal to the bit (seen on RESCO cologne1). Use
+    A second simulation in one process is not always equal bit for bit (seen on RESCO cologne1). Use
     `ugat_marl.simulation.process.ProcessSimulator` if that matters.
     """
 

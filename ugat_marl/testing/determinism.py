@@ -1,4 +1,4 @@
-"""Checks that a seed decides an episode to the bit, independent of all other episodes."""
+"""Checks that a seed decides an episode bit for bit, independent of all other episodes."""
 
 from __future__ import annotations
 
@@ -137,7 +137,7 @@ DETERMINISM_CHECKS = (
 
 
 def check_determinism(make_env: MakeEnv, seed: int = 1) -> list[CheckResult]:
-    """Check that episodes are reproducible to the bit.
+    """Check that episodes are reproducible bit for bit.
 
     The checks play about a dozen whole episodes, so use an environment with short episodes.
 

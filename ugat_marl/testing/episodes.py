@@ -1,4 +1,4 @@
-"""Whole episodes as values that checks inspect and compare to the bit."""
+"""Whole episodes as values that checks inspect and compare bit for bit."""
 
 from __future__ import annotations
 
@@ -286,7 +286,7 @@ def require_same(expected: Episode, repeated: Episode, condition: str, cure: str
 
 
 def different(a: Any, b: Any, path: str = "") -> str:
-    """Return in words where two nested values first differ; "" if they are equal to the bit."""
+    """Return in words where two nested values first differ; "" if they are equal bit for bit."""
     if is_dataclass(a) and is_dataclass(b):
         a, b = asdict(a), asdict(b)  # pyright: ignore[reportArgumentType]
     if isinstance(a, Mapping) and isinstance(b, Mapping):

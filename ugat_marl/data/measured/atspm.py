@@ -89,7 +89,7 @@ _NAMES = {
 ZONE = "the mapping, as time_zone"
 """Place at which the street's time zone is given, for messages."""
 LOOK_BACK_S = 3600.0
-"""Time before a period from which events are read, to know the signal state at its begin."""
+"""Time before a period from which events are read, to know the signal state at its start."""
 
 Source = tuple[str, int]
 """``("phase", 2)``, ``("overlap", 1)`` or ``("arrow", 5)``."""
@@ -97,7 +97,7 @@ Source = tuple[str, int]
 _CODES = {"phase": PHASE_EVENTS, "overlap": OVERLAP_EVENTS, "arrow": ARROW_EVENTS}
 _KIND = {code: kind for kind, codes in _CODES.items() for code in codes}
 _COLOUR = PHASE_EVENTS | OVERLAP_EVENTS | ARROW_EVENTS
-# Among events at one moment, the end of the old colour comes before the begin of the new one.
+# Among events at one moment, the end of the old colour comes before the start of the new one.
 _RANK = {RED: 0, GREEN: 1, YELLOW: 2}
 
 
@@ -442,7 +442,7 @@ def _states(
     device: Device,
     period: Period,
 ) -> SignalLog:
-    """Return the state at the begin of the period and at every change in it."""
+    """Return the state at the start of the period and at every change in it."""
     colours = {source: RED for link_sources in links for source, _ in link_sources}
     later: list[_Event] = []
     seen: set[Source] = set()

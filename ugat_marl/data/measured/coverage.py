@@ -379,7 +379,7 @@ class _Silence:
 
     Attributes:
         period: Id of the period.
-        begin_s: Begin of the silence.
+        begin_s: Start of the silence.
         length_s: Length of the silence.
         meanwhile: Number of vehicles at the busiest neighbour.
     """

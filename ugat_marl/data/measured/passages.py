@@ -310,7 +310,7 @@ def passages_as_written(passages: Passages, begin_s: float, end_s: float) -> Pas
 
     Args:
         passages: Passages in any order.
-        begin_s: Begin of the period.
+        begin_s: Start of the period.
         end_s: End of the period.
 
     Returns:

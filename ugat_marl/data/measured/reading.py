@@ -566,7 +566,7 @@ def _check_states(path: Path, frame: pl.DataFrame, widths: Mapping[str, int]) ->
 def _log(
     entries: list[tuple[float, str]], period: Period, where: str, findings: list[Finding]
 ) -> SignalLog:
-    """Return the changes of one log from the begin of the period; the last of equal times counts.
+    """Return the changes of one log from the start of the period; the last of equal times counts.
 
     A logger that writes the state every second gives the same log as one that writes changes.
     """
@@ -586,7 +586,7 @@ def _log(
         if first > period.begin_s + LATE_S:
             raise MeasuredDataError(
                 f"{where} begins at {first:g} s, {first - period.begin_s:g} s late; write the "
-                "state at or before the begin of the period, or begin the period later"
+                "state at or before the start of the period, or begin the period later"
             )
         findings.append(
             Finding(

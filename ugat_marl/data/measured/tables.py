@@ -437,7 +437,7 @@ def with_period(
         frame: Rows with ``period_id`` and ``time_s``.
         periods: The periods.
         findings: Findings; rows that are left out are added to them.
-        early: True to keep rows before the begin of a period.
+        early: True to keep rows before the start of a period.
 
     Raises:
         MeasuredDataError: No row belongs to a known period, or most rows of a period lie outside

@@ -16,7 +16,7 @@ _ATTRIBUTE = re.compile(r'(\w+)="([^"]*)"')
 def tracks(file: Path, period: str, end_s: float, step_s: float) -> pl.DataFrame:
     """Return the position of every vehicle at every whole second, also on junctions.
 
-    SUMO writes positions at the begin of the step that led to them. Here they have its end, so that
+    SUMO writes positions at the start of the step that led to them. Here they have its end, so that
     they follow the signals that were shown before.
 
     Args:

@@ -1,7 +1,7 @@
 """Every learner by name: the suite's own two, those in the files of baselines/, and a user's.
 
-"dqn" learns a network for each intersection. "universal" is the same algorithm with one network for
-all, whose weights belong to none.
+"dqn" learns a network for each intersection. "universal" is the same algorithm with one network
+that all share, whatever their lanes and phases.
 
 A new learner needs a file in baselines/ and a row in `BASELINES`. The file holds a class that
 follows the protocol `Learner` and is made as ``Learner(env, config, seed)``, and a dataclass of its

@@ -4,8 +4,8 @@ The learner follows Mnih et al. 2015, with double Q-learning (van Hasselt et al.
 updated target network and exploration in bouts. It is stronger than the DQN of the UGAT paper,
 because a policy of a weak learner loses travel time that looks like a gap between domains.
 
-An update after a decision is made while SUMO simulates the next one, whose action is that of the
-weights before it.
+SUMO simulates the next decision while an update runs. The action of that decision therefore still
+uses the weights from before the update.
 """
 
 from __future__ import annotations
@@ -277,7 +277,7 @@ class DQN:
         on_play: OnPlay | None = None,
         best: str | None = None,
     ) -> str | None:
-        """Watch the teacher in an environment; what earlier teachers did is an example no more.
+        """Learn from the teacher in an environment; earlier teachers are no longer examples.
 
         `learn` calls it before the first episode. Call it again in an environment of other
         dynamics, where another rule may be the best one.

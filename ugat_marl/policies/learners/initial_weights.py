@@ -43,7 +43,7 @@ class InitialWeights:
         return cls(weights, dict(content["env_options"]), str(content["origin"]))
 
     def save(self, path: Path) -> None:
-        """Write the weights to a file, whole or not at all."""
+        """Write the weights to a file atomically."""
         content = {
             "weights": self.weights.detach().clone(),
             "env_options": dict(self.env_options),

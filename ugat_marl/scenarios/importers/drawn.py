@@ -185,7 +185,7 @@ class DrawnNetwork:
     load: float
 
     def demand_at(self, time_s: float) -> float:
-        """Return the demand at a time after the begin, as a share of the largest."""
+        """Return the demand at a time after the start, as a share of the largest."""
         course = time_s / self.duration_s
         rise = {"constant": 1.0, "rising": course, "peak": 1.0 - abs(2.0 * course - 1.0)}
         return self.lowest_demand + (1.0 - self.lowest_demand) * rise[self.profile]
@@ -235,7 +235,7 @@ def draw_scenario(
     force: bool = False,
     reporter: Reporter | None = None,
 ) -> Scenario:
-    """Draw a scenario and write its directory, whole or not at all.
+    """Draw a scenario and write its directory atomically.
 
     The same name, seed and ranges give the same files, byte by byte.
 

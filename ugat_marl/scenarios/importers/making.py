@@ -135,7 +135,7 @@ def make_scenario(
     force: bool,
     reporter: Reporter,
 ) -> Made:
-    """Make a scenario directory, whole or not at all.
+    """Make a scenario directory atomically.
 
     Args:
         target: The directory to make.
@@ -180,7 +180,7 @@ def make_draft(
     draw: Callable[[Scenario, Path], object],
     reporter: Reporter,
 ) -> Draft:
-    """Make a folder with roads, drawn lights and a sheet of turning counts, whole or not at all.
+    """Make a folder with roads, drawn lights and a sheet of turning counts atomically.
 
     The folder becomes a scenario by `make_scenario` with the counts that were filled in.
 

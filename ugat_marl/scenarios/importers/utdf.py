@@ -227,7 +227,7 @@ def _reference_s(
     if kind in (1, 2, 3):
         return min(span[{1: 1, 2: 2, 3: 0}[kind]] for span in spans)
     raise ScenarioError(
-        f"{where}: Referenced To = {kind}: offsets are read that refer to the begin of green (0, "
+        f"{where}: Referenced To = {kind}: offsets are read that refer to the start of green (0, "
         "3), yellow (1) or red (2); choose one of these in Synchro"
     )
 
