@@ -1,9 +1,9 @@
 """Rival of a policy that is trained in a fitted street: one that is trained with late greens.
 
 Each episode of a fitted street is another simulation, and a few such episodes are hard to learn
-from. In the plain simulation a learner often gets farther. The rival trains there, with greens that are late
-until the rewards of the street match (`delays`). Worlds of the fitted street tell which of the two
-policies is better.
+from. In the plain simulation a learner often gets farther. The rival trains there, with greens that
+are late until the rewards of the street match (`delays`). Worlds of the fitted street tell which of
+the two policies is better.
 """
 
 from __future__ import annotations
