@@ -99,7 +99,11 @@ def test_origins_and_destinations(tmp_path: Path) -> None:
         ("--counts", "edge,count\nwest1_A1\n", "line 2: count = None is not a number"),
         ("--counts", "edge,count\nwest1_A1,5\nhere,5\n", "line 3: 'here' is not a road for cars"),
         ("--counts", "edge,count\nwest1_A1,0\n", "no row counts a vehicle"),
-        ("--counts", "from,to,count\nwest1_A1,B1_east1,5\n", "no way through the network comes by"),
+        (
+            "--counts",
+            "from,to,count\nwest1_A1,B1_east1,5\n",
+            "no turn leads from west1_A1 to B1_east1",
+        ),
         (
             "--counts",
             "edge,count,begin_s,end_s\nwest1_A1,5,9,9\n",

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from collections import defaultdict
 from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Annotated, Any
@@ -193,10 +194,12 @@ def show(
         f"they depart until {facts.last_s:g} s, most from {facts.busiest_s:g} s on: "
         f"{facts.busiest} within {min(QUARTER_S, facts.duration_s) / 60:g} min"
     )
-    for tls in facts.uncontrolled[:MOST_LIGHTS]:
-        say(f"no agent: traffic light {tls!r}: {facts.reasons[tls]}")
-    if len(facts.uncontrolled) > MOST_LIGHTS:
-        say(f"no agents either: {', '.join(facts.uncontrolled[MOST_LIGHTS:])}")
+    without: dict[str, list[str]] = defaultdict(list)
+    for tls in facts.uncontrolled:
+        without[facts.reasons[tls]].append(tls)
+    for reason, lights in without.items():
+        named = f"traffic light {lights[0]!r}" if len(lights) == 1 else ", ".join(lights)
+        say(f"{'no agent' if len(lights) == 1 else 'no agents'}: {named}: {reason}")
     console.print(_intersections(agents, names))
     for light in [light for light in agents if light.name][:MOST_LIGHTS]:
         say(f"{names.text(light.id)}: {light.name}")

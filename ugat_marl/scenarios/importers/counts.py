@@ -174,6 +174,7 @@ def from_counts(path: Path, begin_s: float, length_s: float, seed: int) -> Vehic
         root = parse_xml(read_bytes(network), str(network))
         streets = Streets.of(root)
         _require_roads(rows, streets, path, network)
+        _require_turns(rows, streets, path)
         _refuse_overlaps(rows, path)
         with tempfile.TemporaryDirectory(prefix="ugat_marl-") as name:
             work = Path(name)
@@ -215,6 +216,18 @@ def _require_roads(rows: Iterable[Row], streets: Streets, path: Path, network: P
                 hint = f"did you mean {guess!r}?" if guess else _ASK_FOR_SHEET
                 raise ScenarioError(
                     f"{path}, line {row.line}: {road!r} is not a road for cars of {network}; {hint}"
+                )
+
+
+def _require_turns(rows: Iterable[Row], streets: Streets, path: Path) -> None:
+    """Refuse counts from a road to one that is not ahead of it."""
+    for row in rows:
+        for here, there in pairwise(row.roads):
+            ahead = streets.ahead.get(here, {}).values()
+            if not any(there in roads for roads in ahead):
+                raise ScenarioError(
+                    f"{path}, line {row.line}: no turn leads from {here} to {there}; --counts "
+                    "takes turns at intersections, and --od counts between any two roads"
                 )
 
 
