@@ -259,6 +259,10 @@ def test_the_table_fits_80_columns_and_begins_with_the_best() -> None:
     assert lines[1].split() == ["delay-actuated:120:40", "61.3", "-", "1", "3"]
     assert lines[2].split() == ["longest-waiting:60", "1234", "2000", "2", "10"]
     assert max(len(line.rstrip()) for line in page.getvalue().splitlines()) <= 80
+    assert "different numbers of seeds" in " ".join(page.getvalue().split())
+    equal = io.StringIO()
+    Console(file=equal, width=80).print(tuning_table("single-v1 in V4", found[:1]))
+    assert "different numbers of seeds" not in " ".join(equal.getvalue().split())
 
 
 def test_a_rule_is_tuned_in_real_episodes(

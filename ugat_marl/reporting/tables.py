@@ -82,6 +82,11 @@ def tuning_table(title: str, results: Sequence[Tuned]) -> RenderableType:
         "ATT: mean in s over the tuning seeds, all vehicles due. worst: of the settings tried. "
         "Numbers after a name are its settings; see docs/reference/rules.md."
     )
+    if len({tuned.best.episodes for tuned in results}) > 1:
+        legend += (
+            " The best settings were played with different numbers of seeds; evaluate ranks them "
+            "on equal ones."
+        )
     return Group(table, Text(legend, style="dim"))
 
 
