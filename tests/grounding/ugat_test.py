@@ -333,7 +333,7 @@ def test_a_policy_trained_in_the_corrected_sim_stands_beside_the_others(
         return learn(self, env, episodes, *rest)
 
     monkeypatch.setattr(DQN, "learn", counting)
-    found = transfer(config, tmp_path / "run")
+    found = transfer(config, tmp_path / "run", workers=1)  # else in processes of their own
     names = ["direct transfer", "phase (the paper's UGAT)", "more plain sim"]
     further = [f"further in {late}", "further in V4"]
     assert found.policies[:6] == [*names, *further, "corrected sim"]
@@ -355,10 +355,11 @@ def test_a_policy_trained_in_the_corrected_sim_stands_beside_the_others(
 @pytest.mark.usefixtures("unjudged")
 def test_training_in_the_corrected_sim_resumes(repaired: Path, tmp_path: Path) -> None:
     config = replace(SHORT, corrected=str(repaired))
-    transfer(config, tmp_path / "unbroken")
+    transfer(config, tmp_path / "unbroken", workers=1)
 
+    killed = KillAfter("training: corrected sim", 11)
     with pytest.raises(KeyboardInterrupt):
-        transfer(config, tmp_path / "run", reporter=KillAfter("training: corrected sim", 11))
+        transfer(config, tmp_path / "run", reporter=killed, workers=1)
     (kept,) = (tmp_path / "run" / "trainings").glob("*-scratch-*/learner.pt")
     assert kept.stat().st_size, "nothing was kept of ten episodes"
     moved = shutil.copytree(repaired, tmp_path / "elsewhere")
