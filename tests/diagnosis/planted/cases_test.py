@@ -97,6 +97,7 @@ def test_where_nothing_is_hidden_nothing_is_named(street, tmp_path: Path) -> Non
 
 
 @pytest.mark.slow
+@pytest.mark.timeout(600)
 def test_an_effect_outside_the_library_is_not_explained_away(street, tmp_path: Path) -> None:
     # Drivers of another kind, and nothing but the old kind's numbers to explain them with.
     among = {"acceleration", "headway", "startup_delay", "late_green"}
