@@ -682,23 +682,28 @@ class Document:
 
         They are kept with an unchanged document, because many scenarios are made of one.
         """
-        if not self.in_rows:
-            # Edited documents do not change; a file may, between two episodes.
-            stat = self.path.stat() if self.content is None and self.path is not None else None
-            state = stat and (stat.st_mtime_ns, stat.st_size)
-            if stat is not None and stat.st_size > _KEPT:
-                return None
-            kept: tuple[Any, Document] | None = self.__dict__.get("_in_rows")
-            if kept is None or kept[0] != state:
-                kept = state, self.changed(lambda _: None)
-                self.__dict__["_in_rows"] = kept
-            return kept[1].rows() if kept[1].in_rows else None
-        assert self.content is not None
-        start, *children = _BEGINS_ROW.split(self.content.decode())
+        document = self if self.in_rows else self._rewritten()
+        if document is None or not document.in_rows:
+            return None
+        assert document.content is not None
+        start, *children = _BEGINS_ROW.split(document.content.decode())
         if not children:
-            return Rows(self.name, start, (), "")
+            return Rows(document.name, start, (), "")
         children[-1], tag, end = children[-1].rpartition("\n</")
-        return Rows(self.name, start, tuple(children), f"{tag}{end}")
+        return Rows(document.name, start, tuple(children), f"{tag}{end}")
+
+    def _rewritten(self) -> Document | None:
+        """Return the document as `Draft` writes it, which is kept; None if the file is long."""
+        state = None  # an edited document does not change; a file may, between two episodes
+        if self.content is None and self.path is not None:
+            stat = self.path.stat()
+            if stat.st_size > _KEPT:
+                return None
+            state = stat.st_mtime_ns, stat.st_size
+        kept: tuple[Any, Document] | None = self.__dict__.get("_kept")
+        if kept is None or kept[0] != state:
+            kept = self.__dict__["_kept"] = state, self.changed(lambda _: None)
+        return kept[1]
 
     def changed(self, change: Callable[[ET.Element], object]) -> Document:
         """Return a document whose parts (see `parts`) a function has changed, in little memory."""

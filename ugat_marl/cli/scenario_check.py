@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 from collections import defaultdict
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from typing import Annotated, Any
 
@@ -194,12 +194,8 @@ def show(
         f"they depart until {facts.last_s:g} s, most from {facts.busiest_s:g} s on: "
         f"{facts.busiest} within {min(QUARTER_S, facts.duration_s) / 60:g} min"
     )
-    without: dict[str, list[str]] = defaultdict(list)
-    for tls in facts.uncontrolled:
-        without[facts.reasons[tls]].append(tls)
-    for reason, lights in without.items():
-        named = f"traffic light {lights[0]!r}" if len(lights) == 1 else ", ".join(lights)
-        say(f"{'no agent' if len(lights) == 1 else 'no agents'}: {named}: {reason}")
+    for text in _no_agents(facts):
+        say(text)
     console.print(_intersections(agents, names))
     for light in [light for light in agents if light.name][:MOST_LIGHTS]:
         say(f"{names.text(light.id)}: {light.name}")
@@ -226,6 +222,18 @@ def show(
         say(f"to fix: {text}")
     if not wrong:
         say("nothing to fix")
+
+
+def _no_agents(facts: Survey) -> Iterator[str]:
+    """Yield which lights are no agents, once for each reason."""
+    without: dict[str, list[str]] = defaultdict(list)
+    for tls in facts.uncontrolled:
+        without[facts.reasons[tls]].append(tls)
+    for reason, lights in without.items():
+        if len(lights) == 1:
+            yield f"no agent: traffic light {lights[0]!r}: {reason}"
+        else:
+            yield f"no agents: {', '.join(lights)}: {reason}"
 
 
 def _table(title: str, *columns: str) -> Table:

@@ -228,28 +228,33 @@ def phase_times(plan: SignalPlan) -> list[tuple[float, float, float]]:
     return times
 
 
+def _staying(plan: SignalPlan) -> list[frozenset[str]]:
+    """Return the movements that stay green after each phase, in the order of the phases."""
+    begins = [begin for begin, *_ in phase_times(plan)]
+    stays = [frozenset[str]()] * len(begins)
+    for ring in {phase.ring for phase in plan.phases}:
+        own = [place for place, phase in enumerate(plan.phases) if phase.ring == ring]
+        own.sort(key=lambda place: begins[place])
+        for place, following in zip(own, [*own[1:], own[0]], strict=True):
+            end = begins[place] + plan.phases[place].split_s
+            pause = (begins[following] - end + 1e-6) % plan.cycle_s  # it may sit a barrier out
+            if pause < 2e-6:
+                both = (plan.phases[place].movements, plan.phases[following].movements)
+                stays[place] = frozenset(both[0]) & frozenset(both[1])
+    return stays
+
+
 def _times(plan: SignalPlan) -> tuple[list[float], _Shown]:
     """Return the times of changes, s from the start of the cycle, and the phases."""
-    spans = phase_times(plan)
     shown: list[tuple[float, float, float, frozenset[str], frozenset[str]]] = []
     times = {0.0, plan.cycle_s}
-    for ring in {phase.ring for phase in plan.phases}:
-        own = [
-            (phase, span)
-            for phase, span in zip(plan.phases, spans, strict=True)
-            if phase.ring == ring
-        ]
-        own.sort(key=lambda pair: pair[1][0])
-        for place, (phase, (begin, green_end, yellow_end)) in enumerate(own):
-            following, (following_begin, *_) = own[(place + 1) % len(own)]
-            movements = frozenset(phase.movements)
-            end = begin + phase.split_s
-            pause = (following_begin - end + 1e-6) % plan.cycle_s  # a ring may sit a barrier out
-            stays = movements & frozenset(following.movements) if pause < 2e-6 else frozenset()
-            shown.append((begin, green_end, yellow_end, movements, stays))
-            if stays:
-                shown.append((green_end, end, end, stays, stays))
-            times |= {begin, green_end, yellow_end, end}
+    for phase, span, stays in zip(plan.phases, phase_times(plan), _staying(plan), strict=True):
+        begin, green_end, yellow_end = span
+        end = begin + phase.split_s
+        shown.append((begin, green_end, yellow_end, frozenset(phase.movements), stays))
+        if stays:
+            shown.append((green_end, end, end, stays, stays))
+        times |= {begin, green_end, yellow_end, end}
     kept: list[float] = []
     for time in sorted(times):
         if not kept or time - kept[-1] > 1e-6:
@@ -419,22 +424,19 @@ def programme_notes(scenario: Scenario, plans: Iterable[SignalPlan], source: str
         source: Name of their table.
     """
     network, rules = Network.read(scenario), _rules(scenario)
-    plans = list(plans)
-    notes = refusal_notes(scenario, plans, source)
+    notes: list[str] = []
     differing: list[str] = []
     for plan in plans:
         light = network.intersection(plan.light)
+        states = _states_or_note(plan, light, network, rules, source, notes)
         if light.times_vary:
             notes.append(
                 f"light {plan.light!r}: {light.times_vary}; the plan has the durations of its "
                 "phases, and SUMO shows other times"
             )
-            continue
-        try:
-            states = plan_states(plan, light, network, rules, source)
-        except ScenarioError:
-            continue  # told above
-        if others := _shown_otherwise(plan, states, light, movement_codes(light, network)):
+        elif states and (
+            others := _shown_otherwise(plan, states, light, movement_codes(light, network))
+        ):
             differing.append(f"{plan.light} ({' '.join(others)})")
     if differing:
         notes.append(
@@ -457,12 +459,26 @@ def refusal_notes(scenario: Scenario, plans: Iterable[SignalPlan], source: str) 
     network, rules = Network.read(scenario), _rules(scenario)
     notes: list[str] = []
     for plan in plans:
-        try:
-            check_plan(plan, source)
-            plan_states(plan, network.intersection(plan.light), network, rules, source)
-        except ScenarioError as error:
-            notes.append(f"--apply would refuse this plan, so change it first: {error}")
+        light = network.intersection(plan.light)
+        _states_or_note(plan, light, network, rules, source, notes)
     return notes
+
+
+def _states_or_note(
+    plan: SignalPlan,
+    light: Intersection,
+    network: Network,
+    rules: RightOfWay,
+    source: str,
+    notes: list[str],
+) -> _States:
+    """Return the states of a plan; none, and a further note, if `with_plans` would refuse it."""
+    try:
+        check_plan(plan, source)
+        return plan_states(plan, light, network, rules, source)
+    except ScenarioError as error:
+        notes.append(f"--apply would refuse this plan, so change it first: {error}")
+        return ()
 
 
 def yellow_notes(plans: Iterable[SignalPlan]) -> list[str]:
@@ -470,19 +486,11 @@ def yellow_notes(plans: Iterable[SignalPlan]) -> list[str]:
     short = [
         f"{plan.light} (phase {number}: {phase.yellow_s:g} s)"
         for plan in plans
-        for number, phase in enumerate(plan.phases, 1)
-        if phase.yellow_s < _LEAST_YELLOW_S and _ending(plan, number - 1)
+        for number, (phase, stays) in enumerate(zip(plan.phases, _staying(plan), strict=True), 1)
+        if phase.yellow_s < _LEAST_YELLOW_S and set(phase.movements) - stays
     ]
     usual = f"{_LEAST_YELLOW_S:g} to 6 s are usual"
     return [f"yellow is short at {', '.join(short)}; {usual}"] if short else []
-
-
-def _ending(plan: SignalPlan, place: int) -> set[str]:
-    """Return the movements that end with a phase: those that the next one of its ring lacks."""
-    phase = plan.phases[place]
-    ring = [other for other in plan.phases if other.ring == phase.ring]
-    following = ring[(ring.index(phase) + 1) % len(ring)]
-    return set(phase.movements) - set(following.movements)
 
 
 def _rules(scenario: Scenario) -> RightOfWay:
@@ -498,7 +506,7 @@ def _shown_otherwise(
 ) -> list[str]:
     """Return the movements whose green or yellow differs between a plan and the programme.
 
-    "crossings" stands for those of people on foot.
+    "crossings" stands for those of pedestrians.
     """
     cycle_s, later_s = plan.cycle_s, plan.offset_s - light.offset_s
     times = {0.0, *accumulate(seconds for seconds, _ in states)}

@@ -137,8 +137,9 @@ def approach_directions(links: Iterable[Link], lanes: Mapping[str, Lane]) -> dic
         lanes: Lanes of the network.
     """
     # In order of their ids: of two roads with one heading the same one gets the better name always.
-    first_lane = dict(sorted({(link.from_edge, link.from_lane) for link in links}, reverse=True))
-    first_lane = dict(sorted(first_lane.items()))
+    first_lane: dict[str, str] = {}
+    for edge, lane in sorted((link.from_edge, link.from_lane) for link in links):
+        first_lane.setdefault(edge, lane)
     headings = [heading_rad(lanes[lane].shape) for lane in first_lane.values()]
     names = MAIN_DIRECTIONS if len(headings) <= len(MAIN_DIRECTIONS) else ALL_DIRECTIONS
     places = [2 * math.pi * place / len(names) for place in range(len(names))]
