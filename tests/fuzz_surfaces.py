@@ -121,7 +121,7 @@ DIAGNOSIS: dict[str, Any] = {
     "periods": {"fit": ["a"], "heldout": ["b"]}, "verified_on_fitted_periods": False,
     "hashes": {"scenario": "h"}, "versions": {"sumo": "1"}, "verdict": "unknown", "sentence": "x",
     "effects": [], "where": [], "left": [], "alternatives": [], "best": None, "heldout": None,
-    "evidence": None, "statistics": [], "lanes": [], "courtesy": None, "travel_time": None,
+    "evidence": None, "statistics": [], "lanes": [], "criteria": None, "travel_time": None,
     "next_measurement": None, "complete": True, "untried": [], "corrected": None,
     "policy_gap": None,
 }  # fmt: skip

@@ -80,11 +80,11 @@ def diagnosed(directory: Path, corrected: str | None = "V4", **changes: Any) -> 
         "statistics", "lanes", "untried", "approaches", "patterns", "unnamed",
     )  # fmt: skip
     none = (
-        "best", "heldout", "evidence", "courtesy", "travel_time", "next_measurement",
+        "best", "heldout", "evidence", "criteria", "travel_time", "next_measurement",
         "traffic_check", "not_corrected",
     )  # fmt: skip
     record = {
-        "schema": "ugat-marl/diagnosis/4",
+        "schema": "ugat-marl/diagnosis/5",
         "scenario": SCENARIO.id,
         "seed": 0,
         "alpha": 0.05,

@@ -193,16 +193,19 @@ def test_domain_randomisation_resumes(tmp_path: Path) -> None:
             "timed match acts in the real domain",
         ),
         ({"real": "sim"}, '"same-world"'),
-        ({"real": "sim", "placebo": "noise"}, "is the simulation itself"),
-        ({"real": "sim", "placebo": "same-world", "oracle": True}, "oracle needs a real domain"),
-        ({"placebo": "same-world", "real_log": Path("x")}, "leave out one of them"),
+        ({"real": "sim", "negative_control": "noise"}, "is the simulation itself"),
+        (
+            {"real": "sim", "negative_control": "same-world", "oracle": True},
+            "oracle needs a real domain",
+        ),
+        ({"negative_control": "same-world", "real_log": Path("x")}, "leave out one of them"),
     ],
 )
 def test_what_makes_no_sense_is_refused(options: dict[str, Any], complaint: str) -> None:
     with pytest.raises(OptionError, match=complaint):
         replace(SMALL, **options)
-    with pytest.raises(UnknownNameError, match=r"placebo 'shufled'.*'shuffled'"):
-        replace(SMALL, placebo="shufled")  # pyright: ignore[reportArgumentType]
+    with pytest.raises(UnknownNameError, match=r"negative control 'shufled'.*'shuffled'"):
+        replace(SMALL, negative_control="shufled")  # pyright: ignore[reportArgumentType]
 
 
 def follows(folder: Path) -> float:
@@ -215,9 +218,9 @@ def follows(folder: Path) -> float:
 
 
 def test_with_the_same_world_nothing_real_is_ever_seen(tmp_path: Path) -> None:
-    alone = transfer(replace(SMALL, real="sim", placebo="same-world"), tmp_path / "alone")
+    alone = transfer(replace(SMALL, real="sim", negative_control="same-world"), tmp_path / "alone")
     assert alone.domains == ["sim"]
-    judged = transfer(replace(SMALL, placebo="same-world"), tmp_path / "judged")
+    judged = transfer(replace(SMALL, negative_control="same-world"), tmp_path / "judged")
     assert judged.domains == ["sim", "V4"]
     for run in ("alone", "judged"):
         log = TransitionLog.read(checkpoint_of(tmp_path / run) / "real-000.parquet")
@@ -229,14 +232,14 @@ def test_with_the_same_world_nothing_real_is_ever_seen(tmp_path: Path) -> None:
 
 
 def test_shuffled_data_of_the_street_lead_nowhere(tmp_path: Path) -> None:
-    transfer(replace(SMALL, placebo="shuffled"), tmp_path / "run")
+    transfer(replace(SMALL, negative_control="shuffled"), tmp_path / "run")
     assert follows(tmp_path / "run") < 0.4
-    with pytest.raises(CheckpointError, match="its placebo"):
+    with pytest.raises(CheckpointError, match="its negative_control"):
         transfer(SMALL, tmp_path / "run", resume=True)
 
 
 def test_a_run_with_noise_for_f_says_so_and_resumes(tmp_path: Path) -> None:
-    config = replace(SMALL, placebo="noise")
+    config = replace(SMALL, negative_control="noise")
     transfer(config, tmp_path / "unbroken")
     assert numbers(tmp_path / "unbroken")[2, "forward/ratio"] > 1.2
     with pytest.raises(KeyboardInterrupt):

@@ -424,7 +424,7 @@ def test_controls_without_a_meaning_are_refused(
 ) -> None:
     ugat = replace(SMALL.ugat, grounding="street", street=QUICK)
     with pytest.raises(OptionError, match=message):
-        transfer(replace(SMALL, placebo=control, ugat=ugat), tmp_path, workers=1)
+        transfer(replace(SMALL, negative_control=control, ugat=ugat), tmp_path, workers=1)
 
 
 def in_part(log: TransitionLog, kept: pl.Expr) -> TransitionLog:

@@ -70,7 +70,7 @@ def content_of(verdict: str = "explained", *, complete: bool = True, **more: Any
     named = verdict in ("explained", "not_identifiable", "partially_explained")
     evidence = {"distance": 118.2, "runner_up_is_worse_by": 4021.0}
     record: dict[str, Any] = {
-        "schema": "ugat-marl/diagnosis/4", "scenario": "crossing-v1", "seed": 0, "alpha": 0.05,
+        "schema": "ugat-marl/diagnosis/5", "scenario": "crossing-v1", "seed": 0, "alpha": 0.05,
         "budget_h": None, "budget_s": 600.0, "left_out": [], "ruled_out": ["speed_spread"],
         "findings": ["detections.csv: no speeds"], "verified_on_fitted_periods": False,
         "periods": {"fit": ["day1", "day2"], "heldout": ["day3"]}, "policy_gap": None,
@@ -113,7 +113,7 @@ def content_of(verdict: str = "explained", *, complete: bool = True, **more: Any
             {"lane": lane, "tls": "C", "before": 1.0 if same else 8.0 * i, "after": 1.0}
             for i, lane in enumerate(LANES)
         ],
-        "courtesy": {
+        "criteria": {
             "before": {"geh_below_5": 1.0, "geh_largest": 1.4, "within_1_sigma": 0.6,
                        "within_2_sigma": 0.98, "absolute_error": 0.9, "systematic_error": 0.5,
                        "saturation_headway_s": 2.03},
@@ -148,7 +148,7 @@ def content_of(verdict: str = "explained", *, complete: bool = True, **more: Any
         ],
     }  # fmt: skip
     if not complete:
-        record |= {"statistics": [], "lanes": [], "courtesy": None, "travel_time": None}
+        record |= {"statistics": [], "lanes": [], "criteria": None, "travel_time": None}
     return record | more
 
 

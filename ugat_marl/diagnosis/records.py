@@ -35,7 +35,7 @@ FILE = "diagnosis.json"
 """Name of the file that a diagnosis writes into its directory."""
 CORRECTED = "corrected"
 """Name of the folder of the corrected scenario, beside that file."""
-SCHEMA = "ugat-marl/diagnosis/4"
+SCHEMA = "ugat-marl/diagnosis/5"
 """Form of the file; it rises whenever the form changes."""
 
 Verdict = Literal[
@@ -602,14 +602,14 @@ class Tables:
     Attributes:
         statistics: Rows for the statistics of the network.
         lanes: Rows for the lanes with detectors.
-        courtesy: Usual criteria of traffic engineers.
+        criteria: Usual criteria of traffic engineers.
         travel_time: Mean simulated travel times.
         approaches: Rows for the approaches, in terms of traffic.
     """
 
     statistics: tuple[StatisticRow, ...] = ()
     lanes: tuple[LaneRow, ...] = ()
-    courtesy: EngineeringCriteria | None = None
+    criteria: EngineeringCriteria | None = None
     travel_time: TravelTimes | None = None
     approaches: tuple[ApproachRow, ...] = ()
 
@@ -692,7 +692,7 @@ class Diagnosis:
         evidence: Chances on the fitted periods; None if nothing could be compared.
         statistics: Statistics of the network, before and after the correction.
         lanes: Lanes with detectors, before and after.
-        courtesy: Usual criteria of traffic engineers, before and after.
+        criteria: Usual criteria of traffic engineers, before and after.
         travel_time: Mean simulated travel times, before and after.
         approaches: Capacity, queue and delay of each approach, before and after.
         traffic_check: Judgement of the correction on the held-out periods; None if there is
@@ -711,7 +711,7 @@ class Diagnosis:
 
     __pydantic_config__ = ConfigDict(extra="forbid")
 
-    schema: Literal["ugat-marl/diagnosis/4"]
+    schema: Literal["ugat-marl/diagnosis/5"]
     scenario: str
     seed: int
     alpha: float
@@ -735,7 +735,7 @@ class Diagnosis:
     evidence: FitEvidence | None
     statistics: tuple[StatisticRow, ...]
     lanes: tuple[LaneRow, ...]
-    courtesy: EngineeringCriteria | None
+    criteria: EngineeringCriteria | None
     travel_time: TravelTimes | None
     approaches: tuple[ApproachRow, ...]
     traffic_check: TrafficCheck | None

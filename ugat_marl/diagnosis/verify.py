@@ -73,7 +73,7 @@ def tables_of(study: Study, base: Tested, best: Tested) -> Tables:
     return Tables(
         statistics_table(study, base, best),
         lanes_table(study, base, best),
-        courtesy(study, base, best),
+        engineering_criteria(study, base, best),
         travel_times(study, best),
         approach_table(
             study.layout,
@@ -149,7 +149,7 @@ def _rms(z: Array) -> float:
     return float(np.sqrt((used**2).mean())) if len(used) else 0.0
 
 
-def courtesy(study: Study, base: Tested, best: Tested) -> EngineeringCriteria:
+def engineering_criteria(study: Study, base: Tested, best: Tested) -> EngineeringCriteria:
     """Compute the usual criteria of traffic engineers: GEH, those of FHWA, saturation headway.
 
     They do not affect the verdict. GEH and headway use the held-out days. The criteria of FHWA use

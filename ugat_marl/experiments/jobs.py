@@ -497,7 +497,7 @@ def _grounded(
             job.seed,
             run,
             start=_start(job, folder),
-            placebo=job.setting.placebo,
+            negative_control=job.setting.negative_control,
             probe=_probe(job, workers),
             device=job.device,
             workers=workers,
@@ -530,7 +530,7 @@ def worlds_of(
         if ugat.grounding == "street":
             require_histories(log)  # now instead of after plain training
         recorded = RecordedWorld(log, env, ugat.fit.held_out_every)
-    without_street = recorded is not None or job.setting.placebo == "same-world"
+    without_street = recorded is not None or job.setting.negative_control == "same-world"
     street = job.sim if without_street else job.target
     assert street is not None
     scenario, options = load_scenario(job.scenario), dict[str, Any](job.options)

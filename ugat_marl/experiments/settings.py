@@ -177,8 +177,8 @@ class Setting:
             has no real domain.
         learner: The algorithm that learns.
         ugat: Settings of UGAT; only for "grounded".
-        placebo: A negative control of "grounded": "same-world" records D_real in the simulation,
-            "shuffled" permutes the outcomes in D_real, "noise" replaces f by noise.
+        negative_control: A negative control of "grounded": "same-world" records D_real in the
+            simulation, "shuffled" permutes the outcomes in D_real, "noise" replaces f by noise.
         episodes: Training episodes after those of direct transfer; None for as many as UGAT has.
         most_delay_s: Longest delay of "delays", in s.
         change_cost: Cost of a change of "penalty", in the unit of the reward.
@@ -192,7 +192,7 @@ class Setting:
     world: str | None = None
     learner: LearnerSpec = field(default_factory=LearnerSpec)
     ugat: UgatConfig | None = None
-    placebo: NegativeControl = "none"
+    negative_control: NegativeControl = "none"
     episodes: int | None = None
     most_delay_s: int = MOST_DELAY_S
     change_cost: float = CHANGE_COST
@@ -207,8 +207,8 @@ class Setting:
                 f"setting {self.name!r} of recipe {self.recipe!r}: give ugat with recipe "
                 '"grounded", and with no other'
             )
-        if self.placebo not in NEGATIVE_CONTROLS:
-            raise UnknownNameError("placebo", self.placebo, NEGATIVE_CONTROLS)
+        if self.negative_control not in NEGATIVE_CONTROLS:
+            raise UnknownNameError("negative control", self.negative_control, NEGATIVE_CONTROLS)
 
     @property
     def knows_target(self) -> bool:
@@ -240,8 +240,8 @@ class Setting:
         parts |= {"learner": self.learner.identity}
         if self.ugat is not None:
             parts["ugat"] = asdict(self.ugat)
-        if self.placebo != "none":
-            parts["placebo"] = self.placebo
+        if self.negative_control != "none":
+            parts["negative_control"] = self.negative_control
         if self.recipe == "delays":
             parts["most_delay_s"] = self.most_delay_s
         if self.recipe == "penalty":

@@ -109,7 +109,7 @@ def train_grounded(
     run: Run,
     *,
     start: Path | None = None,
-    placebo: NegativeControl = "none",
+    negative_control: NegativeControl = "none",
     probe: Probe | None = None,
     device: str = "cpu",
     workers: Workers = None,
@@ -124,7 +124,7 @@ def train_grounded(
         seed: Root of every random choice.
         run: Folder of metrics and checkpoints.
         start: File of a learner after plain training; None to do plain training here.
-        placebo: A negative control.
+        negative_control: A negative control.
         probe: Measures the policy after every iteration.
         device: Device for the fits of f and h.
         workers: Simulations at a time, or an executor, for worlds of a fitted street.
@@ -133,18 +133,18 @@ def train_grounded(
         OptionError: The negative control does not fit the grounding.
     """
     sim, real = worlds
-    if placebo == "shuffled":
+    if negative_control == "shuffled":
         real = ShuffledWorld(real)
     common: dict[str, Any]
     common = {"env": env, "real": real, "config": ugat, "seed": seed, "run": run, "probe": probe}
     algorithm: Ugat | StreetTraining
     if ugat.grounding == "street":
-        if placebo == "noise":
-            raise OptionError('placebo "noise" needs f; grounding "street" has none')
-        if placebo == "shuffled":
+        if negative_control == "noise":
+            raise OptionError('negative control "noise" needs f; grounding "street" has none')
+        if negative_control == "shuffled":
             raise OptionError(
-                'placebo "shuffled" leaves no histories, from which grounding "street" is read; '
-                'use placebo "same-world"'
+                'negative control "shuffled" leaves no histories, from which grounding "street" '
+                'is read; use "same-world"'
             )
         algorithm = street_training(make, workers, device=device, **common)
         residual = ugat.residual(env.recorded_layouts, seed, neighbours_of(env))
@@ -153,7 +153,7 @@ def train_grounded(
         renew = algorithm.renew
     else:
         fitted = ugat.transform(env.recorded_layouts, seed, neighbours_of(env))
-        if placebo == "noise":
+        if negative_control == "noise":
             answer_with_noise(fitted.forward, seed)
         algorithm, renew = Ugat(sim=sim, device=device, **common), _keep
     state = RunState(make(env, seed), fitted)

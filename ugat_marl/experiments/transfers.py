@@ -125,9 +125,9 @@ class TransferConfig:
             the method records there.
         oracle: Also train from scratch in the real domain, for as many episodes as the method in
             all.
-        placebo: A negative control; grounding must win nothing with it. "same-world" records D_real
-            in the simulation, "shuffled" permutes the outcomes in D_real, "noise" replaces f by
-            noise; the last two with phase or timed.
+        negative_control: What the log of the street is replaced by; grounding must win nothing with
+            it. "same-world" records D_real in the simulation, "shuffled" permutes the outcomes in
+            D_real, "noise" replaces f by noise; the last two with phase or timed.
         learner: The learner: universal or dqn, the suite's own, a baseline, or your own as
             my_module:MyLearner (docs/how-to/learners.md); default: universal, and dqn with the
             preset "paper".
@@ -158,7 +158,7 @@ class TransferConfig:
     random_delay_s: int | None = None
     fine_tuned: bool = False
     oracle: bool = False
-    placebo: NegativeControl = "none"
+    negative_control: NegativeControl = "none"
     learner: str = ""
     learner_settings: tuple[str, ...] = ()
     device: str = "cpu"
@@ -174,10 +174,13 @@ class TransferConfig:
             object.__setattr__(self, "learner", usual)
         require_least(1, evaluation_seeds=self.evaluation_seeds, tuning_seeds=self.tuning_seeds)
         require_least(LEAST_BUDGET, rule_budget=self.rule_budget)
-        if domain_label(self.real) == domain_label(self.sim) and self.placebo != "same-world":
+        if (
+            domain_label(self.real) == domain_label(self.sim)
+            and self.negative_control != "same-world"
+        ):
             raise OptionError(
                 f"real = {self.real!r} is the simulation itself; name another domain, such as V4, "
-                'or ask for the placebo "same-world"'
+                'or ask for the negative control "same-world"'
             )
         if len({domain_label(domain) for domain in self.further}) < len(self.further):
             raise OptionError(f"further holds one twice: {' '.join(self.further)}")
@@ -193,11 +196,12 @@ class TransferConfig:
     def _refuse_impossible_controls(self) -> None:
         _ = self.spec  # raises an error for an unknown learner, or settings of another one
         require_device_name(self.device)
-        if self.placebo not in NEGATIVE_CONTROLS:
-            raise UnknownNameError("placebo", self.placebo, NEGATIVE_CONTROLS)
-        if self.placebo == "same-world" and self.real_log is not None:
+        if self.negative_control not in NEGATIVE_CONTROLS:
+            raise UnknownNameError("negative control", self.negative_control, NEGATIVE_CONTROLS)
+        if self.negative_control == "same-world" and self.real_log is not None:
             raise OptionError(
-                'the placebo "same-world" has no street, real_log is of one; leave out one of them'
+                'the negative control "same-world" has no street, real_log is of one; '
+                "leave out one of them"
             )
         require_least(1, random_delay_s=self.random_delay_s)
         continues = {
@@ -377,7 +381,7 @@ def _grounded_job(config: TransferConfig) -> Job:
         "grounded",
         learner=config.spec,
         ugat=config.ugat,
-        placebo=config.placebo,
+        negative_control=config.negative_control,
     )
     return Job(
         setting,

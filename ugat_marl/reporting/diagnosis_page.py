@@ -103,7 +103,7 @@ def diagnosis_page(diagnosis: Diagnosis, network: Network, commands: Sequence[st
         patterns=_patterns(diagnosis),
         unnamed=_effects(diagnosis.unnamed, names),
         ranking=_ranking(diagnosis, names),
-        courtesy=_courtesy(diagnosis),
+        criteria_table=_criteria(diagnosis),
         headways=_headways(page, diagnosis),
         criteria=words.criteria_line(diagnosis),
         policy_gap=_policy_gap(diagnosis),
@@ -318,9 +318,9 @@ def _in_words(effect: EffectRecord, names: LightNames) -> str:
     return f"{text} ({words.values(effect, intervals=False)})" if effect.parameters else text
 
 
-def _courtesy(diagnosis: Diagnosis) -> Grid | None:
+def _criteria(diagnosis: Diagnosis) -> Grid | None:
     """Return the usual criteria of traffic engineering."""
-    criteria = diagnosis.courtesy
+    criteria = diagnosis.criteria
     if criteria is None:
         return None
     before, after, measured = criteria.before, criteria.after, criteria.measured

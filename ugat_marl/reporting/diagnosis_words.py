@@ -187,7 +187,7 @@ def traffic_check_line(diagnosis: Diagnosis) -> str | None:
 
 def criteria_line(diagnosis: Diagnosis) -> str | None:
     """Return the usual criteria for the model as it is, beside our own; None without counts."""
-    criteria, heldout = diagnosis.courtesy, diagnosis.heldout
+    criteria, heldout = diagnosis.criteria, diagnosis.heldout
     if criteria is None or criteria.before.geh_below_5 is None:
         return None
     texts = [f"As it is: {_usual(criteria.before)}"]
