@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import math
 import xml.etree.ElementTree as ET
 from collections import Counter
@@ -25,11 +26,29 @@ from ugat_marl.effects import (
     load_scenario,
     parse_domain,
 )
+from ugat_marl.envs import parallel_env
 from ugat_marl.errors import OptionError, ScenarioError, UnknownNameError
 from ugat_marl.scenarios import Document, Network, Scenario, check_demand
 
 Crossing = Callable[..., Path]
 EDGE = "east1_A1"
+
+
+def test_demand_of_a_file_with_effects_lasts_as_long_as_the_episode(crossing: Crossing) -> None:
+    flow = '<flow id="f" begin="0" vehsPerHour="360" type="car" route="east"/>'
+    record = '\n[[effects]]\nname = "demand_level"\nedge = "*"\nfactor = 1.0\n'
+    plain = crossing(vehicles=flow)
+    changed = crossing(vehicles=flow, toml=lambda text: text + record)
+    due: list[list[int]] = []
+    for path in (plain, changed):
+        due.append([])
+        for seconds in (600, 1800):
+            with contextlib.closing(parallel_env(path, duration_s=seconds)) as env:
+                env.reset(seed=1)
+                while env.agents:
+                    env.step({"signal_0": 0})
+                due[-1].append(env.scores().due)
+    assert due == [[60, 180], [60, 180]]
 
 
 def departing(scenario: Scenario) -> dict[str, ET.Element]:

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import contextlib
 import json
+import math
 import pickle
 from collections.abc import Iterator
 from dataclasses import replace
@@ -219,7 +221,10 @@ def test_after_the_end_only_reset_and_looking_back_make_sense(mixed: TrafficEnv)
 def test_before_reset_nothing_has_a_meaning() -> None:
     env = ugat_marl.parallel_env("single-v1")
     assert env.agents == []
-    for call in (env.state, env.scores, lambda: env.step({}), lambda: env.step({"signal_0": 0})):
+    for call in (
+        env.state, env.scores, lambda: env.step({}), lambda: env.step({"signal_0": 0}),
+        lambda: env.snapshot, lambda: env.seen,
+    ):  # fmt: skip
         with pytest.raises(EpisodeError):
             call()
     env.close()
@@ -258,6 +263,9 @@ def test_scores_are_those_of_the_episode(mixed: TrafficEnv) -> None:
         ({"render_mode": "rgb"}, UnknownNameError, "mean 'rgb_array'"),
         ({"neighbours": -1}, OptionError, "neighbours = -1"),
         ({"neighbours": 1.5}, OptionError, "neighbours = 1.5"),
+        ({"fitted": None}, OptionError, "fitted = None: must be parts"),
+        ({"fitted": [5]}, OptionError, "must be parts of a fitted street"),
+        ({"crossings": "no"}, OptionError, "crossings = 'no': must be True or False"),
         ({"duration_s": 5}, ScenarioError, "shorter than one decision"),
         ({"duration_s": -5}, ScenarioError, "duration_s = -5"),
     ],
@@ -345,6 +353,17 @@ def test_the_reward_may_be_a_function() -> None:
         assert given["signal_0"] == pytest.approx(-40 * float(features.sum()), abs=1e-4)
     assert given["signal_0"] < 0
     env.close()
+
+
+@pytest.mark.parametrize("wrong", [math.nan, None, "much", [1.0, 2.0]])
+def test_a_reward_that_is_no_number_is_refused(wrong: Any) -> None:
+    with contextlib.closing(
+        ugat_marl.parallel_env("single-v1", reward=lambda *_: wrong, duration_s=100)
+    ) as env:
+        env.reset(seed=1)
+        with pytest.raises(OptionError, match="must return one finite number"):
+            env.step({"signal_0": 0})
+        assert env.agents == []
 
 
 def test_under_the_networks_own_programme_actions_say_nothing() -> None:

@@ -231,8 +231,11 @@ def test_a_reset_of_some_leaves_the_step_of_the_others() -> None:
         env.reset(seed=1)
         other.reset(seed=1)
         env.step_async(nothing)
-        env.reset(where=[0])
+        anew = env.reset(where=[0])
+        assert anew.observations[0].any() and not anew.observations[1].any()
         assert env.step_wait().rewards[1] == other.step(nothing).rewards[1]
+        assert not env.reset(where=[0]).rewards.any()
+        other.reset(where=[0])
         assert env.step(nothing).rewards[1] == other.step(nothing).rewards[1]
 
 

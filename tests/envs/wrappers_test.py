@@ -446,6 +446,9 @@ def test_agents_are_named_by_their_lights_and_nothing_else_changes() -> None:
         assert {*ends} == {*light.values()}
     with pytest.raises(ActionError, match="'signala_0': the traffic lights are"):
         named.step({"signala_0": 0})
+    first = named.possible_agents[0]
+    with pytest.raises(ActionError, match=f"action of agent '{first}' is 99"):
+        named.step({**dict.fromkeys(named.agents, 0), first: 99})
     groups = {group: [light[a] for a in own] for group, own in plain.agent_groups.items()}
     assert named.agent_groups == groups
     plain.close()

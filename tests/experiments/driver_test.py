@@ -21,6 +21,8 @@ from pydantic import TypeAdapter
 
 from tests.interrupts import KillAfter, few_descriptors
 from ugat_marl.data import Scores, lock_folder
+from ugat_marl.effects import load_scenario
+from ugat_marl.envs import parallel_env
 from ugat_marl.errors import CheckpointError, MeasurementError, OptionError, UnknownNameError
 from ugat_marl.experiments import (
     Job,
@@ -38,12 +40,14 @@ from ugat_marl.experiments.forked import SERVICE, jobs_fork_on, perform_forked
 from ugat_marl.experiments.jobs import (
     JOB,
     LEARNER,
+    POLICY,
     SCORES,
     evaluation_seeds,
     perform,
     perform_described,
 )
 from ugat_marl.experiments.paper import TABLES, settings_of
+from ugat_marl.experiments.settings import UNTRAINED
 from ugat_marl.grounding import FitConfig, UgatConfig
 from ugat_marl.parallel import DEADLINE_VARIABLE, Heartbeat, Stop
 from ugat_marl.policies import (
@@ -51,6 +55,7 @@ from ugat_marl.policies import (
     DQN_NAME,
     SUITE_LEARNERS,
     DQNConfig,
+    NetworkPolicy,
     learner_is_installed,
     suite_config,
 )
@@ -148,6 +153,28 @@ def test_a_setting_has_settings_of_ugat_if_it_is_grounded() -> None:
     for recipe, ugat in (("direct", UGAT), ("grounded", None)):
         with pytest.raises(OptionError, match="give ugat with recipe"):
             Setting("x", recipe, ugat=ugat)  # pyright: ignore[reportArgumentType]
+
+
+def test_weights_that_are_not_trained_here_get_no_lessons(tmp_path: Path) -> None:
+    learner = LearnerSpec(dqn=DQNConfig(lessons=1, lesson_updates=5))
+    job = replace(
+        PLAIN, setting=Setting(UNTRAINED, "untrained", learner=learner), episodes=0, every=0,
+        domains=("sim",),
+    )  # fmt: skip
+    perform(job, tmp_path, Silent(), 1)
+    env = parallel_env("single-v1", **job.options, **learner.env_options(None))
+    fresh = learner.factory()(env, 3).policy()
+    assert np.array_equal(NetworkPolicy.load(tmp_path / POLICY).parameters, fresh.parameters)
+
+
+def test_the_digest_follows_the_files_of_the_scenario(tmp_path: Path) -> None:
+    town = tmp_path / "town"
+    load_scenario("single-v1").write(town)
+    before = replace(PLAIN, scenario=str(town), options={}).digest
+    text = (town / "scenario.toml").read_text()
+    (town / "scenario.toml").write_text(text.replace("3600", "1800"))
+    assert text != (town / "scenario.toml").read_text()
+    assert replace(PLAIN, scenario=str(town), options={}).digest != before
 
 
 def test_jobs_here_and_in_processes_have_the_same_numbers(tmp_path: Path) -> None:

@@ -16,6 +16,7 @@ from ugat_marl.data import Scores
 from ugat_marl.errors import OptionError, UnknownNameError
 from ugat_marl.experiments import Evaluation, TransferConfig, run_folder
 from ugat_marl.experiments.scores import Result as Episode
+from ugat_marl.grounding import UgatConfig
 from ugat_marl.policies import DQNConfig
 
 
@@ -133,3 +134,16 @@ def test_a_callback_gets_what_is_logged_and_may_end_the_run(
     assert (stage, step) == ("evaluation", 3)
     for row in run.table.to_dicts():
         assert table[f"{row['policy']}/{row['domain']}/att_s"] == row["att_s"]
+
+
+def test_settings_beside_those_that_hold_them_are_refused(tmp_path: Path) -> None:
+    with pytest.raises(OptionError, match="give grounding, pretrain_episodes"):
+        ugat_marl.train("single-v1", iterations=7, ugat=UgatConfig(), out=tmp_path / "run")
+    assert not (tmp_path / "run").exists()
+
+
+def test_policies_may_come_in_any_collection() -> None:
+    rules = {"programme": 1, "fixed-time:30": 2}
+    for several in (rules.keys(), (name for name in rules)):
+        frame = ugat_marl.evaluate("single-v1", several, "sim", seeds=1, duration_s=60, workers=1)
+        assert frame["policy"].to_list() == ["programme", "fixed-time:30"]

@@ -17,7 +17,7 @@ from tests.runs import SMALL, checkpoint_of, numbers, play_nothing, weights
 from ugat_marl.__main__ import main
 from ugat_marl.data import TransitionLog
 from ugat_marl.errors import CheckpointError, OptionError, UnknownNameError
-from ugat_marl.experiments import Evaluation, transfer, transfers
+from ugat_marl.experiments import Evaluation, run_folder, transfer, transfers
 from ugat_marl.experiments.jobs import file_names
 from ugat_marl.experiments.randomised import RandomisedEnv
 from ugat_marl.grounding import RandomDelays, TimedConfig, UgatConfig
@@ -199,6 +199,8 @@ def test_domain_randomisation_resumes(tmp_path: Path) -> None:
             "oracle needs a real domain",
         ),
         ({"negative_control": "same-world", "real_log": Path("x")}, "leave out one of them"),
+        ({"further": ("V2", "SIM")}, "is what the control does"),
+        ({"further": ("V4", "snow")}, "further holds one twice: V4 V4"),
     ],
 )
 def test_what_makes_no_sense_is_refused(options: dict[str, Any], complaint: str) -> None:
@@ -206,6 +208,12 @@ def test_what_makes_no_sense_is_refused(options: dict[str, Any], complaint: str)
         replace(SMALL, **options)
     with pytest.raises(UnknownNameError, match=r"negative control 'shufled'.*'shuffled'"):
         replace(SMALL, negative_control="shufled")  # pyright: ignore[reportArgumentType]
+
+
+def test_a_domain_under_another_name_is_the_same_run() -> None:
+    aliases = replace(SMALL, real="Snow", sim=" SIM ", further=("rain",))
+    assert aliases == replace(SMALL, real="V4", sim="sim", further=("V3",))
+    assert run_folder(aliases).name == "single-v1-V4-s0"
 
 
 def follows(folder: Path) -> float:

@@ -437,6 +437,16 @@ def test_two_processes_do_not_train_in_one_folder(tmp_path: Path) -> None:
     Run(tmp_path / "job", {"a": 1}, Silent()).close()
 
 
+def test_a_refused_run_leaves_its_folder_free(tmp_path: Path) -> None:
+    run = Run(tmp_path, {"a": 1}, Silent())
+    run.save({}, lambda folder: None)
+    run.close()
+    with pytest.raises(CheckpointError) as kept:  # as a notebook keeps the last error
+        Run(tmp_path, {"a": 2}, Silent())
+    Run(tmp_path, {"a": 1}, Silent()).close()
+    assert kept.value.__traceback__ is not None
+
+
 @pytest.mark.usefixtures("unjudged")
 def test_a_changed_log_is_another_run(tmp_path: Path) -> None:
     log = recorded(tmp_path / "real.parquet")

@@ -5,7 +5,9 @@ from __future__ import annotations
 import copy
 import importlib
 import json
+import os
 import re
+import subprocess
 import sys
 from pathlib import Path
 from typing import Any, ClassVar
@@ -362,6 +364,35 @@ def test_what_a_class_of_a_function_holds_is_part_of_its_identity() -> None:
     kinds = [made(1), made(1), made(3), made(1, table=2)]
     first, same, other, also_other = (own_values(own_name(kind)) for kind in kinds)
     assert first == same and other not in (first, also_other) and also_other != first
+
+
+def test_the_identity_of_captured_objects_is_the_same_in_every_process(tmp_path: Path) -> None:
+    (tmp_path / "mine.py").write_text(
+        "import functools\n"
+        "import numpy as np\n"
+        "from ugat_marl.policies.own import own_name, own_values\n"
+        "class Net:\n"
+        "    def __init__(self, n):\n"
+        "        self.n, self.me = n, self\n"
+        "def helper(): pass\n"
+        "def made(n):\n"
+        "    net, kinds, table = Net(n), {'left', 'right', 'through'}, np.arange(n * 5000)\n"
+        "    def make(env, seed):\n"
+        "        return net, kinds, table, helper, make\n"
+        "    return make\n"
+        "for n in (1, 1, 2):\n"
+        "    print(own_values(own_name(functools.partial(made(n), rate=helper))))\n"
+    )
+    printed = [
+        subprocess.run(
+            [sys.executable, "mine.py"], cwd=tmp_path, check=True, capture_output=True, text=True,
+            env={**os.environ, "PYTHONHASHSEED": seed},
+        ).stdout.splitlines()
+        for seed in ("1", "2")
+    ]  # fmt: skip
+    assert printed[0] == printed[1]
+    assert printed[0][0] == printed[0][1] != printed[0][2]
+    assert " at 0x" not in printed[0][0]
 
 
 def test_settings_without_usable_types_are_literals() -> None:

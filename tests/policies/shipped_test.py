@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import shutil
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -20,6 +21,7 @@ from ugat_marl.experiments.jobs import POLICY, Job
 from ugat_marl.policies import (
     DQN,
     DQNConfig,
+    NamedRule,
     NetworkPolicy,
     PolicyCard,
     load_policy,
@@ -27,6 +29,7 @@ from ugat_marl.policies import (
     shipped_policies,
 )
 from ugat_marl.policies.shipped import FOLDER
+from ugat_marl.progress import Silent
 
 MOST_BYTES = 2_000_000
 """Most bytes of all shipped policies and their cards together: they are part of the wheel."""
@@ -98,6 +101,23 @@ def test_a_packed_policy_that_was_changed_is_refused(training: Path, tmp_path: P
         file.write_text(json.dumps({**content, key: value}))
         with pytest.raises(CheckpointError, match=said):
             load_policy(card.id, folder=out)
+
+
+def test_a_row_in_which_one_training_kept_a_rule_is_packed_in_no_part(
+    training: Path, tmp_path: Path
+) -> None:
+    job = replace(Job.read(training), seed=4)
+    other = training.parent / job.name
+    shutil.copytree(training, other)
+    job.write(other)
+    NamedRule("largest-queue:20", ugat_marl.parallel_env("single-v1")).save(other / POLICY)
+    said: list[str] = []
+    reporter = Silent()
+    reporter.say = said.append
+    with pytest.raises(OptionError, match="no finished training"):
+        pack(training.parent, tmp_path / "packed", reporter=reporter)
+    assert "single-v1/direct-transfer is left out" in said[0]
+    assert [card.training_seed for card in pack(training, tmp_path / "packed")] == [3]
 
 
 def test_two_trainings_of_one_name_are_packed_neither(training: Path, tmp_path: Path) -> None:

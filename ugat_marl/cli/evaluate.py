@@ -72,7 +72,7 @@ class Evaluate:
             require_writable(self.out)
         require_numbers(0, first_seed=self.first_seed)
         require_numbers(1, seeds=self.seeds, workers=self.workers)
-        scenario = load_scenario(self.scenario)
+        scenario = load_scenario(self.scenario, self.duration_s)
         domains = self._domains(scenario, console)
         with workers_of(self.workers, self.ray) as workers:
             evaluation = evaluate(

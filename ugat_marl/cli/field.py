@@ -85,7 +85,7 @@ class Field:
     def run(self, console: Console) -> int:
         """Drive the lights and print a summary."""
         self._check()
-        scenario = scenario_in_domain(load_scenario(self.scenario), self.domain)
+        scenario = scenario_in_domain(load_scenario(self.scenario, self.seconds), self.domain)
         policy = policy_factory(self.policy)(parallel_env(scenario))
         site = Site.of(scenario, policy.env_options)
         seconds = self.seconds or scenario.settings.duration_s

@@ -60,7 +60,7 @@ class PolicyGap:
         require_names(policies=self.policies)
         require_numbers(1, seeds=self.seeds, workers=self.workers)
         require_numbers(0, first_seed=self.first_seed)
-        scenario = load_scenario(self.scenario)
+        scenario = load_scenario(self.scenario, self.duration_s)
         diagnosis, corrected = read_diagnosis(self.directory, scenario)
         require_writable(self.directory / FILE)
         if same_for_agents(corrected, scenario):

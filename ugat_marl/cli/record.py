@@ -65,7 +65,7 @@ class Record:
 
     def run(self, console: Console) -> int:
         """Record and write."""
-        scenario = load_scenario(self.scenario)
+        scenario = load_scenario(self.scenario, self.duration_s)
         # a wrong name is an error before anything is written
         scenario_in_domain(scenario, self.domain, recorded=True, duration_s=self.duration_s)
         policy = policy_factory(self.policy)

@@ -135,7 +135,7 @@ class Rollout:
                 require_writable(path)
         if self.video is not None:
             require_video(self.video)
-        scenario = load_scenario(self.scenario)
+        scenario = load_scenario(self.scenario, self.duration_s)
         if self.out is not None:
             self._record(scenario, self.out, console)
         if self.video is not None:

@@ -110,9 +110,7 @@ class ScenarioCheck:
             raise OptionError(f"--headroom {self.headroom}: give a number of seeds, or 0")
         if self.headroom and self.domain != "sim":
             raise OptionError("--headroom plays sim and V1 to V4 by itself; leave out --domain")
-        scenario = scenario_in_domain(
-            load_scenario(self.scenario), self.domain, duration_s=self.duration_s
-        )
+        scenario = scenario_in_domain(load_scenario(self.scenario, self.duration_s), self.domain)
         reporter = Silent() if self.json else Bars(console)
         facts = survey(scenario, reporter)
         runs = (
@@ -142,8 +140,8 @@ class ScenarioCheck:
         return 1 if wrong else 0
 
     def _kit(self, console: Console) -> int:
-        scenario = load_scenario(self.scenario)
         length_s = CONFORMANCE_S if self.duration_s is None else self.duration_s
+        scenario = load_scenario(self.scenario, length_s)
 
         def make() -> TrafficEnv:
             options: dict[str, Any] = {"observation": self.observation}

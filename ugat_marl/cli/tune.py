@@ -67,7 +67,7 @@ class Tune:
         require_numbers(1, workers=self.workers)
         if self.out is not None:
             require_writable(self.out)
-        scenario, reporter = load_scenario(self.scenario), Bars(console)
+        scenario, reporter = load_scenario(self.scenario, self.duration_s), Bars(console)
         with workers_of(self.workers, self.ray) as workers:
             tuned = [
                 tune(

@@ -134,8 +134,12 @@ class Run:
         self._curves: Curves | None = None
         require_writable(directory / IDENTITY_FILE)
         self._lock = lock_folder(directory)
-        _remove_remains(directory)
-        write_identity(directory, identity, begun=self.resumable)
+        try:
+            _remove_remains(directory)
+            write_identity(directory, identity, begun=self.resumable)
+        except BaseException:  # a notebook keeps the error, and what it holds
+            self._lock.close()
+            raise
 
     @property
     def resumable(self) -> bool:

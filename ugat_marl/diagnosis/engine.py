@@ -24,7 +24,14 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ugat_marl.data import installed_version
-from ugat_marl.diagnosis.features import FEATURES, DetectorLayout, Greens, Tally, tally
+from ugat_marl.diagnosis.features import (
+    COUNT_FEATURES,
+    FEATURES,
+    DetectorLayout,
+    Greens,
+    Tally,
+    tally,
+)
 from ugat_marl.diagnosis.intervals import with_intervals
 from ugat_marl.diagnosis.measurement import Sightings
 from ugat_marl.diagnosis.replay import Day, DemandBalance, Replay, Unmeasured, corrected
@@ -90,7 +97,7 @@ def locked_up(tallies: Sequence[Tally], thresholds: Thresholds, usual: float = 0
 
 def _counts(tallies: Sequence[Tally]) -> NDArray[np.float64]:
     """Return the vehicles counted on each day, minus the median of days with the same window."""
-    counts = np.array([day.bins[:3].sum() for day in tallies])
+    counts = np.array([day.bins[: len(COUNT_FEATURES)].sum() for day in tallies])
     for window in {day.window for day in tallies}:
         own = np.array([day.window == window for day in tallies])
         counts[own] -= np.median(counts[own])

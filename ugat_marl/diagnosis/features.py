@@ -664,7 +664,7 @@ def _storage(counter: _Counter, advance: Passages, greens: Greens) -> None:
         return np.interp(when, times, filled)
 
     edges = np.linspace(period.begin_s, period.end_s, counter.bins.shape[2] + 1)
-    counter.bins[3, counter.place] += np.diff(occupied(edges))
+    counter.bins[BIN_FEATURES.index("occupied"), counter.place] += np.diff(occupied(edges))
     if not len(greens.start_s):
         return
     green = occupied(greens.end_s) - occupied(greens.start_s)

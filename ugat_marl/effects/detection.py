@@ -36,7 +36,8 @@ _PLACE = TextParameter("detectors", everywhere=True)
 Overlap = Literal["split", "merged", "unknown"]
 """Report of vehicles that follow so closely that the detector never goes off between them:
 ``split`` ends the first at the arrival of the second, ``merged`` reports one long passage.
-``unknown`` is simulated as ``split``: no vehicle follows so closely that it could be told."""
+``unknown`` is simulated as ``split``: no vehicle follows so closely that it could be told.
+`passages_as_written` cuts the first; until then passages overlap."""
 
 
 def detectors_at(place: str, detectors: Sequence[Detector], effect: str = "") -> frozenset[str]:

@@ -295,7 +295,7 @@ def _parts(domain: str) -> list[str]:
 def domain_label(domain: Domain) -> str:
     """Return the short name of a domain for tables."""
     if isinstance(domain, str):
-        return _names().get(domain.strip().lower(), domain)
+        return {"sim": "sim", **_names()}.get(domain.strip().lower(), domain)
     return "+".join(map(str, domain)) or "sim"
 
 
@@ -323,14 +323,14 @@ def scenario_in_domain(
             decision intervals.
     """
     if (path := domain_path(domain)) is not None:
-        other = load_scenario(path)
+        other = load_scenario(path, duration_s)
         if _signals(other) != _signals(scenario):
             raise ScenarioError(
                 f"domain {domain!r} has other roads or signals than scenario {scenario.id!r}; "
                 "a domain must be on the same network, or a policy means nothing in it"
             )
         _refuse_other_actions(scenario, other, domain)
-        return _checked(other.with_duration(duration_s))
+        return _checked(other)
     effects = parse_domain(domain)
     if not recorded:
         _refuse_detectors(domain, effects)

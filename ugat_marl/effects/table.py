@@ -178,13 +178,19 @@ def apply_effects(scenario: Scenario, effects: Iterable[Effect]) -> Scenario:
     return scenario
 
 
-def load_scenario(name: str | Path | Scenario) -> Scenario:
+def load_scenario(name: str | Path | Scenario, duration_s: float | None = None) -> Scenario:
     """Load a scenario and apply the effects listed in its file (see `read_scenario`).
 
     Effects on controllers and detectors stay listed in its settings: the environment applies the
     first, and whoever measures the scenario the others.
+
+    Args:
+        name: Id or path of a scenario, or a scenario.
+        duration_s: Length of episodes, s; None for that of the file. Effects on demand and on
+            roads last as long: with a longer duration given later they would end before.
     """
     scenario = name if isinstance(name, Scenario) else read_scenario(name)
+    scenario = scenario.with_duration(duration_s)
     where = f" in scenario {scenario.id!r}"
     effects = [effect_from_record(record, where) for record in scenario.settings.effects]
     plain = replace(scenario, settings=scenario.settings.model_copy(update={"effects": ()}))

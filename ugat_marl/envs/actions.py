@@ -26,7 +26,7 @@ def checked_phases(
         if agent not in actions:
             raise ActionError(f"no action for agent {agent!r}; every agent needs one")
         action = actions[agent]
-        if not _is_phase(action, spaces[agent]):
+        if not is_phase(action, spaces[agent]):
             last = spaces[agent].n - 1
             raise ActionError(
                 f"action of agent {agent!r} is {action!r}; "
@@ -54,6 +54,6 @@ def _refuse_unknown(kind: str, given: Mapping[str, Any], agents: Sequence[str]) 
         raise ActionError(f"{kind} for unknown agents {unknown}; agents: {[*agents]}")
 
 
-def _is_phase(action: Any, space: Discrete) -> bool:
+def is_phase(action: Any, space: Discrete) -> bool:
     """Return True if `space` contains `action`; fast for a plain int, the usual case."""
     return (type(action) is int and 0 <= action < space.n) or space.contains(action)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import inspect
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass, fields
 from numbers import Integral
 from typing import Any, Literal, TypedDict, TypeVar, get_args
@@ -124,6 +124,14 @@ class EnvOptions:
         commands: Any = self.commands
         if not _is_count(commands):
             raise OptionError(f"commands = {commands!r}: must be 0 or a number of decisions")
+        given: Any = self.fitted
+        parts = tuple(given) if isinstance(given, Iterable) else (None,)
+        if not all(isinstance(part, ControllerPart) for part in parts):
+            raise OptionError(f"fitted = {given!r}: must be parts of a fitted street")
+        object.__setattr__(self, "fitted", parts)
+        crossings: Any = self.crossings
+        if not isinstance(crossings, bool):
+            raise OptionError(f"crossings = {crossings!r}: must be True or False")
         require_deadline(self.deadline_s)
         if self.deadline_s is not None and self.simulator == "inprocess":
             raise OptionError(

@@ -2,14 +2,15 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from typing import Literal, get_args
+from typing import Any, Literal, get_args
 
 import numpy as np
 from numpy.typing import NDArray
 
-from ugat_marl.errors import UnknownNameError
+from ugat_marl.errors import OptionError, UnknownNameError
 from ugat_marl.scenarios import Network
 from ugat_marl.simulation import Snapshot
 
@@ -133,7 +134,20 @@ class Rewarder:
             return (self._sum_in(before.waiting_s) - self._sum_in(after.waiting_s)).tolist()
         assert callable(self._reward)
         views = zip(self._views(before), self._views(after), strict=True)
-        return [float(self._reward(then, now)) for then, now in views]
+        return [_number(self._reward(then, now)) for then, now in views]
+
+
+def _number(reward: Any) -> float:
+    """Return the reward of a user's function; refuse what is not a finite number."""
+    try:
+        value = float(reward)
+    except (TypeError, ValueError):
+        value = math.nan
+    if not math.isfinite(value):
+        raise OptionError(
+            f"reward: the function returned {reward!r}; it must return one finite number"
+        )
+    return value
 
 
 class _Sums:

@@ -156,11 +156,13 @@ class TrafficEnv(ParallelEnv[str, Any, Any]):
     @property
     def snapshot(self) -> Snapshot:
         """Measured lanes after the last decision interval, or after the reset."""
+        self._require_reset("snapshot")
         return self._snapshot
 
     @property
     def seen(self) -> Snapshot:
         """The `snapshot` after the sensors of effects, as controllers see it."""
+        self._require_reset("seen")
         return self._seen
 
     @property
@@ -338,8 +340,7 @@ class TrafficEnv(ParallelEnv[str, Any, Any]):
 
     def state(self) -> NDArray[np.float32]:
         """Return all observations, one after the other; also after the last step."""
-        if not hasattr(self, "_seen"):
-            raise EpisodeError("state() has no meaning before the first reset()")
+        self._require_reset("state()")
         return np.concatenate(self._observer.observe(self._seen, self.phases, self._memory))
 
     def scores(self) -> Scores:
@@ -460,6 +461,10 @@ class TrafficEnv(ParallelEnv[str, Any, Any]):
         self._snapshot = snapshot
         self._seen = snapshot if self._sensors is None else self._sensors.see(snapshot)
 
+    def _require_reset(self, what: str) -> None:
+        if not hasattr(self, "_seen"):
+            raise EpisodeError(f"{what} has no meaning before the first reset()")
+
     def _observe(self) -> dict[str, NDArray[np.float32]]:
         seen = self._observer.observe(self._seen, self.phases, self._memory)
         return dict(zip(self.agents, seen, strict=True))
@@ -548,7 +553,8 @@ def parallel_env(
         UnknownNameError: No such scenario, domain or option.
         ScenarioError: The scenario's files are missing or contradict each other.
     """
-    return TrafficEnv(load_scenario(scenario), domain, EnvOptions.of(options))
+    given = EnvOptions.of(options)
+    return TrafficEnv(load_scenario(scenario, given.duration_s), domain, given)
 
 
 @with_env_keywords

@@ -18,7 +18,7 @@ from gymnasium import spaces
 from numpy.typing import NDArray
 from pettingzoo.utils import BaseParallelWrapper
 
-from ugat_marl.envs.actions import checked_phases
+from ugat_marl.envs.actions import checked_phases, is_phase
 from ugat_marl.envs.agents import discrete_actions, vector_box
 from ugat_marl.envs.types import AnyParallelEnv, ResetResult, StepResult
 from ugat_marl.errors import ActionError, EpisodeError, OptionError
@@ -193,7 +193,7 @@ class Wrapper(BaseParallelWrapper[str, Any, Any]):
         return infos
 
     def _seen(self, observations: Vectors, infos: Infos) -> dict[str, Any]:
-        """Return the observations for the learner, in fresh arrays."""
+        """Return the observations for the learner; the environment's arrays stay as they are."""
         raise NotImplementedError
 
 
@@ -362,8 +362,10 @@ class _LegalActions(_Masking):
         executed = dict(actions)
         for agent, action in actions.items():
             mask = self._masks.get(agent)
-            if mask is None or not 0 <= int(action) < len(mask) or mask[int(action)]:
-                continue  # permitted, or refused by the environment itself
+            if mask is None or not is_phase(action, spaces.Discrete(len(mask))):
+                continue  # refused by the environment itself
+            if mask[int(action)]:
+                continue
             permitted = np.flatnonzero(mask)
             executed[agent] = int(permitted[int(action) % len(permitted)])
             self._replaced.add(agent)
@@ -434,6 +436,8 @@ class _IntersectionNames(Wrapper):
             raise ActionError(
                 f"action for {unknown[0]!r}: the traffic lights are {', '.join(self._agent)}"
             )
+        if self.agents:
+            checked_phases(actions, self.agents, self.action_spaces)  # errors name the light
         result = self.env.step({self._agent[light]: a for light, a in actions.items()})
         observations, rewards, terminations, truncations, infos = map(self._renamed, result)
         return observations, rewards, terminations, truncations, infos

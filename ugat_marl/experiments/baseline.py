@@ -22,7 +22,7 @@ import tyro
 
 from ugat_marl.effects import load_scenario
 from ugat_marl.envs import AnyParallelEnv, parallel_env
-from ugat_marl.errors import UgatMarlError
+from ugat_marl.errors import UgatMarlError, require_least
 from ugat_marl.experiments.evaluation import evaluate, fixed_policy
 from ugat_marl.experiments.jobs import evaluation_seeds
 from ugat_marl.experiments.training import train_through
@@ -54,6 +54,10 @@ class BaselineArgs:
     evaluation_seeds: int = 5
     out: Path | None = None
 
+    def __post_init__(self) -> None:
+        require_least(1, episodes=self.episodes)
+        require_least(0, evaluate_every=self.evaluate_every, evaluation_seeds=self.evaluation_seeds)
+
 
 class BaselineResult(NamedTuple):
     """Result of a training.
@@ -81,7 +85,7 @@ def train_baseline(
         make: Makes the learner for an environment.
         on_episode: Called after every episode of training.
     """
-    scenario, length = load_scenario(args.scenario), args.duration_s
+    scenario, length = load_scenario(args.scenario, args.duration_s), args.duration_s
     if args.out is not None:
         require_writable(args.out / "policy.pt")
     returns: list[float] = []
@@ -120,7 +124,7 @@ def baseline_command(
         result = train(
             tyro.cli(kind), lambda n, told: print(n, f"return {told['return']:.1f}", flush=True)
         )
-    except UgatMarlError as error:
+    except (UgatMarlError, OSError) as error:
         sys.exit(f"{name}: error: {error}")
     for episodes, att_s in result.att_s.items():
         print(f"{episodes} episodes: mean travel time {np.mean(att_s):.1f} s, by seed {att_s}")

@@ -18,6 +18,7 @@ import numpy as np
 
 from ugat_marl.data import MEASURES, MORE_IS_BETTER, Scores
 from ugat_marl.experiments.statistics import Floats, Interval, PairedTest
+from ugat_marl.policies import nan_last
 
 LEAST_SHARE_ARRIVED = 0.9
 """An episode broke down if a smaller share of the vehicles due arrives."""
@@ -170,7 +171,7 @@ class Comparison:
 
         def mean(name: str) -> float:
             own = values[name]
-            return float(np.mean([own[seed] for seed in shared or own.keys()]))
+            return nan_last(np.mean([own[seed] for seed in shared or own.keys()]))
 
         return min(names, key=mean)
 

@@ -227,8 +227,8 @@ def _perform_apart(folder: str, stop: Stop, forked: bool) -> None:
 
     A job that was stopped and killed is taken up again at its last checkpoint.
     """
-    for _ in range(1 + RETRIES):
-        with Path(folder, LOG).open("wb") as log:
+    for attempt in range(1 + RETRIES):
+        with Path(folder, LOG).open("ab" if attempt else "wb") as log:
             job = perform_forked if forked else _perform_in_new_interpreter
             if job(Path(folder), log, stop):
                 return

@@ -7,7 +7,7 @@ takes names.
 from __future__ import annotations
 
 import re
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Literal
@@ -107,7 +107,7 @@ def train(
         seed: Root of every random choice.
         preset: "paper" for Algorithm 1 as published.
         real_log: Transition log in place of roll-outs in the real domain.
-        ugat: All settings of the algorithm, in place of grounding and numbers above.
+        ugat: All settings of the algorithm; then leave out grounding and numbers of episodes.
         dqn: Settings of the learners universal and dqn.
         out: Folder of the run; None for runs/SCENARIO-REAL-sSEED.
         resume: Continue the run in that folder.
@@ -125,13 +125,18 @@ def train(
     Raises:
         UgatMarlError: An option, the scenario or the learner is at fault; the message names it.
     """
-    settings = ugat or UgatConfig(
+    alone = UgatConfig(
         grounding=grounding,
         pretrain_episodes=pretrain_episodes,
         iterations=iterations,
         grounded_episodes=grounded_episodes,
         real_rollouts=real_rollouts,
     )
+    if ugat is not None and alone != UgatConfig():
+        raise OptionError(
+            "ugat holds all settings of the algorithm; give grounding, pretrain_episodes, "
+            "iterations, grounded_episodes and real_rollouts in it"
+        )
     config = TransferConfig(
         str(scenario),
         real=real,
@@ -146,7 +151,7 @@ def train(
         control=control,
         learner=learner if isinstance(learner, str) else own_name(learner),
         learner_settings=tuple(learner_settings),
-        ugat=settings,
+        ugat=ugat or alone,
         dqn=dqn or DQNConfig(),
     )
     folder = Path(out) if out is not None else run_folder(config)
@@ -200,7 +205,7 @@ def evaluate(
     if not numbers or not domains:
         raise OptionError("seeds and domains need at least one each")
     played = evaluation.evaluate(
-        load_scenario(scenario),
+        load_scenario(scenario, duration_s),
         _factories(policies),
         [domains] if isinstance(domains, str) else domains,
         numbers,
@@ -221,11 +226,14 @@ def run_folder(config: TransferConfig) -> Path:
 
 def _factories(policies: Any) -> Mapping[str, PolicyFactory]:
     """Return makers of policies by name."""
-    if isinstance(policies, Mapping | list | tuple) and not policies:
-        raise OptionError("policies needs at least one")
     if isinstance(policies, Mapping):
+        if not policies:
+            raise OptionError("policies needs at least one")
         return {str(name): _factory(given, str(name)) for name, given in policies.items()}
-    several = policies if isinstance(policies, list | tuple) else [policies]
+    one = _is_name(policies) or callable(policies) or hasattr(policies, "act")
+    several = [policies] if one or not isinstance(policies, Iterable) else list(policies)
+    if not several:
+        raise OptionError("policies needs at least one")
     named = [(_name(given), given) for given in several]
     if len(dict(named)) < len(named):
         raise OptionError(

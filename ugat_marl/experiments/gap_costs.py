@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 
 from ugat_marl.effects import GAP_KINDS, NAMED_DOMAINS
 from ugat_marl.experiments.scores import Estimate, Evaluation
+from ugat_marl.policies import nan_last
 
 
 @dataclass(frozen=True)
@@ -75,7 +76,8 @@ def _above_best(evaluation: Evaluation, policy: str, domain: str) -> NDArray[np.
     Where the best controller has no cost at all, it is nan for the others.
     """
     best = min(
-        evaluation.policies, key=lambda name: float(evaluation.values(name, domain, "cost").mean())
+        evaluation.policies,
+        key=lambda name: nan_last(evaluation.values(name, domain, "cost").mean()),
     )
     least = evaluation.values(best, domain, "cost")
     own = evaluation.values(policy, domain, "cost")

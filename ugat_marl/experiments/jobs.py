@@ -32,7 +32,7 @@ from ugat_marl.data import (
     remove_temporaries,
     with_hashes,
 )
-from ugat_marl.effects import load_scenario, scenario_in_domain
+from ugat_marl.effects import domain_path, load_scenario, scenario_in_domain
 from ugat_marl.envs import AnyParallelEnv, TrafficEnv, parallel_env
 from ugat_marl.errors import CheckpointError, OptionError, UgatMarlError
 from ugat_marl.experiments.evaluation import (
@@ -262,9 +262,19 @@ def file_names(names: Iterable[str]) -> list[str]:
     return files
 
 
-@functools.cache
 def _hash(scenario: str, domain: str, duration_s: float | None) -> str:
-    return scenario_in_domain(load_scenario(scenario), domain, duration_s=duration_s).hash
+    """Return the hash of a scenario in a domain; the files are read each time, for they change."""
+    loaded = load_scenario(scenario, duration_s)
+    if domain_path(domain) is not None:
+        return scenario_in_domain(loaded, domain).hash
+    key = (loaded.hash, domain)
+    if key not in _HASHES:
+        _HASHES[key] = scenario_in_domain(loaded, domain).hash
+    return _HASHES[key]
+
+
+_HASHES: dict[tuple[str, str], str] = {}
+"""Hashes in domains, by hash of the scenario and domain: effects take longer than reading."""
 
 
 @dataclass
@@ -391,7 +401,8 @@ def _judge(
     workers: Workers,
 ) -> None:
     """Play the missing episodes after `mark` training episodes; write them domain by domain."""
-    scenario, name = load_scenario(job.scenario), job.rows.get(mark, job.setting.name)
+    scenario = load_scenario(job.scenario, job.duration_s)
+    name = job.rows.get(mark, job.setting.name)
     for domain, seeds in record.missing(job, mark).items():
         queues = QueueRecord()
         played = evaluate(
@@ -418,7 +429,7 @@ def _rule(job: Job, folder: Path, reporter: Reporter, workers: Workers) -> str:
     """Return the rule that is best in the real domain, chosen on separate tuning seeds."""
     saved, rules, target = folder / RULE_FILE, job.setting.rules, job.target or job.sim
     if not saved.exists():
-        scenario = load_scenario(job.scenario)
+        scenario = load_scenario(job.scenario, job.duration_s)
         common: dict[str, Any] = {
             "seeds": [TUNING_SEED + k for k in range(job.tuning_seeds)],
             "duration_s": job.duration_s,
@@ -454,7 +465,8 @@ def _plain(
         else:
             if before is not None:
                 learner.load(before)  # its world may have had another teacher
-            attended(learner, env, job.seed, reporter, f"lessons: {job.setting.name}")
+            if job.setting.recipe != "untrained":
+                attended(learner, env, job.seed, reporter, f"lessons: {job.setting.name}")
         marks = [mark for mark in job.marks if record.missing(job, mark) or mark == job.episodes]
         if marks[0] < learner.episodes:
             raise OptionError(
@@ -484,7 +496,7 @@ def _grounded(
     """Train by UGAT; yield direct transfer, if plain training was part of it, and the policy."""
     ugat, make = job.setting.ugat, job.setting.learner.factory(job.device)
     assert ugat is not None and job.seed is not None
-    scenario, options = load_scenario(job.scenario), dict[str, Any](job.options)
+    scenario, options = load_scenario(job.scenario, job.duration_s), dict[str, Any](job.options)
     with (
         contextlib.closing(parallel_env(scenario, job.sim, **options)) as env,
         contextlib.closing(Run(folder, job.identity, reporter, on_log)) as run,
@@ -533,7 +545,7 @@ def worlds_of(
     without_street = recorded is not None or job.setting.negative_control == "same-world"
     street = job.sim if without_street else job.target
     assert street is not None
-    scenario, options = load_scenario(job.scenario), dict[str, Any](job.options)
+    scenario, options = load_scenario(job.scenario, job.duration_s), dict[str, Any](job.options)
     sim, real = simulated_worlds(scenario, job.sim, street, ugat, options, workers)
     return sim, recorded or real
 
@@ -542,7 +554,7 @@ def _probe(job: Job, workers: Workers) -> Probe | None:
     """Return the measurement after every iteration, on a seed that no result is reported on."""
     if not job.probe_domains:
         return None
-    scenario = load_scenario(job.scenario)
+    scenario = load_scenario(job.scenario, job.duration_s)
 
     def probe(policy: Policy) -> dict[str, float]:
         played = evaluate(
@@ -573,7 +585,7 @@ def _world(job: Job) -> AnyParallelEnv:
     setting, options = job.setting, dict[str, Any](job.options)
     if setting.commands:
         options["commands"] = setting.commands
-    scenario = load_scenario(job.scenario)
+    scenario = load_scenario(job.scenario, job.duration_s)
     if setting.recipe == "randomised":
         return randomised_env(scenario, options, job.sim)
     env = parallel_env(scenario, setting.world or job.target or job.sim, **options)

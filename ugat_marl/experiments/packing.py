@@ -18,18 +18,25 @@ from ugat_marl.experiments.settings import DIRECT
 from ugat_marl.experiments.statistics import Interval
 from ugat_marl.files import write_whole
 from ugat_marl.policies import CardScores, NetworkPolicy, PolicyCard, is_own, rule_in
+from ugat_marl.progress import Reporter
 
 _LIBRARIES = ("ugat-marl", "eclipse-sumo", "torch", "numpy")
 
 
-def pack(training: Path, folder: Path, command: str = "") -> list[PolicyCard]:
+def pack(
+    training: Path, folder: Path, command: str = "", reporter: Reporter | None = None
+) -> list[PolicyCard]:
     """Copy the policies of finished trainings to a folder, each with its card.
+
+    If one training of a row kept a rule, no policy of that row is copied: the others would look
+    better than the row in its table.
 
     Args:
         training: Folder of a run of ``train``, of the trainings of ``paper``, or of one training.
         folder: Folder to write to: ``SCENARIO/NAME.pt`` and ``SCENARIO/NAME.json``. Policies of the
             same name are replaced.
         command: Command that trained them, for the cards.
+        reporter: Is told of rows that are left out.
 
     Returns:
         The cards, in the order of their folders.
@@ -39,14 +46,24 @@ def pack(training: Path, folder: Path, command: str = "") -> list[PolicyCard]:
         CheckpointError: A file of a training is damaged.
     """
     found: dict[str, tuple[PolicyCard, bytes]] = {}
+    rules: dict[str, Path] = {}
     for place in sorted(path.parent for path in training.rglob(JOB)):
-        for card, policy in _cards(place, command):
+        for card, policy in _cards(place, command, rules):
             if card.id in found:
                 raise OptionError(
                     f"{training} holds two trainings of {card.id}, with other settings; name the "
                     "folder of one of them"
                 )
             found[card.id] = card, policy
+    for row, place in rules.items():
+        others = [card_id for card_id in found if _row(card_id) == row]
+        for card_id in others:
+            del found[card_id]
+        if others and reporter is not None:
+            reporter.say(
+                f"note: {row} is left out: {place.name} kept a rule, which needs no file, and the "
+                f"policies of the other seeds ({len(others)}) would look better than their row"
+            )
     if not found:
         raise OptionError(
             f"{training} holds no finished training with a policy; name the folder of a run of "
@@ -58,8 +75,19 @@ def pack(training: Path, folder: Path, command: str = "") -> list[PolicyCard]:
     return [card for card, _ in found.values()]
 
 
-def _cards(place: Path, command: str) -> list[tuple[PolicyCard, bytes]]:
-    """Return the cards of a training that is finished, and the content of their policies."""
+def _row(card_id: str) -> str:
+    """Return the part of an id that all seeds of a row share."""
+    return card_id.rpartition("-s")[0]
+
+
+def _cards(place: Path, command: str, rules: dict[str, Path]) -> list[tuple[PolicyCard, bytes]]:
+    """Return the cards of a training that is finished, and the content of their policies.
+
+    Args:
+        place: Folder of the training.
+        command: Command that trained.
+        rules: Receives the rows in which the training kept a rule.
+    """
     job = Job.read(place)
     record = Record.read(place)
     if job.seed is None or not record.is_whole(job):
@@ -74,7 +102,10 @@ def _cards(place: Path, command: str) -> list[tuple[PolicyCard, bytes]]:
     for mark, setting in job.rows.items():
         file = place / (POLICY if mark == job.episodes else DIRECT_POLICY)
         own = is_own(job.setting.learner.name)  # whose files only its own module reads
-        if file.exists() and not own and rule_in(file) is None:  # a rule needs no file
+        if file.exists() and not own:
+            if rule_in(file) is not None:
+                rules[_row(_id(job, mark, setting))] = place
+                continue
             NetworkPolicy.load(file)  # a damaged file is refused
             content = file.read_bytes()
             cards.append((_card(job, record, mark, setting, command, content), content))
@@ -84,12 +115,10 @@ def _cards(place: Path, command: str) -> list[tuple[PolicyCard, bytes]]:
 def _card(
     job: Job, record: Record, mark: int, setting: str, command: str, content: bytes
 ) -> PolicyCard:
-    scenario = load_scenario(job.scenario)
-    knows = job.setting.knows_target and mark == job.episodes and setting != DIRECT
-    real = domain_label(job.target) if knows and job.target is not None else None
+    scenario = load_scenario(job.scenario, job.duration_s)
     assert job.seed is not None
     return PolicyCard(
-        id=f"{file_stem(job.scenario)}/{policy_name(setting, real, job.seed)}",
+        id=_id(job, mark, setting),
         setting=setting,
         scenario=job.scenario,
         scenario_hashes={
@@ -97,7 +126,7 @@ def _card(
             for domain in job.domains
         },
         sim=domain_label(job.sim),
-        real=real,
+        real=_real(job, mark, setting),
         training_seed=job.seed,
         episodes=mark,
         learner=job.setting.learner.name,
@@ -109,6 +138,18 @@ def _card(
         sha256=hashlib.sha256(content).hexdigest(),
         job=json.loads(TypeAdapter(Job).dump_json(job)),
     )
+
+
+def _real(job: Job, mark: int, setting: str) -> str | None:
+    """Return the real domain that a policy was trained for; None if it knows none."""
+    knows = job.setting.knows_target and mark == job.episodes and setting != DIRECT
+    return domain_label(job.target) if knows and job.target is not None else None
+
+
+def _id(job: Job, mark: int, setting: str) -> str:
+    assert job.seed is not None
+    name = policy_name(setting, _real(job, mark, setting), job.seed)
+    return f"{file_stem(job.scenario)}/{name}"
 
 
 def policy_name(setting: str, real: str | None, seed: int) -> str:

@@ -99,6 +99,8 @@ def settings_of(
             raise OptionError(f"grounding {grounding!r}: allowed are {', '.join(GROUNDED_NAME)}")
     if wrong := [seconds for seconds in constants if seconds < 1]:
         raise OptionError(f"constants holds {wrong[0]}: delays are whole seconds, at least 1")
+    if len(set(constants)) < len(constants):
+        raise OptionError(f"constants holds one twice: {' '.join(map(str, constants))}")
     # Phase grounding is the paper's: it uses f and h from the start, however accurate they are.
     least = {name: None if name == "phase" else ugat.least_accuracy for name in GROUNDED_NAME}
     alone = replace(ugat, timed=replace(ugat.timed, match=False))  # matching is a row of its own
@@ -483,13 +485,13 @@ def compare(
         workers: Jobs at a time, or an executor.
         reporter: Shows progress.
     """
-    loaded = load_scenario(scenario)
+    loaded = load_scenario(scenario, config.duration_s)
     rows = config.settings(table)
     config.spec.factory(config.device)  # a missing library is an error now, not in a job's log
     timed = any(row.ugat is not None and row.ugat.grounding == "timed" for row in rows)
     for target in config.targets(table):
         # an error now, not in an hour
-        check_worlds(loaded.with_duration(config.duration_s), config.sim, target, timed)
+        check_worlds(loaded, config.sim, target, timed)
     planner = Planner(table, scenario, config)
     plan = [job for row in rows for job in planner.jobs(row)]
     perform_all(planner.bases + plan, folder, workers, reporter, f"paper {table}")

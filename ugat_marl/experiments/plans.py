@@ -152,7 +152,7 @@ def work_of(
         learner = job.setting.learner
         lessons = lesson_episodes(learner.name, learner.dqn)
         if (ugat := job.setting.ugat) is None:
-            if lessons:
+            if lessons and job.setting.recipe != "untrained":
                 add("lessons", lessons)
             add("training", job.episodes if job.start is None else job.episodes // 2)
         else:

@@ -24,6 +24,7 @@ from ugat_marl.data import MEASURES, Scores, json_damage, mean_delay_s, with_has
 from ugat_marl.errors import CheckpointError
 from ugat_marl.experiments.statistics import Interval
 from ugat_marl.files import read_json, write_whole
+from ugat_marl.policies import nan_last
 
 _MAPPINGS = ("hidden", "approaches")
 """Fields of `Scores` that are no single number."""
@@ -120,7 +121,9 @@ class Evaluation:
 
     def regret(self, policy: str, domain: str) -> Estimate:
         """Return the ATT of a policy minus that of the best policy there, in s, paired by seed."""
-        best = min(self.policies, key=lambda name: self.estimate(name, domain, "att_s").mean)
+        best = min(
+            self.policies, key=lambda name: nan_last(self.estimate(name, domain, "att_s").mean)
+        )
         mine = self.values(policy, domain, "att_s")
         return Estimate.of(mine - self.values(best, domain, "att_s"))
 

@@ -248,4 +248,6 @@ class Setting:
             parts["change_cost"] = self.change_cost
         if self.commands:
             parts["commands"] = self.commands
+        if self.recipe == "untrained":
+            parts["lessons"] = 0  # of its own: the rule of another network is in its weights
         return parts

@@ -172,19 +172,24 @@ class TransferConfig:
         if not self.learner:
             usual = UNIVERSAL_NAME if self.preset is None else DQN_NAME
             object.__setattr__(self, "learner", usual)
+        for name in ("real", "sim"):  # V4 and snow are one run
+            object.__setattr__(self, name, domain_label(getattr(self, name)))
+        object.__setattr__(self, "further", tuple(map(domain_label, self.further)))
         require_least(1, evaluation_seeds=self.evaluation_seeds, tuning_seeds=self.tuning_seeds)
         require_least(LEAST_BUDGET, rule_budget=self.rule_budget)
-        if (
-            domain_label(self.real) == domain_label(self.sim)
-            and self.negative_control != "same-world"
-        ):
+        if self.real == self.sim and self.negative_control != "same-world":
             raise OptionError(
                 f"real = {self.real!r} is the simulation itself; name another domain, such as V4, "
                 'or ask for the negative control "same-world"'
             )
-        if len({domain_label(domain) for domain in self.further}) < len(self.further):
+        if len(set(self.further)) < len(self.further):
             raise OptionError(f"further holds one twice: {' '.join(self.further)}")
-        if self.corrected is not None and domain_label(self.corrected) == domain_label(self.sim):
+        if self.control and self.sim in self.further:
+            raise OptionError(
+                f"further = {self.sim} is what the control does ({CONTROL!r}); leave out one of "
+                "the two"
+            )
+        if self.corrected is not None and domain_label(self.corrected) == self.sim:
             raise OptionError(
                 f"corrected = {self.corrected!r} is the simulation itself; name the scenario that "
                 "`ugat-marl diagnose` wrote, or another domain"
@@ -238,7 +243,7 @@ class TransferConfig:
         rows: list[Setting] = []
         if self.control:
             rows.append(Setting(CONTROL, "further", self.sim, spec))
-        rows += [Setting(f"further in {domain_label(d)}", "further", d, spec) for d in self.further]
+        rows += [Setting(f"further in {d}", "further", d, spec) for d in self.further]
         if (most_s := self.random_delay_s) is not None:
             name = f"{RANDOM_DELAY} 0-{most_s} s"
             rows.append(Setting(name, "delays", self.sim, spec, most_delay_s=most_s))
@@ -265,7 +270,7 @@ class TransferConfig:
     @property
     def domains(self) -> list[str]:
         """Domains in which the policies are judged."""
-        only = self.real == "none" or domain_label(self.real) == domain_label(self.sim)
+        only = self.real in ("none", self.sim)
         return [self.sim] if only else [self.sim, self.real]
 
     @property
@@ -304,7 +309,7 @@ def transfer(
         CheckpointError: The folder holds a run with other options.
     """
     reporter = reporter or Silent()
-    scenario = load_scenario(config.scenario)
+    scenario = load_scenario(config.scenario, config.duration_s)
     with contextlib.closing(parallel_env(scenario, config.sim, **config.env_options)) as env:
         _check(config, scenario, env, reporter)  # an error now, not in an hour
         identity = _identity(config, scenario, env)
@@ -515,12 +520,11 @@ def _identity(config: TransferConfig, scenario: Scenario, env: TrafficEnv) -> di
     log = config.real_log  # identified by its content, so the file may be moved
     settings["real_log"] = file_hash(log) if log else None
     hashes = {"sim": env.scenario.hash}
-    scenario = scenario.with_duration(config.duration_s)
     if config.real != "none":
         hashes["real"] = scenario_in_domain(scenario, config.real).hash
     return {
         **settings,
         "scenario_hash": hashes,
-        "domains": [domain_label(d) for d in config.domains],
+        "domains": config.domains,
         "versions": installed_versions("eclipse-sumo", "torch"),
     }

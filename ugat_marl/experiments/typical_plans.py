@@ -20,11 +20,11 @@ import math
 from collections import Counter
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
-from itertools import combinations, pairwise
+from itertools import pairwise
 
 from ugat_marl.effects import Domain
 from ugat_marl.envs import parallel_env
-from ugat_marl.policies import PolicyFactory, roll_out
+from ugat_marl.policies import LONGEST_CYCLE_S, PolicyFactory, roll_out, smallest_covers
 from ugat_marl.progress import Reporter
 from ugat_marl.scenarios import (
     GREEN,
@@ -37,8 +37,6 @@ from ugat_marl.scenarios import (
     programme_plan,
 )
 
-LONGEST_CYCLE_S = 180.0
-"""Longest cycle of a plan, s, as in the rule of Webster."""
 _MOST_SEARCHED = 16
 """Most phases for an exhaustive search of the fewest; with more the search is greedy."""
 _STEADY = 0.5
@@ -177,24 +175,8 @@ def _divided(cycle_s: int, least_s: int, weights: Mapping[int, float]) -> dict[i
 
 def _fewest(served: Sequence[frozenset[str]], shares: Mapping[str, float]) -> dict[int, float]:
     """Return the fewest phases that serve all movements, with their needs; see the module."""
-    every = frozenset(shares)
-    if len(served) <= _MOST_SEARCHED:
-        for size in range(1, len(served) + 1):
-            covers = [
-                chosen
-                for chosen in combinations(range(len(served)), size)
-                if frozenset[str]().union(*(served[phase] for phase in chosen)) == every
-            ]
-            if covers:
-                needs = [_needs(cover, served, shares) for cover in covers]
-                return min(needs, key=lambda own: sum(own.values()))
-    kept: list[int] = []
-    missing = set(every)
-    while missing:
-        best = max(range(len(served)), key=lambda phase: len(missing & served[phase]))
-        kept.append(best)
-        missing -= served[best]
-    return _needs(kept, served, shares)
+    needs = [_needs(cover, served, shares) for cover in smallest_covers(served, _MOST_SEARCHED)]
+    return min(needs, key=lambda own: sum(own.values()))
 
 
 def _needs(

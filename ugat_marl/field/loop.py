@@ -108,7 +108,6 @@ class FieldLoop:
 
         Raises:
             SimulatorError: The street shows none of the lights.
-            OptionError: A light shows a state that it cannot have.
         """
         self._begin(street, Lights(self._site, street, self._limits, all_seen=False))
 

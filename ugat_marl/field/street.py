@@ -239,7 +239,11 @@ class SimulatedStreet:
         launch = launch_of(self._scenario, self._seed, self._directory.fresh(), self._lanes)
         self._simulator = ProcessSimulator()
         self._asked: dict[str, str] = {}
-        self._snapshot = self._simulator.start(launch)
+        try:
+            self._snapshot = self._simulator.start(launch)
+        except BaseException:
+            self._end()
+            raise
         return self
 
     def __exit__(
@@ -248,6 +252,9 @@ class SimulatedStreet:
         error: BaseException | None,
         trace: TracebackType | None,
     ) -> None:
+        self._end()
+
+    def _end(self) -> None:
         self._simulator.close()
         self._directory.remove()
 

@@ -23,11 +23,9 @@ from ugat_marl.grounding.networks import (
     rows_at_once,
 )
 from ugat_marl.grounding.stacked import Stack
+from ugat_marl.grounding.uncertainty import MOST_NETWORKS
 from ugat_marl.grounding.view import View
 from ugat_marl.policies import BatchedMLP, size_mask
-
-MOST = 100
-"""Largest number of networks; larger ones are taken for a mistake."""
 
 
 @dataclass(frozen=True)
@@ -49,8 +47,8 @@ class ForwardConfig:
     def __post_init__(self) -> None:
         if not self.hidden or min(self.hidden) < 1:
             raise OptionError(f"forward hidden is {self.hidden}; allowed: one or more sizes >= 1")
-        if not 1 <= self.members <= MOST:
-            raise OptionError(f"forward members is {self.members}; allowed: 1 to {MOST}")
+        if not 1 <= self.members <= MOST_NETWORKS:
+            raise OptionError(f"forward members is {self.members}; allowed: 1 to {MOST_NETWORKS}")
 
 
 class ForwardModel(TrainableModel):

@@ -93,7 +93,7 @@ class PhaseTransform(Transform):
         f, h = self.forward, self.inverse
         d_real, d_sim = stack_log(real, self.stack), stack_log(simulated, self.stack)
         if on_top:
-            f.begin_as(self._fit_simulated(d_sim, fitter))
+            f.begin_as(_fit_simulated(f, d_sim, d_sim.asked, fitter, "world"))
         forward = _fit_forward(f, d_real, fitter.further() if on_top else fitter)
         means = _expected(f, d_sim, fitter)
         pairs = means if fitter.config.pairs == "smoothed" else d_sim.next_observation
@@ -118,15 +118,6 @@ class PhaseTransform(Transform):
         """Return the outcomes of what was asked; every decision can be grounded."""
         seen = self.forward.view.of(data)
         return Changes("forward", seen, data.next_observation, data.asked), data.weight
-
-    def _fit_simulated(self, data: StackedTransitions, fitter: Fitter) -> ForwardModel:
-        """Fit a model of the simulation with the shape and the inputs of f; return it."""
-        f = self.forward
-        generator = torch_generator(fitter.seed, "world")
-        model = ForwardModel(self.stack, f.config, generator, view=f.view)
-        training_data = Changes("world", f.view.of(data), data.next_observation, data.asked)
-        fitter.fit_changes(model, training_data, fitter.split(data, self.stack))
-        return model
 
     def ground(
         self,
@@ -191,14 +182,34 @@ def _fit_forward(model: ForwardModel, data: StackedTransitions, fitter: Fitter) 
 def _expected(forward: ForwardModel, data: StackedTransitions, fitter: Fitter) -> Tensor:
     """Return the expected next features of simulated states and actions, ``(agents, n, outputs)``.
 
-    They are predictions of a model with the shape of `forward`, fitted to the simulation.
+    They are predictions of a model of the simulation that knows what was executed, as h does.
     """
-    generator, seen = torch_generator(fitter.seed, "simulated"), forward.view.of(data)
-    model = ForwardModel(forward.stack, forward.config, generator, view=forward.view)
-    training_data = Changes("simulated", seen, data.next_observation, data.executed)
-    fitter.fit_changes(model, training_data, fitter.split(data, forward.stack))
+    model = _fit_simulated(forward, data, data.executed, fitter, "simulated")
     with torch.no_grad():
-        return model.predict(seen, data.executed)
+        return model.predict(forward.view.of(data), data.executed)
+
+
+def _fit_simulated(
+    forward: ForwardModel,
+    data: StackedTransitions,
+    phases: Tensor,
+    fitter: Fitter,
+    name: str,
+) -> ForwardModel:
+    """Fit a model of the simulation with the shape and the inputs of f; return it.
+
+    Args:
+        forward: f.
+        data: Transitions of the simulation.
+        phases: Phases that the model knows, ``(agents, n)``: those asked for, or those executed.
+        fitter: Fits.
+        name: Name of the random stream and of the progress bar.
+    """
+    generator = torch_generator(fitter.seed, name)
+    model = ForwardModel(forward.stack, forward.config, generator, view=forward.view)
+    training_data = Changes(name, forward.view.of(data), data.next_observation, phases)
+    fitter.fit_changes(model, training_data, fitter.split(data, forward.stack))
+    return model
 
 
 def _fit_inverse(

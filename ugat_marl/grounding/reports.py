@@ -1,6 +1,7 @@
 """Reports of a fit: held-out errors of f, calibration of u, and the base of all reports.
 
-All numbers are measured on held-out rows, which the models did not see in training.
+Numbers are measured on held-out rows, which the models did not see in training. Exceptions are lost
+times and u of timed grounding, which are means over all greens of the street's log.
 """
 
 from __future__ import annotations

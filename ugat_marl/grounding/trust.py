@@ -1,11 +1,11 @@
 """Trust in f: the intersections where it predicts the street better than the fitted world does.
 
 Two models predict decisions of the street that neither has seen. Both begin as the same model of
-the fitted world, and both learn on from as many decisions: f from the street, its rival from the
+the fitted world, and both learn on from as many decisions: f from the street, its twin from the
 fitted world. If the world explains the street, nothing tells them apart. f is trusted where its
 errors are smaller by more than a margin and by more than chance:
 
-    d     = (1 - margin) * squared error of the rival - squared error of f
+    d     = (1 - margin) * squared error of the twin - squared error of f
     trust = mean of d > 0, by t-tests over blocks of decisions and over folds
 
 The street's log is cut into folds, and each is predicted by models that were fitted without it.
@@ -224,16 +224,16 @@ def _number(part: _Part, use: Tensor) -> Tensor:
 def _tested(
     agents: tuple[str, ...], found: Tensor, street: _Part, fold: Tensor, config: TrustConfig
 ) -> Trust:
-    """Test squared errors ``(2, agents, n)`` of f and its rival, by blocks and by folds."""
-    own, rival = found.double().numpy()
-    surplus = (1.0 - config.margin) * rival - own
+    """Test squared errors ``(2, agents, n)`` of f and its twin, by blocks and by folds."""
+    own, twin = found.double().numpy()
+    surplus = (1.0 - config.margin) * twin - own
     p = np.ones(len(agents))
     means = np.full((2, len(agents)), np.nan)
     for i in range(len(agents)):
         counted = street.weight[i].bool().numpy()
         if not counted.any():
             continue
-        means[:, i] = own[i, counted].mean(), rival[i, counted].mean()
+        means[:, i] = own[i, counted].mean(), twin[i, counted].mean()
         block, part = (groups[i].numpy()[counted] for groups in (street.block, fold))
         if len(np.unique(block)) >= LEAST_BLOCKS:
             p[i] = max(_p(surplus[i, counted], groups) for groups in (block, part))

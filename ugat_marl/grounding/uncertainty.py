@@ -34,7 +34,7 @@ from torch.nn import functional
 from ugat_marl.errors import OptionError
 from ugat_marl.policies import BatchedLinear, BatchedMLP
 
-MOST = 100
+MOST_NETWORKS = 100
 """Largest number of members or passes; larger ones are taken for a mistake."""
 
 MethodName = Literal["edl", "dropout", "ensemble", "none"]
@@ -62,8 +62,8 @@ class Method:
             )
         for name in ("members", "passes"):
             value = getattr(self, name)
-            if not isinstance(value, int) or not 1 <= value <= MOST:
-                raise OptionError(f"{name} is {value}; allowed: whole numbers 1 to {MOST}")
+            if not isinstance(value, int) or not 1 <= value <= MOST_NETWORKS:
+                raise OptionError(f"{name} is {value}; allowed: whole numbers 1 to {MOST_NETWORKS}")
 
 
 @dataclass(frozen=True)

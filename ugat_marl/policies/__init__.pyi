@@ -68,6 +68,7 @@ from .rollout import observer_of as observer_of
 from .rollout import roll_out as roll_out
 from .rollout import stop_callback as stop_callback
 from .rules.approaches import ControlledNetwork as ControlledNetwork
+from .rules.approaches import smallest_covers as smallest_covers
 from .rules.catalogue import RULE_NAMES as RULE_NAMES
 from .rules.catalogue import RULES as RULES
 from .rules.catalogue import STANDARD_RULES as STANDARD_RULES
@@ -78,9 +79,11 @@ from .rules.named import NamedRule as NamedRule
 from .rules.named import rule_in as rule_in
 from .rules.open_loop import FixedTime as FixedTime
 from .rules.race import TUNED_RULES as TUNED_RULES
+from .rules.race import nan_last as nan_last
 from .rules.race import race as race
 from .rules.race import race_fields as race_fields
 from .rules.race import rule_settings as rule_settings
+from .rules.webster import LONGEST_CYCLE_S as LONGEST_CYCLE_S
 from .shipped import CardScores as CardScores
 from .shipped import PolicyCard as PolicyCard
 from .shipped import load_policy as load_policy

@@ -15,6 +15,7 @@ import ast
 import contextlib
 import copy
 import functools
+import hashlib
 import importlib.util
 import inspect
 import io
@@ -29,6 +30,7 @@ from pathlib import Path
 from types import CellType, FunctionType, MethodType, ModuleType
 from typing import Any, get_type_hints
 
+import numpy as np
 from pettingzoo.utils import BaseParallelWrapper
 from pydantic import TypeAdapter, ValidationError
 
@@ -145,34 +147,70 @@ def own_values(name: str) -> list[str]:
     return _values(_given[name]) if name in _given else []
 
 
-def _values(given: Any) -> list[str]:
+def _values(given: Any, inside: tuple[int, ...] = ()) -> list[str]:
+    text = functools.partial(_stable, inside=inside)
     if isinstance(given, functools.partial):
-        keywords = [f"{key}={value!r}" for key, value in sorted(given.keywords.items())]
-        return [*_values(given.func), *map(repr, given.args), *keywords]
+        keywords = [f"{key}={text(value)}" for key, value in sorted(given.keywords.items())]
+        return [*_values(given.func, inside), *map(text, given.args), *keywords]
     if isinstance(given, FunctionType):
         if "<" not in given.__qualname__:  # neither <locals> nor <lambda>: its source says all
             return []
-        inside = inspect.getclosurevars(given).nonlocals
-        taken = [f"{key}={value!r}" for key, value in sorted(inside.items())]
-        return [*taken, *map(repr, given.__defaults__ or ())]
+        captured = inspect.getclosurevars(given).nonlocals
+        taken = [f"{key}={text(value)}" for key, value in sorted(captured.items())]
+        return [*taken, *map(text, given.__defaults__ or ())]
     if inspect.isclass(given):
-        return _values_of_class(given) if "<" in given.__qualname__ else []
+        return _values_of_class(given, inside) if "<" in given.__qualname__ else []
     if isinstance(given, MethodType):
-        return [repr(given.__self__), *_values(given.__self__)]
+        return [text(given.__self__)]
     held = {} if hasattr(given, "__qualname__") else getattr(given, "__dict__", {})
-    return [repr(held)] if held else []
+    return [text(held)] if held else []
 
 
-def _values_of_class(given: type) -> list[str]:
+def _values_of_class(given: type, inside: tuple[int, ...]) -> list[str]:
     """Return what a class that a function made holds: attributes, and values in its methods."""
     held: list[str] = []
     for name, member in sorted(vars(given).items()):
         function = getattr(member, "__func__", member)  # of a static method or a class method
         if isinstance(function, FunctionType):
-            held += [f"{name}: {value}" for value in _values(function)]
+            held += [f"{name}: {value}" for value in _values(function, inside)]
         elif not name.startswith("__") and not hasattr(member, "__get__"):
-            held.append(f"{name}={member!r}")
+            held.append(f"{name}={_stable(member, inside)}")
     return held
+
+
+def _stable(value: Any, inside: tuple[int, ...] = ()) -> str:
+    """Return a value as text that is the same in another process.
+
+    `repr` is not where an object has none of its own (its address), for sets (their order), and for
+    long arrays (their middle is left out).
+
+    Args:
+        value: The value.
+        inside: Identities of the objects that hold it, against endless descents.
+    """
+    if id(value) in inside:
+        return "..."
+    inside = (*inside, id(value))
+    deeper = functools.partial(_stable, inside=inside)
+    if type(value) is dict:
+        return f"{{{', '.join(f'{deeper(key)}: {deeper(held)}' for key, held in value.items())}}}"
+    if type(value) in (list, tuple):
+        return f"{type(value).__name__}({', '.join(map(deeper, value))})"
+    if type(value) in (set, frozenset):
+        return f"{type(value).__name__}({', '.join(sorted(map(deeper, value)))})"
+    if isinstance(value, np.ndarray) and value.dtype != object:
+        digest = hashlib.sha256(np.ascontiguousarray(value).tobytes()).hexdigest()
+        return f"array({value.shape}, {value.dtype}, {digest})"
+    if isinstance(value, FunctionType | MethodType | functools.partial | type):
+        kind = _named(value)
+        return (
+            f"{kind.__module__}.{kind.__qualname__}({_file_hash(kind)}, {_values(value, inside)})"
+        )
+    if type(value).__repr__ is object.__repr__:
+        kind = type(value)
+        held = deeper(getattr(value, "__dict__", {}))
+        return f"{kind.__module__}.{kind.__qualname__}({_file_hash(kind)}, {held})"
+    return repr(value)
 
 
 def own_source(name: str, what: str) -> str | None:
@@ -186,8 +224,13 @@ def own_source(name: str, what: str) -> str | None:
         OptionError: The module is missing.
         UnknownNameError: The object is missing in it.
     """
+    return _file_hash(_named(load_own(name, what)))
+
+
+def _file_hash(kind: Any) -> str | None:
+    """Return the hash of the file that defines a class or function; None if it is in no file."""
     try:
-        file = inspect.getsourcefile(_named(load_own(name, what)))
+        file = inspect.getsourcefile(kind)
     except (TypeError, OSError):  # built in, or typed at a prompt
         return None
     return None if file is None or not Path(file).is_file() else file_hash(Path(file))

@@ -54,5 +54,5 @@ def places_of(record: RunRecord) -> Places | str:
 
 @functools.lru_cache(maxsize=8)
 def _network(scenario: str, sim: str, duration_s: float | None) -> tuple[Network, str]:
-    derived = scenario_in_domain(load_scenario(scenario), sim, duration_s=duration_s)
+    derived = scenario_in_domain(load_scenario(scenario, duration_s), sim, duration_s=duration_s)
     return Network.read(derived), derived.hash

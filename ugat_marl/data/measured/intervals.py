@@ -38,7 +38,8 @@ class Intervals:
     def of(cls, seen: Passages, period: Period, length_s: float) -> Intervals:
         """Add up the passages over a detector.
 
-        A vehicle counts in the interval in which its front arrives.
+        A vehicle counts in the interval in which its front arrives, or, if it was there at the
+        start of the period, in which its rear leaves.
 
         Args:
             seen: Passages over the detector.

@@ -107,8 +107,8 @@ class _Track:
             return None
         if off is None:  # still there at the end, or gone to another lane
             off = np.inf if end == len(self.lane) else np.nan
-        last = off if np.isfinite(off) else on
-        at = {"front": (on,), "mean": (on, last)}.get(detector.speed_at or "rear", (last,))
+        left_s = off if np.isfinite(off) else on
+        at = {"front": (on,), "mean": (on, left_s)}.get(detector.speed_at or "rear", (left_s,))
         speed = float(np.mean(np.interp(at, self.time_s, self.speed_mps)))
         return on, off, speed, self.length_m
 

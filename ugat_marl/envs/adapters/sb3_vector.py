@@ -67,6 +67,8 @@ class SimulationsVecEnv(AgentsVecEnv):
         batch = self.simulations.step_wait()
         infos, agents = self._infos(batch), len(self.simulations.agents)
         for ended in batch.ended:
+            if not batch.truncated[ended.environment]:
+                continue  # of an earlier step, behind which something failed
             last = self._with_masks(ended.observations, ended.masks)
             for row, seen in enumerate(last, ended.environment * agents):
                 infos[row] |= {"terminal_observation": seen, "TimeLimit.truncated": True}

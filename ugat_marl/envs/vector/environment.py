@@ -198,6 +198,10 @@ class VectorEnv:
                 reset without a seed begins the next episodes; their seeds follow from the last.
             where: Numbers of the environments to reset, or a mask of them; all if None.
 
+        Returns:
+            All environments. Those that were not reset show what they showed last, or zeros if a
+            step of theirs is under way; no row has a reward.
+
         Raises:
             SimulatorError: SUMO failed; the message contains its output.
         """
@@ -210,8 +214,13 @@ class VectorEnv:
         self._stepped = [index for index in self._stepped if index not in gone]
         self._begun = [index for index in self._begun if index not in gone]
         self._begin(chosen, seeds)
-        self._memory.rewards[chosen] = 0.0
-        return self._batch(np.zeros(self.n, dtype=np.bool_), ())
+        self._memory.rewards[chosen] = 0.0  # a step that is received later begins with them
+        batch = self._batch(np.zeros(self.n, dtype=np.bool_), ())
+        under_way = [*self._stepped, *self._begun, *self._sent]
+        for rows in (batch.observations, batch.masks, batch.executed):
+            rows[under_way] = 0  # half written
+        batch.rewards[:] = 0.0
+        return batch
 
     def step(self, actions: ArrayLike) -> VectorStep:
         """Show the chosen phases for one decision interval, in all environments.
@@ -297,13 +306,15 @@ class VectorEnv:
                 "send() begins one"
             )
         texts: list[str] = []
-        while len(ready := [index for index, step in self._sent.items() if step.arrived]) < count:
-            waiting = [index for index in self._sent if index not in ready]
-            workers = [self._environments[index].worker for index in waiting]
-            for place in Worker.first_answered(workers):
-                texts += self._receive(waiting[place])
-        for text in dict.fromkeys(texts):
-            warnings.warn(text, stacklevel=2)
+        try:
+            while len(ready := [i for i, step in self._sent.items() if step.arrived]) < count:
+                waiting = [index for index in self._sent if index not in ready]
+                workers = [self._environments[index].worker for index in waiting]
+                for place in Worker.first_answered(workers):
+                    texts += self._receive(waiting[place])
+        finally:
+            for text in dict.fromkeys(texts):
+                warnings.warn(text, stacklevel=2)
         numbers = sorted(ready[:count])
         steps = [self._sent.pop(index) for index in numbers]
         truncated = np.array([step.truncated for step in steps])
@@ -528,7 +539,7 @@ def vector_env(
         scenario: Scenario, as for `ugat_marl.parallel_env`.
         n: Number of environments; each has one simulation in one process.
         domains: One domain for all; a list of `n`; or a function ``(environment, episode) ->
-            domain`` that is called at each reset, such as one of
+            domain`` that is called at each reset, and once before with (0, 0), such as one of
             `ugat_marl.envs.vector.spec.in_turn`.
         autoreset: Mode for the end of an episode, see `Autoreset`.
         wrap: Wrapper of each environment: an importable function, its ``"module:name"``, such as
@@ -547,7 +558,7 @@ def vector_env(
     if autoreset not in get_args(Autoreset):
         raise UnknownNameError("value of option 'autoreset':", str(autoreset), get_args(Autoreset))
     given = checked_options(options)
-    loaded = load_scenario(scenario)
+    loaded = load_scenario(scenario, given.get("duration_s"))
     domain_of = domain_chooser(loaded, domains, n, given.get("duration_s"))
     plain: AnyParallelEnv = parallel_env(loaded, domain_of(0, 0), **given)
     for each in listed(wrap):

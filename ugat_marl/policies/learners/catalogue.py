@@ -142,6 +142,7 @@ def learner_factory(
         UnknownNameError: There is no such learner, or no such setting.
         OptionError: A value is impossible, the library is not installed, or there is no such
             device.
+        CheckpointError: The file of the first weights is missing or damaged.
     """
     from ugat_marl.policies.devices import device_of
 
@@ -153,8 +154,11 @@ def learner_factory(
         if settings:
             raise OptionError(f"learner settings {' '.join(settings)}: those of {name} are --dqn.*")
         from ugat_marl.policies.learners.dqn import DQN
+        from ugat_marl.policies.learners.initial_weights import InitialWeights
 
         suite = suite_config(name, dqn)
+        if suite.start is not None:
+            InitialWeights.load(Path(suite.start))  # a damaged file is an error now
         return lambda env, seed: DQN.of(env, suite, seed, device=place)
     config = _baseline_config(name, settings)
     make = getattr(load_baseline(name), BASELINES[name].learner)

@@ -177,7 +177,9 @@ class DQNConfig:
             self._require("hidden", len(self.hidden) == 2, two)
         alone = f"left away: network = {self.network!r} is one for all agents in any case"
         self._require("shared", self.network == "mlp" or not self.shared, alone)
-        begins = self.start is None or self.network == "universal"
+        # a learner may replace the default, and then checks again
+        usual = isinstance(self.network, UsualValue)
+        begins = self.start is None or usual or self.network == "universal"
         self._require("start", begins, "left away: only network = 'universal' can begin with it")
 
     def _require(self, name: str, holds: bool, allowed: str) -> None:

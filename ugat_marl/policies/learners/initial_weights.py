@@ -10,7 +10,7 @@ from typing import Any
 from torch import Tensor, nn
 
 from ugat_marl.data import checked_tensors, read_checkpoint, write_checkpoint
-from ugat_marl.errors import OptionError
+from ugat_marl.errors import CheckpointError, OptionError
 
 _KIND = "ugat_marl.start"
 
@@ -38,9 +38,13 @@ class InitialWeights:
             CheckpointError: The file is missing, cut short or not finite, or of another kind.
         """
         content = read_checkpoint(path, _KIND)
-        weights = content["weights"]
-        checked_tensors(path, {"weights": weights}, {"weights": weights.new_zeros(weights.shape)})
-        return cls(weights, dict(content["env_options"]), str(content["origin"]))
+        try:
+            weights, options = content["weights"], dict(content["env_options"])
+            expected = {"weights": weights.new_zeros(weights.shape)}
+            checked_tensors(path, {"weights": weights}, expected)
+            return cls(weights, options, str(content["origin"]))
+        except (KeyError, TypeError, ValueError, AttributeError) as error:
+            raise CheckpointError(f"{path}: not initial weights ({error})") from None
 
     def save(self, path: Path) -> None:
         """Write the weights to a file atomically."""

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
+from collections.abc import Hashable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from itertools import combinations
@@ -177,25 +177,37 @@ def covering_phases(intersection: Intersection) -> tuple[int, ...]:
     several remain, take the first.
     """
     served = [green_indices(intersection, phase) for phase in intersection.phases]
-    wanted = frozenset[int]().union(*served)
-    if len(served) > MOST_SEARCHED_PHASES:
-        return _greedy_cover(served, wanted)
-    for size in range(1, len(served) + 1):
-        covers = [
-            chosen
-            for chosen in combinations(range(len(served)), size)
-            if frozenset[int]().union(*(served[i] for i in chosen)) == wanted
-        ]
-        if covers:
-            return min(covers, key=lambda chosen: sum(len(served[i]) for i in chosen))
-    raise AssertionError("all phases together serve every servable link")
+    covers = smallest_covers(served, MOST_SEARCHED_PHASES)
+    return min(covers, key=lambda chosen: sum(len(served[i]) for i in chosen))
 
 
-def _greedy_cover(served: list[frozenset[int]], wanted: frozenset[int]) -> tuple[int, ...]:
+def smallest_covers(
+    served: Sequence[frozenset[Hashable]], most_searched: int
+) -> list[tuple[int, ...]]:
+    """Return the smallest sets of phases that serve everything that all phases serve.
+
+    Args:
+        served: What each phase serves.
+        most_searched: Most phases for an exhaustive search; with more the search is greedy.
+
+    Returns:
+        Ascending numbers of phases: all sets of the smallest size, or the one that is found by
+        taking the phase that serves most of what is missing.
+    """
+    wanted = frozenset[Hashable]().union(*served)
+    if len(served) <= most_searched:
+        for size in range(1, len(served) + 1):
+            covers = [
+                chosen
+                for chosen in combinations(range(len(served)), size)
+                if frozenset[Hashable]().union(*(served[i] for i in chosen)) == wanted
+            ]
+            if covers:
+                return covers
     chosen: list[int] = []
-    left = wanted
-    while left:
-        best = max(range(len(served)), key=lambda i: len(served[i] & left))
+    missing = wanted
+    while missing:
+        best = max(range(len(served)), key=lambda i: len(served[i] & missing))
         chosen.append(best)
-        left -= served[best]
-    return tuple(sorted(chosen))
+        missing -= served[best]
+    return [tuple(sorted(chosen))]

@@ -40,6 +40,11 @@ def rule_settings(name: str, budget: int) -> list[str]:
     return [specs[k] for k in kept]
 
 
+def nan_last(mean: float | np.floating) -> float:
+    """Return a mean for sorting: NaN, of episodes in which no vehicle was due, is the largest."""
+    return math.inf if math.isnan(mean) else float(mean)
+
+
 def race_fields(settings: int) -> list[int]:
     """Return the number of rules in each rung: half of the rung before, down to two."""
     fields = [settings]
@@ -69,7 +74,7 @@ def race(
         for name, results in zip(running, play(rung, tuple(running)), strict=True):
             played[name] += results
         # The sort is stable: of equal rules, the one named first stays first.
-        running.sort(key=lambda name: float(np.mean(played[name])))
+        running.sort(key=lambda name: nan_last(np.mean(played[name])))
         if rung + 1 < rungs:
             kept = max(LEAST_FIELD, math.ceil(len(running) / 2))
             running, left = running[:kept], running[kept:] + left
