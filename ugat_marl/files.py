@@ -292,7 +292,7 @@ def _read_text(
                 f"{path}: has more than {_LONGEST >> 20} MiB, which no such file needs; is it "
                 "another file?"
             )
-        text = path.read_text(encoding="utf-8")
+        text = path.read_text(encoding="utf-8-sig")  # some editors begin files with a mark
     except UnicodeDecodeError as error:
         raise fault(f"{path}: not UTF-8 ({error.reason}); save it as UTF-8") from None
     except OSError as error:

@@ -694,3 +694,105 @@ def test_every_name_that_is_ruled_out_is_an_effect() -> None:
 
 def test_a_finding_is_a_value() -> None:
     assert Finding("x") == Finding("x", ())
+
+
+# --- likely mistakes of an export -----------------------------------------------------------------
+
+
+def scaled(column: str, factor: float) -> Rows:
+    return lambda frame: frame.with_columns(pl.col(column) * factor)
+
+
+@pytest.mark.parametrize(
+    ("change", "words"),
+    [
+        (scaled("speed_mps", 2.237), ("is it in km/h or mph",)),
+        (scaled("speed_mps", 3.6), ("is it in km/h or mph",)),
+        (scaled("speed_mps", 0.0), ("speed_mps is 0 everywhere",)),
+        (scaled("length_m", 3.281), ("median of length_m is 16.4 m", "in feet")),
+        (
+            lambda f: f.with_columns(
+                event=pl.when(pl.col("event") == "on").then(pl.lit("off")).otherwise(pl.lit("on"))
+            ),
+            ("are on and off swapped?",),
+        ),
+    ],
+)
+def test_units_and_events_that_cannot_be_meant_are_named(
+    change: Rows, words: tuple[str, ...], read: Read
+) -> None:
+    days = tuple(
+        replace(p, passages={name: fast(each) for name, each in p.passages.items()})
+        for p in recording().periods
+    )
+    findings = read(replace(recording(), periods=days), {"detections": change})[1]
+    assert [text for text in findings if all(word in text for word in words)], list(findings)
+
+
+def fast(passages: Passages) -> Passages:
+    """The vehicles at the speed limit of the crossing."""
+    return replace(passages, speed_mps=np.full(len(passages), 13.0))
+
+
+def test_zones_in_unusual_places_are_named(read: Read) -> None:
+    a, s, w, x = DETECTORS
+    swapped = (replace(a, kind="stop"), replace(s, kind="advance"), w, x)
+    findings = read(recording(detectors=swapped))[1]
+    assert any("'s') not upstream of the stop detector" in text for text in findings)
+    assert any("'a') more than 30 m upstream of the end" in text for text in findings)
+    turned = (replace(a, position_m=2.0, length_m=440.0), s, w, x)
+    only(read(recording(detectors=turned))[1], "position_m and length_m swapped", "'a'")
+
+
+def test_one_lane_on_red_is_named_though_the_others_are_right(read: Read) -> None:
+    cycle = ((0.0, "Gr"), (20.0, "rG"))
+    log = [(40.0 * i + begin, state) for i in range(180) for begin, state in cycle]
+    begins = 40.0 * np.arange(179)
+
+    def at(offset_s: float) -> Passages:
+        on = begins + offset_s
+        return Passages(on, on + 1, np.full(len(on), 8.0), np.full(len(on), 5.0))
+
+    base = recording()
+    days = tuple(
+        replace(p, signals={"C": tuple(log)}, passages={**p.passages, "s": at(5.0), "w": at(6.0)})
+        for p in base.periods
+    )
+    findings = read(replace(base, periods=days))[1]
+    only(findings, "leave the stop detectors", "('W_C_0') of 2")
+
+
+def test_a_clock_set_back_in_a_sorted_table_is_named(read: Read) -> None:
+    def back(frame: pl.DataFrame) -> pl.DataFrame:
+        late = pl.col("time_s") > 5000
+        moved = pl.when(late).then(pl.col("time_s") - 1800).otherwise("time_s")
+        return frame.with_columns(moved.alias("time_s")).sort("period_id", "time_s")
+
+    findings = read(changes={"detections": back})[1]
+    doubled = [text for text in findings if "two recordings lay on top" in text]
+    assert doubled and all("from 3600 s" in t or "from 4500 s" in t for t in doubled), findings
+
+
+@pytest.mark.parametrize("length_s", [300.0, 600.0])
+def test_a_clock_set_back_is_an_error_in_a_short_period_too(length_s: float, read: Read) -> None:
+    """The copy of the hour lies outside of the period, and must not be left out unseen."""
+    begin_s, end_s = 5000 - length_s / 2, 5000 + length_s / 2
+
+    def cut(passages: Passages) -> Passages:
+        return passages.at(np.flatnonzero((passages.on_s > begin_s) & (passages.off_s < end_s)))
+
+    days = tuple(
+        replace(
+            p, begin_s=begin_s, end_s=end_s,
+            passages={name: cut(each) for name, each in p.passages.items()},
+        )
+        for p in recording().periods
+    )  # fmt: skip
+
+    def back(frame: pl.DataFrame) -> pl.DataFrame:
+        late = pl.col("time_s") > 5000
+        moved = pl.when(late).then(pl.col("time_s") - 3600).otherwise("time_s")
+        return frame.with_columns(moved.alias("time_s"))
+
+    with pytest.raises(MeasuredDataError, match=r"steps back by 3[56]\d\d.*daylight saving"):
+        read(replace(recording(), periods=days), {"detections": back})

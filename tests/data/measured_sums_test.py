@@ -67,6 +67,13 @@ def test_counts_without_the_new_columns_keep_their_hash(
             "12.5",
             "occupancy '12.5' is not a share of time from 0 to 1; divide",
         ),
+        (
+            "counts",
+            "count",
+            "3e10",
+            "more than one vehicle per second and lane; write the vehicles",
+        ),
+        ("counts", "count", "600", "not vehicles per hour"),
         ("counts", "occupancy", "-0.1", "is not a share of time"),
         ("counts", "occupancy", "many", "occupancy is 'many'"),
         ("counts", "mean_speed_mps", "88", "is not a speed from 0 to 70 m/s; multiply miles"),

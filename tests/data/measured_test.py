@@ -152,7 +152,8 @@ def test_what_is_read_is_what_was_written(
         read_measured(tmp_path / "wrong", crossing_scenario, network)
     assert after.lanes is not None and after.lanes["mean_speed_mps"].to_list() == [None, 3.5]
     assert [finding.text.split(" (")[0] for finding in after.findings] == [
-        "periods.csv: 3 periods"  # of 200 s
+        "periods.csv: 3 periods",  # of 200 s
+        "detectors.csv: 2 stop detectors",  # 400 m upstream
     ]
 
 
@@ -387,6 +388,8 @@ WRONG: dict[str, tuple[dict[str, Change], str]] = {
     ),
     "decimal comma": ({"detectors.csv": replaced("40.0", '"40,5"')}, r"point, not a comma"),
     "semicolons": ({"detectors.csv": lambda text: text.replace(",", ";")}, r"semicolons"),
+    "tabs": ({"detectors.csv": lambda text: text.replace(",", "\t")}, r"divided by tabs"),
+    "a line for Excel": ({"detectors.csv": lambda text: "sep=,\n" + text}, r"remove it"),
     "no detectors": ({"detectors.csv": lambda text: text.split("\n")[0] + "\n"}, r"no detectors"),
     "column twice": (
         {"detectors.csv": lambda text: text.replace("length_m", "lane_id ", 1)},
@@ -430,7 +433,7 @@ WRONG: dict[str, tuple[dict[str, Change], str]] = {
         r"no detector can be used: of each, more than 50%.*every on and for every off",
     ),
     "unknown event": ({"detections.csv": replaced(",on,", ",enter,")}, r"'enter' is unknown"),
-    "negative speed": ({"detections.csv": added("day0,100,s,off,-3,")}, r"-3.0' is negative"),
+    "negative speed": ({"detections.csv": added("day0,199,s,off,-3,")}, r"-3.0' is negative"),
     "no time": ({"detections.csv": added("day0,,s,off,,")}, r"time_s is empty"),
     "infinite time": ({"detections.csv": added("day0,1e999,s,off,,")}, r"time_s is '1e999'"),
     "no known detector": (

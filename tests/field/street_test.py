@@ -191,6 +191,12 @@ def test_areas_count_where_they_lie_and_other_lanes_are_missing(
     assert all("missing: no count of lane W_C_0" in reason for reason in reasons)
 
 
+def test_a_simulation_without_areas_is_refused(running: Callable[..., Any]) -> None:
+    scenario = load_scenario("single-v1")
+    with pytest.raises(OptionError, match=r"no lane-area detector \(E2\) on any of the 12 lanes"):
+        running(scenario, Site.of(scenario, {}), detectors="areas")
+
+
 def test_a_simulation_of_another_network_is_refused(running: Callable[..., Any]) -> None:
     site = Site.of(load_scenario("grid2x2-v1"), {})
     with pytest.raises(SimulatorError, match="own network"):
@@ -357,6 +363,11 @@ def test_a_stopped_command_leaves_its_log_and_nothing_else(
         (["--policy", "programme", "--start"], "programme"),
         (["--policy", "longest-waiting", "--start"], "waiting times"),
         (["--policy", "random", "--start", "--limits.answer-ms", "5"], "reserve_ms"),
+        (["--policy", "random", "--start", "--limits.green-s", "0"], "green_s = 0: must be above"),
+        (["--policy", "a.pt", "--start", "--health", "a.pt"], "--health and --policy are one file"),
+        (["--policy", "random", "--start", "--log", "a", "--health", "./a"], "are one file"),
+        (["--policy", "random", "--start", "--health", __file__], "something else than the state"),
+        (["--policy", "random", "--start", "--log", __file__], "something else than decisions"),
     ],
 )
 def test_wrong_calls_are_one_line(

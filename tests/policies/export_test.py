@@ -20,7 +20,7 @@ import ugat_marl
 from ugat_marl.__main__ import main
 from ugat_marl.envs import AgentSet
 from ugat_marl.errors import CheckpointError, OptionError
-from ugat_marl.policies import DQN, NetworkPolicy, export_policy
+from ugat_marl.policies import DQN, NetworkPolicy, export_policy, load_policy
 from ugat_marl.policies.export import FORMATS, NumpyPolicy, portable_network
 from ugat_marl.policies.learners.dqn import DQNConfig
 from ugat_marl.policies.portable import PortableLayers
@@ -216,7 +216,7 @@ def test_the_side_car_says_what_the_rows_are(tmp_path: Path) -> None:
     about = json.loads(export_policy(policy, path, env).read_text())
     assert about.pop("kind") == "ugat_marl.exported_policy" and [
         len(each) for each in about.pop("sha256").values()
-    ] == [64]
+    ] == [64, 64]
     assert about == {
         "network": "mlp",
         "agents": ["cross_0", "tee_0", "cross_1"],
@@ -279,13 +279,32 @@ def test_damaged_files_are_refused(tmp_path: Path) -> None:
         refused("export it again", about=text)
     for sums in ('"0f"', "3", "null"):  # before each format had a sum of its own, it was text
         refused("export it again", about=re.sub(r'"sha256": \{[^}]*\}', f'"sha256": {sums}', about))
-    refused("inputs|outputs|agents", about=about.replace('"a_1",', ""))
+    refused("was changed", about=about.replace('"queue"', '"count"'))
+    refused("was changed", about=about.replace('"a_1",', ""))
     for name in ('"universal"', '"frap"', "null", "[]"):
         refused("export it again", about=about.replace('"mlp"', name))
     refused("export it again", about=about.replace('"env_options": {', '"env_option": {'))
     path.unlink()
     with pytest.raises(CheckpointError, match="No such file"):
         NumpyPolicy.load(path)
+
+
+def test_a_file_of_something_else_is_not_replaced(tmp_path: Path) -> None:
+    (tmp_path / "my.json").write_text('"precious"')
+    with pytest.raises(OptionError, match="describes no exported policy"):
+        export_policy(policy_of(False), tmp_path / "my.npz")
+    assert (tmp_path / "my.json").read_text() == '"precious"'
+    assert not (tmp_path / "my.npz").exists()
+
+
+def test_what_has_no_network_or_is_a_model_says_so(tmp_path: Path) -> None:
+    path = exported(policy_of(False), ".npz", tmp_path)
+    for name, says in (
+        ("largest-queue:20", "is a rule"), (str(tmp_path), "a folder; name a file"),
+        (str(path), r"an exported model.*give the \.pt"),
+    ):  # fmt: skip
+        with pytest.raises(CheckpointError, match=says):
+            load_policy(name)
 
 
 def test_nothing_is_unpickled(tmp_path: Path) -> None:

@@ -21,7 +21,7 @@ from ugat_marl.policies import (
     observed_options,
     suite_config,
 )
-from ugat_marl.policies.export import portable_network
+from ugat_marl.policies.export import _sum_of, portable_network
 from ugat_marl.policies.networks.q_network import q_network
 from ugat_marl.policies.networks.structure import Junction, Structure
 from ugat_marl.policies.portable import PortableUniversal
@@ -169,6 +169,8 @@ def test_files_that_name_another_network_are_refused(tmp_path: Path) -> None:
     path = exported(universal_policy(SIZES["one"]), ".npz", tmp_path)
     assert NumpyPolicy.load(path).agents.names == ("agent_0",)
     side_car = path.with_suffix(".json")
-    side_car.write_text(side_car.read_text().replace('"universal"', '"mlp"'))
+    about = json.loads(side_car.read_text().replace('"universal"', '"mlp"'))
+    about["sha256"][".json"] = _sum_of(about)
+    side_car.write_text(json.dumps(about))
     with pytest.raises(CheckpointError, match=r"lacking or too many.*export it again"):
         NumpyPolicy.load(path)

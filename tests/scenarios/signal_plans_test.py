@@ -296,6 +296,25 @@ def test_plans_that_are_wrong(
     assert not (tmp_path / "x").exists()
 
 
+def test_a_table_that_was_changed_is_not_replaced(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    words = ["plan", "grid2x2-v1", "--out", str(tmp_path / "plans.csv")]
+    assert main(words) == 0
+    changed = (tmp_path / "plans.csv").read_text(encoding="utf-8-sig").splitlines()
+    lights = {line.split(",")[0] for line in changed[1:]}
+    one = next(iter(sorted(lights)))
+    kept = [changed[0], *(line for line in changed[1:] if line.startswith(one))]
+    (tmp_path / "plans.csv").write_text("\n".join(kept) + "\n")
+    assert main(words) == 2
+    assert "perhaps with changes of yours" in capsys.readouterr().err
+    put = ["plan", "grid2x2-v1", "--apply", str(tmp_path / "plans.csv"), "--out"]
+    assert main([*put, str(tmp_path / "town")]) == 0
+    shown = " ".join(capsys.readouterr().out.split())
+    assert "3 lights (" in shown and "without a plan; own programme kept" in shown
+    assert main([*words, "--force"]) == 0
+
+
 def test_a_short_yellow_is_noted(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     (tmp_path / "t.csv").write_text(HEAD + GOOD.replace("30,3,2", "30,0,2", 1))
     words = ["plan", "single-v1", "--apply", str(tmp_path / "t.csv"), "--out", str(tmp_path / "x")]

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import itertools
 import math
 from collections.abc import Callable
 from dataclasses import dataclass, field
@@ -15,7 +16,7 @@ from tyro.conf import Positional, arg
 from ugat_marl.cli.arguments import LengthS, refuse_options
 from ugat_marl.effects import load_scenario, scenario_in_domain
 from ugat_marl.envs import parallel_env
-from ugat_marl.errors import OptionError, counted
+from ugat_marl.errors import OptionError, UgatMarlError, counted
 from ugat_marl.experiments import policy_factory
 from ugat_marl.field import (
     CountSource,
@@ -29,7 +30,7 @@ from ugat_marl.field import (
     TraciStreet,
     TrustLimits,
 )
-from ugat_marl.files import require_writable
+from ugat_marl.files import read_json, require_writable
 from ugat_marl.policies import Policy
 from ugat_marl.progress import Bars, Silent
 
@@ -85,7 +86,8 @@ class Field:
     def run(self, console: Console) -> int:
         """Drive the lights and print a summary."""
         self._check()
-        scenario = scenario_in_domain(load_scenario(self.scenario, self.seconds), self.domain)
+        length_s = self.seconds if self.seconds is None or math.isfinite(self.seconds) else None
+        scenario = scenario_in_domain(load_scenario(self.scenario, length_s), self.domain)
         policy = policy_factory(self.policy)(parallel_env(scenario))
         site = Site.of(scenario, policy.env_options)
         seconds = self.seconds or scenario.settings.duration_s
@@ -129,6 +131,23 @@ class Field:
             raise OptionError("--seed must not be negative, and --seconds must be above 0")
         if not (self.look_for_s >= 0 and 0 < self.sumo_answer_s < math.inf):
             raise OptionError("--look-for-s must be 0 or more, and --sumo-answer-s above 0")
+        self._check_files()
+
+    def _check_files(self) -> None:
+        """Refuse to write over the policy, or over a file that is no log and no state."""
+        named = {"--policy": Path(self.policy), "--log": self.log, "--health": self.health}
+        places = {name: path.resolve() for name, path in named.items() if path is not None}
+        for (one, place), (other, same) in itertools.combinations(places.items(), 2):
+            if place == same:
+                raise OptionError(f"{other} and {one} are one file, {named[other]}; name two")
+        if self.health is not None and self.health.exists():
+            with contextlib.suppress(UgatMarlError, TypeError):
+                if "state" in read_json(self.health, OptionError):
+                    return
+            raise OptionError(
+                f"--health {self.health}: holds something else than the state of a loop, which "
+                "would be lost; name another file"
+            )
 
     def _reach(self) -> str:
         """Return what the loop reaches and writes, for whoever guards this machine."""

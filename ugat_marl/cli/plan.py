@@ -15,7 +15,7 @@ from tyro.conf import Positional, arg
 
 from ugat_marl.cli.arguments import refuse_options, unused
 from ugat_marl.effects import load_scenario, scenario_in_domain
-from ugat_marl.errors import OptionError, counted
+from ugat_marl.errors import OptionError, counted, listed
 from ugat_marl.experiments import policy_factory, typical_plans
 from ugat_marl.files import require_writable
 from ugat_marl.progress import Bars
@@ -60,7 +60,7 @@ class Plan:
         first_seed: Seed of the first episode.
         apply: Table of plans, or combined UTDF file of Synchro.
         lights: Lights of the intersections of a UTDF file, as INTID=LIGHT.
-        force: Replace a scenario of the name --out.
+        force: Replace a table or scenario of the name --out.
     """
 
     scenario: Annotated[Positional[str], arg(metavar="SCENARIO")]
@@ -83,7 +83,12 @@ class Plan:
             played = ("domain", "seeds", "first_seed")
             refuse_options(self, played, "--apply reads plans and plays no episode")
         else:
-            refuse_options(self, ("lights", "force"), "without --apply a table is written")
+            refuse_options(self, ("lights",), "without --apply a table is written")
+            if self.out.exists() and not self.force:
+                raise OptionError(
+                    f"--out {self.out}: is there, perhaps with changes of yours; give another "
+                    "name, or --force to replace it"
+                )
         if self.policy is None:
             refuse_options(
                 self,
@@ -132,6 +137,10 @@ class Plan:
         with new_folder(self.out, force=self.force) as folder:
             planned.write(folder)
         console.print(plan_table(plans, LightNames.of(network)))
+        lights = {light.id for light in network.intersections}
+        without = sorted(lights - {plan.light for plan in plans})
+        if without:
+            notes = (*notes, f"{listed(without, 'light')} without a plan; own programme kept")
         for note in (*notes, *yellow_notes(plans)):
             console.print(f"note: {note}", soft_wrap=True)
         name = shlex.quote(str(self.out))

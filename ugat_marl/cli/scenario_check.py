@@ -110,7 +110,9 @@ class ScenarioCheck:
             raise OptionError(f"--headroom {self.headroom}: give a number of seeds, or 0")
         if self.headroom and self.domain != "sim":
             raise OptionError("--headroom plays sim and V1 to V4 by itself; leave out --domain")
-        scenario = scenario_in_domain(load_scenario(self.scenario, self.duration_s), self.domain)
+        scenario = scenario_in_domain(
+            load_scenario(self.scenario, self.duration_s), self.domain, duration_s=self.duration_s
+        )
         reporter = Silent() if self.json else Bars(console)
         facts = survey(scenario, reporter)
         runs = (

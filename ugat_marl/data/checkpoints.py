@@ -59,6 +59,11 @@ def read_checkpoint(path: Path, kind: str) -> dict[str, Any]:
             warnings.simplefilter("ignore")
             content = torch.load(path, map_location="cpu", weights_only=True)
     except _UNREADABLE as error:
+        if path.suffix in (".npz", ".onnx", ".ts"):
+            raise CheckpointError(
+                f"{path}: an exported model, which other programs read; give the .pt that it was "
+                "made from"
+            ) from None
         raise CheckpointError(
             f"{path}: not a readable checkpoint ({first_line(error)}); it may have been cut short: "
             "use an earlier one or train again"

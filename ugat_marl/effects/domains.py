@@ -330,7 +330,7 @@ def scenario_in_domain(
                 "a domain must be on the same network, or a policy means nothing in it"
             )
         _refuse_other_actions(scenario, other, domain)
-        return _checked(other)
+        return _checked(other.with_duration(duration_s))
     effects = parse_domain(domain)
     if not recorded:
         _refuse_detectors(domain, effects)

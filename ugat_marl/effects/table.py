@@ -186,16 +186,17 @@ def load_scenario(name: str | Path | Scenario, duration_s: float | None = None) 
 
     Args:
         name: Id or path of a scenario, or a scenario.
-        duration_s: Length of episodes, s; None for that of the file. Effects on demand and on
-            roads last as long: with a longer duration given later they would end before.
+        duration_s: Length of the episodes that will be played, s; None for that of the file.
+            Effects on demand and on roads last as long. The scenario keeps the length of its file.
     """
     scenario = name if isinstance(name, Scenario) else read_scenario(name)
-    scenario = scenario.with_duration(duration_s)
     where = f" in scenario {scenario.id!r}"
     effects = [effect_from_record(record, where) for record in scenario.settings.effects]
     plain = replace(scenario, settings=scenario.settings.model_copy(update={"effects": ()}))
-    refuse_outside(plain, effects)
-    return apply_effects(plain, effects)
+    played = plain.with_duration(duration_s)
+    refuse_outside(played, effects)
+    changed = apply_effects(played, effects)
+    return changed if duration_s is None else changed.with_duration(plain.settings.duration_s)
 
 
 def refuse_outside(scenario: Scenario, effects: Iterable[Effect]) -> None:

@@ -30,6 +30,12 @@ class AgentSet:
     observation_sizes: tuple[int, ...]
     action_counts: tuple[int, ...]
 
+    def __str__(self) -> str:
+        """Return the first three agents with their sizes, for messages."""
+        columns = (self.names, self.observation_sizes, self.action_counts)
+        rows = [f"{name} ({n} numbers, {m} actions)" for name, n, m in zip(*columns, strict=True)]
+        return ", ".join(rows[:3]) + f" and {len(rows) - 3} more" * (len(rows) > 3)
+
     @classmethod
     def of(cls, env: AnyParallelEnv) -> AgentSet:
         """Return the agents of a parallel environment with Box vectors and Discrete actions.

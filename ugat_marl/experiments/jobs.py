@@ -266,15 +266,15 @@ def _hash(scenario: str, domain: str, duration_s: float | None) -> str:
     """Return the hash of a scenario in a domain; the files are read each time, for they change."""
     loaded = load_scenario(scenario, duration_s)
     if domain_path(domain) is not None:
-        return scenario_in_domain(loaded, domain).hash
-    key = (loaded.hash, domain)
+        return scenario_in_domain(loaded, domain, duration_s=duration_s).hash
+    key = (loaded.hash, domain, duration_s)
     if key not in _HASHES:
-        _HASHES[key] = scenario_in_domain(loaded, domain).hash
+        _HASHES[key] = scenario_in_domain(loaded, domain, duration_s=duration_s).hash
     return _HASHES[key]
 
 
-_HASHES: dict[tuple[str, str], str] = {}
-"""Hashes in domains, by hash of the scenario and domain: effects take longer than reading."""
+_HASHES: dict[tuple[str, str, float | None], str] = {}
+"""Hashes in domains, by hash of the scenario: effects take longer than reading."""
 
 
 @dataclass

@@ -491,7 +491,7 @@ def compare(
     timed = any(row.ugat is not None and row.ugat.grounding == "timed" for row in rows)
     for target in config.targets(table):
         # an error now, not in an hour
-        check_worlds(loaded, config.sim, target, timed)
+        check_worlds(loaded.with_duration(config.duration_s), config.sim, target, timed)
     planner = Planner(table, scenario, config)
     plan = [job for row in rows for job in planner.jobs(row)]
     perform_all(planner.bases + plan, folder, workers, reporter, f"paper {table}")

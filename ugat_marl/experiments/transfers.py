@@ -195,7 +195,9 @@ class TransferConfig:
                 "`ugat-marl diagnose` wrote, or another domain"
             )
         if self.real == "none" and self.real_log is None:
-            raise OptionError('real = "none" needs a real_log: something must be known of the real')
+            raise OptionError(
+                'real = "none" needs real_log, a log of the street; or name a real domain'
+            )
         self._refuse_impossible_controls()
 
     def _refuse_impossible_controls(self) -> None:
@@ -520,6 +522,7 @@ def _identity(config: TransferConfig, scenario: Scenario, env: TrafficEnv) -> di
     log = config.real_log  # identified by its content, so the file may be moved
     settings["real_log"] = file_hash(log) if log else None
     hashes = {"sim": env.scenario.hash}
+    scenario = scenario.with_duration(config.duration_s)
     if config.real != "none":
         hashes["real"] = scenario_in_domain(scenario, config.real).hash
     return {

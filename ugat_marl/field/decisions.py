@@ -224,8 +224,15 @@ class DecisionLog:
                 raise
 
     def _require_whole(self) -> None:
-        """Refuse a file whose last line has no end, unless a merge that was killed left it so."""
+        """Refuse a file of something else, or whose last line has no end.
+
+        A merge that was killed may have left it so.
+        """
         size = os.fstat(self._file).st_size
+        if size and os.pread(self._file, 1, 0) != b"{":
+            raise OptionError(
+                f"{self.path}: holds something else than decisions; give the log another name"
+            )
         if size == 0 or os.pread(self._file, 1, size - 1) == b"\n":
             return
         if not any(self._overlap(offset, _whole_lines(part)) for offset, part in self._parts()[:1]):

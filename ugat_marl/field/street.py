@@ -107,7 +107,7 @@ class TraciStreet:
         self._time_s, self._amid = 0.0, False
         try:
             self._subscribe(lanes, detectors)
-        except SimulatorError:
+        except BaseException:
             self.close()
             raise
 
@@ -127,6 +127,11 @@ class TraciStreet:
                     name: self._counter.getLaneID(name) for name in self._counter.getIDList()
                 }
                 self._lane_of = {name: lane for name, lane in lane_of.items() if lane in set(lanes)}
+                if not self._lane_of:
+                    raise OptionError(
+                        f"the simulation at {self._where} has no lane-area detector (E2) on any of "
+                        f"the {len(lanes)} lanes; add them, or count on whole lanes"
+                    )
             for name in self._lane_of:
                 self._counter.subscribe(name, _COUNTED)
             self._time_s = float(self._connection.simulation.getTime())

@@ -53,6 +53,8 @@ class TrustLimits:
             value, endless = getattr(self, field.name), field.name in _MAY_BE_ENDLESS
             if not (value >= 0 and (endless or value < math.inf)):
                 raise OptionError(f"{field.name} = {value}: must be a number, 0 or more")
+        if self.green_s == 0:
+            raise OptionError("green_s = 0: must be above 0; the fixed-time plan needs greens")
         if self.look_every_s == 0:
             raise OptionError("look_every_s = 0: lights cannot be looked at without a pause")
         if self.reserve_ms >= self.answer_ms:

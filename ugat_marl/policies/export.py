@@ -19,6 +19,7 @@ holds:
 
 from __future__ import annotations
 
+import contextlib
 import hashlib
 import importlib
 import io
@@ -80,16 +81,37 @@ def export_policy(policy: NetworkPolicy, path: Path, env: AnyParallelEnv | None 
     side_car = path.with_suffix(".json")
     for place in (path, side_car):
         require_writable(place)
+    _refuse_other(side_car)
     about = _about(policy, env)
     model = FORMATS[path.suffix][1](policy)
     write_whole(path, model)
-    about["sha256"] = _sums_beside(side_car, about) | {path.suffix: _sum(model)}
+    sums = {path.suffix: _sum(model), ".json": _sum_of(about)}
+    about["sha256"] = _sums_beside(side_car, about) | sums
     write_whole(side_car, json.dumps(about, indent=1) + "\n")
     return side_car
 
 
 def _sum(model: bytes) -> str:
     return hashlib.sha256(model).hexdigest()
+
+
+def _sum_of(about: Mapping[str, Any]) -> str:
+    """Return the check sum of a side-car, without the check sums that it holds."""
+    told = {key: value for key, value in about.items() if key != "sha256"}
+    return _sum(json.dumps(told, sort_keys=True).encode())
+
+
+def _refuse_other(side_car: Path) -> None:
+    """Refuse to replace a JSON file that is no side-car."""
+    if not side_car.exists():
+        return
+    with contextlib.suppress(CheckpointError, TypeError, KeyError):
+        if read_json(side_car, CheckpointError)["kind"] == _KIND:
+            return
+    raise OptionError(
+        f"{side_car}: is there and describes no exported policy; give the model another name, "
+        "because this file is written beside it"
+    )
 
 
 _OF_THE_SITE = ("decision_interval_s", "intersections")
@@ -186,6 +208,8 @@ class NumpyPolicy:
             model = path.read_bytes()
             if about["kind"] != _KIND or dict(about["sha256"]).get(path.suffix) != _sum(model):
                 raise ValueError("the JSON file beside it belongs to another model")
+            if dict(about["sha256"]).get(".json") != _sum_of(about):
+                raise ValueError("the JSON file beside it was changed")
             with zipfile.ZipFile(io.BytesIO(model)) as archive:
                 require_stored(archive)
             with np.load(io.BytesIO(model), allow_pickle=False) as arrays:
@@ -232,8 +256,8 @@ def _about(policy: NetworkPolicy, env: AnyParallelEnv | None) -> dict[str, Any]:
     description = checkpoint_header(agents, policy.hidden, policy.env_options, policy.shared)
     if env is not None and AgentSet.of(env) != agents:
         raise OptionError(
-            f"the policy acts for {_brief(agents)}, the environment has "
-            f"{_brief(AgentSet.of(env))}; give the scenario it was trained in"
+            f"the policy acts for {agents}, the environment has {AgentSet.of(env)}; give the "
+            "scenario it was trained in"
         )
     base: Any = env.unwrapped if env is not None else None
     return {
@@ -246,13 +270,6 @@ def _about(policy: NetworkPolicy, env: AnyParallelEnv | None) -> dict[str, Any]:
         "decision_interval_s": getattr(base, "decision_interval_s", None),
         "intersections": getattr(base, "intersection_of", None),
     }
-
-
-def _brief(agents: AgentSet) -> str:
-    """Describe the first three agents and their sizes."""
-    columns = (agents.names, agents.observation_sizes, agents.action_counts)
-    rows = [f"{name} ({n} numbers, {m} actions)" for name, n, m in zip(*columns, strict=True)]
-    return ", ".join(rows[:3]) + f" and {len(rows) - 3} more" * (len(rows) > 3)
 
 
 def _matrices(policy: NetworkPolicy) -> bytes:

@@ -18,6 +18,7 @@ from pydantic import TypeAdapter, ValidationError
 from ugat_marl.errors import CheckpointError, UnknownNameError
 from ugat_marl.files import read_json, write_whole
 from ugat_marl.policies.network_policy import NetworkPolicy
+from ugat_marl.policies.rules.catalogue import RULES
 from ugat_marl.policies.rules.named import rule_in
 
 FOLDER = Path(__file__).parent / "shipped"
@@ -149,6 +150,13 @@ def load_policy(name: str | Path, *, folder: Path = FOLDER) -> NetworkPolicy:
                 f"commands that play policies take {spec} itself"
             )
         return NetworkPolicy.load(path)
+    if path.is_dir():
+        raise CheckpointError(f"{path}: a folder; name a file in it, such as policies/*.pt")
+    if str(name).partition(":")[0] in RULES:
+        raise CheckpointError(
+            f"{name} is a rule, which has no network to load or to export; commands that play "
+            "policies take it as it is"
+        )
     card = policy_card(str(name), folder=folder)
     file = shipped_policies(folder)[str(name)]
     if hashlib.sha256(file.read_bytes()).hexdigest() != card.sha256:

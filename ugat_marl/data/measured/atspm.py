@@ -498,7 +498,7 @@ def read_log(path: Path, time_zone: str, findings: list[Finding]) -> pl.DataFram
         MeasuredDataError: The file is unreadable, a column is missing, or times have an unknown
             form.
     """
-    if path.suffix not in (".csv", ".parquet"):
+    if path.suffix.lower() not in (".csv", ".parquet"):
         raise MeasuredDataError(f"{path}: a log is a .csv or a .parquet file")
     raw = read_raw(path, findings)
     names: dict[str, str] = {}

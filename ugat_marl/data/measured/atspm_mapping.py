@@ -75,7 +75,7 @@ class Channel(pydantic.BaseModel):
     length_m: Real = 0.0
     kind: DetectorKind
     id: Name = ""
-    latency_s: Real = 0.0
+    latency_s: Annotated[Real, Field(ge=0, le=10)] = 0.0
     """Delay of the detector's time stamps, s; it is subtracted from them."""
 
 

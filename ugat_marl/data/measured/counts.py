@@ -22,6 +22,13 @@ from ugat_marl.data.measured.values import Finding
 from ugat_marl.errors import MeasuredDataError, nearest
 from ugat_marl.scenarios import Detector, Network, Period
 
+MOST_PER_S = 1.0
+"""Vehicles per second and lane that no street reaches: gaps in a moving queue are near 2 s."""
+SATURATED_PER_S = 0.65
+"""Vehicles per second and lane that no lane serves for a minute or more (2,340 per hour)."""
+LONG_S = 60.0
+"""Shortest interval in which a lane cannot serve more than that."""
+
 
 def counts_of(
     path: Path,
@@ -53,6 +60,7 @@ def counts_of(
     )
     frame = _checked_intervals(path, frame, periods, ("detector_id",), "its detector", findings)
     _refuse_units(path, frame)
+    _check_rates(path, frame, detectors, findings)
     more = [name for name in COUNTS.optional if frame[name].count()]
     return frame.select(*COUNTS.columns, *more)
 
@@ -134,6 +142,34 @@ def _refuse_overlaps(path: Path, frame: pl.DataFrame, keys: tuple[str, ...], own
             "begin_s",
             f"is before the end of an earlier interval of {owner}, {overlap['before'][0]:g} s",
             "write intervals that do not overlap, and no totals of several of them",
+        )
+
+
+def _check_rates(
+    path: Path,
+    frame: pl.DataFrame,
+    detectors: Sequence[Detector],
+    findings: list[Finding],
+) -> None:
+    """Refuse counts that no lane can serve; add a finding on doubtful ones."""
+    lanes = {detector.id: len(detector.lanes) for detector in detectors}
+    length = pl.col("end_s") - pl.col("begin_s")
+    served = pl.col("detector_id").replace_strict(lanes, return_dtype=pl.Float64) * length
+    refuse(
+        path,
+        frame.filter(pl.col("count") > 1 + MOST_PER_S * served),
+        "count",
+        "is more than one vehicle per second and lane",
+        "write the vehicles in the interval, not vehicles per hour, and times in seconds",
+    )
+    many = frame.filter((length >= LONG_S) & (pl.col("count") > SATURATED_PER_S * served))
+    if many.height:
+        findings.append(
+            Finding(
+                f"{path.name}: {many.height} of {frame.height} counts are above "
+                f"{3600 * SATURATED_PER_S:g} vehicles per hour and lane, more than a lane serves; "
+                "are they vehicles per hour, or is a vehicle counted twice?"
+            )
         )
 
 

@@ -1,4 +1,4 @@
-"""Findings on gaps in measured data, and the effects that these gaps rule out."""
+"""Findings on measured data: gaps, with the effects that they rule out, and likely mistakes."""
 
 from __future__ import annotations
 
@@ -10,6 +10,7 @@ import numpy as np
 import polars as pl
 from numpy.typing import NDArray
 
+from ugat_marl.data.measured.plausibility import implausible
 from ugat_marl.data.measured.values import Finding, MeasuredData
 from ugat_marl.effects import known_effects
 from ugat_marl.errors import listed
@@ -21,7 +22,6 @@ from ugat_marl.scenarios import (
     Network,
     Period,
     Scenario,
-    deciding_letter,
     edge_of_lane,
 )
 
@@ -37,9 +37,6 @@ BUSY = 20
 """Least number of vehicles that counts as busy, such as at a neighbour during a silence."""
 EXPECTED = 10.0
 """Least number of vehicles expected during a silence for a report."""
-MOST_ON_RED = 0.6
-"""Largest plausible share of vehicles that leave on red. Above it, lanes, links or clocks are
-probably wrong."""
 MANY_LENGTHS = 3
 """Number of different lengths of one green, in whole s, from which a programme is not fixed."""
 
@@ -111,7 +108,7 @@ def coverage(measured: MeasuredData, scenario: Scenario, network: Network) -> li
         *_of_clocks(measured),
         *_of_places(measured.detectors, network),
         *_of_silence(measured),
-        *_of_agreement(measured, network),
+        *implausible(measured, network),
     ]
 
 
@@ -239,6 +236,14 @@ def _of_counts(measured: MeasuredData, network: Network) -> Iterator[Finding]:
         )
     if counts is None:
         return
+    whole_s = sum(period.length_s for period in measured.periods)
+    length = pl.col("end_s") - pl.col("begin_s")
+    covered_s = counts.group_by("detector_id").agg(length.sum().alias("covered_s"))["covered_s"]
+    if len(covered_s) and np.median(covered_s.to_numpy()) < whole_s / 2:
+        yield Finding(
+            "counts.csv: at most detectors the intervals cover less than half of the periods; what "
+            "happens between them is not compared"
+        )
     yield from _of_each_kind(measured, network, set(counts["detector_id"]))
     if summed and missing:
         yield Finding(
@@ -338,39 +343,6 @@ def _of_places(detectors: Sequence[Detector], network: Network) -> Iterator[Find
             f"detectors.csv: no detector on {listed(bare, 'incoming lane')}, of {len(into)}; "
             "what differs there stays unknown"
         )
-
-
-def _of_agreement(measured: MeasuredData, network: Network) -> Iterator[Finding]:
-    """Yield a finding for each light whose vehicles mostly leave the stop line on red.
-
-    The cause is a wrong lane or link, or a wrong clock.
-    """
-    stops: dict[str, list[str]] = {}
-    for detector in measured.detectors:
-        if detector.kind == "stop" and not detector.beside:
-            stops.setdefault(detector.lane, []).append(detector.id)
-    for light in network.intersections:
-        total = red = 0
-        for lane in light.incoming_lanes:
-            links = sorted({link.index for link in light.links if link.from_lane == lane})
-            for period in measured.periods:
-                log = period.signals.get(light.id)
-                if not log:
-                    continue
-                since = np.array([since for since, _ in log])
-                is_red = np.array([deciding_letter([s[i] for i in links]) == "r" for _, s in log])
-                for name in stops.get(lane, ()):
-                    if name in period.passages:
-                        off = period.passages[name].off_s
-                        shown = np.searchsorted(since, off[np.isfinite(off)], side="right") - 1
-                        total += len(shown)
-                        red += int(is_red[shown].sum())
-        if total >= BUSY and red > MOST_ON_RED * total:
-            yield Finding(
-                f"{red} of {total} vehicles leave the stop detectors of traffic light "
-                f"{light.id!r} while their lane has red; are lanes and links the right ones, "
-                "and the clocks?"
-            )
 
 
 @dataclass(frozen=True)

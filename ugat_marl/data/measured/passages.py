@@ -11,7 +11,7 @@ import polars as pl
 from numpy.typing import NDArray
 
 from ugat_marl.data.measured.copies import FEWEST, TWICE, overlapping
-from ugat_marl.data.measured.tables import PERIOD, ROW, in_order, refuse, refuse_set_back
+from ugat_marl.data.measured.tables import PERIOD, in_order, refuse
 from ugat_marl.data.measured.values import Finding
 from ugat_marl.errors import MeasuredDataError, nearest
 from ugat_marl.scenarios import Detector, Passages, Period
@@ -26,6 +26,13 @@ LONGEST_M = 40.0
 """Largest plausible length of a vehicle."""
 MOST_SHARED = 0.5
 """From this share of equal detections on, two periods hold the same recording."""
+
+DOUBLED_PART_S = 900.0
+"""Length of the parts of a period in which two recordings on top of each other are looked for."""
+DOUBLED_SHARE = 0.05
+"""Share of events without a partner from which on they may lie on top of each other."""
+DOUBLED_DETECTORS = 0.75
+"""Share of the busy detectors at which there must be such events."""
 
 IMPUTED_S = 2.0
 """Longest time between two ons in a row that count as two vehicles. The first one then gets its off
@@ -72,7 +79,7 @@ def passages_of(
 
     Raises:
         MeasuredDataError: An event is unknown, no detector is known, speeds or lengths are
-            impossible, a clock was set back, or two periods share detections.
+            impossible, or two periods share detections.
     """
     refuse(
         path,
@@ -95,9 +102,9 @@ def passages_of(
                 "twice; they count once"
             )
         )
-    stream = _sorted(path, once, periods, names, findings)
+    stream = _sorted(path, once, findings)
     _refuse_copies(path, stream, periods, len(names))
-    paired, broken = _pair(path, stream, names, findings)
+    paired, broken = _pair(path, stream, periods, names, findings)
     return _split(paired, periods, names, broken), frozenset(names[i] for i in broken)
 
 
@@ -158,23 +165,11 @@ def _plausible(
     return values.set(impossible.fill_null(False), None).fill_null(float("nan")).alias(column)
 
 
-def _sorted(
-    path: Path,
-    frame: pl.DataFrame,
-    periods: Sequence[Period],
-    names: Sequence[str],
-    findings: list[Finding],
-) -> _Stream:
+def _sorted(path: Path, frame: pl.DataFrame, findings: list[Finding]) -> _Stream:
     key = frame["key"].to_numpy()
     time = frame["time_s"].to_numpy()
     is_on = (frame["event"] == "on").to_numpy()
 
-    def name(stream: int) -> str:
-        period, detector = divmod(stream // 2, len(names))
-        return f"detector {names[detector]!r} in period {periods[period].id!r}"
-
-    # Ons and offs may have been exported separately, so each has its own stream here.
-    refuse_set_back(path, key * 2 + is_on, time, frame[ROW].to_numpy(), name)
     order = in_order(path, key, time, findings)
     order = order[untangled(key[order], time[order], is_on[order])]
     return _Stream(
@@ -187,7 +182,11 @@ def _sorted(
 
 
 def _pair(
-    path: Path, stream: _Stream, names: Sequence[str], findings: list[Finding]
+    path: Path,
+    stream: _Stream,
+    periods: Sequence[Period],
+    names: Sequence[str],
+    findings: list[Finding],
 ) -> tuple[tuple[NDArray[np.int64], Passages], frozenset[int]]:
     """Return passages with their streams, and the detectors with too many lost events."""
     key, time, is_on = stream.key, stream.time, stream.is_on
@@ -212,6 +211,7 @@ def _pair(
 
     passages = Passages(on, off, of_pair(stream.speed), of_pair(stream.length))
     _report(path, int(imputed.sum()), int(lost_off.sum()), int(lost_on.sum()), len(first), findings)
+    _report_doubled(path, stream, imputed | lost_off | lost_on, periods, len(names), findings)
     detector = key % len(names)
     events = np.bincount(detector, minlength=len(names))
     lost = np.bincount(detector[lost_off | lost_on], minlength=len(names))
@@ -241,6 +241,48 @@ def _report(
             Finding(
                 f"{path.name}: {lost_off} ons without off and {lost_on} offs without on were left "
                 f"out; {kept} passages are left"
+            )
+        )
+
+
+def _report_doubled(
+    path: Path,
+    stream: _Stream,
+    irregular: NDArray[np.bool_],
+    periods: Sequence[Period],
+    detectors: int,
+    findings: list[Finding],
+) -> None:
+    """Add a finding for a time in which two recordings seem to lie on top of each other.
+
+    Where a clock was set back and the table then sorted, events of two hours alternate. So at
+    nearly all detectors ons follow on ons and offs on offs, and at other times they do not.
+    """
+    period = stream.key // detectors
+    begins = np.array([one.begin_s for one in periods])
+    part = ((stream.time - begins[period]) // DOUBLED_PART_S).astype(np.int64)
+    parts = int(part.max(initial=0)) + 1
+    place = period * parts + part
+    cells = place * detectors + stream.key % detectors
+    size = len(periods) * parts
+    events, odd = (
+        np.bincount(cells, weights, size * detectors).reshape(size, detectors)
+        for weights in (np.ones(len(cells)), irregular.astype(float))
+    )
+    busy = events >= FEWEST
+    touched = (busy & (odd > 0)).sum(axis=1) >= DOUBLED_DETECTORS * np.maximum(busy.sum(axis=1), 2)
+    share = odd.sum(axis=1) / np.maximum(events.sum(axis=1), 1)
+    doubled = touched & (share > DOUBLED_SHARE)
+    usual = odd[~doubled].sum() / max(events[~doubled].sum(), 1)
+    for number in np.flatnonzero(doubled & (share > 3 * usual)).tolist():
+        one, begin_s = periods[number // parts], (number % parts) * DOUBLED_PART_S
+        begin_s += one.begin_s
+        findings.append(
+            Finding(
+                f"{path.name}: from {begin_s:g} s to {min(begin_s + DOUBLED_PART_S, one.end_s):g} "
+                f"s of period {one.id!r} {share[number]:.0%} of the events have no partner, at "
+                "nearly all detectors, as if two recordings lay on top of each other; was a clock "
+                "set back, and the table sorted? Then leave this time out"
             )
         )
 

@@ -25,7 +25,6 @@ from ugat_marl.data.measured.tables import (
     place,
     read_table,
     refuse,
-    refuse_set_back,
     with_period,
 )
 from ugat_marl.data.measured.tracks import passages_of_tracks
@@ -497,7 +496,7 @@ def signals_of(
 
     Raises:
         MeasuredDataError: A traffic light is unknown, a state has a wrong length or unknown
-            letters, a clock was set back, or a log begins too late.
+            letters, or a log begins too late.
     """
     _check_states(path, frame, widths)
     names = sorted(widths)
@@ -512,7 +511,6 @@ def signals_of(
         )
 
     time = frame["time_s"].to_numpy()
-    refuse_set_back(path, key, time, frame[ROW].to_numpy(), name)
     order = in_order(path, key, time, findings)
     key, time = key[order], time[order]
     states = frame["state"].gather(order).to_list()

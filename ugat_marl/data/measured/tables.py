@@ -29,6 +29,8 @@ FEW_ROWS = 10
 """With fewer rows, a clock set back looks the same as rows out of order."""
 MOST_OUTSIDE = 0.5
 """Largest share of a period's rows that may lie outside of the period."""
+HOUR_S = 3600.0
+"""Step of a clock at the begin and end of daylight saving."""
 EPOCH = 1e8
 """Times above this are dates, not seconds of a scenario."""
 
@@ -239,7 +241,8 @@ def read_raw(path: Path, findings: list[Finding]) -> pl.DataFrame:
     Raises:
         MeasuredDataError: The file is unreadable, damaged or cut short.
     """
-    return _read_parquet(path) if path.suffix == ".parquet" else _read_csv(path, findings)
+    parquet = path.suffix.lower() == ".parquet"
+    return _read_parquet(path) if parquet else _read_csv(path, findings)
 
 
 def frame_of(table: Table, rows: Sequence[tuple[object, ...]]) -> pl.DataFrame:
@@ -255,12 +258,12 @@ def frame_of(table: Table, rows: Sequence[tuple[object, ...]]) -> pl.DataFrame:
 
 def first_row(path: Path) -> int:
     """Return the number of the first row of a table; line 1 of a CSV file is its header."""
-    return 1 if path.suffix == ".parquet" else 2
+    return 1 if path.suffix.lower() == ".parquet" else 2
 
 
 def place(path: Path, row: int) -> str:
     """Return the name of a row for messages."""
-    unit = {".csv": "line", ".parquet": "row"}.get(path.suffix, "entry")
+    unit = {".csv": "line", ".parquet": "row"}.get(path.suffix.lower(), "entry")
     return f"{path}, {unit} {row}"
 
 
@@ -326,6 +329,8 @@ def _read_parquet(path: Path) -> pl.DataFrame:
 
 def _read_csv(path: Path, findings: list[Finding]) -> pl.DataFrame:
     content = _bytes(path).removeprefix(b"\xef\xbb\xbf")
+    if b"\n" not in content:
+        content = content.replace(b"\r", b"\n")  # line ends of an old Mac
     if b"\0" in content:
         line = content[: content.index(b"\0")].count(b"\n") + 1
         raise MeasuredDataError(
@@ -341,11 +346,16 @@ def _read_csv(path: Path, findings: list[Finding]) -> pl.DataFrame:
         ) from None
     if not content.strip():
         raise MeasuredDataError(f"{path}: the file is empty; it needs a header and rows")
-    if ";" in head and "," not in head:
+    if head.startswith("sep="):
         raise MeasuredDataError(
-            f"{path}: columns are divided by semicolons; save it with commas, and with points in "
-            "numbers"
+            f"{path}: line 1 is {head.strip()!r}, which is for Excel alone; remove it"
         )
+    for mark, name in ((";", "semicolons"), ("\t", "tabs")):
+        if mark in head and "," not in head:
+            raise MeasuredDataError(
+                f"{path}: columns are divided by {name}; save it with commas, and with points in "
+                "numbers"
+            )
     if not content.endswith((b"\n", b"\r")):
         findings.append(
             Finding(f"{path.name}: the last line has no end; the file may have been cut short")
@@ -440,8 +450,8 @@ def with_period(
         early: True to keep rows before the start of a period.
 
     Raises:
-        MeasuredDataError: No row belongs to a known period, or most rows of a period lie outside
-            of it.
+        MeasuredDataError: No row belongs to a known period, most rows of a period lie outside of
+            it, or the clock of a detector or traffic light was set back.
     """
     index = {period.id: i for i, period in enumerate(periods)}
     frame = frame.with_columns(
@@ -466,6 +476,7 @@ def with_period(
     ends = np.array([period.end_s for period in periods])
     which = frame[PERIOD].to_numpy()
     time = frame["time_s"].round(3).to_numpy() + 0.0
+    _refuse_clocks(path, frame, periods, time)  # before the copy of an hour is left out
     inside = time <= ends[which]
     if not early:
         inside &= time >= begins[which]
@@ -473,6 +484,34 @@ def with_period(
         report_outside(path, periods, which, time, inside, findings)
     frame = frame.with_columns(pl.Series("time_s", time))
     return frame.filter(pl.Series(inside))
+
+
+def _refuse_clocks(
+    path: Path, frame: pl.DataFrame, periods: Sequence[Period], time: NDArray[np.float64]
+) -> None:
+    """Refuse rows of a detector or traffic light whose clock was set back."""
+    owners = {"detector_id": "detector", "tls_id": "traffic light"}
+    column = next((name for name in owners if name in frame.columns), None)
+    if column is None or frame.is_empty():
+        return
+    frame = frame.with_columns(pl.Series("time_s", time))
+    if "event" in frame.columns:  # rows that are there twice count once
+        values = [name for name in frame.columns if name != ROW]
+        frame = frame.unique(values, keep="first", maintain_order=True)
+    names = frame[column].unique(maintain_order=True).to_list()
+    index = {name: i for i, name in enumerate(names)}
+    code = frame[column].replace_strict(index, return_dtype=pl.Int64).to_numpy()
+    key = (frame[PERIOD].to_numpy().astype(np.int64) * len(names) + code) * 2
+    if "event" in frame.columns:  # ons and offs may have been exported separately
+        key += (frame["event"] == "on").to_numpy()
+
+    def name(stream: int) -> str:
+        period, number = divmod(stream // 2, len(names))
+        return f"{owners[column]} {names[number]!r} in period {periods[period].id!r}"
+
+    begins = np.array([period.begin_s for period in periods])[frame[PERIOD].to_numpy()]
+    time, row = frame["time_s"].to_numpy(), frame[ROW].to_numpy()
+    refuse_set_back(path, key, time, row, name, begins)
 
 
 def report_outside(
@@ -501,11 +540,13 @@ def report_outside(
     for period, rows, lost in zip(periods, total, outside, strict=True):
         if lost > MOST_OUTSIDE * rows:
             example = time[~inside & (which == periods.index(period))][0]
-            hint = (
-                "these are dates; subtract the moment at which the scenario's clock is 0"
-                if abs(example) > EPOCH
-                else "write times in seconds of the scenario's clock"
-            )
+            away = max(period.begin_s - example, example - period.end_s)
+            if abs(example) > EPOCH:
+                hint = "these are dates; subtract the moment at which the scenario's clock is 0"
+            elif away <= HOUR_S:
+                hint = "is a clock an hour off (daylight saving), or the period too short?"
+            else:
+                hint = "write times in seconds of the scenario's clock"
             raise MeasuredDataError(
                 f"{path}: {lost} of {rows} rows of period {period.id!r} lie outside of it "
                 f"({period.begin_s:g} s to {period.end_s:g} s), the first at {example:g} s; {hint}"
@@ -547,11 +588,12 @@ def refuse_set_back(
     time: NDArray[np.float64],
     row: NDArray[np.int64],
     name: Callable[[int], str],
+    begin_s: NDArray[np.float64] | None = None,
 ) -> None:
     """Refuse streams whose clock was set back.
 
     Two other cases are accepted. Rows out of order step back many times. A file with swapped pieces
-    steps back, but ends before it began, so no time occurs twice.
+    steps back, but ends before it began, so no time occurs twice; all of it is within its period.
 
     Args:
         path: File of the rows.
@@ -560,6 +602,7 @@ def refuse_set_back(
         time: Time of each row, s, ``(n,)``.
         row: Number of each row in its file, ``(n,)``.
         name: Function that names a stream in messages.
+        begin_s: Start of the period of each row, s, ``(n,)``; None if the rows are within theirs.
 
     Raises:
         MeasuredDataError: The clock of a stream was set back, so some time occurs twice.
@@ -576,7 +619,8 @@ def refuse_set_back(
             continue
         step = int(steps[0])
         jump = clock[step - 1] - clock[step]
-        if jump > CLOCK_JUMP_S and clock[end - 1] > clock[begin]:
+        gone = begin_s is not None and clock[end - 1] < begin_s[as_found[begin]]
+        if jump > CLOCK_JUMP_S and (gone or clock[end - 1] > clock[begin]):
             raise MeasuredDataError(
                 f"{place(path, int(row[as_found[step]]))}: the clock of {name(int(stream[begin]))} "
                 f"steps back by {jump:g} s, so some times occur twice (daylight saving, a "
