@@ -199,7 +199,7 @@ def test_domain_randomisation_resumes(tmp_path: Path) -> None:
             "oracle needs a real domain",
         ),
         ({"negative_control": "same-world", "real_log": Path("x")}, "leave out one of them"),
-        ({"further": ("V2", "SIM")}, "is what the control does"),
+        ({"further": ("V2", "SIM"), "control": True}, "is what the control does"),
         ({"further": ("V4", "snow")}, "further holds one twice: V4 V4"),
     ],
 )
