@@ -274,15 +274,19 @@ def _report_doubled(
     share = odd.sum(axis=1) / np.maximum(events.sum(axis=1), 1)
     doubled = touched & (share > DOUBLED_SHARE)
     usual = odd[~doubled].sum() / max(events[~doubled].sum(), 1)
-    for number in np.flatnonzero(doubled & (share > 3 * usual)).tolist():
-        one, begin_s = periods[number // parts], (number % parts) * DOUBLED_PART_S
-        begin_s += one.begin_s
+    found = (doubled & (share > 3 * usual)).reshape(len(periods), parts)
+    for one, marks, shares in zip(periods, found, share.reshape(found.shape), strict=True):
+        if not marks.any():
+            continue
+        first, last = np.flatnonzero(marks)[[0, -1]]
+        begin_s = one.begin_s + first * DOUBLED_PART_S
+        end_s = min(one.begin_s + (last + 1) * DOUBLED_PART_S, one.end_s)
         findings.append(
             Finding(
-                f"{path.name}: from {begin_s:g} s to {min(begin_s + DOUBLED_PART_S, one.end_s):g} "
-                f"s of period {one.id!r} {share[number]:.0%} of the events have no partner, at "
-                "nearly all detectors, as if two recordings lay on top of each other; was a clock "
-                "set back, and the table sorted? Then leave this time out"
+                f"{path.name}: from {begin_s:g} s to {end_s:g} s of period {one.id!r} "
+                f"{shares[marks].mean():.0%} of the events have no partner, at nearly all "
+                "detectors, as if two recordings lay on top of each other; was a clock set back, "
+                "and the table sorted? Then leave this time out"
             )
         )
 
