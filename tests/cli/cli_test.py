@@ -177,6 +177,7 @@ def test_evaluate_prints_and_writes(
     assert len(content["episodes"]) == 2 * 2 * 2
 
 
+@pytest.mark.slow
 def test_a_recorded_log_trains(
     tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:

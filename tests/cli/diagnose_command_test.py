@@ -246,6 +246,7 @@ def test_the_manual_lists_exactly_the_keys_there_are(found: tuple[Path, str, str
     assert set(listed) - there - SOMETIMES == set()
 
 
+@pytest.mark.slow
 @pytest.mark.usefixtures("few")
 def test_the_policy_gap_stays_as_long_as_the_same_is_found(
     found: tuple[Path, str, str], street: Street, tmp_path: Path

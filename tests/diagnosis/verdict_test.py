@@ -330,6 +330,7 @@ def test_a_hint_that_is_not_confirmed_is_weighed_with_the_other_periods(
     assert found.verdict == verdict
 
 
+@pytest.mark.slow
 def test_two_tests_as_a_whole() -> None:
     assert combined(0.03, 0.5) == pytest.approx(0.015 * (1 - np.log(0.015)))
     assert combined(1.0, 1.0) == 1.0

@@ -59,7 +59,7 @@ def test_vehicles_are_where_they_are_in_the_colour_of_their_speed(network: Netwo
 
 def test_heads_show_the_state_by_colour_and_by_form(network: Network) -> None:
     (item,) = network.intersections
-    picture = NetworkRenderer(network, size_px=3000)
+    picture = NetworkRenderer(network, size_px=2000)
     count = max(link.index for link in item.links) + 1
     shown: dict[str, np.ndarray] = {}
     for letter, colour in (("r", _RED), ("G", _SIGNALS["G"]), ("y", _SIGNALS["y"])):

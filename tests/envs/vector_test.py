@@ -534,6 +534,7 @@ def test_the_parent_frees_the_environments_of_a_closed_vector(crossing: Crossing
 # --- nothing is left
 
 
+@pytest.mark.slow
 @needs_proc
 def test_opened_and_closed_ten_times(crossing: Crossing, temporary: Path) -> None:
     directory = crossing()
@@ -626,6 +627,7 @@ def test_an_unused_one_starts_and_leaves_nothing(crossing: Crossing, temporary: 
         env.reset(1)
 
 
+@pytest.mark.slow
 def test_halves_outlive_the_name_of_the_whole(crossing: Crossing, temporary: Path) -> None:
     first, second = vector_env(crossing(), 2, duration_s=20).halves()
     gc.collect()
@@ -837,6 +839,7 @@ def test_the_order_in_which_environments_are_ready_changes_no_episode(count: int
         assert one_by_one(env, 4, episodes=2, count=count) == together(env, 4, episodes=2)
 
 
+@pytest.mark.slow
 def test_a_killed_simulation_is_taken_up_again_while_others_are_received() -> None:
     killed: list[int] = []
     with vector_env("grid2x2-v1", 2, duration_s=LENGTH_S) as env:

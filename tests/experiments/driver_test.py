@@ -175,6 +175,7 @@ def test_the_digest_follows_the_files_of_the_scenario(tmp_path: Path) -> None:
     assert replace(PLAIN, scenario=str(town), options={}).digest != before
 
 
+@pytest.mark.slow
 def test_jobs_here_and_in_processes_have_the_same_numbers(tmp_path: Path) -> None:
     """Plain, grounded and fine-tuned; the rule of another folder has no learner."""
     plan = [
@@ -194,7 +195,7 @@ def test_jobs_here_and_in_processes_have_the_same_numbers(tmp_path: Path) -> Non
     assert here[0].episodes == 4 and here[0].seconds > 0 < here[0].own_seconds
 
 
-@pytest.mark.parametrize("grounded", [False, True])
+@pytest.mark.parametrize("grounded", [pytest.param(False, marks=pytest.mark.slow), True])
 def test_a_killed_job_goes_on_and_ends_with_the_same_numbers(
     grounded: bool, tmp_path: Path
 ) -> None:
@@ -414,6 +415,7 @@ def test_a_job_that_is_stopped_again_and_again_is_reported(
         perform_all([PLAIN], tmp_path, 1, Silent(), "test")
 
 
+@pytest.mark.slow
 @needs_forks
 def test_a_forked_job_ends_with_a_killed_driver(python: list[str], tmp_path: Path) -> None:
     replace(PLAIN, episodes=10**6).write(tmp_path)

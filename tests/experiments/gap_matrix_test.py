@@ -105,7 +105,11 @@ def test_a_table_survives_writing(tmp_path: Path) -> None:
     ("domains", "words"),
     [
         (["sim", "reward"], ["cost of what is wanted", "measured in want-efficiency, want-emis"]),
-        (["sim", "action"], ["what each gap costs", "(12) s", "barrier-both"]),
+        pytest.param(
+            ["sim", "action"],
+            ["what each gap costs", "(12) s", "barrier-both"],
+            marks=pytest.mark.slow,
+        ),
     ],
 )
 def test_evaluate_plays_whole_gaps(

@@ -119,6 +119,7 @@ def test_the_page_by_hand() -> None:
     assert len(rows) == 1 + 3 * 2 and rows[2] == "ippo,wonder 1.0,3,4,120.0,10.0,5.0"
 
 
+@pytest.mark.slow
 def test_what_is_there_is_not_trained_again_and_failures_are_told(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

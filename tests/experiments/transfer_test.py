@@ -61,6 +61,7 @@ def test_without_iterations_there_is_no_ugat_to_judge(tmp_path: Path) -> None:
     assert [path.name for path in (tmp_path / "run/policies").iterdir()] == ["direct-transfer.pt"]
 
 
+@pytest.mark.slow
 def test_every_control_is_trained_as_long_as_it_says_where_it_says(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -115,6 +116,7 @@ def test_controls_are_the_trainings_that_go_by_other_names(tmp_path: Path) -> No
         assert np.array_equal(weights(tmp_path, one), weights(tmp_path, other))
 
 
+@pytest.mark.slow
 def test_domains_whose_names_differ_by_a_sign_are_trained_in_one_by_one(tmp_path: Path) -> None:
     domains = ("acceleration=0.5+demand_timing=*,-60", "acceleration=0.5+demand_timing=*,60")
     transfer(replace(SMALL, further=domains), tmp_path)
@@ -124,6 +126,7 @@ def test_domains_whose_names_differ_by_a_sign_are_trained_in_one_by_one(tmp_path
     assert not np.array_equal(one, two)
 
 
+@pytest.mark.slow
 def test_controls_can_be_added_to_a_run_and_change_nothing_else(tmp_path: Path) -> None:
     transfer(SMALL, tmp_path / "run")
     policies = (
@@ -246,6 +249,7 @@ def test_shuffled_data_of_the_street_lead_nowhere(tmp_path: Path) -> None:
         transfer(SMALL, tmp_path / "run", resume=True)
 
 
+@pytest.mark.slow
 def test_a_run_with_noise_for_f_says_so_and_resumes(tmp_path: Path) -> None:
     config = replace(SMALL, negative_control="noise")
     transfer(config, tmp_path / "unbroken")

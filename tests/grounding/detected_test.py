@@ -111,6 +111,7 @@ def test_passages_are_matched_at_the_least_cost(data: st.DataObject) -> None:
     assert cost == pytest.approx(aligned_by_a_whole_table(first, last, fastest_s, config))
 
 
+@pytest.mark.slow
 def test_a_day_of_passages_needs_no_table_of_all_pairs() -> None:
     on_s = np.cumsum(np.full(10_000, 8.0))
     first = _Crossings(on_s, on_s + 0.5, np.full(10_000, 10.0), np.full(10_000, 5.0))

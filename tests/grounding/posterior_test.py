@@ -45,6 +45,7 @@ def interval(sample: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     return low - 1e-9, high + 1e-9
 
 
+@pytest.mark.slow
 def test_ninety_percent_intervals_hold_the_truth_as_often_as_they_say() -> None:
     inside_effects: list[np.ndarray] = []
     inside_service: list[np.ndarray] = []

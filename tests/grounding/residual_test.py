@@ -93,6 +93,7 @@ def same_world() -> tuple[Residual, ResidualReport]:
     return planted(late=0)
 
 
+@pytest.mark.slow
 def test_the_same_world_is_left_alone(same_world: tuple[Residual, ResidualReport]) -> None:
     residual, report = same_world
     assert report.trust.better.tolist() == [False]
@@ -263,6 +264,7 @@ def trusted_everywhere(*args: Any) -> Trust:
     return replace(trust, better=np.ones_like(trust.better))
 
 
+@pytest.mark.slow
 def test_where_commands_are_late_no_action_is_grounded(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

@@ -75,6 +75,7 @@ def test_each_light_is_late_by_its_own_delay() -> None:
     assert late_world({"b": 0.0}, {"b": "B"}) == StreetWorld()
 
 
+@pytest.mark.slow
 def test_the_rival_is_direct_transfer_trained_further_with_late_greens(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

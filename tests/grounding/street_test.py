@@ -200,6 +200,7 @@ def test_each_part_can_be_fitted_alone(part: str) -> None:
         assert bool(service_s.any()) == (part == "service")
 
 
+@pytest.mark.slow
 def test_the_last_worlds_of_a_fit_are_drawn_from_the_posterior_of_the_others(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:

@@ -155,6 +155,7 @@ def test_every_uncertainty_trains(method: MethodName, tmp_path: Path) -> None:
         assert rows[2, "gate/alpha"] == pytest.approx(rows[1, "gate/mean_u"])
 
 
+@pytest.mark.slow
 @pytest.mark.usefixtures("unjudged")
 def test_a_run_with_dropout_resumes(tmp_path: Path) -> None:
     """Its thinned networks are part of the checkpoint, and are not those of a fresh grounding."""
@@ -167,6 +168,7 @@ def test_a_run_with_dropout_resumes(tmp_path: Path) -> None:
     assert one.equals(two)
 
 
+@pytest.mark.slow
 def test_a_killed_process_resumes(
     tmp_path: Path, python: list[str], capsys: pytest.CaptureFixture[str]
 ) -> None:
@@ -368,6 +370,7 @@ def test_training_in_the_corrected_sim_resumes(repaired: Path, tmp_path: Path) -
     assert np.array_equal(first, again)
 
 
+@pytest.mark.slow
 @pytest.mark.usefixtures("unjudged")
 def test_another_correction_is_trained_for_itself(repaired: Path, tmp_path: Path) -> None:
     """It is a control: one may be added to a finished run, and each has its own training."""
@@ -406,6 +409,7 @@ def test_models_that_are_too_poor_are_not_obeyed(tmp_path: Path) -> None:
         UgatConfig(least_accuracy=1.5)
 
 
+@pytest.mark.slow
 def test_another_directory_can_be_the_real_world(tmp_path: Path) -> None:
     street = load_scenario("single-v1").write(tmp_path / "street")
     config = replace(

@@ -320,6 +320,7 @@ def test_both_groundings_fit_and_ground_with_all_inputs(grounding: Any) -> None:
     assert not torch.equal(made.local.of(data), made.local.of(other))
 
 
+@pytest.mark.slow
 def test_a_run_finds_the_neighbours_by_itself(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

@@ -17,7 +17,7 @@ from ugat_marl.policies import DQN, DQNConfig, RollOutStopped, make_rule
 MAKE = partial(parallel_env, "single-v1", "V4", duration_s=120, observation="movements")
 
 
-@pytest.mark.parametrize("most_delay_s", [0, 3])
+@pytest.mark.parametrize("most_delay_s", [0, pytest.param(3, marks=pytest.mark.slow)])
 @pytest.mark.parametrize("rule", [None, "largest-queue:20"])  # which remembers its episode
 def test_an_executor_plays_the_same(most_delay_s: int, rule: str | None) -> None:
     env = MAKE()

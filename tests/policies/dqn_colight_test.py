@@ -261,6 +261,7 @@ def test_learns_what_only_the_neighbour_sees_and_a_plain_network_cannot():
     assert reached[1] < 0.6
 
 
+@pytest.mark.slow
 def test_learns_toy_traffic_with_unequal_intersections():
     env = ToyTraffic(steps=40)
     structure = Structure("colight", neighbours=((1,), (0, 2), (1,)))

@@ -187,6 +187,7 @@ def test_reaches_the_optimum_where_equal_sights_ask_for_different_actions():
     assert play(ParityEnv(length=100), policy, seed=99) == 1.0
 
 
+@pytest.mark.slow
 def test_unequal_agents_come_close_to_the_rule_that_knows_toy_traffic():
     env = ToyTraffic(steps=40)
     config = DQNConfig(hidden=(32, 32), epsilon_decay_decisions=800, shared=True)

@@ -102,6 +102,7 @@ def test_lessons_and_decisions_have_one_scale() -> None:
         assert torch.equal(learner._tensors()[name], taught[name])
 
 
+@pytest.mark.slow
 def test_the_best_of_the_standard_rules_is_found(env: TrafficEnv) -> None:
     heard: list[str] = []
     name, teacher = find_teacher(env, BEST, 3, heard.append)

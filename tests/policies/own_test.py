@@ -106,6 +106,7 @@ def trained(folder: Path, learner: str, *words: str) -> int:
     return main([*call, *SHORT, *FEW, "--out", str(folder), *words])
 
 
+@pytest.mark.slow
 @pytest.mark.usefixtures("algorithm")
 def test_a_learner_with_two_methods_has_its_row_in_a_table(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]

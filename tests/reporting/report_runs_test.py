@@ -273,6 +273,7 @@ def test_what_is_broken_is_named(run: Path, name: str, how: str) -> None:
         assert any(picture.name == "first-gate" for picture in made.pictures)
 
 
+@pytest.mark.slow
 @pytest.mark.usefixtures("quick_pictures")
 def test_no_damage_is_a_traceback(run: Path, tmp_path: Path) -> None:
     """Every file cut at, and disturbed at, many places."""

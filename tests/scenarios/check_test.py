@@ -371,7 +371,10 @@ MAPS = ("arterial4x4", "cologne1", "cologne3", "cologne8", "grid4x4", "ingolstad
 
 @needs_resco
 @pytest.mark.parametrize("phases", ["programme", "conflict-free", "permitted"])
-@pytest.mark.parametrize("name", MAPS)
+@pytest.mark.parametrize(
+    "name",
+    [pytest.param(name, marks=pytest.mark.slow if name == "ingolstadt21" else ()) for name in MAPS],
+)
 def test_every_resco_map_goes_through(name: str, phases: str) -> None:
     assert name in resco_maps()
     facts = survey(load_scenario(f"resco:{name}").with_control(phases=phases))

@@ -112,6 +112,7 @@ def test_a_drawn_day_keeps_all_that_is_not_a_vehicle(
         assert tags(derived) == tags(scenario)
 
 
+@pytest.mark.slow
 def test_demand_in_additional_files_is_drawn_and_counted_once(
     crossing: Callable[..., Path],
 ) -> None:

@@ -115,6 +115,7 @@ def test_an_episode_need_not_know_what_comes_long_after_it(crossing: Crossing) -
         check_demand(scenario, network, whole=False)
 
 
+@pytest.mark.slow
 def test_a_long_file_is_never_in_memory(crossing: Crossing) -> None:
     """20 MB of vehicles: counted, looked at and hashed in a few MB."""
     line = '<vehicle id="v{0}" depart="{1:.3f}"><route edges="W_C C_E"/></vehicle>' + " " * 900

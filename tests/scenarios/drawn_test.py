@@ -40,6 +40,7 @@ def drawn(tmp_path_factory: pytest.TempPathFactory) -> dict[int, Scenario]:
     return {seed: draw_scenario(folder / f"seed{seed}", seed) for seed in SEEDS}
 
 
+@pytest.mark.slow
 def test_every_network_passes_the_check(drawn: dict[int, Scenario]) -> None:
     for seed, scenario in drawn.items():
         facts = survey(scenario)
@@ -178,7 +179,7 @@ def open_vehicles(scenario: Scenario, duration_s: float) -> tuple[float, float]:
     return due, due - float(played.values(name, "sim", "throughput")[0])
 
 
-@pytest.mark.parametrize("seed", [20, 21, 22])
+@pytest.mark.parametrize("seed", [20, *(pytest.param(n, marks=pytest.mark.slow) for n in (21, 22))])
 def test_queues_grow_well_beyond_capacity_and_not_well_below(seed: int, tmp_path: Path) -> None:
     """The load is an estimate: just above 1 some networks still flow."""
     growth: dict[float, float] = {}

@@ -130,6 +130,7 @@ def test_every_episode_has_a_process_of_its_own(crossing: Crossing) -> None:
     assert eventually(lambda: not any(map(alive, pids)), 1)
 
 
+@pytest.mark.slow
 @needs_proc
 def test_resets_leak_nothing(crossing: Crossing, temporary: Path) -> None:
     env = parallel_env(crossing())

@@ -53,6 +53,7 @@ def test_a_box_is_as_large_as_asked_for_at_any_latitude() -> None:
     assert not box.overlaps(Box.around((25.01, 60.0), 400))
 
 
+@pytest.mark.slow
 def test_the_same_seed_makes_the_same_scenario(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

@@ -31,6 +31,7 @@ def test_beyond_capacity_only_the_total_queue_follows_travel_times() -> None:
     assert wrong_pairs(rows, "queue")
 
 
+@pytest.mark.slow
 @pytest.mark.skipif(not resco_maps(), reason="sumo-rl is not installed")
 def test_ingolstadt7_as_it_comes() -> None:
     """The lanes at its lights begin 1 to 140 m before the stop line."""

@@ -49,7 +49,7 @@ def overlap(window: list[float], truth: tuple[float, float]) -> float:
     return both / (max(window[1], truth[1]) - min(window[0], truth[0]))
 
 
-QUICK = {"signals", "detectors"}
+QUICK = {"detectors"}
 
 
 @pytest.mark.parametrize(

@@ -74,6 +74,7 @@ def test_drivers_are_found_behind_an_error_of_measurement(street, tmp_path: Path
     assert found["verdict"] == "explained", found["sentence"]
 
 
+@pytest.mark.slow
 def test_an_error_of_measurement_alone_leaves_the_traffic_as_it_is(street, tmp_path: Path) -> None:
     found = street.diagnose(street.measure("detector_offset=advance,-12"), tmp_path)
     assert [effect["name"] for effect in found["effects"]] == ["detector_offset"]

@@ -31,6 +31,7 @@ def run(street, measured: MeasuredData, out: Path, **options: Any) -> dict[str, 
     return street.diagnose(measured, out, **{"among": DETECTORS, "effort": FEW, **options})
 
 
+@pytest.mark.slow
 def test_the_same_inputs_give_the_same_file(street, measured: MeasuredData, tmp_path: Path) -> None:
     def once(name: str, **options: Any) -> bytes:
         run(street, measured, tmp_path / name, **options)
@@ -133,7 +134,7 @@ def counts_of(measured: MeasuredData, every_s: float) -> MeasuredData:
     )
 
 
-@pytest.mark.parametrize("every_s", [300.0, 600.0])
+@pytest.mark.parametrize("every_s", [300.0, pytest.param(600.0, marks=pytest.mark.slow)])
 def test_counts_alone_can_show_a_detector_that_misses_vehicles(
     every_s: float, street, tmp_path: Path
 ) -> None:

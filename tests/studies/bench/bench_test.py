@@ -217,6 +217,7 @@ def test_bench_env(tmp_path: Path) -> None:
     assert json.loads(out.read_text())["settings"]["rounds"] == 2
 
 
+@pytest.mark.slow
 def test_bench_learning() -> None:
     report = LearningBench(
         SCENARIO, rounds=2, duration_s=200, warmup_decisions=40, updates=3, repetitions=3

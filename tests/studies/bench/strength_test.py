@@ -25,6 +25,7 @@ def test_it_judges_now_and_then_and_at_the_end_after_every_episode() -> None:
     assert marks == [(5, 10, 15, 18, 19, 20), (1, 2)]
 
 
+@pytest.mark.slow
 def test_it_measures_what_training_and_evaluating_by_hand_give(tmp_path: Path) -> None:
     out = tmp_path / "strength.json"
     config = DQNConfig(warmup_decisions=10, batch_size=4)

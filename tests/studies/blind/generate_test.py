@@ -103,6 +103,7 @@ def _values(item: object) -> list[str]:
     return [x for x in (place,) if x] + [f"{value:.12g}" for value in parameters.values()]
 
 
+@pytest.mark.slow
 def test_the_same_seed_draws_the_same_test(
     test_folder: tuple[Path, Blueprint], tmp_path: Path
 ) -> None:
