@@ -59,6 +59,7 @@ from .ugat import Ugat as Ugat
 from .uncertainty import UNCERTAINTY_METHODS as UNCERTAINTY_METHODS
 from .view import InputsConfig as InputsConfig
 from .view import neighbours_of as neighbours_of
+from .worlds import EPISODES_PER_DELAY as EPISODES_PER_DELAY
 from .worlds import RecordedWorld as RecordedWorld
 from .worlds import RollOutSettings as RollOutSettings
 from .worlds import SimulatedWorld as SimulatedWorld
