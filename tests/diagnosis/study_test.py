@@ -136,6 +136,13 @@ def test_larger_networks_are_simulated_for_fewer_days() -> None:
     assert all(effort.test <= effort.base for effort in efforts)
 
 
+def test_each_stretch_of_the_day_has_some_days() -> None:
+    hours = [Period(f"{d} {h}", h, h + 1, "fit", {}, {}) for d in "ab" for h in range(10)]
+    assert effort_for(1, hours[:1]) == effort_for(1, [*hours[:3], *hours[10:13]]) == Effort()
+    assert (effort_for(9, hours).base, effort_for(9, hours).test) == (60, 60)
+    assert effort_for(9, hours).fit == effort_for(9).fit
+
+
 @dataclass
 class Days:
     """Simulated days by hand.

@@ -106,7 +106,7 @@ def _counts(tallies: Sequence[Tally]) -> NDArray[np.float64]:
 
 # --- simulated days -------------------------------------------------------------------------------
 
-VERSION = 8
+VERSION = 9
 """Version of features and replays; tallies cached under another version are not used."""
 
 _SUPPLEMENTARY = "between "
@@ -516,6 +516,8 @@ class Engine:
         faults = tuple(effect for effect in effects if _after_simulation(effect))
         physics = tuple(effect for effect in effects if not _after_simulation(effect))
         key, period = self._key(physics, number), self.periods[number % len(self.periods)]
+        if self._replay.answering:  # an error of detectors changes the arrivals that are answered
+            key += repr(tuple(map(str, self._detection)))
         with self._of_days:
             day = self._days.get(key)
             new = day is None

@@ -8,7 +8,9 @@ wait anywhere on the detector.
 
 from __future__ import annotations
 
+import dataclasses
 import functools
+import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 
@@ -95,6 +97,7 @@ class DetectorLayout:
         exits: Outgoing lanes with an exit detector: index of the intersection, lane, detector.
         detectors: All detectors.
         owner: SUMO id of the traffic light, by detector.
+        begin_s: Begin of the scenario, s, at which no vehicle waits; inf if it is not known.
     """
 
     intersections: tuple[str, ...]
@@ -102,10 +105,18 @@ class DetectorLayout:
     exits: tuple[tuple[int, str, str], ...]
     detectors: tuple[Detector, ...]
     owner: Mapping[str, str]
+    begin_s: float = math.inf
 
     @classmethod
-    def of(cls, network: Network, detectors: Sequence[Detector]) -> DetectorLayout:
+    def of(
+        cls, network: Network, detectors: Sequence[Detector], begin_s: float = math.inf
+    ) -> DetectorLayout:
         """Find the traffic light and the lane of every detector.
+
+        Args:
+            network: The network.
+            detectors: The detectors.
+            begin_s: Begin of the scenario, s.
 
         Raises:
             MeasuredDataError: No detector is at an intersection with signals.
@@ -146,7 +157,7 @@ class DetectorLayout:
                 "check lane_id in detectors.csv"
             )
         names = tuple(intersection.id for intersection in network.intersections)
-        return cls(names, tuple(lanes), tuple(exits), tuple(detectors), owner)
+        return cls(names, tuple(lanes), tuple(exits), tuple(detectors), owner, begin_s)
 
     @functools.cached_property
     def places(self) -> tuple[tuple[int, str, str], ...]:
@@ -189,11 +200,21 @@ class DetectorLayout:
         return max(metres, 0.0) / of_lane.speed_mps
 
     def greens(self, period: Period) -> tuple[Greens, ...]:
-        """Return the greens of every lane that begin and end inside the period."""
+        """Return the greens of every lane that begin and end inside the period.
+
+        A green at its very begin may have begun before. It counts only at the begin of the
+        scenario, where nobody waits.
+        """
         greens_of_lanes: list[Greens] = []
         for lane in self.lanes:
             log = period.signals.get(self.intersections[lane.intersection], ())
-            greens_of_lanes.append(_greens(log, lane.links, period))
+            greens = _greens(log, lane.links, period)
+            if period.begin_s > self.begin_s and len(greens.start_s):
+                begun = greens.start_s > period.begin_s
+                greens = Greens(
+                    *(getattr(greens, each.name)[begun] for each in dataclasses.fields(Greens))
+                )
+            greens_of_lanes.append(greens)
         return tuple(greens_of_lanes)
 
 

@@ -480,10 +480,13 @@ def uncertainty(
     inverse = np.linalg.pinv(jacobian @ jacobian.T)
     influences: list[Array] = []
     days = days or model.tallies
+    stretches = {day.window for day in days}
     for day in days:
-        difference, _ = change_between(fitter.pools, [day], days)
+        alike = [other for other in days if other.window == day.window]
+        difference, _ = change_between(fitter.pools, [day], alike)
         influences.append(inverse @ (jacobian @ whitener(difference)))
     spread = np.atleast_2d(np.cov(np.stack(influences).T))
+    spread = spread * (len(days) - 1) / max(len(days) - len(stretches), 1)
     # measured periods and simulated days both vary
     covariance = spread * (1.0 / len(fitter.data) + 1.0 / len(model.tallies))
     grids = np.array([h.step for h, values in model.members for _ in values])

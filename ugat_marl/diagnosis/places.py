@@ -814,6 +814,8 @@ def _stuck(periods: Sequence[Period], thresholds: Thresholds) -> list[Hypothesis
         windows: list[tuple[float, float]] = []
         for period in periods:
             seen = period.passages[name]
+            if not len(seen):
+                break
             time = np.nan_to_num(seen.off_s, nan=period.end_s) - np.nan_to_num(
                 seen.on_s, nan=period.begin_s
             )

@@ -204,6 +204,8 @@ class Reference:
         self._thresholds = pools.thresholds
         stacked = _stack(pools, tallies)
         self.stretches = prior.stretches if prior else _stretches(stacked, tallies)
+        self._own_means = max(1, len(self.stretches)) if prior is None else 1
+        self._of_stretches = prior._of_stretches if prior else {}
         stacked = self._level(stacked, tallies)
         partners = self._level(_stack(pools, paired), paired) if paired else {}
         self.blocks: dict[str, Block] = {}
@@ -212,6 +214,8 @@ class Reference:
             block = self._block(sums, before, partners.get(name), name)
             known = before.doubt if before else 0.0
             self.blocks[name] = replace(block, doubt=doubt[name] if doubt else known)
+        if prior is None:
+            self._of_stretches = {name: block.error for name, block in self.blocks.items()}
 
     def _level(self, stacked: dict[str, Array], tallies: Sequence[Tally]) -> dict[str, Array]:
         """Take the means of stretches off the sums of days ``(days, members, features, 2)``."""
@@ -227,7 +231,7 @@ class Reference:
     def _block(self, sums: Array, prior: Block | None, partner: Array | None, name: str) -> Block:
         """Make a block from sums ``(days, members, features, 2)``."""
         timed = name == "time"
-        mean, variance, weight, residual = _moments(sums, self._thresholds)
+        mean, variance, weight, residual = _moments(sums, self._thresholds, self._own_means)
         if timed:
             variance = _smoothed(mean, variance, self._thresholds)
         error = variance / len(sums)
@@ -285,6 +289,10 @@ class Reference:
             sums = {name: several.sum(axis=0) for name, several in days.items()}
         else:
             sums = self.pools.pool(sum_of(data))
+        # The mean of a stretch comes from the days of that stretch alone. Over all stretches these
+        # errors cancel; over k of W they leave W / k - 1 times the error of the mean of all days.
+        measured = {day.window for day in data}
+        missing = max(1, len(self.stretches)) / len(measured) - 1.0 if self.stretches else 0.0
         total = penalty = 0.0
         parts: dict[str, float] = {}
         z: dict[str, Array] = {}
@@ -294,7 +302,7 @@ class Reference:
             weight = sums[name][..., 1] / len(data)
             used = other.used & (weight >= self._thresholds.least_measured)
             value = sums[name][..., 0] / np.maximum(sums[name][..., 1], 1e-9)
-            variance = block.noise(weight, len(data))
+            variance = block.noise(weight, len(data)) + missing * self._of_stretches[name]
             if extra is not None:
                 variance = variance + extra[name]
             mean = np.where(np.isfinite(block.mean), block.mean, other.mean)
@@ -400,11 +408,18 @@ def _smoothed(mean: Array, variance: Array, thresholds: Thresholds) -> Array:
     return np.maximum(mixed, thresholds.least_count_variance)
 
 
-def _moments(sums: Array, thresholds: Thresholds) -> tuple[Array, Array, Array, Array]:
+def _moments(
+    sums: Array, thresholds: Thresholds, means: int = 1
+) -> tuple[Array, Array, Array, Array]:
     """Return ratio estimates from sums ``(days, members, features, 2)``.
 
     With sums s and numbers of observations n: mean m = Σs / Σn, residual of a day
-    r = (s - m n) / mean(n), variance = Σr² / (days - 1).
+    r = (s - m n) / mean(n), variance = Σr² / (days - means).
+
+    Args:
+        sums: Sums and numbers of observations.
+        thresholds: Numbers of the method.
+        means: Number of means that were taken off the days: one for each stretch of the day.
 
     Returns:
         Mean, variance of one day, observations per day: all ``(members, features)``; residuals
@@ -414,7 +429,7 @@ def _moments(sums: Array, thresholds: Thresholds) -> tuple[Array, Array, Array, 
     weight = total[..., 1] / len(sums)
     mean = total[..., 0] / np.maximum(total[..., 1], 1e-9)
     residual = (sums[..., 0] - mean * sums[..., 1]) / np.maximum(weight, 1e-9)
-    variance = (residual**2).sum(axis=0) / max(len(sums) - 1, 1)
+    variance = (residual**2).sum(axis=0) / max(len(sums) - means, 1)
     grain = (_grain(sums.shape[2], thresholds) / np.maximum(weight, 1.0)) ** 2
     mean = np.where(weight > 0, mean, np.nan)
     return mean, np.maximum(variance, grain), weight, residual

@@ -19,6 +19,7 @@ from ugat_marl.data import Finding, MeasuredData, is_actuated
 from ugat_marl.diagnosis.engine import Budget, Engine, default_cache
 from ugat_marl.diagnosis.features import (
     BIN_FEATURES,
+    COUNT_FEATURES,
     DetectorLayout,
     Greens,
     Tally,
@@ -47,7 +48,13 @@ from ugat_marl.diagnosis.residual import Directed, Directions, Null
 from ugat_marl.diagnosis.select import MOVES_OF_A_VALUE, Selector
 from ugat_marl.diagnosis.statistics import Array, Distance, Pools, Reference, change_between, sum_of
 from ugat_marl.diagnosis.supplementary_data import SupplementaryData
-from ugat_marl.diagnosis.thresholds import EFFORTS, LEAST_EFFORT, Effort, Thresholds
+from ugat_marl.diagnosis.thresholds import (
+    DAYS_OF_A_STRETCH,
+    EFFORTS,
+    LEAST_EFFORT,
+    Effort,
+    Thresholds,
+)
 from ugat_marl.effects import Effect, effect_from_record
 from ugat_marl.errors import MeasuredDataError, OptionError, counted
 from ugat_marl.parallel import Workers
@@ -173,12 +180,12 @@ class Study:
         network, thresholds = Network.read(scenario), config.thresholds
         detectors, findings = _compared(scenario, measured, thresholds)
         measured = _noted(measured, findings)
-        layout = DetectorLayout.of(network, detectors)
+        layout = DetectorLayout.of(network, detectors, scenario.settings.begin_s)
         ruled_out = frozenset(name for finding in measured.findings for name in finding.rules_out)
         allowed = library(config.leave_out) - ruled_out
         periods = _fitted_periods(measured, config.thresholds)
         answering = _answering(measured, layout.intersections)
-        effort = config.effort or effort_for(len(layout.intersections))
+        effort = config.effort or effort_for(len(layout.intersections), measured.periods)
         budget = config.budget()
         supplementary = SupplementaryData.of(measured)
         fit = _tallies(layout, measured, periods, thresholds, supplementary)
@@ -350,7 +357,8 @@ class Study:
         known = {number: day.tally for number, day in enumerate(days) if number not in aside}
         tallies = list(known.values())
         reference = Reference(self.pools, tallies, speeds=self.speeds, doubt=self.doubt())
-        counts = sum(float(day.bins[:3].sum()) for day in tallies) / len(tallies)
+        counted = len(COUNT_FEATURES)
+        counts = sum(float(day.bins[:counted].sum()) for day in tallies) / len(tallies)
         if counts < 1.0:
             raise MeasuredDataError(
                 f"scenario {self.scenario.id!r}: in the simulation hardly a vehicle reaches the "
@@ -417,7 +425,11 @@ class Study:
         numbers = self.engine.first(thresholds.pattern_days)
         with reporter.task("patterns in what is left", len(numbers)) as advance:
             simulated = self.engine.reduced(
-                effects, numbers, f"cells of {thresholds.pattern_bin_s:g} s", cells, advance
+                effects,
+                numbers,
+                f"cells of {thresholds.pattern_bin_s:g} s, {thresholds.most_pattern_bins}",
+                cells,
+                advance,
             )
         # Under signals that follow the traffic, simulated counts are the measured ones.
         quantities = QUANTITIES if self.other_days is None else QUANTITIES[:-1]
@@ -453,6 +465,7 @@ class Study:
             OutOfTime: The budget does not suffice for the days that `doubt` needs.
         """
         data = sum_of(self.fit)
+        supplied = {name: sums[..., 1:] > 0 for name, sums in data.supplementary.items()}
         counted, known = data.sums[..., 1:] > 0, data.counted >= data.days
         width = min(known.shape[-1], *(day.bins.shape[-1] for day in tallies))
         seen = [
@@ -460,7 +473,9 @@ class Study:
                 day.sums * counted,
                 day.bins[..., :width] * known[..., :width],
                 day.days,
-                supplementary=day.supplementary,
+                supplementary={
+                    name: sums * supplied[name] for name, sums in day.supplementary.items()
+                },
                 window=day.window,
             )
             for day in tallies
@@ -591,9 +606,20 @@ def _pools(
     return Pools.of(layout, thresholds, together, supplementary.labels if supplementary else None)
 
 
-def effort_for(intersections: int) -> Effort:
-    """Return the numbers of days that suit the size of a network."""
-    return next((effort for most, effort in EFFORTS if intersections <= most), LEAST_EFFORT)
+def effort_for(intersections: int, periods: Sequence[Period] = ()) -> Effort:
+    """Return the numbers of days that suit the size of a network, and the stretches of the day.
+
+    Args:
+        intersections: Number of intersections.
+        periods: The measured periods. Each stretch of the day has a mean of its own, so that tests
+            need some days of each.
+    """
+    effort = next((effort for most, effort in EFFORTS if intersections <= most), LEAST_EFFORT)
+    stretches = len({(period.begin_s, period.end_s) for period in periods})
+    if stretches < 2:
+        return effort
+    least = DAYS_OF_A_STRETCH * stretches
+    return replace(effort, base=max(effort.base, least), test=max(effort.test, least))
 
 
 def _compared(

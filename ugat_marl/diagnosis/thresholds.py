@@ -36,6 +36,11 @@ more and says more, since each intersection shows effects on the whole network. 
 simulated."""
 LEAST_EFFORT = Effort(24, 2, 3, 16)
 """Effort for larger networks."""
+DAYS_OF_A_STRETCH = 6
+"""Least number of days of the scenario as it is, and of a test, for each stretch of the day.
+
+A test compares halves of its days, and each stretch has a mean of its own. Halved: with one day of
+a stretch in each half no noise can be estimated, and hardly anything is told."""
 
 
 @dataclass(frozen=True)

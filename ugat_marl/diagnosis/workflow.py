@@ -111,7 +111,8 @@ def diagnose(
     named = (*timing, *named)
     # errors of this street's detectors are no part of the model of its traffic
     traffic = [effect for effect in named if not effect.on_detectors]
-    refused = diagnosis.not_corrected is not None and not traffic
+    unexplained = diagnosis.not_corrected is not None or diagnosis.verdict == "unknown"
+    refused = unexplained and not traffic
     corrected = None if refused or not named else apply_effects(scenario, traffic)
     _put_corrected(corrected, directory / CORRECTED)
     if corrected is not None:
@@ -500,7 +501,13 @@ def _named(best: Tested, selected: Selected, half_interval: float) -> tuple[Name
         for rival in selected.rivals
         if {hypothesis.name for hypothesis, _ in rival.members} != names
     ]
-    worse_by = min(others) - best.model.cost if others else None
+    # costs of as many days: more days lower the cost of the same model
+    alike = [
+        rival.cost
+        for rival in selected.rivals
+        if {hypothesis.name for hypothesis, _ in rival.members} == names
+    ]
+    worse_by = min(others) - min(alike, default=best.model.cost) if others else None
     grounds = SearchGrounds(best.model.distance.total, worse_by)
     effects: list[NamedEffect] = []
     for place, (hypothesis, values) in enumerate(best.model.members):
@@ -550,10 +557,15 @@ def _alternatives(conclusion: Conclusion, selected: Selected) -> tuple[Explanati
     others = [
         rival
         for rival in selected.rivals
-        if rival.members != chosen.members and rival not in conclusion.indistinct
+        if _keys(rival) != _keys(chosen) and rival not in conclusion.indistinct
     ]
     ranking = [*conclusion.indistinct, *others][:ALTERNATIVES]
     return tuple(_explanation(model) for model in ranking)
+
+
+def _keys(model: Fitted) -> set[tuple[object, ...]]:
+    """Return which effects a model holds, without their values."""
+    return {hypothesis.key for hypothesis, _ in model.members}
 
 
 def _explanation(model: Fitted) -> Explanation:

@@ -174,15 +174,20 @@ def _of_signals(measured: MeasuredData, scenario: Scenario, network: Network) ->
 
 
 def is_actuated(periods: Sequence[Period], tls: str) -> bool:
-    """Return True if a green has more different lengths than a fixed programme gives it."""
-    lengths: dict[str, set[float]] = {}
+    """Return True if a green has more different lengths than a fixed programme gives it.
+
+    Lengths are compared within a period: plans of the day differ from one to the other.
+    """
     for period in periods:
+        lengths: dict[str, set[float]] = {}
         changes = period.signals.get(tls, ())
         # The ends of the period cut the first and the last state short.
         for (begin_s, state), (end_s, _) in itertools.pairwise(changes[1:]):
             if set(state) & GREEN:
                 lengths.setdefault(state, set()).add(round(end_s - begin_s))
-    return any(len(distinct) >= MANY_LENGTHS for distinct in lengths.values())
+        if any(len(distinct) >= MANY_LENGTHS for distinct in lengths.values()):
+            return True
+    return False
 
 
 def _has_yellow(periods: Sequence[Period], tls: str) -> bool:
