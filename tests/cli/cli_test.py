@@ -62,6 +62,9 @@ def complaint(capsys: pytest.CaptureFixture[str], *arguments: str) -> str:
         (["train", "single-v1", "--fit.uncertainty", "ensembel"], "ensemble"),
         (["train", "single-v1", "--fit.members", "0"], "1 to 100"),
         (["train", "single-v1", "--workers", "0"], "--workers 0: must be at least 1"),
+        (["scenario", "new", "x", "--grid", "1x1", "--vph", "9", "--duration-s", "nan"], "seconds"),
+        (["scenario", "new", "x", "--grid", "1x1", "--vph", "9", "--begin-s", "inf"], "--begin-s"),
+        (["record", "single-v1", "--out", "x", "--periods", "0"], "--periods 0: must be at least"),
     ],
 )
 def test_a_wrong_call_is_one_line_with_the_nearest_name(
@@ -75,7 +78,7 @@ def test_a_wrong_call_is_one_line_with_the_nearest_name(
     [
         ("scenario check single-v1 --conformance --headroom 2 --json", "--headroom, --json"),
         ("scenario check single-v1 --observation queue", "--observation"),
-        ("plan single-v1 --out p --lights 1=A1 --force", "--lights, --force"),
+        ("plan single-v1 --out p --lights 1=A1", "--lights"),
         ("plan single-v1 --out p --seeds 5", "--seeds"),
         ("plan single-v1 --out p --apply p.csv --domain V4 --first-seed 3", "--domain, --first-"),
         ("rollout single-v1 --video f.gif --episodes 5 --workers 2", "--episodes, --workers"),

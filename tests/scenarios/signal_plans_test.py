@@ -340,7 +340,7 @@ INTID,TYPE,X,Y,Z,DESCRIPTION
 Lane Group Data
 RECORDNAME,INTID,NBL,NBT,NBR,SBL,SBT,SBR,EBL,EBT,EBR,WBL,WBT,WBR,PED
 Lanes,7,1,2,0,1,2,0,1,2,0,1,2,0,
-Phase1,7,3,8,,7,4,,5,2,,1,6,,
+Phase1,7,3,{nbt},,7,4,,5,2,,1,6,,
 PermPhase1,7,,,,,,,2,,,,,,
 [Timeplans]
 Timing Plan Settings
@@ -348,7 +348,7 @@ RECORDNAME,INTID,DATA
 Control Type,7,0
 Cycle Length,7,90.0
 Referenced To,7,{referenced}
-Reference Phase,7,206
+Reference Phase,7,{reference}
 Offset,7,{offset}
 [Phases]
 Phasing Data
@@ -357,13 +357,15 @@ BRP,7,111,112,211,212,121,122,221,222
 MinGreen,7,4,4,4,4,4,4,4,4
 MaxGreen,7,{d1},30,10,20,10,30,10,20
 Yellow,7,3,3,3,3,3,3.5,3,3
-AllRed,7,2,2,2,2,2,1.5,2,2
+AllRed,7,{allred},2,2,2,2,1.5,2,2
 """
 
 
 def synchro(folder: Path, **values: object) -> Path:
     """A file as Synchro writes it: barrier 1 is 50 s, barrier 2 40 s."""
-    given: dict[str, object] = {"referenced": 3, "offset": 30, "d1": 10}
+    given: dict[str, object] = {
+        "referenced": 3, "reference": 206, "offset": 30, "d1": 10, "nbt": 8, "allred": 2,
+    }  # fmt: skip
     text = UTDF.format(**(given | values))
     (folder / "synchro.csv").write_text(text)
     return folder / "synchro.csv"
@@ -503,6 +505,9 @@ def test_offsets_refer_to_parts_of_phases(
         ({"d1": 12}, (), "the rings differ before the end of barrier 1 (ring 1 52 s, ring 2 50 s)"),
         ({"d1": "ten"}, (), "maxgreen = 'ten' is not a number"),
         ({"referenced": 4}, (), "Referenced To = 4: offsets are read that refer to"),
+        ({"reference": 9}, (), "Reference Phase = 9: the plan has no such phase"),
+        ({"reference": 2.7}, (), "Reference Phase = 2.7 is not a whole number"),
+        ({"allred": -3, "d1": 15}, (), "allred = '-3' is not a time of 0 to 3600 s"),
         ({}, ("8=A1",), "has no plan for an intersection '8'; it has 7"),
         ({}, ("7=B1",), "'B1' is not an agent of the scenario; its agents are A1"),
         ({}, ("7",), "--lights 7: give INTID=LIGHT"),
@@ -519,6 +524,14 @@ def test_files_of_synchro_that_are_wrong(
     words = ["plan", "single-v1", "--apply", str(file), "--out", str(tmp_path / "x")]
     assert main([*words, *(["--lights", *lights] if lights else [])]) == 2
     assert says in capsys.readouterr().err
+
+
+def test_a_movement_that_goes_with_another_turn_is_noted(single: Scenario, tmp_path: Path) -> None:
+    _, notes = read_utdf(synchro(tmp_path, nbt=""), Network.read(single), {})
+    assert notes == (
+        "light 'A1': NBT has no phase in the file; it goes with another turn of its approach, in "
+        "phase 3",
+    )
 
 
 def test_a_plan_becomes_a_scenario(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:

@@ -141,8 +141,9 @@ class Field:
             if place == same:
                 raise OptionError(f"{other} and {one} are one file, {named[other]}; name two")
         if self.health is not None and self.health.exists():
-            with contextlib.suppress(UgatMarlError, TypeError):
-                if "state" in read_json(self.health, OptionError):
+            with contextlib.suppress(UgatMarlError):
+                held = read_json(self.health, OptionError)
+                if isinstance(held, dict) and {"state", "written_at", "pid"} <= held.keys():
                     return
             raise OptionError(
                 f"--health {self.health}: holds something else than the state of a loop, which "

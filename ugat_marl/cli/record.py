@@ -9,7 +9,7 @@ from typing import Annotated
 from rich.console import Console
 from tyro.conf import Positional, arg
 
-from ugat_marl.cli.arguments import LengthS, Workers
+from ugat_marl.cli.arguments import LengthS, Workers, require_numbers
 from ugat_marl.data import as_counts, require_interval, require_replaceable, write_measured
 from ugat_marl.effects import load_scenario, scenario_in_domain
 from ugat_marl.experiments import policy_factory, record
@@ -71,6 +71,8 @@ class Record:
         policy = policy_factory(self.policy)
         if self.counts_every_s is not None:
             require_interval(self.counts_every_s)
+        require_numbers(1, periods=self.periods, workers=self.workers)
+        require_numbers(0, seed=self.seed)
         require_replaceable(self.out)
         require_writable(self.out / "periods.csv")
         measured = record(

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import shlex
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, fields
@@ -31,6 +32,7 @@ from ugat_marl.scenarios import (
     from_sumo,
     from_turning_shares,
     grid_roads,
+    is_configuration,
     make_draft,
     make_scenario,
 )
@@ -124,6 +126,9 @@ class ScenarioNew:
 
     def run(self, console: Console) -> int:
         """Make the scenario and print its facts."""
+        for name, value in (("begin_s", self.begin_s), ("duration_s", self.duration_s)):
+            if value is not None and not 0 <= value < math.inf:
+                raise OptionError(f"--{name.replace('_', '-')} {value}: give seconds, 0 or more")
         roads, vehicles = self._sources()
         if vehicles is None and not self._brings_vehicles():
             return self._draft(roads, console)
@@ -213,7 +218,7 @@ class ScenarioNew:
 
     def _brings_vehicles(self) -> bool:
         """Return True if the source of roads has vehicles of its own."""
-        configured = self.sumo is not None and ".sumocfg" in self.sumo.name
+        configured = self.sumo is not None and is_configuration(self.sumo)
         return bool(self.draw is not None or self.cityflow or configured)
 
     def _vehicles(self) -> VehicleSource | None:
@@ -229,7 +234,7 @@ class ScenarioNew:
             return None
         begin_s, length_s = episode_of(self.sumo)
         begin_s = begin_s if self.begin_s is None else self.begin_s
-        length_s = self.duration_s or length_s
+        length_s = length_s if self.duration_s is None else self.duration_s
         if self.vph is not None:
             return from_turning_shares(self.vph, self.turns, begin_s, length_s, self.seed)
         if self.counts is not None:

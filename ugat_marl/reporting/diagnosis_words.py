@@ -222,6 +222,8 @@ def _usual(row: CriteriaRow) -> str:
     """Return GEH and the number of FHWA's four criteria that are met."""
     below = row.geh_below_5
     text = f"GEH < 5 on {share(below)} of counts"
+    if below is not None and below < GEH_SHARE and share(below) == share(GEH_SHARE):
+        text = f"GEH < 5 on {100 * below:.2f} % of counts"
     if below is not None:
         text += f" ({'met' if below >= GEH_SHARE else 'not met'}, usual: {share(GEH_SHARE)})"
     met = _fhwa(row)

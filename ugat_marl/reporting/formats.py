@@ -23,7 +23,7 @@ def number(value: Any, digits: int = 3) -> str:
         return "–"
     if abs(value) >= 10**digits - 0.5:
         return f"{value:,.0f}".replace(",", "\u00a0").replace("-", "−")
-    return f"{value:.{digits}g}".replace("-", "−")
+    return f"{value + 0.0:.{digits}g}".replace("-", "−")
 
 
 def signed(value: Any) -> str:
@@ -37,10 +37,10 @@ def share(value: Any) -> str:
     if value is None or math.isnan(value):
         return "–"
     percent = 100 * float(value)
-    if percent < 0:
+    if percent < -0.5:
         return f"−{share(-value)}"
     for digits in (0, 1, 2):
-        text = f"{percent:.{digits}f}"
+        text = fixed(percent, digits)
         if text.partition(".")[0] != "100" or value >= 1:
             return f"{text} %"
     return "99.99 %"
@@ -53,30 +53,47 @@ def chance(value: Any) -> str:
     return "< 0.001" if value < 0.001 else f"{value:.2g}"
 
 
+def fixed(value: float, decimals: int) -> str:
+    """Return a number with fixed decimals; what rounds to zero has no sign."""
+    text = f"{value:.{decimals}f}"
+    return text.removeprefix("-") if float(text) == 0 else text
+
+
 def number_text(value: float) -> str:
-    """Return three significant digits, or a whole number above a hundred; "-" for nan."""
+    """Return a number with 0 to 2 decimals, fewer the larger it is; "-" for nan."""
     if math.isnan(value):
         return "-"
     if abs(value) >= 99.95:
-        return f"{value:.0f}"
-    return f"{value:.1f}" if abs(value) >= 0.9995 else f"{value:.2f}"
+        return fixed(value, 0)
+    return fixed(value, 1 if abs(value) >= 0.9995 else 2)
 
 
 def share_text(value: float) -> str:
-    """Return a share of the regret with two decimals; a dash for nan."""
-    return "–" if math.isnan(value) else f"{value:.2f}".replace("-", "−")
+    """Return a share of the regret with two decimals, or more where it would become 1.00.
+
+    The best row alone has 1.00. A dash for nan.
+    """
+    if math.isnan(value):
+        return "–"
+    texts = (fixed(value, decimals) for decimals in (2, 3, 4))
+    return next((text for text in texts if value >= 1 or float(text) < 1), "0.9999").replace(
+        "-", "−"
+    )
 
 
 def percent_text(value: float) -> str:
-    """Return a signed share in per cent; a dash for nan."""
-    return "–" if math.isnan(value) else f"{'−' if value < 0 else '+'}{abs(100 * value):.0f} %"
+    """Return a signed share in per cent; what rounds to zero has no sign. A dash for nan."""
+    if math.isnan(value):
+        return "–"
+    text = fixed(100 * value, 0)
+    return f"{'+' if not text.startswith(('-', '0')) else ''}{text} %".replace("-", "−")
 
 
 def tick_text(value: float, _: Any = None) -> str:
     """Return the text of a number on a scale; the second argument is matplotlib's and unused."""
     if abs(value) >= 9_999.5:
         return f"{value:,.0f}".replace(",", "\u2009").replace("-", "−")
-    return f"{round(value, 6):.4g}".replace("-", "−")
+    return f"{round(value, 6) + 0.0:.4g}".replace("-", "−")
 
 
 PAGE_WIDTH = 140

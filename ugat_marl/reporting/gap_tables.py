@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 
 from rich.console import Group, RenderableType
@@ -10,7 +11,7 @@ from rich.text import Text
 
 from ugat_marl.envs import OBJECTIVE_MEASURES
 from ugat_marl.experiments import Evaluation, domains_by_gap, gap_matrix
-from ugat_marl.reporting.formats import number_text
+from ugat_marl.reporting.formats import fixed, number_text
 from ugat_marl.reporting.terminal import titled_table
 
 
@@ -28,7 +29,7 @@ def gap_matrix_table(evaluation: Evaluation) -> RenderableType:
     for policy, cells in gap_matrix(evaluation).items():
         start = evaluation.estimate(policy, first, "att_s").mean
         table.add_row(
-            Text(policy), number_text(start), *(f"{cell.cost.mean:+.1f}" for cell in cells.values())
+            Text(policy), number_text(start), *(_change(cell.cost.mean) for cell in cells.values())
         )
         worst = [
             f"{cell.worst.removeprefix('want-')}\n{cell.worst_cost:+.0f}"
@@ -109,3 +110,11 @@ def _by_domain(evaluation: Evaluation) -> RenderableType:
         )
         table.add_row(Text(domain), *map(number_text, values))
     return table
+
+
+def _change(percent: float) -> str:
+    """Return a change with its sign and one decimal; "-" for nan."""
+    if math.isnan(percent):
+        return "-"
+    text = fixed(percent, 1)
+    return text if text.startswith("-") or text == "0.0" else f"+{text}"

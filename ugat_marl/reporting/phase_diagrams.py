@@ -63,14 +63,14 @@ def draw_network(scenario: Scenario, out: Path, reporter: Reporter) -> list[Path
     taken = {"network"}
     with reporter.task("drawing intersections", len(network.intersections)) as advance:
         for intersection in network.intersections:
-            name = _file_name(intersection.id, taken)
             place = _Place(intersection, network, walks, _frame(intersection, network))
             count = len(intersection.phases)
             pages = [
                 range(first, min(first + _PER_PAGE, count)) for first in range(0, count, _PER_PAGE)
             ]
             for number, phases in enumerate(pages, 1):
-                page = f"{name}-{number}" if len(pages) > 1 else name
+                name = f"{intersection.id}-{number}" if len(pages) > 1 else intersection.id
+                page = _file_name(name, taken)
                 written += _sheet(page, place, scenario.id, phases).write(out)
             advance()
     return written

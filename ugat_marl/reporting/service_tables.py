@@ -10,7 +10,7 @@ from rich.text import Text
 
 from ugat_marl.data import level_of_service, mean_delay_s
 from ugat_marl.experiments import Evaluation
-from ugat_marl.reporting.formats import number_text
+from ugat_marl.reporting.formats import fixed, number_text
 from ugat_marl.reporting.light_names import LIGHT, LightNames
 from ugat_marl.reporting.page import Grid
 from ugat_marl.reporting.terminal import titled_table
@@ -44,8 +44,14 @@ def approach_text(vehicles: float, delay_s: float) -> str:
 
 
 def delay_text(delay_s: float) -> str:
-    """Return a control delay in s with its level of service, as in ``38.2 D``."""
-    return f"{number_text(delay_s)} {level_of_service(delay_s)}".strip()
+    """Return a control delay in s with its level of service, as in ``38.2 D``.
+
+    Where rounding would pass the limit of the level, there are more decimals, as in ``10.04 B``.
+    """
+    level, text = level_of_service(delay_s), number_text(delay_s)
+    if level and level_of_service(float(text)) != level:
+        text = fixed(delay_s, 2)
+    return f"{text} {level}".strip()
 
 
 def service_tables(evaluation: Evaluation, network: Network) -> list[RenderableType]:

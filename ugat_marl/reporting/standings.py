@@ -30,7 +30,8 @@ def standings_table(scenario: str, table: pl.DataFrame, name: str) -> Renderable
         for row in rows.filter(pl.col("domain") == domain).iter_rows(named=True):
             att = number_text(row["att_s"])
             if row["low_s"] is not None and row["low_s"] < row["high_s"]:
-                att += f" ({number_text(row['low_s'])}–{number_text(row['high_s'])})"
+                to = " to " if row["low_s"] < 0 else "–"
+                att += f" ({number_text(row['low_s'])}{to}{number_text(row['high_s'])})"
             shown.add_row(
                 "▶" if row["setting"] == name else "",
                 Text(row["setting"]),

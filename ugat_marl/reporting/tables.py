@@ -12,7 +12,7 @@ from ugat_marl.data import MEASURES
 from ugat_marl.diagnosis import PolicyGap, TravelTimeEstimate
 from ugat_marl.errors import counted
 from ugat_marl.experiments import Estimate, Evaluation, Tuned, check_run
-from ugat_marl.reporting.formats import number_text
+from ugat_marl.reporting.formats import number_text, share
 from ugat_marl.reporting.terminal import titled_table
 
 
@@ -109,7 +109,7 @@ def policy_gap_table(title: str, gaps: Mapping[str, PolicyGap], seeds: int) -> R
             *(number_text(time.mean) for time in times),
             number_text(gap.before),
             number_text(gap.after),
-            "-" if gap.shrink is None else f"{100 * gap.shrink:.0f} %",
+            share(gap.shrink),
         )
         if any(time.low is not None for time in times):
             table.add_row(*_dim("  95 % interval", *map(_limits, times)))

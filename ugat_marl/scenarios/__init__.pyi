@@ -37,6 +37,7 @@ from .importers.plan import read_road_plan as read_road_plan
 from .importers.sumo_files import episode_of as episode_of
 from .importers.sumo_files import from_routes as from_routes
 from .importers.sumo_files import from_sumo as from_sumo
+from .importers.sumo_files import is_configuration as is_configuration
 from .importers.turning_shares import from_turning_shares as from_turning_shares
 from .importers.turning_shares import poisson_arrivals as poisson_arrivals
 from .importers.turning_shares import weighted_choice as weighted_choice

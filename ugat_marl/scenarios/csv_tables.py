@@ -72,3 +72,12 @@ def rows_of(reader: csv.DictReader[str], path: Path) -> Iterator[dict[str, str]]
             yield row
     except csv.Error as error:
         raise ScenarioError(f"{path}, line {reader.line_num + 1}: not CSV ({error})") from None
+
+
+_FORMULA = "=+-@\t\r"
+"""First characters that make a spreadsheet read a text as a formula."""
+
+
+def as_text(cell: str) -> str:
+    """Return a cell that a spreadsheet takes for text, and not for a formula."""
+    return f"'{cell}" if cell and cell[0] in _FORMULA else cell

@@ -20,7 +20,7 @@ from pathlib import Path
 
 from ugat_marl.errors import ScenarioError, nearest
 from ugat_marl.files import Document, read_bytes, write_whole, xml_bytes
-from ugat_marl.scenarios.csv_tables import columns_of, delimiter_of, rows_of
+from ugat_marl.scenarios.csv_tables import as_text, columns_of, delimiter_of, rows_of
 from ugat_marl.scenarios.junctions import Link, foes_of, right_on_red_of, yields_of
 from ugat_marl.scenarios.network import Intersection, Network
 from ugat_marl.scenarios.phases import (
@@ -52,7 +52,8 @@ COLUMNS = ("light", "intersection", "cycle_s", "offset_s", "ring", "barrier", "p
            "split_s", "yellow_s", "all_red_s")  # fmt: skip
 _SAME_S = 0.05
 """Largest difference of times that count as equal, s: tables round to tenths."""
-_MOST_S = 3600.0
+LONGEST_S = 3600.0
+"""Longest time in a plan, s."""
 _LEAST_YELLOW_S = 3.0
 """Shortest usual yellow, s (MUTCD 2009, section 4D.26)."""
 _PROGRAM = "plan"
@@ -121,8 +122,8 @@ def check_plan(plan: SignalPlan, source: str) -> None:
         source: Name of its file in errors.
 
     Raises:
-        ScenarioError: A split is too short for its yellow and all-red, a movement is in no phase
-            with green, rings differ between two barriers, or the splits do not make the cycle.
+        ScenarioError: A split is too short for its yellow and all-red, rings differ between two
+            barriers, or the splits do not make the cycle.
     """
     where = f"{source}: light {plan.light!r}"
     lengths: dict[int, dict[int, float]] = defaultdict(lambda: defaultdict(float))
@@ -552,7 +553,7 @@ def write_plans(path: Path, plans: Iterable[SignalPlan], network: Network) -> No
         for number, phase in enumerate(plan.phases, 1):
             writer.writerow(
                 (
-                    plan.light, names.get(plan.light, ""), f"{plan.cycle_s:g}",
+                    plan.light, as_text(names.get(plan.light, "")), f"{plan.cycle_s:g}",
                     f"{plan.offset_s:g}", phase.ring, phase.barrier, number,
                     " ".join(phase.movements) or _NOBODY, f"{phase.split_s:g}",
                     f"{phase.yellow_s:g}", f"{phase.all_red_s:g}",
@@ -640,8 +641,8 @@ def _seconds(row: Mapping[str, str | None], key: str, where: str) -> float:
         value = parse_decimal(text or "")
     except ValueError:
         value = math.nan
-    if not 0 <= value <= _MOST_S:
-        raise ScenarioError(f"{where}: {key} = {text!r} is not a time of 0 to {_MOST_S:g} s")
+    if not 0 <= value <= LONGEST_S:
+        raise ScenarioError(f"{where}: {key} = {text!r} is not a time of 0 to {LONGEST_S:g} s")
     return value
 
 

@@ -32,6 +32,7 @@ from ugat_marl.scenarios.importers.cityflow_roadnet import (
 )
 from ugat_marl.scenarios.importers.long_files import objects
 from ugat_marl.scenarios.importers.making import NETWORK, ROUTES, RoadFiles, RoadSource
+from ugat_marl.scenarios.importers.plan import coordinate
 from ugat_marl.scenarios.importers.turning_shares import MOST_VEHICLES, Drive, write_drives
 from ugat_marl.scenarios.junctions import foes_of, links_of, yields_of
 from ugat_marl.scenarios.phases import RightOfWay, state_of
@@ -124,8 +125,8 @@ def _nodes(net: Roadnet) -> ET.Element:
         kind = "dead_end" if crossing.virtual else "priority"
         attributes = {
             "id": crossing.id,
-            "x": f"{crossing.point[0]:g}",
-            "y": f"{crossing.point[1]:g}",
+            "x": coordinate(crossing.point[0]),
+            "y": coordinate(crossing.point[1]),
         }
         if has_light(crossing):
             kind = "traffic_light"

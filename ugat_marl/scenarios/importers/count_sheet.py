@@ -16,7 +16,7 @@ from pathlib import Path
 
 from ugat_marl.errors import ScenarioError
 from ugat_marl.files import write_whole
-from ugat_marl.scenarios.csv_tables import columns_of, delimiter_of
+from ugat_marl.scenarios.csv_tables import as_text, columns_of, delimiter_of
 from ugat_marl.scenarios.junctions import Link, links_of
 from ugat_marl.scenarios.network import lanes_of, streets_of
 from ugat_marl.scenarios.street_names import NamedTurn, intersection_name, named_turns
@@ -25,8 +25,6 @@ FIT_SHEET = "counts-fit.csv"
 """Name of the sheet with the fit in a scenario's folder."""
 
 _NAMES = ("light", "intersection", "street", "approach", "turn", "to_street")
-_FORMULA = "=+-@\t\r"
-"""First characters that make a spreadsheet read a text as a formula."""
 
 
 @dataclass(frozen=True)
@@ -136,9 +134,7 @@ def write_fit(path: Path, fits: Iterable[CountFit], network: NamedNetwork) -> No
 
 def _names(turn: NamedTurn, network: NamedNetwork) -> tuple[str, ...]:
     streets = (network.intersection(turn.light), turn.street, turn.to_street)
-    names, street, to_street = (
-        f"'{text}" if text and text[0] in _FORMULA else text for text in streets
-    )
+    names, street, to_street = map(as_text, streets)
     return (turn.light, names, street, turn.approach, turn.turn, to_street)
 
 

@@ -191,12 +191,19 @@ def _column(number: int) -> str:
     return (_column(rest - 1) if rest else "") + chr(ord("A") + last)
 
 
+def coordinate(metres: float) -> str:
+    """Return a coordinate for netconvert; far from the origin six digits are too few."""
+    return f"{metres:g}" if abs(metres) < 10_000 else f"{metres:.2f}"
+
+
 def netconvert_documents(plan: RoadPlan, speed_mps: float) -> dict[str, bytes]:
     """Return the three plain-XML documents of netconvert, by the option that takes them."""
     nodes, edges, connections = ET.Element("nodes"), ET.Element("edges"), ET.Element("connections")
     for node in plan.nodes.values():
         kind = "traffic_light" if node.signal else "dead_end"
-        ET.SubElement(nodes, "node", id=node.id, x=f"{node.x:g}", y=f"{node.y:g}", type=kind)
+        ET.SubElement(
+            nodes, "node", id=node.id, x=coordinate(node.x), y=coordinate(node.y), type=kind
+        )
     for road in plan.roads.values():
         attributes = {"id": road.id, "from": road.start, "to": road.end}
         limit = speed_mps if road.speed_mps is None else road.speed_mps

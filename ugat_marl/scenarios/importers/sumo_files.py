@@ -16,7 +16,10 @@ from ugat_marl.scenarios.importers.making import RoadFiles, RoadSource, VehicleF
 from ugat_marl.scenarios.scenario import Document, SumoConfiguration, read_scenario
 from ugat_marl.scenarios.settings import ScenarioFile
 
-_CONFIGURATIONS = (".sumocfg", ".sumocfg.xml")
+
+def is_configuration(path: Path) -> bool:
+    """Return True if a file's name is that of a SUMO configuration."""
+    return path.name.endswith((".sumocfg", ".sumocfg.xml"))
 
 
 def from_sumo(path: Path, *, link: bool, own_vehicles: bool) -> RoadSource:
@@ -30,7 +33,7 @@ def from_sumo(path: Path, *, link: bool, own_vehicles: bool) -> RoadSource:
     Raises:
         OptionError: By its name, the file is neither a configuration nor a network.
     """
-    configuration = path.name.endswith(_CONFIGURATIONS)
+    configuration = is_configuration(path)
     if not configuration and not path.name.removesuffix(".gz").endswith(".xml"):
         raise OptionError(f"--sumo {str(path)!r}: give a .sumocfg or a .net.xml")
 
@@ -55,7 +58,7 @@ def episode_of(path: Path | None) -> tuple[float, float]:
     Raises:
         ScenarioError: The configuration cannot be read, or has impossible times.
     """
-    if path is not None and path.name.endswith(_CONFIGURATIONS):
+    if path is not None and is_configuration(path):
         return SumoConfiguration(path).times()
     return 0.0, 3600.0
 

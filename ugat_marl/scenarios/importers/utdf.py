@@ -20,6 +20,7 @@ from ugat_marl.scenarios.csv_tables import delimiter_of, with_point
 from ugat_marl.scenarios.network import Intersection, Network
 from ugat_marl.scenarios.settings import parse_decimal
 from ugat_marl.scenarios.signal_plans import (
+    LONGEST_S,
     PlanPhase,
     SignalPlan,
     check_plan,
@@ -164,6 +165,12 @@ def _plan(
     by_phase: dict[int, list[str]] = defaultdict(list)
     for code in sorted(codes):
         own = served.get(code) or _borrowed(code, served)
+        if own and code not in served and code[2] != "R":
+            listed = " and ".join(map(str, own))
+            notes.append(
+                f"light {light.id!r}: {code} has no phase in the file; it goes with another turn "
+                f"of its approach, in phase {listed}"
+            )
         if not own:
             raise ScenarioError(
                 f"{where}: {code} has no phase in the file, nor has another turn of its approach; "
@@ -175,7 +182,8 @@ def _plan(
     for column, (text, line) in node.phases["brp"].items():
         if not column.startswith("D") or not column[1:].isdigit() or not text:
             continue
-        place, number = int(_number(text, "BRP", where, line)), int(column[1:])
+        place = _whole(_number(text, "BRP", where, line), "BRP", where)
+        number = int(column[1:])
         times = [_time(node, record, column, where) for record in ("maxgreen", "yellow", "allred")]
         if place and times[0]:
             movements = tuple(by_phase.pop(number, ()))
@@ -201,7 +209,7 @@ def _movements(node: _Node, where: str) -> dict[str, list[int]]:
         for column, (text, line) in node.lanes.get(record.lower(), {}).items():
             code = column.rstrip("2")
             if len(code) == 3 and code[2] in "LTRU" and text:
-                number = int(_number(text, record, where, line))
+                number = _whole(_number(text, record, where, line), record, where)
                 if number > 0 and number not in served[code]:
                     served[code].append(number)
     return {code: phases for code, phases in served.items() if phases}
@@ -217,9 +225,14 @@ def _reference_s(
     node: _Node, plan: SignalPlan, phases: Iterable[tuple[int, int, PlanPhase]], where: str
 ) -> float:
     """Return the time in the cycle to which the offset refers, s."""
-    kind = int(_setting(node, "referenced to", where, 0.0))
-    number = int(_setting(node, "reference phase", where, 0.0))
+    kind = _whole(_setting(node, "referenced to", where, 0.0), "Referenced To", where)
+    number = _whole(_setting(node, "reference phase", where, 0.0), "Reference Phase", where)
     wanted = {number % 100, number // 100} - {0}
+    if wanted and not wanted & {own for _, own, _ in phases}:
+        raise ScenarioError(
+            f"{where}: Reference Phase = {number}: the plan has no such phase, so that its offset "
+            "cannot be known; choose one of its phases in Synchro"
+        )
     times = {own: span for (_, own, _), span in zip(phases, phase_times(plan), strict=True)}
     spans = [span for own, span in times.items() if own in wanted] or [next(iter(times.values()))]
     if kind == 0:
@@ -241,7 +254,18 @@ def _setting(node: _Node, record: str, where: str, default: float | None = None)
 
 def _time(node: _Node, record: str, column: str, where: str) -> float:
     text, line = node.phases.get(record, {}).get(column, ("", 0))
-    return _number(text, record, where, line) if text else 0.0
+    value = _number(text, record, where, line) if text else 0.0
+    if not 0 <= value <= LONGEST_S:
+        raise ScenarioError(
+            f"{where}, line {line}: {record} = {text!r} is not a time of 0 to {LONGEST_S:g} s"
+        )
+    return value
+
+
+def _whole(value: float, record: str, where: str) -> int:
+    if value != int(value):
+        raise ScenarioError(f"{where}: {record} = {value:g} is not a whole number")
+    return int(value)
 
 
 def _number(text: str, record: str, where: str, line: int) -> float:
