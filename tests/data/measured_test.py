@@ -22,6 +22,7 @@ from ugat_marl.data import (
     split_periods,
     write_measured,
 )
+from ugat_marl.data.measured.local_time import LocalClock
 from ugat_marl.errors import MeasuredDataError, OutputError
 from ugat_marl.scenarios import (
     Detector,
@@ -622,3 +623,19 @@ def test_wrong_local_times_are_named(
         changes[name] = change
     with pytest.raises(MeasuredDataError, match=words):
         reread(changes)
+
+
+@pytest.mark.parametrize(
+    "texts",
+    [
+        ("2024-11-03T06:30:00Z", "2024-11-03T09:30:00Z"),
+        ("2024-11-03T00:30:00-06:00", "2024-11-03T02:30:00-07:00"),
+    ],
+)
+def test_times_with_an_offset_lose_no_hour_where_the_clock_is_changed(
+    texts: tuple[str, str],
+) -> None:
+    clock = LocalClock({"night": datetime(2024, 11, 3)}, "America/Denver")
+    cells = pl.Series("time", [*texts, ""])
+    seconds = clock.seconds(Path("t.csv"), cells, pl.Series(["night"] * 3), 2)
+    assert seconds.to_list() == [1800.0, 12600.0, None]

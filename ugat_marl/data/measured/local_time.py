@@ -44,11 +44,17 @@ class LocalClock:
         Raises:
             MeasuredDataError: A time cannot be read.
         """
-        local = local_times(path, cells, self.time_zone, start, "periods.csv, as time_zone")
+        times = _times(path, cells, self.time_zone, start, "periods.csv, as time_zone")
         zero = periods.replace_strict(self.zeros, default=None, return_dtype=pl.Datetime("us"))
+        if isinstance(times.dtype, pl.Datetime) and times.dtype.time_zone is not None:
+            # local times would lose or gain an hour where the clock is changed
+            zero = zero.dt.replace_time_zone(
+                self.time_zone, ambiguous="earliest", non_existent="null"
+            )
+            zero = zero.dt.convert_time_zone("UTC")
         # a time of an unknown period is left out later, with its row
-        seconds = ((local - zero).dt.total_microseconds() / 1e6).fill_null(0.0)
-        return seconds.set(local.is_null(), None).alias(f"{cells.name}_s")
+        seconds = ((times - zero).dt.total_microseconds() / 1e6).fill_null(0.0)
+        return seconds.set(times.is_null(), None).alias(f"{cells.name}_s")
 
 
 def require_time_zone(name: str, where: str) -> None:
@@ -68,6 +74,8 @@ def local_times(
 ) -> pl.Series:
     """Return local times without a time zone, in microseconds; empty cells stay empty.
 
+    Over a change of the clock they jump; `LocalClock.seconds` does not.
+
     Args:
         path: File of the times.
         cells: Texts or datetimes; their name is that of the column.
@@ -78,6 +86,14 @@ def local_times(
     Raises:
         MeasuredDataError: The times have an unknown form, or a time zone without `time_zone`.
     """
+    times = _times(path, cells, time_zone, start, mapping)
+    if isinstance(times.dtype, pl.Datetime) and times.dtype.time_zone is not None:
+        times = times.dt.convert_time_zone(time_zone).dt.replace_time_zone(None)
+    return times
+
+
+def _times(path: Path, cells: pl.Series, time_zone: str, start: int, mapping: str) -> pl.Series:
+    """Return times in microseconds, in UTC if they have a time zone; see `local_times`."""
     if isinstance(cells.dtype, pl.String):
         cells = _parsed(path, cells.str.strip_chars(), start)
     if not isinstance(cells.dtype, pl.Datetime):
@@ -90,7 +106,7 @@ def local_times(
                 f"{path}: {cells.name} has the time zone {cells.dtype.time_zone}; write the "
                 f"street's own in {mapping}, such as America/Denver"
             )
-        cells = cells.dt.convert_time_zone(time_zone).dt.replace_time_zone(None)
+        return cells.dt.convert_time_zone("UTC").dt.cast_time_unit("us")
     return cells.cast(pl.Datetime("us"))
 
 
