@@ -8,7 +8,8 @@ blocks depend on each other, so the distribution of the distance is always simul
 
 Periods may be different stretches of a day, with other demand and other queues. Each is compared
 with simulated days of its own stretch: the differences between the means of stretches are taken off
-measured and simulated days alike. Otherwise they would count as chance and hide everything.
+measured and simulated days alike. Otherwise they would count as chance and hide everything. The
+differences are those of the scenario as it is; an effect is taken to change all stretches alike.
 """
 
 from __future__ import annotations

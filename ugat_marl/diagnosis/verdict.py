@@ -205,7 +205,10 @@ def _sufficient(
 
 
 def combined(one: float, other: float) -> float:
-    """Return the p value of two independent tests (Fisher 1932).
+    """Return the p value of two tests (Fisher 1932), taken for independent.
+
+    Fitted and held-out periods are. Both are compared with the same simulated days, whose errors
+    they share; these are small beside the noise of a few periods.
 
     -2 ln(p q) has a chi-square distribution with 4 degrees of freedom.
     """
