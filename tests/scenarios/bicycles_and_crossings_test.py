@@ -8,7 +8,16 @@ from pathlib import Path
 import pytest
 
 from ugat_marl.effects import load_scenario
-from ugat_marl.scenarios import Network, programme_notes, programme_plan, sumo_program
+from ugat_marl.scenarios import (
+    Network,
+    PlanPhase,
+    SignalPlan,
+    movement_codes,
+    programme_notes,
+    programme_plan,
+    sumo_program,
+    with_plans,
+)
 from ugat_marl.scenarios.junctions import crossings_of, foes_of, yields_of
 from ugat_marl.scenarios.phases import RightOfWay
 
@@ -91,3 +100,34 @@ def test_a_plan_that_shows_crossings_longer_is_noted(tmp_path: Path) -> None:
     (light,) = network.intersections
     (note,) = programme_notes(scenario, [programme_plan(light, network)], "p.csv")
     assert "C (crossings" in note
+
+
+def test_a_crossing_stays_green_while_only_the_other_ring_ends(tmp_path: Path) -> None:
+    """Southbound ends 20 s before northbound; both crossings beside them stay green as long."""
+    crossings = "".join(
+        f'<crossing node="C" edges="{arm}C C{arm}" priority="true"/>' for arm in ARMS
+    )
+    scenario = load_scenario(
+        four_arms(tmp_path / "rings-v1", 'numLanes="1" sidewalkWidth="2"/>', crossings)
+    )
+    network = Network.read(scenario)
+    (light,) = network.intersections
+    codes = set(movement_codes(light, network).values())
+    north, south = ({code for code in codes if code[:2] == way} for way in ("NB", "SB"))
+    phases = (
+        PlanPhase(1, 1, tuple(sorted(north)), 40, 3, 2),
+        PlanPhase(2, 1, tuple(sorted(south)), 20, 3, 2),
+        PlanPhase(2, 1, (), 20, 3, 2),
+        PlanPhase(1, 2, tuple(sorted(codes - north - south)), 40, 3, 2),
+    )
+    planned = with_plans(scenario, [SignalPlan(light.id, 80, 0, phases)], "plan")
+    (light,) = Network.read(planned).intersections
+    rows = [
+        "".join(state[walk.index] for s, state in light.programme for _ in range(round(s)))
+        for walk in light.crossings
+    ]
+    for row in rows:
+        assert sum(a != "G" and b == "G" for a, b in zip(row[-1] + row, row, strict=False)) == 1, (
+            row
+        )
+    assert sum(row[:35] == "G" * 35 and "G" not in row[35:40] for row in rows) == 2

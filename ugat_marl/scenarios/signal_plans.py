@@ -17,6 +17,7 @@ from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from itertools import accumulate, combinations, pairwise
 from pathlib import Path
+from typing import NamedTuple
 
 from ugat_marl.errors import ScenarioError, nearest
 from ugat_marl.files import Document, read_bytes, write_whole, xml_bytes
@@ -158,7 +159,8 @@ def plan_states(
     - A link is green if its movement is green in some ring. It stays green from one phase of a ring
       to the next if both have it.
     - It gives way (``g``) to other greens that go first by the junction's rules.
-    - Pedestrian crossings are green with a phase if only turning vehicles cross them.
+    - Pedestrian crossings are green with a phase if only turning vehicles cross them. During yellow
+      and all-red they stay green if they are green after it, too.
 
     Args:
         plan: The plan; `check_plan` has accepted it.
@@ -177,10 +179,12 @@ def plan_states(
     times, shown = _times(plan)
     states: list[tuple[float, str]] = []
     clash = _plan_clash(light, rules)
-    for begin, end in pairwise(times):
-        green, yellow = _signals((begin + end) / 2, shown)
-        state = _state(green, yellow, light, codes, rules, width)
-        going = [link for link in light.links if codes[link] in green]
+    parts = list(pairwise(times))
+    signals = [_signals((begin + end) / 2, shown) for begin, end in parts]
+    walks = _walks(signals, light, codes, rules)
+    for (begin, end), now, walking in zip(parts, signals, walks, strict=True):
+        state = _state(now, walking, light, codes, rules, width)
+        going = [link for link in light.links if codes[link] in now.green]
         if pair := next((pair for pair in combinations(going, 2) if clash(*pair)), None):
             raise ScenarioError(
                 f"{source}: light {plan.light!r}: {_told(pair[0], codes)} and "
@@ -206,8 +210,16 @@ def _told(link: Link, codes: Mapping[Link, str]) -> str:
     )
 
 
-_Shown = Sequence[tuple[float, float, float, frozenset[str], frozenset[str]]]
-"""Start, end of green, end of yellow, movements, and movements that stay green after it."""
+_Shown = Sequence[tuple[float, float, float, float, frozenset[str], frozenset[str]]]
+"""Start, end of green, end of yellow, end, movements, and movements that stay green after it."""
+
+
+class _Signals(NamedTuple):
+    """Movements with green, with yellow, and in their all-red."""
+
+    green: set[str]
+    yellow: set[str]
+    clearing: set[str]
 
 
 def phase_times(plan: SignalPlan) -> list[tuple[float, float, float]]:
@@ -247,14 +259,14 @@ def _staying(plan: SignalPlan) -> list[frozenset[str]]:
 
 def _times(plan: SignalPlan) -> tuple[list[float], _Shown]:
     """Return the times of changes, s from the start of the cycle, and the phases."""
-    shown: list[tuple[float, float, float, frozenset[str], frozenset[str]]] = []
+    shown: list[tuple[float, float, float, float, frozenset[str], frozenset[str]]] = []
     times = {0.0, plan.cycle_s}
     for phase, span, stays in zip(plan.phases, phase_times(plan), _staying(plan), strict=True):
         begin, green_end, yellow_end = span
         end = begin + phase.split_s
-        shown.append((begin, green_end, yellow_end, frozenset(phase.movements), stays))
+        shown.append((begin, green_end, yellow_end, end, frozenset(phase.movements), stays))
         if stays:
-            shown.append((green_end, end, end, stays, stays))
+            shown.append((green_end, end, end, end, stays, stays))
         times |= {begin, green_end, yellow_end, end}
     kept: list[float] = []
     for time in sorted(times):
@@ -282,38 +294,62 @@ def _plan_clash(light: Intersection, rules: RightOfWay) -> Clash:
     return clash
 
 
-def _signals(time_s: float, shown: _Shown) -> tuple[set[str], set[str]]:
-    """Return the movements with green and those with yellow at a time of the cycle."""
+def _signals(time_s: float, shown: _Shown) -> _Signals:
+    """Return what the movements show at a time of the cycle."""
     green: set[str] = set()
     yellow: set[str] = set()
-    for begin, green_end, yellow_end, movements, stays in shown:
+    clearing: set[str] = set()
+    for begin, green_end, yellow_end, end, movements, stays in shown:
         if begin <= time_s < green_end:
             green |= movements
         elif green_end <= time_s < yellow_end:
             yellow |= movements - stays
-    return green, yellow - green
+        elif yellow_end <= time_s < end:
+            clearing |= movements - stays
+    return _Signals(green, yellow - green, clearing - green - yellow)
+
+
+def _walks(
+    signals: Sequence[_Signals],
+    light: Intersection,
+    codes: Mapping[Link, str],
+    rules: RightOfWay,
+) -> list[list[Link]]:
+    """Return the crossings that are green in each part of the cycle."""
+    letters = {link.index for link in light.links}
+    walks = [walk for walk in light.crossings if walk.index not in letters]
+
+    def free(walk: Link, now: _Signals) -> bool:
+        moving = now.green | now.yellow | now.clearing
+        foes = (x for x in light.links if codes[x] in moving and are_foes(x, walk, rules.foes))
+        return all(turn_of(link) != "s" for link in foes)
+
+    def following(place: int) -> _Signals:
+        later = [*signals[place:], *signals[:place]]
+        return next((one for one in later if not (one.yellow or one.clearing)), later[0])
+
+    return [
+        [
+            walk
+            for walk in walks
+            if following(place).green and free(walk, now) and free(walk, following(place))
+        ]
+        for place, now in enumerate(signals)
+    ]
 
 
 def _state(
-    green: set[str],
-    yellow: set[str],
+    now: _Signals,
+    walks: Sequence[Link],
     light: Intersection,
     codes: Mapping[Link, str],
     rules: RightOfWay,
     width: int,
 ) -> str:
-    going = [link for link in light.links if codes[link] in green]
-    letters = {link.index for link in light.links}
-    walks = [
-        walk
-        for walk in light.crossings
-        if walk.index not in letters
-        and not yellow
-        and all(turn_of(link) != "s" for link in going if are_foes(link, walk, rules.foes))
-    ]
-    ending = [link for link in light.links if codes[link] in yellow]
+    going = [link for link in light.links if codes[link] in now.green]
+    ending = [link for link in light.links if codes[link] in now.yellow]
     # Who gives way goes on doing so while the others have yellow.
-    ruled = state_of([*going, *ending, *(walks if going else ())], light.links, rules, width)
+    ruled = state_of([*going, *ending, *walks], light.links, rules, width)
     last = {link.index for link in ending} - {link.index for link in going}
     return "".join("y" if index in last else letter for index, letter in enumerate(ruled))
 
