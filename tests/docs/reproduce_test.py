@@ -31,14 +31,22 @@ def with_gap(row: dict[str, str]) -> str:
     return f"{number_text(float(row['att_s']))} ({number_text(float(row['att_s_gap']))})"
 
 
+def gone(row: dict[str, str], direct: dict[str, str]) -> str:
+    return f"{100 * (1 - float(row['att_s_gap']) / float(direct['att_s_gap'])):.0f} %"
+
+
 @pytest.mark.parametrize("domain", ["V1", "V2", "V3", "V4"])
 def test_transfer_is_that_of_the_tables(domain: str) -> None:
-    here, single = rows("hangzhou_1x1/main"), rows("single-v1/main")
-    table, other = cells(domain)
+    published, here = rows("hangzhou_1x1/preset-paper"), rows("hangzhou_1x1/main")
+    single = rows("single-v1/main")
+    first, table, other = cells(domain)
+    settings = ["direct transfer", "phase (the paper's UGAT)", "more plain sim"]
+    direct, phase, more = (published[setting, domain] for setting in settings)
+    assert (first[4], first[5], first[7]) == tuple(map(with_gap, (direct, phase, more)))
+    assert (first[6], first[8]) == (gone(phase, direct), gone(more, direct))
     direct, timed = here["direct transfer", domain], here["timed", domain]
-    assert (table[4], table[6]) == (with_gap(direct), with_gap(timed))
-    less = 1 - float(timed["att_s_gap"]) / float(direct["att_s_gap"])
-    assert table[7] == f"{100 * less:.0f} %"
+    assert (table[1], table[2]) == (with_gap(direct), with_gap(timed))
+    assert table[3] == gone(timed, direct)
     phase = single["phase (the paper's UGAT)", domain]
     ends = "–".join(number_text(float(phase[f"att_s_{end}"])) for end in ("low", "high"))
     assert other[1] == number_text(float(single["direct transfer", domain]["att_s"]))
