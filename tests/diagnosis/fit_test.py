@@ -232,6 +232,20 @@ def test_95_percent_intervals_cover_95_percent() -> None:
     assert np.mean(errors) == pytest.approx(np.std(estimates), rel=0.4)
 
 
+def test_stretches_of_the_day_make_no_interval_wider() -> None:
+    fitter = a_fitter({"headway": 1.4}, street=18)
+    model = fitter.simulate(start((HEADWAY, 1.4)))
+    days = [day(number, {"headway": 1.4}) for number in range(24)]
+    busier = np.array([1.3, 1.0])
+    apart = [
+        replace(one, sums=one.sums * busier if number % 2 else one.sums, window=(number % 2, 9.0))
+        for number, one in enumerate(days)
+    ]
+    (alike,), _ = uncertainty(fitter, model, days)
+    (error,), _ = uncertainty(fitter, model, apart)
+    assert error == pytest.approx(alike, rel=0.5)
+
+
 def test_uncertain_values_make_statistics_uncertain() -> None:
     fitter = a_fitter({"headway": 1.4}, street=12)
     best = fitter.refine(fitter.simulate(start((HEADWAY, 1.5))))
