@@ -192,7 +192,7 @@ def test_the_table_fits_a_terminal() -> None:
     console.print(policy_gap_table("single-v1: average travel time in s, real: V4", gaps, 5))
     text = console.export_text()
     assert max(map(len, text.splitlines())) <= 80
-    for cell in ("99 %", "-50 %", "812", "7.7", "80.0", "max-pressure:20"):
+    for cell in ("99 %", "−50 %", "812", "7.7", "80.0", "max-pressure:20"):
         assert cell in text
     assert "…" not in text
     assert "1201-1300" in text
