@@ -188,3 +188,15 @@ def test_mistaken_hours_of_probes_are_seen(
     late = replace(given, travel_times=given.travel_times.with_columns(pl.col("time_s") + 3600.0))
     with pytest.raises(MeasuredDataError, match="lie outside of it"):
         read_measured(write_measured(late, tmp_path / "late", csv=True), scenario, network)
+
+
+def test_mean_speeds_that_nobody_drives_are_named(
+    tmp_path: Path, scenario: Scenario, network: Network
+) -> None:
+    given = sums()
+    assert given.counts is not None
+    faster = replace(given, counts=given.counts.with_columns(pl.col("mean_speed_mps") * 3.6))
+    for data, named in ((given, False), (faster, True)):
+        read = read_measured(write_measured(data, tmp_path / str(named)), scenario, network)
+        texts = [finding.text for finding in read.findings]
+        assert any("mean_speed_mps is above" in text for text in texts) == named, texts

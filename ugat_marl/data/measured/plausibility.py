@@ -144,7 +144,8 @@ def _speeds(measured: MeasuredData, network: Network) -> Iterator[Finding]:
     }
     if measured.counts is not None and "mean_speed_mps" in measured.counts.columns:
         of_detector = {detector.id: limits[detector.lane] for detector in measured.detectors}
-        limit = measured.counts["detector_id"].replace_strict(of_detector).to_numpy()
+        names = measured.counts["detector_id"]
+        limit = names.replace_strict(of_detector, default=None).to_numpy()
         means = measured.counts["mean_speed_mps"].cast(pl.Float64).to_numpy()
         shares["counts.csv: mean_speed_mps"] = _joined([means / limit])
     for where, values in shares.items():
