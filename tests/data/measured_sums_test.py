@@ -193,10 +193,11 @@ def test_mistaken_hours_of_probes_are_seen(
 def test_mean_speeds_that_nobody_drives_are_named(
     tmp_path: Path, scenario: Scenario, network: Network
 ) -> None:
-    given = sums()
-    assert given.counts is not None
-    faster = replace(given, counts=given.counts.with_columns(pl.col("mean_speed_mps") * 3.6))
-    for data, named in ((given, False), (faster, True)):
+    given = as_counts(recording(), 10.0)
+    assert given.counts is not None and given.counts.height > 60
+    for speed_mps, named in ((9.0, False), (9.0 * 3.6, True)):
+        counts = given.counts.with_columns(mean_speed_mps=pl.lit(speed_mps))
+        data = replace(given, counts=counts)
         read = read_measured(write_measured(data, tmp_path / str(named)), scenario, network)
         texts = [finding.text for finding in read.findings]
         assert any("mean_speed_mps is above" in text for text in texts) == named, texts
