@@ -283,6 +283,18 @@ def test_jobs_beside_others_have_the_same_numbers(tmp_path: Path) -> None:
     assert logs == [False, True, True], "the first is done here, the others beside it"
 
 
+def test_a_job_starts_from_the_learner_at_the_end_of_its_training(tmp_path: Path) -> None:
+    """A training that is judged every two episodes keeps its learner as often."""
+    start = tmp_path / PLAIN.name / LEARNER
+    assert not driver._is_final(start)
+    PLAIN.write(start.parent)
+    start.write_bytes(b"after two of four episodes")
+    assert not driver._is_final(start)
+    start.unlink()
+    perform_here([PLAIN], tmp_path, Silent())
+    assert driver._is_final(start)
+
+
 @needs_forks
 def test_a_job_beside_does_not_wait_for_a_learner_that_is_lost(tmp_path: Path) -> None:
     perform_here([PLAIN], tmp_path, Silent())

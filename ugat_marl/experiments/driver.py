@@ -29,7 +29,7 @@ from ugat_marl.experiments.forked import (
     perform_forked,
     say_stopped,
 )
-from ugat_marl.experiments.jobs import Job, Record, perform
+from ugat_marl.experiments.jobs import LEARNER, Job, Record, perform
 from ugat_marl.files import require_writable
 from ugat_marl.parallel import (
     RETRIES,
@@ -216,10 +216,22 @@ def _performed_beside(
 def _is_ready(job: Job, folder: Path, stop: Stop, wanted: threading.Event) -> bool:
     """Wait for the learner that a job starts from; False if somebody wants the job before."""
     start = None if job.start is None else folder / job.start
-    while start is not None and not start.exists():
+    while start is not None and not _is_final(start):
         if wanted.is_set() or stop.wait(0.5):
             return False
     return True
+
+
+def _is_final(start: Path) -> bool:
+    """Return True if a file holds the learner at the end of its training.
+
+    A training that is judged several times keeps its learner each time.
+    """
+    if not start.exists():
+        return False
+    base = Job.read(start.parent)
+    kept_often = start.name == LEARNER and (base.every or base.last > 1)
+    return not kept_often or Record.read(start.parent).is_whole(base)
 
 
 def _perform_apart(folder: str, stop: Stop, forked: bool) -> None:
