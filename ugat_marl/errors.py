@@ -139,6 +139,17 @@ def require_least(least: int, **values: int | None) -> None:
             raise OptionError(f"{name} = {value}: must be at least {least}")
 
 
+def require_distinct(**values: Sequence[object]) -> None:
+    """Refuse lists that hold something twice.
+
+    Raises:
+        OptionError: A list does.
+    """
+    for name, given in values.items():
+        if len(set(given)) < len(given):
+            raise OptionError(f"{name} holds one twice: {' '.join(map(str, given))}")
+
+
 def first_names(names: Sequence[str]) -> str:
     """Return the first four names, with dots for further ones."""
     return ", ".join([*names[:4], *["..."] * (len(names) > 4)])

@@ -10,7 +10,7 @@ from typing import Annotated, Any
 from tyro.conf import arg
 
 from ugat_marl import parallel
-from ugat_marl.errors import OptionError
+from ugat_marl.errors import OptionError, require_distinct
 
 
 def unused(metavar: str) -> Any:
@@ -107,8 +107,7 @@ def require_names(**options: Sequence[str]) -> None:
     for name, values in options.items():
         if not values:
             raise OptionError(f"{option_text(name)} needs at least one value")
-        if len(set(values)) < len(values):
-            raise OptionError(f"{option_text(name)} holds one twice: {' '.join(values)}")
+        require_distinct(**{option_text(name): values})
 
 
 @contextlib.contextmanager

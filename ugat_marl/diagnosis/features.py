@@ -8,7 +8,6 @@ wait anywhere on the detector.
 
 from __future__ import annotations
 
-import dataclasses
 import functools
 import math
 from collections.abc import Mapping, Sequence
@@ -208,18 +207,20 @@ class DetectorLayout:
         greens_of_lanes: list[Greens] = []
         for lane in self.lanes:
             log = period.signals.get(self.intersections[lane.intersection], ())
-            greens = _greens(log, lane.links, period)
-            if period.begin_s > self.begin_s and len(greens.start_s):
-                begun = greens.start_s > period.begin_s
-                greens = Greens(
-                    *(getattr(greens, each.name)[begun] for each in dataclasses.fields(Greens))
-                )
-            greens_of_lanes.append(greens)
+            at_begin = period.begin_s <= self.begin_s
+            greens_of_lanes.append(_greens(log, lane.links, period, at_begin=at_begin))
         return tuple(greens_of_lanes)
 
 
-def _greens(log: SignalLog, links: tuple[int, ...], period: Period) -> Greens:
-    """Return the greens of a lane from the letters of its links in the signal log."""
+def _greens(log: SignalLog, links: tuple[int, ...], period: Period, *, at_begin: bool) -> Greens:
+    """Return the greens of a lane from the letters of its links in the signal log.
+
+    Args:
+        log: The log.
+        links: Indices of the links.
+        period: The period.
+        at_begin: True if a green at the very begin of the period counts.
+    """
     seen: dict[str, str] = {}
     changes: list[tuple[float, str]] = []
     for time, state in log:
@@ -232,7 +233,8 @@ def _greens(log: SignalLog, links: tuple[int, ...], period: Period) -> Greens:
     for (start, shown), (end, after), (later, _) in zip(
         changes, changes[1:], [*changes[2:], (period.end_s, "r")], strict=False
     ):
-        if shown in GREEN and start >= period.begin_s and end < period.end_s:
+        begun = start > period.begin_s or (at_begin and start == period.begin_s)
+        if shown in GREEN and begun and end < period.end_s:
             red = min(later, period.end_s) if after in YELLOW else end
             rows.append((start, end, red, shown == "G"))
     table = np.array(rows, dtype=np.float64).reshape(-1, 4)

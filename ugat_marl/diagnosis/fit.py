@@ -14,7 +14,15 @@ from ugat_marl.diagnosis.features import Tally
 from ugat_marl.diagnosis.hypotheses import WINDOW, Hypothesis, Members, effects_of
 from ugat_marl.diagnosis.propose import Direction
 from ugat_marl.diagnosis.records import Fitted
-from ugat_marl.diagnosis.statistics import Array, Pools, Reference, Whitener, change_between, shrunk
+from ugat_marl.diagnosis.statistics import (
+    Array,
+    Pools,
+    Reference,
+    Whitener,
+    Window,
+    change_between,
+    shrunk,
+)
 from ugat_marl.diagnosis.supplementary_data import EVERY_LANE, TRAVEL_TIME
 from ugat_marl.effects import EVERYWHERE, NO_SOFTER
 
@@ -447,6 +455,23 @@ def _crookedness(
     return np.array(squares)
 
 
+def _spread_of_days(
+    fitter: Fitter, days: Sequence[Tally], response: Callable[[dict[str, Array]], Array]
+) -> Array:
+    """Return the covariance of the changes that single days would make in the estimate.
+
+    Each day is compared with the mean of its own stretch of the day.
+    """
+    stretches: dict[Window, list[Tally]] = {}
+    for day in days:
+        stretches.setdefault(day.window, []).append(day)
+    changes = [
+        response(change_between(fitter.pools, [day], stretches[day.window])[0]) for day in days
+    ]
+    free = max(len(days) - len(stretches), 1)
+    return np.atleast_2d(np.cov(np.stack(changes).T)) * (len(days) - 1) / free
+
+
 def uncertainty(
     fitter: Fitter, model: Fitted, days: Sequence[Tally] = (), *, steps: bool = False
 ) -> tuple[Array, dict[str, Array]]:
@@ -478,15 +503,11 @@ def uncertainty(
     changes += fitter.window_changes(model)
     jacobian = derivatives(changes, whitener)
     inverse = np.linalg.pinv(jacobian @ jacobian.T)
-    influences: list[Array] = []
-    days = days or model.tallies
-    stretches = {day.window for day in days}
-    for day in days:
-        alike = [other for other in days if other.window == day.window]
-        difference, _ = change_between(fitter.pools, [day], alike)
-        influences.append(inverse @ (jacobian @ whitener(difference)))
-    spread = np.atleast_2d(np.cov(np.stack(influences).T))
-    spread = spread * (len(days) - 1) / max(len(days) - len(stretches), 1)
+
+    def response(change: dict[str, Array]) -> Array:
+        return inverse @ (jacobian @ whitener(change))
+
+    spread = _spread_of_days(fitter, days or model.tallies, response)
     # measured periods and simulated days both vary
     covariance = spread * (1.0 / len(fitter.data) + 1.0 / len(model.tallies))
     grids = np.array([h.step for h, values in model.members for _ in values])
@@ -502,10 +523,6 @@ def uncertainty(
         extra[name] = np.nan_to_num(extra[name])
     errors = np.sqrt(np.diag(covariance)[:free])
     if steps:
-
-        def response(change: dict[str, Array]) -> Array:
-            return inverse @ (jacobian @ whitener(change))
-
         errors = np.sqrt(errors**2 + _crookedness(fitter, model, errors, response))
 
     return errors, extra

@@ -205,7 +205,6 @@ class Reference:
         self._thresholds = pools.thresholds
         stacked = _stack(pools, tallies)
         self.stretches = prior.stretches if prior else _stretches(stacked, tallies)
-        self._own_means = max(1, len(self.stretches)) if prior is None else 1
         self._of_stretches = prior._of_stretches if prior else {}
         stacked = self._level(stacked, tallies)
         partners = self._level(_stack(pools, paired), paired) if paired else {}
@@ -232,7 +231,8 @@ class Reference:
     def _block(self, sums: Array, prior: Block | None, partner: Array | None, name: str) -> Block:
         """Make a block from sums ``(days, members, features, 2)``."""
         timed = name == "time"
-        mean, variance, weight, residual = _moments(sums, self._thresholds, self._own_means)
+        means = max(1, len(self.stretches)) if prior is None else 1
+        mean, variance, weight, residual = _moments(sums, self._thresholds, means)
         if timed:
             variance = _smoothed(mean, variance, self._thresholds)
         error = variance / len(sums)

@@ -219,13 +219,13 @@ def combined(one: float, other: float) -> float:
 def _rivals(selection: Selected, selector: Selector, config: DiagnosisConfig) -> tuple[Fitted, ...]:
     """Find other sets of effects that leave no more than chance at nearly the same cost."""
     best = selection.best.model
-    names = _kinds(best.members)
+    names = names_of(best.members)
     sufficient: list[Fitted] = []
     near = [
         rival
         for rival in selection.rivals
         if len(rival.members) <= len(best.members)
-        and not _kinds(rival.members) >= names
+        and not names_of(rival.members) >= names
         and rival.cost - best.cost < config.thresholds.indistinct
     ]
     for rival in near[: config.thresholds.rivals_tested]:
@@ -249,7 +249,8 @@ def _at_an_end(members: Members) -> str:
     return " and ".join(texts)
 
 
-def _kinds(members: Members) -> set[str]:
+def names_of(members: Members) -> set[str]:
+    """Return the names of the effects of a model."""
     return {hypothesis.name for hypothesis, _ in members}
 
 

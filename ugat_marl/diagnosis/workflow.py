@@ -53,6 +53,7 @@ from ugat_marl.diagnosis.verdict import (
     describe_errors,
     describe_pattern,
     effect_record,
+    names_of,
     unchallenged,
     unverified,
 )
@@ -495,18 +496,10 @@ def _named(best: Tested, selected: Selected, half_interval: float) -> tuple[Name
     The grounds are the model's distance, and the cost by which the best model with another set of
     effect names is worse. `half_interval` is half the width of a 95 % interval in standard errors.
     """
-    names = {hypothesis.name for hypothesis, _ in best.model.members}
-    others = [
-        rival.cost
-        for rival in selected.rivals
-        if {hypothesis.name for hypothesis, _ in rival.members} != names
-    ]
+    names = names_of(best.model.members)
+    others = [rival.cost for rival in selected.rivals if names_of(rival.members) != names]
     # costs of as many days: more days lower the cost of the same model
-    alike = [
-        rival.cost
-        for rival in selected.rivals
-        if {hypothesis.name for hypothesis, _ in rival.members} == names
-    ]
+    alike = [rival.cost for rival in selected.rivals if names_of(rival.members) == names]
     worse_by = min(others) - min(alike, default=best.model.cost) if others else None
     grounds = SearchGrounds(best.model.distance.total, worse_by)
     effects: list[NamedEffect] = []

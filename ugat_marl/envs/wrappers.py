@@ -362,9 +362,9 @@ class _LegalActions(_Masking):
         executed = dict(actions)
         for agent, action in actions.items():
             mask = self._masks.get(agent)
-            if mask is None or not is_phase(action, spaces.Discrete(len(mask))):
+            if mask is None or not is_phase(action, self.action_spaces[agent]):
                 continue  # refused by the environment itself
-            if mask[int(action)]:
+            if int(action) >= len(mask) or mask[int(action)]:
                 continue
             permitted = np.flatnonzero(mask)
             executed[agent] = int(permitted[int(action) % len(permitted)])

@@ -61,6 +61,7 @@ from ugat_marl.grounding import (
 from ugat_marl.parallel import Workers, in_this_process, send_heartbeats
 from ugat_marl.policies import STANDARD_RULES, TUNED_RULES, Policy, PolicyFactory, attended
 from ugat_marl.progress import Bars, Reporter
+from ugat_marl.scenarios import Scenario
 from ugat_marl.simulation import exit_when_input_ends, kept_warm
 
 JOB, SCORES, POLICY, DIRECT_POLICY, LEARNER, RULE_FILE = (
@@ -210,6 +211,10 @@ class Job:
         """Length of an episode in s; None for the scenario's own."""
         duration_s = self.options.get("duration_s")
         return None if duration_s is None else float(duration_s)
+
+    def loaded(self) -> Scenario:
+        """Load the scenario, for episodes of the job's length."""
+        return load_scenario(self.scenario, self.duration_s)
 
     @property
     def _seed_word(self) -> str:
@@ -401,7 +406,7 @@ def _judge(
     workers: Workers,
 ) -> None:
     """Play the missing episodes after `mark` training episodes; write them domain by domain."""
-    scenario = load_scenario(job.scenario, job.duration_s)
+    scenario = job.loaded()
     name = job.rows.get(mark, job.setting.name)
     for domain, seeds in record.missing(job, mark).items():
         queues = QueueRecord()
@@ -429,7 +434,7 @@ def _rule(job: Job, folder: Path, reporter: Reporter, workers: Workers) -> str:
     """Return the rule that is best in the real domain, chosen on separate tuning seeds."""
     saved, rules, target = folder / RULE_FILE, job.setting.rules, job.target or job.sim
     if not saved.exists():
-        scenario = load_scenario(job.scenario, job.duration_s)
+        scenario = job.loaded()
         common: dict[str, Any] = {
             "seeds": [TUNING_SEED + k for k in range(job.tuning_seeds)],
             "duration_s": job.duration_s,
@@ -496,7 +501,7 @@ def _grounded(
     """Train by UGAT; yield direct transfer, if plain training was part of it, and the policy."""
     ugat, make = job.setting.ugat, job.setting.learner.factory(job.device)
     assert ugat is not None and job.seed is not None
-    scenario, options = load_scenario(job.scenario, job.duration_s), dict[str, Any](job.options)
+    scenario, options = job.loaded(), dict[str, Any](job.options)
     with (
         contextlib.closing(parallel_env(scenario, job.sim, **options)) as env,
         contextlib.closing(Run(folder, job.identity, reporter, on_log)) as run,
@@ -545,7 +550,7 @@ def worlds_of(
     without_street = recorded is not None or job.setting.negative_control == "same-world"
     street = job.sim if without_street else job.target
     assert street is not None
-    scenario, options = load_scenario(job.scenario, job.duration_s), dict[str, Any](job.options)
+    scenario, options = job.loaded(), dict[str, Any](job.options)
     sim, real = simulated_worlds(scenario, job.sim, street, ugat, options, workers)
     return sim, recorded or real
 
@@ -554,7 +559,7 @@ def _probe(job: Job, workers: Workers) -> Probe | None:
     """Return the measurement after every iteration, on a seed that no result is reported on."""
     if not job.probe_domains:
         return None
-    scenario = load_scenario(job.scenario, job.duration_s)
+    scenario = job.loaded()
 
     def probe(policy: Policy) -> dict[str, float]:
         played = evaluate(
@@ -585,7 +590,7 @@ def _world(job: Job) -> AnyParallelEnv:
     setting, options = job.setting, dict[str, Any](job.options)
     if setting.commands:
         options["commands"] = setting.commands
-    scenario = load_scenario(job.scenario, job.duration_s)
+    scenario = job.loaded()
     if setting.recipe == "randomised":
         return randomised_env(scenario, options, job.sim)
     env = parallel_env(scenario, setting.world or job.target or job.sim, **options)

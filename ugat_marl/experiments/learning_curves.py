@@ -11,7 +11,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from statistics import fmean
 
-from ugat_marl.errors import OptionError, UgatMarlError, require_least
+from ugat_marl.errors import UgatMarlError, require_distinct, require_least
 from ugat_marl.experiments.driver import perform_all, record_of
 from ugat_marl.experiments.jobs import RULE_FILE, Job, Record, evaluation_seeds
 from ugat_marl.experiments.settings import RULE, LearnerSpec, Setting
@@ -137,8 +137,7 @@ class CurvesConfig:
         require_least(1, seeds=self.seeds, episodes=self.episodes)
         require_least(1, evaluate_every=self.evaluate_every, evaluation_seeds=self.evaluation_seeds)
         require_least(LEAST_BUDGET, rule_budget=self.rule_budget)
-        if len(set(self.learners)) < len(self.learners):
-            raise OptionError(f"learners holds one twice: {' '.join(self.learners)}")
+        require_distinct(learners=self.learners)
         _ = self.settings  # raises an error for an unknown learner
 
     @property

@@ -11,7 +11,7 @@ import numpy as np
 from pydantic import TypeAdapter
 
 from ugat_marl.data import installed_versions
-from ugat_marl.effects import domain_label, load_scenario, scenario_in_domain
+from ugat_marl.effects import domain_label, scenario_in_domain
 from ugat_marl.errors import OptionError
 from ugat_marl.experiments.jobs import DIRECT_POLICY, JOB, POLICY, Job, Record, file_name, file_stem
 from ugat_marl.experiments.settings import DIRECT
@@ -115,7 +115,7 @@ def _cards(place: Path, command: str, rules: dict[str, Path]) -> list[tuple[Poli
 def _card(
     job: Job, record: Record, mark: int, setting: str, command: str, content: bytes
 ) -> PolicyCard:
-    scenario = load_scenario(job.scenario, job.duration_s)
+    scenario = job.loaded()
     assert job.seed is not None
     return PolicyCard(
         id=_id(job, mark, setting),

@@ -13,7 +13,7 @@ from pathlib import Path
 from typing import Any, Literal
 
 from ugat_marl.effects import domain_label, domain_path, load_scenario
-from ugat_marl.errors import OptionError, UnknownNameError, require_least
+from ugat_marl.errors import OptionError, UnknownNameError, require_distinct, require_least
 from ugat_marl.experiments.comparison import Comparison, Trial
 from ugat_marl.experiments.driver import perform_all, record_of
 from ugat_marl.experiments.evaluation import require_distinct_domains
@@ -99,8 +99,7 @@ def settings_of(
             raise OptionError(f"grounding {grounding!r}: allowed are {', '.join(GROUNDED_NAME)}")
     if wrong := [seconds for seconds in constants if seconds < 1]:
         raise OptionError(f"constants holds {wrong[0]}: delays are whole seconds, at least 1")
-    if len(set(constants)) < len(constants):
-        raise OptionError(f"constants holds one twice: {' '.join(map(str, constants))}")
+    require_distinct(constants=constants)
     # Phase grounding is the paper's: it uses f and h from the start, however accurate they are.
     least = {name: None if name == "phase" else ugat.least_accuracy for name in GROUNDED_NAME}
     alone = replace(ugat, timed=replace(ugat.timed, match=False))  # matching is a row of its own

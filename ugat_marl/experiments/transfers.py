@@ -27,7 +27,13 @@ from ugat_marl.data import (
 )
 from ugat_marl.effects import domain_label, load_scenario, scenario_in_domain
 from ugat_marl.envs import AgentSet, TrafficEnv, parallel_env
-from ugat_marl.errors import OptionError, ScenarioError, UnknownNameError, require_least
+from ugat_marl.errors import (
+    OptionError,
+    ScenarioError,
+    UnknownNameError,
+    require_distinct,
+    require_least,
+)
 from ugat_marl.experiments.driver import perform_here
 from ugat_marl.experiments.jobs import (
     DIRECT_POLICY,
@@ -182,8 +188,7 @@ class TransferConfig:
                 f"real = {self.real!r} is the simulation itself; name another domain, such as V4, "
                 'or ask for the negative control "same-world"'
             )
-        if len(set(self.further)) < len(self.further):
-            raise OptionError(f"further holds one twice: {' '.join(self.further)}")
+        require_distinct(further=self.further)
         if self.control and self.sim in self.further:
             raise OptionError(
                 f"further = {self.sim} is what the control does ({CONTROL!r}); leave out one of "

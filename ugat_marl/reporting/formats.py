@@ -53,10 +53,10 @@ def chance(value: Any) -> str:
     return "< 0.001" if value < 0.001 else f"{value:.2g}"
 
 
-def fixed(value: float, decimals: int) -> str:
-    """Return a number with fixed decimals; what rounds to zero has no sign."""
-    text = f"{value:.{decimals}f}"
-    return text.removeprefix("-") if float(text) == 0 else text
+def fixed(value: float, decimals: int, *, plus: bool = False) -> str:
+    """Return a number with fixed decimals, perhaps with a plus; what rounds to 0 has no sign."""
+    text = f"{value:{'+' if plus else ''}.{decimals}f}"
+    return text.lstrip("+-") if float(text) == 0 else text
 
 
 def number_text(value: float) -> str:
@@ -83,10 +83,7 @@ def share_text(value: float) -> str:
 
 def percent_text(value: float) -> str:
     """Return a signed share in per cent; what rounds to zero has no sign. A dash for nan."""
-    if math.isnan(value):
-        return "–"
-    text = fixed(100 * value, 0)
-    return f"{'+' if not text.startswith(('-', '0')) else ''}{text} %".replace("-", "−")
+    return "–" if math.isnan(value) else f"{fixed(100 * value, 0, plus=True)} %".replace("-", "−")
 
 
 def tick_text(value: float, _: Any = None) -> str:

@@ -114,7 +114,4 @@ def _by_domain(evaluation: Evaluation) -> RenderableType:
 
 def _change(percent: float) -> str:
     """Return a change with its sign and one decimal; "-" for nan."""
-    if math.isnan(percent):
-        return "-"
-    text = fixed(percent, 1)
-    return text if text.startswith("-") or text == "0.0" else f"+{text}"
+    return "-" if math.isnan(percent) else fixed(percent, 1, plus=True)

@@ -325,17 +325,16 @@ def _walks(
         return all(turn_of(link) != "s" for link in foes)
 
     def following(place: int) -> _Signals:
-        later = [*signals[place:], *signals[:place]]
-        return next((one for one in later if not (one.yellow or one.clearing)), later[0])
+        in_turn = [*signals[place:], *signals[:place]]
+        return next((one for one in in_turn if not (one.yellow or one.clearing)), in_turn[0])
 
-    return [
-        [
-            walk
-            for walk in walks
-            if following(place).green and free(walk, now) and free(walk, following(place))
-        ]
-        for place, now in enumerate(signals)
-    ]
+    green: list[list[Link]] = []
+    for place, now in enumerate(signals):
+        later = following(place)
+        green.append(
+            [walk for walk in walks if later.green and free(walk, now) and free(walk, later)]
+        )
+    return green
 
 
 def _state(

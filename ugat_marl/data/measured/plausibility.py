@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterator, Sequence
+from typing import get_args
 
 import numpy as np
 import polars as pl
@@ -15,7 +16,15 @@ from numpy.typing import NDArray
 
 from ugat_marl.data.measured.values import Finding, MeasuredData
 from ugat_marl.errors import listed
-from ugat_marl.scenarios import Detector, Intersection, Network, Passages, Period, deciding_letter
+from ugat_marl.scenarios import (
+    Detector,
+    DetectorKind,
+    Intersection,
+    Network,
+    Passages,
+    Period,
+    deciding_letter,
+)
 
 FEWEST = 20
 """Least number of vehicles that tell something."""
@@ -100,7 +109,12 @@ def _left_on_red(
 # --- passages -------------------------------------------------------------------------------------
 
 
-def _passages(measured: MeasuredData, kinds: Sequence[str]) -> list[tuple[Detector, Passages]]:
+_EVERY_KIND: tuple[DetectorKind, ...] = get_args(DetectorKind)
+
+
+def _passages(
+    measured: MeasuredData, kinds: Sequence[DetectorKind] = _EVERY_KIND
+) -> list[tuple[Detector, Passages]]:
     """Return the passages over detectors of some kinds, of all periods."""
     by_name = {detector.id: detector for detector in measured.detectors if detector.kind in kinds}
     return [
@@ -136,7 +150,7 @@ def _swapped_events(measured: MeasuredData) -> Iterator[Finding]:
 def _speeds(measured: MeasuredData, network: Network) -> Iterator[Finding]:
     """Yield a finding if speeds are too high for m/s, or are not measured at all."""
     limits = {name: lane.speed_mps for name, lane in network.lanes.items()}
-    found = _passages(measured, ("advance", "stop", "exit"))
+    found = _passages(measured)
     shares = {
         "detections: speed_mps": _joined(
             [passages.speed_mps / limits[detector.lane] for detector, passages in found]
@@ -163,7 +177,7 @@ def _speeds(measured: MeasuredData, network: Network) -> Iterator[Finding]:
 
 def _lengths(measured: MeasuredData) -> Iterator[Finding]:
     """Yield a finding if lengths of vehicles are none in m."""
-    found = _passages(measured, ("advance", "stop", "exit"))
+    found = _passages(measured)
     lengths = _joined([passages.length_m for _, passages in found])
     low, high = LENGTHS_M
     if len(lengths) >= FEWEST and not low <= (median := float(np.median(lengths))) <= high:

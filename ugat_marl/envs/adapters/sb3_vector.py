@@ -66,9 +66,7 @@ class SimulationsVecEnv(AgentsVecEnv):
         """Wait for the step of all simulations."""
         batch = self.simulations.step_wait()
         infos, agents = self._infos(batch), len(self.simulations.agents)
-        for ended in batch.ended:
-            if not batch.truncated[ended.environment]:
-                continue  # of an earlier step, behind which something failed
+        for ended in batch.ended_here:
             last = self._with_masks(ended.observations, ended.masks)
             for row, seen in enumerate(last, ended.environment * agents):
                 infos[row] |= {"terminal_observation": seen, "TimeLimit.truncated": True}

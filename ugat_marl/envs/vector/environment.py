@@ -106,6 +106,12 @@ class VectorStep:
     ended: tuple[Ended, ...]
     numbers: NDArray[np.int64]
 
+    @property
+    def ended_here(self) -> tuple[Ended, ...]:
+        """Ended episodes whose row is truncated; not those of an earlier step that failed."""
+        over = set(self.numbers[self.truncated].tolist())
+        return tuple(ended for ended in self.ended if ended.environment in over)
+
 
 class VectorEnv:
     """Environments in their own processes, stepped together; see `vector_env`.
@@ -214,7 +220,7 @@ class VectorEnv:
         self._stepped = [index for index in self._stepped if index not in gone]
         self._begun = [index for index in self._begun if index not in gone]
         self._begin(chosen, seeds)
-        self._memory.rewards[chosen] = 0.0  # a step that is received later begins with them
+        self._memory.rewards[chosen] = 0.0  # a step that others have under way shows these, too
         batch = self._batch(np.zeros(self.n, dtype=np.bool_), ())
         under_way = [*self._stepped, *self._begun, *self._sent]
         for rows in (batch.observations, batch.masks, batch.executed):

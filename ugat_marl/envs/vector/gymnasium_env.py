@@ -117,9 +117,7 @@ class GymnasiumVectorEnv(vector.VectorEnv[Any, Any, Any]):
         observations = np.full(self.num_envs, None, dtype=object)
         masks = np.zeros((self.num_envs, self.env.agent_set.most_actions), dtype=np.int8)
         travel_time_s = np.full(self.num_envs, np.nan)
-        for ended in batch.ended:
-            if not batch.truncated[ended.environment]:
-                continue  # of an earlier step, behind which something failed
+        for ended in batch.ended_here:
             first = ended.environment * len(self.env.agents)
             for row, (vector_seen, mask) in enumerate(
                 zip(ended.observations, ended.masks, strict=True)
