@@ -80,14 +80,25 @@ def replacing(path: Path) -> Iterator[Path]:
         temporary.unlink(missing_ok=True)
 
 
-def require_writable(path: Path) -> None:
+def require_writable(path: Path, suffix: str | None = None) -> None:
     """Refuse a path that cannot become a file, and make its folder.
 
+    Args:
+        path: The file to write.
+        suffix: Suffix of such files, such as ".json". A file that exists and has another one is
+            something else, and is not replaced. None allows every name.
+
     Raises:
-        OutputError: The path is a folder, or its parent cannot be made or written to.
+        OutputError: The path is a folder, a file of another kind is there, or the folder cannot be
+            made or written to.
     """
     if path.is_dir() or not path.name:
         raise OutputError(f"{str(path)!r} is a folder; give the name of a file")
+    if suffix is not None and path.is_file() and path.suffix.lower() != suffix:
+        raise OutputError(
+            f"{path}: there is a file of this name, and it would be replaced by a {suffix} file; "
+            f"give a name that ends in {suffix}"
+        )
     try:
         path.parent.mkdir(parents=True, exist_ok=True)
         with tempfile.TemporaryFile(dir=path.parent):

@@ -36,10 +36,17 @@ def complaint(capsys: pytest.CaptureFixture[str], *arguments: str) -> str:
         (["train", "single-v1", "--real", "undercount=*,0.2"], "which agents do not see"),
         (["train", "single-v1", "--iteratoins", "4"], "'--iterations'"),
         (["train", "single-v1", "--gate.moed", "static"], "'--gate.mode'"),
-        (["train", "single-v1", "--seed", "one"], "--seed"),
+        (["train", "single-v1", "--seed", "one"], "--seed 'one': not a whole number"),
         (["train", "single-v1", "--observation", "cuont"], "'count'"),
         (["train", "single-v1", "--iterations", "-1"], "at least 0"),
-        (["train"], "SCENARIO"),
+        (["train"], "error: train needs SCENARIO; see ugat-marl train --help"),
+        (["import-log"], "import-log needs SCENARIO, MEASURED and --out PATH; see"),
+        (
+            ["train", "x", "--grounding", "foo"],
+            "--grounding 'foo': must be one of 'phase', 'timed'",
+        ),
+        (["train", "single-v1", "--seed"], "--seed needs a value"),
+        (["train", "single-v1", "--rollout-epsilon", "z"], "--rollout-epsilon 'z': not a number"),
         (["train", "single-v1", "extra"], "'extra'"),
         (["train", "single-v1", "--real-log", "nowhere.parquet"], "nowhere.parquet"),
         (["evaluate", "single-v1", "--policies", "largst-queue:20"], "'largest-queue'"),
@@ -92,6 +99,26 @@ def test_options_that_would_do_nothing_are_refused(
     arguments: str, unused: str, capsys: pytest.CaptureFixture[str]
 ) -> None:
     assert f"; leave out {unused}" in complaint(capsys, *arguments.split())
+
+
+@pytest.mark.parametrize(
+    "command",
+    [
+        ["evaluate", "single-v1"],
+        ["tune", "single-v1"],
+        ["rollout", "single-v1"],
+        ["import-log", "single-v1", "measured"],
+        ["compare", "single-v1", "--name", "mine", "--policies", "random"],
+    ],
+    ids=lambda command: command[0],
+)
+def test_a_file_of_another_kind_is_not_replaced(
+    command: list[str], capsys: pytest.CaptureFixture[str], tmp_path: Path
+) -> None:
+    policy = tmp_path / "policy.pt"
+    policy.write_bytes(b"weights")
+    assert "give a name that ends in" in complaint(capsys, *command, "--out", str(policy))
+    assert policy.read_bytes() == b"weights"
 
 
 def test_one_light_has_one_intersection(capsys: pytest.CaptureFixture[str], tmp_path: Path) -> None:

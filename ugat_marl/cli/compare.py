@@ -112,7 +112,7 @@ class Compare:
             )
         require_numbers(1, evaluation_seeds=self.evaluation_seeds, workers=self.workers)
         if self.out is not None:
-            require_writable(self.out)
+            require_writable(self.out, ".csv")
         scenario = load_scenario(self.scenario, self.duration_s)
         length_s = self.duration_s or scenario.settings.duration_s
         judging = Judging(scenario.id, self.evaluation_seeds, float(length_s))

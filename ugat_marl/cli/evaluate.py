@@ -69,7 +69,7 @@ class Evaluate:
         """Evaluate and print."""
         require_names(policies=self.policies, domains=self.domains)
         if self.out is not None:
-            require_writable(self.out)
+            require_writable(self.out, ".json")
         require_numbers(0, first_seed=self.first_seed)
         require_numbers(1, seeds=self.seeds, workers=self.workers)
         scenario = load_scenario(self.scenario, self.duration_s)

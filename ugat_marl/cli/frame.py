@@ -6,6 +6,7 @@ import contextlib
 import errno
 import importlib
 import io
+import itertools
 import os
 import re
 import signal
@@ -19,7 +20,7 @@ from typing import Any
 from rich.console import Console
 
 from ugat_marl.cli.help import DEADLINE, HELP, HELP_ALL, described, options_of, print_help
-from ugat_marl.errors import UgatMarlError, UnknownNameError, nearest
+from ugat_marl.errors import UgatMarlError, UnknownNameError, joined, nearest
 from ugat_marl.progress import Bars, Loudness, loudness, showing
 
 USAGE_ERROR = 2
@@ -28,6 +29,20 @@ TERMINATED = 143
 COMPLETION = "completion"
 LOUDNESS: dict[str, Loudness] = {"--quiet": "quiet", "--verbose": "verbose"}
 """Options of every command."""
+_INDENT_OF_REQUIRED = 6
+"""Spaces before the name of an argument in tyro's box of missing ones."""
+_PLAIN_WORDS = {
+    r"^Error parsing config[\w.]*: *": "",
+    r"^Error parsing (\S+): invalid literal for int\(\) with base 10: (.*)": (
+        r"\1 \2: not a whole number"
+    ),
+    r"^Error parsing (\S+): could not convert string to float: (.*)": r"\1 \2: not a number",
+    r"^invalid choice (.*) for argument '(.*)'\. Expected one of \((.*)\)": (
+        r"\2 \1: must be one of \3"
+    ),
+    r"^Missing value for argument '(.*)'\. Expected 1 values": r"\1 needs a value",
+}
+"""Messages of tyro to what they mean."""
 _LONGEST_MESSAGE = 1500
 """Most characters of an error: about twenty lines of a terminal."""
 _WAYS_OUT = {
@@ -248,7 +263,7 @@ def _parse(line: CommandLine, name: str, words: list[str]) -> Any:
     except SystemExit as end:
         if not end.code:
             raise
-        message = _one_line(messages.getvalue())
+        message = _one_line(messages.getvalue(), name)
         raise UgatMarlError(f"{message}; see {line.program} {name} --help") from None
     if unknown:
         first = unknown[0].partition("=")[0]
@@ -272,14 +287,32 @@ def _with_address(words: list[str]) -> list[str]:
     return complete
 
 
-def _one_line(box: str) -> str:
-    """Return the message in the box that tyro draws, as one line."""
-    lines = [re.sub(r"[│╭╮╰╯]", " ", line).strip() for line in box.splitlines()]
-    until = next((i for i, line in enumerate(lines) if line.startswith("──")), len(lines))
-    words = " ".join(re.sub(r"─+", " ", line) for line in lines[:until])
-    words = re.sub(r"^\s*(Value error|Invalid choice|Required options)\s", "", words)
-    words = re.sub(r"Error parsing config[\w.]*:", "", words)
-    return " ".join(words.split()).rstrip(".")
+def _one_line(box: str, name: str) -> str:
+    """Return the message in the box that tyro draws, as one line.
+
+    Args:
+        box: The box, in line-drawing characters or, on terminals without them, in ASCII.
+        name: Name of the command.
+    """
+    lines = [re.sub(r"[│╭╮╰╯]", " ", line).rstrip() for line in box.splitlines()]
+    under_title = itertools.dropwhile(_is_rule, lines[1:])
+    message = list(itertools.takewhile(lambda line: not _is_rule(line), under_title))
+    if "Required options" in lines[0]:
+        return f"{name} needs {joined([*filter(None, map(_required, message))])}"
+    words = " ".join(" ".join(message).split()).rstrip(".")
+    for pattern, plain in _PLAIN_WORDS.items():
+        words = re.sub(pattern, plain, words)
+    return words
+
+
+def _is_rule(line: str) -> bool:
+    return re.fullmatch(r"\s*[─-]{5,}\s*", line) is not None
+
+
+def _required(line: str) -> str:
+    """Return the argument that a line of tyro's "Required options" names; empty if it explains."""
+    indent = len(line) - len(line.lstrip())
+    return line.strip() if indent == _INDENT_OF_REQUIRED else ""
 
 
 def _print_completion(line: CommandLine, words: list[str]) -> int:

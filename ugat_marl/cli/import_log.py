@@ -48,7 +48,7 @@ class ImportLog:
 
     def run(self, console: Console) -> int:
         """Import the data, write the log, and print what it does not know."""
-        require_writable(self.out)
+        require_writable(self.out, ".parquet")
         scenario = load_scenario(self.scenario)
         network = Network.read(scenario)
         measured = read_measured(self.measured, scenario, network)

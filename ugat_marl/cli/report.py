@@ -62,7 +62,7 @@ class Report:
             raise OptionError("name at least one folder of a run, such as runs/first")
         records = read_records(self.runs)
         out = self.out or (self.runs[0] / PAGE if len(self.runs) == 1 else Path(PAGE))
-        require_writable(out)
+        require_writable(out, ".html")
         if self.pictures is not None:
             require_writable(self.pictures / "picture.svg")
         page = runs_page(records, {r.directory: again(r) for r in records})

@@ -130,10 +130,10 @@ class Rollout:
             refuse_options(self, _RECORDED, "without --out nothing is recorded")
         if self.video is None:
             refuse_options(self, ("film",), "without --video nothing is filmed")
-        for path in (self.out, self.video):
-            if path is not None:
-                require_writable(path)
+        if self.out is not None:
+            require_writable(self.out, ".parquet")
         if self.video is not None:
+            require_writable(self.video)
             require_video(self.video)
         scenario = load_scenario(self.scenario, self.duration_s)
         if self.out is not None:

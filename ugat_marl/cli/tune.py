@@ -66,7 +66,7 @@ class Tune:
         require_numbers(LEAST_BUDGET, budget=self.budget)
         require_numbers(1, workers=self.workers)
         if self.out is not None:
-            require_writable(self.out)
+            require_writable(self.out, ".json")
         scenario, reporter = load_scenario(self.scenario, self.duration_s), Bars(console)
         with workers_of(self.workers, self.ray) as workers:
             tuned = [
