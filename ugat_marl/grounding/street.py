@@ -89,8 +89,8 @@ class StreetConfig:
 
     Attributes:
         parts: Parts that are fitted.
-        simulations: N, worlds that are simulated for the first fit, `AIMED` of them after a look at
-            the others.
+        simulations: N, worlds that are simulated for the first fit: six in ten from the prior,
+            the others near the street, by a fit to these.
         further: Worlds that each further iteration adds, half of them drawn from the posterior.
         simulated_s: Length of an episode in such a world, in s. Of longer episodes of the street
             only this first part is compared. Detectors are compared over whole episodes.
@@ -98,8 +98,8 @@ class StreetConfig:
             best one is kept. 0 keeps the last one.
         rule_budget: Budget that decides how many settings of each rule race in worlds of the fitted
             street. The best rule of all teaches the learner, and is kept if it is better than the
-            trained policies. With 0 only trained policies are kept. None stands for `RULE_BUDGET`
-            with a learner that rules teach, and for 0 with others.
+            trained policies. With 0 only trained policies are kept. None stands for 6 with a
+            learner that rules teach, and for 0 with others.
         rival: "matched": a second learner trains in the simulation with greens that are late until
             rewards match, and its policy is compared with the others. "none" goes without.
         without: Effects left out of the library.
