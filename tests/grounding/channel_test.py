@@ -136,6 +136,9 @@ def test_greens_that_the_simulation_holds_itself_are_not_forbidden() -> None:
     assert fit_channel(log).forbids
     assert not fit_channel(log, held_s=2 * INTERVAL_S).changes
 
+    longer = fit_channel(log, held_s=INTERVAL_S)  # the street holds greens longer than that
+    assert after_one_step(longer, 2, age=1) == [2]
+
     def cyclic_and_held(running: int, age: int) -> Sequence[int]:
         return [running] if age < 2 else [running, (running + 1) % PHASES]
 

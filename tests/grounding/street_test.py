@@ -237,16 +237,16 @@ def test_the_last_worlds_of_a_fit_are_drawn_from_the_posterior_of_the_others(
 @pytest.mark.parametrize(
     ("recorded_s", "simulated_s", "compared_s"),
     [
-        pytest.param(300.0, 100.0, 60.0, marks=pytest.mark.slow),
-        (40.0, 100.0, 40.0),
-        pytest.param(60.0, 40.0, 40.0, marks=pytest.mark.slow),
+        pytest.param(300.0, 200.0, 100.0, marks=pytest.mark.slow),
+        (80.0, 200.0, 80.0),
+        pytest.param(120.0, 80.0, 80.0, marks=pytest.mark.slow),
     ],
 )
 def test_a_street_is_compared_with_worlds_of_the_same_length(
     recorded_s: float, simulated_s: float, compared_s: float
 ) -> None:
     """Queues of a whole peak are not compared with those of its beginning."""
-    config = replace(QUICK, parts=("effects",))
+    config = replace(QUICK, parts=("effects",), simulated_s=100.0)
     env = parallel_env(SCENARIO)
     prior, view = street_prior(env, config), LaneView.of(env.network, "count")
     rule = make_rule("fixed-time:20", env)
@@ -440,14 +440,17 @@ def test_a_log_without_histories_is_refused() -> None:
     require_histories(TransitionLog(log.provenance, log.frame.sample(fraction=1.0, shuffle=True)))
     alone = log.frame.with_columns(episode=step, step=pl.lit(0, dtype=log.frame["step"].dtype))
     alone = alone.with_columns(pl.col("episode").cast(log.frame["episode"].dtype))
+    short = log.frame.with_columns(episode=step // 6, step=step % 6)
+    short = short.cast({name: log.frame[name].dtype for name in ("episode", "step")})
     for broken in (
         in_part(log, step % 2 == 0),
         in_part(log, step % 3 > 0),
         TransitionLog(log.provenance, alone),
+        TransitionLog(log.provenance, short),
     ):
-        with pytest.raises(LogError, match="follow the one before"):
+        with pytest.raises(LogError, match="decisions right before them"):
             require_histories(broken)
-        with pytest.raises(LogError, match="follow the one before"):
+        with pytest.raises(LogError, match="decisions right before them"):
             fit_street(broken, None, None, None, None, QUICK, 0)  # pyright: ignore[reportArgumentType]
 
 
@@ -456,7 +459,7 @@ def test_a_broken_log_ends_a_training_before_it_begins(tmp_path: Path) -> None:
     log.write(tmp_path / "street.parquet")
     ugat = replace(SMALL.ugat, grounding="street", street=QUICK)
     config = replace(SMALL, ugat=ugat, real_log=tmp_path / "street.parquet")
-    with pytest.raises(LogError, match="follow the one before"):
+    with pytest.raises(LogError, match="decisions right before them"):
         transfer(config, tmp_path / "run", workers=1)
 
 

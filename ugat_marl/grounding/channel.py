@@ -34,9 +34,9 @@ from ugat_marl.seeding import numpy_generator
 
 Floats = NDArray[np.float64]
 
-LEAST_IN_ORDER = 0.8
-"""Smallest share of decisions that must follow the one before. With lags of up to six decisions,
-a fifth of the decisions of such a log still have a whole history."""
+LEAST_WHOLE = 0.2
+"""Smallest share of decisions that must have a whole history: right before them, as many decisions
+of their episode as the longest delay of a command."""
 UNEXPLAINED = 1e-3
 """Chance of a decision that no lag explains."""
 Table = NDArray[np.bool_]
@@ -275,17 +275,21 @@ def require_histories(log: TransitionLog) -> None:
     """Refuse a log whose decisions are not in sequence, since nothing late can be seen in it.
 
     Raises:
-        LogError: Too few decisions of an agent follow the one before in their episode.
+        LogError: Too few decisions of an agent have a whole history.
     """
+    most = ChannelConfig.most_lag
     for agent in log.agents:
         rows = log.transitions(agent)
-        follows = int(consecutive(rows.episode, rows.step).sum())
-        if follows < LEAST_IN_ORDER * (len(rows) - 1):
+        begins = np.r_[True, ~consecutive(rows.episode, rows.step)]
+        places = np.arange(len(rows))
+        before = places - np.maximum.accumulate(np.where(begins, places, 0))
+        whole = int((before >= most).sum())
+        if whole < LEAST_WHOLE * len(rows):
             raise LogError(
-                f"only {follows} of the {len(rows)} decisions of {agent} in the log follow the one "
-                "before, step by step in an episode; a fitted street is read from histories of "
-                "commands and counts, so record whole episodes and keep their steps, or choose "
-                "another grounding (--grounding timed)"
+                f"only {whole} of the {len(rows)} decisions of {agent} in the log have {most} "
+                "decisions right before them in their episode; a fitted street is read from "
+                "histories of commands and counts, so record whole episodes of 10 decisions or "
+                "more and keep their steps, or choose another grounding (--grounding timed)"
             )
 
 
@@ -388,7 +392,7 @@ class _Course:
         states = rows + lag
         known = self.age[states] > 0
         alone = self.mask[rows].sum(1) == 1
-        known &= ~(alone & (self.age[states] < self.held + 1.0))  # the green was held, as in sim
+        known &= ~(alone & (self.age[states] < self.held))  # the green was held, as in sim
         rows, states = rows[known], states[known]
         shape = (self.ages, self.phases)
         cells = np.ravel_multi_index((self.age[states], self.running[states]), shape)
