@@ -103,6 +103,32 @@ def test_the_same_world_is_left_alone(same_world: tuple[Residual, ResidualReport
     assert residual.around(env) is env  # type: ignore[arg-type]
 
 
+def test_f_learns_from_earlier_policies_but_is_compared_on_the_latest(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """Where another policy leads, f is better than its twin even if the worlds are the same."""
+    residual = replace(PHASE, fit=replace(PHASE.fit, epochs=2)).residual(LAYOUTS, 0)
+    assert residual is not None
+    earlier, latest = (ByHand(0).collect(None, iteration, 0) for iteration in (0, 1))
+    learnt: list[int] = []
+    compared: list[TransitionLog] = []
+    fit = residual.transform.fit
+
+    def counting(real: TransitionLog, *others: Any, **options: Any) -> Any:
+        learnt.append(len(real))
+        return fit(real, *others, **options)
+
+    def none(transform: Any, real: TransitionLog, *_others: Any) -> Trust:
+        compared.append(real)
+        return Trust.nowhere(transform.stack.agents)
+
+    monkeypatch.setattr(residual.transform, "fit", counting)
+    monkeypatch.setattr("ugat_marl.grounding.residual.compare", none)
+    residual.fit(latest, world(50), Fitter(FitConfig(epochs=2), 0), earlier=[earlier])
+    assert learnt == [len(earlier) + len(latest)]
+    assert compared == [latest]
+
+
 @pytest.fixture(scope="module")
 def late_greens() -> tuple[Residual, ResidualReport]:
     """A street whose first intersection has late greens that no part of the world has."""

@@ -8,6 +8,7 @@ street better than the fitted world does (`trust`): a street that the world expl
 from __future__ import annotations
 
 import warnings
+from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Literal
@@ -73,7 +74,7 @@ class ResidualReport:
         """Return where the residual acts, in one line."""
         agents = self.trust.agents
         if np.isnan(self.trust.world_error).all():
-            return "residual: off, too few decisions of the street to compare with"
+            return "residual: off, too few decisions of the street, or of its worlds, to compare"
         better = int(self.trust.better.sum())
         told = f"residual: f predicts better than the fitted world at {better} of {len(agents)}"
         if not better:
@@ -115,20 +116,26 @@ class Residual:
         world: TransitionLog,
         fitter: Fitter,
         delayed: TransitionLog | None = None,
+        earlier: Sequence[TransitionLog] = (),
     ) -> ResidualReport:
         """Fit f to the street and h to the fitted world; ground only where f is better.
 
+        f is compared with the fitted world on logs of one policy, or it would look better for
+        having seen where another policy leads.
+
         Args:
             real: Transitions of the street.
-            world: Transitions of the fitted street.
+            world: Transitions of the fitted street, under the policy of `real`.
             fitter: Settings, seed and device of the training.
             delayed: The same under random delays, for timed grounding.
+            earlier: Transitions of the street under other policies, from which f learns as well.
 
         Raises:
             LogError: The logs are refused by `Transform.fit`.
         """
         transform, agents = self.transform, self.transform.stack.agents
-        report = transform.fit(real, delayed or world, fitter, on_top=True)
+        known = TransitionLog.concatenate([*earlier, real])
+        report = transform.fit(known, delayed or world, fitter, on_top=True)
         trust = compare(transform, real, world, fitter, self.config.trust)
         proven = np.ones(len(agents), bool)
         if self._least_accuracy is not None:

@@ -12,8 +12,8 @@ another draw.
      3  for i = 1, ..., N: draw a world from the prior, roll pi out in it with channel and detectors
      4  fit the posterior of worlds from the statistics of all logs (`posterior`)
 
-With no data this is domain randomisation; with much data it is the corrected simulation. What no
-part explains is left to f and h on top of it (`residual`).
+With no data this is domain randomisation; the more a log tells, the nearer it is to a corrected
+simulation. What no part explains is left to f and h on top of it (`residual`).
 """
 
 from __future__ import annotations
@@ -467,7 +467,7 @@ def fit_street(
     Args:
         real: Transitions of the street.
         simulation: The simulation.
-        policy: Policy of the log; it acts in the simulated worlds, too.
+        policy: Latest policy of the log; it acts in the simulated worlds, too.
         worlds: Prior of worlds.
         view: Lanes of the network, as the log shows them.
         config: Settings.

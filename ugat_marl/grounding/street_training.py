@@ -385,8 +385,8 @@ class StreetTraining(Algorithm):
                 advance(note=f"{model} {loss:.2g}")
 
             fitter = Fitter(self.config.fit, seed, on_epoch, device_of(self.device))
-            real = TransitionLog.concatenate(state.real)
-            report = residual.fit(real, logs[0], fitter, *logs[1:])
+            *earlier, latest = state.real
+            report = residual.fit(latest, logs[0], fitter, *logs[1:], earlier=earlier)
         say(f"{title}: {report.describe()}")
         for warning in report.fit.warnings if report.acting else ():
             say(f"{title}: residual: {warning}")
