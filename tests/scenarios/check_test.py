@@ -36,7 +36,7 @@ from ugat_marl.scenarios import (
     resco_maps,
     survey,
 )
-from ugat_marl.scenarios.inspection import SATURATION_VPH
+from ugat_marl.scenarios.inspection import SATURATION_VPH, fullest
 
 
 @pytest.fixture(scope="module")
@@ -101,7 +101,8 @@ def test_traffic_is_counted_by_approach(single: Scenario) -> None:
     road = next(a for a in facts.intersections[0].approaches if a.edge == lane.edge)
     assert road.vph == 720
     assert road.worst_vph == 1440  # all of them within a quarter of an hour
-    assert road.flow_ratio == pytest.approx(1440 / (road.lanes * SATURATION_VPH), abs=1e-3)
+    serving = {k.from_lane for k in item.links if k.from_edge == lane.edge and k.to_edge == leads}
+    assert road.flow_ratio == pytest.approx(1440 / (len(serving) * SATURATION_VPH), abs=1e-3)
     assert (road.worst_from_s, facts.busiest_s, facts.busiest, facts.last_s) == (0, 0, 360, 459)
     assert road.first_s == pytest.approx(100 + lane.length_m / lane.speed_mps)
     others = [a for a in facts.intersections[0].approaches if a.edge != lane.edge]
@@ -115,6 +116,31 @@ def test_traffic_is_counted_by_approach(single: Scenario) -> None:
     assert facts.fill_s == pytest.approx(both, rel=0.1)
     assert facts.shortest_episode_s >= 100 + 3 * facts.fill_s
     assert sum(a.vph for a in facts.intersections[0].approaches) == 720
+
+
+@pytest.mark.parametrize(
+    ("flows", "capacity", "share"),
+    [
+        ({"left": 20, "through": 1000, "right": 20}, (1800, 1800, 1800), 1000 / 1800),
+        ({"left": 20, "through": 1000, "right": 20}, (800, 800, 200), 1000 / 800),
+        ({"left": 0, "through": 300, "right": 300}, (400, 400, 400), 300 / 400),
+        ({"left": 900}, (1000, 1000, 0), math.inf),
+        ({}, (1000, 1000, 1000), 0.0),
+    ],
+)
+def test_lanes_of_their_own_are_full_alone(
+    flows: dict[str, float], capacity: tuple[float, ...], share: float
+) -> None:
+    lanes = {"right": {"0"}, "through": {"1"}, "left": {"2"}}
+    assert fullest(flows, lanes, dict(zip("012", capacity, strict=True))) == pytest.approx(share)
+
+
+def test_traffic_divides_among_lanes_that_it_shares() -> None:
+    lanes = {"right": {"0"}, "through": {"0", "1"}, "left": {"1"}}
+    capacity = {"0": 1000.0, "1": 500.0}
+    assert fullest({"right": 300, "through": 600}, lanes, capacity) == pytest.approx(900 / 1500)
+    assert fullest({"right": 900, "through": 300}, lanes, capacity) == pytest.approx(900 / 1000)
+    assert fullest({"left": 400, "through": 600}, lanes, capacity) == pytest.approx(400 / 500)
 
 
 def test_an_approach_that_is_full_for_a_quarter_of_an_hour_is_shown_so(single: Scenario) -> None:

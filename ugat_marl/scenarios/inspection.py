@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 import xml.etree.ElementTree as ET
 from collections import Counter, defaultdict
-from collections.abc import Container, Iterator, Mapping, Sequence
+from collections.abc import Container, Iterator, Mapping, Sequence, Set
 from dataclasses import dataclass, replace
 from itertools import combinations
 
@@ -57,9 +57,11 @@ class ApproachFacts:
         vph: Vehicles per hour whose routes use the road, mean of the episode.
         worst_vph: The same in the worst quarter of an hour, by free flow to the light.
         worst_from_s: Start of this quarter of an hour, s from the start of the episode.
-        flow_ratio: `worst_vph` divided by the flow its lanes would discharge in permanent green.
-        saturation: `worst_vph` divided by the flow its lanes discharge under the network's own
-            programme. Above 1 the queue grows. None if there is no programme or no green.
+        flow_ratio: Traffic of its fullest lanes in that quarter of an hour, divided by the flow
+            that they would discharge in permanent green. Drivers divide among the lanes from which
+            they may turn as evenly as possible.
+        saturation: The same with the flow that lanes discharge under the network's own programme.
+            Above 1 the queue grows. None if there is no programme, or no green for some turn.
         first_s: Time at which the first vehicle can be there, s from the start of the episode; None
             if no route uses the road, or none can be there before the end.
     """
@@ -395,11 +397,15 @@ def _approaches(intersection: Intersection, traffic: _Traffic) -> Sequence[Appro
     for edge, links in roads.items():
         edge_lanes = tuple(dict.fromkeys(link.from_lane for link in links_for_cars(links)))
         vph, (worst_vph, worst_from_s) = traffic.vph[edge], traffic.worst(edge)
-        capacity = SATURATION_VPH * len(edge_lanes)
-        green = sum(_green_s(intersection, lane) for lane in edge_lanes) / len(edge_lanes)
-        saturation = None
+        flows = traffic.turning_vph(edge, worst_from_s)
+        lanes_of = _lanes_by_turn(links)
+        used = frozenset(edge_lanes).union(*lanes_of.values())
+        ratio = fullest(flows, lanes_of, dict.fromkeys(used, SATURATION_VPH))
+        saturation = math.inf
         if cycle_s:
-            saturation = worst_vph / (capacity * green / cycle_s) if green else None
+            greens = {lane: _green_s(intersection, lane) / cycle_s for lane in used}
+            served = {lane: SATURATION_VPH * green for lane, green in greens.items()}
+            saturation = fullest(flows, lanes_of, served)
         approaches.append(
             ApproachFacts(
                 edge,
@@ -407,12 +413,51 @@ def _approaches(intersection: Intersection, traffic: _Traffic) -> Sequence[Appro
                 round(vph, 1),
                 round(worst_vph, 1),
                 worst_from_s,
-                round(worst_vph / capacity, 3),
-                None if saturation is None else round(saturation, 3),
+                round(ratio, 3),
+                _finite(saturation),
                 traffic.first_at_s.get(edge),
             )
         )
     return approaches
+
+
+def _lanes_by_turn(links: Sequence[Link]) -> dict[str, frozenset[str]]:
+    """Return each road that an approach leads to, and the lanes that lead there."""
+    towards: dict[str, list[Link]] = defaultdict(list)
+    for link in links:
+        towards[link.to_edge].append(link)
+    usable = {edge: links_for_cars(each) for edge, each in towards.items()}
+    return {edge: frozenset(link.from_lane for link in each) for edge, each in usable.items()}
+
+
+def fullest(
+    flows_vph: Mapping[str, float],
+    lanes_of: Mapping[str, Set[str]],
+    capacity_vph: Mapping[str, float],
+) -> float:
+    """Return traffic as a share of capacity on the fullest lanes of an approach.
+
+    Traffic is divided among lanes so that the fullest ones are as empty as possible. By the theorem
+    of the maximum flow and the minimum cut, some turns then fill all lanes from which they can be
+    made.
+
+    Args:
+        flows_vph: Turn to its vehicles per hour.
+        lanes_of: Turn to the lanes from which it can be made.
+        capacity_vph: Lane to the vehicles per hour that it can discharge.
+
+    Returns:
+        The share; infinite if a turn with traffic has no capacity.
+    """
+    turns = [turn for turn, flow in flows_vph.items() if flow > 0 and turn in lanes_of]
+    most = 0.0
+    for count in range(1, len(turns) + 1):
+        for together in combinations(turns, count):
+            lanes = frozenset[str]().union(*(lanes_of[turn] for turn in together))
+            capacity = sum(capacity_vph.get(lane, 0.0) for lane in lanes)
+            flow = sum(flows_vph[turn] for turn in together)
+            most = max(most, flow / capacity if capacity > 0 else math.inf)
+    return most
 
 
 def _green_s(intersection: Intersection, lane: str) -> float:
@@ -448,7 +493,8 @@ class _Traffic:
         duration_s: Length of the episode.
         vph: Road to the vehicles per hour whose routes use it.
         passes: Road and quarter of an hour to the vehicles that reach its end.
-        turns: Quarter of an hour to the vehicles from road to road.
+        turns: Quarter of an hour in which the end of the first road is reached, to the vehicles
+            from road to road.
         departing: Quarter of an hour to the vehicles that depart.
         first_at_s: Road to the time at which the first vehicle reaches its end, s from the start.
         first_s: Seconds until the first vehicle departs.
@@ -477,6 +523,20 @@ class _Traffic:
             return 0.0, 0.0
         worst = max(sorted(quarters), key=lambda quarter: quarters[quarter])
         return quarters[worst] * 3600 / self._interval_s, worst * self._interval_s
+
+    def turning_vph(self, edge: str, from_s: float) -> dict[str, float]:
+        """Return next road to vehicles per hour that leave `edge` in a quarter of an hour.
+
+        Args:
+            edge: The road.
+            from_s: Start of the quarter of an hour, s.
+        """
+        turns = self.turns.get(round(from_s / self._interval_s), {})
+        return {
+            after: count * 3600 / self._interval_s
+            for (before, after), count in turns.items()
+            if before == edge
+        }
 
     @property
     def busiest_s(self) -> float:
@@ -526,8 +586,10 @@ class _Traffic:
         """Count a vehicle at the end of each of its roads, if it is there before the end."""
         self.departing[int(depart_s // self._interval_s)] += 1
         self.first_s, self.last_s = min(self.first_s, depart_s), max(self.last_s, depart_s)
-        at_s, before = depart_s, ""
+        at_s, before, quarter = depart_s, "", 0
         for edge in edges:
+            if before:
+                self.turns[quarter][before, edge] += 1
             at_s += seconds.get(edge, 0.0)
             if at_s >= self.duration_s:
                 break
@@ -535,6 +597,4 @@ class _Traffic:
             self.passes[edge][quarter] += 1
             if at_s < self.first_at_s.get(edge, math.inf):
                 self.first_at_s[edge] = at_s
-            if before:
-                self.turns[quarter][before, edge] += 1
             before = edge
