@@ -120,6 +120,15 @@ def test_origins_and_destinations(tmp_path: Path) -> None:
             "from,to,count,begin_s,end_s\nwest1_A1,A1_B1,5,600,1200\nwest1_A1,A1_B1,5,0,900\n",
             "line 2: begin_s = 600 is before the end of an earlier interval of west1_A1 -> A1_B1",
         ),
+        ("--counts", "edge,count\nwest1_A1,5\n,5\n", "line 3: a count without its road"),
+        ("--counts", "edge;count\nwest1_A1;1.250\n", "'1.250' can be 1250 or a little more than 1"),
+        ("--counts", "edge;count\nwest1_A1;1,250\n", "'1.250' can be 1250 or a little more than 1"),
+        (
+            "--counts",
+            "edge,count,begin_s,end_s\nwest1_A1,5,25200,28800\n",
+            "the first begins at 25200 s (line 2); --begin-s 25200",
+        ),
+        ("--counts", "Counts of May\nedge,count\nwest1_A1,5\n", "are needed in the first line"),
         ("--od", "from,to,count\nA1_west1,west1_A1,5\n", "line 2: there is no way from 'A1_west1'"),
         ("--od", "from,to,count\nwest1_A1,up,5\n", "line 2: 'up' is not a road for cars"),
     ],
@@ -155,6 +164,12 @@ def test_long_tables_are_read_row_by_row(tmp_path: Path, monkeypatch: pytest.Mon
     (tmp_path / "t.csv").write_bytes(b"edge,count\n" + b"x" * 200)
     with pytest.raises(ScenarioError, match=r"t\.csv, line 2: is longer than a line of a table"):
         read_rows(tmp_path / "t.csv", 0, 60, Silent(), pairs=False)
+
+
+def test_counts_may_have_three_decimals_and_large_heads(tmp_path: Path) -> None:
+    (tmp_path / "t.csv").write_text("Edge,Count\na,12.345\nb,98.5\n")
+    rows = read_rows(tmp_path / "t.csv", 0, 60, Silent(), pairs=False)
+    assert [row.count for row in rows] == [12.345, 98.5]
 
 
 def test_a_decimal_comma_is_a_point_between_semicolons(tmp_path: Path) -> None:

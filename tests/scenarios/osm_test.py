@@ -21,6 +21,7 @@ from ugat_marl.progress import Silent
 from ugat_marl.scenarios import Network, Scenario, read_scenario, shipped_scenarios, survey
 from ugat_marl.scenarios.importers.osm import items, unpack, write_roads
 from ugat_marl.scenarios.importers.osm_crossings import utm
+from ugat_marl.scenarios.importers.osm_restrictions import Restriction, forbidden_turns
 from ugat_marl.scenarios.junctions import foes_of
 from ugat_marl.scenarios.phases import RightOfWay, are_foes, suited
 
@@ -356,6 +357,85 @@ def test_extracts_that_are_wrong(
     assert made(tmp_path / "a", tmp_path / "bad.osm") == 2
     assert says in capsys.readouterr().err
     assert [path.name for path in tmp_path.iterdir()] == ["bad.osm"]
+
+
+def joined_crossroads(*relations: str, first: str = "") -> str:
+    """A crossroads whose lights are mapped at the stop lines, so that its nodes are joined."""
+    arms = {1000: (0.0, -0.004), 1001: (0.0, 0.004), 1002: (-0.0027, 0.0), 1003: (0.0027, 0.0)}
+    light = '<tag k="highway" v="traffic_signals"/>'
+    nodes, ways = ['<node id="1" lat="48" lon="11"/>'], list[str]()
+    for number, (way, (north, east)) in enumerate(arms.items(), 2):
+        for node, share, tag in ((number, 1.0, ""), (number + 10, 0.0335, light)):
+            place = f'lat="{48 + share * north:.8f}" lon="{11 + share * east:.8f}"'
+            nodes.append(f'<node id="{node}" {place}>{tag}</node>')
+        order = (number, number + 10, 1) if way % 2 == 0 else (1, number + 10, number)
+        along = "".join(f'<nd ref="{node}"/>' for node in order)
+        tags = first if way == 1000 else '<tag k="maxspeed" v="50"/>'
+        ways.append(f'<way id="{way}">{along}<tag k="highway" v="primary"/>{tags}</way>')
+    return f'<osm version="0.6">{"".join((*nodes, *ways, *relations))}</osm>'
+
+
+def restriction_xml(kind: str, start: int, goal: int, via: str = "1", more: str = "") -> str:
+    kind_of_via = "way" if len(via) > 2 else "node"
+    return (
+        f'<relation id="9"><member type="way" ref="{start}" role="from"/>'
+        f'<member type="{kind_of_via}" ref="{via}" role="via"/>'
+        f'<member type="way" ref="{goal}" role="to"/><tag k="type" v="restriction"/>'
+        f'<tag k="restriction" v="{kind}"/>{more}</relation>'
+    )
+
+
+@pytest.mark.parametrize(
+    ("relation", "forbidden"),
+    [
+        ("", set()),
+        (restriction_xml("no_left_turn", 1000, 1003), {1003}),
+        (restriction_xml("only_straight_on", 1000, 1001), {1002, 1003}),
+        (restriction_xml("no_left_turn", 1000, 1003, more='<tag k="except" v="motorcar"/>'), set()),
+    ],
+)
+def test_turns_that_the_map_forbids_at_a_joined_junction_are_taken_out(
+    relation: str, forbidden: set[int], tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    (tmp_path / "x.osm").write_text(joined_crossroads(relation))
+    assert made(tmp_path / "city", tmp_path / "x.osm") == 0
+    (light,) = Network.read(read_scenario(tmp_path / "city")).intersections
+    assert light.id.startswith("cluster")
+
+    def way(edge: str) -> int:
+        return int(edge.removeprefix("-").partition("#")[0])
+
+    turns = {way(k.to_edge) for k in light.links if way(k.from_edge) == 1000}
+    assert turns == {1001, 1002, 1003} - forbidden
+    said = capsys.readouterr().out
+    assert (f"turns that the map forbids were taken out: {len(forbidden)}" in said) == bool(
+        forbidden
+    )
+    assert "1 of 4 roads have no maxspeed on the map" in said and "primary 100" in said
+
+
+def test_a_restriction_of_a_way_inside_a_joined_junction_is_noted() -> None:
+    inside = Restriction("1000", "", "77", only=False)
+    network = """<net><edge id="1000" from="a" to="cluster_1_2"/><edge id="5" from="cluster_1_2"
+        to="b"/><junction id="cluster_1_2"/><connection from="1000" to="5"/></net>"""
+    root = parse_xml(network.encode(), "n")
+    assert forbidden_turns(root, [inside, Restriction("77", "2", "78", only=False)]) == ([], 2)
+    assert forbidden_turns(root, [Restriction("8", "9", "78", only=False)]) == ([], 0)
+    # an edge keeps its last way on
+    assert forbidden_turns(root, [Restriction("1000", "1", "5", only=False)]) == ([], 0)
+
+
+def test_bus_lanes_are_not_for_cars(tmp_path: Path) -> None:
+    tags = (
+        '<tag k="maxspeed" v="50"/><tag k="lanes" v="3"/><tag k="lanes:forward" v="2"/>'
+        '<tag k="lanes:backward" v="1"/><tag k="bus:lanes:forward" v="|designated"/>'
+        '<tag k="vehicle:lanes:forward" v="|no"/>'
+    )
+    (tmp_path / "x.osm").write_text(joined_crossroads(first=tags))
+    assert made(tmp_path / "city", tmp_path / "x.osm") == 0
+    facts = survey(read_scenario(tmp_path / "city"))
+    lanes = {road.edge.partition("#")[0]: road.lanes for road in facts.intersections[0].approaches}
+    assert lanes["1000"] == 1
 
 
 def test_lights_can_be_guessed(tmp_path: Path) -> None:

@@ -526,6 +526,18 @@ def test_files_of_synchro_that_are_wrong(
     assert says in capsys.readouterr().err
 
 
+def test_two_plans_of_one_intersection_are_refused(single: Scenario, tmp_path: Path) -> None:
+    file = synchro(tmp_path)
+    other = synchro(tmp_path, d1=12).read_text()
+    again = synchro(tmp_path)
+    again.write_text(again.read_text() + other)
+    with pytest.raises(ScenarioError, match=r"a file holds one plan for an intersection"):
+        read_utdf(again, Network.read(single), {"7": "A1"})
+    file = synchro(tmp_path)
+    file.write_text(2 * file.read_text())  # the same plan twice does no harm
+    read_utdf(file, Network.read(single), {"7": "A1"})
+
+
 def test_a_movement_that_goes_with_another_turn_is_noted(single: Scenario, tmp_path: Path) -> None:
     _, notes = read_utdf(synchro(tmp_path, nbt=""), Network.read(single), {})
     assert notes == (

@@ -259,7 +259,9 @@ def _fit_table(fits: Sequence[CountFit], names: LightNames) -> Table:
     """Return the counts that are met worst, with their GEH."""
     worst = sorted(fits, key=lambda fit: -fit.geh)[:MOST_COUNTS]
     table = titled_table(f"Counts and vehicles, the {len(worst)} largest GEH of {len(fits)}")
-    for name in (LIGHT, "from", "turn", "to", "counted", "driven", "GEH"):
+    several = len({(fit.begin_s, fit.end_s) for fit in fits}) > 1
+    times = ["time, s"] * several
+    for name in (LIGHT, "from", "turn", "to", *times, "counted", "driven", "GEH"):
         right = name in ("counted", "driven", "GEH")
         table.add_column(name, justify="right" if right else "left", overflow="fold")
     for fit in worst:
@@ -268,7 +270,8 @@ def _fit_table(fits: Sequence[CountFit], names: LightNames) -> Table:
         goal = (turn.to_street if turn else "") or (fit.roads[-1] if len(fit.roads) > 1 else "")
         cells = (f"{fit.counted:g}", f"{fit.driven}", f"{fit.geh:.1f}")
         light, way = (names.text(turn.light), turn.turn) if turn else ("", "")
-        table.add_row(light, start, way, goal, *cells)
+        time = [f"{fit.begin_s:g} to {fit.end_s:g}"] * several
+        table.add_row(light, start, way, goal, *time, *cells)
     return table
 
 

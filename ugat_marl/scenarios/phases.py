@@ -12,7 +12,7 @@ from dataclasses import dataclass, field
 from functools import partial
 from pathlib import Path
 
-from ugat_marl.errors import ScenarioError
+from ugat_marl.errors import ScenarioError, counted
 from ugat_marl.files import parse_xml, read_bytes
 from ugat_marl.scenarios.junctions import (
     Link,
@@ -372,7 +372,7 @@ def suited(network: Path) -> tuple[dict[str, str], list[str]]:
         ("programme", "no phases that can be derived: they keep their programme's"),
     ):
         if count := sum(kind == source for kind in sources.values()):
-            notes.append(f"{count} lights have {why}")
+            notes.append(f"{counted(count, 'light')} {'has' if count == 1 else 'have'} {why}")
     return sources, notes
 
 

@@ -5,11 +5,12 @@ from __future__ import annotations
 import csv
 import functools
 import math
+import re
 import tempfile
 import xml.etree.ElementTree as ET
 from bisect import bisect_left
 from collections import defaultdict, deque
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
 from itertools import chain, pairwise
@@ -99,9 +100,9 @@ def read_rows(
     texts = lines(path, reporter)
     first = next(texts, "")
     reader = csv.DictReader(chain((first,), texts), delimiter=delimiter_of(first))
-    columns = columns_of(reader, path)
+    reader.fieldnames = columns = [name.lower() for name in columns_of(reader, path)]
     turns = {"from", "to"} <= set(columns)
-    if times := [name for name in columns if name.strip().lower() in _NOT_OURS]:
+    if times := [name for name in columns if name in _NOT_OURS]:
         raise ScenarioError(
             f"{path}, line 1: column {times[0]!r} is not known; the interval of a row is begin_s "
             "to end_s, in seconds"
@@ -109,41 +110,94 @@ def read_rows(
     if "count" not in columns or not (turns or ("edge" in columns and not pairs)):
         wanted = "from, to and count" if pairs else "count and edge, or count, from and to"
         raise ScenarioError(
-            f"{path}, line 1: the columns {wanted} are needed; there are: {', '.join(columns)}"
+            f"{path}, line 1: the columns {wanted} are needed in the first line; there "
+            f"are: {', '.join(columns)}"
         )
     rows_read: list[Row] = []
+    written: dict[int, str] = {}
     total = 0.0
     for values in rows_of(reader, path):
-        where = f"{path}, line {reader.line_num}"
         counted = values.get("count")
         if counted is not None and not counted.strip():
             continue
-        roads = tuple(
-            (values[key] or "").strip() for key in (("from", "to") if turns else ("edge",))
-        )
-        count = _number(counted, "count", where)
-        row = Row(
-            roads,
-            count,
-            _number((values.get("begin_s") or "").strip() or f"{begin_s}", "begin_s", where),
-            _number((values.get("end_s") or "").strip() or f"{end_s}", "end_s", where),
-            reader.line_num,
-        )
-        if row.end_s <= row.begin_s:
-            raise ScenarioError(
-                f"{where}: end_s ({row.end_s:g}) is not after begin_s ({row.begin_s:g})"
-            )
+        row = _row(values, turns, (begin_s, end_s), reader.line_num, path)
         rows_read.append(row)
-        total += count
+        if counted is not None and not counted.strip().isdigit():
+            written[row.line] = counted.strip()
+        total += row.count
         if len(rows_read) > _MOST_ROWS or total > MOST_VEHICLES:
             raise ScenarioError(
-                f"{where}: more than "
+                f"{path}, line {row.line}: more than "
                 + (f"{MOST_VEHICLES} vehicles" if total > MOST_VEHICLES else f"{_MOST_ROWS} rows")
                 + "; keep those of the episode, or sum them up"
             )
     if not total:
         raise ScenarioError(f"{path}: no row counts a vehicle; fill in the column count")
+    if not pairs:
+        _refuse_thousands(written, path)
+    _refuse_all_outside(rows_read, path, begin_s, end_s)
     return rows_read
+
+
+def _row(
+    values: Mapping[str, str | None],
+    turns: bool,
+    episode: tuple[float, float],
+    line: int,
+    path: Path,
+) -> Row:
+    """Return a row of the table.
+
+    Args:
+        values: Column to cell.
+        turns: True if the columns ``from`` and ``to`` name the roads.
+        episode: Start and end of the episode, s, for rows without times.
+        line: Line in the file.
+        path: The file.
+    """
+    where = f"{path}, line {line}"
+    roads = tuple((values[key] or "").strip() for key in (("from", "to") if turns else ("edge",)))
+    if not all(roads):
+        raise ScenarioError(
+            f"{where}: a count without its road; fill it in, or delete the row if it is a total"
+        )
+    begin_s, end_s = (
+        _number((values.get(key) or "").strip() or f"{usual}", key, where)
+        for key, usual in zip(("begin_s", "end_s"), episode, strict=True)
+    )
+    if end_s <= begin_s:
+        raise ScenarioError(f"{where}: end_s ({end_s:g}) is not after begin_s ({begin_s:g})")
+    return Row(roads, _number(values.get("count"), "count", where), begin_s, end_s, line)
+
+
+_GROUPED = re.compile(r"[1-9]\d{0,2}[.,]\d{3}", re.ASCII)
+"""A number such as 1.250: a thousand and more, or a little more than one?"""
+
+
+def _refuse_thousands(written: Mapping[int, str], path: Path) -> None:
+    """Refuse counts with a separator of thousands, which reads as a decimal point.
+
+    Args:
+        written: Line to count, of those that are no whole numbers.
+        path: The table.
+    """
+    if written and all(_GROUPED.fullmatch(text) for text in written.values()):
+        line, text = next(iter(written.items()))
+        raise ScenarioError(
+            f"{path}, line {line}: count = {text!r} can be {re.sub('[.,]', '', text)} or a little "
+            f"more than {re.split('[.,]', text)[0]}; write whole vehicles without a separator"
+        )
+
+
+def _refuse_all_outside(rows: Sequence[Row], path: Path, begin_s: float, end_s: float) -> None:
+    """Refuse a table on another clock than the episode's."""
+    if all(row.end_s <= begin_s or row.begin_s >= end_s for row in rows):
+        first = min(rows, key=lambda row: row.begin_s)
+        raise ScenarioError(
+            f"{path}: all intervals lie outside of the episode ({begin_s:g} to {end_s:g} s), the "
+            f"first begins at {first.begin_s:g} s (line {first.line}); --begin-s "
+            f"{first.begin_s:g} lets the episode begin there"
+        )
 
 
 def _number(text: str | None, key: str, where: str) -> float:

@@ -118,5 +118,7 @@ def _texts(pieces: Pieces, path: Path) -> Iterator[str]:
             if text := decoder.decode(piece):
                 yield text
         decoder.decode(b"", final=True)
-    except UnicodeDecodeError as error:
-        raise ScenarioError(f"{path}: is not UTF-8: {error}") from None
+    except UnicodeDecodeError:
+        raise ScenarioError(
+            f"{path}: is not UTF-8; save it again in UTF-8 (in a spreadsheet: CSV UTF-8)"
+        ) from None

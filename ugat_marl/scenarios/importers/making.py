@@ -369,7 +369,10 @@ def _require_counts_kept(made: Path, target: Path) -> None:
     if new.is_file() and is_filled(new) and (target / "scenario.toml").is_file():
         return
     if is_filled(old) and not (new.is_file() and new.read_bytes() == old.read_bytes()):
-        raise OutputError(f"{old} would be lost; give it with --counts, or move it away first")
+        raise OutputError(
+            f"{old} would be lost; move it away first, write to another folder, or give it with "
+            "--counts where a scenario is made from roads"
+        )
 
 
 def _keep_pictures(made: Path, target: Path) -> None:

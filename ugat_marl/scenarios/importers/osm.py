@@ -10,18 +10,25 @@ from __future__ import annotations
 import importlib
 import math
 import tempfile
+from collections import Counter
 from collections.abc import Collection, Iterable, Iterator, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, NamedTuple
 from xml.sax.saxutils import quoteattr
 
-from ugat_marl.errors import OptionError, ScenarioError, install_command
+from ugat_marl.errors import OptionError, ScenarioError, counted, install_command
 from ugat_marl.files import Tag, parse_xml, read_bytes, scratch, write_whole
 from ugat_marl.progress import Reporter
 from ugat_marl.scenarios.importers.long_files import scan
 from ugat_marl.scenarios.importers.making import NETWORK, RoadFiles, RoadSource
 from ugat_marl.scenarios.importers.osm_crossings import crossings_for, has_light
+from ugat_marl.scenarios.importers.osm_restrictions import (
+    Restriction,
+    deleted_connections,
+    forbidden_turns,
+    restriction_of,
+)
 from ugat_marl.scenarios.junctions import crossings_of, foes_of, links_of
 from ugat_marl.scenarios.phases import are_foes
 from ugat_marl.scenarios.settings import parse_decimal
@@ -44,6 +51,7 @@ _OPTIONS = (
     "--junctions.join", "--junctions.join-dist", "15",
     "--tls.guess-signals", "--tls.guess-signals.dist", "30",
     "--tls.join", "--tls.join-dist", "30",
+    "--osm.turn-lanes", "--osm.lane-access",
     "--remove-edges.isolated", "--keep-edges.by-vclass", "passenger", *_AGAIN,
 )  # fmt: skip
 
@@ -63,6 +71,8 @@ class _Extract:
         crossings: Longitude and latitude of crossings that may have a light, degrees.
         unlit: Number of crossings without a light.
         nodes: Ids of the nodes of roads and railways.
+        no_speed: Class to the number of ways for cars without a speed limit.
+        restrictions: Turn restrictions for cars.
     """
 
     roads: int
@@ -71,6 +81,8 @@ class _Extract:
     crossings: tuple[tuple[float, float], ...] = ()
     unlit: int = 0
     nodes: frozenset[str] = frozenset()
+    no_speed: Counter[str] = field(default_factory=Counter)
+    restrictions: tuple[Restriction, ...] = ()
 
 
 def from_osm(path: Path, *, guess: bool, left_hand: bool = False) -> RoadSource:
@@ -109,8 +121,9 @@ def from_osm(path: Path, *, guess: bool, left_hand: bool = False) -> RoadSource:
                 raise ScenarioError(f"{path}: {error}") from None
             if not notes:
                 raise ScenarioError(
-                    f"{path}: none of its lights is at a road for cars; --guess-signals puts some "
-                    "at large junctions"
+                    f"{path}: none of its lights is within 30 m of a junction of roads for cars "
+                    "(lights on plain roads are left out); --guess-signals puts some at large "
+                    "junctions"
                 )
         return RoadFiles(
             f"OpenStreetMap extract {path.name}",
@@ -136,13 +149,22 @@ def _as_xml(path: Path, work: Path, reporter: Reporter) -> Path:
 def _look(source: Path, path: Path, reporter: Reporter) -> _Extract:
     """Count roads and lights; refuse entities before any other program sees the file."""
     roads = signals = unlit = 0
+    no_speed: Counter[str] = Counter()
+    restrictions: list[Restriction] = []
     walks: set[str] = set()
     nodes: set[str] = set()
     crossings: list[tuple[float, float]] = []
     for element in items(source, path, reporter):
         tags = element.tags
         nodes.update(element.way_nodes)
-        roads += element.start.name == "way" and tags.get("highway") in _FOR_CARS
+        kind = tags.get("highway", "")
+        if element.start.name == "way" and kind in _FOR_CARS:
+            roads += 1
+            no_speed[kind] += "maxspeed" not in tags
+        elif element.start.name == "relation":
+            members = (tag for tag in element.inside if tag.name == "member")
+            if restriction := restriction_of(tags, members):
+                restrictions.append(restriction)
         if element.start.name != "node" or not tags:
             continue
         light = "traffic_signals" in (tags.get("highway"), tags.get("crossing"))
@@ -153,7 +175,16 @@ def _look(source: Path, path: Path, reporter: Reporter) -> _Extract:
             crossings.append(place_of(element.start, path))
         else:
             unlit += tags.get("highway") == "crossing"
-    return _Extract(roads, signals, frozenset(walks), tuple(crossings), unlit, frozenset(nodes))
+    return _Extract(
+        roads,
+        signals,
+        frozenset(walks),
+        tuple(crossings),
+        unlit,
+        frozenset(nodes),
+        +no_speed,
+        tuple(restrictions),
+    )
 
 
 def _convert(
@@ -169,6 +200,10 @@ def _convert(
     # removed. Lights at crossings stay: they stop traffic for pedestrians.
     if idle := _idle_lights(made, extract.walks):
         netconvert([*arguments, "--tls.unset", ",".join(idle)], made)
+    root = parse_xml(read_bytes(made), str(made))
+    forbidden, unplaced = forbidden_turns(root, extract.restrictions)
+    if forbidden:
+        _reconnect(deleted_connections(forbidden), made, work)
     if extract.crossings:
         _add_crossings(extract, made, work)
     write_whole(out, made.read_bytes())
@@ -180,6 +215,15 @@ def _convert(
         f"{extract.signals} lights in the extract make {lights} in the network, since those of one "
         "junction share a controller"
     ]
+    notes += _notes_on_speeds(extract, types)
+    if forbidden:
+        listed = ", ".join(f"{start} to {goal}" for start, goal in forbidden[:3])
+        notes.append(f"turns that the map forbids were taken out: {len(forbidden)} ({listed})")
+    if unplaced:
+        notes.append(
+            f"turn restrictions within junctions that were joined from several nodes: {unplaced}, "
+            "not taken over; check the turns there"
+        )
     if idle:
         notes.append(f"{len(idle)} lights on plain roads were left out")
     walked = sum(len(crossings) for crossings in crossings_of(root).values())
@@ -196,8 +240,30 @@ def _add_crossings(extract: _Extract, made: Path, work: Path) -> None:
     root = parse_xml(read_bytes(made), str(made))
     if not (content := crossings_for(root, extract.crossings)):
         return
-    listed, before = work / "crossings.con.xml", work / "before.net.xml"
-    listed.write_bytes(content)
+    _reconnect(content, made, work)
+
+
+def _notes_on_speeds(extract: _Extract, types: Path) -> Iterator[str]:
+    """Yield a note on roads whose speed limit is not on the map."""
+    root = parse_xml(read_bytes(types), str(types))
+    limits = {kind.get("id"): float(kind.get("speed", "nan")) for kind in root.iter("type")}
+    without = extract.no_speed.total()
+    if without:
+        kinds = ", ".join(
+            f"{kind} {3.6 * limits.get(f'highway.{kind}', math.nan):.0f}"
+            for kind, _ in extract.no_speed.most_common(3)
+        )
+        yield (
+            f"{without} of {counted(extract.roads, 'road')} have no maxspeed on the map and get "
+            f"SUMO's limits for their class, in km/h: {kinds}; set maxspeed in the extract where "
+            "that is not so"
+        )
+
+
+def _reconnect(connections: bytes, made: Path, work: Path) -> None:
+    """Change the connections of a network, and rebuild its programmes."""
+    listed, before = work / "changes.con.xml", work / "before.net.xml"
+    listed.write_bytes(connections)
     made.replace(before)
     options = ("--sumo-net-file", str(before), "--connection-files", str(listed), "--tls.rebuild")
     netconvert([*options, *_AGAIN], made)

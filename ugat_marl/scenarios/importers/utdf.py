@@ -109,7 +109,9 @@ def _nodes(path: Path) -> dict[str, _Node]:
                 name = values.get("INTID", ("", 0))[0]
                 node = nodes[name]
                 records = {"lanes": node.lanes, "timeplans": node.timing, "phases": node.phases}
-                records[section][cells[0].lower()] = values
+                record = cells[0].lower()
+                _refuse_other_plan(records[section].get(record), values, name, path)
+                records[section][record] = values
     except csv.Error as error:
         raise ScenarioError(f"{path}, line {reader.line_num + 1}: not CSV ({error})") from None
     timed = {name: node for name, node in nodes.items() if "brp" in node.phases}
@@ -119,6 +121,23 @@ def _nodes(path: Path) -> dict[str, _Node]:
             "export it from Synchro as combined UTDF, or write the table of ugat-marl plan"
         )
     return timed
+
+
+def _refuse_other_plan(
+    before: Mapping[str, tuple[str, int]] | None,
+    now: Mapping[str, tuple[str, int]],
+    name: str,
+    path: Path,
+) -> None:
+    """Refuse a record that is there twice with other values: the file holds several plans."""
+    for column, (text, line) in now.items():
+        earlier, its_line = (before or {}).get(column, (text, 0))
+        if earlier != text:
+            raise ScenarioError(
+                f"{path}, line {line}: {column} of {now['RECORDNAME'][0]} at intersection {name} "
+                f"is {text!r} here and {earlier!r} in line {its_line}; a file holds one plan for "
+                "an intersection: export each plan by itself"
+            )
 
 
 def _matched(
