@@ -64,6 +64,17 @@ def test_counts_of_turns_in_parts_of_the_day(tmp_path: Path) -> None:
     assert early.count(("west1_A1", "A1_northA")) == 0
 
 
+def test_a_long_way_to_a_counted_road_is_told(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    for end_s, told in ((100, True), (3600, False)):
+        table = f"edge,count,begin_s,end_s\nA1_B1,20,0,{end_s}\n"
+        (tmp_path / "t.csv").write_text(table)
+        assert made(tmp_path / f"city{end_s}", "--counts", tmp_path / "t.csv") == 0
+        said = capsys.readouterr().out
+        assert ("intervals are of departures at the edge of the network" in said) == told
+
+
 def test_origins_and_destinations(tmp_path: Path) -> None:
     (tmp_path / "od.csv").write_text(
         "from,to,count\nwest1_A1,B1_east1,50\nnorthA_A1,A1_southA,20\nnorthA_A1,A1_west1,0\n"

@@ -256,7 +256,11 @@ def from_counts(path: Path, begin_s: float, length_s: float, seed: int) -> Vehic
         fits = _fits(rows, sampled, names)
         write_fit(folder / FIT_SHEET, fits, names)
         write_whole(folder / COUNT_SHEET, b"".join(chunks_of(path)))
-        notes = (_summary(fits, path), *_outside(rows, path, begin_s, begin_s + length_s))
+        notes = (
+            _summary(fits, path),
+            *_on_the_way(rows, sampled, root),
+            *_outside(rows, path, begin_s, begin_s + length_s),
+        )
         return VehicleFiles((ROUTES,), notes, fits=fits)
 
     return vehicles
@@ -458,6 +462,35 @@ def _summary(fits: Sequence[CountFit], path: Path) -> str:
         f"{good} of {len(fits)} counts of {path.name} are met within a GEH of {GOOD_GEH:g}; "
         f"{FIT_SHEET} has them one by one"
     )
+
+
+_LATE = 0.1
+"""Share of the shortest interval above which the way from the entry to a count is told."""
+
+
+def _on_the_way(rows: Sequence[Row], drives: Sequence[Drive], root: ET.Element) -> Iterator[str]:
+    """Yield a note if vehicles reach counted places long after they depart.
+
+    Counts are of vehicles that depart in the interval; a detector counts those that come by.
+    """
+    seconds: dict[str, float] = {}
+    for edge in root.iter("edge"):
+        for lane in edge.iter("lane"):
+            speed = max(float(lane.get("speed", "1")), 0.1)
+            seconds[edge.get("id", "")] = float(lane.get("length", "0")) / speed
+    counted_roads = {row.roads[0] for row in rows if row.count}
+    longest_s = 0.0
+    for drive in drives:
+        at_s = 0.0
+        for road in drive.route:
+            at_s += seconds.get(road, 0.0)
+            if road in counted_roads:
+                longest_s = max(longest_s, at_s)
+    if longest_s > _LATE * min(row.end_s - row.begin_s for row in rows):
+        yield (
+            f"intervals are of departures at the edge of the network: vehicles reach the end of "
+            f"a counted road up to {longest_s:.0f} s later, even without traffic"
+        )
 
 
 def _passages(drives: Sequence[Drive]) -> dict[tuple[str, ...], list[float]]:
