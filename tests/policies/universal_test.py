@@ -234,6 +234,21 @@ def test_learns_toy_traffic_and_its_weights_serve_as_a_start(tmp_path: Path):
         toy_learner(0, replace(QUICK, start=str(tmp_path / "start.pt")))
 
 
+def test_a_policy_of_an_earlier_training_serves_as_a_start(tmp_path: Path):
+    learner = toy_learner(1)
+    learner.learn(ToyTraffic(steps=40), 2, seed=0)
+    learner.policy().save(tmp_path / "policy.pt")
+    begun = toy_learner(5, replace(QUICK, start=str(tmp_path / "policy.pt")))
+    assert np.array_equal(begun.policy().parameters, learner.policy().parameters)
+    other = DQN.of(ToyTraffic(), replace(QUICK, network="mlp"), 0)
+    other.policy().save(tmp_path / "other.pt")
+    with pytest.raises(OptionError, match=r"other\.pt: a training begins with .* \"universal\""):
+        InitialWeights.load(tmp_path / "other.pt")
+    (tmp_path / "log.pt").write_bytes(b"torn")
+    with pytest.raises(CheckpointError):
+        InitialWeights.load(tmp_path / "log.pt")
+
+
 def test_learners_that_share_weights_update_the_same_ones():
     env = ToyTraffic(steps=40)
     first, second = toy_learner(1), toy_learner(2)

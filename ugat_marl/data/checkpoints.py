@@ -44,8 +44,12 @@ def write_checkpoint(path: Path, kind: str, content: Mapping[str, Any]) -> None:
             raise
 
 
-def read_checkpoint(path: Path, kind: str) -> dict[str, Any]:
+def read_checkpoint(path: Path, *kinds: str) -> dict[str, Any]:
     """Read a file of `write_checkpoint`; no code from the file is executed.
+
+    Args:
+        path: The file.
+        *kinds: Kinds of content of which it must have one; its own is under the key ``"kind"``.
 
     Raises:
         CheckpointError: The file is missing, cut short, of another kind, or holds a number that is
@@ -69,9 +73,10 @@ def read_checkpoint(path: Path, kind: str) -> dict[str, Any]:
             "use an earlier one or train again"
         ) from None
     kind_read = content.get("kind") if isinstance(content, dict) else None
-    if kind_read != kind:
+    if kind_read not in kinds:
+        expected = " or ".join(map(repr, kinds))
         raise CheckpointError(
-            f"{path}: holds {kind_read!r}, expected {kind!r}; give the right file"
+            f"{path}: holds {kind_read!r}, expected {expected}; give the right file"
         )
     for name, tensor in _tensors("", content):
         if not _is_plain(tensor):

@@ -20,7 +20,8 @@ from ugat_marl.policies.devices import CPU
 from ugat_marl.policies.networks.q_network import Held, greedy_actions, q_network
 from ugat_marl.policies.networks.structure import Structure, structure_in
 
-_KIND = "ugat_marl.network_policy"
+KIND = "ugat_marl.network_policy"
+"""Kind of its checkpoints."""
 
 
 class NetworkPolicy:
@@ -109,7 +110,7 @@ class NetworkPolicy:
         content["parameters"] = torch.from_numpy(self.parameters)
         if self._ceiling is not None:
             content["ceiling"] = self._ceiling
-        write_checkpoint(path, _KIND, content)
+        write_checkpoint(path, KIND, content)
 
     @classmethod
     def load(cls, path: Path) -> NetworkPolicy:
@@ -118,7 +119,7 @@ class NetworkPolicy:
         Raises:
             CheckpointError: The file is missing, cut short, not finite, or not a policy.
         """
-        content = read_checkpoint(path, _KIND)
+        content = read_checkpoint(path, KIND)
         try:
             agents, hidden, env_options, shared = parse_header(content)
             structure = structure_in(content, agents)

@@ -93,8 +93,8 @@ class DQNConfig:
             "universal": one network for all intersections of any road network; `hidden` is the size
             of a movement's embedding and that of the other hidden layers. Unless given, it is the
             one of the learner: "universal" with "universal", "mlp" with "dqn".
-        start: File of weights to begin with, for "universal", such as `studies.pretraining` writes.
-            None draws them.
+        start: File of weights to begin with, for "universal": a policy of an earlier training, or
+            what `studies.pretraining` writes. None draws them.
         ceiling: Quantile at which policies cut each number of an observation. It is measured over
             the last 1000 decisions of training. In a fuller street than in training, a policy then
             acts as in the fullest street it knows. None cuts nothing.

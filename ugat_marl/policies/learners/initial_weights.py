@@ -1,4 +1,4 @@
-"""Weights that a training begins with: those of a network that was trained on other roads."""
+"""Weights that a training begins with: those of a network that was trained before."""
 
 from __future__ import annotations
 
@@ -7,10 +7,13 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
+import torch
 from torch import Tensor, nn
 
 from ugat_marl.data import checked_tensors, read_checkpoint, write_checkpoint
 from ugat_marl.errors import CheckpointError, OptionError
+from ugat_marl.policies.network_policy import KIND as POLICY
+from ugat_marl.policies.network_policy import NetworkPolicy
 
 _KIND = "ugat_marl.start"
 
@@ -32,12 +35,15 @@ class InitialWeights:
 
     @classmethod
     def load(cls, path: Path) -> InitialWeights:
-        """Read a file of `save`.
+        """Read a file of `save`, or the weights of a saved policy.
 
         Raises:
             CheckpointError: The file is missing, cut short or not finite, or of another kind.
+            OptionError: The policy has another network than "universal".
         """
-        content = read_checkpoint(path, _KIND)
+        content = read_checkpoint(path, _KIND, POLICY)
+        if content["kind"] == POLICY:
+            return cls.of_policy(NetworkPolicy.load(path), str(path))
         try:
             weights, options = content["weights"], dict(content["env_options"])
             expected = {"weights": weights.new_zeros(weights.shape)}
@@ -45,6 +51,24 @@ class InitialWeights:
             return cls(weights, options, str(content["origin"]))
         except (KeyError, TypeError, ValueError, AttributeError) as error:
             raise CheckpointError(f"{path}: not initial weights ({error})") from None
+
+    @classmethod
+    def of_policy(cls, policy: NetworkPolicy, origin: str) -> InitialWeights:
+        """Return the weights of a policy.
+
+        Args:
+            policy: A policy with a network "universal".
+            origin: Where it comes from.
+
+        Raises:
+            OptionError: Its network is of another kind.
+        """
+        if policy.structure is None or policy.structure.network != "universal":
+            raise OptionError(
+                f'{origin}: a training begins with the weights of a network "universal", and this '
+                "policy has another one; train the policy with --learner universal"
+            )
+        return cls(torch.from_numpy(policy.parameters), policy.env_options, origin)
 
     def save(self, path: Path) -> None:
         """Write the weights to a file atomically."""
