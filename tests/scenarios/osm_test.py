@@ -438,6 +438,17 @@ def test_bus_lanes_are_not_for_cars(tmp_path: Path) -> None:
     assert lanes["1000"] == 1
 
 
+def test_a_direction_that_is_lost_is_told(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    tags = '<tag k="maxspeed" v="50"/><tag k="lanes" v="2"/><tag k="busway:right" v="lane"/>'
+    for name, first, told in (("a", tags, True), ("b", '<tag k="maxspeed" v="50"/>', False)):
+        (tmp_path / "x.osm").write_text(joined_crossroads(first=first))
+        assert made(tmp_path / name, tmp_path / "x.osm") == 0
+        said = capsys.readouterr().out
+        assert ("though not mapped as one-way: 1 (1000)" in said) == told
+
+
 def test_lights_can_be_guessed(tmp_path: Path) -> None:
     (tmp_path / "dark.osm").write_text(NO_LIGHTS)
     assert made(tmp_path / "a", tmp_path / "dark.osm", "--guess-signals") == 0

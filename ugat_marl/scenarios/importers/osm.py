@@ -10,6 +10,7 @@ from __future__ import annotations
 import importlib
 import math
 import tempfile
+import xml.etree.ElementTree as ET
 from collections import Counter
 from collections.abc import Collection, Iterable, Iterator, Sequence
 from dataclasses import dataclass, field
@@ -24,6 +25,7 @@ from ugat_marl.scenarios.importers.long_files import scan
 from ugat_marl.scenarios.importers.making import NETWORK, RoadFiles, RoadSource
 from ugat_marl.scenarios.importers.osm_crossings import crossings_for, has_light
 from ugat_marl.scenarios.importers.osm_restrictions import (
+    ForbiddenTurns,
     Restriction,
     deleted_connections,
     forbidden_turns,
@@ -56,6 +58,8 @@ _OPTIONS = (
 )  # fmt: skip
 
 
+_ONE_WAY = frozenset({"oneway", "junction"})
+"""Keys of ways that may lead in one direction only."""
 _KINDS = frozenset({"highway", "railway"})
 """Keys of ways that SUMO's type map for OpenStreetMap contains."""
 
@@ -73,6 +77,7 @@ class _Extract:
         nodes: Ids of the nodes of roads and railways.
         no_speed: Class to the number of ways for cars without a speed limit.
         restrictions: Turn restrictions for cars.
+        both_ways: Ids of the ways for cars that are not said to be one-way.
     """
 
     roads: int
@@ -83,6 +88,7 @@ class _Extract:
     nodes: frozenset[str] = frozenset()
     no_speed: Counter[str] = field(default_factory=Counter)
     restrictions: tuple[Restriction, ...] = ()
+    both_ways: frozenset[str] = frozenset()
 
 
 def from_osm(path: Path, *, guess: bool, left_hand: bool = False) -> RoadSource:
@@ -151,6 +157,7 @@ def _look(source: Path, path: Path, reporter: Reporter) -> _Extract:
     roads = signals = unlit = 0
     no_speed: Counter[str] = Counter()
     restrictions: list[Restriction] = []
+    both_ways: set[str] = set()
     walks: set[str] = set()
     nodes: set[str] = set()
     crossings: list[tuple[float, float]] = []
@@ -161,6 +168,8 @@ def _look(source: Path, path: Path, reporter: Reporter) -> _Extract:
         if element.start.name == "way" and kind in _FOR_CARS:
             roads += 1
             no_speed[kind] += "maxspeed" not in tags
+            if not _ONE_WAY & tags.keys() and not kind.startswith("motorway"):
+                both_ways.add(element.start.attributes.get("id", ""))
         elif element.start.name == "relation":
             members = (tag for tag in element.inside if tag.name == "member")
             if restriction := restriction_of(tags, members):
@@ -184,6 +193,7 @@ def _look(source: Path, path: Path, reporter: Reporter) -> _Extract:
         frozenset(nodes),
         +no_speed,
         tuple(restrictions),
+        frozenset(both_ways),
     )
 
 
@@ -200,55 +210,41 @@ def _convert(
     # removed. Lights at crossings stay: they stop traffic for pedestrians.
     if idle := _idle_lights(made, extract.walks):
         netconvert([*arguments, "--tls.unset", ",".join(idle)], made)
-    root = parse_xml(read_bytes(made), str(made))
-    forbidden, unplaced = forbidden_turns(root, extract.restrictions)
-    if forbidden:
-        _reconnect(deleted_connections(forbidden), made, work)
+    forbidden = forbidden_turns(parse_xml(read_bytes(made), str(made)), extract.restrictions)
+    if forbidden.turns:
+        _reconnect(deleted_connections(forbidden.turns), made, work)
     if extract.crossings:
         _add_crossings(extract, made, work)
     write_whole(out, made.read_bytes())
     root = parse_xml(read_bytes(out), str(out))
-    lights = len(links_of(root))
-    if not lights:
+    if not links_of(root):
         return []
-    notes = [
-        f"{extract.signals} lights in the extract make {lights} in the network, since those of one "
-        "junction share a controller"
-    ]
-    notes += _notes_on_speeds(extract, types)
-    if forbidden:
-        listed = ", ".join(f"{start} to {goal}" for start, goal in forbidden[:3])
-        notes.append(f"turns that the map forbids were taken out: {len(forbidden)} ({listed})")
-    if unplaced:
-        notes.append(
-            f"turn restrictions within junctions that were joined from several nodes: {unplaced}, "
-            "not taken over; check the turns there"
-        )
+    return [*_notes(extract, root, len(idle)), *_notes_on_ways(extract, root, types, forbidden)]
+
+
+def _notes(extract: _Extract, root: ET.Element, idle: int) -> Iterator[str]:
+    """Yield notes on the lights and crossings that were made, and on those that were left out."""
+    yield (
+        f"{extract.signals} lights in the extract make {len(links_of(root))} in the network, since "
+        "those of one junction share a controller"
+    )
     if idle:
-        notes.append(f"{len(idle)} lights on plain roads were left out")
+        yield f"{idle} lights on plain roads were left out"
     walked = sum(len(crossings) for crossings in crossings_of(root).values())
     left = extract.unlit + max(0, len(extract.crossings) - walked)
     if walked:
-        notes.append(f"{walked} crossings for people on foot have a light; roads have sidewalks")
+        yield f"{walked} crossings for people on foot have a light; roads have sidewalks"
     if left:
-        notes.append(f"{left} crossings that have no light, or are at no road, were left out")
-    return notes
+        yield f"{left} crossings that have no light, or are at no road, were left out"
 
 
-def _add_crossings(extract: _Extract, made: Path, work: Path) -> None:
-    """Add crossings at lights, and rebuild programmes with green for them."""
-    root = parse_xml(read_bytes(made), str(made))
-    if not (content := crossings_for(root, extract.crossings)):
-        return
-    _reconnect(content, made, work)
-
-
-def _notes_on_speeds(extract: _Extract, types: Path) -> Iterator[str]:
-    """Yield a note on roads whose speed limit is not on the map."""
-    root = parse_xml(read_bytes(types), str(types))
-    limits = {kind.get("id"): float(kind.get("speed", "nan")) for kind in root.iter("type")}
-    without = extract.no_speed.total()
-    if without:
+def _notes_on_ways(
+    extract: _Extract, root: ET.Element, types: Path, forbidden: ForbiddenTurns
+) -> Iterator[str]:
+    """Yield notes on what the map does not say of its ways, and on what the network lacks of it."""
+    if without := extract.no_speed.total():
+        classes = parse_xml(read_bytes(types), str(types)).iter("type")
+        limits = {kind.get("id"): float(kind.get("speed", "nan")) for kind in classes}
         kinds = ", ".join(
             f"{kind} {3.6 * limits.get(f'highway.{kind}', math.nan):.0f}"
             for kind, _ in extract.no_speed.most_common(3)
@@ -258,6 +254,28 @@ def _notes_on_speeds(extract: _Extract, types: Path) -> Iterator[str]:
             f"SUMO's limits for their class, in km/h: {kinds}; set maxspeed in the extract where "
             "that is not so"
         )
+    if turns := forbidden.turns:
+        listed = ", ".join(f"{start} to {goal}" for start, goal in turns[:3])
+        yield f"turns that the map forbids were taken out: {len(turns)} ({listed})"
+    if forbidden.unplaced:
+        yield (
+            "turn restrictions within junctions that were joined from several nodes: "
+            f"{forbidden.unplaced}, not taken over; check the turns there"
+        )
+    ways = {edge.get("id", "").partition("#")[0] for edge in root.iter("edge")}
+    if half := sorted(way for way in extract.both_ways if (way in ways) != (f"-{way}" in ways)):
+        yield (
+            f"roads with one direction for cars, though not mapped as one-way: {len(half)} "
+            f"({', '.join(half[:3])}); look for lanes that are kept for buses"
+        )
+
+
+def _add_crossings(extract: _Extract, made: Path, work: Path) -> None:
+    """Add crossings at lights, and rebuild programmes with green for them."""
+    root = parse_xml(read_bytes(made), str(made))
+    if not (content := crossings_for(root, extract.crossings)):
+        return
+    _reconnect(content, made, work)
 
 
 def _reconnect(connections: bytes, made: Path, work: Path) -> None:

@@ -11,6 +11,7 @@ import xml.etree.ElementTree as ET
 from collections import defaultdict
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
+from typing import NamedTuple
 
 from ugat_marl.files import Tag, xml_bytes
 
@@ -30,6 +31,19 @@ class Restriction:
     via: str
     to_way: str
     only: bool
+
+
+class ForbiddenTurns(NamedTuple):
+    """Turns that a network must not have.
+
+    Attributes:
+        turns: The turns, from edge to edge.
+        unplaced: Number of restrictions at joined junctions one of whose ways has become a part of
+            the junction, so that their turns are not known.
+    """
+
+    turns: list[tuple[str, str]]
+    unplaced: int
 
 
 def restriction_of(tags: Mapping[str, str], members: Iterable[Tag]) -> Restriction | None:
@@ -56,18 +70,12 @@ def restriction_of(tags: Mapping[str, str], members: Iterable[Tag]) -> Restricti
             return None
 
 
-def forbidden_turns(
-    root: ET.Element, restrictions: Iterable[Restriction]
-) -> tuple[list[tuple[str, str]], int]:
+def forbidden_turns(root: ET.Element, restrictions: Iterable[Restriction]) -> ForbiddenTurns:
     """Find the turns of a network that restrictions forbid.
 
     Args:
         root: The network.
         restrictions: The restrictions of its extract.
-
-    Returns:
-        The turns, from edge to edge, and the number of restrictions at joined junctions one of
-        whose ways has become a part of the junction, so that their turns are not known.
     """
     arriving: dict[tuple[str, str], list[str]] = defaultdict(list)
     leaving: dict[tuple[str, str], list[str]] = defaultdict(list)
@@ -103,7 +111,7 @@ def forbidden_turns(
             forbidden = turns[start] - {goal} if one.only else turns[start] & {goal}
             if forbidden != turns[start]:  # an edge without any way on would be a mistake
                 found.update(dict.fromkeys((start, each) for each in sorted(forbidden)))
-    return list(found), lost
+    return ForbiddenTurns(list(found), lost)
 
 
 def deleted_connections(turns: Iterable[tuple[str, str]]) -> bytes:
