@@ -304,3 +304,21 @@ def test_a_street_name_with_a_semicolon_hides_no_count(tmp_path: Path) -> None:
     assert not is_filled(sheet)
     sheet.write_text("street;count;from;to\nMain St;7;a;b\n")
     assert is_filled(sheet)
+
+
+def test_roads_inside_a_light_leave_the_main_directions_to_those_that_lead_to_it() -> None:
+    """A wide dual carriageway: two roads lie between junctions of one light."""
+    east, north, west = (100.0, 0.0), (0.0, 100.0), (-100.0, 0.0)
+    lanes = {
+        f"{edge}_0": Lane(f"{edge}_0", edge, 100, 10, ((-x, -y), (0.0, 0.0)))
+        for edge, (x, y) in {"in_e": east, "in_n": north, "mid_e": east, "mid_w": west}.items()
+    }
+    ways = ("in_e", "mid_e"), ("mid_e", "out_e"), ("in_n", "mid_w"), ("mid_w", "out_w")
+    links = [Link(n, f"{a}_0", f"{b}_0", "s") for n, (a, b) in enumerate(ways)]
+    named = approach_directions(links, lanes)
+    assert [named[edge] for edge in ("in_e", "in_n", "mid_w")] == [
+        "eastbound",
+        "northbound",
+        "westbound",
+    ]
+    assert len(set(named.values())) == 4

@@ -130,25 +130,39 @@ def approach_directions(links: Iterable[Link], lanes: Mapping[str, Lane]) -> dic
     """Return the direction of travel of each road that leads to a traffic light.
 
     Up to eight roads get different names, chosen together so that the squared angles between name
-    and road are least: up to four roads the four main directions, else all eight.
+    and road are least: up to four roads the four main directions, else all eight. Roads between two
+    junctions of the light, as in the middle of a wide dual carriageway, get what is left.
 
     Args:
         links: Links for vehicles of the traffic light.
         lanes: Lanes of the network.
     """
+    links = tuple(links)
     # In order of their ids: of two roads with one heading the same one gets the better name always.
-    first_lane: dict[str, str] = {}
+    headings: dict[str, float] = {}
     for edge, lane in sorted((link.from_edge, link.from_lane) for link in links):
-        first_lane.setdefault(edge, lane)
-    headings = [heading_rad(lanes[lane].shape) for lane in first_lane.values()]
-    names = MAIN_DIRECTIONS if len(headings) <= len(MAIN_DIRECTIONS) else ALL_DIRECTIONS
-    places = [2 * math.pi * place / len(names) for place in range(len(names))]
-    costs = np.array([[_between(heading, place) ** 2 for place in places] for heading in headings])
+        if edge not in headings:
+            headings[edge] = heading_rad(lanes[lane].shape)
+    inside = {link.to_edge for link in links}
+    outer = {edge: heading for edge, heading in headings.items() if edge not in inside}
+    few = len(outer) <= len(MAIN_DIRECTIONS)
+    directions = _nearest_names(outer, MAIN_DIRECTIONS if few else ALL_DIRECTIONS)
+    inner = {edge: heading for edge, heading in headings.items() if edge in inside}
+    left = [name for name in ALL_DIRECTIONS if name not in directions.values()]
+    directions |= _nearest_names(inner, left if len(inner) <= len(left) else ALL_DIRECTIONS)
+    return {edge: directions[edge] for edge in headings}
+
+
+def _nearest_names(headings: Mapping[str, float], names: Sequence[str]) -> dict[str, str]:
+    """Return a name for each road, different ones if there are enough."""
+    places = [2 * math.pi * ALL_DIRECTIONS.index(name) / len(ALL_DIRECTIONS) for name in names]
+    costs = [[_between(heading, place) ** 2 for place in places] for heading in headings.values()]
+    table = np.array(costs).reshape(len(headings), len(names))
     if len(headings) > len(names):
-        chosen = costs.argmin(axis=1)
+        chosen = table.argmin(axis=1)
     else:
-        _, chosen = optimize.linear_sum_assignment(costs)
-    return {edge: names[place] for edge, place in zip(first_lane, chosen, strict=True)}
+        _, chosen = optimize.linear_sum_assignment(table)
+    return {edge: names[place] for edge, place in zip(headings, chosen, strict=True)}
 
 
 def heading_rad(shape: Sequence[tuple[float, float]]) -> float:
