@@ -23,6 +23,7 @@ from ugat_marl.policies import (
     NetworkPolicy,
     Pretraining,
     export_policy,
+    has_first_lessons,
     observed_options,
     roll_out,
     suite_config,
@@ -240,6 +241,15 @@ def test_a_policy_of_an_earlier_training_serves_as_a_start(tmp_path: Path):
     learner.policy().save(tmp_path / "policy.pt")
     begun = toy_learner(5, replace(QUICK, start=str(tmp_path / "policy.pt")))
     assert np.array_equal(begun.policy().parameters, learner.policy().parameters)
+    assert not has_first_lessons(begun) and has_first_lessons(learner)
+    told: list[float] = []
+    begun.learn(ToyTraffic(steps=40), 1, 0, lambda _, numbers: told.append(numbers["epsilon"]))
+    assert told == [QUICK.epsilon_end]
+    with pytest.warns(UserWarning, match="has not seen commands under way"):
+        late = DQN(
+            AgentSet.of(ToyTraffic()), begun.config, 0, {"commands": 2}, structure=toy_structure()
+        )
+    assert has_first_lessons(late)
     other = DQN.of(ToyTraffic(), replace(QUICK, network="mlp"), 0)
     other.policy().save(tmp_path / "other.pt")
     with pytest.raises(OptionError, match=r"other\.pt: a training begins with .* \"universal\""):

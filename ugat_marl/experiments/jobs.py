@@ -59,7 +59,14 @@ from ugat_marl.grounding import (
     require_histories,
 )
 from ugat_marl.parallel import Workers, in_this_process, send_heartbeats
-from ugat_marl.policies import STANDARD_RULES, TUNED_RULES, Policy, PolicyFactory, attended
+from ugat_marl.policies import (
+    STANDARD_RULES,
+    TUNED_RULES,
+    Policy,
+    PolicyFactory,
+    attended,
+    has_first_lessons,
+)
 from ugat_marl.progress import Bars, Reporter
 from ugat_marl.scenarios import Scenario
 from ugat_marl.simulation import exit_when_input_ends, kept_warm
@@ -470,7 +477,8 @@ def _plain(
         else:
             if before is not None:
                 learner.load(before)  # its world may have had another teacher
-            if job.setting.recipe != "untrained":
+            taught = before is not None or has_first_lessons(learner)
+            if taught and job.setting.recipe != "untrained":
                 attended(learner, env, job.seed, reporter, f"lessons: {job.setting.name}")
         marks = [mark for mark in job.marks if record.missing(job, mark) or mark == job.episodes]
         if marks[0] < learner.episodes:

@@ -13,7 +13,7 @@ from ugat_marl.grounding.config import UgatConfig
 from ugat_marl.grounding.gate import Gate
 from ugat_marl.grounding.state import RunState, is_kept
 from ugat_marl.grounding.worlds import TransitionSource
-from ugat_marl.policies import Learner, Policy, attended
+from ugat_marl.policies import Learner, Policy, attended, has_first_lessons
 
 CHECKPOINT_EPISODES = 10
 """Episodes of plain training between two checkpoints."""
@@ -48,7 +48,7 @@ class Algorithm:
     def _pretrain(self, state: RunState[Any]) -> None:
         """Train in plain E_sim for M episodes; keep the policy as direct transfer (line 1)."""
         wanted = self.config.pretrain_episodes
-        if state.pretrained == 0 < wanted:
+        if state.pretrained == 0 < wanted and has_first_lessons(state.learner):
             self._attend(state.learner, self.env, "plain sim")
         while state.pretrained < wanted:
             episodes = min(CHECKPOINT_EPISODES, wanted - state.pretrained)

@@ -24,6 +24,7 @@ from .learners.dqn_config import Usual as Usual
 from .learners.dqn_config import UsualName as UsualName
 from .learners.initial_weights import InitialWeights as InitialWeights
 from .learners.lessons import attended as attended
+from .learners.lessons import has_first_lessons as has_first_lessons
 from .learners.library import LibraryLearner as LibraryLearner
 from .learners.library import TrainingEnv as TrainingEnv
 from .learners.library import check_settings as check_settings

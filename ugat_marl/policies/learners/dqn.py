@@ -11,6 +11,7 @@ uses the weights from before the update.
 from __future__ import annotations
 
 import copy
+import warnings
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
@@ -206,8 +207,20 @@ class DQN:
         self._discount = self.config.discount**tens
         self._steps = max(1, round(self.config.steps / tens))
         self._acting = Acting(self._online, self._weights)
+        self.begins_taught = False
+        """True if the weights are those of an earlier policy: then there are no first lessons, and
+        exploration is as low as after lessons."""
         if self.config.start is not None:
-            self.load_initial_weights(InitialWeights.load(Path(self.config.start)))
+            initial = InitialWeights.load(Path(self.config.start))
+            if self.env_options.get("commands") and not initial.env_options.get("commands"):
+                warnings.warn(
+                    f"{self.config.start} has not seen commands under way, which policies see "
+                    "here; the training begins without it",
+                    stacklevel=2,
+                )
+            else:
+                self.load_initial_weights(initial)
+                self.begins_taught = True
 
     @classmethod
     def of(
@@ -261,7 +274,8 @@ class DQN:
                 f"the environment's agents are {AgentSet.of(env)}, this learner's {self.agents}; "
                 "make a new learner with DQN.of(env)"
             )
-        if self.config.teacher and self.episodes == self.taught == 0:
+        first = self.episodes == self.taught == 0 and not self.begins_taught
+        if self.config.teacher and first:
             self.attend(env, seed)
         with one_thread():
             for _ in range(episodes):
@@ -326,6 +340,10 @@ class DQN:
         teacher = self.config.teacher or ""
         return best if teacher == BEST and best is not None else teacher
 
+    def _epsilon(self) -> float:
+        """Return the share of exploratory decisions now."""
+        return self.config.epsilon(self.decisions, taught=self.begins_taught or self.taught > 0)
+
     def _watch(self, env: AnyParallelEnv, teacher: Policy, seed: int) -> None:
         """Let the teacher play an episode, and store its decisions."""
         self._replay.end()
@@ -385,7 +403,7 @@ class DQN:
         observations, infos = env.reset(seed=derive_seed(seed, "dqn", "episode", number))
         now, allowed = self.agents.stack(observations), self.agents.masks(infos)
         while env.agents:
-            epsilon = self.config.epsilon(self.decisions, taught=self.taught > 0)
+            epsilon = self._epsilon()
             acting = self._acting.network()
             seen = torch.from_numpy(now) * self._inputs[:, 0]
             greedy = greedy_actions(acting, seen, torch.from_numpy(allowed))
@@ -409,7 +427,7 @@ class DQN:
             "return": tally.reward,
             "loss": tally.loss / updates,
             "q": tally.q / updates,
-            "epsilon": self.config.epsilon(self.decisions, taught=self.taught > 0),
+            "epsilon": self._epsilon(),
         }
 
     def _is_time_to_update(self) -> bool:

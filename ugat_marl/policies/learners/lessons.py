@@ -32,6 +32,11 @@ OnPlay = Callable[[str], None]
 """Called after an episode with the rule that played it."""
 
 
+def has_first_lessons(learner: Learner) -> bool:
+    """Return False if a learner begins with the weights of a policy, which no rule has to teach."""
+    return not getattr(learner, "begins_taught", False)
+
+
 def attended(
     learner: Learner,
     env: AnyParallelEnv,
