@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import copy
 import gc
 import hashlib
 import importlib
@@ -960,3 +961,15 @@ def test_a_function_of_domains_that_fails_leaves_environments_that_can_begin_aga
         envs.reset(seed=5)
     envs.step(zeros)
     envs.close()
+
+
+def test_what_is_under_way_at_the_end_is_forgotten_and_nothing_is_copied() -> None:
+    with vector_env("single-v1", 1, duration_s=50) as env:
+        batch = env.reset(seed=1)
+        with pytest.raises(EpisodeError, match="cannot be copied"):
+            copy.deepcopy(env)
+        env.step_async(batch.masks.argmax(axis=-1))
+    with pytest.raises(EpisodeError, match="this vector_env is closed"):
+        env.step_wait()
+    with pytest.raises(EpisodeError, match="this vector_env is closed"):
+        env.recv()

@@ -243,3 +243,11 @@ def test_a_log_that_is_renamed_goes_on_under_its_name(tmp_path: Path) -> None:
     before = numbers(old)
     assert before and before + numbers(path) == [*range(230)]
     assert names(tmp_path) == ["field.jsonl", "field.jsonl.1"]
+
+
+def test_a_json_file_of_something_else_is_no_log(tmp_path: Path) -> None:
+    path = tmp_path / "settings.json"
+    path.write_text('{"a": 1}\n')
+    with pytest.raises(OptionError, match="holds something else than decisions"):
+        DecisionLog(path)
+    assert path.read_text() == '{"a": 1}\n'

@@ -3,17 +3,24 @@
 from __future__ import annotations
 
 import copy
+import functools
 import importlib
 import json
+import math
 import os
 import re
 import subprocess
 import sys
+from collections import OrderedDict, deque
+from dataclasses import dataclass
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any, ClassVar
 
+import numpy as np
 import polars as pl
 import pytest
+import torch
 
 import ugat_marl
 from tests.interrupts import KillAfter
@@ -30,6 +37,7 @@ from ugat_marl.policies import (
     load_own,
     own_name,
     own_policy,
+    own_source,
     own_values,
 )
 from ugat_marl.testing import ToyTraffic
@@ -367,6 +375,88 @@ def test_what_a_class_of_a_function_holds_is_part_of_its_identity() -> None:
     assert first == same and other not in (first, also_other) and also_other != first
 
 
+@dataclass
+class Settings:
+    weights: Any
+
+
+@pytest.mark.parametrize(
+    "hold",
+    [
+        lambda array: array,
+        Settings,
+        torch.from_numpy,
+        lambda array: OrderedDict(start=array),
+        lambda array: SimpleNamespace(start=array),
+        lambda array: pl.DataFrame({"start": array}),
+        lambda array: deque([array]),
+    ],
+    ids=["array", "dataclass", "tensor", "mapping", "namespace", "table", "deque"],
+)
+def test_long_arrays_are_a_part_of_an_identity_whatever_holds_them(hold: Any) -> None:
+    """Their middle is left out of their `repr`."""
+
+    def identity(middle: float) -> object:
+        array = np.zeros(5000)
+        array[2500] = middle
+        return own_values(own_name(functools.partial(Settings, hold(array))))
+
+    assert identity(0.0) == identity(0.0) != identity(1.0)
+
+
+def test_what_is_typed_in_a_notebook_is_known_by_its_code() -> None:
+    def hash_of(phase: int, lines: int = 0) -> str | None:
+        space: dict[str, Any] = {"__name__": "__main__"}
+        code = (
+            f"class Typed:\n def policy(self):\n  return lambda seen: dict.fromkeys(seen, {phase})"
+        )
+        exec("\n" * lines + code, space)
+        space["Typed"].__module__ = "a notebook"
+        return own_source(own_name(space["Typed"]), "learner")
+
+    assert hash_of(0) is not None
+    assert hash_of(0) == hash_of(0, lines=3) != hash_of(7)
+
+
+@pytest.mark.parametrize(
+    ("asked", "says"),
+    [
+        ({"observation": "movements", "duration_s": 50}, "hold 'duration_s', which the evaluation"),
+        ({"domain": "V4"}, "hold 'domain'"),
+        ({"reward": "pressure"}, "a policy may ask for observation, neighbours, commands, signals"),
+        ("count", "its env_options are a str"),
+    ],
+)
+def test_a_policy_does_not_decide_how_it_is_judged(asked: object, says: str) -> None:
+    def still(observations: Any) -> dict[str, int]:
+        return dict.fromkeys(observations, 0)
+
+    still.env_options = asked  # type: ignore[attr-defined]
+    with pytest.raises(OptionError, match=re.escape(says)):
+        ugat_marl.evaluate("single-v1", still, ["sim"], seeds=1, duration_s=100)
+
+
+@pytest.mark.parametrize(
+    "action", [np.array([1, 2]), torch.tensor([1, 2]), "0x", None, math.nan, math.inf, 0.5]
+)
+def test_a_wrong_action_is_named_with_its_agent(action: Any) -> None:
+    policy = OwnPolicy(lambda _: {"a": 0, "b": action}, "mine", {})
+    with pytest.raises(
+        OptionError, match=r"policy 'mine' returned .* for 'b'; it must be the number"
+    ):
+        policy.act({}, {})
+
+
+def test_a_maker_with_some_arguments_filled_in_makes_a_policy() -> None:
+    def make(env: Any, phase: int) -> Any:
+        assert env.possible_agents
+        return lambda observations: dict.fromkeys(observations, phase)
+
+    toy = ToyTraffic()
+    policy = own_policy(functools.partial(make, phase=1), "made", toy)
+    assert policy.act({"a": np.zeros(1)}, {}) == {"a": 1}
+
+
 def test_the_identity_of_captured_objects_is_the_same_in_every_process(tmp_path: Path) -> None:
     (tmp_path / "mine.py").write_text(
         "import functools\n"
@@ -537,7 +627,7 @@ def test_a_class_with_settings_of_its_own_keeps_them() -> None:
 
     policy = own_policy(Held, "held", ToyTraffic())
     observations, infos = ToyTraffic().reset(seed=0)
-    with pytest.raises(OptionError, match="dictionary from every agent to the number of a phase"):
+    with pytest.raises(OptionError, match="it must be the number of a phase, one whole number"):
         policy.act(observations, infos)  # 0.9 is not a phase
 
 

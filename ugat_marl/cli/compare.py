@@ -19,6 +19,7 @@ from ugat_marl.experiments import (
     Judging,
     PaperConfig,
     compare,
+    lost_rows,
     policy_factory,
     read_standings,
     require_room,
@@ -134,6 +135,7 @@ class Compare:
                     "number and length, so the row stands alone; --table takes a table of yours",
                     soft_wrap=True,
                 )
+        self._require_kept(table)
         domains = self._domains(table)
         require_room(table, self.name, map(domain_label, domains))
         with workers_of(self.workers, self.ray) as workers:
@@ -145,6 +147,19 @@ class Compare:
             write_csv(self.out, judging.written_to(whole).write_csv())
             console.print(f"table: {self.out}", soft_wrap=True)
         return 0
+
+    def _require_kept(self, table: pl.DataFrame) -> None:
+        """Refuse to replace a table whose rows the new one would not have."""
+        if self.out is None or not self.out.is_file():
+            return
+        lost = lost_rows(read_standings(self.out), table)
+        if not lost.is_empty():
+            row = lost.row(0, named=True)
+            raise OptionError(
+                f"--out {self.out}: is there, with rows that would be lost, such as "
+                f"{row['setting']!r} in {row['domain']}; --table {self.out} keeps them, or give "
+                "another --out"
+            )
 
     def _domains(self, table: pl.DataFrame) -> tuple[str, ...]:
         known = table["domain"].unique(maintain_order=True).to_list()

@@ -30,6 +30,7 @@ from ugat_marl.policies import (
     Policy,
     PolicyFactory,
     StepCallback,
+    asked_options,
     is_own,
     load_own,
     make_rule,
@@ -323,8 +324,7 @@ class OwnPolicyFactory:
 
     def __call__(self, env: TrafficEnv) -> Policy:
         """Return the policy for an environment, whose options are those that it asks for."""
-        options = getattr(self.given, "env_options", None)
-        if options:
+        if options := asked_options(self.given, self.name):
             env = parallel_env(env.scenario, **options)
         return copy.deepcopy(own_policy(self.given, self.name, env))
 

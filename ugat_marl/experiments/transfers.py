@@ -439,8 +439,8 @@ def _write_results(
             continue
         policies.add(directory / "policies" / f"{file}.pt")
         write_whole(directory / "policies" / f"{file}.pt", policy.read_bytes())
-    for path in {*(directory / "policies").glob("*.pt")} - policies:
-        path.unlink()  # of a row that an earlier call asked for
+    for path in _policies_before(directory) - policies:  # of rows that an earlier call asked for
+        path.unlink(missing_ok=True)
     write_whole(directory / METRICS_FILE, (folder / plan[0].name / METRICS_FILE).read_bytes())
     write_queues(
         directory / QUEUES,
@@ -455,6 +455,15 @@ def _write_results(
     table = Evaluation(scenario.id, scenario.hash, results, _notes(config, rules))
     table.write(directory / "table.json")
     return table
+
+
+def _policies_before(directory: Path) -> set[Path]:
+    """Return the files of policies that an earlier call may have written; all others stay."""
+    if not (directory / "table.json").is_file():
+        return set()
+    earlier = Evaluation.read(directory / "table.json")
+    names = dict.fromkeys(result.policy for result in earlier.results)
+    return {directory / "policies" / f"{file}.pt" for file in file_names(names)}
 
 
 def _notes(config: TransferConfig, rules: Mapping[str, str]) -> dict[str, str]:

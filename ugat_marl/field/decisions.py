@@ -28,6 +28,9 @@ _AT_ONCE = 64
 _HASHED = re.compile(rb'(\{.*), "hash": "([0-9a-f]{16})"\}\n')
 """A line without its hash, and the hash."""
 
+_BEGINS = b'{"time_s": '
+"""Begin of every line."""
+
 Source = Literal["policy", "fallback", "both"]
 
 
@@ -229,7 +232,7 @@ class DecisionLog:
         A merge that was killed may have left it so.
         """
         size = os.fstat(self._file).st_size
-        if size and os.pread(self._file, 1, 0) != b"{":
+        if not _BEGINS.startswith(os.pread(self._file, len(_BEGINS), 0)):
             raise OptionError(
                 f"{self.path}: holds something else than decisions; give the log another name"
             )

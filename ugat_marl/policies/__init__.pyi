@@ -49,6 +49,7 @@ from .networks.q_network import flatten_parameters as flatten_parameters
 from .networks.q_network import parameters_for_unscaled as parameters_for_unscaled
 from .own import OwnLearnerFactory as OwnLearnerFactory
 from .own import OwnPolicy as OwnPolicy
+from .own import asked_options as asked_options
 from .own import check_own_learner as check_own_learner
 from .own import is_own as is_own
 from .own import is_savable as is_savable

@@ -14,6 +14,7 @@ from __future__ import annotations
 import ast
 import contextlib
 import copy
+import dataclasses
 import functools
 import hashlib
 import importlib.util
@@ -25,9 +26,11 @@ import sys
 import tempfile
 import warnings
 import zipfile
+from collections import deque
 from collections.abc import Callable, Mapping, Sequence
-from pathlib import Path
-from types import CellType, FunctionType, MethodType, ModuleType
+from enum import Enum
+from pathlib import Path, PurePath
+from types import CellType, CodeType, FunctionType, MethodType, ModuleType
 from typing import Any, get_type_hints
 
 import numpy as np
@@ -206,11 +209,39 @@ def _stable(value: Any, inside: tuple[int, ...] = ()) -> str:
         return (
             f"{kind.__module__}.{kind.__qualname__}({_file_hash(kind)}, {_values(value, inside)})"
         )
-    if type(value).__repr__ is object.__repr__:
-        kind = type(value)
-        held = deeper(getattr(value, "__dict__", {}))
-        return f"{kind.__module__}.{kind.__qualname__}({_file_hash(kind)}, {held})"
-    return repr(value)
+    return repr(value) if isinstance(value, _PLAIN) else _stable_object(value, deeper)
+
+
+_PLAIN = (type(None), bool, int, float, complex, str, bytes, range, slice, PurePath, Enum)
+"""Types whose `repr` says all."""
+
+
+def _stable_object(value: Any, deeper: Callable[[Any], str]) -> str:
+    """Return any other object as text: its class, and what it holds.
+
+    The `repr` of a data class, a tensor or a table may leave out the middle of long arrays.
+    """
+    kind = type(value)
+    named = f"{kind.__module__}.{kind.__qualname__}"
+    if named == "torch.Tensor" or named.startswith("torch.nn.parameter."):
+        array = value.detach().cpu()
+        whole = array.double() if array.is_floating_point() else array  # numpy lacks some types
+        return f"{named}({array.dtype}, {deeper(whole.numpy())})"
+    if isinstance(value, Mapping):
+        return f"{named}({deeper(dict(value.items()))})"
+    if isinstance(value, Sequence | deque):
+        return f"{named}({deeper(list(value))})"
+    held = getattr(value, "__dict__", {})
+    if dataclasses.is_dataclass(value):
+        held = {field.name: getattr(value, field.name) for field in dataclasses.fields(value)}
+    says_what = kind.__getstate__ is not object.__getstate__  # as a table of polars does
+    if not says_what and (held or kind.__repr__ is object.__repr__):
+        return f"{named}({_file_hash(kind)}, {deeper(held)})"
+    try:  # what a copy is made of
+        _, *made_of = value.__reduce_ex__(4)
+    except TypeError:
+        return repr(value)
+    return f"{named}({deeper([one for one in made_of[:2] if one is not None])})"
 
 
 def own_source(name: str, what: str) -> str | None:
@@ -228,12 +259,28 @@ def own_source(name: str, what: str) -> str | None:
 
 
 def _file_hash(kind: Any) -> str | None:
-    """Return the hash of the file that defines a class or function; None if it is in no file."""
+    """Return the hash of the file that defines a class or function, or else of its code.
+
+    What is typed at a prompt or in a notebook is in no file. None if there is no code either.
+    """
     try:
         file = inspect.getsourcefile(kind)
-    except (TypeError, OSError):  # built in, or typed at a prompt
-        return None
-    return None if file is None or not Path(file).is_file() else file_hash(Path(file))
+    except (TypeError, OSError):
+        file = None
+    if file is not None and Path(file).is_file():
+        return file_hash(Path(file))
+    members = vars(kind).values() if inspect.isclass(kind) else (kind,)
+    codes = [getattr(getattr(one, "__func__", one), "__code__", None) for one in members]
+    texts = [_code_text(code) for code in codes if code is not None]
+    return hashlib.sha256("".join(texts).encode()).hexdigest() if texts else None
+
+
+def _code_text(code: CodeType) -> str:
+    """Return all that a function does as text, without the place where it was written."""
+    constants = (
+        _code_text(one) if isinstance(one, CodeType) else _stable(one) for one in code.co_consts
+    )
+    return f"{code.co_code.hex()} {code.co_names} {code.co_varnames} {list(constants)}"
 
 
 def _module_in(file: Path) -> ModuleType:
@@ -255,6 +302,32 @@ def _module_in(file: Path) -> ModuleType:
         del sys.modules[name]
         raise
     return module
+
+
+OF_POLICIES = ("observation", "neighbours", "commands", "signals")
+"""Options of an environment that a policy may ask for: what it sees, and how signals are shown."""
+
+
+def asked_options(given: Any, name: str) -> dict[str, Any]:
+    """Return the ``env_options`` of a user's policy.
+
+    Raises:
+        OptionError: They are no mapping, or hold what the evaluation decides, such as the length of
+            an episode.
+    """
+    asked = getattr(given, "env_options", {})
+    if not isinstance(asked, Mapping):
+        raise OptionError(
+            f"policy {name!r}: its env_options are a {type(asked).__name__}; they must be a "
+            'dictionary such as {"observation": "movements"}'
+        )
+    for key in asked:
+        if key not in OF_POLICIES:
+            raise OptionError(
+                f"policy {name!r}: its env_options hold {key!r}, which the evaluation decides; a "
+                f"policy may ask for {', '.join(OF_POLICIES)}"
+            )
+    return dict(asked)
 
 
 class OwnPolicy:
@@ -286,10 +359,9 @@ class OwnPolicy:
                 f"policy {name!r}: a {type(given).__name__} has no act(observations, infos) and "
                 "cannot be called; give it that method, or give a function"
             )
-        self.env_options: Mapping[str, Any] = {
-            **env_options,
-            **getattr(given, "env_options", {}),
-        }
+        asked = getattr(given, "env_options", {})  # a learner that is its own policy trained so
+        shown = {key: asked[key] for key in OF_POLICIES if key in asked}
+        self.env_options: Mapping[str, Any] = {**env_options, **shown}
         self._given, self._name, self._state, self._shared = given, name, state, shared
         self._sees_infos = _sees_infos(act)
 
@@ -312,13 +384,21 @@ class OwnPolicy:
         """
         act = getattr(self._given, "act", self._given)
         chosen = act(observations, infos) if self._sees_infos else act(observations)
-        try:
-            return {agent: _whole(action) for agent, action in chosen.items()}
-        except (AttributeError, TypeError, ValueError):
+        if not isinstance(chosen, Mapping):
             raise OptionError(
                 f"policy {self._name!r} returned a {type(chosen).__name__}; it must return a "
                 "dictionary from every agent to the number of a phase"
-            ) from None
+            )
+        actions: dict[str, int] = {}
+        for agent, action in chosen.items():
+            try:
+                actions[agent] = _whole(action)
+            except (AttributeError, TypeError, ValueError, OverflowError, RuntimeError):
+                raise OptionError(
+                    f"policy {self._name!r} returned {action!r} for {agent!r}; it must be the "
+                    "number of a phase, one whole number"
+                ) from None
+        return actions
 
     def save(self, path: Path) -> None:
         """Write the state of the learner that made the policy atomically."""
@@ -345,9 +425,16 @@ def own_policy(given: Any, name: str, env: AnyParallelEnv) -> Policy:
         if not (_takes(given, 1) or _takes(given, 0)):
             raise OptionError(_not_made(given, name))
         given = given(*[env] if _wants_env(given) else [])
-    elif inspect.isroutine(given) and _first_argument(given) == "env":
+    elif _is_maker(given):
         given = given(env)
+    asked_options(given, name)
     return OwnPolicy(given, name, {})
+
+
+def _is_maker(given: Any) -> bool:
+    """Return True for a function, also with some arguments filled in, that takes ``env`` first."""
+    function = isinstance(given, functools.partial) or inspect.isroutine(given)
+    return function and _first_argument(given) == "env"
 
 
 def _not_made(given: Any, name: str) -> str:

@@ -162,7 +162,7 @@ def _nearest_names(headings: Mapping[str, float], names: Sequence[str]) -> dict[
         chosen = table.argmin(axis=1)
     else:
         _, chosen = optimize.linear_sum_assignment(table)
-    return {edge: names[place] for edge, place in zip(headings, chosen, strict=True)}
+    return {edge: names[int(place)] for edge, place in zip(headings, chosen, strict=True)}
 
 
 def heading_rad(shape: Sequence[tuple[float, float]]) -> float:

@@ -255,6 +255,7 @@ class VectorEnv:
         Raises:
             EpisodeError: No step has begun.
         """
+        _ = self._memory  # a closed one says so
         if not self._stepped and not self._begun:
             raise EpisodeError("step_wait() without step_async()")
         stepped, begun = self._stepped, self._begun
@@ -306,6 +307,7 @@ class VectorEnv:
             SimulatorError: SUMO failed in one environment, which has no episode now. The steps of
                 the others can still be received, with the episode that it had ended before.
         """
+        _ = self._memory  # a closed one says so
         if not 1 <= count <= len(self._sent):
             raise EpisodeError(
                 f"recv({count}): {len(self._sent)} environments are in the middle of a step; "
@@ -332,6 +334,7 @@ class VectorEnv:
         """End all simulations and processes and remove their files; a second call does nothing."""
         for env in self._environments:
             env.close()
+        self._stepped, self._begun, self._sent = [], [], {}
         shared, self._shared = self._shared, None
         if shared is not None:
             self._arrays = None
@@ -342,6 +345,15 @@ class VectorEnv:
 
     def __exit__(self, *_: object) -> None:
         self.close()
+
+    def __deepcopy__(self, _: object) -> VectorEnv:
+        raise EpisodeError(
+            "a vector_env cannot be copied, as its processes and its memory cannot; make another "
+            "one"
+        )
+
+    def __copy__(self) -> VectorEnv:
+        return self.__deepcopy__(None)
 
     def __del__(self) -> None:
         if getattr(self, "_shared", None) is not None:
