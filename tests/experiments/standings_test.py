@@ -160,4 +160,6 @@ def test_rules_are_put_into_a_table(
     assert "results in V4, which would be lost" in capsys.readouterr().err
     # So is a table whose rows the new one would not have.
     assert main([*call, *words, "--table", str(table), "--out", str(out)]) == 2
-    assert f"rows that would be lost, such as 'mine' in V4; --table {out}" in capsys.readouterr().err
+    assert (
+        f"rows that would be lost, such as 'mine' in V4; --table {out}" in capsys.readouterr().err
+    )
