@@ -232,8 +232,8 @@ def _stable_object(value: Any, deeper: Callable[[Any], str]) -> str:
     if isinstance(value, Sequence | deque):
         return f"{named}({deeper(list(value))})"
     held = getattr(value, "__dict__", {})
-    if dataclasses.is_dataclass(value):
-        held = {field.name: getattr(value, field.name) for field in dataclasses.fields(value)}
+    if dataclasses.is_dataclass(kind):
+        held = {field.name: getattr(value, field.name) for field in dataclasses.fields(kind)}
     says_what = kind.__getstate__ is not object.__getstate__  # as a table of polars does
     if not says_what and (held or kind.__repr__ is object.__repr__):
         return f"{named}({_file_hash(kind)}, {deeper(held)})"
