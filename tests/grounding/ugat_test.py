@@ -286,7 +286,7 @@ def test_a_log_that_does_not_fit_is_refused(tmp_path: Path) -> None:
             transfer(config, tmp_path / f"run-{name}")
     short = recorded(tmp_path / "short.parquet", observation="movements")
     whole = TransitionLog.read(short)
-    for name, rows in (("no row", 0), ("to hold out", 1)):
+    for name, rows in (("no row", 0), ("right before them", 1)):
         TransitionLog(whole.provenance, whole.frame.head(rows)).write(short)
         config = TransferConfig("single-v1", real="none", real_log=short, duration_s=100)
         with pytest.raises(LogError, match=name):
