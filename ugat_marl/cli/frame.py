@@ -294,10 +294,10 @@ def _one_line(box: str, name: str) -> str:
         box: The box, in line-drawing characters or, on terminals without them, in ASCII.
         name: Name of the command.
     """
-    lines = [re.sub(r"[│╭╮╰╯]", " ", line).rstrip() for line in box.splitlines()]
-    under_title = itertools.dropwhile(_is_rule, lines[1:])
+    title, *lines = [re.sub(r"[│╭╮╰╯]", " ", line).rstrip() for line in box.splitlines()] or [""]
+    under_title = itertools.dropwhile(_is_rule, lines)
     message = list(itertools.takewhile(lambda line: not _is_rule(line), under_title))
-    if "Required options" in lines[0]:
+    if "Required options" in title:
         return f"{name} needs {joined([*filter(None, map(_required, message))])}"
     words = " ".join(" ".join(message).split()).rstrip(".")
     for pattern, plain in _PLAIN_WORDS.items():
