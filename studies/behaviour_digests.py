@@ -350,7 +350,7 @@ def training(grounding: str, *more: str) -> tuple[Values, Values]:
 def measured_values(folder: Path, label: str) -> Values:
     """Return the number of rows, the sums of columns and a digest of measured data."""
     values: Values = {}
-    for path in sorted(folder.iterdir()):
+    for path in sorted(path for path in folder.iterdir() if path.suffix in (".csv", ".parquet")):
         rows = table_of(path)
         values[f"{label}{path.stem}: rows"] = [len(rows)]
         for name in rows[0] if rows else ():
