@@ -19,7 +19,7 @@ from ugat_marl.experiments import (
     Judging,
     PaperConfig,
     compare,
-    lost_rows,
+    lost_row,
     policy_factory,
     read_standings,
     require_room,
@@ -150,11 +150,7 @@ class Compare:
 
     def _require_kept(self, table: pl.DataFrame) -> None:
         """Refuse to replace a table whose rows the new one would not have."""
-        if self.out is None or not self.out.is_file():
-            return
-        lost = lost_rows(read_standings(self.out), table)
-        if not lost.is_empty():
-            row = lost.row(0, named=True)
+        if self.out is not None and self.out.is_file() and (row := lost_row(self.out, table)):
             raise OptionError(
                 f"--out {self.out}: is there, with rows that would be lost, such as "
                 f"{row['setting']!r} in {row['domain']}; --table {self.out} keeps them, or give "

@@ -19,9 +19,8 @@ from ugat_marl.experiments import (
     as_standings,
     compare,
     file_stem,
-    lost_rows,
+    lost_row,
     machine_facts,
-    read_standings,
 )
 from ugat_marl.files import require_writable, write_whole
 from ugat_marl.policies import device_of
@@ -182,9 +181,7 @@ def _require_kept(file: Path, text: str) -> None:
     Raises:
         OutputError: Trainings would be lost; nothing was written.
     """
-    lost = lost_rows(read_standings(file), as_standings(text.encode(), "the new table"))
-    if not lost.is_empty():
-        row = lost.row(0, named=True)
+    if row := lost_row(file, as_standings(text.encode(), "the new table")):
         raise OutputError(
             f"{file.parent} holds a table of other trainings, such as {row['setting']!r} in "
             f"{row['domain']} with seed {row['training_seed']}; give the same command with another "

@@ -70,6 +70,7 @@ from .sim_check import check_run as check_run
 from .sim_check import check_table as check_table
 from .standings import Judging as Judging
 from .standings import as_standings as as_standings
+from .standings import lost_row as lost_row
 from .standings import lost_rows as lost_rows
 from .standings import ranked as ranked
 from .standings import read_standings as read_standings

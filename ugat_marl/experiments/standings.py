@@ -174,6 +174,12 @@ def lost_rows(before: pl.DataFrame, after: pl.DataFrame) -> pl.DataFrame:
     return before.join(after, on=list(SCHEMA), how="anti", maintain_order="left")
 
 
+def lost_row(file: Path, after: pl.DataFrame) -> dict[str, Any] | None:
+    """Return the first row of a file that another table has not; None if nothing would be lost."""
+    lost = lost_rows(read_standings(file), after)
+    return None if lost.is_empty() else lost.row(0, named=True)
+
+
 def _kind(name: str) -> str:
     """Return what stands in a column, in words."""
     return "whole number" if SCHEMA[name] == pl.Int64 else "number"

@@ -28,6 +28,7 @@ from ugat_marl.data import (
 from ugat_marl.effects import domain_label, load_scenario, scenario_in_domain
 from ugat_marl.envs import AgentSet, TrafficEnv, parallel_env
 from ugat_marl.errors import (
+    CheckpointError,
     OptionError,
     ScenarioError,
     UnknownNameError,
@@ -459,9 +460,10 @@ def _write_results(
 
 def _policies_before(directory: Path) -> set[Path]:
     """Return the files of policies that an earlier call may have written; all others stay."""
-    if not (directory / "table.json").is_file():
+    try:
+        earlier = Evaluation.read(directory / "table.json")
+    except CheckpointError:  # none yet, or a damaged one, which is about to be replaced
         return set()
-    earlier = Evaluation.read(directory / "table.json")
     names = dict.fromkeys(result.policy for result in earlier.results)
     return {directory / "policies" / f"{file}.pt" for file in file_names(names)}
 

@@ -14,7 +14,7 @@ from ugat_marl.progress import Reporter
 from ugat_marl.scenarios.capacity import SATURATION_VPH, Flows, degrees_of_saturation
 from ugat_marl.scenarios.demand import Demand, check_demand
 from ugat_marl.scenarios.junctions import Link, foes_of, links_for_cars, yields_of
-from ugat_marl.scenarios.network import Intersection, Network
+from ugat_marl.scenarios.network import Intersection, Network, free_flow_s
 from ugat_marl.scenarios.phases import RightOfWay, are_foes, programme_phases, turn_of
 from ugat_marl.scenarios.routes import departures
 from ugat_marl.scenarios.scenario import Scenario
@@ -396,8 +396,7 @@ def _approaches(intersection: Intersection, traffic: _Traffic) -> Sequence[Appro
     approaches: list[ApproachFacts] = []
     for edge, links in roads.items():
         edge_lanes = tuple(dict.fromkeys(link.from_lane for link in links_for_cars(links)))
-        vph, (worst_vph, worst_from_s) = traffic.vph[edge], traffic.worst(edge)
-        flows = traffic.turning_vph(edge, worst_from_s)
+        vph, (worst_vph, worst_from_s, flows) = traffic.vph[edge], traffic.worst(edge)
         lanes_of = _lanes_by_turn(links)
         used = frozenset(edge_lanes).union(*lanes_of.values())
         ratio = fullest(flows, lanes_of, dict.fromkeys(used, SATURATION_VPH))
@@ -516,27 +515,22 @@ class _Traffic:
     def _interval_s(self) -> float:
         return min(QUARTER_S, self.duration_s)
 
-    def worst(self, edge: str) -> tuple[float, float]:
-        """Return the flow in the worst quarter of an hour, vehicles per hour, and its start, s."""
+    def worst(self, edge: str) -> tuple[float, float, dict[str, float]]:
+        """Return the flow of a road in its worst quarter of an hour, vehicles per hour.
+
+        Returns:
+            The flow, the start of the quarter, s, and the flow to each of the next roads.
+        """
         quarters = self.passes.get(edge)
         if not quarters:
-            return 0.0, 0.0
+            return 0.0, 0.0, {}
         worst = max(sorted(quarters), key=lambda quarter: quarters[quarter])
-        return quarters[worst] * 3600 / self._interval_s, worst * self._interval_s
-
-    def turning_vph(self, edge: str, from_s: float) -> dict[str, float]:
-        """Return next road to vehicles per hour that leave `edge` in a quarter of an hour.
-
-        Args:
-            edge: The road.
-            from_s: Start of the quarter of an hour, s.
-        """
-        turns = self.turns.get(round(from_s / self._interval_s), {})
-        return {
+        flows = {
             after: count * 3600 / self._interval_s
-            for (before, after), count in turns.items()
+            for (before, after), count in self.turns.get(worst, {}).items()
             if before == edge
         }
+        return quarters[worst] * 3600 / self._interval_s, worst * self._interval_s, flows
 
     @property
     def busiest_s(self) -> float:
@@ -561,9 +555,7 @@ class _Traffic:
     def of(
         cls, scenario: Scenario, network: Network, demand: Demand, reporter: Reporter | None
     ) -> _Traffic:
-        seconds: dict[str, float] = {}
-        for lane in network.lanes.values():
-            seconds[lane.edge] = lane.length_m / max(lane.speed_mps, 0.1)
+        seconds = free_flow_s(network.lanes.values())
         begin, length_s = scenario.settings.begin_s, scenario.settings.duration_s
         passes: Counter[str] = Counter()
         lengths_s: list[float] = []

@@ -432,6 +432,11 @@ def lanes_of(root: ET.Element) -> dict[str, Lane]:
     return lanes
 
 
+def free_flow_s(lanes: Iterable[Lane]) -> dict[str, float]:
+    """Return road (SUMO's edge) to the time that its last lane takes at the speed limit, s."""
+    return {lane.edge: lane.length_m / max(lane.speed_mps, 0.1) for lane in lanes}
+
+
 def streets_of(root: ET.Element) -> dict[str, str]:
     """Return road (SUMO's edge) to the name of its street, without roads that have no name."""
     names = {edge.get("id", ""): edge.get("name", "") for edge in root.iter("edge")}

@@ -39,6 +39,7 @@ from ugat_marl.scenarios.importers.turning_shares import (
     walked,
     write_drives,
 )
+from ugat_marl.scenarios.network import free_flow_s, lanes_of
 from ugat_marl.scenarios.scenario import COUNT_SHEET
 from ugat_marl.scenarios.settings import parse_decimal
 from ugat_marl.scenarios.sumo_tools import convert
@@ -473,11 +474,7 @@ def _on_the_way(rows: Sequence[Row], drives: Sequence[Drive], root: ET.Element) 
 
     Counts are of vehicles that depart in the interval; a detector counts those that come by.
     """
-    seconds: dict[str, float] = {}
-    for edge in root.iter("edge"):
-        for lane in edge.iter("lane"):
-            speed = max(float(lane.get("speed", "1")), 0.1)
-            seconds[edge.get("id", "")] = float(lane.get("length", "0")) / speed
+    seconds = free_flow_s(lanes_of(root).values())
     counted_roads = {row.roads[0] for row in rows if row.count}
     longest_s = 0.0
     for drive in drives:

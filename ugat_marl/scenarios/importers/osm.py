@@ -210,7 +210,10 @@ def _convert(
     # removed. Lights at crossings stay: they stop traffic for pedestrians.
     if idle := _idle_lights(made, extract.walks):
         netconvert([*arguments, "--tls.unset", ",".join(idle)], made)
-    forbidden = forbidden_turns(parse_xml(read_bytes(made), str(made)), extract.restrictions)
+    forbidden = ForbiddenTurns([], 0)
+    if extract.restrictions:
+        root = parse_xml(read_bytes(made), str(made))
+        forbidden = forbidden_turns(root, extract.restrictions)
     if forbidden.turns:
         _reconnect(deleted_connections(forbidden.turns), made, work)
     if extract.crossings:
