@@ -3,7 +3,7 @@
 #   make demo       trains a policy across the gap on a shipped network; table, page, film
 #   make test       builds the wheel, installs it into .venv and tests it
 #   make test-slow  the tests that take long and are left out there
-#   make test-all   both, small versions of the paper's tables, 3,000 damaged inputs, and each documented command (over two hours)
+#   make test-all   both, small versions of the paper's tables, digests of behaviour, 3,000 damaged inputs, and each documented command (over two hours)
 #   make check      format, lint, types, architecture, words, tests
 #   make compat     the learners of other libraries: what runs where (LATEST=1: their newest releases)
 #   make bench      the figures of docs/, measured on this machine

@@ -446,7 +446,7 @@ def played(name: str) -> dict[str, Any]:
         RuntimeError: The part failed.
     """
     done = subprocess.run(
-        [sys.executable, "-m", "studies.behaviour_digests", "play", name],
+        [sys.executable, __file__, "play", name],
         env={**os.environ, **ENVIRONMENT},
         capture_output=True,
         text=True,

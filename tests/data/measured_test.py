@@ -308,6 +308,22 @@ def test_writing_replaces_measured_data_and_nothing_else(tmp_path: Path) -> None
     assert sorted(path.name for path in tmp_path.iterdir()) == ["empty", "file", "street"]
 
 
+@pytest.mark.parametrize(("name", "lose"), [("periods.csv", False), ("detectors.csv", True)])
+def test_data_that_somebody_else_measured_or_changed_are_kept(
+    tmp_path: Path, name: str, lose: bool
+) -> None:
+    directory = write_measured(recording(), tmp_path / "street")
+    if lose:  # as in a folder made by hand
+        (directory / CSV_HASHES).unlink()
+    else:
+        table = (directory / name).read_text()
+        (directory / name).write_text(table.replace("0.0", "1.0", 1))
+    before = {path.name: path.read_bytes() for path in directory.iterdir()}
+    with pytest.raises(OutputError, match=f"{name} was not written by record or import-atspm"):
+        write_measured(recording(3), directory)
+    assert {path.name: path.read_bytes() for path in directory.iterdir()} == before
+
+
 def test_a_write_that_fails_leaves_the_old_data(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

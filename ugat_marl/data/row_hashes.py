@@ -193,6 +193,18 @@ def csv_damage(path: Path, frame: pl.DataFrame) -> str:
     return ""
 
 
+def is_hashed_csv(path: Path) -> bool:
+    """Return True if a CSV table has hashes beside it and is what was written.
+
+    Raises:
+        OSError: The file cannot be read.
+        polars.exceptions.PolarsError: The file is not a table.
+    """
+    if path.name not in _known_csv_hashes(path.parent):
+        return False
+    return not csv_damage(path, csv_texts(path.read_bytes()))
+
+
 def _known_csv_hashes(directory: Path) -> dict[str, Any]:
     file = directory / CSV_HASHES
     try:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import secrets
 import shutil
-from collections.abc import Sequence
+from collections.abc import Collection, Sequence
 from pathlib import Path
 
 import numpy as np
@@ -26,7 +26,12 @@ from ugat_marl.data.measured.tables import (
     frame_of,
 )
 from ugat_marl.data.measured.values import MeasuredData
-from ugat_marl.data.row_hashes import CSV_HASHES, write_csv_hashes, write_hashed
+from ugat_marl.data.row_hashes import (
+    CSV_HASHES,
+    is_hashed_csv,
+    write_csv_hashes,
+    write_hashed,
+)
 from ugat_marl.errors import OutputError
 from ugat_marl.files import put_folder
 from ugat_marl.scenarios import Passages, Period
@@ -40,14 +45,15 @@ def write_measured(measured: MeasuredData, directory: Path, *, csv: bool = False
 
     Args:
         measured: The data; their findings are not written.
-        directory: A new or empty directory, or one with measured data, which are replaced.
+        directory: A new or empty directory, or one that holds what this function wrote, which is
+            replaced.
         csv: True to write CSV where Parquet is the default.
 
     Returns:
         `directory`.
 
     Raises:
-        OutputError: The directory holds other files, or cannot be written.
+        OutputError: The directory holds anything else, or cannot be written.
     """
     require_replaceable(directory)
     suffix = ".csv" if csv else ".parquet"
@@ -93,8 +99,10 @@ def write_measured(measured: MeasuredData, directory: Path, *, csv: bool = False
 def require_replaceable(directory: Path) -> None:
     """Refuse a directory that `write_measured` would not replace. Call this before measuring.
 
+    Data that somebody else has measured, or changed, may be the only copy.
+
     Raises:
-        OutputError: The directory holds other files, or is a file.
+        OutputError: The directory holds anything but what `write_measured` wrote, or is a file.
     """
     if directory.name in ("", ".."):
         raise OutputError(f"{directory}: is a folder in use; give the name of a new one")
@@ -119,6 +127,23 @@ def require_replaceable(directory: Path) -> None:
             f"{directory}: is not empty and has no periods.csv, so it is not measured data to "
             "replace; give another directory"
         )
+    if (changed := _changed_table(directory, there)) is not None:
+        raise OutputError(
+            f"{directory}: {changed} was not written by record or import-atspm, or has changed "
+            "since, and would be lost; give another directory, or move it away"
+        )
+
+
+def _changed_table(directory: Path, names: Collection[str]) -> str | None:
+    """Return the name of a CSV table that is not as `write_measured` wrote it."""
+    for name in sorted(name for name in names if name.endswith(".csv")):
+        try:
+            whole = is_hashed_csv(directory / name)
+        except (OSError, pl.exceptions.PolarsError):
+            whole = False
+        if not whole:
+            return name
+    return None
 
 
 def _write(frame: pl.DataFrame, path: Path) -> None:
