@@ -59,12 +59,10 @@ class Starving:
 
     def reset(self, seed: int) -> None:
         """Begin with the first phase again."""
-        del seed
         self._decision = 0
 
     def act(self, observations: Mapping[str, Any], infos: Any) -> dict[str, int]:
         """Return the phase whose turn it is."""
-        del infos
         turn = int(self._decision * self.env.decision_interval_s // 30)
         self._decision += 1
         return {agent: phases[turn % len(phases)] for agent, phases in self._phases.items()}

@@ -90,13 +90,11 @@ class Silent:
     @contextlib.contextmanager
     def task(self, name: str, total: int) -> Iterator[Advance]:
         """Do nothing."""
-        del name, total
         yield lambda note="": None
 
     @contextlib.contextmanager
     def whole(self, name: str, shares: Mapping[str, Share]) -> Iterator[None]:
         """Do nothing."""
-        del name, shares
         yield
 
     def say(self, text: str) -> None:

@@ -63,7 +63,6 @@ class Steps(Silent):
     @contextlib.contextmanager
     def task(self, name: str, total: int) -> Iterator[Any]:
         """Count the start of a task and its steps."""
-        del name, total
         self._add()
         yield lambda note="": self._add()
 

@@ -60,7 +60,6 @@ class World(Engine):
         numbers: Sequence[int],
         advance: Callable[[], None] | None = None,
     ) -> list[Replicate]:
-        del advance
         self.asked.append(tuple(map(str, effects)))
         return [Replicate(self.played(number, effects), 60.0) for number in numbers]
 

@@ -49,12 +49,10 @@ class Ledger:
         return Fitted(members, {}, blank, blank, cost)
 
     def refine(self, start: Fitted, rounds: int, *, closely: bool = False) -> Fitted:
-        del rounds, closely
         members = self.refined.get(names(start.members), start.members)
         return replace(start, members=members)
 
     def fitted(self, start: Fitted, directions: object) -> Fitted:
-        del directions
         return self.refine(start, 1)
 
     def test(self, model: Fitted) -> records.Tested:

@@ -220,7 +220,6 @@ def test_an_unnamed_correction_is_asked_for_and_has_to_help(
     after = days(3, 16, travel_s, travel_s / 5)
 
     def ordinary(effects: tuple[Effect, ...], numbers: list[int], advance: Any) -> dict[int, Any]:
-        del advance
         tried.append(effects)
         return {n: SimpleNamespace(tally=after[n]) for n in numbers}
 

@@ -88,7 +88,6 @@ def test_the_drawn_intersection_has_the_phases_of_the_street(folder: Path) -> No
 
 @absent
 def test_the_demand_is_that_of_the_first_hour_alone(folder: Path) -> None:
-    del folder
     given = pl.read_csv(ROOT / "docs" / "tutorials" / "real-street" / "turns.csv")
     turns = {(a, b): count for a, b, count in given.select("from", "to", "count").iter_rows()}
     rows = log().filter((pl.col("EventId") == 82) & (pl.col("s") < 3600))

@@ -45,7 +45,6 @@ class ByHand:
         self._late = late
 
     def collect(self, policy: Any, iteration: int, seed: int) -> TransitionLog:
-        del policy
         generator = np.random.default_rng((seed, iteration, self._late))
         domain = "street" if self._late else "sim"
         recorder = TransitionRecorder(Provenance("by hand", "", domain, (), 10.0, "count", LAYOUTS))
@@ -81,7 +80,6 @@ class Idle:
     episodes = 0
 
     def learn(self, env: Any, episodes: int, *_: Any) -> None:
-        del env
         self.episodes += episodes
 
     def policy(self) -> Idle:
@@ -153,11 +151,9 @@ def test_a_roll_out_records_the_policy_s_own_action() -> None:
         env_options: Mapping[str, Any] = {}
 
         def reset(self, seed: int) -> None:
-            del seed
             self.asked = iter([1, 2, 3, 4, 5, 6, 7, 1, 2, 3])
 
         def act(self, observations: Any, infos: Any) -> dict[str, int]:
-            del observations, infos
             return {"signal_0": next(self.asked)}
 
     try:
@@ -181,7 +177,6 @@ def test_every_iteration_has_its_own_traffic() -> None:
             del seed
 
         def act(self, observations: Any, infos: Any) -> dict[str, int]:
-            del infos
             return dict.fromkeys(observations, 0)
 
     world = SimulatedWorld(make, "real", episodes=2, epsilon=0.0)

@@ -46,7 +46,6 @@ class Alternating:
         self._decision = seed
 
     def act(self, observations: Mapping[str, Any], infos: Any) -> dict[str, int]:
-        del infos
         self._decision += 1
         return dict.fromkeys(observations, self._decision % 2)
 

@@ -161,7 +161,6 @@ class Cycling:
         self._decision = seed
 
     def act(self, observations: Mapping[str, Any], infos: Any) -> dict[str, int]:
-        del infos
         self._decision += 1
         return {a: self._decision // (1 + i % 3) % 2 for i, a in enumerate(observations)}
 

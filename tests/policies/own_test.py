@@ -243,7 +243,6 @@ def test_an_option_of_a_policy_does_not_get_the_infos() -> None:
 def test_a_policy_of_the_command_line(
     algorithm: Any, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    del algorithm
     monkeypatch.setenv("COLUMNS", "200")
     words = ["--policies", "my_algo:first_phase", "fixed-time:30", "--domains", "sim"]
     assert main(["evaluate", "single-v1", *words, "--seeds", "1", "--duration-s", "100"]) == 0
@@ -492,7 +491,6 @@ def test_settings_without_usable_types_are_literals() -> None:
         assert learner._given.double is False
 
     def make(env: Absent, rate: float = 0.5) -> Any:  # type: ignore[name-defined]  # noqa: F821
-        del env
         return Closing(rate)
 
     learner = OwnLearnerFactory(own_name(make), ["rate=0.2"])(ToyTraffic(), 0)
@@ -519,7 +517,6 @@ def test_a_class_of_policies_is_made_for_the_environment_it_asks_for() -> None:
 
 
 def test_a_training_with_the_same_seed_is_the_same(algorithm: Any) -> None:
-    del algorithm
     seen: list[list[float]] = []
     for _ in range(2):
         learner = OwnLearnerFactory("my_algo:Cycle")(ToyTraffic(), 0)

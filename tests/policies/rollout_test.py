@@ -26,7 +26,6 @@ class Always:
         self.resets.append(seed)
 
     def act(self, observations: Mapping[str, Any], infos: Mapping[str, Any]) -> dict[str, int]:
-        del infos
         return dict.fromkeys(observations, 0)
 
 

@@ -164,7 +164,6 @@ def test_the_kernel_alone_holds(
         return document
 
     def no_fault(option: str, value: str) -> str:
-        del option, value
         return ""
 
     monkeypatch.setattr(scenario, "admitted", unchecked)

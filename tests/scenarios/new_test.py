@@ -497,7 +497,6 @@ def test_long_files_are_read_with_progress(tmp_path: Path, monkeypatch: pytest.M
 
 
 def nobody(folder: Path, network: Path, reporter: Reporter) -> VehicleFiles:
-    del network, reporter
     (folder / "none.rou.xml").write_text("<routes/>")
     return VehicleFiles(("none.rou.xml",))
 

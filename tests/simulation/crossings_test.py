@@ -67,11 +67,9 @@ class Plan:
         self._phases = phases
 
     def reset(self, seed: int) -> None:
-        del seed
         self._left = list(self._phases)
 
     def act(self, observations: Mapping[str, Any], infos: Mapping[str, Any]) -> dict[str, int]:
-        del infos
         phase = self._left.pop(0) if self._left else 0
         return dict.fromkeys(observations, phase)
 

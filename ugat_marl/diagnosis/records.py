@@ -315,7 +315,6 @@ class LogGrounds:
 
     def in_words(self, number: Callable[[float], str]) -> str:
         """Return the grounds as a phrase; it has no number."""
-        del number
         return self.source if self.rival is None else f"{self.source}; looks like {self.rival} too"
 
 

@@ -46,7 +46,6 @@ class ExecutionDelay(ControllerEffect):
         self, network: Network, timing: SignalTiming, decision_interval_s: float
     ) -> Actuator:
         """Make an actuator that delays commands by whole decisions."""
-        del timing
         nothing = (None,) * len(network.intersections)
         return _Late(nothing, whole_decisions(self.seconds, decision_interval_s))
 
@@ -57,7 +56,6 @@ class _Late(Actuator):
         self._decisions = decisions
 
     def reset(self, seed: int) -> None:
-        del seed
         self._under_way: deque[Commands] = deque([self._nothing] * self._decisions)
 
     def send(self, commands: Commands) -> Commands:
@@ -81,7 +79,6 @@ class LostCommands(ControllerEffect):
         self, network: Network, timing: SignalTiming, decision_interval_s: float
     ) -> Actuator:
         """Make an actuator that loses commands, independently for each light."""
-        del network, timing, decision_interval_s
         return _Lossy(self.share)
 
 
@@ -117,7 +114,6 @@ class PhaseOrder(ControllerEffect):
         Raises:
             ScenarioError: The phases of an intersection have no barrier.
         """
-        del timing, decision_interval_s
         return _Ordered(
             [successors(intersection, self.rule) for intersection in network.intersections]
         )
@@ -148,7 +144,6 @@ class MaxGreen(ControllerEffect):
         Raises:
             ScenarioError: The minimum green is longer.
         """
-        del network
         if timing.min_green_s > self.seconds:
             raise ScenarioError(
                 f"max_green={self.seconds:g}: the minimum green is {timing.min_green_s:g} s; give "
@@ -164,7 +159,6 @@ class _Bounded(Actuator):
         self._interval_s = interval_s
 
     def restrict(self, mask: NDArray[np.int8], place: int, state: SignalState) -> None:
-        del place
         green_s = state.elapsed_s - self._clearance_s if state.clearing else state.elapsed_s
         if green_s + self._interval_s > self._most_green_s + _INSTANT_S:
             mask[state.phase] = 0

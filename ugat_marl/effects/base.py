@@ -141,7 +141,6 @@ class Effect(ControllerPart):
 
         Return None for an effect without times.
         """
-        del scenario
         begin, end = getattr(self, "begin_s", None), getattr(self, "end_s", None)
         return None if begin is None or end is None else (begin, end)
 
@@ -163,7 +162,6 @@ class Effect(ControllerPart):
         Raises:
             UnknownNameError: The detector does not exist.
         """
-        del detectors, owner
         return period
 
     def installed(self, detectors: Sequence[Detector]) -> tuple[Detector, ...]:
@@ -184,7 +182,6 @@ class Effect(ControllerPart):
             period: Measured passages; it does not change itself.
             detectors: All detectors.
         """
-        del detectors
         return period
 
     def in_words(self) -> str:

@@ -72,7 +72,6 @@ class ControllerPart:
 
     def sensor(self, network: Network, decision_interval_s: float) -> Sensor | None:
         """Make the sensor that changes the counts of controllers; None without such a change."""
-        del network, decision_interval_s
         return None
 
     def actuator(
@@ -83,7 +82,6 @@ class ControllerPart:
         Raises:
             ScenarioError: The phases of an intersection do not allow it.
         """
-        del network, timing, decision_interval_s
         return None
 
     def service(self) -> Mapping[str, tuple[float, float]]:

@@ -117,7 +117,6 @@ class DetectorOffset(_OfDetectors):
 
     def observe(self, period: Period, detectors: Sequence[Detector], owner: Owner) -> Period:
         """Check the place; the passages are recorded at the true position already."""
-        del owner
         detectors_at(self.place, detectors, self.name)
         return period
 
@@ -144,7 +143,6 @@ class DetectorZone(_OfDetectors):
 
     def observe(self, period: Period, detectors: Sequence[Detector], owner: Owner) -> Period:
         """Check the place; the passages are recorded over the true zone already."""
-        del owner
         detectors_at(self.place, detectors, self.name)
         return period
 
@@ -172,7 +170,6 @@ class DetectorSpeeds(_OfDetectors):
 
     def observe(self, period: Period, detectors: Sequence[Detector], owner: Owner) -> Period:
         """Check the place; the speeds are recorded at the true point already."""
-        del owner
         detectors_at(self.place, detectors, self.name)
         return period
 
@@ -207,10 +204,8 @@ class DetectorExtension(_OfDetectors):
 
     def observe(self, period: Period, detectors: Sequence[Detector], owner: Owner) -> Period:
         """Move the ends, or for a delay the begins, of all passages."""
-        del owner
 
         def extended(name: str, passages: Passages) -> Passages:
-            del name
             if self.seconds < 0:
                 late = replace(passages, on_s=passages.on_s - self.seconds)
                 return late.at(~(late.on_s >= late.off_s))
@@ -223,7 +218,6 @@ class DetectorExtension(_OfDetectors):
         """Take the extension off the ends; a delay and merged vehicles stay as they are."""
 
         def shorter(name: str, passages: Passages) -> Passages:
-            del name
             ends = passages.off_s - max(self.seconds, 0.0)
             return replace(passages, off_s=np.where(ends < passages.on_s, passages.on_s, ends))
 
@@ -261,10 +255,8 @@ class DetectorPulse(_OfDetectors):
 
     def observe(self, period: Period, detectors: Sequence[Detector], owner: Owner) -> Period:
         """End all passages after the pulse; a vehicle that came before the period has none."""
-        del owner
 
         def pulsed(name: str, passages: Passages) -> Passages:
-            del name
             known = passages.at(np.isfinite(passages.on_s))
             return replace(known, off_s=known.on_s + self.seconds)
 
@@ -286,7 +278,6 @@ class DetectorSplash(_OfDetectors):
 
     def observe(self, period: Period, detectors: Sequence[Detector], owner: Owner) -> Period:
         """Add passages of the next lanes, chosen by a hash of the detector, number and time."""
-        del owner
         beside = next_detectors(detectors)
 
         def splashed(name: str, passages: Passages) -> Passages:

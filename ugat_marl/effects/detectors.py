@@ -89,7 +89,6 @@ class Undercount(DetectorEffect):
 
     def observe(self, period: Period, detectors: Sequence[Detector], owner: Owner) -> Period:
         """Leave out passages, chosen by a hash of the detector and their number and time."""
-        del owner
 
         def thinned(name: str, passages: Passages) -> Passages:
             times = np.where(np.isnan(passages.on_s), passages.off_s, passages.on_s)
@@ -117,7 +116,6 @@ class SignalClock(DetectorEffect):
 
     def observe(self, period: Period, detectors: Sequence[Detector], owner: Owner) -> Period:
         """Shift all times of the detectors."""
-        del detectors
         shift = self.seconds
         return edited(period, _at(self.place, period, owner), lambda _, p: _moved(p, shift, shift))
 
@@ -139,11 +137,9 @@ class ClockDrift(DetectorEffect):
 
     def observe(self, period: Period, detectors: Sequence[Detector], owner: Owner) -> Period:
         """Shift times in proportion to the time since the period began."""
-        del detectors
         rate = self.seconds_per_hour / 3600.0
 
         def drifted(name: str, passages: Passages) -> Passages:
-            del name
             on, off = passages.on_s - period.begin_s, passages.off_s - period.begin_s
             return _moved(passages, rate * on, rate * off)
 
@@ -163,7 +159,6 @@ class Stuck(DetectorEffect):
 
     def observe(self, period: Period, detectors: Sequence[Detector], owner: Owner) -> Period:
         """Replace all passages between the times by one long passage without speed."""
-        del owner
         names = _named(self, self.detector, detectors)
         begin, end = max(self.begin_s, period.begin_s), min(self.end_s, period.end_s)
         if begin >= end:
@@ -171,7 +166,6 @@ class Stuck(DetectorEffect):
         long = Passages(np.array([begin]), np.array([end]), np.array([np.nan]), np.array([np.nan]))
 
         def held(name: str, passages: Passages) -> Passages:
-            del name
             return Passages.concatenated([passages.at(~_within(passages, begin, end)), long])
 
         return edited(period, names, held)
@@ -190,10 +184,8 @@ class Dropout(DetectorEffect):
 
     def observe(self, period: Period, detectors: Sequence[Detector], owner: Owner) -> Period:
         """Leave out all passages between the times."""
-        del owner
 
         def silent(name: str, passages: Passages) -> Passages:
-            del name
             return passages.at(~_within(passages, self.begin_s, self.end_s))
 
         return edited(period, _named(self, self.detector, detectors), silent)
@@ -213,7 +205,6 @@ class Swapped(DetectorEffect):
 
     def observe(self, period: Period, detectors: Sequence[Detector], owner: Owner) -> Period:
         """Exchange the passages of the two."""
-        del owner
         (first,), (second,) = (_named(self, x, detectors) for x in (self.detector, self.other))
         passages = {name: x for name, x in period.passages.items() if name not in (first, second)}
         for name, source in ((first, second), (second, first)):

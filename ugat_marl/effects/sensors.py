@@ -34,7 +34,6 @@ class CountingNoise(ControllerEffect):
 
     def sensor(self, network: Network, decision_interval_s: float) -> Sensor:
         """Make a sensor that draws a relative error for each lane and decision."""
-        del network, decision_interval_s
         return _Noise(self.share)
 
 
@@ -67,7 +66,6 @@ class CountingError(ControllerEffect):
 
     def sensor(self, network: Network, decision_interval_s: float) -> Sensor:
         """Make a sensor that draws an absolute error for each lane and decision."""
-        del network, decision_interval_s
         return _Error(self.vehicles)
 
 
@@ -97,7 +95,6 @@ class DetectorFailure(ControllerEffect):
 
     def sensor(self, network: Network, decision_interval_s: float) -> DeadDetectors:
         """Make a sensor with dead detectors."""
-        del decision_interval_s
         return DeadDetectors(self.share, len(network.lane_table().ids))
 
 
@@ -146,7 +143,6 @@ class DetectionZone(ControllerEffect):
 
     def sensor(self, network: Network, decision_interval_s: float) -> Sensor:
         """Make a sensor with zones at the stop lines; lanes without a stop line report 0."""
-        del decision_interval_s
         return _Zone(self.metres, network)
 
 
@@ -179,7 +175,6 @@ class ObservationDelay(ControllerEffect):
 
     def sensor(self, network: Network, decision_interval_s: float) -> Sensor:
         """Make a sensor that delays counts by whole decisions."""
-        del network
         return _Late(whole_decisions(self.seconds, decision_interval_s))
 
 
@@ -190,7 +185,6 @@ class _Late(Sensor):
         self._decisions = decisions
 
     def reset(self, seed: int) -> None:
-        del seed
         self._under_way: deque[tuple[NDArray[np.float64], NDArray[np.float64]]] = deque()
 
     def read(self, reading: Reading) -> Reading:
@@ -212,7 +206,6 @@ class LostReadings(ControllerEffect):
 
     def sensor(self, network: Network, decision_interval_s: float) -> Sensor:
         """Make a sensor that loses counts, independently for each lane."""
-        del network, decision_interval_s
         return _Lossy(self.share)
 
 
@@ -247,7 +240,6 @@ class QuantisedCounts(ControllerEffect):
 
     def sensor(self, network: Network, decision_interval_s: float) -> Sensor:
         """Make a sensor that rounds counts to the step; halves are rounded up."""
-        del network, decision_interval_s
         return _Steps(self.vehicles)
 
 

@@ -100,7 +100,6 @@ class VehicleEffect(Effect):
 
     def _write(self, element: ET.Element, number: float, settings: ScenarioFile) -> None:
         """Write the effect's number into one type of a scenario with these settings."""
-        del settings
         _set(element, self.attribute, number)
 
 

@@ -89,7 +89,6 @@ class Jobs:
 
     def prepare(self, order: dict[str, Any]) -> None:
         """Load what every job needs."""
-        del order
         for name in PRELOADED:
             importlib.import_module(name)
 

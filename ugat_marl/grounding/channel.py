@@ -156,7 +156,6 @@ class CommandChannel(ControllerPart):
         self, network: Network, timing: SignalTiming, decision_interval_s: float
     ) -> FittedActuator | None:
         """Return an actuator that acts as the channel; each episode draws its weights."""
-        del network
         return FittedActuator(self, timing, decision_interval_s) if self.changes else None
 
     def describe(self) -> str:

@@ -236,7 +236,6 @@ class DeadLanes(ControllerPart):
 
     def sensor(self, network: Network, decision_interval_s: float) -> Sensor:
         """Make a sensor with these dead detectors."""
-        del decision_interval_s
         table = network.lane_table()
         alive = np.ones(len(table.ids))
         alive[table.indices(self._lanes)] = 0.0

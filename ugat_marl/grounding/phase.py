@@ -88,7 +88,6 @@ class PhaseTransform(Transform):
         on_top: bool = False,
     ) -> PhaseReport:
         """Fit f on the real log, and h on the simulated log; rewards are not used."""
-        del rewards
         refuse_mismatch(real, simulated)
         f, h = self.forward, self.inverse
         d_real, d_sim = stack_log(real, self.stack), stack_log(simulated, self.stack)

@@ -387,7 +387,6 @@ class EvidentialNet(AnswerNet):
 
     def outputs(self, inputs: Tensor, arguments: LossArguments) -> Tensor:
         """Return the concentrations."""
-        del arguments
         return self(inputs)
 
     def row_loss(self, outputs: Tensor, target: Tensor, arguments: LossArguments) -> Tensor:
@@ -605,12 +604,10 @@ class EnsembleNet(AnswerNet):
 
     def outputs(self, inputs: Tensor, arguments: LossArguments) -> Tensor:
         """Return the logits."""
-        del arguments
         return self.logits(inputs)
 
     def row_loss(self, outputs: Tensor, target: Tensor, arguments: LossArguments) -> Tensor:
         """Return the cross-entropy, member by member."""
-        del arguments
         member_target = target.reshape(outputs.shape[:3])
         return negative_log_likelihood(outputs, member_target, self.valid_actions[:, None]).view(
             target.shape

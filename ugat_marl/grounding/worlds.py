@@ -320,7 +320,6 @@ class Replay:
 
     def act(self, observations: Observations, infos: Infos) -> Actions:
         """Return the commands of the next decision of the log."""
-        del infos
         commands = self._commands[self._episode]
         step, self._step = self._step, self._step + 1
         return {
@@ -374,7 +373,6 @@ class RecordedWorld:
 
     def collect(self, policy: Policy, iteration: int, seed: int) -> TransitionLog | None:
         """Return the whole log at the first iteration, nothing afterwards."""
-        del policy, seed
         return self._log if iteration == 0 else None
 
     def replay(self) -> Policy | None:

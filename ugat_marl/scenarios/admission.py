@@ -334,7 +334,6 @@ def admitted(document: Document) -> Document:
 @functools.lru_cache(maxsize=256)
 def _file_has_outputs(document: Document, version: tuple[int, ...]) -> bool:
     """Return `_has_outputs` of a file; a version of a long file is looked through once."""
-    del version
     return _has_outputs(document)
 
 

@@ -186,7 +186,6 @@ def _test_content(
     document: Document, test: Callable[[Document], bool], size: int, changed_ns: int
 ) -> bool:
     """Test the file; the size and time of change make the cache forget a changed file."""
-    del size, changed_ns
     return test(document)
 
 

@@ -187,7 +187,6 @@ class Simulations:
         self, order: dict[str, Any], descriptors: Sequence[int]
     ) -> Callable[[Message], Message]:
         """Return a function that answers questions to a fresh simulator."""
-        del order, descriptors
         simulator = self._simulator()
         return lambda question: _answer(simulator, question.header)
 

@@ -283,7 +283,6 @@ def drawn_sources(
     drawn = draw_network(seed, ranges)
 
     def roads(folder: Path, reporter: Reporter) -> RoadFiles:
-        del reporter
         shared = any({"s", "l"} <= set(lane) for r in drawn.plan.roads.values() for lane in r.lanes)
         programme = {
             "tls.yellow.time": int(drawn.control["yellow_s"]),
@@ -299,7 +298,6 @@ def drawn_sources(
         )
 
     def vehicles(folder: Path, network: Path, reporter: Reporter) -> VehicleFiles:
-        del reporter
         drives = _drives(drawn, network)
         if not drives:
             raise ScenarioError(

@@ -299,7 +299,6 @@ def _check(spacing_m: float, speed_mps: float) -> None:
 
 def _drawn(plan: RoadPlan, speed_mps: float, description: str) -> RoadSource:
     def roads(folder: Path, reporter: Reporter) -> RoadFiles:
-        del reporter
         write_whole(
             folder / NETWORK, build_network(netconvert_documents(plan, speed_mps), NETCONVERT)
         )

@@ -197,7 +197,6 @@ def from_turning_shares(
     """Return a source of vehicles that `walked` draws by turning shares, from `begin_s` on."""
 
     def vehicles(folder: Path, network: Path, reporter: Reporter) -> VehicleFiles:
-        del reporter
         streets = Streets.of(parse_xml(read_bytes(network), str(network)))
         drives = walked(streets, vph, shares, length_s, seed)
         later = (replace(drive, depart_s=begin_s + drive.depart_s) for drive in drives)
