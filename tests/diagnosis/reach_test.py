@@ -11,7 +11,10 @@ import pytest
 
 from ugat_marl.data import MeasuredData
 from ugat_marl.diagnosis import DiagnosisConfig, Study
-from ugat_marl.diagnosis.study import missing_interval_findings, unreached_edge_findings
+from ugat_marl.diagnosis.compared_detectors import (
+    missing_interval_findings,
+    unreached_edge_findings,
+)
 from ugat_marl.diagnosis.thresholds import Thresholds
 from ugat_marl.effects import load_scenario
 from ugat_marl.errors import MeasuredDataError

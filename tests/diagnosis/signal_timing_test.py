@@ -17,8 +17,8 @@ from ugat_marl.diagnosis.features import (
     DetectorLayout,
 )
 from ugat_marl.diagnosis.intervals import bins_together, counts_tally, without_gaps
+from ugat_marl.diagnosis.signal_timing import timing_effects
 from ugat_marl.diagnosis.statistics import Pools
-from ugat_marl.diagnosis.study import timing_effects
 from ugat_marl.diagnosis.thresholds import Thresholds
 from ugat_marl.effects import load_scenario
 from ugat_marl.scenarios import Network, Period, Scenario, SignalLog

@@ -16,16 +16,16 @@ import pytest
 from ugat_marl.data import MeasuredData
 from ugat_marl.diagnosis import DiagnosisConfig, Study, Tally
 from ugat_marl.diagnosis import study as module
+from ugat_marl.diagnosis.compared_detectors import (
+    detectors_to_compare,
+    duplicate_detector_findings,
+    one_of_each,
+)
+from ugat_marl.diagnosis.demand_variation import day_to_day_variation, measured_variation
 from ugat_marl.diagnosis.engine import Engine
 from ugat_marl.diagnosis.features import BIN_FEATURES, FEATURES, INDEX
 from ugat_marl.diagnosis.statistics import Pools
-from ugat_marl.diagnosis.study import (
-    day_to_day_variation,
-    detectors_to_compare,
-    duplicate_detector_findings,
-    effort_for,
-    one_of_each,
-)
+from ugat_marl.diagnosis.study import effort_for
 from ugat_marl.diagnosis.thresholds import Effort, Thresholds
 from ugat_marl.effects import Effect, Headway
 from ugat_marl.errors import MeasuredDataError
@@ -213,7 +213,7 @@ def test_an_interval_that_was_not_reported_is_no_quieter_day() -> None:
     days = [Tally(sums, bins), Tally(sums, bins * known, known=known)]
     layout = SimpleNamespace(lanes=(SimpleNamespace(intersection=0),), intersections=("C",))
     given = SimpleNamespace(periods=measured(NAMES, NAMES).periods)
-    found = module._variation(cast(Any, layout), cast(Any, given), days, THRESHOLDS)
+    found = measured_variation(cast(Any, layout), cast(Any, given), days, THRESHOLDS)
     assert found == 0.0
 
 

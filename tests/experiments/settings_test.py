@@ -11,7 +11,7 @@ import pytest
 from ugat_marl.errors import OptionError
 from ugat_marl.experiments.settings import LearnerSpec
 from ugat_marl.policies import DQNConfig, is_own, own_name
-from ugat_marl.policies.own import load_own
+from ugat_marl.policies.own_names import load_own
 
 
 def test_weights_to_begin_with_count_by_their_content(tmp_path: Path) -> None:

@@ -460,7 +460,7 @@ def test_the_identity_of_captured_objects_is_the_same_in_every_process(tmp_path:
     (tmp_path / "mine.py").write_text(
         "import functools\n"
         "import numpy as np\n"
-        "from ugat_marl.policies.own import own_name, own_values\n"
+        "from ugat_marl.policies.own_names import own_name, own_values\n"
         "class Net:\n"
         "    def __init__(self, n):\n"
         "        self.n, self.me = n, self\n"

@@ -415,7 +415,7 @@ def test_seeds_are_put_together_with_intervals(tmp_path: Path) -> None:
         row for row in page.cells if row[:1] == ["phase (the paper's UGAT)"] and len(row) == 2
     )
     assert row[1] == f"135 ({words.number(interval.low)} to {words.number(interval.high)})"
-    assert "3 training seeds" in page.text and "best rule there" in page.text
+    assert "3 training seeds" in page.text and "best rule, tuned there" in page.text
     assert page.row("s1")[3:6] == ["phase (the paper's UGAT)", "1", "whole"]
     curves = [d.name for d in made.pictures if "seeds" in d.name]
     assert curves == [f"grid2x2-v1-V4-phase-seeds-{w}" for w in ("learning", "att", "gate")]

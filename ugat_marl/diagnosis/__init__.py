@@ -5,7 +5,10 @@ the next one: Located, Proposed, Fitted, Selected, Verified. The result is a `Di
 content of ``diagnosis.json``.
 
     workflow    all stages in their order, and what is written
-    study       inputs of one diagnosis; signal times read off the log
+    study       inputs of one diagnosis
+    compared_detectors  detectors that are compared, and findings on the others
+    demand_variation  variation of demand from day to day
+    signal_timing  yellow and all-red times read off the signal log
     thresholds  every number of the method, with its unit and its reason
     records     the records of the stages, and the form of ``diagnosis.json``
     features    measured lanes, and the features of one period there

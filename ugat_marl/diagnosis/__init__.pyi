@@ -38,12 +38,12 @@ from .records import TravelTimeEstimate as TravelTimeEstimate
 from .records import TravelTimes as TravelTimes
 from .records import Verdict as Verdict
 from .records import Verified as Verified
+from .signal_timing import IN_THE_LOG as IN_THE_LOG
 from .statistics import Reference as Reference
 from .statistics import change_between as change_between
 from .statistics import correlation_groups as correlation_groups
 from .statistics import sum_of as sum_of
 from .statistics import whitened as whitened
-from .study import IN_THE_LOG as IN_THE_LOG
 from .study import DiagnosisConfig as DiagnosisConfig
 from .study import Study as Study
 from .thresholds import Effort as Effort

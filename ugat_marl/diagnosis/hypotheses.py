@@ -297,6 +297,6 @@ def _without(members: Members, place: int) -> Members:
     return (*members[:place], *members[place + 1 :])
 
 
-def names_of(members: Members) -> str:
+def title_of(members: Members) -> str:
     """Return the names of the effects, for progress and notes."""
     return "+".join(hypothesis.name for hypothesis, _ in members)

@@ -194,10 +194,10 @@ class Replay:
             SimulatorError: SUMO refused, or its process crashed repeatedly.
         """
         day = self._day(seed)
-        scenario, due = _with(day, effects), None
+        scenario, due = Effect.apply_all(day, effects), None
         if self._arrivals is not None:
             others = [effect for effect in effects if not effect.on_departures]
-            drivers = scenario if len(others) == len(effects) else _with(day, others)
+            drivers = scenario if len(others) == len(effects) else Effect.apply_all(day, others)
             came = period
             for error in self._detection:
                 came = error.undone(came, self._detectors)
@@ -246,7 +246,7 @@ class Replay:
         """
         if self._arrivals is None:
             raise ValueError("no arrivals are given in the place of those asked for")
-        return self._arrivals.asked(_with(self._day(seed), effects), period)
+        return self._arrivals.asked(Effect.apply_all(self._day(seed), effects), period)
 
     def _day(self, seed: int) -> Scenario:
         with self._lock:
@@ -317,12 +317,6 @@ class Replay:
             point_to_point=point_to_point,
             lane_states=watched,
         )
-
-
-def _with(scenario: Scenario, effects: Sequence[Effect]) -> Scenario:
-    for effect in effects:
-        scenario = effect.apply(scenario)
-    return scenario
 
 
 def _logged(period: Period) -> Period:

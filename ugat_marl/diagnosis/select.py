@@ -20,7 +20,7 @@ from ugat_marl.diagnosis.hypotheses import (
     each_left_out,
     effects_of,
     merged,
-    names_of,
+    title_of,
 )
 from ugat_marl.diagnosis.places import PlaceFinder
 from ugat_marl.diagnosis.propose import Direction, between, promising, propose, squared_gap
@@ -387,8 +387,8 @@ class Selector:
                     try:
                         models_tried.append(self._kept(self._fitter.simulate(members)))
                     except (SimulatorError, OptionError, ScenarioError) as error:
-                        self._reporter.say(f"note: {names_of(members)} left out: {error}")
-                advance(note=names_of(members))
+                        self._reporter.say(f"note: {title_of(members)} left out: {error}")
+                advance(note=title_of(members))
         return models_tried
 
     def _refined(
@@ -412,7 +412,7 @@ class Selector:
                 if best is None or cost_before - model.cost > won:
                     fitted = self._kept(self._fitter.fitted(model, directions))
                     best = fitted if best is None or fitted.cost < best.cost else best
-                advance(note=names_of(model.members))
+                advance(note=title_of(model.members))
         return best
 
     def _kept(self, model: Fitted) -> Fitted:
@@ -477,7 +477,7 @@ def pruned(
                 part = parts[index]
                 without = fitter.refine(fitter.simulate(part), fitter.thresholds.steps_without)
                 fewer[index] = kept(settled(without))
-                advance(note=names_of(part))
+                advance(note=title_of(part))
         unsure = [fewer[index] for index in doubtful(best, fitter.thresholds.half_interval)]
         least = min(fewer.values(), key=cost_of)
         if least.cost - settled(best.model).cost > fitter.thresholds.negligible:

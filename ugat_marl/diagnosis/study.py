@@ -3,22 +3,19 @@
 from __future__ import annotations
 
 import functools
-import itertools
 import math
 import time
-from collections import Counter
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 
 import numpy as np
-import polars as pl
-from scipy import stats
 
 from ugat_marl.data import Finding, MeasuredData, is_actuated
+from ugat_marl.diagnosis.compared_detectors import compared_detectors
+from ugat_marl.diagnosis.demand_variation import measured_variation, variation_findings
 from ugat_marl.diagnosis.engine import Budget, Engine, default_cache
 from ugat_marl.diagnosis.features import (
-    BIN_FEATURES,
     COUNT_FEATURES,
     DetectorLayout,
     Greens,
@@ -55,20 +52,15 @@ from ugat_marl.diagnosis.thresholds import (
     Effort,
     Thresholds,
 )
-from ugat_marl.effects import Effect, effect_from_record
-from ugat_marl.errors import MeasuredDataError, OptionError, counted
+from ugat_marl.effects import Effect
+from ugat_marl.errors import MeasuredDataError, OptionError
 from ugat_marl.parallel import Workers
 from ugat_marl.progress import Reporter, Share
 from ugat_marl.scenarios import (
-    GREEN,
-    Detector,
     Network,
     Period,
     Scenario,
-    SignalLog,
     SpeedPoint,
-    driven_routes,
-    edge_of_lane,
 )
 
 
@@ -178,7 +170,7 @@ class Study:
                 reaches a measured lane.
         """
         network, thresholds = Network.read(scenario), config.thresholds
-        detectors, findings = _compared(scenario, measured, thresholds)
+        detectors, findings = compared_detectors(scenario, measured, thresholds)
         measured = _noted(measured, findings)
         layout = DetectorLayout.of(network, detectors, scenario.settings.begin_s)
         ruled_out = frozenset(name for finding in measured.findings for name in finding.rules_out)
@@ -190,8 +182,8 @@ class Study:
         supplementary = SupplementaryData.of(measured)
         fit = _tallies(layout, measured, periods, thresholds, supplementary)
         heldout = _tallies(layout, measured, measured.of("heldout"), thresholds, supplementary)
-        variation = _variation(layout, measured, (*fit, *heldout), thresholds)
-        measured = _noted(measured, _of_variation(variation))
+        variation = measured_variation(layout, measured, (*fit, *heldout), thresholds)
+        measured = _noted(measured, variation_findings(variation))
 
         def simulating(answering: bool, base_days: int) -> Engine:
             return Engine(
@@ -622,81 +614,6 @@ def effort_for(intersections: int, periods: Sequence[Period] = ()) -> Effort:
     return replace(effort, base=max(effort.base, least), test=max(effort.test, least))
 
 
-def _compared(
-    scenario: Scenario, measured: MeasuredData, thresholds: Thresholds
-) -> tuple[tuple[Detector, ...], tuple[Finding, ...]]:
-    """Return the detectors to compare, and findings on the others and on their roads."""
-    detectors = one_of_each(measured, detectors_to_compare(measured))
-    findings = (
-        *duplicate_detector_findings(measured, detectors),
-        *unreached_edge_findings(scenario, measured, detectors),
-        *missing_interval_findings(measured, detectors, thresholds),
-    )
-    return detectors, findings
-
-
-def detectors_to_compare(measured: MeasuredData) -> tuple[Detector, ...]:
-    """Return the detectors to compare.
-
-    If at least half of the detectors never saw a vehicle, they count as missing from the recording,
-    and only the others are compared. Otherwise a silent detector counted zero vehicles.
-    """
-    if not measured.has_events:
-        return measured.detectors
-    seen = {
-        x for period in measured.periods for x, passages in period.passages.items() if len(passages)
-    }
-    detectors = tuple(detector for detector in measured.detectors if detector.id in seen)
-    return (
-        detectors
-        if detectors and 2 * len(detectors) <= len(measured.detectors)
-        else measured.detectors
-    )
-
-
-def one_of_each(measured: MeasuredData, detectors: Sequence[Detector]) -> tuple[Detector, ...]:
-    """Return detectors of which no two of a kind lie on one lane, so that no vehicle counts twice.
-
-    Those that saw vehicles in most periods, or in most intervals of counts, are kept; of equals the
-    first.
-    """
-    if measured.has_events or measured.counts is None:
-        rows = Counter(name for period in measured.periods for name in period.passages)
-    else:
-        rows = Counter(measured.counts.filter(pl.col("count") > 0)["detector_id"].to_list())
-    taken: set[tuple[str, str]] = set()
-    kept: set[str] = set()
-    for detector in sorted(detectors, key=lambda one: -rows[one.id]):
-        if taken.isdisjoint(places := _places(detector)):
-            taken |= places
-            kept.add(detector.id)
-    return tuple(detector for detector in detectors if detector.id in kept)
-
-
-def _places(detector: Detector) -> set[tuple[str, str]]:
-    """Return lane and kind of a detector, for each lane that it lies on."""
-    return {(lane, detector.kind) for lane in detector.lanes}
-
-
-def duplicate_detector_findings(
-    measured: MeasuredData, compared: Sequence[Detector]
-) -> tuple[Finding, ...]:
-    """Return a finding on each detector that is not compared beside another of its kind."""
-    used = {place: detector.id for detector in compared for place in _places(detector)}
-    findings: list[Finding] = []
-    for detector in measured.detectors:
-        others = [place for place in sorted(_places(detector)) if place in used]
-        if others and used[others[0]] != detector.id:
-            lane, kind = others[0]
-            findings.append(
-                Finding(
-                    f"detectors.csv: {detector.id!r} is not compared; lane {lane!r} has "
-                    f"{used[lane, kind]!r} as {kind} detector already"
-                )
-            )
-    return tuple(findings)
-
-
 def _tallies(
     layout: DetectorLayout,
     measured: MeasuredData,
@@ -719,75 +636,6 @@ def _tallies(
     return tuple(days)
 
 
-# --- variation from day to day --------------------------------------------------------------------
-
-
-def day_to_day_variation(counts: Array, thresholds: Thresholds) -> float:
-    """Estimate how much demand varies from day to day, on top of the chance of single vehicles.
-
-    The mean square of a day's counts around their mean has the expectation ``m + (s m)^2``, for a
-    mean m and a variation s. No variation at all, as in a simulation, and a variation with a
-    half-normal distribution are equally likely before the counts are seen. If no variation is
-    likelier afterwards, it is taken; otherwise the posterior root mean square of the variation is.
-
-    Args:
-        counts: Vehicles per day at places that no vehicle passes twice, ``(places, days)``. The
-            busiest one is used: others see many of the same vehicles.
-        thresholds: Numbers of the method.
-
-    Returns:
-        Standard deviation as a share of the mean, rounded to `Thresholds.grain_of_variation`.
-    """
-    days = counts[int(np.argmax(counts.sum(axis=1)))] if len(counts) else np.empty(0)
-    if len(days) < 2 or not days.mean():
-        return 0.0
-    freedom = len(days) - 1
-    squares = max(float(((days - days.mean()) ** 2).sum()), 1e-6)  # counts may be equal
-    shares = np.arange(0.0, 1.0, 0.002)
-    scale = days.mean() + (shares * days.mean()) ** 2
-    logs = stats.chi2.logpdf(squares / scale, freedom) - np.log(scale)
-    prior = np.exp(-0.5 * (shares / thresholds.usual_variation) ** 2)
-    prior[0] = prior[1:].sum()
-    posterior = prior * np.exp(logs - logs.max())
-    if posterior[0] > posterior[1:].sum():
-        return 0.0
-    posterior[0] = 0.0
-    posterior /= posterior.sum()
-    found = math.sqrt(float((posterior * shares**2).sum()))
-    grain = thresholds.grain_of_variation
-    return round(grain * round(found / grain), 6)
-
-
-def _variation(
-    layout: DetectorLayout, measured: MeasuredData, days: Sequence[Tally], thresholds: Thresholds
-) -> float:
-    """Estimate the variation from day to day; 0 if the periods are not the same time of days."""
-    if len({(period.begin_s, period.end_s) for period in measured.periods}) > 1:
-        return 0.0
-    owners = np.array([lane.intersection for lane in layout.lanes])
-    known = np.all([day.counted > 0 for day in days], axis=0)  # a missing interval is no zero
-    rows: list[Array] = []
-    for number in range(len(layout.intersections)):
-        lanes = np.flatnonzero(owners == number)
-        by_kind = [
-            np.array([(day.bins * known)[kind, lanes].sum() for day in days])
-            for kind in (BIN_FEATURES.index("count_stop"), BIN_FEATURES.index("count_advance"))
-        ]
-        rows.append(max(by_kind, key=lambda counts: float(counts.sum())))
-    return day_to_day_variation(np.array(rows), thresholds)
-
-
-def _of_variation(variation: float) -> tuple[Finding, ...]:
-    """Return a finding on the variation from day to day; none without one."""
-    if not variation:
-        return ()
-    share = f"{100 * variation:.0f} %"
-    text = (
-        f"demand differs from day to day by about {share}, on top of chance; so do simulated days"
-    )
-    return (Finding(text),)
-
-
 def _of_speed_points(stated: SpeedPoint, seen: SpeedPoint) -> Finding:
     """Return a finding on a stated point of speed measurement that vehicles contradict."""
     text = (
@@ -804,152 +652,3 @@ def _of_length(kind: str, street_m: float, model_m: float) -> Finding:
         f"{street_m:.1f} m long at {kind} detectors, and {model_m:.1f} m in the simulation; check "
         "length_m and extensions. These occupancies were not used"
     )
-
-
-# --- measured edges without demand ----------------------------------------------------------------
-
-_NAMED = 6
-"""Largest number of edges that a message names."""
-
-
-def missing_interval_findings(
-    measured: MeasuredData, compared: Sequence[Detector], thresholds: Thresholds
-) -> tuple[Finding, ...]:
-    """Return a finding on the detectors whose counts lack intervals."""
-    if measured.has_events or measured.counts is None:
-        return ()
-    whole = without_gaps(measured.counts, measured.periods, thresholds)
-    others = {detector.id for detector in compared} - whole
-    if not others:
-        return ()
-    return (
-        Finding(
-            f"counts.csv: intervals are missing at {len(others)} of "
-            f"{counted(len(compared), 'detector')} ({_few(others)}); there only bins of "
-            "time are compared, and no means over periods. Fill the gaps, or leave the periods "
-            "with gaps out"
-        ),
-    )
-
-
-def unreached_edge_findings(
-    scenario: Scenario, measured: MeasuredData, detectors: Sequence[Detector]
-) -> tuple[Finding, ...]:
-    """Return a finding on edges where detectors counted vehicles but no route of the demand leads.
-
-    Args:
-        scenario: The scenario as it is.
-        measured: The measured data.
-        detectors: Detectors that are compared.
-
-    Raises:
-        MeasuredDataError: No route leads over any of the measured edges.
-    """
-    edges = {detector.id: edge_of_lane(detector.lane) for detector in detectors}
-    counted: dict[str, int] = {}
-    for period in measured.periods:
-        for name, passages in period.passages.items():
-            if name in edges and len(passages):
-                counted[edges[name]] = counted.get(edges[name], 0) + len(passages)
-    if not measured.has_events and measured.counts is not None:
-        for name, count in measured.counts.select("detector_id", "count").iter_rows():
-            if name in edges and count:
-                counted[edges[name]] = counted.get(edges[name], 0) + int(count)
-    left = set(edges.values())
-    for way in driven_routes(scenario):
-        left.difference_update(way)
-        if not left:
-            return ()
-    if left == set(edges.values()):
-        raise MeasuredDataError(
-            f"scenario {scenario.id!r}: no vehicle of its demand comes over a measured edge "
-            f"({_few(left)}); check lane_id in detectors.csv, and the demand of the scenario"
-        )
-    missed = {edge for edge in left if counted.get(edge)}
-    if not missed:
-        return ()
-    vehicles = sum(counted[edge] for edge in missed)
-    return (
-        Finding(
-            f"scenario {scenario.id!r}: no vehicle of its demand comes over {_few(missed)}, where "
-            f"detectors counted {vehicles}; demand that is not there is no effect of the library, "
-            "so add it to the scenario first"
-        ),
-    )
-
-
-def _few(edges: set[str]) -> str:
-    named = sorted(edges)
-    return ", ".join(named[:_NAMED]) + (" ..." if len(named) > _NAMED else "")
-
-
-# --- effects that the signal log shows by itself --------------------------------------------------
-
-IN_THE_LOG = ("yellow_time", "all_red_time")
-"""Effects that are read off the signal log. A replay of the log contains them already."""
-_AMBER = frozenset("yY")
-
-
-def timing_effects(
-    scenario: Scenario, network: Network, measured: MeasuredData, thresholds: Thresholds
-) -> tuple[Effect, ...]:
-    """Return effects for yellow and all-red times of the log that differ from the scenario's.
-
-    Logs that show the network's own programme, its states and its clearances, are left out.
-    """
-    yellow: Counter[float] = Counter()
-    red: Counter[float] = Counter()
-    controlled = {intersection.id: intersection for intersection in network.intersections}
-    for period in measured.periods:
-        for tls, log in period.signals.items():
-            if tls in controlled and not _own(log, controlled[tls].programme, thresholds):
-                for kind, duration in _clearances(log):
-                    (yellow if kind == "y" else red)[round(duration, 1)] += 1
-    effects: list[Effect] = []
-    control = scenario.control
-    clearances = (yellow, control.yellow_s), (red, control.all_red_s)
-    for name, (seen, now) in zip(IN_THE_LOG, clearances, strict=True):
-        total = sum(seen.values())
-        if total >= thresholds.least_clearances:
-            value, count = seen.most_common(1)[0]
-            if (
-                count >= thresholds.usual_share * total
-                and abs(value - now) > thresholds.least_timing_s
-            ):
-                effects.append(effect_from_record({"name": name, "seconds": value}))
-    return tuple(effects)
-
-
-def _own(log: SignalLog, programme: tuple[tuple[float, str], ...], thresholds: Thresholds) -> bool:
-    """Return True if a log shows the states and clearances of the network's own programme."""
-    if not {state for _, state in log} <= {state for _, state in programme}:
-        return False
-    twice = (*programme, *programme)
-    begins = itertools.accumulate((seconds for seconds, _ in twice), initial=0.0)
-    own = _clearances(tuple(zip(begins, (state for _, state in twice), strict=False)))
-    shown = _clearances(log[1:])  # the first state may have begun before the log
-    alike = sum(
-        any(kind == k and abs(duration - d) <= thresholds.least_timing_s for k, d in own)
-        for kind, duration in shown
-    )
-    return alike >= thresholds.usual_share * len(shown)
-
-
-def _clearances(log: SignalLog) -> list[tuple[str, float]]:
-    """Return durations in s of yellow (``y``), and from its end to the next green (``r``).
-
-    Other links may be green at the same time. Red-yellow does not count as yellow.
-    """
-    durations: list[tuple[str, float]] = []
-    began = ended = math.nan
-    for (_, before), (time_s, state) in itertools.pairwise(log):
-        pairs = list(zip(before, state, strict=False))
-        if any(new in _AMBER and old not in _AMBER for old, new in pairs):
-            began = time_s
-        if any(old in _AMBER and new not in _AMBER for old, new in pairs):
-            durations.append(("y", time_s - began))
-            ended = time_s
-        if any(new in GREEN and old not in GREEN for old, new in pairs):
-            durations.append(("r", time_s - ended))
-            ended = math.nan
-    return [(kind, duration) for kind, duration in durations if duration == duration]

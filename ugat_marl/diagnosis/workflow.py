@@ -45,7 +45,8 @@ from ugat_marl.diagnosis.records import (
     Verdict,
     Verified,
 )
-from ugat_marl.diagnosis.study import IN_THE_LOG, DiagnosisConfig, Study, timing_effects
+from ugat_marl.diagnosis.signal_timing import IN_THE_LOG, timing_effects
+from ugat_marl.diagnosis.study import DiagnosisConfig, Study
 from ugat_marl.diagnosis.traffic import traffic_check
 from ugat_marl.diagnosis.verdict import (
     capitalised,
@@ -182,11 +183,11 @@ def _diagnosed(
         study = study.with_empty_start_finding(base, reporter)
     except OutOfTime:
         return _nothing_simulated(study, timing), errors
-    diagnosis, searched = _compared(study, base, timing, reporter)
+    diagnosis, searched = _all_stages(study, base, timing, reporter)
     return diagnosis, (*errors, *searched)
 
 
-def _compared(
+def _all_stages(
     study: Study, base: Tested, timing: tuple[Effect, ...], reporter: Reporter
 ) -> tuple[Diagnosis, tuple[Effect, ...]]:
     """Run all stages after the simulation of the scenario as it is.

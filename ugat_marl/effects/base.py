@@ -53,6 +53,10 @@ class NumberParameter:
         return self.low <= value <= self.high
 
 
+TIME_OF_EPISODE = NumberParameter("s", 0.0, 1e7)
+"""Begin or end of a part of the episode."""
+
+
 @dataclass(frozen=True)
 class TextParameter:
     """Name that is a parameter of an effect: a place of the network, or a model.

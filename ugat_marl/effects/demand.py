@@ -17,6 +17,7 @@ from typing import ClassVar
 
 from ugat_marl.effects.base import (
     EVERYWHERE,
+    TIME_OF_EPISODE,
     Effect,
     ExaminedStrengths,
     NumberParameter,
@@ -44,7 +45,6 @@ TWIN_S = 15.0
 """Largest time between the departures of a twin and its original, in s."""
 
 _FACTOR = NumberParameter("", 0.0, 20.0)
-_TIME = NumberParameter("s", 0.0, 1e7)
 _EXPONENTIAL = re.compile(r"\s*exp\((.*)\)\s*")
 _TWIN = re.compile(rb"(\++)(?:\d+|surge|after)[\"']")
 
@@ -151,8 +151,8 @@ class DemandSurge(Effect):
     name: ClassVar[str] = "demand_surge"
     on_departures: ClassVar[bool] = True
     ranges: ClassVar[dict[str, NumberParameter]] = {
-        "begin_s": _TIME,
-        "end_s": _TIME,
+        "begin_s": TIME_OF_EPISODE,
+        "end_s": TIME_OF_EPISODE,
         "factor": _FACTOR,
     }
     texts: ClassVar[dict[str, TextParameter]] = {"edge": TextParameter("edge", everywhere=True)}

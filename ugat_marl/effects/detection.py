@@ -95,11 +95,22 @@ class _OfDetectors(DetectorEffect):
 
 
 @dataclass(frozen=True)
-class DetectorOffset(_OfDetectors):
+class _OfInstallation(_OfDetectors):
+    """Base of effects on detectors that are installed otherwise than stated."""
+
+    on_installation: ClassVar[bool] = True
+
+    def observe(self, period: Period, detectors: Sequence[Detector], owner: Owner) -> Period:
+        """Check the place; the passages are recorded by the true installation already."""
+        detectors_at(self.place, detectors, self.name)
+        return period
+
+
+@dataclass(frozen=True)
+class DetectorOffset(_OfInstallation):
     """Detectors lie `metres` farther downstream than stated; negative means upstream."""
 
     name: ClassVar[str] = "detector_offset"
-    on_installation: ClassVar[bool] = True
     ranges: ClassVar[dict[str, NumberParameter]] = {"metres": NumberParameter("m", -60.0, 60.0)}
     texts: ClassVar[dict[str, TextParameter]] = {"place": _PLACE}
     metres: float
@@ -115,18 +126,12 @@ class DetectorOffset(_OfDetectors):
             detectors, lambda one: replace(one, position_m=max(one.position_m + self.metres, 0.0))
         )
 
-    def observe(self, period: Period, detectors: Sequence[Detector], owner: Owner) -> Period:
-        """Check the place; the passages are recorded at the true position already."""
-        detectors_at(self.place, detectors, self.name)
-        return period
-
 
 @dataclass(frozen=True)
-class DetectorZone(_OfDetectors):
+class DetectorZone(_OfInstallation):
     """Zones of detectors are `metres` longer than stated, at their downstream end."""
 
     name: ClassVar[str] = "detector_zone"
-    on_installation: ClassVar[bool] = True
     ranges: ClassVar[dict[str, NumberParameter]] = {"metres": NumberParameter("m", -30.0, 30.0)}
     texts: ClassVar[dict[str, TextParameter]] = {"place": _PLACE}
     metres: float
@@ -141,18 +146,12 @@ class DetectorZone(_OfDetectors):
             detectors, lambda one: replace(one, length_m=max(one.length_m + self.metres, 0.0))
         )
 
-    def observe(self, period: Period, detectors: Sequence[Detector], owner: Owner) -> Period:
-        """Check the place; the passages are recorded over the true zone already."""
-        detectors_at(self.place, detectors, self.name)
-        return period
-
 
 @dataclass(frozen=True)
-class DetectorSpeeds(_OfDetectors):
+class DetectorSpeeds(_OfInstallation):
     """Detectors measure speeds at another point of the passage than stated."""
 
     name: ClassVar[str] = "detector_speeds"
-    on_installation: ClassVar[bool] = True
     texts: ClassVar[dict[str, TextParameter]] = {
         "place": _PLACE,
         "point": TextParameter("point of a passage", allowed=SPEED_POINTS),
@@ -167,11 +166,6 @@ class DetectorSpeeds(_OfDetectors):
     def installed(self, detectors: Sequence[Detector]) -> tuple[Detector, ...]:
         """Set the point at which speeds are measured."""
         return self._changed(detectors, lambda one: replace(one, speed_at=self.point))
-
-    def observe(self, period: Period, detectors: Sequence[Detector], owner: Owner) -> Period:
-        """Check the place; the speeds are recorded at the true point already."""
-        detectors_at(self.place, detectors, self.name)
-        return period
 
 
 @dataclass(frozen=True)

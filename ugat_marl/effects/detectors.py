@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 
 from ugat_marl.effects.base import (
     EVERYWHERE,
+    TIME_OF_EPISODE,
     Effect,
     ExaminedStrengths,
     NumberParameter,
@@ -24,7 +25,6 @@ from ugat_marl.effects.places import network_places
 from ugat_marl.errors import UnknownNameError
 from ugat_marl.scenarios import Detector, Passages, Period, Scenario
 
-_TIME = NumberParameter("s", 0.0, 1e7)
 _CLOCK = TextParameter("traffic light", everywhere=True)
 
 
@@ -151,7 +151,10 @@ class Stuck(DetectorEffect):
     """A detector is always on between two times."""
 
     name: ClassVar[str] = "stuck"
-    ranges: ClassVar[dict[str, NumberParameter]] = {"begin_s": _TIME, "end_s": _TIME}
+    ranges: ClassVar[dict[str, NumberParameter]] = {
+        "begin_s": TIME_OF_EPISODE,
+        "end_s": TIME_OF_EPISODE,
+    }
     texts: ClassVar[dict[str, TextParameter]] = {"detector": TextParameter("detector")}
     detector: str
     begin_s: float
@@ -176,7 +179,10 @@ class Dropout(DetectorEffect):
     """A detector reports nothing between two times."""
 
     name: ClassVar[str] = "dropout"
-    ranges: ClassVar[dict[str, NumberParameter]] = {"begin_s": _TIME, "end_s": _TIME}
+    ranges: ClassVar[dict[str, NumberParameter]] = {
+        "begin_s": TIME_OF_EPISODE,
+        "end_s": TIME_OF_EPISODE,
+    }
     texts: ClassVar[dict[str, TextParameter]] = {"detector": TextParameter("detector")}
     detector: str
     begin_s: float

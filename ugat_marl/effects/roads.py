@@ -14,7 +14,13 @@ from dataclasses import dataclass, replace
 from itertools import chain, count
 from typing import ClassVar
 
-from ugat_marl.effects.base import Effect, NumberParameter, TextParameter, hashed_uniform
+from ugat_marl.effects.base import (
+    TIME_OF_EPISODE,
+    Effect,
+    NumberParameter,
+    TextParameter,
+    hashed_uniform,
+)
 from ugat_marl.effects.documents import edit, seconds_text
 from ugat_marl.effects.places import network_places
 from ugat_marl.errors import OptionError, ScenarioError
@@ -26,7 +32,6 @@ _LENGTH_M = 5.0
 _LAST_M = 60.0
 _PARKED = "parking."
 """Beginning of the ids of vehicles that park."""
-_TIME = NumberParameter("s", 0.0, 1e7)
 
 
 @dataclass(frozen=True)
@@ -34,7 +39,10 @@ class LaneClosure(Effect):
     """No vehicle passes a point near the end of a lane between two times, as after an accident."""
 
     name: ClassVar[str] = "lane_closure"
-    ranges: ClassVar[dict[str, NumberParameter]] = {"begin_s": _TIME, "end_s": _TIME}
+    ranges: ClassVar[dict[str, NumberParameter]] = {
+        "begin_s": TIME_OF_EPISODE,
+        "end_s": TIME_OF_EPISODE,
+    }
     texts: ClassVar[dict[str, TextParameter]] = {"lane": TextParameter("lane")}
     lane: str
     begin_s: float
@@ -63,7 +71,7 @@ class Incident(Effect):
 
     name: ClassVar[str] = "incident"
     ranges: ClassVar[dict[str, NumberParameter]] = {
-        "after_s": _TIME,
+        "after_s": TIME_OF_EPISODE,
         "lasts_s": NumberParameter("s", 1.0, 1e7),
     }
     after_s: float

@@ -54,7 +54,9 @@ from .scenario_check import remarks as remarks
 from .scores import Estimate as Estimate
 from .scores import Evaluation as Evaluation
 from .scores import Tuned as Tuned
+from .scores import best_rule_note as best_rule_note
 from .scores import result_of as result_of
+from .scores import rule_policy as rule_policy
 from .settings import CONTROL as CONTROL
 from .settings import DIRECT as DIRECT
 from .settings import GROUNDED_NAME as GROUNDED_NAME

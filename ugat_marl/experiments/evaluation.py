@@ -14,7 +14,7 @@ import numpy as np
 from ugat_marl.effects import Domain, domain_label
 from ugat_marl.envs import AgentSet, TrafficEnv, parallel_env
 from ugat_marl.errors import CheckpointError, OptionError
-from ugat_marl.experiments.scores import Evaluation, Result, RuleTrial
+from ugat_marl.experiments.scores import Evaluation, Result, RuleTrial, best_rule_note
 from ugat_marl.parallel import (
     Stop,
     Workers,
@@ -174,7 +174,7 @@ def best_rules(
             duration_s=duration_s,
             workers=workers,
             reporter=reporter,
-            title=f"best rule in {domain_label(domain)}",
+            title=best_rule_note(domain_label(domain)),
         )
         best[domain_label(domain)] = trials[0].spec
     return best
@@ -277,11 +277,6 @@ def rule_factory(spec: str) -> PolicyFactory:
     """Return a factory for a controller such as ``"largest-queue:30"``, and check its spelling."""
     parse_rule(spec)
     return RuleFactory(spec)
-
-
-def fixed_policy(policy: Policy) -> PolicyFactory:
-    """Return a factory that gives copies of one policy."""
-    return FixedPolicy(policy)
 
 
 def policy_factory(spec: str) -> PolicyFactory:

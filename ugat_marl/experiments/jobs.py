@@ -37,9 +37,9 @@ from ugat_marl.envs import AnyParallelEnv, TrafficEnv, parallel_env
 from ugat_marl.errors import CheckpointError, OptionError, UgatMarlError
 from ugat_marl.experiments.evaluation import (
     TUNING_SEED,
+    FixedPolicy,
     best_rules,
     evaluate,
-    fixed_policy,
     rule_factory,
 )
 from ugat_marl.experiments.queues import QUEUES, QueueRecord
@@ -399,7 +399,7 @@ def perform(
         trained = _plain(job, folder, record, reporter)
     with contextlib.closing(trained) as policies:
         for mark, policy in policies:
-            _judge(job, mark, fixed_policy(policy), record, folder, reporter, workers)
+            _judge(job, mark, FixedPolicy(policy), record, folder, reporter, workers)
     return record
 
 
@@ -572,7 +572,7 @@ def _probe(job: Job, workers: Workers) -> Probe | None:
     def probe(policy: Policy) -> dict[str, float]:
         played = evaluate(
             scenario,
-            {"policy": fixed_policy(policy)},
+            {"policy": FixedPolicy(policy)},
             job.probe_domains,
             [TUNING_SEED],
             duration_s=job.duration_s,

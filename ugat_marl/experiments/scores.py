@@ -30,6 +30,16 @@ _MAPPINGS = ("hidden", "approaches")
 """Fields of `Scores` that are no single number."""
 
 
+def best_rule_note(domain: str) -> str:
+    """Return the name of the note of an evaluation that holds the best rule of a domain."""
+    return f"best rule in {domain}"
+
+
+def rule_policy(rule: str) -> str:
+    """Return the name of a rule among the policies of an evaluation."""
+    return f"rule {rule}"
+
+
 @dataclass(frozen=True)
 class Result:
     """One episode of a policy in a domain.
@@ -85,6 +95,15 @@ class Evaluation:
     def domains(self) -> list[str]:
         """Names of the domains, in the order they were evaluated."""
         return list(dict.fromkeys(result.domain for result in self.results))
+
+    def best_rule(self, domain: str) -> str | None:
+        """Return the best rule of a domain, such as ``"sotl:1:2"``; None if none is noted."""
+        return self.notes.get(best_rule_note(domain))
+
+    def best_rule_policy(self, domain: str) -> str | None:
+        """Return the name of the policy that is the best rule; None if no rule is noted."""
+        rule = self.best_rule(domain)
+        return None if rule is None else rule_policy(rule)
 
     def values(self, policy: str, domain: str, measure: str) -> NDArray[np.float64]:
         """Return one value per seed, in the order of the seeds."""

@@ -65,8 +65,8 @@ def check_run(evaluation: Evaluation) -> SimCheck | None:
     if not evaluation.results:
         return None
     sim = evaluation.domains[0]
-    rule = f"rule {evaluation.notes.get(f'best rule in {sim}')}"
-    if DIRECT not in evaluation.policies or rule not in evaluation.policies:
+    rule = evaluation.best_rule_policy(sim)
+    if rule is None or not {DIRECT, rule} <= set(evaluation.policies):
         return None
     times = [evaluation.estimate(name, sim, "att_s").mean for name in (DIRECT, rule)]
     if not all(map(math.isfinite, times)):

@@ -74,8 +74,13 @@ def outcome_of(evaluation: Evaluation) -> TransferOutcome | None:
         return None
     real, policy = evaluation.domains[1], grounded[0]
     own, direct = (evaluation.values(name, real, "att_s") for name in (policy, DIRECT))
-    rule = evaluation.notes.get(f"best rule in {real}", "")
-    rule_s = evaluation.estimate(f"rule {rule}", real, "att_s").mean if rule else math.nan
+    rule = evaluation.best_rule_policy(real)
+    rule_s = math.nan if rule is None else evaluation.estimate(rule, real, "att_s").mean
     return TransferOutcome(
-        real, policy, float(own.mean()), PairedTest.of(own, direct), rule, rule_s
+        real,
+        policy,
+        float(own.mean()),
+        PairedTest.of(own, direct),
+        evaluation.best_rule(real) or "",
+        rule_s,
     )

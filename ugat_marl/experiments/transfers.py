@@ -49,7 +49,7 @@ from ugat_marl.experiments.jobs import (
 )
 from ugat_marl.experiments.plans import described_plan, jobs_beside, work_of
 from ugat_marl.experiments.queues import QUEUES, write_queues
-from ugat_marl.experiments.scores import Evaluation, Result
+from ugat_marl.experiments.scores import Evaluation, Result, best_rule_note, rule_policy
 from ugat_marl.experiments.settings import (
     CONTROL,
     CORRECTED,
@@ -430,7 +430,7 @@ def _write_results(
                 rules[domain_label(job.target or job.sim)] = (
                     folder / job.name / RULE_FILE
                 ).read_text()
-                name = f"rule {rules[domain_label(job.target or job.sim)]}"
+                name = rule_policy(rules[domain_label(job.target or job.sim)])
             rows.setdefault(name, (job, mark, record))  # one rule may be the best of both domains
     trained = {name: row for name, row in rows.items() if row[0].seed is not None}
     policies: set[Path] = set()
@@ -475,7 +475,7 @@ def _notes(config: TransferConfig, rules: Mapping[str, str]) -> dict[str, str]:
     else:
         searched = f"{', '.join(TUNED_RULES)}; each tuned with up to {config.rule_budget} episodes"
     return {
-        **{f"best rule in {domain}": rule for domain, rule in rules.items()},
+        **{best_rule_note(domain): rule for domain, rule in rules.items()},
         "rules searched": searched,
         "training seed": str(config.seed),
         "learner": config.learner,

@@ -9,7 +9,6 @@ an infinite one (GAT, no gate). Where every u was 0, alpha keeps its value.
 from __future__ import annotations
 
 import contextlib
-import warnings
 from collections import deque
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
@@ -200,15 +199,9 @@ class Gate:
             self.load_state_dict(state)
 
     def update(self) -> GateReport:
-        """End an iteration: report, set a dynamic alpha to mean(u), and reset the counts.
-
-        Warns (UserWarning) if, after the first iteration, intersections took every grounded action
-        or none. Mode "infinite" does not warn.
-        """
+        """End an iteration: report, set a dynamic alpha to mean(u), and reset the counts."""
         self.end_epoch()
         report = self.report()
-        if report.warning:
-            warnings.warn(report.warning, stacklevel=2)
         if self.config.mode == "dynamic" and self._epochs:
             total = np.sum(self._epochs, axis=0)
             if self._pooled:

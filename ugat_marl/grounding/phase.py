@@ -31,7 +31,6 @@ from ugat_marl.grounding.reports import (
 )
 from ugat_marl.grounding.stacked import StackedTransitions, stack_log
 from ugat_marl.grounding.transform import GroundedActions, Transform
-from ugat_marl.grounding.uncertainty import Method
 from ugat_marl.grounding.view import InputsConfig, Moment, Neighbours
 from ugat_marl.policies import one_thread
 from ugat_marl.seeding import torch_generator
@@ -148,10 +147,6 @@ class PhaseTransform(Transform):
         accepted = self.gate.decide(u, actions, grounded, settled.allowed)  # lines 13 and 15
         executed = np.where(accepted, grounded, actions)
         return GroundedActions(executed, grounded, u, accepted, np.zeros_like(u))
-
-    def fresh_inverse(self, method: Method) -> InverseModel:
-        """Return an unfitted h of the same shape with this method of uncertainty."""
-        return InverseModel(self.stack, self.inverse.config, torch_generator(0), method, self.local)
 
 
 # --- fits of single models

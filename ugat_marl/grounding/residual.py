@@ -7,7 +7,6 @@ street better than the fitted world does (`trust`): a street that the world expl
 
 from __future__ import annotations
 
-import warnings
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
@@ -156,9 +155,7 @@ class Residual:
 
     def end_iteration(self) -> GateReport:
         """Set alpha for the next iteration and return the decisions of the gate."""
-        with warnings.catch_warnings():
-            warnings.simplefilter("ignore")  # the report holds them
-            return self.transform.gate.update()
+        return self.transform.gate.update()
 
     def save(self, path: Path) -> None:
         """Write models and gate to a file atomically."""

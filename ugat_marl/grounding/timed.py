@@ -44,7 +44,6 @@ from ugat_marl.grounding.reports import (
 )
 from ugat_marl.grounding.stacked import Stack, StackedTransitions, alike, stack_log
 from ugat_marl.grounding.transform import GroundedActions, Transform
-from ugat_marl.grounding.uncertainty import Method
 from ugat_marl.grounding.view import InputsConfig, Moment, Neighbours
 from ugat_marl.policies import one_thread
 from ugat_marl.seeding import torch_generator
@@ -157,17 +156,6 @@ class TimedTransform(Transform):
     def models(self) -> dict[str, nn.Module]:
         """All modules with weights, by their names in a checkpoint."""
         return {**super().models, "simulated": self.simulated, "constants": self.constants}
-
-    def fresh_inverse(self, method: Method) -> DelayModel:
-        """Return an unfitted h of the same shape with this method of uncertainty."""
-        return DelayModel(
-            self.stack,
-            self.inverse.config,
-            self.timed.most_s,
-            torch_generator(0),
-            method,
-            self.local,
-        )
 
     @one_thread()
     def fit(

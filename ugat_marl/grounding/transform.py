@@ -8,6 +8,7 @@ h is sure enough. In `PhaseTransform` a' is another phase; in `TimedTransform` i
 from __future__ import annotations
 
 import abc
+import copy
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
@@ -168,10 +169,6 @@ class Transform(abc.ABC):
     ) -> GroundedActions:
         """Ground one action per agent with fitted models; the arguments are those of `__call__`."""
 
-    @abc.abstractmethod
-    def fresh_inverse(self, method: Method) -> AnswerModel:
-        """Return an unfitted h of the same shape with this method of uncertainty."""
-
     @one_thread()
     @torch.no_grad()
     def __call__(
@@ -233,7 +230,9 @@ class Transform(abc.ABC):
                 "use the same inputs (history, hops) and the same network"
             )
         method = _method(state)
-        for name, model in {**self.models, "inverse": self.fresh_inverse(method)}.items():
+        inverse = copy.deepcopy(self.inverse)
+        inverse.renew(method, torch_generator(0))
+        for name, model in {**self.models, "inverse": inverse}.items():
             _refuse_foreign(name, state.get(name), model.state_dict())
         if not isinstance(state.get("gate"), Mapping):
             raise CheckpointError("the grounding in the checkpoint has no gate")

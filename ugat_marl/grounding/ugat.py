@@ -46,7 +46,6 @@ D_real may also be a log that was recorded earlier (line 4).
 from __future__ import annotations
 
 import concurrent.futures
-import warnings
 from dataclasses import dataclass
 
 import numpy as np
@@ -170,9 +169,7 @@ class Ugat(Algorithm):
 
     def _update_alpha(self, state: RunState[Transform]) -> GateReport:
         """Set alpha for the next iteration (line 17); warnings are shown beside the bars."""
-        with warnings.catch_warnings():
-            warnings.simplefilter("ignore")
-            report = state.transform.gate.update()
+        report = state.transform.gate.update()
         if report.warning:
             self.run.reporter.say(report.warning)
         return report

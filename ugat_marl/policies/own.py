@@ -2,8 +2,7 @@
 
 A learner of a user needs ``learn(env, episodes)`` and ``policy()``. A policy needs
 ``act(observations, infos)``, or is a function of the same arguments; ``infos`` may be left out.
-Both are named as ``module:name``, as in an entry point of Python, and the module is looked for in
-the working folder, too.
+`own_names` finds them by their names.
 
 With ``save(path)`` and ``load(path)`` a learner can also be resumed, and trainings can start from
 what it has learnt.
@@ -11,31 +10,21 @@ what it has learnt.
 
 from __future__ import annotations
 
-import ast
 import contextlib
 import copy
-import dataclasses
 import functools
-import hashlib
-import importlib.util
 import inspect
 import io
 import json
-import re
-import sys
 import tempfile
 import warnings
 import zipfile
-from collections import deque
 from collections.abc import Callable, Mapping, Sequence
-from enum import Enum
-from pathlib import Path, PurePath
-from types import CellType, CodeType, FunctionType, MethodType, ModuleType
+from pathlib import Path
+from types import CellType, FunctionType
 from typing import Any, get_type_hints
 
-import numpy as np
 from pettingzoo.utils import BaseParallelWrapper
-from pydantic import TypeAdapter, ValidationError
 
 from ugat_marl.envs import (
     Actions,
@@ -46,263 +35,17 @@ from ugat_marl.envs import (
     StepResult,
     checked_phases,
 )
-from ugat_marl.errors import CheckpointError, OptionError, UgatMarlError, UnknownNameError
-from ugat_marl.files import file_hash, parse_json, require_stored, write_whole
+from ugat_marl.errors import CheckpointError, OptionError, UgatMarlError
+from ugat_marl.files import parse_json, require_stored, write_whole
+from ugat_marl.policies.learner_settings import parsed_settings
+from ugat_marl.policies.own_names import load_own
 from ugat_marl.policies.protocols import EpisodeCallback, Policy
 from ugat_marl.seeding import derive_seed
 
 NEEDED = {"learn": ("env", "episodes"), "policy": ()}
 """Methods that a learner must have, and their arguments."""
 
-_NAME = re.compile(r"[\w./\\-]+:[A-Za-z_<][\w.<>]*")
 _STATE, _COUNTERS = "learner.pt", "counters.json"
-
-_given: dict[str, Any] = {}
-"""Objects that were given in Python, by the name under which settings hold them."""
-
-
-def is_own(name: str) -> bool:
-    """Return True if a name has the form ``module:name``."""
-    return _NAME.fullmatch(name) is not None
-
-
-def own_name(given: Any) -> str:
-    """Return the name ``module:name`` of an object, under which `load_own` finds it here."""
-    kind = _named(given)
-    name = f"{kind.__module__}:{kind.__qualname__}"
-    if not _is_found(kind, given):
-        name += ".<given>"  # no other process may take what it finds by the name for it
-    _given[name] = given
-    return name
-
-
-def _is_found(kind: Any, given: Any) -> bool:
-    """Return False if the name of `kind` leads to another object than was given.
-
-    It does so for a `functools.partial`, a bound method, and a function or class in a decorator
-    that copied its name.
-    """
-    found: Any = sys.modules.get(kind.__module__)
-    for part in kind.__qualname__.split("."):
-        found = getattr(found, part, None)
-    if hasattr(given, "__qualname__") or isinstance(given, functools.partial):
-        return found == given or "<" in kind.__qualname__
-    return found is kind
-
-
-def load_own(name: str, what: str) -> Any:
-    """Return the object that a user names.
-
-    Args:
-        name: ``module:name``; the module may also be a path that ends in .py.
-        what: Kind of thing for messages, such as "learner".
-
-    Raises:
-        OptionError: The module is missing.
-        UnknownNameError: The object is missing in it.
-    """
-    if name in _given:
-        return _given[name]
-    place, _, path = name.partition(":")
-    file = Path(place).resolve() if place.endswith(".py") else None
-    folder = str(Path.cwd() if file is None else file.parent)
-    if folder not in sys.path:
-        sys.path.insert(0, folder)
-    module_name = place if file is None else file.stem
-    try:
-        found: Any = importlib.import_module(place) if file is None else _module_in(file)
-    except ModuleNotFoundError as error:
-        if error.name != module_name.partition(".")[0]:
-            raise OptionError(
-                f"{what} {name!r}: the module needs {error.name}, which is not installed"
-            ) from None
-        raise OptionError(
-            f"{what} {name!r}: there is no module {module_name!r} in {folder} or among the "
-            "installed packages; write the name of a file without .py, a colon, and the name in it"
-        ) from None
-    for part in path.split("."):
-        if not hasattr(found, part):
-            own = getattr(found, "__module__", getattr(found, "__name__", None))
-            names = [
-                key
-                for key, value in vars(found).items()
-                if callable(value) and getattr(value, "__module__", own) == own
-            ]
-            raise UnknownNameError(f"{what} in {module_name}", part, names)
-        found = getattr(found, part)
-    return found
-
-
-def _named(given: Any) -> Any:
-    """Return the class or function by whose name an object is known."""
-    if isinstance(given, functools.partial):
-        return _named(given.func)
-    return given if hasattr(given, "__qualname__") else type(given)
-
-
-def own_values(name: str) -> list[str]:
-    """Return what an object that was given in Python holds beside its source, as text.
-
-    These are arguments of a `functools.partial`, values captured by an inner function or by the
-    methods of an inner class, and attributes of such a class or of an instance. Two objects of one
-    name and source differ in nothing else.
-    """
-    return _values(_given[name]) if name in _given else []
-
-
-def _values(given: Any, inside: tuple[int, ...] = ()) -> list[str]:
-    text = functools.partial(_stable, inside=inside)
-    if isinstance(given, functools.partial):
-        keywords = [f"{key}={text(value)}" for key, value in sorted(given.keywords.items())]
-        return [*_values(given.func, inside), *map(text, given.args), *keywords]
-    if isinstance(given, FunctionType):
-        if "<" not in given.__qualname__:  # neither <locals> nor <lambda>: its source says all
-            return []
-        captured = inspect.getclosurevars(given).nonlocals
-        taken = [f"{key}={text(value)}" for key, value in sorted(captured.items())]
-        return [*taken, *map(text, given.__defaults__ or ())]
-    if inspect.isclass(given):
-        return _values_of_class(given, inside) if "<" in given.__qualname__ else []
-    if isinstance(given, MethodType):
-        return [text(given.__self__)]
-    held = {} if hasattr(given, "__qualname__") else getattr(given, "__dict__", {})
-    return [text(held)] if held else []
-
-
-def _values_of_class(given: type, inside: tuple[int, ...]) -> list[str]:
-    """Return what a class that a function made holds: attributes, and values in its methods."""
-    held: list[str] = []
-    for name, member in sorted(vars(given).items()):
-        function = getattr(member, "__func__", member)  # of a static method or a class method
-        if isinstance(function, FunctionType):
-            held += [f"{name}: {value}" for value in _values(function, inside)]
-        elif not name.startswith("__") and not hasattr(member, "__get__"):
-            held.append(f"{name}={_stable(member, inside)}")
-    return held
-
-
-def _stable(value: Any, inside: tuple[int, ...] = ()) -> str:
-    """Return a value as text that is the same in another process.
-
-    `repr` is not where an object has none of its own (its address), for sets (their order), and for
-    long arrays (their middle is left out).
-
-    Args:
-        value: The value.
-        inside: Identities of the objects that hold it, against endless descents.
-    """
-    if id(value) in inside:
-        return "..."
-    inside = (*inside, id(value))
-    deeper = functools.partial(_stable, inside=inside)
-    if type(value) is dict:
-        return f"{{{', '.join(f'{deeper(key)}: {deeper(held)}' for key, held in value.items())}}}"
-    if type(value) in (list, tuple):
-        return f"{type(value).__name__}({', '.join(map(deeper, value))})"
-    if type(value) in (set, frozenset):
-        return f"{type(value).__name__}({', '.join(sorted(map(deeper, value)))})"
-    if isinstance(value, np.ndarray) and value.dtype != object:
-        digest = hashlib.sha256(np.ascontiguousarray(value).tobytes()).hexdigest()
-        return f"array({value.shape}, {value.dtype}, {digest})"
-    if isinstance(value, FunctionType | MethodType | functools.partial | type):
-        kind = _named(value)
-        return (
-            f"{kind.__module__}.{kind.__qualname__}({_file_hash(kind)}, {_values(value, inside)})"
-        )
-    return repr(value) if isinstance(value, _PLAIN) else _stable_object(value, deeper)
-
-
-_PLAIN = (type(None), bool, int, float, complex, str, bytes, range, slice, PurePath, Enum)
-"""Types whose `repr` says all."""
-
-
-def _stable_object(value: Any, deeper: Callable[[Any], str]) -> str:
-    """Return any other object as text: its class, and what it holds.
-
-    The `repr` of a data class, a tensor or a table may leave out the middle of long arrays.
-    """
-    kind = type(value)
-    named = f"{kind.__module__}.{kind.__qualname__}"
-    if named == "torch.Tensor" or named.startswith("torch.nn.parameter."):
-        array = value.detach().cpu()
-        whole = array.double() if array.is_floating_point() else array  # numpy lacks some types
-        return f"{named}({array.dtype}, {deeper(whole.numpy())})"
-    if isinstance(value, Mapping):
-        return f"{named}({deeper(dict(value.items()))})"
-    if isinstance(value, Sequence | deque):
-        return f"{named}({deeper(list(value))})"
-    held = getattr(value, "__dict__", {})
-    if dataclasses.is_dataclass(kind):
-        held = {field.name: getattr(value, field.name) for field in dataclasses.fields(kind)}
-    says_what = kind.__getstate__ is not object.__getstate__  # as a table of polars does
-    if not says_what and (held or kind.__repr__ is object.__repr__):
-        return f"{named}({_file_hash(kind)}, {deeper(held)})"
-    try:  # what a copy is made of
-        _, *made_of = value.__reduce_ex__(4)
-    except TypeError:
-        return repr(value)
-    return f"{named}({deeper([one for one in made_of[:2] if one is not None])})"
-
-
-def own_source(name: str, what: str) -> str | None:
-    """Return the hash of the file that defines a user's object; None if it is in no file.
-
-    Args:
-        name: Name as for `load_own`.
-        what: Kind of thing for messages, such as "learner".
-
-    Raises:
-        OptionError: The module is missing.
-        UnknownNameError: The object is missing in it.
-    """
-    return _file_hash(_named(load_own(name, what)))
-
-
-def _file_hash(kind: Any) -> str | None:
-    """Return the hash of the file that defines a class or function, or else of its code.
-
-    What is typed at a prompt or in a notebook is in no file. None if there is no code either.
-    """
-    try:
-        file = inspect.getsourcefile(kind)
-    except (TypeError, OSError):
-        file = None
-    if file is not None and Path(file).is_file():
-        return file_hash(Path(file))
-    members = vars(kind).values() if inspect.isclass(kind) else (kind,)
-    codes = [getattr(getattr(one, "__func__", one), "__code__", None) for one in members]
-    texts = [_code_text(code) for code in codes if code is not None]
-    return hashlib.sha256("".join(texts).encode()).hexdigest() if texts else None
-
-
-def _code_text(code: CodeType) -> str:
-    """Return all that a function does as text, without the place where it was written."""
-    constants = (
-        _code_text(one) if isinstance(one, CodeType) else _stable(one) for one in code.co_consts
-    )
-    return f"{code.co_code.hex()} {code.co_names} {code.co_varnames} {list(constants)}"
-
-
-def _module_in(file: Path) -> ModuleType:
-    """Return the module of a file, under a name of its own: files of two folders may share theirs.
-
-    Raises:
-        ModuleNotFoundError: There is no such file, or the module needs another one.
-    """
-    name = f"{file.stem} in {file.parent}"
-    if name in sys.modules:
-        return sys.modules[name]
-    specification = importlib.util.spec_from_file_location(name, file)
-    if specification is None or specification.loader is None or not file.exists():
-        raise ModuleNotFoundError(name=file.stem)
-    module = sys.modules[name] = importlib.util.module_from_spec(specification)
-    try:
-        specification.loader.exec_module(module)
-    except BaseException:
-        del sys.modules[name]
-        raise
-    return module
-
 
 OF_POLICIES = ("observation", "neighbours", "commands", "signals")
 """Options of an environment that a policy may ask for: what it sees, and how signals are shown."""
@@ -792,56 +535,6 @@ def _resolved(function: Any, key: str, hint: Any) -> dict[str, Any]:
     """
     holder = type("holder", (), {"__annotations__": {key: hint}})
     return get_type_hints(holder, getattr(function, "__globals__", {}))
-
-
-def parsed_settings(
-    settings: Sequence[str], names: Sequence[str], hints: Mapping[str, Any], learner: str
-) -> dict[str, Any]:
-    """Return settings of a learner, given as ``NAME=VALUE``, in their types.
-
-    Args:
-        settings: The settings; a name may have ``-`` for ``_``.
-        names: Known names.
-        hints: Name to type. A value without a type becomes a literal of Python, or text.
-        learner: Name of the learner for messages.
-
-    Raises:
-        OptionError: A setting has another form, or a value another type.
-        UnknownNameError: A name is unknown.
-    """
-    values: dict[str, Any] = {}
-    for setting in settings:
-        name, equals, text = setting.partition("=")
-        name = name.replace("-", "_")
-        if not equals or not text:
-            raise OptionError(f"learner setting {setting!r}: must be NAME=VALUE")
-        if name not in names:
-            raise UnknownNameError(f"setting of {learner}", name, names)
-        if hints.get(name, Any) is Any:
-            values[name] = _plain_value(text)
-            continue
-        whole = text.split(",") if "tuple" in str(hints[name]) else text
-        value = None if text.lower() == "none" else whole
-        try:
-            values[name] = TypeAdapter(hints[name]).validate_python(value)
-        except ValidationError as error:
-            reason = error.errors()[0]["msg"]
-            raise OptionError(f"learner setting {setting!r}: {reason}") from None
-    return values
-
-
-def _plain_value(text: str) -> Any:
-    """Return a number, a tuple or another literal of Python; other words stay text.
-
-    Truth values and none may have any case, as in other settings.
-    """
-    word = text.capitalize()
-    if word in ("True", "False", "None"):
-        return ast.literal_eval(word)
-    try:
-        return ast.literal_eval(text)
-    except (ValueError, SyntaxError):
-        return text
 
 
 def _copied(given: Any, shared: Sequence[Any], name: str, memo: dict[int, Any]) -> Any:

@@ -16,6 +16,7 @@ from ugat_marl.experiments import (
     DIRECT,
     GROUNDED_NAME,
     Evaluation,
+    best_rule_note,
     is_grounded,
     matched_name,
     means_by_step,
@@ -288,8 +289,8 @@ def transfer_picture(evaluation: Evaluation, metrics: Metrics, path: Path) -> No
         ]
         if rows:
             _draw_curve(picture, right, number, rows)
-        rule = f"rule {evaluation.notes.get(f'best rule in {domain}')}"
-        if rule in evaluation.policies:
+        rule = evaluation.best_rule_policy(domain)
+        if rule is not None and rule in evaluation.policies:
             colour, level = (
                 curve_style(number)["color"],
                 evaluation.estimate(rule, domain, "att_s").mean,
@@ -297,7 +298,7 @@ def transfer_picture(evaluation: Evaluation, metrics: Metrics, path: Path) -> No
             right.axhline(level, color=colour, linestyle=(0, (1, 2)), linewidth=1)
             # at the left, where direct transfer is far from the rule, and not where curves meet it
             right.annotate(
-                printable(shortened(f"best rule in {domain}", 34)), (0.12, level), (0, 3),
+                printable(shortened(best_rule_note(domain), 34)), (0.12, level), (0, 3),
                 color=colour, xycoords=("axes fraction", "data"), textcoords="offset points",
                 ha="left", fontsize=10,
             )  # fmt: skip
@@ -456,7 +457,7 @@ def radar_lines(evaluation: Evaluation, real: str) -> dict[str, list[float]]:
     These policies are direct transfer, grounded ones and the best rule, five at most.
     """
     sim, policies = evaluation.domains[0], evaluation.policies
-    rule = f"rule {evaluation.notes.get(f'best rule in {real}')}"
+    rule = evaluation.best_rule_policy(real)
     shown = [policies[0], *(p for p in policies if is_grounded(p) and p != policies[0])]
     shown += [p for p in policies if p == rule and p not in shown]
 

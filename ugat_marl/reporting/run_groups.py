@@ -9,7 +9,7 @@ from dataclasses import dataclass
 from typing import Any
 
 from ugat_marl.errors import counted
-from ugat_marl.experiments import DIRECT, Comparison, Trial, is_grounded
+from ugat_marl.experiments import DIRECT, RULE, Comparison, Trial, is_grounded, rule_policy
 from ugat_marl.reporting.run_records import RunRecord
 
 _APART = (
@@ -20,8 +20,6 @@ _APART = (
 """Settings in which trainings of one group may differ, since they do not change UGAT itself."""
 _SIMULATING = ("ugat-marl", "eclipse-sumo", "libsumo")
 """Packages whose versions decide how vehicles move."""
-RULE = "best rule there"
-"""Name of the best rule of the real domain, as a setting."""
 
 
 @dataclass(frozen=True)
@@ -107,9 +105,9 @@ def _of_run(record: RunRecord) -> Iterable[Trial]:
     if evaluation is None or len(evaluation.domains) != 2:
         return
     real = evaluation.domains[1]
-    rule = f"rule {evaluation.notes.get(f'best rule in {real}')}"
+    rule = evaluation.best_rule_policy(real)
     for r in evaluation.results:
-        if r.policy.startswith("rule ") and r.policy != rule:
+        if r.policy.startswith(rule_policy("")) and r.policy != rule:
             continue
         setting = RULE if r.policy == rule else r.policy
         domain = record.sim if r.domain == evaluation.domains[0] else r.domain
@@ -136,7 +134,7 @@ def _rank(setting: str) -> int:
     """Return the place of a setting: direct transfer, groundings, other settings, rules."""
     if setting.startswith(DIRECT):
         return 0
-    if setting.startswith("best rule"):
+    if setting == RULE:
         return 3
     return 1 if is_grounded(setting) else 2
 

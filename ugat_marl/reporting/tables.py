@@ -11,7 +11,7 @@ from rich.text import Text
 from ugat_marl.data import MEASURES
 from ugat_marl.diagnosis import PolicyGap, TravelTimeEstimate
 from ugat_marl.errors import counted
-from ugat_marl.experiments import Estimate, Evaluation, Tuned, check_run
+from ugat_marl.experiments import Estimate, Evaluation, Tuned, best_rule_note, check_run
 from ugat_marl.reporting.formats import number_text, share
 from ugat_marl.reporting.terminal import titled_table
 
@@ -136,8 +136,11 @@ def _backlog(evaluation: Evaluation, domain: str) -> list[str]:
 
 
 def _caption(evaluation: Evaluation) -> str:
-    keys = [f"best rule in {domain}" for domain in evaluation.domains]
-    lines = [f"{key}: {evaluation.notes[key]}" for key in keys if key in evaluation.notes]
+    lines = [
+        f"{best_rule_note(domain)}: {rule}"
+        for domain in evaluation.domains
+        if (rule := evaluation.best_rule(domain)) is not None
+    ]
     if check := check_run(evaluation):
         lines.insert(0, check.sentence("--pretrain-episodes"))
     if corrected := evaluation.notes.get("corrected sim"):

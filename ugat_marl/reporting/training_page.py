@@ -16,7 +16,18 @@ from typing import Any
 from ugat_marl.data import MEASURES
 from ugat_marl.envs import OBJECTIVE_MEASURES
 from ugat_marl.errors import counted
-from ugat_marl.experiments import PHASE, Estimate, Evaluation, check_run, is_grounded, outcome_of
+from ugat_marl.experiments import (
+    DIRECT,
+    ORACLE,
+    PHASE,
+    RULE,
+    STREET,
+    Estimate,
+    Evaluation,
+    check_run,
+    is_grounded,
+    outcome_of,
+)
 from ugat_marl.reporting import charts
 from ugat_marl.reporting.figures import NamedFigure, printable
 from ugat_marl.reporting.formats import number, share, signed
@@ -43,7 +54,7 @@ _OPEN = 4
 """Largest number of sections that are shown unfolded."""
 _WORST = 10
 """Number of intersections in the table of the longest queues."""
-_RADARS = ("direct transfer", PHASE, "fitted street", "trained in real", "best rule")
+_RADARS = (DIRECT, PHASE, STREET, ORACLE, RULE)
 _RADAR = "Every axis is scaled by its best value, at the rim; the middle is worst."
 _STRETCH = "Mean of a stretch of episodes, with its 95 % interval over "
 
@@ -193,13 +204,16 @@ def _overview_row(record: RunRecord) -> list[str]:
         shown = _main_policies(evaluation)
         policy = next(filter(is_grounded, shown), shown[0])
         sim, *reals = evaluation.domains
-        rules = {real: f"rule {evaluation.notes.get(f'best rule in {real}')}" for real in reals}
         cells["sim"] = _with_interval(evaluation.estimate(policy, sim, "att_s"))
         cells["real"] = _in_each(evaluation, dict.fromkeys(reals, policy))
         if not record.job:
             direct = dict.fromkeys(reals or [sim], evaluation.policies[0])
             cells["direct"] = _in_each(evaluation, direct)
-        judged = {real: rule for real, rule in rules.items() if rule in evaluation.policies}
+        judged = {
+            real: rule
+            for real in reals
+            if (rule := evaluation.best_rule_policy(real)) in evaluation.policies and rule
+        }
         cells["rule"] = _in_each(evaluation, judged, named=len(reals) > 1)
     return [
         record.name, record.scenario or "–", f"{record.sim} → {', '.join(reals) or '–'}",
@@ -388,7 +402,7 @@ def _between(estimate: Estimate) -> str:
 
 def _main_policies(evaluation: Evaluation) -> list[str]:
     """Return those of direct transfer, grounded ones and the best rule that were evaluated."""
-    rule = f"rule {evaluation.notes.get(f'best rule in {evaluation.domains[-1]}')}"
+    rule = evaluation.best_rule_policy(evaluation.domains[-1])
     return [
         name
         for place, name in enumerate(evaluation.policies)

@@ -10,9 +10,7 @@ from numpy.typing import NDArray
 
 from ugat_marl.data.measured.tracks import COARSEST_S
 from ugat_marl.scenarios import Period
-
-HALTING_MPS = 0.1
-"""Speed in m/s below which SUMO calls a vehicle halting."""
+from ugat_marl.simulation import HALTING_MPS
 
 
 def traffic_of_lanes(

@@ -24,14 +24,10 @@ from typing import Any, get_type_hints
 from ugat_marl.data import installed_version
 from ugat_marl.envs import AnyParallelEnv
 from ugat_marl.errors import OptionError, UnknownNameError, install_command
+from ugat_marl.policies.learner_settings import parsed_settings
 from ugat_marl.policies.learners.dqn_config import DQNConfig, UsualValue
-from ugat_marl.policies.own import (
-    OwnLearnerFactory,
-    is_own,
-    load_own,
-    own_learner_options,
-    parsed_settings,
-)
+from ugat_marl.policies.own import OwnLearnerFactory, own_learner_options
+from ugat_marl.policies.own_names import is_own, load_own
 from ugat_marl.policies.protocols import Learner
 
 LearnerFactory = Callable[[AnyParallelEnv, int], Learner]

@@ -1,0 +1,80 @@
+"""Variation of demand from day to day, on top of the chance of single vehicles."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+
+import numpy as np
+from scipy import stats
+
+from ugat_marl.data import Finding, MeasuredData
+from ugat_marl.diagnosis.features import BIN_FEATURES, DetectorLayout, Tally
+from ugat_marl.diagnosis.statistics import Array
+from ugat_marl.diagnosis.thresholds import Thresholds
+
+
+def day_to_day_variation(counts: Array, thresholds: Thresholds) -> float:
+    """Estimate how much demand varies from day to day, on top of the chance of single vehicles.
+
+    The mean square of a day's counts around their mean has the expectation ``m + (s m)^2``, for a
+    mean m and a variation s. No variation at all, as in a simulation, and a variation with a
+    half-normal distribution are equally likely before the counts are seen. If no variation is
+    likelier afterwards, it is taken; otherwise the posterior root mean square of the variation is.
+
+    Args:
+        counts: Vehicles per day at places that no vehicle passes twice, ``(places, days)``. The
+            busiest one is used: others see many of the same vehicles.
+        thresholds: Numbers of the method.
+
+    Returns:
+        Standard deviation as a share of the mean, rounded to `Thresholds.grain_of_variation`.
+    """
+    days = counts[int(np.argmax(counts.sum(axis=1)))] if len(counts) else np.empty(0)
+    if len(days) < 2 or not days.mean():
+        return 0.0
+    freedom = len(days) - 1
+    squares = max(float(((days - days.mean()) ** 2).sum()), 1e-6)  # counts may be equal
+    shares = np.arange(0.0, 1.0, 0.002)
+    scale = days.mean() + (shares * days.mean()) ** 2
+    logs = stats.chi2.logpdf(squares / scale, freedom) - np.log(scale)
+    prior = np.exp(-0.5 * (shares / thresholds.usual_variation) ** 2)
+    prior[0] = prior[1:].sum()
+    posterior = prior * np.exp(logs - logs.max())
+    if posterior[0] > posterior[1:].sum():
+        return 0.0
+    posterior[0] = 0.0
+    posterior /= posterior.sum()
+    found = math.sqrt(float((posterior * shares**2).sum()))
+    grain = thresholds.grain_of_variation
+    return round(grain * round(found / grain), 6)
+
+
+def measured_variation(
+    layout: DetectorLayout, measured: MeasuredData, days: Sequence[Tally], thresholds: Thresholds
+) -> float:
+    """Estimate the variation from day to day; 0 if the periods are not the same time of days."""
+    if len({(period.begin_s, period.end_s) for period in measured.periods}) > 1:
+        return 0.0
+    owners = np.array([lane.intersection for lane in layout.lanes])
+    known = np.all([day.counted > 0 for day in days], axis=0)  # a missing interval is no zero
+    rows: list[Array] = []
+    for number in range(len(layout.intersections)):
+        lanes = np.flatnonzero(owners == number)
+        by_kind = [
+            np.array([(day.bins * known)[kind, lanes].sum() for day in days])
+            for kind in (BIN_FEATURES.index("count_stop"), BIN_FEATURES.index("count_advance"))
+        ]
+        rows.append(max(by_kind, key=lambda counts: float(counts.sum())))
+    return day_to_day_variation(np.array(rows), thresholds)
+
+
+def variation_findings(variation: float) -> tuple[Finding, ...]:
+    """Return a finding on the variation from day to day; none without one."""
+    if not variation:
+        return ()
+    share = f"{100 * variation:.0f} %"
+    text = (
+        f"demand differs from day to day by about {share}, on top of chance; so do simulated days"
+    )
+    return (Finding(text),)

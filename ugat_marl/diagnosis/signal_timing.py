@@ -1,0 +1,81 @@
+"""Yellow and all-red times that the signal log shows by itself."""
+
+from __future__ import annotations
+
+import itertools
+import math
+from collections import Counter
+
+from ugat_marl.data import MeasuredData
+from ugat_marl.diagnosis.thresholds import Thresholds
+from ugat_marl.effects import Effect, effect_from_record
+from ugat_marl.scenarios import GREEN, Network, Scenario, SignalLog
+
+IN_THE_LOG = ("yellow_time", "all_red_time")
+"""Effects that are read off the signal log. A replay of the log contains them already."""
+_AMBER = frozenset("yY")
+
+
+def timing_effects(
+    scenario: Scenario, network: Network, measured: MeasuredData, thresholds: Thresholds
+) -> tuple[Effect, ...]:
+    """Return effects for yellow and all-red times of the log that differ from the scenario's.
+
+    Logs that show the network's own programme, its states and its clearances, are left out.
+    """
+    yellow: Counter[float] = Counter()
+    red: Counter[float] = Counter()
+    controlled = {intersection.id: intersection for intersection in network.intersections}
+    for period in measured.periods:
+        for tls, log in period.signals.items():
+            if tls in controlled and not _own(log, controlled[tls].programme, thresholds):
+                for kind, duration in _clearances(log):
+                    (yellow if kind == "y" else red)[round(duration, 1)] += 1
+    effects: list[Effect] = []
+    control = scenario.control
+    clearances = (yellow, control.yellow_s), (red, control.all_red_s)
+    for name, (seen, now) in zip(IN_THE_LOG, clearances, strict=True):
+        total = sum(seen.values())
+        if total >= thresholds.least_clearances:
+            value, count = seen.most_common(1)[0]
+            if (
+                count >= thresholds.usual_share * total
+                and abs(value - now) > thresholds.least_timing_s
+            ):
+                effects.append(effect_from_record({"name": name, "seconds": value}))
+    return tuple(effects)
+
+
+def _own(log: SignalLog, programme: tuple[tuple[float, str], ...], thresholds: Thresholds) -> bool:
+    """Return True if a log shows the states and clearances of the network's own programme."""
+    if not {state for _, state in log} <= {state for _, state in programme}:
+        return False
+    twice = (*programme, *programme)
+    begins = itertools.accumulate((seconds for seconds, _ in twice), initial=0.0)
+    own = _clearances(tuple(zip(begins, (state for _, state in twice), strict=False)))
+    shown = _clearances(log[1:])  # the first state may have begun before the log
+    alike = sum(
+        any(kind == k and abs(duration - d) <= thresholds.least_timing_s for k, d in own)
+        for kind, duration in shown
+    )
+    return alike >= thresholds.usual_share * len(shown)
+
+
+def _clearances(log: SignalLog) -> list[tuple[str, float]]:
+    """Return durations in s of yellow (``y``), and from its end to the next green (``r``).
+
+    Other links may be green at the same time. Red-yellow does not count as yellow.
+    """
+    durations: list[tuple[str, float]] = []
+    began = ended = math.nan
+    for (_, before), (time_s, state) in itertools.pairwise(log):
+        pairs = list(zip(before, state, strict=False))
+        if any(new in _AMBER and old not in _AMBER for old, new in pairs):
+            began = time_s
+        if any(old in _AMBER and new not in _AMBER for old, new in pairs):
+            durations.append(("y", time_s - began))
+            ended = time_s
+        if any(new in GREEN and old not in GREEN for old, new in pairs):
+            durations.append(("r", time_s - ended))
+            ended = math.nan
+    return [(kind, duration) for kind, duration in durations if duration == duration]
