@@ -137,6 +137,7 @@ def test_workers_of_a_vector_import_the_function() -> None:
     [
         (lambda view: view.vehicles.reshape(1, -1), "shape (1,"),
         (lambda view: [float("nan")], "not finite"),
+        (lambda view: "text", "returned .text. .str.; it must return one row"),
     ],
 )
 def test_a_function_that_returns_no_row_is_refused(function: Any, says: str) -> None:

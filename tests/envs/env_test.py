@@ -118,6 +118,9 @@ def test_missing_and_unknown_agents_are_named(mixed: TrafficEnv) -> None:
         mixed.step({a: 0 for a in right if a != last})
     with pytest.raises(ActionError, match=r"unknown agents \['signal_9'\]"):
         mixed.step({**right, "signal_9": 0})
+    for nothing in (None, [0, 0]):
+        with pytest.raises(ActionError, match=r"actions are .*; give a dictionary"):
+            mixed.step(nothing)  # pyright: ignore[reportArgumentType]
 
 
 def test_what_learners_hand_over_is_accepted(mixed: TrafficEnv) -> None:

@@ -464,12 +464,18 @@ def test_one_that_cannot_be_replaced_is_over() -> None:
             env.step(chosen(batch.masks, 0, 0))
 
 
-def test_errors_of_the_users_own_functions_are_told_whole(module: Callable[[str], str]) -> None:
-    own = module("def reward(before, after):\n    return 1 / 0\n")
+@pytest.mark.parametrize(
+    ("fault", "named"),
+    [("return 1 / 0", "ZeroDivisionErr"), ("raise SystemExit(3)", "SystemExit: 3")],
+)
+def test_errors_of_the_users_own_functions_are_told_whole(
+    fault: str, named: str, module: Callable[[str], str]
+) -> None:
+    own = module(f"def reward(before, after):\n    {fault}\n")
     reward = __import__(own).reward
     with vector_env("single-v1", 1, reward=reward, duration_s=LENGTH_S) as env:
         batch = env.reset(1)
-        with pytest.raises(WorkerError, match="(?s)by the reward or the wrapper.*ZeroDivisionErr"):
+        with pytest.raises(WorkerError, match=f"(?s)by the reward or the wrapper.*{named}"):
             env.step(chosen(batch.masks, 0, 0))
         batch = env.reset(2)  # it goes on
 

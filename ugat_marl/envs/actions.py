@@ -49,7 +49,12 @@ def checked_delays(seconds: Mapping[str, float], agents: Sequence[str]) -> dict[
     return {agent: float(delay) for agent, delay in seconds.items()}
 
 
-def _refuse_unknown(kind: str, given: Mapping[str, Any], agents: Sequence[str]) -> None:
+def _refuse_unknown(kind: str, given: Any, agents: Sequence[str]) -> None:
+    if not isinstance(given, Mapping):
+        raise ActionError(
+            f"{kind} are {str(given)[:80]!r} ({type(given).__name__}); give a dictionary with the "
+            f"agents as its keys: {[*agents]}"
+        )
     if unknown := sorted(set(given) - set(agents), key=str):
         raise ActionError(f"{kind} for unknown agents {unknown}; agents: {[*agents]}")
 

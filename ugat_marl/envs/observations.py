@@ -232,7 +232,14 @@ class Observer:
     def _features(self, view: IntersectionView) -> NDArray[np.float64]:
         """Return the features that the user's function makes of an intersection."""
         assert self._function is not None
-        values = np.asarray(self._function(view), dtype=np.float64)
+        given = self._function(view)
+        try:
+            values = np.asarray(given, dtype=np.float64)
+        except (TypeError, ValueError):
+            raise OptionError(
+                f"observation: the function returned {str(given)[:80]!r} ({type(given).__name__}); "
+                "it must return one row of finite numbers"
+            ) from None
         if values.ndim != 1 or not values.size or not np.isfinite(values).all():
             raise OptionError(
                 f"observation: the function returned an array of shape {values.shape}"

@@ -56,7 +56,7 @@ class FitConfig:
         kl_weight: Final weight of that divergence, for "edl"; 1 in Sensoy et al. With eight phases
             that often look alike, 1 keeps h from learning: on grid2x2-v1 its held-out accuracy is
             0.60 (u 0.90, AUROC of u 0.72) against 0.70 (0.48, 0.73) at 0.1.
-        off_data_weight: Weight of the certainty of h on invented inputs (`OffData`), for all
+        off_data_weight: Weight of the certainty of h on invented inputs off the data, for all
             methods but "none". With 0 each method is that of its paper, and u need not rise off the
             data.
         warm_start: Continue from the current weights instead of drawing new ones.

@@ -42,7 +42,7 @@ class GateConfig:
             "fitted" is the mean u of h's answers to the predictions of f after the first fit.
         uncertainty_of: The u that is compared: "h-after-f" asks h for the prediction of every
             network of f, and counts their disagreement; "h" asks it for their mean, as in the
-            paper. With one network (`ForwardConfig.members`) both are the same.
+            paper. With one network (`forward.members`) both are the same.
     """
 
     mode: Literal["infinite", "static", "dynamic"] = "dynamic"

@@ -68,8 +68,7 @@ class TimedConfig:
         target_noise: Noise on the changes from which h learns, in units of the root mean square
             error of the model of the simulation. It stands for the error of f.
         match: True if the delays of an intersection are moved together until the policy gets the
-            same reward in both domains (`delays.match_delays`). This needs roll-outs of the policy
-            in both.
+            same reward in both domains. This needs roll-outs of the policy in both.
     """
 
     most_s: int = 5

@@ -134,7 +134,7 @@ def _answered(answer: Callable[[Message], Message], question: Message) -> Messag
         return Message({"error": str(error), "kinds": kinds}, [])
     except MemoryError:
         return Message({"error": too_much_memory(), "kinds": [SimulatorError.__name__]}, [])
-    except Exception:  # noqa: BLE001 - the user's reward or wrapper may raise anything
+    except (Exception, SystemExit):  # noqa: BLE001 - the user's reward or wrapper may raise them
         return Message({"error": traceback.format_exc(limit=-5), "kinds": []}, [])
 
 
