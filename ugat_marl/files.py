@@ -368,12 +368,14 @@ class Tag(NamedTuple):
         attributes: Its attributes.
         line: Its line in the document, from 1.
         parent: Tag of the element around it; empty for the root.
+        section: Tag of the child of the root around it; empty for the root and its children.
     """
 
     name: str
     attributes: dict[str, str]
     line: int
     parent: str = ""
+    section: str = ""
 
 
 def chunks_of(path: Path, reporter: Reporter | None = None) -> Iterator[bytes]:
@@ -418,7 +420,8 @@ def scan_xml(pieces: Iterable[bytes], name: str) -> Iterator[Tag]:
     around = [""]
 
     def start(tag: str, attributes: dict[str, str]) -> None:
-        tags.append(Tag(tag, attributes, parser.CurrentLineNumber, around[-1]))
+        section = around[2] if len(around) > 2 else ""
+        tags.append(Tag(tag, attributes, parser.CurrentLineNumber, around[-1], section))
         around.append(tag)
         if len(around) > _DEEPEST + 1:  # with the text around the root
             _refuse_depth(parser, name)

@@ -241,6 +241,10 @@ def arms(*degrees: float) -> tuple[list[Link], dict[str, Lane]]:
         ((30, 120, 210, 300), ("northbound", "eastbound", "southbound", "westbound")),
         ((350, 170, 80), ("northbound", "southbound", "eastbound")),
         ((0, 40, 180), ("northbound", "eastbound", "southbound")),  # no name twice
+        (  # southbound would not be northbound for a fourth
+            (90, 140, 180, 230),
+            ("eastbound", "southeastbound", "southbound", "southwestbound"),
+        ),
         (
             (0, 90, 180, 270, 45),
             ("northbound", "eastbound", "southbound", "westbound", "northeastbound"),

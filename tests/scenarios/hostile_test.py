@@ -41,6 +41,10 @@ OPTIONS = [
 ]  # fmt: skip
 
 ADDITIONAL = {
+    "metadata": '<metadata><configuration><output><edgeData id="d" file="{out}"/>'
+    "</output></configuration></metadata>",
+    "metadata include": '<metadata><configuration><include href="{secret}"/></configuration>'
+    "</metadata>",
     "timedEvent": '<timedEvent type="SaveTLSStates" source="C" dest="{out}"/>',
     "calibrator": '<calibrator id="c" edge="W_C" pos="0" output="{out}" freq="10"/>',
     "include": '<include href="{secret}"/>',

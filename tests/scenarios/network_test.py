@@ -227,6 +227,25 @@ def test_the_programme_of_an_additional_file_counts(crossing: Callable[..., Path
     assert item.phases == ("rG", "gr")
 
 
+def test_times_of_phases_may_have_hours_and_minutes_and_a_wrong_one_is_named(
+    crossing: Callable[..., Path],
+) -> None:
+    directory = crossing(toml=lambda text: 'additional = ["lights.add.xml"]\n' + text)
+    lights = (
+        '<additional><tlLogic id="C" type="static" programID="mine" offset="0">'
+        '<phase duration="0:01:07" state="rG"/><phase duration="8" state="gr"/></tlLogic>'
+        "</additional>"
+    )
+    (directory / "lights.add.xml").write_text(lights)
+    item = Network.read(load_scenario(directory)).intersections[0]
+    assert item.programme == ((67.0, "rG"), (8.0, "gr"))
+    (directory / "lights.add.xml").write_text(lights.replace("0:01:07", "0:01"))
+    with pytest.raises(
+        ScenarioError, match=r"lights\.add\.xml: traffic light 'C' has a .* none \(0:01"
+    ):
+        Network.read(load_scenario(directory))
+
+
 # --- networks from netconvert ---------------------------------------------------------------------
 
 
@@ -470,3 +489,41 @@ def test_a_light_that_is_no_agent_has_a_reason() -> None:
     )
     derived = Network.read(poor.with_control(phases="conflict-free"))
     assert "T" not in derived.uncontrolled
+
+
+def test_lights_have_their_place_in_a_network_without_internal_lanes(tmp_path: Path) -> None:
+    ends = (("a", -90, 0), ("b", 110, 0), ("c", 10, 90), ("d", 10, -90))
+    nodes = '<node id="x" x="10" y="0" type="traffic_light"/>' + "".join(
+        f'<node id="{name}" x="{x}" y="{y}"/>' for name, x, y in ends
+    )
+    edges = "".join(
+        f'<edge id="{name}in" from="{name}" to="x"/><edge id="{name}out" from="x" to="{name}"/>'
+        for name, _, _ in ends
+    )
+    places = []
+    for name, options in (("with", ()), ("without", ("--no-internal-links",))):
+        network = Network.read(
+            read_scenario(
+                netconvert(
+                    tmp_path / name, nodes, edges, *options, "--offset.disable-normalization"
+                )
+            )
+        )
+        (light,) = network.intersections
+        places.append(light.position)
+        assert any("has no internal lanes at x" in note for note in network.notes) == bool(options)
+    assert places[0] == places[1] == (10.0, 0.0)
+
+
+def test_what_netconvert_writes_of_its_options_is_admitted(tmp_path: Path) -> None:
+    nodes = (
+        '<node id="a" x="0" y="0"/><node id="x" x="100" y="0" type="traffic_light"/>'
+        '<node id="b" x="200" y="0"/><node id="c" x="100" y="90"/>'
+    )
+    edges = (
+        '<edge id="in" from="a" to="x"/><edge id="out" from="x" to="b"/>'
+        '<edge id="side" from="c" to="x"/>'
+    )
+    directory = netconvert(tmp_path / "a", nodes, edges, "--write-metadata")
+    assert b"<metadata" in next(directory.glob("*.net.xml")).read_bytes()
+    assert Network.read(read_scenario(directory)).intersections[0].id == "x"

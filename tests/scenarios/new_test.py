@@ -219,6 +219,23 @@ def test_a_configuration_becomes_a_scenario(link: bool, files: Path, tmp_path: P
     check_demand(scenario, Network.read(scenario))
 
 
+def test_what_a_scenario_cannot_have_is_said(
+    files: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    (files / "state.xml").write_text("<snapshot/>")
+    configuration = files / "city.sumocfg"
+    text = configuration.read_text().replace(
+        '<end value="960"/>', '<load-state value="state.xml"/>'
+    )
+    configuration.write_text(text.replace("<begin", '<max-num-vehicles value="10"/><begin'))
+    assert made(tmp_path / "a", "--sumo", configuration) == 0
+    said = " ".join("".join(capsys.readouterr()).split())
+    assert "note: city.sumocfg: load-state = state.xml left out: an episode begins" in said
+    assert "note: city.sumocfg: it has no end, so an episode is one hour" in said
+    assert "max-num-vehicles" not in said, "it is kept"
+    assert read_scenario(tmp_path / "a").settings.sumo["max-num-vehicles"] == "10"
+
+
 def test_such_a_scenario_is_driven(files: Path, tmp_path: Path) -> None:
     target = tmp_path / "Łódź, Śródmieście 2"
     assert made(target, "--sumo", files / "city.sumocfg") == 0

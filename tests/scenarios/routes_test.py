@@ -1,11 +1,25 @@
-"""Route files of single vehicles told from all others, tag after tag."""
+"""Vehicles and their routes are those that SUMO drives."""
 
 from __future__ import annotations
 
-import pytest
+import subprocess
+import xml.etree.ElementTree as ET
+from collections import Counter
+from collections.abc import Callable
+from dataclasses import replace
+from pathlib import Path
 
+import pytest
+import sumo
+
+from ugat_marl.effects import load_scenario
 from ugat_marl.files import Tag
-from ugat_marl.scenarios.routes import OwnEdges
+from ugat_marl.scenarios import Scenario, demand_as_vehicles
+from ugat_marl.scenarios.routes import OwnEdges, departures, scaled_number
+
+Crossing = Callable[..., Path]
+
+DETOUR = ("west1_A1", "A1_A2", "A2_B2", "B2_B1", "B1_east1")
 
 OWN = ("vehicle", "route")
 
@@ -39,3 +53,67 @@ def test_single_vehicles_with_their_own_edges(
     found = read(*names)
     assert found.lost is lost
     assert found.ended() is holds
+
+
+def on_grid(demand: str) -> Scenario:
+    """Return the grid of four lights with other vehicles."""
+    scenario = load_scenario("grid2x2-v1")
+    return replace(scenario, routes=(scenario.routes[0].edited(demand.encode()),))
+
+
+def test_routes_of_the_file_are_kept_where_a_shorter_one_exists() -> None:
+    detour = " ".join(DETOUR)
+    scenario = on_grid(
+        f'<routes><route id="round" edges="{detour}"/>'
+        '<flow id="a" route="round" begin="0" end="100" number="20"/>'
+        f'<vehicle id="b" depart="100"><route edges="{detour}"/></vehicle>'
+        '<trip id="c" depart="200" from="west1_A1" to="B1_east1"/></routes>'
+    )
+    routes = Counter(tuple(edges) for _, _, edges in departures(scenario, routed=False))
+    assert routes == {DETOUR: 21, ("west1_A1", "A1_B1", "B1_east1"): 1}
+
+
+@pytest.mark.parametrize("named", [False, True])
+def test_laps_of_a_repeated_route_count(named: bool) -> None:
+    laps = "A1_A2 A2_B2 B2_B1 B1_A1"
+    own = f'<route edges="{laps}" repeat="2"/>'
+    vehicle = f'<vehicle id="a" depart="0">{own}</vehicle>'
+    if named:
+        route = own.replace("<route", '<route id="laps"')
+        vehicle = f'{route}<vehicle id="a" depart="0" route="laps"/>'
+    scenario = on_grid(f"<routes>{vehicle}</routes>")
+    ((_, _, edges),) = departures(scenario, routed=not named)
+    assert edges == 3 * laps.split()
+
+
+@pytest.mark.parametrize("scale", [0.333, 0.5, 0.7, 1.3, 1.57, 2.0, 2.5])
+@pytest.mark.parametrize("kind", ["vehicles", "flow"])
+def test_copies_of_vehicles_are_those_of_sumo(
+    kind: str, scale: float, crossing: Crossing, tmp_path: Path
+) -> None:
+    demand = "".join(
+        f'<vehicle id="{n}" depart="{n}"><route edges="S_C C_N"/></vehicle>' for n in range(90)
+    )
+    if kind == "flow":
+        demand = '<flow id="f" begin="0" end="90" period="1" from="S_C" to="C_N"/>'
+    scenario = load_scenario(crossing(vehicles=demand))
+    options = {"scale": str(scale)}
+    settings = scenario.settings.model_copy(update={"sumo": options, "duration_s": 90.0})
+    ours = demand_as_vehicles(replace(scenario, settings=settings))
+    report = tmp_path / "vehicles.xml"
+    subprocess.run(
+        [
+            str(Path(sumo.SUMO_HOME) / "bin" / "sumo"), "--no-step-log", "--no-warnings",
+            "--net-file", str(scenario.network.path), "--route-files", str(scenario.routes[0].path),
+            "--scale", str(scale), "--end", "2000", "--vehroute-output", str(report),
+            "--vehroute-output.write-unfinished",
+        ],
+        check=True, stdout=subprocess.DEVNULL,
+    )  # fmt: skip
+    theirs = {vehicle.get("id") for vehicle in ET.parse(report).getroot().iter("vehicle")}
+    root = ET.fromstring(ours.routes[0].read())
+    found = {vehicle.get("id") for vehicle in root.iter("vehicle")}
+    if kind == "flow":  # SUMO numbers the vehicles of flows anew
+        assert len(found) == len(theirs)
+    else:
+        assert found == theirs and scaled_number(90, scale) == len(theirs)

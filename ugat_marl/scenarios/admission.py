@@ -350,6 +350,8 @@ def _has_outputs(document: Document) -> bool:
 def _fault(tag: Tag) -> str:
     """Return the first thing in an element that is not allowed; empty if there is none."""
     name = tag.name
+    if tag.section == "metadata" or (name == "metadata" and tag.parent in _ROOTS):
+        return _metadata_fault(tag)
     if name not in _ELEMENTS and not (name in _ROOTS and not tag.parent):
         if name == "include":
             return "<include> reads another file; name that file in the scenario instead"
@@ -369,6 +371,18 @@ def _fault(tag: Tag) -> str:
             )
     check = _CHECKS.get(name)
     return (check(tag) if check is not None else "") or _number_fault(tag)
+
+
+def _metadata_fault(tag: Tag) -> str:
+    """Return a fault of an element of ``<metadata>``, in which netconvert writes its options.
+
+    SUMO reads elements that it knows there, too.
+    """
+    known = {"value", "created_at", "created_by"}
+    others = {x for x in tag.attributes if not x.startswith(("xmlns", "xsi:"))} - known
+    if tag.name in _ELEMENTS or tag.name in _ROOTS or others:
+        return f"<{tag.name}> in <metadata> is not an option of netconvert; leave <metadata> out"
+    return ""
 
 
 def _number_fault(tag: Tag) -> str:
@@ -398,6 +412,8 @@ def _parameter_fault(tag: Tag) -> str:
     if tag.parent in _OPEN_KEYS or _is_output(tag.attributes, tag.parent) or key in OPTIONS:
         return ""
     device = re.fullmatch(r"has\.([\w-]+)\.device", key)
+    if device is not None and device[1] == "tripinfo":
+        return "the scores of an episode need the device tripinfo of every vehicle; leave it out"
     if device is not None:
         known = device[1] in _DEVICES or tag.attributes.get("value", "").lower() in ("false", "0")
         return "" if known else f"the device {device[1]!r} writes files; leave it out"

@@ -103,11 +103,13 @@ def links_of(root: ET.Element) -> dict[str, list[Link]]:
     left_hand = root.get("lefthand", "").lower() in ("true", "1")
     rails = rail_signals_of(root)
     closed = lanes_without_cars(root)
+    ends = {edge.get("id"): edge.get("to", "") for edge in root.iter("edge")}
     for element in root.iter("connection"):
         tls = element.get("tl")
         if tls is None or tls in rails or element.get("from", ":").startswith(":"):
             continue
         junction, request = _request_of(element.get("via", ""))
+        junction = junction or ends.get(element.get("from"), "")
         links[tls].append(
             Link(
                 index=int(element.get("linkIndex", "0")),
@@ -210,7 +212,8 @@ def has_bit(a: Link, b: Link, matrix: Matrix) -> bool:
     """Return True if the matrix marks link `b` in the row of link `a`."""
     if a.junction != b.junction or a.request < 0 or b.request < 0:
         return False
-    return bool(matrix[a.junction][a.request] >> b.request & 1)
+    rows = matrix[a.junction]  # none at a junction without right of way
+    return bool(rows) and bool(rows[a.request] >> b.request & 1)
 
 
 def _matrix(root: ET.Element, attribute: str) -> dict[str, list[int]]:
@@ -227,7 +230,10 @@ def _matrix(root: ET.Element, attribute: str) -> dict[str, list[int]]:
 
 
 def _request_of(via: str) -> tuple[str, int]:
-    """Return junction and matrix row of an internal lane ``:<junction>_<first row>_<lane>``."""
+    """Return junction and matrix row of an internal lane ``:<junction>_<first row>_<lane>``.
+
+    Without a lane, as in a network without internal lanes, they are "" and -1.
+    """
     if not via:
         return "", -1
     junction, first, lane = via[1:].rsplit("_", 2)

@@ -198,7 +198,7 @@ class Network:
             tuple(uncontrolled),
             streets_of(root),
             reasons,
-            tuple(notes),
+            (*notes, *_unknown_conflicts(agents_found)),
         )
 
     def intersection(self, tls: str) -> Intersection:
@@ -332,6 +332,21 @@ def _programme_of(
             f"{', '.join(map(str, sorted(changed)))} have to yield and got g in place of G"
         )
     return mended, width
+
+
+def _unknown_conflicts(intersections: Sequence[Intersection]) -> list[str]:
+    """Return a note on the lights of which SUMO's file tells no conflicts; none if there are none.
+
+    The rows of its matrices are named by internal lanes, and `netconvert --no-internal-links`
+    leaves those out.
+    """
+    names = [light.id for light in intersections if all(x.request < 0 for x in light.links)]
+    if not names:
+        return []
+    return [
+        f"the network has no internal lanes at {', '.join(names)}, so conflicts of greens are not "
+        "known there, and none are counted; build it without --no-internal-links to have them"
+    ]
 
 
 def _reason(
@@ -487,15 +502,21 @@ def _programmes(root: ET.Element, scenario: Scenario) -> dict[str, _Programme]:
     A definition without phases gives a known programme another offset.
     """
     programmes: dict[str, _Programme] = {}
-    parts = chain.from_iterable(document.parts() for document in scenario.additional)
-    for tree in chain((root,), parts):
+    trees = [(scenario.network.source, root)]
+    parts = ((each.source, part) for each in scenario.additional for part in each.parts())
+    for source, tree in chain(trees, parts):
         for logic in tree.iter("tlLogic"):
             tls, name = logic.get("id", ""), logic.get("programID", "")
-            states = tuple(
-                (float(phase.get("duration", "0")), phase.get("state", ""))
-                for phase in logic.iter("phase")
-            )
-            offset_s = _offset_s(logic, scenario)
+            try:
+                states = tuple(
+                    (parse_time(phase.get("duration", "0")), phase.get("state", ""))
+                    for phase in logic.iter("phase")
+                )
+                offset_s = _offset_s(logic, scenario)
+            except ValueError as error:
+                raise ScenarioError(
+                    f"{source}: traffic light {tls!r} has a time that is none ({error})"
+                ) from None
             if states:
                 programmes[tls] = _Programme(name, states, offset_s, _times_vary(logic))
             elif tls in programmes and programmes[tls].id == name:
@@ -531,11 +552,10 @@ def _turns(intersections: Sequence[Intersection], names: Sequence[str]) -> Turns
 
 
 def _positions(root: ET.Element) -> dict[str, tuple[float, float]]:
-    positions = {
+    return {
         element.get("id", ""): (float(element.get("x", "0")), float(element.get("y", "0")))
         for element in root.iter("junction")
     }
-    return {"": (0.0, 0.0), **positions}
 
 
 def _centre(points: list[tuple[float, float]]) -> tuple[float, float]:

@@ -3,10 +3,9 @@
 from __future__ import annotations
 
 import functools
-import math
 import tempfile
 import xml.etree.ElementTree as ET
-from collections.abc import Callable, Iterable, Iterator, Mapping
+from collections.abc import Callable, Collection, Iterable, Iterator, Mapping
 from dataclasses import replace
 from pathlib import Path
 
@@ -36,7 +35,7 @@ def is_blocker(vehicle: str, vehicle_type: str) -> bool:
         vehicle: Id of the vehicle.
         vehicle_type: Its type. Blockers have a type of their own, and its name begins their ids.
     """
-    return vehicle.startswith(BLOCKERS) and vehicle.rpartition(".")[0] == vehicle_type
+    return vehicle_type.startswith(BLOCKERS) and vehicle.rpartition(".")[0] == vehicle_type
 
 
 class OwnEdges:
@@ -74,7 +73,14 @@ def demand_as_vehicles(scenario: Scenario) -> Scenario:
     """
     scale = demand_scale(scenario)
     if scale != 1:
-        return _scaled(demand_as_vehicles(_without_scale(scenario)), scale)
+        documents = (*scenario.routes, *scenario.additional)
+        flows = {
+            tag.attributes.get("id", "")
+            for document in documents
+            for tag in document.scan()
+            if tag.name == "flow"
+        }
+        return _scaled(demand_as_vehicles(_without_scale(scenario)), _Copies(scale, flows))
     beside = [_test_file(document, _holds_demand) for document in scenario.additional]
     if not any(beside) and all(_test_file(x, _holds_single_vehicles) for x in scenario.routes):
         return scenario
@@ -92,7 +98,34 @@ def demand_scale(scenario: Scenario) -> float:
 
 def scaled_number(vehicles: int, scale: float) -> int:
     """Return the number of vehicles that SUMO makes of `vehicles` with its option ``scale``."""
-    return math.ceil(round(vehicles * scale, 9))
+    copies = _Copies(scale)
+    return sum(copies.of("") for _ in range(vehicles))
+
+
+class _Copies:
+    """Numbers of vehicles that SUMO makes of each vehicle, as `MSVehicleControl::getQuota` does.
+
+    Args:
+        scale: SUMO's option ``scale``.
+        flows: Ids of the flows, which number their vehicles themselves.
+    """
+
+    def __init__(self, scale: float, flows: Collection[str] = ()) -> None:
+        self._scale, self._flows = scale, flows
+        self._thousandths = int(scale % 1 * 1000 + 0.5)
+        self._loaded = 0  # copies count, too
+
+    def of(self, vehicle: str) -> int:
+        """Return the number for the next vehicle of the files, by its id."""
+        flow, _, place = vehicle.rpartition(".")
+        if flow in self._flows and place.isdecimal():
+            number = int(place)
+        else:
+            number = int((self._loaded + 1) / self._scale) if self._scale > 1 else self._loaded
+        more = number % 1000 * self._thousandths % 1000 < self._thousandths
+        copies = int(self._scale) + int(more)
+        self._loaded += max(copies, 1)
+        return copies
 
 
 def _without_scale(scenario: Scenario) -> Scenario:
@@ -100,16 +133,13 @@ def _without_scale(scenario: Scenario) -> Scenario:
     return replace(scenario, settings=scenario.settings.model_copy(update={"sumo": options}))
 
 
-def _scaled(scenario: Scenario, scale: float) -> Scenario:
-    """Return the scenario with `scale` copies of each vehicle, named as SUMO names its copies.
+def _scaled(scenario: Scenario, copies: _Copies) -> Scenario:
+    """Return the scenario with copies of each vehicle, named as SUMO names those of its files.
 
-    The first n vehicles of the files become ceil(n * scale), as with SUMO's option. Vehicles that
-    block a lane stay single.
+    Vehicles that block a lane stay single.
     """
-    read = 0
 
     def copied(document: Document) -> Document:
-        nonlocal read
         draft = None
         for part in document.parts():
             draft = draft or Draft(document.name.removesuffix(".gz"), part)
@@ -118,13 +148,12 @@ def _scaled(scenario: Scenario, scale: float) -> Scenario:
                 if element.tag != "vehicle" or element.get("id", "").startswith(BLOCKERS):
                     kept.append(element)
                     continue
-                copies = scaled_number(read + 1, scale) - scaled_number(read, scale)
-                read += 1
-                for number in range(copies):
+                vehicle = element.get("id", "")
+                for number in range(copies.of(vehicle)):
                     copy = ET.Element(element.tag, element.attrib)
                     copy[:] = element[:]
                     if number:
-                        copy.set("id", f"{element.get('id', '')}.{number}")
+                        copy.set("id", f"{vehicle}.{number}")
                     kept.append(copy)
             part[:] = kept
             draft.add(*(child_texts(part) if kept else ()))
@@ -170,7 +199,8 @@ def departures(
                 if depart >= end:  # vehicles are sorted by departure
                     break
             elif tag.name == "route" and "id" not in tag.attributes and not blocks:
-                yield name, depart, tag.attributes.get("edges", "").split()
+                laps = 1 + int(tag.attributes.get("repeat", "0"))
+                yield name, depart, laps * tag.attributes.get("edges", "").split()
 
 
 def _test_file(document: Document, test: Callable[[Document], bool]) -> bool:
@@ -238,6 +268,7 @@ def _routed_by_duarouter(scenario: Scenario) -> tuple[Document, ...]:
             "--vtype-output", str(directory / "types.xml"),
             "--begin", repr(settings.begin_s),
             "--end", repr(settings.begin_s + settings.duration_s),
+            "--skip-new-routes", "true",  # else it replaces routes of the files by shorter ones
             "--ptline-routing", "true",  # else vehicles with a line, such as buses, are left out
             "--ignore-errors", "true",
             "--no-warnings", "true",

@@ -215,8 +215,10 @@ _SYNONYMS = {
 """Names that SUMO allows for the elements of a configuration."""
 
 
-_IGNORED = ("time-to-teleport", "max-depart-delay", "random", "seed", "max-num-vehicles")
+_IGNORED = ("time-to-teleport", "max-depart-delay", "random", "seed")
 """Settings of SUMO that change traffic and are the same in all scenarios."""
+_LACKING = re.compile(r"load-state.*|(lane-)?weight.*|device\.(toc|stationfinder)\..*")
+"""Settings of SUMO that change traffic and that no scenario has."""
 
 
 class SumoConfiguration:
@@ -270,9 +272,22 @@ class SumoConfiguration:
         options = {option: self.given[option] for option in self.given if option in OPTIONS}
         return {"step_length_s": self.seconds("step-length", "1"), "sumo": options}
 
+    @property
+    def has_end(self) -> bool:
+        """True if it says when the simulation ends."""
+        return self.seconds("end", "-1") >= 0
+
     def ignored(self) -> list[str]:
-        """Return the settings that change traffic and that no scenario has, as ``name = value``."""
+        """Return the settings that all scenarios have in common, as ``name = value``."""
         return [f"{name} = {self.given[name]}" for name in _IGNORED if self.given.get(name)]
+
+    def lacking(self) -> list[str]:
+        """Return the settings that change traffic and that no scenario has, as ``name = value``."""
+        return [
+            f"{name} = {value}"
+            for name, value in self.given.items()
+            if value and _LACKING.fullmatch(name) and name not in OPTIONS
+        ]
 
 
 def _load_sumocfg(path: Path, scenario_id: str) -> Scenario:

@@ -27,6 +27,8 @@ TURN_NAMES = {"l": "left", "L": "left", "s": "through", "r": "right", "R": "righ
 _TURN_ORDER = ("left", "through", "right", "u-turn")
 _HEADING_M = 30.0
 """Length of road before the stop line whose direction counts, m; less is a kerb, more a bend."""
+_FARTHEST_RAD = math.radians(60.0)
+"""Largest angle between a road and a name of the four main directions; 45° are between two."""
 _MOST_STREETS = 3
 
 
@@ -130,8 +132,9 @@ def approach_directions(links: Iterable[Link], lanes: Mapping[str, Lane]) -> dic
     """Return the direction of travel of each road that leads to a traffic light.
 
     Up to eight roads get different names, chosen together so that the squared angles between name
-    and road are least: up to four roads the four main directions, else all eight. Roads between two
-    junctions of the light, as in the middle of a wide dual carriageway, get what is left.
+    and road are least. Up to four roads get the four main directions, unless one of them would be
+    farther than `_FARTHEST_RAD` from its name; others get all eight. Roads between two junctions of
+    the light, as in the middle of a wide dual carriageway, get what is left.
 
     Args:
         links: Links for vehicles of the traffic light.
@@ -145,8 +148,10 @@ def approach_directions(links: Iterable[Link], lanes: Mapping[str, Lane]) -> dic
             headings[edge] = heading_rad(lanes[lane].shape)
     inside = {link.to_edge for link in links}
     outer = {edge: heading for edge, heading in headings.items() if edge not in inside}
-    few = len(outer) <= len(MAIN_DIRECTIONS)
-    directions = _nearest_names(outer, MAIN_DIRECTIONS if few else ALL_DIRECTIONS)
+    directions = _nearest_names(outer, MAIN_DIRECTIONS)
+    angles = [_between(outer[edge], _angle_of(name)) for edge, name in directions.items()]
+    if len(outer) > len(MAIN_DIRECTIONS) or max(angles, default=0.0) > _FARTHEST_RAD:
+        directions = _nearest_names(outer, ALL_DIRECTIONS)
     inner = {edge: heading for edge, heading in headings.items() if edge in inside}
     left = [name for name in ALL_DIRECTIONS if name not in directions.values()]
     directions |= _nearest_names(inner, left if len(inner) <= len(left) else ALL_DIRECTIONS)
@@ -155,7 +160,7 @@ def approach_directions(links: Iterable[Link], lanes: Mapping[str, Lane]) -> dic
 
 def _nearest_names(headings: Mapping[str, float], names: Sequence[str]) -> dict[str, str]:
     """Return a name for each road, different ones if there are enough."""
-    places = [2 * math.pi * ALL_DIRECTIONS.index(name) / len(ALL_DIRECTIONS) for name in names]
+    places = [*map(_angle_of, names)]
     costs = [[_between(heading, place) ** 2 for place in places] for heading in headings.values()]
     table = np.array(costs).reshape(len(headings), len(names))
     if len(headings) > len(names):
@@ -163,6 +168,11 @@ def _nearest_names(headings: Mapping[str, float], names: Sequence[str]) -> dict[
     else:
         _, chosen = optimize.linear_sum_assignment(table)
     return {edge: names[int(place)] for edge, place in zip(headings, chosen, strict=True)}
+
+
+def _angle_of(name: str) -> float:
+    """Return the angle of a direction, clockwise from north, rad."""
+    return 2 * math.pi * ALL_DIRECTIONS.index(name) / len(ALL_DIRECTIONS)
 
 
 def heading_rad(shape: Sequence[tuple[float, float]]) -> float:

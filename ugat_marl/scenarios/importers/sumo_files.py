@@ -83,10 +83,21 @@ def from_routes(paths: Sequence[Path], *, link: bool) -> VehicleSource:
 def _configured(
     path: Path, folder: Path, link: bool, own_vehicles: bool, reporter: Reporter
 ) -> RoadFiles:
-    if ignored := SumoConfiguration(path).ignored():
+    given = SumoConfiguration(path)
+    if ignored := given.ignored():
         reporter.say(
             f"note: {path.name}: {', '.join(ignored)} left out: vehicles are never teleported or "
             "given up, and the seed is that of the episode; traffic may differ from SUMO's own"
+        )
+    if lacking := given.lacking():
+        reporter.say(
+            f"note: {path.name}: {', '.join(lacking)} left out: an episode begins in an empty "
+            "network, and edges have no weights of their own; traffic differs from SUMO's own"
+        )
+    if not given.has_end:
+        reporter.say(
+            f"note: {path.name}: it has no end, so an episode is one hour; write duration_s into "
+            "scenario.toml for another length"
         )
     if own_vehicles:
         scenario = read_scenario(path)
