@@ -75,6 +75,12 @@ def test_what_needs_no_router_is_known(vehicles: str, routed: bool, crossing: Cr
     assert (demand_as_vehicles(load_scenario(directory)).routes[0].path is not None) is routed
 
 
+def test_vehicles_that_no_score_would_hold_are_refused(crossing: Crossing) -> None:
+    unseen = '<vType id="t"><param key="has.tripinfo.device" value="false"/></vType>' + car("a", 0)
+    with pytest.raises(ScenarioError, match="scores .* need the device tripinfo of every vehicle"):
+        load_scenario(crossing(vehicles=unseen))
+
+
 @pytest.mark.parametrize("kind", ["vehicles", "flow"])
 def test_the_scale_of_the_demand_counts(kind: str, crossing: Crossing) -> None:
     demand = {
