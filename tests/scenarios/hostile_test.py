@@ -277,6 +277,7 @@ def test_a_pile_of_elements_is_refused(crossing: Crossing) -> None:
     [
         ('<flow id="a" begin="0" end="60" number="400000000" route="east"/>', "", "more than 1000"),
         ("", '<parkingArea id="p" lane="W_C_0" roadsideCapacity="400000000"/>', "more than 100000"),
+        ('<route id="r" edges="W_C C_E" repeat="400000000"/>', "", "more than 10000"),
         ("", '<busStop id="p" lane="W_C_0" personCapacity="400000000"/>', "more than 100000"),
     ],
 )

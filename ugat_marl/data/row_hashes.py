@@ -193,7 +193,7 @@ def csv_damage(path: Path, frame: pl.DataFrame) -> str:
     return ""
 
 
-def is_hashed_csv(path: Path) -> bool:
+def is_csv_as_written(path: Path) -> bool:
     """Return True if a CSV table has hashes beside it and is what was written.
 
     Raises:

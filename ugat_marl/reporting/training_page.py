@@ -212,7 +212,7 @@ def _overview_row(record: RunRecord) -> list[str]:
         judged = {
             real: rule
             for real in reals
-            if (rule := evaluation.best_rule_policy(real)) in evaluation.policies and rule
+            if (rule := evaluation.best_rule_policy(real)) and rule in evaluation.policies
         }
         cells["rule"] = _in_each(evaluation, judged, named=len(reals) > 1)
     return [

@@ -129,11 +129,12 @@ _OFF_BELOW_0: frozenset[str] = frozenset({"lateral-resolution"})
 """Options of these that 0 or less switches off."""
 _MOST_OF: Mapping[str, int] = {
     "number": 10_000_000,
+    "repeat": 10_000,
     "roadsideCapacity": 100_000,
     "personCapacity": 100_000,
 }
 """Largest values of attributes for which SUMO takes memory or time: the vehicles of a flow, the
-spaces of a parking area, and the places of a stop."""
+laps of a route, the spaces of a parking area, and the places of a stop."""
 
 _YES_OR_NO = _words(
     """
@@ -282,7 +283,8 @@ _NUMERIC = _words(
     departSpeed desiredMaxSpeed duration emergencyDecel end endPos fromLane height impatience index
     length linkIndex linkIndex2 loadingDuration mass maxDur maxSpeed maxSpeedLat minDur minGap
     minGapLat number numLanes offset period personNumber personsPerHour pos posLat priority
-    probability sigma speed speedDev speedFactor startPos tau toLane until vehsPerHour width x y z
+    probability repeat sigma speed speedDev speedFactor startPos tau toLane until vehsPerHour width
+    x y z
     """
 )
 """Attributes whose value is a number, or sometimes a word."""

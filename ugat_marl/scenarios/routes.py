@@ -145,10 +145,10 @@ def _scaled(scenario: Scenario, copies: _Copies) -> Scenario:
             draft = draft or Draft(document.name.removesuffix(".gz"), part)
             kept: list[ET.Element] = []
             for element in part:
-                if element.tag != "vehicle" or element.get("id", "").startswith(BLOCKERS):
+                vehicle = element.get("id", "")
+                if element.tag != "vehicle" or is_blocker(vehicle, element.get("type", "")):
                     kept.append(element)
                     continue
-                vehicle = element.get("id", "")
                 for number in range(copies.of(vehicle)):
                     copy = ET.Element(element.tag, element.attrib)
                     copy[:] = element[:]
@@ -199,7 +199,8 @@ def departures(
                 if depart >= end:  # vehicles are sorted by departure
                     break
             elif tag.name == "route" and "id" not in tag.attributes and not blocks:
-                laps = 1 + int(tag.attributes.get("repeat", "0"))
+                again = tag.attributes.get("repeat", "")
+                laps = 1 + int(again) if again.isdecimal() else 1
                 yield name, depart, laps * tag.attributes.get("edges", "").split()
 
 

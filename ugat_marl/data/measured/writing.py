@@ -28,7 +28,7 @@ from ugat_marl.data.measured.tables import (
 from ugat_marl.data.measured.values import MeasuredData
 from ugat_marl.data.row_hashes import (
     CSV_HASHES,
-    is_hashed_csv,
+    is_csv_as_written,
     write_csv_hashes,
     write_hashed,
 )
@@ -138,7 +138,7 @@ def _changed_table(directory: Path, names: Collection[str]) -> str | None:
     """Return the name of a CSV table that is not as `write_measured` wrote it."""
     for name in sorted(name for name in names if name.endswith(".csv")):
         try:
-            whole = is_hashed_csv(directory / name)
+            whole = is_csv_as_written(directory / name)
         except (OSError, pl.exceptions.PolarsError):
             whole = False
         if not whole:
