@@ -10,6 +10,7 @@ import contextlib
 import difflib
 import re
 from collections.abc import Iterable, Sequence
+from typing import Literal, get_args, get_origin, get_type_hints
 
 LISTED = 32
 """Most names in one error message. If there are more, the message lists the nearest ones."""
@@ -137,6 +138,23 @@ def require_least(least: int, **values: int | None) -> None:
     for name, value in values.items():
         if value is not None and value < least:
             raise OptionError(f"{name} = {value}: must be at least {least}")
+
+
+def require_choices(settings: object, name: str) -> None:
+    """Refuse a field of a data class whose value is none of its ``Literal``.
+
+    Args:
+        settings: An object of the data class.
+        name: Name of the settings for the message.
+
+    Raises:
+        OptionError: A field holds another value.
+    """
+    for field, hint in get_type_hints(type(settings)).items():
+        value = getattr(settings, field)
+        if get_origin(hint) is Literal and value not in get_args(hint):
+            allowed = ", ".join(get_args(hint))
+            raise OptionError(f"{name} {field} is {value!r}; allowed: {allowed}")
 
 
 def require_distinct(**values: Sequence[object]) -> None:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import math
+from typing import Literal
 
 import numpy as np
 import pytest
@@ -25,7 +26,7 @@ from ugat_marl.grounding import (
     fit_inverse,
     stack_log,
 )
-from ugat_marl.grounding.fitting import PAIRS, EpochCallback, split
+from ugat_marl.grounding.fitting import EpochCallback, split
 from ugat_marl.grounding.forward import ForwardConfig, ForwardModel
 from ugat_marl.grounding.phase import PhaseReport, _fit_forward
 from ugat_marl.grounding.reports import (
@@ -202,10 +203,11 @@ def test_report_is_flat_numbers(fitted) -> None:
 def test_h_reads_means_best_if_it_learnt_from_means() -> None:
     log = planted(0.1, noise=0.3)  # arrivals scatter more than what a phase does
     found = {}
-    for pairs in PAIRS:
+    both: tuple[Literal["observed", "smoothed"], ...] = ("observed", "smoothed")
+    for pairs in both:
         f, h = models()
         found[pairs] = fit(f, h, log, log, dataclasses.replace(QUICK, pairs=pairs), seed=0)
-    observed, smoothed = (found[pairs].accuracy_on_means.mean() for pairs in PAIRS)
+    observed, smoothed = (found[pairs].accuracy_on_means.mean() for pairs in both)
     assert smoothed > observed + 0.05
     assert found["observed"].inverse.accuracy.mean() >= found["smoothed"].inverse.accuracy.mean()
 

@@ -211,22 +211,21 @@ class Study:
                 supplementary=supplementary,
             )
 
-        engine = simulating(answering, effort.base)
         return cls(
-            scenario,
-            network,
-            measured,
-            config,
-            layout,
-            engine,
-            _pools(layout, measured, supplementary, thresholds),
-            allowed,
-            tuple(global_hypotheses(scenario, allowed)),
-            effort,
-            fit,
-            heldout or fit,
-            simulating(False, 0) if answering else None,
-            ruled_out,
+            scenario=scenario,
+            network=network,
+            measured=measured,
+            config=config,
+            layout=layout,
+            engine=simulating(answering, effort.base),
+            pools=_pools(layout, measured, supplementary, thresholds),
+            allowed=allowed,
+            hypotheses=tuple(global_hypotheses(scenario, allowed)),
+            effort=effort,
+            fit=fit,
+            heldout=heldout or fit,
+            other_days=simulating(False, 0) if answering else None,
+            ruled_out=ruled_out,
             day_to_day=variation,
         )
 
@@ -284,17 +283,17 @@ class Study:
         ]
         measurement = Measurement(self.layout.detectors, together(seen), simulated, thresholds)
         errors = measurement.errors(self.config.leave_out)
+        measured = self.measured
         if (points := measurement.contradicted_point()) is not None:
             finding = _of_speed_points(*points)
             reporter.say(f"note: {finding.text}")
-            measured = replace(self.measured, findings=(*self.measured.findings, finding))
-            self = replace(self, measured=measured)
+            measured = _noted(measured, [finding])
         if not errors:
-            return self
+            return replace(self, measured=measured)
         effects = tuple(error.effect for error in errors)
         other = None if self.other_days is None else self.other_days.detecting(effects)
         engine = self.engine.detecting(effects)
-        return replace(self, engine=engine, other_days=other, detection=errors)
+        return replace(self, measured=measured, engine=engine, other_days=other, detection=errors)
 
     def _occupancies_as_they_are(self, reporter: Reporter) -> Study:
         """Set occupancies aside that do not fit counts and speeds, see `intervals.implausible`.

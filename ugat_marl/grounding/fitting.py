@@ -19,7 +19,7 @@ import torch
 from torch import Tensor, nn
 
 from ugat_marl.data import TransitionLog
-from ugat_marl.errors import LogError, OptionError
+from ugat_marl.errors import LogError, OptionError, require_choices
 from ugat_marl.grounding.forward import ForwardModel
 from ugat_marl.grounding.inverse import AnswerModel
 from ugat_marl.grounding.networks import TrainableModel, full_width, rows_at_once
@@ -29,8 +29,6 @@ from ugat_marl.grounding.uncertainty import LossArguments, Method, MethodName, a
 from ugat_marl.grounding.view import View
 from ugat_marl.policies import CPU, on_device
 from ugat_marl.seeding import torch_generator
-
-PAIRS = ("observed", "smoothed")
 
 
 @dataclass(frozen=True)
@@ -83,8 +81,7 @@ class FitConfig:
 
     def __post_init__(self) -> None:
         _ = self.method  # refuses what is impossible
-        if self.pairs not in PAIRS:
-            raise OptionError(f"fit pairs is {self.pairs!r}; allowed: {', '.join(PAIRS)}")
+        require_choices(self, "fit")
         for name, least in (("epochs", 1), ("batch_size", 1), ("patience", 1), ("kl_epochs", 0)):
             if getattr(self, name) < least:
                 raise OptionError(f"fit {name} is {getattr(self, name)}; allowed: >= {least}")

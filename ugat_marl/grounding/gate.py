@@ -18,13 +18,8 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
-from ugat_marl.errors import CheckpointError, OptionError
+from ugat_marl.errors import CheckpointError, OptionError, require_choices
 from ugat_marl.grounding.reports import complaint
-
-MODES = ("infinite", "static", "dynamic")
-SCOPES = ("intersection", "pooled")
-STARTS = ("open", "fitted")
-UNCERTAINTIES = ("h-after-f", "h")
 
 
 @dataclass(frozen=True)
@@ -53,17 +48,7 @@ class GateConfig:
     uncertainty_of: Literal["h-after-f", "h"] = "h-after-f"
 
     def __post_init__(self) -> None:
-        if self.mode not in MODES:
-            raise OptionError(f"gate mode is {self.mode!r}; allowed: {', '.join(MODES)}")
-        if self.scope not in SCOPES:
-            raise OptionError(f"gate scope is {self.scope!r}; allowed: {', '.join(SCOPES)}")
-        if self.start not in STARTS:
-            raise OptionError(f"gate start is {self.start!r}; allowed: {', '.join(STARTS)}")
-        if self.uncertainty_of not in UNCERTAINTIES:
-            raise OptionError(
-                f"gate uncertainty_of is {self.uncertainty_of!r}; allowed: "
-                f"{', '.join(UNCERTAINTIES)}"
-            )
+        require_choices(self, "gate")
         if not 0.0 < self.static_alpha <= 1.0:
             raise OptionError(f"gate static_alpha is {self.static_alpha}; allowed: in (0, 1]")
         if self.window_epochs < 1:

@@ -12,7 +12,7 @@ from typing import Literal
 import torch
 from torch import Tensor
 
-from ugat_marl.errors import OptionError
+from ugat_marl.errors import OptionError, require_choices
 from ugat_marl.grounding.networks import Standardiser, TrainableModel, by_member, rows_at_once
 from ugat_marl.grounding.stacked import Stack
 from ugat_marl.grounding.uncertainty import (
@@ -26,8 +26,6 @@ from ugat_marl.grounding.uncertainty import (
     PlainNet,
 )
 from ugat_marl.grounding.view import View
-
-HEADS = ("shared", "own")
 
 
 @dataclass(frozen=True)
@@ -49,8 +47,7 @@ class InverseConfig:
     head: Literal["shared", "own"] = "shared"
 
     def __post_init__(self) -> None:
-        if self.head not in HEADS:
-            raise OptionError(f"inverse head is {self.head!r}; allowed: {', '.join(HEADS)}")
+        require_choices(self, "inverse")
         if not self.hidden or min(self.hidden) < 1:
             raise OptionError(f"inverse hidden is {self.hidden}; allowed: one or more sizes >= 1")
         if self.embedding < 1:

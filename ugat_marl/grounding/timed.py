@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 from torch import Tensor, nn
 
 from ugat_marl.data import AgentLayout, TransitionLog
-from ugat_marl.errors import OptionError
+from ugat_marl.errors import OptionError, require_choices
 from ugat_marl.grounding.delays import (
     EpisodeRewards,
     LostTime,
@@ -51,8 +51,6 @@ from ugat_marl.seeding import torch_generator
 END_S = 0.5
 """Distance in s from the longest delay tried; a best delay within it may in truth be longer."""
 
-ANSWERS = ("state", "constant")
-
 
 @dataclass(frozen=True)
 class TimedConfig:
@@ -80,8 +78,7 @@ class TimedConfig:
     def __post_init__(self) -> None:
         if self.most_s < 1:
             raise OptionError(f"timed most_s is {self.most_s}; allowed: >= 1")
-        if self.answer not in ANSWERS:
-            raise OptionError(f"timed answer is {self.answer!r}; allowed: {', '.join(ANSWERS)}")
+        require_choices(self, "timed")
         if not 0 < self.spread_s < float("inf"):
             raise OptionError(f"timed spread_s is {self.spread_s}; allowed: > 0, finite")
         if not 0 <= self.target_noise < float("inf"):
