@@ -236,6 +236,21 @@ def test_what_a_scenario_cannot_have_is_said(
     assert read_scenario(tmp_path / "a").settings.sumo["max-num-vehicles"] == "10"
 
 
+def test_usual_times_of_signals_are_whole_steps(
+    files: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    configuration = files / "city.sumocfg"
+    text = configuration.read_text().replace("<begin", '<step-length value="0.4"/><begin')
+    configuration.write_text(text)
+    assert made(tmp_path / "a", "--sumo", configuration) == 0
+    control = read_scenario(tmp_path / "a").control
+    assert (control.yellow_s, control.min_green_s) == (3.2, 5.2)
+    assert (control.all_red_s, control.decision_interval_s) == (2.0, 10.0)
+    assert read_scenario(configuration).control == control
+    said = " ".join("".join(capsys.readouterr()).split())
+    assert "do not divide the usual times of signals; yellow_s = 3.2, min_green_s = 5.2" in said
+
+
 def test_such_a_scenario_is_driven(files: Path, tmp_path: Path) -> None:
     target = tmp_path / "Łódź, Śródmieście 2"
     assert made(target, "--sumo", files / "city.sumocfg") == 0

@@ -25,6 +25,7 @@ from ugat_marl.scenarios.settings import (
     ControlSettings,
     ScenarioFile,
     parse_time,
+    usual_times,
     validate_settings,
 )
 from ugat_marl.scenarios.signals import SignalTiming
@@ -268,9 +269,12 @@ class SumoConfiguration:
         return begin, end - begin if end >= 0 else 3600.0
 
     def physics(self) -> dict[str, Any]:
-        """Return the step length and the options of SUMO, as in ``scenario.toml``."""
+        """Return step length, options of SUMO and times of signals, as in ``scenario.toml``."""
         options = {option: self.given[option] for option in self.given if option in OPTIONS}
-        return {"step_length_s": self.seconds("step-length", "1"), "sumo": options}
+        step_s = self.seconds("step-length", "1")
+        times = usual_times(step_s) if step_s > 0 else {}
+        settings: dict[str, Any] = {"step_length_s": step_s, "sumo": options}
+        return {**settings, "control": times} if times else settings
 
     @property
     def has_end(self) -> bool:

@@ -44,6 +44,29 @@ class ControlSettings(pydantic.BaseModel):
     """Distance upstream of a stop line, m, within which vehicles count beyond short lanes too."""
 
 
+_IN_STEPS = ("decision_interval_s", "yellow_s", "all_red_s", "min_green_s")
+"""Times of `ControlSettings` that have to be whole numbers of simulation steps."""
+
+
+def usual_times(step_s: float) -> dict[str, float]:
+    """Return the usual times that are no whole number of steps, in s, each made longer until it is.
+
+    Args:
+        step_s: Length of a simulation step, s.
+    """
+    usual = ControlSettings()
+    times = {name: float(getattr(usual, name)) for name in _IN_STEPS}
+    return {
+        name: round(math.ceil(time_s / step_s - 1e-6) * step_s, 6)
+        for name, time_s in times.items()
+        if not _is_whole(time_s / step_s)
+    }
+
+
+def _is_whole(number: float) -> bool:
+    return abs(number - round(number)) <= 1e-6
+
+
 class IntersectionSettings(pydantic.BaseModel):
     """Settings of one traffic light that differ from `ControlSettings`."""
 
@@ -105,14 +128,9 @@ def validate_settings(raw: Mapping[str, Any], source: str) -> ScenarioFile:
             raise ScenarioError(f"{source}: sumo.{option} = {value!r} {fault}")
     control = settings.control
     step = settings.step_length_s
-    for key, value in (
-        ("begin_s", settings.begin_s),
-        ("control.decision_interval_s", control.decision_interval_s),
-        ("control.yellow_s", control.yellow_s),
-        ("control.all_red_s", control.all_red_s),
-        ("control.min_green_s", control.min_green_s),
-    ):
-        if abs(value / step - round(value / step)) > 1e-6:
+    times = {f"control.{name}": float(getattr(control, name)) for name in _IN_STEPS}
+    for key, value in {"begin_s": settings.begin_s, **times}.items():
+        if not _is_whole(value / step):
             raise ScenarioError(
                 f"{source}: {key} = {value:g} is not a multiple of step_length_s = {step:g}; "
                 "SUMO would cut it short"

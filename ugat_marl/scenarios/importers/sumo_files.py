@@ -94,6 +94,12 @@ def _configured(
             f"note: {path.name}: {', '.join(lacking)} left out: an episode begins in an empty "
             "network, and edges have no weights of their own; traffic differs from SUMO's own"
         )
+    if times := given.physics().get("control"):
+        longer = ", ".join(f"{name} = {value:g}" for name, value in times.items())
+        reporter.say(
+            f"note: {path.name}: its steps do not divide the usual times of signals; {longer} "
+            "in their place"
+        )
     if not given.has_end:
         reporter.say(
             f"note: {path.name}: it has no end, so an episode is one hour; write duration_s into "
@@ -117,7 +123,7 @@ def _configured(
     usual = ScenarioFile.model_fields
     kept = {
         key: settings[key]
-        for key in ("begin_s", "duration_s", "step_length_s", "sumo")
+        for key in ("begin_s", "duration_s", "step_length_s", "sumo", "control")
         if key in settings and settings[key] != usual[key].default
     }
 
