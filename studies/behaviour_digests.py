@@ -518,11 +518,15 @@ def write(path: Path, chosen: Sequence[str]) -> int:
     return int(bad > 0)
 
 
+def versions() -> dict[str, str]:
+    """Return the installed versions to which numbers belong."""
+    python = ".".join(map(str, sys.version_info[:3]))
+    return {"python": python} | {name: importlib.metadata.version(name) for name in PACKAGES}
+
+
 def save(path: Path, held: Mapping[str, Any]) -> None:
     """Write the parts, one line per label."""
-    versions = {"python": ".".join(map(str, sys.version_info[:3]))}
-    versions |= {name: importlib.metadata.version(name) for name in PACKAGES}
-    lines = ["{", f' "made_with": {json.dumps(versions)},', ' "parts": {']
+    lines = ["{", f' "made_with": {json.dumps(versions())},', ' "parts": {']
     for name, part in held.items():
         lines += [f"  {json.dumps(name)}: {{", f'   "sha256": "{part["sha256"]}",']
         for kind in ("values", "names"):

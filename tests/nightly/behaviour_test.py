@@ -5,14 +5,12 @@ A change of a number that is meant goes with new digests, in a commit that gives
 
 from __future__ import annotations
 
-import importlib.metadata
 import json
-import sys
 from pathlib import Path
 
 import pytest
 
-from studies.behaviour_digests import NotInstalled, difference, moved, parts, played
+from studies.behaviour_digests import NotInstalled, difference, moved, parts, played, versions
 
 pytestmark = [pytest.mark.nightly, pytest.mark.timeout(3600)]
 
@@ -23,19 +21,13 @@ WRITTEN = json.loads(
 
 def of_other_versions() -> str:
     """Return what is installed in another version than the numbers belong to."""
+    written = WRITTEN["made_with"]
     others = [
-        f"{name} {installed}, not {version}"
-        for name, version in WRITTEN["made_with"].items()
-        if (installed := version_of(name)) != version
+        f"{name} {installed}, not {written[name]}"
+        for name, installed in versions().items()
+        if installed != written[name]
     ]
     return "; ".join(others)
-
-
-def version_of(name: str) -> str:
-    """Return the installed version of a package, or of Python."""
-    if name == "python":
-        return ".".join(map(str, sys.version_info[:3]))
-    return importlib.metadata.version(name)
 
 
 @pytest.mark.skipif(bool(of_other_versions()), reason=of_other_versions())

@@ -98,6 +98,8 @@ def demand_scale(scenario: Scenario) -> float:
 
 def scaled_number(vehicles: int, scale: float) -> int:
     """Return the number of vehicles that SUMO makes of `vehicles` with its option ``scale``."""
+    if scale == 1:
+        return vehicles
     copies = _Copies(scale)
     return sum(copies.of("") for _ in range(vehicles))
 

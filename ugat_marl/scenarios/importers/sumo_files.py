@@ -110,12 +110,11 @@ def _configured(
         network, routes, additional = scenario.network, scenario.routes, scenario.additional
         settings = scenario.settings.model_dump(mode="json", exclude_defaults=True)
     else:
-        configuration = SumoConfiguration(path)
-        network = _network_of(configuration)
-        begin_s, duration_s = configuration.times()
-        settings = {"begin_s": begin_s, "duration_s": duration_s, **configuration.physics()}
+        network = _network_of(given)
+        begin_s, duration_s = given.times()
+        settings = {"begin_s": begin_s, "duration_s": duration_s, **given.physics()}
         routes = additional = ()
-        if left_out := configuration.names("additional-files"):
+        if left_out := given.names("additional-files"):
             reporter.say(
                 f"note: {path.name}: its vehicles are replaced, so its additional files are left "
                 f"out, too ({', '.join(left_out)}); add those without vehicles to scenario.toml"
