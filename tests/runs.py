@@ -87,11 +87,11 @@ def play_nothing(patch: pytest.MonkeyPatch) -> None:
         ]
         return Evaluation(scenario.id, scenario.hash, tuple(results), {})
 
-    def best_rules(_: Scenario, domains: Sequence[Domain], **__: Any) -> dict[str, str]:
-        return {domain_label(domain): "programme" for domain in domains}
+    def best_rule(*_: Any, **__: Any) -> str:
+        return "programme"
 
     patch.setattr(f"{JOBS}.evaluate", evaluate)
-    patch.setattr(f"{JOBS}.best_rules", best_rules)
+    patch.setattr(f"{JOBS}.best_rule", best_rule)
 
 
 def perform_in_this_process(patch: pytest.MonkeyPatch) -> None:

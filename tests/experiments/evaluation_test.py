@@ -15,7 +15,7 @@ from ugat_marl.data import Scores
 from ugat_marl.effects import load_scenario
 from ugat_marl.envs import parallel_env
 from ugat_marl.errors import CheckpointError, OptionError, UnknownNameError
-from ugat_marl.experiments import Evaluation, best_rules, evaluate, policy_factory, rule_factory
+from ugat_marl.experiments import Evaluation, best_rule, evaluate, policy_factory, rule_factory
 from ugat_marl.experiments.evaluation import Result
 from ugat_marl.policies import DQN
 from ugat_marl.simulation import host
@@ -121,9 +121,8 @@ def test_simulations_of_an_evaluation_have_one_warm_parent() -> None:
 def test_the_best_rule_is_the_one_with_the_smallest_travel_time() -> None:
     scenario = load_scenario("single-v1")
     rules = ("random", "largest-queue:20")
-    assert best_rules(
-        scenario, ["sim"], rules=rules, seeds=[1], duration_s=600
-    ) == {"sim": "largest-queue:20"}  # fmt: skip
+    best = best_rule(scenario, "sim", rules=rules, seeds=[1], duration_s=600)
+    assert best == "largest-queue:20"
 
 
 def test_a_wrong_name_is_refused_before_anything_runs() -> None:

@@ -22,11 +22,11 @@ from ugat_marl.experiments import (
     Evaluation,
     TransferConfig,
     Tuned,
-    best_rules,
+    best_rule,
     evaluation,
     jobs,
     tune,
-    tuned_rules,
+    tuned_rule,
     tuning,
 )
 from ugat_marl.experiments.evaluation import race_rules
@@ -99,10 +99,9 @@ def test_a_lucky_first_episode_does_not_win(streets: Streets) -> None:
 
 def test_the_best_rule_is_searched_in_each_domain_by_itself(streets: Streets) -> None:
     rules = ("fixed-time:20", "fixed-time:50", "largest-queue:30", "max-pressure:40")
-    found = best_rules(
-        load_scenario("single-v1"), ["sim", "V4"], rules=rules, seeds=[SEED, SEED + 1]
-    )
-    assert found == {"sim": "fixed-time:50", "V4": "fixed-time:20"}
+    seeds, expected = [SEED, SEED + 1], {"sim": "fixed-time:50", "V4": "fixed-time:20"}
+    for domain, best in expected.items():
+        assert best_rule(load_scenario("single-v1"), domain, rules=rules, seeds=seeds) == best
     assert len(streets.played) == 2 * (4 + 2)
 
 
@@ -191,8 +190,8 @@ def test_a_memory_that_is_not_finite_is_replaced(streets: Streets, tmp_path: Pat
 
 def test_tuned_rules_are_better_than_their_defaults(streets: Streets) -> None:
     names = ("largest-queue", "programme")
-    found = tuned_rules(load_scenario("single-v1"), ["sim", "V4"], 24, names=names)
-    assert found == {"sim": "largest-queue:50", "V4": "largest-queue:20"}
+    for domain, best in {"sim": "largest-queue:50", "V4": "largest-queue:20"}.items():
+        assert tuned_rule(load_scenario("single-v1"), domain, 24, names=names) == best
 
 
 @pytest.mark.parametrize(
@@ -210,7 +209,7 @@ def test_a_run_is_judged_beside_tuned_rules_where_asked(
     best: dict[str, str],
 ) -> None:
     play_nothing(monkeypatch)
-    monkeypatch.setattr(jobs, "best_rules", best_rules)
+    monkeypatch.setattr(jobs, "best_rule", best_rule)
     config = TransferConfig("single-v1", rule_budget=rule_budget)
     for domain, spec in best.items():
         job = Job(Setting(RULE, "rule"), "single-v1", target=domain, domains=(domain,))

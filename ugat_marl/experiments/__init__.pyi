@@ -9,7 +9,7 @@ from .driver import perform_all as perform_all
 from .driver import perform_here as perform_here
 from .driver import record_of as record_of
 from .evaluation import TUNING_SEED as TUNING_SEED
-from .evaluation import best_rules as best_rules
+from .evaluation import best_rule as best_rule
 from .evaluation import evaluate as evaluate
 from .evaluation import policy_factory as policy_factory
 from .evaluation import rule_factory as rule_factory
@@ -97,5 +97,5 @@ from .transfers import transfer as transfer
 from .tuning import BUDGET as BUDGET
 from .tuning import LEAST_BUDGET as LEAST_BUDGET
 from .tuning import tune as tune
-from .tuning import tuned_rules as tuned_rules
+from .tuning import tuned_rule as tuned_rule
 from .typical_plans import typical_plans as typical_plans

@@ -147,37 +147,31 @@ def evaluate(
     return Evaluation(scenario.id, scenario.hash, tuple(results), dict(notes or {}))
 
 
-def best_rules(
+def best_rule(
     scenario: Scenario,
-    domains: Sequence[Domain],
+    domain: Domain,
     *,
     rules: Sequence[str] = STANDARD_RULES,
     seeds: Sequence[int] = (TUNING_SEED, TUNING_SEED + 1),
     duration_s: float | None = None,
     workers: Workers = None,
     reporter: Reporter | None = None,
-) -> dict[str, str]:
-    """Find the rule with the smallest mean ATT on the tuning seeds, for each domain.
+) -> str:
+    """Return the spelling of the rule with the smallest mean ATT in a domain on the tuning seeds.
 
     The rules are raced: after each seed the worse half drops out.
-
-    Returns:
-        Spelling of the best rule, by name of the domain.
     """
-    best: dict[str, str] = {}
-    for domain in domains:
-        trials = race_rules(
-            scenario,
-            domain,
-            rules,
-            [[seed] for seed in seeds],
-            duration_s=duration_s,
-            workers=workers,
-            reporter=reporter,
-            title=best_rule_note(domain_label(domain)),
-        )
-        best[domain_label(domain)] = trials[0].spec
-    return best
+    trials = race_rules(
+        scenario,
+        domain,
+        rules,
+        [[seed] for seed in seeds],
+        duration_s=duration_s,
+        workers=workers,
+        reporter=reporter,
+        title=best_rule_note(domain_label(domain)),
+    )
+    return trials[0].spec
 
 
 @kept_warm()

@@ -38,7 +38,7 @@ from ugat_marl.errors import CheckpointError, OptionError, UgatMarlError
 from ugat_marl.experiments.evaluation import (
     TUNING_SEED,
     FixedPolicy,
-    best_rules,
+    best_rule,
     evaluate,
     rule_factory,
 )
@@ -46,7 +46,7 @@ from ugat_marl.experiments.queues import QUEUES, QueueRecord
 from ugat_marl.experiments.randomised import randomised_env
 from ugat_marl.experiments.settings import DIRECT, Setting, short_name
 from ugat_marl.experiments.training import Effort, simulated_worlds, train_grounded, train_through
-from ugat_marl.experiments.tuning import VERSION, tuned_rules
+from ugat_marl.experiments.tuning import VERSION, tuned_rule
 from ugat_marl.files import file_hash, parse_json, read_json, write_whole
 from ugat_marl.grounding import (
     ChangePenalty,
@@ -450,15 +450,11 @@ def _rule(job: Job, folder: Path, reporter: Reporter, workers: Workers) -> str:
         }
         if job.rule_budget is not None:
             names = rules or TUNED_RULES
-            (best,) = tuned_rules(
-                scenario, [target], job.rule_budget, names=names, **common
-            ).values()
+            best = tuned_rule(scenario, target, job.rule_budget, names=names, **common)
         elif len(rules) == 1:
             (best,) = rules
         else:
-            (best,) = best_rules(
-                scenario, [target], rules=rules or STANDARD_RULES, **common
-            ).values()
+            best = best_rule(scenario, target, rules=rules or STANDARD_RULES, **common)
         write_whole(saved, best)
     return saved.read_text()
 

@@ -19,7 +19,7 @@ from typing import Any
 from ugat_marl.data import installed_version, json_damage, with_hashes
 from ugat_marl.effects import Domain, domain_label, scenario_in_domain
 from ugat_marl.errors import CheckpointError, UnknownNameError, require_least
-from ugat_marl.experiments.evaluation import TUNING_SEED, best_rules, race_rules
+from ugat_marl.experiments.evaluation import TUNING_SEED, best_rule, race_rules
 from ugat_marl.experiments.scores import RuleTrial, Tuned
 from ugat_marl.files import read_json, user_cache, write_whole
 from ugat_marl.parallel import Workers
@@ -94,9 +94,9 @@ def tune(
     return Tuned(name, domain_label(domain), trials)
 
 
-def tuned_rules(
+def tuned_rule(
     scenario: Scenario,
-    domains: Sequence[Domain],
+    domain: Domain,
     budget: int = BUDGET,
     *,
     names: Sequence[str] = TUNED_RULES,
@@ -104,38 +104,20 @@ def tuned_rules(
     duration_s: float | None = None,
     workers: Workers = None,
     reporter: Reporter | None = None,
-) -> dict[str, str]:
-    """Tune the rules in each domain and find the best tuned rule there.
+) -> str:
+    """Tune the rules in a domain; return the spelling of the best tuned rule there.
 
-    `best_rules` does the same without tuning.
-
-    Returns:
-        Spelling of the best rule, by name of the domain.
+    `best_rule` does the same without tuning.
     """
-    rules: dict[str, str] = {}
-    for domain in domains:
-        tuned = [
-            tune(
-                name,
-                scenario,
-                domain,
-                budget,
-                duration_s=duration_s,
-                workers=workers,
-                reporter=reporter,
-            )
-            for name in names
-        ]
-        rules |= best_rules(
-            scenario,
-            [domain],
-            rules=[each.best.spec for each in tuned],
-            seeds=seeds,
-            duration_s=duration_s,
-            workers=workers,
-            reporter=reporter,
-        )
-    return rules
+    common: dict[str, Any] = {
+        "duration_s": duration_s,
+        "workers": workers,
+        "reporter": reporter,
+    }
+    tuned = [tune(name, scenario, domain, budget, **common) for name in names]
+    return best_rule(
+        scenario, domain, rules=[each.best.spec for each in tuned], seeds=seeds, **common
+    )
 
 
 def rungs(settings: int, budget: int) -> list[list[int]]:
