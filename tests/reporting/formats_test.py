@@ -6,7 +6,15 @@ import math
 
 import pytest
 
-from ugat_marl.reporting.formats import number, number_text, percent_text, share, share_text
+from ugat_marl.experiments import Interval
+from ugat_marl.reporting.formats import (
+    mean_text,
+    number,
+    number_text,
+    percent_text,
+    share,
+    share_text,
+)
 from ugat_marl.reporting.service_tables import delay_text
 
 
@@ -31,6 +39,19 @@ def test_what_rounds_to_zero_has_no_sign(value: float, texts: tuple[str, ...]) -
 )  # fmt: skip
 def test_only_the_best_share_is_one(value: float, text: str) -> None:
     assert share_text(value) == text
+
+
+@pytest.mark.parametrize(
+    ("interval", "text"),
+    [
+        (Interval(7.0, 6.5, 7.5), "7.0 (6.5–7.5)"),
+        (Interval(0.0, -2.0, 2.0), "0.00 (-2.0 to 2.0)"),
+        (Interval(7.0, 7.0, 7.0), "7.0"),
+        (Interval(7.0, math.nan, math.nan), "7.0"),
+    ],
+)
+def test_a_mean_has_its_interval_if_there_is_one(interval: Interval, text: str) -> None:
+    assert mean_text(interval) == text
 
 
 def test_changes_keep_their_sign() -> None:

@@ -20,6 +20,16 @@ class Interval:
     low: float
     high: float
 
+    @property
+    def is_wide(self) -> bool:
+        """True if the ends are known and differ."""
+        return self.low < self.high
+
+    @property
+    def half(self) -> float:
+        """Half of the interval's width."""
+        return (self.high - self.low) / 2
+
     @classmethod
     def of(cls, values: Floats) -> Interval:
         """Return the mean of ``(n,)`` values with its interval.

@@ -26,6 +26,7 @@ from ugat_marl.reporting.formats import (
     PAGE_WIDTH,
     command_block,
     made_with,
+    mean_text,
     number_text,
     percent_text,
     share_text,
@@ -166,7 +167,7 @@ def _headlines(comparison: Comparison, direct: str) -> list[tuple[str, Cell]]:
         ),
         (
             "transfer regret, s above the best in the table",
-            lambda s, t: with_interval(Interval.of(comparison.regret_s(s, t))),
+            lambda s, t: mean_text(Interval.of(comparison.regret_s(s, t))),
         ),
         (
             "share of the regret won back (1: the best in the table)",
@@ -176,7 +177,7 @@ def _headlines(comparison: Comparison, direct: str) -> list[tuple[str, Cell]]:
 
 
 def _estimated(comparison: Comparison, domain: str | None) -> Cell:
-    return lambda s, t: with_interval(comparison.estimate(s, t, "att_s", domain))
+    return lambda s, t: mean_text(comparison.estimate(s, t, "att_s", domain))
 
 
 def _backlog(comparison: Comparison) -> Cell:
@@ -279,15 +280,6 @@ def _provenance(comparison: Comparison, facts: Mapping[str, Any]) -> list[str]:
         **comparison.notes,
     }
     return [*command_block(facts["command"]), "", *made_with(rows)]
-
-
-def with_interval(interval: Interval) -> str:
-    """Return a mean with its interval, if it has one."""
-    if math.isnan(interval.low) or interval.low == interval.high:
-        return number_text(interval.mean)
-    to = " to " if interval.low < 0 else "–"
-    mean, low, high = map(number_text, (interval.mean, interval.low, interval.high))
-    return f"{mean} ({low}{to}{high})"
 
 
 def _tested(test: PairedTest) -> str:

@@ -1,7 +1,8 @@
 """Numbers as texts, and texts of Markdown.
 
-`number`, `signed`, `share` and `chance` are for prose and pages, `number_text`, `share_text` and
-`percent_text` for columns of tables, which align by their decimals, and `tick_text` for axes.
+`number`, `signed`, `share` and `chance` are for prose and pages, `number_text`, `ends_text`,
+`mean_text`, `share_text` and `percent_text` for columns of tables, which align by their decimals,
+and `tick_text` for axes.
 """
 
 from __future__ import annotations
@@ -9,7 +10,10 @@ from __future__ import annotations
 import math
 import re
 from collections.abc import Mapping
-from typing import Any
+from typing import TYPE_CHECKING, Any
+
+if TYPE_CHECKING:
+    from ugat_marl.experiments import Interval
 
 
 def number(value: Any, digits: int = 3) -> str:
@@ -66,6 +70,17 @@ def number_text(value: float) -> str:
     if abs(value) >= 99.95:
         return fixed(value, 0)
     return fixed(value, 1 if abs(value) >= 0.9995 else 2)
+
+
+def ends_text(low: float, high: float) -> str:
+    """Return an interval; a dash between its ends would make a negative one unclear."""
+    return f"{number_text(low)}{' to ' if low < 0 else '–'}{number_text(high)}"
+
+
+def mean_text(interval: Interval) -> str:
+    """Return a mean with its interval, if it has one."""
+    mean = number_text(interval.mean)
+    return f"{mean} ({ends_text(interval.low, interval.high)})" if interval.is_wide else mean
 
 
 def share_text(value: float) -> str:

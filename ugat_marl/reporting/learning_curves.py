@@ -11,8 +11,7 @@ from typing import Any
 import numpy as np
 
 from ugat_marl.experiments import Curve, Curves, CurvesConfig, Interval
-from ugat_marl.reporting.comparison_tables import with_interval
-from ugat_marl.reporting.formats import command_block, made_with, number_text
+from ugat_marl.reporting.formats import command_block, made_with, mean_text, number_text
 
 
 def curves_page(study: Curves, config: CurvesConfig, facts: Mapping[str, Any]) -> str:
@@ -75,8 +74,8 @@ def _row(curves: Sequence[Curve], fixed_s: float, best_rule_s: float) -> str:
         str(len(curves)),
         f"{np.median([curve.speed for curve in curves]):.0f}",
         number_text(float(np.median([curve.own_ms for curve in curves]))),
-        with_interval(Interval.of(np.array([curve.best_s for curve in curves]))),
-        with_interval(Interval.of(last)),
+        mean_text(Interval.of(np.array([curve.best_s for curve in curves]))),
+        mean_text(Interval.of(last)),
         number_text(float(last.mean() - fixed_s)),
         *(
             "-" if math.isnan(rule_s) else f"{(last < rule_s).sum()} of {len(last)}"

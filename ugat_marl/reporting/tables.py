@@ -12,7 +12,7 @@ from ugat_marl.data import MEASURES
 from ugat_marl.diagnosis import PolicyGap, TravelTimeEstimate
 from ugat_marl.errors import counted
 from ugat_marl.experiments import Estimate, Evaluation, Tuned, best_rule_note, check_run
-from ugat_marl.reporting.formats import number_text, share
+from ugat_marl.reporting.formats import ends_text, mean_text, number_text, share
 from ugat_marl.reporting.terminal import titled_table
 
 
@@ -26,10 +26,10 @@ def transfer_table(evaluation: Evaluation) -> RenderableType:
         for heading in (domain, "Δ", "regret"):
             table.add_column(heading, justify="right")
     for policy in evaluation.policies:
-        cells = [_with_interval(evaluation.estimate(policy, first, "att_s"))]
+        cells = [mean_text(evaluation.estimate(policy, first, "att_s"))]
         for domain in others:
             cells += [
-                _with_interval(evaluation.estimate(policy, domain, "att_s")),
+                mean_text(evaluation.estimate(policy, domain, "att_s")),
                 _signed(evaluation.gap(policy, domain, "att_s")),
                 number_text(evaluation.regret(policy, domain).mean),
             ]
@@ -123,7 +123,7 @@ def policy_gap_table(title: str, gaps: Mapping[str, PolicyGap], seeds: int) -> R
 def _limits(time: TravelTimeEstimate) -> str:
     if time.low is None or time.high is None:
         return "-"
-    return _between(time.low, time.high)
+    return ends_text(time.low, time.high)
 
 
 def _backlog(evaluation: Evaluation, domain: str) -> list[str]:
@@ -184,20 +184,9 @@ def _dim(*cells: str) -> list[Text]:
     return [Text(cell, style="dim") for cell in cells]
 
 
-def _with_interval(estimate: Estimate) -> str:
-    if math.isnan(estimate.low):
-        return number_text(estimate.mean)
-    return f"{number_text(estimate.mean)} ({_between(estimate.low, estimate.high)})"
-
-
-def _between(low: float, high: float) -> str:
-    """Return both ends of an interval; a dash between them would make a negative one unclear."""
-    return f"{number_text(low)}{' to ' if low < 0 else '-'}{number_text(high)}"
-
-
 def _half(estimate: Estimate) -> str:
     """Return half of an interval."""
-    return f"±{number_text((estimate.high - estimate.low) / 2)}"
+    return f"±{number_text(estimate.half)}"
 
 
 def _signed(estimate: Estimate) -> str:

@@ -395,7 +395,7 @@ def _boxes(record: RunRecord) -> list[tuple[str, str]]:
 
 def _between(estimate: Estimate) -> str:
     """Return the 95 % interval of a number in a box; "" without one."""
-    if not math.isfinite(estimate.low) or estimate.low == estimate.high:
+    if not estimate.is_wide:
         return ""
     return f", 95 %: {number(estimate.low)} to {number(estimate.high)} s"
 
@@ -602,16 +602,16 @@ def _flat(settings: Mapping[str, Any], prefix: str = "") -> list[tuple[str, str]
 
 def _with_interval(estimate: Estimate) -> str:
     """Return a mean with its interval, if it has one."""
-    if not math.isfinite(estimate.low) or estimate.low == estimate.high:
+    if not estimate.is_wide:
         return number(estimate.mean)
     return f"{number(estimate.mean)} {_ends(estimate.low, estimate.high)}"
 
 
 def _with_half(estimate: Estimate) -> str:
     """Return a mean with half of its interval, if it has one, for narrow columns."""
-    if not math.isfinite(estimate.low) or estimate.low == estimate.high:
+    if not estimate.is_wide:
         return number(estimate.mean)
-    return f"{number(estimate.mean)} ±{number((estimate.high - estimate.low) / 2, 2)}"
+    return f"{number(estimate.mean)} ±{number(estimate.half, 2)}"
 
 
 def _ends(low: float, high: float) -> str:
