@@ -435,9 +435,11 @@ def in_part(log: TransitionLog, kept: pl.Expr) -> TransitionLog:
 def test_a_log_without_histories_is_refused() -> None:
     log = recorded(LATE, 300)
     step = pl.col("step")
-    require_histories(log)
-    require_histories(in_part(log, step != 9))  # one decision was lost
-    require_histories(TransitionLog(log.provenance, log.frame.sample(fraction=1.0, shuffle=True)))
+    most = QUICK.longest_lag
+    require_histories(log, most)
+    require_histories(in_part(log, step != 9), most)  # one decision was lost
+    shuffled = log.frame.sample(fraction=1.0, shuffle=True)
+    require_histories(TransitionLog(log.provenance, shuffled), most)
     alone = log.frame.with_columns(episode=step, step=pl.lit(0, dtype=log.frame["step"].dtype))
     alone = alone.with_columns(pl.col("episode").cast(log.frame["episode"].dtype))
     short = log.frame.with_columns(episode=step // 6, step=step % 6)
@@ -449,9 +451,23 @@ def test_a_log_without_histories_is_refused() -> None:
         TransitionLog(log.provenance, short),
     ):
         with pytest.raises(LogError, match="decisions right before them"):
-            require_histories(broken)
+            require_histories(broken, most)
         with pytest.raises(LogError, match="decisions right before them"):
             fit_street(broken, None, None, None, None, QUICK, 0)  # pyright: ignore[reportArgumentType]
+
+
+def test_histories_are_as_long_as_the_delays_that_are_looked_for() -> None:
+    log = recorded(LATE, 300)
+    six = log.frame.with_columns(episode=pl.col("step") // 6, step=pl.col("step") % 6)
+    short = TransitionLog(
+        log.provenance, six.cast({name: log.frame[name].dtype for name in ("episode", "step")})
+    )
+    near = replace(QUICK, channel=ChannelConfig(most_lag=4))
+    assert near.longest_lag == 4 and replace(QUICK, parts=("service",)).longest_lag == 1
+    require_histories(short, near.longest_lag)
+    far = replace(QUICK, channel=ChannelConfig(most_lag=8)).longest_lag
+    with pytest.raises(LogError, match="whole episodes of 10 decisions"):
+        require_histories(short, far)
 
 
 def test_a_broken_log_ends_a_training_before_it_begins(tmp_path: Path) -> None:

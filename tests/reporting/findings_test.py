@@ -19,8 +19,12 @@ from ugat_marl.reporting.street_found import commands_found, detectors_found, fo
 from ugat_marl.scenarios import Network
 
 
-def record(folder: Path, numbers: dict[str, float]) -> RunRecord:
-    rows = [("iteration", 1, name, value) for name, value in numbers.items()]
+def record(folder: Path, *iterations: dict[str, float]) -> RunRecord:
+    rows = [
+        ("iteration", number, name, value)
+        for number, numbers in enumerate(iterations, 1)
+        for name, value in numbers.items()
+    ]
     nothing: dict[str, Any] = {}
     return RunRecord(
         "run", folder, False, nothing, nothing, nothing, None, Metrics(rows), None, None, (), 0.0
@@ -54,6 +58,19 @@ def test_detectors(tmp_path: Path) -> None:
         "Detectors: vehicles count only within 21 m of the stop line, counts err by 10 %."
     )
     assert detectors_found(record(tmp_path / "c", {})) == ""
+
+
+def test_what_an_iteration_did_not_find_is_not_taken_from_the_one_before(tmp_path: Path) -> None:
+    street = {"street/commands": 0.0, "eyes/dead": 0.0}
+    late = {"channel/lag_2": 0.93, "channel/lost": 0.07, "channel/late_s/signal_0": 20.0}
+    first = street | late | {"judged/before": 90.0, "judged/of_the_rival": 80.0}
+    second = street | {"channel/lag_0": 1.0, "judged/before": 95.0, "judged/after": 90.0}
+    run = record(tmp_path, first, second)
+    section = found_on_street(run)
+    assert section is not None
+    assert section["commands"] == "Commands: obeyed at once."
+    assert section["kept"].endswith("Kept was the policy after training.")
+    assert findings_table(run, None) is None
 
 
 def test_effects_and_the_policy_that_was_kept(tmp_path: Path) -> None:

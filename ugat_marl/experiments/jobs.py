@@ -549,7 +549,7 @@ def worlds_of(
     if job.real_log is not None:
         log = TransitionLog.read(Path(job.real_log))
         if ugat.grounding == "street":
-            require_histories(log)  # now instead of after plain training
+            require_histories(log, ugat.street.longest_lag)  # before plain training
         recorded = RecordedWorld(log, env, ugat.fit.held_out_every)
     without_street = recorded is not None or job.setting.negative_control == "same-world"
     street = job.sim if without_street else job.target

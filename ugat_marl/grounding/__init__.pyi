@@ -2,6 +2,7 @@ from .algorithm import CHECKPOINT_EPISODES as CHECKPOINT_EPISODES
 from .algorithm import DIRECT_LEARNER as DIRECT_LEARNER
 from .algorithm import Probe as Probe
 from .channel import CommandChannel as CommandChannel
+from .channel import commands_in_words as commands_in_words
 from .channel import fit_channel as fit_channel
 from .channel import require_histories as require_histories
 from .config import USUAL_REWARD as USUAL_REWARD
@@ -14,6 +15,7 @@ from .controls import ShuffledWorld as ShuffledWorld
 from .controls import answer_with_noise as answer_with_noise
 from .delays import MATCHED_REWARDS as MATCHED_REWARDS
 from .detected import DetectionConfig as DetectionConfig
+from .eyes import detectors_in_words as detectors_in_words
 from .fitting import FitConfig as FitConfig
 from .fitting import Fitter as Fitter
 from .gate import GateConfig as GateConfig

@@ -27,7 +27,7 @@ from numpy.typing import NDArray
 
 from ugat_marl.data import AgentLayout, TransitionLog, Transitions, consecutive
 from ugat_marl.effects import Actuator, Commands, ControllerPart
-from ugat_marl.errors import CheckpointError, LogError, OptionError
+from ugat_marl.errors import CheckpointError, LogError, OptionError, counted
 from ugat_marl.grounding.draws import DRAWS, with_intervals
 from ugat_marl.scenarios import Network, SignalState, SignalTiming
 from ugat_marl.seeding import numpy_generator
@@ -160,13 +160,8 @@ class CommandChannel(ControllerPart):
 
     def describe(self) -> str:
         """Return what was found in one line."""
-        if not self.changes:
-            return "commands: obeyed at once"
-        late = [(k, w) for k, w in enumerate(self.network[:-1]) if k and w > 0]
-        parts = [f"{100 * w:.0f} % {k} decisions late" for k, w in late]
-        parts += [f"{100 * self.lost:.0f} % lost"] if self.lost else []
-        parts += ["some phases forbidden"] if self.forbids else []
-        return "commands: " + ", ".join(parts)
+        shares = dict(enumerate(self.network[:-1].tolist()))
+        return f"commands: {commands_in_words(shares, self.lost, self.forbids)}"
 
     def as_dict(self, interval_s: float) -> dict[str, float]:
         """Return flat numbers for the metrics of a run.
@@ -220,6 +215,24 @@ class CommandChannel(ControllerPart):
         return channel
 
 
+def commands_in_words(shares: Mapping[int, float], lost: float, forbids: bool) -> str:
+    """Return what became of commands, in words.
+
+    Args:
+        shares: Delay in decisions to the share of commands that are so late.
+        lost: Share of commands that are lost.
+        forbids: True if some changes of phase are refused.
+    """
+    parts = [
+        f"{100 * share:.0f} % take effect {counted(lag, 'decision')} late"
+        for lag, share in sorted(shares.items())
+        if lag and share
+    ]
+    parts += [f"{100 * lost:.0f} % are lost"] if lost else []
+    parts += ["some changes of phase are refused"] if forbids else []
+    return ", ".join(parts) or "obeyed at once"
+
+
 class FittedActuator(Actuator):
     """Actuator that delays, loses and refuses commands as a fitted channel does.
 
@@ -270,13 +283,18 @@ class FittedActuator(Actuator):
             mask *= allowed
 
 
-def require_histories(log: TransitionLog) -> None:
+def require_histories(log: TransitionLog, most: int) -> None:
     """Refuse a log whose decisions are not in sequence, since nothing late can be seen in it.
+
+    Args:
+        log: Transitions of the street.
+        most: Longest delay that is looked for, in decisions.
 
     Raises:
         LogError: Too few decisions of an agent have a whole history.
     """
-    most = ChannelConfig.most_lag
+    # episodes of this length have as large a share of whole histories as is asked for
+    shortest = math.ceil(most / (1 - LEAST_WHOLE))
     for agent in log.agents:
         rows = log.transitions(agent)
         begins = np.r_[True, ~consecutive(rows.episode, rows.step)]
@@ -287,8 +305,9 @@ def require_histories(log: TransitionLog) -> None:
             raise LogError(
                 f"only {whole} of the {len(rows)} decisions of {agent} in the log have {most} "
                 "decisions right before them in their episode; a fitted street is read from "
-                "histories of commands and counts, so record whole episodes of 10 decisions or "
-                "more and keep their steps, or choose another grounding (--grounding timed)"
+                "histories of commands and counts, so record whole episodes of "
+                f"{shortest} decisions or more and keep their steps, or choose another grounding "
+                "(--grounding timed)"
             )
 
 

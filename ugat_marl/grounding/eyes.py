@@ -37,7 +37,7 @@ from ugat_marl.effects import (
     Sensor,
     Stage,
 )
-from ugat_marl.errors import CheckpointError, OptionError
+from ugat_marl.errors import CheckpointError, OptionError, counted
 from ugat_marl.grounding.draws import DRAWS, with_intervals
 from ugat_marl.grounding.summaries import Floats, LaneRows, LaneView
 from ugat_marl.scenarios import Network
@@ -164,16 +164,19 @@ class Eyes:
 
     def describe(self) -> str:
         """Return what was found in one line."""
-        words = [
-            f"{self.dead.sum():.1f} of {len(self.dead)} lanes dead" if self.dead.any() else "",
-            f"zone {self.zone_m[0]:.0f} to {self.zone_m[1]:.0f} m" if self.zone_m[1] else "",
-            f"error {self.absolute:.1f} veh" if self.absolute else "",
-            f"error {100 * self.relative:.0f} %" if self.relative else "",
-            f"{self.lag} decisions late" if self.lag else "",
-            f"{100 * self.lost:.0f} % lost" if self.lost else "",
-            f"steps of {self.step:g} veh" if self.step else "",
-        ]
-        return "detectors: " + (", ".join(filter(None, words)) or "no fault found")
+        return f"detectors: {detectors_in_words(self._numbers())}"
+
+    def _numbers(self) -> dict[str, float]:
+        """Return the faults as numbers, without chances of single lanes."""
+        return {
+            "dead": float(self.dead.sum()),
+            "zone_m": self.zone_m[1],
+            "absolute": self.absolute,
+            "relative": self.relative,
+            "lag": float(self.lag),
+            "lost": self.lost,
+            "step": self.step,
+        }
 
     def as_dict(self, lanes_of: Mapping[str, Sequence[int]]) -> dict[str, float]:
         """Return flat numbers for the metrics of a run.
@@ -181,15 +184,7 @@ class Eyes:
         Args:
             lanes_of: Agent to the positions of its lanes.
         """
-        numbers = {
-            "eyes/dead": float(self.dead.sum()),
-            "eyes/zone_m": self.zone_m[1],
-            "eyes/absolute": self.absolute,
-            "eyes/relative": self.relative,
-            "eyes/lag": float(self.lag),
-            "eyes/lost": self.lost,
-            "eyes/step": self.step,
-        }
+        numbers = {f"eyes/{name}": value for name, value in self._numbers().items()}
         if self.dead.any():
             dead = numpy_generator(0, "eyes", "dead").random((DRAWS, len(self.dead))) < self.dead
             unseen = [dead[:, list(places)].sum(1) for places in lanes_of.values()]
@@ -220,6 +215,27 @@ class Eyes:
             )
         except (KeyError, TypeError, ValueError) as error:
             raise CheckpointError(f"the eyes in the checkpoint are damaged: {error}") from None
+
+
+_FAULTS = {
+    "dead": lambda lanes: f"{lanes:.1f} lanes are not seen",
+    "zone_m": lambda zone_m: f"vehicles count only within {zone_m:.0f} m of the stop line",
+    "absolute": lambda error: f"counts err by {error:.1f} vehicles",
+    "relative": lambda error: f"counts err by {100 * error:.0f} %",
+    "lag": lambda lag: f"counts are {counted(round(lag), 'decision')} late",
+    "lost": lambda share: f"{100 * share:.0f} % are lost",
+    "step": lambda step: f"counts come in steps of {step:g} vehicles",
+}
+
+
+def detectors_in_words(numbers: Mapping[str, float]) -> str:
+    """Return the faults of detectors in words.
+
+    Args:
+        numbers: Fault to its number, as `Eyes` has them: dead lanes in all, longest zone.
+    """
+    parts = [say(numbers[name]) for name, say in _FAULTS.items() if numbers.get(name)]
+    return ", ".join(parts) or "no fault found"
 
 
 class DeadLanes(ControllerPart):

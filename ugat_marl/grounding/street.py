@@ -151,6 +151,13 @@ class StreetConfig:
         return self.rule_budget
 
     @property
+    def longest_lag(self) -> int:
+        """Longest delay of commands or counts that is looked for, in decisions; at least 1."""
+        commands = self.channel.most_lag if "channel" in self.parts else 1
+        counts = self.eyes.most_lag if "eyes" in self.parts else 1
+        return max(1, commands, counts)
+
+    @property
     def has_rival(self) -> bool:
         """True if a second learner competes with the first one."""
         return self.rival != "none" and self.judged > 0
@@ -481,7 +488,7 @@ def fit_street(
     Raises:
         LogError: Too many decisions are missing in the log, or they are not in sequence.
     """
-    require_histories(real)
+    require_histories(real, config.longest_lag)
     history = history or FitHistory()
     lanes, interval_s = worlds.lanes, real.provenance.decision_interval_s
     timing = simulation.scenario.timing

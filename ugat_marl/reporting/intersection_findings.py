@@ -91,7 +91,7 @@ def findings_maps(record: RunRecord, places: Places) -> list[tuple[NamedFigure |
 def _found(record: RunRecord, quantity: _Quantity) -> _Found:
     """Return a quantity of each agent with its interval; empty if it was not looked for."""
     middle, low, high = (
-        {agent: quantity.scale * rows[-1][1] for agent, rows in record.agents(metric).items()}
+        {agent: quantity.scale * value for agent, value in record.parts(metric).items()}
         for metric in quantity.metrics
     )
     return {

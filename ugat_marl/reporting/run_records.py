@@ -10,6 +10,7 @@ from __future__ import annotations
 
 import contextlib
 import csv
+import functools
 import math
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
@@ -127,13 +128,22 @@ class RunRecord:
         rows = self.metrics.rows if self.metrics is not None else []
         return sorted({step: v for s, step, n, v in rows if (s, n) == (stage, name)}.items())
 
-    def agents(self, name: str) -> dict[str, list[tuple[int, float]]]:
-        """Return agent to the iterations and values logged under ``name/agent``."""
-        by_agent: dict[str, dict[int, float]] = {}
-        for stage, step, key, value in self.metrics.rows if self.metrics is not None else []:
-            if stage == "iteration" and key.startswith(f"{name}/"):
-                by_agent.setdefault(key.removeprefix(f"{name}/"), {})[step] = value
-        return {agent: sorted(values.items()) for agent, values in by_agent.items()}
+    @functools.cached_property
+    def last_iteration(self) -> Mapping[str, float]:
+        """Numbers logged in the last iteration, by name; empty before the first one.
+
+        What an iteration does not find, such as late commands, it does not log. So a number of an
+        earlier iteration says nothing of the last one.
+        """
+        rows = self.metrics.rows if self.metrics is not None else []
+        last = max((step for stage, step, *_ in rows if stage == "iteration"), default=0)
+        return {n: v for stage, step, n, v in rows if (stage, step) == ("iteration", last)}
+
+    def parts(self, name: str) -> dict[str, float]:
+        """Return agent or part to the value of the last iteration under ``name/part``."""
+        begin = f"{name}/"
+        found = self.last_iteration.items()
+        return {key.removeprefix(begin): v for key, v in found if key.startswith(begin)}
 
 
 @dataclass(frozen=True)

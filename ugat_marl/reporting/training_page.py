@@ -506,9 +506,7 @@ def _gate_grid(record: RunRecord, places: Places | None) -> Grid:
         "gate/acceptance": "accepted", "gate/mean_u": "mean u", "gate/alpha": "α",
         "gate/change_rate": "changed", "gate/trusted": "f and h are proven",
     }  # fmt: skip
-    last = {
-        key: {agent: rows[-1][1] for agent, rows in record.agents(key).items()} for key in columns
-    }
+    last = {key: record.parts(key) for key in columns}
     shown = {key: text for key, text in columns.items() if last[key]}
     rows: list[list[str]] = []
     for agent in last["gate/acceptance"]:
