@@ -314,6 +314,13 @@ def test_a_fit_within_its_errors_stays_where_it_is() -> None:
     assert fitter.settled(plain, np.empty(0)) is plain
 
 
+def test_an_effect_without_a_value_is_simulated_on_as_many_days_as_others() -> None:
+    fitter = a_fitter({"headway": 1.43}, street=15)
+    known = Hypothesis("headway", (("seconds", 1.43),), (), ((),), None)
+    found = fitter.settled(fitter.simulate(((known, ()),)), np.empty(0))
+    assert len(found.tallies) == THRESHOLDS.settling_days
+
+
 def test_a_derivative_is_taken_over_a_move_that_does_something_plain() -> None:
     fitter = a_fitter({"headway": 1.43}, street=16)
     model = fitter.simulate(start((HEADWAY, 2.5), (GAP, 3.7)))

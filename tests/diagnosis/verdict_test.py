@@ -27,6 +27,7 @@ from ugat_marl.diagnosis.verdict import (
     unchallenged,
     unverified,
 )
+from ugat_marl.diagnosis.workflow import _alternatives
 from ugat_marl.scenarios import Detector
 
 HEADWAY = Hypothesis("headway", (), ("seconds",), ((1.5,),), (1.0,), 0.05)
@@ -347,3 +348,17 @@ def test_a_rival_is_as_near_after_as_many_days(settled: float, named: int) -> No
     selector: Any = SimpleNamespace(test=lambda _model: tested)
     selection = Selected(best, (rival,), True, examined=frozenset())
     assert len(_rivals(selection, selector, DiagnosisConfig())) == named
+
+
+def test_a_set_of_effects_is_told_once_among_the_alternatives() -> None:
+    """A model that fits as well was simulated again, with more days, and is another object."""
+
+    def model(seconds: float) -> Any:
+        distance = SimpleNamespace(total=1.0)
+        return SimpleNamespace(members=((LATE, (seconds,)),), distance=distance, cost=seconds)
+
+    best = SimpleNamespace(model=SimpleNamespace(members=((HEADWAY, (1.5,)),)))
+    conclusion: Any = SimpleNamespace(best=best, indistinct=(model(2.0),))
+    selection = Selected(best, (model(2.5), best.model), True, examined=frozenset())  # pyright: ignore[reportArgumentType]
+    (told,) = _alternatives(conclusion, selection)
+    assert told.cost == 2.0

@@ -14,7 +14,7 @@ from ugat_marl.__main__ import main
 from ugat_marl.cli.paper import _require_kept
 from ugat_marl.errors import CheckpointError, OptionError, OutputError
 from ugat_marl.experiments import as_standings, lost_rows, ranked, read_standings, with_standings
-from ugat_marl.experiments.standings import SCHEMA
+from ugat_marl.experiments.standings import SCHEMA, Judging
 
 HEAD = ",".join(SCHEMA)
 TABLE = f"""{HEAD}
@@ -96,6 +96,16 @@ def test_a_table_is_not_replaced_by_one_that_lacks_its_trainings(tmp_path: Path)
         with pytest.raises(OutputError, match="'fast' in V4 with seed 2"):
             _require_kept(file, fewer)
     assert file.read_text() == TABLE
+
+
+def test_a_length_is_compared_as_a_number(tmp_path: Path) -> None:
+    """A spreadsheet writes 3600 for 3600.0."""
+    lines = [f"{line},single-v1,5,3600" for line in TABLE.splitlines()]
+    lines[0] = f"{HEAD},scenario,episodes,duration_s"
+    file = written(tmp_path, "\n".join(lines))
+    assert Judging("single-v1", 5, 3600.0).require_in(file)
+    with pytest.raises(OptionError, match="duration_s = 3600, not 1800; give --duration-s 3600"):
+        Judging("single-v1", 5, 1800.0).require_in(file)
 
 
 def test_every_committed_table_can_be_read() -> None:

@@ -18,6 +18,7 @@ from ugat_marl.grounding.detected import (
     LaneCourse,
     LaneEstimate,
     _aligned,
+    _Clock,
     _Crossings,
     greens_of,
     staircase,
@@ -340,3 +341,10 @@ def test_greens_of_a_lane_join_what_goes_on() -> None:
     assert greens_of(period, "C", [0]) == [(0.0, 20.0), (40.0, 60.0)]
     assert greens_of(period, "C", [1]) == [(10.0, 20.0), (23.0, 40.0)]
     assert greens_of(period, "D", [0]) == []
+
+
+def test_a_clock_counts_each_vehicle_of_a_stamp() -> None:
+    """Vehicles of several lanes have one time where stamps are coarse."""
+    clock = _Clock.of(Period("day", 0.0, 100.0, "fit", {}, {}), np.array([10.0, 10, 10, 20, 30]))
+    assert clock.read(np.array([10.0, 20.0, 30.0])) == pytest.approx([3, 4, 5], abs=0.01)
+    assert clock.when(np.array([4.0])) == pytest.approx([20.0], abs=0.01)

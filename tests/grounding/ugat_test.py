@@ -8,10 +8,12 @@ import os
 import shutil
 import signal
 import subprocess
+import threading
 import time
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
@@ -28,6 +30,7 @@ from ugat_marl.envs import parallel_env
 from ugat_marl.errors import CheckpointError, LogError, OptionError, ScenarioError, UnknownNameError
 from ugat_marl.experiments import TransferConfig, transfer
 from ugat_marl.grounding import FitConfig, GateConfig, SimulatedWorld, UgatConfig
+from ugat_marl.grounding.ugat import Ugat
 from ugat_marl.grounding.uncertainty import MethodName
 from ugat_marl.policies import (
     DQN,
@@ -463,3 +466,34 @@ def test_a_changed_log_is_another_run(tmp_path: Path) -> None:
     TransitionLog.concatenate([TransitionLog.read(log)] * 2).write(log)
     with pytest.raises(CheckpointError, match="real_log"):
         transfer(config, tmp_path / "run", resume=True)
+
+
+def test_a_failed_roll_out_ends_the_other_one() -> None:
+    """The street fails at once; the simulation goes on until it is stopped."""
+
+    class Failing:
+        def collect(self, *_: object) -> TransitionLog:
+            raise LogError("the street does not answer")
+
+        def stop(self) -> None:
+            pass
+
+    class Endless:
+        def __init__(self) -> None:
+            self.ended = threading.Event()
+
+        def collect(self, *_: object) -> None:
+            if not self.ended.wait(60):
+                raise TimeoutError
+
+        def stop(self) -> None:
+            self.ended.set()
+
+    endless, state = Endless(), SimpleNamespace(iteration=0, stage="real", simulated=[], real=[])
+    training: Any = SimpleNamespace(
+        sim=endless, real=Failing(), seed=0, run=SimpleNamespace(reporter=Silent())
+    )
+    begun = time.monotonic()
+    with pytest.raises(LogError, match="does not answer"):
+        Ugat._roll_out(training, state, None)  # pyright: ignore[reportArgumentType]
+    assert endless.ended.is_set() and time.monotonic() - begun < 30

@@ -3,12 +3,14 @@
 from __future__ import annotations
 
 import itertools
+import math
 
 import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from ugat_marl.reporting import formats
+from ugat_marl.reporting import charts, formats
+from ugat_marl.reporting.figures import add_axes, new_picture
 from ugat_marl.reporting.style import CURVES, DARK, LIGHT, curve_style
 
 # Machado, Oliveira, Fernandes 2009, severity 1: linear RGB as a colour-blind eye sees it.
@@ -98,3 +100,14 @@ def test_curves_differ_without_colour_too() -> None:
 )
 def test_numbers_that_round_up_to_another_length_stay_readable(made: str, text: str) -> None:
     assert made == text
+
+
+@pytest.mark.parametrize(("markers", "points"), [(True, [5.0, 6, 7, 8]), (False, [5.0, 8])])
+def test_a_value_that_no_line_reaches_has_a_marker(markers: bool, points: list[float]) -> None:
+    picture = new_picture("curve", "A curve", 300)
+    axes = add_axes(picture, 58, 54, 14, 46)
+    means = [5.0, math.nan, 6.0, 7.0, math.nan, 8.0]
+    rows = [(float(x), mean, mean, mean) for x, mean in enumerate(means)]
+    charts._draw_curve(picture, axes, 0, rows, markers=markers)
+    _, *dots = axes.lines
+    assert [float(dot.get_ydata()[0]) for dot in dots] == points

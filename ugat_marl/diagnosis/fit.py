@@ -192,13 +192,18 @@ class Fitter:
     def settled(self, model: Fitted, errors: Array) -> Fitted:
         """Take a last step with more days, since the search stops at a small gain.
 
+        A model whose effects have no free value is only simulated on these days, so that its cost
+        can be compared with those of others.
+
         Args:
             model: The model.
             errors: Standard errors of its free values.
         """
-        if not len(model.values):
+        if not model.members:
             return model
         precise = self.simulate(model.members, self.thresholds.settling_days)
+        if not len(precise.values):
+            return precise
         whitener = self.whitener(precise)
         step = _solve(self.jacobian(model, whitener), whitener.measured, self.thresholds.ridge)
         if (np.abs(step) <= self.thresholds.settled_within * errors).all():

@@ -480,7 +480,8 @@ def pruned(
                 advance(note=title_of(part))
         unsure = [fewer[index] for index in doubtful(best, fitter.thresholds.half_interval)]
         least = min(fewer.values(), key=cost_of)
-        if least.cost - settled(best.model).cost > fitter.thresholds.negligible:
+        now = settled(best.model).cost
+        if least.cost - now > fitter.thresholds.negligible:
             if not unsure:
                 break
             least = min(unsure, key=cost_of)
@@ -488,7 +489,7 @@ def pruned(
         enough = tested.residual.p > alpha
         # If no set suffices anyway, an effect that may be absent is not named either.
         vain = least in unsure and best.residual.p <= alpha
-        if least.cost > best.model.cost and not enough and not vain:
+        if least.cost > now and not enough and not vain:
             break
         best = exact(tested)
     remaining = merged((), best.model.members)

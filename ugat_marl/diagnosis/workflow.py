@@ -547,12 +547,9 @@ def _with_grounds(effect: EffectRecord, grounds: SearchGrounds) -> NamedEffect:
 
 def _alternatives(conclusion: Conclusion, selected: Selected) -> tuple[Explanation, ...]:
     """Return the models besides the selected one; models that fit equally well come first."""
-    chosen = conclusion.best.model
-    others = [
-        rival
-        for rival in selected.rivals
-        if _keys(rival) != _keys(chosen) and rival not in conclusion.indistinct
-    ]
+    # A set of effects may be simulated several times, with other values and more days.
+    told = [_keys(model) for model in (conclusion.best.model, *conclusion.indistinct)]
+    others = [rival for rival in selected.rivals if _keys(rival) not in told]
     ranking = [*conclusion.indistinct, *others][:ALTERNATIVES]
     return tuple(_explanation(model) for model in ranking)
 

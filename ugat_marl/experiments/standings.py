@@ -97,11 +97,11 @@ class Judging:
         if scenarios and self.scenario not in scenarios:
             raise OptionError(f"{path}: a table of {', '.join(scenarios)}, not of {self.scenario}")
         for name, option in (("episodes", "evaluation-seeds"), ("duration_s", "duration-s")):
-            wanted = str(getattr(self, name))
+            wanted = float(getattr(self, name))
             for given in _values_in(own, name):
-                if given != wanted:
+                if _number_in(given) != wanted:
                     raise OptionError(
-                        f"{path}: judged with {name} = {given}, not {wanted}; "
+                        f"{path}: judged with {name} = {given}, not {wanted:g}; "
                         f"give --{option} {given}"
                     )
         return bool(_values_in(own, "episodes"))
@@ -118,6 +118,14 @@ def _values_in(texts: pl.DataFrame, column: str) -> list[str]:
     if column not in texts.columns:
         return []
     return texts[column].drop_nulls().unique(maintain_order=True).to_list()
+
+
+def _number_in(text: str) -> float:
+    """Return the number that a cell holds; nan for none."""
+    try:
+        return float(text)
+    except ValueError:
+        return math.nan
 
 
 def as_standings(content: bytes, name: str) -> pl.DataFrame:

@@ -362,10 +362,12 @@ class _Clock:
         ends = np.array([period.begin_s - 600.0, period.end_s])
         if entries is None or len(entries) < 2:
             return cls(ends, ends)
-        inside = np.unique(entries[(entries > ends[0]) & (entries < ends[1])])
-        at_s = np.concatenate([ends[:1], inside, ends[1:]])
+        inside = entries[(entries > ends[0]) & (entries < ends[1])]
+        stamps, vehicles = np.unique(inside, return_counts=True)  # lanes may share a stamp
+        at_s = np.concatenate([ends[:1], stamps, ends[1:]])
+        reads = np.concatenate([[0], np.cumsum(vehicles), [len(inside) + 1]])
         # a little of every second, so that the clock never stands
-        return cls(at_s, np.arange(len(at_s)) + 1e-6 * (at_s - ends[0]))
+        return cls(at_s, reads + 1e-6 * (at_s - ends[0]))
 
     def read(self, times_s: Floats | float) -> Floats:
         """Return what the clock reads at some times."""

@@ -115,9 +115,12 @@ class Ugat(Algorithm):
             running = [
                 pool.submit(world.collect, policy, state.iteration, self.seed) for world in worlds
             ]
+            left, first = set(running), concurrent.futures.FIRST_EXCEPTION
             try:
-                while concurrent.futures.wait(running, timeout=0.2).not_done:
-                    pass  # a timeout lets Ctrl-C interrupt the wait
+                while left:  # a timeout lets Ctrl-C interrupt the wait
+                    done, left = concurrent.futures.wait(left, timeout=0.2, return_when=first)
+                    for future in done:
+                        future.result()  # a failed roll-out ends the other one
             except BaseException:
                 for world in worlds:
                     world.stop()

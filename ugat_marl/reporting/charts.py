@@ -184,11 +184,12 @@ def _draw_curve(
     marker = style.pop("marker")
     axes.fill_between(x, low, high, color=style["color"], alpha=0.18, linewidth=0)
     axes.plot(x, mean, **style)
-    alone = np.isfinite(mean) & ~np.isfinite(np.r_[mean[1:], np.nan] + np.r_[np.nan, mean[:-1]])
-    for place, value, single in zip(x, mean, alone, strict=True):
-        if np.isfinite(value) and (markers or (single and len(x) == 1)):
-            (dot,) = axes.plot(place, value, marker=marker, color=style["color"], zorder=3)
-            add_tip(dot, f"{place:g}: {tick_text(value)}")
+    known = np.isfinite(mean)
+    alone = known & ~np.r_[known[1:], False] & ~np.r_[False, known[:-1]]  # no line reaches it
+    shown = known if markers else alone
+    for place, value in zip(x[shown], mean[shown], strict=True):
+        (dot,) = axes.plot(place, value, marker=marker, color=style["color"], zorder=3)
+        add_tip(dot, f"{place:g}: {tick_text(value)}")
 
 
 def _several(records: Sequence[RunRecord]) -> str:
