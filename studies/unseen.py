@@ -25,11 +25,18 @@ from rich.console import Console
 
 from studies.osm_extracts import make_all
 from ugat_marl.data import write_csv
-from ugat_marl.experiments import DIRECT, RULE, STREET, Comparison, PaperConfig, compare
+from ugat_marl.experiments import (
+    DIRECT,
+    RULE,
+    STREET,
+    Comparison,
+    PaperConfig,
+    all_standings,
+    compare,
+)
 from ugat_marl.files import write_whole
 from ugat_marl.grounding import RIVALS, StreetConfig
 from ugat_marl.progress import Bars
-from ugat_marl.reporting import seeds_csv
 from ugat_marl.scenarios import NetworkRanges, draw_scenario
 from ugat_marl.seeding import derive_seed
 
@@ -127,7 +134,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
             "main", str(scenario), config, given.out / "runs", given.jobs, Bars(console)
         )
         folder = given.out / scenario.name
-        write_csv(folder / "seeds.csv", seeds_csv(table))
+        write_csv(folder / "seeds.csv", all_standings(table).write_csv())
         outcomes += outcomes_of(scenario.name, table)
         write_whole(given.out / "summary.md", summary(outcomes))
     console.print(summary(outcomes))

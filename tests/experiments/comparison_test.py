@@ -8,11 +8,12 @@ from pathlib import Path
 
 import matplotlib.image
 import numpy as np
+import polars as pl
 import pytest
 
 from ugat_marl.data import Scores
-from ugat_marl.experiments import Comparison, Trial
-from ugat_marl.reporting import comparison_csv, comparison_page, gap_picture, seeds_csv
+from ugat_marl.experiments import Comparison, Trial, all_standings
+from ugat_marl.reporting import comparison_csv, comparison_page, gap_picture
 
 BLANK = Scores(0, 0, 0, 0, 0, 0, 0, 0, 0, 0)
 FACTS = {
@@ -162,4 +163,17 @@ def test_pages_hold_the_numbers(found: Comparison) -> None:
     table = comparison_csv(found).splitlines()
     assert len(table) == 5
     assert table[0].startswith("scenario,setting,domain,training_seeds,att_s,")
-    assert "phase (the paper's UGAT),V4,0,130.0,71.0,0.0" in seeds_csv(found).splitlines()
+    rows = all_standings(found).write_csv().splitlines()
+    assert rows[0] == "setting,domain,training_seed,att_s,att_s_sim,throughput"
+    assert "phase (the paper's UGAT),V4,0,130.0,71.0,0.0" in rows
+    assert '"best rule, tuned there",V4,1,120.0,80.0,0.0' in rows
+
+
+def test_a_setting_without_a_training_has_no_row_for_it() -> None:
+    rows = [
+        *trials("direct transfer", {0: (70.0, 200.0), 1: (72.0, 240.0)}),
+        *trials("phase (the paper's UGAT)", {1: (71.0, 150.0)}),
+    ]
+    found = all_standings(Comparison("toy", "0" * 8, "sim", tuple(rows), {}))
+    phase = found.filter(pl.col("setting") == "phase (the paper's UGAT)")
+    assert phase.rows() == [("phase (the paper's UGAT)", "V4", 1, 150.0, 71.0, 0.0)]

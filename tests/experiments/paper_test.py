@@ -6,6 +6,7 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
+import polars as pl
 import pytest
 
 from tests.runs import perform_in_this_process
@@ -231,6 +232,8 @@ def test_a_table_from_the_command_line(
     assert {path.name for path in folder.iterdir()} == {
         "table.md", "table.csv", "seeds.csv", "row-hashes.json", "radar.png", "gaps.png",
     }  # fmt: skip
+    judged = pl.read_csv(folder / "seeds.csv").select("scenario", "episodes", "duration_s")
+    assert set(judged.rows()) == {("single-v1", 2, 120.0)}
     before = (folder / "table.csv").read_bytes()
     trained = sorted(path for path in (tmp_path / "runs").iterdir() if path.is_dir())
     assert all(set(read_queues(path / QUEUES)["domain"]) >= {"V4"} for path in trained)

@@ -153,10 +153,10 @@ def test_rules_are_put_into_a_table(
     assert "a table of grid4x4-v1, not of single-v1" in capsys.readouterr().err
     table.with_name("table.csv").write_text("scenario,setting\nsingle-v1,fast\n")
     # The table that was written says how it was judged.
-    assert main([*call, *words, "--table", str(out)]) == 0
+    assert main([*call, "--table", str(out)]) == 0
     assert "note:" not in capsys.readouterr().out
     for changed, said in (
-        (["--duration-s", "240"], "duration_s = 300.0, not 240.0; give --duration-s 300.0"),
+        (["--duration-s", "240"], "duration_s = 300.0, not 240; give --duration-s 300.0"),
         (["--evaluation-seeds", "1"], "episodes = 2, not 1; give --evaluation-seeds 2"),
     ):
         assert main([*call, *words, *changed, "--table", str(out)]) == 2

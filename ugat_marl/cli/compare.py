@@ -19,6 +19,7 @@ from ugat_marl.experiments import (
     Judging,
     PaperConfig,
     compare,
+    judged_in,
     lost_row,
     policy_factory,
     read_standings,
@@ -60,8 +61,9 @@ class Compare:
         table: Table to add the row to: a seeds.csv of ugat-marl paper, or what --out wrote before;
             default: the shipped policies of the scenario.
         domains: The real domains; default: those of the table, or V1 and V4.
-        evaluation_seeds: Number of episodes of each policy in each domain; tables have 5.
-        duration_s: Length of an episode in s; default: the scenario's own, as in tables.
+        evaluation_seeds: Number of episodes of each policy in each domain; default: that of the
+            table, or 5.
+        duration_s: Length of an episode in s; default: that of the table, or the scenario's own.
         out: CSV file of the table with the new row.
         runs: Folder of the trainings of the learner; a killed call goes on there.
         workers: Simulations or trainings at a time; default: one per core.
@@ -77,7 +79,7 @@ class Compare:
     episodes: int = 20
     table: Path | None = None
     domains: tuple[str, ...] = ()
-    evaluation_seeds: int = 5
+    evaluation_seeds: int | None = None
     duration_s: float | None = None
     out: Path | None = None
     runs: Path = Path("runs/compare")
@@ -114,21 +116,23 @@ class Compare:
         require_numbers(1, evaluation_seeds=self.evaluation_seeds, workers=self.workers)
         if self.out is not None:
             require_writable(self.out, ".csv")
-        scenario = load_scenario(self.scenario, self.duration_s)
-        length_s = self.duration_s or scenario.settings.duration_s
-        judging = Judging(scenario.id, self.evaluation_seeds, float(length_s))
+        told = {} if self.table is None else judged_in(self.table)
+        episodes = self.evaluation_seeds or int(told.get("episodes", PaperConfig.evaluation_seeds))
+        length_s = self.duration_s or told.get("duration_s")
+        scenario = load_scenario(self.scenario, length_s)
+        judging = Judging.of(scenario, episodes, length_s)
         if self.table is not None:
             table = read_standings(self.table)
             if not judging.require_in(self.table):
                 console.print(
                     f"note: {self.table} does not say in which episodes its rows were judged; "
                     "ranks mean something only if it was "
-                    f"{counted(self.evaluation_seeds, 'episode')} of {length_s:g} s, as the new "
-                    "row is (--evaluation-seeds, --duration-s)",
+                    f"{counted(judging.episodes, 'episode')} of {judging.duration_s:g} s, as the "
+                    "new row is (--evaluation-seeds, --duration-s)",
                     soft_wrap=True,
                 )
         else:
-            table = shipped_standings(scenario, self.evaluation_seeds, self.duration_s)
+            table = shipped_standings(scenario, judging)
             if table.is_empty():
                 console.print(
                     f"note: no shipped policy of {scenario.id} was judged in episodes of this "
@@ -139,7 +143,7 @@ class Compare:
         domains = self._domains(table)
         require_room(table, self.name, map(domain_label, domains))
         with workers_of(self.workers, self.ray) as workers:
-            own = self._judged(scenario, domains, workers, Bars(console))
+            own = self._judged(scenario, judging, domains, workers, Bars(console))
         whole = with_standings(table, own)
         shown = whole.filter(pl.col("domain").is_in([*map(domain_label, domains)]))
         console.print(standings_table(scenario.id, shown, self.name))
@@ -164,6 +168,7 @@ class Compare:
     def _judged(
         self,
         scenario: Scenario,
+        judging: Judging,
         domains: tuple[str, ...],
         workers: Workers,
         reporter: Reporter,
@@ -175,8 +180,7 @@ class Compare:
                 scenario,
                 [policy_factory(spec) for spec in self.policies],
                 domains,
-                episodes=self.evaluation_seeds,
-                duration_s=self.duration_s,
+                judging=judging,
                 workers=workers,
                 reporter=reporter,
             )
@@ -186,8 +190,8 @@ class Compare:
             seeds=self.seeds,
             episodes=self.episodes,
             rows=(DIRECT,),
-            evaluation_seeds=self.evaluation_seeds,
-            duration_s=self.duration_s,
+            evaluation_seeds=judging.episodes,
+            duration_s=judging.length_s,
             learner=self.learner,
             learner_settings=self.learner_settings,
         )

@@ -11,11 +11,14 @@ from tyro.conf import arg
 
 from ugat_marl.cli.arguments import RayAddress, require_numbers, workers_of
 from ugat_marl.data import write_csv
+from ugat_marl.effects import load_scenario
 from ugat_marl.errors import OptionError, OutputError
 from ugat_marl.experiments import (
     DIRECT,
     Comparison,
+    Judging,
     PaperConfig,
+    all_standings,
     as_standings,
     compare,
     file_stem,
@@ -29,7 +32,6 @@ from ugat_marl.reporting import (
     comparison_csv,
     comparison_page,
     draw_table,
-    seeds_csv,
     terminal_tables,
 )
 
@@ -92,7 +94,10 @@ class _Paper:
                 comparison = compare(
                     self.table, scenario, self.config, self.runs, workers, Bars(console)
                 )
-            _write(comparison, self.title or self.table, folder)
+            config = self.config
+            loaded = load_scenario(scenario, config.duration_s)
+            judging = Judging.of(loaded, config.evaluation_seeds, config.duration_s)
+            _write(comparison, judging, self.title or self.table, folder)
             console.print(terminal_tables(comparison, DIRECT))
             console.print(f"table and pictures: {folder}\ntrainings: {self.runs}", soft_wrap=True)
         return 0
@@ -164,8 +169,8 @@ class Gap(_Paper):
     table: ClassVar[str] = "gap"
 
 
-def _write(comparison: Comparison, title: str, folder: Path) -> None:
-    seeds = seeds_csv(comparison)
+def _write(comparison: Comparison, judging: Judging, title: str, folder: Path) -> None:
+    seeds = judging.written_to(all_standings(comparison)).write_csv()
     if (folder / SEEDS).is_file():
         _require_kept(folder / SEEDS, seeds)
     page = comparison_page(comparison, DIRECT, title, machine_facts())

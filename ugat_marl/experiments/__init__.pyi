@@ -71,7 +71,9 @@ from .settings import is_grounded as is_grounded
 from .sim_check import check_run as check_run
 from .sim_check import check_table as check_table
 from .standings import Judging as Judging
+from .standings import all_standings as all_standings
 from .standings import as_standings as as_standings
+from .standings import judged_in as judged_in
 from .standings import lost_row as lost_row
 from .standings import lost_rows as lost_rows
 from .standings import ranked as ranked

@@ -83,6 +83,10 @@ class Comparison:
         """Seeds of the trainings, ascending."""
         return sorted({t.training_seed for t in self.trials if t.training_seed is not None})
 
+    def seeds_of(self, setting: str, target: str) -> list[int]:
+        """Return the seeds of a setting's trainings, ascending; all seeds for a rule."""
+        return sorted(seed for seed in self._by_seed(setting, target, "att_s") if seed is not None)
+
     def has(self, setting: str, target: str) -> bool:
         """Return True if there are trials of the setting for that domain."""
         return any(played[:2] == (setting, target) for played in self._scores)

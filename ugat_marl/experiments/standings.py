@@ -2,14 +2,15 @@
 
 A table of standings has one row per setting, real domain and training, as ``seeds.csv`` of `paper`
 has: ``setting``, ``domain``, ``training_seed``, ``att_s`` (mean travel time in the domain, s),
-``att_s_sim`` (in the simulation, s) and ``throughput`` (vehicles that arrived in the domain).
+``att_s_sim`` (in the simulation, s) and ``throughput`` (vehicles that arrived in the domain). Its
+file tells in each row how it was judged: ``scenario``, ``episodes`` and ``duration_s``.
 """
 
 from __future__ import annotations
 
 import math
 from collections.abc import Iterable, Sequence
-from dataclasses import dataclass, fields
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -64,22 +65,34 @@ def read_standings(path: Path) -> pl.DataFrame:
 
 @dataclass(frozen=True)
 class Judging:
-    """Conditions under which a table was judged; `compare` writes them into each row.
+    """Conditions under which a table was judged; they are in each row of its file.
 
     Attributes:
         scenario: Id of the scenario.
         episodes: Number of episodes of each policy in each domain.
         duration_s: Length of an episode in s.
+        length_s: The same, or None if it is the scenario's own; it is in no file.
     """
 
     scenario: str
     episodes: int
     duration_s: float
+    length_s: float | None = None
+
+    @classmethod
+    def of(cls, scenario: Scenario, episodes: int, length_s: float | None) -> Judging:
+        """Return the conditions in a scenario; None stands for its own length of episodes."""
+        own_s = float(scenario.settings.duration_s)
+        length_s = None if length_s == own_s else length_s
+        return cls(scenario.id, episodes, float(length_s or own_s), length_s)
 
     def written_to(self, table: pl.DataFrame) -> pl.DataFrame:
         """Return a table with columns that say this."""
-        columns = {field.name: getattr(self, field.name) for field in fields(self)}
-        return table.with_columns(**{name: pl.lit(value) for name, value in columns.items()})
+        return table.with_columns(
+            scenario=pl.lit(self.scenario),
+            episodes=pl.lit(self.episodes),
+            duration_s=pl.lit(self.duration_s),
+        )
 
     def require_in(self, path: Path) -> bool:
         """Refuse the file of a table that was judged otherwise.
@@ -118,6 +131,14 @@ def _values_in(texts: pl.DataFrame, column: str) -> list[str]:
     if column not in texts.columns:
         return []
     return texts[column].drop_nulls().unique(maintain_order=True).to_list()
+
+
+def judged_in(path: Path) -> dict[str, float]:
+    """Return number and length of episodes, as far as the file of a table tells them."""
+    cells = _cells(path)
+    told = {name: _values_in(cells, name) for name in ("episodes", "duration_s")}
+    numbers = {name: _number_in(texts[0]) for name, texts in told.items() if texts}
+    return {name: number for name, number in numbers.items() if number >= 1}
 
 
 def _number_in(text: str) -> float:
@@ -193,17 +214,14 @@ def _kind(name: str) -> str:
     return "whole number" if SCHEMA[name] == pl.Int64 else "number"
 
 
-def shipped_standings(
-    scenario: Scenario, episodes: int, duration_s: float | None = None
-) -> pl.DataFrame:
+def shipped_standings(scenario: Scenario, judging: Judging) -> pl.DataFrame:
     """Return the standings of the shipped policies of a scenario, from their cards.
 
     Cards of another version of the scenario, or of other episodes, are left out.
 
     Args:
         scenario: The scenario.
-        episodes: Number of episodes of each policy in each domain.
-        duration_s: Length of an episode in s; None for the scenario's own.
+        judging: Conditions of the new row.
     """
     rows: list[dict[str, Any]] = []
     for name in shipped_policies():
@@ -213,7 +231,7 @@ def shipped_standings(
         here = card.scores.get(card.sim)
         if here is None or card.scenario_hashes.get(card.sim) != scenario.hash:
             continue
-        if (card.first_seed, card.duration_s) != (EVALUATION_SEED, duration_s):
+        if (card.first_seed, card.duration_s) != (EVALUATION_SEED, judging.length_s):
             continue
         rows += [
             {
@@ -225,7 +243,7 @@ def shipped_standings(
                 "throughput": scores.throughput,
             }
             for domain, scores in card.scores.items()
-            if domain != card.sim and scores.episodes == here.episodes == episodes
+            if domain != card.sim and scores.episodes == here.episodes == judging.episodes
         ]
     return pl.DataFrame(rows, schema=SCHEMA)
 
@@ -236,9 +254,7 @@ def standings_of(
     policies: Sequence[PolicyFactory],
     domains: Sequence[Domain],
     *,
-    sim: Domain = "sim",
-    episodes: int = 5,
-    duration_s: float | None = None,
+    judging: Judging,
     workers: Workers = None,
     reporter: Reporter | None = None,
 ) -> pl.DataFrame:
@@ -249,9 +265,7 @@ def standings_of(
         scenario: The scenario.
         policies: One per training; the first has training seed 0.
         domains: The real domains.
-        sim: The simulation.
-        episodes: Number of episodes of each policy in each domain.
-        duration_s: Length of an episode in s; None for the scenario's own.
+        judging: Number and length of the episodes.
         workers: Simulations at a time, or an executor.
         reporter: Shows progress.
     """
@@ -259,9 +273,9 @@ def standings_of(
     played = evaluate(
         scenario,
         numbered,
-        [sim, *domains],
-        range(EVALUATION_SEED, EVALUATION_SEED + episodes),
-        duration_s=duration_s,
+        ["sim", *domains],
+        range(EVALUATION_SEED, EVALUATION_SEED + judging.episodes),
+        duration_s=judging.length_s,
         workers=workers,
         reporter=reporter,
     )
@@ -276,7 +290,7 @@ def standings_of(
                 "domain": domain,
                 "training_seed": seed,
                 "att_s": mean(policy, domain, "att_s"),
-                "att_s_sim": mean(policy, domain_label(sim), "att_s"),
+                "att_s_sim": mean(policy, "sim", "att_s"),
                 "throughput": mean(policy, domain, "throughput"),
             }
             for domain in map(domain_label, domains)
@@ -284,6 +298,11 @@ def standings_of(
         ],
         schema=SCHEMA,
     )
+
+
+def all_standings(comparison: Comparison) -> pl.DataFrame:
+    """Return the rows of all settings of a table of `paper`."""
+    return pl.concat([standings_from(comparison, name, name) for name in comparison.settings])
 
 
 def standings_from(comparison: Comparison, setting: str, name: str) -> pl.DataFrame:
@@ -298,7 +317,7 @@ def standings_from(comparison: Comparison, setting: str, name: str) -> pl.DataFr
         rows += [
             {"setting": name, "domain": target, "training_seed": seed}
             | {column: round(float(values[place]), 3) for column, values in columns.items()}
-            for place, seed in enumerate(comparison.training_seeds)
+            for place, seed in enumerate(comparison.seeds_of(setting, target))
         ]
     return pl.DataFrame(rows, schema=SCHEMA)
 

@@ -137,25 +137,6 @@ def read_rows(path: Path) -> list[dict[str, Any]]:
         ]
 
 
-def seeds_csv(comparison: Comparison) -> str:
-    """Return every training with its mean ATT and throughput as CSV, for tests of a reader."""
-    text = io.StringIO()
-    writer = csv.writer(text, lineterminator="\n")
-    writer.writerow(["setting", "domain", "training_seed", "att_s", "att_s_sim", "throughput"])
-    seeds = comparison.training_seeds
-    for setting in comparison.settings:
-        for target in comparison.targets:
-            if comparison.has(setting, target):
-                columns = [
-                    comparison.values(setting, target, "att_s"),
-                    comparison.values(setting, target, "att_s", comparison.sim),
-                    comparison.values(setting, target, "throughput"),
-                ]
-                for seed, *values in zip(seeds, *(c.tolist() for c in columns), strict=True):
-                    writer.writerow([setting, target, seed, *(round(v, 3) for v in values)])
-    return text.getvalue()
-
-
 def _headlines(comparison: Comparison, direct: str) -> list[tuple[str, Cell]]:
     return [
         ("average travel time in the real domain, s", _estimated(comparison, None)),
