@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import csv
 import math
+import re
 from collections import defaultdict
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
@@ -94,17 +95,24 @@ def heading(page: Path) -> str:
     return page.read_text(encoding="utf-8").partition("\n")[0].removeprefix("# ")
 
 
+def learner(page: Path) -> str:
+    """Return the learner of a table, from the command on its page."""
+    text = page.read_text(encoding="utf-8")
+    named = re.search(r"--learner\s+(\S+)", text)
+    return named[1] if named else "dqn" if "--preset paper" in text else "universal"
+
+
 def overview(folder: Path = FOLDER) -> str:
     """Return the overview as Markdown: every domain of every table of transfer, and means."""
     lines = [
-        "| table | | direct transfer (regret) | timed | timed, rewards matched "
+        "| table, learner | | direct transfer (regret) | timed | timed, rewards matched "
         "| fitted street | more plain `sim` | constant delay | trained in real | best rule there |",
         "|---|---|---:|---:|---:|---:|---:|---:|---:|---:|",
     ]
     for table in sorted(folder.glob("*/main*/table.csv")):
         found = known(table)
         page = table.with_suffix(".md")
-        first = f"[{heading(page)}]({page.relative_to(folder)})"
+        first = f"[{heading(page)}]({page.relative_to(folder)}), {learner(page)}"
         # Effects that all domains of a table share are in its sim, too, and are left out.
         shared = {domain.partition("+")[2] for domain in found}
         for domain, column in found.items():

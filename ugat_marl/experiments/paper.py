@@ -305,7 +305,8 @@ class PaperConfig:
         sim_rollouts: Episodes added to D_sim per iteration.
         real_rollouts: Episodes added to D_real per iteration.
         preset: "paper" for Algorithm 1 exactly as published: phase grounding, the reward queue, the
-            learner dqn. Numbers of episodes that are not given become 60, 4, 10, 3 and 3.
+            learner dqn. If not given, there are 60 plain episodes, 4 iterations, 10 grounded
+            episodes, and 3 roll-outs each in sim and on the street.
         groundings: Kinds of grounding: phase, timed, street; default: all that the table can have.
         constants: Constant delays in s that "main" sweeps.
         rows: Names of the rows to train; phase stands for the paper's UGAT, and direct transfer is

@@ -105,8 +105,8 @@ class TransferConfig:
             needs `real_log`: only the log is known of the real domain.
         sim: The simulation to train in; "sim", or a domain like `real`.
         preset: "paper" for Algorithm 1 exactly as published; it decides the reward (queue) and all
-            settings of the algorithm. Numbers of episodes that are not given become 60, 4, 10, 3
-            and 3.
+            settings of the algorithm. If not given, there are 60 plain episodes, 4 iterations,
+            10 grounded episodes, and 3 roll-outs each in sim and on the street.
         real_log: Transition log that replaces the roll-outs in the real domain.
         seed: Root of every random choice in training.
         observation: Kind of observation: count, queue, pressure, waiting, density, movements;
