@@ -25,7 +25,7 @@ from ugat_marl.grounding import (
 )
 from ugat_marl.grounding.measured_log import phases_shown
 from ugat_marl.grounding.summaries import NAMES, OF_COUNTS
-from ugat_marl.grounding.worlds import Replay
+from ugat_marl.grounding.worlds import RecordedCommands
 from ugat_marl.policies import observer_of, roll_out
 from ugat_marl.scenarios import Network, Scenario
 from ugat_marl.scenarios.junctions import Upstream
@@ -182,7 +182,7 @@ def test_a_learner_and_a_fit_take_the_log(crossing: Scenario, measured: Measured
     log = imported(measured, crossing, "movements")
     env = parallel_env(crossing, observation="movements")
     world = RecordedWorld(log, env)
-    taken = world.collect(Replay(log), 0, 0)
+    taken = world.collect(RecordedCommands(log), 0, 0)
     assert taken is not None and taken.frame.equals(log.frame)
     summary = LaneView.of(Network.read(crossing), "movements").summary(log)
     assert np.isfinite(summary.values[:, NAMES.index("mean")]).all()
@@ -209,7 +209,7 @@ def test_a_log_whose_steps_count_from_midnight_is_the_same_log(
     log = imported(measured, crossing)
     late = TransitionLog(log.provenance, log.frame.with_columns(step=pl.col("step") + 2520))
     world = RecordedWorld(late, parallel_env(crossing, observation="count"))
-    taken = world.collect(Replay(log), 0, 0)
+    taken = world.collect(RecordedCommands(log), 0, 0)
     assert taken is not None and taken.frame.equals(log.frame)
 
 

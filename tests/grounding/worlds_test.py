@@ -12,7 +12,7 @@ from ugat_marl.data import AgentLayout, Provenance, TransitionLog, TransitionRec
 from ugat_marl.errors import LogError
 from ugat_marl.grounding import ShuffledWorld
 from ugat_marl.grounding.controls import shuffled
-from ugat_marl.grounding.worlds import Replay
+from ugat_marl.grounding.worlds import RecordedCommands
 from ugat_marl.policies import Policy
 
 LAYOUTS = {"a_0": AgentLayout(2, 2), "b_0": AgentLayout(1, 2, 1)}
@@ -112,7 +112,7 @@ def commanded(commands: dict[str, dict[int, list[int]]]) -> TransitionLog:
 
 
 def played(log: TransitionLog, episode: int, decisions: int) -> dict[str, list[int]]:
-    replay = Replay(log)
+    replay = RecordedCommands(log)
     replay.reset(episode)
     acts = [replay.act(dict.fromkeys(LAYOUTS), {}) for _ in range(decisions)]
     return {agent: [act[agent] for act in acts] for agent in LAYOUTS}
@@ -128,6 +128,6 @@ def test_episodes_without_commands_of_an_agent_are_not_repeated() -> None:
     for episode in (0, 1):
         assert played(log, episode, 2) == {"a_0": [1, 0], "b_0": [1, 1]}
     with pytest.raises(LogError, match="no row of b_0"):
-        Replay(commanded({"a_0": {0: [0]}, "b_0": {}}))
+        RecordedCommands(commanded({"a_0": {0: [0]}, "b_0": {}}))
     with pytest.raises(LogError, match="no episode has a decision of every agent$"):
-        Replay(commanded({"a_0": {0: [0]}, "b_0": {1: [0]}}))
+        RecordedCommands(commanded({"a_0": {0: [0]}, "b_0": {1: [0]}}))

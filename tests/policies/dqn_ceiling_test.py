@@ -18,7 +18,7 @@ from ugat_marl.errors import CheckpointError, OptionError
 from ugat_marl.policies import DQN, NetworkPolicy
 from ugat_marl.policies.export import NumpyPolicy, portable_network
 from ugat_marl.policies.learners.dqn import DQNConfig
-from ugat_marl.policies.learners.replay import Replay
+from ugat_marl.policies.learners.replay import ReplayBuffer
 from ugat_marl.policies.learners.scaling import ceilings
 from ugat_marl.testing import ToyTraffic
 
@@ -110,7 +110,7 @@ def test_ceilings_by_hand() -> None:
 
 
 def test_recent_decisions_are_the_last_ones_of_the_ring() -> None:
-    replay = Replay(AgentSet(("a",), (1,), (2,)), 4)
+    replay = ReplayBuffer(AgentSet(("a",), (1,), (2,)), 4)
     one = np.zeros(1, np.int64)
     for i in range(6):
         row = np.full((1, 1), i, np.float32)

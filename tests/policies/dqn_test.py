@@ -20,7 +20,7 @@ from ugat_marl.envs import AgentSet
 from ugat_marl.errors import ActionError, CheckpointError, EpisodeError, OptionError
 from ugat_marl.policies import DQN, Learner, NetworkPolicy, Policy
 from ugat_marl.policies.learners.dqn import DQNConfig, StickyExploration
-from ugat_marl.policies.learners.replay import Replay
+from ugat_marl.policies.learners.replay import ReplayBuffer
 
 QUICK = DQNConfig(
     hidden=(16, 16),
@@ -551,7 +551,7 @@ def test_exploration_drops_a_bout_that_is_no_longer_allowed():
 
 def test_replay_keeps_the_newest_and_draws_the_same_times_for_all():
     agents = AgentSet(("a", "b"), (1, 2), (2, 2))
-    replay = Replay(agents, 4)
+    replay = ReplayBuffer(agents, 4)
     for i in range(6):
         row = np.full((2, 2), i, np.float32)
         number = np.full(2, i)
@@ -566,7 +566,7 @@ def test_replay_keeps_the_newest_and_draws_the_same_times_for_all():
 @pytest.mark.parametrize("steps", [1, 3])
 def test_returns_of_several_decisions_stop_at_the_end_of_an_episode_and_at_the_newest(steps: int):
     """Decision i pays i + 1 and leads to i + 1; episodes end after 2 and 5; 9 fill a ring of 7."""
-    replay, discount = Replay(AgentSet(("a",), (1,), (2,)), 7), 0.5
+    replay, discount = ReplayBuffer(AgentSet(("a",), (1,), (2,)), 7), 0.5
     for i in range(9):
         row, one = np.full((1, 1), i, np.float32), np.zeros(1, np.int64)
         paid, mask = np.array([i + 1], np.float32), np.ones((1, 2), np.bool_)

@@ -51,7 +51,7 @@ def test_learner_episodes_and_options_part_trainings() -> None:
 def test_settings_of_the_suites_learners_part_trainings() -> None:
     records = [job(0), job(1), job(0, hidden=8)]
     assert [len(part) for part in seeds_of_one(records)] == [2, 1]
-    assert job_labels(records)[2] == "direct transfer (dqn.hidden [8])"
+    assert job_labels(records)[2] == "direct transfer (dqn.hidden 8)"
 
 
 def test_trainings_of_two_versions_are_not_one_setting() -> None:

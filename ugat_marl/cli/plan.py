@@ -19,7 +19,7 @@ from ugat_marl.errors import OptionError, counted, listed
 from ugat_marl.experiments import policy_factory, typical_plans
 from ugat_marl.files import require_writable
 from ugat_marl.progress import Bars
-from ugat_marl.reporting import LIGHT, LightNames, titled_table
+from ugat_marl.reporting import LIGHT_HEADING, LightNames, titled_table
 from ugat_marl.scenarios import (
     Network,
     Scenario,
@@ -167,7 +167,14 @@ def plan_table(plans: Sequence[SignalPlan], names: LightNames) -> Table:
     """Return the plans as a table, with the green time of each phase; rings if there are some."""
     table = titled_table("")
     rings = any((phase.ring, phase.barrier) != (1, 1) for plan in plans for phase in plan.phases)
-    for heading in (LIGHT, "cycle", "offset", *(["ring"] if rings else []), "phase", "turns"):
+    for heading in (
+        LIGHT_HEADING,
+        "cycle",
+        "offset",
+        *(["ring"] if rings else []),
+        "phase",
+        "turns",
+    ):
         table.add_column(heading, overflow="fold")
     for heading in ("split", "green", "yellow", "all-red"):
         table.add_column(heading, justify="right")

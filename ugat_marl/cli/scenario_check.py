@@ -32,7 +32,7 @@ from ugat_marl.experiments import (
     remarks,
 )
 from ugat_marl.progress import Bars, Silent
-from ugat_marl.reporting import LIGHT, LightNames, approach_table, titled_table
+from ugat_marl.reporting import LIGHT_HEADING, LightNames, approach_table, titled_table
 from ugat_marl.scenarios import (
     PHASE_SOURCES,
     QUARTER_S,
@@ -249,7 +249,7 @@ def _intersections(agents: Sequence[IntersectionFacts], names: LightNames) -> Ta
     for light in agents:
         groups.setdefault(_row(light), []).append(names.text(light.id))
     table = _table(
-        "Intersections", LIGHT, "lanes", "links", "movem.", "conflicts", "phases", "remarks"
+        "Intersections", LIGHT_HEADING, "lanes", "links", "movem.", "conflicts", "phases", "remarks"
     )
     table.columns[-1].justify = "left"
     for row, lights in groups.items():
@@ -304,7 +304,7 @@ def _phase_sources(agents: Sequence[IntersectionFacts], names: LightNames) -> Ta
     """Return the degree of saturation of the fullest lights with each source of phases."""
     fullest = sorted(agents, key=lambda light: -degree_with(light, "now"))[:MOST_LIGHTS]
     title = "Demand as a share of capacity with other phases, busiest quarter of an hour"
-    table = _table(title, LIGHT, "now", *PHASE_SOURCES, "best")
+    table = _table(title, LIGHT_HEADING, "now", *PHASE_SOURCES, "best")
     for light in fullest:
         cells = [
             "-" if light.degrees.get(source) is None else f"{degree_with(light, source):.0%}"
@@ -322,7 +322,7 @@ def _approaches(agents: Sequence[IntersectionFacts], names: LightNames) -> Table
     shown = all_roads[:MOST_APPROACHES]
     title = f"Saturation by approach, the highest {len(shown)} of {len(all_roads)}"
     headings = ("veh/h", "worst 15 min", "flow ratio", "own programme")
-    table = _table(title, LIGHT, "road", "lanes", *headings)
+    table = _table(title, LIGHT_HEADING, "road", "lanes", *headings)
     table.columns[1].justify = "left"
     if any(phase.permitted for light in agents for phase in light.phases):
         table.caption_justify = "left"

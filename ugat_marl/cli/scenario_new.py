@@ -16,7 +16,7 @@ from tyro.conf import Positional, arg
 from ugat_marl.cli.arguments import given_words, option_text, refuse_options, unused
 from ugat_marl.errors import OptionError, counted
 from ugat_marl.progress import Bars
-from ugat_marl.reporting import LIGHT, LightNames, draw_network, titled_table
+from ugat_marl.reporting import LIGHT_HEADING, LightNames, draw_network, titled_table
 from ugat_marl.scenarios import (
     CountFit,
     RoadSource,
@@ -261,7 +261,7 @@ def _fit_table(fits: Sequence[CountFit], names: LightNames) -> Table:
     table = titled_table(f"Counts and vehicles, the {len(worst)} largest GEH of {len(fits)}")
     several = len({(fit.begin_s, fit.end_s) for fit in fits}) > 1
     times = ["time, s"] * several
-    for name in (LIGHT, "from", "turn", "to", *times, "counted", "driven", "GEH"):
+    for name in (LIGHT_HEADING, "from", "turn", "to", *times, "counted", "driven", "GEH"):
         right = name in ("counted", "driven", "GEH")
         table.add_column(name, justify="right" if right else "left", overflow="fold")
     for fit in worst:

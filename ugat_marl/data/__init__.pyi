@@ -42,7 +42,6 @@ from .runs import remove_temporaries as remove_temporaries
 from .runs import write_identity as write_identity
 from .runs import write_settings as write_settings
 from .scores import MEASURES as MEASURES
-from .scores import MORE_IS_BETTER as MORE_IS_BETTER
 from .scores import EpisodeRecorder as EpisodeRecorder
 from .scores import Scores as Scores
 from .transitions import Provenance as Provenance

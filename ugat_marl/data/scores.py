@@ -59,8 +59,6 @@ MEASURES: dict[str, str] = {
     "delay_s": "delay [s]",
 }
 """The five measures of the paper and the delay in seconds, each with its heading in tables."""
-MORE_IS_BETTER = ("throughput", "reward")
-"""Measures for which a larger value is better."""
 
 
 def relative_slowness(

@@ -15,7 +15,7 @@ from ugat_marl.diagnosis.records import Disagreement, Located, Tested
 from ugat_marl.diagnosis.select import Selector
 from ugat_marl.diagnosis.statistics import Array, Distance, Reference
 from ugat_marl.diagnosis.study import Study
-from ugat_marl.diagnosis.supplementary_data import MEASURES
+from ugat_marl.diagnosis.supplementary_data import SUPPLEMENTARY_MEASURES
 from ugat_marl.diagnosis.thresholds import Thresholds
 
 SHOWN = 40
@@ -141,7 +141,7 @@ def _between(
     rows: list[Disagreement] = []
     for member, feature in zip(*np.nonzero(z), strict=True):
         label = reference.pools.supplementary[block][int(member)]
-        name, unit = MEASURES[block][int(feature)]
+        name, unit = SUPPLEMENTARY_MEASURES[block][int(feature)]
         value, size = float(z[member, feature]), float(difference[member, feature])
         p = two_sided(value, reference.pools.thresholds.heavy_tail)
         said = f"{name} {label.edge} → {label.following}" if label.following else name

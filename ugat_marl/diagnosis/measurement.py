@@ -781,9 +781,7 @@ class Measurement:
         measured, simulated = (
             x.gaps[members].sum(axis=0) for x in (self._measured, self._simulated)
         )
-        closer = simulated[
-            : 1 + int(np.searchsorted(GAP_EDGES_S, seconds + 1e-9, "right") - 1)
-        ].sum()
+        closer = simulated[: int(np.searchsorted(GAP_EDGES_S, seconds + 1e-9, "right"))].sum()
         share = closer / max(simulated.sum(), 1.0)
         expected = float(share * measured.sum())
         if expected < limit.least_touching:

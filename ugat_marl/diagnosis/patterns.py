@@ -26,7 +26,7 @@ from numpy.typing import NDArray
 
 from ugat_marl.diagnosis.features import DetectorLayout, Discharge, Greens, free_vehicles
 from ugat_marl.diagnosis.records import Pattern
-from ugat_marl.diagnosis.residual import drawn_days, log_normal_tail
+from ugat_marl.diagnosis.residual import drawn_days, log_moments, log_normal_tail
 from ugat_marl.diagnosis.thresholds import DayThresholds, Thresholds
 from ugat_marl.effects import DemandLevel, DemandSurge, Effect, LaneService
 from ugat_marl.scenarios import DetectorKind, Passages, Period
@@ -392,11 +392,12 @@ def patterns(
         sets, counts = sets_of(layout, cells[0].shape[:-1]), quantity == "count"
         regression = Regression(sets, cells, thresholds, counts=counts)
         chance = list(_by_chance(sets, cells, len(measured), thresholds, counts=counts))
+        moments = log_moments(chance, thresholds.least_log_spread)
         for term, p, again in _terms(
             regression,
             np.sum([day[quantity] for day in measured], axis=0),
             np.sum([day[quantity] for day in heldout], axis=0) if heldout else None,
-            lambda gain, drawn=chance: _tail(gain, drawn),
+            lambda gain, moments=moments: log_normal_tail(gain, *moments),
             thresholds,
             alpha / len(quantities),
         ):
@@ -447,12 +448,6 @@ def _by_chance(
             days = drawn_days(generator, len(others), periods, thresholds)
             drawn = np.sum([others[int(day)] for day in days], axis=0)
             yield model.best(*model.pulls(drawn)).gain
-
-
-def _tail(gain: float, drawn: Sequence[float]) -> float:
-    """Return the chance of such a gain, by a log-normal distribution of the drawn ones."""
-    logs = np.log(np.maximum(drawn, 1e-9))
-    return log_normal_tail(gain, float(logs.mean()), max(float(logs.std(ddof=1)), 0.02))
 
 
 def _pattern(

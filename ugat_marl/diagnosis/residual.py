@@ -88,8 +88,7 @@ class Null:
                     draws.setdefault(name, []).append(value)
                 draws.setdefault("total", []).append(distance.total)
         self._moments = {
-            name: _log_moments(values, thresholds.least_log_spread)
-            for name, values in draws.items()
+            name: log_moments(values, thresholds.least_log_spread) for name, values in draws.items()
         }
         self.expected = float(np.mean(draws["total"]))
 
@@ -184,7 +183,8 @@ def _statistics(distance: Distance, directed: Directed | None, more: float) -> d
     return {name: value + more for name, value in values.items()}
 
 
-def _log_moments(values: Sequence[float], least_spread: float) -> tuple[float, float]:
+def log_moments(values: Sequence[float], least_spread: float) -> tuple[float, float]:
+    """Return mean and standard deviation of logarithms, the latter at least `least_spread`."""
     logs = np.log(np.maximum(values, 1e-9))
     return float(logs.mean()), max(float(logs.std(ddof=1)), least_spread)
 

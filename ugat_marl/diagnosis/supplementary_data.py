@@ -28,7 +28,7 @@ Span = tuple[float, float]
 
 TURNING, TRAVEL_TIME, LANES, EVERY_LANE = "turning", "travel time", "lanes", "every lane"
 """Names of the blocks of statistics."""
-MEASURES: Mapping[str, tuple[tuple[str, str], ...]] = {
+SUPPLEMENTARY_MEASURES: Mapping[str, tuple[tuple[str, str], ...]] = {
     TURNING: (("vehicles that turn", "1/min"),),
     TRAVEL_TIME: (("travel time", "s"),),
     **dict.fromkeys(
@@ -137,7 +137,7 @@ class SupplementaryData:
     def measured(self, period: str) -> dict[str, Array]:
         """Return sums and numbers of observations of a measured period, by block.
 
-        Each array is ``(members, measures, 2)``, with the measures of `MEASURES`.
+        Each array is ``(members, measures, 2)``, with the measures of `SUPPLEMENTARY_MEASURES`.
         """
         states = self.states.get(period, np.zeros((0, 3, 2)))
         return self._blocks(self.counts[period], self._minutes(period), self.times[period], states)

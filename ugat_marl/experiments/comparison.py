@@ -16,7 +16,7 @@ from typing import Any
 
 import numpy as np
 
-from ugat_marl.data import MEASURES, MORE_IS_BETTER, Scores
+from ugat_marl.data import MEASURES, Scores
 from ugat_marl.experiments.statistics import Floats, Interval, PairedTest
 from ugat_marl.policies import nan_last
 
@@ -194,15 +194,14 @@ class Comparison:
         mine = Interval.of(self.regret_s(setting, target)).mean
         return 1.0 - mine / start if start > 0 else math.nan
 
-    def reduction(self, setting: str, target: str, direct: str, measure: str = "att_s") -> float:
-        """Return the share by which a setting reduces the gap of `direct` (paper, Table 2).
+    def reduction(self, setting: str, target: str, direct: str) -> float:
+        """Return the share by which a setting reduces the gap of ATT of `direct` (paper, Table 2).
 
         1 - gap(setting) / gap(direct), both means over training seeds. The share is nan where
         direct transfer has no gap.
         """
-        sign = -1.0 if measure in MORE_IS_BETTER else 1.0
-        start = sign * float(self.gaps(direct, target, measure).mean())
-        mine = sign * float(self.gaps(setting, target, measure).mean())
+        start = float(self.gaps(direct, target, "att_s").mean())
+        mine = float(self.gaps(setting, target, "att_s").mean())
         return 1.0 - mine / start if start > 0 else math.nan
 
     def rows(self) -> list[dict[str, Any]]:

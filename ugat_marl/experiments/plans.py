@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 
@@ -175,11 +174,8 @@ def _rule_episodes(job: Job) -> int:
     """Return the number of episodes of the search for the best rule."""
     if job.rule_budget is not None:
         return job.rule_budget * len(job.setting.rules or TUNED_RULES)
-    left, episodes = len(job.setting.rules or STANDARD_RULES), 0
-    for _ in range(job.tuning_seeds):
-        episodes += left
-        left = max(2, math.ceil(left / 2))
-    return episodes
+    rules = len(job.setting.rules or STANDARD_RULES)
+    return sum(race_fields(rules, job.tuning_seeds)) if rules > 1 else 0
 
 
 def _grounded_work(

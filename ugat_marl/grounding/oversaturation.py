@@ -44,12 +44,10 @@ class Oversaturation:
             agents: Names of the intersections, in the order of the view.
         """
         measured: list[tuple[float, float, float]] = []
-        begin = 0
-        for scale in view.scale:
-            own = rows[begin : begin + len(scale)]
-            begin += len(scale)
-            full = np.any([row.full for row in own], axis=0)
-            held = np.any([row.held & row.has for row in own], axis=0)
+        for places in view.lanes_of(agents).values():
+            lanes = [rows[place] for place in places]
+            full = np.any([lane.full for lane in lanes], axis=0)
+            held = np.any([lane.held & lane.has for lane in lanes], axis=0)
             both = float(np.logical_or(full, held).mean())
             measured.append((float(full.mean()), float(held.mean()), both))
         return cls(tuple(agents), *np.array(measured).T)

@@ -285,7 +285,7 @@ def roll_outs(
     return TransitionLog.concatenate(list(logs)), tuple(scores)
 
 
-class Replay:
+class RecordedCommands:
     """Policy that repeats the commands of a log, decision by decision.
 
     Each episode repeats one in which every agent has a command. A decision that the log lacks
@@ -377,7 +377,7 @@ class RecordedWorld:
 
     def replay(self) -> Policy | None:
         """Return a policy that repeats the log: whoever made it, other worlds get its commands."""
-        return Replay(self._log)
+        return RecordedCommands(self._log)
 
     def stop(self) -> None:
         """Do nothing; `collect` returns at once."""

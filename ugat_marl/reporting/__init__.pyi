@@ -4,7 +4,6 @@ from .charts import gap_picture as gap_picture
 from .charts import transfer_picture as transfer_picture
 from .comparison_tables import comparison_csv as comparison_csv
 from .comparison_tables import comparison_page as comparison_page
-from .comparison_tables import read_rows as read_rows
 from .comparison_tables import terminal_tables as terminal_tables
 from .diagnosis_page import commands_on_page as commands_on_page
 from .diagnosis_page import write_diagnosis_page as write_diagnosis_page
@@ -17,12 +16,13 @@ from .gap_tables import objective_tables as objective_tables
 from .headroom_table import headroom_markdown as headroom_markdown
 from .learning_curves import curves_as_csv as curves_as_csv
 from .learning_curves import curves_page as curves_page
-from .light_names import LIGHT as LIGHT
+from .light_names import LIGHT_HEADING as LIGHT_HEADING
 from .light_names import LightNames as LightNames
 from .phase_diagrams import draw_network as draw_network
 from .run_records import RunRecord as RunRecord
 from .run_records import TableRecord as TableRecord
 from .run_records import read_records as read_records
+from .run_records import read_rows as read_rows
 from .service_tables import approach_table as approach_table
 from .service_tables import service_tables as service_tables
 from .standings import standings_table as standings_table

@@ -40,7 +40,7 @@ from ugat_marl.reporting.formats import tick_text
 from ugat_marl.reporting.run_records import RunRecord
 from ugat_marl.reporting.style import LIGHT, curve_style, styled
 
-MEASURES: dict[str, tuple[str, str]] = {
+RADAR_AXES: dict[str, tuple[str, str]] = {
     "att_s": ("travel time", "s"),
     "throughput": ("throughput", "veh"),
     "reward": ("reward", "per step"),
@@ -398,7 +398,7 @@ def radar_picture(
 
     Args:
         title: Title of the picture.
-        lines: Label to a value for each of `MEASURES`. A line with a missing value is not drawn.
+        lines: Label to a value for each of `RADAR_AXES`. A line with a missing value is not drawn.
         name: Name of the picture.
     """
     known = {label: row for label, row in lines.items() if all(map(math.isfinite, row))}
@@ -443,7 +443,7 @@ def comparison_radar(
         cells = [by_cell.get((setting, target), {}) for setting in settings]
         drawn = [(cells[0], "_sim"), *((cell, "") for cell in cells)]
         table = [
-            [float(cell.get(f"{measure}{end}", math.nan)) for measure in MEASURES]
+            [float(cell.get(f"{measure}{end}", math.nan)) for measure in RADAR_AXES]
             for cell, end in drawn
         ]
         _draw_radar(axes, table)
@@ -463,7 +463,7 @@ def radar_lines(evaluation: Evaluation, real: str) -> dict[str, list[float]]:
     shown += [p for p in policies if p == rule and p not in shown]
 
     def means(policy: str, domain: str) -> list[float]:
-        return [float(evaluation.values(policy, domain, measure).mean()) for measure in MEASURES]
+        return [float(evaluation.values(policy, domain, measure).mean()) for measure in RADAR_AXES]
 
     lines = {f"{policies[0]} in {sim}": means(policies[0], sim)}
     return lines | {f"{policy} in {real}": means(policy, real) for policy in shown[:5]}
@@ -487,13 +487,13 @@ def goodness(values: NDArray[np.float64], more_is_better: bool) -> NDArray[np.fl
 
 
 def _draw_radar(axes: Any, rows: Sequence[Sequence[float]]) -> None:
-    """Draw lines on polar axes, one axis for each of `MEASURES`; skip rows with a nan."""
+    """Draw lines on polar axes, one axis for each of `RADAR_AXES`; skip rows with a nan."""
     table = np.array(rows, dtype=float)
     if not np.isfinite(table).any(axis=0).all():  # no row has some measure
         axes.set_axis_off()
         return
-    scaled = np.stack([goodness(table[:, i], m == "throughput") for i, m in enumerate(MEASURES)])
-    angles = np.linspace(0, 2 * np.pi, len(MEASURES), endpoint=False)
+    scaled = np.stack([goodness(table[:, i], m == "throughput") for i, m in enumerate(RADAR_AXES)])
+    angles = np.linspace(0, 2 * np.pi, len(RADAR_AXES), endpoint=False)
     axes.set_theta_zero_location("N")
     axes.set_theta_direction(-1)
     for number, row in enumerate(scaled.T):
@@ -508,8 +508,8 @@ def _draw_radar(axes: Any, rows: Sequence[Sequence[float]]) -> None:
     axes.set_rlabel_position(36)
     axes.set_xticks(angles, [])
     axes.spines["polar"].set_visible(False)
-    best = [_best(table[:, i], m) for i, m in enumerate(MEASURES)]
-    for angle, (measure, unit), text in zip(angles, MEASURES.values(), best, strict=True):
+    best = [_best(table[:, i], m) for i, m in enumerate(RADAR_AXES)]
+    for angle, (measure, unit), text in zip(angles, RADAR_AXES.values(), best, strict=True):
         side = round(math.sin(angle), 3)
         anchor = "center" if side == 0 else ("left" if side > 0 else "right")
         up = 10 if side == 0 else 2 if math.cos(angle) > 0 else -28

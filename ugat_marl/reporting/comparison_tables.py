@@ -7,7 +7,6 @@ import io
 import math
 import textwrap
 from collections.abc import Callable, Mapping
-from pathlib import Path
 from typing import Any
 
 from rich.console import Group, RenderableType
@@ -121,20 +120,6 @@ def comparison_csv(comparison: Comparison) -> str:
     for row in rows:
         writer.writerow({k: "" if _is_nan(v) else _rounded(v) for k, v in row.items()})
     return text.getvalue()
-
-
-def read_rows(path: Path) -> list[dict[str, Any]]:
-    """Return the rows of a file of `comparison_csv`; nan for an empty cell.
-
-    Args:
-        path: A ``table.csv``.
-    """
-    words = {"scenario", "setting", "domain"}
-    with path.open(encoding="utf-8", newline="") as file:
-        return [
-            {k: v if k in words else float(v or math.nan) for k, v in row.items()}
-            for row in csv.DictReader(file)
-        ]
 
 
 def _headlines(comparison: Comparison, direct: str) -> list[tuple[str, Cell]]:

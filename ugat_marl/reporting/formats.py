@@ -108,6 +108,18 @@ def tick_text(value: float, _: Any = None) -> str:
     return f"{round(value, 6) + 0.0:.4g}".replace("-", "−")
 
 
+def flat_settings(settings: Mapping[str, Any], prefix: str = "") -> list[tuple[str, str]]:
+    """Return settings by their paths, such as ``ugat.gate.mode``."""
+    rows: list[tuple[str, str]] = []
+    for key, value in settings.items():
+        if isinstance(value, Mapping) and value:
+            rows += flat_settings(value, f"{prefix}{key}.")
+        else:
+            shown = ", ".join(map(str, value)) if isinstance(value, list) else str(value)
+            rows.append((f"{prefix}{key}", shown))
+    return rows
+
+
 PAGE_WIDTH = 140
 """Longest line of prose in Markdown, in characters."""
 COMMAND_WIDTH = 100

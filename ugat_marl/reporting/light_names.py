@@ -41,5 +41,5 @@ class LightNames:
         return ", ".join(filter(None, (self.streets.get(light, ""), self.text(light))))
 
 
-LIGHT = "light (agent)"
+LIGHT_HEADING = "light (agent)"
 """Heading of a column of `LightNames.text`."""

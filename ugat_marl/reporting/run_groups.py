@@ -10,6 +10,7 @@ from typing import Any
 
 from ugat_marl.errors import counted
 from ugat_marl.experiments import DIRECT, RULE, Comparison, Trial, is_grounded, rule_policy
+from ugat_marl.reporting.formats import flat_settings
 from ugat_marl.reporting.run_records import RunRecord
 
 _APART = (
@@ -145,7 +146,7 @@ def _seed(record: RunRecord) -> int | None:
 
 def job_labels(records: Sequence[RunRecord]) -> list[str]:
     """Return names of jobs; equal names get the settings in which the jobs differ."""
-    flat = [dict(_flat(record.ugat)) | _trained(record) for record in records]
+    flat = [dict(flat_settings(record.ugat)) | _trained(record) for record in records]
     names = [record.setting for record in records]
     labels: list[str] = []
     for record, name, settings in zip(records, names, flat, strict=True):
@@ -180,15 +181,7 @@ def _trained(record: RunRecord) -> dict[str, str]:
     if isinstance(learner, Mapping):
         own = learner.get("settings")
         told["learner"] = " ".join(map(str, [learner.get("name"), *(own or ())]))
-        told |= dict(_flat({"dqn": learner.get("dqn") or {}}))
+        told |= dict(flat_settings({"dqn": learner.get("dqn") or {}}))
     if isinstance(options, Mapping):
-        told |= dict(_flat(options, "options."))
+        told |= dict(flat_settings(options, "options."))
     return told
-
-
-def _flat(settings: Mapping[str, Any], prefix: str = "") -> Iterable[tuple[str, str]]:
-    for key, value in settings.items():
-        if isinstance(value, Mapping):
-            yield from _flat(value, f"{prefix}{key}.")
-        else:
-            yield f"{prefix}{key}", str(value)

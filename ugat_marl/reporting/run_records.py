@@ -361,13 +361,18 @@ def _scores(path: Path, settings: Mapping[str, Any]) -> Evaluation:
 
 def _table(directory: Path, name: str) -> TableRecord:
     reader = _Reader(directory)
-    rows = reader.read(TABLE_CSV, _csv, "there is nothing to show") or []
+    rows = reader.read(TABLE_CSV, read_rows, "there is nothing to show") or []
     page = reader.read(TABLE_MD, lambda p: p.read_text(errors="replace"), "its command is unknown")
     command = next(iter(commands_in(page or "")), "")
     return TableRecord(name, directory, tuple(rows), command, tuple(reader.missing))
 
 
-def _csv(path: Path) -> list[dict[str, Any]]:
+def read_rows(path: Path) -> list[dict[str, Any]]:
+    """Return the rows of a ``table.csv``; nan for a cell that is no number.
+
+    Raises:
+        ValueError: The file is no such table, or damaged.
+    """
     try:
         wrong = csv_damage(path, csv_texts(path.read_bytes()))
     except pl.exceptions.PolarsError as error:

@@ -11,7 +11,7 @@ from rich.text import Text
 from ugat_marl.data import level_of_service, mean_delay_s
 from ugat_marl.experiments import Evaluation
 from ugat_marl.reporting.formats import fixed, number_text
-from ugat_marl.reporting.light_names import LIGHT, LightNames
+from ugat_marl.reporting.light_names import LIGHT_HEADING, LightNames
 from ugat_marl.reporting.page import Grid
 from ugat_marl.reporting.terminal import titled_table
 from ugat_marl.scenarios import Network, named_approaches
@@ -101,7 +101,7 @@ def approach_table(title: str, delays: Mapping[str, Delays], network: Network) -
     for first in range(0, len(delays), MOST_CONTROLLERS):
         part = dict([*delays.items()][first : first + MOST_CONTROLLERS])
         table = titled_table(f"{title}{more}")
-        for heading in (LIGHT, "approach", "road"):
+        for heading in (LIGHT_HEADING, "approach", "road"):
             table.add_column(heading, overflow="fold", max_width=22)
         table.add_column("veh", justify="right")
         for controller in part:

@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+import math
+
 import polars as pl
 from rich.console import Group, RenderableType
 from rich.text import Text
 
-from ugat_marl.experiments import ranked
-from ugat_marl.reporting.formats import chance, number_text, share_text
+from ugat_marl.experiments import Interval, ranked
+from ugat_marl.reporting.formats import chance, mean_text, number_text, share_text
 from ugat_marl.reporting.terminal import titled_table
 
 
@@ -28,10 +30,8 @@ def standings_table(scenario: str, table: pl.DataFrame, name: str) -> Renderable
         for heading in ("runs", "ATT (95 %)", "gap", "regret", "won back", "p"):
             shown.add_column(heading, justify="right", no_wrap=True)
         for row in rows.filter(pl.col("domain") == domain).iter_rows(named=True):
-            att = number_text(row["att_s"])
-            if row["low_s"] is not None and row["low_s"] < row["high_s"]:
-                to = " to " if row["low_s"] < 0 else "–"
-                att += f" ({number_text(row['low_s'])}{to}{number_text(row['high_s'])})"
+            ends = (math.nan if row[end] is None else row[end] for end in ("low_s", "high_s"))
+            att = mean_text(Interval(row["att_s"], *ends))
             shown.add_row(
                 "▶" if row["setting"] == name else "",
                 Text(row["setting"]),

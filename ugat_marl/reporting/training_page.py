@@ -30,7 +30,7 @@ from ugat_marl.experiments import (
 )
 from ugat_marl.reporting import charts
 from ugat_marl.reporting.figures import NamedFigure, printable
-from ugat_marl.reporting.formats import number, share, signed
+from ugat_marl.reporting.formats import flat_settings, number, share, signed
 from ugat_marl.reporting.intersection_findings import findings_maps, findings_table
 from ugat_marl.reporting.light_names import LightNames
 from ugat_marl.reporting.network_maps import minutes_picture, node_map
@@ -309,8 +309,8 @@ def _radar_lines(labels: Sequence[str], cells: Cells, domain: str) -> dict[str, 
     for place, label in enumerate(shown[:5]):
         row = cells[label, domain]
         if place == 0:
-            lines[f"{label} in sim"] = [as_number(row.get(f"{m}_sim")) for m in charts.MEASURES]
-        lines[f"{label} in {domain}"] = [as_number(row.get(m)) for m in charts.MEASURES]
+            lines[f"{label} in sim"] = [as_number(row.get(f"{m}_sim")) for m in charts.RADAR_AXES]
+        lines[f"{label} in {domain}"] = [as_number(row.get(m)) for m in charts.RADAR_AXES]
     return lines
 
 
@@ -361,7 +361,7 @@ def _training(page: Page, record: RunRecord, commands: Commands) -> dict[str, An
         "queues": _worst(page, record, places if isinstance(places, Places) else None),
         "commands": commands.get(record.directory, ()),
         "provenance": [("folder", str(record.directory)), *versions, *hashes, *notes],
-        "settings": _flat(record.settings),
+        "settings": flat_settings(record.settings),
     }
 
 
@@ -584,18 +584,6 @@ def _worst_grid(by_policy: Mapping[str, Queues], names: LightNames) -> Grid:
             cells += [number(means[policy][tls]), number(row[worst]), f"minute {worst}"]
         rows.append(cells)
     return Grid(headings, rows, numbers)
-
-
-def _flat(settings: Mapping[str, Any], prefix: str = "") -> list[tuple[str, str]]:
-    """Return settings by their paths, such as ``ugat.gate.mode``."""
-    rows: list[tuple[str, str]] = []
-    for key, value in settings.items():
-        if isinstance(value, Mapping) and value:
-            rows += _flat(value, f"{prefix}{key}.")
-        else:
-            shown = ", ".join(map(str, value)) if isinstance(value, list) else str(value)
-            rows.append((f"{prefix}{key}", shown))
-    return rows
 
 
 def _with_interval(estimate: Estimate) -> str:

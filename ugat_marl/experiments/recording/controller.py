@@ -91,7 +91,7 @@ def own_programmes(
     watched = tuple(sorted(with_programme - set(fixed)))
     if not fixed:
         return {}, watched
-    begin, end = scenario.settings.begin_s, scenario.settings.duration_s
+    end_s = scenario.settings.begin_s + scenario.settings.duration_s
     with tempfile.TemporaryDirectory(prefix="ugat_marl-") as name:
         directory = Path(name)
         watching = switch_document(fixed, directory / "signals.xml")
@@ -100,12 +100,12 @@ def own_programmes(
         )
         launch = launch_of(empty, 0, directory / "sumo", ())
         launch.write()
-        command = launch.command("--end", repr(begin + end))
+        command = launch.command("--end", repr(end_s))
         done = finished("sumo", command)
         if done.returncode:
             said = " ".join(done.stderr.split())
             raise SimulatorError(f"SUMO cannot run the signals of {scenario.id!r}: {said}")
-        return switches(directory / "signals.xml", begin + end), watched
+        return switches(directory / "signals.xml", end_s), watched
 
 
 def switch_document(lights: Sequence[str], file: Path) -> Document:

@@ -29,7 +29,7 @@ from ugat_marl.policies.devices import CPU
 from ugat_marl.policies.learners.dqn_config import CEILING_DECISIONS, DQNConfig
 from ugat_marl.policies.learners.initial_weights import InitialWeights
 from ugat_marl.policies.learners.lessons import BEST, OnPlay, find_teacher, plays
-from ugat_marl.policies.learners.replay import Replay
+from ugat_marl.policies.learners.replay import ReplayBuffer
 from ugat_marl.policies.learners.scaling import ceilings, input_factors
 from ugat_marl.policies.network_policy import NetworkPolicy, checkpoint_header, parse_header
 from ugat_marl.policies.networks.batched import one_thread, size_mask
@@ -197,7 +197,7 @@ class DQN:
         self._target_weights.data.copy_(self._weights.data)
         self._target.requires_grad_(False)
         self._adam = torch.optim.Adam([self._weights], lr=self.config.learning_rate, fused=True)
-        self._replay = Replay(agents, self.config.replay_capacity)
+        self._replay = ReplayBuffer(agents, self.config.replay_capacity)
         self._centre = torch.zeros(len(agents), 1, device=device)
         scale = self.config.reward_scale or (UNIVERSAL_SCALE if self._is_universal else 1.0)
         self._scale = torch.full((len(agents), 1), scale, device=device)

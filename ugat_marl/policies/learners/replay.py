@@ -57,7 +57,7 @@ _COLUMNS = (
 """Columns of the memory that have a row for each agent."""
 
 
-class Replay:
+class ReplayBuffer:
     """A ring of the last `capacity` decisions of all agents, as ``(agents, capacity, ...)``.
 
     It stays on the CPU also for updates on a GPU: it is large, and an update needs little of it.

@@ -45,12 +45,22 @@ def nan_last(mean: float | np.floating) -> float:
     return math.inf if math.isnan(mean) else float(mean)
 
 
-def race_fields(settings: int) -> list[int]:
-    """Return the number of rules in each rung: half of the rung before, down to two."""
+def race_fields(settings: int, rungs: int | None = None) -> list[int]:
+    """Return the number of rules in each rung: half of the rung before, but at least two.
+
+    Args:
+        settings: Number of rules at the start.
+        rungs: Number of rungs; None for one after the other until two rules are left.
+    """
     fields = [settings]
-    while fields[-1] > LEAST_FIELD:
-        fields.append(math.ceil(fields[-1] / 2))
+    while len(fields) < rungs if rungs is not None else fields[-1] > LEAST_FIELD:
+        fields.append(_next_field(fields[-1]))
     return fields
+
+
+def _next_field(rules: int) -> int:
+    """Return the number of rules that go on from a rung."""
+    return min(rules, max(LEAST_FIELD, math.ceil(rules / 2)))
 
 
 def race(
@@ -76,6 +86,6 @@ def race(
         # The sort is stable: of equal rules, the one named first stays first.
         running.sort(key=lambda name: nan_last(np.mean(played[name])))
         if rung + 1 < rungs:
-            kept = max(LEAST_FIELD, math.ceil(len(running) / 2))
+            kept = _next_field(len(running))
             running, left = running[:kept], running[kept:] + left
     return {name: played[name] for name in running + left}
