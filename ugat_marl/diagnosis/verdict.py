@@ -31,6 +31,9 @@ from ugat_marl.errors import joined
 NOUNS = {"swapped": "swapped detectors", "stuck": "a stuck detector"}
 """Nouns for effects whose names are no nouns, for sentences."""
 
+LEAST_Z = 0.05
+"""Smallest standardised difference for which periods are counted: beyond some thousand periods the
+number says no more."""
 
 UNEXPLAINED = "Simulation and measurement disagree, and no effect of the library explains it"
 
@@ -283,7 +286,7 @@ def _separating(best: Fitted, rival: Fitted, held: Collection[int], deciding_z: 
     z = np.nan_to_num(np.where(block.used[0], difference / deviation, 0.0))
     index = int(np.argmax(np.abs(z)))
     name, regime, _ = ALL_FEATURES[index]
-    periods = int(np.ceil((deciding_z / max(abs(float(z[index])), 0.05)) ** 2))
+    periods = int(np.ceil((deciding_z / max(abs(float(z[index])), LEAST_Z)) ** 2))
     many = "one period" if periods == 1 else f"{periods} periods"
     source = "" if index in held else f" of {_SOURCES.get(regime, 'detections of single vehicles')}"
     return (

@@ -58,6 +58,10 @@ class EyesConfig:
             decisions of the simulation would have broken the street's limit. Halved, a quiet hour
             looks like a zone or a dead lane.
         together: Decisions that count as one observation, because queues change slowly.
+        limit: Quantile of the counts that is taken for their limit. By hand: single larger counts
+            are noise. At 1 one reading decides.
+        margin: Standard deviations of the noise by which the limit is lowered, since noise raises
+            the largest counts. Halved, zones look longer under noise.
         filled: Smallest share of counts at the limit of a zone, of that of the simulation's counts
             which reach it: queues fill a zone, and quiet traffic never does. On the shipped
             networks zones have 0.4 or more, half of the traffic 0.05 or less.
@@ -76,6 +80,8 @@ class EyesConfig:
 
     surprise: float = 8.0
     together: float = 10.0
+    limit: float = 0.998
+    margin: float = 2.0
     filled: float = 0.2
     pull: float = 2.0
     queue: float = 4.0
@@ -95,10 +101,10 @@ class EyesConfig:
         for name in ("surprise", "together", "pull"):
             if not 0 < getattr(self, name) < math.inf:
                 raise OptionError(f"eyes {name} is {getattr(self, name)}; allowed: > 0, finite")
-        for name in ("queue", "long_queue", "fraction"):
+        for name in ("queue", "long_queue", "fraction", "margin"):
             if not 0 <= getattr(self, name) < math.inf:
                 raise OptionError(f"eyes {name} is {getattr(self, name)}; allowed: >= 0, finite")
-        for name in ("filled", "least_lost"):
+        for name in ("limit", "filled", "least_lost"):
             if not 0 <= getattr(self, name) <= 1:
                 raise OptionError(f"eyes {name} is {getattr(self, name)}; allowed: 0 to 1")
         for name in ("absolute", "relative"):
@@ -305,9 +311,9 @@ def _dead(rows: Sequence[LaneRows], perfect: Sequence[LaneRows], config: EyesCon
     dead, episodes = np.zeros(len(rows)), np.zeros(len(rows))
     busy_lanes = [float((x.before > 0).mean()) if len(x.before) else 0.0 for x in perfect]
     quiet = _quietness(rows, busy_lanes)
-    for place, (own, busy) in enumerate(zip(rows, busy_lanes, strict=True)):
-        for episode in np.unique(own.episode):
-            counts = own.before[own.episode == episode]
+    for place, (lane, busy) in enumerate(zip(rows, busy_lanes, strict=True)):
+        for episode in np.unique(lane.episode):
+            counts = lane.before[lane.episode == episode]
             if busy * quiet[int(episode)] * len(counts) / config.together < config.surprise:
                 continue  # nobody might have come
             episodes[place] += 1
@@ -344,7 +350,7 @@ def _zone(
         return 0.0, 0.0
     counts = np.concatenate([rows[place].before for place in alive])
     usual = np.concatenate([perfect[place].before for place in alive])
-    most = float(np.quantile(counts, 0.998)) - 2.0 * noise
+    most = float(np.quantile(counts, config.limit)) - config.margin * noise
     cut = max(1.0, round(most))
     beyond = float((usual > cut + 0.5).mean()) * len(counts)
     if beyond / config.together < config.surprise * len(alive):

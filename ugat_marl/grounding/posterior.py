@@ -113,6 +113,10 @@ class ServicePrior:
 SERVICE = (ServicePrior(0.5, 5.0), ServicePrior(0.35, 3.0))
 """Priors of the red at the beginning of a green, and of the red in each further decision."""
 
+UNCHANGED = 1e-3
+"""Distance from nominal up to which an effect is left out of a world, in its unit; values have four
+decimals."""
+
 
 @dataclass(frozen=True)
 class WorldValues:
@@ -224,7 +228,7 @@ class WorldPrior:
         """Return the effects of a world that change something; those on demand come first."""
         made: list[Effect] = []
         for item, value in zip(self.library, values.effects, strict=True):
-            if abs(value - item.nominal) > 1e-3:
+            if abs(value - item.nominal) > UNCHANGED:
                 kind = known_effects()[item.name]
                 given = dict.fromkeys(kind.texts, EVERYWHERE) | {
                     next(iter(kind.ranges)): round(float(value), 4)

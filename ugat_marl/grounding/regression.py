@@ -28,6 +28,9 @@ FOLDS = 10
 NEAR = 0.3
 """Share of the simulated worlds that the kernel takes into account. Halved, draws follow the
 regression's local errors more closely, from fewer of them."""
+MOST_DEVIATIONS = 4.0
+"""Standard deviations at which a statistic is cut. By hand: a square of more would extrapolate far
+beyond the simulated worlds. Halved, real differences are cut as well."""
 
 
 @dataclass(frozen=True)
@@ -54,7 +57,7 @@ class Design:
     def inputs(self, statistics: Floats) -> Floats:
         """Return the inputs of the regression, ``(n, 1 + 2 k)``; the first one is 1."""
         z = np.nan_to_num((statistics - self.mean) / self.spread, nan=0.0)
-        z = np.clip(z, -4.0, 4.0)
+        z = np.clip(z, -MOST_DEVIATIONS, MOST_DEVIATIONS)
         return np.concatenate((np.ones((len(z), 1)), z, z**2), axis=1)
 
 
