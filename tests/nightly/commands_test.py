@@ -142,6 +142,7 @@ def stock(tmp_path_factory: pytest.TempPathFactory) -> Path:
         run(folder, *small(f"ugat-marl {command}"))
 
     do("scenario new town --osm town.osm --counts docs/tutorials/town/counts.csv")
+    do("scenario new try-town --osm town.osm --counts docs/tutorials/town/counts.csv")
     do("scenario new my-grid --grid 1x2 --vph 200 --duration-s 600")
     do("scenario new my-town --arterial 2 --vph 200 --duration-s 600")
     for name in ("my-city", "my-scenario"):  # the network of found/corrected and of the logs
@@ -207,6 +208,8 @@ def test_a_documented_command_runs(command: str, stock: Path, tmp_path: Path) ->
     goal = next((words[2] for _ in words if words[:2] == ["scenario", "new"]), "")
     for made in {goal, *(words[words.index("--out") + 1 :][:1] if "--out" in words else [])}:
         place = folder / made
-        if made and place.is_dir() and not filled_in:
-            shutil.rmtree(place)  # made here, and now by the command
+        if made and words.count(made) == 1 and not filled_in:  # made here, and now by the command
+            if place.is_dir():
+                shutil.rmtree(place)
+            place.unlink(missing_ok=True)
     run(folder, *words)
