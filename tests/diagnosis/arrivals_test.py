@@ -11,16 +11,16 @@ import pytest
 
 from ugat_marl.data import is_actuated
 from ugat_marl.diagnosis import Reference, Tally
-from ugat_marl.diagnosis.engine import Engine
-from ugat_marl.diagnosis.features import BIN_FEATURES, FEATURES, INDEX, DetectorLayout, tally
-from ugat_marl.diagnosis.replay import (
+from ugat_marl.diagnosis.arrivals import (
     Arrivals,
     DemandBalance,
-    Replay,
     by_lane_left,
     corrected,
     unhindered,
 )
+from ugat_marl.diagnosis.engine import Engine
+from ugat_marl.diagnosis.features import BIN_FEATURES, FEATURES, INDEX, DetectorLayout, tally
+from ugat_marl.diagnosis.replay import Replay
 from ugat_marl.diagnosis.statistics import Pools
 from ugat_marl.diagnosis.thresholds import Thresholds
 from ugat_marl.effects import Effect, load_scenario, parse_domain

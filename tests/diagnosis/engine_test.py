@@ -24,8 +24,9 @@ from ugat_marl.diagnosis.engine import (
     locked_up,
 )
 from ugat_marl.diagnosis.features import BIN_FEATURES, FEATURES, DetectorLayout, tally
-from ugat_marl.diagnosis.replay import Day, Replay, Unmeasured
+from ugat_marl.diagnosis.replay import Day, Replay
 from ugat_marl.diagnosis.thresholds import Thresholds
+from ugat_marl.diagnosis.unmeasured import Unmeasured
 from ugat_marl.effects import Effect, apply_detector_effects, load_scenario, parse_domain
 from ugat_marl.errors import SimulatorError
 from ugat_marl.scenarios import Network, Passages, Period, Scenario

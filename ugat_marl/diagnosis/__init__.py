@@ -18,7 +18,9 @@ content of ``diagnosis.json``.
     statistics  statistics of several periods, their noise, distances, whitening
     measurement errors of the detectors, read off single vehicles before all else
     error_places  choice of the detectors that err: as few as the data ask for
-    replay      one simulated day under the measured signals, with measured arrivals
+    arrivals    the vehicles of a day at the times at which detectors saw the street's
+    replay      one simulated day under the measured signals
+    unmeasured  speeds and lengths that the street's detectors do not measure
     engine      simulated days in parallel, with a cache, within a budget
     locate      test of the scenario as it is, and the places that contradict it
     hypotheses  the library of effects, and sets of them

@@ -24,6 +24,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ugat_marl.data import installed_version
+from ugat_marl.diagnosis.arrivals import DemandBalance, corrected
 from ugat_marl.diagnosis.features import (
     COUNT_FEATURES,
     FEATURES,
@@ -34,9 +35,10 @@ from ugat_marl.diagnosis.features import (
 )
 from ugat_marl.diagnosis.intervals import with_intervals
 from ugat_marl.diagnosis.measurement import Sightings
-from ugat_marl.diagnosis.replay import Day, DemandBalance, Replay, Unmeasured, corrected
+from ugat_marl.diagnosis.replay import Day, Replay
 from ugat_marl.diagnosis.supplementary_data import SupplementaryData
 from ugat_marl.diagnosis.thresholds import Thresholds
+from ugat_marl.diagnosis.unmeasured import Unmeasured
 from ugat_marl.effects import Effect
 from ugat_marl.errors import OptionError, ScenarioError, SimulatorError, UgatMarlError
 from ugat_marl.files import user_cache, write_whole
