@@ -130,7 +130,7 @@ def episode(request: dict[str, Any]) -> dict[str, Any]:
     actions = random_actions(env, seed)
     recorder = RecordingSimulator(Path(request["record"])) if request["record"] else None
     if recorder is not None:
-        env._simulator = recorder
+        env.simulate_with(recorder)
     if simulator != "inprocess":
         env.reset(seed=seed)  # the first reset also starts the warm parent, once per process
     began = time.perf_counter()

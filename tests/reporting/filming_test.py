@@ -41,7 +41,7 @@ def test_the_camera_changes_nothing() -> None:
     env, policy = made()
     plain, plain_policy = made()
     camera = Filmed(ProcessSimulator(), 55, 170)
-    env._simulator = camera
+    env.simulate_with(camera)
     try:
         assert roll_out(env, policy, 5).steps == roll_out(plain, plain_policy, 5).steps == 30
         assert env.scores() == plain.scores()

@@ -40,6 +40,7 @@ from ugat_marl.errors import EpisodeError, OptionError
 from ugat_marl.files import OwnDirectory
 from ugat_marl.scenarios import Network, Scenario, check_demand, signals
 from ugat_marl.simulation import (
+    SignalPlans,
     Simulator,
     Snapshot,
     launch_of,
@@ -131,6 +132,7 @@ class TrafficEnv(ParallelEnv[str, Any, Any]):
         self._renderer: NetworkRenderer | None = None
         self._recorded: tuple[Observer, ...] = ()
         self._meanwhile: Callable[[], object] | None = None
+        self._watch: Callable[[float, SignalPlans], object] | None = None
 
     # --- spaces -------------------------------------------------------------------------------
 
@@ -292,6 +294,21 @@ class TrafficEnv(ParallelEnv[str, Any, Any]):
         """Measure from the next episode on what these observers read, too; none measures less."""
         self._recorded = observers
 
+    def simulate_with(self, simulator: Simulator) -> None:
+        """Simulate with this simulator from the next reset on; `close` closes it."""
+        if self._simulator is not None:
+            self._simulator.close()
+        self._simulator = simulator
+
+    def watch_plans(self, look: Callable[[float, SignalPlans], object] | None) -> None:
+        """Let a function see the signals that each step plans.
+
+        Args:
+            look: Called with the start of the step in s, and the signals of each light, before late
+                greens hold them back; not with `signals="programme"`. None for nobody.
+        """
+        self._watch = look
+
     def remember(self, commands: Mapping[str, int]) -> None:
         """Let observations show these commands for the next step, and not the actions of `step`.
 
@@ -443,6 +460,8 @@ class TrafficEnv(ParallelEnv[str, Any, Any]):
             states.append(after)
         if self._programmes is not None:
             plans = {}
+        elif self._watch is not None:
+            self._watch(self._snapshot.time_s, plans)
         plans = self._delays.hold(plans)
         work, self._meanwhile = self._meanwhile, None
         self._look(self._simulator.advance(self.decision_interval_s, plans, work))

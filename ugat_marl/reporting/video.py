@@ -174,7 +174,7 @@ def film_episode(
             f"{duration_s:g} s; choose a shorter or earlier stretch"
         )
     filmed = Filmed(ProcessSimulator(), begin_s, begin_s + length_s)
-    env._simulator = filmed
+    env.simulate_with(filmed)
 
     def on_step(step: int) -> None:
         if step * env.decision_interval_s >= begin_s + length_s:

@@ -168,7 +168,7 @@ def test_recorded_switches_are_what_sumo_showed(tmp_path: Path) -> None:
     """The record, read second by second, is SUMO's own account of its signals."""
     env = parallel_env(SCENARIO, simulator="inprocess", duration_s=100)
     recorder = RecordingSimulator(tmp_path)
-    env._simulator = recorder
+    env.simulate_with(recorder)
     env.reset(seed=1)
     (light,) = env.intersection_of.values()
     for action in random_actions(env, 5)[:-1]:

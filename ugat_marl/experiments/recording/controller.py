@@ -12,43 +12,37 @@ from dataclasses import replace
 from pathlib import Path
 from xml.sax.saxutils import unescape
 
-from ugat_marl.envs import EnvOptions, TrafficEnv, parallel_env
+from ugat_marl.envs import parallel_env
 from ugat_marl.errors import SimulatorError
 from ugat_marl.files import parse_xml, xml_bytes
 from ugat_marl.policies import PolicyFactory, roll_out, stop_callback
-from ugat_marl.scenarios import Document, Network, Scenario, SignalLog, finished, signals
-from ugat_marl.simulation import launch_of
+from ugat_marl.scenarios import Document, Network, Scenario, SignalLog, finished
+from ugat_marl.simulation import SignalPlans, launch_of
 
 _STATE = re.compile(r'<tlsState time="([\d.]+)" id="([^"]*)" [^>]*?state="([^"]*)"')
 
 
-class _LoggingEnv(TrafficEnv):
-    """Environment that keeps the commands of its controller.
+class _Commands:
+    """Commands of a controller, as `TrafficEnv.watch_plans` shows them.
 
-    `signals.advance` plans the signals as in the environment itself. The log holds the plan before
-    an effect of the domain delays a green.
-
-    Attributes:
-        commanded: Pairs of time in s and signal state, by id of the traffic light.
+    The log holds the plan before an effect of the domain delays a green.
     """
 
-    commanded: dict[str, list[tuple[float, str]]]
+    def __init__(self) -> None:
+        self._given: dict[str, list[tuple[float, str]]] = defaultdict(list)
 
-    def _advance(self, requested: list[int]) -> None:
-        if self.options.signals == "actions":
-            for light, state, phase in zip(
-                self.network.intersections, self._states, requested, strict=True
-            ):
-                _, segments = signals.advance(
-                    light.phases, state, phase, self.decision_interval_s, self._timing
-                )
-                log = self.commanded[light.id]
-                since = self._snapshot.time_s
-                for duration, shown in segments:
-                    if not log or log[-1][1] != shown:
-                        log.append((round(since, 3), shown))
-                    since += duration
-        super()._advance(requested)
+    def look(self, time_s: float, plans: SignalPlans) -> None:
+        """Add the plans of a step that begins at a time."""
+        for light, segments in plans.items():
+            log, since_s = self._given[light], time_s
+            for duration_s, shown in segments:
+                if not log or log[-1][1] != shown:
+                    log.append((round(since_s, 3), shown))
+                since_s += duration_s
+
+    def logs(self) -> dict[str, SignalLog]:
+        """Return time in s and state of each change, by id of the traffic light."""
+        return {light: tuple(log) for light, log in self._given.items()}
 
 
 def play(
@@ -56,13 +50,13 @@ def play(
 ) -> dict[str, SignalLog]:
     """Play one episode and return the commands, by id of the traffic light."""
     policy = make(parallel_env(scenario))
-    env = _LoggingEnv(scenario, "sim", EnvOptions.of(policy.env_options))
-    env.commanded = defaultdict(list)
+    env, commands = parallel_env(scenario, **policy.env_options), _Commands()
+    env.watch_plans(commands.look)
     try:
         roll_out(env, policy, seed, on_step=stop_callback(stop))
     finally:
         env.close()
-    return {tls: tuple(log) for tls, log in env.commanded.items()}
+    return commands.logs()
 
 
 def own_programmes(
