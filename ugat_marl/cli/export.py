@@ -21,9 +21,9 @@ class Export:
     The files are described in docs/how-to/export.md.
 
     Examples:
-        ugat-marl export runs/demo/policies/fitted-street.pt
+        ugat-marl export runs/demo/policies/direct-transfer.pt
         --out policy.onnx --scenario single-v1
-        ugat-marl export runs/demo/policies/fitted-street.pt --out policy.npz
+        ugat-marl export runs/demo/policies/direct-transfer.pt --out policy.npz
 
     Attributes:
         policy: File of a trained policy.
