@@ -348,3 +348,25 @@ def test_texts_of_children_are_those_of_elementtree(root: ET.Element) -> None:
     ET.indent(root, "    ")
     whole = ET.tostring(root, "unicode")
     assert texts == (whole[whole.index(">") + 1 :].lstrip().split(end)[:-1] if len(root) else [])
+
+
+def test_a_link_goes_on_to_point_at_what_is_written(tmp_path: Path) -> None:
+    target, link = tmp_path / "deep" / "target.txt", tmp_path / "link.txt"
+    write_whole(target, "old")
+    link.symlink_to(target)
+    write_whole(link, "new")
+    assert link.is_symlink() and target.read_text() == "new"
+
+
+def test_a_pipe_is_not_replaced(tmp_path: Path) -> None:
+    pipe = tmp_path / "pipe"
+    os.mkfifo(pipe)
+    with pytest.raises(OutputError, match="is no file, but a device or a pipe"):
+        write_whole(pipe, "text")
+    assert stat.S_ISFIFO(pipe.stat().st_mode)
+
+
+def test_a_long_name_can_be_written(tmp_path: Path) -> None:
+    write_whole(tmp_path / ("a" * 250), "text")
+    with pytest.raises(OutputError, match="cannot be written"):
+        write_whole(tmp_path / ("a" * 300), "text")

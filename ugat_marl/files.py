@@ -66,7 +66,8 @@ _IN_ATTRIBUTE = _IN_TEXT | str.maketrans(
 def replacing(path: Path) -> Iterator[Path]:
     """Yield a temporary path beside `path`; it replaces `path` if the block ends normally."""
     require_writable(path)
-    temporary = path.with_name(f".{path.name}.{secrets.token_hex(8)}.tmp")
+    path = path.resolve()  # a link goes on to point at the file
+    temporary = path.with_name(f".{secrets.token_hex(8)}.tmp")
     # opened like any new file, so that the system applies the umask
     os.close(os.open(temporary, os.O_WRONLY | os.O_CREAT | os.O_EXCL, 0o666))
     try:
@@ -92,9 +93,17 @@ def require_writable(path: Path, suffix: str | None = None) -> None:
         OutputError: The path is a folder, a file of another kind is there, or the folder cannot be
             made or written to.
     """
-    if path.is_dir() or not path.name:
+    try:
+        is_there, is_file, is_folder = path.exists(), path.is_file(), path.is_dir()
+    except OSError as error:  # a name that is too long
+        raise OutputError(
+            f"{str(path)[:80]}: cannot be written ({error.strerror}); give another name"
+        ) from None
+    if is_folder or not path.name:
         raise OutputError(f"{str(path)!r} is a folder; give the name of a file")
-    if suffix is not None and path.is_file() and path.suffix.lower() != suffix:
+    if is_there and not is_file:
+        raise OutputError(f"{path}: is no file, but a device or a pipe; give the name of a file")
+    if suffix is not None and is_file and path.suffix.lower() != suffix:
         raise OutputError(
             f"{path}: there is a file of this name, and it would be replaced by a {suffix} file; "
             f"give a name that ends in {suffix}"

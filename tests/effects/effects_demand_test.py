@@ -628,3 +628,30 @@ def test_a_truck_is_no_faster_than_the_car_it_replaces() -> None:
         for item in document.parse().iter("vType")
     }
     assert speeds["heavy.slow"] == "8" and speeds["heavy.car"] == "36.11"
+
+
+@pytest.mark.parametrize("inside", [True, False])
+def test_a_turned_vehicle_keeps_its_stops_before_the_turn(inside: bool) -> None:
+    stops = f'<stop edge="{EDGE}" endPos="20" duration="30"/><stop lane="A1_west1_0" duration="9"/>'
+    route = f'<route edges="{EDGE} A1_west1">{stops if inside else ""}</route>'
+    demand = (
+        f'<routes><vehicle id="a" depart="1">{route}{"" if inside else stops}</vehicle></routes>'
+    )
+    scenario = load_scenario("single-v1")
+    scenario = replace(scenario, routes=(scenario.routes[0].edited(demand.encode()),))
+    turned = departing(sound(apply_effects(scenario, [Turning(EDGE, "A1_northA", 1)])))["a"]
+    assert edges(turned) == [EDGE, "A1_northA"]
+    assert [stop.get("edge") for stop in turned.iter("stop")] == [EDGE]
+    assert [child.tag for child in turned] == ["route", "stop"]
+
+
+def test_laps_of_a_turned_vehicle_count() -> None:
+    laps = ["A1_A2", "A2_B2", "B2_B1", "B1_A1"]
+    demand = (
+        f'<routes><vehicle id="a" depart="1"><route edges="{" ".join(laps)}" repeat="1"/></vehicle>'
+        "</routes>"
+    )
+    scenario = load_scenario("grid2x2-v1")
+    scenario = replace(scenario, routes=(scenario.routes[0].edited(demand.encode()),))
+    turned = departing(sound(apply_effects(scenario, [Turning("B1_A1", "A1_west1", 1)])))["a"]
+    assert edges(turned) == [*laps, "A1_west1"]

@@ -425,3 +425,12 @@ def test_vehicles_that_block_a_lane_are_no_travellers(
         drives = sum(1 for _ in driven_routes(scenario))
         counts.append((len(trips.finished), check_demand(scenario, network).vehicles, drives))
     assert counts[0][0] > 0 and set(counts) == {counts[0]}
+
+
+def test_only_the_vehicles_of_the_effect_park_at_other_times() -> None:
+    own = '<vehicle id="parking.7" depart="100"><route edges="east1_A1 A1_west1"/></vehicle>'
+    scenario = load_scenario("single-v1")
+    document = scenario.routes[0].edited(f"<routes>{own}</routes>".encode())
+    (shifted,) = shift_parking(replace(scenario, routes=(document,)), 3).routes
+    (vehicle,) = shifted.parse().iter("vehicle")
+    assert vehicle.get("depart") == "100"

@@ -193,6 +193,14 @@ def test_letters_beyond_the_links_stay_red() -> None:
     assert conflict_free_phases(links, rules, 4, "here") == ("Grrr", "rGrr")
 
 
+def test_many_movements_that_agree_are_one_phase_at_once() -> None:
+    """Without a pivot the time doubles with each of them."""
+    count = 60
+    links = [link(i, f"a{i}", "s") for i in range(count)]
+    rules = RightOfWay(matrix(count, set()))
+    assert conflict_free_phases(links, rules, count, "here") == ("G" * count,)
+
+
 def test_too_many_phases_are_refused() -> None:
     pairs = 7  # 2 ** 7 maximal sets
     links = [link(i, f"a{i}", "s") for i in range(2 * pairs)]

@@ -13,7 +13,7 @@ import pytest
 import sumo
 
 from ugat_marl.effects import load_scenario
-from ugat_marl.files import Tag
+from ugat_marl.files import Document, Tag
 from ugat_marl.scenarios import Scenario, demand_as_vehicles
 from ugat_marl.scenarios.routes import OwnEdges, departures, scaled_number
 
@@ -117,3 +117,29 @@ def test_copies_of_vehicles_are_those_of_sumo(
         assert len(found) == len(theirs)
     else:
         assert found == theirs and scaled_number(90, scale) == len(theirs)
+
+
+def test_departures_with_a_sign_or_a_leading_point_are_times() -> None:
+    scenario = on_grid(
+        "<routes>"
+        + "".join(
+            f'<vehicle id="{n}" depart="{text}"><route edges="west1_A1 A1_B1"/></vehicle>'
+            for n, text in enumerate((".5", "+1000", "+2000.5", "1:00:00"))
+        )
+        + "</routes>"
+    )
+    times = [depart for _, depart, _ in departures(scenario, routed=True)]
+    assert times == [0.5, 1000.0, 2000.5]  # the last one is due when the episode ends
+
+
+def test_files_of_two_folders_may_have_one_name(tmp_path: Path) -> None:
+    scenario = load_scenario("grid2x2-v1")
+    documents: list[Document] = []
+    for folder in ("a", "b"):
+        text = f'<routes><trip id="{folder}" depart="1" from="west1_A1" to="A1_B1"/></routes>'
+        path = tmp_path / folder / "r.rou.xml"
+        path.parent.mkdir()
+        path.write_text("<routes/>")
+        documents.append(replace(Document("r.rou.xml", path), content=text.encode()))
+    days = demand_as_vehicles(replace(scenario, routes=tuple(documents)))
+    assert [name for name, *_ in departures(days, routed=True)] == ["a", "b"]

@@ -159,6 +159,18 @@ def test_with_control_and_duration_leave_the_original(crossing: Crossing) -> Non
         scenario.with_duration(5)
 
 
+def test_a_key_in_the_wrong_place_is_told_where_it_belongs(crossing: Crossing) -> None:
+    file = crossing() / "scenario.toml"
+    file.write_text('phases = "programme"\n' + file.read_text())
+    with pytest.raises(ScenarioError, match=r"unknown key 'phases'; it belongs under \[control\]"):
+        read_scenario(file.parent)
+
+
+def test_a_name_that_is_too_long_is_no_scenario() -> None:
+    with pytest.raises(UnknownNameError, match="unknown scenario 'aaa"):
+        read_scenario("a" * 300)
+
+
 @pytest.mark.parametrize(
     ("duration", "interval", "step", "decisions"),
     [(3600, 10, 1, 360), (3600, 0.1, 0.1, 36000), (0.3, 0.1, 0.1, 3), (95, 10, 1, 9)],

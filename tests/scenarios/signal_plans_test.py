@@ -623,3 +623,15 @@ def test_the_typical_plan_of_the_programme_is_the_programme(single: Scenario) ->
 def test_two_plans_of_one_light_are_refused(single: Scenario) -> None:
     with pytest.raises(ScenarioError, match="two plans for light 'A1'"):
         with_plans(single, [dual_ring(), dual_ring(5.0)], "plans.csv")
+
+
+def test_no_part_of_a_cycle_is_shorter_than_its_last_decimal(single: Scenario) -> None:
+    """SUMO refuses a phase of 0 s."""
+    phases = (
+        PlanPhase(1, 1, ("EBT", "EBR", "EBL"), 30, 3, 2),
+        PlanPhase(2, 1, ("WBT", "WBR", "WBL"), 30.0004, 3, 2),
+        PlanPhase(1, 2, ("NBT", "NBR", "SBT", "SBR", "NBL", "SBL"), 30, 3, 2),
+    )
+    scenario = with_plans(single, [SignalPlan("A1", 60, 0, phases)], "plans.csv")
+    (light,) = Network.read(scenario).intersections
+    assert min(seconds for seconds, _ in light.programme) >= 0.001

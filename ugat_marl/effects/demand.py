@@ -36,7 +36,7 @@ from ugat_marl.effects.documents import (
 )
 from ugat_marl.effects.places import network_places
 from ugat_marl.errors import OptionError
-from ugat_marl.scenarios import Scenario, parse_time
+from ugat_marl.scenarios import Scenario, laps_of, parse_time
 
 TAGS = ("<vehicle", "<trip", "<flow")
 """Texts of demand; a document without any of them has no demand."""
@@ -120,7 +120,8 @@ class Routes:
 
 
 def _edges(element: ET.Element) -> tuple[str, ...]:
-    return tuple(element.get("edges", "").split())
+    """Return the edges of a route, as often as its laps are driven."""
+    return laps_of(element.attrib) * tuple(element.get("edges", "").split())
 
 
 @dataclass(frozen=True)

@@ -26,7 +26,7 @@ from ugat_marl.effects.table import (
 )
 from ugat_marl.errors import OptionError, ScenarioError, UnknownNameError, nearest
 from ugat_marl.files import with_home
-from ugat_marl.scenarios import Network, Scenario
+from ugat_marl.scenarios import Network, Scenario, is_configuration
 
 Domain = str | Sequence[Effect]
 """``"sim"``, a named domain or its alias, ``"effect=value+effect=value"``, a scenario directory or
@@ -392,12 +392,13 @@ def _greens(scenario: Scenario) -> dict[str, tuple[str, ...]]:
 
 
 def domain_path(domain: Domain) -> Path | None:
-    """Return the path if a domain is a scenario directory or a ``.sumocfg``, else None."""
+    """Return the path if a domain is a scenario directory or a SUMO configuration, else None."""
     if not isinstance(domain, str):
         return None
     path = with_home(domain)
     try:
-        named = path.suffix == ".sumocfg" or (path / "scenario.toml").is_file()
+        file = path if path.name == "scenario.toml" else path / "scenario.toml"
+        named = is_configuration(path) or file.is_file()
     except OSError:  # a long list of effects is not a possible path
         return None
     return path if named else None

@@ -25,7 +25,7 @@ from ugat_marl.effects.documents import edit, seconds_text
 from ugat_marl.effects.places import network_places
 from ugat_marl.errors import OptionError, ScenarioError
 from ugat_marl.files import xml_bytes
-from ugat_marl.scenarios import Document, Scenario
+from ugat_marl.scenarios import Document, Scenario, is_blocker
 from ugat_marl.seeding import numpy_generator
 
 _LENGTH_M = 5.0
@@ -186,13 +186,17 @@ def shift_parking(scenario: Scenario, seed: int) -> Scenario:
     shift = numpy_generator(seed).uniform(0, duration)
 
     def later(root: ET.Element) -> bool:
-        parked = [x for x in root.iter("vehicle") if x.get("id", "").startswith(_PARKED)]
+        parked = [x for x in root.iter("vehicle") if _is_parked(x.get("id", ""), x.get("type", ""))]
         for element in parked:
             time = (float(element.get("depart", "0")) - begin + shift) % duration
             element.set("depart", f"{begin + time:.2f}")
         return bool(parked)
 
     return replace(scenario, routes=edit(scenario.routes, later, _PARKED, in_order=True))
+
+
+def _is_parked(vehicle: str, vehicle_type: str) -> bool:
+    return vehicle_type.startswith(_PARKED) and is_blocker(vehicle, vehicle_type)
 
 
 def _with_blockers(

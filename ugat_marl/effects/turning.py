@@ -177,16 +177,22 @@ def _way_out(start: str, places: Places) -> Way:
 
 
 def _with_route(element: ET.Element, edges: Way) -> ET.Element:
-    """Return the vehicle or flow on another route; stops elsewhere are left out."""
+    """Return the vehicle or flow on another route; stops there that name a lane or edge stay."""
     made = copy.deepcopy(element)
     if made.tag == "trip":
         made.tag = "vehicle"
     for key in ("route", "from", "to", "via", *_ENDS):
         made.attrib.pop(key, None)
-    for child in list(made):
-        lane = edge_of_lane(child.get("lane", ""))
-        if child.tag == "route" or (child.tag == "stop" and lane not in edges):
-            made.remove(child)
     route = ET.Element("route", {"edges": " ".join(edges)})
+    stops = [stop for child in made for stop in (child if child.tag == "route" else [child])]
+    for child in list(made):
+        if child.tag in ("route", "stop"):
+            made.remove(child)
     made.insert(0, route)
+    made.extend(stop for stop in stops if stop.tag == "stop" and _edge_of(stop) in edges)
     return made
+
+
+def _edge_of(stop: ET.Element) -> str:
+    """Return the edge on which a vehicle stops; "" for a stop with a name, such as a bus stop."""
+    return stop.get("edge") or edge_of_lane(stop.get("lane", ""))

@@ -37,7 +37,6 @@ from .importers.plan import read_road_plan as read_road_plan
 from .importers.sumo_files import episode_of as episode_of
 from .importers.sumo_files import from_routes as from_routes
 from .importers.sumo_files import from_sumo as from_sumo
-from .importers.sumo_files import is_configuration as is_configuration
 from .importers.turning_shares import from_turning_shares as from_turning_shares
 from .importers.turning_shares import poisson_arrivals as poisson_arrivals
 from .importers.turning_shares import weighted_choice as weighted_choice
@@ -86,8 +85,10 @@ from .routes import demand_as_vehicles as demand_as_vehicles
 from .routes import departures as departures
 from .routes import driven_routes as driven_routes
 from .routes import is_blocker as is_blocker
+from .routes import laps_of as laps_of
 from .scenario import Document as Document
 from .scenario import Scenario as Scenario
+from .scenario import is_configuration as is_configuration
 from .scenario import read_scenario as read_scenario
 from .scenario import resco_maps as resco_maps
 from .scenario import shipped_scenarios as shipped_scenarios

@@ -440,6 +440,11 @@ def _lane_fault(tag: Tag) -> str:
                 f"lane {lane!r} has {attribute} = {text[:40]!r}, which is not a finite number "
                 "above 0; build the network again with netconvert"
             )
+    if "length" in tag.attributes and len(tag.attributes.get("shape", "").split()) < 2:
+        return (
+            f"lane {tag.attributes.get('id', '')!r} has no shape of two points or more; build the "
+            "network again with netconvert"
+        )
     return ""
 
 

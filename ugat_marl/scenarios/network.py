@@ -512,6 +512,9 @@ def _programmes(root: ET.Element, scenario: Scenario) -> dict[str, _Programme]:
                     (parse_time(phase.get("duration", "0")), phase.get("state", ""))
                     for phase in logic.iter("phase")
                 )
+                for phase in logic.iter("phase"):
+                    for key in ("minDur", "maxDur"):  # effects read them later
+                        parse_time(phase.get(key, "0"))
                 offset_s = _offset_s(logic, scenario)
             except ValueError as error:
                 raise ScenarioError(

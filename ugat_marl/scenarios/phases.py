@@ -320,7 +320,7 @@ def _right_may_go(
 def _maximal_cliques(
     compatible: Mapping[Movement, set[Movement]], source: str
 ) -> Iterator[frozenset[Movement]]:
-    """Yield all maximal cliques (Bron-Kerbosch). The graphs are small, so it needs no pivoting."""
+    """Yield all maximal cliques (Bron and Kerbosch 1973, with the pivot of Tomita et al. 2006)."""
     count = 0
     stack = [(frozenset[Movement](), set(compatible), set[Movement]())]
     while stack:
@@ -334,7 +334,10 @@ def _maximal_cliques(
                 )
             yield clique
             continue
-        for name in sorted(candidates):
+        pivot = max(
+            sorted(candidates | excluded), key=lambda name: len(compatible[name] & candidates)
+        )
+        for name in sorted(candidates - compatible[pivot]):
             near = compatible[name]
             stack.append((clique | {name}, candidates & near, excluded & near))
             candidates = candidates - {name}

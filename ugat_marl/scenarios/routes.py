@@ -196,14 +196,27 @@ def departures(
         for tag in document.scan(reporter):
             if tag.name == "vehicle":
                 name, text = tag.attributes.get("id", ""), tag.attributes.get("depart", "0")
-                depart = parse_time(text) if text[:1].isdigit() else begin
+                depart = _depart_s(text, begin)
                 blocks = is_blocker(name, tag.attributes.get("type", ""))
                 if depart >= end:  # vehicles are sorted by departure
                     break
             elif tag.name == "route" and "id" not in tag.attributes and not blocks:
-                again = tag.attributes.get("repeat", "")
-                laps = 1 + int(again) if again.isdecimal() else 1
-                yield name, depart, laps * tag.attributes.get("edges", "").split()
+                edges = tag.attributes.get("edges", "").split()
+                yield name, depart, laps_of(tag.attributes) * edges
+
+
+def laps_of(route: Mapping[str, str]) -> int:
+    """Return how often the edges of a route with these attributes are driven."""
+    again = route.get("repeat", "")
+    return 1 + int(again) if again.isdecimal() else 1
+
+
+def _depart_s(text: str, begin_s: float) -> float:
+    """Return the time of a departure; words, such as "triggered", stand for the begin."""
+    try:
+        return parse_time(text)
+    except ValueError:
+        return begin_s
 
 
 def _test_file(document: Document, test: Callable[[Document], bool]) -> bool:
@@ -350,7 +363,9 @@ def _for_sumo(document: Document, directory: Path) -> Path:
     plain = path is not None and document.content is None and path.suffix != ".gz"
     if path is not None and plain and "," not in str(path.resolve()):  # SUMO splits names at ","
         return path.resolve()
-    copy = directory / document.name.removesuffix(".gz").replace(",", "_")
+    # a folder for each copy: files of two folders may have one name
+    place = Path(tempfile.mkdtemp(dir=directory))
+    copy = place / document.name.removesuffix(".gz").replace(",", "_")
     with replacing(copy) as temporary, temporary.open("wb") as file:
         file.writelines(document.pieces())
     return copy

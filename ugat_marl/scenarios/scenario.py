@@ -132,6 +132,11 @@ class Scenario:
         return directory
 
 
+def is_configuration(path: Path) -> bool:
+    """Return True if a file's name is that of a SUMO configuration."""
+    return path.name.endswith((".sumocfg", ".sumocfg.xml"))
+
+
 def read_scenario(name: str | Path) -> Scenario:
     """Load a scenario.
 
@@ -149,7 +154,7 @@ def read_scenario(name: str | Path) -> Scenario:
     if text.startswith("resco:"):
         return _load_sumocfg(_resco_configuration(text.removeprefix("resco:")), text)
     path = with_home(text)
-    if path.suffix == ".sumocfg" or path.name.endswith(".sumocfg.xml"):
+    if is_configuration(path):
         return _load_sumocfg(path, path.name.split(".")[0])
     if _is_file(path / "scenario.toml"):
         return _load_directory(path)
@@ -158,12 +163,12 @@ def read_scenario(name: str | Path) -> Scenario:
     shipped = dict(shipped_scenarios())
     if text in shipped:
         return _load_directory(shipped[text])
-    if text and (path / COUNT_SHEET).is_file():
+    if text and _is_file(path / COUNT_SHEET):
         raise ScenarioError(
             f"{path}: has roads and no vehicles yet; fill in {path / COUNT_SHEET}, and make it "
             "again with --counts, as its README.md says"
         )
-    if text and path.is_dir():
+    if text and _is_folder(path):
         raise ScenarioError(f"{path}: a directory without scenario.toml is not a scenario")
     raise UnknownNameError(
         "scenario", text, shipped, "A directory, a .sumocfg file and resco:<map> work as well."
@@ -330,6 +335,14 @@ def _is_file(path: Path) -> bool:
     """Return True for a file; a name that is too long or impossible is none."""
     try:
         return path.is_file()
+    except (OSError, ValueError):
+        return False
+
+
+def _is_folder(path: Path) -> bool:
+    """Return True for a folder; a name that is too long or impossible is none."""
+    try:
+        return path.is_dir()
     except (OSError, ValueError):
         return False
 

@@ -177,7 +177,7 @@ def parse_time(text: str) -> float:
     if ":" not in text:  # as in nearly every file
         return parse_decimal(text) + 0.0  # "-0" is 0
     parts = [parse_decimal(part) for part in text.split(":")]
-    if len(parts) not in (1, 3, 4):
+    if len(parts) not in (3, 4):
         raise ValueError(text)
     seconds = 0.0
     for part, unit in zip(reversed(parts), (1, 60, 3600, 86400), strict=False):
@@ -190,8 +190,10 @@ def parse_time(text: str) -> float:
 def _explain(problem: Any) -> str:
     """Return one error of pydantic in the terms of ``scenario.toml``."""
     names = [str(part) for part in problem["loc"]]
-    if "phases" in names:  # pydantic adds the alternatives of the union after the key
-        key = ".".join(names[: names.index("phases") + 1])
+    place = 1 if names[0] == "control" else 2  # [control] phases, [intersections.A1] phases
+    is_phases = names[0] in ("control", "intersections") and names[place : place + 1] == ["phases"]
+    if is_phases and problem["type"] != "extra_forbidden":
+        key = ".".join(names[: place + 1])  # pydantic adds the alternatives of the union
         if problem["type"] == "missing":
             return f"key {key!r} is missing"
         allowed = "'programme', 'conflict-free', 'permitted', or a list of SUMO states in quotes"
@@ -200,6 +202,8 @@ def _explain(problem: Any) -> str:
     if problem["type"] == "extra_forbidden":
         known = _known_keys(names[:-1])
         guess = nearest(names[-1], known)
+        if len(names) == 1 and names[0] in ControlSettings.model_fields:
+            return f"unknown key {key!r}; it belongs under [control]"
         hint = f"did you mean {guess!r}?" if guess else f"known: {', '.join(known)}"
         return f"unknown key {key!r}; {hint}"
     if problem["type"] == "missing":

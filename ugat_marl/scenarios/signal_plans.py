@@ -53,6 +53,8 @@ COLUMNS = ("light", "intersection", "cycle_s", "offset_s", "ring", "barrier", "p
            "split_s", "yellow_s", "all_red_s")  # fmt: skip
 _SAME_S = 0.05
 """Largest difference of times that count as equal, s: tables round to tenths."""
+SHORTEST_S = 0.001
+"""Shortest part of a cycle: the times of programmes are written with three decimals."""
 LONGEST_S = 3600.0
 """Longest time in a plan, s."""
 _LEAST_YELLOW_S = 3.0
@@ -270,7 +272,7 @@ def _times(plan: SignalPlan) -> tuple[list[float], _Shown]:
         times |= {begin, green_end, yellow_end, end}
     kept: list[float] = []
     for time in sorted(times):
-        if not kept or time - kept[-1] > 1e-6:
+        if not kept or time - kept[-1] >= SHORTEST_S:
             kept.append(time)
     return kept, shown
 
@@ -396,7 +398,7 @@ def with_plans(scenario: Scenario, plans: Iterable[SignalPlan], source: str) -> 
             offset=f"{plan.offset_s:g}",
         )  # fmt: skip
         for seconds, state in plan_states(plan, lights[plan.light], network, rules, source):
-            ET.SubElement(logic, "phase", duration=f"{seconds:g}", state=state)
+            ET.SubElement(logic, "phase", duration=f"{seconds:.10g}", state=state)
     name = "plans.add.xml"
     for document in scenario.additional:
         if document.name == name:

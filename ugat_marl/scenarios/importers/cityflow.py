@@ -389,7 +389,8 @@ def write_routes(
 def _end_s(path: Path) -> float:
     """Return the end of the last flow that has one, s, and at least one hour."""
     ends = (flow.get("endTime") for flow, _ in objects(path, Silent()))
-    return max([3600.0, *(float(end) for end in ends if isinstance(end, int | float))])
+    numbers = (float(end) for end in ends if isinstance(end, int | float))
+    return max([3600.0, *filter(math.isfinite, numbers)])  # others are refused in their flows
 
 
 def _departures(flow: Mapping[str, Any], end_s: Callable[[], float], where: str) -> Iterator[float]:

@@ -155,6 +155,7 @@ def make_scenario(
         copied = dict(draft.copied)
         with _errors_about(copied, folder, draft.network):
             fleet = VehicleFiles(draft.routes)
+            admitted(Document(NETWORK, folder / draft.network))  # before its values are read
             if vehicles:
                 fleet = vehicles(folder, folder / draft.network, reporter)
                 copied |= fleet.copied

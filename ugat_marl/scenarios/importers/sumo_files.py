@@ -13,13 +13,13 @@ from ugat_marl.progress import Reporter
 from ugat_marl.scenarios.demand import edges_used
 from ugat_marl.scenarios.importers.long_files import scan
 from ugat_marl.scenarios.importers.making import RoadFiles, RoadSource, VehicleFiles, VehicleSource
-from ugat_marl.scenarios.scenario import Document, SumoConfiguration, read_scenario
+from ugat_marl.scenarios.scenario import (
+    Document,
+    SumoConfiguration,
+    is_configuration,
+    read_scenario,
+)
 from ugat_marl.scenarios.settings import ScenarioFile
-
-
-def is_configuration(path: Path) -> bool:
-    """Return True if a file's name is that of a SUMO configuration."""
-    return path.name.endswith((".sumocfg", ".sumocfg.xml"))
 
 
 def from_sumo(path: Path, *, link: bool, own_vehicles: bool) -> RoadSource:
