@@ -5,6 +5,7 @@ The recordings are made by hand on the crossing of tests/data, two hours long.
 
 from __future__ import annotations
 
+import shutil
 from collections.abc import Callable, Mapping
 from dataclasses import replace
 from pathlib import Path
@@ -108,6 +109,7 @@ def read(
     def reading(
         given: MeasuredData | None = None, changes: Mapping[str, Rows] | None = None
     ) -> tuple[MeasuredData, dict[str, tuple[str, ...]]]:
+        shutil.rmtree(tmp_path / "street", ignore_errors=True)  # changed below, and not replaced
         directory = write_measured(given or recording(), tmp_path / "street")
         for name, change in (changes or {}).items():
             file = directory / f"{name}.parquet"

@@ -324,6 +324,15 @@ def test_data_that_somebody_else_measured_or_changed_are_kept(
     assert {path.name: path.read_bytes() for path in directory.iterdir()} == before
 
 
+@pytest.mark.parametrize("name", ["detections.parquet", "trajectories.parquet"])
+def test_so_are_parquet_tables(tmp_path: Path, name: str) -> None:
+    directory = write_measured(recording(), tmp_path / "street")
+    pl.DataFrame({"time_s": [1.0]}).write_parquet(directory / name)
+    with pytest.raises(OutputError, match=f"{name} was not written by record or import-atspm"):
+        write_measured(recording(3), directory)
+    assert pl.read_parquet(directory / name)["time_s"].to_list() == [1.0]
+
+
 def test_a_write_that_fails_leaves_the_old_data(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

@@ -3,10 +3,11 @@
 from __future__ import annotations
 
 import contextlib
+import copy
 import json
 import math
 import pickle
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -529,3 +530,16 @@ def test_what_a_recording_reads_is_measured() -> None:
     first, second = (log.transitions(log.agents[0]) for log in logs)
     assert np.array_equal(first.observation, second.observation)
     assert first.observation[-1].max() > 0
+
+
+def test_an_environment_is_copied_before_its_simulation_only(crossing: Callable[..., Path]) -> None:
+    env = parallel_env(crossing())
+    for copied in (copy.copy(env), copy.deepcopy(env)):
+        copied.reset(seed=1)
+        copied.close()
+    env.reset(seed=1)
+    for make in (copy.copy, copy.deepcopy):
+        with pytest.raises(EpisodeError, match="cannot be copied after reset"):
+            make(env)
+    env.step(dict.fromkeys(env.agents, 0))
+    env.close()

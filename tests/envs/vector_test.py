@@ -978,4 +978,6 @@ def test_what_is_under_way_at_the_end_is_forgotten_and_nothing_is_copied() -> No
     with pytest.raises(EpisodeError, match="this vector_env is closed"):
         env.step_wait()
     with pytest.raises(EpisodeError, match="this vector_env is closed"):
+        env.send(batch.masks.argmax(axis=-1))
+    with pytest.raises(EpisodeError, match="this vector_env is closed"):
         env.recv()

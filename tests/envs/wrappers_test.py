@@ -451,6 +451,9 @@ def test_agents_are_named_by_their_lights_and_nothing_else_changes() -> None:
         named.step({**dict.fromkeys(named.agents, 0), first: 99})
     groups = {group: [light[a] for a in own] for group, own in plain.agent_groups.items()}
     assert named.agent_groups == groups
+    assert {*named.layouts} == {*named.recorded_layouts} == {*light.values()}
+    named.remember(dict.fromkeys(named.agents, 0))
+    named.delay_greens(dict.fromkeys(named.agents, 1.0))
     plain.close()
     named.close()
     parallel_api_test(intersection_names(ugat_marl.parallel_env("single-v1", duration_s=100)), 12)

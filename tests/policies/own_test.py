@@ -562,6 +562,9 @@ def test_files_of_one_name_in_two_folders_are_two_modules(
     ("name", "error", "says"),
     [
         ("my_aglo:Cycle", OptionError, "no module 'my_aglo'"),
+        ("./my_algo:Cycle", OptionError, r"no module './my_algo' .*without .py"),
+        (".my_algo:Cycle", OptionError, "no module '.my_algo'"),
+        ("numpy.foo:Cycle", OptionError, "no module 'numpy.foo'"),
         ("my_algo:Cylce", UnknownNameError, "'Cycle'"),
         ("my_algo.py:Cylce", UnknownNameError, "'Cycle'"),
     ],

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping
+from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
@@ -11,7 +12,7 @@ import pytest
 from ugat_marl.effects import load_scenario
 from ugat_marl.envs import TrafficEnv, parallel_env
 from ugat_marl.errors import OptionError
-from ugat_marl.policies import EpsilonGreedy, make_rule, observer_of, roll_out
+from ugat_marl.policies import EpsilonGreedy, RollOutStopped, make_rule, observer_of, roll_out
 
 
 class Always:
@@ -130,3 +131,19 @@ def test_greens_that_no_action_means_are_not_recorded() -> None:
             assert set(log.transitions("signal_0").executed.tolist()) == {0, 1, 2, 3}
         finally:
             env.close()
+
+
+def test_a_stopped_episode_leaves_no_measurement_for_the_next_one(env: TrafficEnv) -> None:
+    def stop(step: int) -> None:
+        raise RollOutStopped
+
+    with pytest.raises(RollOutStopped):
+        roll_out(env, Always(), 1, record=observer_of(env, "waiting"), on_step=stop)
+    roll_out(env, Always(), 1)
+    assert len(env.snapshot.waiting_s) == 0
+
+
+def test_an_environment_of_others_is_not_recorded(env: TrafficEnv) -> None:
+    other: Any = SimpleNamespace(unwrapped=object())
+    with pytest.raises(OptionError, match="object cannot be recorded"):
+        roll_out(other, Always(), 1, record=observer_of(env))

@@ -118,7 +118,7 @@ class Compare:
             require_writable(self.out, ".csv")
         told = {} if self.table is None else judged_in(self.table)
         episodes = self.evaluation_seeds or int(told.get("episodes", PaperConfig.evaluation_seeds))
-        length_s = self.duration_s or told.get("duration_s")
+        length_s = told.get("duration_s") if self.duration_s is None else self.duration_s
         scenario = load_scenario(self.scenario, length_s)
         judging = Judging.of(scenario, episodes, length_s)
         if self.table is not None:

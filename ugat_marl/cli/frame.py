@@ -41,6 +41,7 @@ _PLAIN_WORDS = {
         r"\2 \1: must be one of \3"
     ),
     r"^Missing value for argument '(.*)'\. Expected 1 values": r"\1 needs a value",
+    r"^Error parsing [\w.]+: *": "",
 }
 """Messages of tyro to what they mean."""
 _LONGEST_MESSAGE = 1500

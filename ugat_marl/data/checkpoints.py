@@ -152,10 +152,12 @@ def _is_plain(tensor: torch.Tensor) -> bool:
     return tensor.numel() * tensor.element_size() <= tensor.untyped_storage().nbytes()
 
 
-def _tensors(prefix: str, content: Mapping[str, Any]) -> Iterator[tuple[str, torch.Tensor]]:
+def _tensors(prefix: str, content: Mapping[Any, Any]) -> Iterator[tuple[str, torch.Tensor]]:
     for key, value in content.items():
         if isinstance(value, Mapping):
             yield from _tensors(f"{prefix}{key}.", value)
+        elif isinstance(value, list | tuple):
+            yield from _tensors(f"{prefix}{key}.", dict(enumerate(value)))
         elif isinstance(value, torch.Tensor):
             yield f"{prefix}{key}", value
         elif isinstance(value, float):

@@ -205,6 +205,17 @@ def is_csv_as_written(path: Path) -> bool:
     return not csv_damage(path, csv_texts(path.read_bytes()))
 
 
+def is_parquet_as_written(path: Path) -> bool:
+    """Return True if a Parquet table holds hashes and is what was written.
+
+    Raises:
+        OSError: The file cannot be read.
+        polars.exceptions.PolarsError: The file is not a table.
+    """
+    frame, metadata = read_quietly(path)
+    return is_hashed(metadata) and not damage(frame, metadata)
+
+
 def _known_csv_hashes(directory: Path) -> dict[str, Any]:
     file = directory / CSV_HASHES
     try:
@@ -282,12 +293,15 @@ _ONE_AT_A_TIME = threading.Lock()
 def _without_standard_error() -> Iterator[None]:
     """Drop the standard error of a block if the block fails."""
     sys.stderr.flush()
-    try:
-        kept = os.dup(2)
-    except OSError:  # no standard error at all
-        yield
-        return
-    with tempfile.TemporaryFile() as said:
+    with contextlib.ExitStack() as open_files:
+        try:
+            said = open_files.enter_context(tempfile.TemporaryFile())
+            kept = os.dup(2)
+        except OSError:  # no standard error at all, or no place to keep it
+            said, kept = None, -1
+        if said is None:
+            yield
+            return
         try:
             os.dup2(said.fileno(), 2)
             yield

@@ -269,11 +269,17 @@ def lock_folder(directory: Path) -> IO[str]:
 
         try:
             fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
-        except OSError:
+        except BlockingIOError:
             lock.close()
             raise OptionError(
                 f"{directory}: another process is training in this folder; wait for it, or name "
                 "another one"
+            ) from None
+        except OSError as error:  # such as a network drive without locks
+            lock.close()
+            raise OptionError(
+                f"{directory}: cannot be locked ({error.strerror}), so two trainings could write "
+                "there at once; name a folder on another drive"
             ) from None
     return lock
 

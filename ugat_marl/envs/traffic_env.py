@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import copy
 import warnings
 from collections.abc import Callable, Mapping
 from pathlib import Path
@@ -400,6 +401,26 @@ class TrafficEnv(ParallelEnv[str, Any, Any]):
             simulator.close()
         self._directory.remove()
 
+    def __copy__(self) -> TrafficEnv:
+        return self._copied(self.__dict__)
+
+    def __deepcopy__(self, memo: dict[int, Any]) -> TrafficEnv:
+        return self._copied(copy.deepcopy(self._require_no_simulation().__dict__, memo))
+
+    def _copied(self, parts: Mapping[str, Any]) -> TrafficEnv:
+        made = object.__new__(type(self._require_no_simulation()))
+        made.__dict__.update(parts)
+        return made
+
+    def _require_no_simulation(self) -> TrafficEnv:
+        """Refuse to copy a running simulation: two environments would step and close it."""
+        if self._simulator is not None:
+            raise EpisodeError(
+                "an environment cannot be copied after reset(), as its simulation cannot; make "
+                "another one, or copy it before"
+            )
+        return self
+
     def __del__(self) -> None:
         if getattr(self, "_simulator", None) is not None:
             self.close()
@@ -508,7 +529,7 @@ class TrafficEnv(ParallelEnv[str, Any, Any]):
             warnings.warn(
                 f"scenario {self.scenario.id!r}: no vehicle has entered the network in the first "
                 f"{self._decision * self.decision_interval_s:g} s ({reason}); check departures",
-                stacklevel=3,
+                stacklevel=4,
             )
 
     def _finish(self) -> None:

@@ -421,6 +421,28 @@ class _IntersectionNames(Wrapper):
         """Every name to itself."""
         return {light: light for light in self.possible_agents}
 
+    @property
+    def layouts(self) -> dict[str, Any]:
+        """Traffic light to the parts of its observation."""
+        base: Any = self.env.unwrapped
+        return self._renamed(base.layouts)
+
+    @property
+    def recorded_layouts(self) -> dict[str, Any]:
+        """The same without the memory of commands."""
+        base: Any = self.env.unwrapped
+        return self._renamed(base.recorded_layouts)
+
+    def remember(self, commands: Mapping[str, int]) -> None:
+        """Let observations show these commands, see `TrafficEnv.remember`."""
+        base: Any = self.env.unwrapped
+        base.remember({self._agent.get(light, light): c for light, c in commands.items()})
+
+    def delay_greens(self, seconds: Mapping[str, float]) -> None:
+        """Delay greens of the next step, see `TrafficEnv.delay_greens`."""
+        base: Any = self.env.unwrapped
+        base.delay_greens({self._agent.get(light, light): s for light, s in seconds.items()})
+
     def reset(self, seed: int | None = None, options: dict[str, Any] | None = None) -> ResetResult:
         """Start an episode of the wrapped environment."""
         observations, infos = self.env.reset(seed=seed, options=options)

@@ -80,9 +80,11 @@ def load_own(name: str, what: str) -> Any:
         sys.path.insert(0, folder)
     module_name = place if file is None else file.stem
     try:
+        if file is None and not re.fullmatch(r"\w+(\.\w+)*", place):
+            raise ModuleNotFoundError(name=place)  # such as ./my_algo
         found: Any = importlib.import_module(place) if file is None else _module_in(file)
     except ModuleNotFoundError as error:
-        if error.name != module_name.partition(".")[0]:
+        if not f"{module_name}.".startswith(f"{error.name}."):
             raise OptionError(
                 f"{what} {name!r}: the module needs {error.name}, which is not installed"
             ) from None

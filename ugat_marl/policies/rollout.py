@@ -73,8 +73,26 @@ def roll_out(
         on_step: Function called after every decision.
     """
     base: Any = env.unwrapped
-    if record is not None:
-        base.measure_for(record)
+    if record is not None and not hasattr(base, "measure_for"):
+        raise OptionError(
+            f"{type(base).__name__} cannot be recorded: record needs an environment of ugat_marl"
+        )
+    try:
+        if record is not None:
+            base.measure_for(record)
+        return _played(env, policy, seed, record, on_step)
+    finally:
+        if record is not None:
+            base.measure_for()
+
+
+def _played(
+    env: AnyParallelEnv,
+    policy: Policy,
+    seed: int,
+    record: Observer | None,
+    on_step: StepCallback | None,
+) -> Episode:
     observations, infos = env.reset(seed=seed)
     policy.reset(seed)
     recording = _Recording(env, record, seed, infos) if record else None
@@ -89,8 +107,6 @@ def roll_out(
         steps += 1
         if on_step is not None:
             on_step(steps)
-    if record is not None:
-        base.measure_for()
     return Episode(steps, total / max(steps, 1), recording.log() if recording else None)
 
 

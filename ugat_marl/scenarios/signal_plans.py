@@ -419,7 +419,7 @@ def programme_plan(light: Intersection, network: Network) -> SignalPlan:
     yellow, as long as some light is yellow, and its all-red. Red-amber is part of the all-red.
 
     Raises:
-        ScenarioError: The light has no programme with two greens, or a phase without clearance.
+        ScenarioError: The light has no programme with two greens.
     """
     codes = movement_codes(light, network)
     states = list(light.programme)

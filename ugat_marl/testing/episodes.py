@@ -286,7 +286,7 @@ def require_same(expected: Episode, repeated: Episode, condition: str, cure: str
 
 
 def different(a: Any, b: Any, path: str = "") -> str:
-    """Return in words where two nested values first differ; "" if they are equal bit for bit."""
+    """Return where two nested values first differ; "" if they are equal. NaN equals NaN."""
     if is_dataclass(a) and is_dataclass(b):
         a, b = asdict(a), asdict(b)  # pyright: ignore[reportArgumentType]
     if isinstance(a, Mapping) and isinstance(b, Mapping):

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -88,10 +89,10 @@ def require_interval(length_s: float) -> None:
     """Refuse an impossible length of intervals.
 
     Raises:
-        OptionError: The length is not above 0.
+        OptionError: The length is below 1 s, or not finite.
     """
-    if not length_s > 0:
-        raise OptionError(f"an interval of {length_s:g} s: the length must be above 0")
+    if not 1 <= length_s < math.inf:
+        raise OptionError(f"an interval of {length_s:g} s: give seconds, 1 or more")
 
 
 def as_counts(measured: MeasuredData, length_s: float) -> MeasuredData:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import secrets
 import shutil
-from collections.abc import Collection, Sequence
+from collections.abc import Sequence, Set
 from pathlib import Path
 
 import numpy as np
@@ -29,6 +29,7 @@ from ugat_marl.data.measured.values import MeasuredData
 from ugat_marl.data.row_hashes import (
     CSV_HASHES,
     is_csv_as_written,
+    is_parquet_as_written,
     write_csv_hashes,
     write_hashed,
 )
@@ -134,12 +135,13 @@ def require_replaceable(directory: Path) -> None:
         )
 
 
-def _changed_table(directory: Path, names: Collection[str]) -> str | None:
-    """Return the name of a CSV table that is not as `write_measured` wrote it."""
-    for name in sorted(name for name in names if name.endswith(".csv")):
+def _changed_table(directory: Path, names: Set[str]) -> str | None:
+    """Return the name of a table that is not as `write_measured` wrote it."""
+    for name in sorted(names - {CSV_HASHES}):
+        is_as_written = is_csv_as_written if name.endswith(".csv") else is_parquet_as_written
         try:
-            whole = is_csv_as_written(directory / name)
-        except (OSError, pl.exceptions.PolarsError):
+            whole = is_as_written(directory / name)
+        except (OSError, pl.exceptions.PolarsError, pl.exceptions.PanicException):
             whole = False
         if not whole:
             return name

@@ -370,6 +370,7 @@ class VectorEnv:
 
     def _ask(self, chosen: list[int], requested: NDArray[np.int64]) -> tuple[list[int], list[int]]:
         """Begin a step; return the environments that make it, and those that begin an episode."""
+        _ = self._memory  # a closed one says so
         anew = self.autoreset == "next-step"
         idle: dict[int, bool] = {}
         for index in chosen:

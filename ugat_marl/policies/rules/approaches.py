@@ -68,7 +68,7 @@ class ControlledNetwork:
         """Return the fewest decisions that last at least `seconds`."""
         if not 0 < seconds < math.inf:
             raise OptionError(f"a phase cannot be held {seconds} s; give a number above 0")
-        return math.ceil(seconds / self.decision_interval_s - 1e-9)
+        return max(1, math.ceil(seconds / self.decision_interval_s - 1e-9))
 
 
 class Traffic(NamedTuple):
