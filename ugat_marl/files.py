@@ -66,7 +66,9 @@ _IN_ATTRIBUTE = _IN_TEXT | str.maketrans(
 def replacing(path: Path) -> Iterator[Path]:
     """Yield a temporary path beside `path`; it replaces `path` if the block ends normally."""
     require_writable(path)
-    path = path.resolve()  # a link goes on to point at the file
+    if path.is_symlink():  # it goes on to point at the file
+        path = Path(os.path.realpath(path))
+        require_writable(path)
     temporary = path.with_name(f".{secrets.token_hex(8)}.tmp")
     # opened like any new file, so that the system applies the umask
     os.close(os.open(temporary, os.O_WRONLY | os.O_CREAT | os.O_EXCL, 0o666))

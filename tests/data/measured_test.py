@@ -660,7 +660,27 @@ def test_wrong_local_times_are_named(
 def test_times_with_an_offset_lose_no_hour_where_the_clock_is_changed(
     texts: tuple[str, str],
 ) -> None:
-    clock = LocalClock({"night": datetime(2024, 11, 3)}, "America/Denver")
     cells = pl.Series("time", [*texts, ""])
-    seconds = clock.seconds(Path("t.csv"), cells, pl.Series(["night"] * 3), 2)
+    seconds = clock_from("2024-11-03").seconds(Path("t.csv"), cells, pl.Series(["night"] * 3), 2)
     assert seconds.to_list() == [1800.0, 12600.0, None]
+
+
+def clock_from(zero: str) -> LocalClock:
+    """The clock of a night in Denver that is 0 at this time."""
+    zero += " 00:00:00" if len(zero) == 10 else ""
+    cells = pl.Series("zero", [zero])
+    return LocalClock.of(Path("periods.csv"), pl.Series(["night"]), cells, "America/Denver")
+
+
+@pytest.mark.parametrize(("offset", "second"), [("-06:00", 10.0), ("-07:00", 10.0)])
+def test_a_zero_within_the_hour_that_comes_twice_keeps_its_offset(
+    offset: str, second: float
+) -> None:
+    clock = clock_from(f"2024-11-03T01:30:00{offset}")
+    cells = pl.Series("time", [f"2024-11-03T01:30:10{offset}"])
+    assert clock.seconds(Path("t.csv"), cells, pl.Series(["night"]), 2).to_list() == [second]
+
+
+def test_a_zero_that_clocks_did_not_show_is_an_error() -> None:
+    with pytest.raises(MeasuredDataError, match=r"periods.csv, line 2: zero is 2024-03-10 02:30"):
+        clock_from("2024-03-10 02:30:00")

@@ -26,11 +26,44 @@ class LocalClock:
 
     Attributes:
         zeros: Period to its local time.
+        zeros_utc: The same in UTC.
         time_zone: Time zone of the street; "" if the times have none.
     """
 
     zeros: Mapping[str, datetime]
+    zeros_utc: Mapping[str, datetime]
     time_zone: str = ""
+
+    @classmethod
+    def of(cls, path: Path, periods: pl.Series, cells: pl.Series, time_zone: str) -> LocalClock:
+        """Return the clock of some periods.
+
+        Args:
+            path: File of the times, for messages.
+            periods: Name of each period.
+            cells: Local time at which the scenario's clock is 0 in each.
+            time_zone: Time zone of the street; "" if it is not known.
+
+        Raises:
+            MeasuredDataError: A time cannot be read, or the clock of the street never showed it.
+        """
+        times = _times(path, cells, time_zone, 2, "the column time_zone")
+        if isinstance(times.dtype, pl.Datetime) and times.dtype.time_zone is not None:
+            utc, local = times, times.dt.convert_time_zone(time_zone).dt.replace_time_zone(None)
+        else:
+            local = times
+            utc = local.dt.replace_time_zone(
+                time_zone or "UTC", ambiguous="earliest", non_existent="null"
+            ).dt.convert_time_zone("UTC")
+        if (never := utc.is_null() & local.is_not_null()).any():
+            at = int(never.arg_true()[0])
+            raise MeasuredDataError(
+                f"{path}, line {at + 2}: {cells.name} is {local[at]}, which clocks in {time_zone} "
+                "did not show, as they were set forward; write a time with its offset"
+            )
+        return cls(
+            dict(zip(periods, local, strict=True)), dict(zip(periods, utc, strict=True)), time_zone
+        )
 
     def seconds(self, path: Path, cells: pl.Series, periods: pl.Series, start: int) -> pl.Series:
         """Return times as seconds of the scenario's clock, named as `cells` with ``_s``.
@@ -45,13 +78,10 @@ class LocalClock:
             MeasuredDataError: A time cannot be read.
         """
         times = _times(path, cells, self.time_zone, start, "periods.csv, as time_zone")
-        zero = periods.replace_strict(self.zeros, default=None, return_dtype=pl.Datetime("us"))
-        if isinstance(times.dtype, pl.Datetime) and times.dtype.time_zone is not None:
-            # local times would lose or gain an hour where the clock is changed
-            zero = zero.dt.replace_time_zone(
-                self.time_zone, ambiguous="earliest", non_existent="null"
-            )
-            zero = zero.dt.convert_time_zone("UTC")
+        # local times would lose or gain an hour where the clock is changed
+        is_utc = isinstance(times.dtype, pl.Datetime) and times.dtype.time_zone is not None
+        zeros = self.zeros_utc if is_utc else self.zeros
+        zero = periods.replace_strict(zeros, default=None, return_dtype=times.dtype)
         # a time of an unknown period is left out later, with its row
         seconds = ((times - zero).dt.total_microseconds() / 1e6).fill_null(0.0)
         return seconds.set(times.is_null(), None).alias(f"{cells.name}_s")

@@ -15,7 +15,7 @@ from ugat_marl.data.measured import tables
 from ugat_marl.data.measured.copies import refuse_copies
 from ugat_marl.data.measured.counts import counts_of, travel_times_of, turning_of
 from ugat_marl.data.measured.coverage import coverage
-from ugat_marl.data.measured.local_time import LocalClock, local_times, require_time_zone
+from ugat_marl.data.measured.local_time import LocalClock, require_time_zone
 from ugat_marl.data.measured.passages import MOST_UNPAIRED, passages_of
 from ugat_marl.data.measured.tables import (
     PERIOD,
@@ -202,8 +202,7 @@ def _clock(path: Path, frame: pl.DataFrame) -> LocalClock | None:
         )
     zone = zones[0] if zones else ""
     require_time_zone(zone, str(path))
-    zeros = local_times(path, frame["zero"], zone, 2, "the column time_zone")
-    return LocalClock(dict(zip(frame["period_id"], zeros, strict=True)), zone)
+    return LocalClock.of(path, frame["period_id"], frame["zero"], zone)
 
 
 def _missing(directory: Path, table: Table) -> MeasuredDataError:
