@@ -229,7 +229,7 @@ _FAULTS = {
     "absolute": lambda error: f"counts err by {error:.1f} vehicles",
     "relative": lambda error: f"counts err by {100 * error:.0f} %",
     "lag": lambda lag: f"counts are {counted(round(lag), 'decision')} late",
-    "lost": lambda share: f"{100 * share:.0f} % are lost",
+    "lost": lambda share: f"{100 * share:.0f} % of the counts are lost",
     "step": lambda step: f"counts come in steps of {step:g} vehicles",
 }
 

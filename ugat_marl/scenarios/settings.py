@@ -190,8 +190,9 @@ def parse_time(text: str) -> float:
 def _explain(problem: Any) -> str:
     """Return one error of pydantic in the terms of ``scenario.toml``."""
     names = [str(part) for part in problem["loc"]]
-    place = 1 if names[0] == "control" else 2  # [control] phases, [intersections.A1] phases
-    is_phases = names[0] in ("control", "intersections") and names[place : place + 1] == ["phases"]
+    table = names[0] if names else ""  # an error of the whole file has no place
+    place = 1 if table == "control" else 2  # [control] phases, [intersections.A1] phases
+    is_phases = table in ("control", "intersections") and names[place : place + 1] == ["phases"]
     if is_phases and problem["type"] != "extra_forbidden":
         key = ".".join(names[: place + 1])  # pydantic adds the alternatives of the union
         if problem["type"] == "missing":
