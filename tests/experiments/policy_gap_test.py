@@ -195,4 +195,4 @@ def test_the_table_fits_a_terminal() -> None:
     for cell in ("99 %", "−50 %", "812", "7.7", "80.0", "max-pressure:20"):
         assert cell in text
     assert "…" not in text
-    assert "1201-1300" in text
+    assert "1201–1300" in text
