@@ -167,14 +167,8 @@ def plan_table(plans: Sequence[SignalPlan], names: LightNames) -> Table:
     """Return the plans as a table, with the green time of each phase; rings if there are some."""
     table = titled_table("")
     rings = any((phase.ring, phase.barrier) != (1, 1) for plan in plans for phase in plan.phases)
-    for heading in (
-        LIGHT_HEADING,
-        "cycle",
-        "offset",
-        *(["ring"] if rings else []),
-        "phase",
-        "turns",
-    ):
+    headings = (LIGHT_HEADING, "cycle", "offset", *(["ring"] if rings else []), "phase", "turns")
+    for heading in headings:
         table.add_column(heading, overflow="fold")
     for heading in ("split", "green", "yellow", "all-red"):
         table.add_column(heading, justify="right")

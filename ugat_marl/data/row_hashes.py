@@ -293,15 +293,13 @@ _ONE_AT_A_TIME = threading.Lock()
 def _without_standard_error() -> Iterator[None]:
     """Drop the standard error of a block if the block fails."""
     sys.stderr.flush()
-    with contextlib.ExitStack() as open_files:
-        try:
-            said = open_files.enter_context(tempfile.TemporaryFile())
-            kept = os.dup(2)
-        except OSError:  # no standard error at all, or no place to keep it
-            said, kept = None, -1
-        if said is None:
-            yield
-            return
+    try:
+        said = tempfile.TemporaryFile()  # noqa: SIM115 - closed below
+        kept = os.dup(2)
+    except OSError:  # no place for what is said, or no standard error at all
+        yield
+        return
+    with said:
         try:
             os.dup2(said.fileno(), 2)
             yield

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import copy
 import warnings
 from collections.abc import Callable, Mapping
 from pathlib import Path
@@ -401,25 +400,14 @@ class TrafficEnv(ParallelEnv[str, Any, Any]):
             simulator.close()
         self._directory.remove()
 
-    def __copy__(self) -> TrafficEnv:
-        return self._copied(self.__dict__)
-
-    def __deepcopy__(self, memo: dict[int, Any]) -> TrafficEnv:
-        return self._copied(copy.deepcopy(self._require_no_simulation().__dict__, memo))
-
-    def _copied(self, parts: Mapping[str, Any]) -> TrafficEnv:
-        made = object.__new__(type(self._require_no_simulation()))
-        made.__dict__.update(parts)
-        return made
-
-    def _require_no_simulation(self) -> TrafficEnv:
+    def __getstate__(self) -> dict[str, Any]:
         """Refuse to copy a running simulation: two environments would step and close it."""
         if self._simulator is not None:
             raise EpisodeError(
                 "an environment cannot be copied after reset(), as its simulation cannot; make "
                 "another one, or copy it before"
             )
-        return self
+        return self.__dict__
 
     def __del__(self) -> None:
         if getattr(self, "_simulator", None) is not None:

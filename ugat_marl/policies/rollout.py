@@ -72,18 +72,18 @@ def roll_out(
             those that the policy reads. It needs an environment of the suite.
         on_step: Function called after every decision.
     """
+    if record is None:
+        return _played(env, policy, seed, None, on_step)
     base: Any = env.unwrapped
-    if record is not None and not hasattr(base, "measure_for"):
+    if not hasattr(base, "measure_for"):
         raise OptionError(
             f"{type(base).__name__} cannot be recorded: record needs an environment of ugat_marl"
         )
     try:
-        if record is not None:
-            base.measure_for(record)
+        base.measure_for(record)
         return _played(env, policy, seed, record, on_step)
     finally:
-        if record is not None:
-            base.measure_for()
+        base.measure_for()
 
 
 def _played(

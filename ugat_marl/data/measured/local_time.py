@@ -48,10 +48,10 @@ class LocalClock:
             MeasuredDataError: A time cannot be read, or the clock of the street never showed it.
         """
         times = _times(path, cells, time_zone, 2, "the column time_zone")
-        if isinstance(times.dtype, pl.Datetime) and times.dtype.time_zone is not None:
-            utc, local = times, times.dt.convert_time_zone(time_zone).dt.replace_time_zone(None)
+        local = utc = times
+        if _is_zoned(times):
+            local = _shown(times, time_zone)
         else:
-            local = times
             utc = local.dt.replace_time_zone(
                 time_zone or "UTC", ambiguous="earliest", non_existent="null"
             ).dt.convert_time_zone("UTC")
@@ -79,8 +79,7 @@ class LocalClock:
         """
         times = _times(path, cells, self.time_zone, start, "periods.csv, as time_zone")
         # local times would lose or gain an hour where the clock is changed
-        is_utc = isinstance(times.dtype, pl.Datetime) and times.dtype.time_zone is not None
-        zeros = self.zeros_utc if is_utc else self.zeros
+        zeros = self.zeros_utc if _is_zoned(times) else self.zeros
         zero = periods.replace_strict(zeros, default=None, return_dtype=times.dtype)
         # a time of an unknown period is left out later, with its row
         seconds = ((times - zero).dt.total_microseconds() / 1e6).fill_null(0.0)
@@ -117,9 +116,16 @@ def local_times(
         MeasuredDataError: The times have an unknown form, or a time zone without `time_zone`.
     """
     times = _times(path, cells, time_zone, start, mapping)
-    if isinstance(times.dtype, pl.Datetime) and times.dtype.time_zone is not None:
-        times = times.dt.convert_time_zone(time_zone).dt.replace_time_zone(None)
-    return times
+    return _shown(times, time_zone) if _is_zoned(times) else times
+
+
+def _is_zoned(times: pl.Series) -> bool:
+    return isinstance(times.dtype, pl.Datetime) and times.dtype.time_zone is not None
+
+
+def _shown(times: pl.Series, time_zone: str) -> pl.Series:
+    """Return times of a zone as clocks in `time_zone` show them, without a zone."""
+    return times.dt.convert_time_zone(time_zone).dt.replace_time_zone(None)
 
 
 def _times(path: Path, cells: pl.Series, time_zone: str, start: int, mapping: str) -> pl.Series:
