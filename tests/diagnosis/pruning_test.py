@@ -14,8 +14,9 @@ import pytest
 from ugat_marl.diagnosis import Hypothesis, global_hypotheses, records
 from ugat_marl.diagnosis.fit import Fitter
 from ugat_marl.diagnosis.hypotheses import Members, library
+from ugat_marl.diagnosis.prune import Pruner, doubtful
 from ugat_marl.diagnosis.records import Fitted
-from ugat_marl.diagnosis.select import Selector, doubtful, pruned
+from ugat_marl.diagnosis.select import Selector
 from ugat_marl.diagnosis.thresholds import Effort, Thresholds
 from ugat_marl.effects import known_effects, load_scenario
 from ugat_marl.progress import Advance, Silent
@@ -59,6 +60,9 @@ class Ledger:
         self.tested.append(names(model.members))
         return self.with_chance(self.simulate(model.members, 16))
 
+    def kept(self, model: Fitted) -> Fitted:
+        return model
+
     def exact(self, tested: records.Tested) -> records.Tested:
         self.exactly.append(names(tested.model.members))
         return tested
@@ -72,7 +76,7 @@ class Ledger:
         fitter = cast(Fitter, cast(object, self))
         blank = cast(Any, None)
         base = records.Tested(Fitted((), {}, blank, blank, 0.0), blank, np.empty(0), {})
-        left = pruned(best, base, fitter, lambda model: model, self.test, self.exact, 0.05)
+        left = Pruner(fitter, self, 0.05, Silent()).pruned(best, base)
         if left.model.members:
             assert self.exactly[-1] == names(left.model.members), "the result has exact errors"
         return left.model.members
@@ -181,7 +185,7 @@ def test_progress_is_told_of_every_smaller_set() -> None:
             yield lambda note="": notes.append(note)
 
     fitter = cast(Fitter, cast(object, ledger))
-    pruned(best, best, fitter, lambda model: model, ledger.test, ledger.exact, 0.05, Heard())
+    Pruner(fitter, ledger, 0.05, Heard()).pruned(best, best)
     assert sorted(notes) == ["demand_level", "headway"]
 
 

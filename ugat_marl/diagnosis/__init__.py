@@ -29,6 +29,7 @@ content of ``diagnosis.json``.
     fit         values of a set of effects, and their errors
     residual    the test of the difference that a model leaves
     select      the search, round by round
+    prune       effects that do not matter, or that the explanation does not need, left out
     patterns    sparse regression on what is left, where no effect explains it
     verify      both models on held-out periods, side by side; the usual criteria
     traffic     both models in terms of traffic; the check of traffic

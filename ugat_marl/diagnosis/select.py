@@ -17,20 +17,20 @@ from ugat_marl.diagnosis.hypotheses import (
     a_few,
     both_ways,
     cautious_drivers,
-    each_left_out,
     effects_of,
     merged,
     title_of,
 )
 from ugat_marl.diagnosis.places import PlaceFinder
 from ugat_marl.diagnosis.propose import Direction, between, promising, propose, squared_gap
+from ugat_marl.diagnosis.prune import Pruner, doubtful
 from ugat_marl.diagnosis.records import Fitted, Located, Selected, Tested
 from ugat_marl.diagnosis.residual import Directions, Null
 from ugat_marl.diagnosis.statistics import Whitener, sum_of
 from ugat_marl.diagnosis.thresholds import Effort
 from ugat_marl.effects import Effect
 from ugat_marl.errors import OptionError, ScenarioError, SimulatorError
-from ugat_marl.progress import Reporter, Silent
+from ugat_marl.progress import Reporter
 from ugat_marl.scenarios import Period
 
 MOVES_OF_A_VALUE = 4
@@ -107,10 +107,7 @@ class Selector:
                 best = improved
                 if best.residual.p > self._alpha:
                     break
-            best = pruned(
-                best, base, self._fitter, self._kept, self.test, self.exact, self._alpha,
-                self._reporter,
-            )  # fmt: skip
+            best = Pruner(self._fitter, self, self._alpha, self._reporter).pruned(best, base)
         except OutOfTime:
             complete = False
             cheapest = min(self._seen.values(), key=cost_of, default=best.model)
@@ -142,7 +139,7 @@ class Selector:
 
     def _tested(self, model: Fitted) -> Tested:
         fitter = self._fitter
-        model = self._kept(fitter.settled(model, uncertainty(fitter, model)[0]))
+        model = self.kept(fitter.settled(model, uncertainty(fitter, model)[0]))
         days = self._days(model)
         errors, extra = uncertainty(fitter, model, days)
         for name, difference in self._first.difference.items():
@@ -251,7 +248,7 @@ class Selector:
         if best is None:
             return None
         steps = self._thresholds.steps_of_the_best
-        best = self._kept(self._fitter.refine(best, steps, closely=True))
+        best = self.kept(self._fitter.refine(best, steps, closely=True))
         gain = before - best.cost
         if gain > self._thresholds.price:
             return self.test(best)
@@ -385,7 +382,7 @@ class Selector:
                 members = merged(model.members, new)
                 if members:
                     try:
-                        models_tried.append(self._kept(self._fitter.simulate(members)))
+                        models_tried.append(self.kept(self._fitter.simulate(members)))
                     except (SimulatorError, OptionError, ScenarioError) as error:
                         self._reporter.say(f"note: {title_of(members)} left out: {error}")
                 advance(note=title_of(members))
@@ -410,134 +407,14 @@ class Selector:
                 share = self._thresholds.candidate_gain_share
                 won = 0.0 if best is None else share * (cost_before - best.cost)
                 if best is None or cost_before - model.cost > won:
-                    fitted = self._kept(self._fitter.fitted(model, directions))
+                    fitted = self.kept(self._fitter.fitted(model, directions))
                     best = fitted if best is None or fitted.cost < best.cost else best
                 advance(note=title_of(model.members))
         return best
 
-    def _kept(self, model: Fitted) -> Fitted:
-        """Keep the best model of every set of effects; return the given model."""
+    def kept(self, model: Fitted) -> Fitted:
+        """Keep a model for the list of rivals if it is the best one of its effects; return it."""
         key = str(sorted(str(hypothesis.key) for hypothesis, _ in model.members))
         if key not in self._seen or model.cost < self._seen[key].cost:
             self._seen[key] = model
         return model
-
-
-# --- pruning --------------------------------------------------------------------------------------
-
-
-def pruned(
-    best: Tested,
-    base: Tested,
-    fitter: Fitter,
-    kept: Callable[[Fitted], Fitted],
-    test: Callable[[Fitted], Tested],
-    exact: Callable[[Tested], Tested],
-    alpha: float,
-    reporter: Reporter | None = None,
-) -> Tested:
-    """Drop effects that do not matter, or that the explanation does not need.
-
-    If two sets of effects leave only chance, the smaller set is the explanation. Costs are compared
-    with equal numbers of days, since more days lower the cost of the same model. Few days would
-    leave the comparison to chance where queues are long.
-
-    Args:
-        best: The tested set to start from.
-        base: The scenario as it is; the result if every effect is fitted to nothing.
-        fitter: Simulator and fitter of models.
-        kept: Function that keeps a fitted model for the list of rivals.
-        test: Function that tests a model.
-        exact: Function that makes the errors of a tested model exact.
-        alpha: Level of the tests.
-        reporter: Display of progress; None for no display.
-
-    Returns:
-        The smallest set, with exact errors.
-    """
-    reporter = reporter or Silent()
-
-    def settled(model: Fitted) -> Fitted:
-        return fitter.simulate(model.members, fitter.thresholds.settling_days)
-
-    members = tuple(member for member in best.model.members if member[0].matters(member[1]))
-    if not members:
-        return base
-    if len(members) < len(best.model.members):
-        best = test(fitter.refine(fitter.simulate(members), fitter.thresholds.steps_without))
-    best = exact(best)
-    while len(best.model.members) > 1:
-        fewer: dict[int, Fitted] = {}
-        parts = each_left_out(best.model.members)
-        indices = [index for index in range(len(parts)) if not _beyond_doubt(best, index, fitter)]
-        if not indices:
-            break
-        with reporter.task("without single effects", len(indices)) as advance:
-            for index in indices:
-                part = parts[index]
-                without = fitter.refine(fitter.simulate(part), fitter.thresholds.steps_without)
-                fewer[index] = kept(settled(without))
-                advance(note=title_of(part))
-        unsure = [fewer[index] for index in doubtful(best, fitter.thresholds.half_interval)]
-        least = min(fewer.values(), key=cost_of)
-        now = settled(best.model).cost
-        if least.cost - now > fitter.thresholds.negligible:
-            if not unsure:
-                break
-            least = min(unsure, key=cost_of)
-        tested = test(least)
-        enough = tested.residual.p > alpha
-        # If no set suffices anyway, an effect that may be absent is not named either.
-        vain = least in unsure and best.residual.p <= alpha
-        if least.cost > now and not enough and not vain:
-            break
-        best = exact(tested)
-    remaining = merged((), best.model.members)
-    if len(remaining) < len(best.model.members):
-        best = exact(test(fitter.simulate(remaining))) if remaining else base
-    return _sure(best, base, fitter, lambda model: exact(test(model)))
-
-
-def _sure(best: Tested, base: Tested, fitter: Fitter, test: Callable[[Fitted], Tested]) -> Tested:
-    """Drop effects whose intervals hold their usual values, the least certain one first.
-
-    The errors of `best` are exact, and so are those that `test` returns.
-    """
-    thresholds = fitter.thresholds
-    while unsure := doubtful(best, thresholds.half_interval):
-        least = min(unsure, key=lambda index: _deviations(best, index))
-        members = each_left_out(best.model.members)[least]
-        if not members:
-            return base
-        best = test(fitter.refine(fitter.simulate(members), thresholds.steps_without))
-    return best
-
-
-def _beyond_doubt(tested: Tested, index: int, fitter: Fitter) -> bool:
-    """Return True if the data fit so much worse without the member at `index` that it stays.
-
-    The errors of the values are those of all values together, so they hold what other effects could
-    do in its place.
-    """
-    hypothesis, values = tested.model.members[index]
-    certain = bool((tested.errors_of(index) > 0.0).all())
-    known = bool(values) and hypothesis.nominal is not None and certain
-    return known and _deviations(tested, index) > fitter.thresholds.beyond_doubt
-
-
-def _deviations(tested: Tested, index: int) -> float:
-    """Return how many standard errors the member at `index` is away from its usual values."""
-    hypothesis, values = tested.model.members[index]
-    errors = np.maximum(tested.errors_of(index), 1e-12)
-    return float((np.abs(np.subtract(values, hypothesis.nominal or 0.0)) / errors).max())
-
-
-def doubtful(tested: Tested, half_interval: float) -> list[int]:
-    """Return indices of effects whose intervals hold the nominal values: they may be absent."""
-    indices: list[int] = []
-    for index, (hypothesis, values) in enumerate(tested.model.members):
-        if values and hypothesis.nominal is not None:
-            away = np.abs(np.subtract(values, hypothesis.nominal))
-            if (away <= half_interval * tested.errors_of(index)).all():
-                indices.append(index)
-    return indices
