@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import subprocess
 import xml.etree.ElementTree as ET
 from collections.abc import Callable, Sequence
 from pathlib import Path
@@ -21,7 +22,7 @@ from ugat_marl.effects import (
     with_late_green_programmes,
 )
 from ugat_marl.errors import OptionError, ScenarioError
-from ugat_marl.scenarios import Network
+from ugat_marl.scenarios import Network, sumo_program
 from ugat_marl.simulation.mesoscopic import MesoscopicLanes
 from ugat_marl.testing.episodes import play, random_actions
 
@@ -34,6 +35,7 @@ class FakeApi:
         self.routes: dict[str, tuple[str, ...]] = {}
         self.held_s: dict[str, float] = {}
         self.queue: dict[str, int] = {}
+        self.fast: dict[str, float] = {}
         self.lane = self.edge = self.vehicle = self
 
     def getLinks(self, lane: str) -> Sequence[tuple[str, ...]]:
@@ -43,9 +45,6 @@ class FakeApi:
 
     def getLength(self, lane: str) -> float:
         return 200.0
-
-    def getMaxSpeed(self, lane: str) -> float:
-        return 10.0
 
     def getLastStepVehicleIDs(self, edge: str) -> Sequence[str]:
         return [name for name, route in self.routes.items() if route[0] == edge]
@@ -67,6 +66,9 @@ class FakeApi:
 
     def getWaitingTime(self, name: str) -> float:
         return self.held_s.get(name, 0.0)
+
+    def getAllowedSpeed(self, name: str) -> float:
+        return self.fast.get(name, 10.0)
 
     def getSpeed(self, name: str) -> float:
         return 0.0 if name in self.held_s else 8.0
@@ -123,6 +125,17 @@ def test_who_stays_longer_than_the_way_takes_halts() -> None:
     assert not measured.measure(40.0, LIMITS)[:2].any()
 
 
+def test_a_slow_driver_in_free_flow_does_not_wait() -> None:
+    api = FakeApi()
+    api.fast["slow"] = 5.0
+    measured = MesoscopicLanes(api, LANES, 500.0)
+    for name in ("slow", "usual"):
+        api.enter(name, "in", "right")
+    halting = [measured.measure(time_s, LIMITS)[1, 0] for time_s in (0.0, 8.0, 16.0, 24.0)]
+    assert halting == [0, 0, 1, 2], "200 m take 40 and 20 s, half of them before the first look"
+    assert measured.standing == {"in": ["slow", "usual"]}
+
+
 def test_of_a_queue_that_drives_off_as_many_move_as_have_left() -> None:
     """Six wait, SUMO lists them from the end of the queue; the first of them is held up or not."""
     api = FakeApi()
@@ -154,7 +167,7 @@ class PlainLook:
         for place, lane in enumerate(lanes):
             self.of.setdefault(lane[:-2], []).append(place)
         self.segment_m = segment_m
-        self.known: dict[str, tuple[str, float, float, int]] = {}
+        self.known: dict[str, tuple[str, float, float, int, float]] = {}
         self.left = [0] * len(lanes)
         self.asked, self.moving, self.looked_s = 0, 0, -1e9
 
@@ -164,13 +177,14 @@ class PlainLook:
         for edge, own in self.of.items():
             metres = libsumo.lane.getLength(edge + "_0")
             pieces = max(1, int(metres / self.segment_m + 0.5))
-            needs_s = metres / pieces / libsumo.lane.getMaxSpeed(edge + "_0")
-            queues: dict[int, list[tuple[str, float]]] = {lane: [] for lane in own}
+            queues: dict[int, list[tuple[str, float, float]]] = {lane: [] for lane in own}
             for name in libsumo.edge.getLastStepVehicleIDs(edge):
                 self.asked += 1
                 at_m = ask.getLanePosition(name)
-                was = before.get(name, ("", 0.0, 0.0, -1))
-                moved, since_s = was[:2] != (edge, at_m), was[2]
+                was = before.get(name, ("", 0.0, 0.0, -1, 0.0))
+                moved, since_s, needs_s = was[:2] != (edge, at_m), was[2], was[4]
+                if was[0] != edge:
+                    needs_s = metres / pieces / ask.getAllowedSpeed(name)
                 if moved:
                     since_s = time_s - min(time_s - self.looked_s, needs_s) / 2
                 following = (*ask.getRoute(name), "")[ask.getRouteIndex(name) + 1]
@@ -182,32 +196,32 @@ class PlainLook:
                     lane = was[3]
                 lane = next((x for x in fit if self.lanes[x] == queue), lane)
                 rows[0, lane] += 1.0
-                queues[lane].append((name, time_s - since_s - needs_s))
-                self.known[name] = edge, at_m, since_s, lane
+                queues[lane].append((name, time_s - since_s - needs_s, needs_s))
+                self.known[name] = edge, at_m, since_s, lane, needs_s
             for name, was in before.items():
                 if was[0] == edge and self.known.get(name, ("",))[0] != edge:
                     self.left[was[3]] += 1
             for lane, queue in queues.items():
-                self.queue(lane, queue, needs_s, limits[lane], rows)
+                self.queue(lane, queue, limits[lane], rows)
         self.looked_s = time_s
         rows[2] = np.where(rows[0] > 0, rows[2] / np.maximum(rows[0], 1.0), limits)
         return rows
 
-    def queue(self, lane: int, names: Any, needs_s: float, limit: float, rows: Any) -> None:
+    def queue(self, lane: int, names: Any, limit: float, rows: Any) -> None:
         """Adds the vehicles of one lane, the one at the stop line last."""
         ask = libsumo.vehicle
-        wait = [name for name, waited in names if waited > 0]
+        wait = [name for name, waited, _ in names if waited > 0]
         if wait and ask.getWaitingTime(names[-1][0]) > 0:
             self.left[lane] = 0
         start = wait[::-1][: self.left[lane]]
         self.moving += len(start)
-        for name, waited in names:
+        for name, waited, _ in names:
             if name not in wait:
                 speed, held = ask.getSpeed(name), ask.getWaitingTime(name)
                 rows[1:, lane] += (speed < 0.1, speed, held)
             elif name not in start:
                 rows[1:, lane] += (1.0, 0.0, waited)
-        for name, waited in names:
+        for name, waited, needs_s in names:
             if name in start:
                 rows[2, lane] += limit * needs_s / (needs_s + waited)
 
@@ -473,3 +487,48 @@ def test_queues_are_about_those_of_car_following() -> None:
 def test_what_needs_positions_is_refused(domain: str, options: dict[str, Any]) -> None:
     with pytest.raises(OptionError, match="mesoscopic model.*leave out queue_model"):
         ugat_marl.parallel_env("single-v1", domain, duration_s=60, **options)
+
+
+def test_a_queue_beyond_a_node_counts_upstream_as_in_car_following(tmp_path: Path) -> None:
+    """A road to the light is 80 m long, and 420 m lie before it, far into which its queue reaches.
+
+    The queue model has no waves of moving vehicles in a long queue, so it counts more who stand.
+    """
+    (tmp_path / "n.xml").write_text(
+        '<nodes><node id="W" x="-500" y="0"/><node id="M" x="-80" y="0" type="priority"/>'
+        '<node id="J" x="0" y="0" type="traffic_light"/><node id="E" x="300" y="0"/>'
+        '<node id="N" x="0" y="300"/><node id="S" x="0" y="-300"/></nodes>'
+    )
+    edges = "".join(f'<edge id="{a}{b}" from="{a}" to="{b}"/>' for a, b in ROADS)
+    (tmp_path / "e.xml").write_text(f"<edges>{edges}</edges>")
+    command = [str(sumo_program("netconvert")), "-n", "n.xml", "-e", "e.xml", "-o", "c.net.xml"]
+    subprocess.run(command, check=True, capture_output=True, cwd=tmp_path)
+    (tmp_path / "c.rou.xml").write_text(
+        '<routes><route id="we" edges="WM MJ JE"/><route id="ns" edges="NJ JS"/>'
+        '<flow id="a" route="we" begin="0" end="600" vehsPerHour="900"/>'
+        '<flow id="b" route="ns" begin="0" end="600" vehsPerHour="300"/></routes>'
+    )
+    (tmp_path / "c.sumocfg").write_text(
+        '<configuration><net-file value="c.net.xml"/><route-files value="c.rou.xml"/>'
+        '<begin value="0"/><end value="600"/></configuration>'
+    )
+    upstream = {domain: mean_upstream(tmp_path / "c.sumocfg", domain) for domain in ("sim", "meso")}
+    assert upstream["sim"] > 3.0
+    assert 1.0 < upstream["meso"] / upstream["sim"] < 2.5
+
+
+ROADS = ("WM", "MJ", "JE", "NJ", "JS")
+
+
+def mean_upstream(configuration: Path, domain: str) -> float:
+    env = ugat_marl.parallel_env(str(configuration), domain)
+    queued: list[float] = []
+    try:
+        env.reset(seed=1)
+        while env.agents:
+            turn = len(queued) // 2
+            env.step({agent: turn % env.action_space(agent).n for agent in env.agents})
+            queued.append(env.snapshot.queued_upstream.sum())
+    finally:
+        env.close()
+    return float(np.mean(queued))

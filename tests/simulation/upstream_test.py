@@ -22,6 +22,7 @@ class Roads:
 
     vehicles: dict[str, tuple[str, float, tuple[str, ...]]]
     asked: list[str] = field(default_factory=list[str])
+    halted: list[str] = field(default_factory=list[str])
 
     @property
     def api(self) -> Any:
@@ -29,6 +30,7 @@ class Roads:
             return [n for n, (lane, _, _) in self.vehicles.items() if lane[:-2] == road]
 
         def halting(road: str) -> int:
+            self.halted.append(road)
             return sum(self.vehicles[name][1] < 0.1 for name in on(road))
 
         def route(name: str) -> tuple[str, ...]:
@@ -42,9 +44,12 @@ class Roads:
         def outside() -> list[str]:
             return [name for name, (lane, _, _) in self.vehicles.items() if not lane]
 
+        links = {"e_0": ("a_0", "f_0"), "f_0": ("b_0",)}
+
         return SimpleNamespace(
             edge=SimpleNamespace(
                 getIDList=lambda: ["a", "b", "e", "f", "x", "y", ":j"],
+                getLaneNumber=lambda road: 1,
                 getLastStepHaltingNumber=halting,
                 getLastStepVehicleIDs=on,
             ),
@@ -54,6 +59,7 @@ class Roads:
                 getRoute=route,
                 getRouteIndex=at,
             ),
+            lane=SimpleNamespace(getLinks=lambda lane: [(to,) for to in links.get(lane, ())]),
             simulation=SimpleNamespace(getPendingVehicles=outside),
         )
 
@@ -104,3 +110,9 @@ def test_a_route_is_asked_for_once_on_each_road() -> None:
     roads.vehicles["one"] = ("f_0", 0.0, ("e", "f", "b", "x"))
     assert queues.measure(0).tolist() == pytest.approx([0.0, 1.0, 1.0, 0.0])
     assert sorted(roads.asked) == ["one", "one", "two"]
+
+
+def test_roads_that_lead_to_no_light_are_not_asked() -> None:
+    roads = Roads({"one": ("x_0", 0.0, ("a", "x"))})
+    assert queued(roads) == [0.0] * 4
+    assert roads.halted == ["e", "f"]

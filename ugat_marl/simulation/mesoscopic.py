@@ -28,12 +28,14 @@ class _Stay:
     Attributes:
         position_m: Start of the segment on its edge.
         since_s: Estimated time at which the vehicle entered the segment.
+        drive_s: Time in which the vehicle drives through a segment, by its limit and its own speed.
         lanes: Indices of the lanes that lead to the vehicle's next edge.
         lane: Index of the lane on which the vehicle counts; -1 if not known yet.
     """
 
     position_m: float
     since_s: float
+    drive_s: float
     lanes: Sequence[int]
     lane: int
 
@@ -46,7 +48,7 @@ class _Road:
         edge: Name of the edge.
         lanes: Indices of its lanes.
         towards: Following edge to the indices of the lanes that lead there.
-        segment_s: Driving time through a segment at the speed limit.
+        segment_m: Length of a segment.
         last_m: A segment that begins after this position is the last one; -1 if there is only one.
         stays: Vehicles on the edge at the last measurement.
     """
@@ -54,7 +56,7 @@ class _Road:
     edge: str
     lanes: list[int]
     towards: dict[str, list[int]]
-    segment_s: float
+    segment_m: float
     last_m: float
     stays: dict[str, _Stay]
 
@@ -65,9 +67,9 @@ class MesoscopicLanes:
     A vehicle counts on the lane that leads to the next edge of its route. If several lanes do, it
     counts on the lane of its queue in SUMO, or else on the lane with the fewest vehicles.
 
-    A vehicle waits if it has been in its segment for longer than the drive at the speed limit
-    takes. SUMO's own waiting time covers only the first vehicle of a queue. The time of entry lies
-    between two measurements and is estimated.
+    A vehicle waits if it has been in its segment for longer than its drive through it takes, by the
+    limit and its own speed. SUMO's own waiting time covers only the first vehicle of a queue. The
+    time of entry lies between two measurements and is estimated.
 
     A waiting vehicle halts, unless the queue drives off and the vehicle is near the stop line. In
     car following, about one vehicle per second starts and one leaves every two seconds. So as many
@@ -82,6 +84,9 @@ class MesoscopicLanes:
         api: The module `libsumo`, with a running simulation.
         lanes: Lanes to measure.
         segment_m: Requested length of a segment.
+
+    Attributes:
+        standing: Edge to its vehicles that halted at the last measurement.
     """
 
     def __init__(self, api: Any, lanes: Sequence[str], segment_m: float) -> None:
@@ -96,9 +101,10 @@ class MesoscopicLanes:
             road.lanes.append(place)
             for following in {edge_of_lane(link[0]) for link in api.lane.getLinks(lane)}:
                 road.towards[following].append(place)
-            road.segment_s = length / segments / api.lane.getMaxSpeed(lane)
+            road.segment_m = length / segments
             road.last_m = length * (1 - 1.5 / segments) if segments > 1 else -1.0
         self._routes: dict[str, Sequence[str]] = {}  # a vehicle's new route has a new name
+        self.standing: dict[str, list[str]] = {}
         self._measured_s = -math.inf
         self._left = [0] * self._count  # since the first vehicle of the lane was last held up
 
@@ -113,59 +119,63 @@ class MesoscopicLanes:
         names_on, api = self._api.edge.getLastStepVehicleIDs, self._api.vehicle
         position_m, waiting_s, speed_mps = api.getLanePosition, api.getWaitingTime, api.getSpeed
         passed_s = time_s - self._measured_s
+        self.standing = defaultdict(list)
         for road in self._roads.values():
             names, before = names_on(road.edge), road.stays
             if not names and not before:
                 continue
-            segment_s, last_m = road.segment_s, road.last_m
-            entered_s = time_s - min(passed_s, segment_s) / 2
+            last_m = road.last_m
             stays: dict[str, _Stay] = {}
             road.stays = stays
-            waiting: dict[int, list[float]] = {}
+            waiting: dict[int, list[tuple[str, float, float]]] = {}
             first: dict[int, str] = {}
             for name in names:
                 stay = before.get(name)
                 if stay is None:
-                    stay = self._entered(name, road, entered_s)
+                    stay = self._entered(name, road, time_s, passed_s)
                     stay.lane = self._lane(name, road, stay, vehicles)
                 elif stay.position_m <= last_m and (at_m := position_m(name)) != stay.position_m:
-                    stay.position_m, stay.since_s = at_m, entered_s
+                    stay.position_m = at_m
+                    stay.since_s = time_s - min(passed_s, stay.drive_s) / 2
                     stay.lane = self._lane(name, road, stay, vehicles)
                 stays[name] = stay
                 lane = stay.lane
                 vehicles[lane] += 1.0
                 first[lane] = name  # SUMO lists queues from their ends
-                waited = time_s - stay.since_s - segment_s
+                waited = time_s - stay.since_s - stay.drive_s
                 if waited > 0:
-                    waiting.setdefault(lane, []).append(waited)
+                    waiting.setdefault(lane, []).append((name, waited, stay.drive_s))
                     continue
                 speed = speed_mps(name)
                 speeds[lane] += speed
-                halting[lane] += speed < HALTING_MPS
+                if speed < HALTING_MPS:
+                    halting[lane] += 1.0
+                    self.standing[road.edge].append(name)
                 if speed == 0:  # SUMO gives speed 0 to vehicles it holds up
                     waits[lane] += waiting_s(name)
             for name, stay in before.items():
                 self._left[stay.lane] += name not in stays
-            for lane, waited_s in waiting.items():
+            for lane, held_up in waiting.items():
                 if waiting_s(first[lane]) > 0:
                     self._left[lane] = 0
-                standing = max(len(waited_s) - self._left[lane], 0)
-                halting[lane] += standing
-                waits[lane] += sum(waited_s[:standing])
-                for waited in waited_s[standing:]:
-                    speeds[lane] += limits[lane] * segment_s / (segment_s + waited)
+                standing = held_up[: max(len(held_up) - self._left[lane], 0)]
+                halting[lane] += len(standing)
+                waits[lane] += sum(waited for _, waited, _ in standing)
+                self.standing[road.edge] += [name for name, _, _ in standing]
+                speeds[lane] += _sum_of_speeds(held_up[len(standing) :], limits[lane])
         self._measured_s = time_s
         measured = np.array([vehicles, halting, speeds, waits])
         there = measured[0] > 0
         measured[2] = np.where(there, measured[2] / np.maximum(measured[0], 1.0), limits)
         return measured
 
-    def _entered(self, name: str, road: _Road, entered_s: float) -> _Stay:
+    def _entered(self, name: str, road: _Road, time_s: float, passed_s: float) -> _Stay:
         lanes = road.lanes
         if road.towards and len(lanes) > 1:
             lanes = road.towards.get(self._following(name, road.edge)) or lanes
         position_m = self._api.vehicle.getLanePosition(name) if road.last_m >= 0 else 0.0
-        return _Stay(position_m, entered_s, lanes, -1)
+        drive_s = road.segment_m / self._api.vehicle.getAllowedSpeed(name)
+        return _Stay(position_m, time_s - min(passed_s, drive_s) / 2, drive_s, lanes, -1)
 
     def _following(self, name: str, edge: str) -> str:
         """Return the edge behind `edge` on a vehicle's route; empty if it ends there."""
@@ -191,6 +201,11 @@ class MesoscopicLanes:
         if stay.lane in stay.lanes:
             return stay.lane
         return min(stay.lanes, key=lambda place: vehicles[place])
+
+
+def _sum_of_speeds(held_up: Sequence[tuple[str, float, float]], limit_mps: float) -> float:
+    """Return the mean speeds in their segment of vehicles that move again, added up, m/s."""
+    return sum(limit_mps * drive_s / (drive_s + waited) for _, waited, drive_s in held_up)
 
 
 def refuse_in_queues(scenario: Scenario, **requested: bool) -> None:

@@ -94,7 +94,9 @@ class LibsumoSimulator:
             self._mesoscopic = MesoscopicLanes(libsumo, launch.lanes, launch.segment_m)
         self._upstream = None
         if launch.turns:
-            self._upstream = UpstreamQueues(libsumo, launch.lanes, launch.turns, launch.behind)
+            self._upstream = UpstreamQueues(
+                libsumo, launch.lanes, launch.turns, launch.behind, launch.segment_m
+            )
         return self._snapshot()
 
     def advance(

@@ -8,13 +8,14 @@ Each of these vehicles belongs to the next agent's light on its route.
 from __future__ import annotations
 
 from collections import defaultdict
-from collections.abc import Sequence
+from collections.abc import Collection, Iterator, Sequence
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from ugat_marl.scenarios import Turns, UpstreamLanes
+from ugat_marl.scenarios import Turns, UpstreamLanes, edge_of_lane
+from ugat_marl.simulation.mesoscopic import MesoscopicLanes
 from ugat_marl.simulation.snapshots import HALTING_MPS
 
 _Place = tuple[str, tuple[int, ...]]
@@ -31,25 +32,34 @@ class UpstreamQueues:
     left out.
 
     SUMO is asked one question for each such road, and further ones only about roads with a queue.
-    The routes of vehicles are asked for once on each road.
+    Roads from which no such light can be reached are left out. The routes of vehicles are asked for
+    once on each road.
 
     Args:
         api: The module `libsumo`, with a running simulation.
         lanes: Measured lanes.
         turns: Ways across the agents' lights.
         behind: Lanes and roads that are counted with short lanes.
+        segment_m: Requested length of a segment of the mesoscopic model, m; 0 without it.
     """
 
-    def __init__(self, api: Any, lanes: Sequence[str], turns: Turns, behind: UpstreamLanes) -> None:
+    def __init__(
+        self,
+        api: Any,
+        lanes: Sequence[str],
+        turns: Turns,
+        behind: UpstreamLanes,
+        segment_m: float = 0.0,
+    ) -> None:
         self._api = api
         self._count = len(lanes)
         self._turns = {(start, end): places for start, end, places in turns}
-        at_lights = {start for start, _, _ in turns}
-        self._roads: list[str] = [
-            road
-            for road in api.edge.getIDList()
-            if not road.startswith(":") and road not in at_lights
-        ]
+        self._roads = _roads_before(api, {start for start, _, _ in turns})
+        self._queues: MesoscopicLanes | None = None
+        if segment_m:
+            every = [f"{road}_{n}" for road in self._roads for n in range(_width(api, road))]
+            self._queues = MesoscopicLanes(api, every, segment_m)
+            self._limits = np.ones(len(every))  # no speed is used
         self._on_lane = _shares(behind.lanes)
         self._outside = _shares(behind.roads)
         self._known: dict[str, _Place] = {}
@@ -63,18 +73,27 @@ class UpstreamQueues:
         """
         queued = np.zeros(self._count)
         known, self._known = self._known, {}
-        roads, vehicles = self._api.edge, self._api.vehicle
-        for road in self._roads:
-            if not roads.getLastStepHaltingNumber(road):
-                continue
-            for name in roads.getLastStepVehicleIDs(road):
-                if vehicles.getSpeed(name) < HALTING_MPS:
-                    counted = self._on_lane.get(vehicles.getLaneID(name), 0.0)
-                    self._add(queued, name, road, 1.0 - counted, known)
+        vehicles = self._api.vehicle
+        for road, names in self._halting():
+            for name in names:
+                counted = self._on_lane.get(vehicles.getLaneID(name), 0.0) if self._on_lane else 0.0
+                self._add(queued, name, road, 1.0 - counted, known)
         for name in self._api.simulation.getPendingVehicles() if backlog else ():
             counted = self._outside.get(vehicles.getRoute(name)[0], 0.0) if self._outside else 0.0
             self._add(queued, name, "", 1.0 - counted, known)
         return queued
+
+    def _halting(self) -> Iterator[tuple[str, Sequence[str]]]:
+        """Yield the roads with a queue, and the vehicles that halt there."""
+        if self._queues is not None:
+            self._queues.measure(self._api.simulation.getTime(), self._limits)
+            yield from self._queues.standing.items()
+            return
+        roads, vehicles = self._api.edge, self._api.vehicle
+        for road in self._roads:
+            if roads.getLastStepHaltingNumber(road):
+                names = roads.getLastStepVehicleIDs(road)
+                yield road, [name for name in names if vehicles.getSpeed(name) < HALTING_MPS]
 
     def _add(
         self,
@@ -100,6 +119,29 @@ class UpstreamQueues:
             if turn in self._turns:
                 return self._turns[turn]
         return ()
+
+
+def _roads_before(api: Any, at_lights: Collection[str]) -> list[str]:
+    """Return the roads from which a vehicle can reach a road at an agent's light, in SUMO's order.
+
+    Roads at the lights are not among them.
+    """
+    roads = [x for x in api.edge.getIDList() if not x.startswith(":") and x not in at_lights]
+    into: dict[str, set[str]] = defaultdict(set)
+    for road in roads:
+        for number in range(_width(api, road)):
+            for link in api.lane.getLinks(f"{road}_{number}"):
+                into[edge_of_lane(link[0])].add(road)
+    reached, left = set(at_lights), list(at_lights)
+    while left:
+        new = into[left.pop()] - reached
+        reached |= new
+        left += new
+    return [road for road in roads if road in reached]
+
+
+def _width(api: Any, road: str) -> int:
+    return api.edge.getLaneNumber(road)
 
 
 def _shares(counted: Sequence[Sequence[tuple[str, float]]]) -> dict[str, float]:
