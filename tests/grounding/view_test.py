@@ -297,6 +297,21 @@ def test_off_the_data_phases_of_neighbours_stay_phases() -> None:
     assert not set(own.flatten().tolist()) & {0.0, 1.0}
 
 
+def test_observed_rows_are_those_of_the_agent_itself() -> None:
+    """The agents have no row in common, and the second one has fewer."""
+    view = View(STACK, 1, ROW)
+    data = stack_log(recorded([(0, k) for k in range(20)]), STACK)
+    number = torch.arange(20.0).expand(3, -1)[..., None]
+    inputs = torch.cat([view.of(data), number, number], 2)
+    own = [set(range(0, 20, 2)), {1, 3, 5}, {7}]
+    weight = torch.tensor([[float(k in rows) for k in range(20)] for rows in own])
+    kept = torch.zeros(3, 1, inputs.shape[-1], dtype=torch.bool)
+    kept[..., -1] = True
+    off_data = OffData.around(inputs, weight, view, kept)
+    drawn = off_data.draw(400, torch_generator(0), 1.0)[..., -1]
+    assert [set(map(int, rows.tolist())) for rows in drawn] == own
+
+
 @pytest.mark.parametrize("grounding", ["phase", "timed"])
 def test_both_groundings_fit_and_ground_with_all_inputs(grounding: Any) -> None:
     timed = TimedConfig(most_s=2)

@@ -170,7 +170,8 @@ class OffData:
 
     Attributes:
         inputs: ``(agents, n, width)`` unscaled inputs of h.
-        candidates: ``(m,)`` positions along n from which observed rows are drawn.
+        candidates: ``(agents, m)`` positions along n from which observed rows are drawn: an agent's
+            rows with weight, where they are fewer than another's the first ones again.
         low: ``(agents, 1, width)`` lower end of the box; `high` is the upper end.
         kept: ``(agents, 1, width)`` bool, columns that are never redrawn, such as phases.
         change: ``(agents, 1, width)`` bool, columns of the change of the features.
@@ -207,9 +208,9 @@ class OffData:
             change[i, 0, size:] = True
         if fixed is not None:
             kept = kept | fixed
-        candidates = weight.bool().all(0).nonzero()[:, 0]
-        if not len(candidates):  # agents measured at different times share no column
-            candidates = weight.bool().any(0).nonzero()[:, 0]
+        own = on_rows.sum(1).clamp(min=1)
+        first = on_rows[..., 0].int().argsort(dim=1, descending=True, stable=True)
+        candidates = first.gather(1, torch.arange(int(own.max())).expand(len(own), -1) % own)
         return cls(inputs, candidates, centre - reach, centre + reach, kept, change)
 
     def to(self, device: torch.device) -> OffData:
@@ -226,8 +227,9 @@ class OffData:
                 observed state and a drawn change.
         """
         device = self.inputs.device
-        rows = torch.randint(len(self.candidates), (count,), generator=generator).to(device)
-        observed = self.inputs.index_select(1, self.candidates[rows])
+        rows = torch.randint(self.candidates.shape[1], (count,), generator=generator).to(device)
+        places = self.candidates[:, rows, None].expand(-1, -1, self.inputs.shape[-1])
+        observed = self.inputs.gather(1, places)
         noise = torch.rand(observed.shape, generator=generator).to(device)
         drawn = torch.addcmul(self.low, self.high - self.low, noise)
         whole = torch.rand(1, count, 1, generator=generator).to(device) < state_share
