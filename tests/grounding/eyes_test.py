@@ -8,8 +8,8 @@ import numpy as np
 import pytest
 
 from ugat_marl.data import AgentLayout, Provenance, TransitionLog, TransitionRecorder
-from ugat_marl.grounding.eyes import Eyes, fit_eyes
-from ugat_marl.grounding.summaries import LaneView
+from ugat_marl.grounding.eyes import Eyes, EyesConfig, _dead, fit_eyes
+from ugat_marl.grounding.summaries import LaneRows, LaneView
 
 LANES = 4
 PHASES = 2
@@ -178,3 +178,20 @@ def test_eyes_survive_their_checkpoint() -> None:
     eyes = Eyes(np.array([0.0, 0.5]), (15.0, 26.0), 1.0, 0.1, 2, 0.3, 5.0)
     again = Eyes.from_state(eyes.state_dict())
     assert again.state_dict() == eyes.state_dict()
+
+
+@pytest.mark.parametrize("pull", [0.25, 2.0])
+def test_a_lane_that_nobody_can_judge_is_dead_as_often_as_the_others(pull: float) -> None:
+    config = EyesConfig(pull=pull)
+
+    def rows_of(counts: np.ndarray) -> LaneRows:
+        step, blank = np.arange(len(counts)), np.zeros(len(counts))
+        never = np.zeros(len(counts), dtype=bool)
+        return LaneRows(
+            np.zeros_like(step), step, counts, counts, blank, blank, never, never, never
+        )
+
+    busy, silent = np.full(400, 3.0), np.zeros(400)
+    rows = [rows_of(busy), rows_of(silent), rows_of(silent[:0])]
+    dead = _dead(rows, [rows_of(busy), rows_of(busy), rows_of(busy[:0])], config)
+    assert dead[2] == pytest.approx(0.5)

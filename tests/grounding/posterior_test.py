@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import dataclasses
+
 import numpy as np
 import pytest
 
@@ -172,3 +174,16 @@ def test_a_street_without_unused_green_is_given_none_on_average() -> None:
     truth = WorldValues(np.array([x.nominal for x in WORLDS.library]), np.zeros((len(LANES), 2)))
     sample_s = Posterior.fit(WORLDS, SIMULATED, summary(truth, 5)).sample(400)[1]
     assert np.quantile(sample_s[:, :, 0].mean(1), 0.05) == 0.0
+
+
+def test_a_part_that_was_not_fitted_is_not_told() -> None:
+    truth = WORLDS.draw(1000)
+    whole = Posterior.fit(WORLDS, SIMULATED, summary(truth, 1000))
+    effects, greens = whole.describe()
+    assert effects.startswith("effects: ") and greens.startswith("greens: ")
+    one = dataclasses.replace(whole, worlds=dataclasses.replace(WORLDS, service=False))
+    assert [line.partition(":")[0] for line in one.describe()] == ["effects"]
+    places = {"a": list(range(len(LANES)))}
+    told = {name.partition("/")[0] for name in one.as_dict(places)}
+    assert told == {"effects"}
+    assert {name.partition("/")[0] for name in whole.as_dict(places)} > told

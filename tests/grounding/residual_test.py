@@ -257,6 +257,9 @@ def test_without_a_residual_there_is_none() -> None:
     assert replace(PHASE, grounding="phase").residual(LAYOUTS, 0) is None
     with pytest.raises(UnknownNameError, match="phse"):
         ResidualConfig(kind="phse")  # type: ignore[arg-type]
+    for name in ("worlds", "members", "history"):
+        with pytest.raises(OptionError, match=f"residual {name} = 0: must be at least"):
+            ResidualConfig(**{name: 0})  # type: ignore[arg-type]
     with pytest.raises(OptionError, match="folds"):
         TrustConfig(folds=1)
 

@@ -285,6 +285,8 @@ def test_unknown_parts_and_too_few_simulations_are_refused() -> None:
         StreetConfig(parts=("eye",))
     with pytest.raises(OptionError, match="at least 20"):
         StreetConfig(simulations=3)
+    with pytest.raises(OptionError, match="simulated_s = nan: must be above 0"):
+        StreetConfig(simulated_s=float("nan"))
     for wrong, told in (
         ({"most_lag": -1}, "most_lag is -1"),
         ({"ages": 1}, "ages is 1; allowed: >= 2"),

@@ -319,7 +319,7 @@ def _dead(rows: Sequence[LaneRows], perfect: Sequence[LaneRows], config: EyesCon
             episodes[place] += 1
             dead[place] += not counts.any()
     share = dead.sum() / max(episodes.sum(), 1.0)
-    return (dead + config.pull * share) / np.maximum(episodes + config.pull, 1.0)
+    return (dead + config.pull * share) / (episodes + config.pull)
 
 
 def _quietness(rows: Sequence[LaneRows], busy: Sequence[float]) -> dict[int, float]:

@@ -276,6 +276,10 @@ class SimulatedLog:
     summary: Summary
 
 
+NAMED = 0.1
+"""Least chance of an effect that is said."""
+
+
 @dataclass(frozen=True)
 class Posterior:
     """Draws of the worlds that the street's log leaves possible.
@@ -403,6 +407,27 @@ class Posterior:
         drawn = [self.drawn(generator) for _ in range(number)]
         return np.stack([v.effects for v in drawn]), np.stack([v.service_s for v in drawn])
 
+    def describe(self) -> list[str]:
+        """Return what was found, a line for each part that was fitted."""
+        effects, service_s = self.sample(DRAWS)
+        lines: list[str] = []
+        if self.worlds.library:
+            low, high = np.quantile(effects, (0.05, 0.95), axis=0)
+            ranges = zip(self.worlds.library, low, high, strict=True)
+            named = [
+                f"{x.name} {a:.2g} to {b:.2g} ({chance:.0%})"
+                for place, (x, a, b) in enumerate(ranges)
+                if (chance := self.presence.chance_of(place)) >= NAMED
+            ]
+            lines.append(f"effects: {', '.join(named) or 'none'}")
+        if self.worlds.service:
+            begin_s, each_s = service_s.mean(0).T
+            lines.append(
+                f"greens: {begin_s.min():.1f} to {begin_s.max():.1f} s unused at their beginning, "
+                f"{each_s.min():.1f} to {each_s.max():.1f} s in each further decision"
+            )
+        return lines
+
     def as_dict(self, lanes_of: Mapping[str, Sequence[int]]) -> dict[str, float]:
         """Return flat numbers for the metrics of a run: medians and 90 % intervals.
 
@@ -418,6 +443,8 @@ class Posterior:
             numbers[f"effects/{item.name}/high"] = float(high)
             numbers[f"effects/{item.name}/nominal"] = item.nominal
             numbers[f"effects/{item.name}/chance"] = self.presence.chance_of(place)
+        if not self.worlds.service:
+            return numbers
         for lane, (begin_s, each_s) in zip(self.worlds.lanes, service_s.mean(0), strict=True):
             numbers[f"service/begin_s/{lane}"] = float(begin_s)
             numbers[f"service/each_s/{lane}"] = float(each_s)

@@ -47,7 +47,6 @@ from ugat_marl.grounding.channel import (
     fit_channel,
     require_histories,
 )
-from ugat_marl.grounding.draws import DRAWS
 from ugat_marl.grounding.eyes import Eyes, EyesConfig, fit_eyes
 from ugat_marl.grounding.posterior import (
     LIBRARY,
@@ -68,9 +67,6 @@ from ugat_marl.seeding import derive_seed, numpy_generator
 
 KIND = "street"
 """Name of this kind of checkpoint, written into the file."""
-
-NAMED = 0.1
-"""Least chance of an effect that is said."""
 
 PARTS = ("channel", "eyes", "service", "effects")
 """Parts of a street, each of which can be left out."""
@@ -137,7 +133,7 @@ class StreetConfig:
             raise OptionError(
                 f"rule_budget = {self.rule_budget}: must be at least 2, or 0 for no rules"
             )
-        if self.simulated_s <= 0:
+        if not self.simulated_s > 0:  # not a number either
             raise OptionError(f"simulated_s = {self.simulated_s}: must be above 0")
 
     def budget_of_rules(self, *, taught: bool) -> int:
@@ -234,21 +230,7 @@ class FittedStreet:
         """Return what was found, a line for each part."""
         lines = [part.describe() for part in (self.channel, self.eyes) if part is not None]
         if self.posterior is not None:
-            effects, service_s = self.posterior.sample(DRAWS)
-            low, high = np.quantile(effects, (0.05, 0.95), axis=0)
-            ranges = zip(self.posterior.worlds.library, low, high, strict=True)
-            chance = self.posterior.presence.chance_of
-            named = [
-                f"{x.name} {a:.2g} to {b:.2g} ({chance(place):.0%})"
-                for place, (x, a, b) in enumerate(ranges)
-                if chance(place) >= NAMED
-            ]
-            lines.append(f"effects: {', '.join(named) or 'none'}")
-            begin_s, each_s = service_s.mean(0).T
-            lines.append(
-                f"greens: {begin_s.min():.1f} to {begin_s.max():.1f} s unused at their beginning, "
-                f"{each_s.min():.1f} to {each_s.max():.1f} s in each further decision"
-            )
+            lines += self.posterior.describe()
         return lines
 
     def as_dict(self, lanes_of: Mapping[str, Sequence[int]]) -> dict[str, float]:
