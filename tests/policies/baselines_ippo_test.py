@@ -356,6 +356,7 @@ def test_the_step_size_anneals_to_nothing() -> None:
         {"epochs": 0},
         {"hidden": (8, 0)},
         {"clip": float("inf")},
+        {"reward_scale": 0.0},
     ],
 )
 def test_settings_are_checked(wrong: dict[str, Any]) -> None:

@@ -501,9 +501,11 @@ def test_masks_that_allow_nothing_or_have_the_wrong_length_are_errors():
     ("option", "value"),
     [
         ("hidden", (0,)),
+        ("hidden", 64),
         ("learning_rate", 0.0),
         ("discount", 1.0),
         ("batch_size", 0),
+        ("batch_size", 1.5),
         ("warmup_decisions", 20_000),
         ("target_rate", 1.5),
         ("epsilon_end", -0.1),

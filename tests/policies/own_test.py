@@ -40,6 +40,7 @@ from ugat_marl.policies import (
     own_source,
     own_values,
 )
+from ugat_marl.policies.learner_settings import parsed_settings
 from ugat_marl.testing import ToyTraffic
 
 ALGORITHM = '''
@@ -415,6 +416,32 @@ def test_what_is_typed_in_a_notebook_is_known_by_its_code() -> None:
 
     assert hash_of(0) is not None
     assert hash_of(0) == hash_of(0, lines=3) != hash_of(7)
+
+
+def test_an_environment_that_a_learner_holds_is_known_by_what_it_is_made_of() -> None:
+    """Not by where it is in an episode, which differs at each start."""
+
+    def values_of(domain: str) -> list[list[str]]:
+        env = ugat_marl.parallel_env("single-v1", domain, duration_s=100)
+
+        def policy(observations: Any) -> dict[str, int]:
+            return dict.fromkeys(env.possible_agents, len(observations))
+
+        found = [own_values(own_name(policy))]
+        for seed in (1, 2):
+            env.reset(seed=seed)
+            found.append(own_values(own_name(policy)))
+        env.close()
+        return [*found, own_values(own_name(policy))]
+
+    one, other = values_of("sim"), values_of("V4")
+    assert all(values == one[0] for values in one)
+    assert one[0] != other[0]
+
+
+@pytest.mark.parametrize("text", ["{[1]:2}", "-" * 20_000 + "1", "some words"])
+def test_words_that_are_no_literal_stay_words(text: str) -> None:
+    assert parsed_settings([f"x={text}"], ["x"], {}, "mine") == {"x": text}
 
 
 @pytest.mark.parametrize(

@@ -57,5 +57,5 @@ def _plain_value(text: str) -> Any:
         return ast.literal_eval(word)
     try:
         return ast.literal_eval(text)
-    except (ValueError, SyntaxError):
+    except (ValueError, SyntaxError, TypeError, MemoryError, RecursionError):
         return text

@@ -203,6 +203,8 @@ def _stable_object(value: Any, deeper: Callable[[Any], str]) -> str:
         return f"{named}({deeper(dict(value.items()))})"
     if isinstance(value, Sequence | deque):
         return f"{named}({deeper(list(value))})"
+    if all(hasattr(value, name) for name in ("reset", "step", "unwrapped")):
+        return f"{named}({_file_hash(kind)}, {deeper(_made_of(value.unwrapped))})"
     held = getattr(value, "__dict__", {})
     if dataclasses.is_dataclass(kind):
         held = {field.name: getattr(value, field.name) for field in dataclasses.fields(kind)}
@@ -214,6 +216,17 @@ def _stable_object(value: Any, deeper: Callable[[Any], str]) -> str:
     except TypeError:
         return repr(value)
     return f"{named}({deeper([one for one in made_of[:2] if one is not None])})"
+
+
+def _made_of(env: Any) -> dict[str, Any]:
+    """Return what an environment was made of; where it is in an episode is no setting."""
+    scenario = getattr(env, "scenario", None)
+    return {
+        "environment": type(env),
+        "scenario": getattr(scenario, "hash", None),
+        "domain": getattr(env, "domain", None),
+        "options": dict(getattr(env, "env_options", {})),
+    }
 
 
 def own_source(name: str, what: str) -> str | None:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from numbers import Integral
 from typing import Any, get_args
 
 from ugat_marl.errors import OptionError
@@ -40,6 +41,10 @@ class UsualName(UsualValue, str):
 
 
 _MLP: Any = UsualName("mlp")
+
+
+def _is_size(number: object) -> bool:
+    return isinstance(number, Integral) and number >= 1
 
 
 @dataclass(frozen=True)
@@ -136,7 +141,7 @@ class DQNConfig:
 
     def __post_init__(self) -> None:
         # JSON gives a list, which would differ from the tuple of a checkpoint
-        if not isinstance(self.hidden, UsualSizes):
+        if isinstance(self.hidden, list):
             object.__setattr__(self, "hidden", tuple(self.hidden))
         for name in (
             "batch_size",
@@ -149,8 +154,10 @@ class DQNConfig:
             "lessons",
             "lesson_updates",
         ):
-            self._require(name, getattr(self, name) >= 1, "at least 1")
-        self._require("hidden", all(width >= 1 for width in self.hidden), "sizes of at least 1")
+            self._require(name, _is_size(getattr(self, name)), "a whole number of at least 1")
+        sizes: Any = self.hidden
+        known = isinstance(sizes, tuple) and all(map(_is_size, sizes))
+        self._require("hidden", known, "a tuple of whole numbers of at least 1")
         self._require("learning_rate", 0 < self.learning_rate < 1, "between 0 and 1")
         self._require("discount", 0 <= self.discount < 1, "at least 0 and below 1")
         self._require("target_rate", 0 < self.target_rate <= 1, "above 0, at most 1")
