@@ -655,3 +655,25 @@ def test_laps_of_a_turned_vehicle_count() -> None:
     scenario = replace(scenario, routes=(scenario.routes[0].edited(demand.encode()),))
     turned = departing(sound(apply_effects(scenario, [Turning("B1_A1", "A1_west1", 1)])))["a"]
     assert edges(turned) == [*laps, "A1_west1"]
+
+
+@pytest.mark.parametrize("effect", [DemandTiming("*", 30), DemandTiming("*", -30)])
+def test_who_departs_at_once_does_so_at_another_time(effect: Effect, crossing: Crossing) -> None:
+    """SUMO refuses a flow that ends before it begins."""
+    burst = '<flow id="b" begin="100" end="100" number="5" route="east"/>'
+    (flow,) = departing(apply_effects(load_scenario(crossing(vehicles=burst)), [effect])).values()
+    at = "130" if effect == DemandTiming("*", 30) else "70"
+    assert (flow.get("begin"), flow.get("end"), flow.get("number")) == (at, at, "5")
+
+
+def test_a_surge_has_ended_where_a_burst_begins(crossing: Crossing) -> None:
+    burst = '<flow id="b" begin="100" end="100" number="5" route="east"/>'
+    scenario = load_scenario(crossing(vehicles=burst))
+    for window, number in (((50, 100), 5), ((100, 150), 10)):
+        changed = apply_effects(scenario, [DemandSurge("*", *window, 2)])
+        assert sum(numbers(changed).values()) == number
+
+
+def test_a_demand_that_an_effect_took_away_says_so(crossing: Crossing) -> None:
+    with pytest.raises(ScenarioError, match=r"between 0 s and 200 s after demand_level=\*,0; "):
+        parallel_env(crossing(), "demand_level=*,0")

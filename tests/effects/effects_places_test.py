@@ -18,6 +18,7 @@ from ugat_marl.effects import (
     AllRedTime,
     Effect,
     LaneClosure,
+    LaneService,
     LateGreen,
     LocalSpeed,
     Parking,
@@ -27,12 +28,13 @@ from ugat_marl.effects import (
     late_greens,
     load_scenario,
     parse_domain,
+    refuse_service,
     scenario_in_domain,
     shift_parking,
     with_late_green_programmes,
 )
 from ugat_marl.errors import OptionError, ScenarioError, UnknownNameError
-from ugat_marl.scenarios import Network, Scenario, check_demand, driven_routes
+from ugat_marl.scenarios import Network, Scenario, Withheld, check_demand, driven_routes
 from ugat_marl.simulation import LibsumoSimulator, launch_of
 
 Crossing = Callable[..., Path]
@@ -306,10 +308,50 @@ def test_a_programme_that_is_late(crossing: Crossing) -> None:
         states(apply_effects(load_scenario(crossing(edit=jumping)), [LateGreen("C", 3)]))
 
 
+def test_lanes_that_are_not_served_are_red_in_programmes_too(crossing: Crossing) -> None:
+    """A cycle of 40 and 10 s; link 0 loses 2 s at its begin and 1 s in each further decision."""
+    scenario = load_scenario(crossing())
+    red = {"C": Withheld((2.0, 0.0), (1.0, 0.0))}
+
+    def states(scenario: Scenario) -> list[tuple[float, str]]:
+        changed = with_late_green_programmes(scenario, red).network
+        logic = next(iter(changed.parse().iter("tlLogic")))
+        return [(float(x.get("duration", "")), x.get("state", "")) for x in logic]
+
+    assert states(scenario) == [(2, "rr"), (8, "Gr"), *3 * [(1, "rr"), (9, "Gr")], (10, "rG")]
+    late = states(apply_effects(scenario, [LateGreen("C", 1)]))
+    assert (late[0], late[-2:]) == ((3, "rr"), [(1, "rr"), (9, "rG")])
+    actuated = crossing(edit=lambda text: text.replace('type="static"', 'type="actuated"'))
+    assert states(load_scenario(actuated)) == [(2, "rr"), (38, "Gr"), (10, "rG")]
+    jumping = crossing(edit=lambda text: text.replace('state="Gr"/>', 'state="Gr" next="1"/>'))
+    assert states(load_scenario(jumping)) == [(40, "Gr"), (10, "rG")]
+
+
+def test_a_programme_serves_a_lane_as_little_as_agents_do(crossing: Crossing) -> None:
+    path, travel_s = crossing(), list[float]()
+    for effects in ([], [LaneService("W_C_0", 8.0, 0.0)]):
+        env = parallel_env(path, effects, signals="programme")
+        env.reset(seed=1)
+        while env.agents:
+            env.step(dict.fromkeys(env.agents, 0))
+        travel_s.append(env.scores().att_s)
+        env.close()
+    assert travel_s[1] > travel_s[0] + 1.0
+
+
+def test_service_of_a_lane_that_no_agent_controls_is_refused(crossing: Crossing) -> None:
+    network = Network.read(load_scenario(crossing()))
+    refuse_service(network, [LaneService("W_C_0", 8.0, 0.0)])
+    with pytest.raises(OptionError, match="'C_N_0' leads to no light of an agent"):
+        refuse_service(network, [LaneService("C_N_0", 8.0, 0.0)])
+
+
 def test_clearance_times() -> None:
     scenario = apply_effects(load_scenario("single-v1"), [YellowTime(4.2), AllRedTime(1)])
     assert (scenario.control.yellow_s, scenario.control.all_red_s) == (4, 1)
     assert scenario.applied == ("yellow_time=4.2", "all_red_time=1")
+    halves = apply_effects(load_scenario("single-v1"), [YellowTime(2.5), AllRedTime(0.5)])
+    assert (halves.control.yellow_s, halves.control.all_red_s) == (3, 1)
 
 
 # --- all of them
@@ -434,3 +476,10 @@ def test_only_the_vehicles_of_the_effect_park_at_other_times() -> None:
     (shifted,) = shift_parking(replace(scenario, routes=(document,)), 3).routes
     (vehicle,) = shifted.parse().iter("vehicle")
     assert vehicle.get("depart") == "100"
+
+
+@pytest.mark.parametrize("effect", ["lane_closure=west1_A1_0,100,200", "parking=east1_A1_0,30,20"])
+def test_nobody_stands_on_lanes_that_are_queues(effect: str) -> None:
+    for domain in (f"meso+{effect}", f"{effect}+meso"):
+        with pytest.raises(ScenarioError, match=r"=.*mesoscopic model .* leave out one of the two"):
+            scenario_in_domain(load_scenario("single-v1"), domain)

@@ -30,6 +30,7 @@ from ugat_marl.effects import (
     YellowRunning,
     apply_effects,
     load_scenario,
+    parse_domain,
     scenario_in_domain,
 )
 from ugat_marl.effects.vehicles import DRIVER_MODELS
@@ -458,3 +459,15 @@ def test_a_model_that_does_not_exist() -> None:
     assert DriverModel("idm") == DriverModel("IDM")
     with pytest.raises(UnknownNameError, match=r"model of effect 'driver_model': 'IDN'.*'IDM'"):
         DriverModel("IDN")
+
+
+def test_trucks_are_no_better_than_the_cars_of_their_weather() -> None:
+    scenario = apply_effects(load_scenario("single-v1"), [*parse_domain("V4"), HeavyShare(0.5)])
+    trucks = [
+        kind
+        for document in (*scenario.additional, *scenario.routes)
+        for kind in document.parse().iter("vType")
+        if kind.get("id", "").startswith("heavy.")
+    ]
+    assert trucks
+    assert {(kind.get("accel"), kind.get("decel")) for kind in trucks} == {("0.5", "1.5")}

@@ -115,7 +115,10 @@ def test_impossible_values(text: str, error: type[Exception], message: str) -> N
 
 def test_without_effects_there_is_nothing_to_do() -> None:
     assert Actuators.of(parse_domain("V4"), NETWORKS["single-v1"], TIMING, 10.0) is None
-    assert scenario_in_domain(load_scenario("single-v1"), "min_green=15").control.min_green_s == 15
+    scenario = load_scenario("single-v1")
+    for asked, least in (("15", 15), ("2.5", 3), ("0.5", 1), ("0", 0)):
+        changed = scenario_in_domain(scenario, f"min_green={asked}")
+        assert changed.control.min_green_s == least, "at least as long, in whole steps"
 
 
 # --- which phase may follow which

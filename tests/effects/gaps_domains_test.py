@@ -468,3 +468,13 @@ def test_times_of_effects_lie_in_the_episode_that_is_asked_for() -> None:
     parked = ugat_marl.parallel_env("single-v1", "parking=northA_A1_0,60,30", duration_s=7200)
     last = parked.scenario.routes[-1].parse()[-1]
     assert float(last.get("depart", "0")) > 7000
+
+
+def test_a_domain_that_could_be_read_only_once_is_refused() -> None:
+    with pytest.raises(OptionError, match="give a name such as 'V1', or a list of effects"):
+        parse_domain(iter([StartupDelay(0.5)]))  # type: ignore[arg-type]
+
+
+def test_a_misspelt_name_behind_an_effect_with_a_fixed_choice_is_told_as_a_domain() -> None:
+    with pytest.raises(UnknownNameError, match=r"unknown domain 'snoww'.* Did you mean 'snow'"):
+        parse_domain("objective=fairness+snoww")

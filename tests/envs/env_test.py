@@ -543,3 +543,17 @@ def test_an_environment_is_copied_before_its_simulation_only(crossing: Callable[
             make(env)
     env.step(dict.fromkeys(env.agents, 0))
     env.close()
+
+
+@pytest.mark.parametrize("seed", [np.array(2), np.int64(2), True])
+def test_a_seed_is_any_whole_number(seed: Any) -> None:
+    env = parallel_env("single-v1", duration_s=20)
+    env.reset(seed=seed)
+    env.close()
+
+
+@pytest.mark.parametrize("seed", [-1, 1.5, np.array([1, 2]), "1"])
+def test_other_seeds_are_refused(seed: Any) -> None:
+    env = parallel_env("single-v1", duration_s=20)
+    with pytest.raises(OptionError, match="must be a whole number from 0 on"):
+        env.reset(seed=seed)

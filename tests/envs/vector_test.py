@@ -981,3 +981,13 @@ def test_what_is_under_way_at_the_end_is_forgotten_and_nothing_is_copied() -> No
         env.send(batch.masks.argmax(axis=-1))
     with pytest.raises(EpisodeError, match="this vector_env is closed"):
         env.recv()
+
+
+def test_effects_of_a_file_may_last_as_long_as_the_episode(tmp_path: Path) -> None:
+    """The scenario's own length is 600 s."""
+    directory = load_scenario("single-v1").with_duration(600).write(tmp_path / "town")
+    table = '[[effects]]\nname = "dropout"\ndetector = "stop:northA_A1_0"\n'
+    with (directory / "scenario.toml").open("a") as file:
+        file.write(table + "begin_s = 700\nend_s = 900\n")
+    with vector_env(directory, 1, duration_s=1200) as env:
+        env.reset(1)

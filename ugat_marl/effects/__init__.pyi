@@ -79,6 +79,7 @@ from .sensors import LostReadings as LostReadings
 from .sensors import ObservationDelay as ObservationDelay
 from .sensors import QuantisedCounts as QuantisedCounts
 from .service import LaneService as LaneService
+from .service import refuse_service as refuse_service
 from .service import service_of as service_of
 from .service import withheld as withheld
 from .signals import AllRedTime as AllRedTime

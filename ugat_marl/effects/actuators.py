@@ -7,6 +7,7 @@ asked for. The machine always keeps minimum green, yellow and all-red.
 from __future__ import annotations
 
 import itertools
+import math
 from collections import deque
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
@@ -175,7 +176,8 @@ class MinGreen(Effect):
     def apply(self, scenario: Scenario) -> Scenario:
         """Set `control.min_green_s`."""
         step = scenario.settings.step_length_s
-        changed = scenario.with_control(min_green_s=round(self.seconds / step) * step)
+        steps = math.ceil(self.seconds / step - 1e-9)
+        changed = scenario.with_control(min_green_s=steps * step)
         return replace(changed, applied=(*scenario.applied, str(self)))
 
 

@@ -337,7 +337,7 @@ class _Regular:
             flow.attrib.pop(key, None)
         flow.set("begin", seconds_text(self.begin_s))
         flow.set("number", str(self.number))
-        if self.spacing_s > 0:
+        if self.spacing_s > 0 or "end" in flow.attrib:
             flow.set("end", seconds_text(self.end_s))
         return flow
 
@@ -495,6 +495,8 @@ def _scaled_window(
     end = regular.end_s if regular else _random_end_s(element, over_s)
     first, last = max(begin, window[0]), min(end, window[1])
     if first > last or (first == last and (regular is None or regular.spacing_s)):
+        return [element]
+    if first >= window[1]:  # all depart at once when the window ends
         return [element]
     if first == begin and last == end:
         return [flow for flow in parted_flow(element, (factor,), over_s, salt) if flow is not None]

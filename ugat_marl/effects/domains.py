@@ -241,7 +241,7 @@ def parse_domain(domain: Domain) -> tuple[Effect, ...]:
         given: Any = domain
         if isinstance(given, Path):
             raise OptionError(f"domain {given!r}: give a scenario directory as text, str(path)")
-        if not isinstance(given, Iterable):
+        if not isinstance(given, Sequence):  # an iterator could be read once only
             raise OptionError(
                 f"domain {given!r}: give a name such as 'V1', or a list of effects such as "
                 "[StartupDelay(0.5)]"
@@ -285,7 +285,8 @@ def _parts(domain: str) -> list[str]:
         name = parts[-1].partition("=")[0].strip().lower() if parts else ""
         kind = EFFECTS.get(name)
         new = "=" in part or part.strip().lower() in {"", "sim", *_names()}
-        if kind is not None and kind.texts and not new:
+        named = kind is not None and any(not text.allowed for text in kind.texts.values())
+        if named and not new:
             parts[-1] += f"+{part}"
         else:
             parts.append(part)

@@ -7,6 +7,8 @@ from dataclasses import dataclass, replace
 from typing import ClassVar
 
 from ugat_marl.effects.base import Effect, NumberParameter
+from ugat_marl.effects.roads import LaneClosure, Parking, no_blockers
+from ugat_marl.errors import ScenarioError
 from ugat_marl.scenarios import Scenario, validate_settings
 
 HEADWAY_S = 1.4
@@ -43,7 +45,13 @@ class QueueModel(Effect):
         here all are `HEADWAY_S`. The network's own programmes keep their yellow, because phases may
         be read from them. The option `meso-lane-queue` is not used, because SUMO 1.28 crashes with
         it on some networks.
+
+        Raises:
+            ScenarioError: Vehicles stand on lanes, which is not possible in queues.
         """
+        for effect in scenario.applied:
+            if effect.partition("=")[0] in (LaneClosure.name, Parking.name):
+                raise ScenarioError(no_blockers(effect))
         options = {
             "mesosim": "true",
             "meso-edgelength": f"{self.metres:g}",

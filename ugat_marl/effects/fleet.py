@@ -210,13 +210,16 @@ def _chance(vehicle_type: ET.Element) -> float:
 def _truck(car: ET.Element, name: str) -> ET.Element:
     truck = copy.deepcopy(car)
     truck.attrib.pop("probability", None)
+    least = {"accel": 1.0, "decel": 3.5, "maxSpeed": 36.11}
+    for element in truck.iter():  # models inside of it, an old way to write a type, overrule it
+        for key, most in least.items():
+            least[key] = min(most, float(element.get(key, "inf")))
     for model in truck:
         for key in ("accel", "decel"):
             model.attrib.pop(key, None)
-    fastest = min(float(car.get("maxSpeed", "inf")), 36.11)
     truck.attrib |= {
-        "id": name, "length": "12", "accel": "1", "decel": "3.5", "guiShape": "truck",
-        "maxSpeed": f"{fastest:g}",
+        "id": name, "length": "12", "accel": f"{least['accel']:g}", "decel": f"{least['decel']:g}",
+        "guiShape": "truck", "maxSpeed": f"{least['maxSpeed']:g}",
     }  # fmt: skip
     return truck
 

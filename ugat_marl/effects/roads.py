@@ -54,7 +54,9 @@ class LaneClosure(Effect):
         Raises:
             UnknownNameError: No such lane.
             OptionError: The lane is too short to stand on.
+            ScenarioError: The scenario has the queue model, whose lanes cannot be blocked.
         """
+        _refuse_queues(scenario, self)
         begin = max(self.begin_s, scenario.settings.begin_s)
         if begin >= self.end_s:
             return replace(scenario, applied=(*scenario.applied, str(self)))
@@ -126,7 +128,9 @@ class Parking(Effect):
         Raises:
             UnknownNameError: No such lane.
             OptionError: The lane is too short to stand on.
+            ScenarioError: The scenario has the queue model, whose lanes cannot be blocked.
         """
+        _refuse_queues(scenario, self)
         settings = scenario.settings
         number = math.floor(self.per_hour * settings.duration_s / 3600.0 + 0.5)
         parts = [(n + hashed_uniform(self.name, self.lane, str(n))) / number for n in range(number)]
@@ -197,6 +201,19 @@ def shift_parking(scenario: Scenario, seed: int) -> Scenario:
 
 def _is_parked(vehicle: str, vehicle_type: str) -> bool:
     return vehicle_type.startswith(_PARKED) and is_blocker(vehicle, vehicle_type)
+
+
+def _refuse_queues(scenario: Scenario, effect: Effect) -> None:
+    if scenario.settings.is_mesoscopic:
+        raise ScenarioError(no_blockers(str(effect)))
+
+
+def no_blockers(effect: str) -> str:
+    """Say that an effect, such as ``lane_closure=...``, and the queue model exclude each other."""
+    return (
+        f"{effect}: in SUMO's mesoscopic model (queue_model, the domain 'meso') a vehicle that "
+        "stands blocks another lane or none; leave out one of the two"
+    )
 
 
 def _with_blockers(

@@ -9,6 +9,7 @@ from typing import ClassVar
 from ugat_marl.effects.base import ControllerEffect, NumberParameter, TextParameter
 from ugat_marl.effects.controllers import ControllerPart
 from ugat_marl.effects.places import network_places
+from ugat_marl.errors import OptionError
 from ugat_marl.scenarios import Intersection, Network, Scenario, Withheld
 
 Seconds = tuple[float, float]
@@ -21,7 +22,8 @@ class LaneService(ControllerEffect):
 
     The first is start-up lost time of this lane alone. The second lowers its saturation flow:
     queues stop for some seconds in every decision in which the green goes on. Controllers command
-    and observe the full green. A network may have one such effect for each lane.
+    and observe the full green. A network may have one such effect for each lane. SUMO's own
+    programmes show the same red, see `with_late_green_programmes`.
     """
 
     name: ClassVar[str] = "lane_service"
@@ -71,6 +73,21 @@ def withheld(network: Network, lanes: Mapping[str, Seconds]) -> dict[str, Withhe
     """Return the red of single links by traffic light, for lights with such a lane."""
     found = {item.id: _of_light(item, lanes) for item in network.intersections}
     return {light: red for light, red in found.items() if any(red.begin_s) or any(red.each_s)}
+
+
+def refuse_service(network: Network, effects: Iterable[ControllerPart]) -> None:
+    """Refuse effects on lanes that lead to no agent's light: nobody would withhold their green.
+
+    Raises:
+        OptionError: There is such an effect.
+    """
+    reached = {link.from_lane for item in network.intersections for link in item.links}
+    for lane in service_of(effects, ()):
+        if lane not in reached:
+            raise OptionError(
+                f"lane_service: lane {lane!r} leads to no light of an agent, and only there green "
+                "is withheld; leave it out"
+            )
 
 
 def _of_light(item: Intersection, lanes: Mapping[str, Seconds]) -> Withheld:

@@ -2,8 +2,11 @@
 
 from __future__ import annotations
 
+import math
 import xml.etree.ElementTree as ET
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
+from itertools import accumulate, pairwise
 from typing import ClassVar
 
 from ugat_marl.effects.base import (
@@ -17,7 +20,15 @@ from ugat_marl.effects.documents import edit, seconds_text
 from ugat_marl.effects.places import network_places
 from ugat_marl.errors import ScenarioError
 from ugat_marl.scenarios import LateGreenMemory as Held
-from ugat_marl.scenarios import Scenario, parse_time, validate_settings, with_late_green
+from ugat_marl.scenarios import (
+    Scenario,
+    Segment,
+    Withheld,
+    parse_time,
+    validate_settings,
+    with_late_green,
+    withheld_log,
+)
 
 QUEUE_START_S = 2.0
 """Start-up time in s that the mesoscopic model lacks, because its queues move at once."""
@@ -109,27 +120,44 @@ def late_greens(scenario: Scenario) -> dict[str, float]:
     return {tls: seconds for tls, seconds in late.items() if seconds > 0}
 
 
-def with_late_green_programmes(scenario: Scenario) -> Scenario:
+def with_late_green_programmes(
+    scenario: Scenario, red: Mapping[str, Withheld] | None = None
+) -> Scenario:
     """Return the scenario with late green in SUMO's own programmes, for the simulator only.
 
     The phases of agents are read from the unchanged scenario. A programme has whole simulation
     steps, so the late green is rounded to them.
 
+    Args:
+        scenario: The scenario.
+        red: Traffic light to the red of its single links, beside late green.
+
+    Programmes that follow the traffic have the red at the beginning of a green alone, since their
+    greens have no fixed lengths, and those that jump between their phases have none.
+
     Raises:
-        ScenarioError: A programme jumps between its phases, so they cannot be split.
+        ScenarioError: A programme jumps between its phases, so they cannot be split for late green.
     """
-    late = late_greens(scenario)
-    if not late:
+    late, red = late_greens(scenario), red or {}
+    if not late and not red:
         return scenario
     step = scenario.settings.step_length_s
     queues = QUEUE_START_S if scenario.settings.is_mesoscopic else 0.0
 
     def change(root: ET.Element) -> bool:
-        logics = [element for element in root.iter("tlLogic") if element.get("id") in late]
+        logics = [x for x in root.iter("tlLogic") if x.get("id") in late or x.get("id") in red]
         for logic in logics:
-            seconds = late[logic.get("id", "")]
-            if seconds > queues or not _jumps(logic):  # of queues alone nobody asked for it
-                _delay(logic, round(seconds / step) * step, step, scenario.id)
+            name = logic.get("id", "")
+            seconds = late.get(name, 0.0)
+            whole = round(seconds / step) * step
+            if _jumps(logic):
+                if seconds > queues:  # of queues alone nobody asked for it
+                    raise _too_late(logic, scenario)
+            elif name in red and logic.get("type", "static") == "static":
+                _withhold(logic, whole, red[name], scenario)
+            else:
+                own_s = [whole + seconds for seconds in red[name].begin_s] if name in red else whole
+                _delay(logic, own_s, step)
         return bool(logics)
 
     return replace(
@@ -145,23 +173,16 @@ def _with_control(scenario: Scenario, effect: Effect, key: str, seconds: float) 
             f"{effect}: the queue model shows its clearance as red; put {effect.name} before it"
         )
     step = scenario.settings.step_length_s
-    changed = scenario.with_control(**{key: round(seconds / step) * step})
+    changed = scenario.with_control(**{key: math.floor(seconds / step + 0.5) * step})
     return replace(changed, applied=(*scenario.applied, str(effect)))
 
 
-def _delay(logic: ET.Element, late_s: float, step_s: float, scenario: str) -> None:
+def _delay(logic: ET.Element, late_s: float | Sequence[float], step_s: float) -> None:
     """Split every phase of a programme in which something turns green."""
     phases = logic.findall("phase")
-    if late_s <= 0 or not phases:
+    if not late_s or not phases:
         return
-    if _jumps(logic):
-        raise ScenarioError(
-            f"scenario {scenario!r}: late green in the programme of traffic light "
-            f"{logic.get('id')!r}, whose phases name their successors (next=...), is not possible"
-        )
-    cycle = [
-        (parse_time(element.get("duration", "0")), element.get("state", "")) for element in phases
-    ]
+    cycle = _cycle(phases)
     held, _ = with_late_green(cycle, late_s, step_s, Held.after(cycle[-1][1]))
     for phase, segment in zip(phases, cycle, strict=True):
         held, shown = with_late_green([segment], late_s, step_s, held)
@@ -175,6 +196,44 @@ def _delay(logic: ET.Element, late_s: float, step_s: float, scenario: str) -> No
             if key in phase.attrib:
                 left = max(parse_time(phase.get(key, "0")) - lost, step_s)
                 phase.set(key, seconds_text(left))
+
+
+def _withhold(logic: ET.Element, late_s: float, red: Withheld, scenario: Scenario) -> None:
+    """Show red to single links in a programme of fixed times, as an environment does in its plans.
+
+    Decisions are counted from the start of the first cycle, and the second cycle is kept: in it
+    every green has a begin.
+    """
+    phases = logic.findall("phase")
+    cycle = _cycle(phases)
+    ends = list(accumulate(seconds for seconds, _ in cycle))
+    if not ends or ends[-1] <= 0:
+        return
+    log = [
+        (turn * ends[-1] + begin, state)
+        for turn in range(2)
+        for begin, (_, state) in zip([0.0, *ends], cycle, strict=False)
+    ]
+    step, decision_s = scenario.settings.step_length_s, scenario.control.decision_interval_s
+    shown = withheld_log(log, red, late_s, step, decision_s, 2 * ends[-1])
+    before = [state for time, state in shown if time <= ends[-1]]
+    second = [(0.0, before[-1])]
+    second += [(time - ends[-1], state) for time, state in shown if ends[-1] < time < 2 * ends[-1]]
+    for phase in phases:
+        logic.remove(phase)
+    for (begin, state), (end, _) in pairwise([*second, (ends[-1], "")]):
+        ET.SubElement(logic, "phase", {"duration": seconds_text(end - begin), "state": state})
+
+
+def _cycle(phases: Sequence[ET.Element]) -> list[Segment]:
+    return [(parse_time(phase.get("duration", "0")), phase.get("state", "")) for phase in phases]
+
+
+def _too_late(logic: ET.Element, scenario: Scenario) -> ScenarioError:
+    return ScenarioError(
+        f"scenario {scenario.id!r}: late green in the programme of traffic light "
+        f"{logic.get('id')!r}, whose phases name their successors (next=...), is not possible"
+    )
 
 
 def _jumps(logic: ET.Element) -> bool:

@@ -215,7 +215,8 @@ class Imperfection(VehicleEffect):
 class ReactionStep(VehicleEffect):
     """Drivers decide only every `seconds` (`actionStepLength`), rounded to simulation steps.
 
-    Their time gap grows with it where it was shorter, see `Headway`.
+    Their time gap grows with it where it was shorter, see `Headway`. A shorter step after a longer
+    one keeps that gap.
     """
 
     name: ClassVar[str] = "reaction_step"

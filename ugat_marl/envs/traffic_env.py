@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import operator
 import warnings
 from collections.abc import Callable, Mapping
 from pathlib import Path
@@ -20,6 +21,7 @@ from ugat_marl.effects import (
     domain_label,
     late_greens,
     load_scenario,
+    refuse_service,
     scenario_in_domain,
     service_of,
     with_late_green_programmes,
@@ -117,6 +119,7 @@ class TrafficEnv(ParallelEnv[str, Any, Any]):
         )
         interval_s = self.decision_interval_s
         self._actuators = Actuators.of(parts, self.network, self._timing, interval_s)
+        refuse_service(self.network, effects)
         self._withheld = withheld(self.network, service_of(effects, options.fitted))
         self._objectives = Objectives.of(effects, self.scenario)
         self._name_agents()
@@ -195,11 +198,8 @@ class TrafficEnv(ParallelEnv[str, Any, Any]):
                 drawn from `np_random`.
             options: Not used.
         """
-        given: Any = seed
-        if seed is not None and (not isinstance(given, SupportsIndex) or seed < 0):
-            raise OptionError(f"seed = {seed!r}: must be a whole number from 0 on")
         if seed is not None:
-            self.np_random = np.random.default_rng(seed)
+            self.np_random = np.random.default_rng(_whole(seed))
         self._scores, self.agents = None, []  # if SUMO does not start, no episode has begun
         self._start(int(self.np_random.integers(2**31)))
         try:
@@ -438,7 +438,7 @@ class TrafficEnv(ParallelEnv[str, Any, Any]):
             self._simulator = simulator_of(self.options.simulator, self.options.deadline_s)
         readers = (self._rewarder, self._observer, *self._recorded)
         launch = launch_of(
-            with_late_green_programmes(self.scenario),
+            with_late_green_programmes(self.scenario, self._withheld if self._programmes else None),
             seed,
             self._directory.fresh(),
             self._lanes.ids,
@@ -528,6 +528,16 @@ class TrafficEnv(ParallelEnv[str, Any, Any]):
         trips = self._simulator.finish()
         scores = self._recorder.scores(trips)
         self._scores = self._objectives.judged(scores, trips) if self._objectives else scores
+
+
+def _whole(seed: SupportsIndex) -> int:
+    try:
+        whole = operator.index(seed)
+    except TypeError:
+        whole = -1
+    if whole < 0:
+        raise OptionError(f"seed = {seed!r}: must be a whole number from 0 on")
+    return whole
 
 
 def step_meanwhile(

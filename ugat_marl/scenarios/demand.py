@@ -106,8 +106,9 @@ def check_demand(
             routed &= singles.ended()
     if not vehicles and not flows:
         files = ", ".join(document.source for document in scenario.routes)
+        effects = f" after {', '.join(scenario.applied)}" if scenario.applied else ""
         raise ScenarioError(
-            f"{files}: no vehicle departs between {begin:g} s and {end:g} s; "
+            f"{files}: no vehicle departs between {begin:g} s and {end:g} s{effects}; "
             "check begin_s and duration_s against the departure times"
         )
     scale = demand_scale(scenario)

@@ -84,7 +84,8 @@ class Spec:
         options |= {name: imported(text) for name, text in self.functions.items()}
         options["fitted"] = tuple(imported(text).from_state(state) for text, state in self.fitted)
         options["simulator"] = "inprocess"
-        scenario = replace(load_scenario(self.scenario), applied=tuple(self.applied))
+        scenario = load_scenario(self.scenario, options.get("duration_s"))
+        scenario = replace(scenario, applied=tuple(self.applied))
         env: AnyParallelEnv = parallel_env(scenario, received(domain), **options)
         for wrap in self.wraps:
             env = imported(wrap)(env)
