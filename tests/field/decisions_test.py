@@ -14,6 +14,7 @@ import pytest
 
 from ugat_marl.errors import OptionError, OutputError
 from ugat_marl.field import Decision, DecisionLog, read_decisions
+from ugat_marl.field.decisions import _line_hash
 
 SEGMENT = 4096
 """Size of a segment in these tests, so that many are made."""
@@ -251,3 +252,10 @@ def test_a_json_file_of_something_else_is_no_log(tmp_path: Path) -> None:
     with pytest.raises(OptionError, match="holds something else than decisions"):
         DecisionLog(path)
     assert path.read_text() == '{"a": 1}\n'
+
+
+def test_a_line_with_the_right_hash_and_no_json_is_told(tmp_path: Path) -> None:
+    text, path = b'{"x": [}', tmp_path / "log.jsonl"
+    path.write_bytes(text[:-1] + b', "hash": "' + _line_hash(text) + b'"}\n')
+    with pytest.raises(OptionError, match="line 1 is not what was written"):
+        list(read_decisions(path))

@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import itertools
 import random
 from collections.abc import Mapping
+from types import SimpleNamespace
 from typing import Any
 
 import pytest
@@ -11,6 +13,8 @@ import pytest
 from tests.field.loop_test import LIGHT, QUICK, SITE, MadeUpStreet, Scripted, broken_rules
 from ugat_marl.errors import OptionError, SimulatorError
 from ugat_marl.field import FieldLoop, TrustLimits
+from ugat_marl.field.lights import Lights
+from ugat_marl.scenarios import SignalTiming
 
 PHASES = SITE.network.intersections[0].phases
 OTHERS = set(SITE.lights) - {LIGHT}
@@ -217,3 +221,66 @@ def test_a_street_that_came_back_is_taken_over_from_what_it_shows() -> None:
 def test_looks_without_a_pause_are_refused() -> None:
     with pytest.raises(OptionError, match="look_every_s"):
         TrustLimits(look_every_s=0.0)
+
+
+class SlowCalls:
+    """Two lights; every call takes 60 ms, B obeys late, and A goes dark by hand at some time."""
+
+    def __init__(self, late_s: float) -> None:
+        self.time_s, self.late_s = 100.0, late_s
+        self.states = {"A": TWO[0], "B": TWO[0]}
+        self.under_way: list[tuple[float, str, str]] = []
+        self.of_b: list[str] = []
+        self.dark_s = float("inf")
+
+    def _pass(self, seconds: float) -> None:
+        self.time_s += seconds
+        for item in [item for item in self.under_way if item[0] <= self.time_s]:
+            self.under_way.remove(item)
+            _, light, state = item
+            if light == "B" and self.states["B"] != state:
+                self.of_b.append(state)
+            self.states[light] = state
+        if self.time_s >= self.dark_s:
+            self.states["A"], self.dark_s = "rrrr", float("inf")
+
+    def now_s(self) -> float:
+        return self.time_s
+
+    def shown(self) -> dict[str, str]:
+        self._pass(0.06)
+        return dict(self.states)
+
+    def show(self, states: Mapping[str, str]) -> None:
+        self._pass(0.06)
+        for light, state in states.items():
+            late_s = self.late_s if light == "B" else 0.0
+            self.under_way.append((self.time_s + late_s, light, state))
+        self._pass(0.0)
+
+    def wait(self, until_s: float) -> None:
+        self._pass(max(until_s - self.time_s, 0.0))
+
+
+TWO = ("GGrr", "rrGG")
+
+
+@pytest.mark.parametrize("late_s", [1.7 + place / 60 for place in range(9, 14)])
+def test_all_red_is_shown_though_another_light_is_taken_over_at_the_end(late_s: float) -> None:
+    """B's yellow may end while A is asked for its state, and its all-red is still to come."""
+    items = [SimpleNamespace(id=name, phases=TWO) for name in "AB"]
+    site: Any = SimpleNamespace(
+        network=SimpleNamespace(intersections=items),
+        lights=("A", "B"),
+        timing=SignalTiming(3.0, 2.0, 5.0),
+        decision_interval_s=5.0,
+    )
+    for dark in range(30):
+        street: Any = SlowCalls(late_s)
+        lights = Lights(site, street, TrustLimits())
+        lights.act(lights.plan({"A": 0, "B": 0}), lambda: None)
+        street.dark_s = street.time_s + 3.5 + dark / 10
+        for _ in range(2):
+            lights.faults()
+            lights.act(lights.plan({"A": 0, "B": 1}), lambda: None)
+        assert ("yyrr", "rrGG") not in set(itertools.pairwise(street.of_b))

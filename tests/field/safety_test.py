@@ -2,7 +2,12 @@
 
 from __future__ import annotations
 
+import contextlib
+import queue
+import threading
+import time
 from collections.abc import Sequence
+from typing import Any
 
 import pytest
 from hypothesis import Phase, settings
@@ -12,7 +17,10 @@ from hypothesis.stateful import initialize, invariant, rule, run_state_machine_a
 from tests.scenarios import signals_test
 from ugat_marl.effects import load_scenario
 from ugat_marl.errors import OptionError
+from ugat_marl.field import LaneCount, TrustLimits
+from ugat_marl.field.answering import Answering, Late
 from ugat_marl.field.safety import Light, Trust, fixed_time
+from ugat_marl.field.watchdog import Watchdog
 from ugat_marl.scenarios import GREEN, Network, Segment, SignalTiming
 
 LINKS = signals_test.LINKS
@@ -161,3 +169,32 @@ def test_the_plan_serves_every_link_of_every_light() -> None:
         assert green == servable
         assert all(actions[item.id] == asked[0][item.id] for actions in asked[:3])
         assert asked[3][item.id] != asked[0][item.id]
+
+
+def test_a_function_that_a_signal_interrupted_answers_nobody_else() -> None:
+    asked = Answering()
+    release = threading.Event()
+
+    class Interrupted(queue.SimpleQueue):  # type: ignore[type-arg]
+        def get(self, block: bool = True, timeout: float | None = None) -> Any:
+            raise KeyboardInterrupt
+
+    answers = asked._answers
+    asked._answers = Interrupted()
+    with pytest.raises(KeyboardInterrupt):
+        asked.ask(release.wait, within_s=1.0)
+    asked._answers = answers
+    release.set()
+    deadline = time.monotonic() + 10.0
+    while asked._owed and time.monotonic() < deadline:
+        with contextlib.suppress(Late):
+            assert asked.ask(lambda: "mine", within_s=5.0) == "mine"
+    assert asked.ask(lambda: "mine", within_s=5.0) == "mine"
+    asked.close()
+
+
+def test_a_gap_without_any_count_is_no_green_with_an_unchanged_count() -> None:
+    watchdog = Watchdog({"a": 10.0}, False, TrustLimits())
+    watchdog.check({"a": LaneCount(1000.0, 1.0)}, 1000.0)
+    watchdog.check({}, 1190.0)  # as the loop does while nothing can be read
+    assert watchdog.check({"a": LaneCount(1200.0, 1.0)}, 1200.0)[1] == {}

@@ -51,11 +51,12 @@ class Answering:
             except queue.Empty:
                 raise Late("still busy with an earlier decision") from None
             self._owed -= 1
+        self._owed += 1  # until it is here: a signal may end the wait too
         self._questions.put((function, arguments))
         try:
             answer, error = self._answers.get(timeout=max(within_s, 0.0))
+            self._owed -= 1
         except queue.Empty:
-            self._owed += 1
             raise Late(f"no answer within {1e3 * within_s:.0f} ms") from None
         if error is not None:
             raise NoAnswer(f"{type(error).__name__}: {error}") from error

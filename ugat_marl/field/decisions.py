@@ -263,12 +263,17 @@ def read_decisions(path: Path) -> Iterator[dict[str, Any]]:
         with path.open("rb") as lines:
             for number, line in enumerate(lines, 1):
                 match = _HASHED.fullmatch(line)
-                if match is None or _line_hash(match[1] + b"}") != match[2]:
+                text = match[1] + b"}" if match else b""
+                try:
+                    if match is None or _line_hash(text) != match[2]:
+                        raise ValueError("another hash")
+                    decision = json.loads(text)
+                except ValueError:
                     raise OptionError(
                         f"{path}: line {number} is not what was written; copy the log again, or "
                         "remove the line"
-                    )
-                yield json.loads(match[1] + b"}")
+                    ) from None
+                yield decision
     except OSError as error:
         raise OptionError(f"{path}: cannot be read ({error.strerror}); name a log") from None
 

@@ -51,6 +51,10 @@ class _Course:
         self.asked_s, self.since_s = now_s, None
         return True
 
+    def goes_on(self, now_s: float) -> bool:
+        """Return True if there is more to show: a next state, or the rest of the state of now."""
+        return len(self.segments) > 1 or self.ends_after(now_s)
+
     def ends_after(self, now_s: float) -> bool:
         """Return True if the state of now has not got its full time yet."""
         return self.until_s is None or self.until_s > now_s + _SLACK_S
@@ -158,7 +162,7 @@ class Lights:
                 self._send(changes)
                 self._send(self._compare(courses, end))
                 now = self._street.now_s()
-            if not any(course.ends_after(now) for course in courses.values()):
+            if not any(course.goes_on(now) for course in courses.values()):
                 break
             self._street.wait(self._next_look(courses.values(), now))
         if not courses and now < end:  # no light can be seen
@@ -166,11 +170,15 @@ class Lights:
 
     def _next_look(self, courses: Collection[_Course], now: float) -> float:
         """Return the time of the next command or look, s."""
-        ends = [course.until_s for course in courses]
-        if None in ends:
-            return now + min(_POLL_S, self._limits.look_every_s)
-        later = [end for end in ends if end is not None and end > now + _SLACK_S]
-        return min(now + self._limits.look_every_s, *later)
+        looks = [now + self._limits.look_every_s]
+        for course in courses:
+            if course.until_s is None:
+                looks.append(now + _POLL_S)
+            elif course.ends_after(now):
+                looks.append(course.until_s)
+            elif course.goes_on(now):  # its time ended while others were asked
+                looks.append(now)
+        return min(looks)
 
     def _send(self, states: Mapping[str, str]) -> None:
         if states:

@@ -190,6 +190,7 @@ class FieldLoop:
         try:
             counts, wrong = self._watchdog.check(self._street.read(), now, self._without_green)
         except (Exception, SystemExit) as error:  # noqa: BLE001 - whatever a detector's driver raises
+            self._watchdog.check({}, now)  # what comes after the gap is a change
             reason = f"missing: no counts at all, {type(error).__name__}: {error}"
             return {}, dict.fromkeys(self._lights.machines, reason)
         faults: dict[str, str] = {}

@@ -115,7 +115,7 @@ class FieldService:
                     raise
                 if self._lost is None:
                     self._say(f"the street is gone ({error}); looking for it again")
-                self._lost = error
+                self._lost = error.with_traceback(None)  # which would keep the old street open
                 self._health.tell("looking", **self._facts())
                 self._sleep(min(pause_s, max(until - time.monotonic(), 0.0)))
                 pause_s = min(2 * pause_s, LONGEST_PAUSE_S)
