@@ -11,6 +11,7 @@ import contextlib
 import errno
 import gzip
 import hashlib
+import importlib.util
 import io
 import json
 import os
@@ -81,6 +82,27 @@ def replacing(path: Path) -> Iterator[Path]:
         raise
     finally:
         temporary.unlink(missing_ok=True)
+
+
+@contextlib.contextmanager
+def only_writer(directory: Path) -> Iterator[None]:
+    """Lock a folder during a block, in which a file there is read and changed.
+
+    Another process waits for it. Nothing is locked where that is not possible: on Windows, and on
+    some network drives.
+    """
+    if importlib.util.find_spec("fcntl") is None:
+        yield
+        return
+    import fcntl
+
+    folder = os.open(directory, os.O_RDONLY)
+    try:
+        with contextlib.suppress(OSError):
+            fcntl.flock(folder, fcntl.LOCK_EX)
+        yield
+    finally:
+        os.close(folder)
 
 
 def require_writable(path: Path, suffix: str | None = None) -> None:

@@ -143,3 +143,17 @@ def test_a_packed_archive_is_refused_before_it_is_unpacked(tmp_path: Path) -> No
     assert (tmp_path / "b.pt").stat().st_size < 10**5
     with pytest.raises(CheckpointError, match="is packed, which the suite never does"):
         read_checkpoint(tmp_path / "b.pt", "toy")
+
+
+def test_what_holds_itself_and_rare_kinds_of_numbers_are_refused(tmp_path: Path) -> None:
+    endless: list[Any] = []
+    endless.append(endless)
+    for content, says in (
+        (endless, "nested too deeply"),
+        (torch.zeros(2, dtype=torch.float8_e4m3fn), "not a dense tensor of usual numbers"),
+        (torch.zeros(2, dtype=torch.complex64), "not a dense tensor of usual numbers"),
+    ):
+        path = tmp_path / "x.pt"
+        torch.save({"kind": "policy", "x": content}, path)
+        with pytest.raises(CheckpointError, match=says):
+            read_checkpoint(path, "policy")

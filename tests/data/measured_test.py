@@ -2,11 +2,14 @@
 
 from __future__ import annotations
 
+import re
 import tempfile
 from collections.abc import Callable
 from dataclasses import replace
 from datetime import datetime, timedelta
 from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
 
 import numpy as np
 import polars as pl
@@ -22,7 +25,10 @@ from ugat_marl.data import (
     split_periods,
     write_measured,
 )
+from ugat_marl.data.measured import tables
 from ugat_marl.data.measured.local_time import LocalClock
+from ugat_marl.data.measured.reading import _of_moments
+from ugat_marl.effects import load_scenario
 from ugat_marl.errors import MeasuredDataError, OutputError
 from ugat_marl.scenarios import (
     Detector,
@@ -681,6 +687,42 @@ def test_a_zero_within_the_hour_that_comes_twice_keeps_its_offset(
     assert clock.seconds(Path("t.csv"), cells, pl.Series(["night"]), 2).to_list() == [second]
 
 
+def test_a_zero_that_clocks_showed_twice_needs_its_offset() -> None:
+    with pytest.raises(
+        MeasuredDataError, match="showed twice, as they were set back; write a time"
+    ):
+        clock_from("2024-11-03T01:30:00")
+
+
 def test_a_zero_that_clocks_did_not_show_is_an_error() -> None:
     with pytest.raises(MeasuredDataError, match=r"periods.csv, line 2: zero is 2024-03-10 02:30"):
         clock_from("2024-03-10 02:30:00")
+
+
+@pytest.mark.parametrize(
+    ("name", "row", "says"),
+    [
+        ("lanes", "10,{lane},2,9", "halting '9.0' is more than there are vehicles"),
+        ("lanes", "10,{lane},5000,0", "vehicles '5000.0' is more than the lane has room for"),
+        ("trajectories", "v,10,{lane},99999,5", "position_m '99999.0' is beyond the end of"),
+        ("trajectories", "v,10,{lane},50,900", "speed_mps '900.0' is more than 70 m/s"),
+    ],
+)
+def test_moments_that_no_street_shows_are_refused(
+    name: str, row: str, says: str, tmp_path: Path
+) -> None:
+    scenario = load_scenario("single-v1")
+    network = Network.read(scenario)
+    lane = network.intersections[0].incoming_lanes[0]
+    columns = {
+        "lanes": "period_id,time_s,lane_id,vehicles,halting",
+        "trajectories": "period_id,vehicle_id,time_s,lane_id,position_m,speed_mps",
+    }
+    table = tables.LANES if name == "lanes" else tables.TRAJECTORIES
+    path = tmp_path / f"{name}.csv"
+    path.write_text(f"{columns[name]}\np,{row.format(lane=lane)}\n")
+    files: Any = SimpleNamespace(
+        has=lambda _: True, findings=[], rows=lambda _: (path, tables.read_table(path, table, []))
+    )
+    with pytest.raises(MeasuredDataError, match=rf"line 2: {re.escape(says)}"):
+        _of_moments(files, table, (Period("p", 0.0, 600.0, "fit", {}, {}),), network)

@@ -236,3 +236,17 @@ def test_of_seconds_long_after_the_last_moment_nothing_is_known() -> None:
     table = traffic_of_lanes(rows, ["l_0"], DAY, moments)
     assert not table["vehicles"].null_count()
     assert table["vehicles"][40:50].sum() == 0.0, "observed, and empty"
+
+
+def test_vehicles_that_are_lost_from_sight_on_a_zone_are_counted_all_the_same() -> None:
+    """The view ends at 40 m, in the zone; cars of 5 m follow each other after 3 s."""
+    rows = pl.concat(
+        track(["a_0"] * 5, [0.0, 10.0, 20.0, 30.0, 40.0], 10.0).with_columns(
+            pl.col("time_s") + 3.0 * number, vehicle_id=pl.lit(f"v{number}")
+        )
+        for number in range(4)
+    )
+    seen = passages(rows, Detector("d", "a_0", 38.0, 2.0, "exit"))["d"]
+    assert seen.on_s.tolist() == [13.8, 16.8, 19.8, 22.8]
+    assert seen.off_s[:3].tolist() == [14.0, 17.0, 20.0]
+    assert np.isnan(seen.off_s[3]), "it is there at the end of all positions"

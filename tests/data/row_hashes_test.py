@@ -31,6 +31,7 @@ from ugat_marl.data.row_hashes import (
 from ugat_marl.data.runs import Metrics
 from ugat_marl.data.transitions import read_parquet
 from ugat_marl.errors import CheckpointError, LogError, MeasuredDataError
+from ugat_marl.files import only_writer
 
 
 def every_kind(rows: int) -> pl.DataFrame:
@@ -145,7 +146,7 @@ def csv_fault(path: Path) -> str:
 def test_a_small_file_of_very_many_rows_is_refused(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(row_hashes, "_FEW_ROWS", 1000)
+    monkeypatch.setattr(row_hashes, "_FEW_CELLS", 1000)
     packed, honest = tmp_path / "packed.parquet", tmp_path / "honest.parquet"
     pl.DataFrame({"a": np.zeros(500_000)}).write_parquet(packed)
     pl.DataFrame({"a": np.random.default_rng(1).random(5000)}).write_parquet(honest)
@@ -293,3 +294,37 @@ def test_threads_that_read_leave_the_standard_error_alone(tmp_path: Path) -> Non
     with ThreadPoolExecutor(8) as pool:
         list(pool.map(lambda _: read_quietly(tmp_path / "t.parquet"), range(100)))
     assert os.path.samestat(before, os.fstat(2))
+
+
+def test_a_long_table_of_a_quiet_street_is_read(tmp_path: Path) -> None:
+    path, rows = tmp_path / "lanes.parquet", 1_200_000
+    write_hashed(pl.DataFrame({"vehicles": np.zeros(rows), "halting": np.zeros(rows)}), path)
+    assert path.stat().st_size < rows
+    assert read_quietly(path)[0].height == rows
+
+
+@pytest.mark.parametrize("tables", [{"a.csv": 1}, {"a.csv": {"rows": 1}}, []])
+def test_hashes_of_another_form_are_damaged(tables: object, tmp_path: Path) -> None:
+    path = csv_of(tmp_path, 3)
+    hashes = {"tables": tables, "hash": row_hashes._hash(tables)}
+    (tmp_path / CSV_HASHES).write_text(json.dumps(hashes))
+    assert "the hashes beside it are" in csv_fault(path)
+
+
+def test_groups_of_hashes_are_a_list(tmp_path: Path) -> None:
+    frame, path = pl.DataFrame({"a": [1]}), tmp_path / "a.parquet"
+    text = json.dumps({"rows": 1, "head": row_hashes._head(frame, {}), "groups": 5})
+    frame.write_parquet(path, metadata=dict.fromkeys(HASH_KEYS, text))
+    assert row_hashes.damage(*read_quietly(path)) == "its hashes are damaged"
+
+
+@pytest.mark.skipif(not hasattr(os, "fork"), reason="folders are not locked on Windows")
+def test_two_writers_of_one_folder_wait_for_each_other(tmp_path: Path) -> None:
+    csv_of(tmp_path, 3)
+    with ThreadPoolExecutor(1) as pool:
+        with only_writer(tmp_path):
+            writing = pool.submit(write_csv, tmp_path / "b.csv", "name\ny\n")
+            with pytest.raises(TimeoutError):
+                writing.result(0.2)
+        writing.result(10)
+    assert csv_fault(tmp_path / "a.csv") == csv_fault(tmp_path / "b.csv") == ""

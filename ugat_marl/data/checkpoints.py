@@ -78,12 +78,16 @@ def read_checkpoint(path: Path, *kinds: str) -> dict[str, Any]:
         raise CheckpointError(
             f"{path}: holds {kind_read!r}, expected {expected}; give the right file"
         )
-    for name, tensor in _tensors("", content):
-        if not _is_plain(tensor):
-            raise CheckpointError(
-                f"{path}: {name} is not a dense tensor that stores all its elements "
-                f"({tensor.layout}, {tensor.dtype}, {tensor.device}); save it with write_checkpoint"
-            )
+    try:
+        for name, tensor in _tensors("", content):
+            if not _is_plain(tensor):
+                raise CheckpointError(
+                    f"{path}: {name} is not a dense tensor of usual numbers that stores all its "
+                    f"elements ({tensor.layout}, {tensor.dtype}, {tensor.device}); save it with "
+                    "write_checkpoint"
+                )
+    except RecursionError:
+        raise CheckpointError(f"{path}: nested too deeply; save it with write_checkpoint") from None
     _require_finite(content, path, "cannot be used: take an earlier checkpoint or train again")
     return content
 
@@ -141,6 +145,15 @@ def checked_tensors(
     return {name: read[name] for name in expected}
 
 
+_DTYPES = frozenset(
+    {
+        torch.float16, torch.bfloat16, torch.float32, torch.float64, torch.bool, torch.uint8,
+        torch.int8, torch.int16, torch.int32, torch.int64,
+    }
+)  # fmt: skip
+"""Kinds of numbers that a checkpoint may hold. Of rarer ones torch cannot say what is finite."""
+
+
 def _is_plain(tensor: torch.Tensor) -> bool:
     """Return True for a dense tensor in memory that holds all of its elements.
 
@@ -148,6 +161,8 @@ def _is_plain(tensor: torch.Tensor) -> bool:
     tensors have no values to check.
     """
     if tensor.layout != torch.strided or tensor.is_quantized or tensor.is_meta:
+        return False
+    if tensor.dtype not in _DTYPES:
         return False
     return tensor.numel() * tensor.element_size() <= tensor.untyped_storage().nbytes()
 

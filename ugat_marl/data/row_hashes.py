@@ -29,7 +29,7 @@ from typing import Any
 import polars as pl
 
 from ugat_marl.errors import CheckpointError
-from ugat_marl.files import parse_json, read_json, write_whole
+from ugat_marl.files import only_writer, parse_json, read_json, require_writable, write_whole
 
 HASH_KEYS = ("ugat_marl.row_hashes", "ugat_marl.row_hashes.copy")
 """Keys of the hashes in the metadata of the file."""
@@ -42,8 +42,10 @@ CSV_HASHES = "row-hashes.json"
 
 _GROUP_ROWS = 65536
 """Rows of a row group. Half as many name the damage more closely and make the file longer."""
-_FEW_ROWS = 1_000_000
-"""Rows that are read whatever the size of their file. Ten times as many fill 1 GB of a wide log."""
+_FEW_CELLS = 100_000_000
+"""Cells that are read whatever the size of their file: 1 GB. Twice as many may fill a laptop."""
+_NESTED_CELLS = 100
+"""Numbers that a cell with a list or an array is taken to hold."""
 _MOST_CSV_GROUPS = 1024
 """Most hashes of a CSV table. Twice as many name the damage more closely and double their file."""
 
@@ -82,6 +84,11 @@ def write_csv_hashes(directory: Path, names: Iterable[str]) -> None:
         directory: Folder of the files.
         names: Names of the files; those of other files stay in the list.
     """
+    with only_writer(directory):
+        _add_csv_hashes(directory, names)
+
+
+def _add_csv_hashes(directory: Path, names: Iterable[str]) -> None:
     tables = _known_csv_hashes(directory)
     for name in names:
         frame = csv_texts((directory / name).read_bytes())
@@ -97,11 +104,13 @@ def write_csv(path: Path, text: str) -> None:
 
     A run that is killed between the two leaves a table without hashes.
     """
-    tables = _known_csv_hashes(path.parent)
-    if tables.pop(path.name, None) is not None:
-        _store_csv_hashes(path.parent, tables)
-    write_whole(path, text)
-    write_csv_hashes(path.parent, [path.name])
+    require_writable(path)
+    with only_writer(path.parent):
+        tables = _known_csv_hashes(path.parent)
+        if tables.pop(path.name, None) is not None:
+            _store_csv_hashes(path.parent, tables)
+        write_whole(path, text)
+        _add_csv_hashes(path.parent, [path.name])
 
 
 def with_hashes(content: Mapping[str, Any], rows: str) -> dict[str, Any]:
@@ -234,11 +243,18 @@ def _csv_hashes(file: Path) -> dict[str, Any]:
     try:
         tables = content["tables"]
         whole = content["hash"] == _hash(tables)
-    except (KeyError, TypeError):
+        for table in tables.values():
+            whole &= _have_form(table["rows"], table["head"], table["groups"])
+    except (KeyError, TypeError, AttributeError):
         whole, tables = False, {}
     if not whole:
         raise CheckpointError(f"{file}: not what was written")
     return tables
+
+
+def _have_form(rows: Any, head: Any, groups: Any) -> bool:
+    """Return True if values from a file can be the hashes of a table; anybody can write some."""
+    return type(rows) is int and rows >= 0 and isinstance(head, str) and isinstance(groups, list)
 
 
 def _rows_of_csv_group(rows: int) -> int:
@@ -269,12 +285,16 @@ def read_quietly(source: Path | io.BytesIO) -> tuple[pl.DataFrame, dict[str, str
 def _refuse_repeated_rows(source: Path | io.BytesIO) -> None:
     """Refuse a small file of very many equal rows, which would fill the memory.
 
-    Only the footer is read. Equal rows take next to no space, and rows of a street differ at least
-    in their times.
+    Only the footer is read. Equal rows take next to no space. So do those of a quiet street, but
+    they are not that many.
     """
     size = source.stat().st_size if isinstance(source, Path) else len(source.getbuffer())
-    rows = pl.scan_parquet(_again(source)).select(pl.len()).collect().item()
-    if rows > max(_FEW_ROWS, size):
+    table = pl.scan_parquet(_again(source))
+    cells = sum(
+        _NESTED_CELLS if kind.is_nested() else 1 for kind in table.collect_schema().dtypes()
+    )
+    rows = table.select(pl.len()).collect().item()
+    if rows > size and rows * cells > _FEW_CELLS:
         raise pl.exceptions.ComputeError(f"{rows} rows in {size} bytes")
 
 
@@ -330,7 +350,7 @@ def damage(frame: pl.DataFrame, metadata: Mapping[str, str], own: tuple[str, ...
         rows, head, groups = stored["rows"], stored["head"], stored["groups"]
     except (CheckpointError, KeyError, TypeError):
         return "its hashes are damaged"
-    if texts[0] != texts[1]:
+    if texts[0] != texts[1] or not _have_form(rows, head, groups):
         return "its hashes are damaged"
     if rows != frame.height:
         return f"it has {frame.height} rows, and had {rows} when it was written"

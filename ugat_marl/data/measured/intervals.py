@@ -106,7 +106,7 @@ def as_counts(measured: MeasuredData, length_s: float) -> MeasuredData:
         The data with ``counts``, with occupancies and mean speeds, and without passages.
 
     Raises:
-        OptionError: The length is not above 0.
+        OptionError: The length is below 1 s.
     """
     require_interval(length_s)
     parts: list[pl.DataFrame] = []

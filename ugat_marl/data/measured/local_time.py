@@ -53,13 +53,19 @@ class LocalClock:
             local = _shown(times, time_zone)
         else:
             utc = local.dt.replace_time_zone(
-                time_zone or "UTC", ambiguous="earliest", non_existent="null"
+                time_zone or "UTC", ambiguous="null", non_existent="null"
             ).dt.convert_time_zone("UTC")
-        if (never := utc.is_null() & local.is_not_null()).any():
-            at = int(never.arg_true()[0])
+        if (unsure := utc.is_null() & local.is_not_null()).any():
+            at = int(unsure.arg_true()[0])
+            once = local.dt.replace_time_zone(time_zone, ambiguous="earliest", non_existent="null")
+            what = (
+                "did not show, as they were set forward"
+                if once[at] is None
+                else "showed twice, as they were set back"
+            )
             raise MeasuredDataError(
                 f"{path}, line {at + 2}: {cells.name} is {local[at]}, which clocks in {time_zone} "
-                "did not show, as they were set forward; write a time with its offset"
+                f"{what}; write a time with its offset"
             )
         return cls(
             dict(zip(periods, local, strict=True)), dict(zip(periods, utc, strict=True)), time_zone

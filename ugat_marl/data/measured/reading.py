@@ -16,7 +16,7 @@ from ugat_marl.data.measured.copies import refuse_copies
 from ugat_marl.data.measured.counts import counts_of, travel_times_of, turning_of
 from ugat_marl.data.measured.coverage import coverage
 from ugat_marl.data.measured.local_time import LocalClock, require_time_zone
-from ugat_marl.data.measured.passages import MOST_UNPAIRED, passages_of
+from ugat_marl.data.measured.passages import FASTEST_MPS, MOST_UNPAIRED, passages_of
 from ugat_marl.data.measured.tables import (
     PERIOD,
     ROW,
@@ -49,6 +49,12 @@ from ugat_marl.scenarios import (
 
 TOLERANCE_M = 0.1
 """Tolerance for a zone that reaches beyond its lane: networks round lengths to 1 cm."""
+
+_BEYOND_M = 20.0
+"""Distance behind the end of its lane at which a vehicle may be seen: roads on maps and lanes of a
+network differ by some metres."""
+_SHORTEST_M = 2.0
+"""Room that a vehicle takes on a lane: a motorcycle."""
 
 SIGNAL_GAP_S = 600.0
 """A log with one state for longer than this probably has a gap."""
@@ -272,9 +278,11 @@ def _of_moments(
                 path, frame.filter(pl.col(column) < 0), column, "is negative", "correct the rows"
             )
     tracks = table is tables.TRAJECTORIES
+    lengths_m: dict[str, float] = {}
     for name in frame["lane_id"].unique(maintain_order=True):
         if not (tracks and name.startswith(":")):  # a vehicle may be inside of a junction
-            _lane_of(f"{path}: a row", name, network)
+            lengths_m[name] = _lane_of(f"{path}: a row", name, network).length_m
+    _refuse_impossible(path, frame, tracks, lengths_m)
     what = "vehicle_id" if tracks else "lane_id"
     once = frame.unique(["period_id", what, "time_s"], keep="first", maintain_order=True)
     if twice := frame.height - once.height:
@@ -287,6 +295,26 @@ def _of_moments(
     lengths = ("length_m",) if "length_m" in frame.columns and frame["length_m"].count() else ()
     optional = lengths if tracks else table.optional
     return frame.select(*table.columns, *optional)
+
+
+def _refuse_impossible(
+    path: Path, frame: pl.DataFrame, tracks: bool, lengths_m: Mapping[str, float]
+) -> None:
+    """Refuse rows that no street can show, of trajectories or of lanes."""
+    length_m = pl.col("lane_id").replace_strict(
+        lengths_m, default=math.inf, return_dtype=pl.Float64
+    )
+    if tracks:
+        far = frame.filter(pl.col("position_m") > length_m + _BEYOND_M)
+        refuse(path, far, "position_m", "is beyond the end of the lane", "correct lane or position")
+        fast = frame.filter(pl.col("speed_mps") > FASTEST_MPS)
+        refuse(path, fast, "speed_mps", f"is more than {FASTEST_MPS:g} m/s", "write m/s")
+        return
+    most = length_m / _SHORTEST_M + 2
+    full = frame.filter(pl.col("vehicles") > most)
+    refuse(path, full, "vehicles", "is more than the lane has room for", "correct the rows")
+    more = frame.filter(pl.col("halting") > pl.col("vehicles"))
+    refuse(path, more, "halting", "is more than there are vehicles", "correct the rows")
 
 
 def _refuse_empty(path: Path, kind: str, periods: list[str]) -> None:

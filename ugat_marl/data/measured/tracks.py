@@ -77,15 +77,20 @@ class _Track:
                 yield self.lane[begin], begin, index
                 begin = index
 
-    def passage(self, detector: Detector, begin: int, end: int) -> tuple[float, ...] | None:
+    def passage(
+        self, detector: Detector, begin: int, end: int, until_s: float
+    ) -> tuple[float, ...] | None:
         """Return on and off in s, speed in m/s and length in m; None if it does not come over.
 
-        A vehicle that is on the zone when it is first seen has no on (NaN).
+        A vehicle that is on the zone when it is first seen has no on (NaN), and one that is there
+        at the end of all positions no off (infinite). One that is lost from sight on the zone
+        leaves it then.
 
         Args:
             detector: A detector on the lane.
             begin: Index of the first position on the lane.
             end: Index behind the last one.
+            until_s: Time of the last position of any vehicle in the period, s.
         """
         start = self.driven_m[begin] - self.position_m[begin]  # distance at the start of the lane
         first, last = begin, end - 1
@@ -105,8 +110,8 @@ class _Track:
             on = np.nan
         if on is None:
             return None
-        if off is None:  # still there at the end, or gone to another lane
-            off = np.inf if end == len(self.lane) else np.nan
+        if off is None:
+            off = np.inf if self.time_s[-1] >= until_s else float(self.time_s[-1])
         left_s = off if np.isfinite(off) else on
         at = {"front": (on,), "mean": (on, left_s)}.get(detector.speed_at or "rear", (left_s,))
         speed = float(np.mean(np.interp(at, self.time_s, self.speed_mps)))
@@ -179,8 +184,9 @@ def passages_of_tracks(
     for period in periods:
         own = vehicles.filter(pl.col("period_id") == period.id)
         rows: dict[tuple[str, str], list[tuple[float, ...]]] = {}
+        until_s = max(own["time_s"], default=np.inf)
         for part in own.partition_by("vehicle_id", maintain_order=True):
-            _collect(_Track.of(part), by_lane, rows)
+            _collect(_Track.of(part), by_lane, until_s, rows)
         seen = {detector.id: _over(detector, rows) for detector in detectors}
         found.append(
             {
@@ -209,12 +215,13 @@ def passages_of_tracks(
 def _collect(
     track: _Track,
     by_lane: Mapping[str, Sequence[Detector]],
+    until_s: float,
     rows: dict[tuple[str, str], list[tuple[float, ...]]],
 ) -> None:
     """Add the passages of a vehicle to those of each lane of each detector."""
     for lane, begin, end in track.stays():
         for detector in by_lane.get(lane, ()):
-            if (passage := track.passage(detector, begin, end)) is not None:
+            if (passage := track.passage(detector, begin, end, until_s)) is not None:
                 rows.setdefault((detector.id, lane), []).append(passage)
 
 
