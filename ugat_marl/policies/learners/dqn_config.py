@@ -44,7 +44,7 @@ _MLP: Any = UsualName("mlp")
 
 
 def _is_size(number: object) -> bool:
-    return isinstance(number, Integral) and number >= 1
+    return isinstance(number, Integral) and int(number) >= 1
 
 
 @dataclass(frozen=True)
