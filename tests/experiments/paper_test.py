@@ -11,11 +11,14 @@ import pytest
 
 from tests.runs import perform_in_this_process
 from ugat_marl.__main__ import main
+from ugat_marl.data import Scores
 from ugat_marl.errors import OptionError, UnknownNameError
-from ugat_marl.experiments import DIRECT, QUEUES, TIMED, PaperConfig, read_queues
-from ugat_marl.experiments.jobs import SCORES
+from ugat_marl.experiments import DIRECT, QUEUES, TIMED, PaperConfig, TransferConfig, read_queues
+from ugat_marl.experiments.driver import record_of
+from ugat_marl.experiments.jobs import SCORES, Record
 from ugat_marl.experiments.paper import TABLES, Planner, settings_of
 from ugat_marl.experiments.settings import LearnerSpec, Setting
+from ugat_marl.experiments.transfers import planned_jobs
 from ugat_marl.grounding import FitConfig, GateConfig, InputsConfig, TimedConfig, UgatConfig
 
 SHORT = PaperConfig(episodes=10, iterations=2, grounded_episodes=5, real_rollouts=3, seeds=2)
@@ -126,6 +129,24 @@ def test_every_policy_has_as_many_episodes() -> None:
     assert episodes(DIRECT) == 10
     assert episodes("more plain sim") == episodes("trained in real") == 20
     assert episodes("fine-tuned on the same data") == 10 + 2 * 3  # as many as UGAT saw
+
+
+def test_a_job_with_the_usual_number_of_episodes_is_known_when_it_is_done(tmp_path: Path) -> None:
+    """Scores in files are known by plain numbers, and defaults are none."""
+    config = PaperConfig(seeds=1)
+    jobs = [job for setting in config.settings("main") for job in planner(config).jobs(setting)]
+    for job in {
+        job.name: job for job in [*jobs, *planned_jobs(TransferConfig("single-v1"))]
+    }.values():
+        scores = {
+            (mark, domain, seed): Scores(*range(10))
+            for mark in job.marks
+            for domain in job.domains
+            for seed in job.evaluation_seeds
+        }
+        (tmp_path / job.name).mkdir()
+        Record(scores).write(tmp_path / job.name)
+        assert record_of(job, tmp_path) is not None, job.name
 
 
 def test_tables_share_trainings() -> None:

@@ -134,6 +134,10 @@ class Job:
     evaluation_seeds: tuple[int, ...] = ()
     device: str = "cpu"
 
+    def __post_init__(self) -> None:
+        # A default of settings (`UsualValue`) is no key of the scores that files hold.
+        object.__setattr__(self, "episodes", int(self.episodes))
+
     @property
     def rows(self) -> dict[int, str]:
         """Names of the job's rows in a table, by number of training episodes.
@@ -143,7 +147,7 @@ class Job:
         """
         names = {self.episodes: self.setting.name}
         if self.setting.ugat is not None and self.start is None:
-            names |= {self.setting.ugat.pretrain_episodes: DIRECT}
+            names |= {int(self.setting.ugat.pretrain_episodes): DIRECT}
         return dict(sorted(names.items()))
 
     @property
@@ -524,7 +528,7 @@ def _grounded(
             workers=workers,
         )
     assert state.direct is not None  # plain training comes first
-    policies = {ugat.pretrain_episodes: state.direct, job.episodes: state.policy()}
+    policies = {int(ugat.pretrain_episodes): state.direct, job.episodes: state.policy()}
     for mark in job.rows:
         _save(policies[mark], folder / (POLICY if mark == job.episodes else DIRECT_POLICY))
         yield mark, policies[mark]
