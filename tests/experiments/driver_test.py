@@ -5,6 +5,7 @@ from __future__ import annotations
 import contextlib
 import json
 import os
+import shutil
 import signal
 import subprocess
 import sys
@@ -21,7 +22,7 @@ from pydantic import TypeAdapter
 
 from tests.interrupts import KillAfter, few_descriptors
 from ugat_marl.data import Scores, lock_folder
-from ugat_marl.effects import load_scenario
+from ugat_marl.effects import load_scenario, scenario_in_domain
 from ugat_marl.envs import parallel_env
 from ugat_marl.errors import CheckpointError, MeasurementError, OptionError, UnknownNameError
 from ugat_marl.experiments import (
@@ -451,6 +452,35 @@ SCORE = Scores(1, 1, 1, 1, 1, 1, 1, 1, 1, 1)
 
 def whole_record() -> Record:
     return Record({(m, d, s): SCORE for m in (2, 4) for d in ("sim", "V4") for s in (1000, 1001)})
+
+
+def test_what_was_played_in_a_street_that_has_changed_is_played_again(tmp_path: Path) -> None:
+    street = str(tmp_path / "street")
+
+    def job() -> Job:
+        return replace(PLAIN, domains=("sim", street), every=0)
+
+    def made(domain: str) -> None:
+        scenario_in_domain(load_scenario("single-v1"), domain).write(tmp_path / "street")
+
+    made("V1")
+    record = Record()
+    for domain in job().domains:
+        record.add_scores(job(), 4, domain, {1000: SCORE, 1001: SCORE})
+    record.write(tmp_path)
+    assert Record.read(tmp_path).is_whole(job())
+    shutil.rmtree(tmp_path / "street")
+    made("V4")
+    again = Record.read(tmp_path)
+    assert again.missing(job(), 4) == {street: [1000, 1001]}
+    again.add_scores(job(), 4, street, {1000: SCORE})
+    assert again.missing(job(), 4) == {street: [1001]}, "the old ones are dropped"
+    assert "worlds" not in with_hashes_of(whole_record(), tmp_path), "other files are as ever"
+
+
+def with_hashes_of(record: Record, folder: Path) -> str:
+    record.write(folder)
+    return (folder / SCORES).read_text()
 
 
 def test_what_a_killed_job_was_writing_is_cleared(tmp_path: Path) -> None:

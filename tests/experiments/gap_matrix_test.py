@@ -155,3 +155,14 @@ def test_domains_a_network_does_not_allow_are_left_out(
     named = ["--domains", "sim", "barrier-both", "--seeds", "1", "--policies", "max-pressure"]
     assert main(["evaluate", str(scenario), *named]) == 2, "what one names has to fit"
     assert "have no barrier" in capsys.readouterr().err
+
+
+def test_a_domain_without_a_number_does_not_hide_the_worst_of_the_others() -> None:
+    table = {"sim": 60.0, "V1": math.nan, "V4": 860.0}
+    results = tuple(
+        Result("a", domain, seed, scores(att_s))
+        for domain, att_s in table.items()
+        for seed in (0, 1)
+    )
+    (cell,) = gap_matrix(Evaluation("here", "0", results, {}))["a"].values()
+    assert (cell.worst, cell.worst_cost) == ("V4", 800.0)

@@ -96,6 +96,10 @@ def test_a_table_is_not_replaced_by_one_that_lacks_its_trainings(tmp_path: Path)
         with pytest.raises(OutputError, match="'fast' in V4 with seed 2"):
             _require_kept(file, fewer)
     assert file.read_text() == TABLE
+    other = tmp_path / "other.csv"
+    other.write_text("a,b\n1,2\n")
+    with pytest.raises(OutputError, match="no table that could be replaced; .* another --out"):
+        _require_kept(other, TABLE)
 
 
 def test_a_length_is_compared_as_a_number(tmp_path: Path) -> None:
@@ -140,6 +144,12 @@ def test_rules_are_put_into_a_table(
     for domain, column in (("V4", "att_s"), ("sim", "att_s_sim")):
         known = played.filter(pl.col("domain") == domain)["att_s"].to_numpy()
         assert own[column].to_numpy() == pytest.approx(known, abs=1e-3)
+    other = tmp_path / "other.csv"
+    other.write_text("a,b\n1,2\n")
+    assert main([*call, *words, "--table", str(table), "--out", str(other)]) == 2
+    assert "no table of compare that could be replaced; give" in capsys.readouterr().err
+    assert main([*call[:3], " ", *call[4:]]) == 2
+    assert "give the new row a name" in capsys.readouterr().err
     for wrong in ([], ["--policies", "random", "--learner", "dqn"]):
         assert main(["compare", "single-v1", "--name", "mine", *wrong]) == 2
         assert "one of the two" in capsys.readouterr().err

@@ -13,7 +13,7 @@ from tyro.conf import Positional, arg
 from ugat_marl.cli.arguments import RayAddress, refuse_options, require_numbers, workers_of
 from ugat_marl.data import write_csv
 from ugat_marl.effects import domain_label, load_scenario
-from ugat_marl.errors import OptionError, counted
+from ugat_marl.errors import CheckpointError, OptionError, counted
 from ugat_marl.experiments import (
     DIRECT,
     Judging,
@@ -103,6 +103,8 @@ class Compare:
 
     def run(self, console: Console) -> int:
         """Judge, print the table, write it."""
+        if not self.name.strip():
+            raise OptionError(f"--name {self.name!r}: give the new row a name")
         if bool(self.policies) == (self.learner is not None):
             raise OptionError("compare needs --policies or --learner, one of the two")
         if twice := [each for each in self.policies if self.policies.count(each) > 1]:
@@ -154,7 +156,16 @@ class Compare:
 
     def _require_kept(self, table: pl.DataFrame) -> None:
         """Refuse to replace a table whose rows the new one would not have."""
-        if self.out is not None and self.out.is_file() and (row := lost_row(self.out, table)):
+        if self.out is None or not self.out.is_file():
+            return
+        try:
+            row = lost_row(self.out, table)
+        except CheckpointError as error:
+            raise OptionError(
+                f"--out: {error}, so it is no table of compare that could be replaced; give "
+                "another --out"
+            ) from None
+        if row:
             raise OptionError(
                 f"--out {self.out}: is there, with rows that would be lost, such as "
                 f"{row['setting']!r} in {row['domain']}; --table {self.out} keeps them, or give "

@@ -87,7 +87,9 @@ class Field:
         """Drive the lights and print a summary."""
         self._check()
         length_s = self.seconds if self.seconds is None or math.isfinite(self.seconds) else None
-        scenario = scenario_in_domain(load_scenario(self.scenario, length_s), self.domain)
+        scenario = scenario_in_domain(
+            load_scenario(self.scenario, length_s), self.domain, duration_s=length_s
+        )
         policy = policy_factory(self.policy)(parallel_env(scenario))
         site = Site.of(scenario, policy.env_options)
         seconds = self.seconds or scenario.settings.duration_s

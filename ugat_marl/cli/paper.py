@@ -12,7 +12,7 @@ from tyro.conf import arg
 from ugat_marl.cli.arguments import RayAddress, require_numbers, workers_of
 from ugat_marl.data import write_csv
 from ugat_marl.effects import load_scenario
-from ugat_marl.errors import OptionError, OutputError
+from ugat_marl.errors import CheckpointError, OptionError, OutputError
 from ugat_marl.experiments import (
     DIRECT,
     Comparison,
@@ -186,7 +186,14 @@ def _require_kept(file: Path, text: str) -> None:
     Raises:
         OutputError: Trainings would be lost; nothing was written.
     """
-    if row := lost_row(file, as_standings(text.encode(), "the new table")):
+    try:
+        row = lost_row(file, as_standings(text.encode(), "the new table"))
+    except CheckpointError as error:
+        raise OutputError(
+            f"{error}, so it is no table that could be replaced; give the same command with "
+            "another --out, it trains nothing again"
+        ) from None
+    if row:
         raise OutputError(
             f"{file.parent} holds a table of other trainings, such as {row['setting']!r} in "
             f"{row['domain']} with seed {row['training_seed']}; give the same command with another "

@@ -27,7 +27,8 @@ class PolicyGap:
 
     Play the policies in sim, in the corrected scenario and in the real domain.
 
-    The travel times are printed, and added to DIR/diagnosis.json and report.html.
+    The travel times are printed, and stand in DIR/diagnosis.json and report.html in the place of
+    those of an earlier call.
 
     Examples:
         ugat-marl policy-gap single-v1 found --real V4
@@ -61,7 +62,7 @@ class PolicyGap:
         require_numbers(1, seeds=self.seeds, workers=self.workers)
         require_numbers(0, first_seed=self.first_seed)
         scenario = load_scenario(self.scenario, self.duration_s)
-        diagnosis, corrected = read_diagnosis(self.directory, scenario)
+        diagnosis, corrected = read_diagnosis(self.directory, scenario, self.duration_s)
         require_writable(self.directory / FILE)
         if same_for_agents(corrected, scenario):
             console.print("note: only detectors were at fault; the traffic was not corrected")

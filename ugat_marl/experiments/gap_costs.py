@@ -60,7 +60,7 @@ def _cell(evaluation: Evaluation, policy: str, gap: str, domains: Sequence[str])
         ]
     )
     means = costs.mean(axis=1)
-    worst = int(means.argmax())
+    worst = int(np.where(np.isnan(means), -np.inf, means).argmax())
     return Cell(Estimate.of(costs.mean(axis=0)), domains[worst], float(means[worst]))
 
 

@@ -186,6 +186,15 @@ class Job:
         return parts if self.every else {**parts, "episodes": self.episodes}
 
     @functools.cached_property
+    def judged_worlds(self) -> dict[str, str]:
+        """Domain of the evaluation to its hash, for scenario directories, which may change."""
+        return {
+            domain: _hash(self.scenario, domain, self.duration_s)
+            for domain in self.domains
+            if domain_path(domain) is not None
+        }
+
+    @functools.cached_property
     def digest(self) -> str:
         """First ten hexadecimal digits of the hash of `identity`."""
         text = json.dumps(self.identity, sort_keys=True)
@@ -302,12 +311,14 @@ class Record:
         episodes: Number of training episodes that `seconds` and `own_seconds` cover.
         seconds: Time of training without evaluations, in s.
         own_seconds: Processor time of the learner's process during training, in s.
+        worlds: Domain to the hash of the world that was played there, for scenario directories.
     """
 
     scores: dict[tuple[int, str, int], Scores] = field(default_factory=dict)
     episodes: int = 0
     seconds: float = 0.0
     own_seconds: float = 0.0
+    worlds: dict[str, str] = field(default_factory=dict[str, str])
 
     @classmethod
     def read(cls, folder: Path) -> Record:
@@ -330,7 +341,7 @@ class Record:
                 key = int(row.pop("trained")), str(row.pop("domain")), int(row.pop("seed"))
                 row["approaches"] = {k: tuple(v) for k, v in row.get("approaches", {}).items()}
                 scores[key] = Scores(**row)
-            return cls(scores, **content["training"])
+            return cls(scores, **content["training"], worlds=dict(content.get("worlds", {})))
         except (CheckpointError, ArithmeticError, ValueError, TypeError, KeyError, AttributeError):
             return cls()
 
@@ -341,7 +352,8 @@ class Record:
             for (trained, domain, seed), scores in self.scores.items()
         ]
         training = {name: getattr(self, name) for name in ("episodes", "seconds", "own_seconds")}
-        hashed = with_hashes({"training": training, "episodes": rows}, "episodes")
+        worlds = {"worlds": self.worlds} if self.worlds else {}
+        hashed = with_hashes({"training": training, **worlds, "episodes": rows}, "episodes")
         content = json.dumps(hashed, indent=1)
         write_whole(folder / SCORES, content + "\n")
 
@@ -352,12 +364,31 @@ class Record:
         self.own_seconds += effort.own_seconds
 
     def missing(self, job: Job, mark: int) -> dict[str, list[int]]:
-        """Return the seeds not yet played after `mark` training episodes, by domain."""
+        """Return the seeds not yet played after `mark` training episodes, by domain.
+
+        What was played in a scenario directory that has changed since counts as not played.
+        """
         seeds = {
-            domain: [s for s in job.evaluation_seeds if (mark, domain, s) not in self.scores]
+            domain: [
+                s
+                for s in job.evaluation_seeds
+                if (mark, domain, s) not in self.scores or self._is_other(job, domain)
+            ]
             for domain in job.domains
         }
         return {domain: left for domain, left in seeds.items() if left}
+
+    def _is_other(self, job: Job, domain: str) -> bool:
+        now = job.judged_worlds.get(domain)
+        return now is not None and self.worlds.get(domain, now) != now
+
+    def add_scores(self, job: Job, mark: int, domain: str, scores: Mapping[int, Scores]) -> None:
+        """Add the scores of episodes by seed; those of another world of that name are dropped."""
+        if self._is_other(job, domain):
+            self.scores = {key: held for key, held in self.scores.items() if key[1] != domain}
+        if (now := job.judged_worlds.get(domain)) is not None:
+            self.worlds[domain] = now
+        self.scores |= {(mark, domain, seed): held for seed, held in scores.items()}
 
     def is_whole(self, job: Job) -> bool:
         """Return True if nothing of the job is missing."""
@@ -437,7 +468,7 @@ def _judge(
         # between the two, the same episodes are played again; their first seed is their number.
         if mark in job.rows:
             queues.write(folder / QUEUES, keep=True, batch=seeds[0])
-        record.scores |= {(mark, domain, r.seed): r.scores for r in played.results}
+        record.add_scores(job, mark, domain, {r.seed: r.scores for r in played.results})
         record.write(folder)
 
 

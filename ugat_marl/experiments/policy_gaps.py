@@ -70,6 +70,8 @@ def policy_gap(
     """
     if not policies or not seeds:
         raise OptionError("a policy gap needs at least one policy and one seed")
+    if duration_s is not None:  # effects need to know it
+        scenario = scenario.with_duration(duration_s)
     world = scenario_in_domain(scenario, real, recorded=True)
     if same_for_agents(world, scenario):
         raise OptionError(
@@ -115,12 +117,15 @@ def _travel_time(estimate: Estimate) -> TravelTimeEstimate:
     )
 
 
-def read_diagnosis(directory: Path, scenario: Scenario) -> tuple[Diagnosis, Scenario]:
+def read_diagnosis(
+    directory: Path, scenario: Scenario, duration_s: float | None = None
+) -> tuple[Diagnosis, Scenario]:
     """Read a diagnosis and the corrected scenario beside it.
 
     Args:
         directory: Output folder of `ugat_marl.diagnosis.workflow.diagnose`.
         scenario: The scenario that was diagnosed.
+        duration_s: Length of episodes in the corrected scenario, s; None for its own.
 
     Raises:
         OptionError: The directory holds no diagnosis, one of another scenario, or one that
@@ -150,7 +155,7 @@ def read_diagnosis(directory: Path, scenario: Scenario) -> tuple[Diagnosis, Scen
     place = directory / CORRECTED
     if not (place / "scenario.toml").is_file():
         raise ScenarioError(f"{place}: the corrected scenario is gone; diagnose again")
-    return diagnosis, load_scenario(place)
+    return diagnosis, load_scenario(place, duration_s)
 
 
 def write_policy_gap(

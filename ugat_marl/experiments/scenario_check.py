@@ -164,7 +164,8 @@ def problems(
         best = min(runs, key=lambda run: run.backlog)
         if is_full(runs, facts.duration_s):
             roads = Counter(outside or {}).most_common(_NAMED)
-            where = "; they wait at " + ", ".join(f"{road} ({n})" for road, n in roads)
+            where = ", ".join(f"{road} ({n})" for road, n in roads)
+            where = f"; under the network's own programme they wait at {where}"
             faults.append(
                 f"{best.backlog} of {best.due} vehicles cannot enter even under {best.rule}"
                 f"{where if roads else ''}; lower the demand, or look at what blocks these roads"

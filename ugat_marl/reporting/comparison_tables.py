@@ -213,6 +213,12 @@ def _meaning(comparison: Comparison, direct: str) -> list[str]:
         if better
         else f"No setting is better than direct transfer in every domain with p < {CERTAIN:g}."
     )
+    tested = len([setting for setting in comparison.settings if setting != direct])
+    if tested > 1:
+        first += (
+            f" Each of {tested} is tested by itself: of as many that change nothing, "
+            f"{tested * CERTAIN / 2:.2g} would pass in one domain by chance."
+        )
     check = check_table(comparison)
     trained = (
         check.sentence("`--episodes`")
