@@ -53,8 +53,8 @@ TOLERANCE_M = 0.1
 _BEYOND_M = 20.0
 """Distance behind the end of its lane at which a vehicle may be seen: roads on maps and lanes of a
 network differ by some metres."""
-_SHORTEST_M = 2.0
-"""Room that a vehicle takes on a lane: a motorcycle."""
+_SHORTEST_M = 1.0
+"""Least room that a vehicle takes on a lane: bicycles side by side."""
 
 SIGNAL_GAP_S = 600.0
 """A log with one state for longer than this probably has a gap."""

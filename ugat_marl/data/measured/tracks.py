@@ -184,7 +184,7 @@ def passages_of_tracks(
     for period in periods:
         own = vehicles.filter(pl.col("period_id") == period.id)
         rows: dict[tuple[str, str], list[tuple[float, ...]]] = {}
-        until_s = max(own["time_s"], default=np.inf)
+        until_s = float(own["time_s"].to_numpy().max(initial=-np.inf))
         for part in own.partition_by("vehicle_id", maintain_order=True):
             _collect(_Track.of(part), by_lane, until_s, rows)
         seen = {detector.id: _over(detector, rows) for detector in detectors}
