@@ -174,7 +174,8 @@ class MesoscopicLanes:
         if road.towards and len(lanes) > 1:
             lanes = road.towards.get(self._following(name, road.edge)) or lanes
         position_m = self._api.vehicle.getLanePosition(name) if road.last_m >= 0 else 0.0
-        drive_s = road.segment_m / self._api.vehicle.getAllowedSpeed(name)
+        # a speed sign may forbid to drive at all
+        drive_s = road.segment_m / max(self._api.vehicle.getAllowedSpeed(name), HALTING_MPS)
         return _Stay(position_m, time_s - min(passed_s, drive_s) / 2, drive_s, lanes, -1)
 
     def _following(self, name: str, edge: str) -> str:
