@@ -91,18 +91,34 @@ def only_writer(directory: Path) -> Iterator[None]:
     Another process waits for it. Nothing is locked where that is not possible: on Windows, and on
     some network drives.
     """
-    if importlib.util.find_spec("fcntl") is None:
+    if os.name == "nt":  # a folder cannot be opened there
         yield
         return
-    import fcntl
-
     folder = os.open(directory, os.O_RDONLY)
     try:
         with contextlib.suppress(OSError):
-            fcntl.flock(folder, fcntl.LOCK_EX)
+            lock(folder, wait=True)
         yield
     finally:
         os.close(folder)
+
+
+def lock(descriptor: int, *, wait: bool = False) -> None:
+    """Lock an open file or folder until it is closed; a killed process frees it. Not on Windows.
+
+    Args:
+        descriptor: The file or folder.
+        wait: True to wait until another process frees it.
+
+    Raises:
+        BlockingIOError: Another process has locked it.
+        OSError: It cannot be locked, such as on some network drives.
+    """
+    if importlib.util.find_spec("fcntl") is None:
+        return
+    import fcntl
+
+    fcntl.flock(descriptor, fcntl.LOCK_EX | (0 if wait else fcntl.LOCK_NB))
 
 
 def require_writable(path: Path, suffix: str | None = None) -> None:

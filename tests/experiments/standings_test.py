@@ -144,12 +144,6 @@ def test_rules_are_put_into_a_table(
     for domain, column in (("V4", "att_s"), ("sim", "att_s_sim")):
         known = played.filter(pl.col("domain") == domain)["att_s"].to_numpy()
         assert own[column].to_numpy() == pytest.approx(known, abs=1e-3)
-    other = tmp_path / "other.csv"
-    other.write_text("a,b\n1,2\n")
-    assert main([*call, *words, "--table", str(table), "--out", str(other)]) == 2
-    assert "no table of compare that could be replaced; give" in capsys.readouterr().err
-    assert main([*call[:3], " ", *call[4:]]) == 2
-    assert "give the new row a name" in capsys.readouterr().err
     for wrong in ([], ["--policies", "random", "--learner", "dqn"]):
         assert main(["compare", "single-v1", "--name", "mine", *wrong]) == 2
         assert "one of the two" in capsys.readouterr().err
@@ -183,3 +177,15 @@ def test_rules_are_put_into_a_table(
     assert (
         f"rows that would be lost, such as 'mine' in V4; --table {out}" in capsys.readouterr().err
     )
+
+
+def test_a_file_of_another_kind_is_kept_and_a_row_has_a_name(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    call = ["compare", "single-v1", "--name", "mine", "--policies", "largest-queue:20", "random"]
+    other = tmp_path / "other.csv"
+    other.write_text("a,b\n1,2\n")
+    assert main([*call, "--table", str(written(tmp_path)), "--out", str(other)]) == 2
+    assert "no table of compare that could be replaced; give" in capsys.readouterr().err
+    assert main([*call[:3], " ", *call[4:]]) == 2
+    assert "give the new row a name" in capsys.readouterr().err

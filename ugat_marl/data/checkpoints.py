@@ -160,9 +160,7 @@ def _is_plain(tensor: torch.Tensor) -> bool:
     A stride of 0 lets a few bytes stand for more elements than any memory holds; quantised and meta
     tensors have no values to check.
     """
-    if tensor.layout != torch.strided or tensor.is_quantized or tensor.is_meta:
-        return False
-    if tensor.dtype not in _DTYPES:
+    if tensor.layout != torch.strided or tensor.is_meta or tensor.dtype not in _DTYPES:
         return False
     return tensor.numel() * tensor.element_size() <= tensor.untyped_storage().nbytes()
 

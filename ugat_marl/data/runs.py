@@ -9,7 +9,6 @@ from __future__ import annotations
 
 import fnmatch
 import importlib.metadata
-import importlib.util
 import json
 import math
 import shutil
@@ -23,7 +22,7 @@ import polars as pl
 from ugat_marl.data.curves import CURVES_FILE, Curves
 from ugat_marl.data.row_hashes import damage, read_quietly, write_hashed
 from ugat_marl.errors import CheckpointError, OptionError, first_line
-from ugat_marl.files import read_json, replacing, require_writable, write_whole
+from ugat_marl.files import lock, read_json, replacing, require_writable, write_whole
 from ugat_marl.progress import Reporter
 
 CHECKPOINT_FOLDER = "checkpoint"
@@ -263,25 +262,22 @@ def lock_folder(directory: Path) -> IO[str]:
     Raises:
         OptionError: Another process has locked the folder.
     """
-    lock = (directory / ".lock").open("w")
-    if importlib.util.find_spec("fcntl") is not None:  # not on Windows
-        import fcntl
-
-        try:
-            fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
-        except BlockingIOError:
-            lock.close()
-            raise OptionError(
-                f"{directory}: another process is training in this folder; wait for it, or name "
-                "another one"
-            ) from None
-        except OSError as error:  # such as a network drive without locks
-            lock.close()
-            raise OptionError(
-                f"{directory}: cannot be locked ({error.strerror}), so two trainings could write "
-                "there at once; name a folder on another drive"
-            ) from None
-    return lock
+    file = (directory / ".lock").open("w")
+    try:
+        lock(file.fileno())
+    except BlockingIOError:
+        file.close()
+        raise OptionError(
+            f"{directory}: another process is training in this folder; wait for it, or name "
+            "another one"
+        ) from None
+    except OSError as error:  # such as a network drive without locks
+        file.close()
+        raise OptionError(
+            f"{directory}: cannot be locked ({error.strerror}), so two trainings could write "
+            "there at once; name a folder on another drive"
+        ) from None
+    return file
 
 
 def _refuse_other(file: Path, identity: Mapping[str, Any]) -> None:

@@ -126,14 +126,13 @@ def with_late_green_programmes(
     """Return the scenario with late green in SUMO's own programmes, for the simulator only.
 
     The phases of agents are read from the unchanged scenario. A programme has whole simulation
-    steps, so the late green is rounded to them.
+    steps, so the late green is rounded to them. Programmes that follow the traffic have the red of
+    single links at the beginning of a green alone, since their greens have no fixed lengths, and
+    those that jump between their phases have none.
 
     Args:
         scenario: The scenario.
         red: Traffic light to the red of its single links, beside late green.
-
-    Programmes that follow the traffic have the red at the beginning of a green alone, since their
-    greens have no fixed lengths, and those that jump between their phases have none.
 
     Raises:
         ScenarioError: A programme jumps between its phases, so they cannot be split for late green.
@@ -156,8 +155,8 @@ def with_late_green_programmes(
             elif name in red and logic.get("type", "static") == "static":
                 _withhold(logic, whole, red[name], scenario)
             else:
-                own_s = [whole + seconds for seconds in red[name].begin_s] if name in red else whole
-                _delay(logic, own_s, step)
+                own = [whole + begin_s for begin_s in red[name].begin_s] if name in red else whole
+                _delay(logic, own, step)
         return bool(logics)
 
     return replace(
@@ -206,22 +205,19 @@ def _withhold(logic: ET.Element, late_s: float, red: Withheld, scenario: Scenari
     """
     phases = logic.findall("phase")
     cycle = _cycle(phases)
-    ends = list(accumulate(seconds for seconds, _ in cycle))
-    if not ends or ends[-1] <= 0:
+    *begins, length = accumulate((seconds for seconds, _ in cycle), initial=0.0)
+    if length <= 0:
         return
-    log = [
-        (turn * ends[-1] + begin, state)
-        for turn in range(2)
-        for begin, (_, state) in zip([0.0, *ends], cycle, strict=False)
-    ]
+    first = [(begin, state) for begin, (_, state) in zip(begins, cycle, strict=True)]
+    log = [*first, *((length + begin, state) for begin, state in first)]
     step, decision_s = scenario.settings.step_length_s, scenario.control.decision_interval_s
-    shown = withheld_log(log, red, late_s, step, decision_s, 2 * ends[-1])
-    before = [state for time, state in shown if time <= ends[-1]]
+    shown = withheld_log(log, red, late_s, step, decision_s, 2 * length)
+    before = [state for time, state in shown if time <= length]
     second = [(0.0, before[-1])]
-    second += [(time - ends[-1], state) for time, state in shown if ends[-1] < time < 2 * ends[-1]]
+    second += [(time - length, state) for time, state in shown if length < time < 2 * length]
     for phase in phases:
         logic.remove(phase)
-    for (begin, state), (end, _) in pairwise([*second, (ends[-1], "")]):
+    for (begin, state), (end, _) in pairwise([*second, (length, "")]):
         ET.SubElement(logic, "phase", {"duration": seconds_text(end - begin), "state": state})
 
 

@@ -379,6 +379,7 @@ class Record:
         return {domain: left for domain, left in seeds.items() if left}
 
     def _is_other(self, job: Job, domain: str) -> bool:
+        """Return True if the scores of a domain are of another world of that name."""
         now = job.judged_worlds.get(domain)
         return now is not None and self.worlds.get(domain, now) != now
 

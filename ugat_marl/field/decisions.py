@@ -5,7 +5,6 @@ from __future__ import annotations
 import contextlib
 import errno
 import hashlib
-import importlib.util
 import json
 import os
 import re
@@ -15,7 +14,7 @@ from pathlib import Path
 from typing import Any, Literal
 
 from ugat_marl.errors import OptionError, OutputError
-from ugat_marl.files import require_writable
+from ugat_marl.files import lock, require_writable
 
 _SEGMENT_BYTES = 1 << 20
 """Size from which a segment is closed, bytes. A larger one delays one decision in a day for longer.
@@ -217,14 +216,11 @@ class DecisionLog:
 
     def _open_file(self) -> None:
         self._file = os.open(self.path, os.O_RDWR | os.O_CREAT, 0o666)
-        if importlib.util.find_spec("fcntl") is not None:  # not on Windows
-            import fcntl
-
-            try:
-                fcntl.flock(self._file, fcntl.LOCK_EX | fcntl.LOCK_NB)
-            except BlockingIOError:
-                self._release()
-                raise
+        try:
+            lock(self._file)
+        except BlockingIOError:
+            self._release()
+            raise
 
     def _require_whole(self) -> None:
         """Refuse a file of something else, or whose last line has no end.
@@ -262,20 +258,26 @@ def read_decisions(path: Path) -> Iterator[dict[str, Any]]:
     try:
         with path.open("rb") as lines:
             for number, line in enumerate(lines, 1):
-                match = _HASHED.fullmatch(line)
-                text = match[1] + b"}" if match else b""
-                try:
-                    if match is None or _line_hash(text) != match[2]:
-                        raise ValueError("another hash")
-                    decision = json.loads(text)
-                except ValueError:
+                decision = _decision_in(line)
+                if decision is None:
                     raise OptionError(
                         f"{path}: line {number} is not what was written; copy the log again, or "
                         "remove the line"
-                    ) from None
+                    )
                 yield decision
     except OSError as error:
         raise OptionError(f"{path}: cannot be read ({error.strerror}); name a log") from None
+
+
+def _decision_in(line: bytes) -> dict[str, Any] | None:
+    """Return the decision in a line of a log; None if the line is not what was written."""
+    match = _HASHED.fullmatch(line)
+    if match is None or _line_hash(text := match[1] + b"}") != match[2]:
+        return None
+    try:
+        return json.loads(text)
+    except ValueError:
+        return None
 
 
 def _line_hash(text: bytes) -> bytes:

@@ -182,11 +182,7 @@ def passages_of_tracks(
         )
     found: list[dict[str, Passages]] = []
     for period in periods:
-        own = vehicles.filter(pl.col("period_id") == period.id)
-        rows: dict[tuple[str, str], list[tuple[float, ...]]] = {}
-        until_s = float(own["time_s"].to_numpy().max(initial=-np.inf))
-        for part in own.partition_by("vehicle_id", maintain_order=True):
-            _collect(_Track.of(part), by_lane, until_s, rows)
+        rows = _crossings(vehicles.filter(pl.col("period_id") == period.id), by_lane)
         seen = {detector.id: _over(detector, rows) for detector in detectors}
         found.append(
             {
@@ -212,17 +208,19 @@ def passages_of_tracks(
     return tuple(found)
 
 
-def _collect(
-    track: _Track,
-    by_lane: Mapping[str, Sequence[Detector]],
-    until_s: float,
-    rows: dict[tuple[str, str], list[tuple[float, ...]]],
-) -> None:
-    """Add the passages of a vehicle to those of each lane of each detector."""
-    for lane, begin, end in track.stays():
-        for detector in by_lane.get(lane, ()):
-            if (passage := track.passage(detector, begin, end, until_s)) is not None:
-                rows.setdefault((detector.id, lane), []).append(passage)
+def _crossings(
+    vehicles: pl.DataFrame, by_lane: Mapping[str, Sequence[Detector]]
+) -> dict[tuple[str, str], list[tuple[float, ...]]]:
+    """Return detector and lane to the passages of all vehicles of a period there."""
+    rows: dict[tuple[str, str], list[tuple[float, ...]]] = {}
+    until_s = float(vehicles["time_s"].to_numpy().max(initial=-np.inf))
+    for part in vehicles.partition_by("vehicle_id", maintain_order=True):
+        track = _Track.of(part)
+        for lane, begin, end in track.stays():
+            for detector in by_lane.get(lane, ()):
+                if (passage := track.passage(detector, begin, end, until_s)) is not None:
+                    rows.setdefault((detector.id, lane), []).append(passage)
+    return rows
 
 
 def _over(
