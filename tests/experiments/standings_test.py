@@ -11,9 +11,8 @@ import pytest
 import scipy.stats
 
 from ugat_marl.__main__ import main
-from ugat_marl.cli.paper import _require_kept
 from ugat_marl.errors import CheckpointError, OptionError, OutputError
-from ugat_marl.experiments import as_standings, lost_rows, ranked, read_standings, with_standings
+from ugat_marl.experiments import as_standings, ranked, read_standings, require_kept, with_standings
 from ugat_marl.experiments.standings import SCHEMA, Judging
 
 HEAD = ",".join(SCHEMA)
@@ -87,19 +86,17 @@ def test_a_table_is_not_replaced_by_one_that_lacks_its_trainings(tmp_path: Path)
     folder = tmp_path / "single-v1" / "main"
     folder.mkdir(parents=True)
     file = written(folder)
-    table = read_standings(file)
-    more = TABLE + "fast,V1,0,70,60,960\n"
-    _require_kept(file, more)
-    _require_kept(file, TABLE)
-    assert lost_rows(table, as_standings(more.encode(), "")).is_empty()
+    for kept in (TABLE, TABLE + "fast,V1,0,70,60,960\n"):
+        require_kept(file, as_standings(kept.encode(), ""), "")
     for fewer in (TABLE.replace("fast,V4,2,85,62,952\n", ""), TABLE.replace("85", "86")):
         with pytest.raises(OutputError, match="'fast' in V4 with seed 2"):
-            _require_kept(file, fewer)
+            require_kept(file, as_standings(fewer.encode(), ""), "give another")
     assert file.read_text() == TABLE
     other = tmp_path / "other.csv"
     other.write_text("a,b\n1,2\n")
-    with pytest.raises(OutputError, match="no table that could be replaced; .* another --out"):
-        _require_kept(other, TABLE)
+    with pytest.raises(OutputError, match="no table that could be replaced; give another"):
+        require_kept(other, read_standings(file), "give another")
+    require_kept(tmp_path / "none.csv", read_standings(file), "")
 
 
 def test_a_length_is_compared_as_a_number(tmp_path: Path) -> None:
@@ -175,7 +172,7 @@ def test_rules_are_put_into_a_table(
     # So is a table whose rows the new one would not have.
     assert main([*call, *words, "--table", str(table), "--out", str(out)]) == 2
     assert (
-        f"rows that would be lost, such as 'mine' in V4; --table {out}" in capsys.readouterr().err
+        f"would be lost, such as 'mine' in V4 with seed 0; --table {out}" in capsys.readouterr().err
     )
 
 
@@ -186,6 +183,6 @@ def test_a_file_of_another_kind_is_kept_and_a_row_has_a_name(
     other = tmp_path / "other.csv"
     other.write_text("a,b\n1,2\n")
     assert main([*call, "--table", str(written(tmp_path)), "--out", str(other)]) == 2
-    assert "no table of compare that could be replaced; give" in capsys.readouterr().err
+    assert "no table that could be replaced; give" in capsys.readouterr().err
     assert main([*call[:3], " ", *call[4:]]) == 2
     assert "give the new row a name" in capsys.readouterr().err

@@ -13,16 +13,16 @@ from tyro.conf import Positional, arg
 from ugat_marl.cli.arguments import RayAddress, refuse_options, require_numbers, workers_of
 from ugat_marl.data import write_csv
 from ugat_marl.effects import domain_label, load_scenario
-from ugat_marl.errors import CheckpointError, OptionError, counted
+from ugat_marl.errors import OptionError, counted
 from ugat_marl.experiments import (
     DIRECT,
     Judging,
     PaperConfig,
     compare,
     judged_in,
-    lost_row,
     policy_factory,
     read_standings,
+    require_kept,
     require_room,
     shipped_standings,
     standings_from,
@@ -141,7 +141,9 @@ class Compare:
                     "number and length, so the row stands alone; --table takes a table of yours",
                     soft_wrap=True,
                 )
-        self._require_kept(table)
+        if self.out is not None:
+            keeping = f"--table {self.out} keeps them, or "
+            require_kept(self.out, table, "give another --out", keeping)
         domains = self._domains(table)
         require_room(table, self.name, map(domain_label, domains))
         with workers_of(self.workers, self.ray) as workers:
@@ -153,24 +155,6 @@ class Compare:
             write_csv(self.out, judging.written_to(whole).write_csv())
             console.print(f"table: {self.out}", soft_wrap=True)
         return 0
-
-    def _require_kept(self, table: pl.DataFrame) -> None:
-        """Refuse to replace a table whose rows the new one would not have."""
-        if self.out is None or not self.out.is_file():
-            return
-        try:
-            row = lost_row(self.out, table)
-        except CheckpointError as error:
-            raise OptionError(
-                f"--out: {error}, so it is no table of compare that could be replaced; give "
-                "another --out"
-            ) from None
-        if row:
-            raise OptionError(
-                f"--out {self.out}: is there, with rows that would be lost, such as "
-                f"{row['setting']!r} in {row['domain']}; --table {self.out} keeps them, or give "
-                "another --out"
-            )
 
     def _domains(self, table: pl.DataFrame) -> tuple[str, ...]:
         known = table["domain"].unique(maintain_order=True).to_list()

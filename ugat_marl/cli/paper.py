@@ -12,7 +12,7 @@ from tyro.conf import arg
 from ugat_marl.cli.arguments import RayAddress, require_numbers, workers_of
 from ugat_marl.data import write_csv
 from ugat_marl.effects import load_scenario
-from ugat_marl.errors import CheckpointError, OptionError, OutputError
+from ugat_marl.errors import OptionError
 from ugat_marl.experiments import (
     DIRECT,
     Comparison,
@@ -22,8 +22,8 @@ from ugat_marl.experiments import (
     as_standings,
     compare,
     file_stem,
-    lost_row,
     machine_facts,
+    require_kept,
 )
 from ugat_marl.files import require_writable, write_whole
 from ugat_marl.policies import device_of
@@ -171,31 +171,10 @@ class Gap(_Paper):
 
 def _write(comparison: Comparison, judging: Judging, title: str, folder: Path) -> None:
     seeds = judging.written_to(all_standings(comparison)).write_csv()
-    if (folder / SEEDS).is_file():
-        _require_kept(folder / SEEDS, seeds)
+    remedy = "give the same command with another --out, it trains nothing again"
+    require_kept(folder / SEEDS, as_standings(seeds.encode(), "the new table"), remedy)
     page = comparison_page(comparison, DIRECT, title, machine_facts())
     write_whole(folder / "table.md", page + "\n")
     write_csv(folder / "table.csv", comparison_csv(comparison))
     write_csv(folder / SEEDS, seeds)
     draw_table(comparison.rows(), comparison.sim, folder)
-
-
-def _require_kept(file: Path, text: str) -> None:
-    """Refuse to replace a table by one that lacks trainings of it, or has others in their place.
-
-    Raises:
-        OutputError: Trainings would be lost; nothing was written.
-    """
-    try:
-        row = lost_row(file, as_standings(text.encode(), "the new table"))
-    except CheckpointError as error:
-        raise OutputError(
-            f"{error}, so it is no table that could be replaced; give the same command with "
-            "another --out, it trains nothing again"
-        ) from None
-    if row:
-        raise OutputError(
-            f"{file.parent} holds a table of other trainings, such as {row['setting']!r} in "
-            f"{row['domain']} with seed {row['training_seed']}; give the same command with another "
-            "--out, it trains nothing again"
-        )

@@ -74,10 +74,9 @@ from .standings import Judging as Judging
 from .standings import all_standings as all_standings
 from .standings import as_standings as as_standings
 from .standings import judged_in as judged_in
-from .standings import lost_row as lost_row
-from .standings import lost_rows as lost_rows
 from .standings import ranked as ranked
 from .standings import read_standings as read_standings
+from .standings import require_kept as require_kept
 from .standings import require_room as require_room
 from .standings import shipped_standings as shipped_standings
 from .standings import standings_from as standings_from

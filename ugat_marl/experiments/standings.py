@@ -19,7 +19,7 @@ import polars as pl
 
 from ugat_marl.data import csv_damage, csv_texts
 from ugat_marl.effects import Domain, domain_label
-from ugat_marl.errors import CheckpointError, OptionError
+from ugat_marl.errors import CheckpointError, OptionError, OutputError
 from ugat_marl.experiments.comparison import Comparison
 from ugat_marl.experiments.evaluation import evaluate
 from ugat_marl.experiments.jobs import EVALUATION_SEED
@@ -198,15 +198,31 @@ def _standings_in(texts: pl.DataFrame | None, name: str) -> pl.DataFrame:
     return rows
 
 
-def lost_rows(before: pl.DataFrame, after: pl.DataFrame) -> pl.DataFrame:
-    """Return the rows of a table that another one has not, with all their numbers."""
-    return before.join(after, on=list(SCHEMA), how="anti", maintain_order="left")
+def require_kept(file: Path, after: pl.DataFrame, remedy: str, keeping: str = "") -> None:
+    """Refuse to replace a table by one that lacks trainings of it, or has others in their place.
 
+    Args:
+        file: The table; if it is not there, nothing is refused.
+        after: What would replace it.
+        remedy: What to do instead, for the error.
+        keeping: What else would keep the rows, for the error.
 
-def lost_row(file: Path, after: pl.DataFrame) -> dict[str, Any] | None:
-    """Return the first row of a file that another table has not; None if nothing would be lost."""
-    lost = lost_rows(read_standings(file), after)
-    return None if lost.is_empty() else lost.row(0, named=True)
+    Raises:
+        OutputError: Trainings would be lost, or the file is another kind of table.
+    """
+    if not file.is_file():
+        return
+    try:
+        before = read_standings(file)
+    except CheckpointError as error:
+        raise OutputError(f"{error}, so it is no table that could be replaced; {remedy}") from None
+    lost = before.join(after, on=list(SCHEMA), how="anti", maintain_order="left")
+    if not lost.is_empty():
+        row = lost.row(0, named=True)
+        raise OutputError(
+            f"{file} has trainings that would be lost, such as {row['setting']!r} in "
+            f"{row['domain']} with seed {row['training_seed']}; {keeping}{remedy}"
+        )
 
 
 def _kind(name: str) -> str:
