@@ -40,6 +40,7 @@ class Ledger:
     tested: list[tuple[str, ...]] = field(default_factory=list)
     exactly: list[tuple[str, ...]] = field(default_factory=list)
     refined: dict[tuple[str, ...], Members] = field(default_factory=dict)
+    in_the_end: dict[tuple[str, ...], float] = field(default_factory=dict)
     thresholds: Thresholds = THRESHOLDS
 
     def simulate(self, members: Members, days: int | None = None) -> Fitted:
@@ -51,7 +52,8 @@ class Ledger:
 
     def refine(self, start: Fitted, rounds: int, *, closely: bool = False) -> Fitted:
         members = self.refined.get(names(start.members), start.members)
-        return replace(start, members=members)
+        cost = self.in_the_end.get(names(members), start.cost) if closely else start.cost
+        return replace(start, members=members, cost=cost)
 
     def fitted(self, start: Fitted, directions: object) -> Fitted:
         return self.refine(start, 1)
@@ -314,6 +316,25 @@ def test_a_further_effect_is_compared_on_equal_numbers_of_days() -> None:
     ledger.costs[both] = 1000.0 - THRESHOLDS.price / 2
     selector.test = lambda model: pytest.fail("half a price is not a gain")
     assert selector._fitted(start, [(DEMAND,)], 1, "candidates") is None
+
+
+@pytest.mark.parametrize(
+    ("first", "found"), [(1900.0, ("desired_speed",)), (2100.0, ("demand_level",))]
+)
+def test_what_is_fitted_more_slowly_is_not_left_for_an_imitation(
+    first: float, found: tuple[str, ...]
+) -> None:
+    """Few steps put the imitation first; only candidates of twice its cost are given up."""
+    costs = {(): 9000.0, ("demand_level",): 1000.0 - FEW, ("desired_speed",): first - FEW}
+    in_the_end = {("demand_level",): 980.0, ("desired_speed",): 100.0}
+    ledger = Ledger(costs, dict.fromkeys(costs, 0.01), in_the_end=in_the_end)
+    selector: Any = object.__new__(Selector)
+    selector._fitter, selector._thresholds, selector._reporter = ledger, THRESHOLDS, Silent()
+    selector._seen, selector._of_round, selector._alpha = {}, {}, 0.05
+    selector.test = ledger.test
+    start = ledger.with_chance(ledger.simulate((), 16))
+    best = selector._fitted(start, [(DEMAND,), (SPEED,)], 0, "candidates")
+    assert names(best.model.members) == found
 
 
 def test_simulated_strengths_that_cost_less_are_candidates_themselves() -> None:

@@ -244,11 +244,12 @@ class Selector:
         title = f"round {number + 1}: {what}"
         before = self._cost_before(start.model)
         tried = self._simulated(start.model, list(dict.fromkeys(chosen)), title)
-        best = self._refined(tried, before, self._of_round.get(number, ()))
-        if best is None:
+        fitted = self._refined(tried, before, self._of_round.get(number, ()))
+        if not fitted:
             return None
         steps = self._thresholds.steps_of_the_best
-        best = self.kept(self._fitter.refine(best, steps, closely=True))
+        close = (self.kept(self._fitter.refine(one, steps, closely=True)) for one in fitted)
+        best = min(close, key=cost_of)
         gain = before - best.cost
         if gain > self._thresholds.price:
             return self.test(best)
@@ -390,27 +391,32 @@ class Selector:
 
     def _refined(
         self, models: Sequence[Fitted], cost_before: float, directions: Sequence[Direction]
-    ) -> Fitted | None:
-        """Fit the most promising models and the best single effect; return the best of them.
+    ) -> list[Fitted]:
+        """Fit the most promising models and the best single effect.
 
         Args:
             models: Simulated models.
             cost_before: Cost of the model before.
             directions: Changes by single effects on top of the model before.
+
+        Returns:
+            The best of them, and those that more steps of their fits may put before it.
         """
         ranked, count = sorted(models, key=cost_of), self._thresholds.candidates_fitted
         simple = [model for model in ranked[count:] if len(model.members) == 1]
         ranked = ranked[:count] + simple[:1]
-        best: Fitted | None = None
+        fitted: list[Fitted] = []
+        share, rivals = self._thresholds.candidate_gain_share, self._thresholds.rival_share
+        least = cost_before
         with self._reporter.task("fitting", len(ranked)) as advance:
             for model in ranked:
-                share = self._thresholds.candidate_gain_share
-                won = 0.0 if best is None else share * (cost_before - best.cost)
-                if best is None or cost_before - model.cost > won:
-                    fitted = self.kept(self._fitter.fitted(model, directions))
-                    best = fitted if best is None or fitted.cost < best.cost else best
+                if not fitted or cost_before - model.cost > share * (cost_before - least):
+                    fitted.append(self.kept(self._fitter.fitted(model, directions)))
+                    least = min(fitted, key=cost_of).cost
                 advance(note=title_of(model.members))
-        return best
+        most = min(rivals * least, cost_before - share * (cost_before - least))
+        fitted.sort(key=cost_of)
+        return fitted[:1] + [one for one in fitted[1:] if one.cost <= most]
 
     def kept(self, model: Fitted) -> Fitted:
         """Keep a model for the list of rivals if it is the best one of its effects; return it."""

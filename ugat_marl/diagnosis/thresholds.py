@@ -700,6 +700,10 @@ class Thresholds(DayThresholds):
     """Share of the best candidate's gain that another candidate must reach to be fitted. By hand:
     its gain is that before its fit, the other's that after it. Halved: more candidates are
     fitted."""
+    rival_share: float = 2.0
+    """Multiple of the best candidate's cost up to which other candidates are fitted to the end as
+    well. By hand: `steps` may leave half of the cost, and effects that imitate each other change
+    places in the rest. Halved: the one that is fitted faster is taken."""
     large_distance: float = 20.0
     """Distance per statistic beyond which several effects at once are likely from the start. By
     hand. Halved: cautious drivers are tried more often."""
