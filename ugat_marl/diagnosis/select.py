@@ -247,8 +247,11 @@ class Selector:
         fitted = self._refined(tried, before, self._of_round.get(number, ()))
         if not fitted:
             return None
-        steps = self._thresholds.steps_of_the_best
-        close = (self.kept(self._fitter.refine(one, steps, closely=True)) for one in fitted)
+        steps, close = self._thresholds.steps_of_the_best, list[Fitted]()
+        with self._reporter.task("closer fits", len(fitted)) as advance:
+            for model in fitted:
+                close.append(self.kept(self._fitter.refine(model, steps, closely=True)))
+                advance(note=title_of(model.members))
         best = min(close, key=cost_of)
         gain = before - best.cost
         if gain > self._thresholds.price:

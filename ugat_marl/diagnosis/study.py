@@ -253,6 +253,7 @@ class Study:
             "round 1: places": Share(lanes, effort.bank),
             "round 1: candidates": Share(2 * sum(limits.candidates), effort.fit),
             "fitting": Share(2 * limits.candidates_fitted, moves * effort.fit),
+            "closer fits": Share(2, 2 * limits.steps_of_the_best * effort.fit),
             "is what is left chance": Share(2 * test),
             "how certain the values are": Share(2 * len(limits.straightness_moves), effort.fit),
             "round 2": Share(2 * len(self.hypotheses), effort.bank),
