@@ -505,6 +505,15 @@ def parse_xml(content: bytes, name: str) -> ET.Element:
     return growing.ended()
 
 
+def read_xml(path: Path) -> ET.Element:
+    """Parse the XML of a file, which may be packed, without document types or entities.
+
+    Raises:
+        ScenarioError: The file is missing or unreadable, or its XML is at fault (see `parse_xml`).
+    """
+    return parse_xml(read_bytes(path), str(path))
+
+
 def parts_of_xml(pieces: Iterable[bytes], name: str) -> Iterator[ET.Element]:
     """Yield a document of any length as trees: copies of its root, each with the next children.
 

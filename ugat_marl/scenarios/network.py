@@ -11,7 +11,6 @@ from itertools import chain
 import numpy as np
 
 from ugat_marl.errors import ScenarioError, counted
-from ugat_marl.files import parse_xml
 from ugat_marl.scenarios.junctions import (
     Link,
     Upstream,
@@ -131,7 +130,7 @@ class Network:
                 light.
         """
         document = scenario.network
-        root = parse_xml(document.read(), document.source)
+        root = document.parse()
         if root.tag != "net":
             raise ScenarioError(
                 f"{document.source}: a SUMO network begins with <net>, this with <{root.tag}>"
@@ -248,7 +247,7 @@ def signal_widths(scenario: Scenario) -> dict[str, int]:
     Raises:
         ScenarioError: The network is not well-formed.
     """
-    root = parse_xml(scenario.network.read(), scenario.network.source)
+    root = scenario.network.parse()
     programmes = _programmes(root, scenario)
     return {
         tls: len(programmes[tls].states[0][1])

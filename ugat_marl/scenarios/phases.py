@@ -13,7 +13,7 @@ from functools import partial
 from pathlib import Path
 
 from ugat_marl.errors import ScenarioError, counted
-from ugat_marl.files import parse_xml, read_bytes
+from ugat_marl.files import read_xml
 from ugat_marl.scenarios.junctions import (
     Link,
     Matrix,
@@ -357,7 +357,7 @@ def suited(network: Path) -> tuple[dict[str, str], list[str]]:
     Returns:
         Light to the source of its phases, and notes for the user.
     """
-    root = parse_xml(read_bytes(network), str(network))
+    root = read_xml(network)
     rules = RightOfWay(foes_of(root), yields_of(root))
     crossings = crossings_of(root)
     programmes = _programmes_of(root)

@@ -19,7 +19,7 @@ from pathlib import Path
 from typing import Any
 
 from ugat_marl.errors import ScenarioError, UnknownNameError, install_command
-from ugat_marl.files import Document, parse_xml, read_bytes, read_toml, with_home, write_whole
+from ugat_marl.files import Document, read_toml, read_xml, with_home, write_whole
 from ugat_marl.scenarios.admission import OPTIONS, admitted
 from ugat_marl.scenarios.settings import (
     ControlSettings,
@@ -239,7 +239,7 @@ class SumoConfiguration:
 
     def __init__(self, path: Path) -> None:
         self.path = path
-        root = parse_xml(read_bytes(path), str(path))
+        root = read_xml(path)
         self.given = {item.tag: item.get("value", item.get("v", "")) for item in root.iter()}
 
     def value(self, key: str, default: str = "") -> str:

@@ -20,7 +20,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ugat_marl.errors import ScenarioError, nearest
-from ugat_marl.files import chunks_of, parse_xml, read_bytes, write_whole, xml_bytes
+from ugat_marl.files import chunks_of, parse_xml, read_bytes, read_xml, write_whole, xml_bytes
 from ugat_marl.progress import Reporter
 from ugat_marl.scenarios.csv_tables import columns_of, delimiter_of, rows_of
 from ugat_marl.scenarios.importers.count_sheet import (
@@ -226,7 +226,7 @@ def from_counts(path: Path, begin_s: float, length_s: float, seed: int) -> Vehic
 
     def vehicles(folder: Path, network: Path, reporter: Reporter) -> VehicleFiles:
         rows = read_rows(path, begin_s, begin_s + length_s, reporter, pairs=False)
-        root = parse_xml(read_bytes(network), str(network))
+        root = read_xml(network)
         streets = Streets.of(root)
         _require_roads(rows, streets, path, network)
         _require_turns(rows, streets, path)
@@ -414,7 +414,7 @@ def _counts_for_sumo(rows: Sequence[Row], grid_s: float, work: Path, seed: int) 
 
 
 def _sampled(path: Path) -> Iterator[Drive]:
-    for number, element in enumerate(parse_xml(read_bytes(path), str(path)).iter("vehicle")):
+    for number, element in enumerate(read_xml(path).iter("vehicle")):
         route = element.find("route")
         if route is not None:
             edges = tuple(route.get("edges", "").split())
@@ -511,7 +511,7 @@ def from_od(path: Path, begin_s: float, length_s: float, seed: int) -> VehicleSo
 
     def vehicles(folder: Path, network: Path, reporter: Reporter) -> VehicleFiles:
         rows = read_rows(path, begin_s, begin_s + length_s, reporter, pairs=True)
-        streets = Streets.of(parse_xml(read_bytes(network), str(network)))
+        streets = Streets.of(read_xml(network))
         _require_roads(rows, streets, path, network)
         reachable = functools.cache(partial(_reachable, streets))
         for row in rows:

@@ -17,7 +17,7 @@ from typing import Any, Literal
 import numpy as np
 
 from ugat_marl.errors import OptionError, ScenarioError
-from ugat_marl.files import Document, parse_xml, read_bytes, write_whole
+from ugat_marl.files import Document, read_xml, write_whole
 from ugat_marl.progress import Reporter, Silent
 from ugat_marl.scenarios.capacity import degrees_of_saturation
 from ugat_marl.scenarios.importers.making import (
@@ -328,7 +328,7 @@ def _settings(drawn: DrawnNetwork, network: Path) -> Mapping[str, Any]:
 
 def _drives(drawn: DrawnNetwork, network: Path) -> list[Drive]:
     """Draw the vehicles: Poisson arrivals at every entry, routes by the shares of the turns."""
-    streets = Streets.of(parse_xml(read_bytes(network), str(network)))
+    streets = Streets.of(read_xml(network))
     routes = {
         entry: route_shares(streets, entry, lambda road: drawn.turns[road])
         for entry in drawn.entries

@@ -19,7 +19,7 @@ from typing import Any, NamedTuple
 from xml.sax.saxutils import quoteattr
 
 from ugat_marl.errors import OptionError, ScenarioError, counted, install_command
-from ugat_marl.files import Tag, parse_xml, read_bytes, scratch, write_whole
+from ugat_marl.files import Tag, read_xml, scratch, write_whole
 from ugat_marl.progress import Reporter
 from ugat_marl.scenarios.importers.long_files import scan
 from ugat_marl.scenarios.importers.making import NETWORK, RoadFiles, RoadSource
@@ -212,14 +212,14 @@ def _convert(
         netconvert([*arguments, "--tls.unset", ",".join(idle)], made)
     forbidden = ForbiddenTurns([], 0)
     if extract.restrictions:
-        root = parse_xml(read_bytes(made), str(made))
+        root = read_xml(made)
         forbidden = forbidden_turns(root, extract.restrictions)
     if forbidden.turns:
         _reconnect(deleted_connections(forbidden.turns), made, work)
     if extract.crossings:
         _add_crossings(extract, made, work)
     write_whole(out, made.read_bytes())
-    root = parse_xml(read_bytes(out), str(out))
+    root = read_xml(out)
     if not links_of(root):
         return []
     return [*_notes(extract, root, len(idle)), *_notes_on_ways(extract, root, types, forbidden)]
@@ -246,7 +246,7 @@ def _notes_on_ways(
 ) -> Iterator[str]:
     """Yield notes on what the map does not say of its ways, and on what the network lacks of it."""
     if without := extract.no_speed.total():
-        classes = parse_xml(read_bytes(types), str(types)).iter("type")
+        classes = read_xml(types).iter("type")
         limits = {kind.get("id"): float(kind.get("speed", "nan")) for kind in classes}
         kinds = ", ".join(
             f"{kind} {3.6 * limits.get(f'highway.{kind}', math.nan):.0f}"
@@ -275,7 +275,7 @@ def _notes_on_ways(
 
 def _add_crossings(extract: _Extract, made: Path, work: Path) -> None:
     """Add crossings at lights, and rebuild programmes with green for them."""
-    root = parse_xml(read_bytes(made), str(made))
+    root = read_xml(made)
     if not (content := crossings_for(root, extract.crossings)):
         return
     _reconnect(content, made, work)
@@ -292,7 +292,7 @@ def _reconnect(connections: bytes, made: Path, work: Path) -> None:
 
 def _idle_lights(network: Path, walks: Iterable[str]) -> list[str]:
     """Return the junctions of lights without conflicting streams, except those in `walks`."""
-    root = parse_xml(read_bytes(network), str(network))
+    root = read_xml(network)
     foes = foes_of(root)
     kept = set(walks)
     idle: list[str] = []

@@ -8,7 +8,7 @@ from itertools import pairwise
 from pathlib import Path
 
 from ugat_marl.errors import OptionError, ScenarioError
-from ugat_marl.files import Tag, parse_xml, read_bytes
+from ugat_marl.files import Tag, read_xml
 from ugat_marl.progress import Reporter
 from ugat_marl.scenarios.demand import edges_used
 from ugat_marl.scenarios.importers.long_files import scan
@@ -180,7 +180,7 @@ def _require_new(path: Path) -> None:
 
 def _leads(network: Path) -> dict[str, set[str]]:
     """Return, for each edge of a network, the edges it leads to."""
-    root = parse_xml(read_bytes(network), str(network))
+    root = read_xml(network)
     onward: dict[str, set[str]] = {edge.get("id", ""): set() for edge in root.iter("edge")}
     for element in root.iter("connection"):
         onward.setdefault(element.get("from", ""), set()).add(element.get("to", ""))

@@ -15,7 +15,7 @@ from xml.sax.saxutils import quoteattr
 import numpy as np
 
 from ugat_marl.errors import OptionError, ScenarioError
-from ugat_marl.files import parse_xml, read_bytes, replacing
+from ugat_marl.files import read_xml, replacing
 from ugat_marl.progress import Reporter
 from ugat_marl.scenarios.importers.making import ROUTES, VehicleFiles, VehicleSource
 from ugat_marl.scenarios.importers.streets import Streets
@@ -197,7 +197,7 @@ def from_turning_shares(
     """Return a source of vehicles that `walked` draws by turning shares, from `begin_s` on."""
 
     def vehicles(folder: Path, network: Path, reporter: Reporter) -> VehicleFiles:
-        streets = Streets.of(parse_xml(read_bytes(network), str(network)))
+        streets = Streets.of(read_xml(network))
         drives = walked(streets, vph, shares, length_s, seed)
         later = (replace(drive, depart_s=begin_s + drive.depart_s) for drive in drives)
         write_drives(folder / ROUTES, later)
