@@ -25,6 +25,7 @@ import tyro
 from rich.console import Console
 from rich.table import Table
 
+from ugat_marl.cli import guarded
 from ugat_marl.envs import parallel_env
 from ugat_marl.errors import OptionError, UgatMarlError
 from ugat_marl.policies import BASELINES, learner_factory, learner_library
@@ -151,4 +152,4 @@ def short(text: str) -> str:
 
 
 if __name__ == "__main__":
-    sys.exit(tyro.cli(Compat).run())
+    sys.exit(guarded("compat.py", lambda: tyro.cli(Compat).run()))

@@ -20,9 +20,10 @@ import tyro
 from rich.console import Console
 from tyro.conf import arg
 
+from ugat_marl.cli import guarded
 from ugat_marl.data import write_csv
 from ugat_marl.effects import load_scenario
-from ugat_marl.errors import OptionError, UgatMarlError
+from ugat_marl.errors import OptionError
 from ugat_marl.experiments import CurvesConfig, file_stem, learn_curves, machine_facts
 from ugat_marl.files import require_writable, write_whole
 from ugat_marl.progress import Bars
@@ -71,7 +72,4 @@ class Results:
 
 
 if __name__ == "__main__":
-    try:
-        sys.exit(tyro.cli(Results).run())
-    except UgatMarlError as error:
-        sys.exit(f"results.py: error: {error}")
+    sys.exit(guarded("results.py", lambda: tyro.cli(Results).run()))

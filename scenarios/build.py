@@ -9,12 +9,14 @@ The same sources give the same bytes, whatever the day and the machine; a test r
 from __future__ import annotations
 
 import argparse
+import sys
 import tomllib
 from pathlib import Path
 from typing import Any
 
 from demand import draw_demand
 
+from ugat_marl.cli import guarded
 from ugat_marl.errors import ScenarioError
 from ugat_marl.files import write_whole
 from ugat_marl.scenarios import build_network, netconvert_documents, read_road_plan
@@ -87,4 +89,4 @@ def main() -> None:
 
 
 if __name__ == "__main__":
-    main()
+    sys.exit(guarded("build.py", main))

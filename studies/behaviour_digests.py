@@ -40,6 +40,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 import ugat_marl
+from ugat_marl.cli import guarded
 
 Values = dict[str, list[Any]]
 """Label to numbers and short texts."""
@@ -311,7 +312,8 @@ def command(*arguments: str | Path) -> None:
     Raises:
         RuntimeError: The command failed; the message quotes the end of its output.
     """
-    line = [sys.executable, "-m", "ugat_marl", *map(str, arguments)]
+    # -P: the package of this process, not one in the working directory
+    line = [sys.executable, "-P", "-m", "ugat_marl", *map(str, arguments)]
     done = subprocess.run(line, capture_output=True, text=True, check=False)
     if done.returncode:
         raise RuntimeError(f"{' '.join(line)}\n{done.stdout[-2000:]}\n{done.stderr[-2000:]}")
@@ -447,7 +449,7 @@ def played(name: str) -> dict[str, Any]:
     """
     done = subprocess.run(
         [sys.executable, __file__, "play", name],
-        env={**os.environ, **ENVIRONMENT},
+        env={**os.environ, **ENVIRONMENT, "PYTHONPATH": os.pathsep.join(filter(None, sys.path))},
         capture_output=True,
         text=True,
         check=False,
@@ -457,6 +459,8 @@ def played(name: str) -> dict[str, Any]:
     answer = json.loads(done.stdout.splitlines()[-1])
     if "missing" in answer:
         raise NotInstalled(answer["missing"])
+    if (package := answer.pop("package")) != ugat_marl.__file__:
+        raise RuntimeError(f"{name} was played with {package}, not with {ugat_marl.__file__}")
     return answer
 
 
@@ -482,7 +486,8 @@ def answer(name: str) -> int:
         print(json.dumps({"missing": str(error)}))
         return 0
     values = plain(values)
-    print(json.dumps({"sha256": digest_of(values), "values": values, "names": plain(names)}))
+    said = {"sha256": digest_of(values), "values": values, "names": plain(names)}
+    print(json.dumps({**said, "package": ugat_marl.__file__}))
     return 0
 
 
@@ -490,13 +495,20 @@ def answer(name: str) -> int:
 
 
 def write(path: Path, chosen: Sequence[str]) -> int:
-    """Play every part twice and write the parts that are equal; return 1 if some differ."""
+    """Play every part twice and write the parts that are equal; return 1 if some differ.
+
+    Raises:
+        SystemExit: The parts that would stay in the file were made with other versions.
+    """
     held: dict[str, Any] = {}
     if path.exists():
-        held = json.loads(path.read_text(encoding="utf-8"))["parts"]
+        written = json.loads(path.read_text(encoding="utf-8"))
+        held = {name: part for name, part in written["parts"].items() if name not in chosen}
+        if held and (others := other_versions(written["made_with"])):
+            raise SystemExit(f"{path} was made with other versions ({others}); write all parts")
     bad = 0
+    save(path, held)
     for name in chosen:
-        held.pop(name, None)
         began = time.monotonic()
         try:
             first, second = played(name), played(name)
@@ -514,8 +526,17 @@ def write(path: Path, chosen: Sequence[str]) -> int:
             continue
         held[name] = first
         say("written", name, took)
-        save(path, {key: held[key] for key in parts() if key in held})
+        save(path, held)
     return int(bad > 0)
+
+
+def other_versions(made_with: Mapping[str, str]) -> str:
+    """Return which versions are installed instead of those of some numbers; empty if none."""
+    return "; ".join(
+        f"{name} {installed}, not {made_with.get(name)}"
+        for name, installed in versions().items()
+        if installed != made_with.get(name)
+    )
 
 
 def versions() -> dict[str, str]:
@@ -525,7 +546,8 @@ def versions() -> dict[str, str]:
 
 
 def save(path: Path, held: Mapping[str, Any]) -> None:
-    """Write the parts, one line per label."""
+    """Write the parts in their usual order, one line per label."""
+    held = {name: held[name] for name in parts() if name in held}
     lines = ["{", f' "made_with": {json.dumps(versions())},', ' "parts": {']
     for name, part in held.items():
         lines += [f"  {json.dumps(name)}: {{", f'   "sha256": "{part["sha256"]}",']
@@ -539,8 +561,10 @@ def save(path: Path, held: Mapping[str, Any]) -> None:
 
 def check(path: Path, chosen: Sequence[str]) -> int:
     """Play the parts again and print one line for each; return 1 if one differs."""
-    held = json.loads(path.read_text(encoding="utf-8"))["parts"]
-    different = 0
+    written = json.loads(path.read_text(encoding="utf-8"))
+    held, different = written["parts"], 0
+    if others := other_versions(written["made_with"]):
+        print(f"note: numbers may differ because of {others}", flush=True)
     for name in chosen:
         began = time.monotonic()
         try:
@@ -554,6 +578,7 @@ def check(path: Path, chosen: Sequence[str]) -> int:
             continue
         took = f"{time.monotonic() - began:.0f} s"
         if name not in held:
+            different += 1
             say("not held", name, took)
         elif now["sha256"] == held[name]["sha256"] and not moved(held[name], now):
             said = "" if now == held[name] else f"; other words: {difference(held[name], now)}"
@@ -621,4 +646,4 @@ def main() -> int:
 
 
 if __name__ == "__main__":
-    sys.exit(main())
+    sys.exit(guarded("python -m studies.behaviour_digests", main))

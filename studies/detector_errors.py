@@ -9,10 +9,12 @@ Only the first stage of a diagnosis runs, the one that looks at the detectors.
 from __future__ import annotations
 
 import argparse
+import sys
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
+from ugat_marl.cli import guarded
 from ugat_marl.diagnosis import DiagnosisConfig, Study
 from ugat_marl.effects import load_scenario
 from ugat_marl.experiments import policy_factory, record
@@ -119,4 +121,4 @@ def main(arguments: Sequence[str] | None = None) -> None:
 
 
 if __name__ == "__main__":
-    main()
+    sys.exit(guarded("python -m studies.detector_errors", main))

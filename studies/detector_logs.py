@@ -11,6 +11,8 @@ street is fitted to either log, in the same worlds.
 from __future__ import annotations
 
 import argparse
+import contextlib
+import sys
 from collections.abc import Sequence
 from dataclasses import dataclass
 
@@ -18,6 +20,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ugat_marl import parallel_env
+from ugat_marl.cli import guarded
 from ugat_marl.data import MeasuredData, TransitionLog
 from ugat_marl.effects import load_scenario
 from ugat_marl.experiments import policy_factory, record
@@ -76,7 +79,6 @@ def record_street(
 
 def _log(measured: MeasuredData, scenario: Scenario, domain: str, source: str) -> TransitionLog:
     network = Network.read(scenario)
-    assert source in ("best", "detections")
     return log_of_measured(measured, scenario, network, domain, "movements", source).log
 
 
@@ -111,11 +113,11 @@ def fits(
     scenario: Scenario, lanes: TransitionLog, detectors: TransitionLog, simulations: int
 ) -> dict[str, list[str]]:
     """Fit a street to either log, in the same worlds; return each effect with its 90 % interval."""
-    env = parallel_env(scenario, observation="movements")
     config = StreetConfig(parts=("service", "effects"), simulations=simulations)
-    worlds, view = street_prior(env, config), LaneView.of(env.network, "movements")
+    with contextlib.closing(parallel_env(scenario, observation="movements")) as env:
+        worlds, view = street_prior(env, config), LaneView.of(env.network, "movements")
+        replay = RecordedWorld(lanes, env).replay()
     simulation = Simulation(scenario, "sim", {"observation": "movements"}, 0.0)
-    replay = RecordedWorld(lanes, env).replay()
     assert replay is not None
     street, known = fit_street(lanes, simulation, replay, worlds, view, config, 0)
     assert street.posterior is not None
@@ -144,6 +146,7 @@ def main() -> None:
     given = parser.parse_args()
     print("| network | queues | lanes | vehicles | error | said |")
     print("|---|---|---:|---:|---:|---:|")
+    tables: list[str] = []
     for name in given.scenarios:
         scenario = load_scenario(name)
         logs = record_street(scenario, given.domain, given.policy, given.periods, given.duration_s)
@@ -154,11 +157,11 @@ def main() -> None:
             )
         if given.simulations:
             found = fits(scenario, *logs, given.simulations)
-            print("\n| effect | from lanes | from detectors |\n|---|---:|---:|")
+            tables.append(f"\n{name}\n\n| effect | from lanes | from detectors |\n|---|---:|---:|")
             columns = (found["effect"], found["lanes"], found["detectors"])
-            for cells in zip(*columns, strict=True):
-                print(f"| {' | '.join(cells)} |")
+            tables += [f"| {' | '.join(cells)} |" for cells in zip(*columns, strict=True)]
+    print(*tables, sep="\n")
 
 
 if __name__ == "__main__":
-    main()
+    sys.exit(guarded("python -m studies.detector_logs", main))

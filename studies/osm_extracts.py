@@ -20,7 +20,8 @@ from pathlib import Path
 
 import osmium
 
-from ugat_marl.errors import ScenarioError
+from ugat_marl.cli import guarded
+from ugat_marl.errors import OutputError, ScenarioError
 from ugat_marl.experiments import problems
 from ugat_marl.progress import Silent
 from ugat_marl.scenarios import (
@@ -219,7 +220,13 @@ def try_box(extract: Extract, box: Box, load: float, target: Path, seed: int, co
 
 
 def make_all(path: Path, seed: int, out: Path, count: int) -> int:
-    """Make the scenarios and return how many there are."""
+    """Make the scenarios and return how many there are.
+
+    Raises:
+        OutputError: The folder holds something.
+    """
+    if out.is_dir() and any(out.iterdir()):
+        raise OutputError(f"{out}: holds something already; give another folder, or empty it")
     extract = read_extract(path)
     random = numpy_generator(seed, "osm extracts")
     words = ["python", "-m", "studies.osm_extracts", path.name, "--seed", str(seed)]
@@ -257,4 +264,4 @@ def main(words: Sequence[str] | None = None) -> int:
 
 
 if __name__ == "__main__":
-    sys.exit(main())
+    sys.exit(guarded("python -m studies.osm_extracts", main))

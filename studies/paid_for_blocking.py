@@ -11,6 +11,7 @@ about two policies if it pays more to the one whose vehicles, over all that are 
 from __future__ import annotations
 
 import argparse
+import sys
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any
@@ -19,6 +20,7 @@ import numpy as np
 from scipy.stats import spearmanr
 
 from ugat_marl import parallel_env
+from ugat_marl.cli import guarded
 from ugat_marl.effects import Domain
 from ugat_marl.envs import Rewarder, TrafficEnv
 from ugat_marl.policies import Policy, make_rule, roll_out
@@ -187,4 +189,4 @@ def main() -> None:
 
 
 if __name__ == "__main__":
-    main()
+    sys.exit(guarded("python -m studies.paid_for_blocking", main))

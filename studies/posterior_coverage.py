@@ -22,6 +22,7 @@ import argparse
 import contextlib
 import hashlib
 import json
+import sys
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -32,6 +33,7 @@ from rich.console import Console
 from scipy.stats import binomtest
 
 from ugat_marl import parallel_env
+from ugat_marl.cli import guarded
 from ugat_marl.data import TransitionLog, installed_versions
 from ugat_marl.effects import load_scenario
 from ugat_marl.experiments import policy_factory
@@ -139,7 +141,7 @@ def answers(
         posterior: The posterior for the log of the street.
         kind: Distribution of the street.
         truth: Its values.
-        prior: Draws of the prior: effects ``(n, effects)``, and the lanes' mean service ``(n, 2)``.
+        prior: Draws of the prior: effects ``(n, effects)``, and service ``(n, lanes, 2)``.
     """
     effects, service_s = posterior.sample(400)
     names = [item.name for item in posterior.worlds.library]
@@ -148,10 +150,12 @@ def answers(
     ]
     for j, name in enumerate(("green unused at first, s", "green unused later, s")):
         mean_s = truth.service_s[:, j].mean()
-        columns.append((f"mean {name}", mean_s, service_s[:, :, j].mean(1), prior[1][:, j]))
+        columns.append(
+            (f"mean {name}", mean_s, service_s[:, :, j].mean(1), prior[1][:, :, j].mean(1))
+        )
         for lane in range(len(posterior.worlds.lanes)):
             value = truth.service_s[lane, j]
-            columns.append((f"lanes: {name}", value, service_s[:, lane, j], prior[1][:, j]))
+            columns.append((f"lanes: {name}", value, service_s[:, lane, j], prior[1][:, lane, j]))
     asked: list[Asked] = []
     for name, value, sample, blind in columns:
         low, middle, high = (float(q) for q in np.quantile(sample, (INTERVAL[0], 0.5, INTERVAL[1])))
@@ -176,11 +180,13 @@ def study(network: Network, number: int, simulations: int, seed: int, folder: Pa
     streets = streets_of(worlds, number, seed)
     values = [worlds.draw(derive_seed(seed, "world", k), LEARNT) for k in range(prior)]
     known = network.simulated(values, seed, folder, "prior")
-    seen = network.summaries([value for _, value in streets], seed, folder, "streets", episodes=2)
+    hidden = [value for _, value in streets]
+    apart = derive_seed(seed, "streets")  # not the vehicles of the worlds
+    seen = network.summaries(hidden, apart, folder, "streets", episodes=2)
     several = [worlds.draw(derive_seed(seed, "blind", k)) for k in range(400)]
     blind = (
         np.stack([value.effects for value in several]),
-        np.stack([value.service_s.mean(0) for value in several]),
+        np.stack([value.service_s for value in several]),
     )
     asked: list[Asked] = []
     for k, ((kind, truth), summary) in enumerate(zip(streets, seen, strict=True)):
@@ -309,6 +315,7 @@ def table(asked: Sequence[Asked]) -> str:
             f"| {kind} | {name} | {len(group)} | {rate(group):.2f} | "
             f"{ends.low:.2f}–{ends.high:.2f} | {width:.2f} | {told} |"
         )
+    lines += ["", "Intervals are of all cases, also where several of them are of one street."]
     return "\n".join(lines)
 
 
@@ -338,4 +345,4 @@ def main() -> None:
 
 
 if __name__ == "__main__":
-    main()
+    sys.exit(guarded("python -m studies.posterior_coverage", main))

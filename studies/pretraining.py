@@ -12,6 +12,7 @@ from __future__ import annotations
 
 import argparse
 import contextlib
+import sys
 import time
 from collections.abc import Sequence
 from pathlib import Path
@@ -20,6 +21,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from studies.same_options import require_same
+from ugat_marl.cli import guarded
 from ugat_marl.effects import Domain
 from ugat_marl.envs import TrafficEnv, parallel_env
 from ugat_marl.experiments import drawn_effects, effect_ranges
@@ -113,7 +116,13 @@ def main(arguments: Sequence[str] | None = None) -> None:
 def drawn_networks(
     folder: Path, first_seed: int, count: int, ranges: NetworkRanges
 ) -> list[Scenario]:
-    """Return drawn road networks; those that a folder holds already are read."""
+    """Return drawn road networks; those that a folder holds already are read.
+
+    Raises:
+        OutputError: The networks there are of another draw.
+    """
+    draw = {"first_seed": first_seed, "largest": ranges.intersections[1]}
+    require_same(folder / "draw.json", draw, begun=folder.exists())
     for seed in range(first_seed, first_seed + count):
         if not (folder / f"d{seed}").exists():
             draw_scenario(folder / f"d{seed}", seed, ranges)
@@ -168,4 +177,4 @@ def played(scenarios: Sequence[Scenario], policy: str | Pretraining) -> NDArray[
 
 
 if __name__ == "__main__":
-    main()
+    sys.exit(guarded("python -m studies.pretraining", main))

@@ -8,7 +8,8 @@ table of ``paper main`` with the same rows. The summary names every road network
 ones on which the method does worst first, and leaves none out. A domain without headroom, in which
 no row is 5 % better than direct transfer, is marked and counts in no mean.
 
-An interrupted run goes on with the same command.
+An interrupted run goes on with the same command. With ``--only`` some of the networks are run, and
+the summary has their names.
 """
 
 from __future__ import annotations
@@ -16,6 +17,7 @@ from __future__ import annotations
 import argparse
 import math
 import shutil
+import sys
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -24,7 +26,10 @@ import numpy as np
 from rich.console import Console
 
 from studies.osm_extracts import make_all
+from studies.same_options import require_same
+from ugat_marl.cli import guarded
 from ugat_marl.data import write_csv
+from ugat_marl.errors import ScenarioError, UnknownNameError
 from ugat_marl.experiments import (
     DIRECT,
     RULE,
@@ -129,6 +134,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
         ),
     )
     console, outcomes = Console(width=100), list[Outcome]()
+    page = "-".join(["summary", *sorted(set(given.only or ()))])
     for scenario in scenarios(given):
         table = compare(
             "main", str(scenario), config, given.out / "runs", given.jobs, Bars(console)
@@ -136,31 +142,48 @@ def main(arguments: Sequence[str] | None = None) -> None:
         folder = given.out / scenario.name
         write_csv(folder / "seeds.csv", all_standings(table).write_csv())
         outcomes += outcomes_of(scenario.name, table)
-        write_whole(given.out / "summary.md", summary(outcomes))
+        write_whole(given.out / f"{page}.md", summary(outcomes))
     console.print(summary(outcomes))
 
 
 def scenarios(given: argparse.Namespace) -> list[Path]:
-    """Return the folders of the drawn road networks; those that exist are kept."""
+    """Return the folders of the drawn road networks; those that exist are kept.
+
+    Raises:
+        OutputError: The networks there are of another draw.
+        ScenarioError: The extract has too few places.
+        UnknownNameError: No network has a name in `given.only`.
+    """
     folders: list[Path] = []
     ranges = NetworkRanges(intersections=(1, given.largest))
+    networks, towns = given.out / "networks", given.out / "towns"
+    draw = {"seed": given.seed, "largest": given.largest}
+    require_same(networks / "draw.json", draw, begun=networks.exists())
     for k in range(given.networks):
-        folder = given.out / "networks" / f"drawn-{k}"
+        folder = networks / f"drawn-{k}"
         if not folder.exists():
             draw_scenario(folder, derive_seed(given.seed, "unseen", k), ranges)
         folders.append(folder)
     if given.pbf is not None:
-        towns = given.out / "towns"
+        cut = {"pbf": given.pbf.name, "seed": given.seed, "extracts": given.extracts}
+        require_same(given.out / "towns.json", cut, begun=towns.exists())
         if not towns.exists():
             half = given.out / "towns-half-made"
             shutil.rmtree(half, ignore_errors=True)
-            make_all(given.pbf, given.seed, half / towns.name, given.extracts)
+            made = make_all(given.pbf, given.seed, half / towns.name, given.extracts)
+            if made < given.extracts:
+                raise ScenarioError(
+                    f"{given.pbf}: has {made} places that fit, not {given.extracts}; ask for fewer "
+                    "with --extracts, in a new folder"
+                )
             (half / towns.name).rename(towns)
             half.rmdir()
         folders += sorted(path for path in towns.iterdir() if path.is_dir())
-    if given.only:
-        folders = [folder for folder in folders if folder.name in given.only]
-    return folders
+    known = [folder.name for folder in folders]
+    for name in given.only or ():
+        if name not in known:
+            raise UnknownNameError("network", name, known)
+    return [folder for folder in folders if not given.only or folder.name in given.only]
 
 
 def outcomes_of(network: str, table: Comparison) -> list[Outcome]:
@@ -210,4 +233,4 @@ def summary(outcomes: Sequence[Outcome]) -> str:
 
 
 if __name__ == "__main__":
-    main()
+    sys.exit(guarded("python -m studies.unseen", main))

@@ -83,9 +83,14 @@ class EnvBench:
         notes = [_METHOD]
         rows: list[dict[str, Any]] = []
         targets: list[Target] = []
-        for name in self.scenarios:
-            scenario, remark = find_scenario(name, other)
+        measured: set[str] = set()
+        for asked in self.scenarios:
+            scenario, remark = find_scenario(asked, other)
             notes += [remark] if remark else []
+            name = str(scenario) if remark else asked
+            if name in measured:  # what is measured in the place of several
+                continue
+            measured.add(name)
             with tempfile.TemporaryDirectory(prefix="ugat_marl-bench-") as folder:
                 variants = self._variants(scenario, Path(folder), other)
                 with reporter.task(name, self.rounds * len(variants)) as advance:

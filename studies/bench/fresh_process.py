@@ -69,7 +69,7 @@ def in_fresh_process(
 
 
 def _variables(scratch: Path, more: Mapping[str, str]) -> dict[str, str]:
-    # The checkout comes last, so that an installed suite is measured if there is one.
+    # The folders of this process come first, so that the suite measured is the one that it has.
     entries = [entry or str(Path.cwd()) for entry in sys.path]
     path = os.pathsep.join(dict.fromkeys([*entries, str(CHECKOUT)]))
     return {

@@ -19,7 +19,7 @@ from ugat_marl.files import write_whole
 from ugat_marl.scenarios import Network, Scenario
 
 PLAN, LABELS, GRADES, VISIBLE = "plan.json", "labels", "grades.json", "visible.json"
-DIAGNOSIS, RUN = "diagnosis.json", "run.json"
+DIAGNOSIS, RUN, OPTIONS = "diagnosis.json", "run.json", "run-options.json"
 SCHEMA = "ugat-marl/blind/1"
 
 WINDOW = ("begin_s", "end_s")

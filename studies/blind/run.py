@@ -5,6 +5,7 @@ from __future__ import annotations
 import concurrent.futures
 import json
 import os
+import signal
 import subprocess
 import sys
 import time
@@ -15,6 +16,9 @@ from studies.blind.cases import DIAGNOSIS, RUN, Case, chosen, read_json
 from ugat_marl.errors import BlindTestError
 from ugat_marl.files import write_whole
 from ugat_marl.progress import Reporter, Silent
+
+_INTERRUPTED = (130, 143, -signal.SIGINT, -signal.SIGTERM)
+"""Exit codes of a process that was interrupted or terminated."""
 
 Diagnose = Callable[[Case, Path, Path], None]
 """Diagnose a case: the case, its measured data, and the folder that gets ``diagnosis.json``."""
@@ -40,7 +44,7 @@ def run_cases(
         reporter: Reporter of the progress.
 
     Returns:
-        Number of diagnosed cases, and number of failed ones.
+        Number of diagnosed cases, and number of failed ones. One that was interrupted is neither.
 
     Raises:
         BlindTestError: The directory holds no blind test, or a case has not been measured.
@@ -69,7 +73,7 @@ def run_cases(
                         failed += not run.result()
                         advance()
                 finally:
-                    pool.shutdown(wait=False, cancel_futures=True)
+                    pool.shutdown(cancel_futures=True)
     return len(left) - failed, failed
 
 
@@ -97,6 +101,8 @@ def _apart(directory: Path, case: Case, command: Sequence[str]) -> bool:
     # the module path of this process, by which the checkout is found
     variables = {**os.environ, "PYTHONPATH": os.pathsep.join(filter(None, sys.path))}
     done = subprocess.run(call, capture_output=True, text=True, env=variables, check=False)
+    if done.returncode in _INTERRUPTED:  # no result; the same command goes on with this case
+        raise KeyboardInterrupt
     if not (folder / RUN).exists():  # the process ended before it could write why
         said = " ".join(done.stderr.split())[-500:]
         _note(folder, time.monotonic() - start, f"exit code {done.returncode}: {said}")

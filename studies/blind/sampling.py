@@ -108,8 +108,9 @@ def draw_tasks(
     exact = cases * weights / weights.sum()
     counts = np.floor(exact).astype(int)
     # Cases without effects are rounded up, because too few of them would flatter the result.
-    first = np.array([name != "none" for name in classes])
-    rest = np.lexsort((counts - exact, first))[: cases - counts.sum()]
+    part = exact - counts > 1e-9
+    last = np.array([name != "none" for name in classes]) | ~part
+    rest = np.lexsort((counts - exact, last))[: cases - counts.sum()]
     counts[rest] += 1
     tasks: list[Task] = []
     for name, count in zip(classes, counts.tolist(), strict=True):

@@ -121,7 +121,8 @@ def separation(
     It is the Mahalanobis distance of their means, ``sqrt(d' C^-1 d)`` with the noise C, as seen by
     the best linear test, for the block of statistics that separates them best. The square is
     estimated by ``d_1' C^-1 d_2`` with the differences d_1 and d_2 of alternate days. This estimate
-    has no bias, because the noise of the two halves is independent.
+    has no bias, because the noise of the two halves is independent. The first third of the days
+    chooses the block, and the others measure: the largest of several estimates is too large.
 
     Args:
         reference: Reference that gives the noise.
@@ -132,13 +133,23 @@ def separation(
     Returns:
         Standard deviations; 0 where chance turns the estimate of the square negative.
     """
+    third = len(after) // 3
+    choosing = _squares(reference, data, after[:third], before[:third])
+    squares = _squares(reference, data, after[third:], before[third:])
+    return math.sqrt(max(0.0, squares[max(choosing, key=choosing.__getitem__)]))
+
+
+def _squares(
+    reference: Reference, data: Sequence[Tally], after: Sequence[Tally], before: Sequence[Tally]
+) -> dict[str, float]:
+    """Return the estimate of `separation` for every block, from all of the days."""
     halves = [change_between(reference.pools, after[i::2], before[i::2])[0] for i in (0, 1)]
     sums = reference.pools.pool(sum_of(data))
-    squares: list[float] = []
+    squares: dict[str, float] = {}
     for name, block in reference.blocks.items():
         weight = sums[name][..., 1] / len(data)
         noise = np.sqrt(block.noise(weight, len(data)))
         groups = correlation_groups(block.used & (weight >= 1.0), block.correlation)
         one, two = (whitened(half[name] / noise, groups) for half in halves)
-        squares.append(float(one @ two))
-    return math.sqrt(max(0.0, *squares))
+        squares[name] = float(one @ two)
+    return squares

@@ -10,7 +10,7 @@ from pathlib import Path
 
 import pytest
 
-from studies.behaviour_digests import NotInstalled, difference, moved, parts, played, versions
+from studies.behaviour_digests import NotInstalled, difference, moved, other_versions, parts, played
 
 pytestmark = [pytest.mark.nightly, pytest.mark.timeout(3600)]
 
@@ -19,18 +19,10 @@ WRITTEN = json.loads(
 )
 
 
-def of_other_versions() -> str:
-    """Return what is installed in another version than the numbers belong to."""
-    written = WRITTEN["made_with"]
-    others = [
-        f"{name} {installed}, not {written[name]}"
-        for name, installed in versions().items()
-        if installed != written[name]
-    ]
-    return "; ".join(others)
+OTHERS = other_versions(WRITTEN["made_with"])
 
 
-@pytest.mark.skipif(bool(of_other_versions()), reason=of_other_versions())
+@pytest.mark.skipif(bool(OTHERS), reason=OTHERS)
 @pytest.mark.parametrize("name", parts())
 def test_the_numbers_are_those_that_were_written_down(name: str) -> None:
     if name not in WRITTEN["parts"]:

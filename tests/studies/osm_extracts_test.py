@@ -11,7 +11,7 @@ import pytest
 pytest.importorskip("osmium")
 
 from studies.osm_extracts import Box, Extract, cut, main, read_extract
-from ugat_marl.errors import ScenarioError
+from ugat_marl.errors import OutputError, ScenarioError
 from ugat_marl.scenarios import degrees_of_saturation, read_scenario
 
 TOWN = Path(__file__).parents[1] / "fixtures" / "town.osm"
@@ -80,6 +80,10 @@ def test_boxes_that_do_not_fit_are_named(
     assert "box 0 is left out" in out
     assert "only 0 of 1 boxes" in err
     assert not (tmp_path / "towns").exists() or not list((tmp_path / "towns").iterdir())
+    (tmp_path / "towns").mkdir(exist_ok=True)
+    (tmp_path / "towns" / "notes.txt").touch()
+    with pytest.raises(OutputError, match="holds something already"):
+        main(words)
 
 
 def test_an_extract_without_lights_is_an_error(tmp_path: Path) -> None:

@@ -9,6 +9,7 @@ import pytest
 
 from studies import unseen
 from studies.unseen import Outcome, scenarios, summary
+from ugat_marl.errors import OutputError, UnknownNameError
 
 
 def outcome(network: str, direct: float, street: float, rule: float, sim: float = 50.0) -> Outcome:
@@ -45,4 +46,10 @@ def test_some_of_the_drawn_networks_are_run(
     assert [folder.name for folder in scenarios(given)] == ["drawn-0", "drawn-1", "drawn-2"]
     given.only = ["drawn-2"]
     assert [folder.name for folder in scenarios(given)] == ["drawn-2"]
+    given.only = ["drawn-3"]
+    with pytest.raises(UnknownNameError, match="drawn-3"):
+        scenarios(given)
+    given.only, given.seed = None, 2
+    with pytest.raises(OutputError, match="made with seed = 1, not 2"):
+        scenarios(given)
     assert len(set(drawn)) == len(drawn) == 3  # those that exist are kept

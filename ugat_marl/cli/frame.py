@@ -99,24 +99,42 @@ def run(line: CommandLine, arguments: Sequence[str]) -> int:
         The exit code: 0, 1 (a check or target failed), 2 (wrong call or input; one line names the
         fault), 130 (interrupted), 143 (terminated).
     """
-    for stream in (sys.stdout, sys.stderr):  # a terminal without Greek letters shows "?" for them
-        if isinstance(stream, io.TextIOWrapper):
-            stream.reconfigure(errors="replace")
     console = Console(highlight=False, markup=False)
     arguments, level = _without_loudness(arguments)
     arguments, seconds = _without_deadline(arguments)
     progress = (
         console if console.is_terminal else Console(stderr=True, highlight=False, markup=False)
     )
-    try:
-        with _ended_in_order(), loudness(level), showing(Bars(progress)), _deadline(seconds):
+
+    def perform() -> int:
+        with loudness(level), showing(Bars(progress)), _deadline(seconds):
             return _dispatch(line, list(arguments), console)
+
+    return guarded(line.program, perform)
+
+
+def guarded(program: str, call: Callable[[], int | None]) -> int:
+    """Call a program's main function; an error is one line, and SIGTERM ends it in order.
+
+    Args:
+        program: Name of the program, as a user types it.
+        call: The function; it returns the exit code, or None for 0.
+
+    Returns:
+        The exit code; see `run`.
+    """
+    for stream in (sys.stdout, sys.stderr):  # a terminal without Greek letters shows "?" for them
+        if isinstance(stream, io.TextIOWrapper):
+            stream.reconfigure(errors="replace")
+    try:
+        with _ended_in_order():
+            return call() or 0
     except UgatMarlError as error:
-        print(f"{line.program}: error: {_in_one_line(str(error))}", file=sys.stderr)
+        print(f"{program}: error: {_in_one_line(str(error))}", file=sys.stderr)
         return USAGE_ERROR
     except KeyboardInterrupt as interrupt:
         terminated = isinstance(interrupt, Terminated)
-        ended = f"{line.program}: {'terminated' if terminated else 'interrupted'}"
+        ended = f"{program}: {'terminated' if terminated else 'interrupted'}"
         print("; ".join([ended, *map(str, interrupt.args)]), file=sys.stderr)
         return TERMINATED if terminated else INTERRUPTED
     except BrokenPipeError:  # else the interpreter writes to the closed pipe at its end
@@ -126,18 +144,18 @@ def run(line: CommandLine, arguments: Sequence[str]) -> int:
         place = f"{str(error.filename)[:200]}: " if error.filename is not None else ""
         said = error.strerror or str(error) or type(error).__name__
         way_out = _WAYS_OUT.get(error.errno or 0, "")
-        print(f"{line.program}: error: {place}{said}{way_out}", file=sys.stderr)
+        print(f"{program}: error: {place}{said}{way_out}", file=sys.stderr)
         return USAGE_ERROR
     except RecursionError:
         print(
-            f"{line.program}: error: a file is nested too deeply to be read; no file of the suite "
+            f"{program}: error: a file is nested too deeply to be read; no file of the suite "
             "nests that deep",
             file=sys.stderr,
         )
         return USAGE_ERROR
     except MemoryError:
         print(
-            f"{line.program}: error: out of memory; use a smaller file, fewer workers, or a larger "
+            f"{program}: error: out of memory; use a smaller file, fewer workers, or a larger "
             "machine",
             file=sys.stderr,
         )

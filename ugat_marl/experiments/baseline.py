@@ -125,6 +125,7 @@ def baseline_command(
             tyro.cli(kind), lambda n, told: print(n, f"return {told['return']:.1f}", flush=True)
         )
     except (UgatMarlError, OSError) as error:
-        sys.exit(f"{name}: error: {error}")
+        print(f"{name}: error: {error}", file=sys.stderr)
+        sys.exit(2)
     for episodes, att_s in result.att_s.items():
         print(f"{episodes} episodes: mean travel time {np.mean(att_s):.1f} s, by seed {att_s}")

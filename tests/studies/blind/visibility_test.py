@@ -80,6 +80,19 @@ def test_chance_alone_is_not_seen(reference: Reference) -> None:
     assert np.mean(np.array(found) >= SEEN) <= 0.05
 
 
+@pytest.mark.parametrize(("moved", "seen"), [(slice(8), 0.0), (slice(8, 24), 4.0)])
+def test_days_that_choose_the_block_do_not_measure_it(
+    reference: Reference, moved: slice, seen: float
+) -> None:
+    before = gaussian([2], 24)
+    after = before.copy()
+    after[moved, :4] += 2 / np.sqrt(PERIODS)
+    data = days_of(gaussian([3], PERIODS))
+    assert separation(reference, data, days_of(after), days_of(before)) == pytest.approx(
+        seen, rel=0.05
+    )
+
+
 @pytest.mark.parametrize(
     "record",
     [
