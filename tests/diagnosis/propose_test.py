@@ -11,7 +11,8 @@ from numpy.typing import NDArray
 
 from ugat_marl.diagnosis import Hypothesis, Reference, Tally
 from ugat_marl.diagnosis.features import BIN_FEATURES, FEATURES
-from ugat_marl.diagnosis.propose import Direction, between, propose
+from ugat_marl.diagnosis.hypotheses import Members, merged
+from ugat_marl.diagnosis.propose import Direction, between, exchanges, propose
 from ugat_marl.diagnosis.records import Proposed
 from ugat_marl.diagnosis.statistics import Pools, Whitener
 from ugat_marl.diagnosis.thresholds import Thresholds
@@ -230,3 +231,65 @@ def test_rays_between_two_strengths_of_one_effect() -> None:
     # Nothing lies between shorter and longer than nominal, nor between two effects.
     assert len(between([weak, one], (0.33, 0.67))) == 2
     assert len(between(directions()[:2], (0.33, 0.67))) == 2
+
+
+def on_top(among: Sequence[Direction], present: str, values: tuple[float, ...]) -> list[Direction]:
+    """Directions on top of a model with one effect, which goes to nothing and farther."""
+    found: list[Direction] = []
+    for one in among:
+        if one.hypothesis.name != present:
+            found.append(one)
+            continue
+        assert one.hypothesis.nominal is not None
+        (usual,), (level,) = one.hypothesis.nominal, one.level
+        for new in (usual, values[0] + 0.4 * (values[0] - usual)):
+            share = (new - values[0]) / (level - usual)
+            moved = {name: share * change for name, change in one.difference.items()}
+            found.append(Direction(one.hypothesis, (new,), moved, one.variance, values))
+    return found
+
+
+def left_by(
+    reference: Reference, among: Sequence[Direction], hidden: str, present: str, strength: float
+) -> tuple[Members, list[Direction], Whitener]:
+    """What a model with one effect leaves of data in which another one is hidden."""
+    held = next(one for one in among if one.hypothesis.name == present)
+    members = ((held.hypothesis, held.at(strength)),)
+    planted = dict.fromkeys((hidden,), 1.0)
+    planted[present] = planted.get(present, 0.0) - strength
+    return members, on_top(among, present, held.at(strength)), whitener(reference, planted, among)
+
+
+def test_an_imitation_is_exchanged_for_the_right_effect(reference: Reference) -> None:
+    among = directions()
+    right = among[5]  # a start-up delay; the headway does nearly the same
+    mixed = 0.9 * right.difference["network"] + 0.3 * among[0].difference["network"]
+    imitation = {"network": mixed, "time": NO_TIME}
+    among[0] = replace(among[0], difference=imitation)
+    members, above, target = left_by(reference, among, "startup_delay", "headway", 0.9)
+    best = exchanges(members, above, target, THRESHOLDS)[0]
+    assert values(best) == pytest.approx({"headway": 1.0, "startup_delay": 0.6}, abs=0.02)
+    assert best.expected < 1.0 < float(target.measured @ target.measured)
+    assert merged(members, best.members) == ((right.hypothesis, (0.6,)),)
+
+
+def test_a_right_effect_is_not_exchanged(reference: Reference) -> None:
+    among = directions()
+    members, above, target = left_by(reference, among, "startup_delay", "startup_delay", 1.0)
+    assert exchanges(members, above, target, THRESHOLDS) == []
+
+
+def test_what_stays_moves_along(reference: Reference) -> None:
+    """Beside the imitation another effect is too strong."""
+    among = directions()
+    right, other = among[5], among[2]
+    imitation = {"network": 0.9 * right.difference["network"], "time": NO_TIME}
+    among[0] = replace(among[0], difference=imitation)
+    held = among[0]
+    members = ((held.hypothesis, (1.5,)), (other.hypothesis, other.at(1.3)))
+    above = on_top(among, "headway", (1.5,))
+    above = on_top(above, "acceleration", other.at(1.3))
+    planted = {"startup_delay": 1.0, "acceleration": -0.3, "headway": -1.0}
+    best = exchanges(members, above, whitener(reference, planted, among), THRESHOLDS)[0]
+    expected = {"headway": 1.0, "startup_delay": 0.6, "acceleration": 1.6}
+    assert values(best) == pytest.approx(expected, abs=0.03)

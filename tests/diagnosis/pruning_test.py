@@ -337,6 +337,24 @@ def test_what_is_fitted_more_slowly_is_not_left_for_an_imitation(
     assert names(best.model.members) == found
 
 
+def test_an_exchange_is_fitted_although_it_costs_more_before_that() -> None:
+    """Of five candidates the exchange comes last; fitted, it is the best."""
+    parts = [(h, h.levels[0]) for h in EVERY if len(h.levels) and h.name != "headway"][:4]
+    bigger = [("headway", hypothesis.name) for hypothesis, _ in parts]
+    costs = {("headway",): 1000.0, **{key: 900.0 - n for n, key in enumerate(bigger)}}
+    costs |= {("desired_speed",): 1200.0}
+    ledger = Ledger(costs, dict.fromkeys(costs, 0.9), in_the_end={("desired_speed",): 500.0})
+    ledger.fitted = lambda start, _: ledger.refine(start, 1, closely=True)  # type: ignore[method-assign]
+    selector: Any = object.__new__(Selector)
+    selector._fitter, selector._thresholds, selector._reporter = ledger, THRESHOLDS, Silent()
+    selector._seen, selector._of_round, selector._alpha = {}, {}, 0.05
+    selector.test = ledger.with_chance
+    start = ledger.with_chance(ledger.simulate((HEADWAY,), 16))
+    none = (HEADWAY[0], HEADWAY[0].nominal)
+    found = selector._fitted(start, [*((part,) for part in parts), (none, SPEED)], 1, "candidates")
+    assert names(found.model.members) == ("desired_speed",)
+
+
 def test_simulated_strengths_that_cost_less_are_candidates_themselves() -> None:
     costs = {("headway",): 1000.0, ("headway", "demand_level"): 900.0}
     ledger = Ledger({**costs, ("headway", "desired_speed"): 1100.0}, {})

@@ -15,7 +15,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from ugat_marl.diagnosis.hypotheses import Hypothesis
+from ugat_marl.diagnosis.hypotheses import Hypothesis, Members
 from ugat_marl.diagnosis.records import Proposed
 from ugat_marl.diagnosis.statistics import Distance, Reference, Whitener, softened, without_noise
 from ugat_marl.diagnosis.thresholds import Thresholds
@@ -101,11 +101,8 @@ def propose(
     if not directions:
         return []
     target = whitener.measured
-    basis = np.stack(
-        [whitener(without_noise(x.difference, x.variance, thresholds)) for x in directions]
-    )
-    gram = basis @ basis.T
-    match = basis @ target
+    basis = [whitener(without_noise(x.difference, x.variance, thresholds)) for x in directions]
+    gram, match = _products(basis, target)
     start = float(target @ target)
     best: dict[tuple[object, ...], Proposed] = {}
     kept = list(range(len(directions)))
@@ -155,19 +152,99 @@ def _least_squares(
         both: True for directions that may have a negative strength.
         thresholds: Numbers of the method.
     """
-    part = gram[np.ix_(chosen, chosen)]
-    try:
-        strengths = np.linalg.solve(
-            part + thresholds.strength_ridge * np.trace(part) * np.eye(len(chosen)),
-            match[list(chosen)],
-        )
-    except np.linalg.LinAlgError:
+    strengths = _solved(gram, match, chosen, thresholds)
+    if strengths is None:
         return None
     # a negative strength helps only if the effect has an opposite
     size = np.where(both, np.abs(strengths), strengths)
     if (size < thresholds.least_strength).any():
         return None
     return np.clip(strengths, -thresholds.farthest, thresholds.farthest)
+
+
+def _solved(
+    gram: Array, match: Array, chosen: Sequence[int], thresholds: Thresholds
+) -> Array | None:
+    """Return the best strengths along directions, of any size; None if there are none."""
+    part = gram[np.ix_(chosen, chosen)]
+    ridge = thresholds.strength_ridge * np.trace(part) * np.eye(len(chosen))
+    try:
+        return np.linalg.solve(part + ridge, match[list(chosen)])
+    except np.linalg.LinAlgError:
+        return None
+
+
+def exchanges(
+    members: Members, directions: Sequence[Direction], whitener: Whitener, thresholds: Thresholds
+) -> list[Proposed]:
+    """Find effects that may stand in the place of one of the model's, in order of the cost left.
+
+    Effects that imitate each other are not told apart while much else is unknown. Later the
+    imitation is there, and the right effect adds hardly anything to it. So one effect is taken out
+    and another one put in, and the values of the others move along.
+
+    Args:
+        members: Members of the model.
+        directions: Changes of the statistics on top of the model. Those of a member at its nominal
+            values take it out, the others move it.
+        whitener: What the model leaves, and its noise.
+        thresholds: Numbers of the method.
+
+    Returns:
+        Changes of the model, each pair of effects once: nominal values of the one that goes, values
+        of the one that comes and of those that stay. Pairs that would leave clearly more than the
+        model does are left out.
+    """
+    basis = [whitener(without_noise(x.difference, x.variance, thresholds)) for x in directions]
+    gram, match = _products(basis, whitener.measured)
+    gap = float(whitener.measured @ whitener.measured)
+    present = {hypothesis.key for hypothesis, _ in members}
+    absent = [k for k, one in enumerate(directions) if one.hypothesis.key not in present]
+    out, moves = _of_members(members, directions)
+    best: dict[tuple[object, object], Proposed] = {}
+    for key, gone in out.items():
+        stay = [move for other, move in moves.items() if other != key]
+        left = gap - 2 * match[gone] + gram[gone, gone]
+        goes = (directions[gone].hypothesis, directions[gone].level)
+        for come in absent:
+            chosen = [come, *stay]
+            strengths = _solved(gram, match - gram[gone], chosen, thresholds)
+            if strengths is None:
+                continue
+            comes = directions[come].hypothesis
+            if (abs(strengths[0]) if comes.both else strengths[0]) < thresholds.least_strength:
+                continue
+            strengths = np.clip(strengths, -thresholds.farthest, thresholds.farthest)
+            part = gram[np.ix_(chosen, chosen)]
+            cost = left - float(strengths @ (2 * (match - gram[gone])[chosen] - part @ strengths))
+            pair = (key, comes.key)
+            if pair not in best or cost < best[pair].expected:
+                moved = zip(chosen, strengths.tolist(), strict=True)
+                values = ((directions[k].hypothesis, directions[k].at(x)) for k, x in moved)
+                best[pair] = Proposed((goes, *values), cost)
+    most = thresholds.near_share * gap + thresholds.near_cost
+    near = [proposal for proposal in best.values() if proposal.expected <= most]
+    return sorted(near, key=lambda proposal: proposal.expected)
+
+
+def _products(basis: Sequence[Array], target: Array) -> tuple[Array, Array]:
+    """Return the scalar products of directions with each other, and with the target."""
+    rows = np.stack(basis) if basis else np.empty((0, len(target)))
+    return rows @ rows.T, rows @ target
+
+
+def _of_members(
+    members: Members, directions: Sequence[Direction]
+) -> tuple[dict[object, int], dict[object, int]]:
+    """Return indices of the directions that take a member out, and of those that move it."""
+    out: dict[object, int] = {}
+    moves: dict[object, int] = {}
+    for hypothesis, _ in members:
+        for k, one in enumerate(directions):
+            if one.hypothesis.key == hypothesis.key and hypothesis.nominal is not None:
+                gone = one.level == hypothesis.clipped(hypothesis.nominal)
+                (out if gone else moves).setdefault(hypothesis.key, k)
+    return out, moves
 
 
 def _useful(

@@ -22,7 +22,14 @@ from ugat_marl.diagnosis.hypotheses import (
     title_of,
 )
 from ugat_marl.diagnosis.places import PlaceFinder
-from ugat_marl.diagnosis.propose import Direction, between, promising, propose, squared_gap
+from ugat_marl.diagnosis.propose import (
+    Direction,
+    between,
+    exchanges,
+    promising,
+    propose,
+    squared_gap,
+)
 from ugat_marl.diagnosis.prune import Pruner, doubtful
 from ugat_marl.diagnosis.records import Fitted, Located, Selected, Tested
 from ugat_marl.diagnosis.residual import Directions, Null
@@ -231,6 +238,8 @@ class Selector:
             )
         else:
             chosen += self._nearer(start.model, number)
+            exchanged = exchanges(start.model.members, directions, whitener, self._thresholds)
+            chosen += [one.members for one in exchanged[: self._thresholds.exchanged]]
         best = self._fitted(start, chosen, number, "candidates")
         if best is None and not near:  # simulations did not confirm the prediction of the library
             chosen = self._at_places(start.model, directions, number)
@@ -244,7 +253,7 @@ class Selector:
         title = f"round {number + 1}: {what}"
         before = self._cost_before(start.model)
         tried = self._simulated(start.model, list(dict.fromkeys(chosen)), title)
-        fitted = self._refined(tried, before, self._of_round.get(number, ()))
+        fitted = self._refined(tried, start.model, before, self._of_round.get(number, ()))
         if not fitted:
             return None
         steps, close = self._thresholds.steps_of_the_best, list[Fitted]()
@@ -393,13 +402,20 @@ class Selector:
         return models_tried
 
     def _refined(
-        self, models: Sequence[Fitted], cost_before: float, directions: Sequence[Direction]
+        self,
+        models: Sequence[Fitted],
+        before: Fitted,
+        cost_before: float,
+        directions: Sequence[Direction],
     ) -> list[Fitted]:
-        """Fit the most promising models and the best single effect.
+        """Fit the most promising models, the best single effect, and all exchanges.
+
+        An exchange may cost more than the model before until its values are fitted.
 
         Args:
             models: Simulated models.
-            cost_before: Cost of the model before.
+            before: The model before.
+            cost_before: Its cost, from as many days as candidates have.
             directions: Changes by single effects on top of the model before.
 
         Returns:
@@ -407,13 +423,16 @@ class Selector:
         """
         ranked, count = sorted(models, key=cost_of), self._thresholds.candidates_fitted
         simple = [model for model in ranked[count:] if len(model.members) == 1]
+        exchanged = [model for model in ranked if _is_exchange(model, before)]
         ranked = ranked[:count] + simple[:1]
+        ranked += [model for model in exchanged if all(model is not one for one in ranked)]
         fitted: list[Fitted] = []
         share, rivals = self._thresholds.candidate_gain_share, self._thresholds.rival_share
         least = cost_before
         with self._reporter.task("fitting", len(ranked)) as advance:
             for model in ranked:
-                if not fitted or cost_before - model.cost > share * (cost_before - least):
+                enough = cost_before - model.cost > share * (cost_before - least)
+                if not fitted or enough or any(model is one for one in exchanged):
                     fitted.append(self.kept(self._fitter.fitted(model, directions)))
                     least = min(fitted, key=cost_of).cost
                 advance(note=title_of(model.members))
@@ -427,3 +446,9 @@ class Selector:
         if key not in self._seen or model.cost < self._seen[key].cost:
             self._seen[key] = model
         return model
+
+
+def _is_exchange(model: Fitted, before: Fitted) -> bool:
+    """Return True if a model has an effect that another one lacks, and as many as it at most."""
+    new, old = ({hypothesis.key for hypothesis, _ in one.members} for one in (model, before))
+    return len(new) <= len(old) and not new <= old

@@ -681,6 +681,9 @@ class Thresholds(DayThresholds):
     kinds_of_places: int = 5
     """Kinds of effects at places for which the best effect is simulated. By hand, to save time.
     Halved: rarer kinds wait for another round."""
+    exchanged: int = 2
+    """Exchanges of an effect of the model for another one that are fitted in a round. By hand: most
+    effects have one or two that imitate them. Halved: an imitation stays more often."""
     nearest: int = 3
     """Simulated strengths that are tried unchanged. By hand. Halved: effects that act in steps are
     missed where directions mislead."""
