@@ -535,19 +535,17 @@ def test_a_street_that_is_late_shortens_nothing() -> None:
 
 
 def test_a_loop_that_is_gone_leaves_no_thread() -> None:
-    def threads() -> int:
-        return sum(thread.name == "policy" for thread in threading.enumerate())
+    def threads() -> set[threading.Thread]:
+        return {thread for thread in threading.enumerate() if thread.name == "policy"}
 
-    before = threads()
+    before = threads()  # those of other tests may end meanwhile
     loop = FieldLoop(SITE, Scripted(), MadeUpStreet(), QUICK)
     loop.drive(20.0)
-    assert threads() == before + 1
+    (own,) = threads() - before
     del loop
     gc.collect()
-    until = time.monotonic() + 10.0
-    while threads() > before and time.monotonic() < until:
-        time.sleep(0.01)
-    assert threads() == before
+    own.join(10.0)
+    assert not own.is_alive()
 
 
 # --- records --------------------------------------------------------------------------------------
