@@ -9,7 +9,7 @@ from typing import Annotated
 from rich.console import Console
 from tyro.conf import Positional, arg
 
-from studies.blind.cases import DIAGNOSIS, OPTIONS, Case, read_plan, read_street
+from studies.blind.cases import Case, read_plan, read_street
 from studies.blind.detectors import first_stages
 from studies.blind.detectors import markdown as detectors_markdown
 from studies.blind.generate import VARIATIONS, Blueprint, generate
@@ -19,7 +19,6 @@ from studies.blind.sampling import GROUPS
 from studies.blind.strengths import STRENGTHS
 from studies.blind.table import markdown, write_table
 from studies.blind.visibility import judge_visibility
-from studies.same_options import require_same
 from ugat_marl.cli import LengthS
 from ugat_marl.diagnosis import DiagnosisConfig, diagnose
 from ugat_marl.errors import OptionError
@@ -118,15 +117,13 @@ class BlindRun:
             "run", str(self.directory), "--budget-s", str(self.budget_s),
             "--alpha", str(self.alpha), "--seed", str(self.seed),
         ]  # fmt: skip
-        options = {"budget_s": self.budget_s, "alpha": self.alpha, "seed": self.seed}
-        begun = any(self.directory.glob(f"*/{DIAGNOSIS}"))
-        require_same(self.directory / OPTIONS, options, begun=begun)
         done, failed = run_cases(
             self.directory,
             self._diagnose(),
             only=self.only,
             jobs=self.jobs,
             command=command,
+            options={"budget_s": self.budget_s, "alpha": self.alpha, "seed": self.seed},
             reporter=Bars(console),
         )
         console.print(f"{done} diagnosed, {failed} failed: {self.directory}", soft_wrap=True)

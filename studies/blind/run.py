@@ -9,10 +9,12 @@ import signal
 import subprocess
 import sys
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
+from typing import Any
 
-from studies.blind.cases import DIAGNOSIS, RUN, Case, chosen, read_json
+from studies.blind.cases import DIAGNOSIS, OPTIONS, RUN, Case, chosen, read_json
+from studies.same_options import require_same
 from ugat_marl.errors import BlindTestError
 from ugat_marl.files import write_whole
 from ugat_marl.progress import Reporter, Silent
@@ -31,6 +33,7 @@ def run_cases(
     only: Sequence[str] = (),
     jobs: int = 1,
     command: Sequence[str] = (),
+    options: Mapping[str, Any] | None = None,
     reporter: Reporter | None = None,
 ) -> tuple[int, int]:
     """Diagnose the cases that have no diagnosis yet; one that fails does not stop the others.
@@ -41,6 +44,7 @@ def run_cases(
         only: Ids of cases; empty for all.
         jobs: Cases at a time; several run in their own processes.
         command: Command line that runs one case; the id is appended.
+        options: Options on which diagnoses depend; None to compare none.
         reporter: Reporter of the progress.
 
     Returns:
@@ -48,6 +52,7 @@ def run_cases(
 
     Raises:
         BlindTestError: The directory holds no blind test, or a case has not been measured.
+        OutputError: Diagnoses of other options are there.
         UnknownNameError: There is no such case.
     """
     left = [
@@ -59,6 +64,9 @@ def run_cases(
                 f"{directory / case.case}: not measured yet; go on with "
                 "python -m studies.blind generate"
             )
+    if options is not None:
+        begun = any(directory.glob(f"*/{DIAGNOSIS}"))
+        require_same(directory / OPTIONS, options, begun=begun)
     failed = 0
     with (reporter or Silent()).task("diagnosing", len(left)) as advance:
         if jobs == 1:

@@ -117,9 +117,7 @@ def propose(
             strengths = _least_squares(gram, match, chosen, signs, thresholds)
             if strengths is None:
                 continue
-            left = start - float(
-                strengths @ (2 * match[list(chosen)] - gram[np.ix_(chosen, chosen)] @ strengths)
-            )
+            left = start - _taken_off(gram, match, chosen, strengths)
             cost = left + thresholds.price * size
             if keys not in best or cost < best[keys].expected:
                 members = tuple(
@@ -174,6 +172,12 @@ def _solved(
         return None
 
 
+def _taken_off(gram: Array, match: Array, chosen: Sequence[int], strengths: Array) -> float:
+    """Return by how much directions at some strengths shorten the squared difference."""
+    part = gram[np.ix_(chosen, chosen)]
+    return float(strengths @ (2 * match[list(chosen)] - part @ strengths))
+
+
 def exchanges(
     members: Members, directions: Sequence[Direction], whitener: Whitener, thresholds: Thresholds
 ) -> list[Proposed]:
@@ -204,19 +208,18 @@ def exchanges(
     best: dict[tuple[object, object], Proposed] = {}
     for key, gone in out.items():
         stay = [move for other, move in moves.items() if other != key]
-        left = gap - 2 * match[gone] + gram[gone, gone]
+        without, left = match - gram[gone], gap - 2 * match[gone] + gram[gone, gone]
         goes = (directions[gone].hypothesis, directions[gone].level)
         for come in absent:
             chosen = [come, *stay]
-            strengths = _solved(gram, match - gram[gone], chosen, thresholds)
+            strengths = _solved(gram, without, chosen, thresholds)
             if strengths is None:
                 continue
             comes = directions[come].hypothesis
             if (abs(strengths[0]) if comes.both else strengths[0]) < thresholds.least_strength:
                 continue
             strengths = np.clip(strengths, -thresholds.farthest, thresholds.farthest)
-            part = gram[np.ix_(chosen, chosen)]
-            cost = left - float(strengths @ (2 * (match - gram[gone])[chosen] - part @ strengths))
+            cost = left - _taken_off(gram, without, chosen, strengths)
             pair = (key, comes.key)
             if pair not in best or cost < best[pair].expected:
                 moved = zip(chosen, strengths.tolist(), strict=True)

@@ -422,17 +422,17 @@ class Selector:
             The best of them, and those that more steps of their fits may put before it.
         """
         ranked, count = sorted(models, key=cost_of), self._thresholds.candidates_fitted
-        simple = [model for model in ranked[count:] if len(model.members) == 1]
-        exchanged = [model for model in ranked if _is_exchange(model, before)]
-        ranked = ranked[:count] + simple[:1]
-        ranked += [model for model in exchanged if all(model is not one for one in ranked)]
+        simple = next((model for model in ranked[count:] if len(model.members) == 1), None)
+        ranked = ranked[:count] + [
+            model for model in ranked[count:] if model is simple or _is_exchange(model, before)
+        ]
         fitted: list[Fitted] = []
         share, rivals = self._thresholds.candidate_gain_share, self._thresholds.rival_share
         least = cost_before
         with self._reporter.task("fitting", len(ranked)) as advance:
             for model in ranked:
                 enough = cost_before - model.cost > share * (cost_before - least)
-                if not fitted or enough or any(model is one for one in exchanged):
+                if not fitted or enough or _is_exchange(model, before):
                     fitted.append(self.kept(self._fitter.fitted(model, directions)))
                     least = min(fitted, key=cost_of).cost
                 advance(note=title_of(model.members))

@@ -286,6 +286,8 @@ def test_diagnoses_with_other_options_are_not_mixed(
     test_folder: tuple[Path, Blueprint], tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     directory = shutil.copytree(test_folder[0], tmp_path / "test")
+    assert run(LINE, ["run", str(tmp_path / "none")]) == 2
+    assert not (tmp_path / "none").exists(), "what is no blind test gets no file"
     words = ["run", str(directory), "--only"]
     (directory / "run-options.json").write_text('{"budget_s": 600.0, "alpha": 0.05, "seed": 7}')
     assert run(LINE, words) == 2
