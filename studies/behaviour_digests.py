@@ -41,6 +41,7 @@ from numpy.typing import NDArray
 
 import ugat_marl
 from ugat_marl.cli import guarded
+from ugat_marl.parallel import import_path
 
 Values = dict[str, list[Any]]
 """Label to numbers and short texts."""
@@ -449,7 +450,7 @@ def played(name: str) -> dict[str, Any]:
     """
     done = subprocess.run(
         [sys.executable, __file__, "play", name],
-        env={**os.environ, **ENVIRONMENT, "PYTHONPATH": os.pathsep.join(filter(None, sys.path))},
+        env={**os.environ, **ENVIRONMENT, "PYTHONPATH": import_path()},
         capture_output=True,
         text=True,
         check=False,

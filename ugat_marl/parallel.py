@@ -363,7 +363,7 @@ class RayExecutor(Executor):
         self._owns = not ray.is_initialized()
         if self._owns:
             own = {k: v for k, v in os.environ.items() if k.startswith("UGAT_MARL_")}  # limits
-            variables = {**own, "OMP_NUM_THREADS": "1", "PYTHONPATH": _import_path()}
+            variables = {**own, "OMP_NUM_THREADS": "1", "PYTHONPATH": import_path()}
             known: dict[str, Any] = {} if address != "local" else {"include_dashboard": False}
             try:
                 ray.init(
@@ -533,6 +533,6 @@ def _kill(process: int) -> None:
         os.kill(process, signal.SIGKILL)
 
 
-def _import_path() -> str:
-    """Return this process's import path, so that workers can import the same modules."""
+def import_path() -> str:
+    """Return PYTHONPATH for a process that is to import the same modules as this one."""
     return os.pathsep.join(entry or str(Path.cwd()) for entry in sys.path)

@@ -16,6 +16,7 @@ from pathlib import Path
 from typing import Any
 
 from ugat_marl.errors import MeasurementError
+from ugat_marl.parallel import import_path
 
 CHECKOUT = Path(__file__).resolve().parents[2]
 
@@ -70,12 +71,10 @@ def in_fresh_process(
 
 def _variables(scratch: Path, more: Mapping[str, str]) -> dict[str, str]:
     # The folders of this process come first, so that the suite measured is the one that it has.
-    entries = [entry or str(Path.cwd()) for entry in sys.path]
-    path = os.pathsep.join(dict.fromkeys([*entries, str(CHECKOUT)]))
     return {
         **os.environ,
         "OMP_NUM_THREADS": "1",
-        "PYTHONPATH": path,
+        "PYTHONPATH": os.pathsep.join([import_path(), str(CHECKOUT)]),
         "TMPDIR": str(scratch),
         **more,
     }

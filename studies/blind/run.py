@@ -17,6 +17,7 @@ from studies.blind.cases import DIAGNOSIS, OPTIONS, RUN, Case, chosen, read_json
 from studies.same_options import require_same
 from ugat_marl.errors import BlindTestError
 from ugat_marl.files import write_whole
+from ugat_marl.parallel import import_path
 from ugat_marl.progress import Reporter, Silent
 
 _INTERRUPTED = (130, 143, -signal.SIGINT, -signal.SIGTERM)
@@ -107,7 +108,7 @@ def _apart(directory: Path, case: Case, command: Sequence[str]) -> bool:
     (folder / RUN).unlink(missing_ok=True)
     call = [sys.executable, "-m", "studies.blind", *command, "--only", case.case]
     # the module path of this process, by which the checkout is found
-    variables = {**os.environ, "PYTHONPATH": os.pathsep.join(filter(None, sys.path))}
+    variables = {**os.environ, "PYTHONPATH": import_path()}
     done = subprocess.run(call, capture_output=True, text=True, env=variables, check=False)
     if done.returncode in _INTERRUPTED:  # no result; the same command goes on with this case
         raise KeyboardInterrupt

@@ -27,14 +27,13 @@ import tempfile
 import threading
 import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from pathlib import Path
 from typing import IO, Any, ClassVar, Literal, Protocol
 
 from numpy.typing import NDArray
 
 from ugat_marl import errors
 from ugat_marl.errors import OptionError, SimulatorCrashed, UgatMarlError, WorkerError
-from ugat_marl.parallel import DEADLINE_VARIABLE, require_deadline, usual_deadline_s
+from ugat_marl.parallel import DEADLINE_VARIABLE, import_path, require_deadline, usual_deadline_s
 from ugat_marl.scenarios import MEMORY_VARIABLE, most_memory
 from ugat_marl.simulation.channel import Channel, ChannelClosed, Message
 
@@ -557,5 +556,4 @@ def _command(*arguments: str) -> list[str]:
 
 def _environment(defaults: Mapping[str, str]) -> dict[str, str]:
     """Return the environment variables, with this process's import path for the user's modules."""
-    path = os.pathsep.join(entry or str(Path.cwd()) for entry in sys.path)
-    return {**defaults, **os.environ, "PYTHONPATH": path, "PYTHONSAFEPATH": "1"}
+    return {**defaults, **os.environ, "PYTHONPATH": import_path(), "PYTHONSAFEPATH": "1"}
