@@ -392,12 +392,18 @@ def restriction_xml(kind: str, start: int, goal: int, via: str = "1", more: str 
         (restriction_xml("no_left_turn", 1000, 1003), {1003}),
         (restriction_xml("only_straight_on", 1000, 1001), {1002, 1003}),
         (restriction_xml("no_left_turn", 1000, 1003, more='<tag k="except" v="motorcar"/>'), set()),
+        # netconvert does not name the fifth node of a junction, nor a way that is within one
+        (restriction_xml("no_left_turn", 1000, 1003, via="99"), {1003}),
+        (restriction_xml("only_straight_on", 1000, 1001, via="555"), {1002, 1003}),
     ],
 )
 def test_turns_that_the_map_forbids_at_a_joined_junction_are_taken_out(
     relation: str, forbidden: set[int], tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    (tmp_path / "x.osm").write_text(joined_crossroads(relation))
+    crossroads = joined_crossroads(relation)
+    if 'ref="99"' in relation:
+        crossroads = crossroads.replace('"1"', '"99"')
+    (tmp_path / "x.osm").write_text(crossroads)
     assert made(tmp_path / "city", tmp_path / "x.osm") == 0
     (light,) = Network.read(read_scenario(tmp_path / "city")).intersections
     assert light.id.startswith("cluster")
@@ -421,6 +427,8 @@ def test_a_restriction_of_a_way_inside_a_joined_junction_is_noted() -> None:
     root = parse_xml(network.encode(), "n")
     assert forbidden_turns(root, [inside, Restriction("77", "2", "78", only=False)]) == ([], 2)
     assert forbidden_turns(root, [Restriction("8", "9", "78", only=False)]) == ([], 0)
+    # from one junction over a way to another, which SUMO has no word for
+    assert forbidden_turns(root, [Restriction("5", "", "1000", only=False)]) == ([], 1)
     # an edge keeps its last way on
     assert forbidden_turns(root, [Restriction("1000", "1", "5", only=False)]) == ([], 0)
 

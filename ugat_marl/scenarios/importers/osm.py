@@ -262,8 +262,8 @@ def _notes_on_ways(
         yield f"turns that the map forbids were taken out: {len(turns)} ({listed})"
     if forbidden.unplaced:
         yield (
-            "turn restrictions within junctions that were joined from several nodes: "
-            f"{forbidden.unplaced}, not taken over; check the turns there"
+            f"turn restrictions that were not taken over: {forbidden.unplaced}, within junctions "
+            "joined from several nodes or over a way between two junctions; check the turns there"
         )
     ways = {edge.get("id", "").partition("#")[0] for edge in root.iter("edge")}
     if half := sorted(way for way in extract.both_ways if (way in ways) != (f"-{way}" in ways)):

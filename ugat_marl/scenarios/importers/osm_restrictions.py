@@ -38,8 +38,8 @@ class ForbiddenTurns(NamedTuple):
 
     Attributes:
         turns: The turns, from edge to edge.
-        unplaced: Number of restrictions at joined junctions one of whose ways has become a part of
-            the junction, so that their turns are not known.
+        unplaced: Number of restrictions whose turns are not known: at a joined junction one of
+            whose ways has become a part of it, or from one junction over a way to another.
     """
 
     turns: list[tuple[str, str]]
@@ -97,21 +97,33 @@ def forbidden_turns(root: ET.Element, restrictions: Iterable[Restriction]) -> Fo
     ways = {way for _, way in arriving}
     joined = {name for names in junctions.values() for name in names if "cluster" in name}
     touching = {way for end, way in (*arriving, *leaving) if end in joined}
-    lost = 0
+    unplaced = 0
     found: dict[tuple[str, str], None] = {}
     for one in restrictions:
+        # The name of a joined junction tells four of its nodes, and no way that has become a part
+        # of it: the others are known by the two ways that meet there.
+        known = junctions.get(one.via, [])
+        places = known or [
+            name
+            for name in sorted(joined)
+            if (name, one.from_way) in arriving and (name, one.to_way) in leaving
+        ]
         both = {one.from_way, one.to_way}
-        if both - ways and (both & touching or joined.intersection(junctions[one.via])):
-            lost += 1
-        for junction in junctions[one.via]:
-            starts, goals = arriving[junction, one.from_way], leaving[junction, one.to_way]
-            if len(starts) != 1 or len(goals) != 1:
-                continue
-            start, goal = starts[0], goals[0]
-            forbidden = turns[start] - {goal} if one.only else turns[start] & {goal}
-            if forbidden != turns[start]:  # an edge without any way on would be a mistake
-                found.update(dict.fromkeys((start, each) for each in sorted(forbidden)))
-    return ForbiddenTurns(list(found), lost)
+        match [
+            (start, goal)
+            for place in places
+            for start in arriving.get((place, one.from_way), ())
+            for goal in leaving.get((place, one.to_way), ())
+        ]:
+            case [(start, goal)]:
+                forbidden = turns[start] - {goal} if one.only else turns[start] & {goal}
+                if forbidden != turns[start]:  # an edge without any way on would be a mistake
+                    found.update(dict.fromkeys((start, each) for each in sorted(forbidden)))
+            case _ if both <= ways:
+                unplaced += not known or known[0] in joined  # at others, netconvert has obeyed it
+            case _:
+                unplaced += bool(both & touching or joined.intersection(known))
+    return ForbiddenTurns(list(found), unplaced)
 
 
 def deleted_connections(turns: Iterable[tuple[str, str]]) -> bytes:
