@@ -12,7 +12,16 @@ from numpy.typing import NDArray
 from ugat_marl.diagnosis import Hypothesis, Reference, Tally
 from ugat_marl.diagnosis.features import BIN_FEATURES, FEATURES
 from ugat_marl.diagnosis.hypotheses import Members, merged
-from ugat_marl.diagnosis.propose import Direction, between, exchanges, propose
+from ugat_marl.diagnosis.propose import (
+    Direction,
+    _is_something,
+    _useful,
+    between,
+    exchanges,
+    promising,
+    propose,
+    squared_gap,
+)
 from ugat_marl.diagnosis.records import Proposed
 from ugat_marl.diagnosis.statistics import Pools, Whitener
 from ugat_marl.diagnosis.thresholds import Thresholds
@@ -293,3 +302,104 @@ def test_what_stays_moves_along(reference: Reference) -> None:
     best = exchanges(members, above, whitener(reference, planted, among), THRESHOLDS)[0]
     expected = {"headway": 1.0, "startup_delay": 0.6, "acceleration": 1.6}
     assert values(best) == pytest.approx(expected, abs=0.03)
+
+
+def test_the_variance_between_two_strengths_is_that_of_a_weighted_mean() -> None:
+    one, other = directions(3)[0], directions(4)[0]
+    variance = {"network": np.full((1, len(FEATURES)), 4.0), "time": NO_TIME}
+    weak = replace(one, variance=variance)
+    strong = replace(weak, level=(2.0,), difference=other.difference)
+    middle = between([weak, strong], (0.25,))[2]
+    assert middle.variance["network"] == pytest.approx(4.0 * (0.75**2 + 0.25**2))
+
+
+def test_changes_of_single_lanes_that_may_be_noise_are_not_proposed() -> None:
+    noise = np.random.default_rng(1).standard_normal((400, WIDTH))
+    days = [day(20.0 + values) for values in noise]
+    reference = Reference(Pools({"lane": np.ones((1, 1))}, THRESHOLDS), days)
+    one = directions()[0]
+    change = one.difference["network"]
+    measured = reference.blocks["lane"].mean[0, :WIDTH] + change[0, :WIDTH]
+    target = Whitener(reference, [day(measured)] * 5, 0.0)
+    for variance, proposed in ((0.0, 1), (400.0, 0)):
+        loud = {"lane": np.full_like(change, variance), "time": NO_TIME}
+        of_lane = replace(one, difference={"lane": change, "time": NO_TIME}, variance=loud)
+        assert len(propose([of_lane], target, THRESHOLDS)) == proposed
+
+
+def test_an_effect_with_an_opposite_may_work_backwards(reference: Reference) -> None:
+    among = directions()
+    opposite = replace(among[0], hypothesis=replace(among[0].hypothesis, both=True))
+    target = whitener(reference, {"headway": -0.8}, among)
+    (found,) = propose([opposite], target, THRESHOLDS)
+    assert values(found)["headway"] == pytest.approx(1.0 - 0.8 * 0.5, abs=0.01)
+
+
+def test_an_effect_with_an_opposite_may_come_in_its_exchange(reference: Reference) -> None:
+    among = directions()
+    right = among[5]
+    among[0] = replace(
+        among[0], difference={"network": 0.9 * right.difference["network"], "time": NO_TIME}
+    )
+    backwards = {name: -change for name, change in right.difference.items()}
+    for both in (True, False):
+        hypothesis = replace(right.hypothesis, both=both)
+        among[5] = replace(right, hypothesis=hypothesis, difference=backwards)
+        held = among[0]
+        members = ((held.hypothesis, held.at(0.9)),)
+        above = on_top(among, "headway", held.at(0.9))
+        target = whitener(reference, {"headway": -0.9, "startup_delay": -1.0}, among)
+        found = exchanges(members, above, target, THRESHOLDS)
+        assert any("startup_delay" in values(one) for one in found) == both
+
+
+def in_sizes(*costs: tuple[int, float]) -> list[Proposed]:
+    """Sets of effects by their number and the cost that they would leave, least first."""
+    among = [one.hypothesis for one in directions()]
+    sets = [
+        Proposed(tuple((h, (float(place),)) for h in among[:size]), cost)
+        for place, (size, cost) in enumerate(costs)
+    ]
+    return sorted(sets, key=lambda proposal: proposal.expected)
+
+
+def test_a_larger_set_has_to_promise_clearly_more() -> None:
+    worth = THRESHOLDS.larger_share * 100.0 - THRESHOLDS.larger_gain
+    for cost, sizes in ((worth + 1.0, [1]), (worth - 1.0, [1, 2])):
+        chosen = promising(in_sizes((1, 100.0), (2, cost)), THRESHOLDS)
+        assert [len(one.members) for one in chosen] == sizes
+
+
+def test_near_sets_of_a_size_are_tried_too_but_not_all() -> None:
+    most = THRESHOLDS.near_share * 100.0 + THRESHOLDS.near_cost
+    near = np.linspace(100.0, most - 1.0, THRESHOLDS.candidates[0] + 3)
+    chosen = promising(in_sizes(*((1, float(cost)) for cost in near)), THRESHOLDS)
+    assert [one.expected for one in chosen] == list(near[: THRESHOLDS.candidates[0]])
+    far = promising(in_sizes((1, 100.0), (1, most + 1.0)), THRESHOLDS)
+    assert [one.expected for one in far] == [100.0]
+
+
+def test_the_hypotheses_of_the_best_sets_are_kept_for_triples() -> None:
+    among = directions()
+    sets = in_sizes((1, 9.0), (2, 5.0))
+    best: dict[tuple[object, ...], Proposed] = {(i,): one for i, one in enumerate(sets[::-1])}
+    third = replace(sets[0], members=((among[7].hypothesis, (0.1,)),), expected=1.0)
+    best[(9,)] = third
+    assert _useful(best, among, 2) == [7, 0]
+    assert _useful(best, among, 9) == [7, 0, 1]
+
+
+def test_the_gap_is_measured_in_units_of_the_noise_of_the_periods(reference: Reference) -> None:
+    shifted = reference.blocks["network"].mean[0, :WIDTH] + 0.2 * np.eye(WIDTH)[0]
+    gaps = [
+        squared_gap(reference.distance([day(shifted)] * periods), reference, periods)
+        for periods in (1, 4)
+    ]
+    assert gaps[0] == pytest.approx(0.04, rel=0.3), "the noise has a variance of 1"
+    assert gaps[1] == pytest.approx(4 * gaps[0], rel=0.05)
+
+
+def test_values_on_their_usual_place_are_nothing() -> None:
+    hypothesis = directions()[0].hypothesis
+    assert _is_something(hypothesis, (1.5,))
+    assert not _is_something(hypothesis, (1.0,))

@@ -11,7 +11,8 @@ from typing import Any, cast
 import numpy as np
 import pytest
 
-from ugat_marl.diagnosis import Hypothesis, global_hypotheses, records
+from ugat_marl.diagnosis import Hypothesis, global_hypotheses, records, select
+from ugat_marl.diagnosis.features import FEATURES
 from ugat_marl.diagnosis.fit import Fitter
 from ugat_marl.diagnosis.hypotheses import Members, library
 from ugat_marl.diagnosis.prune import Pruner, doubtful
@@ -87,6 +88,15 @@ class Ledger:
 @dataclass
 class Chance:
     p: float
+
+
+def selector_with(ledger: Ledger) -> Any:
+    """A selector whose simulations are those of a ledger."""
+    selector: Any = object.__new__(Selector)
+    selector._fitter, selector._thresholds, selector._reporter = ledger, THRESHOLDS, Silent()
+    selector._seen, selector._of_round, selector._alpha = {}, {}, 0.05
+    selector._effort, selector._of_library, selector._places = Effort(), (), ()
+    return selector
 
 
 def names(members: Members) -> tuple[str, ...]:
@@ -253,8 +263,7 @@ def test_when_the_budget_ends_no_doubtful_effect_is_named_either() -> None:
     best = ledger.with_chance(ledger.simulate((HEADWAY, DEMAND), 16), 0.04)
     assert doubtful(best, THRESHOLDS.half_interval) == [1], "0.95 +- 0.08 may be the usual 1"
     base = ledger.with_chance(replace(best.model, members=(), cost=2000.0), 0.0)
-    selector: Any = object.__new__(Selector)
-    selector._thresholds = THRESHOLDS
+    selector = selector_with(ledger)
     alone = [ledger.simulate((member,), 16) for member in (HEADWAY, DEMAND)]
     selector._seen = {str(number): model for number, model in enumerate([best.model, *alone])}
     assert selector._without_doubtful(best, base).model.members == (HEADWAY,)
@@ -271,7 +280,7 @@ def test_when_the_budget_ends_nothing_too_small_to_matter_is_named(
     both = ("headway", "demand_level")
     costs = {both: 900.0, ("headway",): 1000.0, ("demand_level",): 950.0}
     ledger = Ledger(costs, {("demand_level",): 0.9})
-    selector: Any = object.__new__(Selector)
+    selector = selector_with(ledger)
     models = [ledger.simulate(members, 16) for members in ((HEADWAY, weak), (HEADWAY,), (weak,))]
     base = replace(models[0], members=(), cost=2000.0)
     selector._seen = {str(number): model for number, model in enumerate(models)}
@@ -305,9 +314,7 @@ def test_a_further_effect_is_compared_on_equal_numbers_of_days() -> None:
     both = ("headway", "demand_level")
     ledger = Ledger({both: 700.0, ("headway",): 1000.0}, {both: 0.9, ("headway",): 0.01})
     start = ledger.with_chance(ledger.simulate((HEADWAY,), 16))
-    selector: Any = object.__new__(Selector)
-    selector._fitter, selector._thresholds, selector._reporter = ledger, THRESHOLDS, Silent()
-    selector._seen, selector._of_round, selector._alpha = {}, {}, 0.05
+    selector = selector_with(ledger)
     selector.test = ledger.test
     # With few days both cost more than the headway alone does with many.
     assert ledger.simulate((HEADWAY, DEMAND)).cost > start.model.cost
@@ -328,9 +335,7 @@ def test_what_is_fitted_more_slowly_is_not_left_for_an_imitation(
     costs = {(): 9000.0, ("demand_level",): 1000.0 - FEW, ("desired_speed",): first - FEW}
     in_the_end = {("demand_level",): 980.0, ("desired_speed",): 100.0}
     ledger = Ledger(costs, dict.fromkeys(costs, 0.01), in_the_end=in_the_end)
-    selector: Any = object.__new__(Selector)
-    selector._fitter, selector._thresholds, selector._reporter = ledger, THRESHOLDS, Silent()
-    selector._seen, selector._of_round, selector._alpha = {}, {}, 0.05
+    selector = selector_with(ledger)
     selector.test = ledger.test
     start = ledger.with_chance(ledger.simulate((), 16))
     best = selector._fitted(start, [(DEMAND,), (SPEED,)], 0, "candidates")
@@ -345,9 +350,7 @@ def test_an_exchange_is_fitted_although_it_costs_more_before_that() -> None:
     costs |= {("desired_speed",): 1200.0}
     ledger = Ledger(costs, dict.fromkeys(costs, 0.9), in_the_end={("desired_speed",): 500.0})
     ledger.fitted = lambda start, _: ledger.refine(start, 1, closely=True)  # type: ignore[method-assign]
-    selector: Any = object.__new__(Selector)
-    selector._fitter, selector._thresholds, selector._reporter = ledger, THRESHOLDS, Silent()
-    selector._seen, selector._of_round, selector._alpha = {}, {}, 0.05
+    selector = selector_with(ledger)
     selector.test = ledger.with_chance
     start = ledger.with_chance(ledger.simulate((HEADWAY,), 16))
     none = (HEADWAY[0], HEADWAY[0].nominal)
@@ -358,10 +361,129 @@ def test_an_exchange_is_fitted_although_it_costs_more_before_that() -> None:
 def test_simulated_strengths_that_cost_less_are_candidates_themselves() -> None:
     costs = {("headway",): 1000.0, ("headway", "demand_level"): 900.0}
     ledger = Ledger({**costs, ("headway", "desired_speed"): 1100.0}, {})
-    selector: Any = object.__new__(Selector)
-    selector._fitter, selector._thresholds, selector._effort = ledger, THRESHOLDS, Effort()
+    selector = selector_with(ledger)
     one, other = (SimpleNamespace(hypothesis=h, level=level) for h, level in (SPEED, DEMAND))
     selector._of_round = {1: [one, other]}
     model = ledger.simulate((HEADWAY,), 16)
     assert selector._nearer(model, 1) == [(DEMAND,)]
     assert selector._nearer(model, 2) == []
+
+
+@pytest.mark.parametrize(
+    ("before", "gain", "after", "taken"),
+    [
+        (1e-6, THRESHOLDS.price / 2, 0.5, True),
+        (1e-6, -THRESHOLDS.price / 2, 0.5, True),
+        (1e-6, THRESHOLDS.price / 2, 0.01, False),
+        (0.04, THRESHOLDS.price / 2, 0.5, False),
+        (1e-6, -2 * THRESHOLDS.price, 0.5, False),
+    ],
+)
+def test_an_effect_that_leaves_only_chance_is_taken_for_less_than_its_price(
+    before: float, gain: float, after: float, taken: bool
+) -> None:
+    """Though not if what was left before may have been chance, nor if it costs more itself."""
+    costs = {("headway",): 1000.0, ("headway", "demand_level"): 1000.0 - gain}
+    ledger = Ledger(costs, {("headway",): before, ("headway", "demand_level"): after})
+    selector = selector_with(ledger)
+    selector.test = ledger.test
+    start = ledger.with_chance(ledger.simulate((HEADWAY,), 16))
+    found = selector._fitted(start, [(DEMAND,)], 1, "candidates")
+    assert (found is not None) == taken
+
+
+def test_only_strengths_that_come_nearer_to_the_data_are_candidates_by_themselves(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    ledger: Any = Ledger({("headway",): 900.0, ("desired_speed",): 800.0}, {})
+    gaps = {"headway": 0.9 * THRESHOLDS.nearer, "desired_speed": 1.1 * THRESHOLDS.nearer}
+    ledger.base, ledger.data = None, []
+    selector = selector_with(ledger)
+    selector._library, selector._first = [HEADWAY[0], SPEED[0]], 1.0
+
+    def simulate(members: Members, days: int) -> Fitted:
+        model = Ledger.simulate(ledger, members, days)
+        return replace(model, distance=cast(Any, gaps[names(members)[0]]))
+
+    ledger.simulate = simulate
+    monkeypatch.setattr(select, "squared_gap", lambda distance, base, periods: distance)
+    assert selector._nearest() == [(HEADWAY,)]
+
+
+@pytest.mark.parametrize(
+    ("number", "gap", "calls"),
+    [
+        # a small distance lies in single places
+        (0, 0.5 * THRESHOLDS.small_distance, [["predicted", "places", "nearest"]]),
+        (0, 2.0 * THRESHOLDS.small_distance, [["predicted", "nearest"], ["places"]]),
+        (0, 2.0 * THRESHOLDS.large_distance, [["predicted", "nearest", "cautious"], ["places"]]),
+        (1, 2.0 * THRESHOLDS.large_distance, [["predicted", "nearer", "exchange"], ["places"]]),
+    ],
+)
+def test_what_a_round_tries_follows_from_the_distance(
+    number: int, gap: float, calls: list[list[str]], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    ledger: Any = Ledger({}, {})
+    ledger.data = [SimpleNamespace(sums=FEATURES)]
+    selector, statistics = selector_with(ledger), 100
+    measured = np.full(statistics, np.sqrt(gap))
+    selector._library, selector._library_directions = (), lambda model, number: ()
+    selector._whitener = lambda model, blocks: SimpleNamespace(measured=measured)
+    selector._nearest, selector._nearer = lambda: ["nearest"], lambda model, number: ["nearer"]
+    selector._at_places = lambda model, directions, number: ["places"]
+    tried: list[list[str]] = []
+    selector._fitted = lambda start, chosen, number, what: tried.append(chosen)
+    found = [SimpleNamespace(members="predicted", expected=0.0)]
+    monkeypatch.setattr(select, "propose", lambda *_: found)
+    monkeypatch.setattr(select, "promising", lambda *_: found)
+    swapped = SimpleNamespace(members="exchange")
+    monkeypatch.setattr(select, "exchanges", lambda *_: [swapped] * (THRESHOLDS.exchanged + 1))
+    monkeypatch.setattr(select, "cautious_drivers", lambda library: ["cautious"])
+    start = SimpleNamespace(model=SimpleNamespace(members=()))
+    assert selector._round(start, number) is None
+    assert [list(dict.fromkeys(each)) for each in tried] == calls
+    assert tried[0].count("exchange") == (THRESHOLDS.exchanged if number else 0)
+
+
+def test_what_the_library_does_not_explain_at_all_is_looked_for_at_places(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    ledger: Any = Ledger({}, {})
+    ledger.data = [SimpleNamespace(sums=FEATURES)]
+    selector = selector_with(ledger)
+    gap = 2.0 * THRESHOLDS.small_distance
+    measured = np.full(100, np.sqrt(gap))
+    selector._library, selector._library_directions = (), lambda model, number: ()
+    selector._whitener = lambda model, blocks: SimpleNamespace(measured=measured)
+    selector._nearest = lambda: ["nearest"]
+    selector._at_places = lambda model, directions, number: ["places"]
+    tried: list[list[str]] = []
+    selector._fitted = lambda start, chosen, number, what: tried.append(chosen)
+    enough = 100.0 + THRESHOLDS.look_elsewhere * (100.0 * gap - 100.0)
+    for expected, at_once in ((enough - 1.0, False), (enough + 1.0, True)):
+        found = [SimpleNamespace(members="predicted", expected=expected)]
+        monkeypatch.setattr(select, "propose", lambda *_, found=found: found)
+        monkeypatch.setattr(select, "promising", lambda *_, found=found: found)
+        tried.clear()
+        selector._round(SimpleNamespace(model=SimpleNamespace(members=())), 0)
+        assert ("places" in tried[0]) == at_once
+
+
+def test_a_share_of_each_difference_counts_as_noise_of_the_model() -> None:
+    """No simulation is more exact than that, however many of its days are simulated."""
+    ledger: Any = Ledger({("headway",): 1000.0}, {("headway",): 0.5})
+    ledger.data, ledger.settled, ledger.changes = [], lambda model, errors: model, lambda model: []
+    selector = selector_with(ledger)
+    selector._first = SimpleNamespace(difference={"network": np.array([[3.0, -20.0]])})
+    selector._days = lambda model: []
+    asked: list[Any] = []
+    selector._null = lambda *_: SimpleNamespace(
+        test=lambda data, extra: asked.append(extra) or Chance(0.5)
+    )
+    model = replace(ledger.simulate((HEADWAY,), 16), members=())
+    with pytest.MonkeyPatch.context() as patched:
+        nothing = {"network": np.zeros((1, 2))}
+        patched.setattr(select, "uncertainty", lambda *_: (np.empty(0), dict(nothing)))
+        selector._tested(model)
+    share = THRESHOLDS.tolerance
+    assert asked[0]["network"] == pytest.approx(np.array([[3.0, -20.0]]) ** 2 * share**2)

@@ -178,10 +178,11 @@ def test_a_documented_command_is_understood(
     assert code == 0, capsys.readouterr().err
 
 
-@pytest.mark.parametrize("command", COMMAND_LINES)
-def test_a_documented_policy_is_one_that_a_run_writes(command: str) -> None:
-    for name in re.findall(r"runs/[\w.-]+/policies/([\w.-]+)\.pt", command):
-        assert name in WRITTEN
+def test_documented_policies_are_those_that_a_run_writes() -> None:
+    commands = " ".join(str(case.values[0]) for case in COMMAND_LINES)
+    named = re.findall(r"runs/[\w.-]+/policies/([\w.-]+)\.pt", commands)
+    assert len(named) > 10
+    assert set(named) <= WRITTEN
 
 
 CHEAP = ("scenario list", "domains", "evaluate")

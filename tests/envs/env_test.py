@@ -547,8 +547,14 @@ def test_an_environment_is_copied_before_its_simulation_only(crossing: Callable[
 
 @pytest.mark.parametrize("seed", [np.array(2), np.int64(2), True])
 def test_a_seed_is_any_whole_number(seed: Any) -> None:
-    env = parallel_env("single-v1", duration_s=20)
-    env.reset(seed=seed)
+    env = parallel_env("single-v1", duration_s=60)
+    ends: list[Any] = []
+    for same in (seed, int(seed)):
+        env.reset(seed=same)
+        for _ in range(6):
+            seen, *_ = env.step(dict.fromkeys(env.agents, 0))
+        ends.append(next(iter(seen.values())))
+    assert ends[0].tolist() == ends[1].tolist() and ends[0].any()
     env.close()
 
 

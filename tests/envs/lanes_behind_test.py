@@ -79,7 +79,9 @@ def test_who_waits_behind_is_counted(split: Scenario) -> None:
 def test_the_field_loop_counts_them_as_the_environment_does(split: Scenario) -> None:
     site = Site.of(split, {"observation": "count"})
     assert {"wM_0", "Ww_0"} <= set(site.capacity)
+    # each lane by itself, since a detector counts no other
     assert site.capacity["Ww_0"] == pytest.approx(site.network.lanes["Ww_0"].length_m / 7.5)
+    assert site.capacity["wM_0"] == 1.0
     env = ugat_marl.parallel_env(split, observation="count")
     (item,) = env.network.intersections
     env.reset(seed=1)
@@ -99,6 +101,18 @@ def test_the_field_loop_counts_them_as_the_environment_does(split: Scenario) -> 
     assert standing == 8
     assert site.observe(counts, 60.0, [red])[agent] == pytest.approx(seen[agent])
     env.close()
+
+
+def test_the_field_loop_tells_who_halts_behind_from_who_drives(split: Scenario) -> None:
+    site = Site.of(split, {"observation": "queue"})
+
+    def seen(vehicles: float, halting: float) -> list[float]:
+        counts = {name: LaneCount(60.0, 0.0, 0.0) for name in site.capacity}
+        counts["Ww_0"] = LaneCount(60.0, vehicles, halting)
+        (observed,) = site.observe(counts, 60.0, [0]).values()
+        return observed.tolist()
+
+    assert seen(7.0, 4.0) == seen(4.0, 4.0) != seen(7.0, 7.0)
 
 
 def test_a_rule_serves_them(split: Scenario) -> None:

@@ -284,3 +284,18 @@ def test_all_red_is_shown_though_another_light_is_taken_over_at_the_end(late_s: 
             lights.faults()
             lights.act(lights.plan({"A": 0, "B": 1}), lambda: None)
         assert ("yyrr", "rrGG") not in set(itertools.pairwise(street.of_b))
+
+
+def test_lights_are_looked_at_as_often_as_the_limits_say() -> None:
+    """A light that disobeys within a decision is found before the next one."""
+    looks: list[float] = []
+
+    class Watched(MadeUpStreet):
+        def shown(self) -> Mapping[str, str]:
+            looks.append(self.time_s)
+            return super().shown()
+
+    loop = FieldLoop(SITE, Scripted(), Watched(), QUICK)
+    loop.drive(60.0)
+    loop.close()
+    assert max(b - a for a, b in itertools.pairwise(looks)) <= QUICK.look_every_s + 1e-6

@@ -9,6 +9,7 @@ import shutil
 import threading
 import time
 from collections.abc import Callable, Mapping
+from dataclasses import replace
 from decimal import Decimal
 from itertools import pairwise
 from pathlib import Path
@@ -84,13 +85,23 @@ class Scripted:
     def __init__(self, does: Callable[[dict[str, int]], Any] = lambda actions: actions) -> None:
         self.does = does
         self.seen: list[Mapping[str, Any]] = []
+        self.infos: list[Mapping[str, Any]] = []
 
     def reset(self, seed: int) -> None:
-        self.seen = []
+        self.seen, self.infos = [], []
 
     def act(self, observations: Any, infos: Any) -> Any:
         self.seen.append(observations)
+        self.infos.append(infos)
         return self.does({agent: len(infos[agent]["action_mask"]) - 1 for agent in infos})
+
+
+def wait_for_the_answer(loop: FieldLoop) -> None:
+    """Wait until the policy's thread has given the answer to a question that was too late."""
+    until = time.monotonic() + 30.0
+    while not loop._asked._answers.qsize():
+        assert time.monotonic() < until
+        time.sleep(0.01)
 
 
 def replaced(count: LaneCount | None) -> Callable[[Counts], Counts]:
@@ -314,7 +325,7 @@ def test_the_loop_tells_which_lanes_had_green() -> None:
     for lane, faulty in ((served, True), (starved, False)):
         street = MadeUpStreet()
         policy = Scripted(lambda actions: dict.fromkeys(actions, 0))
-        loop = FieldLoop(SITE, policy, street, TrustLimits(frozen_after_s=100))
+        loop = FieldLoop(SITE, policy, street, TrustLimits(answer_ms=2000, frozen_after_s=100))
         street.spoil = lambda counts, lane=lane, street=street: {
             **counts,
             lane: LaneCount(street.time_s, 4.0),
@@ -322,6 +333,23 @@ def test_the_loop_tells_which_lanes_had_green() -> None:
         reasons = [decision.fallback.get(LIGHT, "") for decision in decide(loop, street, 14)]
         assert [bool(reason) for reason in reasons] == [False] * 11 + [faulty] * 3
         assert not faulty or reasons[11] == f"frozen: 4 vehicles for 110 s of green on {lane}"
+
+
+def test_a_lane_that_counts_as_before_after_no_counts_at_all_is_not_frozen() -> None:
+    (item, *_) = SITE.network.intersections
+    lane = min(link.from_lane for link in item.links if item.phases[0][link.index] in GREEN)
+    street = MadeUpStreet()
+    policy = Scripted(lambda actions: dict.fromkeys(actions, 0))
+    limits = TrustLimits(answer_ms=2000, return_after=0, frozen_after_s=100)
+    loop = FieldLoop(SITE, policy, street, limits)
+
+    def constant(counts: Counts) -> Counts:
+        return {**counts, lane: LaneCount(street.time_s, 4.0)}
+
+    for spoil, times in ((constant, 1), (failing, 13), (constant, 1)):
+        street.spoil = spoil
+        (*_, last) = decide(loop, street, times)
+    assert not last.fallback
 
 
 def test_a_lane_that_fell_silent_is_found_but_not_one_that_never_counted() -> None:
@@ -398,7 +426,7 @@ def test_a_slow_policy_misses_its_deadline_and_is_not_asked_while_it_is_busy() -
     assert len(asked) == 1
     policy.does = lambda actions: actions
     released.set()
-    time.sleep(0.2)
+    wait_for_the_answer(loop)
     sources = [decision.source for decision in decide(loop, street, 3)]
     assert sources == ["fallback", "fallback", "policy"], "a late answer was taken for a new one"
 
@@ -418,7 +446,7 @@ def test_a_policy_that_was_busy_is_reset_before_it_decides_for_a_street_that_cam
     loop.take_over(returned)  # the policy is still at the decision before
     policy.does = lambda actions: actions
     released.set()
-    time.sleep(0.2)
+    wait_for_the_answer(loop)
     (decision,) = decide(loop, returned)
     assert not decision.fallback or "late" not in str(decision.fallback)
     assert len(policy.seen) == 1, "it remembers the street before"
@@ -652,14 +680,15 @@ def test_a_street_without_one_of_the_lights_is_refused() -> None:
 # --- time -----------------------------------------------------------------------------------------
 
 
-def test_a_network_answers_for_sixteen_lights() -> None:
+def test_a_network_answers_in_time_for_sixteen_lights() -> None:
     scenario = load_scenario("grid4x4-v1")
     policy = DQN(AgentSet.of(parallel_env(scenario))).policy()
     site = Site.of(scenario, policy.env_options)
     street = MadeUpStreet(site)
-    loop = FieldLoop(site, policy, street)
+    loop = FieldLoop(site, policy, street, QUICK)
     summary = loop.drive(1000.0)
     assert len(summary.latencies_ms) == 100
+    assert summary.fallback_share == 0
 
 
 def test_the_street_of_the_page_is_driven() -> None:
@@ -715,6 +744,31 @@ def test_a_policy_that_needs_its_last_commands_sees_those_the_loop_gave() -> Non
         assert shown[1].argmax(1)[0] == made[0].phases[light]
         assert not shown[1][1].any()
         assert shown[2].argmax(1).tolist() == [made[1].phases[light], made[0].phases[light]]
+
+
+def test_a_policy_that_needs_its_last_commands_sees_the_age_of_the_green_that_runs() -> None:
+    """Not of the one that was asked for, which the minimum green holds back."""
+    site = Site.of(GRID, {"commands": 1})
+    site = replace(site, timing=replace(site.timing, min_green_s=12.0))
+    street, policy = MadeUpStreet(site), Scripted(lambda asked: dict.fromkeys(asked, 1))
+    loop = FieldLoop(site, policy, street, QUICK)
+    decide(loop, street, 3)
+    loop.close()
+    agent = site.observer.agents[0]
+    ages_s = [60.0 * float(seen[agent][-1]) for seen in policy.seen]
+    assert ages_s == pytest.approx([0.0, 10.0, 10.0])
+
+
+def test_a_policy_is_told_which_phases_it_may_ask_for() -> None:
+    """All of them if the minimum green of 25 s ends within the 10 s until the next decision."""
+    site = replace(SITE, timing=replace(SITE.timing, min_green_s=25.0))
+    street, policy = MadeUpStreet(site), Scripted(lambda asked: dict.fromkeys(asked, 1))
+    loop = FieldLoop(site, policy, street, QUICK)
+    decide(loop, street, 4)
+    loop.close()
+    agent = site.observer.agents[0]
+    free = [bool(infos[agent]["action_mask"].all()) for infos in policy.infos]
+    assert free == [False, False, True, False]
 
 
 @pytest.mark.parametrize("form", ["torch", "numpy"])

@@ -26,7 +26,7 @@ from ugat_marl.grounding import (
     fit_inverse,
     stack_log,
 )
-from ugat_marl.grounding.fitting import EpochCallback, split
+from ugat_marl.grounding.fitting import EpochCallback, OffData, split
 from ugat_marl.grounding.forward import ForwardConfig, ForwardModel
 from ugat_marl.grounding.phase import PhaseReport, _fit_forward
 from ugat_marl.grounding.reports import (
@@ -472,3 +472,17 @@ def test_expected_calibration_error_by_hand() -> None:
     assert expected_calibration_error(np.ones(3), np.ones(3, bool)) == 0.0
     assert expected_calibration_error(np.array([0.0, 1.0]), np.array([True, False])) == 1.0
     assert math.isnan(expected_calibration_error(np.array([]), np.array([], bool)))
+
+
+@pytest.mark.parametrize(("state_share", "redrawn"), [(0.0, 0.0), (0.25, 0.25), (1.0, 1.0)])
+def test_invented_inputs_have_a_drawn_change_and_a_share_of_them_a_drawn_state(
+    state_share: float, redrawn: float
+) -> None:
+    """Observed values are below 1, drawn ones from 5 to 6; the first column is a phase."""
+    generator = torch_generator(0, "a test")
+    inputs = torch.rand(1, 50, 4, generator=generator)
+    kept, change = torch.tensor([[[1, 0, 0, 0]], [[0, 0, 1, 1]]], dtype=torch.bool)[:, None]
+    ends = (torch.full((1, 1, 4), end) for end in (5.0, 6.0))
+    off = OffData(inputs, torch.arange(50)[None], *ends, kept, change)
+    drawn = (off.draw(400, generator, state_share) >= 5.0).float().mean(1)[0]
+    assert drawn.tolist() == pytest.approx([0.0, redrawn, 1.0, 1.0], abs=0.07)

@@ -5,11 +5,13 @@ from __future__ import annotations
 import copy
 from dataclasses import replace
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
 import pytest
 import torch
+from numpy.typing import NDArray
 from scipy import stats
 
 from tests.grounding.planted_street_test import LANES, LAYOUTS, PHASES, STARTS, ByHand
@@ -40,7 +42,7 @@ from ugat_marl.grounding import (
 from ugat_marl.grounding.forward import ForwardConfig
 from ugat_marl.grounding.residual import ResidualReport
 from ugat_marl.grounding.street_training import RESIDUAL
-from ugat_marl.grounding.trust import Trust, _p, compare
+from ugat_marl.grounding.trust import Trust, _p, _tested, compare
 from ugat_marl.grounding.uncertainty import mixed_concentration
 from ugat_marl.grounding.view import Moment
 
@@ -211,6 +213,41 @@ def test_f_is_trusted_by_chance_no_more_often_than_the_level_says() -> None:
     group = np.repeat(np.arange(20), 30)
     p = [_p(generator.normal(0, 1, 600), group) for _ in range(400)]
     assert np.mean(np.array(p) < 0.05) == pytest.approx(0.05, abs=0.03)
+
+
+def comparison(own: NDArray[np.float64], twin: NDArray[np.float64], **settings: float) -> Trust:
+    """The comparison of errors ``(agents, 240)`` of f and the fitted world: 8 blocks, 5 folds."""
+    agents = tuple("abcdefgh"[: len(own)])
+    rows = torch.arange(240).expand(len(own), 240)
+    street: Any = SimpleNamespace(weight=torch.ones(len(own), 240), block=rows // 30)
+    found = torch.tensor(np.stack([own, twin]))
+    return _tested(agents, found, street, rows // 48, TrustConfig(**settings))
+
+
+def test_f_has_to_be_better_by_the_margin() -> None:
+    twin = 1.0 + 0.01 * np.random.default_rng(0).standard_normal((1, 240))
+    assert not comparison(0.97 * twin, twin, margin=0.05).better.any()
+    assert comparison(0.90 * twin, twin, margin=0.05).better.all()
+
+
+def test_of_blocks_and_folds_the_more_careful_test_counts() -> None:
+    """Blocks of a fold are alike here: the test by blocks takes them for more than they are."""
+    twin, fold = np.ones((1, 240)), np.arange(240) // 48
+    own = 0.95 * twin - np.array([0.5, 0.4, -0.3, 0.6, -0.2])[fold]
+    surplus = (0.95 * twin - own)[0]
+    by_blocks, by_folds = _p(surplus, np.arange(240) // 30), _p(surplus, fold)
+    assert by_blocks < 0.9 * by_folds
+    assert comparison(own, twin, margin=0.05).p[0] == pytest.approx(by_folds, rel=1e-5)
+
+
+def test_the_level_is_shared_by_the_intersections() -> None:
+    own = 0.93 + 0.06 * np.repeat([[1.0, -1.0] * 4], 30, axis=1)
+    twin = np.ones_like(own)
+    level = 1.5 * float(comparison(own, twin).p[0])
+    assert 0.0 < level < 0.5
+    assert comparison(own, twin, level=level).better.all()
+    both = comparison(np.repeat(own, 2, axis=0), np.repeat(twin, 2, axis=0), level=level)
+    assert not both.better.any()
 
 
 # --- u of h after f

@@ -220,7 +220,11 @@ def test_learns_toy_traffic_and_its_weights_serve_as_a_start(tmp_path: Path):
     learner = toy_learner(1)
     assert played(env, learner.policy()) < -10
     learner.learn(env, 20, seed=0)
-    trained = played(env, learner.policy())
+    policy: Any = learner.policy()
+    running, newest = learner.running_weights.numpy().ravel(), learner._weights.detach().numpy()
+    assert np.array_equal(policy.parameters, running), "it acts with the running mean"
+    assert not np.array_equal(running, newest.ravel())
+    trained = played(env, policy)
     assert trained > -3  # the rule that knows the game has -2.71, random phases -8.85
     InitialWeights(learner.running_weights, {"observation": "toy"}, "a test").save(
         tmp_path / "start.pt"
