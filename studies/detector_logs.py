@@ -117,7 +117,7 @@ def fits(
     with contextlib.closing(parallel_env(scenario, observation="movements")) as env:
         worlds, view = street_prior(env, config), LaneView.of(env.network, "movements")
         replay = RecordedWorld(lanes, env).replay()
-    simulation = Simulation(scenario, "sim", {"observation": "movements"}, 0.0)
+    simulation = Simulation(scenario, {"observation": "movements"}, 0.0)
     assert replay is not None
     street, known = fit_street(lanes, simulation, replay, worlds, view, config, 0)
     assert street.posterior is not None

@@ -236,7 +236,7 @@ class Network:
         with contextlib.closing(parallel_env(scenario, observation="movements")) as env:
             worlds = street_prior(env, StreetConfig(parts=("service", "effects")))
             view, acting = LaneView.of(env.network, "movements"), policy_factory(policy)(env)
-        simulation = Simulation(scenario, "sim", {"observation": "movements"}, EPSILON, jobs)
+        simulation = Simulation(scenario, {"observation": "movements"}, EPSILON, jobs)
         return cls(name, worlds, view, policy, acting, simulation)
 
     def simulated(

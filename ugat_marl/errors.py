@@ -99,12 +99,8 @@ class MeasuredDataError(UgatMarlError):
     """Measured data of the street are missing, damaged, or contradict themselves or the network."""
 
 
-class MeasurementError(UgatMarlError):
-    """A measured process of a benchmark failed, or did different work from its counterpart."""
-
-
-class BlindTestError(UgatMarlError):
-    """A blind test's plan, labels or grades are missing or damaged, or cannot be drawn."""
+class JobError(UgatMarlError):
+    """A training or an evaluation of a table failed in its own process."""
 
 
 class CheckpointError(UgatMarlError):

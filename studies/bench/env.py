@@ -13,8 +13,9 @@ from typing import Any
 from studies.bench.fresh_process import in_fresh_process
 from studies.bench.report import Report, Spread, Target, require_positive
 from studies.bench.sumo_rl import PETTINGZOO, SUMO_RL, SumoRl, install_sumo_rl
+from studies.errors import MeasurementError
 from ugat_marl.effects import load_scenario
-from ugat_marl.errors import MeasurementError, install_command
+from ugat_marl.errors import install_command
 from ugat_marl.progress import Advance, Reporter, Silent
 
 _FOLDER = Path(__file__).parent

@@ -15,7 +15,7 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
-from ugat_marl.errors import MeasurementError
+from studies.errors import MeasurementError
 from ugat_marl.parallel import import_path
 
 CHECKOUT = Path(__file__).resolve().parents[2]

@@ -13,7 +13,8 @@ from typing import Any
 from studies.bench.fresh_process import in_fresh_process
 from studies.bench.memory import growth_of
 from studies.bench.report import Report, Spread, Target, require_positive
-from ugat_marl.errors import MeasurementError, OptionError, install_command
+from studies.errors import MeasurementError
+from ugat_marl.errors import OptionError, install_command
 from ugat_marl.policies import learner_is_installed, require_known_learner
 from ugat_marl.progress import Reporter, Silent
 

@@ -9,8 +9,8 @@ from typing import Literal
 
 from studies.bench.fresh_process import in_fresh_process
 from studies.bench.report import Report, Target, require_positive
+from studies.errors import MeasurementError
 from ugat_marl.effects import load_scenario
-from ugat_marl.errors import MeasurementError
 from ugat_marl.progress import Reporter, Silent
 
 

@@ -124,7 +124,7 @@ class StrengthBench:
         scenario, plan = load_scenario(self.scenario), self.plan
         with tempfile.TemporaryDirectory(prefix="ugat_marl-") as name:
             folder = Path(name)
-            by_rule, *records = perform_here(plan, folder, reporter or Silent())
+            by_rule, *records = perform_here(plan, folder, reporter=reporter or Silent())
             rule = (folder / plan[0].name / RULE_FILE).read_text()
         rule_s = fmean(s.att_s for s in by_rule.played(plan[0], 0, self.domain))
         trained = zip(plan[1:], records, strict=True)

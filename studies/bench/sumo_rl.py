@@ -16,8 +16,8 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+from studies.errors import MeasurementError
 from ugat_marl.data import installed_version, installed_versions
-from ugat_marl.errors import MeasurementError
 from ugat_marl.files import write_whole
 
 SUMO_RL = "1.4.5"

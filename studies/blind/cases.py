@@ -12,9 +12,10 @@ from dataclasses import asdict, dataclass, field, fields
 from pathlib import Path
 from typing import Any
 
+from studies.errors import BlindTestError
 from ugat_marl.data import MeasuredData, read_measured
 from ugat_marl.effects import Effect, load_scenario
-from ugat_marl.errors import BlindTestError, UnknownNameError
+from ugat_marl.errors import UnknownNameError
 from ugat_marl.files import write_whole
 from ugat_marl.scenarios import Network, Scenario
 

@@ -24,9 +24,10 @@ from studies.blind.cases import (
 from studies.blind.places import Busy, busy_places
 from studies.blind.sampling import GROUPS, Sample, Task, draw_sample, draw_tasks
 from studies.blind.strengths import STRENGTHS, nominal_of
+from studies.errors import BlindTestError
 from ugat_marl.data import write_measured
 from ugat_marl.effects import Effect, load_scenario
-from ugat_marl.errors import BlindTestError, OptionError
+from ugat_marl.errors import OptionError
 from ugat_marl.experiments import policy_factory, record
 from ugat_marl.files import write_whole
 from ugat_marl.progress import Reporter, Silent

@@ -22,9 +22,9 @@ from studies.blind.cases import (
     read_plan,
 )
 from studies.blind.strengths import ALL_KINDS, ERRORS
+from studies.errors import BlindTestError
 from ugat_marl.diagnosis import Diagnosis, EffectRecord, LogGrounds, NamedEffect, PolicyGap
 from ugat_marl.effects import EVERYWHERE
-from ugat_marl.errors import BlindTestError
 from ugat_marl.files import write_whole
 
 Verdict = Literal[

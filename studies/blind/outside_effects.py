@@ -7,6 +7,7 @@ from collections import Counter
 from dataclasses import dataclass, replace
 from typing import ClassVar
 
+from studies.errors import BlindTestError
 from ugat_marl.effects import (
     Effect,
     NumberParameter,
@@ -16,7 +17,6 @@ from ugat_marl.effects import (
     network_places,
     seconds_text,
 )
-from ugat_marl.errors import BlindTestError
 from ugat_marl.files import xml_bytes
 from ugat_marl.scenarios import Document, Network, Scenario
 

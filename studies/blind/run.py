@@ -14,8 +14,8 @@ from pathlib import Path
 from typing import Any
 
 from studies.blind.cases import DIAGNOSIS, OPTIONS, RUN, Case, chosen, read_json
+from studies.errors import BlindTestError
 from studies.same_options import require_same
-from ugat_marl.errors import BlindTestError
 from ugat_marl.files import write_whole
 from ugat_marl.parallel import import_path
 from ugat_marl.progress import Reporter, Silent

@@ -24,7 +24,7 @@ from tests.interrupts import KillAfter, few_descriptors
 from ugat_marl.data import Scores, lock_folder
 from ugat_marl.effects import load_scenario, scenario_in_domain
 from ugat_marl.envs import parallel_env
-from ugat_marl.errors import CheckpointError, MeasurementError, OptionError, UnknownNameError
+from ugat_marl.errors import CheckpointError, JobError, OptionError, UnknownNameError
 from ugat_marl.experiments import (
     Job,
     LearnerSpec,
@@ -185,8 +185,11 @@ def test_jobs_here_and_in_processes_have_the_same_numbers(tmp_path: Path) -> Non
         after(PLAIN, Setting("fine-tuned", "further", learner=QUICK)),
         RULE,
     ]
-    here = perform_here(plan, tmp_path / "here", Silent())
-    assert perform_all(plan[::-1], tmp_path / "apart", 2, Silent(), "test") == {}
+    here = perform_here(plan, tmp_path / "here", reporter=Silent())
+    assert (
+        perform_all(plan[::-1], tmp_path / "apart", workers=2, reporter=Silent(), title="test")
+        == {}
+    )
     for job, record in zip(plan, here, strict=True):
         apart = record_of(job, tmp_path / "apart")
         assert apart is not None and record.is_whole(job)
@@ -263,12 +266,14 @@ def test_every_learner_can_have_a_job(name: str, tmp_path: Path) -> None:
 
 def test_a_failed_job_says_why_and_the_others_go_on_if_they_shall(tmp_path: Path) -> None:
     broken = replace(PLAIN, options={"observation": "conut"})
-    with pytest.raises(MeasurementError, match="conut"):
-        perform_all([broken], tmp_path, 1, Silent(), "test")
+    with pytest.raises(JobError, match="conut"):
+        perform_all([broken], tmp_path, workers=1, reporter=Silent(), title="test")
     assert "conut" in (tmp_path / broken.name / LOG).read_text()
     assert json.loads((tmp_path / broken.name / JOB).read_text())["setting"]["recipe"] == "direct"
     fine = replace(PLAIN, episodes=1, every=0)
-    failures = perform_all([broken, fine], tmp_path, 1, Silent(), "test", keep_going=True)
+    failures = perform_all(
+        [broken, fine], tmp_path, workers=1, reporter=Silent(), title="test", keep_going=True
+    )
     assert list(failures) == [broken.name] and "conut" in failures[broken.name]
     assert record_of(fine, tmp_path) is not None
 
@@ -277,8 +282,8 @@ def test_a_failed_job_says_why_and_the_others_go_on_if_they_shall(tmp_path: Path
 def test_jobs_beside_others_have_the_same_numbers(tmp_path: Path) -> None:
     """The grounded job is begun beside plain training, and waits for the learner of that."""
     plan = [PLAIN, after(PLAIN, Setting("UGAT", "grounded", learner=QUICK, ugat=UGAT)), RULE]
-    one = perform_here(plan, tmp_path / "one", Silent())
-    two = perform_here(plan, tmp_path / "two", Silent(), 3, beside=plan[1:])
+    one = perform_here(plan, tmp_path / "one", reporter=Silent())
+    two = perform_here(plan, tmp_path / "two", workers=3, reporter=Silent(), beside=plan[1:])
     assert [record.scores for record in one] == [record.scores for record in two]
     logs = [(tmp_path / "two" / job.name / LOG).exists() for job in plan]
     assert logs == [False, True, True], "the first is done here, the others beside it"
@@ -292,24 +297,24 @@ def test_a_job_starts_from_the_learner_at_the_end_of_its_training(tmp_path: Path
     start.write_bytes(b"after two of four episodes")
     assert not driver._is_final(start)
     start.unlink()
-    perform_here([PLAIN], tmp_path, Silent())
+    perform_here([PLAIN], tmp_path, reporter=Silent())
     assert driver._is_final(start)
 
 
 @needs_forks
 def test_a_job_beside_does_not_wait_for_a_learner_that_is_lost(tmp_path: Path) -> None:
-    perform_here([PLAIN], tmp_path, Silent())
+    perform_here([PLAIN], tmp_path, reporter=Silent())
     (tmp_path / PLAIN.name / LEARNER).unlink()
     waits = after(PLAIN, Setting("fine-tuned", "further", learner=QUICK))
     with pytest.raises(CheckpointError, match="no such"):
-        perform_here([PLAIN, waits], tmp_path, Silent(), 2, beside=[waits])
+        perform_here([PLAIN, waits], tmp_path, workers=2, reporter=Silent(), beside=[waits])
 
 
 @needs_forks
 def test_a_job_that_fails_beside_others_says_why(tmp_path: Path) -> None:
     broken = replace(PLAIN, options={"observation": "conut"})
     with pytest.raises(UnknownNameError, match="conut"):
-        perform_here([RULE, broken], tmp_path, Silent(), 2, beside=[broken])
+        perform_here([RULE, broken], tmp_path, workers=2, reporter=Silent(), beside=[broken])
     assert "conut" in (tmp_path / broken.name / LOG).read_text()
     assert record_of(RULE, tmp_path) is not None
 
@@ -323,8 +328,8 @@ def test_jobs_beside_others_end_with_them(tmp_path: Path) -> None:
         perform_here(
             [PLAIN, long, waits],
             tmp_path,
-            KillAfter("training: direct transfer", 2),
-            3,
+            workers=3,
+            reporter=KillAfter("training: direct transfer", 2),
             beside=[long, waits],
         )
     assert time.monotonic() - begun < 60
@@ -335,9 +340,9 @@ def test_jobs_beside_others_end_with_them(tmp_path: Path) -> None:
 def test_two_drivers_do_not_train_in_one_folder(tmp_path: Path) -> None:
     lock = lock_folder(tmp_path)
     with pytest.raises(OptionError, match="another process"):
-        perform_all([], tmp_path, 1, Silent(), "test")
+        perform_all([], tmp_path, workers=1, reporter=Silent(), title="test")
     lock.close()
-    perform_all([], tmp_path, 1, Silent(), "test")
+    perform_all([], tmp_path, workers=1, reporter=Silent(), title="test")
 
 
 def test_a_job_ends_with_whoever_started_it(tmp_path: Path) -> None:
@@ -401,7 +406,7 @@ def test_a_stopped_job_is_killed_and_taken_up_again_with_the_same_numbers(
     forked: bool, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     job = replace(PLAIN, episodes=30, every=10, evaluation_seeds=evaluation_seeds(1))
-    perform_here([job], tmp_path / "here", Silent())
+    perform_here([job], tmp_path / "here", reporter=Silent())
     monkeypatch.setattr(driver, "jobs_fork_on", lambda device: forked)
     monkeypatch.setenv(DEADLINE_VARIABLE, "15")  # an interpreter starts within it
     place = tmp_path / "apart" / job.name
@@ -424,8 +429,8 @@ def test_a_job_that_is_stopped_again_and_again_is_reported(
             return True
 
     monkeypatch.setattr(forked, "Heartbeat", Still)
-    with pytest.raises(MeasurementError, match=r"did not run on for 900 s .* was killed"):
-        perform_all([PLAIN], tmp_path, 1, Silent(), "test")
+    with pytest.raises(JobError, match=r"did not run on for 900 s .* was killed"):
+        perform_all([PLAIN], tmp_path, workers=1, reporter=Silent(), title="test")
 
 
 @pytest.mark.slow

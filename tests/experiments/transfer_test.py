@@ -158,7 +158,7 @@ def test_the_folder_is_locked_until_the_table_is_written(
         refused.append(str(told.value))
         return "table"
 
-    def perform(*_: Any) -> list[Any]:
+    def perform(*_: Any, **_options: Any) -> list[Any]:
         return []
 
     monkeypatch.setattr(transfers, "perform_here", perform)

@@ -21,7 +21,7 @@ from pathlib import Path
 from typing import IO
 
 from ugat_marl.data import LogCallback, lock_folder
-from ugat_marl.errors import MeasurementError
+from ugat_marl.errors import JobError
 from ugat_marl.experiments.forked import (
     ONE_CORE,
     heartbeat_of,
@@ -65,10 +65,10 @@ def record_of(job: Job, folder: Path) -> Record | None:
 def perform_all(
     plan: Sequence[Job],
     folder: Path,
+    *,
     workers: Workers,
     reporter: Reporter,
     title: str,
-    *,
     keep_going: bool = False,
 ) -> dict[str, str]:
     """Perform the unfinished jobs, each in its own process.
@@ -85,7 +85,7 @@ def perform_all(
         Reason of failure by name of the job; empty unless `keep_going`.
 
     Raises:
-        MeasurementError: A job failed; its log holds the reason. Results of other jobs are kept.
+        JobError: A job failed; its log holds the reason. Results of other jobs are kept.
         OptionError: Another process performs jobs in that folder.
     """
     jobs = list({job.name: job for job in plan}.values())
@@ -118,7 +118,7 @@ def perform_all(
                     if record_of(job, folder) is None:
                         failures[job.name] = _failure(folder / job.name)
                         if not keep_going:
-                            raise MeasurementError(failures[job.name])
+                            raise JobError(failures[job.name])
                     advance(note=job.short)
         finally:
             stop.set()
@@ -130,8 +130,9 @@ def perform_all(
 def perform_here(
     plan: Sequence[Job],
     folder: Path,
-    reporter: Reporter,
+    *,
     workers: Workers = 1,
+    reporter: Reporter,
     on_log: LogCallback | None = None,
     beside: Sequence[Job] = (),
 ) -> list[Record]:
@@ -140,8 +141,8 @@ def perform_here(
     Args:
         plan: Jobs; a job comes after the job it starts from.
         folder: Folder that holds the jobs' folders.
-        reporter: Shows progress.
         workers: Simulations at a time, or an executor, see `perform`.
+        reporter: Shows progress.
         on_log: See `perform`.
         beside: Jobs of the plan that may be performed meanwhile, each in a process and on a core
             of its own, at most ``workers - 1`` at a time. What they say is in their logs.

@@ -207,7 +207,9 @@ def learn_curves(
     trainings = [job for job in config.trainings(spelling) if _can_be_made(job, failures)]
     rules = config.rules(spelling)
     plan = [*trainings, *rules]
-    failures |= perform_all(plan, folder, workers, reporter, "training", keep_going=True)
+    failures |= perform_all(
+        plan, folder, workers=workers, reporter=reporter, title="training", keep_going=True
+    )
     records = {job.name: record_of(job, folder) for job in plan}
     curves = [
         Curve.of(job, r, scenario) for job in trainings if (r := records[job.name]) is not None

@@ -21,8 +21,9 @@ from studies.bench.memory import MemoryBench, growth_of
 from studies.bench.memory_program import family, look
 from studies.bench.report import Report, Spread, Target
 from studies.bench.sumo_rl import SumoRl
+from studies.errors import MeasurementError
 from ugat_marl.envs import parallel_env
-from ugat_marl.errors import MeasurementError, OptionError
+from ugat_marl.errors import OptionError
 from ugat_marl.experiments import machine_facts
 
 SCENARIO = "single-v1"

@@ -11,7 +11,8 @@ import pytest
 import studies.bench.device as device_module
 from studies.bench.device import DeviceBench, compared, pays_from
 from studies.bench.device_program import LAYOUT, measure, random_log
-from ugat_marl.errors import MeasurementError, OptionError
+from studies.errors import MeasurementError
+from ugat_marl.errors import OptionError
 
 
 @pytest.mark.parametrize(

@@ -31,13 +31,14 @@ from studies.blind.sampling import (
     draw_tasks,
 )
 from studies.blind.strengths import ERRORS, KINDS
+from studies.errors import BlindTestError
 from tests.studies.blind.diagnoses import says
 from ugat_marl.cli import run
 from ugat_marl.data import read_measured
 from ugat_marl.diagnosis import IN_THE_LOG, Routes
 from ugat_marl.diagnosis.hypotheses import library
 from ugat_marl.effects import effect_from_record, known_effects, load_scenario
-from ugat_marl.errors import BlindTestError, OptionError, UnknownNameError
+from ugat_marl.errors import OptionError, UnknownNameError
 from ugat_marl.experiments import policy_factory, record
 from ugat_marl.scenarios import Detector, Network, Passages, Period, Scenario
 

@@ -14,6 +14,7 @@ from studies.blind.cases import Case, Hidden, Label, write_label, write_plan
 from studies.blind.grade import Grade, grade, grade_cases, read_grades
 from studies.blind.strengths import ALL_KINDS, ERRORS, KINDS, nominal_of
 from studies.blind.table import AIMS, confusion, markdown, rows_of, wilson, write_table
+from studies.errors import BlindTestError
 from tests.studies.blind.diagnoses import says
 from ugat_marl.diagnosis import Diagnosis
 from ugat_marl.effects import (
@@ -23,7 +24,6 @@ from ugat_marl.effects import (
     load_scenario,
     measurement_effects,
 )
-from ugat_marl.errors import BlindTestError
 
 
 def hidden(**record: Any) -> Hidden:
