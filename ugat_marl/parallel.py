@@ -144,12 +144,13 @@ class Heartbeat:
 
     Args:
         sign: Returns a number that differs after every sign of `send_heartbeats`.
-        deadline_s: Seconds without a sign after which the process counts as dead; None for
-            `usual_deadline_s`.
+
+    Attributes:
+        deadline_s: Seconds without a sign after which the process counts as dead.
     """
 
-    def __init__(self, sign: Callable[[], int], deadline_s: float | None = None) -> None:
-        self.deadline_s = usual_deadline_s() if deadline_s is None else deadline_s
+    def __init__(self, sign: Callable[[], int]) -> None:
+        self.deadline_s = usual_deadline_s()
         self._sign = sign
         self._last = sign()
         self._seen_s = time.monotonic()

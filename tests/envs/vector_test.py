@@ -741,6 +741,7 @@ def test_wrong_calls(crossing: Crossing) -> None:
         ({"observatoin": "count"}, UnknownNameError, "Did you mean 'observation'"),
         ({"domains": ["sim"]}, OptionError, "domains has 1 entries for 2 .*in_turn"),
         ({"domains": "V44"}, UnknownNameError, "Did you mean 'V4'"),
+        ({"domain": "V4"}, OptionError, "vector_env takes domains"),
         ({"domains": ["sim", "V44"]}, UnknownNameError, "Did you mean 'V4'"),
         ({"domains": ["sim", StartupDelay(1.0)]}, OptionError, "mixes domains and single effects"),
         ({"wrap": lambda env: env}, OptionError, "wrap = .*move it to a module"),

@@ -13,8 +13,9 @@ import pytest
 import ugat_marl
 from tests.runs import search_few_rules
 from ugat_marl.data import Scores
+from ugat_marl.effects import Headway
 from ugat_marl.errors import OptionError, UnknownNameError
-from ugat_marl.experiments import Evaluation, TransferConfig, run_folder
+from ugat_marl.experiments import Evaluation, PaperConfig, TransferConfig, run_folder
 from ugat_marl.experiments.scores import Result as Episode
 from ugat_marl.grounding import UgatConfig
 from ugat_marl.policies import DQNConfig
@@ -69,6 +70,10 @@ def test_one_domain_may_be_a_text() -> None:
     one = np.int64(1)
     frame = ugat_marl.evaluate("single-v1", "random", "V1", seeds=one, duration_s=100, workers=1)
     assert frame["domain"].to_list() == ["V1"]
+    frame = ugat_marl.evaluate(
+        "single-v1", "random", [Headway(1.4)], seeds=[1], duration_s=100, workers=1
+    )
+    assert frame["domain"].to_list() == ["headway=1.4"]
 
 
 def test_wrong_calls_are_refused() -> None:
@@ -79,6 +84,22 @@ def test_wrong_calls_are_refused() -> None:
         ugat_marl.train("single-v1", learner="ippo", dqn=DQNConfig(batch_size=8))
     with pytest.raises(OptionError, match="at least one"):
         ugat_marl.evaluate("single-v1", ["random"], [])
+    wrong: list[Any] = [1.5, [1.7], True, [-1], "12"]
+    for seeds in wrong:
+        with pytest.raises(OptionError, match="give a number of episodes, or a list of seeds"):
+            ugat_marl.evaluate("single-v1", ["random"], ["sim"], seeds=seeds)
+    mixed: list[Any] = ["sim", Headway(1.4)]
+    with pytest.raises(OptionError, match="mixes domains and single effects"):
+        ugat_marl.evaluate("single-v1", ["random"], mixed)
+    loaded: Any = ugat_marl.load_scenario("single-v1")
+    with pytest.raises(OptionError, match=r"name or the path .* scenario.write\(folder\)"):
+        ugat_marl.train(loaded)
+    preset: Any
+    for preset in ("papr", ""):
+        with pytest.raises(UnknownNameError, match="unknown preset"):
+            ugat_marl.train("single-v1", preset=preset)
+        with pytest.raises(UnknownNameError, match="unknown preset"):
+            PaperConfig(preset=preset)
     with pytest.raises(UnknownNameError, match="largest-queue"):
         ugat_marl.evaluate("single-v1", "largst-queue", ["sim"])
     with pytest.raises(UnknownNameError, match="universal"):
@@ -137,8 +158,12 @@ def test_a_callback_gets_what_is_logged_and_may_end_the_run(
 
 
 def test_settings_beside_those_that_hold_them_are_refused(tmp_path: Path) -> None:
-    with pytest.raises(OptionError, match="give grounding, pretrain_episodes"):
-        ugat_marl.train("single-v1", iterations=7, ugat=UgatConfig(), out=tmp_path / "run")
+    usual = int(UgatConfig.iterations)
+    for iterations in (7, usual):
+        with pytest.raises(OptionError, match="give grounding, pretrain_episodes"):
+            ugat_marl.train(
+                "single-v1", iterations=iterations, ugat=UgatConfig(), out=tmp_path / "run"
+            )
     assert not (tmp_path / "run").exists()
 
 

@@ -60,7 +60,7 @@ def test_greens_are_as_late_as_those_of_the_street(
         rule = EpsilonGreedy(make_rule("max-pressure:10", env), 0.3)
         logs = [roll_out(env, rule, seed, record=observer_of(env)).log for seed in (1, 2, 3)]
         street = TransitionLog.concatenate([log for log in logs if log is not None])
-        simulation = Simulation(scenario, "sim", options, epsilon=0.3, workers=1)
+        simulation = Simulation(scenario, options, epsilon=0.3, workers=1)
         done: list[None] = []
         acting = make_rule("max-pressure:10", env)
     found = matched_delays(street, simulation, acting, 0, lambda: done.append(None))

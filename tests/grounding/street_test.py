@@ -71,7 +71,7 @@ def recorded(domain: str, seconds: float = 900.0, seed: int = 0) -> TransitionLo
 
 
 def simulation(seconds: float = 100.0) -> Simulation:
-    return Simulation(SCENARIO, "sim", {"duration_s": seconds}, epsilon=0.3, workers=1)
+    return Simulation(SCENARIO, {"duration_s": seconds}, epsilon=0.3, workers=1)
 
 
 @pytest.fixture(scope="module")
@@ -341,7 +341,7 @@ def test_worlds_beside_a_log_of_other_commands_get_these_commands(
         acted.append((simulation.epsilon, policy))
 
     monkeypatch.setattr(street_training, "street_log", listening)
-    simulation = Simulation(load_scenario("single-v1"), "sim", {}, epsilon=0.3)
+    simulation = Simulation(load_scenario("single-v1"), {}, epsilon=0.3)
     for replay, expected in (("the log", (0.0, "the log")), (None, (0.3, "the policy"))):
         training = Mock(spec=StreetTraining)
         training.simulation, training.config = simulation, Mock(residual_delay_s=0)

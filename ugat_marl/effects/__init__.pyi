@@ -54,6 +54,7 @@ from .domains import NamedDomain as NamedDomain
 from .domains import domain_label as domain_label
 from .domains import domain_path as domain_path
 from .domains import expand_domains as expand_domains
+from .domains import is_one_domain as is_one_domain
 from .domains import parse_domain as parse_domain
 from .domains import scenario_in_domain as scenario_in_domain
 from .engine import BlockerPatience as BlockerPatience

@@ -300,6 +300,25 @@ def domain_label(domain: Domain) -> str:
     return "+".join(map(str, domain)) or "sim"
 
 
+def is_one_domain(given: Domain | Sequence[Domain]) -> bool:
+    """Return True for one domain, and False for a sequence of them.
+
+    A sequence of effects is one domain.
+
+    Raises:
+        OptionError: A sequence holds both domains and single effects.
+    """
+    any_value: Any = given  # what is none, such as None, is refused where it is parsed
+    listed = any_value if isinstance(any_value, Sequence) and not isinstance(given, str) else ()
+    single = [entry for entry in listed if not isinstance(entry, str | list | tuple)]
+    if 0 < len(single) < len(listed):
+        raise OptionError(
+            f"domains mixes domains and single effects ({single[0]}); put the effects of one "
+            "domain into a list of their own"
+        )
+    return len(single) == len(listed)
+
+
 def scenario_in_domain(
     scenario: Scenario,
     domain: Domain,

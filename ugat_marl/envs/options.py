@@ -145,9 +145,15 @@ class EnvOptions:
 
         Raises:
             UnknownNameError: An option or a value does not exist.
+            OptionError: A value is impossible, or the domain has another name.
         """
         known = [field.name for field in fields(cls)]
         for name in options:
+            if name in ("domain", "domains"):
+                raise OptionError(
+                    f"{name} is no option of this function: parallel_env and env take domain, "
+                    "vector_env takes domains"
+                )
             if name not in known:
                 raise UnknownNameError("option", name, known)
         return cls(**options)

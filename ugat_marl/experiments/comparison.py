@@ -127,9 +127,9 @@ class Comparison:
             return means
         return dict.fromkeys(self.training_seeds or [None], means[None])
 
-    def _paired(self, one: str, other: str, target: str, measure: str) -> tuple[Floats, Floats]:
-        """Return the values of two settings for the training seeds that both have, ``(n,)``."""
-        first, second = (self._by_seed(name, target, measure) for name in (one, other))
+    def _paired(self, one: str, other: str, target: str) -> tuple[Floats, Floats]:
+        """Return the ATT of two settings for the training seeds that both have, in s, ``(n,)``."""
+        first, second = (self._by_seed(name, target, "att_s") for name in (one, other))
         both = sorted(first.keys() & second.keys(), key=lambda s: s or 0)
         return np.array([first[s] for s in both]), np.array([second[s] for s in both])
 
@@ -159,9 +159,9 @@ class Comparison:
         there = self.values(setting, target, measure)
         return there - self.values(setting, target, measure, self.sim)
 
-    def test(self, one: str, other: str, target: str, measure: str = "att_s") -> PairedTest:
-        """Compare two settings in a domain, by the training seeds that both have."""
-        return PairedTest.of(*self._paired(one, other, target, measure))
+    def test(self, one: str, other: str, target: str) -> PairedTest:
+        """Compare the ATT of two settings in a domain, by the training seeds that both have."""
+        return PairedTest.of(*self._paired(one, other, target))
 
     def best(self, target: str, among: Sequence[str] | None = None) -> str:
         """Return the setting with the lowest mean ATT in a domain.
@@ -181,7 +181,7 @@ class Comparison:
 
     def regret_s(self, setting: str, target: str) -> Floats:
         """Return the ATT minus that of the best setting there, in s, one per common seed."""
-        mine, best = self._paired(setting, self.best(target), target, "att_s")
+        mine, best = self._paired(setting, self.best(target), target)
         return mine - best
 
     def won_back(self, setting: str, target: str, direct: str) -> float:

@@ -87,7 +87,6 @@ def evaluate(
     workers: Workers = None,
     reporter: Reporter | None = None,
     title: str = "evaluating",
-    notes: Mapping[str, str] | None = None,
     watch: Watch | None = None,
     approaches: bool = False,
 ) -> Evaluation:
@@ -102,7 +101,6 @@ def evaluate(
         workers: Simulations at a time; None for the number of cores; or an executor.
         reporter: Shows progress.
         title: Title of the progress bar.
-        notes: Further facts, kept with the result.
         watch: Makes callbacks that observe the environments; needs workers in this process.
         approaches: True to measure the control delay on every approach (`Scores.approaches`).
 
@@ -144,7 +142,7 @@ def evaluate(
         for i, (name, domain) in enumerate(_pairs(policies, domains))
     }
     results.sort(key=lambda r: (order[r.policy, r.domain], r.seed))
-    return Evaluation(scenario.id, scenario.hash, tuple(results), dict(notes or {}))
+    return Evaluation(scenario.id, scenario.hash, tuple(results), {})
 
 
 def best_rule(

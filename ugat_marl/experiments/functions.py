@@ -1,7 +1,7 @@
 """Functions of scripts and notebooks: train across a gap, and evaluate policies.
 
-They do what the commands ``train`` and ``evaluate`` do, and take objects of Python where a command
-takes names.
+They do what the commands ``train`` and ``evaluate`` do with the options used most, and take objects
+of Python where a command takes names.
 """
 
 from __future__ import annotations
@@ -9,14 +9,14 @@ from __future__ import annotations
 import re
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
+from numbers import Integral
 from pathlib import Path
 from typing import Any, Literal
 
-import numpy as np
 import polars as pl
 
 from ugat_marl.data import LogCallback
-from ugat_marl.effects import Domain, domain_label, load_scenario
+from ugat_marl.effects import Domain, domain_label, is_one_domain, load_scenario
 from ugat_marl.errors import OptionError
 from ugat_marl.experiments import evaluation
 from ugat_marl.experiments.evaluation import OwnPolicyFactory, policy_factory
@@ -25,7 +25,7 @@ from ugat_marl.experiments.scores import Evaluation
 from ugat_marl.experiments.transfers import TransferConfig, transfer
 from ugat_marl.grounding import USUAL_REWARD, UgatConfig
 from ugat_marl.parallel import Workers
-from ugat_marl.policies import DQNConfig, PolicyFactory, own_name
+from ugat_marl.policies import DQNConfig, PolicyFactory, Usual, own_name
 from ugat_marl.progress import Reporter, usual
 from ugat_marl.scenarios import Scenario
 
@@ -49,7 +49,7 @@ class Training:
 
     @property
     def policies(self) -> dict[str, Path]:
-        """Files of the trained policies, by the name of the file without suffix."""
+        """Files of the policies, by the name of the file without suffix; one may hold a rule."""
         return {path.stem: path for path in sorted((self.folder / "policies").glob("*.pt"))}
 
     def __repr__(self) -> str:
@@ -132,10 +132,19 @@ def train(
         grounded_episodes=grounded_episodes,
         real_rollouts=real_rollouts,
     )
-    if ugat is not None and alone != UgatConfig():
+    numbers = (pretrain_episodes, iterations, grounded_episodes, real_rollouts)
+    if ugat is not None and (
+        grounding != UgatConfig.grounding or not all(isinstance(n, Usual) for n in numbers)
+    ):
         raise OptionError(
             "ugat holds all settings of the algorithm; give grounding, pretrain_episodes, "
             "iterations, grounded_episodes and real_rollouts in it"
+        )
+    where: Any = scenario
+    if not isinstance(where, str | Path):
+        raise OptionError(
+            "train takes the name or the path of a scenario, since a resumed run reads it again, "
+            f"and not a {type(where).__name__}; scenario.write(folder) makes a folder to name"
         )
     config = TransferConfig(
         str(scenario),
@@ -169,7 +178,7 @@ def train(
 def evaluate(
     scenario: str | Path | Scenario,
     policies: Any = ("programme", "largest-queue:20", "max-pressure:10", "random"),
-    domains: Sequence[Domain] | str = ("sim", "V1", "V2", "V3", "V4"),
+    domains: Domain | Sequence[Domain] = ("sim", "V1", "V2", "V3", "V4"),
     *,
     seeds: int | Sequence[int] = 5,
     duration_s: float | None = None,
@@ -185,7 +194,8 @@ def evaluate(
             spelling of a rule, the file of a trained policy, ``module:name``, an object with
             ``act(observations, infos)``, a function of the same arguments, or a class or a function
             of ``env`` that makes one.
-        domains: Domains; gaps are differences from the first. A text is one domain.
+        domains: Domains; gaps are differences from the first. A text is one domain, and so is a
+            sequence of effects.
         seeds: Number of episodes of each policy in each domain, or the seeds themselves.
         duration_s: Length of an episode in s; None for the scenario's own.
         each_episode: Return one row per episode with all measures.
@@ -198,16 +208,14 @@ def evaluate(
     Raises:
         UgatMarlError: A name or an option is at fault; the message names it.
     """
-    if isinstance(seeds, int | np.integer):
-        numbers: Sequence[int] = range(EVALUATION_SEED, EVALUATION_SEED + int(seeds))
-    else:
-        numbers = [int(seed) for seed in seeds]
+    numbers = _seeds(seeds)
     if not numbers or not domains:
         raise OptionError("seeds and domains need at least one each")
+    listed: Any = [domains] if is_one_domain(domains) else domains
     played = evaluation.evaluate(
         load_scenario(scenario, duration_s),
         _factories(policies),
-        [domains] if isinstance(domains, str) else domains,
+        listed,
         numbers,
         duration_s=duration_s,
         workers=workers,
@@ -222,6 +230,17 @@ def run_folder(config: TransferConfig) -> Path:
     parts = (file_stem(scenario), Path(real).name)
     name = "-".join(re.sub(r"[^\w=+.]+", "-", part).strip("-.") for part in parts)
     return Path("runs") / f"{name}-s{config.seed}"
+
+
+def _seeds(given: Any) -> list[int]:
+    """Return the seeds of episodes from their number, or from themselves."""
+    several = isinstance(given, Iterable)
+    listed: list[Any] = list(given) if several else [given]
+    for seed in listed:
+        if isinstance(seed, bool) or not isinstance(seed, Integral) or seed < 0:
+            raise OptionError(f"seeds = {given!r}: give a number of episodes, or a list of seeds")
+    numbers = [int(seed) for seed in listed]
+    return numbers if several else [EVALUATION_SEED + number for number in range(numbers[0])]
 
 
 def _factories(policies: Any) -> Mapping[str, PolicyFactory]:

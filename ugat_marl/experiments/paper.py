@@ -51,6 +51,7 @@ from ugat_marl.grounding import (
     UgatConfig,
     as_published,
     published_reward,
+    require_preset,
 )
 from ugat_marl.parallel import Workers
 from ugat_marl.policies import (
@@ -305,7 +306,7 @@ class PaperConfig:
         sim_rollouts: Episodes added to D_sim per iteration.
         real_rollouts: Episodes added to D_real per iteration.
         preset: "paper" for Algorithm 1 exactly as published: phase grounding, the reward queue, the
-            learner dqn. If not given, there are 60 plain episodes, 4 iterations, 10 grounded
+            learner dqn. Of what is not given, it has 60 plain episodes, 4 iterations, 10 grounded
             episodes, and 3 roll-outs each in sim and on the street.
         groundings: Kinds of grounding: phase, timed, street; default: all that the table can have.
         constants: Constant delays in s that "main" sweeps.
@@ -363,6 +364,7 @@ class PaperConfig:
     street: StreetConfig = field(default_factory=StreetConfig)
 
     def __post_init__(self) -> None:
+        require_preset(self.preset)
         if self.preset is not None:
             self._take_published()
         if not self.learner:
@@ -494,7 +496,9 @@ def compare(
         check_worlds(loaded.with_duration(config.duration_s), config.sim, target, timed)
     planner = Planner(table, scenario, config)
     plan = [job for row in rows for job in planner.jobs(row)]
-    perform_all(planner.bases + plan, folder, workers, reporter, f"paper {table}")
+    perform_all(
+        planner.bases + plan, folder, workers=workers, reporter=reporter, title=f"paper {table}"
+    )
     trials = [trial for row in rows for trial in planner.trials(row, folder)]
     late = [constant_name(seconds) for seconds in config.constants]
     return Comparison(

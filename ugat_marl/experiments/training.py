@@ -217,7 +217,7 @@ def street_training(make: LearnerFactory, workers: Workers, **common: Any) -> St
         for field in fields(env.options)
         if field.name != "crossings"
     }
-    simulation = Simulation(env.scenario, "sim", options, common["config"].rollout_epsilon, workers)
+    simulation = Simulation(env.scenario, options, common["config"].rollout_epsilon, workers)
     view = LaneView.of(env.network, str(env.options.observation))
     return StreetTraining(simulation=simulation, make=make, view=view, **common)
 

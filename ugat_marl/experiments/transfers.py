@@ -72,6 +72,7 @@ from ugat_marl.grounding import (
     UgatConfig,
     as_published,
     published_reward,
+    require_preset,
 )
 from ugat_marl.parallel import Workers
 from ugat_marl.policies import (
@@ -105,7 +106,7 @@ class TransferConfig:
             needs `real_log`: only the log is known of the real domain.
         sim: The simulation to train in; "sim", or a domain like `real`.
         preset: "paper" for Algorithm 1 exactly as published; it decides the reward (queue) and all
-            settings of the algorithm. If not given, there are 60 plain episodes, 4 iterations,
+            settings of the algorithm. Of what is not given, it has 60 plain episodes, 4 iterations,
             10 grounded episodes, and 3 roll-outs each in sim and on the street.
         real_log: Transition log that replaces the roll-outs in the real domain.
         seed: Root of every random choice in training.
@@ -173,6 +174,7 @@ class TransferConfig:
     dqn: DQNConfig = field(default_factory=DQNConfig)
 
     def __post_init__(self) -> None:
+        require_preset(self.preset)
         if self.preset is not None:
             object.__setattr__(self, "ugat", as_published(self.ugat))
             object.__setattr__(self, "reward", published_reward(self.reward))
@@ -341,7 +343,9 @@ def transfer(
         for line in described_plan(plan, directory, folder, episode_s, beside):
             reporter.say(line)
         with reporter.whole("whole run", work_of(plan, folder, episode_s, beside)):
-            records = perform_here(plan, folder, reporter, workers, on_log, beside)
+            records = perform_here(
+                plan, folder, workers=workers, reporter=reporter, on_log=on_log, beside=beside
+            )
         table = _write_results(config, scenario, directory, plan, records)
     if on_log is not None:
         on_log("evaluation", config.episodes, _means(table))

@@ -172,6 +172,16 @@ PUBLISHED_EPOCHS = 300
 """Epochs of the fits in the paper."""
 
 
+def require_preset(name: str | None) -> None:
+    """Refuse a preset that does not exist.
+
+    Raises:
+        UnknownNameError: It is neither None nor "paper".
+    """
+    if name not in (None, "paper"):
+        raise UnknownNameError("preset", name, ("paper",))
+
+
 def as_published(config: UgatConfig) -> UgatConfig:
     """Return Algorithm 1 of the paper without departures, with these numbers of episodes.
 

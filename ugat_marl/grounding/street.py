@@ -32,7 +32,7 @@ from pettingzoo.utils import BaseParallelWrapper
 from torch import Tensor
 
 from ugat_marl.data import TransitionLog, read_checkpoint, write_checkpoint
-from ugat_marl.effects import ControllerPart, Domain, Effect
+from ugat_marl.effects import ControllerPart, Effect
 from ugat_marl.envs import AgentSet, ResetResult, TrafficEnv, parallel_env
 from ugat_marl.errors import (
     CheckpointError,
@@ -58,10 +58,9 @@ from ugat_marl.grounding.posterior import (
 )
 from ugat_marl.grounding.residual import ResidualConfig, of_one_street
 from ugat_marl.grounding.summaries import LaneView, Summary
-from ugat_marl.grounding.worlds import recorded
-from ugat_marl.grounding.wrappers import RandomDelays
+from ugat_marl.grounding.worlds import delayed, explored
 from ugat_marl.parallel import Stop, Workers, in_order, retry_on_crash
-from ugat_marl.policies import EpsilonGreedy, Policy, roll_out, stop_callback
+from ugat_marl.policies import Policy, roll_out, stop_callback
 from ugat_marl.scenarios import Scenario
 from ugat_marl.seeding import derive_seed, numpy_generator
 
@@ -306,7 +305,6 @@ class Simulation:
 
     Attributes:
         scenario: The network and its traffic.
-        sim: The simulation, as a domain.
         options: Options of the environments.
         epsilon: Chance of a random phase in roll-outs.
         workers: Simulations at a time, or an executor.
@@ -314,7 +312,6 @@ class Simulation:
     """
 
     scenario: Scenario
-    sim: Domain
     options: Mapping[str, Any]
     epsilon: float
     workers: Workers = None
@@ -329,8 +326,7 @@ class Simulation:
         """Return an environment of a world."""
         fitted = (*self.options.get("fitted", ()), *world.parts)
         given: dict[str, Any] = {**self.options, **options, "fitted": fitted}
-        domain = _joined(self.sim, world.effects)
-        return parallel_env(self.scenario, domain, **given)
+        return parallel_env(self.scenario, world.effects, **given)
 
     def shown(self, commands: int) -> int:
         """Return how many own commands agents see, where a street asks for some.
@@ -349,13 +345,8 @@ class Simulation:
 
     def play(self, world: StreetWorld, policy: Policy, seed: int, stop: Stop) -> TransitionLog:
         """Run one episode in a world and record it."""
-        made = self.env(world, **policy.env_options, crossings=True)
-        env = RandomDelays(made, self.most_delay_s) if self.most_delay_s else made
-        exploring = EpsilonGreedy(copy.deepcopy(policy), self.epsilon)
-        try:
-            return recorded(env, exploring, seed, stop)
-        finally:
-            env.close()
+        env = delayed(self.env(world, **policy.env_options, crossings=True), self.most_delay_s)
+        return explored(env, policy, self.epsilon, seed, stop)
 
     def att_s(self, world: StreetWorld, policy: Policy, seed: int, stop: Stop) -> float:
         """Run one episode in a world; return the average travel time in s."""
@@ -628,13 +619,3 @@ def _simulated(arrays: Any) -> tuple[SimulatedLog, ...]:
         )
     except (KeyError, TypeError, ValueError, AttributeError) as error:
         raise CheckpointError(f"simulated worlds of the checkpoint are damaged: {error}") from None
-
-
-def _joined(sim: Domain, effects: Sequence[Effect]) -> Domain:
-    if not effects:
-        return sim
-    if sim == "sim":
-        return tuple(effects)
-    if not isinstance(sim, str):
-        return (*sim, *effects)
-    return "+".join((sim, *map(str, effects)))

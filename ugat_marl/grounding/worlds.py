@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import copy
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
@@ -155,10 +156,8 @@ def _for_policy(make_env: Callable[..., TrafficEnv], policy: Policy) -> Callable
     return partial(make_env, commands=commands) if commands else make_env
 
 
-def _delayed(
-    make_env: Callable[[], TrafficEnv], most_delay_s: int, always_s: int | None = None
-) -> AnyParallelEnv:
-    env = make_env()
+def delayed(env: TrafficEnv, most_delay_s: int, always_s: int | None = None) -> AnyParallelEnv:
+    """Return an environment with `RandomDelays`, or as it is if `most_delay_s` is 0."""
     return RandomDelays(env, most_delay_s, always_s) if most_delay_s else env
 
 
@@ -186,6 +185,24 @@ def recorded(
     return played.log
 
 
+def explored(
+    env: AnyParallelEnv, policy: Policy, epsilon: float, seed: int, stop: Stop
+) -> TransitionLog:
+    """Run an episode of a policy that explores, as `recorded`, and close the environment.
+
+    The policy is copied: policies with a memory must not share it between threads.
+
+    Args:
+        env: The environment.
+        policy: The policy.
+        epsilon: Chance of a random phase.
+        seed: Seed of the episode.
+        stop: Flag that ends the episode early.
+    """
+    with contextlib.closing(env):
+        return recorded(env, EpsilonGreedy(copy.deepcopy(policy), epsilon), seed, stop)
+
+
 @dataclass(frozen=True)
 class _RollOutAlone:
     """Roll-outs that each have their own environment, in any process.
@@ -204,15 +221,8 @@ class _RollOutAlone:
 
     def play(self, seed: int, always_s: int | None, stop: Stop) -> TransitionLog:
         """Run one roll-out, with random delays or with the constant delay `always_s`."""
-        make_env = _for_policy(self.make_env, self.policy)
-        env = _delayed(make_env, self.most_delay_s, always_s)
-        policy = copy.deepcopy(
-            self.policy
-        )  # policies with memory must not share it between threads
-        try:
-            return recorded(env, EpsilonGreedy(policy, self.epsilon), seed, stop)
-        finally:
-            env.close()
+        env = delayed(_for_policy(self.make_env, self.policy)(), self.most_delay_s, always_s)
+        return explored(env, self.policy, self.epsilon, seed, stop)
 
 
 @dataclass(frozen=True)
@@ -245,10 +255,8 @@ class RollOutSettings:
         env = parallel_env(self.scenario, self.domain, **options)
         observer = observer_of(env, self.observation, self.neighbours)
         exploring = EpsilonGreedy(policy, self.epsilon)
-        try:
+        with contextlib.closing(env):
             return recorded(env, exploring, seed, stop, observer), env.scores()
-        finally:
-            env.close()
 
 
 def roll_outs(

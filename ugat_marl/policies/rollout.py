@@ -145,9 +145,18 @@ class _Recording:
         self._refuse_other_greens()
         executed = {agent: int(infos[agent]["executed_action"]) for agent in self._names}
         delay_s = {agent: float(infos[agent].get("delay_s", 0.0)) for agent in self._names}
-        acted, served, got, delay_s = map(self._renamed, (actions, executed, rewards, delay_s))
-        row = self._seen, acted, served, got, then, delay_s, self._served(), self._masks
-        self._recorder.record(0, self._step, *row)
+        self._recorder.record(
+            episode=0,
+            step=self._step,
+            observations=self._seen,
+            actions=self._renamed(actions),
+            executed=self._renamed(executed),
+            rewards=self._renamed(rewards),
+            next_observations=then,
+            delays_s=self._renamed(delay_s),
+            served=self._served(),
+            masks=self._masks,
+        )
         self._seen = then
         if self._base.agents:
             self._masks = self._masks_of(infos)

@@ -147,7 +147,7 @@ def load_policy(name: str | Path, *, folder: Path = FOLDER) -> NetworkPolicy:
         if (spec := rule_in(path)) is not None:
             raise CheckpointError(
                 f"{path}: holds the rule {spec}, which has no network to load or to export; "
-                f"commands that play policies take {spec} itself"
+                "ugat_marl.evaluate and commands that play policies take the file or the rule"
             )
         return NetworkPolicy.load(path)
     if path.is_dir():

@@ -21,18 +21,19 @@ class Places:
     Attributes:
         network: The network.
         intersection_of: Agent to SUMO's id of its traffic light.
-        note: Remark on the map for the reader; "" for none.
     """
 
     network: Network
     intersection_of: Mapping[str, str]
-    note: str
 
 
-def places_of(record: RunRecord) -> Places | str:
-    """Return the places of a training's agents, or the reason why they are not known."""
+def places_of(record: RunRecord) -> tuple[Places | None, str]:
+    """Return the places of a training's agents, None if not known, and a remark for the reader.
+
+    The remark is "" if there is nothing to say.
+    """
     if not record.scenario:
-        return "no map: the scenario is not on record"
+        return None, "no map: the scenario is not on record"
     options: Any = record.settings.get("options") if record.job else record.settings
     options = options if isinstance(options, Mapping) else {}
     try:
@@ -44,12 +45,12 @@ def places_of(record: RunRecord) -> Places | str:
         agents = Observer(network, str(options.get("observation") or "count"), neighbours).agents
     except (UgatMarlError, OSError, ValueError, TypeError) as error:
         reason = " ".join(str(error).split())
-        return f"no map: scenario {record.scenario!r} cannot be read here ({reason[:200]})"
+        return None, f"no map: scenario {record.scenario!r} cannot be read here ({reason[:200]})"
     tls = [each.id for each in network.intersections]
     recorded = record.hashes.get("sim") or record.hashes.get(record.sim)
     changed = recorded not in (None, own_hash)
     note = "The scenario has changed since; the map shows it as it is now." if changed else ""
-    return Places(network, dict(zip(agents, tls, strict=True)), note)
+    return Places(network, dict(zip(agents, tls, strict=True))), note
 
 
 @functools.lru_cache(maxsize=8)

@@ -334,7 +334,7 @@ def _seeds(page: Page, runs: Sequence[RunRecord]) -> list[Figure]:
 
 
 def _training(page: Page, record: RunRecord, commands: Commands) -> dict[str, Any]:
-    places = places_of(record)
+    places, remark = places_of(record)
     evaluation = record.evaluation
     judged = evaluation is not None and evaluation.policies
     learning = charts.learning_picture([record], _file_name(record.name, "learning"))
@@ -356,9 +356,9 @@ def _training(page: Page, record: RunRecord, commands: Commands) -> dict[str, An
         "curves": page.figures((learning, f"{_STRETCH}its episodes."), (travel, once)),
         "street": found_on_street(record),
         "found": _found(page, record, places),
-        "places": places.note if isinstance(places, Places) else places,
+        "places": remark,
         "gate": _gate(page, record, places),
-        "queues": _worst(page, record, places if isinstance(places, Places) else None),
+        "queues": _worst(page, record, places),
         "commands": commands.get(record.directory, ()),
         "provenance": [("folder", str(record.directory)), *versions, *hashes, *notes],
         "settings": flat_settings(record.settings),
@@ -411,7 +411,7 @@ def _main_policies(evaluation: Evaluation) -> list[str]:
 
 
 def _scores(
-    page: Page, record: RunRecord, evaluation: Evaluation, places: Places | str
+    page: Page, record: RunRecord, evaluation: Evaluation, places: Places | None
 ) -> dict[str, Any]:
     """Return travel times with gap and regret, levels of service, and all measures."""
     first, *others = evaluation.domains
@@ -443,7 +443,7 @@ def _scores(
         _file_name(record.name, "travel-times"),
     )
     caption = "Mean over the episodes with its 95 % interval."
-    network = places.network if isinstance(places, Places) else None
+    network = places.network if places is not None else None
     check, outcome = check_run(evaluation), outcome_of(evaluation)
     return {
         "sim": first,
@@ -477,19 +477,18 @@ def _measures(evaluation: Evaluation) -> Grid:
     return Grid(headings, rows, headings[2:])
 
 
-def _found(page: Page, record: RunRecord, places: Places | str) -> dict[str, Any] | None:
+def _found(page: Page, record: RunRecord, places: Places | None) -> dict[str, Any] | None:
     """Return what was found at each intersection; None if nothing was looked for there."""
-    known = places if isinstance(places, Places) else None
-    table = findings_table(record, known)
+    table = findings_table(record, places)
     if table is None:
         return None
     return {
-        "figures": page.figures(*(findings_maps(record, known) if known is not None else ())),
+        "figures": page.figures(*(findings_maps(record, places) if places is not None else ())),
         "table": table,
     }
 
 
-def _gate(page: Page, record: RunRecord, places: Places | str) -> dict[str, Any] | None:
+def _gate(page: Page, record: RunRecord, places: Places | None) -> dict[str, Any] | None:
     """Return the gate over the iterations and, for the last iteration, by intersection."""
     curve = charts.gate_picture([record], _file_name(record.name, "gate"))
     if curve is None:
@@ -497,7 +496,7 @@ def _gate(page: Page, record: RunRecord, places: Places | str) -> dict[str, Any]
     caption = "Means over the intersections. A grounded action is taken where u is below α."
     return {
         "figures": page.figures((curve, caption)),
-        "table": _gate_grid(record, places if isinstance(places, Places) else None),
+        "table": _gate_grid(record, places),
     }
 
 

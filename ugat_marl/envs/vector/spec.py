@@ -11,6 +11,7 @@ from ugat_marl.effects import (
     Domain,
     domain_path,
     effect_from_record,
+    is_one_domain,
     load_scenario,
     parse_domain,
     scenario_in_domain,
@@ -189,22 +190,16 @@ def domain_chooser(
         duration_s: Length of their episodes, s; None for that of the scenario.
 
     Raises:
-        OptionError: The list has another length.
+        OptionError: The list has another length, or mixes domains and single effects.
         UnknownNameError: A domain does not exist.
     """
     if callable(domains):
         return domains
     given: Any = domains
-    is_one = isinstance(given, str) or not isinstance(given, Sequence)
-    if is_one or not any(map(_is_domain, given)):
+    if is_one_domain(given):
         scenario_in_domain(scenario, given, duration_s=duration_s)
         return lambda environment, episode: given
     listed: list[Any] = list(given)
-    if effects := [choice for choice in listed if not _is_domain(choice)]:
-        raise OptionError(
-            f"domains mixes domains and single effects ({effects[0]}); put the effects of one "
-            "domain into a list of their own"
-        )
     if len(listed) != n:
         raise OptionError(
             f"domains has {len(listed)} entries for {n} environments: give one for each, or "
@@ -231,11 +226,6 @@ def in_turn(domains: Sequence[Domain]) -> DomainOf:
     if not listed:
         raise OptionError("in_turn() needs at least one domain")
     return lambda environment, episode: listed[(environment + episode) % len(listed)]
-
-
-def _is_domain(choice: Any) -> bool:
-    """Return True if an entry of a list is a whole domain, and not one effect of a domain."""
-    return isinstance(choice, str | list | tuple)
 
 
 def agents_of(env: AnyParallelEnv) -> dict[str, list[Any]]:
