@@ -28,7 +28,7 @@ from ugat_marl.diagnosis.thresholds import Thresholds
 from ugat_marl.effects import StartupDelay, load_scenario
 from ugat_marl.envs import TrafficEnv
 from ugat_marl.errors import OptionError, SimulatorCrashed
-from ugat_marl.experiments import evaluate, rule_factory
+from ugat_marl.experiments import evaluation_of, rule_factory
 from ugat_marl.grounding import RollOutSettings, roll_outs
 from ugat_marl.parallel import (
     DEADLINE_VARIABLE,
@@ -104,7 +104,7 @@ def test_a_stop_is_heard_where_it_was_made() -> None:
 def results(workers: Any, policies: Any = None) -> Any:
     policies = policies or {rule: rule_factory(rule) for rule in ("largest-queue:20", "random")}
     scenario = load_scenario("single-v1")
-    return evaluate(
+    return evaluation_of(
         scenario, policies, ["sim", "V4"], [5, 6], duration_s=LENGTH_S, workers=workers
     ).results
 
@@ -341,7 +341,7 @@ def test_ray_replaces_a_worker_that_is_stopped(
 
 def test_what_is_watched_is_played_here(ray: Executor) -> None:
     with pytest.raises(OptionError, match="needs workers in this process"):
-        evaluate(
+        evaluation_of(
             load_scenario("single-v1"), {"r": rule_factory("random")}, ["sim"], [1],
             workers=ray, watch=lambda name, env: lambda step: None,
         )  # fmt: skip

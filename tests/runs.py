@@ -71,7 +71,7 @@ def search_few_rules(patch: pytest.MonkeyPatch, *rules: str) -> None:
 def play_nothing(patch: pytest.MonkeyPatch) -> None:
     """Let every evaluation give the same scores at once, and the programme be the best rule."""
 
-    def evaluate(
+    def evaluation_of(
         scenario: Scenario,
         policies: Mapping[str, Any],
         domains: Sequence[Domain],
@@ -90,7 +90,7 @@ def play_nothing(patch: pytest.MonkeyPatch) -> None:
     def best_rule(*_: Any, **__: Any) -> str:
         return "programme"
 
-    patch.setattr(f"{JOBS}.evaluate", evaluate)
+    patch.setattr(f"{JOBS}.evaluation_of", evaluation_of)
     patch.setattr(f"{JOBS}.best_rule", best_rule)
 
 

@@ -234,7 +234,7 @@ def ray(request: Request) -> dict[str, Any]:
     from ray.cluster_utils import Cluster  # pyright: ignore[reportMissingImports]
 
     from ugat_marl.effects import load_scenario
-    from ugat_marl.experiments import evaluate, rule_factory
+    from ugat_marl.experiments import evaluation_of, rule_factory
     from ugat_marl.parallel import RayExecutor
 
     cluster: Any = Cluster(
@@ -250,7 +250,7 @@ def ray(request: Request) -> dict[str, Any]:
             def play(count: int, length_s: float) -> tuple[float, str]:
                 began = time.perf_counter()
                 seeds = range(count)
-                found = evaluate(
+                found = evaluation_of(
                     scenario, rules, ["sim"], seeds, duration_s=length_s, workers=workers
                 )
                 return time.perf_counter() - began, repr(found.results)

@@ -34,7 +34,7 @@ from ugat_marl.effects import (
     scenario_in_domain,
 )
 from ugat_marl.errors import OptionError, ScenarioError, UnknownNameError
-from ugat_marl.experiments import evaluate, rule_factory
+from ugat_marl.experiments import evaluation_of, rule_factory
 from ugat_marl.scenarios import Scenario, shipped_scenarios
 from ugat_marl.simulation import LibsumoSimulator, launch_of
 
@@ -473,7 +473,7 @@ def test_vehicles_that_hold_each_other_on_a_junction_let_go() -> None:
     arrived: dict[str, float] = {}
     for domain in ("V1", "V1+blocker_patience=60"):
         rule = {"rule": rule_factory("actuated:60:3")}
-        found = evaluate(
+        found = evaluation_of(
             load_scenario("resco:cologne3"), rule, [domain], [1002], duration_s=1200, workers=1
         )
         arrived[domain] = found.results[0].scores.throughput / found.results[0].scores.due

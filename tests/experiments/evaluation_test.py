@@ -15,7 +15,7 @@ from ugat_marl.data import Scores
 from ugat_marl.effects import load_scenario
 from ugat_marl.envs import parallel_env
 from ugat_marl.errors import CheckpointError, OptionError, UnknownNameError
-from ugat_marl.experiments import Evaluation, best_rule, evaluate, policy_factory, rule_factory
+from ugat_marl.experiments import Evaluation, best_rule, evaluation_of, policy_factory, rule_factory
 from ugat_marl.experiments.evaluation import Result
 from ugat_marl.policies import DQN
 from ugat_marl.simulation import host
@@ -78,7 +78,7 @@ def test_how_many_run_at_once_changes_nothing() -> None:
     scenario = load_scenario("single-v1")
     policies = {rule: rule_factory(rule) for rule in ("largest-queue:20", "random", "programme")}
     one, two = (
-        evaluate(scenario, policies, ["sim", "V4"], [5, 6], duration_s=200, workers=workers)
+        evaluation_of(scenario, policies, ["sim", "V4"], [5, 6], duration_s=200, workers=workers)
         for workers in (1, 2)
     )
     assert one.results == two.results
@@ -114,7 +114,7 @@ def test_simulations_of_an_evaluation_have_one_warm_parent() -> None:
         blocks.append(host._WarmParent._blocks)
         return rule_factory("random")(env)
 
-    evaluate(load_scenario("single-v1"), {"own": make}, ["sim"], [1], duration_s=20, workers=1)
+    evaluation_of(load_scenario("single-v1"), {"own": make}, ["sim"], [1], duration_s=20, workers=1)
     assert blocks and min(blocks) == before + 1
 
 
@@ -128,7 +128,7 @@ def test_the_best_rule_is_the_one_with_the_smallest_travel_time() -> None:
 def test_a_wrong_name_is_refused_before_anything_runs() -> None:
     scenario = load_scenario("single-v1")
     with pytest.raises(UnknownNameError, match="V4"):
-        evaluate(scenario, {"r": rule_factory("random")}, ["sim", "V44"], [1])
+        evaluation_of(scenario, {"r": rule_factory("random")}, ["sim", "V44"], [1])
     with pytest.raises(UnknownNameError, match="largest-queue"):
         policy_factory("largest-que:20")
 
@@ -138,13 +138,13 @@ def test_a_policy_of_another_scenario_is_refused(tmp_path: Path) -> None:
     learner.policy().save(tmp_path / "policy.pt")
     factory = policy_factory(str(tmp_path / "policy.pt"))
     with pytest.raises(CheckpointError, match="other intersections than those of scenario"):
-        evaluate(load_scenario("single-v1"), {"p": factory}, ["sim"], [1], duration_s=100)
+        evaluation_of(load_scenario("single-v1"), {"p": factory}, ["sim"], [1], duration_s=100)
 
 
 def test_a_trained_policy_is_played_from_its_file(tmp_path: Path) -> None:
     learner = DQN.of(parallel_env("single-v1"))
     learner.policy().save(tmp_path / "policy.pt")
-    found = evaluate(
+    found = evaluation_of(
         load_scenario("single-v1"), {"p": policy_factory(str(tmp_path / "policy.pt"))}, ["sim"],
         [1], duration_s=100,
     )  # fmt: skip

@@ -14,7 +14,7 @@ import pytest
 from tests.interrupts import few_descriptors
 from ugat_marl.effects import load_scenario
 from ugat_marl.errors import CheckpointError
-from ugat_marl.experiments import evaluate, read_queues, rule_factory
+from ugat_marl.experiments import evaluation_of, read_queues, rule_factory
 from ugat_marl.experiments.queues import QueueRecord, write_queues
 from ugat_marl.scenarios import Network
 
@@ -75,7 +75,7 @@ def test_long_intervals_leave_minutes_out() -> None:
 def test_an_evaluation_fills_it(tmp_path: Path) -> None:
     record = QueueRecord()
     rules = {name: rule_factory(name) for name in ("fixed-time:30", "max-pressure:20")}
-    found = evaluate(
+    found = evaluation_of(
         load_scenario("single-v1"), rules, ["sim", "V4"], [1, 2], duration_s=300, watch=record.watch
     )
     record.write(tmp_path / "queues.parquet")

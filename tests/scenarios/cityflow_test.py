@@ -14,7 +14,7 @@ import pytest
 from ugat_marl.__main__ import main
 from ugat_marl.effects import load_scenario
 from ugat_marl.errors import ScenarioError
-from ugat_marl.experiments import evaluate, rule_factory
+from ugat_marl.experiments import evaluation_of, rule_factory
 from ugat_marl.files import xml_bytes
 from ugat_marl.progress import Silent
 from ugat_marl.scenarios import Network, Scenario, read_scenario
@@ -372,7 +372,7 @@ def test_hangzhou_travel_times_agree(hangzhou: Path, tmp_path: Path) -> None:
     """Under the same fixed programme, within 3 %; both are far from free flow (54 s)."""
     ours, theirs = both(hangzhou / "hangzhou_1x1", tmp_path)
     att_s = [
-        evaluate(form, {"fixed": rule_factory("fixed-time:30")}, ("sim",), (0, 1))
+        evaluation_of(form, {"fixed": rule_factory("fixed-time:30")}, ("sim",), (0, 1))
         .values("fixed", "sim", "att_s")
         .mean()
         for form in (ours, with_their_type(theirs))

@@ -12,7 +12,7 @@ import pytest
 
 from ugat_marl.__main__ import main
 from ugat_marl.errors import OptionError, OutputError, ScenarioError
-from ugat_marl.experiments import evaluate, problems, rule_factory
+from ugat_marl.experiments import evaluation_of, problems, rule_factory
 from ugat_marl.files import parse_xml
 from ugat_marl.scenarios import (
     DrawnNetwork,
@@ -172,7 +172,7 @@ def test_lanes_of_an_approach(
 def open_vehicles(scenario: Scenario, duration_s: float) -> tuple[float, float]:
     """Vehicles due, and those that have not arrived at the end."""
     name = "largest-queue:60"
-    played = evaluate(
+    played = evaluation_of(
         scenario.with_duration(duration_s), {name: rule_factory(name)}, ("sim",), (1,), workers=1
     )
     due = float(played.values(name, "sim", "due")[0])

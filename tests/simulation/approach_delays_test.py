@@ -13,7 +13,7 @@ from ugat_marl.data import level_of_service, mean_delay_s
 from ugat_marl.effects import load_scenario
 from ugat_marl.envs import parallel_env
 from ugat_marl.errors import SimulatorError
-from ugat_marl.experiments import Evaluation, evaluate, rule_factory
+from ugat_marl.experiments import Evaluation, evaluation_of, rule_factory
 from ugat_marl.files import parse_xml
 from ugat_marl.scenarios import Network, read_scenario
 from ugat_marl.simulation import measured_approaches
@@ -58,7 +58,7 @@ def test_the_delay_of_one_car_at_a_red_light(crossing: Callable[..., Path]) -> N
 def test_measuring_changes_no_traffic() -> None:
     scenario = load_scenario("single-v1").with_duration(300)
     found = [
-        evaluate(
+        evaluation_of(
             scenario, {"rule": rule_factory("largest-queue:20")}, ("sim",), (3,), workers=1,
             approaches=measured,
         )
@@ -138,7 +138,7 @@ def test_delays_are_weighed_by_vehicles(tmp_path: Path) -> None:
     assert mean_delay_s([(300, 10.0), (100, 50.0)]) == 20.0
     assert mean_delay_s([(300, 10.0), (0, math.nan)]) == 10.0, "an approach that nobody passed"
     scenario = load_scenario("single-v1").with_duration(100)
-    found = evaluate(
+    found = evaluation_of(
         scenario, {"p": rule_factory("programme")}, ("sim",), (1, 2), workers=1, approaches=True
     )
     first, second = (result.scores.approaches for result in found.results)

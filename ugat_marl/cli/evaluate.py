@@ -14,7 +14,7 @@ from ugat_marl.cli.arguments import RayAddress, require_names, require_numbers, 
 from ugat_marl.effects import NAMED_DOMAINS, expand_domains, load_scenario
 from ugat_marl.envs import parallel_env
 from ugat_marl.errors import OptionError, ScenarioError
-from ugat_marl.experiments import domains_by_gap, evaluate, policy_factory
+from ugat_marl.experiments import domains_by_gap, evaluation_of, policy_factory
 from ugat_marl.files import require_writable
 from ugat_marl.progress import Bars
 from ugat_marl.reporting import (
@@ -75,7 +75,7 @@ class Evaluate:
         scenario = load_scenario(self.scenario, self.duration_s)
         domains = self._domains(scenario, console)
         with workers_of(self.workers, self.ray) as workers:
-            evaluation = evaluate(
+            evaluation = evaluation_of(
                 scenario,
                 dict(zip(names_of(self.policies), map(policy_factory, self.policies), strict=True)),
                 domains,

@@ -10,7 +10,7 @@ from .driver import perform_here as perform_here
 from .driver import record_of as record_of
 from .evaluation import TUNING_SEED as TUNING_SEED
 from .evaluation import best_rule as best_rule
-from .evaluation import evaluate as evaluate
+from .evaluation import evaluation_of as evaluation_of
 from .evaluation import policy_factory as policy_factory
 from .evaluation import rule_factory as rule_factory
 from .functions import Training as Training

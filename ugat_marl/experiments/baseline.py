@@ -23,7 +23,7 @@ import tyro
 from ugat_marl.effects import load_scenario
 from ugat_marl.envs import AnyParallelEnv, parallel_env
 from ugat_marl.errors import UgatMarlError, require_least
-from ugat_marl.experiments.evaluation import FixedPolicy, evaluate
+from ugat_marl.experiments.evaluation import FixedPolicy, evaluation_of
 from ugat_marl.experiments.jobs import evaluation_seeds
 from ugat_marl.experiments.training import train_through
 from ugat_marl.files import require_writable, write_whole
@@ -104,7 +104,9 @@ def train_baseline(
         for mark, policy in train_through(learner, env, marks, args.seed, on_episode=note):
             if seeds:
                 played = {"it": FixedPolicy(policy)}
-                evaluation = evaluate(scenario, played, [args.domain], seeds, duration_s=length)
+                evaluation = evaluation_of(
+                    scenario, played, [args.domain], seeds, duration_s=length
+                )
                 att_s[mark] = [result.scores.att_s for result in evaluation.results]
         result = BaselineResult(learner.policy(), returns, att_s)
     if args.out is not None:

@@ -77,7 +77,7 @@ def require_distinct_domains(domains: Sequence[Domain]) -> None:
 
 
 @kept_warm()
-def evaluate(
+def evaluation_of(
     scenario: Scenario,
     policies: Mapping[str, PolicyFactory],
     domains: Sequence[Domain],
@@ -202,7 +202,7 @@ def race_rules(
     """
 
     def play(rung: int, running: Sequence[str]) -> list[list[float]]:
-        evaluation = evaluate(
+        evaluation = evaluation_of(
             scenario,
             {spec: RuleFactory(spec) for spec in running},
             [domain],

@@ -18,8 +18,7 @@ import polars as pl
 from ugat_marl.data import LogCallback
 from ugat_marl.effects import Domain, domain_label, is_one_domain, load_scenario
 from ugat_marl.errors import OptionError
-from ugat_marl.experiments import evaluation
-from ugat_marl.experiments.evaluation import OwnPolicyFactory, policy_factory
+from ugat_marl.experiments.evaluation import OwnPolicyFactory, evaluation_of, policy_factory
 from ugat_marl.experiments.jobs import EVALUATION_SEED, file_stem
 from ugat_marl.experiments.scores import Evaluation
 from ugat_marl.experiments.transfers import TransferConfig, transfer
@@ -212,7 +211,7 @@ def evaluate(
     if not numbers or not domains:
         raise OptionError("seeds and domains need at least one each")
     listed: Any = [domains] if is_one_domain(domains) else domains
-    played = evaluation.evaluate(
+    played = evaluation_of(
         load_scenario(scenario, duration_s),
         _factories(policies),
         listed,

@@ -39,7 +39,7 @@ from ugat_marl.experiments.evaluation import (
     TUNING_SEED,
     FixedPolicy,
     best_rule,
-    evaluate,
+    evaluation_of,
     rule_factory,
 )
 from ugat_marl.experiments.queues import QUEUES, QueueRecord
@@ -453,7 +453,7 @@ def _judge(
     name = job.rows.get(mark, job.setting.name)
     for domain, seeds in record.missing(job, mark).items():
         queues = QueueRecord()
-        played = evaluate(
+        played = evaluation_of(
             scenario,
             {name: factory},
             [domain],
@@ -602,7 +602,7 @@ def _probe(job: Job, workers: Workers) -> Probe | None:
     scenario = job.loaded()
 
     def probe(policy: Policy) -> dict[str, float]:
-        played = evaluate(
+        played = evaluation_of(
             scenario,
             {"policy": FixedPolicy(policy)},
             job.probe_domains,

@@ -20,7 +20,7 @@ from ugat_marl.effects import (
     scenario_in_domain,
 )
 from ugat_marl.errors import OptionError, ScenarioError
-from ugat_marl.experiments.evaluation import evaluate
+from ugat_marl.experiments.evaluation import evaluation_of
 from ugat_marl.experiments.scores import Estimate, Evaluation
 from ugat_marl.experiments.statistics import number_or_none
 from ugat_marl.parallel import Workers
@@ -84,7 +84,7 @@ def policy_gap(
     )
     evaluations: dict[str, Evaluation] = {}
     for name, place in (("sim", scenario), ("corrected", repaired), ("real", world)):
-        evaluations[name] = evaluate(
+        evaluations[name] = evaluation_of(
             place,
             policies,
             ["sim"],

@@ -49,7 +49,7 @@ class QueueRecord:
         self._lock = threading.Lock()
 
     def watch(self, policy: str, domain: str, env: AnyParallelEnv) -> StepCallback:
-        """Return a callback for `evaluation.evaluate`, one per environment.
+        """Return a callback for `evaluation_of`, one per environment.
 
         Args:
             policy: Name of the policy.

@@ -9,7 +9,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
 
-from ugat_marl.experiments.evaluation import evaluate, rule_factory
+from ugat_marl.experiments.evaluation import evaluation_of, rule_factory
 from ugat_marl.experiments.transfer_headroom import HeadroomRow
 from ugat_marl.files import chunks_of, scan_xml
 from ugat_marl.progress import Reporter
@@ -66,7 +66,7 @@ def play_check_rules(
     scenario: Scenario, seed: int, workers: int | None, reporter: Reporter
 ) -> tuple[RuleEpisode, ...]:
     """Play one episode under each of `RULES`, and measure the delay on every approach."""
-    evaluation = evaluate(
+    evaluation = evaluation_of(
         scenario,
         {name: rule_factory(name) for name in RULES},
         ("sim",),

@@ -21,7 +21,7 @@ from ugat_marl.data import csv_damage, csv_texts
 from ugat_marl.effects import Domain, domain_label
 from ugat_marl.errors import CheckpointError, OptionError, OutputError
 from ugat_marl.experiments.comparison import Comparison
-from ugat_marl.experiments.evaluation import evaluate
+from ugat_marl.experiments.evaluation import evaluation_of
 from ugat_marl.experiments.jobs import EVALUATION_SEED
 from ugat_marl.experiments.settings import DIRECT
 from ugat_marl.experiments.statistics import Interval, number_or_none, student_p
@@ -286,7 +286,7 @@ def standings_of(
         reporter: Shows progress.
     """
     numbered = {f"{name}, training {seed}": make for seed, make in enumerate(policies)}
-    played = evaluate(
+    played = evaluation_of(
         scenario,
         numbered,
         ["sim", *domains],

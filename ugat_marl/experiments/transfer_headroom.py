@@ -11,7 +11,7 @@ from dataclasses import dataclass
 
 from ugat_marl.effects import Domain
 from ugat_marl.errors import OptionError
-from ugat_marl.experiments.evaluation import evaluate, rule_factory
+from ugat_marl.experiments.evaluation import evaluation_of, rule_factory
 from ugat_marl.parallel import Workers
 from ugat_marl.progress import Reporter
 from ugat_marl.scenarios import Scenario
@@ -74,7 +74,7 @@ def measure_headroom(
         raise OptionError("headroom needs at least one domain, one hold and one seed")
     rules = {hold_s: f"largest-queue:{hold_s}" for hold_s in holds_s}
     names = [*rules.values(), "programme"]
-    evaluation = evaluate(
+    evaluation = evaluation_of(
         scenario,
         {name: rule_factory(name) for name in names},
         domains,

@@ -12,7 +12,7 @@ from studies.bench.strength import StrengthBench
 from ugat_marl.envs import parallel_env
 from ugat_marl.errors import OptionError
 from ugat_marl.experiments import EVALUATION_SEED as FIRST_SEED
-from ugat_marl.experiments import evaluate, rule_factory
+from ugat_marl.experiments import evaluation_of, rule_factory
 from ugat_marl.policies import DQN, roll_out
 from ugat_marl.policies.learners.dqn import DQNConfig
 
@@ -55,7 +55,9 @@ def test_it_measures_what_training_and_evaluating_by_hand_give(tmp_path: Path) -
     assert row["curve"] == {"2": row["ATT [s]"]}
 
     rule = report.settings["rule"]
-    found = evaluate(scenario, {rule: rule_factory(rule)}, ["sim"], [FIRST_SEED, FIRST_SEED + 1])
+    found = evaluation_of(
+        scenario, {rule: rule_factory(rule)}, ["sim"], [FIRST_SEED, FIRST_SEED + 1]
+    )
     by_rule = found.estimate(rule, "sim", "att_s").mean  # the scenario is in V4 already
     strong, steady = report.targets
     assert strong.measured == row["/ rule"] == pytest.approx(row["ATT [s]"] / by_rule)
