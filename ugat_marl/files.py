@@ -39,7 +39,7 @@ _KEPT = 8 << 20
 """Bytes of an edited document above which it is kept in a file instead of in memory."""
 _INDENT = "    "
 _BEGINS_ROW = re.compile(rf"\n{_INDENT}(?=<[^/])")
-"""Where a child begins in a document that `Draft` wrote."""
+"""Where a child begins in a document that `DocumentDraft` wrote."""
 _UNPACKED = 256 << 20
 """Unpacked bytes from which the ratio of an archive counts."""
 _MOST_RATIO = 100
@@ -694,7 +694,7 @@ class Document:
         content: The edited bytes, or None if the file on disk is used.
         home: Folder of an edited document that is too long for memory. The folder is removed with
             this object.
-        in_rows: True if the content is known to be as `Draft` writes it.
+        in_rows: True if the content is known to be as `DocumentDraft` writes it.
     """
 
     name: str
@@ -765,7 +765,7 @@ class Document:
         return Rows(document.name, start, tuple(children), f"{tag}{end}")
 
     def _rewritten(self) -> Document | None:
-        """Return the document as `Draft` writes it, which is kept; None if the file is long."""
+        """Return the document as a `DocumentDraft`, which is kept; None if the file is long."""
         state = None  # an edited document does not change; a file may, between two episodes
         if self.content is None and self.path is not None:
             stat = self.path.stat()
@@ -782,7 +782,7 @@ class Document:
         draft = None
         for part in self.parts():
             change(part)
-            draft = draft or Draft(self.name.removesuffix(".gz"), part)
+            draft = draft or DocumentDraft(self.name.removesuffix(".gz"), part)
             draft.add(*child_texts(part))
         assert draft is not None
         return draft.document()
@@ -840,7 +840,7 @@ class Rows:
         return "".join((self.start, *rows, self.end)).encode()
 
 
-class Draft:
+class DocumentDraft:
     """An XML document under construction: in memory, or in a file once it is long.
 
     Args:

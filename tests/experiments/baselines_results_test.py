@@ -10,7 +10,7 @@ from typing import Any
 import pytest
 
 from ugat_marl.errors import OptionError
-from ugat_marl.experiments import Curve, Curves, CurvesConfig
+from ugat_marl.experiments import Curve, CurvesConfig, LearningCurves
 from ugat_marl.policies.learners.catalogue import baselines_folder
 
 FILE = baselines_folder() / "results.py"
@@ -37,7 +37,7 @@ def test_a_page_and_a_table_are_written_and_failures_are_told(
 ) -> None:
     rules = {"programme": 60.0, "fixed-time:30": 55.0, "sotl": 50.0}
     curves = (Curve("dqn", "", 0, {1: 70.0}),)
-    found = Curves("single-v1", "sim", curves, rules, "sotl", {"vdn": "needs benchmarl"})
+    found = LearningCurves("single-v1", "sim", curves, rules, "sotl", {"vdn": "needs benchmarl"})
     monkeypatch.setattr(results, "learn_curves", lambda *_: found)
     given = results.Results(("single-v1",), CurvesConfig(episodes=1), out=tmp_path)
     assert given.run() == 1

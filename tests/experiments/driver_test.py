@@ -27,8 +27,8 @@ from ugat_marl.envs import parallel_env
 from ugat_marl.errors import CheckpointError, JobError, OptionError, UnknownNameError
 from ugat_marl.experiments import (
     Job,
+    JobRecord,
     LearnerSpec,
-    Record,
     Setting,
     driver,
     forked,
@@ -195,7 +195,7 @@ def test_jobs_here_and_in_processes_have_the_same_numbers(tmp_path: Path) -> Non
         assert apart is not None and record.is_whole(job)
         assert apart.scores == record.scores and len(record.scores) == 4 * len(job.marks)
     assert here[0].scores != here[1].scores
-    assert Record.read(tmp_path / "here" / PLAIN.name) == here[0]
+    assert JobRecord.read(tmp_path / "here" / PLAIN.name) == here[0]
     assert here[0].episodes == 4 and here[0].seconds > 0 < here[0].own_seconds
 
 
@@ -217,7 +217,7 @@ def test_a_killed_job_goes_on_and_ends_with_the_same_numbers(
     whole = perform(job, tmp_path / "whole", Silent())
     with pytest.raises(KeyboardInterrupt):
         perform(job, tmp_path / "killed", KillAfter(title, 1 if grounded else 11))
-    assert not Record.read(tmp_path / "killed").is_whole(job)
+    assert not JobRecord.read(tmp_path / "killed").is_whole(job)
     again = perform(job, tmp_path / "killed", Silent())
     assert again.scores == whole.scores
     played = (tmp_path / "killed" / SCORES).read_bytes()
@@ -231,10 +231,10 @@ def test_scores_that_cannot_be_read_now_are_not_replaced(tmp_path: Path) -> None
     perform(job, tmp_path, Silent())
     before = (tmp_path / SCORES).read_bytes()
     with few_descriptors(0), pytest.raises(OSError, match="Too many open files"):
-        Record.read(tmp_path)
+        JobRecord.read(tmp_path)
     assert (tmp_path / SCORES).read_bytes() == before
     (tmp_path / SCORES).write_bytes(before[:-20])
-    assert not Record.read(tmp_path).scores
+    assert not JobRecord.read(tmp_path).scores
 
 
 def test_more_episodes_train_only_those_and_fewer_are_refused(tmp_path: Path) -> None:
@@ -417,7 +417,7 @@ def test_a_stopped_job_is_killed_and_taken_up_again_with_the_same_numbers(
         os.kill(stopped, signal.SIGSTOP)
         assert done.result(120) == {}
     assert not Path(f"/proc/{stopped}/environ").exists()
-    assert Record.read(place).scores == Record.read(tmp_path / "here" / job.name).scores
+    assert JobRecord.read(place).scores == JobRecord.read(tmp_path / "here" / job.name).scores
 
 
 @needs_forks
@@ -455,8 +455,10 @@ with Path(sys.argv[2]).open("wb") as log:
 SCORE = Scores(1, 1, 1, 1, 1, 1, 1, 1, 1, 1)
 
 
-def whole_record() -> Record:
-    return Record({(m, d, s): SCORE for m in (2, 4) for d in ("sim", "V4") for s in (1000, 1001)})
+def whole_record() -> JobRecord:
+    return JobRecord(
+        {(m, d, s): SCORE for m in (2, 4) for d in ("sim", "V4") for s in (1000, 1001)}
+    )
 
 
 def test_what_was_played_in_a_street_that_has_changed_is_played_again(tmp_path: Path) -> None:
@@ -469,21 +471,21 @@ def test_what_was_played_in_a_street_that_has_changed_is_played_again(tmp_path: 
         scenario_in_domain(load_scenario("single-v1"), domain).write(tmp_path / "street")
 
     made("V1")
-    record = Record()
+    record = JobRecord()
     for domain in job().domains:
         record.add_scores(job(), 4, domain, {1000: SCORE, 1001: SCORE})
     record.write(tmp_path)
-    assert Record.read(tmp_path).is_whole(job())
+    assert JobRecord.read(tmp_path).is_whole(job())
     shutil.rmtree(tmp_path / "street")
     made("V4")
-    again = Record.read(tmp_path)
+    again = JobRecord.read(tmp_path)
     assert again.missing(job(), 4) == {street: [1000, 1001]}
     again.add_scores(job(), 4, street, {1000: SCORE})
     assert again.missing(job(), 4) == {street: [1001]}, "the old ones are dropped"
     assert "worlds" not in with_hashes_of(whole_record(), tmp_path), "other files are as ever"
 
 
-def with_hashes_of(record: Record, folder: Path) -> str:
+def with_hashes_of(record: JobRecord, folder: Path) -> str:
     record.write(folder)
     return (folder / SCORES).read_text()
 
@@ -510,7 +512,7 @@ def test_a_broken_description_of_a_job_is_named(
 )
 def test_a_broken_record_is_an_empty_one(tmp_path: Path, content: str) -> None:
     (tmp_path / SCORES).write_text(content)
-    assert Record.read(tmp_path) == Record()
+    assert JobRecord.read(tmp_path) == JobRecord()
 
 
 def test_no_flipped_bit_of_a_record_is_read_as_another_one(tmp_path: Path) -> None:
@@ -522,7 +524,7 @@ def test_no_flipped_bit_of_a_record_is_read_as_another_one(tmp_path: Path) -> No
         flipped = bytearray(content)
         flipped[place // 8] ^= 1 << place % 8
         file.write_bytes(flipped)
-        assert Record.read(tmp_path) in (record, Record())
+        assert JobRecord.read(tmp_path) in (record, JobRecord())
 
 
 def test_a_job_is_done_when_everything_was_played(tmp_path: Path) -> None:
@@ -530,7 +532,7 @@ def test_a_job_is_done_when_everything_was_played(tmp_path: Path) -> None:
     record.write(tmp_path / PLAIN.name)
     assert record_of(PLAIN, tmp_path) == record
     for key in record.scores:
-        part = Record({other: SCORE for other in record.scores if other != key})
+        part = JobRecord({other: SCORE for other in record.scores if other != key})
         part.write(tmp_path / PLAIN.name)
         assert record_of(PLAIN, tmp_path) is None, key
     assert asdict(record)["episodes"] == 0

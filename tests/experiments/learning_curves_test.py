@@ -16,9 +16,9 @@ from ugat_marl.errors import OptionError, UnknownNameError
 from ugat_marl.experiments import (
     RULE,
     Curve,
-    Curves,
     CurvesConfig,
-    Record,
+    JobRecord,
+    LearningCurves,
     file_stem,
     learn_curves,
     record_of,
@@ -59,12 +59,12 @@ def test_a_curve_is_the_means_of_a_record() -> None:
         for mark in job.marks
         for seed in job.evaluation_seeds
     }
-    found = Curve.of(job, Record(played, episodes=4, seconds=2.0, own_seconds=1.0), scenario)
+    found = Curve.of(job, JobRecord(played, episodes=4, seconds=2.0, own_seconds=1.0), scenario)
     assert found.att_s == {2: 1004.0, 4: 1006.0}  # seeds 1000 to 1004
     assert found.speed == 4 * scenario.decisions / 2
     assert found.own_ms == 1000 / (4 * scenario.decisions)
     short = replace(job, options={**job.options, "duration_s": 50.0})
-    half = Curve.of(short, Record(played, episodes=4, seconds=2.0, own_seconds=1.0), scenario)
+    half = Curve.of(short, JobRecord(played, episodes=4, seconds=2.0, own_seconds=1.0), scenario)
     assert (half.speed, half.own_ms) == (found.speed / 2, 2 * found.own_ms)
 
 
@@ -94,7 +94,7 @@ def test_the_page_by_hand() -> None:
         curve("dqn", 3, 500.0, 400.0),
     )
     rules = {"programme": 200.0, "fixed-time:30": 150.0, "sotl": 125.0}
-    found = Curves("single-v1", "sim", curves, rules, "sotl", {})
+    found = LearningCurves("single-v1", "sim", curves, rules, "sotl", {})
     lines = curves_page(found, CONFIG, FACTS).splitlines()
     table = lines[next(i for i, line in enumerate(lines) if line.startswith("| learner")) :]
     cells = [[cell.strip() for cell in line.split("|")[1:-1]] for line in table if "| " in line]
@@ -113,7 +113,7 @@ def test_the_page_by_hand() -> None:
     ]
     assert [row[6] for row in cells[3:]] == ["200", "150", "125"]
     assert "results.py --seeds 2" in lines
-    failed = curves_page(Curves("single-v1", "sim", curves, {}, "", {}), CONFIG, FACTS)
+    failed = curves_page(LearningCurves("single-v1", "sim", curves, {}, "", {}), CONFIG, FACTS)
     assert "| - | - | - |" in failed, "no rule was played to its end"
     rows = curves_as_csv(curves).splitlines()
     assert len(rows) == 1 + 3 * 2 and rows[2] == "ippo,wonder 1.0,3,4,120.0,10.0,5.0"

@@ -15,7 +15,7 @@ from ugat_marl.data import Scores
 from ugat_marl.errors import OptionError, UnknownNameError
 from ugat_marl.experiments import DIRECT, QUEUES, TIMED, PaperConfig, TransferConfig, read_queues
 from ugat_marl.experiments.driver import record_of
-from ugat_marl.experiments.jobs import SCORES, Record
+from ugat_marl.experiments.jobs import SCORES, JobRecord
 from ugat_marl.experiments.paper import TABLES, Planner, settings_of
 from ugat_marl.experiments.settings import LearnerSpec, Setting
 from ugat_marl.experiments.transfers import planned_jobs
@@ -145,7 +145,7 @@ def test_a_job_with_the_usual_number_of_episodes_is_known_when_it_is_done(tmp_pa
             for seed in job.evaluation_seeds
         }
         (tmp_path / job.name).mkdir()
-        Record(scores).write(tmp_path / job.name)
+        JobRecord(scores).write(tmp_path / job.name)
         assert record_of(job, tmp_path) is not None, job.name
 
 

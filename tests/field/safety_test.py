@@ -19,7 +19,7 @@ from ugat_marl.effects import load_scenario
 from ugat_marl.errors import OptionError
 from ugat_marl.field import LaneCount, TrustLimits
 from ugat_marl.field.answering import Answering, Late
-from ugat_marl.field.safety import Light, Trust, fixed_time
+from ugat_marl.field.safety import Light, PolicyTrust, fixed_time
 from ugat_marl.field.watchdog import Watchdog
 from ugat_marl.scenarios import GREEN, Network, Segment, SignalTiming
 
@@ -144,7 +144,7 @@ def test_a_light_of_another_network_is_refused() -> None:
 
 
 def test_a_fault_is_told_and_trust_comes_back_after_good_decisions() -> None:
-    trust = Trust(["A", "B"], 2)
+    trust = PolicyTrust(["A", "B"], 2)
     assert trust.judge({}) == {}
     assert trust.judge({"A": "stale: x"}) == {"A": "stale: x"}
     assert trust.judge({}) == {"A": "returning: 1 of 2 good decisions after stale: x"}

@@ -16,7 +16,7 @@ from ugat_marl.data import Scores
 from ugat_marl.effects import load_scenario, scenario_in_domain
 from ugat_marl.envs import AgentSet
 from ugat_marl.errors import CheckpointError, OptionError, UnknownNameError
-from ugat_marl.experiments import LearnerSpec, Record, Setting, pack
+from ugat_marl.experiments import JobRecord, LearnerSpec, Setting, pack
 from ugat_marl.experiments.jobs import POLICY, Job
 from ugat_marl.policies import (
     DQN,
@@ -60,7 +60,7 @@ def training(tmp_path: Path) -> Path:
     folder.mkdir(parents=True)
     job.write(folder)
     times = {"sim": (60.0, 62.0), "V4": (100.0, 104.0)}
-    record = Record(
+    record = JobRecord(
         {
             (2, domain, seed): scored(value)
             for domain, values in times.items()
@@ -137,7 +137,7 @@ def test_a_training_of_another_version_is_not_packed(training: Path, tmp_path: P
 
 
 def test_what_is_not_finished_is_not_packed(training: Path, tmp_path: Path) -> None:
-    record = Record.read(training)
+    record = JobRecord.read(training)
     record.scores.popitem()
     record.write(training)
     with pytest.raises(OptionError, match="no finished training"):

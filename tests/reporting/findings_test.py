@@ -13,7 +13,7 @@ from ugat_marl.data import Metrics
 from ugat_marl.effects import load_scenario
 from ugat_marl.policies import NamedRule
 from ugat_marl.reporting.intersection_findings import findings_maps, findings_table
-from ugat_marl.reporting.places import Places
+from ugat_marl.reporting.places import AgentPlaces
 from ugat_marl.reporting.run_records import RunRecord
 from ugat_marl.reporting.street_found import commands_found, detectors_found, found_on_street
 from ugat_marl.scenarios import Network
@@ -143,7 +143,7 @@ def test_delays_of_timed_grounding_have_their_interval(tmp_path: Path) -> None:
 def test_a_map_shows_each_number_with_its_interval(tmp_path: Path) -> None:
     scenario = load_scenario("grid2x2-v1")
     lights = {"signal_0": "A1", "signal_1": "A2", "signal_2": "B1", "signal_3": "B2"}
-    places = Places(Network.read(scenario), lights)
+    places = AgentPlaces(Network.read(scenario), lights)
     late = {agent: (k - 0.5, float(k), k + 0.5) for k, agent in enumerate(lights, 1)}
     found = record(tmp_path / "run", with_ends("channel/late_s", late))
     ((picture, caption),) = findings_maps(found, places)
@@ -154,5 +154,5 @@ def test_a_map_shows_each_number_with_its_interval(tmp_path: Path) -> None:
     for k, light in enumerate(lights.values(), 1):
         assert f"<title>{light}: {k} ({k - 0.5} to {k + 0.5}) s</title>" in page
         assert f">({k - 0.5} to {k + 0.5})<" in page
-    alone = Places(places.network, {"signal_0": "A1"})
+    alone = AgentPlaces(places.network, {"signal_0": "A1"})
     assert findings_maps(found, alone) == []

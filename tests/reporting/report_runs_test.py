@@ -31,7 +31,7 @@ from ugat_marl.experiments import (
     Evaluation,
     Interval,
     Job,
-    Record,
+    JobRecord,
     Setting,
     TransferConfig,
     means_by_step,
@@ -443,7 +443,7 @@ def make_job(folder: Path, name: str, played: Sequence[str], setting: Setting, *
         (0, d, s): scores(base + 50 * (d != "sim") + s) for d in played for s in (0, 1)
     }
     if played_scores:
-        Record(played_scores).write(folder / name)
+        JobRecord(played_scores).write(folder / name)
 
 
 def test_jobs_of_a_paper_make_a_table(tmp_path: Path) -> None:

@@ -8,7 +8,7 @@ from typing import Any
 CURVES_FILE = Path("tensorboard") / "events.out.tfevents.run"
 
 
-class Curves:
+class EventFile:
     """Event file of TensorBoard that depends on the numbers of a run alone.
 
     TensorBoard's own writer puts the clock, the host and the process into the file and its name, so

@@ -19,7 +19,7 @@ from typing import IO, Any
 
 import polars as pl
 
-from ugat_marl.data.curves import CURVES_FILE, Curves
+from ugat_marl.data.curves import CURVES_FILE, EventFile
 from ugat_marl.data.row_hashes import damage, read_quietly, write_hashed
 from ugat_marl.errors import CheckpointError, OptionError, first_line
 from ugat_marl.files import lock, read_json, replacing, require_writable, write_whole
@@ -130,7 +130,7 @@ class Run:
         self.reporter = reporter
         self._on_log = on_log
         self.metrics = Metrics()
-        self._curves: Curves | None = None
+        self._curves: EventFile | None = None
         require_writable(directory / IDENTITY_FILE)
         self._lock = lock_folder(directory)
         try:
@@ -217,7 +217,7 @@ class Run:
 
     def _draw(self, stage: str, step: int, numbers: Mapping[str, float]) -> None:
         if self._curves is None:
-            self._curves = Curves(self.directory / CURVES_FILE)
+            self._curves = EventFile(self.directory / CURVES_FILE)
         for name, value in numbers.items():
             if math.isfinite(value) and (self.reporter.verbose or _is_main(stage, name)):
                 self._curves.add_scalar(f"{stage}/{name}", value, step)

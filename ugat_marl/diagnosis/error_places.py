@@ -44,7 +44,7 @@ class Equation:
 
 
 @dataclass(frozen=True)
-class Estimate:
+class ValueWithError:
     """A number with its standard error."""
 
     value: float
@@ -68,7 +68,7 @@ class Choice:
         cost: Squared standardised misfit, with the priors and a price for every number.
     """
 
-    estimates: Mapping[Number, Estimate]
+    estimates: Mapping[Number, ValueWithError]
     cost: float
 
 
@@ -180,7 +180,7 @@ class ErrorPlaces:
         cost = left @ left + ((found / scale) ** 2).sum()
         cost += sum(self._prices[place] for place, _ in numbers)
         errors = np.sqrt(np.diag(covariance))
-        estimates = [Estimate(float(x), float(e)) for x, e in zip(found, errors, strict=True)]
+        estimates = [ValueWithError(float(x), float(e)) for x, e in zip(found, errors, strict=True)]
         return Choice(dict(zip(numbers, estimates, strict=True)), float(cost))
 
 

@@ -26,9 +26,9 @@ from ugat_marl.diagnosis.error_places import (
     Choice,
     Equation,
     ErrorPlaces,
-    Estimate,
     Group,
     Number,
+    ValueWithError,
 )
 from ugat_marl.diagnosis.features import DetectorLayout, Greens
 from ugat_marl.diagnosis.thresholds import Thresholds
@@ -338,7 +338,7 @@ def _twins(track: _Track, others: Sequence[_Track], thresholds: Thresholds) -> t
 
 
 @dataclass(frozen=True)
-class _Median(Estimate):
+class _Median(ValueWithError):
     """A median with its error, and the robust spread of single values."""
 
     spread: float
@@ -393,8 +393,8 @@ class _Zones:
     """
 
     points: Mapping[str, SpeedPoint]
-    estimates: Mapping[Number, Estimate]
-    rivals: Mapping[Number, Estimate]
+    estimates: Mapping[Number, ValueWithError]
+    rivals: Mapping[Number, ValueWithError]
 
 
 def _changed(measured: Array, simulated: Array) -> float:
@@ -505,19 +505,19 @@ class Measurement:
         return frozenset(index for place in offsets for index in self._members(place))
 
     @staticmethod
-    def _possible(index: int, estimate: Estimate) -> bool:
+    def _possible(index: int, estimate: ValueWithError) -> bool:
         """Return True if an extension or zone is within the range of its effect."""
         ranges = (DetectorExtension.ranges["seconds"], DetectorZone.ranges["metres"])
         return ranges[index].holds(estimate.value)
 
-    def _matters(self, number: Number, estimate: Estimate) -> bool:
+    def _matters(self, number: Number, estimate: ValueWithError) -> bool:
         """Return True if an extension or zone is possible, large enough, and beyond chance."""
         limit, (_, index) = self._thresholds, number
         least = (limit.least_extension_s, limit.least_zone_m)[index]
         differs = estimate.differs(least, limit.named_deviations)
         return differs and self._possible(index, estimate)
 
-    def _of_zone(self, place: str, index: int, estimate: Estimate) -> Effect:
+    def _of_zone(self, place: str, index: int, estimate: ValueWithError) -> Effect:
         """Return the effect of an extension or of the length of a zone."""
         if index == _EXTENSION:
             seconds = round(estimate.value, 2)
@@ -611,9 +611,9 @@ class Measurement:
 
     def _rivals(
         self, searches: Sequence[ErrorPlaces], best: Choice, elsewhere: Mapping[str, float]
-    ) -> dict[Number, Estimate]:
+    ) -> dict[Number, ValueWithError]:
         """Return extensions that explain the data as well as a zone does, and the reverse."""
-        rivals: dict[Number, Estimate] = {}
+        rivals: dict[Number, ValueWithError] = {}
         for number in best.estimates:
             place, index = number
             other = (place, 1 - index)
@@ -794,7 +794,7 @@ class Measurement:
         names = detectors_at(place, self._detectors)
         return [index for index, one in enumerate(self._detectors) if one.id in names]
 
-    def _offsets(self, splashes: Sequence[DetectorError]) -> dict[str, Estimate]:
+    def _offsets(self, splashes: Sequence[DetectorError]) -> dict[str, ValueWithError]:
         """Return by how much advance and stop detectors are farther apart than stated, m.
 
         Approaches with splash are left out: what crosses both detectors need not be one vehicle.

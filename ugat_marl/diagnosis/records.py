@@ -100,7 +100,7 @@ class Fitted:
 
 
 @dataclass(frozen=True)
-class Residual:
+class ResidualTest:
     """Test of one model on one data set.
 
     Attributes:
@@ -132,7 +132,7 @@ class Tested:
     """
 
     model: Fitted
-    residual: Residual
+    residual: ResidualTest
     errors: Array
     extra: dict[str, Array]
 
@@ -219,8 +219,8 @@ class Verified:
             without a gap or without a corrected model.
     """
 
-    before: Residual
-    after: Residual
+    before: ResidualTest
+    after: ResidualTest
     shrink: float | None
 
 

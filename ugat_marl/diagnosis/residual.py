@@ -18,7 +18,7 @@ from scipy import special
 from ugat_marl.diagnosis.features import Tally
 from ugat_marl.diagnosis.fit import WIDE
 from ugat_marl.diagnosis.propose import Direction
-from ugat_marl.diagnosis.records import Residual
+from ugat_marl.diagnosis.records import ResidualTest
 from ugat_marl.diagnosis.statistics import (
     SINGLE,
     Distance,
@@ -96,7 +96,7 @@ class Null:
         self,
         data: Sequence[Tally],
         extra: Mapping[str, Array] | None = None,
-    ) -> Residual:
+    ) -> ResidualTest:
         """Test a data set.
 
         A difference must not depend on a single day, since a network may lock up on one day in a
@@ -117,11 +117,11 @@ class Null:
             else residual
         )
 
-    def _judge(self, distance: Distance) -> Residual:
+    def _judge(self, distance: Distance) -> ResidualTest:
         values = _statistics(distance, self._directed, self._thresholds.added_distance)
         chances = {name: self._chance(name, value) for name, value in values.items()}
         smallest = min(chances.values())
-        return Residual(
+        return ResidualTest(
             distance.total,
             self.floor,
             self.expected,

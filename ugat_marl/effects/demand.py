@@ -50,7 +50,7 @@ _TWIN = re.compile(rb"(\++)(?:\d+|surge|after)[\"']")
 
 
 @dataclass
-class Routes:
+class NamedRoutes:
     """Routes that are defined apart from their vehicles.
 
     Attributes:
@@ -64,7 +64,7 @@ class Routes:
     several: dict[str, set[str]] = field(default_factory=dict)
 
     @classmethod
-    def of(cls, scenario: Scenario) -> Routes:
+    def of(cls, scenario: Scenario) -> NamedRoutes:
         """Read all routes that vehicles of a scenario may refer to."""
         documents = (*scenario.additional, *scenario.routes)
         routes = cls()
@@ -213,7 +213,9 @@ class DemandTiming(Effect):
         return replace_departing(scenario, self, self.edge, shifted)
 
 
-def _refuse_unknown_origin(effect: Effect, element: ET.Element, edge: str, routes: Routes) -> None:
+def _refuse_unknown_origin(
+    effect: Effect, element: ET.Element, edge: str, routes: NamedRoutes
+) -> None:
     """Refuse demand of which only SUMO decides whether it starts on an edge.
 
     Raises:
@@ -253,11 +255,11 @@ def replace_departing(
     Raises:
         UnknownNameError: The edge does not exist.
     """
-    routes = Routes()
+    routes = NamedRoutes()
     if edge != EVERYWHERE:
         places = network_places(scenario)
         places.check(effect.name, "edge", edge, places.edges)
-        routes = Routes.of(scenario)
+        routes = NamedRoutes.of(scenario)
 
     def change(root: ET.Element) -> bool:
         children: list[ET.Element] = []

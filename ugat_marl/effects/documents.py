@@ -13,7 +13,7 @@ from dataclasses import replace
 from itertools import chain, count, islice
 from typing import IO
 
-from ugat_marl.files import Draft, Rows, child_texts, scratch, xml_bytes
+from ugat_marl.files import DocumentDraft, Rows, child_texts, scratch, xml_bytes
 from ugat_marl.scenarios import (
     DEPARTING,
     TRAVELLERS,
@@ -134,7 +134,7 @@ def _edited(document: Document, change: Change, in_order: bool) -> Document:
     draft, changed = None, False
     departure, rows = _clock(), _Sorted()
     for part in document.parts():
-        draft = draft or Draft(document.name.removesuffix(".gz"), part)
+        draft = draft or DocumentDraft(document.name.removesuffix(".gz"), part)
         changed |= change(part)
         if in_order:
             rows.add(zip(map(departure, part), child_texts(part), strict=True))

@@ -18,7 +18,7 @@ from ugat_marl.effects.base import (
     hashed_uniform,
     salt_of,
 )
-from ugat_marl.effects.demand import TAGS, Routes, parted_flow
+from ugat_marl.effects.demand import TAGS, NamedRoutes, parted_flow
 from ugat_marl.effects.documents import edit_scenario, free_suffix, is_demand, mentions
 from ugat_marl.effects.places import Places, network_places
 from ugat_marl.errors import ScenarioError, UnknownNameError
@@ -64,7 +64,7 @@ class Turning(Effect):
                 f"edge behind {self.from_edge!r}:", self.to_edge, ahead,
                 f"Effect {self.name!r} names it.",
             )  # fmt: skip
-        routes = Routes.of(scenario)
+        routes = NamedRoutes.of(scenario)
 
         def way(element: ET.Element) -> Way:
             edges = routes.edges_of(element) or _fastest(element, places)

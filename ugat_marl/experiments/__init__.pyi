@@ -21,12 +21,12 @@ from .gap_costs import gap_matrix as gap_matrix
 from .jobs import EVALUATION_SEED as EVALUATION_SEED
 from .jobs import RULE_FILE as RULE_FILE
 from .jobs import Job as Job
-from .jobs import Record as Record
+from .jobs import JobRecord as JobRecord
 from .jobs import evaluation_seeds as evaluation_seeds
 from .jobs import file_stem as file_stem
 from .learning_curves import Curve as Curve
-from .learning_curves import Curves as Curves
 from .learning_curves import CurvesConfig as CurvesConfig
+from .learning_curves import LearningCurves as LearningCurves
 from .learning_curves import learn_curves as learn_curves
 from .machine import machine_facts as machine_facts
 from .packing import pack as pack

@@ -29,7 +29,7 @@ from ugat_marl.experiments.forked import (
     perform_forked,
     say_stopped,
 )
-from ugat_marl.experiments.jobs import LEARNER, Job, Record, perform
+from ugat_marl.experiments.jobs import LEARNER, Job, JobRecord, perform
 from ugat_marl.files import require_writable
 from ugat_marl.parallel import (
     RETRIES,
@@ -50,14 +50,14 @@ _TAIL = 400
 """Number of characters shown from the end of a failed job's log."""
 
 
-def record_of(job: Job, folder: Path) -> Record | None:
+def record_of(job: Job, folder: Path) -> JobRecord | None:
     """Return the record of a job; None if an evaluation is missing.
 
     Args:
         job: The job.
         folder: Folder that holds the jobs' folders.
     """
-    record = Record.read(folder / job.name)
+    record = JobRecord.read(folder / job.name)
     return record if record.is_whole(job) else None
 
 
@@ -135,7 +135,7 @@ def perform_here(
     reporter: Reporter,
     on_log: LogCallback | None = None,
     beside: Sequence[Job] = (),
-) -> list[Record]:
+) -> list[JobRecord]:
     """Perform jobs one after another in this process and return their records.
 
     Args:
@@ -150,7 +150,7 @@ def perform_here(
     Raises:
         OptionError: Another process performs jobs in that folder.
     """
-    records: list[Record] = []
+    records: list[JobRecord] = []
     require_writable(folder / LOG)
     with (  # the lock is held until the last job has ended
         contextlib.closing(lock_folder(folder)),
@@ -232,7 +232,7 @@ def _is_final(start: Path) -> bool:
         return False
     base = Job.read(start.parent)
     kept_often = start.name == LEARNER and (base.every or base.last > 1)
-    return not kept_often or Record.read(start.parent).is_whole(base)
+    return not kept_often or JobRecord.read(start.parent).is_whole(base)
 
 
 def _perform_apart(folder: str, stop: Stop, forked: bool) -> None:

@@ -45,7 +45,12 @@ from ugat_marl.experiments.evaluation import (
 from ugat_marl.experiments.queues import QUEUES, QueueRecord
 from ugat_marl.experiments.randomised import randomised_env
 from ugat_marl.experiments.settings import DIRECT, Setting, short_name
-from ugat_marl.experiments.training import Effort, simulated_worlds, train_grounded, train_through
+from ugat_marl.experiments.training import (
+    TrainingCost,
+    simulated_worlds,
+    train_grounded,
+    train_through,
+)
 from ugat_marl.experiments.tuning import VERSION, tuned_rule
 from ugat_marl.files import file_hash, parse_json, read_json, write_whole
 from ugat_marl.grounding import (
@@ -303,7 +308,7 @@ _HASHES: dict[tuple[str, str, float | None], str] = {}
 
 
 @dataclass
-class Record:
+class JobRecord:
     """Result of a job: the scores of its evaluation episodes, and the cost of its training.
 
     Attributes:
@@ -321,7 +326,7 @@ class Record:
     worlds: dict[str, str] = field(default_factory=dict[str, str])
 
     @classmethod
-    def read(cls, folder: Path) -> Record:
+    def read(cls, folder: Path) -> JobRecord:
         """Read a record that `write` wrote; an empty record if the file is missing or damaged.
 
         Raises:
@@ -357,7 +362,7 @@ class Record:
         content = json.dumps(hashed, indent=1)
         write_whole(folder / SCORES, content + "\n")
 
-    def add(self, effort: Effort) -> None:
+    def add(self, effort: TrainingCost) -> None:
         """Add the cost of some training episodes."""
         self.episodes += effort.episodes
         self.seconds += effort.seconds
@@ -407,7 +412,7 @@ def perform(
     reporter: Reporter,
     workers: Workers = 1,
     on_log: LogCallback | None = None,
-) -> Record:
+) -> JobRecord:
     """Do the missing training and evaluations of a job, and write them to its folder.
 
     Args:
@@ -422,7 +427,7 @@ def perform(
         OptionError: An evaluation is missing, and the training has already passed it.
     """
     remove_temporaries(folder)
-    record = Record.read(folder)
+    record = JobRecord.read(folder)
     if record.is_whole(job):
         return record
     if job.setting.recipe == "rule":
@@ -443,7 +448,7 @@ def _judge(
     job: Job,
     mark: int,
     factory: PolicyFactory,
-    record: Record,
+    record: JobRecord,
     folder: Path,
     reporter: Reporter,
     workers: Workers,
@@ -496,7 +501,7 @@ def _rule(job: Job, folder: Path, reporter: Reporter, workers: Workers) -> str:
 
 
 def _plain(
-    job: Job, folder: Path, record: Record, reporter: Reporter
+    job: Job, folder: Path, record: JobRecord, reporter: Reporter
 ) -> Generator[tuple[int, Policy], None, None]:
     """Train without grounding; yield the policy at each mark with missing episodes and the end."""
     assert job.seed is not None
@@ -519,7 +524,7 @@ def _plain(
                 f"{len(job.evaluation_seeds)} episodes there; remove it, or name another --runs"
             )
 
-        def keep(effort: Effort) -> None:
+        def keep(effort: TrainingCost) -> None:
             record.add(effort)
             if job.every:
                 record.write(folder)

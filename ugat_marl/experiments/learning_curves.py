@@ -13,7 +13,7 @@ from statistics import fmean
 
 from ugat_marl.errors import UgatMarlError, require_distinct, require_least
 from ugat_marl.experiments.driver import perform_all, record_of
-from ugat_marl.experiments.jobs import RULE_FILE, Job, Record, evaluation_seeds
+from ugat_marl.experiments.jobs import RULE_FILE, Job, JobRecord, evaluation_seeds
 from ugat_marl.experiments.settings import RULE, LearnerSpec, Setting
 from ugat_marl.experiments.tuning import LEAST_BUDGET
 from ugat_marl.parallel import Workers
@@ -46,7 +46,7 @@ class Curve:
     own_ms: float = 0.0
 
     @classmethod
-    def of(cls, job: Job, record: Record, scenario: Scenario) -> Curve:
+    def of(cls, job: Job, record: JobRecord, scenario: Scenario) -> Curve:
         """Return the curve of a finished job that is judged in a single domain.
 
         Args:
@@ -86,7 +86,7 @@ class Curve:
 
 
 @dataclass(frozen=True)
-class Curves:
+class LearningCurves:
     """Learning curves of all learners on a scenario, and the rules beside them.
 
     Attributes:
@@ -190,7 +190,7 @@ def learn_curves(
     folder: Path,
     workers: Workers,
     reporter: Reporter,
-) -> Curves:
+) -> LearningCurves:
     """Perform the unfinished jobs and return all curves.
 
     A missing library or a failed job does not stop the other jobs.
@@ -221,7 +221,7 @@ def learn_curves(
             rule = (folder / job.name / RULE_FILE).read_text()
             att_s[rule] = fmean(s.att_s for s in record.played(job, 0, config.domain))
             best = rule if job.setting.name == RULE else best
-    return Curves(scenario.id, config.domain, tuple(curves), att_s, best, failures)
+    return LearningCurves(scenario.id, config.domain, tuple(curves), att_s, best, failures)
 
 
 def _can_be_made(job: Job, failures: dict[str, str]) -> bool:

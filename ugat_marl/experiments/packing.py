@@ -13,7 +13,15 @@ from pydantic import TypeAdapter
 from ugat_marl.data import installed_versions
 from ugat_marl.effects import domain_label, scenario_in_domain
 from ugat_marl.errors import OptionError
-from ugat_marl.experiments.jobs import DIRECT_POLICY, JOB, POLICY, Job, Record, file_name, file_stem
+from ugat_marl.experiments.jobs import (
+    DIRECT_POLICY,
+    JOB,
+    POLICY,
+    Job,
+    JobRecord,
+    file_name,
+    file_stem,
+)
 from ugat_marl.experiments.settings import DIRECT
 from ugat_marl.experiments.statistics import Interval
 from ugat_marl.files import write_whole
@@ -89,7 +97,7 @@ def _cards(place: Path, command: str, rules: dict[str, Path]) -> list[tuple[Poli
         rules: Receives the rows in which the training kept a rule.
     """
     job = Job.read(place)
-    record = Record.read(place)
+    record = JobRecord.read(place)
     if job.seed is None or not record.is_whole(job):
         return []
     if not place.name.endswith(job.digest):
@@ -113,7 +121,7 @@ def _cards(place: Path, command: str, rules: dict[str, Path]) -> list[tuple[Poli
 
 
 def _card(
-    job: Job, record: Record, mark: int, setting: str, command: str, content: bytes
+    job: Job, record: JobRecord, mark: int, setting: str, command: str, content: bytes
 ) -> PolicyCard:
     scenario = job.loaded()
     assert job.seed is not None
@@ -158,7 +166,7 @@ def policy_name(setting: str, real: str | None, seed: int) -> str:
     return "-".join([file_name(setting), *world, f"s{seed}"])
 
 
-def _scores(job: Job, record: Record, mark: int, domain: str) -> CardScores:
+def _scores(job: Job, record: JobRecord, mark: int, domain: str) -> CardScores:
     played = record.played(job, mark, domain)
     att = Interval.of(np.array([scores.att_s for scores in played]))
     alone = len(played) < 2  # one episode has no interval

@@ -8,7 +8,7 @@ from pathlib import Path
 from ugat_marl.errors import counted
 from ugat_marl.experiments.driver import OTHER_PARTS
 from ugat_marl.experiments.forked import jobs_fork_on
-from ugat_marl.experiments.jobs import Job, Record
+from ugat_marl.experiments.jobs import Job, JobRecord
 from ugat_marl.grounding import EPISODES_PER_DELAY, ROLL_OUTS, UgatConfig
 from ugat_marl.parallel import Workers, in_this_process, parts_at_a_time
 from ugat_marl.policies import (
@@ -86,7 +86,7 @@ def described_plan(
         episode_s: Length of an episode, in s.
         beside: Jobs of the plan that are performed beside the others.
     """
-    todo = [job for job in plan if not Record.read(folder / job.name).is_whole(job)]
+    todo = [job for job in plan if not JobRecord.read(folder / job.name).is_whole(job)]
     lines = [f"run: {directory}"]
     if len(todo) < len(plan):
         lines.append(f"done before: {len(plan) - len(todo)} of {len(plan)} parts")
@@ -140,7 +140,7 @@ def work_of(
         weights[name] = weight
 
     for job in plan:
-        record = Record.read(folder / job.name)
+        record = JobRecord.read(folder / job.name)
         if record.is_whole(job):
             continue
         for mark in job.marks:

@@ -53,7 +53,7 @@ from ugat_marl.policies import (
 from ugat_marl.scenarios import Scenario, green_begins_at_once
 
 
-class Effort(NamedTuple):
+class TrainingCost(NamedTuple):
     """Cost of some episodes of training.
 
     Attributes:
@@ -74,7 +74,7 @@ def train_through(
     seed: int,
     *,
     on_episode: EpisodeCallback | None = None,
-    on_chunk: Callable[[Effort], None] | None = None,
+    on_chunk: Callable[[TrainingCost], None] | None = None,
 ) -> Iterator[tuple[int, Policy]]:
     """Train a learner and yield its policy at every mark.
 
@@ -94,7 +94,9 @@ def train_through(
             chunk = min(CHECKPOINT_EPISODES, mark - learner.episodes)
             begin, cpu_begin = time.perf_counter(), time.process_time()
             learner.learn(env, chunk, seed, on_episode)
-            effort = Effort(chunk, time.perf_counter() - begin, time.process_time() - cpu_begin)
+            effort = TrainingCost(
+                chunk, time.perf_counter() - begin, time.process_time() - cpu_begin
+            )
             if on_chunk is not None:
                 on_chunk(effort)
         yield mark, learner.policy()

@@ -42,7 +42,7 @@ from ugat_marl.experiments.jobs import (
     RULE_FILE,
     SCORES,
     Job,
-    Record,
+    JobRecord,
     evaluation_seeds,
     file_names,
     worlds_of,
@@ -422,11 +422,11 @@ def _write_results(
     scenario: Scenario,
     directory: Path,
     plan: Sequence[Job],
-    records: Sequence[Record],
+    records: Sequence[JobRecord],
 ) -> Evaluation:
     """Write table, queues, metrics and policies of finished jobs; return the table."""
     folder = directory / TRAININGS
-    rows: dict[str, tuple[Job, int, Record]] = {}
+    rows: dict[str, tuple[Job, int, JobRecord]] = {}
     rules: dict[str, str] = {}
     for job, record in zip(plan, records, strict=True):
         for mark, name in job.rows.items():

@@ -21,7 +21,7 @@ from ugat_marl.envs import checked_phases
 from ugat_marl.field.answering import Answering, Late, NoAnswer
 from ugat_marl.field.decisions import Decision, DecisionLog
 from ugat_marl.field.lights import Lights
-from ugat_marl.field.safety import Trust, fixed_time
+from ugat_marl.field.safety import PolicyTrust, fixed_time
 from ugat_marl.field.site import Site
 from ugat_marl.field.street import LaneCount, Street
 from ugat_marl.field.watchdog import TrustLimits, Watchdog
@@ -118,7 +118,7 @@ class FieldLoop:
             self._memory.reset([light.phase for light in lights.machines.values()])
         self._watchdog = Watchdog(self._site.capacity, self._site.halting, self._limits)
         self._without_green: frozenset[str] = frozenset()
-        self._trust = Trust(self._site.lights, self._limits.return_after)
+        self._trust = PolicyTrust(self._site.lights, self._limits.return_after)
         self._warm_up(self._policy)
 
     def drive(

@@ -87,7 +87,7 @@ class Light:
         return shown
 
 
-class Trust:
+class PolicyTrust:
     """Trust in the policy, per light: lost at a fault, regained after some good decisions.
 
     Args:

@@ -22,7 +22,7 @@ SIMULATING = ("libsumo", "numpy", "ugat-marl")
 
 
 @dataclass(frozen=True)
-class Episode:
+class RollOut:
     """Result of one roll-out.
 
     Attributes:
@@ -61,7 +61,7 @@ def roll_out(
     *,
     record: Observer | None = None,
     on_step: StepCallback | None = None,
-) -> Episode:
+) -> RollOut:
     """Play one whole episode.
 
     Args:
@@ -92,7 +92,7 @@ def _played(
     seed: int,
     record: Observer | None,
     on_step: StepCallback | None,
-) -> Episode:
+) -> RollOut:
     observations, infos = env.reset(seed=seed)
     policy.reset(seed)
     recording = _Recording(env, record, seed, infos) if record else None
@@ -107,7 +107,7 @@ def _played(
         steps += 1
         if on_step is not None:
             on_step(steps)
-    return Episode(steps, total / max(steps, 1), recording.log() if recording else None)
+    return RollOut(steps, total / max(steps, 1), recording.log() if recording else None)
 
 
 def observer_of(

@@ -10,7 +10,7 @@ from ugat_marl.reporting.figures import NamedFigure
 from ugat_marl.reporting.formats import number
 from ugat_marl.reporting.network_maps import node_map
 from ugat_marl.reporting.page import Grid
-from ugat_marl.reporting.places import Places
+from ugat_marl.reporting.places import AgentPlaces
 from ugat_marl.reporting.run_records import RunRecord
 
 
@@ -54,7 +54,7 @@ _Found = dict[str, tuple[float, float, float]]
 """Agent to the number and to the lower and upper end of its interval."""
 
 
-def findings_table(record: RunRecord, places: Places | None) -> Grid | None:
+def findings_table(record: RunRecord, places: AgentPlaces | None) -> Grid | None:
     """Return the findings at each intersection, as the last iteration left them.
 
     Args:
@@ -77,7 +77,7 @@ def findings_table(record: RunRecord, places: Places | None) -> Grid | None:
     return Grid(["agent", "traffic light", *titles], rows, titles)
 
 
-def findings_maps(record: RunRecord, places: Places) -> list[tuple[NamedFigure | None, str]]:
+def findings_maps(record: RunRecord, places: AgentPlaces) -> list[tuple[NamedFigure | None, str]]:
     """Return a map of each quantity that was found, with its caption.
 
     A single intersection needs no map.
@@ -108,7 +108,7 @@ def _cell(found: _Found, agent: str) -> str:
 
 
 def _map(
-    record: RunRecord, places: Places, quantity: _Quantity, found: _Found
+    record: RunRecord, places: AgentPlaces, quantity: _Quantity, found: _Found
 ) -> tuple[NamedFigure | None, str]:
     """Return the map of a quantity; each circle has the number and, below it, its interval."""
     shown = {

@@ -10,11 +10,11 @@ from typing import Any
 
 import numpy as np
 
-from ugat_marl.experiments import Curve, Curves, CurvesConfig, Interval
+from ugat_marl.experiments import Curve, CurvesConfig, Interval, LearningCurves
 from ugat_marl.reporting.formats import command_block, made_with, mean_text, number_text
 
 
-def curves_page(study: Curves, config: CurvesConfig, facts: Mapping[str, Any]) -> str:
+def curves_page(study: LearningCurves, config: CurvesConfig, facts: Mapping[str, Any]) -> str:
     """Return a page of Markdown with the travel times of the learners and rules on a scenario.
 
     Args:

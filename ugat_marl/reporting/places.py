@@ -15,7 +15,7 @@ from ugat_marl.scenarios import Network
 
 
 @dataclass(frozen=True)
-class Places:
+class AgentPlaces:
     """A network and the traffic lights of its agents.
 
     Attributes:
@@ -27,7 +27,7 @@ class Places:
     intersection_of: Mapping[str, str]
 
 
-def places_of(record: RunRecord) -> tuple[Places | None, str]:
+def places_of(record: RunRecord) -> tuple[AgentPlaces | None, str]:
     """Return the places of a training's agents, None if not known, and a remark for the reader.
 
     The remark is "" if there is nothing to say.
@@ -50,7 +50,7 @@ def places_of(record: RunRecord) -> tuple[Places | None, str]:
     recorded = record.hashes.get("sim") or record.hashes.get(record.sim)
     changed = recorded not in (None, own_hash)
     note = "The scenario has changed since; the map shows it as it is now." if changed else ""
-    return Places(network, dict(zip(agents, tls, strict=True))), note
+    return AgentPlaces(network, dict(zip(agents, tls, strict=True))), note
 
 
 @functools.lru_cache(maxsize=8)

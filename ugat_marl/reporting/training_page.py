@@ -35,7 +35,7 @@ from ugat_marl.reporting.intersection_findings import findings_maps, findings_ta
 from ugat_marl.reporting.light_names import LightNames
 from ugat_marl.reporting.network_maps import minutes_picture, node_map
 from ugat_marl.reporting.page import Figure, Grid, Page, render
-from ugat_marl.reporting.places import Places, places_of
+from ugat_marl.reporting.places import AgentPlaces, places_of
 from ugat_marl.reporting.run_groups import groups, seeds_of_one
 from ugat_marl.reporting.run_records import RunRecord, TableRecord, as_number
 from ugat_marl.reporting.service_tables import LEGEND, service_grid
@@ -411,7 +411,7 @@ def _main_policies(evaluation: Evaluation) -> list[str]:
 
 
 def _scores(
-    page: Page, record: RunRecord, evaluation: Evaluation, places: Places | None
+    page: Page, record: RunRecord, evaluation: Evaluation, places: AgentPlaces | None
 ) -> dict[str, Any]:
     """Return travel times with gap and regret, levels of service, and all measures."""
     first, *others = evaluation.domains
@@ -477,7 +477,7 @@ def _measures(evaluation: Evaluation) -> Grid:
     return Grid(headings, rows, headings[2:])
 
 
-def _found(page: Page, record: RunRecord, places: Places | None) -> dict[str, Any] | None:
+def _found(page: Page, record: RunRecord, places: AgentPlaces | None) -> dict[str, Any] | None:
     """Return what was found at each intersection; None if nothing was looked for there."""
     table = findings_table(record, places)
     if table is None:
@@ -488,7 +488,7 @@ def _found(page: Page, record: RunRecord, places: Places | None) -> dict[str, An
     }
 
 
-def _gate(page: Page, record: RunRecord, places: Places | None) -> dict[str, Any] | None:
+def _gate(page: Page, record: RunRecord, places: AgentPlaces | None) -> dict[str, Any] | None:
     """Return the gate over the iterations and, for the last iteration, by intersection."""
     curve = charts.gate_picture([record], _file_name(record.name, "gate"))
     if curve is None:
@@ -500,7 +500,7 @@ def _gate(page: Page, record: RunRecord, places: Places | None) -> dict[str, Any
     }
 
 
-def _gate_grid(record: RunRecord, places: Places | None) -> Grid:
+def _gate_grid(record: RunRecord, places: AgentPlaces | None) -> Grid:
     columns = {
         "gate/acceptance": "accepted", "gate/mean_u": "mean u", "gate/alpha": "α",
         "gate/change_rate": "changed", "gate/trusted": "f and h are proven",
@@ -525,7 +525,7 @@ def _of_gate(key: str, value: float) -> str:
     return share(value) if is_share and math.isfinite(value) else number(value)
 
 
-def _worst(page: Page, record: RunRecord, places: Places | None) -> dict[str, Any] | None:
+def _worst(page: Page, record: RunRecord, places: AgentPlaces | None) -> dict[str, Any] | None:
     """Return the intersections and minutes with the longest queues in the real domain."""
     if record.queues is None or record.evaluation is None:
         return None

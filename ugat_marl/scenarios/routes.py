@@ -10,7 +10,7 @@ from dataclasses import replace
 from pathlib import Path
 
 from ugat_marl.errors import ScenarioError
-from ugat_marl.files import Draft, Tag, child_texts, replacing
+from ugat_marl.files import DocumentDraft, Tag, child_texts, replacing
 from ugat_marl.progress import Reporter
 from ugat_marl.scenarios.scenario import Document, Scenario
 from ugat_marl.scenarios.settings import parse_time
@@ -144,7 +144,7 @@ def _scaled(scenario: Scenario, copies: _Copies) -> Scenario:
     def copied(document: Document) -> Document:
         draft = None
         for part in document.parts():
-            draft = draft or Draft(document.name.removesuffix(".gz"), part)
+            draft = draft or DocumentDraft(document.name.removesuffix(".gz"), part)
             kept: list[ET.Element] = []
             for element in part:
                 vehicle = element.get("id", "")
@@ -302,7 +302,7 @@ def _routed_by_duarouter(scenario: Scenario) -> tuple[Document, ...]:
                 f"scenario {scenario.id!r}: its trips or flows cannot be turned into routes: "
                 f"{error}"
             ) from None
-        routed = Draft(_ROUTED, ET.Element("routes"))
+        routed = DocumentDraft(_ROUTED, ET.Element("routes"))
         for document in scenario.routes:
             for texts in _children(document, DEFINITIONS):
                 routed.add(*texts)
@@ -314,7 +314,7 @@ def _routed_by_duarouter(scenario: Scenario) -> tuple[Document, ...]:
 
 def _travellers(document: Document, index: int) -> Document | None:
     """Return the persons and containers of a route file; None if there are none."""
-    drafted, some = Draft(f"others{index or ''}.rou.xml", ET.Element("routes")), False
+    drafted, some = DocumentDraft(f"others{index or ''}.rou.xml", ET.Element("routes")), False
     for texts in _children(document, TRAVELLERS):
         drafted.add(*texts)
         some |= bool(texts)

@@ -64,7 +64,7 @@ def _as_links(value: Any) -> Any:
 LinksOf = Annotated[Links, pydantic.BeforeValidator(_as_links)]
 
 
-class Channel(pydantic.BaseModel):
+class DetectorChannel(pydantic.BaseModel):
     """Detector channel of a controller, and its position on a lane."""
 
     model_config = _STRICT
@@ -100,7 +100,7 @@ class Device(pydantic.BaseModel):
     overlaps: dict[Number, LinksOf] = {}
     constant: dict[Number, Annotated[str, Field(pattern="^[rugGyYoOs]$")]] = {}
     on_red: tuple[Index, ...] = ()
-    detectors: tuple[Channel, ...] = ()
+    detectors: tuple[DetectorChannel, ...] = ()
 
 
 class Span(pydantic.BaseModel):

@@ -29,7 +29,7 @@ from ugat_marl.scenarios import parse_decimal
 
 
 @dataclass(frozen=True)
-class Parameter:
+class RuleParameter:
     """A number in the spelling of a rule.
 
     Attributes:
@@ -55,38 +55,38 @@ class Rule:
     """
 
     make: Callable[..., Policy]
-    parameters: tuple[Parameter, ...] = ()
+    parameters: tuple[RuleParameter, ...] = ()
 
 
 _HOLDS = (10.0, 20.0, 30.0, 40.0, 50.0, 60.0)
 _LONGEST = (20.0, 30.0, 40.0, 60.0, 80.0, 120.0)
 
 
-def _held(default: float, choices: tuple[float, ...] = _HOLDS) -> Parameter:
-    return Parameter("shortest time of a phase", "seconds", default, choices)
+def _held(default: float, choices: tuple[float, ...] = _HOLDS) -> RuleParameter:
+    return RuleParameter("shortest time of a phase", "seconds", default, choices)
 
 
 RULES: Mapping[str, Rule] = {
     "actuated": Rule(
         Actuated,
         (
-            Parameter("longest time of a phase", "seconds", 40, _LONGEST),
-            Parameter("headway that ends a green", "seconds", 3, (2, 3, 5)),
+            RuleParameter("longest time of a phase", "seconds", 40, _LONGEST),
+            RuleParameter("headway that ends a green", "seconds", 3, (2, 3, 5)),
         ),
     ),
     "delay-actuated": Rule(
         DelayActuated,
         (
-            Parameter("longest time of a phase", "seconds", 40, _LONGEST),
-            Parameter("waiting on a lane that is left out", "vehicle-seconds", 10, (1, 10, 40)),
+            RuleParameter("longest time of a phase", "seconds", 40, _LONGEST),
+            RuleParameter("waiting on a lane that is left out", "vehicle-seconds", 10, (1, 10, 40)),
         ),
     ),
-    "fixed-time": Rule(FixedTime, (Parameter("time of a phase", "seconds", 30, _HOLDS),)),
+    "fixed-time": Rule(FixedTime, (RuleParameter("time of a phase", "seconds", 30, _HOLDS),)),
     "green-wave": Rule(
         GreenWave,
         (
-            Parameter("time of a phase", "seconds", 20, (10, 20, 30)),
-            Parameter("time of the phase along the road", "seconds", 30, (20, 30, 40, 60)),
+            RuleParameter("time of a phase", "seconds", 20, (10, 20, 30)),
+            RuleParameter("time of the phase along the road", "seconds", 30, (20, 30, 40, 60)),
         ),
     ),
     "largest-queue": Rule(LargestQueue, (_held(20),)),
@@ -98,7 +98,7 @@ RULES: Mapping[str, Rule] = {
     "sotl": Rule(
         SelfOrganising,
         (
-            Parameter(
+            RuleParameter(
                 "impatience that switches", "vehicle-seconds", 600, (150, 300, 600, 1200, 2400)
             ),
             _held(10, (10, 20, 30)),
@@ -107,7 +107,7 @@ RULES: Mapping[str, Rule] = {
     "webster": Rule(
         Webster,
         (
-            Parameter(
+            RuleParameter(
                 "saturation flow", "vehicles an hour and lane", 1800, (900, 1200, 1500, 1800, 2100)
             ),
         ),

@@ -17,7 +17,7 @@ from ugat_marl.scenarios import Intersection, Link, edge_of_lane
 
 
 @dataclass(frozen=True)
-class Road:
+class Corridor:
     """A chain of intersections, each reached from the one before by driving straight on.
 
     Attributes:
@@ -33,7 +33,7 @@ class Road:
     lanes: int
 
 
-def main_roads(network: ControlledNetwork) -> list[Road]:
+def main_roads(network: ControlledNetwork) -> list[Corridor]:
     """Find roads that share no intersection and together pass all intersections.
 
     The longest road is taken first: the one with the most intersections, then with the most lanes
@@ -41,7 +41,7 @@ def main_roads(network: ControlledNetwork) -> list[Road]:
     at the earlier agent is taken. A later road ends where it meets a road already taken.
     """
     free = dict(network.intersections)
-    roads: list[Road] = []
+    roads: list[Corridor] = []
     while free:
         candidates = [road for agent in free for road in _roads_from(agent, free, network)]
         best = max(
@@ -55,7 +55,7 @@ def main_roads(network: ControlledNetwork) -> list[Road]:
 
 def _roads_from(
     agent: str, free: Mapping[str, Intersection], network: ControlledNetwork
-) -> Iterator[Road]:
+) -> Iterator[Corridor]:
     entered = {
         edge_of_lane(lane): other
         for other, intersection in free.items()
@@ -73,7 +73,7 @@ def _roads_from(
             agents.append(following)
             edges.append(ahead[0].to_edge)
             arrival_s.append(arrival_s[-1] + network.free_flow_s[ahead[0].to_lane])
-        yield Road(tuple(agents), tuple(edges), tuple(arrival_s), lanes)
+        yield Corridor(tuple(agents), tuple(edges), tuple(arrival_s), lanes)
 
 
 class GreenWave:
@@ -127,7 +127,7 @@ class GreenWave:
         self._time += 1
         return actions
 
-    def _plan(self, road: Road, network: ControlledNetwork) -> None:
+    def _plan(self, road: Corridor, network: ControlledNetwork) -> None:
         main, other = network.decisions(self.main_s), network.decisions(self.green_s)
         cycles = [network.approaches[agent].cycle for agent in road.agents]
         length = main + other * (max(len(cycle) for cycle in cycles) - 1)
