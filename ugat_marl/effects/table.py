@@ -178,7 +178,7 @@ def apply_effects(scenario: Scenario, effects: Iterable[Effect]) -> Scenario:
     return scenario
 
 
-def load_scenario(name: str | Path | Scenario, duration_s: float | None = None) -> Scenario:
+def load_scenario(name: str | Path | Scenario, played_s: float | None = None) -> Scenario:
     """Load a scenario and apply the effects listed in its file (see `read_scenario`).
 
     Effects on controllers and detectors stay listed in its settings: the environment applies the
@@ -186,17 +186,18 @@ def load_scenario(name: str | Path | Scenario, duration_s: float | None = None) 
 
     Args:
         name: Id or path of a scenario, or a scenario.
-        duration_s: Length of the episodes that will be played, s; None for that of the file.
-            Effects on demand and on roads last as long. The scenario keeps the length of its file.
+        played_s: Length of the episodes that will be played, s; None for that of the file. Effects
+            on demand and on roads last as long. The scenario keeps the length of its file: give
+            the environment the same number as ``duration_s``.
     """
     scenario = name if isinstance(name, Scenario) else read_scenario(name)
     where = f" in scenario {scenario.id!r}"
     effects = [effect_from_record(record, where) for record in scenario.settings.effects]
     plain = replace(scenario, settings=scenario.settings.model_copy(update={"effects": ()}))
-    played = plain.with_duration(duration_s)
+    played = plain.with_duration(played_s)
     refuse_outside(played, effects)
     changed = apply_effects(played, effects)
-    return changed if duration_s is None else changed.with_duration(plain.settings.duration_s)
+    return changed if played_s is None else changed.with_duration(plain.settings.duration_s)
 
 
 def refuse_outside(scenario: Scenario, effects: Iterable[Effect]) -> None:
