@@ -69,7 +69,7 @@ class Streets:
 @pytest.fixture
 def streets(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> Streets:
     made = Streets()
-    monkeypatch.setattr(evaluation, "evaluate", made.evaluate)
+    monkeypatch.setattr(evaluation, "evaluation_of", made.evaluate)
     monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
     return made
 
