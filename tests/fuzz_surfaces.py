@@ -46,7 +46,7 @@ from ugat_marl.diagnosis import Diagnosis
 from ugat_marl.effects import load_scenario, parse_domain, scenario_in_domain
 from ugat_marl.envs import parallel_env
 from ugat_marl.errors import OptionError, UgatMarlError
-from ugat_marl.experiments.jobs import Record
+from ugat_marl.experiments.jobs import JobRecord
 from ugat_marl.experiments.scores import Evaluation
 from ugat_marl.policies import DQN, DQNConfig, NetworkPolicy, export_policy
 from ugat_marl.policies.export import NumpyPolicy
@@ -324,7 +324,7 @@ def build_records(folder: Path) -> None:
     runs.evaluation().write(folder / "table.json")
     runs.metrics().write(folder / "metrics.parquet")
     (folder / "diagnosis.json").write_text(json.dumps(DIAGNOSIS))
-    Record({(0, "sim", 1): runs.scores(100.0)}, 3, 1.5, 0.5).write(folder)
+    JobRecord({(0, "sim", 1): runs.scores(100.0)}, 3, 1.5, 0.5).write(folder)
 
 
 def use_records(folder: Path) -> None:
@@ -333,7 +333,7 @@ def use_records(folder: Path) -> None:
     for read in (
         lambda: Evaluation.read(folder / "table.json"),
         lambda: Metrics.read(folder / "metrics.parquet"),
-        lambda: Record.read(folder),
+        lambda: JobRecord.read(folder),
         lambda: _diagnosis(folder),
     ):
         try:
