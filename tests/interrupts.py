@@ -5,11 +5,20 @@ from __future__ import annotations
 import contextlib
 import os
 import resource
-from collections.abc import Iterator
+import time
+from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
 
 from ugat_marl.progress import Silent
+
+
+def eventually(condition: Callable[[], object], within_s: float = 30.0) -> bool:
+    """Wait until a condition holds; return False if it does not within some seconds."""
+    deadline = time.monotonic() + within_s
+    while not condition() and time.monotonic() < deadline:
+        time.sleep(0.02)
+    return bool(condition())
 
 
 class KillAt(Silent):

@@ -410,6 +410,34 @@ def test_only_strengths_that_come_nearer_to_the_data_are_candidates_by_themselve
     assert selector._nearest() == [(HEADWAY,)]
 
 
+def tried_in_round(
+    monkeypatch: pytest.MonkeyPatch, number: int, gap: float, expected: float = 0.0
+) -> list[list[str]]:
+    """What a round tries, in words, call by call.
+
+    The squared difference is `gap` times 100, the number of statistics. The proposals of the
+    library would leave `expected`, and nothing that is tried helps.
+    """
+    ledger: Any = Ledger({}, {})
+    ledger.data = [SimpleNamespace(sums=FEATURES)]
+    selector = selector_with(ledger)
+    measured = np.full(100, np.sqrt(gap))
+    selector._library, selector._library_directions = (), lambda model, number: ()
+    selector._whitener = lambda model, blocks: SimpleNamespace(measured=measured)
+    selector._nearest, selector._nearer = lambda: ["nearest"], lambda model, number: ["nearer"]
+    selector._at_places = lambda model, directions, number: ["places"]
+    tried: list[list[str]] = []
+    selector._fitted = lambda start, chosen, number, what: tried.append(chosen)
+    found = [SimpleNamespace(members="predicted", expected=expected)]
+    monkeypatch.setattr(select, "propose", lambda *_: found)
+    monkeypatch.setattr(select, "promising", lambda *_: found)
+    swapped = SimpleNamespace(members="exchange")
+    monkeypatch.setattr(select, "exchanges", lambda *_: [swapped] * (THRESHOLDS.exchanged + 1))
+    monkeypatch.setattr(select, "cautious_drivers", lambda library: ["cautious"])
+    assert selector._round(SimpleNamespace(model=SimpleNamespace(members=())), number) is None
+    return tried
+
+
 @pytest.mark.parametrize(
     ("number", "gap", "calls"),
     [
@@ -423,24 +451,7 @@ def test_only_strengths_that_come_nearer_to_the_data_are_candidates_by_themselve
 def test_what_a_round_tries_follows_from_the_distance(
     number: int, gap: float, calls: list[list[str]], monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    ledger: Any = Ledger({}, {})
-    ledger.data = [SimpleNamespace(sums=FEATURES)]
-    selector, statistics = selector_with(ledger), 100
-    measured = np.full(statistics, np.sqrt(gap))
-    selector._library, selector._library_directions = (), lambda model, number: ()
-    selector._whitener = lambda model, blocks: SimpleNamespace(measured=measured)
-    selector._nearest, selector._nearer = lambda: ["nearest"], lambda model, number: ["nearer"]
-    selector._at_places = lambda model, directions, number: ["places"]
-    tried: list[list[str]] = []
-    selector._fitted = lambda start, chosen, number, what: tried.append(chosen)
-    found = [SimpleNamespace(members="predicted", expected=0.0)]
-    monkeypatch.setattr(select, "propose", lambda *_: found)
-    monkeypatch.setattr(select, "promising", lambda *_: found)
-    swapped = SimpleNamespace(members="exchange")
-    monkeypatch.setattr(select, "exchanges", lambda *_: [swapped] * (THRESHOLDS.exchanged + 1))
-    monkeypatch.setattr(select, "cautious_drivers", lambda library: ["cautious"])
-    start = SimpleNamespace(model=SimpleNamespace(members=()))
-    assert selector._round(start, number) is None
+    tried = tried_in_round(monkeypatch, number, gap)
     assert [list(dict.fromkeys(each)) for each in tried] == calls
     assert tried[0].count("exchange") == (THRESHOLDS.exchanged if number else 0)
 
@@ -448,24 +459,10 @@ def test_what_a_round_tries_follows_from_the_distance(
 def test_what_the_library_does_not_explain_at_all_is_looked_for_at_places(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    ledger: Any = Ledger({}, {})
-    ledger.data = [SimpleNamespace(sums=FEATURES)]
-    selector = selector_with(ledger)
     gap = 2.0 * THRESHOLDS.small_distance
-    measured = np.full(100, np.sqrt(gap))
-    selector._library, selector._library_directions = (), lambda model, number: ()
-    selector._whitener = lambda model, blocks: SimpleNamespace(measured=measured)
-    selector._nearest = lambda: ["nearest"]
-    selector._at_places = lambda model, directions, number: ["places"]
-    tried: list[list[str]] = []
-    selector._fitted = lambda start, chosen, number, what: tried.append(chosen)
     enough = 100.0 + THRESHOLDS.look_elsewhere * (100.0 * gap - 100.0)
     for expected, at_once in ((enough - 1.0, False), (enough + 1.0, True)):
-        found = [SimpleNamespace(members="predicted", expected=expected)]
-        monkeypatch.setattr(select, "propose", lambda *_, found=found: found)
-        monkeypatch.setattr(select, "promising", lambda *_, found=found: found)
-        tried.clear()
-        selector._round(SimpleNamespace(model=SimpleNamespace(members=())), 0)
+        tried = tried_in_round(monkeypatch, 0, gap, expected)
         assert ("places" in tried[0]) == at_once
 
 

@@ -23,6 +23,7 @@ import pytest
 from gymnasium import vector as gymnasium_vector
 from gymnasium.wrappers.vector import RecordEpisodeStatistics
 
+from tests.interrupts import eventually
 from ugat_marl import parallel_env, vector_env
 from ugat_marl.effects import ControllerPart, StartupDelay, load_scenario, parse_domain
 from ugat_marl.envs import AgentSet, VectorEnv, agent_indicator, pad_spaces
@@ -150,13 +151,6 @@ def gone(pid: int) -> bool:
     except ProcessLookupError:
         return True
     return Path(f"/proc/{pid}/stat").read_text().rpartition(")")[2].split()[0] == "Z"
-
-
-def eventually(condition: Callable[[], bool], within_s: float = 30.0) -> bool:
-    deadline = time.monotonic() + within_s
-    while not condition() and time.monotonic() < deadline:
-        time.sleep(0.02)
-    return condition()
 
 
 # --- the same as alone

@@ -10,7 +10,7 @@ import signal
 import subprocess
 import sys
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import asdict, replace
 from pathlib import Path
@@ -20,7 +20,7 @@ import numpy as np
 import pytest
 from pydantic import TypeAdapter
 
-from tests.interrupts import KillAfter, few_descriptors
+from tests.interrupts import KillAfter, eventually, few_descriptors
 from ugat_marl.data import Scores, lock_folder
 from ugat_marl.effects import load_scenario, scenario_in_domain
 from ugat_marl.envs import parallel_env
@@ -354,13 +354,6 @@ def test_a_job_ends_with_whoever_started_it(tmp_path: Path) -> None:
     assert process.stdin is not None
     process.stdin.close()
     assert process.wait(60) == 1
-
-
-def eventually(condition: Callable[[], object], within_s: float) -> bool:
-    deadline = time.monotonic() + within_s
-    while not condition() and time.monotonic() < deadline:
-        time.sleep(0.05)
-    return bool(condition())
 
 
 def writers(log: Path) -> set[str]:

@@ -5,13 +5,13 @@ from __future__ import annotations
 import os
 import subprocess
 import tempfile
-import time
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
 
+from tests.interrupts import eventually
 from ugat_marl.effects import PAPER_WORLDS, load_scenario, scenario_in_domain
 from ugat_marl.envs import parallel_env
 from ugat_marl.errors import ScenarioError
@@ -126,10 +126,8 @@ def test_no_process_and_no_folder_is_left(tmp_path: Path, monkeypatch: pytest.Mo
         at_work.append(len(descendants()))
     assert len(set(at_work)) == 1 and at_work[0] > before
     env.close()
-    until = time.monotonic() + 20  # a process that was told to end takes a moment on a busy machine
-    while len(descendants()) > before and time.monotonic() < until:
-        time.sleep(0.05)
-    assert len(descendants()) == before
+    # a process that was told to end takes a moment on a busy machine
+    assert eventually(lambda: len(descendants()) == before, 20.0)
     assert not list(tmp_path.iterdir())
 
 

@@ -20,6 +20,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from tests.interrupts import eventually
 from ugat_marl.effects import load_scenario
 from ugat_marl.envs import AgentSet, parallel_env
 from ugat_marl.errors import OptionError, SimulatorError
@@ -39,6 +40,7 @@ from ugat_marl.scenarios import GREEN
 GRID = load_scenario("grid2x2-v1")
 SITE = Site.of(GRID, {})
 LIGHT = SITE.lights[0]
+AGENT = SITE.observer.agents[0]
 LANE = SITE.sees[LIGHT][0]
 QUICK = TrustLimits(answer_ms=2000, return_after=2)  # decisions in time on a busy machine
 Counts = dict[str, LaneCount]
@@ -98,10 +100,7 @@ class Scripted:
 
 def wait_for_the_answer(loop: FieldLoop) -> None:
     """Wait until the policy's thread has given the answer to a question that was too late."""
-    until = time.monotonic() + 30.0
-    while not loop._asked._answers.qsize():
-        assert time.monotonic() < until
-        time.sleep(0.01)
+    assert eventually(loop._asked._answers.qsize)
 
 
 def replaced(count: LaneCount | None) -> Callable[[Counts], Counts]:
@@ -746,28 +745,27 @@ def test_a_policy_that_needs_its_last_commands_sees_those_the_loop_gave() -> Non
         assert shown[2].argmax(1).tolist() == [made[1].phases[light], made[0].phases[light]]
 
 
-def test_a_policy_that_needs_its_last_commands_sees_the_age_of_the_green_that_runs() -> None:
-    """Not of the one that was asked for, which the minimum green holds back."""
-    site = Site.of(GRID, {"commands": 1})
-    site = replace(site, timing=replace(site.timing, min_green_s=12.0))
+def asked_under(site: Site, min_green_s: float, times: int) -> Scripted:
+    """A policy that asked for phase 1 at some decisions, under a minimum green."""
+    site = replace(site, timing=replace(site.timing, min_green_s=min_green_s))
     street, policy = MadeUpStreet(site), Scripted(lambda asked: dict.fromkeys(asked, 1))
     loop = FieldLoop(site, policy, street, QUICK)
-    decide(loop, street, 3)
+    decide(loop, street, times)
     loop.close()
-    agent = site.observer.agents[0]
-    ages_s = [60.0 * float(seen[agent][-1]) for seen in policy.seen]
+    return policy
+
+
+def test_a_policy_that_needs_its_last_commands_sees_the_age_of_the_green_that_runs() -> None:
+    """Not of the one that was asked for, which the minimum green holds back."""
+    policy = asked_under(Site.of(GRID, {"commands": 1}), min_green_s=12.0, times=3)
+    ages_s = [60.0 * float(seen[AGENT][-1]) for seen in policy.seen]
     assert ages_s == pytest.approx([0.0, 10.0, 10.0])
 
 
 def test_a_policy_is_told_which_phases_it_may_ask_for() -> None:
     """All of them if the minimum green of 25 s ends within the 10 s until the next decision."""
-    site = replace(SITE, timing=replace(SITE.timing, min_green_s=25.0))
-    street, policy = MadeUpStreet(site), Scripted(lambda asked: dict.fromkeys(asked, 1))
-    loop = FieldLoop(site, policy, street, QUICK)
-    decide(loop, street, 4)
-    loop.close()
-    agent = site.observer.agents[0]
-    free = [bool(infos[agent]["action_mask"].all()) for infos in policy.infos]
+    policy = asked_under(SITE, min_green_s=25.0, times=4)
+    free = [bool(infos[AGENT]["action_mask"].all()) for infos in policy.infos]
     assert free == [False, False, True, False]
 
 

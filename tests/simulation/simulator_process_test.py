@@ -21,6 +21,7 @@ from typing import Any
 import numpy as np
 import pytest
 
+from tests.interrupts import eventually
 from ugat_marl import parallel_env
 from ugat_marl.effects import load_scenario
 from ugat_marl.errors import EpisodeError, OptionError, SimulatorCrashed, SimulatorError
@@ -53,13 +54,6 @@ def alive(pid: int) -> bool:
     except ProcessLookupError:
         return False
     return True
-
-
-def eventually(condition: Callable[[], bool], within_s: float = 30.0) -> bool:
-    deadline = time.monotonic() + within_s
-    while not condition() and time.monotonic() < deadline:
-        time.sleep(0.02)
-    return condition()
 
 
 def episode(env: Any, seed: int, actions_seed: int = 0) -> str:

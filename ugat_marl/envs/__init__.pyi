@@ -12,6 +12,7 @@ from .observations import OBSERVATION_UNITS as OBSERVATION_UNITS
 from .observations import WAITING_SCALE_S as WAITING_SCALE_S
 from .observations import Observer as Observer
 from .options import EnvOptions as EnvOptions
+from .options import is_count as is_count
 from .registration import register_single as register_single
 from .rendering import NetworkRenderer as NetworkRenderer
 from .rewards import IntersectionView as IntersectionView

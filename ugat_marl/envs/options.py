@@ -119,10 +119,10 @@ class EnvOptions:
                 names = [choice for choice in allowed if choice]
                 raise UnknownNameError(f"value of option {name!r}:", str(value), names)
         roads: Any = self.neighbours
-        if not _is_count(roads):
+        if not is_count(roads):
             raise OptionError(f"neighbours = {roads!r}: must be 0 or a number of roads, such as 1")
         commands: Any = self.commands
-        if not _is_count(commands):
+        if not is_count(commands):
             raise OptionError(f"commands = {commands!r}: must be 0 or a number of decisions")
         given: Any = self.fitted
         parts = tuple(given) if isinstance(given, Iterable) else (None,)
@@ -159,5 +159,6 @@ class EnvOptions:
         return cls(**options)
 
 
-def _is_count(value: Any) -> bool:
+def is_count(value: Any) -> bool:
+    """Return True for a whole number from 0 on; a bool is none."""
     return not isinstance(value, bool) and isinstance(value, Integral) and int(value) >= 0

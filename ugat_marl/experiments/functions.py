@@ -9,7 +9,6 @@ from __future__ import annotations
 import re
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
-from numbers import Integral
 from pathlib import Path
 from typing import Any, Literal
 
@@ -17,6 +16,7 @@ import polars as pl
 
 from ugat_marl.data import LogCallback
 from ugat_marl.effects import Domain, domain_label, is_one_domain, load_scenario
+from ugat_marl.envs import is_count
 from ugat_marl.errors import OptionError
 from ugat_marl.experiments.evaluation import OwnPolicyFactory, evaluation_of, policy_factory
 from ugat_marl.experiments.jobs import EVALUATION_SEED, file_stem
@@ -235,9 +235,8 @@ def _seeds(given: Any) -> list[int]:
     """Return the seeds of episodes from their number, or from themselves."""
     several = isinstance(given, Iterable)
     listed: list[Any] = list(given) if several else [given]
-    for seed in listed:
-        if isinstance(seed, bool) or not isinstance(seed, Integral) or seed < 0:
-            raise OptionError(f"seeds = {given!r}: give a number of episodes, or a list of seeds")
+    if not all(map(is_count, listed)):
+        raise OptionError(f"seeds = {given!r}: give a number of episodes, or a list of seeds")
     numbers = [int(seed) for seed in listed]
     return numbers if several else [EVALUATION_SEED + number for number in range(numbers[0])]
 

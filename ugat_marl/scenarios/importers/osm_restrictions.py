@@ -105,7 +105,7 @@ def forbidden_turns(root: ET.Element, restrictions: Iterable[Restriction]) -> Fo
         known = junctions.get(one.via, [])
         places = known or [
             name
-            for name in sorted(joined)
+            for name in joined
             if (name, one.from_way) in arriving and (name, one.to_way) in leaving
         ]
         both = {one.from_way, one.to_way}
