@@ -18,7 +18,8 @@ from ugat_marl.simulation import Host
 from ugat_marl.simulation.process import SERVICE
 
 # `studies` is imported from the checkout; behind all else, so that the installed suite is tested.
-sys.path.append(str(Path(__file__).resolve().parents[1]))
+CHECKOUT = str(Path(__file__).resolve().parents[1])
+sys.path.append(CHECKOUT)
 
 hypothesis.settings.register_profile(
     "suite",
@@ -157,8 +158,8 @@ def temporary(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
 
 @pytest.fixture
 def python(monkeypatch: pytest.MonkeyPatch) -> list[str]:
-    """The command of an interpreter that imports the package under test, from any directory."""
+    """The command of an interpreter that imports what this one does, from any directory."""
     package = str(Path(ugat_marl.__file__).parents[1])
     others = filter(None, os.environ.get("PYTHONPATH", "").split(os.pathsep))
-    monkeypatch.setenv("PYTHONPATH", os.pathsep.join(dict.fromkeys([package, *others])))
+    monkeypatch.setenv("PYTHONPATH", os.pathsep.join(dict.fromkeys([package, *others, CHECKOUT])))
     return [sys.executable]

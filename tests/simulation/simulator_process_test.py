@@ -198,15 +198,11 @@ def test_a_seed_fixes_the_episode_whatever_ran_before(python: list[str]) -> None
     env.close()
     other.close()
     script = (
-        "import sys, importlib.util as u\n"
-        "spec = u.spec_from_file_location('t', sys.argv[1])\n"
-        "t = u.module_from_spec(spec); sys.modules['t'] = t; spec.loader.exec_module(t)\n"
-        "env = t.parallel_env(t.NETWORK, duration_s=600, simulator='spawn')\n"
-        "print(t.episode(env, seed=11)); env.close()\n"
+        "from tests.simulation.simulator_process_test import NETWORK, episode, parallel_env\n"
+        "env = parallel_env(NETWORK, duration_s=600, simulator='spawn')\n"
+        "print(episode(env, seed=11)); env.close()\n"
     )
-    again = subprocess.run(
-        [*python, "-c", script, __file__], capture_output=True, text=True, check=True
-    )
+    again = subprocess.run([*python, "-c", script], stdout=subprocess.PIPE, text=True, check=True)
     assert again.stdout.split() == [first]
 
 
