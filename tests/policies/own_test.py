@@ -412,7 +412,7 @@ def test_what_is_typed_in_a_notebook_is_known_by_its_code() -> None:
         )
         exec("\n" * lines + code, space)
         space["Typed"].__module__ = "a notebook"
-        return own_source(own_name(space["Typed"]), "learner")
+        return own_source(own_name(space["Typed"]))
 
     assert hash_of(0) is not None
     assert hash_of(0) == hash_of(0, lines=3) != hash_of(7)

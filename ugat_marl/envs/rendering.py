@@ -51,6 +51,7 @@ class NetworkRenderer:
     ) -> None:
         from matplotlib.backends.backend_agg import FigureCanvasAgg
         from matplotlib.collections import LineCollection, PolyCollection
+        from matplotlib.colors import LinearSegmentedColormap
         from matplotlib.figure import Figure
 
         self._view = _View.of(network, size_px)
@@ -62,7 +63,7 @@ class NetworkRenderer:
         self._axes.set_ylim(0, height)
         self._axes.axis("off")
         self._fastest = max(lane.speed_mps for lane in network.lanes.values())
-        self._colours = _ramp(_SPEEDS)
+        self._colours = LinearSegmentedColormap.from_list("speed", _SPEEDS)(np.arange(256))
         self._draw_roads(network)
         self._draw_names(network, names or {})
         self._draw_legend()
@@ -236,14 +237,3 @@ def _least_distance(points: Floats) -> float:
         return 200.0
     apart = np.linalg.norm(points[:, None] - points[None], axis=2)
     return float(apart[np.triu_indices(len(points), 1)].min())
-
-
-def _ramp(colours: tuple[str, ...]) -> Floats:
-    """Return 256 colours between the given ones, RGBA ``(256, 4)``."""
-    from matplotlib.colors import to_rgba
-
-    stops = np.array([to_rgba(colour) for colour in colours])
-    at = np.linspace(0, len(colours) - 1, 256)
-    low = np.minimum(np.floor(at).astype(np.int64), len(colours) - 2)
-    share = (at - low)[:, None]
-    return stops[low] * (1 - share) + stops[low + 1] * share

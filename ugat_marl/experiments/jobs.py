@@ -44,7 +44,7 @@ from ugat_marl.experiments.evaluation import (
 )
 from ugat_marl.experiments.queues import QUEUES, QueueRecord
 from ugat_marl.experiments.randomised import randomised_env
-from ugat_marl.experiments.settings import DIRECT, Setting, short_name
+from ugat_marl.experiments.settings import CHANGE_COST, DIRECT, Setting, short_name
 from ugat_marl.experiments.training import (
     TrainingCost,
     simulated_worlds,
@@ -641,7 +641,7 @@ def _world(job: Job) -> AnyParallelEnv:
     env = parallel_env(scenario, setting.world or job.target or job.sim, **options)
     if setting.recipe == "delays":
         return RandomDelays(env, setting.most_delay_s)
-    return ChangePenalty(env, setting.change_cost) if setting.recipe == "penalty" else env
+    return ChangePenalty(env, CHANGE_COST) if setting.recipe == "penalty" else env
 
 
 def perform_described(folder: Path) -> int:

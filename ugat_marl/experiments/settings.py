@@ -153,7 +153,7 @@ class LearnerSpec:
                 settings["start"] = file_hash(Path(self.dqn.start))
             return {"name": self.name, "settings": settings}
         if is_own(self.name):
-            source = own_source(self.name, "learner")
+            source = own_source(self.name)
             identity = {"name": self.name, "settings": list(self.settings), "source": source}
             values = own_values(self.name)
             return {**identity, "values": values} if values else identity
@@ -181,7 +181,6 @@ class Setting:
             simulation, "shuffled" permutes the outcomes in D_real, "noise" replaces f by noise.
         episodes: Training episodes after those of direct transfer; None for as many as UGAT has.
         most_delay_s: Longest delay of "delays", in s.
-        change_cost: Cost of a change of "penalty", in the unit of the reward.
         commands: Number of own commands that agents see in training without grounding; a fitted
             street decides it by itself.
         rules: Rules among which "rule" chooses; empty for all.
@@ -195,7 +194,6 @@ class Setting:
     negative_control: NegativeControl = "none"
     episodes: int | None = None
     most_delay_s: int = MOST_DELAY_S
-    change_cost: float = CHANGE_COST
     commands: int = 0
     rules: tuple[str, ...] = ()
 
@@ -245,7 +243,7 @@ class Setting:
         if self.recipe == "delays":
             parts["most_delay_s"] = self.most_delay_s
         if self.recipe == "penalty":
-            parts["change_cost"] = self.change_cost
+            parts["change_cost"] = CHANGE_COST
         if self.commands:
             parts["commands"] = self.commands
         if self.recipe == "untrained":

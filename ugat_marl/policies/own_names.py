@@ -229,18 +229,17 @@ def _made_of(env: Any) -> dict[str, Any]:
     }
 
 
-def own_source(name: str, what: str) -> str | None:
-    """Return the hash of the file that defines a user's object; None if it is in no file.
+def own_source(name: str) -> str | None:
+    """Return the hash of the file that defines a user's learner; None if it has no code.
 
     Args:
         name: Name as for `load_own`.
-        what: Kind of thing for messages, such as "learner".
 
     Raises:
         OptionError: The module is missing.
         UnknownNameError: The object is missing in it.
     """
-    return _file_hash(_named(load_own(name, what)))
+    return _file_hash(_named(load_own(name, "learner")))
 
 
 def _file_hash(kind: Any) -> str | None:

@@ -31,13 +31,10 @@ class PolicyCase(EnvironmentCase):
         policy: The policy.
         make_env: Function that returns a new environment with the policy's `env_options`.
         seed: Seed of the episode and of `policy.reset`.
-        max_steps: Number of steps after which an episode counts as endless.
     """
 
-    def __init__(
-        self, policy: Policy, make_env: MakeEnv, seed: int = 1, max_steps: int = 10_000
-    ) -> None:
-        super().__init__(make_env, seed, max_steps)
+    def __init__(self, policy: Policy, make_env: MakeEnv, seed: int = 1) -> None:
+        super().__init__(make_env, seed)
         self.policy = policy
         self._first: Answers | None = None
         self._again: Answers | None = None

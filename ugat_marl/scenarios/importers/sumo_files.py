@@ -39,7 +39,8 @@ def from_sumo(path: Path, *, link: bool, own_vehicles: bool) -> RoadSource:
 
     def roads(folder: Path, reporter: Reporter) -> RoadFiles:
         if not configuration:
-            _require_root(path, ("net",), "SUMO network", reporter)
+            for _ in _rooted(path, ("net",), "SUMO network", reporter):
+                pass
             name = _placed(path, folder, link)
             return RoadFiles(
                 f"SUMO network {path.name}",
@@ -206,11 +207,6 @@ def _require_connected(tag: Tag, leads: Mapping[str, set[str]], path: Path, netw
                 f"{path}, line {tag.line}: a route goes from edge {a!r} to {b!r}, but no "
                 f"connection of {network} leads there; route the demand again (duarouter)"
             )
-
-
-def _require_root(path: Path, tags: Sequence[str], kind: str, reporter: Reporter) -> None:
-    for _ in _rooted(path, tags, kind, reporter):
-        pass
 
 
 def _rooted(path: Path, tags: Sequence[str], kind: str, reporter: Reporter) -> Iterator[Tag]:
