@@ -427,6 +427,10 @@ WRONG: dict[str, tuple[dict[str, Change], str]] = {
         {"detectors.csv": lambda text: text.replace("length_m", "lane_id ", 1)},
         r"column 'lane_id' is there twice",
     ),
+    "column twice by one name": (
+        {"detectors.csv": lambda text: text.replace("length_m", "lane_id", 1)},
+        r"column 'lane_id' is there twice",
+    ),
     "column missing": (
         {"periods.csv": replaced("begin_s", "begins")},
         r"'begin_s' \(is it 'begins'",
@@ -704,6 +708,7 @@ def test_a_zero_that_clocks_did_not_show_is_an_error() -> None:
     [
         ("lanes", "10,{lane},2,9", "halting '9.0' is more than there are vehicles"),
         ("lanes", "10,{lane},5000,0", "vehicles '5000.0' is more than the lane has room for"),
+        ("lanes with speeds", "10,{lane},2,1,80", "mean_speed_mps '80.0' is more than 70 m/s"),
         ("trajectories", "v,10,{lane},99999,5", "position_m '99999.0' is beyond the end of"),
         ("trajectories", "v,10,{lane},50,900", "speed_mps '900.0' is more than 70 m/s"),
     ],
@@ -716,9 +721,10 @@ def test_moments_that_no_street_shows_are_refused(
     lane = network.intersections[0].incoming_lanes[0]
     columns = {
         "lanes": "period_id,time_s,lane_id,vehicles,halting",
+        "lanes with speeds": "period_id,time_s,lane_id,vehicles,halting,mean_speed_mps",
         "trajectories": "period_id,vehicle_id,time_s,lane_id,position_m,speed_mps",
     }
-    table = tables.LANES if name == "lanes" else tables.TRAJECTORIES
+    table = tables.TRAJECTORIES if name == "trajectories" else tables.LANES
     path = tmp_path / f"{name}.csv"
     path.write_text(f"{columns[name]}\np,{row.format(lane=lane)}\n")
     files: Any = SimpleNamespace(

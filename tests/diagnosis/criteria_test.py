@@ -2,14 +2,27 @@
 
 from __future__ import annotations
 
+from types import SimpleNamespace
+from typing import Any
+
 import numpy as np
 import pytest
 from numpy.typing import ArrayLike
 
 from ugat_marl.diagnosis import Tally
-from ugat_marl.diagnosis.features import BIN_FEATURES, FEATURES, INDEX
+from ugat_marl.diagnosis.features import ALL_FEATURES, BIN_FEATURES, FEATURES, INDEX
+from ugat_marl.diagnosis.statistics import Distance
 from ugat_marl.diagnosis.thresholds import Thresholds
-from ugat_marl.diagnosis.verify import Criteria, fhwa, geh, hourly, representative
+from ugat_marl.diagnosis.verify import (
+    Criteria,
+    fhwa,
+    geh,
+    hourly,
+    lanes_table,
+    representative,
+    statistics_table,
+    travel_times,
+)
 
 THRESHOLDS = Thresholds()
 
@@ -101,3 +114,57 @@ def test_counts_of_an_hour_are_compared_by_the_hour() -> None:
     )
     assert by_hour == Criteria(1.0, 1.0, 1.0, 1.0)
     assert by_quarter is not None and by_quarter.within_2_sigma == 0.0
+
+
+def test_no_measured_interval_is_split() -> None:
+    """Counts of ten minutes are judged by twenty, for a quarter of an hour would smooth them."""
+    generator = np.random.default_rng(1)
+    counts = generator.poisson(100, (40, 6)).astype(float)  # 40 days of an hour
+
+    def of_day(row: np.ndarray) -> Tally:
+        bins = np.zeros((len(BIN_FEATURES), 1, 12))
+        bins[STOP] = np.repeat(row / 2.0, 2)
+        return Tally(np.zeros((len(FEATURES), 1, 2)), bins)
+
+    days = [of_day(row) for row in counts]
+    sums = counts.reshape(40, 3, 2).sum(axis=2)
+    mean = of_day(np.repeat(sums.mean(axis=0) / 2.0, 2))
+    typical = sums[representative(sums[:, None])]
+    within = np.abs(typical - sums.mean(axis=0)) <= sums.std(axis=0, ddof=1)
+    found = fhwa(days, [mean], 2, THRESHOLDS)
+    assert found is not None and found.within_1_sigma == pytest.approx(within.mean())
+
+
+def test_a_statistic_without_any_difference_stays_in_the_tables() -> None:
+    width = len(ALL_FEATURES)
+    used = np.zeros((1, width), np.bool_)
+    used[0, :2] = True
+    z = np.zeros((1, width))
+    z[0, 1] = 4.0
+    parts = {"network": z, "lane": z}
+    distance = Distance(0.0, {}, 0.0, {"network": used, "lane": used}, parts, parts)
+    block = SimpleNamespace(mean=np.ones((1, width)), variance=np.ones((1, width)))
+    reference = SimpleNamespace(
+        distance=lambda *_, **__: distance, blocks={"network": block, "lane": block}
+    )
+    model: Any = SimpleNamespace(model=SimpleNamespace(reference=reference))
+    layout = SimpleNamespace(places=[(0, "in", "in_0")], intersections=("A",))
+    study: Any = SimpleNamespace(heldout=[None], layout=layout)
+    first, second = statistics_table(study, model, model)
+    assert (first.z_before, second.z_before) == (0.0, 4.0)
+    (lane,) = lanes_table(study, model, model)
+    assert lane.before == pytest.approx(np.sqrt(8.0))  # of a 0 and a 4
+
+
+def test_travel_times_ask_for_no_further_days() -> None:
+    asked: list[list[int]] = []
+
+    def ordinary(_: object, numbers: list[int]) -> dict[int, Any]:
+        asked.append(numbers)
+        return {number: SimpleNamespace(travel_time_s=100.0) for number in numbers}
+
+    engine = SimpleNamespace(first=lambda count: range(1, count + 1), ordinary=ordinary)
+    study: Any = SimpleNamespace(engine=engine, effort=SimpleNamespace(test=4, base=4))
+    base: Any = SimpleNamespace(model=SimpleNamespace(days=dict.fromkeys(range(4)), effects=()))
+    travel_times(study, base, base)
+    assert asked == [[1, 2, 3]] * 2

@@ -8,7 +8,7 @@ from collections.abc import Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
 from pathlib import Path
-from typing import Any
+from typing import Any, cast
 
 import numpy as np
 import pytest
@@ -314,6 +314,20 @@ def test_what_decides_a_day_decides_which_is_remembered(
     for name, (made, streets) in others.items():
         made.replicates((), [0])
         assert len(streets.calls) == 1, name
+
+
+def test_sums_between_places_are_those_of_their_own_period(
+    scenario: Scenario, layout: DetectorLayout, tmp_path: Path
+) -> None:
+    """Two periods of equal signals and hours are one day else; their spans differ."""
+    periods = [replace(PERIODS[0], id=name) for name in ("a", "b")]
+    keys: list[set[str]] = []
+    for order in (periods, periods[::-1]):
+        made, _ = an_engine(scenario, layout, tmp_path, periods=order)
+        keys.append({made._key((), 0)})
+        made._supplementary = cast(Any, object())
+        keys.append({made._key((), 0)})
+    assert keys[0] == keys[2] and keys[1] != keys[3]
 
 
 def test_another_version_of_the_features_forgets(

@@ -373,16 +373,17 @@ def a_surge(begin_s: float, end_s: float) -> Members:
     return ((Hypothesis("demand_surge", fixed, ("factor",), ((1.5,),), (1.0,), 0.1), (1.5,)),)
 
 
-def a_fitter_of_windows(truth: tuple[float, float]) -> Fitter:
+def a_fitter_of_windows(*truth: tuple[float, float]) -> Fitter:
     world = Windows()
     base_days = played(world)
-    data = [with_surge(number, 0.5 * surge(*truth), 18) for number in range(5)]
+    change = 0.5 * sum((surge(*window) for window in truth), np.zeros(WIDTH))
+    data = [with_surge(number, change, 18) for number in range(5)]
     base = Reference(POOLS, list(base_days.values()))
     return Fitter(world, POOLS, base, base_days, data, days=8, speeds=True)
 
 
-def window_of(members: Members) -> tuple[float, float]:
-    fixed = dict(members[0][0].fixed)
+def window_of(members: Members, place: int = 0) -> tuple[float, float]:
+    fixed = dict(members[place][0].fixed)
     return float(fixed["begin_s"]), float(fixed["end_s"])
 
 
@@ -397,6 +398,15 @@ def test_a_window_five_minutes_off_at_both_ends_is_found(first: tuple[float, flo
     assert window_of(best.members) == pytest.approx(Windows.TRUTH, abs=45.0)
     assert best.values[0] == pytest.approx(1.5, abs=0.05)
     assert best.cost <= begun.cost
+
+
+def test_two_windows_that_are_off_to_both_sides_are_found() -> None:
+    truth = (600.0, 1200.0), (2400.0, 3000.0)
+    fitter = a_fitter_of_windows(*truth)
+    members = (*a_surge(480.0, 1080.0), *a_surge(2520.0, 3120.0))
+    best = fitter._windows(fitter.simulate(members))
+    for place, window in enumerate(truth):
+        assert window_of(best.members, place) == pytest.approx(window, abs=45.0)
 
 
 def test_the_values_alone_would_not_find_the_window() -> None:

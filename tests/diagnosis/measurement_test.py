@@ -19,6 +19,8 @@ from ugat_marl.diagnosis.measurement import (
     THIRD,
     Measurement,
     Sightings,
+    _regimes_at_stop,
+    _Track,
     together,
 )
 from ugat_marl.diagnosis.thresholds import OF_SIGHTINGS, Thresholds
@@ -125,6 +127,23 @@ def test_an_extension_looks_like_a_zone_where_all_drive_at_one_speed(pace: float
     else:
         assert str(error.rival) == "detector_zone=*,3"
         assert said.endswith(", or have zones 3 m longer than stated (here both look the same)")
+
+
+@pytest.mark.parametrize("earlier", [(), (20.0, 60.0), (97.0,)])
+def test_vehicles_before_the_first_whole_green_are_no_part_of_its_queue(
+    earlier: tuple[float, ...],
+) -> None:
+    starts, ends = np.array([100.0, 200.0]), np.array([130.0, 230.0])
+    greens = Greens(starts, ends, ends + 3, np.array([200.0, 300.0]), np.ones(2, np.bool_))
+    off = np.array([*earlier, *(at + n for at in starts for n in (2, 4, 6, 8, 10))])
+    on = off - 1.0
+    on[[len(earlier), len(earlier) + 5]] = starts - 2.0  # the first one waits
+    five = np.full(len(on), 5.0)
+    track = _Track.of(
+        Passages(on, off, five, five), Detector("line", "in_0", 150.0, 0.0, "stop"), THRESHOLDS
+    )
+    queues = _regimes_at_stop(track, greens, THRESHOLDS)[len(earlier) :].tolist()
+    assert queues[:5] == queues[5:] == [-1, SECOND, THIRD, FOURTH, FOURTH]
 
 
 def test_nothing_is_named_where_nothing_is_wrong() -> None:

@@ -155,6 +155,30 @@ def test_where_nothing_is_planted_hardly_anything_is_told() -> None:
     assert told <= 1
 
 
+def test_of_patterns_that_overlap_each_has_what_the_others_leave(
+    simulated: list[dict[str, np.ndarray]],
+) -> None:
+    slower = {0: 1 / 0.7, 1: 1 / 0.85}  # north_0 discharges 30 % less, north_1 15 %
+
+    def street(seed: int) -> dict[str, np.ndarray]:
+        cells_there = cells(day(seed))
+        for lane, factor in slower.items():
+            cells_there["discharge"][lane] *= [1.0, factor, factor**2]
+        return cells_there
+
+    days = [street(seed) for seed in range(5)]
+    span = 0.0, HOUR_S
+    told = patterns(LAYOUT, days[:3], days[3:], simulated, ("discharge",), span, THRESHOLDS, 0.05)
+    places = [(one.place, one.movement) for one in told]
+    assert len(places) > 1 and len({*places}) == len(places)
+    lost = {str(one).split(",")[0]: float(str(one).split(",")[-1])
+            for one in unnamed_effects(told, LAYOUT, (), decision_s=10.0)}  # fmt: skip
+    assert lost == {
+        "lane_service=north_0": pytest.approx(3.0, abs=0.2),
+        "lane_service=north_1": pytest.approx(1.5, abs=0.2),
+    }
+
+
 def test_a_pattern_of_the_fitted_periods_alone_is_not_told(
     simulated: list[dict[str, np.ndarray]],
 ) -> None:

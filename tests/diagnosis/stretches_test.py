@@ -27,7 +27,7 @@ def largest(difference: dict[tuple[str, int], list[float]], variance: float) -> 
     for (kind, lane), row in difference.items():
         values[BIN_FEATURES.index(kind) * len(EDGES) + lane] = row
     z = values / np.sqrt(variance)
-    return largest_stretches(EDGES, Distance(0.0, {}, 0.0, {"time": z}, {"time": values}))
+    return largest_stretches(EDGES, Distance(0.0, {}, 0.0, {}, {"time": z}, {"time": values}))
 
 
 def test_lanes_of_an_edge_are_added() -> None:

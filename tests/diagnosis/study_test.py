@@ -213,7 +213,7 @@ def test_an_interval_that_was_not_reported_is_no_quieter_day() -> None:
     days = [Tally(sums, bins), Tally(sums, bins * known, known=known)]
     layout = SimpleNamespace(lanes=(SimpleNamespace(intersection=0),), intersections=("C",))
     given = SimpleNamespace(periods=measured(NAMES, NAMES).periods)
-    found = measured_variation(cast(Any, layout), cast(Any, given), days, THRESHOLDS)
+    found = measured_variation(cast(Any, layout), cast(Any, given), (days, ()), THRESHOLDS)
     assert found == 0.0
 
 
@@ -274,6 +274,17 @@ def test_a_day_alone_and_a_street_without_vehicles_do_not_vary() -> None:
     assert day_to_day_variation(np.array([[90.0]]), Thresholds()) == 0.0
     assert day_to_day_variation(np.zeros((2, 5)), Thresholds()) == 0.0
     assert day_to_day_variation(np.empty((0, 5)), Thresholds()) == 0.0
+
+
+def test_a_change_between_fitted_and_held_out_days_is_no_variation() -> None:
+    days = np.array([[2000.0, 2030.0, 1980.0, 2500.0, 2480.0]])
+    assert day_to_day_variation(days, Thresholds()) > 0.1
+    assert day_to_day_variation(days, Thresholds(), [0, 0, 0, 1, 1]) == 0.0
+    varied = np.array([[2000.0, 2600.0, 1500.0, 2500.0, 1600.0]])
+    assert day_to_day_variation(varied, Thresholds(), [0, 0, 0, 1, 1]) > 0.1
+    alone = np.array([[2000.0, 2500.0]])  # nothing tells a change from a variation
+    of_two = day_to_day_variation(alone, Thresholds())
+    assert day_to_day_variation(alone, Thresholds(), [0, 1]) == of_two > 0.0
 
 
 def test_of_several_places_the_busiest_one_counts() -> None:

@@ -72,6 +72,19 @@ def test_greens_without_vehicles_are_no_journeys() -> None:
     assert check is not None and check.measure != "travel time and queue"
 
 
+def test_a_correction_that_empties_a_lane_is_refused() -> None:
+    """The other lane alone would come nearer."""
+    real, old = days(1, 2, 25, 5), days(2, 16, 25, 5)
+    old = [replace(day, journeys=day.journeys * [[[1.1, 1.0], [1.0, 1.0]]]) for day in old]
+    new = [
+        replace(day, journeys=day.journeys * [[[1.0], [0.0]], [[1.0], [0.0]]])
+        for day in days(3, 16, 25, 5)
+    ]
+    check = traffic_check(real, old, new, THRESHOLDS)
+    assert check is not None and not check.better
+    assert check.error_after == pytest.approx(1.0, abs=0.1)  # half of the times, half of the queues
+
+
 def test_a_correction_that_makes_waiting_worse_is_refused() -> None:
     check = traffic_check(days(1, 2, 20, 4), days(2, 16, 20, 4), days(3, 16, 22, 5), THRESHOLDS)
     assert check is not None and not check.better

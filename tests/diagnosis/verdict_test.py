@@ -350,6 +350,21 @@ def test_a_rival_is_as_near_after_as_many_days(settled: float, named: int) -> No
     assert len(_rivals(selection, selector, DiagnosisConfig())) == named
 
 
+@pytest.mark.parametrize(("edge", "named"), [("E_C", 1), ("S_C", 0)])
+def test_the_same_effect_elsewhere_is_a_rival(edge: str, named: int) -> None:
+    def slow(edge: str, cost: float) -> Any:
+        hypothesis = Hypothesis("local_speed", (("edge", edge),), ("factor",), ((0.8,),), (1.0,))
+        return SimpleNamespace(members=((hypothesis, (0.8,)),), cost=cost)
+
+    best: Any = SimpleNamespace(model=slow("S_C", 100.0))
+    other = slow(edge, 100.1)
+    selector: Any = SimpleNamespace(
+        test=lambda model: SimpleNamespace(model=model, residual=SimpleNamespace(p=0.5))
+    )
+    selection = Selected(best, (other,), True, examined=frozenset())
+    assert len(_rivals(selection, selector, DiagnosisConfig())) == named
+
+
 def test_a_set_of_effects_is_told_once_among_the_alternatives() -> None:
     """A model that fits as well was simulated again, with more days, and is another object."""
 

@@ -57,7 +57,7 @@ def a_distance(layout: DetectorLayout, counts: Counts) -> Distance:
             row = INDEX["count_stop" if place < len(layout.lanes) else "count_exit"]
             value, error = counts[edge]
             difference[place, row], z[place, row] = value / 60.0, value / error
-    return Distance(0.0, {}, 0.0, {"lane": z}, {"lane": difference})
+    return Distance(0.0, {}, 0.0, {}, {"lane": z}, {"lane": difference})
 
 
 def directed(layout: DetectorLayout, ways: Mapping[Way, float], counts: Counts) -> dict[str, float]:

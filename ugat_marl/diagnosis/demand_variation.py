@@ -14,7 +14,9 @@ from ugat_marl.diagnosis.statistics import Array
 from ugat_marl.diagnosis.thresholds import Thresholds
 
 
-def day_to_day_variation(counts: Array, thresholds: Thresholds) -> float:
+def day_to_day_variation(
+    counts: Array, thresholds: Thresholds, splits: Sequence[int] | None = None
+) -> float:
     """Estimate how much demand varies from day to day, on top of the chance of single vehicles.
 
     The mean square of a day's counts around their mean has the expectation ``m + (s m)^2``, for a
@@ -26,6 +28,9 @@ def day_to_day_variation(counts: Array, thresholds: Thresholds) -> float:
         counts: Vehicles per day at places that no vehicle passes twice, ``(places, days)``. The
             busiest one is used: others see many of the same vehicles.
         thresholds: Numbers of the method.
+        splits: Number of each day's split; None for one. Days differ from the mean of their own
+            split, because a change between the splits is no variation. Splits of single days are
+            taken together.
 
     Returns:
         Standard deviation as a share of the mean, rounded to `Thresholds.grain_of_variation`.
@@ -33,8 +38,12 @@ def day_to_day_variation(counts: Array, thresholds: Thresholds) -> float:
     days = counts[int(np.argmax(counts.sum(axis=1)))] if len(counts) else np.empty(0)
     if len(days) < 2 or not days.mean():
         return 0.0
-    freedom = len(days) - 1
-    squares = max(float(((days - days.mean()) ** 2).sum()), 1e-6)  # counts may be equal
+    own = np.zeros(len(days), np.int64) if splits is None else np.asarray(splits)
+    if len(set(own)) == len(days):
+        own = np.zeros_like(own)
+    usual = np.array([days[own == split].mean() for split in own])
+    freedom = len(days) - len(set(own))
+    squares = max(float(((days - usual) ** 2).sum()), 1e-6)  # counts may be equal
     shares = np.arange(0.0, 1.0, 0.002)
     scale = days.mean() + (shares * days.mean()) ** 2
     logs = stats.chi2.logpdf(squares / scale, freedom) - np.log(scale)
@@ -51,9 +60,20 @@ def day_to_day_variation(counts: Array, thresholds: Thresholds) -> float:
 
 
 def measured_variation(
-    layout: DetectorLayout, measured: MeasuredData, days: Sequence[Tally], thresholds: Thresholds
+    layout: DetectorLayout,
+    measured: MeasuredData,
+    splits: Sequence[Sequence[Tally]],
+    thresholds: Thresholds,
 ) -> float:
-    """Estimate the variation from day to day; 0 if the periods are not the same time of days."""
+    """Estimate the variation from day to day; 0 if the periods are not the same time of days.
+
+    Args:
+        layout: Lanes and detectors.
+        measured: The data.
+        splits: Tallies of the fitted and of the held-out periods.
+        thresholds: Numbers of the method.
+    """
+    days = [day for split in splits for day in split]
     if len({(period.begin_s, period.end_s) for period in measured.periods}) > 1:
         return 0.0
     owners = np.array([lane.intersection for lane in layout.lanes])
@@ -66,7 +86,8 @@ def measured_variation(
             for kind in (BIN_FEATURES.index("count_stop"), BIN_FEATURES.index("count_advance"))
         ]
         rows.append(max(by_kind, key=lambda counts: float(counts.sum())))
-    return day_to_day_variation(np.array(rows), thresholds)
+    numbers = [number for number, split in enumerate(splits) for _ in split]
+    return day_to_day_variation(np.array(rows), thresholds, numbers)
 
 
 def variation_findings(variation: float) -> tuple[Finding, ...]:

@@ -108,8 +108,12 @@ def _counts(tallies: Sequence[Tally]) -> NDArray[np.float64]:
 
 # --- simulated days -------------------------------------------------------------------------------
 
-VERSION = 9
+VERSION = 10
 """Version of features and replays; tallies cached under another version are not used."""
+
+_READING = threading.Lock()
+"""Held while arrays are read: numpy parses their heads with `ast`, and in Python 3.11 two threads
+that do so at once may raise a SystemError (gh-106905)."""
 
 _SUPPLEMENTARY = "between "
 """Start of the names of `Tally.supplementary` in the cache."""
@@ -549,8 +553,11 @@ class Engine:
         return self._workers.submit(self._replay.simulate, effects, period, seed).result()
 
     def _key(self, effects: Sequence[Effect], number: int) -> str:
-        signals = self._signals[number % len(self.periods)]
-        text = repr((self._root, tuple(map(str, effects)), number, signals))
+        place = number % len(self.periods)
+        of_period = (self._signals[place],)
+        if self._supplementary is not None:  # its spans are those of the period
+            of_period += (self.periods[place].id,)
+        text = repr((self._root, tuple(map(str, effects)), number, *of_period))
         return hashlib.sha256(text.encode()).hexdigest()
 
     def _remembered(self, key: str, number: int) -> Replicate | None:
@@ -597,8 +604,9 @@ class Engine:
         """Return the arrays under a key of the cache; None if absent or damaged."""
         if self._cache is None:
             return None
+        file = self._cache / key[:2] / f"{key}.npz"
         try:
-            with np.load(self._cache / key[:2] / f"{key}.npz", allow_pickle=False) as stored:
+            with _READING, np.load(file, allow_pickle=False) as stored:
                 return {name: stored[name] for name in stored.files}
         except (OSError, EOFError, ValueError, KeyError, zipfile.BadZipFile, zlib.error):
             return None

@@ -76,7 +76,7 @@ class Greens:
         end_s: End of green and start of yellow.
         red_s: Start of red.
         next_s: Start of the next green, or end of the period.
-        protected: True if the green gives right of way.
+        protected: True if the green gives right of way when it begins.
     """
 
     start_s: NDArray[np.float64]

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 import math
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
@@ -227,13 +228,13 @@ class Fitter:
         members = best.members
         cost = self.simulate(members, self.thresholds.window_days).cost
         for step in self.thresholds.window_steps_s:
-            for direction in ((-1, 0), (1, 0), (0, -1), (0, 1)):
+            sides = ((-1, 0), (1, 0), (0, -1), (0, 1))
+            for place, direction in itertools.product(range(len(members)), sides):
                 while True:
                     move = (step * direction[0], step * direction[1])
-                    moved = tuple(
-                        (_shifted(h, move, self.thresholds.shortest_window_s), values)
-                        for h, values in members
-                    )
+                    hypothesis, values = members[place]
+                    shifted = _shifted(hypothesis, move, self.thresholds.shortest_window_s)
+                    moved = (*members[:place], (shifted, values), *members[place + 1 :])
                     if moved == members:
                         break
                     cost_after = self.simulate(moved, self.thresholds.window_days).cost

@@ -272,9 +272,10 @@ def _regimes_at_stop(track: _Track, greens: Greens, thresholds: Thresholds) -> N
         return regime
     cycle, green = _cycles(track.on + track.over, greens)
     settled = green & (track.on > greens.start_s[cycle] + thresholds.settled_green_s)
-    first = np.searchsorted(cycle, cycle, "left")
-    number = np.arange(len(cycle)) - first
     crossed = track.on + track.over
+    begun = np.searchsorted(greens.start_s, crossed, "right")  # 0 before the first whole green
+    first = np.searchsorted(begun, begun, "left")
+    number = np.arange(len(cycle)) - first
     gap = np.where(number == 0, 0.0, np.diff(crossed, prepend=crossed[0]))
     broken = np.cumsum(gap > thresholds.queue_break_s)
     waited = track.on[first] < greens.start_s[cycle[first]]

@@ -11,7 +11,8 @@ vehicle. With m the simulated mean of a cell, s^2 its variance and n numbers of 
 A pattern is a set of cells that differs by the same share b: all cells of some lanes, from some
 vehicle on, in some window of time. Its best share is b = sum(a) / sum(v), and it explains
 sum(a)^2 / sum(v). All such sets are compared, and the best one is taken off, until only chance is
-left. Chance is known from simulated days that are treated as data.
+left. The shares of all sets found are estimated together, so that of two that overlap each has what
+the other leaves. Chance is known from simulated days that are treated as data.
 """
 
 from __future__ import annotations
@@ -327,9 +328,21 @@ class Regression:
         place = tuple(int(index) for index in chosen)
         return PatternTerm(place, share, 1.0 / math.sqrt(max(own, 1e-12)), float(gain[chosen]))
 
-    def taken_off(self, pull: Array, size: Array, term: PatternTerm) -> Array:
-        """Return the pulls that are left once the share of a term is expected."""
-        return pull - term.share * size * self.mask(term)
+    def together(self, measured: Array, terms: Sequence[PatternTerm]) -> list[PatternTerm]:
+        """Return terms with the shares that explain most together, by weighted least squares."""
+        pull, size = self.pulls(measured)
+        masks = [self.mask(term) for term in terms]
+        sizes = [[float((size * one * other).sum()) for other in masks] for one in masks]
+        pulls = [float((pull * mask).sum()) for mask in masks]
+        shares = np.linalg.lstsq(np.array(sizes), np.array(pulls), rcond=None)[0]
+        return [replace(term, share=float(b)) for term, b in zip(terms, shares, strict=True)]
+
+    def without(self, measured: Array, terms: Sequence[PatternTerm]) -> Array:
+        """Return data from which the shares of terms are taken off."""
+        left, (mean, _) = measured.copy(), self._usual
+        for term in terms:
+            left[..., 1] -= term.share * self.mask(term) * mean * measured[..., 0]
+        return left
 
     def of(self, term: PatternTerm, measured: Array) -> tuple[float, float]:
         """Return share and standard error of data in the set of cells of a term.
@@ -415,20 +428,33 @@ def _terms(
     alpha: float,
 ) -> Iterator[tuple[PatternTerm, float, float | None]]:
     """Yield terms with their p value and their share on the held-out periods."""
-    pull, size = regression.pulls(measured)
-    for _ in range(thresholds.most_patterns):
-        term = regression.best(pull, size)
-        p = chance(term.gain)
-        share, error = regression.of(term, measured)
-        if p > alpha or abs(share) < thresholds.least_share:
-            return
-        again: float | None = None
-        if heldout is not None:
-            again, doubt = regression.of(term, heldout)
-            if again * math.copysign(1.0, share) < thresholds.half_interval * doubt:
-                return  # the other periods do not have it
-        yield replace(term, share=share, error=error), p, again
-        pull = regression.taken_off(pull, size, term)
+
+    def judged(terms: Sequence[PatternTerm]) -> list[tuple[PatternTerm, float | None] | None]:
+        """Return each with what the others leave, and with that on the held-out periods, if any.
+
+        None for a term that is too small, or that the held-out periods do not have.
+        """
+        found: list[tuple[PatternTerm, float | None] | None] = []
+        for place, term in enumerate(terms):
+            others = [*terms[:place], *terms[place + 1 :]]
+            share, error = regression.of(term, regression.without(measured, others))
+            again, holds = None, abs(share) >= thresholds.least_share
+            if heldout is not None:
+                again, doubt = regression.of(term, regression.without(heldout, others))
+                holds &= again * math.copysign(1.0, share) >= thresholds.half_interval * doubt
+            found.append((replace(term, share=share, error=error), again) if holds else None)
+        return found
+
+    terms: list[PatternTerm] = []
+    while len(terms) < thresholds.most_patterns:
+        new = regression.best(*regression.pulls(regression.without(measured, terms)))
+        more = regression.together(measured, [*terms, new])
+        if chance(new.gain) > alpha or judged(more)[-1] is None:
+            break
+        terms = more
+    for one in filter(None, judged(terms)):
+        term, again = one
+        yield term, chance(term.gain), again
 
 
 def _by_chance(
@@ -510,14 +536,16 @@ def unnamed_effects(
         origins: Edges on which vehicles start.
         decision_s: Time between two decisions of a controller, s.
     """
-    service: dict[str, tuple[float, float]] = {}
+    service: dict[str, tuple[float, float]] = {}  # seconds at the begin, and how much gaps grow
     demand: list[Effect] = []
     for one in found:
         if one.quantity == "discharge" and one.window is None and not one.long_vehicles:
-            begin, each = _lost_s(one, decision_s)
+            until_s = _until_s(one)
+            lost_s = 0.0 if until_s is None else -one.change * until_s
+            growth = 1.0 / (1.0 + one.change) - 1.0 if until_s is None else 0.0
             for lane in _lanes_of(one, layout):
                 before = service.get(lane, (0.0, 0.0))
-                service[lane] = before[0] + begin, before[1] + each
+                service[lane] = before[0] + lost_s, before[1] + growth
         elif (
             one.quantity == "count"
             and one.place
@@ -531,23 +559,22 @@ def unnamed_effects(
                 if one.window is None
                 else DemandSurge(one.place, *one.window, factor)
             )
-    lost = [
-        LaneService(lane, min(begin, MOST_LOST_S), min(each, MOST_LOST_S))
-        for lane, (begin, each) in service.items()
-        if begin or each
-    ]
+    lost: list[Effect] = []
+    for lane, (lost_s, growth) in service.items():
+        begin, each = (
+            round(min(max(seconds, 0.0), MOST_LOST_S), 1)
+            for seconds in (lost_s, decision_s * (1.0 - 1.0 / (1.0 + growth)))
+        )
+        if begin or each:
+            lost.append(LaneService(lane, begin, each))
     return (*demand, *lost)
 
 
-def _lost_s(pattern: Pattern, decision_s: float) -> tuple[float, float]:
-    """Return unused seconds at the start of green and in each further decision."""
-    share = max(-pattern.change, 0.0)
+def _until_s(pattern: Pattern) -> float | None:
+    """Return the age of green, s, at which a pattern ends; None if it does not."""
     _, until_s = pattern.green_s or (None, None)
     _, until = pattern.vehicles or (None, None)
-    if until_s is None and until is not None:
-        until_s = until * USUAL_GAP_S
-    lost = (share * until_s, 0.0) if until_s is not None else (0.0, share * decision_s)
-    return round(lost[0], 1), round(lost[1], 1)
+    return until * USUAL_GAP_S if until_s is None and until is not None else until_s
 
 
 def _lanes_of(pattern: Pattern, layout: DetectorLayout) -> list[str]:

@@ -158,13 +158,15 @@ class Distance:
         parts: Squared Mahalanobis distance of every block.
         penalty: Sum of the logarithms of the variances relative to those of a reference, for the
             comparison of models; 0 without a reference.
-        z: Standardised differences of every block, 0 where unused, ``(members, features)``.
+        used: Mask of the statistics that are compared, by block, ``(members, features)``.
+        z: Standardised differences of every block, 0 where unused, same shape.
         difference: Data minus model in units of the features, 0 where unused, same shape.
     """
 
     total: float
     parts: dict[str, float]
     penalty: float
+    used: dict[str, NDArray[np.bool_]]
     z: dict[str, Array]
     difference: dict[str, Array]
 
@@ -296,12 +298,14 @@ class Reference:
         missing = max(1, len(self.stretches)) / len(measured) - 1.0 if self.stretches else 0.0
         total = penalty = 0.0
         parts: dict[str, float] = {}
+        compared: dict[str, NDArray[np.bool_]] = {}
         z: dict[str, Array] = {}
         difference: dict[str, Array] = {}
         for name, block in self.blocks.items():
             other = relative_to.blocks[name] if relative_to else block
             weight = sums[name][..., 1] / len(data)
             used = other.used & (weight >= self._thresholds.least_measured)
+            compared[name] = used
             value = sums[name][..., 0] / np.maximum(sums[name][..., 1], 1e-9)
             variance = block.noise(weight, len(data)) + missing * self._of_stretches[name]
             if extra is not None:
@@ -318,7 +322,7 @@ class Reference:
                     np.maximum(variance, 1e-12) / (other.variance / len(data) + other.doubt)
                 )
                 penalty += float(ratio[used].sum())
-        return Distance(total, parts, penalty, z, difference)
+        return Distance(total, parts, penalty, compared, z, difference)
 
 
 def softened(block: str, z: Array, thresholds: Thresholds) -> Array:
@@ -353,12 +357,12 @@ def _stretches(
     for window in set(windows):
         own = np.array([other == window for other in windows])
         found[window] = {
-            name: np.nan_to_num(_means(sums[own]) - _means(sums)) for name, sums in stacked.items()
+            name: np.nan_to_num(means(sums[own]) - means(sums)) for name, sums in stacked.items()
         }
     return found
 
 
-def _means(sums: Array) -> Array:
+def means(sums: Array) -> Array:
     """Return ratios of sums over days; NaN without observations."""
     total = sums.sum(axis=0)
     return np.where(total[..., 1] > 0, total[..., 0] / np.maximum(total[..., 1], 1e-9), np.nan)

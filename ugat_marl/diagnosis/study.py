@@ -182,7 +182,7 @@ class Study:
         supplementary = SupplementaryData.of(measured)
         fit = _tallies(layout, measured, periods, thresholds, supplementary)
         heldout = _tallies(layout, measured, measured.of("heldout"), thresholds, supplementary)
-        variation = measured_variation(layout, measured, (*fit, *heldout), thresholds)
+        variation = measured_variation(layout, measured, (fit, heldout), thresholds)
         measured = _noted(measured, variation_findings(variation))
 
         def simulating(answering: bool, base_days: int) -> Engine:

@@ -20,7 +20,7 @@ from ugat_marl.diagnosis.features import (
     Tally,
 )
 from ugat_marl.diagnosis.records import ApproachRow, Sides, TrafficCheck
-from ugat_marl.diagnosis.statistics import Array, sum_of
+from ugat_marl.diagnosis.statistics import Array, means, sum_of
 from ugat_marl.diagnosis.supplementary_data import TRAVEL_TIME
 from ugat_marl.diagnosis.thresholds import Thresholds
 
@@ -134,10 +134,12 @@ def _check(
 
     Both models have the same days.
     """
-    street, simulated, repaired = (_ratio(side.sum(axis=0)) for side in (real, old, new))
+    street, simulated, repaired = (means(side) for side in (real, old, new))
     weight = real.sum(axis=0)[..., 1]
-    used = np.isfinite(street) & np.isfinite(simulated) & np.isfinite(repaired)
+    # A place that one model alone has emptied counts against it, with the whole measured value.
+    used = np.isfinite(street) & (np.isfinite(simulated) | np.isfinite(repaired))
     weight = np.where(used, weight, 0.0)
+    simulated, repaired = np.nan_to_num(simulated), np.nan_to_num(repaired)
 
     def error(model: Array, data: Array) -> float:
         apart = np.where(used, np.abs(data - model), 0.0) * weight
@@ -148,9 +150,9 @@ def _check(
     gains: list[float] = []
     for _ in range(thresholds.check_draws):
         days = generator.choice(len(new), len(real))
-        drawn = street + np.nan_to_num(_ratio(new[days].sum(axis=0)) - repaired)
+        drawn = street + np.nan_to_num(means(new[days]) - repaired)
         again = generator.choice(len(new), len(new))  # the same days of both models
-        models = (np.nan_to_num(_ratio(side[again].sum(axis=0))) for side in (old, new))
+        models = (np.nan_to_num(means(side[again])) for side in (old, new))
         first, last = (error(model, drawn) for model in models)
         gains.append(first - last)
     first, last, noise = error(simulated, street), error(repaired, street), float(np.std(gains))
@@ -158,11 +160,6 @@ def _check(
     near = last <= thresholds.most_traffic_error
     better = near and first - last > thresholds.check_deviations * noise
     return TrafficCheck(measure, first, last, noise, better)
-
-
-def _ratio(sums: Array) -> Array:
-    """Return sums over numbers of observations; NaN without observations."""
-    return np.where(sums[..., 1] > 0, sums[..., 0] / np.maximum(sums[..., 1], 1e-9), np.nan)
 
 
 def _journeys(days: Sequence[Tally]) -> Array | None:
@@ -186,7 +183,7 @@ def _passing(days: Sequence[Tally]) -> Array | None:
 
 
 def _served(days: Sequence[Tally]) -> Array | None:
-    """Return vehicles per bin of time at stop and exit detectors, ``(days, 1, places, 2)``."""
+    """Return vehicles at stop and exit detectors, ``(days, 1, kinds * places * bins, 2)``."""
     shortest = min(day.bins.shape[-1] for day in days)
     sums = [
         np.stack([x[_SERVED, :, :shortest].ravel() for x in (day.bins, day.counted)], axis=-1)

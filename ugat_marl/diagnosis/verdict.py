@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Collection, Sequence
+from typing import Any
 
 import numpy as np
 from scipy import stats
@@ -26,7 +27,7 @@ from ugat_marl.diagnosis.select import Selector
 from ugat_marl.diagnosis.study import DiagnosisConfig
 from ugat_marl.diagnosis.thresholds import Thresholds
 from ugat_marl.effects import Effect, known_effects
-from ugat_marl.errors import joined
+from ugat_marl.errors import counted, joined
 
 NOUNS = {"swapped": "swapped detectors", "stuck": "a stuck detector"}
 """Nouns for effects whose names are no nouns, for sentences."""
@@ -118,7 +119,7 @@ def unchallenged(
         timing: Effects that are read off the signal log.
         detection: Errors of measurement.
     """
-    blind = f"; {len(ruled_out)} effects could not be examined" if ruled_out else ""
+    blind = f"; {counted(len(ruled_out), 'effect')} could not be examined" if ruled_out else ""
     sentence = f"Nothing in the data contradicts the scenario as it is{blind}."
     known = [f"the signal log has {' and '.join(map(str, timing))}"] if timing else []
     known += [describe_errors(detection)] if detection else []
@@ -220,15 +221,15 @@ def combined(one: float, other: float) -> float:
 
 
 def _rivals(selection: Selected, selector: Selector, config: DiagnosisConfig) -> tuple[Fitted, ...]:
-    """Find other sets of effects that leave no more than chance at nearly the same cost."""
+    """Find other sets of effects, or places, that leave only chance at nearly the same cost."""
     best = selection.best.model
-    names = names_of(best.members)
+    keys = keys_of(best.members)
     sufficient: list[Fitted] = []
     near = [
         rival
         for rival in selection.rivals
         if len(rival.members) <= len(best.members)
-        and not names_of(rival.members) >= names
+        and not keys_of(rival.members) >= keys
         and rival.cost - best.cost < config.thresholds.indistinct
     ]
     for rival in near[: config.thresholds.rivals_tested]:
@@ -252,9 +253,9 @@ def _at_an_end(members: Members) -> str:
     return " and ".join(texts)
 
 
-def names_of(members: Members) -> set[str]:
-    """Return the names of the effects of a model."""
-    return {hypothesis.name for hypothesis, _ in members}
+def keys_of(members: Members) -> set[tuple[Any, ...]]:
+    """Return names and places of the effects of a model."""
+    return {hypothesis.key for hypothesis, _ in members}
 
 
 def _look_at(selection: Selected) -> str | None:

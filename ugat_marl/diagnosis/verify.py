@@ -74,7 +74,7 @@ def tables_of(study: Study, base: Tested, best: Tested) -> Tables:
         statistics_table(study, base, best),
         lanes_table(study, base, best),
         engineering_criteria(study, base, best),
-        travel_times(study, best),
+        travel_times(study, base, best),
         approach_table(
             study.layout,
             study.heldout,
@@ -110,7 +110,7 @@ def statistics_table(study: Study, base: Tested, best: Tested) -> tuple[Statisti
     rows: list[StatisticRow] = []
     width = before.z["network"].shape[1]
     for index, (name, regime, unit) in enumerate(ALL_FEATURES[:width]):
-        if before.z["network"][0, index] == 0.0:
+        if not before.used["network"][0, index]:
             continue
         rows.append(
             StatisticRow(
@@ -130,23 +130,23 @@ def statistics_table(study: Study, base: Tested, best: Tested) -> tuple[Statisti
 
 def lanes_table(study: Study, base: Tested, best: Tested) -> tuple[LaneRow, ...]:
     """Return the root mean square of every lane's standardised differences."""
-    before = base.model.reference.distance(study.heldout).z["lane"]
+    distance = base.model.reference.distance(study.heldout)
+    before, used = distance.z["lane"], distance.used["lane"]
     after = best.model.reference.distance(study.heldout, relative_to=base.model.reference).z["lane"]
     return tuple(
         LaneRow(
             lane=name,
             tls=study.layout.intersections[owner],
-            before=_rms(before[index]),
-            after=_rms(after[index]),
+            before=_rms(before[index][used[index]]),
+            after=_rms(after[index][used[index]]),
         )
         for index, (owner, _, name) in enumerate(study.layout.places)
-        if np.any(before[index])
+        if used[index].any()
     )
 
 
 def _rms(z: Array) -> float:
-    used = z[z != 0]
-    return float(np.sqrt((used**2).mean())) if len(used) else 0.0
+    return float(np.sqrt((z**2).mean()))
 
 
 def engineering_criteria(study: Study, base: Tested, best: Tested) -> EngineeringCriteria:
@@ -186,12 +186,14 @@ def _headway(days: Sequence[Tally]) -> float | None:
     return float(total[0] / total[1]) if total[1] else None
 
 
-def travel_times(study: Study, best: Tested) -> TravelTimes:
+def travel_times(study: Study, base: Tested, best: Tested) -> TravelTimes:
     """Return the mean simulated travel time of the measured days, before and after.
 
     Detectors do not measure travel times, so there is no measured value to compare with.
     """
-    numbers = study.engine.first(min(study.effort.test, study.effort.base))
+    wanted = study.engine.first(min(study.effort.test, study.effort.base))
+    # no others, which a spent budget would not allow
+    numbers = [number for number in wanted if number in base.model.days]
 
     def mean(effects: tuple[Effect, ...]) -> float | None:
         days = study.engine.ordinary(effects, numbers)
@@ -264,7 +266,8 @@ def fhwa(
         None if there are too few days, or if no detector counts in all intervals of all days.
     """
     shortest = min(day.bins.shape[-1] for day in (*measured, *simulated))
-    bins = min(max(round(thresholds.interval_s / thresholds.bin_s), together), shortest)
+    wanted = max(round(thresholds.interval_s / thresholds.bin_s), together)
+    bins = min(together * math.ceil(wanted / together), shortest)  # no measured interval is split
     real = [_intervals(day, bins, shortest // bins) for day in measured]
     days = np.stack([counts for counts, _ in real])
     model = np.mean([_intervals(day, bins, shortest // bins)[0] for day in simulated], axis=0)

@@ -23,6 +23,7 @@ from ugat_marl.diagnosis.patterns import unnamed_effects
 from ugat_marl.diagnosis.places import Routes
 from ugat_marl.diagnosis.records import (
     CORRECTED,
+    FILE,
     SCHEMA,
     Conclusion,
     Diagnosis,
@@ -54,7 +55,7 @@ from ugat_marl.diagnosis.verdict import (
     describe_errors,
     describe_pattern,
     effect_record,
-    names_of,
+    keys_of,
     unchallenged,
     unverified,
 )
@@ -116,11 +117,13 @@ def diagnose(
     unexplained = diagnosis.not_corrected is not None or diagnosis.verdict == "unknown"
     refused = unexplained and not traffic
     corrected = None if refused or not named else apply_effects(scenario, traffic)
-    _put_corrected(corrected, directory / CORRECTED)
     if corrected is not None:
         diagnosis = replace(diagnosis, corrected=CORRECTED)
     written = Diagnosis.from_json(diagnosis.to_json())  # numbers rounded like those of the file
     written = replace(written, policy_gap=_known_gap(directory, written))
+    # If it is killed here, no earlier verdict may stay beside another corrected scenario.
+    (directory / FILE).unlink(missing_ok=True)
+    _put_corrected(corrected, directory / CORRECTED)
     written.write(directory)
     return written
 
@@ -414,10 +417,15 @@ def _record(
 
 def _nothing_simulated(study: Study, timing: tuple[Effect, ...]) -> Diagnosis:
     """Make the record for a budget that ended before the scenario as it is was simulated."""
+    known, wanted = study.engine.known, study.effort.base
+    there = (
+        f"{known} of {wanted} simulated days of the scenario as it is are there"
+        if known < wanted
+        else "simulated days with other vehicles, by which they are judged, are missing"
+    )
     sentence = (
-        f"The budget ended before anything could be compared: {study.engine.known} of "
-        f"{study.effort.base} simulated days of the scenario as it is are there. Run the same "
-        "command again to go on, or give a larger budget."
+        f"The budget ended before anything could be compared: {there}. Run the same command again "
+        "to go on, or give a larger budget."
     )
     return _unsearched(study, timing, "provisional", sentence, ())
 
@@ -494,13 +502,14 @@ def _unsearched(
 def _named(best: Tested, selected: Selected, half_interval: float) -> tuple[NamedEffect, ...]:
     """Return records of the effects of the selected model, with intervals and grounds.
 
-    The grounds are the model's distance, and the cost by which the best model with another set of
-    effect names is worse. `half_interval` is half the width of a 95 % interval in standard errors.
+    The grounds are the model's distance, and the cost by which the best model with other effects,
+    or with the same ones elsewhere, is worse. `half_interval` is half the width of a 95 % interval
+    in standard errors.
     """
-    names = names_of(best.model.members)
-    others = [rival.cost for rival in selected.rivals if names_of(rival.members) != names]
+    keys = keys_of(best.model.members)
+    others = [rival.cost for rival in selected.rivals if keys_of(rival.members) != keys]
     # costs of as many days: more days lower the cost of the same model
-    alike = [rival.cost for rival in selected.rivals if names_of(rival.members) == names]
+    alike = [rival.cost for rival in selected.rivals if keys_of(rival.members) == keys]
     worse_by = min(others) - min(alike, default=best.model.cost) if others else None
     grounds = SearchGrounds(best.model.distance.total, worse_by)
     effects: list[NamedEffect] = []
@@ -548,15 +557,10 @@ def _with_grounds(effect: EffectRecord, grounds: SearchGrounds) -> NamedEffect:
 def _alternatives(conclusion: Conclusion, selected: Selected) -> tuple[Explanation, ...]:
     """Return the models besides the selected one; models that fit equally well come first."""
     # A set of effects may be simulated several times, with other values and more days.
-    told = [_keys(model) for model in (conclusion.best.model, *conclusion.indistinct)]
-    others = [rival for rival in selected.rivals if _keys(rival) not in told]
+    told = [keys_of(model.members) for model in (conclusion.best.model, *conclusion.indistinct)]
+    others = [rival for rival in selected.rivals if keys_of(rival.members) not in told]
     ranking = [*conclusion.indistinct, *others][:ALTERNATIVES]
     return tuple(_explanation(model) for model in ranking)
-
-
-def _keys(model: Fitted) -> set[tuple[object, ...]]:
-    """Return which effects a model holds, without their values."""
-    return {hypothesis.key for hypothesis, _ in model.members}
 
 
 def _explanation(model: Fitted) -> Explanation:

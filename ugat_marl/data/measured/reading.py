@@ -310,6 +310,8 @@ def _refuse_impossible(
         fast = frame.filter(pl.col("speed_mps") > FASTEST_MPS)
         refuse(path, fast, "speed_mps", f"is more than {FASTEST_MPS:g} m/s", "write m/s")
         return
+    fast = frame.filter(pl.col("mean_speed_mps") > FASTEST_MPS)
+    refuse(path, fast, "mean_speed_mps", f"is more than {FASTEST_MPS:g} m/s", "write m/s")
     most = length_m / _SHORTEST_M + 2
     full = frame.filter(pl.col("vehicles") > most)
     refuse(path, full, "vehicles", "is more than the lane has room for", "correct the rows")

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import csv
 import io
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
@@ -368,10 +369,11 @@ def _read_csv(path: Path, findings: list[Finding]) -> pl.DataFrame:
         ) from None
     if wrong := csv_damage(path, frame):  # tables of others carry no hashes
         raise MeasuredDataError(f"{path}: damaged, {wrong}")
-    names = [name.strip() for name in frame.columns]
-    if twice := sorted({name for name in names if names.count(name) > 1}):
+    # polars gives the second of two equal names another one
+    written = [name.strip() for name in next(csv.reader([head]), [])]
+    if twice := sorted({name for name in written if written.count(name) > 1}):
         raise MeasuredDataError(f"{path}: column {twice[0]!r} is there twice; keep one of them")
-    return frame.rename(dict(zip(frame.columns, names, strict=True)))
+    return frame.rename({name: name.strip() for name in frame.columns})
 
 
 def _bytes(path: Path) -> bytes:
