@@ -54,6 +54,10 @@ _LARGEST = 1 << 256
 generator has 128 bits."""
 _TOO_DEEP = f"more than {_DEEPEST} tables or lists inside each other, which no such file needs"
 _TOO_LONG = "a number is far too long, which no such file needs"
+
+MALFORMED = (ArithmeticError, AttributeError, LookupError, TypeError, ValueError)
+"""Exceptions that parsed data of another form than expected raises where it is taken apart."""
+
 _NO_ROOM = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG)
 _SPECIAL = re.compile('[&<>"\\r\\n\\t]')
 _IN_TEXT = str.maketrans({"&": "&amp;", "<": "&lt;", ">": "&gt;"})

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import math
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
@@ -15,7 +16,7 @@ from tests.interrupts import few_descriptors
 from ugat_marl.effects import load_scenario
 from ugat_marl.errors import CheckpointError
 from ugat_marl.experiments import evaluation_of, read_queues, rule_factory
-from ugat_marl.experiments.queues import QueueRecord, write_queues
+from ugat_marl.experiments.queues import _SCHEMA, QueueRecord, write_queues
 from ugat_marl.scenarios import Network
 
 
@@ -177,3 +178,8 @@ def test_a_damaged_file_is_one_line(content: bytes, tmp_path: Path) -> None:
     pl.DataFrame({"a": [1]}).write_parquet(tmp_path / "q.parquet")
     with pytest.raises(CheckpointError, match="not the queues of a run"):
         read_queues(tmp_path / "q.parquet")
+    for minute, queue in ((0, math.nan), (10**12, 1.0), (-1, 1.0)):
+        row = ("policy", "sim", 0, minute, "A", queue, 1)
+        pl.DataFrame([row], schema=_SCHEMA, orient="row").write_parquet(tmp_path / "q.parquet")
+        with pytest.raises(CheckpointError, match="a queue or a minute is impossible"):
+            read_queues(tmp_path / "q.parquet")

@@ -166,7 +166,7 @@ def test_the_main_road_runs_through_all_lights():
 
 def test_the_green_travels_with_the_vehicles():
     rule = GreenWave(row_of(3, apart_s=21), green_s=20, main_s=40)
-    assert rule.offsets() == {"signal_0": 0, "signal_1": 2, "signal_2": 4}
+    assert rule._offsets == {"signal_0": 0, "signal_1": 2, "signal_2": 4}
     seen = [rule.act({}, {}) for _ in range(12)]
     along = {agent: [each[agent] for each in seen] for agent in seen[0]}
     # the road has green (phase 1) for 40 s of 60 s, each light 20 s after the one before it

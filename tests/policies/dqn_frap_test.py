@@ -318,6 +318,9 @@ def test_a_policy_file_with_a_broken_structure_is_refused(tmp_path: Path):
         {"greens": ((float("nan"),) * 4,) * 3},
         {"movements": ()},
         {"first_phase": "here"},
+        {"vehicles": (1.0,)},  # not one for each feature
+        {"commands": (3,)},  # the others show none
+        {"interval_s": -10.0},
     ):
         first, *rest = whole["structure"]["junctions"]
         structure = {"network": "frap", "junctions": ({**first, **junction}, *rest)}

@@ -206,6 +206,21 @@ def test_a_format_that_knows_the_site_leaves_the_others_readable(tmp_path: Path)
     assert NumpyPolicy.load(path).agents == policy.agents
 
 
+@pytest.mark.parametrize("changed", ["weights", "ceiling"])
+def test_files_of_two_policies_of_one_shape_do_not_belong_together(
+    tmp_path: Path, changed: str
+) -> None:
+    policy = policy_of(False, ceiling=5.0)
+    path = exported(policy, ".npz", tmp_path)
+    other = policy_of(False, ceiling=5.0 if changed == "weights" else 6.0)
+    if changed == "weights":
+        arguments = (other.agents, other.hidden, -policy.parameters, other.env_options)
+        other = NetworkPolicy(*arguments, False, None, policy.ceiling)
+    exported(other, ".ts", tmp_path)
+    with pytest.raises(CheckpointError, match="belongs to another model"):
+        NumpyPolicy.load(path)
+
+
 # --- the side-car -------------------------------------------------------------------------------
 
 
@@ -215,8 +230,8 @@ def test_the_side_car_says_what_the_rows_are(tmp_path: Path) -> None:
     path = tmp_path / "deep" / "policy.npz"
     about = json.loads(export_policy(policy, path, env).read_text())
     assert about.pop("kind") == "ugat_marl.exported_policy" and [
-        len(each) for each in about.pop("sha256").values()
-    ] == [64, 64]
+        len(each) for each in (about.pop("parameters"), *about.pop("sha256").values())
+    ] == [64, 64, 64]
     assert about == {
         "network": "mlp",
         "agents": ["cross_0", "tee_0", "cross_1"],
@@ -229,7 +244,7 @@ def test_the_side_car_says_what_the_rows_are(tmp_path: Path) -> None:
         "intersections": {"cross_0": "A", "tee_0": "B", "cross_1": "C"},
     }
     keys = re.findall(r"`(\w+)`", PAGE.partition("| key of")[2].partition("\n\n")[0])
-    assert {*about, "kind", "sha256"} <= set(keys)
+    assert {*about, "kind", "sha256", "parameters"} <= set(keys)
     without = json.loads(export_policy(policy, path).read_text())
     assert without["decision_interval_s"] is without["intersections"] is None
 

@@ -380,6 +380,11 @@ class Settings:
     weights: Any
 
 
+@dataclass(slots=True)
+class Slotted:
+    weights: Any
+
+
 @pytest.mark.parametrize(
     "hold",
     [
@@ -390,8 +395,9 @@ class Settings:
         lambda array: SimpleNamespace(start=array),
         lambda array: pl.DataFrame({"start": array}),
         lambda array: deque([array]),
+        Slotted,
     ],
-    ids=["array", "dataclass", "tensor", "mapping", "namespace", "table", "deque"],
+    ids=["array", "dataclass", "tensor", "mapping", "namespace", "table", "deque", "slots"],
 )
 def test_long_arrays_are_a_part_of_an_identity_whatever_holds_them(hold: Any) -> None:
     """Their middle is left out of their `repr`."""
@@ -402,6 +408,26 @@ def test_long_arrays_are_a_part_of_an_identity_whatever_holds_them(hold: Any) ->
         return own_values(own_name(functools.partial(Settings, hold(array))))
 
     assert identity(0.0) == identity(0.0) != identity(1.0)
+
+
+def test_defaults_and_closures_of_a_function_are_a_part_of_its_identity() -> None:
+    def made(phase: int, late: bool = False) -> Any:
+        def act(observations: Any, *, chosen: int = phase) -> Any:
+            return dict.fromkeys(observations, chosen + offset)
+
+        if not late:
+            offset = 0
+        held = own_values(own_name(act))  # where late, while `offset` has no value
+        offset = 0
+        return held
+
+    assert made(0) == made(0) != made(1)
+    assert made(0, late=True) != made(0)
+
+
+def test_an_object_with_slots_is_known_by_them() -> None:
+    assert own_values(own_name(Slotted(1))) == own_values(own_name(Slotted(1)))
+    assert own_values(own_name(Slotted(1))) != own_values(own_name(Slotted(2)))
 
 
 def test_what_is_typed_in_a_notebook_is_known_by_its_code() -> None:

@@ -470,6 +470,10 @@ def test_the_verdict_is_told_in_terms_of_traffic(network: Network) -> None:
     assert "48 % before, 5 % after" in page
     shown = printed(diagnosis)
     assert "approach W_C" in shown, "its delay differs most"
+    unknown = {**diagnosis.to_json()["approaches"][0], "approach": "N_C"}
+    unknown["delay"] = {"measured": 99.0, "before": None, "after": None}
+    rows = [*diagnosis.to_json()["approaches"], unknown]
+    assert "approach W_C" in printed(diagnosis_of(approaches=rows)), "N_C cannot be compared"
     assert "delay between the detectors, s" in shown
 
 

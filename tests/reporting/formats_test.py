@@ -14,6 +14,7 @@ from ugat_marl.reporting.formats import (
     percent_text,
     share,
     share_text,
+    signed_text,
 )
 from ugat_marl.reporting.service_tables import delay_text
 
@@ -30,6 +31,7 @@ def test_what_rounds_to_zero_has_no_sign(value: float, texts: tuple[str, ...]) -
     assert not set(shown) & set(texts)
     assert shown == ("0.00", "0.00", "0 %", "0 %")
     assert number(-0.0) == "0"
+    assert signed_text(value) == signed_text(-value) == "0.00"
 
 
 @pytest.mark.parametrize(
@@ -56,6 +58,7 @@ def test_a_mean_has_its_interval_if_there_is_one(interval: Interval, text: str) 
 
 def test_changes_keep_their_sign() -> None:
     assert [percent_text(x) for x in (0.25, -0.25, 0.001)] == ["+25 %", "−25 %", "0 %"]
+    assert [signed_text(x) for x in (0.25, -0.25, 250.0)] == ["+0.25", "-0.25", "+250"]
 
 
 @pytest.mark.parametrize(

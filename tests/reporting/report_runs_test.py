@@ -5,6 +5,7 @@ from __future__ import annotations
 import html
 import json
 import re
+import shlex
 import shutil
 import subprocess
 import xml.etree.ElementTree as ET
@@ -329,6 +330,10 @@ def test_a_changed_digit_of_the_table_is_damage_with_its_row(run: Path) -> None:
 def test_values_of_a_wrong_kind_are_no_traceback(run: Path) -> None:
     table = json.loads((run / "table.json").read_text())
     del table["row_hashes"]  # else it is damaged
+    for key, value in {"approaches": [1], "hidden": "x"}.items():
+        rows = [{**row, key: value} for row in table["episodes"]]
+        (run / "table.json").write_text(json.dumps(table | {"episodes": rows}))
+        assert "table.json cannot be used" in page_of(run)[1].text
     table["episodes"][0]["att_s"] = None
     table["episodes"][9]["queue"] = None
     (run / "table.json").write_text(json.dumps(table))
@@ -470,6 +475,17 @@ def test_jobs_of_a_paper_make_a_table(tmp_path: Path) -> None:
     assert page.row("timed-1")[2] == "sim → V4" and page.row("timed-1")[8].startswith("160 (")
 
 
+def test_a_job_that_is_judged_further_shows_the_seeds_of_every_domain(tmp_path: Path) -> None:
+    make_job(tmp_path, "direct-0", (), Setting("direct transfer", "direct"))
+    attained = {("sim", 0): 100.0, ("sim", 1): 110.0, ("V4", 1): 150.0}
+    played = {(0, domain, seed): scores(att) for (domain, seed), att in attained.items()}
+    JobRecord(played).write(tmp_path / "direct-0")
+    (record,) = read_records([tmp_path / "direct-0"])
+    assert isinstance(record, RunRecord) and record.evaluation is not None
+    assert record.evaluation.gap("direct transfer", "V4", "att_s").mean == pytest.approx(40.0)
+    page_of(tmp_path / "direct-0")
+
+
 def test_a_job_shows_its_worst_minutes(tmp_path: Path) -> None:
     make_job(tmp_path, "direct-0", ("sim", "V4"), Setting("direct transfer", "direct"))
     rows = [("direct transfer", d, 0, m, "A1", 3.0 + m, 6) for d in ("sim", "V4") for m in range(5)]
@@ -502,6 +518,8 @@ def test_a_command_is_read_as_it_was_written() -> None:
     assert max(map(len, lines)) <= 102
     assert commands_in("\n".join(["# A page", "", *lines, ""])) == [command.strip()]
     assert commands_in("no command") == []
+    place = shlex.join(["ugat-marl", "train", "/home/it's/a net"])
+    assert commands_in("\n".join(command_block(place))) == [place]
 
 
 def test_a_finished_table_is_shown_with_its_command() -> None:

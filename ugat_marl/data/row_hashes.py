@@ -29,7 +29,14 @@ from typing import Any
 import polars as pl
 
 from ugat_marl.errors import CheckpointError
-from ugat_marl.files import only_writer, parse_json, read_json, require_writable, write_whole
+from ugat_marl.files import (
+    MALFORMED,
+    only_writer,
+    parse_json,
+    read_json,
+    require_writable,
+    write_whole,
+)
 
 HASH_KEYS = ("ugat_marl.row_hashes", "ugat_marl.row_hashes.copy")
 """Keys of the hashes in the metadata of the file."""
@@ -245,7 +252,7 @@ def _csv_hashes(file: Path) -> dict[str, Any]:
         whole = content["hash"] == _hash(tables)
         for table in tables.values():
             whole &= _have_form(table["rows"], table["head"], table["groups"])
-    except (KeyError, TypeError, AttributeError):
+    except MALFORMED:
         whole, tables = False, {}
     if not whole:
         raise CheckpointError(f"{file}: not what was written")
@@ -348,7 +355,7 @@ def damage(frame: pl.DataFrame, metadata: Mapping[str, str], own: tuple[str, ...
     try:
         stored = parse_json(texts[0] or "", "hashes", CheckpointError)
         rows, head, groups = stored["rows"], stored["head"], stored["groups"]
-    except (CheckpointError, KeyError, TypeError):
+    except (CheckpointError, *MALFORMED):
         return "its hashes are damaged"
     if texts[0] != texts[1] or not _have_form(rows, head, groups):
         return "its hashes are damaged"

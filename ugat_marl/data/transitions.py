@@ -22,7 +22,7 @@ from numpy.typing import NDArray
 from ugat_marl.data.layouts import AgentLayout
 from ugat_marl.data.row_hashes import damage, is_hashed, read_quietly, write_hashed
 from ugat_marl.errors import LogError, first_line
-from ugat_marl.files import parse_json, replacing
+from ugat_marl.files import MALFORMED, parse_json, replacing
 
 FORMAT = 2
 METADATA_KEY = "ugat_marl.data.transitions"
@@ -137,7 +137,7 @@ class Provenance:
                 if not isinstance(told, str):
                     raise LogError(f"provenance: {told!r} is neither a version nor a unit")
             return cls(seeds=tuple(content.pop("seeds")), layouts=layouts, **content)
-        except (ValueError, TypeError, KeyError, AttributeError) as error:
+        except MALFORMED as error:
             raise LogError(f"provenance cannot be understood ({error!r})") from None
 
 

@@ -52,7 +52,7 @@ from ugat_marl.experiments.training import (
     train_through,
 )
 from ugat_marl.experiments.tuning import VERSION, tuned_rule
-from ugat_marl.files import file_hash, parse_json, read_json, write_whole
+from ugat_marl.files import MALFORMED, file_hash, parse_json, read_json, write_whole
 from ugat_marl.grounding import (
     ChangePenalty,
     Probe,
@@ -347,7 +347,7 @@ class JobRecord:
                 row["approaches"] = {k: tuple(v) for k, v in row.get("approaches", {}).items()}
                 scores[key] = Scores(**row)
             return cls(scores, **content["training"], worlds=dict(content.get("worlds", {})))
-        except (CheckpointError, ArithmeticError, ValueError, TypeError, KeyError, AttributeError):
+        except (CheckpointError, *MALFORMED):
             return cls()
 
     def write(self, folder: Path) -> None:

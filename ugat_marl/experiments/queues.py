@@ -30,6 +30,7 @@ _SCHEMA = {
     "queue": pl.Float64,
     "looks": pl.Int64,
 }
+_MOST_MINUTES = 60 * 24 * 366
 _BATCH = ["policy", "domain", "batch"]
 _PLACE = ["policy", "domain", "minute", "intersection"]
 
@@ -177,4 +178,9 @@ def _batches(path: Path) -> pl.DataFrame:
         raise CheckpointError(f"{path}: not the queues of a run, since a cell is empty")
     if wrong := damage(frame, metadata):
         raise CheckpointError(f"{path}: damaged, {wrong}")
+    possible = pl.col("queue").is_finite() & pl.col("minute").is_between(0, _MOST_MINUTES)
+    if not frame.select(possible.all()).item():
+        raise CheckpointError(
+            f"{path}: not the queues of a run, since a queue or a minute is impossible"
+        )
     return frame

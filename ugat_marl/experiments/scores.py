@@ -23,7 +23,7 @@ from numpy.typing import NDArray
 from ugat_marl.data import MEASURES, Scores, json_damage, mean_delay_s, with_hashes
 from ugat_marl.errors import CheckpointError
 from ugat_marl.experiments.statistics import Interval
-from ugat_marl.files import read_json, write_whole
+from ugat_marl.files import MALFORMED, read_json, write_whole
 from ugat_marl.policies import nan_last
 
 _MAPPINGS = ("hidden", "approaches")
@@ -233,7 +233,7 @@ class Evaluation:
             notes = {str(key): str(text) for key, text in content["notes"].items()}
             scenario, its_hash = str(content["scenario"]), str(content["scenario_hash"])
             evaluation = cls(scenario, its_hash, results, notes)
-        except (ArithmeticError, ValueError, TypeError, KeyError, AttributeError) as error:
+        except MALFORMED as error:
             raise CheckpointError(
                 f"{path}: not the table of a run ({error!r}); it may have been cut short"
             ) from None

@@ -21,7 +21,7 @@ from ugat_marl.effects import Domain, domain_label, scenario_in_domain
 from ugat_marl.errors import CheckpointError, UnknownNameError, require_least
 from ugat_marl.experiments.evaluation import TUNING_SEED, best_rule, race_rules
 from ugat_marl.experiments.scores import RuleTrial, Tuned
-from ugat_marl.files import read_json, user_cache, write_whole
+from ugat_marl.files import MALFORMED, read_json, user_cache, write_whole
 from ugat_marl.parallel import Workers
 from ugat_marl.policies import RULE_NAMES, RULES, TUNED_RULES, race_fields, rule_settings
 from ugat_marl.progress import Reporter
@@ -169,7 +169,7 @@ def _recall(place: Path, specs: Sequence[str]) -> tuple[RuleTrial, ...] | None:
         trials = tuple(
             RuleTrial(str(r["spec"]), float(r["att_s"]), int(r["episodes"])) for r in rows
         )
-    except (CheckpointError, ArithmeticError, ValueError, KeyError, TypeError):
+    except (CheckpointError, *MALFORMED):
         return None
     whole = sorted(trial.spec for trial in trials) == sorted(specs)
     return trials if whole and all(math.isfinite(trial.att_s) for trial in trials) else None

@@ -28,6 +28,7 @@ from numpy.typing import NDArray
 from ugat_marl.data import AgentLayout, TransitionLog, Transitions, consecutive
 from ugat_marl.effects import Actuator, Commands, ControllerPart
 from ugat_marl.errors import CheckpointError, LogError, OptionError, counted
+from ugat_marl.files import MALFORMED
 from ugat_marl.grounding.draws import DRAWS, with_intervals
 from ugat_marl.scenarios import Network, SignalState, SignalTiming
 from ugat_marl.seeding import numpy_generator
@@ -207,7 +208,7 @@ class CommandChannel(ControllerPart):
                 tuple(np.array(table, bool) for table in state["tables"]),
                 float(state["pull"]),
             )
-        except (KeyError, TypeError, ValueError) as error:
+        except MALFORMED as error:
             raise CheckpointError(f"the channel in the checkpoint is damaged: {error}") from None
         agents, kinds = len(channel.agents), len(channel.network)
         if channel.counts.shape != (agents, kinds) or len(channel.tables) != agents:

@@ -38,6 +38,7 @@ from ugat_marl.effects import (
     Stage,
 )
 from ugat_marl.errors import CheckpointError, OptionError, counted
+from ugat_marl.files import MALFORMED
 from ugat_marl.grounding.draws import DRAWS, with_intervals
 from ugat_marl.grounding.summaries import Floats, LaneRows, LaneView
 from ugat_marl.scenarios import Network
@@ -219,7 +220,7 @@ class Eyes:
                 float(state["lost"]),
                 float(state["step"]),
             )
-        except (KeyError, TypeError, ValueError) as error:
+        except MALFORMED as error:
             raise CheckpointError(f"the eyes in the checkpoint are damaged: {error}") from None
 
 

@@ -34,6 +34,7 @@ from ugat_marl.effects import (
     nominal_number,
 )
 from ugat_marl.errors import CheckpointError, UnknownNameError
+from ugat_marl.files import MALFORMED
 from ugat_marl.grounding.draws import DRAWS, with_intervals
 from ugat_marl.grounding.presence import LEAST_SPREAD, Presence, lanes_differ
 from ugat_marl.grounding.regression import Design, Floats, kernel, left_out, ridge
@@ -468,7 +469,7 @@ class Posterior:
         try:
             parts: dict[str, NDArray[np.float64]]
             parts = {name: np.array(state[name], dtype=np.float64) for name in _NUMBERS}
-        except (KeyError, TypeError, ValueError) as error:
+        except MALFORMED as error:
             raise CheckpointError(f"the worlds in the checkpoint are damaged: {error}") from None
         number, effects, lanes = len(parts["chances"]), len(worlds.library), len(worlds.lanes)
         shapes = {

@@ -41,6 +41,7 @@ from ugat_marl.errors import (
     UnknownNameError,
     require_least,
 )
+from ugat_marl.files import MALFORMED
 from ugat_marl.grounding.channel import (
     ChannelConfig,
     CommandChannel,
@@ -617,5 +618,5 @@ def _simulated(arrays: Any) -> tuple[SimulatedLog, ...]:
             SimulatedLog(WorldValues(effects, service_s), Summary.of(values, rows))
             for effects, service_s, values, rows in zip(*columns, strict=True)
         )
-    except (KeyError, TypeError, ValueError, AttributeError) as error:
+    except MALFORMED as error:
         raise CheckpointError(f"simulated worlds of the checkpoint are damaged: {error}") from None

@@ -13,6 +13,7 @@ holds:
 - ``env_options``: options of `ugat_marl.parallel_env` that the policy was trained with.
 - ``decision_interval_s``, ``intersections``: seconds between decisions, and agent to traffic light;
   null for an export without an environment.
+- ``parameters``: hash of the policy's parameters, its ceiling included.
 - ``sha256``: suffix of each format to the hash of its model; it shows which files belong
   together.
 """
@@ -35,7 +36,7 @@ from numpy.typing import NDArray
 
 from ugat_marl.envs import Actions, AgentSet, AnyParallelEnv, Infos, Observations
 from ugat_marl.errors import CheckpointError, OptionError, install_command
-from ugat_marl.files import read_json, require_stored, require_writable, write_whole
+from ugat_marl.files import MALFORMED, read_json, require_stored, require_writable, write_whole
 from ugat_marl.policies.portable import (
     PORTABLE,
     Layer,
@@ -127,7 +128,7 @@ def _sums_beside(side_car: Path, about: Mapping[str, Any]) -> dict[str, str]:
     try:
         held = dict(read_json(side_car, CheckpointError))
         sums = dict(held["sha256"])
-    except (CheckpointError, KeyError, TypeError, ValueError):
+    except (CheckpointError, *MALFORMED):
         return {}
     return sums if of_the_policy(held) == json.loads(json.dumps(of_the_policy(about))) else {}
 
@@ -269,7 +270,13 @@ def _about(policy: NetworkPolicy, env: AnyParallelEnv | None) -> dict[str, Any]:
         "env_options": json.loads(description["env_options"]),
         "decision_interval_s": getattr(base, "decision_interval_s", None),
         "intersections": getattr(base, "intersection_of", None),
+        "parameters": _sum(_parameters(policy)),
     }
+
+
+def _parameters(policy: NetworkPolicy) -> bytes:
+    ceiling = policy.ceiling
+    return policy.parameters.tobytes() + (b"" if ceiling is None else ceiling.tobytes())
 
 
 def _matrices(policy: NetworkPolicy) -> bytes:

@@ -15,7 +15,7 @@ from torch import Tensor, nn
 from ugat_marl.data import read_checkpoint, write_checkpoint
 from ugat_marl.envs import Actions, AgentSet, Infos, Observations
 from ugat_marl.errors import CheckpointError, first_line
-from ugat_marl.files import parse_json
+from ugat_marl.files import MALFORMED, parse_json
 from ugat_marl.policies.devices import CPU
 from ugat_marl.policies.networks.q_network import Held, greedy_actions, q_network
 from ugat_marl.policies.networks.structure import Structure, structure_in
@@ -128,7 +128,7 @@ class NetworkPolicy:
                 raise TypeError("its parameters are no tensor of float32")
             arguments = (agents, hidden, parameters, env_options, shared, structure)
             return cls(*arguments, content.get("ceiling"))
-        except (KeyError, TypeError, ValueError, RuntimeError, OverflowError) as error:
+        except (RuntimeError, *MALFORMED) as error:
             raise CheckpointError(
                 f"{path}: not a whole policy ({first_line(error)}); save it again"
             ) from None

@@ -36,7 +36,7 @@ from ugat_marl.envs import (
     checked_phases,
 )
 from ugat_marl.errors import CheckpointError, OptionError, UgatMarlError
-from ugat_marl.files import parse_json, require_stored, write_whole
+from ugat_marl.files import MALFORMED, parse_json, require_stored, write_whole
 from ugat_marl.policies.learner_settings import parsed_settings
 from ugat_marl.policies.own_names import load_own
 from ugat_marl.policies.protocols import EpisodeCallback, Policy
@@ -58,18 +58,24 @@ def asked_options(given: Any, name: str) -> dict[str, Any]:
         OptionError: They are no mapping, or hold what the evaluation decides, such as the length of
             an episode.
     """
-    asked = getattr(given, "env_options", {})
-    if not isinstance(asked, Mapping):
-        raise OptionError(
-            f"policy {name!r}: its env_options are a {type(asked).__name__}; they must be a "
-            'dictionary such as {"observation": "movements"}'
-        )
+    asked = _env_options(given, f"policy {name!r}")
     for key in asked:
         if key not in OF_POLICIES:
             raise OptionError(
                 f"policy {name!r}: its env_options hold {key!r}, which the evaluation decides; a "
                 f"policy may ask for {', '.join(OF_POLICIES)}"
             )
+    return asked
+
+
+def _env_options(given: Any, what: str) -> dict[str, Any]:
+    """Return the ``env_options`` of an object of a user; `what` names it in an error."""
+    asked = getattr(given, "env_options", {})
+    if not isinstance(asked, Mapping):
+        raise OptionError(
+            f"{what}: its env_options are a {type(asked).__name__}; they must be a "
+            'dictionary such as {"observation": "movements"}'
+        )
     return dict(asked)
 
 
@@ -102,7 +108,7 @@ class OwnPolicy:
                 f"policy {name!r}: a {type(given).__name__} has no act(observations, infos) and "
                 "cannot be called; give it that method, or give a function"
             )
-        asked = getattr(given, "env_options", {})  # a learner that is its own policy trained so
+        asked = _env_options(given, f"policy {name!r}")  # its own policy, the learner trained so
         shown = {key: asked[key] for key in OF_POLICIES if key in asked}
         self.env_options: Mapping[str, Any] = {**env_options, **shown}
         self._given, self._name, self._state, self._shared = given, name, state, shared
@@ -209,7 +215,6 @@ class OwnLearner:
         self._given, self._name = given, name
         self._env_options = dict(getattr(env.unwrapped, "env_options", {}))
         self._shared: list[Any] = [env, env.unwrapped]
-        self._seed, self._on_episode = 0, None
 
     @property
     def savable(self) -> bool:
@@ -263,7 +268,7 @@ class OwnLearner:
         Raises:
             CheckpointError: The file is missing, damaged, or the user's ``load`` refuses it.
         """
-        self.episodes = int(_counters(path)["episodes"])
+        episodes = _counters(path)["episodes"]
         with tempfile.TemporaryDirectory() as folder:
             try:
                 with zipfile.ZipFile(path) as packed:
@@ -274,6 +279,7 @@ class OwnLearner:
                     f"{path}: the learner {self._name!r} cannot load it "
                     f"({type(error).__name__}: {error})"
                 ) from error
+        self.episodes = episodes
 
     def _packed(self) -> bytes:
         """Return the files that the user's ``save`` writes, and the counters, as a zip file."""
@@ -389,7 +395,7 @@ class OwnLearnerFactory:
 
 def own_learner_options(name: str) -> dict[str, Any]:
     """Return the options of the environment that a user's learner asks for (``env_options``)."""
-    return dict(getattr(load_own(name, "learner"), "env_options", {}))
+    return _env_options(load_own(name, "learner"), f"learner {name!r}")
 
 
 def is_savable(given: Any) -> bool:
@@ -440,11 +446,11 @@ def _counters(path: Path) -> dict[str, Any]:
             require_stored(packed)
             text = packed.read(_COUNTERS).decode("utf-8")
             counters = parse_json(text, f"{path}, {_COUNTERS}", CheckpointError)
-            return {
-                "episodes": int(counters["episodes"]),
-                "env_options": dict(counters["env_options"]),
-            }
-    except (OSError, KeyError, ValueError, TypeError, zipfile.BadZipFile) as error:
+            episodes = int(counters["episodes"])
+            if episodes < 0:
+                raise ValueError(f"{episodes} episodes")
+            return {"episodes": episodes, "env_options": dict(counters["env_options"])}
+    except (OSError, zipfile.BadZipFile, *MALFORMED) as error:
         raise CheckpointError(f"{path}: not the state of a learner of a user ({error})") from None
 
 
@@ -481,10 +487,8 @@ def _sees_infos(act: Callable[..., Any]) -> bool:
     """Return True if a policy's second argument is the infos, not an option of its own."""
     if not _takes(act, 2):
         return False
-    with contextlib.suppress(TypeError, ValueError):  # a function in C without a signature
-        second = [*inspect.signature(act).parameters.values()][1:2]
-        return all(one.default is one.empty or one.name == "infos" for one in second)
-    return True
+    second = [*_arguments(act).values()][1:2]
+    return all(one.default is one.empty or one.name == "infos" for one in second)
 
 
 def _wants_env(made: Callable[..., Any]) -> bool:
@@ -505,19 +509,26 @@ def _whole(action: Any) -> int:
     return int(action)
 
 
+def _arguments(function: Callable[..., Any]) -> Mapping[str, inspect.Parameter]:
+    """Return the arguments by name; none for a function in C without a signature."""
+    try:
+        return inspect.signature(function).parameters
+    except (TypeError, ValueError):
+        return {}
+
+
 def _first_argument(function: Callable[..., Any]) -> str:
-    return next(iter(inspect.signature(function).parameters), "")
+    return next(iter(_arguments(function)), "")
 
 
 def _offered(make: Callable[..., Any], values: Mapping[str, Any]) -> dict[str, Any]:
     """Return those of the values that a class or function has arguments for."""
-    return {name: values[name] for name in inspect.signature(make).parameters if name in values}
+    return {name: values[name] for name in _arguments(make) if name in values}
 
 
 def _converted(make: Callable[..., Any], settings: Sequence[str], name: str) -> dict[str, Any]:
     """Return the settings of a user's learner in the types of its arguments."""
-    parameters = inspect.signature(make).parameters
-    names = [key for key in parameters if key not in ("env", "seed")]
+    names = [key for key in _arguments(make) if key not in ("env", "seed")]
     hints: dict[str, Any] = {}
     if settings:
         function: Any = make.__init__ if inspect.isclass(make) else make

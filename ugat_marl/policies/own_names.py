@@ -6,6 +6,7 @@ working folder, too. An object that was given in Python has a name of the same f
 
 from __future__ import annotations
 
+import contextlib
 import dataclasses
 import functools
 import hashlib
@@ -97,7 +98,7 @@ def load_own(name: str, what: str) -> Any:
             own = getattr(found, "__module__", getattr(found, "__name__", None))
             names = [
                 key
-                for key, value in vars(found).items()
+                for key, value in getattr(found, "__dict__", {}).items()
                 if callable(value) and getattr(value, "__module__", own) == own
             ]
             raise UnknownNameError(f"{what} in {module_name}", part, names)
@@ -116,8 +117,8 @@ def own_values(name: str) -> list[str]:
     """Return what an object that was given in Python holds beside its source, as text.
 
     These are arguments of a `functools.partial`, values captured by an inner function or by the
-    methods of an inner class, and attributes of such a class or of an instance. Two objects of one
-    name and source differ in nothing else.
+    methods of an inner class, its defaults, and attributes of such a class or of an instance, those
+    in slots included. Two objects of one name and source differ in nothing else.
     """
     return _values(_given[name]) if name in _given else []
 
@@ -130,15 +131,35 @@ def _values(given: Any, inside: tuple[int, ...] = ()) -> list[str]:
     if isinstance(given, FunctionType):
         if "<" not in given.__qualname__:  # neither <locals> nor <lambda>: its source says all
             return []
-        captured = inspect.getclosurevars(given).nonlocals
-        taken = [f"{key}={text(value)}" for key, value in sorted(captured.items())]
-        return [*taken, *map(text, given.__defaults__ or ())]
+        defaults = (given.__kwdefaults__ or {}).items()
+        return [
+            *(f"{key}={text(value)}" for key, value in sorted(_captured(given).items())),
+            *map(text, given.__defaults__ or ()),
+            *(f"{key}={text(value)}" for key, value in sorted(defaults)),
+        ]
     if inspect.isclass(given):
         return _values_of_class(given, inside) if "<" in given.__qualname__ else []
     if isinstance(given, MethodType):
         return [text(given.__self__)]
-    held = {} if hasattr(given, "__qualname__") else getattr(given, "__dict__", {})
+    held = {} if hasattr(given, "__qualname__") else _attributes(given)
     return [text(held)] if held else []
+
+
+def _captured(function: FunctionType) -> dict[str, Any]:
+    """Return the values of a closure; a variable that has none yet is left out."""
+    captured: dict[str, Any] = {}
+    cells = function.__closure__ or ()
+    for name, cell in zip(function.__code__.co_freevars, cells, strict=True):
+        with contextlib.suppress(ValueError):
+            captured[name] = cell.cell_contents
+    return captured
+
+
+def _attributes(value: Any) -> dict[str, Any]:
+    """Return the attributes of an object, those in slots included."""
+    state: Any = object.__getstate__(value)
+    held, slots = state if isinstance(state, tuple) else (state, None)
+    return {**(held or {}), **(slots or {})}
 
 
 def _values_of_class(given: type, inside: tuple[int, ...]) -> list[str]:
@@ -205,7 +226,7 @@ def _stable_object(value: Any, deeper: Callable[[Any], str]) -> str:
         return f"{named}({deeper(list(value))})"
     if all(hasattr(value, name) for name in ("reset", "step", "unwrapped")):
         return f"{named}({_file_hash(kind)}, {deeper(_made_of(value.unwrapped))})"
-    held = getattr(value, "__dict__", {})
+    held = _attributes(value)
     if dataclasses.is_dataclass(kind):
         held = {field.name: getattr(value, field.name) for field in dataclasses.fields(kind)}
     says_what = kind.__getstate__ is not object.__getstate__  # as a table of polars does

@@ -101,20 +101,19 @@ class PolicyCard:
             CheckpointError: The file is missing, damaged, or of another form.
         """
         content = read_json(path, CheckpointError)
+        if isinstance(content, dict) and (version := content.get("version", VERSION)) != VERSION:
+            raise CheckpointError(
+                f"{path}: a card of version {version}, this package reads {VERSION}; copy the one "
+                "of your version"
+            )
         try:
-            card = TypeAdapter(cls).validate_python(content)
+            return TypeAdapter(cls).validate_python(content)
         except ValidationError as error:
             first = error.errors()[0]
             where = ".".join(map(str, first["loc"]))
             raise CheckpointError(
                 f"{path}: not the card of a policy ({where}: {first['msg']}); copy it again"
             ) from None
-        if card.version != VERSION:
-            raise CheckpointError(
-                f"{path}: a card of version {card.version}, this package reads {VERSION}; copy the "
-                "one of your version"
-            )
-        return card
 
 
 def shipped_policies(folder: Path = FOLDER) -> dict[str, Path]:

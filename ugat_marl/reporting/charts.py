@@ -476,13 +476,13 @@ def goodness(values: NDArray[np.float64], more_is_better: bool) -> NDArray[np.fl
     ``min(s) / s``.
 
     Args:
-        values: ``(n,)``, all of one sign.
+        values: ``(n,)``, all of one sign; nan stays nan.
         more_is_better: True if the largest size is the best.
     """
     sizes = np.abs(values)
     best = np.nanmax(sizes) if more_is_better else np.nanmin(sizes)
     if best == 0.0:
-        return np.where(sizes == 0.0, 1.0, 0.0)
+        return np.where(np.isnan(sizes), np.nan, sizes == 0.0)
     return sizes / best if more_is_better else best / sizes
 
 

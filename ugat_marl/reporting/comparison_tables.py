@@ -13,7 +13,7 @@ from rich.console import Group, RenderableType
 from rich.text import Text
 
 from ugat_marl.data import MEASURES
-from ugat_marl.errors import joined
+from ugat_marl.errors import counted, joined
 from ugat_marl.experiments import (
     LEAST_SHARE_ARRIVED,
     Comparison,
@@ -29,6 +29,7 @@ from ugat_marl.reporting.formats import (
     number_text,
     percent_text,
     share_text,
+    signed_text,
 )
 from ugat_marl.reporting.terminal import titled_table
 
@@ -55,9 +56,15 @@ def terminal_tables(comparison: Comparison, direct: str) -> RenderableType:
         blocks.append(table)
     if check := check_table(comparison):
         blocks.append(Text(check.sentence("--episodes")))
-    count = len(comparison.training_seeds)
-    blocks.append(Text(f"{count} training seeds; intervals: 95 %, Student's, over them."))
+    blocks.append(Text(seeds_note(comparison)))
     return Group(*blocks)
+
+
+def seeds_note(comparison: Comparison) -> str:
+    """Return a sentence on the training seeds and the intervals over them."""
+    count = len(comparison.training_seeds)
+    wide = "intervals: 95 %, Student's, over them" if count > 1 else "no intervals over them"
+    return f"{counted(count, 'training seed')}; {wide}."
 
 
 def comparison_page(
@@ -160,7 +167,7 @@ def _with_gap(comparison: Comparison, measure: str) -> Cell:
     def cell(setting: str, target: str) -> str:
         gap = float(comparison.gaps(setting, target, measure).mean())
         mean = number_text(comparison.estimate(setting, target, measure).mean)
-        return f"{mean} ({'+' if gap >= 0 else ''}{number_text(gap)})"
+        return f"{mean} ({signed_text(gap)})"
 
     return cell
 
@@ -241,10 +248,13 @@ def _better_everywhere(comparison: Comparison, setting: str, direct: str) -> boo
 
 
 def _provenance(comparison: Comparison, facts: Mapping[str, Any]) -> list[str]:
+    seeds = comparison.training_seeds
     cores = "1 core" if facts["cores"] == 1 else f"{facts['cores']} cores"
     rows = {
-        "training seeds": ", ".join(map(str, comparison.training_seeds)),
-        "intervals": "95 %, Student's, over training seeds",
+        "training seeds": ", ".join(map(str, seeds)),
+        "intervals": "95 %, Student's, over training seeds"
+        if len(seeds) > 1
+        else "none, of one training seed",
         "processor": f"{facts['cpu']}, {cores}",
         "Python": facts["python"],
         **facts["versions"],
@@ -256,7 +266,7 @@ def _provenance(comparison: Comparison, facts: Mapping[str, Any]) -> list[str]:
 
 def _tested(test: PairedTest) -> str:
     mean = test.difference
-    text = f"{'+' if mean.mean >= 0 else ''}{number_text(mean.mean)}"
+    text = signed_text(mean.mean)
     if not math.isnan(mean.low):
         text += f" ({number_text(mean.low)} to {number_text(mean.high)}), p {_p(test.p)}"
     return f"{text}, {test.better}/{test.count}"

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 import re
+import shlex
 from collections.abc import Callable, Sequence
 from html import unescape
 from pathlib import Path
@@ -400,12 +401,11 @@ def _usual_commands(diagnosis: Diagnosis) -> list[str]:
     """Return the commands with words in capitals for the paths, which no record holds."""
     options = f"--alpha {diagnosis.alpha:g} --seed {diagnosis.seed}"
     for option, value in (("h", diagnosis.budget_h), ("s", diagnosis.budget_s)):
-        options = options if value is None else f"--budget-{option} {value:g} {options}"
+        options = options if value is None else f"--budget-{option} {value:.15g} {options}"
     if diagnosis.left_out:
         options += " --leave-out " + " ".join(diagnosis.left_out)
-    lines = [f"ugat-marl diagnose {diagnosis.scenario} MEASURED --out DIR {options}"]
+    scenario = shlex.quote(diagnosis.scenario)
+    lines = [f"ugat-marl diagnose {scenario} MEASURED --out DIR {options}"]
     if diagnosis.corrected:
-        lines.append(
-            f"ugat-marl train {diagnosis.scenario} --sim DIR/{diagnosis.corrected} --real REAL"
-        )
+        lines.append(f"ugat-marl train {scenario} --sim DIR/{diagnosis.corrected} --real REAL")
     return lines

@@ -161,7 +161,8 @@ def slowest(diagnosis: Diagnosis) -> list[ApproachRow]:
     """Return the approach whose measured delay differs most from the scenario as it is."""
 
     def apart(row: ApproachRow) -> float:
-        return abs((row.delay.measured or 0.0) - (row.delay.before or 0.0))
+        measured, before = row.delay.measured, row.delay.before
+        return -1.0 if measured is None or before is None else abs(measured - before)
 
     return sorted(diagnosis.approaches, key=apart)[-1:]
 

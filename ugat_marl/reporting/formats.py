@@ -1,8 +1,8 @@
 """Numbers as texts, and texts of Markdown.
 
-`number`, `signed`, `share` and `chance` are for prose and pages, `number_text`, `ends_text`,
-`mean_text`, `share_text` and `percent_text` for columns of tables, which align by their decimals,
-and `tick_text` for axes.
+`number`, `signed`, `share` and `chance` are for prose and pages, and `tick_text` for axes.
+`number_text`, `signed_text`, `ends_text`, `mean_text`, `share_text` and `percent_text` are for
+columns of tables, which align by their decimals.
 """
 
 from __future__ import annotations
@@ -72,6 +72,12 @@ def number_text(value: float) -> str:
     return fixed(value, 1 if abs(value) >= 0.9995 else 2)
 
 
+def signed_text(value: float) -> str:
+    """Return `number_text` of a number with its sign; what rounds to 0 has none."""
+    text = number_text(value)
+    return text if text.startswith("-") or float(text) == 0 else f"+{text}"
+
+
 def ends_text(low: float, high: float) -> str:
     """Return an interval; a dash between its ends would make a negative one unclear."""
     return f"{number_text(low)}{' to ' if low < 0 else '–'}{number_text(high)}"
@@ -129,7 +135,7 @@ COMMAND_WIDTH = 100
 def command_block(command: str) -> list[str]:
     """Return a command as a block of Markdown, with long lines continued."""
     lines = [""]
-    for word in re.findall(r"(?:[^\s']|'[^']*')+", command):
+    for word in re.findall(r"""(?:[^\s'"]|'[^']*'|"[^"]*"|['"])+""", command):
         if lines[-1] and len(lines[-1]) + 1 + len(word) > COMMAND_WIDTH:
             lines[-1] += " \\"
             lines.append(f"  {word}")

@@ -32,7 +32,7 @@ def gap_matrix_table(evaluation: Evaluation) -> RenderableType:
             Text(policy), number_text(start), *(_change(cell.cost.mean) for cell in cells.values())
         )
         worst = [
-            f"{cell.worst.removeprefix('want-')}\n{cell.worst_cost:+.0f}"
+            f"{cell.worst.removeprefix('want-')}\n{fixed(cell.worst_cost, 0, plus=True)}"
             if cell.worst_cost > 0
             else "-"
             for cell in cells.values()

@@ -8,8 +8,8 @@ from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
-from ugat_marl.errors import counted
 from ugat_marl.experiments import DIRECT, RULE, Comparison, Trial, is_grounded, rule_policy
+from ugat_marl.reporting.comparison_tables import seeds_note
 from ugat_marl.reporting.formats import flat_settings
 from ugat_marl.reporting.run_records import RunRecord
 
@@ -50,12 +50,9 @@ def groups(records: Sequence[RunRecord]) -> list[Group]:
         first = members[0]
         trials.sort(key=lambda trial: _rank(trial.setting))
         comparison = Comparison(first.scenario, "", first.sim, tuple(trials), {})
-        count = len(comparison.training_seeds)
-        note = f"{counted(count, 'training seed')}; "
-        note += "intervals: 95 %, Student's, over them." if count > 1 else "no intervals over them."
         title = f"{first.scenario}, trained in {first.sim}"
         title += "" if first.job else f", {first.grounding or 'unknown'} grounding"
-        with_several.append(Group(title, comparison.rows(), note, left_out))
+        with_several.append(Group(title, comparison.rows(), seeds_note(comparison), left_out))
     return with_several
 
 

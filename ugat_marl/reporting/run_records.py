@@ -30,7 +30,7 @@ from ugat_marl.data import (
 )
 from ugat_marl.errors import CheckpointError, OptionError, UgatMarlError
 from ugat_marl.experiments import QUEUES, TRAININGS, Evaluation, read_queues, result_of
-from ugat_marl.files import read_json
+from ugat_marl.files import MALFORMED, read_json
 from ugat_marl.reporting.formats import commands_in
 
 RUN, JOB, TABLE, SCORES = "run.json", "job.json", "table.json", "scores.json"
@@ -188,7 +188,7 @@ class _Reader:
             if path.stat().st_size > _LONGEST:
                 raise ValueError(f"it has more than {_LONGEST // 1_000_000} MB")
             return parse(path)
-        except (UgatMarlError, OSError, ArithmeticError, ValueError, TypeError, KeyError) as error:
+        except (UgatMarlError, OSError, csv.Error, *MALFORMED) as error:
             reason = " ".join(str(error).replace(f"{path}: ", "").split())
             self.missing.append(f"{name} cannot be used ({reason[:160]}): {without}")
             return None
@@ -345,6 +345,7 @@ def _written(directory: Path, checkpoint: str) -> float:
 
 
 def _scores(path: Path, settings: Mapping[str, Any]) -> Evaluation:
+    """Return the scores of a job: of its last training, and of seeds played in every domain."""
     content = _object(path)
     rows = content["episodes"]
     if wrong := json_damage(content, "episodes"):
@@ -353,10 +354,15 @@ def _scores(path: Path, settings: Mapping[str, Any]) -> Evaluation:
         raise ValueError("no scores in it")
     policy = str(settings.get("name", "unknown"))
     last = max(int(row["trained"]) for row in rows)
-    results = tuple(
-        result_of({**row, "policy": policy}) for row in rows if int(row["trained"]) == last
-    )
-    return Evaluation(str(settings.get("scenario", "")), "", results, {})
+    results = [result_of({**row, "policy": policy}) for row in rows if int(row["trained"]) == last]
+    seeds: dict[str, set[int]] = {}
+    for result in results:
+        seeds.setdefault(result.domain, set()).add(result.seed)
+    everywhere = set.intersection(*seeds.values())
+    if not everywhere:
+        raise ValueError("no seed was played in every domain")
+    results = [result for result in results if result.seed in everywhere]
+    return Evaluation(str(settings.get("scenario", "")), "", tuple(results), {})
 
 
 def _table(directory: Path, name: str) -> TableRecord:

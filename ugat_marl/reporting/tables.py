@@ -12,7 +12,7 @@ from ugat_marl.data import MEASURES
 from ugat_marl.diagnosis import PolicyGap, TravelTimeEstimate
 from ugat_marl.errors import counted
 from ugat_marl.experiments import Estimate, Evaluation, Tuned, best_rule_note, check_run
-from ugat_marl.reporting.formats import ends_text, mean_text, number_text, share
+from ugat_marl.reporting.formats import ends_text, mean_text, number_text, share, signed_text
 from ugat_marl.reporting.terminal import titled_table
 
 
@@ -190,5 +190,4 @@ def _half(estimate: Estimate) -> str:
 
 
 def _signed(estimate: Estimate) -> str:
-    text = number_text(estimate.mean)
-    return text if text.startswith("-") else f"+{text}"
+    return signed_text(estimate.mean)

@@ -247,7 +247,8 @@ def _fewer_seeds(rows: Sequence[Mapping[str, Any]]) -> str:
     """Return a sentence on settings with fewer training seeds than others; "" without any."""
     counts: dict[str, int] = {}
     for row in rows:
-        if (seeds := row.get("training_seeds")) is not None:
+        seeds = row.get("training_seeds")
+        if isinstance(seeds, int | float) and math.isfinite(seeds):
             counts[str(row["setting"])] = max(int(seeds), counts.get(str(row["setting"]), 0))
     most = max(counts.values(), default=0)
     fewer = [f"{setting} ({count})" for setting, count in counts.items() if count < most]
@@ -518,7 +519,7 @@ def _gate_grid(record: RunRecord, places: AgentPlaces | None) -> Grid:
 
 def _of_gate(key: str, value: float) -> str:
     if key == "gate/trusted":
-        return "yes" if value else "no"
+        return "–" if math.isnan(value) else "yes" if value else "no"
     if math.isinf(value):
         return "∞"
     is_share = key in ("gate/acceptance", "gate/change_rate")

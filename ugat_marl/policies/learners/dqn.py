@@ -25,6 +25,7 @@ from torch import Tensor, nn
 from ugat_marl.data import checked_tensors, read_checkpoint, write_checkpoint
 from ugat_marl.envs import ActionMask, AgentSet, AnyParallelEnv, step_meanwhile
 from ugat_marl.errors import CheckpointError, EpisodeError, OptionError
+from ugat_marl.files import MALFORMED
 from ugat_marl.policies.devices import CPU
 from ugat_marl.policies.learners.dqn_config import CEILING_DECISIONS, DQNConfig
 from ugat_marl.policies.learners.initial_weights import InitialWeights
@@ -618,7 +619,7 @@ class DQN:
             )
             if min(counters.values()) < 0 or not self._are_actions(stored["action"]):
                 raise ValueError("counters below 0, or actions that no agent has")
-        except (KeyError, TypeError, ValueError, AttributeError) as error:
+        except MALFORMED as error:
             raise CheckpointError(f"{path}: not a whole checkpoint ({error!r})") from None
         self.env_options = env_options
         for name in _COUNTERS:

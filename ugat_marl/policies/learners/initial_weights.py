@@ -12,6 +12,7 @@ from torch import Tensor, nn
 
 from ugat_marl.data import read_checkpoint, write_checkpoint
 from ugat_marl.errors import CheckpointError, OptionError
+from ugat_marl.files import MALFORMED
 from ugat_marl.policies.network_policy import KIND as POLICY
 from ugat_marl.policies.network_policy import NetworkPolicy
 
@@ -49,7 +50,7 @@ class InitialWeights:
             if weights.dtype != torch.float32 or weights.ndim != 1:
                 raise TypeError("weights are no row of float32")
             return cls(weights, options, str(content["origin"]))
-        except (KeyError, TypeError, ValueError, AttributeError) as error:
+        except MALFORMED as error:
             raise CheckpointError(f"{path}: not initial weights ({error})") from None
 
     @classmethod

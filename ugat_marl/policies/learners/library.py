@@ -25,6 +25,7 @@ from torch import Tensor, nn
 from ugat_marl.data import read_checkpoint, write_checkpoint
 from ugat_marl.envs import AgentSet, AnyParallelEnv, ResetResult, StepResult
 from ugat_marl.errors import ActionError, CheckpointError, EpisodeError, OptionError
+from ugat_marl.files import MALFORMED
 from ugat_marl.policies.learners.scaling import InputScale, RewardScale, observation_mask
 from ugat_marl.policies.network_policy import NetworkPolicy, checkpoint_header, parse_header
 from ugat_marl.policies.networks.batched import one_thread
@@ -107,7 +108,7 @@ class LibraryLearner(abc.ABC):
             if [one.shape for one in sums] != [one.sums.shape for one in self._scales]:
                 raise CheckpointError(f"{path}: its sums have shapes of another learner")
             self._restore(content["networks"], content["rest"])
-        except (KeyError, TypeError, ValueError, RuntimeError, AttributeError) as error:
+        except (RuntimeError, *MALFORMED) as error:
             raise CheckpointError(f"{path}: not a whole checkpoint ({error!r})") from None
         self.episodes = episodes
         for one, scale in zip(sums, self._scales, strict=True):

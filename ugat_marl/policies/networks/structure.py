@@ -146,6 +146,8 @@ class Structure:
         kinds = {len(kinds) for junction in self.junctions for kinds in junction.movements}
         if len(kinds) != 1:
             raise ValueError(f"movements with {sorted(kinds)} kinds of numbers")
+        if len({len(junction.commands) for junction in self.junctions}) > 1:
+            raise ValueError("junctions that show different numbers of commands")
         sizes = zip(self.junctions, agents.observation_sizes, agents.action_counts, strict=True)
         for junction, size, actions in sizes:
             places = [at for kinds in junction.movements for kind in kinds for at in kind]
@@ -159,6 +161,8 @@ class Structure:
                 or len(junction.greens) != actions
                 or widths != {len(junction.movements)}
                 or not all(0 <= share <= 1 for share in shares)
+                or len(junction.vehicles) not in (0, junction.first_phase)
+                or min(junction.interval_s, junction.clearance_s) < 0
             ):
                 raise ValueError(f"{junction} is none of {size} numbers and {actions} phases")
 

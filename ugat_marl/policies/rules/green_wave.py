@@ -108,10 +108,6 @@ class GreenWave:
             self._plan(road, network)
         self._time = 0
 
-    def offsets(self) -> dict[str, int]:
-        """Return the delay of each agent's cycle, in decisions."""
-        return dict(self._offsets)
-
     def reset(self, seed: int) -> None:
         """Start the clocks again."""
         self._time = 0
