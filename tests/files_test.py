@@ -370,3 +370,9 @@ def test_a_long_name_can_be_written(tmp_path: Path) -> None:
     write_whole(tmp_path / ("a" * 250), "text")
     with pytest.raises(OutputError, match="cannot be written"):
         write_whole(tmp_path / ("a" * 300), "text")
+
+
+def test_a_name_in_another_encoding_is_one_line(tmp_path: Path) -> None:
+    with pytest.raises(OutputError, match=r"'made of caf.*' in it is not UTF-8; rename that file"):
+        files.write_whole(tmp_path / "README.md", "made of caf\udce9.net.xml")
+    assert not list(tmp_path.iterdir())

@@ -175,9 +175,18 @@ def file_hash(path: Path) -> str:
 
 
 def write_whole(path: Path, content: bytes | str) -> None:
-    """Write `content` to `path`. A reader sees either the old file or the whole new one."""
+    """Write `content` to `path`. A reader sees either the old file or the whole new one.
+
+    Raises:
+        OutputError: The text cannot be written as UTF-8, as names of files in other encodings.
+    """
+    try:
+        content = content.encode() if isinstance(content, str) else content
+    except UnicodeEncodeError as error:
+        name = error.object[max(0, error.start - 20) : error.end + 20]
+        raise OutputError(f"{path}: {name!r} in it is not UTF-8; rename that file") from None
     with replacing(path) as temporary:
-        temporary.write_bytes(content.encode() if isinstance(content, str) else content)
+        temporary.write_bytes(content)
 
 
 def put_folder(made: Path, target: Path, before: Path) -> None:

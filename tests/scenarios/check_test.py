@@ -36,7 +36,8 @@ from ugat_marl.scenarios import (
     resco_maps,
     survey,
 )
-from ugat_marl.scenarios.inspection import SATURATION_VPH, fullest
+from ugat_marl.scenarios.inspection import SATURATION_VPH, _in_part, fullest
+from ugat_marl.scenarios.settings import validate_settings
 
 
 @pytest.fixture(scope="module")
@@ -141,6 +142,75 @@ def test_traffic_divides_among_lanes_that_it_shares() -> None:
     assert fullest({"right": 300, "through": 600}, lanes, capacity) == pytest.approx(900 / 1500)
     assert fullest({"right": 900, "through": 300}, lanes, capacity) == pytest.approx(900 / 1000)
     assert fullest({"left": 400, "through": 600}, lanes, capacity) == pytest.approx(400 / 500)
+
+
+@pytest.mark.parametrize(
+    ("duration_s", "worst_vph", "from_s"),
+    [
+        (1200.0, 300.0, 0.0),  # the rest of five minutes belongs to the only quarter
+        (1400.0, 720.0, 900.0),  # a quarter of 500 s
+        (1800.0, 400.0, 900.0),
+    ],
+)
+def test_a_last_quarter_that_is_shorter_has_its_own_length(
+    single: Scenario, duration_s: float, worst_vph: float, from_s: float
+) -> None:
+    (item,) = Network.read(single).intersections
+    start, goal = item.links[0].from_edge, item.links[0].to_edge
+    vehicles = "".join(
+        f'<vehicle id="{i}" depart="{900 + 2 * i}"><route edges="{start} {goal}"/></vehicle>'
+        for i in range(100)
+    )
+    routes = (Document("r.rou.xml", None, f"<routes>{vehicles}</routes>".encode()),)
+    facts = survey(replace(single, routes=routes).with_duration(duration_s))
+    (road,) = [a for a in facts.intersections[0].approaches if a.edge == start]
+    assert (road.worst_vph, road.worst_from_s) == (pytest.approx(worst_vph, abs=0.1), from_s)
+    assert (facts.busiest, facts.busiest_s) == (100, from_s)
+
+
+def test_a_light_s_own_late_green_belongs_to_every_source_of_phases(single: Scenario) -> None:
+    settings = single.settings.model_dump()
+    settings["intersections"] = {"A1": {"late_green_s": 20.0}}
+    late = replace(single, settings=validate_settings(settings, "test"))
+    (before,), (after,) = survey(single).intersections, survey(late).intersections
+    assert after.degrees["now"] == after.degrees["conflict-free"] != before.degrees["now"]
+    assert set(after.degrees) == set(before.degrees)
+    for source, degree in after.degrees.items():
+        assert degree is not None and degree > (before.degrees[source] or 0.0), source
+
+
+def test_nineteen_of_twenty_routes_are_no_longer_than_said(single: Scenario) -> None:
+    edges = [link.from_edge for link in Network.read(single).intersections[0].links]
+    ways = [edges[0], f"{edges[0]} {Network.read(single).intersections[0].links[0].to_edge}"]
+    vehicles = "".join(
+        f'<vehicle id="{i}" depart="{i}"><route edges="{way}"/></vehicle>'
+        for i, way in enumerate(ways)
+    )
+    routes = (Document("r.rou.xml", None, f"<routes>{vehicles}</routes>".encode()),)
+    short, both = (
+        survey(replace(single, routes=(Document("r.rou.xml", None, text.encode()),))).fill_s
+        for text in (
+            f'<routes><vehicle id="0" depart="0"><route edges="{ways[0]}"/></vehicle></routes>',
+            routes[0].read().decode(),
+        )
+    )
+    assert both > 1.5 * short  # of two routes, 95 % are both
+
+
+def test_a_lane_whose_right_turn_may_go_on_red_is_not_served_in_part() -> None:
+    light, lane = next(
+        (light, lane)
+        for light in Network.read(load_scenario("mixed-v1")).intersections
+        for lane in light.incoming_lanes
+        if {x.direction for x in light.links if x.from_lane == lane} == {"s", "r"}
+    )
+    letters = ["r"] * len(light.phases[0])
+    for link in light.links:
+        if link.from_lane == lane:
+            letters[link.index] = "G" if link.direction == "s" else "s"
+    assert not _in_part(lane, replace(light, phases=("".join(letters),)))
+    shut = "".join(letters).replace("s", "r")
+    assert _in_part(lane, replace(light, phases=(shut,)))
 
 
 def test_an_approach_that_is_full_for_a_quarter_of_an_hour_is_shown_so(single: Scenario) -> None:

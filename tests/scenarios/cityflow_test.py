@@ -264,6 +264,7 @@ def test_a_roadnet_that_is_wrong(
         ([flow(["wm"], 9, 3)], "endTime (3) is before startTime (9)"),
         ([flow(["wm"], 0, 9, 0)], "interval = 0 must be above 0"),
         ([flow(["wm"], 0, 9e9, 1)], f"more than {MOST_VEHICLES} vehicles"),
+        ([flow(["wm"], 0, 9, 1e-308)], f"more than {MOST_VEHICLES} vehicles"),
         ([flow(["wm"], 0, 0, maxSpeed=0)], "maxSpeed = 0 must be above 0"),
         ([flow(["wm"], 0, -1), flow(["wm"], 0, 1e999)], "'endTime' is missing or not a number"),
         ([{"route": ["wm"]}], "'vehicle' is missing"),

@@ -12,6 +12,7 @@ import numpy as np
 import pytest
 
 from ugat_marl.__main__ import main
+from ugat_marl.effects import load_scenario
 from ugat_marl.files import parse_xml
 from ugat_marl.scenarios import (
     Lane,
@@ -326,3 +327,13 @@ def test_roads_inside_a_light_leave_the_main_directions_to_those_that_lead_to_it
         "westbound",
     ]
     assert len(set(named.values())) == 4
+
+
+def test_a_sheet_asks_for_no_turns_that_cars_cannot_make(tmp_path: Path) -> None:
+    root = load_scenario("single-v1").network.parse()
+    before = write_template(tmp_path / "all.csv", root)
+    for lane in root.iter("lane"):
+        if lane.get("id") == "east1_A1_2":  # the lane of left turns
+            lane.set("allow", "bus")
+    assert write_template(tmp_path / "cars.csv", root) == before - 1
+    assert "east1_A1,A1_southA" not in (tmp_path / "cars.csv").read_text(encoding="utf-8-sig")

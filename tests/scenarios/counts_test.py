@@ -13,7 +13,7 @@ from ugat_marl.__main__ import main
 from ugat_marl.errors import ScenarioError
 from ugat_marl.progress import Silent
 from ugat_marl.scenarios import read_scenario, sumo_program
-from ugat_marl.scenarios.importers.counts import Row, _closed, read_rows
+from ugat_marl.scenarios.importers.counts import Row, _closed, _outside, read_rows
 
 
 def made(target: Path, *words: str | Path) -> int:
@@ -304,3 +304,24 @@ def test_intervals_with_a_common_step_of_less_than_seconds_are_refused(
     said = " ".join(capsys.readouterr().err.split())
     assert "c.csv, line 3: the interval 900.5 to 1800 s" in said
     assert "no common step longer than 0.5 s" in said
+
+
+def test_a_part_of_a_vehicle_outside_of_the_episode_is_not_told() -> None:
+    rows = [Row(("a",), 10.0, 0.0, 3650.0, 2)]
+    assert list(_outside(rows, Path("c.csv"), 0.0, 3600.0)) == []
+    assert len(list(_outside(rows, Path("c.csv"), 0.0, 3000.0))) == 1
+
+
+def test_columns_that_differ_in_case_are_one(tmp_path: Path) -> None:
+    (tmp_path / "c.csv").write_text("edge,count,Count\na,5,700\n")
+    with pytest.raises(ScenarioError, match="the column count is there twice"):
+        read_rows(tmp_path / "c.csv", 0, 3600, Silent(), pairs=False)
+
+
+@pytest.mark.parametrize("mark", ["\u2028", "\x85", "\x0c"])
+@pytest.mark.parametrize("end", ["\n", "\r\n", "\r"])
+def test_names_may_hold_marks_that_end_lines_elsewhere(tmp_path: Path, mark: str, end: str) -> None:
+    lines = ("street,edge,count", f"High{mark}Street,a,5", "Other,b,7", "")
+    (tmp_path / "c.csv").write_bytes(end.join(lines).encode())
+    rows = read_rows(tmp_path / "c.csv", 0, 3600, Silent(), pairs=False)
+    assert [(row.roads, row.count, row.line) for row in rows] == [(("a",), 5, 2), (("b",), 7, 3)]

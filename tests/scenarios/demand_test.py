@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import tracemalloc
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 
 import libsumo
@@ -13,6 +14,7 @@ from ugat_marl.effects import load_scenario
 from ugat_marl.errors import ScenarioError
 from ugat_marl.scenarios import (
     Demand,
+    Document,
     Network,
     check_demand,
     demand_as_vehicles,
@@ -203,3 +205,14 @@ def test_shipped_demand_can_be_driven(name: str) -> None:
     demand = check_demand(scenario, Network.read(scenario))
     assert demand.flows == 0  # written out vehicle by vehicle
     assert demand.vehicles > 1500
+
+
+def test_flows_of_calibrators_are_no_demand() -> None:
+    scenario = load_scenario("single-v1")
+    calibrator = (
+        '<additional><calibrator id="c" lane="east1_A1_0" pos="10"><flow begin="0" end="3600" '
+        'vehsPerHour="200" route="r" type="car"/></calibrator></additional>'
+    )
+    more = replace(scenario, additional=(Document("c.add.xml", None, calibrator.encode()),))
+    network = Network.read(scenario)
+    assert check_demand(more, network) == check_demand(scenario, network)

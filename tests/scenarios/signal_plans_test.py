@@ -96,6 +96,39 @@ def test_a_ring_that_sits_a_barrier_out_clears_before_it(single: Scenario) -> No
     assert {"NBT", "SBT"} <= green_at(scenario, 86, "y")
 
 
+def test_movements_that_share_a_letter_are_green_together(single: Scenario) -> None:
+    """The left turn from the east has the letter of a through lane, to which the other yields."""
+    root = single.network.parse()
+    ways = {
+        (item.get("from"), item.get("to"), item.get("fromLane")): item
+        for item in root.iter("connection")
+        if item.get("tl") == "A1"
+    }
+    left = next(item for key, item in ways.items() if key[:2] == ("east1_A1", "A1_southA"))
+    through = next(item for key, item in ways.items() if key[:2] == ("east1_A1", "A1_west1"))
+    left.set("linkIndex", through.get("linkIndex", ""))
+    shared = replace(single, network=Document("n.net.xml", None, xml_bytes(root)))
+    (light,) = Network.read(with_plans(shared, [dual_ring()], "plan.csv")).intersections
+    opposite = next(
+        link.index
+        for link in light.links
+        if (link.from_edge, link.to_edge) == ("west1_A1", "A1_northA")
+    )
+    states = [state for _, state in light.programme]
+    both = [s for s in states if s[opposite] in "Gg" and s[int(left.get("linkIndex", ""))] in "Gg"]
+    assert both and all(state[opposite] == "g" for state in both)
+
+
+@pytest.mark.parametrize("split_s", [14.99, 15.0, 15.01])
+def test_a_plan_lasts_its_cycle(single: Scenario, split_s: float) -> None:
+    codes = ("WBL EBL", "WBT WBR EBT EBR", "NBL SBL", "NBT NBR SBT SBR")
+    phases = tuple(PlanPhase(1, 1, tuple(each.split()), split_s, 3, 2) for each in codes)
+    (light,) = Network.read(
+        with_plans(single, [SignalPlan("A1", 60, 0.0, phases)], "plan.csv")
+    ).intersections
+    assert sum(seconds for seconds, _ in light.programme) == pytest.approx(60.0, abs=1e-9)
+
+
 def test_a_movement_of_two_phases_in_turn_stays_green(single: Scenario) -> None:
     phases = (
         PlanPhase(1, 1, ("EBL", "EBT", "EBR"), 25, 3, 2),
@@ -524,6 +557,28 @@ def test_files_of_synchro_that_are_wrong(
     words = ["plan", "single-v1", "--apply", str(file), "--out", str(tmp_path / "x")]
     assert main([*words, *(["--lights", *lights] if lights else [])]) == 2
     assert says in capsys.readouterr().err
+
+
+@pytest.mark.parametrize(
+    ("brp", "says"),
+    [("11,112,211,212", "BRP 11 of phase 1"), ("111,112,201,212", "BRP 201 of phase 3"),
+     ("-111,112,211,212", "BRP -111 of phase 1")],
+)  # fmt: skip
+def test_places_of_phases_have_three_digits(
+    brp: str, says: str, single: Scenario, tmp_path: Path
+) -> None:
+    file = synchro(tmp_path)
+    file.write_text(file.read_text().replace("111,112,211,212", brp))
+    with pytest.raises(ScenarioError, match=f"{says} is not barrier, ring and position"):
+        read_utdf(file, Network.read(single), {})
+
+
+def test_a_column_with_another_kind_of_digit_is_no_phase(single: Scenario, tmp_path: Path) -> None:
+    file = synchro(tmp_path)
+    before, _ = read_utdf(file, Network.read(single), {})
+    text = file.read_text().replace(",D8\n", ",D8,D²\n").replace("221,222\n", "221,222,311\n")
+    file.write_text(text, encoding="utf-8")
+    assert read_utdf(file, Network.read(single), {})[0] == before
 
 
 def test_two_plans_of_one_intersection_are_refused(single: Scenario, tmp_path: Path) -> None:

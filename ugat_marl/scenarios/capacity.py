@@ -164,14 +164,14 @@ class _Loaded:
                 for name, lane in places
             ),
             {
-                lane: np.array([_may_go(links, phase) for phase in light.phases])
+                lane: np.array([may_go(links, phase) for phase in light.phases])
                 for lane, links in by_lane.items()
             },
             tuple(_conflicts(light.phases, movements, ratios, yielding)),
         )
 
 
-def _may_go(links: Sequence[Link], phase: str) -> bool:
+def may_go(links: Sequence[Link], phase: str) -> bool:
     """Return True if all links have green; one that may go on red after a stop holds up nobody."""
     return all(phase[link.index] in GREEN or phase[link.index] == "s" for link in links)
 

@@ -33,7 +33,8 @@ def columns_of(reader: csv.DictReader[str], path: Path) -> list[str]:
     """Read the first line; return the names without blanks, which then name the cells of rows.
 
     Raises:
-        ScenarioError: It is not CSV, tells a spreadsheet its separator, or holds a name twice.
+        ScenarioError: It is not CSV, tells a spreadsheet its separator, or holds a name twice,
+            large or small.
     """
     try:
         columns = [name.strip() for name in reader.fieldnames or ()]
@@ -44,7 +45,8 @@ def columns_of(reader: csv.DictReader[str], path: Path) -> list[str]:
             f"{path}, line 1: {columns[0]!r} is for a spreadsheet; delete this line, so that the "
             "file begins with the names of its columns"
         )
-    if twice := [name for name in dict.fromkeys(columns) if name and columns.count(name) > 1]:
+    lowered = [name.lower() for name in columns]
+    if twice := [name for name in dict.fromkeys(lowered) if name and lowered.count(name) > 1]:
         raise ScenarioError(f"{path}, line 1: the column {twice[0]} is there twice; keep one")
     reader.fieldnames = columns
     return columns

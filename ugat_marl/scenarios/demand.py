@@ -10,9 +10,9 @@ from ugat_marl.files import Tag
 from ugat_marl.progress import Reporter
 from ugat_marl.scenarios.network import Network
 from ugat_marl.scenarios.routes import (
-    DEPARTING,
     OwnEdges,
     demand_scale,
+    departs,
     is_blocker,
     scaled_number,
 )
@@ -86,7 +86,7 @@ def check_demand(
                 if not edges.issuperset(used):
                     edge = next(edge for edge in used if edge not in edges)
                     raise _unknown_edge(document, tag, edge, scenario)
-            if tag.name in DEPARTING:
+            if departs(tag):
                 routed &= in_routes
                 depart = _depart_s(tag, document, begin, max(begin, latest))
                 if depart < latest and in_routes:

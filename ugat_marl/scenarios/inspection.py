@@ -11,7 +11,7 @@ from itertools import combinations
 
 from ugat_marl.errors import ScenarioError
 from ugat_marl.progress import Reporter
-from ugat_marl.scenarios.capacity import SATURATION_VPH, Flows, degrees_of_saturation
+from ugat_marl.scenarios.capacity import SATURATION_VPH, Flows, degrees_of_saturation, may_go
 from ugat_marl.scenarios.demand import Demand, check_demand
 from ugat_marl.scenarios.junctions import Link, foes_of, links_for_cars, yields_of
 from ugat_marl.scenarios.network import Intersection, Network, free_flow_s
@@ -236,7 +236,11 @@ PHASE_SOURCES = ("programme", "conflict-free", "permitted")
 def _degrees(scenario: Scenario, flows_vph: Flows) -> dict[str, dict[str, float]]:
     """Return source of phases, or ``now``, to the degree of saturation of each light."""
     found = {"now": degrees_of_saturation(scenario, flows_vph)}
-    settings = scenario.settings.model_copy(update={"intersections": {}})
+    lights = {
+        light: own.model_copy(update={"phases": None})
+        for light, own in scenario.settings.intersections.items()
+    }
+    settings = scenario.settings.model_copy(update={"intersections": lights})
     for source in PHASE_SOURCES:
         other = replace(scenario, settings=settings).with_control(phases=source)
         try:
@@ -343,9 +347,11 @@ def _times_of(intersection: Intersection, *, yellow: bool) -> tuple[float, ...]:
 
 
 def _in_part(lane: str, intersection: Intersection) -> bool:
-    indices = {link.index for link in intersection.links if link.from_lane == lane}
-    shown = ({state[index] in GREEN for index in indices} for state in intersection.phases)
-    return any(len(letters) > 1 for letters in shown)
+    links = [link for link in intersection.links if link.from_lane == lane]
+    return any(
+        any(state[link.index] in GREEN for link in links) and not may_go(links, state)
+        for state in intersection.phases
+    )
 
 
 def _clashes(intersection: Intersection, rules: RightOfWay) -> Iterator[str]:
@@ -488,6 +494,9 @@ QUARTER_S = 900.0
 class _Traffic:
     """Traffic from the routes. Vehicles are taken to drive at the speed limit.
 
+    The last quarter of an hour of an episode is half as long to half as long again, since what is
+    left over belongs to it. Quarters are compared by their flows per hour.
+
     Attributes:
         duration_s: Length of the episode.
         vph: Road to the vehicles per hour whose routes use it.
@@ -512,8 +521,17 @@ class _Traffic:
     fill_s: float
 
     @property
-    def _interval_s(self) -> float:
-        return min(QUARTER_S, self.duration_s)
+    def _last(self) -> int:
+        """Number of the last quarter of an hour."""
+        return max(1, round(self.duration_s / QUARTER_S)) - 1
+
+    def _quarter(self, at_s: float) -> int:
+        return min(int(at_s // QUARTER_S), self._last)
+
+    def _vph(self, count: int, quarter: int) -> float:
+        """Return vehicles per hour, from vehicles in a quarter of an hour."""
+        end_s = self.duration_s if quarter == self._last else (quarter + 1) * QUARTER_S
+        return count * 3600 / (end_s - quarter * QUARTER_S)
 
     def worst(self, edge: str) -> tuple[float, float, dict[str, float]]:
         """Return the flow of a road in its worst quarter of an hour, vehicles per hour.
@@ -524,32 +542,36 @@ class _Traffic:
         quarters = self.passes.get(edge)
         if not quarters:
             return 0.0, 0.0, {}
-        worst = max(sorted(quarters), key=lambda quarter: quarters[quarter])
+        worst = max(sorted(quarters), key=lambda quarter: self._vph(quarters[quarter], quarter))
         flows = {
-            after: count * 3600 / self._interval_s
+            after: self._vph(count, worst)
             for (before, after), count in self.turns.get(worst, {}).items()
             if before == edge
         }
-        return quarters[worst] * 3600 / self._interval_s, worst * self._interval_s, flows
+        return self._vph(quarters[worst], worst), worst * QUARTER_S, flows
+
+    @property
+    def _busiest(self) -> int:
+        """Number of the quarter of an hour with the most departures."""
+        counts = self.departing
+        return max(sorted(counts), key=lambda n: self._vph(counts[n], n), default=0)
 
     @property
     def busiest_s(self) -> float:
         """Start of the quarter of an hour with the most departures, s."""
-        if not self.departing:
-            return 0.0
-        most = max(sorted(self.departing), key=lambda quarter: self.departing[quarter])
-        return most * self._interval_s
+        return self._busiest * QUARTER_S
 
     @property
     def busiest(self) -> int:
         """Number of vehicles that depart in the busiest quarter of an hour."""
-        return max(self.departing.values(), default=0)
+        return self.departing[self._busiest]
 
     @property
     def busiest_flows_vph(self) -> dict[tuple[str, str], float]:
         """Vehicles per hour from road to road, in the quarter of an hour with the most of them."""
-        most = max(self.turns.values(), key=lambda turns: turns.total(), default=Counter())
-        return {turn: count * 3600 / self._interval_s for turn, count in most.items()}
+        turns = self.turns
+        most = max(sorted(turns), key=lambda n: self._vph(turns[n].total(), n), default=0)
+        return {turn: self._vph(count, most) for turn, count in turns.get(most, {}).items()}
 
     @classmethod
     def of(
@@ -571,12 +593,12 @@ class _Traffic:
         hours = length_s / 3600
         lengths_s.sort()
         traffic.vph = Counter({e: n / hours for e, n in passes.items()})
-        traffic.fill_s = lengths_s[int(0.95 * (len(lengths_s) - 1))] if lengths_s else 0.0
+        traffic.fill_s = lengths_s[math.ceil(0.95 * len(lengths_s)) - 1] if lengths_s else 0.0
         return traffic
 
     def _drive(self, depart_s: float, edges: Sequence[str], seconds: Mapping[str, float]) -> None:
         """Count a vehicle at the end of each of its roads, if it is there before the end."""
-        self.departing[int(depart_s // self._interval_s)] += 1
+        self.departing[self._quarter(depart_s)] += 1
         self.first_s, self.last_s = min(self.first_s, depart_s), max(self.last_s, depart_s)
         at_s, before, quarter = depart_s, "", 0
         for edge in edges:
@@ -585,7 +607,7 @@ class _Traffic:
             at_s += seconds.get(edge, 0.0)
             if at_s >= self.duration_s:
                 break
-            quarter = int(at_s // self._interval_s)
+            quarter = self._quarter(at_s)
             self.passes[edge][quarter] += 1
             if at_s < self.first_at_s.get(edge, math.inf):
                 self.first_at_s[edge] = at_s

@@ -163,6 +163,7 @@ class Network:
             light_links = tuple(sorted(links[tls], key=lambda link: (link.index, link.to_lane)))
             walks = tuple(crossings.get(tls, ()))
             own = programmes.get(tls, _NO_PROGRAMME)
+            _check_requests((*light_links, *walks), rules, document.source)
             programme, width = _programme_of(
                 scenario, tls, own.states, (*light_links, *walks), rules, notes
             )
@@ -367,9 +368,26 @@ def _reason(
     return f"{text}, whose ways do not cross{more}"
 
 
+def _check_requests(links: Sequence[Link], rules: RightOfWay, source: str) -> None:
+    """Refuse links without a row in the right of way of their junction."""
+    for link in links:
+        for rows in (rules.foes[link.junction], rules.yields[link.junction]):
+            if rows and link.request >= len(rows):
+                raise ScenarioError(
+                    f"{source}: junction {link.junction!r} has {counted(len(rows), 'request')}, "
+                    f"and a connection needs request {link.request}; build the network again"
+                )
+
+
 def _check_programme(programme: Sequence[tuple[float, str]], width: int, where: str) -> int:
     """Refuse an impossible programme and return the number of letters of its states."""
     letters = len(programme[0][1])
+    durations = [seconds for seconds, _ in programme]
+    if min(durations) < 0 or not sum(durations):
+        raise ScenarioError(
+            f"{where}: the states of its programme last {', '.join(f'{x:g}' for x in durations)} "
+            "s; write durations of at least 0 that are not all 0"
+        )
     for index, (_, state) in enumerate(programme):
         state_name = f"{where}: state {index} of its programme ({state!r})"
         if len(state) < width or len(state) != letters:

@@ -347,9 +347,9 @@ def _maximal_cliques(
 def suited(network: Path) -> tuple[dict[str, str], list[str]]:
     """Find the lights for which conflict-free phases do not fit, and a better source of phases.
 
-    If a lane serves both straight on and left turns, a vehicle that waits for one of them blocks a
-    phase for the other. At such lights left turns are permitted. Lights with fewer than two derived
-    phases keep the phases of their programme, if it has at least two.
+    If a lane serves both straight on and turns across opposite traffic, a vehicle that waits for
+    one of them blocks a phase for the other. At such lights these turns are permitted. Lights with
+    fewer than two derived phases keep the phases of their programme, if it has at least two.
 
     Args:
         network: The ``.net.xml``.
@@ -370,8 +370,9 @@ def suited(network: Path) -> tuple[dict[str, str], list[str]]:
         elif usual != "conflict-free":
             sources[tls] = usual
     notes: list[str] = []
+    across = "lanes for straight on and turns across opposite traffic: these turns are permitted"
     for source, why in (
-        ("permitted", "lanes for straight on and left turns: their left turns are permitted"),
+        ("permitted", across),
         ("programme", "no phases that can be derived: they keep their programme's"),
     ):
         if count := sum(kind == source for kind in sources.values()):

@@ -247,7 +247,12 @@ def _holds_single_vehicles(document: Document) -> bool:
 
 def _holds_demand(document: Document) -> bool:
     """Return True if the file holds vehicles, trips or flows other than those of calibrators."""
-    return any(tag.name in DEPARTING and tag.parent != "calibrator" for tag in document.scan())
+    return any(map(departs, document.scan()))
+
+
+def departs(tag: Tag) -> bool:
+    """Return True for vehicles, trips and flows, but not for the flows of calibrators."""
+    return tag.name in DEPARTING and tag.parent != "calibrator"
 
 
 def _without_demand(document: Document) -> Document:

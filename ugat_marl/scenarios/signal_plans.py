@@ -13,7 +13,7 @@ import io
 import math
 import xml.etree.ElementTree as ET
 from collections import defaultdict
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Collection, Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from itertools import accumulate, combinations, pairwise
 from pathlib import Path
@@ -186,7 +186,7 @@ def plan_states(
     walks = _walks(signals, light, codes, rules)
     for (begin, end), now, walking in zip(parts, signals, walks, strict=True):
         state = _state(now, walking, light, codes, rules, width)
-        going = [link for link in light.links if codes[link] in now.green]
+        going = _shown_with(now.green, light, codes)
         if pair := next((pair for pair in combinations(going, 2) if clash(*pair)), None):
             raise ScenarioError(
                 f"{source}: light {plan.light!r}: {_told(pair[0], codes)} and "
@@ -269,7 +269,8 @@ def _times(plan: SignalPlan) -> tuple[list[float], _Shown]:
         shown.append((begin, green_end, yellow_end, end, frozenset(phase.movements), stays))
         if stays:
             shown.append((green_end, end, end, end, stays, stays))
-        times |= {begin, green_end, yellow_end, end}
+        # splits may exceed the cycle by what rounding leaves
+        times |= {min(time, plan.cycle_s) for time in (begin, green_end, yellow_end, end)}
     kept: list[float] = []
     for time in sorted(times):
         if not kept or time - kept[-1] >= SHORTEST_S:
@@ -347,12 +348,20 @@ def _state(
     rules: RightOfWay,
     width: int,
 ) -> str:
-    going = [link for link in light.links if codes[link] in now.green]
-    ending = [link for link in light.links if codes[link] in now.yellow]
+    going = _shown_with(now.green, light, codes)
+    ending = _shown_with(now.yellow, light, codes)
     # Who gives way goes on doing so while the others have yellow.
     ruled = state_of([*going, *ending, *walks], light.links, rules, width)
     last = {link.index for link in ending} - {link.index for link in going}
     return "".join("y" if index in last else letter for index, letter in enumerate(ruled))
+
+
+def _shown_with(
+    movements: Collection[str], light: Intersection, codes: Mapping[Link, str]
+) -> list[Link]:
+    """Return the links of movements, and those that share a letter with them."""
+    indices = {link.index for link in light.links if codes[link] in movements}
+    return [link for link in light.links if link.index in indices]
 
 
 def _check_movements(plan: SignalPlan, known: set[str], source: str) -> None:

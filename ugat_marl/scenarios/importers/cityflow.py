@@ -14,7 +14,6 @@ import math
 import tempfile
 import xml.etree.ElementTree as ET
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from dataclasses import dataclass
 from functools import cached_property
 from itertools import pairwise
 from pathlib import Path
@@ -64,9 +63,9 @@ def from_cityflow(
         notes = write_network(net, folder / NETWORK)
         length_s, routes = duration_s or 3600.0, ()
         if own_vehicles:
-            demand = write_routes(flow, net, folder / ROUTES, duration_s, reporter, exact=exact)
+            last_s = write_routes(flow, net, folder / ROUTES, duration_s, reporter, exact=exact)
             routes = (ROUTES,)
-            length_s = duration_s or max(3600.0, 600.0 * (math.floor(demand.last_s / 600) + 1))
+            length_s = duration_s or max(3600.0, 600.0 * (math.floor(last_s / 600) + 1))
         return RoadFiles(
             f"CityFlow network {roadnet.name}",
             f"Turned from CityFlow's `{roadnet.name}` and `{flow.name}`: lanes, stop lines, turns "
@@ -324,19 +323,6 @@ def _clearing(
         yield length_s - yellow_s, "".join(kept)
 
 
-@dataclass(frozen=True)
-class Flows:
-    """Vehicles that were written.
-
-    Attributes:
-        vehicles: Number of vehicles.
-        last_s: Departure of the last vehicle.
-    """
-
-    vehicles: int
-    last_s: float
-
-
 def write_routes(
     path: Path,
     net: Roadnet,
@@ -345,7 +331,7 @@ def write_routes(
     reporter: Reporter,
     *,
     exact: bool,
-) -> Flows:
+) -> float:
     """Turn a ``flow.json`` into a route file.
 
     Vehicles keep their size, gap, accelerations and speed. Without `exact` they follow each other
@@ -360,6 +346,9 @@ def write_routes(
             flow that has one, and at least one hour.
         reporter: Shows progress if the file is long.
         exact: True for CityFlow's headways and driving without randomness.
+
+    Returns:
+        Departure of the last vehicle, s.
 
     Raises:
         ScenarioError: The file is not a list of flows, or a flow is impossible; the message names
@@ -383,7 +372,7 @@ def write_routes(
         raise ScenarioError(f"{path}: no vehicle in it")
     drives.sort(key=lambda drive: drive.depart_s)  # stable: equal times keep the file's order
     write_drives(out, drives, types.values())
-    return Flows(len(drives), drives[-1].depart_s)
+    return drives[-1].depart_s
 
 
 def _end_s(path: Path) -> float:
@@ -405,9 +394,9 @@ def _departures(flow: Mapping[str, Any], end_s: Callable[[], float], where: str)
     if last > start and interval <= 0:
         raise ScenarioError(f"{where}: interval = {interval:g} must be above 0")
     steps = (last - start) / interval if last > start else 0.0
-    count = max(1, math.ceil(steps - 1e-9)) if end < 0 else 1 + int(steps + 1e-9)
-    if count > MOST_VEHICLES:
+    if steps > MOST_VEHICLES:  # also infinite
         raise ScenarioError(f"{where}: more than {MOST_VEHICLES} vehicles")
+    count = max(1, math.ceil(steps - 1e-9)) if end < 0 else 1 + int(steps + 1e-9)
     for i in range(count):
         yield start + i * interval
 

@@ -64,7 +64,10 @@ class NamedNetwork:
             turns = named_turns(light, links, lanes, streets)
             self._names[light] = intersection_name(links, streets)
             self._turns.update(((turn.from_edge, turn.to_edge), turn) for turn in turns)
-            self._choices += turns if _has_choice(links) else ()
+            driven = [link for link in links if link.cars]  # counts of cars alone are asked for
+            ways = {(link.from_edge, link.to_edge) for link in driven}
+            if _has_choice(driven):
+                self._choices += [turn for turn in turns if (turn.from_edge, turn.to_edge) in ways]
 
     def turn(self, roads: Sequence[str]) -> NamedTurn | None:
         """Return the turn from the first road to the second; None if it has no light."""

@@ -540,7 +540,7 @@ def _outside(rows: Iterable[Row], path: Path, begin_s: float, end_s: float) -> I
         inside_s = max(0.0, min(row.end_s, end_s) - max(row.begin_s, begin_s))
         total += row.count
         lost += row.count * (1 - inside_s / (row.end_s - row.begin_s))
-    if lost > 0:
+    if lost >= 0.5:
         yield (
             f"{lost:.0f} of the {total:.0f} vehicles of {path.name} are outside of the episode "
             f"({begin_s:g} to {end_s:g} s) and never drive; begin_s and end_s of the rows are on "

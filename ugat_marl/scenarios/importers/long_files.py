@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import codecs
+import io
 import json
 import re
 from collections.abc import Iterable, Iterator
@@ -79,7 +80,8 @@ def lines(path: Path, reporter: Reporter) -> Iterator[str]:
     """
     rest, count = "", 0
     for text in _texts(chunks_of(path, reporter), path):
-        *whole, rest = (rest + text).splitlines(keepends=True) or [""]
+        # lines end as in CSV: `str.splitlines` would also end them at marks inside of names
+        *whole, rest = io.StringIO(rest + text, newline="").readlines() or [""]
         count += len(whole)
         yield from whole
         if len(rest) > _MOST:

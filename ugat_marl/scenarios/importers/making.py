@@ -14,7 +14,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
-from ugat_marl.errors import OutputError, ScenarioError
+from ugat_marl.errors import OutputError, ScenarioError, counted
 from ugat_marl.files import put_folder, write_whole
 from ugat_marl.progress import Reporter
 from ugat_marl.scenarios.admission import admitted
@@ -266,7 +266,7 @@ def _readme(made: Made, draft: RoadFiles, command: str) -> str:
         "",
         f"- **Intersections:** {len(phases)} with {spread} green phases{more}",
         f"- **Vehicles:** {made.demand.vehicles}"
-        + (f" and {made.demand.flows} flows" if made.demand.flows else "")
+        + (f" and {counted(made.demand.flows, 'flow')}" if made.demand.flows else "")
         + f" in {settings.duration_s:g} s",
         "",
         *_origin(draft.origin, command, made.notes),

@@ -20,6 +20,7 @@ from ugat_marl.errors import OptionError, ScenarioError
 from ugat_marl.files import write_whole, xml_bytes
 from ugat_marl.progress import Reporter
 from ugat_marl.scenarios.importers.making import NETWORK, RoadFiles, RoadSource
+from ugat_marl.scenarios.naming import letters
 from ugat_marl.scenarios.sumo_tools import netconvert
 
 TURNS = {"l": "left", "s": "straight", "r": "right"}
@@ -158,7 +159,7 @@ def grid(
         east_west: Lanes of the roads along the rows, kerb first, each with its turns.
         north_south: Lanes of the roads along the columns, kerb first, each with its turns.
     """
-    letters = [_column(number) for number in range(columns)]
+    names = [letters(number).upper() for number in range(columns)]
     nodes: dict[str, Node] = {}
     roads: dict[str, Road] = {}
 
@@ -172,23 +173,17 @@ def grid(
     width, height = (columns - 1) * spacing_m, (rows - 1) * spacing_m
     for row in range(rows):
         y = row * spacing_m
-        inner = [Node(f"{x}{row + 1}", i * spacing_m, y, True) for i, x in enumerate(letters)]
+        inner = [Node(f"{x}{row + 1}", i * spacing_m, y, True) for i, x in enumerate(names)]
         west = Node(f"west{row + 1}", -entry_m, y, False)
         east = Node(f"east{row + 1}", width + entry_m, y, False)
         add([west, *inner, east], tuple(east_west))
-    for column, letter in enumerate(letters):
+    for column, letter in enumerate(names):
         x = column * spacing_m
         inner = [nodes[f"{letter}{row + 1}"] for row in range(rows)]
         south = Node(f"south{letter}", x, -entry_m, False)
         north = Node(f"north{letter}", x, height + entry_m, False)
         add([south, *inner, north], tuple(north_south))
     return RoadPlan(nodes, roads)
-
-
-def _column(number: int) -> str:
-    """Return A to Z, then AA, AB, ..., as in a spreadsheet."""
-    rest, last = divmod(number, 26)
-    return (_column(rest - 1) if rest else "") + chr(ord("A") + last)
 
 
 def coordinate(metres: float) -> str:

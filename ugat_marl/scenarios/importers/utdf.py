@@ -10,6 +10,7 @@ from __future__ import annotations
 
 import csv
 import io
+import re
 from collections import defaultdict
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
@@ -199,9 +200,14 @@ def _plan(
             by_phase[number].append(code)
     phases: list[tuple[int, int, PlanPhase]] = []
     for column, (text, line) in node.phases["brp"].items():
-        if not column.startswith("D") or not column[1:].isdigit() or not text:
+        if not re.fullmatch(r"D[0-9]+", column) or not text:
             continue
         place = _whole(_number(text, "BRP", where, line), "BRP", where)
+        if place and not (111 <= place <= 999 and place // 10 % 10):
+            raise ScenarioError(
+                f"{where}, line {line}: BRP {place} of phase {column[1:]} is not barrier, ring and "
+                "position, one digit each from 1"
+            )
         number = int(column[1:])
         times = [_time(node, record, column, where) for record in ("maxgreen", "yellow", "allred")]
         if place and times[0]:
