@@ -3,12 +3,13 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from dataclasses import replace
 
 import numpy as np
 import pytest
 
 from ugat_marl.data import AgentLayout, Provenance, TransitionLog, TransitionRecorder
-from ugat_marl.grounding.eyes import Eyes, EyesConfig, _dead, fit_eyes
+from ugat_marl.grounding.eyes import Eyes, EyesConfig, _dead, _noise, fit_eyes
 from ugat_marl.grounding.summaries import LaneRows, LaneView
 
 LANES = 4
@@ -137,6 +138,21 @@ def test_noise_is_found_with_its_size() -> None:
     assert eyes.relative == pytest.approx(0.1, abs=0.05)
     assert eyes.absolute <= 1.0
     assert found(absolute).absolute == pytest.approx(3.0, abs=1.0)
+
+
+@pytest.mark.filterwarnings("error")
+def test_a_street_without_red_has_no_noise_to_tell() -> None:
+    counts = np.random.default_rng(1).uniform(0.0, 9.0, 40)
+    numbers, never = np.arange(40), np.zeros(40, np.bool_)
+    green, dark = (
+        LaneRows(
+            0 * numbers, numbers, counts, counts, counts, 10.0 * numbers * lit,
+            np.full(40, lit), never, never,
+        )
+        for lit in (True, False)
+    )  # fmt: skip
+    green = replace(green, age_s=np.full(40, 10.0))
+    assert _noise([green], [dark], EyesConfig()) == (0.0, 0.0)
 
 
 @pytest.mark.parametrize("lag", [1, 3])

@@ -130,7 +130,6 @@ def test_forward_beats_no_change_and_comes_near_the_noise(fitted) -> None:
     # Arrivals are uniform on [0, 0.1]: nobody predicts better than their deviation, 0.029.
     assert (report.forward.error > 0.02).all() and (report.forward.error < 0.045).all()
     assert report.forward.training.split == "episodes"
-    assert report.forward.training.held_out_rows == 2 * 150
 
 
 def test_forward_knows_the_real_rate(fitted) -> None:

@@ -75,6 +75,7 @@ def test_lanes_that_differ_are_seen() -> None:
     assert lanes_differ(near, spread, 2.5) < -0.5
     one_is_slow = near + np.eye(12)[3] * 3.0
     assert lanes_differ(one_is_slow, spread, 2.5) > 5.0
+    assert lanes_differ(np.zeros(1), np.full(1, 0.01), 2.5) == 0.0  # one alone is the mean
 
 
 @pytest.mark.parametrize("ratio", [1e-9, 0.3, 1.0, 40.0])

@@ -28,6 +28,7 @@ from ugat_marl.grounding import (
     Simulation,
     StreetConfig,
     StreetFit,
+    StreetWorld,
     UgatConfig,
     fit_channel,
     fit_street,
@@ -42,7 +43,10 @@ from ugat_marl.grounding.posterior import Posterior, WorldValues
 from ugat_marl.grounding.state import RunState
 from ugat_marl.grounding.street_training import StreetTraining
 from ugat_marl.grounding.summaries import NAMES
+from ugat_marl.parallel import LocalProcesses
 from ugat_marl.policies import (
+    DQN,
+    DQNConfig,
     EpsilonGreedy,
     NamedRule,
     Policy,
@@ -291,7 +295,7 @@ def test_unknown_parts_and_too_few_simulations_are_refused() -> None:
         ({"most_lag": -1}, "most_lag is -1"),
         ({"ages": 1}, "ages is 1; allowed: >= 2"),
         ({"pull": 0.0}, "pull is 0.0; allowed: > 0"),
-        ({"refused": 1.0}, "refused is 1.0; allowed: 0 to 1"),
+        ({"refused": 1.0}, "refused is 1.0; allowed: from 0 to below 1"),
         ({"gain": float("nan")}, "gain is nan"),
     ):
         with pytest.raises(OptionError, match=told):
@@ -349,6 +353,20 @@ def test_worlds_beside_a_log_of_other_commands_get_these_commands(
         training._as_recorded = partial(StreetTraining._as_recorded, training)
         StreetTraining._street_logs(training, Mock(iteration=0), "the policy", Mock(), 2, 0)
         assert acted.pop() == expected
+
+
+def test_policies_are_compared_in_processes_as_here() -> None:
+    """An executor cannot be sent to its own processes."""
+    here = simulation()
+    env = here.plain(0)
+    policies = [NamedRule("largest-queue:20", env), DQN.of(env, DQNConfig(), 3).policy()]
+    env.close()
+    with LocalProcesses(1) as processes:
+        found = [
+            one.compare([StreetWorld()], policies, [7], lambda: None)
+            for one in (here, replace(here, workers=processes))
+        ]
+    assert found[0].shape == (2, 1) and np.array_equal(*found)
 
 
 def test_the_kept_policy_is_the_one_on_the_street(

@@ -80,7 +80,9 @@ class ChannelConfig:
                 raise OptionError(f"channel {name} is {getattr(self, name)}; allowed: >= {least}")
         for name in ("refused", "least_share"):
             if not 0 <= getattr(self, name) < 1:
-                raise OptionError(f"channel {name} is {getattr(self, name)}; allowed: 0 to 1")
+                raise OptionError(
+                    f"channel {name} is {getattr(self, name)}; allowed: from 0 to below 1"
+                )
         if not 0 < self.pull < math.inf:
             raise OptionError(f"channel pull is {self.pull}; allowed: > 0, finite")
         if not 0 <= self.gain < math.inf:

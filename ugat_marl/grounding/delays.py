@@ -42,7 +42,7 @@ STEP_S = 0.1
 LEAST_ROWS = 5
 """Smallest number of transitions of a phase from which its mean is used."""
 LEAST_S = 0.5
-"""Smallest delay, in s, that does not round to 0 s."""
+"""Smallest delay, in s, that is taken for one: half of the step of whole seconds."""
 LEVEL = 3.84
 """95 % quantile of chi-squared with one degree of freedom."""
 

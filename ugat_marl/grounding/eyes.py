@@ -378,10 +378,11 @@ def _noise(
     """
     generator = numpy_generator(0, "eyes", "noise")
     before, after = _in_red(perfect)
-    if not len(before):
+    seen = _in_red(rows)
+    if not len(before) or not len(seen[0]):  # no red tells nothing of noise
         return 0.0, 0.0
     drawn = generator.standard_normal((2, 2, len(before)))
-    wanted = _falls(*_in_red(rows))
+    wanted = _falls(*seen)
     best, answer = np.inf, (0.0, 0.0)
     for absolute in config.absolute:
         for relative in config.relative:

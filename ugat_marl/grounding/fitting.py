@@ -420,7 +420,6 @@ class Fitter:
             train_loss=train_loss,
             held_out_loss=float(best.loss.mean()),
             split=rows.kind,
-            held_out_rows=int(rows.held_out.sum()),
         )
 
 

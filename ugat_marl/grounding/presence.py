@@ -109,7 +109,7 @@ def lanes_differ(offsets: Floats, spread: Floats, most: float) -> float:
     """Return the log of how much more likely offsets of lanes are if lanes differ.
 
     If they differ, each is drawn from a normal distribution, whose standard deviation is somewhere
-    between 0 and `most`.
+    between 0 and `most`. One lane alone tells nothing: 0.
 
     Args:
         offsets: Estimated distance of each lane from the mean, ``(lanes,)``.
@@ -117,6 +117,8 @@ def lanes_differ(offsets: Floats, spread: Floats, most: float) -> float:
         most: Largest standard deviation of the lanes.
     """
     tried = np.linspace(0.0, most, SPREADS_TRIED)[:, None]
+    if len(offsets) < 2:  # a lane alone is the mean
+        return 0.0
     logs = norm.logpdf(offsets, 0.0, np.hypot(spread, tried)).sum(1)
     differ = np.log(np.mean(np.exp(logs - logs.max()))) + logs.max()
     return float(differ - logs[0])

@@ -131,14 +131,12 @@ class TrainingRecord:
         train_loss: Mean training loss of the last epoch, over agents.
         held_out_loss: Mean held-out loss of the kept weights.
         split: "episodes", or "steps" if the log has only one episode.
-        held_out_rows: Number of rows held out, over all agents.
     """
 
     epochs: int
     train_loss: float
     held_out_loss: float
     split: str
-    held_out_rows: int
 
     def as_dict(self, prefix: str) -> dict[str, float]:
         """Return epochs and losses as flat numbers."""

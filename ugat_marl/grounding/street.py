@@ -371,7 +371,8 @@ class Simulation:
         stop = Stop()
         pairs = list(zip(worlds, seeds, strict=True))
         parts = [(world, policy, seed, stop) for policy in policies for world, seed in pairs]
-        times_s = in_order(self.workers, self.att_s, parts, stop, lambda _: on_done())
+        alone = replace(self, workers=None)  # an executor cannot be sent to its own processes
+        times_s = in_order(self.workers, alone.att_s, parts, stop, lambda _: on_done())
         return np.array(times_s).reshape(len(policies), len(worlds))
 
     def logs(

@@ -375,8 +375,8 @@ class StreetTraining(Algorithm):
             return {"residual/acting": 0.0}
         seed = derive_seed(self.seed, "residual", state.iteration)
         logs = self._street_logs(state, policy, street, residual.config.worlds, seed)
-        # f, h, models of the world, and in each fold f and its twin
-        fits = 4 + 2 * residual.config.trust.folds
+        # f, h, models of the world, that of trust, and in each fold f and its twin
+        fits = 4 + (residual.config.kind == "phase") + 2 * residual.config.trust.folds
         with self.run.reporter.task(
             f"fitting the residual, {title}", fits * self.config.fit.epochs
         ) as advance:

@@ -62,7 +62,9 @@ class TrustConfig:
     def __post_init__(self) -> None:
         for name in ("margin", "level"):
             if not 0 <= getattr(self, name) < 1:
-                raise OptionError(f"trust {name} is {getattr(self, name)}; allowed: 0 to 1")
+                raise OptionError(
+                    f"trust {name} is {getattr(self, name)}; allowed: from 0 to below 1"
+                )
         if self.folds < 2:
             raise OptionError(f"trust folds is {self.folds}; allowed: >= 2")
 

@@ -1,17 +1,18 @@
 """Methods for the uncertainty of h: each has a loss for training, and answers with a u.
 
 The network of a method has one encoder per intersection and one head shared by all, or a head per
-intersection. The methods differ in how they read its outputs. u is always in [0, 1]. With u = 0 one
-action is certain; with u = 1 all phases of the intersection have the same probability.
+intersection. The methods differ in how they read its outputs. u is always in [0, 1]. With u = 1 all
+phases of the intersection have the same probability.
 
 - ``edl``: u = K / S of a Dirichlet distribution (Sensoy, Kaplan, Kandemir, "Evidential Deep
-  Learning to Quantify Classification Uncertainty", NeurIPS 2018).
+  Learning to Quantify Classification Uncertainty", NeurIPS 2018). Near 0 there is much evidence,
+  which may be for several actions.
 - ``dropout`` (Gal, Hron, Kendall, "Concrete Dropout", NeurIPS 2017) and ``ensemble``
   (Lakshminarayanan, Pritzel, Blundell, "Simple and Scalable Predictive Uncertainty Estimation using
   Deep Ensembles", NeurIPS 2017): the predictive entropy of the mean over networks, in units of its
-  maximum log K (`normalised_entropy`). The mutual information of network and action would not do:
-  it is low where several actions lead to the same next state and all networks agree on equal
-  probabilities. The evidence of ``edl`` is low in such states, too.
+  maximum log K (`normalised_entropy`). With u = 0 one action is certain. The mutual information of
+  network and action would not do: it is low where several actions lead to the same next state and
+  all networks agree on equal probabilities. The evidence of ``edl`` is low in such states, too.
 - ``none``: u = 0.
 
 Rows may have different numbers of classes. A mask marks the classes of a row, and K is their
@@ -355,7 +356,7 @@ def mixed_concentration(probability: Tensor, total: Tensor) -> tuple[Tensor, Ten
 
 
 def misleading(alpha: Tensor, target: Tensor) -> Tensor:
-    """Return `alpha` without the evidence for the true class (Sensoy et al., section 3)."""
+    """Return `alpha` without the evidence for the true class (Sensoy et al., section 4)."""
     truth = functional.one_hot(target, alpha.shape[-1])
     return truth + (1 - truth) * alpha
 
@@ -428,7 +429,8 @@ RATE_SPEED = 10.0
 """Factor by which rates learn faster than weights, because a fit has only a few hundred updates."""
 
 LENGTH_SCALE = 1e-2
-"""Length scale l of the prior, as in the authors' code; it allows weights of about 1 / l."""
+"""Length scale l of the prior, by hand (the authors' notebooks have 1e-4); it allows weights of
+about 1 / l."""
 
 SMALLEST_RATE = 1e-6
 """Smallest distance of rates and draws from 0 and 1, where logarithms are infinite."""
