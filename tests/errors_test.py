@@ -23,3 +23,7 @@ def test_the_only_name_that_begins_so_is_meant() -> None:
     names = ["observation", "reward", "neighbours"]
     assert "Did you mean 'observation'?" in str(UnknownNameError("option", "obs", names))
     assert "Did you mean" not in str(UnknownNameError("option", "ob", names))
+
+
+def test_where_nothing_is_known_nothing_is_listed() -> None:
+    assert str(UnknownNameError("learner in math", "x", [])) == "unknown learner in math 'x'."

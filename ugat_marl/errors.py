@@ -51,9 +51,8 @@ class UnknownNameError(UgatMarlError, ValueError):
             close = difflib.get_close_matches(name, shown, n=LISTED, cutoff=0.0)
             shown = [*sorted(close), f"and {len(self.allowed) - LISTED} more"]
         listed = ", ".join(repr(item) if "," in item else item for item in shown)
-        super().__init__(
-            f"unknown {kind} {name!r}.{guess} Known: {listed}.{' ' + hint if hint else ''}"
-        )
+        known = f" Known: {listed}." if listed else ""
+        super().__init__(f"unknown {kind} {name!r}.{guess}{known}{' ' + hint if hint else ''}")
 
     def __reduce__(self) -> tuple[type[UnknownNameError], tuple[str, str, list[str], str]]:
         return (type(self), (self.kind, self.name, self.allowed, self.hint))
