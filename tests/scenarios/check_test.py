@@ -8,6 +8,7 @@ import math
 import re
 import struct
 import xml.etree.ElementTree as ET
+from collections.abc import Iterable
 from dataclasses import replace
 from pathlib import Path
 
@@ -43,6 +44,16 @@ from ugat_marl.scenarios.settings import validate_settings
 @pytest.fixture(scope="module")
 def single() -> Scenario:
     return load_scenario("single-v1")
+
+
+def driven(scenario: Scenario, drives: Iterable[tuple[float, str]]) -> Scenario:
+    """The scenario with vehicles that depart at a time, s, and take these edges, and no others."""
+    vehicles = "".join(
+        f'<vehicle id="{number}" depart="{depart_s:.1f}"><route edges="{edges}"/></vehicle>'
+        for number, (depart_s, edges) in enumerate(drives)
+    )
+    routes = Document("r.rou.xml", None, f"<routes>{vehicles}</routes>".encode())
+    return replace(scenario, routes=(routes,))
 
 
 def test_an_intersection_is_counted(single: Scenario) -> None:
@@ -88,17 +99,12 @@ def test_bus_lanes_add_no_capacity_for_cars(single: Scenario) -> None:
 
 
 def test_traffic_is_counted_by_approach(single: Scenario) -> None:
-    routes = [Document("r.rou.xml", None, b"<routes/>")]
     network = Network.read(single)
     item = network.intersections[0]
     lane = network.lanes[item.incoming_lanes[0]]
     leads = next(k.to_edge for k in item.links if k.from_edge == lane.edge)
-    vehicles = "".join(
-        f'<vehicle id="{i}" depart="{100 + i}"><route edges="{lane.edge} {leads}"/></vehicle>'
-        for i in range(360)
-    )
-    routes = (Document("r.rou.xml", None, f"<routes>{vehicles}</routes>".encode()),)
-    facts = survey(replace(single, routes=routes).with_duration(1800))
+    drives = [(100 + i, f"{lane.edge} {leads}") for i in range(360)]
+    facts = survey(driven(single, drives).with_duration(1800))
     road = next(a for a in facts.intersections[0].approaches if a.edge == lane.edge)
     assert road.vph == 720
     assert road.worst_vph == 1440  # all of them within a quarter of an hour
@@ -157,12 +163,8 @@ def test_a_last_quarter_that_is_shorter_has_its_own_length(
 ) -> None:
     (item,) = Network.read(single).intersections
     start, goal = item.links[0].from_edge, item.links[0].to_edge
-    vehicles = "".join(
-        f'<vehicle id="{i}" depart="{900 + 2 * i}"><route edges="{start} {goal}"/></vehicle>'
-        for i in range(100)
-    )
-    routes = (Document("r.rou.xml", None, f"<routes>{vehicles}</routes>".encode()),)
-    facts = survey(replace(single, routes=routes).with_duration(duration_s))
+    drives = [(900 + 2 * i, f"{start} {goal}") for i in range(100)]
+    facts = survey(driven(single, drives).with_duration(duration_s))
     (road,) = [a for a in facts.intersections[0].approaches if a.edge == start]
     assert (road.worst_vph, road.worst_from_s) == (pytest.approx(worst_vph, abs=0.1), from_s)
     assert (facts.busiest, facts.busiest_s) == (100, from_s)
@@ -180,20 +182,9 @@ def test_a_light_s_own_late_green_belongs_to_every_source_of_phases(single: Scen
 
 
 def test_nineteen_of_twenty_routes_are_no_longer_than_said(single: Scenario) -> None:
-    edges = [link.from_edge for link in Network.read(single).intersections[0].links]
-    ways = [edges[0], f"{edges[0]} {Network.read(single).intersections[0].links[0].to_edge}"]
-    vehicles = "".join(
-        f'<vehicle id="{i}" depart="{i}"><route edges="{way}"/></vehicle>'
-        for i, way in enumerate(ways)
-    )
-    routes = (Document("r.rou.xml", None, f"<routes>{vehicles}</routes>".encode()),)
-    short, both = (
-        survey(replace(single, routes=(Document("r.rou.xml", None, text.encode()),))).fill_s
-        for text in (
-            f'<routes><vehicle id="0" depart="0"><route edges="{ways[0]}"/></vehicle></routes>',
-            routes[0].read().decode(),
-        )
-    )
+    link = Network.read(single).intersections[0].links[0]
+    drives = [(0, link.from_edge), (1, f"{link.from_edge} {link.to_edge}")]
+    short, both = (survey(driven(single, some)).fill_s for some in (drives[:1], drives))
     assert both > 1.5 * short  # of two routes, 95 % are both
 
 
@@ -217,12 +208,7 @@ def test_an_approach_that_is_full_for_a_quarter_of_an_hour_is_shown_so(single: S
     """700 vehicles in the third quarter of an hour; the mean over the hour is a quarter of that."""
     (item,) = Network.read(single).intersections
     start, goal = item.links[0].from_edge, item.links[0].to_edge
-    vehicles = "".join(
-        f'<vehicle id="{i}" depart="{1800 + i * 1.2:.1f}"><route edges="{start} {goal}"/></vehicle>'
-        for i in range(700)
-    )
-    routes = (Document("r.rou.xml", None, f"<routes>{vehicles}</routes>".encode()),)
-    facts = survey(replace(single, routes=routes))
+    facts = survey(driven(single, ((1800 + i * 1.2, f"{start} {goal}") for i in range(700))))
     (road,) = [a for a in facts.intersections[0].approaches if a.edge == start]
     assert (road.vph, road.worst_vph, road.worst_from_s) == (700, 2800, 1800)
     assert road.saturation is not None
@@ -382,13 +368,9 @@ def test_roads_where_vehicles_wait_outside_are_named(single: Scenario) -> None:
     (item,) = Network.read(single).intersections
     full, free, *_ = dict.fromkeys(link.from_edge for link in item.links)
     goal = {k.from_edge: k.to_edge for k in item.links if k.direction == "s"}
-    vehicles = "".join(
-        f'<vehicle id="v{i}" depart="{i * 0.3:.1f}"><route edges="{road} {goal[road]}"/></vehicle>'
-        for i in range(1000)
-        for road in [free if i % 100 == 0 else full]
-    )
-    routes = (Document("r.rou.xml", None, f"<routes>{vehicles}</routes>".encode()),)
-    crowded = replace(single, routes=routes).with_duration(300)
+    roads = (free if i % 100 == 0 else full for i in range(1000))
+    drives = ((i * 0.3, f"{road} {goal[road]}") for i, road in enumerate(roads))
+    crowded = driven(single, drives).with_duration(300)
     outside = left_outside(crowded, 1)
     assert set(outside) == {full}
     assert outside[full] > 300

@@ -16,10 +16,8 @@ import sumo
 
 from ugat_marl.effects import load_scenario
 from ugat_marl.errors import ScenarioError, UnknownNameError
-from ugat_marl.files import xml_bytes
 from ugat_marl.scenarios import (
     GREEN,
-    Document,
     Intersection,
     Network,
     Scenario,
@@ -533,10 +531,13 @@ def test_what_netconvert_writes_of_its_options_is_admitted(tmp_path: Path) -> No
 
 def test_a_network_without_a_row_of_right_of_way_is_refused() -> None:
     scenario = load_scenario("single-v1").with_control(phases="programme")
-    root = scenario.network.parse()
-    junction = next(item for item in root.iter("junction") if item.get("id") == "A1")
-    junction.remove(junction.findall("request")[-1])
-    short = replace(scenario, network=Document("n.net.xml", None, xml_bytes(root)))
+
+    def drop(part: ET.Element) -> None:
+        for junction in part.iter("junction"):
+            if junction.get("id") == "A1":
+                junction.remove(junction.findall("request")[-1])
+
+    short = replace(scenario, network=scenario.network.changed(drop))
     with pytest.raises(ScenarioError, match=r"junction 'A1' has \d+ requests, and a connection"):
         Network.read(short)
 
@@ -544,9 +545,11 @@ def test_a_network_without_a_row_of_right_of_way_is_refused() -> None:
 @pytest.mark.parametrize("durations", [("0",), ("-5", "60")])
 def test_programmes_that_take_no_time_are_refused(durations: tuple[str, ...]) -> None:
     scenario = load_scenario("single-v1")
-    root = scenario.network.parse()
-    for number, phase in enumerate(root.iter("phase")):
-        phase.set("duration", durations[number % len(durations)])
-    still = replace(scenario, network=Document("n.net.xml", None, xml_bytes(root)))
+
+    def stop(part: ET.Element) -> None:
+        for number, phase in enumerate(part.iter("phase")):
+            phase.set("duration", durations[number % len(durations)])
+
+    still = replace(scenario, network=scenario.network.changed(stop))
     with pytest.raises(ScenarioError, match="write durations of at least 0 that are not all 0"):
         Network.read(still)

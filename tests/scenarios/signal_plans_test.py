@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import copy
+import xml.etree.ElementTree as ET
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
@@ -15,7 +16,7 @@ from ugat_marl.effects import load_scenario
 from ugat_marl.envs import parallel_env
 from ugat_marl.errors import ScenarioError
 from ugat_marl.experiments import rule_factory, typical_plans
-from ugat_marl.files import Document, xml_bytes
+from ugat_marl.files import Document
 from ugat_marl.progress import Silent
 from ugat_marl.scenarios import (
     Network,
@@ -51,6 +52,14 @@ def dual_ring(offset_s: float = 0.0) -> SignalPlan:
 @pytest.fixture(scope="module")
 def single() -> Scenario:
     return load_scenario("single-v1").with_duration(300)
+
+
+def changed_programmes(scenario: Scenario, change: Callable[[ET.Element], object]) -> Scenario:
+    def of_part(part: ET.Element) -> None:
+        for logic in part.iter("tlLogic"):
+            change(logic)
+
+    return replace(scenario, network=scenario.network.changed(of_part))
 
 
 def green_at(scenario: Scenario, second: float, letters: str = "Gg") -> set[str]:
@@ -98,24 +107,19 @@ def test_a_ring_that_sits_a_barrier_out_clears_before_it(single: Scenario) -> No
 
 def test_movements_that_share_a_letter_are_green_together(single: Scenario) -> None:
     """The left turn from the east has the letter of a through lane, to which the other yields."""
-    root = single.network.parse()
-    ways = {
-        (item.get("from"), item.get("to"), item.get("fromLane")): item
-        for item in root.iter("connection")
-        if item.get("tl") == "A1"
-    }
-    left = next(item for key, item in ways.items() if key[:2] == ("east1_A1", "A1_southA"))
-    through = next(item for key, item in ways.items() if key[:2] == ("east1_A1", "A1_west1"))
-    left.set("linkIndex", through.get("linkIndex", ""))
-    shared = replace(single, network=Document("n.net.xml", None, xml_bytes(root)))
+    (light,) = Network.read(single).intersections
+    index = {(link.from_edge, link.to_edge): link.index for link in light.links}
+    through, opposite = index["east1_A1", "A1_west1"], index["west1_A1", "A1_northA"]
+
+    def share(part: ET.Element) -> None:
+        for way in part.iter("connection"):
+            if (way.get("from"), way.get("to")) == ("east1_A1", "A1_southA"):
+                way.set("linkIndex", str(through))
+
+    shared = replace(single, network=single.network.changed(share))
     (light,) = Network.read(with_plans(shared, [dual_ring()], "plan.csv")).intersections
-    opposite = next(
-        link.index
-        for link in light.links
-        if (link.from_edge, link.to_edge) == ("west1_A1", "A1_northA")
-    )
     states = [state for _, state in light.programme]
-    both = [s for s in states if s[opposite] in "Gg" and s[int(left.get("linkIndex", ""))] in "Gg"]
+    both = [state for state in states if state[opposite] in "Gg" and state[through] in "Gg"]
     assert both and all(state[opposite] == "g" for state in both)
 
 
@@ -199,12 +203,9 @@ def test_a_table_comes_back(single: Scenario, tmp_path: Path) -> None:
 def test_the_offset_of_a_programme_comes_back(
     single: Scenario, offset: str, additional: str, expected_s: float, tmp_path: Path
 ) -> None:
-    root = single.network.parse()
-    next(root.iter("tlLogic")).set("offset", offset)
     more = Document("o.add.xml", None, f"<additional>{additional}</additional>".encode())
     changed = replace(
-        single,
-        network=Document(single.network.name, None, xml_bytes(root)),
+        changed_programmes(single, lambda logic: logic.set("offset", offset)),
         additional=(more,),
         settings=single.settings.model_copy(update={"begin_s": 120.0}),
     )
@@ -231,32 +232,25 @@ def test_a_plan_that_differs_from_its_programme_is_noted() -> None:
 @pytest.mark.parametrize("later_s", [0.0, 37.0])
 def test_a_plan_that_is_its_programme_needs_no_note(later_s: float) -> None:
     grid = load_scenario("grid2x2-v1")
-    root = grid.network.parse()
-    for logic in root.iter("tlLogic"):
+
+    def later(logic: ET.Element) -> None:
         logic.set("offset", str(later_s))
         first = logic[0]  # the cycle then begins with the yellow after this green
         logic.remove(first)
         logic.append(first)
-    moved = replace(grid, network=Document(grid.network.name, None, xml_bytes(root)))
+
+    moved = changed_programmes(grid, later)
     network = Network.read(moved)
     plans = [programme_plan(light, network) for light in network.intersections]
     assert all(plan.offset_s != later_s for plan in plans)
     assert programme_notes(moved, plans, "p.csv") == []
 
 
-def changed_programmes(name: str, change: Callable[[Any], object]) -> Scenario:
-    scenario = load_scenario(name)
-    root = scenario.network.parse()
-    for logic in root.iter("tlLogic"):
-        change(logic)
-    return replace(scenario, network=Document(scenario.network.name, None, xml_bytes(root)))
-
-
 @pytest.mark.parametrize(
     ("kind", "said"), [("actuated", "follows the traffic (actuated)"), ("NEMA", "rings of its own")]
 )
 def test_a_programme_with_other_times_than_its_file_is_noted(kind: str, said: str) -> None:
-    varying = changed_programmes("single-v1", lambda logic: logic.set("type", kind))
+    varying = changed_programmes(load_scenario("single-v1"), lambda logic: logic.set("type", kind))
     network = Network.read(varying)
     plans = [programme_plan(light, network) for light in network.intersections]
     (note,) = programme_notes(varying, plans, "p.csv")
@@ -274,7 +268,10 @@ def test_red_amber_is_no_yellow() -> None:
                 amber.set("state", phase.get("state").replace("G", "u").replace("g", "u"))
                 logic.insert(list(logic).index(phase), amber)
 
-    plain, amber = load_scenario("single-v1"), changed_programmes("single-v1", change)
+    plain, amber = (
+        load_scenario("single-v1"),
+        changed_programmes(load_scenario("single-v1"), change),
+    )
     (light,), (changed,) = Network.read(plain).intersections, Network.read(amber).intersections
     before = programme_plan(light, Network.read(plain))
     after = programme_plan(changed, Network.read(amber))

@@ -446,13 +446,17 @@ def _terms(
         return found
 
     terms: list[PatternTerm] = []
+    kept: list[tuple[PatternTerm, float | None] | None] = []
     while len(terms) < thresholds.most_patterns:
         new = regression.best(*regression.pulls(regression.without(measured, terms)))
-        more = regression.together(measured, [*terms, new])
-        if chance(new.gain) > alpha or judged(more)[-1] is None:
+        if chance(new.gain) > alpha:
             break
-        terms = more
-    for one in filter(None, judged(terms)):
+        more = regression.together(measured, [*terms, new])
+        found = judged(more)
+        if found[-1] is None:
+            break
+        terms, kept = more, found
+    for one in filter(None, kept):
         term, again = one
         yield term, chance(term.gain), again
 
