@@ -268,10 +268,8 @@ def test_red_amber_is_no_yellow() -> None:
                 amber.set("state", phase.get("state").replace("G", "u").replace("g", "u"))
                 logic.insert(list(logic).index(phase), amber)
 
-    plain, amber = (
-        load_scenario("single-v1"),
-        changed_programmes(load_scenario("single-v1"), change),
-    )
+    plain = load_scenario("single-v1")
+    amber = changed_programmes(plain, change)
     (light,), (changed,) = Network.read(plain).intersections, Network.read(amber).intersections
     before = programme_plan(light, Network.read(plain))
     after = programme_plan(changed, Network.read(amber))
