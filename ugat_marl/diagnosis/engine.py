@@ -108,7 +108,7 @@ def _counts(tallies: Sequence[Tally]) -> NDArray[np.float64]:
 
 # --- simulated days -------------------------------------------------------------------------------
 
-VERSION = 10
+VERSION = 11
 """Version of features and replays; tallies cached under another version are not used."""
 
 _READING = threading.Lock()

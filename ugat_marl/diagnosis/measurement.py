@@ -79,8 +79,9 @@ class Sightings:
             ``(pairs, 4)``.
         gaps: Numbers of passages by the time without a vehicle after them, ``(detectors, bins)``:
             none at all, then bins of `GAP_EDGES_S`.
-        twins: Rows for every detector: lone passages with a twin on the next lane, and all those
-            with a twin or with no passage there: ``(detectors, 2)``.
+        twins: Rows for every detector, of moments at which nothing else passes beside it:
+            passages with twins on the next lanes, counted at the first of their detectors, and
+            passages alone: ``(detectors, 2)``.
     """
 
     passages: Array
@@ -133,17 +134,11 @@ class Sightings:
                 )
         for _, _, name in layout.exits:
             rows.append(tracks[name].rows(number[name], tracks[name].alone_only()))
-        beside = next_detectors(layout.detectors)
         return cls(
             np.concatenate([np.empty((0, 5)), *rows]),
             np.concatenate([np.empty((0, 4)), *pairs]),
             np.array([tracks[one.id].gaps for one in layout.detectors]),
-            np.array(
-                [
-                    _twins(tracks[one.id], [tracks[name] for name in beside[one.id]], thresholds)
-                    for one in layout.detectors
-                ]
-            ),
+            _twins(layout.detectors, tracks, thresholds),
         )
 
     def __add__(self, other: Sightings) -> Sightings:
@@ -317,22 +312,53 @@ def _pairs(
     return rows[change < thresholds.steady_share * limit_mps]
 
 
-def _twins(track: _Track, others: Sequence[_Track], thresholds: Thresholds) -> tuple[float, float]:
-    """Count pairs of a lone passage and a next lane: with a twin, and with a twin or nothing."""
-    lone = np.flatnonzero(track.alone())
-    on, over = track.on[lone], track.over[lone]
-    twins = possible = 0.0
-    for other in others:
-        first = np.searchsorted(other.on, on - thresholds.free_gap_s)
-        near = np.searchsorted(other.on, on + thresholds.free_gap_s) - first
-        same = np.zeros(len(lone), np.bool_)
-        only = np.flatnonzero(near == 1)
-        same[only] = (np.abs(other.on[first[only]] - on[only]) < thresholds.twin_s) & (
-            np.abs(other.over[first[only]] - over[only]) < thresholds.twin_s
-        )
-        twins += float(same.sum())
-        possible += float(((near == 0) | same).sum())
-    return twins, possible
+def _twins(
+    detectors: Sequence[Detector], tracks: Mapping[str, _Track], thresholds: Thresholds
+) -> Array:
+    """Count passages with twins on the next lanes, and passages alone: ``(detectors, 2)``.
+
+    Only moments count at which nothing else passes on the lanes side by side. Otherwise a quiet
+    lane beside a busy one would show more splash than vehicles, but few twins of lone vehicles.
+    """
+    counts = np.zeros((len(detectors), 2))
+    number = {one.id: index for index, one in enumerate(detectors)}
+    beside = {
+        number[name]: frozenset(number[other] for other in others)
+        for name, others in next_detectors(detectors).items()
+    }
+    for members in _side_by_side(beside):
+        parts = [tracks[detectors[index].id] for index in members]
+        on, over = (np.concatenate(x) for x in ([t.on for t in parts], [t.over for t in parts]))
+        index = np.repeat(members, [len(t.on) for t in parts])
+        order = np.argsort(on, kind="stable")
+        on, over, index = on[order], over[order], index[order]
+        starts = np.flatnonzero(np.diff(on, prepend=-np.inf) > thresholds.apart_s)
+        if not len(starts):
+            continue
+        ends = np.append(starts[1:], len(on))
+        alone = index[starts[ends == starts + 1]]
+        counts[:, 1] += np.bincount(alone, minlength=len(counts))
+        spread = [
+            np.maximum.reduceat(x, starts) - np.minimum.reduceat(x, starts) for x in (on, over)
+        ]
+        alike = (ends > starts + 1) & (np.maximum(*spread) < thresholds.twin_s)
+        for start, end in zip(starts[alike].tolist(), ends[alike].tolist(), strict=True):
+            passed = set(index[start:end].tolist())
+            beside_one = any(all(x in {one, *beside[one]} for x in passed) for one in passed)
+            if len(passed) == end - start and beside_one:
+                counts[min(passed), 0] += 1.0
+    return counts
+
+
+def _side_by_side(beside: Mapping[int, frozenset[int]]) -> list[list[int]]:
+    """Return the detectors that lie side by side, directly or over others; none that lie alone."""
+    groups: list[set[int]] = []
+    for one, others in beside.items():
+        if others:
+            group = {one, *others}
+            apart = [known for known in groups if known.isdisjoint(group)]
+            groups = [*apart, group.union(*(x for x in groups if not x.isdisjoint(group)))]
+    return [sorted(group) for group in groups]
 
 
 # --- estimates ----------------------------------------------------------------------------------
@@ -364,6 +390,33 @@ def _grain_s(times: Array) -> float:
         if bool((np.abs(steps - np.round(steps)) < 0.01).all()):
             return grain
     return 0.0
+
+
+def _splash(twins: Array, beside: NDArray[np.int64]) -> ValueWithError:
+    """Return the share s of vehicles that each detector beside theirs reports as well.
+
+    Of N vehicles whose lane has n detectors beside, ``N (1 - s)^n`` are alone. So the numbers of
+    passages alone, each divided by ``(1 - s)^n``, sum to the number of vehicles. The error is that
+    of Poisson numbers, with one more twin, since none of a few is no certainty.
+
+    Args:
+        twins: Rows of `Sightings.twins`.
+        beside: Number of detectors beside that may report vehicles of each: ``(detectors,)``.
+    """
+    together, alone = float(twins[:, 0].sum()), twins[:, 1]
+    total = together + float(alone.sum())
+    # Newton's method in x = 1 / (1 - s): the sum is convex in x, so it nears the root from above.
+    x = 1.0
+    for _ in range(50):
+        x -= float((alone * x**beside).sum() - total) / _slope(alone, beside, x)
+    share = 1.0 - 1.0 / x
+    spread = together + 1.0 + float((alone * (x**beside - 1.0) ** 2).sum())
+    return ValueWithError(share, math.sqrt(spread) / (_slope(alone, beside, x) * x**2))
+
+
+def _slope(alone: Array, beside: NDArray[np.int64], x: float) -> float:
+    """Return the derivative of the sum of `alone` by ``x**beside``."""
+    return float((alone * beside * x ** (beside - 1.0)).sum())
 
 
 @dataclass(frozen=True)
@@ -859,33 +912,22 @@ class Measurement:
         return float(np.median([stops[x.lane] - x.position_m for x in advance if x.lane in stops]))
 
     def _splashes(self) -> list[DetectorError]:
-        """Return the places of detectors that report vehicles of the next lane.
-
-        A share s of reported vehicles gives a share ``f = 2 s / (1 + c s)`` of lone passages with a
-        twin: both the vehicle and its splash have one, but not on the lanes at its other side. With
-        n next lanes of each of the detectors, c is the sum of n^2 by the sum of n.
-        """
-        limit, beside = self._thresholds, next_detectors(self._detectors)
+        """Return the places of detectors that report vehicles of the next lane."""
+        limit = self._thresholds
+        reported = [0] * len(self._detectors)  # by how many detectors beside it
+        number = {one.id: index for index, one in enumerate(self._detectors)}
+        for others in next_detectors(self._detectors).values():
+            for other in others:
+                reported[number[other]] += 1
         equations: dict[Group, list[Equation]] = {}
         for group, members in self._groups.items():
-            measured, simulated = (
-                x.twins[members].sum(axis=0) for x in (self._measured, self._simulated)
-            )
-            if min(measured[1], simulated[1]) < limit.least_sightings:
+            beside = np.array([reported[index] for index in members])
+            counts = [x.twins[members] for x in (self._measured, self._simulated)]
+            if min(x[beside > 0, 1].sum() for x in counts) < limit.least_sightings:
                 continue
-            lanes = np.array([len(beside[self._detectors[index].id]) for index in members])
-            c = float((lanes**2).sum() / lanes.sum())
-            twins = [x[0] / x[1] for x in (measured, simulated)]
-            # variances of shares, with one more twin, since none of a few is no certainty
-            chance = [
-                (f * (1.0 - f) + 1.0 / x[1]) / x[1]
-                for f, x in zip(twins, (measured, simulated), strict=True)
-            ]
-            excess = twins[0] - twins[1]
-            error = np.sqrt(sum(chance) + (limit.twin_doubt * twins[1]) ** 2)
-            slope = 2.0 / (2.0 - c * excess) ** 2
-            row = Equation(float(excess / (2.0 - c * excess)), (1.0,), float(slope * error))
-            equations[group] = [row]
+            found, usual = (_splash(x, beside) for x in counts)
+            error = math.hypot(found.error, usual.error, limit.twin_doubt * usual.value)
+            equations[group] = [Equation(found.value - usual.value, (1.0,), error)]
         search = ErrorPlaces(equations, (limit.usual_splash,), limit.price_of_an_error)
         return [
             DetectorError(
