@@ -7,6 +7,7 @@ import gc
 import hashlib
 import importlib
 import os
+import pickle
 import signal
 import subprocess
 import sys
@@ -14,7 +15,7 @@ import time
 import uuid
 import warnings
 import weakref
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
 from typing import Any, cast
 
@@ -964,11 +965,91 @@ def test_a_function_of_domains_that_fails_leaves_environments_that_can_begin_aga
     envs.close()
 
 
+def test_a_forked_child_leaves_the_simulations_of_its_parent_alone(temporary: Path) -> None:
+    with vector_env("single-v1", 1, duration_s=60) as env:
+        batch = env.reset(seed=3)
+        actions = chosen(batch.masks, 0, 0)
+        reader, writer = os.pipe()
+        child = os.fork()
+        if child == 0:
+            try:
+                for act in (lambda: env.step(actions), lambda: env.reset(seed=3)):
+                    with pytest.raises(EpisodeError) as refused:
+                        act()
+                    os.write(writer, str(refused.value).encode())
+            finally:
+                os._exit(0)
+        assert os.waitpid(child, 0)[1] == 0
+        assert os.read(reader, 1000).count(b"belongs to another process") == 2
+        rewards = [env.step(actions).rewards.tolist() for _ in range(6)]
+        env.reset(seed=3)
+        assert [env.step(actions).rewards.tolist() for _ in range(6)] == rewards
+    assert list(temporary.iterdir()) == []
+
+
+def test_a_step_that_a_reset_of_other_halves_dropped_is_not_waited_for() -> None:
+    with vector_env("single-v1", 2, duration_s=60) as env:
+        first, _ = env.halves()
+        actions = chosen(env.reset(seed=3).masks, 0, 0)
+        first.step_async(actions[:1])
+        env.reset(seed=3)
+        with pytest.raises(EpisodeError, match="a reset dropped the step of environment 0"):
+            first.step_wait()
+        env.step_async(actions)
+        first.reset(seed=3)
+        with pytest.raises(EpisodeError, match="a reset dropped the step of environment 0"):
+            env.step_wait()
+        env.reset(seed=3)
+        env.step(actions)
+
+
+def test_a_step_that_is_interrupted_is_over_in_all_environments(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    with vector_env("single-v1", 3, duration_s=60) as env:
+        actions = chosen(env.reset(seed=3).masks, 0, 0)
+        monkeypatch.setattr(env._environments[1].worker, "answer", interrupted)
+        with pytest.raises(KeyboardInterrupt):
+            env.step(actions)
+        with pytest.raises(EpisodeError, match="environment 1 has no episode"):
+            env.step(actions)
+        env.reset(where=[1, 2])
+        env.step(actions)
+
+
+def interrupted() -> None:
+    raise KeyboardInterrupt
+
+
+def test_wrappers_that_are_none_are_refused(module: Callable[[str], str]) -> None:
+    own = module("def forgets(env):\n    pass\n")
+    for wrap, text in ((5, "a wrapper or a list"), (f"{own}:forgets", "returned NoneType")):
+        with pytest.raises(OptionError, match=text):
+            vector_env("single-v1", 1, wrap=cast(Any, wrap))
+
+
+def test_a_stopped_process_ends_with_its_user(python: Sequence[str], temporary: Path) -> None:
+    program = (
+        "import os, signal, sys\n"
+        "from ugat_marl import vector_env\n"
+        "env = vector_env('single-v1', 1, duration_s=60)\n"
+        "env.reset(seed=1)\n"
+        "pid = env._environments[0].worker._pid\n"
+        "os.kill(pid, signal.SIGSTOP)\n"
+        "print(pid, flush=True)\n"
+        "os.kill(os.getpid(), signal.SIGKILL)\n"
+    )
+    run = subprocess.run([*python, "-c", program], stdout=subprocess.PIPE, timeout=60)
+    assert eventually(lambda: gone(int(run.stdout)), 20)
+    assert eventually(lambda: not list(temporary.iterdir()), 20)
+
+
 def test_what_is_under_way_at_the_end_is_forgotten_and_nothing_is_copied() -> None:
     with vector_env("single-v1", 1, duration_s=50) as env:
         batch = env.reset(seed=1)
-        with pytest.raises(EpisodeError, match="cannot be copied"):
-            copy.deepcopy(env)
+        for copied in (copy.copy, copy.deepcopy, pickle.dumps):
+            with pytest.raises(EpisodeError, match="cannot be copied"):
+                copied(env)
         env.step_async(batch.masks.argmax(axis=-1))
     with pytest.raises(EpisodeError, match="this vector_env is closed"):
         env.step_wait()

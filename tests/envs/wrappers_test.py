@@ -67,6 +67,7 @@ class Steep(ParallelEnv):
         self.possible_agents = ["a_1", "b_2"]
         self.agents: list[str] = []
         self.told: list[Any] = []
+        self.row = np.float32([1, 10])
         self.masks = masks
         self.forgets = forgets
         self.observation_spaces = {
@@ -83,7 +84,9 @@ class Steep(ParallelEnv):
 
     def _see(self) -> tuple[dict[str, Any], dict[str, Any]]:
         n = len(self.told)
-        seen = {"a_1": np.float32([1 + n, 10]), "b_2": np.float32([n, 20, 30])}
+        # One array at every step, as of environments that fill a buffer.
+        self.row[0] = 1 + n
+        seen = {"a_1": self.row, "b_2": np.float32([n, 20, 30])}
         seen.pop(self.forgets, None)
         infos: dict[str, Any] = {agent: {"time": n} for agent in self.possible_agents}
         if self.masks:
@@ -130,8 +133,9 @@ def test_padding_in_closed_form() -> None:
 def test_padding_refuses_actions_that_an_agent_does_not_have(wrong: dict[str, Any]) -> None:
     env = pad_spaces(Steep())
     env.reset()
-    with pytest.raises(ActionError, match="padding"):
+    with pytest.raises(ActionError) as refused:
         env.step({"a_1": 0, "b_2": 0, **wrong})
+    assert ("2 to 3 is padding" in str(refused.value)) == (wrong.get("a_1") in (2, 3))
     assert env.told == []  # the environment within heard nothing of it
     env.step({"a_1": 1, "b_2": 0})
     assert env.told == [{"a_1": 1, "b_2": 0}]
@@ -231,6 +235,27 @@ def test_forbidden_actions_become_permitted_ones() -> None:
             assert infos[agent]["action_replaced"] == int(asked[agent] != executed[agent])
     with pytest.raises(ActionError):
         env.step({"a_1": 9, "b_2": 0})
+
+
+def test_a_policy_sees_its_own_command_though_another_one_is_executed() -> None:
+    env = legal_actions(
+        ugat_marl.parallel_env("single-v1", "phase_order=cyclic", commands=1, duration_s=60)
+    )
+    env.reset(seed=1)
+    observations, *_, infos = env.step({"signal_0": 5})
+    assert infos["signal_0"]["action_replaced"] == 1
+    assert observations["signal_0"][-9:-1].tolist() == [0, 0, 0, 0, 0, 1, 0, 0]
+    env.close()
+
+
+@pytest.mark.parametrize("wrap", [legal_actions, intersection_names])
+@pytest.mark.parametrize("actions", [None, [0]])
+def test_actions_that_are_no_dictionary_are_refused(wrap: Any, actions: Any) -> None:
+    env = wrap(ugat_marl.parallel_env("single-v1", duration_s=60))
+    env.reset(seed=1)
+    with pytest.raises(ActionError, match="give a dictionary"):
+        env.step(actions)
+    env.close()
 
 
 @pytest.mark.parametrize("wrapper", SINGLE)

@@ -4,18 +4,19 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 
 import pytest
 
 from tests.crossroads import build_crossroads
 from ugat_marl.data import level_of_service, mean_delay_s
-from ugat_marl.effects import load_scenario
+from ugat_marl.effects import load_scenario, scenario_in_domain
 from ugat_marl.envs import parallel_env
 from ugat_marl.errors import SimulatorError
 from ugat_marl.experiments import Evaluation, evaluation_of, rule_factory
 from ugat_marl.files import parse_xml
-from ugat_marl.scenarios import Network, read_scenario
+from ugat_marl.scenarios import Document, Network, read_scenario
 from ugat_marl.simulation import measured_approaches
 from ugat_marl.simulation.approach_delays import approach_roads, read_approach_delays
 
@@ -53,6 +54,22 @@ def test_the_delay_of_one_car_at_a_red_light(crossing: Callable[..., Path]) -> N
     assert red_s < waited_s < red_s + lane.speed_mps * (0.5 / 2.5 + 0.5 / 4.5) + 2
     # Nothing else is lost on these roads; SUMO adds up steps of a second in two ways.
     assert waited_s + delays["S_C"][1] == pytest.approx(lost_s, abs=1.5)
+
+
+def test_vehicles_that_block_a_lane_are_no_traffic() -> None:
+    """One parks on an empty road for most of the time; the only traveller comes from the south."""
+    scenario = load_scenario("single-v1").with_duration(300)
+    trip = b'<routes><trip id="t" depart="1" from="southA_A1" to="A1_northA"/></routes>'
+    alone = replace(scenario, routes=(Document("one.rou.xml", None, trip),))
+    parked = scenario_in_domain(alone, "parking=northA_A1_0,12,240")
+    network = Network.read(scenario)
+    with measured_approaches(parked, network) as (measured, read):
+        env = parallel_env(measured)
+        env.reset(seed=1)
+        while env.agents:
+            env.step(dict.fromkeys(env.agents, 0))
+        env.close()
+        assert read()["northA_A1"] == (0.0, pytest.approx(0.0, abs=0.01))
 
 
 def test_measuring_changes_no_traffic() -> None:

@@ -49,12 +49,26 @@ def checked_delays(seconds: Mapping[str, float], agents: Sequence[str]) -> dict[
     return {agent: float(delay) for agent, delay in seconds.items()}
 
 
-def _refuse_unknown(kind: str, given: Any, agents: Sequence[str]) -> None:
+def require_mapping(kind: str, given: Any, agents: Sequence[str]) -> None:
+    """Refuse what is no dictionary.
+
+    Args:
+        kind: What is given, for the message.
+        given: What is given.
+        agents: The agents, which should be the keys.
+
+    Raises:
+        ActionError: It is no dictionary.
+    """
     if not isinstance(given, Mapping):
         raise ActionError(
             f"{kind} are {str(given)[:80]!r} ({type(given).__name__}); give a dictionary with the "
             f"agents as its keys: {[*agents]}"
         )
+
+
+def _refuse_unknown(kind: str, given: Any, agents: Sequence[str]) -> None:
+    require_mapping(kind, given, agents)
     if unknown := sorted(set(given) - set(agents), key=str):
         raise ActionError(f"{kind} for unknown agents {unknown}; agents: {[*agents]}")
 

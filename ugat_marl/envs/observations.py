@@ -200,7 +200,7 @@ class Observer:
             self._context = np.concatenate(seen)
             self._parts = _slices([len(part) for part in seen])
 
-    def _flat(self, snapshot: Snapshot) -> NDArray[np.float64]:
+    def _flat(self, snapshot: Snapshot) -> NDArray[np.floating]:
         if self._function is not None:
             rows = [self._features(view) for view in self._views(snapshot)]
             for row, layout in zip(rows, self.layouts, strict=True):
@@ -229,12 +229,13 @@ class Observer:
             values = both[self._gather]
         return np.minimum(values, 1.0)
 
-    def _features(self, view: IntersectionView) -> NDArray[np.float64]:
+    def _features(self, view: IntersectionView) -> NDArray[np.float32]:
         """Return the features that the user's function makes of an intersection."""
         assert self._function is not None
         given = self._function(view)
         try:
-            values = np.asarray(given, dtype=np.float64)
+            with np.errstate(over="ignore"):  # what float32 cannot hold is infinite, and refused
+                values = np.asarray(given, dtype=np.float64).astype(np.float32)
         except (TypeError, ValueError):
             raise OptionError(
                 f"observation: the function returned {str(given)[:80]!r} ({type(given).__name__}); "

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import copy
 import operator
 import warnings
 from collections.abc import Callable, Mapping
@@ -408,6 +409,10 @@ class TrafficEnv(ParallelEnv[str, Any, Any]):
                 "another one, or copy it before"
             )
         return self.__dict__
+
+    def __copy__(self) -> TrafficEnv:
+        """Return a deep copy: two environments do not share files and sensors."""
+        return copy.deepcopy(self)
 
     def __del__(self) -> None:
         if getattr(self, "_simulator", None) is not None:

@@ -18,7 +18,7 @@ from gymnasium import spaces
 from numpy.typing import NDArray
 from pettingzoo.utils import BaseParallelWrapper
 
-from ugat_marl.envs.actions import checked_phases, is_phase
+from ugat_marl.envs.actions import checked_phases, is_phase, require_mapping
 from ugat_marl.envs.agents import discrete_actions, vector_box
 from ugat_marl.envs.types import AnyParallelEnv, ResetResult, StepResult
 from ugat_marl.errors import ActionError, EpisodeError, OptionError
@@ -236,10 +236,18 @@ class _Pad(Wrapper):
             try:
                 checked_phases(actions, self.env.agents, self._own)
             except ActionError as error:
-                raise ActionError(
-                    f"{error}; actions up to {self._most - 1} are padding, and 0 in the "
-                    "action_mask of its info"
-                ) from None
+                raise ActionError(f"{error}{self._of_padding(actions)}") from None
+
+    def _of_padding(self, actions: Any) -> str:
+        """Return what to add to a refusal if one of the actions is padding."""
+        padded = self.action_spaces
+        for agent, action in actions.items() if isinstance(actions, Mapping) else ():
+            if agent in padded and is_phase(action, padded[agent]):
+                own = int(self._own[agent].n)
+                if int(action) >= own:
+                    there = f"{own} to {self._most - 1}" if own < self._most - 1 else f"{own}"
+                    return f"; {there} is padding, and 0 in the action_mask of its info"
+        return ""
 
     def _told(self, infos: Infos) -> Infos:
         told = dict(infos)
@@ -315,7 +323,7 @@ class _FrameStack(Wrapper):
         for agent, vector in observations.items():
             if agent not in self._frames:
                 self._frames[agent] = deque([np.zeros_like(vector)] * self.frames, self.frames)
-            self._frames[agent].append(vector)
+            self._frames[agent].append(vector.copy())  # an environment may use one array again
         return {agent: np.concatenate(self._frames[agent]) for agent in observations}
 
 
@@ -358,6 +366,7 @@ class _LegalActions(_Masking):
         self._replaced = set()
 
     def _translated(self, actions: dict[str, Any]) -> dict[str, Any]:
+        require_mapping("actions", actions, self.env.agents)
         self._replaced = set()
         executed = dict(actions)
         for agent, action in actions.items():
@@ -369,7 +378,17 @@ class _LegalActions(_Masking):
             permitted = np.flatnonzero(mask)
             executed[agent] = int(permitted[int(action) % len(permitted)])
             self._replaced.add(agent)
+        if self._replaced and (remember := getattr(self.env, "remember", None)):
+            remember({agent: self._asked(agent, actions, executed) for agent in executed})
         return executed
+
+    def _asked(self, agent: str, actions: Mapping[str, Any], executed: Mapping[str, Any]) -> Any:
+        """Return the command to remember: that of the policy, if the agent has such a phase."""
+        space = self.action_spaces.get(agent)
+        asked = actions[agent]
+        if isinstance(space, PaddedDiscrete) and is_phase(asked, space) and asked >= space.own:
+            return executed[agent]
+        return asked
 
     def _told(self, infos: Infos) -> Infos:
         self._masks = {agent: self._mask(agent, infos) for agent in self.env.agents}
@@ -454,6 +473,7 @@ class _IntersectionNames(Wrapper):
         Raises:
             ActionError: A name is that of no traffic light, or the environment refuses an action.
         """
+        require_mapping("actions", actions, self.agents)
         if unknown := [name for name in actions if name not in self._agent]:
             raise ActionError(
                 f"action for {unknown[0]!r}: the traffic lights are {', '.join(self._agent)}"

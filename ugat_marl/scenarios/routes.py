@@ -38,6 +38,17 @@ def is_blocker(vehicle: str, vehicle_type: str) -> bool:
     return vehicle_type.startswith(BLOCKERS) and vehicle.rpartition(".")[0] == vehicle_type
 
 
+def blocker_types(scenario: Scenario) -> tuple[str, ...]:
+    """Return the types of the vehicles that effects have added to block lanes."""
+    return tuple(
+        vehicle.get("type", "")
+        for document in scenario.routes
+        if document.name.startswith(BLOCKERS)
+        for vehicle in [document.parse().find("vehicle")]
+        if vehicle is not None and is_blocker(vehicle.get("id", ""), vehicle.get("type", ""))
+    )
+
+
 class OwnEdges:
     """Test of a route file: does it hold only single vehicles with their own edges?"""
 

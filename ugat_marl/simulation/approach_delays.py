@@ -4,7 +4,7 @@ Control delay is the time that a vehicle loses because of a light: braking, wait
 getting under way again. Here it is the time lost against free flow on the road that leads to the
 light and inside the junction. Where a map cuts the road at nodes from which there is one way on,
 the pieces upstream count too. Vehicles that wait outside the network are on no road and do not
-count.
+count, and those that block lanes for effects are no traffic.
 """
 
 from __future__ import annotations
@@ -20,13 +20,14 @@ from pathlib import Path
 
 from ugat_marl.errors import SimulatorError
 from ugat_marl.files import xml_bytes
-from ugat_marl.scenarios import Document, Network, Scenario, edge_of_lane, start_lane
+from ugat_marl.scenarios import Document, Network, Scenario, blocker_types, edge_of_lane, start_lane
 
 ApproachDelays = Mapping[str, tuple[float, float]]
 """Approach (SUMO's edge at a light) to the number of vehicles that passed the light in an episode,
 and their mean control delay, s."""
 
 _FILE = "approaches.xml"
+_BLOCKERS_FILE = "blockers.xml"
 
 
 @contextlib.contextmanager
@@ -48,22 +49,25 @@ def measured_approaches(
     roads = approach_roads(scenario.network.parse(), network)
     with tempfile.TemporaryDirectory(prefix="ugat_marl-") as name:
         file = Path(name).resolve() / _FILE
+        of_blockers = file.with_name(_BLOCKERS_FILE) if (kinds := blocker_types(scenario)) else None
         root = ET.Element("additional")
-        ET.SubElement(
-            root,
-            "edgeData",
-            {"id": "approaches", "file": str(file), "withInternal": "true", "excludeEmpty": "true"},
-        )
+        wanted = {"id": "approaches", "withInternal": "true", "excludeEmpty": "true"}
+        ET.SubElement(root, "edgeData", {**wanted, "file": str(file)})
+        if of_blockers is not None:
+            only = {"id": "blockers", "file": str(of_blockers), "vTypes": " ".join(kinds)}
+            ET.SubElement(root, "edgeData", {**wanted, **only})
         extra = Document("approaches.add.xml", None, xml_bytes(root))
         measured = replace(
             scenario,
             additional=(*scenario.additional, extra),
             outputs=(*scenario.outputs, str(file.parent)),
         )
-        yield measured, lambda: read_approach_delays(file, roads)
+        yield measured, lambda: read_approach_delays(file, roads, of_blockers)
 
 
-def read_approach_delays(file: Path, roads: Mapping[str, frozenset[str]]) -> ApproachDelays:
+def read_approach_delays(
+    file: Path, roads: Mapping[str, frozenset[str]], of_blockers: Path | None = None
+) -> ApproachDelays:
     """Read SUMO's edge data.
 
     The delay is the time lost on the roads of an approach by all vehicles, divided by the number of
@@ -73,6 +77,7 @@ def read_approach_delays(file: Path, roads: Mapping[str, frozenset[str]]) -> App
     Args:
         file: SUMO's output.
         roads: Approach to the roads whose lost time counts for it, as of `approach_roads`.
+        of_blockers: SUMO's output of the vehicles that block lanes, which do not count.
 
     Raises:
         SimulatorError: The file is missing or incomplete.
@@ -80,12 +85,13 @@ def read_approach_delays(file: Path, roads: Mapping[str, frozenset[str]]) -> App
     lost_s: dict[str, float] = defaultdict(float)
     left: dict[str, float] = defaultdict(float)
     try:
-        for _, element in ET.iterparse(file):
-            if element.tag == "edge":
-                road = element.get("id", "")
-                lost_s[road] += float(element.get("timeLoss", "0"))
-                left[road] += float(element.get("left", "0"))
-            element.clear()
+        for path, sign in ((file, 1.0), (of_blockers, -1.0)):
+            for _, element in ET.iterparse(path) if path is not None else ():
+                if element.tag == "edge":
+                    road = element.get("id", "")
+                    lost_s[road] += sign * float(element.get("timeLoss", "0"))
+                    left[road] += sign * float(element.get("left", "0"))
+                element.clear()
     except (OSError, ET.ParseError, ValueError) as error:
         raise SimulatorError(f"SUMO's data on roads cannot be read ({error})") from None
     return {

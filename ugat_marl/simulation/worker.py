@@ -20,6 +20,7 @@ import threading
 import time
 import traceback
 from collections.abc import Callable
+from pathlib import Path
 from typing import TYPE_CHECKING, Any, NoReturn
 
 from ugat_marl.errors import SimulatorError, UgatMarlError
@@ -64,7 +65,11 @@ def _abandoned(parent: int, user: int) -> bool:
         os.kill(user, 0)
     except (ProcessLookupError, PermissionError):  # it ended; its number may have a new owner
         return True
-    return False
+    try:  # it may have ended without its parent having noticed, which waits for our output
+        state = Path(f"/proc/{user}/stat").read_bytes().rpartition(b")")[2].split()[0]
+    except (OSError, IndexError):
+        return False
+    return state == b"Z"
 
 
 class _Life:
@@ -168,8 +173,8 @@ def _serve(service: Service, user: int, descriptor: int) -> None:
             control.sendall(pid.to_bytes(8, "little"))
             workers = {each: folder for each, folder in workers.items() if _runs(each)}
             workers[pid] = order.get("directory")
-    service.abandoned()
     _end_workers(workers, user)
+    service.abandoned()
 
 
 def _runs(worker: int) -> bool:

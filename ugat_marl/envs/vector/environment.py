@@ -8,7 +8,7 @@ import warnings
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, Literal, Unpack, get_args
+from typing import Any, Literal, Never, Unpack, get_args
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -237,7 +237,8 @@ class VectorEnv:
         Raises:
             ActionError: The shape is wrong, or an agent does not have the phase; nothing was
                 simulated.
-            EpisodeError: An environment has no running episode.
+            EpisodeError: An environment has no running episode. In mode ``"next-step"`` its next
+                one begins instead, also after one that failed.
             SimulatorError: SUMO failed. The other environments have made their step. Episodes that
                 ended in it are handed over with the next step, also after a `reset`.
         """
@@ -253,14 +254,21 @@ class VectorEnv:
         """Wait for the step that `step_async` began.
 
         Raises:
-            EpisodeError: No step has begun.
+            EpisodeError: No step has begun, or a reset by other halves dropped a part of it.
         """
         _ = self._memory  # a closed one says so
         if not self._stepped and not self._begun:
             raise EpisodeError("step_wait() without step_async()")
         stepped, begun = self._stepped, self._begun
         self._stepped, self._begun = [], []
-        answers, failed = self._arrived([*stepped, *begun])
+        asked = [*stepped, *begun]
+        dropped = [index for index in asked if not self._environments[index].pending]
+        if dropped:  # by a reset of a `vector_env` with other halves
+            self._drop(asked)
+            raise EpisodeError(
+                f"a reset dropped the step of environment {dropped[0]}; call reset()"
+            )
+        answers, failed = self._arrived(asked)
         memory = self._memory
         memory.rewards[begun] = 0.0
         over = [index for index in stepped if index in answers and answers[index].over]
@@ -346,14 +354,12 @@ class VectorEnv:
     def __exit__(self, *_: object) -> None:
         self.close()
 
-    def __deepcopy__(self, _: object) -> VectorEnv:
+    def __reduce__(self) -> Never:
+        """Refuse copies and pickles."""
         raise EpisodeError(
             "a vector_env cannot be copied, as its processes and its memory cannot; make another "
             "one"
         )
-
-    def __copy__(self) -> VectorEnv:
-        return self.__deepcopy__(None)
 
     def __del__(self) -> None:
         if getattr(self, "_shared", None) is not None:
@@ -505,9 +511,18 @@ class VectorEnv:
                 answers[index] = self._environments[index].answer()
             except UgatMarlError as error:
                 failed.append(error)
+            except BaseException:  # Ctrl-C: nobody waits for the others
+                self._drop(chosen)
+                raise
         for text in dict.fromkeys(_said(answers.values())):
             warnings.warn(text, stacklevel=4)
         return answers, failed
+
+    def _drop(self, chosen: Sequence[int]) -> None:
+        """End the episodes of the environments that have not answered."""
+        for index in chosen:
+            if self._environments[index].pending:
+                self._environments[index].close()
 
     def _ended(self, index: int, answer: Answer) -> Ended:
         memory, episode = self._memory, self._environments[index].episode
@@ -582,6 +597,10 @@ def vector_env(
     plain: AnyParallelEnv = parallel_env(loaded, domain_of(0, 0), **given)
     for each in listed(wrap):
         plain = imported(spelling("wrap", each))(plain)
+        if not hasattr(plain, "possible_agents"):
+            raise OptionError(
+                f"wrap = {each!r}: returned {type(plain).__name__} and not an environment"
+            )
     shared = Shared(loaded, given, wrap, AgentSet.of(plain), n)
     environments = [RemoteEnv(shared, index, shared.arrays.part(index)) for index in range(n)]
     return VectorEnv(environments, shared.arrays, plain, domain_of, autoreset, shared)

@@ -98,15 +98,17 @@ class Shared:
         self._folder: Path | None = None
         self._directory = OwnDirectory()
         self._memory = shared_memory(self.shape)
+        self._owner = os.getpid()
         self.arrays = Arrays.over(self._memory, self.shape)
 
     def start(self, domain: Domain, index: int) -> Worker:
         """Start a fresh process for an episode of an environment.
 
         Raises:
-            EpisodeError: The vector is closed.
+            EpisodeError: The vector is closed, or belongs to another process.
             SimulatorCrashed: No process can be started.
         """
+        self.require_own()
         if self._memory < 0:
             raise EpisodeError("this vector_env is closed; make another one")
         folder = self._own_folder()
@@ -121,6 +123,18 @@ class Shared:
             "path": sys.path,
         }
         return self.host.start(order, (self._memory,))
+
+    def require_own(self) -> None:
+        """Refuse a forked child, which would step and replace the simulations of its parent.
+
+        Raises:
+            EpisodeError: This vector belongs to another process.
+        """
+        if self._owner != os.getpid():
+            raise EpisodeError(
+                "this vector_env belongs to another process, of which this one is a fork; make "
+                "another one here"
+            )
 
     def close(self) -> None:
         """Release host, memory and folder, after the processes of all episodes have ended."""
@@ -187,13 +201,19 @@ class RemoteEnv:
         self._ask(actions)
 
     def _ask(self, actions: NDArray[np.int64]) -> None:
+        worker = self.worker
         self.arrays.actions[:] = actions
         with contextlib.suppress(ChannelClosed):  # `answer` replaces a dead process
-            self.worker.ask("step")
+            worker.ask("step")
 
     @property
     def worker(self) -> Worker:
-        """The process of the running episode."""
+        """The process of the running episode.
+
+        Raises:
+            EpisodeError: This vector belongs to another process.
+        """
+        self._shared.require_own()
         assert self._worker is not None
         return self._worker
 

@@ -111,10 +111,19 @@ def checked_options(options: Mapping[str, Any]) -> dict[str, Any]:
 
 
 def listed(wraps: Wraps) -> list[Wrap]:
-    """Return wrappers as a list, the innermost first."""
+    """Return wrappers as a list, the innermost first.
+
+    Raises:
+        OptionError: It is neither a wrapper nor a list of them.
+    """
     if wraps is None:
         return []
-    return [wraps] if isinstance(wraps, str) or callable(wraps) else list(wraps)
+    if isinstance(wraps, str) or callable(wraps):
+        return [wraps]
+    given: Any = wraps
+    if not isinstance(given, Sequence):
+        raise OptionError(f"wrap = {given!r}: must be a wrapper or a list of wrappers")
+    return list(wraps)
 
 
 def spelling(option: str, function: Callable[..., Any] | str) -> str:
