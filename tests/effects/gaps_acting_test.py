@@ -39,6 +39,11 @@ def actuators(domain: str, name: str = "single-v1", seed: int = 1) -> Actuators:
     return made
 
 
+def test_a_longest_green_below_that_of_one_decision_is_refused() -> None:
+    with pytest.raises(ScenarioError, match="max_green=20: a green of one decision is 25 s"):
+        Actuators.of(parse_domain("max_green=20"), NETWORKS["single-v1"], TIMING, 30.0)
+
+
 def test_a_longest_green_below_the_minimum_green_is_refused() -> None:
     with pytest.raises(ScenarioError, match="max_green=40: the minimum green is 60 s"):
         Actuators.of(

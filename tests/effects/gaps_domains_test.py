@@ -33,7 +33,8 @@ from ugat_marl.effects.sensors import DeadDetectors
 from ugat_marl.envs import OBJECTIVE_MEASURES, TrafficEnv
 from ugat_marl.envs.sensors import Sensors
 from ugat_marl.errors import OptionError, ScenarioError, UnknownNameError
-from ugat_marl.scenarios import signals
+from ugat_marl.files import xml_bytes
+from ugat_marl.scenarios import Scenario, signals
 from ugat_marl.simulation import Snapshot
 from ugat_marl.testing import check_determinism, check_environment
 
@@ -432,6 +433,35 @@ def test_the_checks_can_fail() -> None:
                 (AssertionError, ValueError, TypeError, IndexError, ArithmeticError)
             ):
                 CHECKS[effect.name](trace, *values_of(effect))
+
+
+def test_an_incident_leaves_a_lane_for_cars() -> None:
+    scenario = load_scenario("grid2x2-v1")
+
+    def closed(scenario: Scenario) -> str:
+        (text,) = scenario_in_domain(scenario, "incident").applied
+        return text.partition("=")[2].partition(",")[0]
+
+    edge = closed(scenario).rpartition("_")[0]
+    network = scenario.network.parse()
+    for lane in network.iter("lane"):
+        if lane.get("id") == f"{edge}_1":
+            lane.set("allow", "pedestrian")
+    changed = replace(scenario, network=scenario.network.edited(xml_bytes(network)))
+    assert closed(changed).rpartition("_")[0] != edge
+
+
+@pytest.mark.parametrize("block", ["lane_closure=east1_A1_1,250,300", "parking=east1_A1_1,12,30"])
+def test_a_blocked_lane_changes_no_traffic_before(block: str) -> None:
+    """A parked vehicle comes in the middle of each 300 s."""
+    seen: list[list[Any]] = []
+    for domain in ("sim", block):
+        env = ugat_marl.parallel_env("single-v1", domain, duration_s=300)
+        env.reset(seed=1)
+        rows = [env.step(dict.fromkeys(env.agents, n // 3 % 4)) for n in range(14)]
+        seen.append([(observations, rewards) for observations, rewards, *_ in rows])
+        env.close()
+    assert str(seen[0]) == str(seen[1])
 
 
 def test_an_incident_needs_a_lane_that_is_long_enough() -> None:

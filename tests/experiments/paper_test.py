@@ -220,6 +220,8 @@ def test_greens_are_late_in_the_simulation_that_is_trained_in(tmp_path: Path) ->
     with pytest.raises(OptionError, match="--constants"):
         worlds(str(tmp_path))
     assert settings_of("main", UgatConfig(), str(tmp_path), constants=())
+    with pytest.raises(OptionError, match="late greens of its own"):
+        worlds("V1+late_green=A1,2")
 
 
 def test_the_simulation_is_no_real_domain_of_its_own_table() -> None:

@@ -143,12 +143,17 @@ class MaxGreen(ControllerEffect):
         """Make an actuator that ends greens before they are too long.
 
         Raises:
-            ScenarioError: The minimum green is longer.
+            ScenarioError: The minimum green is longer, or that of one decision is.
         """
         if timing.min_green_s > self.seconds:
             raise ScenarioError(
                 f"max_green={self.seconds:g}: the minimum green is {timing.min_green_s:g} s; give "
                 "at least as many"
+            )
+        if (least_s := decision_interval_s - timing.clearance_s) > self.seconds:
+            raise ScenarioError(
+                f"max_green={self.seconds:g}: a green of one decision is {least_s:g} s; give at "
+                "least as many, or a shorter control.decision_interval_s"
             )
         return _Bounded(self.seconds, timing.clearance_s, decision_interval_s)
 

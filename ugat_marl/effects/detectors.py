@@ -189,7 +189,10 @@ class Dropout(DetectorEffect):
     end_s: float
 
     def observe(self, period: Period, detectors: Sequence[Detector], owner: Owner) -> Period:
-        """Leave out all passages between the times."""
+        """Leave out all passages that overlap the time.
+
+        Of a passage that begins or ends in it, a log has half the events, which tell nothing.
+        """
 
         def silent(name: str, passages: Passages) -> Passages:
             return passages.at(~_within(passages, self.begin_s, self.end_s))

@@ -98,7 +98,11 @@ class Incident(Effect):
                 f"effect {self.name!r}: scenario {scenario.id!r} has no lane of {_LAST_M:g} m that "
                 "leads to a signal; name one with lane_closure"
             )
-        wide = [lane for lane in lanes if len(places.edges[places.lanes[lane].edge]) > 1]
+        wide = [
+            lane
+            for lane in lanes
+            if sum(places.lanes[x].cars for x in places.edges[places.lanes[lane].edge]) > 1
+        ]
         lane = min(wide or lanes, key=lambda lane: hashed_uniform(self.name, lane))
         return LaneClosure(lane, *self.window(scenario)).apply(scenario)
 
@@ -254,6 +258,8 @@ def _with_blockers(
             "id": kind,
             "vClass": "passenger" if place.cars else "ignoring",
             "length": f"{_LENGTH_M:g}",
+            # Without a spread SUMO draws no random number, and the traffic before is that of `sim`.
+            "speedDev": "0",
             "color": "255,128,0",
         },
     )

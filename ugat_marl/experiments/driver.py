@@ -282,4 +282,8 @@ def _end(process: subprocess.Popen[bytes]) -> None:
 
 def _failure(folder: Path) -> str:
     text = (folder / LOG).read_text(errors="replace").strip()
-    return f"{folder.name} failed: {text[-_TAIL:]} (whole log: {folder / LOG})"
+    said = text[-_TAIL:] or (
+        "its process ended without a word, as when memory runs out, of which one job at a time "
+        "needs less; the same command goes on"
+    )
+    return f"{folder.name} failed: {said} (whole log: {folder / LOG})"

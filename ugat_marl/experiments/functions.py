@@ -19,7 +19,7 @@ from ugat_marl.effects import Domain, domain_label, is_one_domain, load_scenario
 from ugat_marl.envs import is_count
 from ugat_marl.errors import OptionError
 from ugat_marl.experiments.evaluation import OwnPolicyFactory, evaluation_of, policy_factory
-from ugat_marl.experiments.jobs import EVALUATION_SEED, file_stem
+from ugat_marl.experiments.jobs import EVALUATION_SEED, file_stem, shortened
 from ugat_marl.experiments.scores import Evaluation
 from ugat_marl.experiments.transfers import TransferConfig, transfer
 from ugat_marl.grounding import USUAL_REWARD, UgatConfig
@@ -228,7 +228,7 @@ def run_folder(config: TransferConfig) -> Path:
     scenario, real = config.scenario, domain_label(config.real)
     parts = (file_stem(scenario), Path(real).name)
     name = "-".join(re.sub(r"[^\w=+.]+", "-", part).strip("-.") for part in parts)
-    return Path("runs") / f"{name}-s{config.seed}"
+    return Path("runs") / f"{shortened(name)}-s{config.seed}"
 
 
 def _seeds(given: Any) -> list[int]:

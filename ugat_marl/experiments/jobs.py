@@ -282,6 +282,12 @@ def _cut(name: str) -> str:
     return name.encode()[:_MOST_NAME_BYTES].decode(errors="ignore")
 
 
+def shortened(name: str) -> str:
+    """Return a name that file systems take; a digest tells those apart that are cut."""
+    cut = _cut(name)
+    return name if cut == name else f"{cut}-{hashlib.sha256(name.encode()).hexdigest()[:10]}"
+
+
 def file_names(names: Iterable[str]) -> list[str]:
     """Return names of files for policies, all different: repeated names end in -2, -3 and so on."""
     files: list[str] = []

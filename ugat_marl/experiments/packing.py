@@ -21,6 +21,7 @@ from ugat_marl.experiments.jobs import (
     JobRecord,
     file_name,
     file_stem,
+    shortened,
 )
 from ugat_marl.experiments.settings import DIRECT
 from ugat_marl.experiments.statistics import Interval
@@ -163,7 +164,7 @@ def _id(job: Job, mark: int, setting: str) -> str:
 def policy_name(setting: str, real: str | None, seed: int) -> str:
     """Return the name of a packed policy, such as ``fitted-street-V4-s0``."""
     world = [] if real is None else [re.sub(r"[^\w=+.]+", "-", real).strip("-.")]
-    return "-".join([file_name(setting), *world, f"s{seed}"])
+    return f"{shortened('-'.join([file_name(setting), *world]))}-s{seed}"
 
 
 def _scores(job: Job, record: JobRecord, mark: int, domain: str) -> CardScores:

@@ -12,7 +12,7 @@ from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any, Literal
 
-from ugat_marl.effects import domain_label, domain_path, load_scenario
+from ugat_marl.effects import LateGreen, domain_label, domain_path, load_scenario, parse_domain
 from ugat_marl.errors import OptionError, UnknownNameError, require_distinct, require_least
 from ugat_marl.experiments.comparison import Comparison, Trial
 from ugat_marl.experiments.driver import perform_all, record_of
@@ -141,11 +141,17 @@ def late_in(sim: str, seconds: int) -> str:
     """Return the simulation with every green late by a constant delay in s.
 
     Raises:
-        OptionError: The simulation is a separate scenario; no effect can be added to it by name.
+        OptionError: The simulation is a separate scenario, to which no effect can be added by
+            name, or has late greens of its own.
     """
     if domain_path(sim) is not None:
         raise OptionError(
             f"sim = {sim!r} is a scenario of its own, in which no greens can be delayed: give "
+            "--constants without any number"
+        )
+    if any(isinstance(effect, LateGreen) for effect in parse_domain(sim)):
+        raise OptionError(
+            f"sim = {sim!r} has late greens of its own, which constant delays would replace: give "
             "--constants without any number"
         )
     late = f"late_green=*,{seconds}"

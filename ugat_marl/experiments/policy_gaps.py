@@ -72,7 +72,7 @@ def policy_gap(
         raise OptionError("a policy gap needs at least one policy and one seed")
     if duration_s is not None:  # effects need to know it
         scenario = scenario.with_duration(duration_s)
-    world = scenario_in_domain(scenario, real, recorded=True)
+    world = scenario_in_domain(scenario, real, recorded=True, duration_s=duration_s)
     if same_for_agents(world, scenario):
         raise OptionError(
             f"real = {domain_label(real)!r} is the simulation itself; there is no gap"
@@ -80,7 +80,7 @@ def policy_gap(
     repaired = (
         corrected
         if isinstance(corrected, Scenario)
-        else scenario_in_domain(scenario, corrected, recorded=True)
+        else scenario_in_domain(scenario, corrected, recorded=True, duration_s=duration_s)
     )
     evaluations: dict[str, Evaluation] = {}
     for name, place in (("sim", scenario), ("corrected", repaired), ("real", world)):

@@ -138,7 +138,7 @@ def judged_in(path: Path) -> dict[str, float]:
     cells = _cells(path)
     told = {name: _values_in(cells, name) for name in ("episodes", "duration_s")}
     numbers = {name: _number_in(texts[0]) for name, texts in told.items() if texts}
-    return {name: number for name, number in numbers.items() if number >= 1}
+    return {name: number for name, number in numbers.items() if 1 <= number < math.inf}
 
 
 def _number_in(text: str) -> float:

@@ -16,6 +16,7 @@ movement gets green, and which phase follows which.
 from __future__ import annotations
 
 import cmath
+import copy
 import math
 from collections import Counter
 from collections.abc import Mapping, Sequence
@@ -23,8 +24,9 @@ from dataclasses import dataclass, field
 from itertools import pairwise
 
 from ugat_marl.effects import Domain
-from ugat_marl.envs import parallel_env
-from ugat_marl.policies import LONGEST_CYCLE_S, PolicyFactory, roll_out, smallest_covers
+from ugat_marl.envs import TrafficEnv, parallel_env
+from ugat_marl.parallel import retry_on_crash
+from ugat_marl.policies import LONGEST_CYCLE_S, Policy, PolicyFactory, roll_out, smallest_covers
 from ugat_marl.progress import Reporter
 from ugat_marl.scenarios import (
     GREEN,
@@ -116,8 +118,7 @@ def typical_plans(
     try:
         with reporter.task("playing episodes", len(seeds)) as advance:
             for seed in seeds:
-                course: list[list[int]] = []
-                roll_out(env, policy, seed, on_step=lambda _, c=course: c.append(env.phases))
+                course = retry_on_crash(lambda seed=seed: _course(env, policy, seed))
                 for light, phases in zip(shown, zip(*course, strict=True), strict=True):
                     light.add(phases, begin_s, control.decision_interval_s, clearance_s)
                 advance()
@@ -136,6 +137,14 @@ def _served(light: Intersection, network: Network) -> list[frozenset[str]]:
         frozenset(code for link, code in codes.items() if state[link.index] in GREEN)
         for state in light.phases
     ]
+
+
+def _course(env: TrafficEnv, policy: Policy, seed: int) -> list[list[int]]:
+    """Return the phases of an episode, decision by decision."""
+    course: list[list[int]] = []
+    played = copy.deepcopy(policy)  # a user's policy may remember earlier episodes
+    roll_out(env, played, seed, on_step=lambda _: course.append(env.phases))
+    return course
 
 
 def _plan(light: str, shown: _Shown, scenario: Scenario) -> SignalPlan:
