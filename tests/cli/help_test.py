@@ -111,6 +111,8 @@ def test_bash_completes(capsys: pytest.CaptureFixture[str], tmp_path: Path) -> N
     assert completed("paper", "main", "--no-dqn") == []
     assert "--no-control" in completed("train", "single-v1", "--no")
     assert completed("report", "--ru") == [], "an argument without a name"
+    assert completed("check", "gr") == networks, "a short name"
+    assert completed("completion", "") == ["bash", "zsh", "fish"]
 
 
 @pytest.mark.parametrize("shell", ["zsh", "fish"])

@@ -11,9 +11,11 @@ import pytest
 import scipy.stats
 
 from ugat_marl.__main__ import main
+from ugat_marl.cli.compare import Compare
+from ugat_marl.data import write_csv
 from ugat_marl.errors import CheckpointError, OptionError, OutputError
 from ugat_marl.experiments import as_standings, ranked, read_standings, require_kept, with_standings
-from ugat_marl.experiments.standings import SCHEMA, Judging
+from ugat_marl.experiments.standings import SCHEMA, Judging, judged_in
 
 HEAD = ",".join(SCHEMA)
 TABLE = f"""{HEAD}
@@ -97,6 +99,31 @@ def test_a_table_is_not_replaced_by_one_that_lacks_its_trainings(tmp_path: Path)
     with pytest.raises(OutputError, match="no table that could be replaced; give another"):
         require_kept(other, read_standings(file), "give another")
     require_kept(tmp_path / "none.csv", read_standings(file), "")
+
+
+def test_a_number_of_episodes_without_end_tells_nothing(tmp_path: Path) -> None:
+    lines = [f"{line},inf" for line in TABLE.splitlines()]
+    lines[0] = f"{HEAD},episodes"
+    assert judged_in(written(tmp_path, "\n".join(lines))) == {}
+
+
+def test_two_calls_at_once_keep_both_rows(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    table = written(tmp_path)
+    own = [
+        read_standings(table).filter(pl.col("setting") == "fast").with_columns(setting=pl.lit(name))
+        for name in ("first", "second")
+    ]
+
+    def judged(*_: object) -> pl.DataFrame:
+        """The other call writes its row while this one judges."""
+        if len(own) == 2:
+            write_csv(table, pl.concat([read_standings(table), own.pop()]).write_csv())
+        return own[0]
+
+    monkeypatch.setattr(Compare, "_judged", judged)
+    words = ["--policies", "random", "--table", str(table), "--out", str(table)]
+    assert main(["compare", "single-v1", "--name", "first", *words]) == 0
+    assert {"first", "second", "fast"} < {*read_standings(table)["setting"]}
 
 
 def test_a_length_is_compared_as_a_number(tmp_path: Path) -> None:

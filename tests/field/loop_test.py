@@ -505,6 +505,11 @@ def broken_rules(by_second: list[dict[str, str]]) -> list[str]:
                 for a, b in zip(before, after, strict=True)
             ):
                 found.append(f"{item.id}: green ends without yellow at {second}")
+            just = shown[max(second + 1 - int(timing.all_red_s), 0) : second + 1]
+            if "y" in "".join(just) and any(
+                b in GREEN and a not in GREEN for a, b in zip(before, after, strict=True)
+            ):
+                found.append(f"{item.id}: green at {second} without all red before")
         for link in {link.index for link in item.links}:
             letters = "".join("G" if state[link] in GREEN else state[link] for state in shown)
             for kind, run in _runs(letters)[1:-1]:

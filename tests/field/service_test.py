@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import errno
 import json
 import math
 import signal
@@ -76,6 +77,33 @@ def test_a_street_that_comes_back_is_driven_for_what_is_left(
     assert times == [0, 10, 20, 30, 40, *range(0, 60, 10)]  # the fifth was under way
     assert summary.decisions == 11
     assert second.time_s == 60.0
+
+
+def test_a_full_disk_behind_the_output_does_not_stop_the_lights() -> None:
+    def full(_: str) -> None:
+        raise OSError(errno.ENOSPC, "No space left on device")
+
+    connect = Coming(Leaving(45.0), MadeUpStreet())
+    summary = service(connect, say=full, sleep=lambda _: None).run(100.0)
+    assert summary.decisions == 11
+
+
+def test_a_host_that_takes_no_connection_is_not_waited_for_without_end() -> None:
+    with socket.socket() as listener:
+        listener.bind(("127.0.0.1", 0))
+        listener.listen(0)
+        port = listener.getsockname()[1]
+        waiting = [socket.socket() for _ in range(4)]
+        for one in waiting:  # until the queue of the listener is full
+            one.setblocking(False)
+            one.connect_ex(("127.0.0.1", port))
+        begun = time.monotonic()
+        with pytest.raises(SimulatorError, match="nobody listened for 0.5 s"):
+            TraciStreet((), port, "127.0.0.1", patience_s=0.5)
+        assert time.monotonic() - begun < 10.0
+        for one in waiting:
+            one.close()
+    assert socket.getdefaulttimeout() is None
 
 
 def test_a_street_that_stays_away_ends_the_service_after_its_time() -> None:

@@ -370,6 +370,7 @@ def test_a_stopped_command_leaves_its_log_and_nothing_else(
         (["--policy", "a.pt", "--start", "--health", "a.pt"], "--health and --policy are one file"),
         (["--policy", "random", "--start", "--log", "a", "--health", "./a"], "are one file"),
         (["--policy", "random", "--start", "--health", __file__], "something else than the state"),
+        (["--policy", "random", "--start", "--sumo-answer-s", "1"], "leave out --sumo-answer-s"),
         (["--policy", "random", "--start", "--log", __file__], "something else than decisions"),
     ],
 )

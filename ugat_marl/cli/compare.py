@@ -141,20 +141,42 @@ class Compare:
                     "number and length, so the row stands alone; --table takes a table of yours",
                     soft_wrap=True,
                 )
-        if self.out is not None:
-            keeping = f"--table {self.out} keeps them, or "
-            require_kept(self.out, table, "give another --out", keeping)
+        self._require_kept(table)
         domains = self._domains(table)
+        if "sim" in map(domain_label, domains):
+            raise OptionError("--domains sim: the simulation is played anyway; name real domains")
         require_room(table, self.name, map(domain_label, domains))
         with workers_of(self.workers, self.ray) as workers:
             own = self._judged(scenario, judging, domains, workers, Bars(console))
-        whole = with_standings(table, own)
+        whole = self._written(own, judging, table)
         shown = whole.filter(pl.col("domain").is_in([*map(domain_label, domains)]))
         console.print(standings_table(scenario.id, shown, self.name))
         if self.out is not None:
-            write_csv(self.out, judging.written_to(whole).write_csv())
             console.print(f"table: {self.out}", soft_wrap=True)
         return 0
+
+    def _written(self, own: pl.DataFrame, judging: Judging, table: pl.DataFrame) -> pl.DataFrame:
+        """Return the table with the new rows; write it if that is asked for."""
+        whole = with_standings(table, own)
+        out = self.out
+        if out is None:
+            return whole
+        extended = self.table is not None and self.table.resolve() == out.resolve()
+
+        def text() -> str:
+            nonlocal whole
+            if extended:  # another call may have added rows meanwhile
+                whole = with_standings(read_standings(out), own)
+            self._require_kept(whole)
+            return judging.written_to(whole).write_csv()
+
+        write_csv(out, text)
+        return whole
+
+    def _require_kept(self, table: pl.DataFrame) -> None:
+        if self.out is not None:
+            keeping = f"--table {self.out} keeps them, or "
+            require_kept(self.out, table, "give another --out", keeping)
 
     def _domains(self, table: pl.DataFrame) -> tuple[str, ...]:
         known = table["domain"].unique(maintain_order=True).to_list()

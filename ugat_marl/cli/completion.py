@@ -11,7 +11,7 @@ from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from typing import Any, Literal, get_args, get_origin
 
-from ugat_marl.cli.help import DEADLINE, HELP_ALL, is_positional, options_of
+from ugat_marl.cli.help import COMPLETION, DEADLINE, HELP_ALL, is_positional, options_of
 from ugat_marl.effects import NAMED_DOMAINS
 from ugat_marl.errors import UnknownNameError
 from ugat_marl.policies import BASELINES, RULE_NAMES, SUITE_LEARNERS
@@ -44,13 +44,19 @@ class Verb:
     lists: tuple[str, ...]
 
 
-def completion_script(program: str, commands: Mapping[str, tuple[str, str]], shell: str) -> str:
+def completion_script(
+    program: str,
+    commands: Mapping[str, tuple[str, str]],
+    shell: str,
+    short: Mapping[str, tuple[str, ...]] | None = None,
+) -> str:
     """Return the script of a shell.
 
     Args:
         program: Name of the program.
         commands: Commands as in `CommandLine`.
         shell: "bash", "zsh" or "fish".
+        short: Short names of commands, and the words that replace them.
 
     Raises:
         UnknownNameError: There is no script for the shell.
@@ -58,6 +64,9 @@ def completion_script(program: str, commands: Mapping[str, tuple[str, str]], she
     if shell not in SHELLS:
         raise UnknownNameError("shell", shell, SHELLS)
     verbs = {name: _verb(place, text) for name, (place, text) in commands.items()}
+    for name, words in (short or {}).items():
+        verbs[name] = verbs[" ".join(word for word in words if not word.startswith("-"))]
+    verbs[COMPLETION] = Verb("print the completion script of a shell", {}, (*SHELLS,), (), ())
     return _SCRIPTS[shell](program, verbs)
 
 
@@ -148,7 +157,7 @@ def _bash(program: str, verbs: Mapping[str, Verb]) -> str:
         "        esac",
         "    done",
         '    case "$COMP_CWORD,$verb" in',
-        f'        1,*) words="{" ".join(groups)} completion" ;;',
+        f'        1,*) words="{" ".join(groups)}" ;;',
     ]
     lines += [
         f'        2,{name}\\ *) words="{" ".join(members)}" ;;'

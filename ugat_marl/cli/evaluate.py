@@ -85,6 +85,8 @@ class Evaluate:
                 reporter=Bars(console),
                 approaches=True,
             )
+        if self.out is not None:
+            evaluation.write(self.out)
         if len(domains) > MOST_IN_DETAIL and domains_by_gap(evaluation):
             console.print(gap_matrix_table(evaluation))
         else:
@@ -94,7 +96,6 @@ class Evaluate:
         for table in service_tables(evaluation, Network.read(scenario)):
             console.print(table)
         if self.out is not None:
-            evaluation.write(self.out)
             console.print(f"table: {self.out}", soft_wrap=True)
         return 0
 

@@ -122,6 +122,8 @@ class Field:
             raise OptionError(f"--port {self.port}: a port is a number from 1 to 65535")
         if not self.start:
             refuse_options(self, ("domain", "seed"), "only --start uses these options")
+        else:
+            refuse_options(self, ("sumo_answer_s",), "--start runs SUMO here, which answers")
         if self.start and self.host != "localhost":
             raise OptionError(f"--start runs SUMO here, and not at --host {self.host}")
         if self.start and (self.port is not None or self.look_for_s or self.detectors != "lanes"):
@@ -142,7 +144,8 @@ class Field:
         for (one, place), (other, same) in itertools.combinations(places.items(), 2):
             if place == same:
                 raise OptionError(f"{other} and {one} are one file, {named[other]}; name two")
-        if self.health is not None and self.health.exists():
+        # An empty one is what a loss of power may leave.
+        if self.health is not None and self.health.exists() and self.health.stat().st_size:
             with contextlib.suppress(UgatMarlError):
                 held = read_json(self.health, OptionError)
                 if isinstance(held, dict) and {"state", "written_at", "pid"} <= held.keys():

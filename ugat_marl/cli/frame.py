@@ -19,14 +19,21 @@ from typing import Any
 
 from rich.console import Console
 
-from ugat_marl.cli.help import DEADLINE, HELP, HELP_ALL, described, options_of, print_help
+from ugat_marl.cli.help import (
+    COMPLETION,
+    DEADLINE,
+    HELP,
+    HELP_ALL,
+    described,
+    options_of,
+    print_help,
+)
 from ugat_marl.errors import UgatMarlError, UnknownNameError, joined, nearest
 from ugat_marl.progress import Bars, Loudness, loudness, showing
 
 USAGE_ERROR = 2
 INTERRUPTED = 130
 TERMINATED = 143
-COMPLETION = "completion"
 LOUDNESS: dict[str, Loudness] = {"--quiet": "quiet", "--verbose": "verbose"}
 """Options of every command."""
 _INDENT_OF_REQUIRED = 6
@@ -100,8 +107,8 @@ def run(line: CommandLine, arguments: Sequence[str]) -> int:
         fault), 130 (interrupted), 143 (terminated).
     """
     console = Console(highlight=False, markup=False)
-    arguments, level = _without_loudness(arguments)
-    arguments, seconds = _without_deadline(arguments)
+    arguments, level = without_loudness(arguments)
+    arguments, seconds = without_deadline(arguments)
     progress = (
         console if console.is_terminal else Console(stderr=True, highlight=False, markup=False)
     )
@@ -189,14 +196,14 @@ def _in_one_line(text: str) -> str:
     return f"{words[: 2 * _LONGEST_MESSAGE // 3]} ... {words[-_LONGEST_MESSAGE // 3 :]}"
 
 
-def _without_loudness(words: Sequence[str]) -> tuple[list[str], Loudness]:
+def without_loudness(words: Sequence[str]) -> tuple[list[str], Loudness]:
     """Return the words without --quiet and --verbose, and how much they ask to be said."""
     asked = [word for word in words if word in LOUDNESS]
     rest = [word for word in words if word not in LOUDNESS]
     return rest, LOUDNESS[asked[-1]] if asked else "usual"
 
 
-def _without_deadline(words: Sequence[str]) -> tuple[list[str], str | None]:
+def without_deadline(words: Sequence[str]) -> tuple[list[str], str | None]:
     """Return the words without --deadline-s, and its seconds; None if it is not among them."""
     rest, seconds = list[str](), None
     left = iter(words)
@@ -343,7 +350,7 @@ def _print_completion(line: CommandLine, words: list[str]) -> int:
         for shell, load in SHELLS.items():
             print(f"  {shell:<5} {load.format(program=line.program)}")
         return 0 if words and words[0] in HELP else USAGE_ERROR
-    print(completion_script(line.program, line.commands, words[0]), end="")
+    print(completion_script(line.program, line.commands, words[0], line.short), end="")
     return 0
 
 

@@ -18,6 +18,8 @@ from collections.abc import Collection, Sequence
 from typing import Annotated, Any, TextIO, Union, get_args, get_origin, get_type_hints
 
 HELP = ("-h", "--help")
+COMPLETION = "completion"
+"""Command that prints the script of a shell."""
 DEADLINE = "--deadline-s"
 """Option of every command: seconds within which a simulation has to answer."""
 HELP_ALL = "--help-all"

@@ -87,6 +87,8 @@ class _Paper:
                 "leave --ray or --device out"
             )
         device_of(self.config.device)  # a missing device is an error now, not in a job's log
+        for scenario in self.config.scenario:  # a wrong one is an error before any is trained in
+            load_scenario(scenario, self.config.duration_s)
         for scenario in self.config.scenario:
             folder = self.out / file_stem(scenario) / self.table
             require_writable(folder / "table.md")

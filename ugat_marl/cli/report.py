@@ -15,7 +15,7 @@ from tyro.conf import Positional, arg
 
 from ugat_marl.errors import CheckpointError, OptionError, UgatMarlError
 from ugat_marl.experiments import TransferConfig
-from ugat_marl.files import require_writable, write_whole
+from ugat_marl.files import MALFORMED, require_writable, write_whole
 from ugat_marl.policies import is_own, rule_in
 from ugat_marl.reporting import RunRecord, TableRecord, read_records, runs_page, write_pictures
 
@@ -113,7 +113,7 @@ def _policy(path: Path, learner: object) -> str:
 def _train(record: RunRecord, folder: str) -> list[str]:
     try:
         options = train_options(record.settings)
-    except (UgatMarlError, TypeError, ValueError):
+    except (UgatMarlError, *MALFORMED):
         return []  # of a damaged file, or of a learner that this version does not have
     place = ["--out", f"{folder}-again"] if record.finished else ["--out", folder, "--resume"]
     return [shlex.join(["ugat-marl", "train", record.scenario, *options, *place])]

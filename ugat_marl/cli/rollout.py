@@ -136,10 +136,10 @@ class Rollout:
             require_writable(self.video)
             require_video(self.video)
         scenario = load_scenario(self.scenario, self.duration_s)
+        if self.video is not None:  # first, as it shows its own faults sooner
+            self._film(scenario, self.video, console)
         if self.out is not None:
             self._record(scenario, self.out, console)
-        if self.video is not None:
-            self._film(scenario, self.video, console)
         return 0
 
     def _record(self, scenario: Scenario, out: Path, console: Console) -> None:

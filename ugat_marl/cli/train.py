@@ -13,6 +13,7 @@ from rich.text import Text
 from tyro.conf import arg
 
 from ugat_marl.cli.arguments import RayAddress, Workers, require_numbers, workers_of
+from ugat_marl.cli.frame import without_deadline, without_loudness
 from ugat_marl.data import METRICS_FILE, Metrics
 from ugat_marl.errors import OptionError
 from ugat_marl.experiments import TransferConfig, outcome_of, run_folder, transfer
@@ -103,9 +104,11 @@ class Train:
     def _call(self, directory: Path) -> str:
         """Return the command line that continues the run."""
         program, *words = sys.argv
+        words, _ = without_deadline(without_loudness(words)[0])
         given = [word for word in words if word != "--resume"]
-        if Path(program).name not in ("ugat-marl", "__main__.py") or given[:1] != ["train"]:
-            given = ["train", self.config.scenario, "..."]  # called by another program
-        if self.out is None:
+        known = Path(program).name in ("ugat-marl", "__main__.py") and given[:1] == ["train"]
+        if not known:  # called by another program
+            given = ["train", self.config.scenario, "..."]
+        if self.out is None or not known:
             given += ["--out", str(directory)]
         return shlex.join(["ugat-marl", *given, "--resume"]).replace("'...'", "...")

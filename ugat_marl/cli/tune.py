@@ -82,8 +82,9 @@ class Tune:
                 )
                 for name in self.rules
             ]
-        console.print(tuning_table(f"{scenario.id} in {domain_label(self.domain)}", tuned))
         if self.out is not None:
             write_whole(self.out, json.dumps([asdict(each) for each in tuned], indent=1) + "\n")
+        console.print(tuning_table(f"{scenario.id} in {domain_label(self.domain)}", tuned))
+        if self.out is not None:
             console.print(f"table: {self.out}", soft_wrap=True)
         return 0

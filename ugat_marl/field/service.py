@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import math
 import time
 from collections.abc import Callable
@@ -114,7 +115,7 @@ class FieldService:
                 if time.monotonic() >= until:
                     raise
                 if self._lost is None:
-                    self._say(f"the street is gone ({error}); looking for it again")
+                    self._tell_user(f"the street is gone ({error}); looking for it again")
                 self._lost = error.with_traceback(None)  # which would keep the old street open
                 self._health.tell("looking", **self._facts())
                 self._sleep(min(pause_s, max(until - time.monotonic(), 0.0)))
@@ -131,7 +132,7 @@ class FieldService:
     def _tell(self, decision: Decision, on_decision: Callable[[Decision], None] | None) -> None:
         if self._lost is not None:
             self._lost = None
-            self._say("the street is back")
+            self._tell_user("the street is back")
         self._health.tell(
             "driving",
             street_time_s=decision.time_s,
@@ -144,6 +145,10 @@ class FieldService:
             except Exception as error:
                 self._of_caller = error  # it says nothing about the street
                 raise
+
+    def _tell_user(self, text: str) -> None:
+        with contextlib.suppress(OSError):  # a full disk does not stop the lights
+            self._say(text)
 
     def _facts(self) -> dict[str, object]:
         summary = LoopSummary() if self._loop is None else self._loop.summary

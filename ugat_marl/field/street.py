@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import contextlib
 import math
+import socket
 import time
 from collections import defaultdict
 from collections.abc import Callable, Iterator, Mapping, Sequence
@@ -200,7 +201,8 @@ def _connected(port: int, host: str, patience_s: float) -> Any:
     until = time.monotonic() + patience_s
     while True:
         try:
-            return connect(port, 0, host)
+            with _new_sockets(max(until - time.monotonic(), 1.0)):
+                return connect(port, 0, host)
         except (TraCIException, FatalTraCIError, OSError) as error:
             if time.monotonic() > until:
                 raise SimulatorError(
@@ -208,6 +210,17 @@ def _connected(port: int, host: str, patience_s: float) -> Any:
                     f"({error}); start it with --remote-port {port}, or use --start"
                 ) from None
             time.sleep(_RETRY_S)
+
+
+@contextlib.contextmanager
+def _new_sockets(timeout_s: float) -> Iterator[None]:
+    """Give new sockets a timeout: traci connects without one, minutes to a host that is off."""
+    before = socket.getdefaulttimeout()
+    socket.setdefaulttimeout(timeout_s)
+    try:
+        yield
+    finally:
+        socket.setdefaulttimeout(before)
 
 
 class SimulatedStreet:
