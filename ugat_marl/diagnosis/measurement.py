@@ -317,8 +317,9 @@ def _twins(
 ) -> Array:
     """Count passages with twins on the next lanes, and passages alone: ``(detectors, 2)``.
 
-    Only moments count at which nothing else passes on the lanes side by side. Otherwise a quiet
-    lane beside a busy one would show more splash than vehicles, but few twins of lone vehicles.
+    Only moments count at which nothing else passes on the lanes side by side, within the time of a
+    free gap. Within less, leaders of queues that start side by side would look like twins.
+    Otherwise a quiet lane beside a busy one would show more splash than vehicles, but few twins.
     """
     counts = np.zeros((len(detectors), 2))
     number = {one.id: index for index, one in enumerate(detectors)}
@@ -332,7 +333,7 @@ def _twins(
         index = np.repeat(members, [len(t.on) for t in parts])
         order = np.argsort(on, kind="stable")
         on, over, index = on[order], over[order], index[order]
-        starts = np.flatnonzero(np.diff(on, prepend=-np.inf) > thresholds.apart_s)
+        starts = np.flatnonzero(np.diff(on, prepend=-np.inf) > thresholds.free_gap_s)
         if not len(starts):
             continue
         ends = np.append(starts[1:], len(on))

@@ -173,7 +173,7 @@ class DayThresholds:
 
 OF_SIGHTINGS = (
     "touching_s", "no_gap_s", "longest_alone_s", "crawling_mps", "least_braking_mps",
-    "least_travel_s", "longest_travel_s", "steady_share", "twin_s", "apart_s",
+    "least_travel_s", "longest_travel_s", "steady_share", "twin_s",
 )  # fmt: skip
 """Numbers that decide what is kept of single vehicles, beside those of a day."""
 
@@ -307,10 +307,6 @@ class Thresholds(DayThresholds):
     twin_s: float = 0.15
     """Difference of two passages on adjacent lanes below which they are twins, s. By hand. Halved:
     detectors with unlike response times do not show splash."""
-    apart_s: float = 3.0
-    """Time between passages on lanes side by side beyond which they are looked at one by one, s.
-    By hand: queues discharge every 2 s. Halved: vehicles that leave queues side by side look like
-    twins."""
     inexact: float = 0.01
     """Share by which kinematics of simulated and real vehicles may differ. By hand. Halved: errors
     of detectors by small differences of driving are named."""
