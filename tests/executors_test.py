@@ -27,7 +27,7 @@ from ugat_marl.diagnosis.replay import Replay
 from ugat_marl.diagnosis.thresholds import Thresholds
 from ugat_marl.effects import StartupDelay, load_scenario
 from ugat_marl.envs import TrafficEnv
-from ugat_marl.errors import OptionError, SimulatorCrashed
+from ugat_marl.errors import JobError, OptionError, SimulatorCrashed
 from ugat_marl.experiments import evaluation_of, rule_factory
 from ugat_marl.grounding import RollOutSettings, roll_outs
 from ugat_marl.parallel import (
@@ -139,6 +139,26 @@ def test_processes_that_die_are_replaced(tmp_path: Path) -> None:
         assert processes.submit(int, "1").result() == 1
     with pytest.raises(RuntimeError, match="shutdown"):
         processes.submit(int, "1")
+
+
+UNPACKED_NOWHERE = """
+class Own(Exception):
+    def __init__(self, one, two):
+        super().__init__(one)
+import pathlib
+file = pathlib.Path({file!r})
+file.write_text(file.read_text() + "." if file.exists() else ".")
+raise Own("the reason", 2)
+"""
+
+
+def test_an_error_that_cannot_be_sent_is_told_and_nothing_is_repeated(tmp_path: Path) -> None:
+    file = tmp_path / "calls"
+    with LocalProcesses(1) as processes:
+        with pytest.raises(JobError, match="Own: the reason"):
+            processes.submit(exec, UNPACKED_NOWHERE.format(file=str(file)), {}).result()
+        assert processes.submit(int, "1").result() == 1
+    assert file.read_text() == "."
 
 
 @pytest.mark.slow

@@ -27,10 +27,17 @@ from concurrent.futures import (
     wait,
 )
 from concurrent.futures.process import BrokenProcessPool
+from multiprocessing.reduction import ForkingPickler
 from pathlib import Path
 from typing import Any, NamedTuple, TypeVar
 
-from ugat_marl.errors import OptionError, SimulatorCrashed, install_command
+from ugat_marl.errors import (
+    JobError,
+    OptionError,
+    SimulatorCrashed,
+    first_line,
+    install_command,
+)
 
 Workers = int | Executor | None
 """Number of parts at a time, None for the number of usable cores, or an executor."""
@@ -320,13 +327,29 @@ class _Process(ProcessPoolExecutor):
         Raises:
             BrokenProcessPool: The process died, or was stopped and killed.
         """
-        future = self.submit(part)
+        future = self.submit(_carried, part)
         heartbeat = Heartbeat(lambda: self._beats.value)
         while not wait([future], timeout=_BEAT_S).done:
             if heartbeat.is_lost():
                 for each in [*self._processes.values()]:  # the pool has no method for it
                     each.kill()
         return future.result()
+
+
+def _carried(part: Callable[[], Any]) -> Any:
+    """Do a part; replace an error that pickle does not bring back, which would look like a death.
+
+    Raises:
+        JobError: The part raised such an error.
+    """
+    try:
+        return part()
+    except Exception as error:
+        try:
+            ForkingPickler.loads(ForkingPickler.dumps(error))
+        except Exception:  # noqa: BLE001 - whatever its class does when it is made again
+            raise JobError(f"{type(error).__name__}: {first_line(error)}") from None
+        raise
 
 
 def _beat(beats: Any) -> None:

@@ -5,6 +5,7 @@ The recordings are made by hand on the crossing of tests/data, two hours long.
 
 from __future__ import annotations
 
+import os
 import shutil
 from collections.abc import Callable, Mapping
 from dataclasses import replace
@@ -24,6 +25,7 @@ from ugat_marl.data import (
     write_measured,
 )
 from ugat_marl.data.measured import coverage
+from ugat_marl.data.measured.tables import read_raw
 from ugat_marl.effects import known_effects
 from ugat_marl.errors import MeasuredDataError
 from ugat_marl.scenarios import (
@@ -186,6 +188,34 @@ def test_a_clock_set_back_is_an_error(read: Read, jump: float) -> None:
         read(changes={"detections": back})
     with pytest.raises(MeasuredDataError, match=r"traffic light 'C'.* steps back"):
         read(changes={"signals": back})
+
+
+def test_a_clock_set_back_is_an_error_beside_late_rows(read: Read) -> None:
+    """Each stream has a row that was delivered late, before its clock was set back."""
+
+    def back(frame: pl.DataFrame) -> pl.DataFrame:
+        late = pl.col("time_s") > 5000
+        frame = frame.with_columns(
+            pl.when(late).then(pl.col("time_s") - 3600).otherwise("time_s").alias("time_s")
+        )
+        order = pl.int_range(pl.len()) + 1.5 * (pl.int_range(pl.len()) == 4)
+        return frame.sort(order.over("detector_id", "event"), maintain_order=True)
+
+    with pytest.raises(MeasuredDataError, match=r"steps back by [\d.]+ s.*occur twice"):
+        read(changes={"detections": back})
+
+
+def test_a_header_that_is_too_long_is_no_table(tmp_path: Path) -> None:
+    path = tmp_path / "periods.csv"
+    path.write_text("x" * 140_000 + ",b\n1,2\n")
+    with pytest.raises(MeasuredDataError, match="not a table"):
+        read_raw(path, [])
+
+
+def test_a_pipe_is_no_table(tmp_path: Path) -> None:
+    os.mkfifo(tmp_path / "periods.csv")
+    with pytest.raises(MeasuredDataError, match="is a pipe"):
+        read_raw(tmp_path / "periods.csv", [])
 
 
 def test_a_clock_that_starts_again_from_zero_is_an_error(read: Read) -> None:

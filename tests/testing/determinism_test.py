@@ -135,6 +135,7 @@ def test_every_check_has_a_broken_environment() -> None:
 
 def test_the_toy_environment_passes() -> None:
     assert not failed_checks(check_determinism(ToyTraffic))
+    assert not failed_checks(check_determinism(lambda: ToyTraffic(masked=True)))
 
 
 @pytest.mark.parametrize("scenario", ["single-v1", "grid2x2-v1", "mixed-v1"])

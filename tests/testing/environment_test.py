@@ -458,6 +458,27 @@ class KeepsWhatItGives(ToyTraffic):
         ).astype(np.float32)
 
 
+@breaks("what_was_given_may_be_changed")
+class GivesOneMask(Telling):
+    def tell(self, infos):
+        if self._step == 0:
+            self.kept = {agent: info["action_mask"] for agent, info in infos.items()}
+        for agent, info in infos.items():
+            info["action_mask"] = self.kept[agent]
+
+
+@breaks("what_was_given_may_be_changed")
+class RewardsWhatWasGiven(ToyTraffic):
+    def _observe(self):
+        self.given = super()._observe()
+        return self.given.copy()
+
+    def step(self, actions):
+        before = {agent: float(vector.sum()) for agent, vector in self.given.items()}
+        observations, _, *others = super().step(actions)
+        return observations, before, *others
+
+
 @breaks("pictures_are_pictures")
 class DrawsFloats(ToyTraffic):
     def render(self):
@@ -477,6 +498,16 @@ class StumblesOverWrongActions(ToyTraffic):
             return super().step(actions)
         except ActionError:
             self.agents = []
+            raise
+
+
+@breaks("wrong_actions_are_refused")
+class MovesBeforeItRefuses(ToyTraffic):
+    def step(self, actions):
+        try:
+            return super().step(actions)
+        except ActionError:
+            self._serve("cross_0", 0)
             raise
 
 

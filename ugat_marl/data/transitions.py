@@ -22,7 +22,7 @@ from numpy.typing import NDArray
 from ugat_marl.data.layouts import AgentLayout
 from ugat_marl.data.row_hashes import damage, is_hashed, read_quietly, write_hashed
 from ugat_marl.errors import LogError, first_line
-from ugat_marl.files import MALFORMED, parse_json, replacing
+from ugat_marl.files import MALFORMED, parse_json, refuse_endless, replacing
 
 FORMAT = 2
 METADATA_KEY = "ugat_marl.data.transitions"
@@ -596,6 +596,7 @@ def _refuse_rows(frame: pl.DataFrame, bad: pl.Expr, column: str, complaint: str)
 
 def _refuse_half_file(path: Path) -> None:
     """Refuse a file that does not begin and end with the magic number of Parquet."""
+    refuse_endless(path, LogError)
     try:
         with path.open("rb") as file:
             head = file.read(4)

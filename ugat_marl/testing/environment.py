@@ -259,10 +259,14 @@ def results_are_fresh(case: EnvironmentCase) -> None:
 
 def what_was_given_may_be_changed(case: EnvironmentCase) -> None:
     """Changes to returned observations, infos and results do not change the environment."""
+    is_repeatable = case.is_repeatable
     env = case.make()
     moment = begin(env, case.seed)
     choose = random_actions(case.seed)
-    for step, expected in enumerate(case.episode.moments[:-1]):
+    moments = case.episode.moments
+    for step, expected in enumerate(moments[:-1]):
+        if is_repeatable:
+            _require_the_same(expected, moment, step)
         state = np.array(env.state())
         actions = choose(step, env, moment.infos)
         for agent in env.agents:
@@ -280,6 +284,17 @@ def what_was_given_may_be_changed(case: EnvironmentCase) -> None:
             f"{_when(step)}, clearing what was given changed env.agents; keep copies",
         )
         moment = proceed(env, actions)
+    if is_repeatable:
+        _require_the_same(moments[-1], moment, len(moments) - 1)
+
+
+def _require_the_same(expected: StepReturn, moment: StepReturn, step: int) -> None:
+    """Compare a moment with that of the episode in which nothing was overwritten."""
+    if where := different(expected.parts, moment.parts):
+        raise ConformanceError(
+            f"overwriting what was given before changed what is given {_when(step)}: {where}; "
+            "return fresh arrays, and keep copies"
+        )
 
 
 def _overwrite(array: Any) -> None:
@@ -322,8 +337,12 @@ def pictures_are_pictures(case: EnvironmentCase) -> None:
 
 
 def wrong_actions_are_refused(case: EnvironmentCase) -> None:
-    """An action out of range, or a missing one, is an error; after it the episode goes on."""
+    """An action out of range, or a missing one, is an error; after it the episode goes on.
+
+    It goes on as if nothing had been asked.
+    """
     case.need_episode()
+    is_repeatable = case.is_repeatable
     env = case.make()
     _, infos = env.reset(seed=case.seed)
     right = random_actions(case.seed)(0, env, infos)
@@ -342,12 +361,19 @@ def wrong_actions_are_refused(case: EnvironmentCase) -> None:
             raise ConformanceError(
                 f"{kind} was accepted; raise ugat_marl.errors.ActionError before anything moves"
             )
+    moments: list[StepReturn] = []
     with Listening() as heard:
-        env.step(right)
+        moments.append(proceed(env, right))
     require(
         heard.error is None,
         f"after a refused action a right one fails too ({heard.error}); check all actions before "
         "anything moves",
+    )
+    where = different(case.episode.moments[1].parts, moments[0].parts)
+    require(
+        not (is_repeatable and where),
+        f"a refused action changed the step after it: {where}; check all actions before anything "
+        "moves",
     )
 
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import copy
+import functools
 from collections.abc import Callable, Mapping
 from dataclasses import asdict, dataclass, is_dataclass
 from typing import Any
@@ -113,6 +114,14 @@ class EnvironmentCase:
             self._episode = self.play(self._keep(), self.seed)
             self._failed = False
         return self._episode
+
+    @functools.cached_property
+    def is_repeatable(self) -> bool:
+        """True if the episode is the same when it is played again."""
+        moments = self.episode.moments
+        again = self.play(self.make(), self.seed)
+        pairs = zip(moments, again.moments, strict=False)
+        return not any(different(a.parts, b.parts) for a, b in pairs)
 
     def need_episode(self) -> None:
         """Skip a check if no whole episode can be run.

@@ -537,7 +537,11 @@ def read_log(path: Path, time_zone: str, findings: list[Finding]) -> pl.DataFram
             "is not a whole number",
             "export the log again, or leave the row out",
         )
-    return whole.with_columns(
-        pl.col("event").cast(pl.Int64, strict=False),
-        pl.col("parameter").cast(pl.Int64, strict=False),
-    ).drop_nulls()
+        refuse(
+            path,
+            whole.filter(pl.col(column).abs() > 2**31),
+            column,
+            "is no number of a controller",
+            "export the log again, or leave the row out",
+        )
+    return whole.with_columns(pl.col("event").cast(pl.Int64), pl.col("parameter").cast(pl.Int64))

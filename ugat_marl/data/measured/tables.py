@@ -17,6 +17,7 @@ from ugat_marl.data.measured.local_time import LocalClock
 from ugat_marl.data.measured.values import Finding
 from ugat_marl.data.row_hashes import csv_damage, csv_texts, damage, read_quietly
 from ugat_marl.errors import MeasuredDataError, first_line, nearest
+from ugat_marl.files import refuse_endless
 from ugat_marl.scenarios import Period
 
 ROW = "row"
@@ -363,20 +364,23 @@ def _read_csv(path: Path, findings: list[Finding]) -> pl.DataFrame:
         )
     try:
         frame = csv_texts(content)
-    except (pl.exceptions.PolarsError, pl.exceptions.PanicException, OSError, ValueError) as error:
+        # polars gives the second of two equal names another one
+        written = [name.strip() for name in next(csv.reader([head]), [])]
+    except (
+        pl.exceptions.PolarsError, pl.exceptions.PanicException, OSError, ValueError, csv.Error
+    ) as error:  # fmt: skip
         raise MeasuredDataError(
             f"{path}: not a table ({first_line(error)}); every line needs the columns of line 1"
         ) from None
     if wrong := csv_damage(path, frame):  # tables of others carry no hashes
         raise MeasuredDataError(f"{path}: damaged, {wrong}")
-    # polars gives the second of two equal names another one
-    written = [name.strip() for name in next(csv.reader([head]), [])]
     if twice := sorted({name for name in written if written.count(name) > 1}):
         raise MeasuredDataError(f"{path}: column {twice[0]!r} is there twice; keep one of them")
     return frame.rename({name: name.strip() for name in frame.columns})
 
 
 def _bytes(path: Path) -> bytes:
+    refuse_endless(path, MeasuredDataError)
     try:
         return path.read_bytes()
     except OSError as error:
@@ -617,12 +621,13 @@ def refuse_set_back(
     starts = np.flatnonzero(np.diff(stream, prepend=-1))
     for begin, end in zip(starts, np.append(starts[1:], len(stream)), strict=True):
         steps = back[(back > begin) & (back < end)]
+        steps = steps[clock[steps - 1] - clock[steps] > CLOCK_JUMP_S]  # others are late rows
         if not 1 <= len(steps) <= 2 or end - begin < FEW_ROWS:
             continue
         step = int(steps[0])
         jump = clock[step - 1] - clock[step]
         gone = begin_s is not None and clock[end - 1] < begin_s[as_found[begin]]
-        if jump > CLOCK_JUMP_S and (gone or clock[end - 1] > clock[begin]):
+        if gone or clock[end - 1] > clock[begin]:
             raise MeasuredDataError(
                 f"{place(path, int(row[as_found[step]]))}: the clock of {name(int(stream[begin]))} "
                 f"steps back by {jump:g} s, so some times occur twice (daylight saving, a "
