@@ -39,6 +39,16 @@ def test_a_shown_difference_has_its_interval() -> None:
     )
 
 
+def test_long_times_are_whole_seconds() -> None:
+    text = outcome([500.0, 520.0, 540.0], [302.0, 302.0, 302.0]).sentence()
+    assert "218 s less than with direct transfer (95 % interval 168 to 268 s" in text
+
+
+def test_the_same_policy_is_no_difference_of_zero() -> None:
+    text = outcome([120.0, 100.0, 100.0], [120.0, 100.0, 100.0]).sentence()
+    assert "fitted street, to the last digit as with direct transfer; the best" in text
+
+
 def test_harm_is_told_as_such() -> None:
     text = outcome([102.0, 102.0, 102.0], [110.0, 112.0, 114.0]).sentence()
     assert "10 s more than with direct transfer (95 % interval 5 to 15 s" in text

@@ -70,7 +70,8 @@ def read_checkpoint(path: Path, *kinds: str) -> dict[str, Any]:
             ) from None
         raise CheckpointError(
             f"{path}: not a readable checkpoint ({first_line(error)}); it may have been cut short: "
-            "use an earlier one or train again"
+            "use an earlier one or train again. What a learner of yours has saved is given as "
+            "MODULE:CLASS@FILE"
         ) from None
     kind_read = content.get("kind") if isinstance(content, dict) else None
     if kind_read not in kinds:

@@ -164,8 +164,10 @@ def unverified(selected: Selected, verified: Verified | None = None) -> Conclusi
             gone = ", which brings the held-out periods no nearer"
         named = f"{describe_members(members)}{gone}"
         nearest = f"The nearest explanation so far, not verified, is {named}."
-    else:
+    elif any(rival.members for rival in selected.rivals):
         nearest = "No effect that was tried so far explains it."
+    else:
+        nearest = "No effect has been tried yet."
     sentence = (
         "Simulation and measurement disagree; the budget ended before the search did. "
         f"{nearest} Run the same command again to go on."

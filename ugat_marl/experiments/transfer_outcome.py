@@ -45,22 +45,29 @@ class TransferOutcome:
         if self.shown:
             low, high = sorted((abs(change.low), abs(change.high)))
             text = (
-                f"{begin}, {abs(change.mean):.3g} s {'less' if change.mean < 0 else 'more'} than "
-                f"with direct transfer (95 % interval {low:.2g} to {high:.2g} s, "
+                f"{begin}, {_seconds(abs(change.mean))} s {'less' if change.mean < 0 else 'more'} "
+                f"than with direct transfer (95 % interval {_seconds(low)} to {_seconds(high)} s, "
                 f"p = {self.test.p:.1g}, {n} episodes with the same vehicles)"
             )
+        elif change.low == change.high == 0.0:
+            text = f"{begin}, to the last digit as with direct transfer"
         elif math.isfinite(change.low):
             text = (
-                f"{begin}; no difference from direct transfer is shown ({change.low:+.2g} to "
-                f"{change.high:+.2g} s, {n} episodes with the same vehicles)"
+                f"{begin}; no difference from direct transfer is shown ({_seconds(change.low, '+')} "
+                f"to {_seconds(change.high, '+')} s, {n} episodes with the same vehicles)"
             )
         elif n == 1:
-            text = f"{begin}, {change.mean:+.3g} s against direct transfer in a single episode"
+            text = f"{begin}, {_seconds(change.mean, '+')} s against direct transfer in a single episode"
         else:
             text = f"{begin}; some of the {n} episodes have no travel time, so no test is possible"
         if self.rule:
             text += f"; the best rule there, {self.rule}, needs {self.rule_s:.3g} s"
         return f"{text}."
+
+
+def _seconds(value: float, sign: str = "") -> str:
+    """Return a time in whole seconds from 10 s on, and with two digits below; "+" shows signs."""
+    return f"{value:{sign}.0f}" if abs(value) >= 9.5 else f"{value:{sign}.2g}"
 
 
 def outcome_of(evaluation: Evaluation) -> TransferOutcome | None:

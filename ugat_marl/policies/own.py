@@ -441,6 +441,8 @@ def check_own_learner(
 
 def _counters(path: Path) -> dict[str, Any]:
     """Return the counters in a file of `OwnLearner.save`."""
+    if not path.is_file():
+        raise CheckpointError(f"{path}: no such checkpoint file")
     try:
         with zipfile.ZipFile(path) as packed:
             require_stored(packed)

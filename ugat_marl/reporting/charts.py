@@ -157,7 +157,7 @@ def _label(axes: Any, x_label: str, y_label: str) -> None:
     axes.set_xlabel(x_label, loc="right")
     axes.set_title(y_label, color=LIGHT["soft"], x=-50 / _points_wide(axes))
     axes.grid(visible=False, axis="x")
-    axes.xaxis.set_major_locator(MaxNLocator(7, integer=True))
+    axes.xaxis.set_major_locator(MaxNLocator(7, integer=True, min_n_ticks=1))
     axes.yaxis.set_major_locator(MaxNLocator(6))
     for axis in (axes.xaxis, axes.yaxis):
         axis.set_major_formatter(FuncFormatter(tick_text))

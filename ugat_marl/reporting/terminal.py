@@ -32,7 +32,11 @@ class WholeWords(Table):
         widths = [None] * len(spans) if fits else _widths(spans, room)
         for column, width in zip(self.columns, widths, strict=True):
             column.width = width
+        title, self.title = self.title, None
+        if title:  # as wide as the screen, and not as the table
+            yield title if isinstance(title, Text) else Text(title)
         yield from super().__rich_console__(console, options)
+        self.title = title
 
 
 def _span(console: Console, options: ConsoleOptions, column: Column) -> Measurement:
