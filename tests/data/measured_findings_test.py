@@ -212,6 +212,13 @@ def test_a_header_that_is_too_long_is_no_table(tmp_path: Path) -> None:
         read_raw(path, [])
 
 
+def test_columns_of_lists_are_refused_unread(tmp_path: Path) -> None:
+    path = tmp_path / "signals.parquet"
+    pl.DataFrame({"time_s": [1.0], "other": [[0] * 10]}).write_parquet(path)
+    with pytest.raises(MeasuredDataError, match="column 'other' holds lists"):
+        read_raw(path, [])
+
+
 def test_a_pipe_is_no_table(tmp_path: Path) -> None:
     os.mkfifo(tmp_path / "periods.csv")
     with pytest.raises(MeasuredDataError, match="is a pipe"):

@@ -279,10 +279,16 @@ def _hash(content: Any) -> str:
     return hashlib.blake2b(text.encode(), digest_size=16).hexdigest()
 
 
-def read_quietly(source: Path | io.BytesIO) -> tuple[pl.DataFrame, dict[str, str]]:
+def read_quietly(
+    source: Path | io.BytesIO, *, nested: bool = True
+) -> tuple[pl.DataFrame, dict[str, str]]:
     """Return the table and the metadata of a Parquet file; a damaged one prints nothing.
 
     Threads of polars print their own stack traces before they raise the error in Python.
+
+    Args:
+        source: The file, or its content.
+        nested: False to refuse columns of lists, one of which may hold more than the memory.
 
     Raises:
         polars.exceptions.PolarsError: The file is damaged, or has more rows than bytes; also
@@ -290,6 +296,9 @@ def read_quietly(source: Path | io.BytesIO) -> tuple[pl.DataFrame, dict[str, str
     """
     with _ONE_AT_A_TIME, _without_standard_error():
         _refuse_repeated_rows(source)
+        for name, kind in pl.scan_parquet(_again(source)).collect_schema().items():
+            if not nested and kind.is_nested():
+                raise pl.exceptions.SchemaError(f"column {name!r} holds lists ({kind})")
         frame = pl.read_parquet(_again(source))
         return frame, pl.read_parquet_metadata(_again(source))
 

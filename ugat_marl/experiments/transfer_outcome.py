@@ -53,11 +53,14 @@ class TransferOutcome:
             text = f"{begin}, to the last digit as with direct transfer"
         elif math.isfinite(change.low):
             text = (
-                f"{begin}; no difference from direct transfer is shown ({_seconds(change.low, '+')} "
-                f"to {_seconds(change.high, '+')} s, {n} episodes with the same vehicles)"
+                f"{begin}; no difference from direct transfer is shown "
+                f"({_seconds(change.low, '+')} to {_seconds(change.high, '+')} s, {n} episodes with the same vehicles)"
             )
         elif n == 1:
-            text = f"{begin}, {_seconds(change.mean, '+')} s against direct transfer in a single episode"
+            text = (
+                f"{begin}, {_seconds(change.mean, '+')} s against direct transfer in a single "
+                "episode"
+            )
         else:
             text = f"{begin}; some of the {n} episodes have no travel time, so no test is possible"
         if self.rule:

@@ -319,7 +319,7 @@ def _read_parquet(path: Path) -> pl.DataFrame:
             "copy it again"
         )
     try:
-        frame, metadata = read_quietly(io.BytesIO(content))
+        frame, metadata = read_quietly(io.BytesIO(content), nested=False)
     except (pl.exceptions.PolarsError, pl.exceptions.PanicException, OSError, ValueError) as error:
         raise MeasuredDataError(
             f"{path}: damaged Parquet file ({first_line(error)}); copy or export it again"
