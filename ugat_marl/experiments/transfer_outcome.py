@@ -54,7 +54,8 @@ class TransferOutcome:
         elif math.isfinite(change.low):
             text = (
                 f"{begin}; no difference from direct transfer is shown "
-                f"({_seconds(change.low, '+')} to {_seconds(change.high, '+')} s, {n} episodes with the same vehicles)"
+                f"({_seconds(change.low, '+')} to {_seconds(change.high, '+')} s, {n} episodes "
+                "with the same vehicles)"
             )
         elif n == 1:
             text = (
