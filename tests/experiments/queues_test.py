@@ -93,14 +93,14 @@ def test_an_evaluation_fills_it(tmp_path: Path) -> None:
 def test_another_evaluation_adds_its_episodes(tmp_path: Path) -> None:
     path = tmp_path / "queues.parquet"
 
-    def write(domain: str, *episodes: float, keep: bool = True, batch: int = 0) -> None:
+    def write(domain: str, *episodes: float, keep: bool = True, **options: Any) -> None:
         env = stub(decisions=1, interval_s=60.0)
         look = (record := QueueRecord()).watch("policy", domain, env)
         for halting in episodes:
             lanes = len(env.network.lane_table().ids)
             env.snapshot = SimpleNamespace(halting=np.full(lanes, halting))
             look(1)
-        record.write(path, keep=keep, batch=batch)
+        record.write(path, keep=keep, **options)
 
     path.write_bytes(b"broken")
     write("sim", 1.0)
@@ -118,6 +118,8 @@ def test_another_evaluation_adds_its_episodes(tmp_path: Path) -> None:
         assert path.read_bytes() == whole
     write("V4", 2.0, 4.0, 6.0)  # a batch grows, since more seeds were asked for after the kill
     assert set(read_queues(path).filter(domain="V4")["looks"]) == {5}
+    write("V4", 3.0, batch=7, anew=True)  # of another world of that name
+    assert set(read_queues(path).filter(domain="V4")["looks"]) == {1}
     write("V1", 1.0, keep=False)
     assert set(read_queues(path)["domain"]) == {"V1"}
 

@@ -383,20 +383,20 @@ class JobRecord:
             domain: [
                 s
                 for s in job.evaluation_seeds
-                if (mark, domain, s) not in self.scores or self._is_other(job, domain)
+                if (mark, domain, s) not in self.scores or self.is_other(job, domain)
             ]
             for domain in job.domains
         }
         return {domain: left for domain, left in seeds.items() if left}
 
-    def _is_other(self, job: Job, domain: str) -> bool:
+    def is_other(self, job: Job, domain: str) -> bool:
         """Return True if the scores of a domain are of another world of that name."""
         now = job.judged_worlds.get(domain)
         return now is not None and self.worlds.get(domain, now) != now
 
     def add_scores(self, job: Job, mark: int, domain: str, scores: Mapping[int, Scores]) -> None:
         """Add the scores of episodes by seed; those of another world of that name are dropped."""
-        if self._is_other(job, domain):
+        if self.is_other(job, domain):
             self.scores = {key: held for key, held in self.scores.items() if key[1] != domain}
         if (now := job.judged_worlds.get(domain)) is not None:
             self.worlds[domain] = now
@@ -479,7 +479,8 @@ def _judge(
         # The queues come before the record, which marks these episodes as played. If a process dies
         # between the two, the same episodes are played again; their first seed is their number.
         if mark in job.rows:
-            queues.write(folder / QUEUES, keep=True, batch=seeds[0])
+            anew = record.is_other(job, domain)
+            queues.write(folder / QUEUES, keep=True, batch=seeds[0], anew=anew)
         record.add_scores(job, mark, domain, {r.seed: r.scores for r in played.results})
         record.write(folder)
 

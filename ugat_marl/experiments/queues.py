@@ -31,7 +31,8 @@ _SCHEMA = {
     "looks": pl.Int64,
 }
 _MOST_MINUTES = 60 * 24 * 366
-_BATCH = ["policy", "domain", "batch"]
+_OWNER = ["policy", "domain"]
+_BATCH = [*_OWNER, "batch"]
 _PLACE = ["policy", "domain", "minute", "intersection"]
 
 
@@ -107,7 +108,7 @@ class QueueRecord:
         schema = {name: kind for name, kind in _SCHEMA.items() if name != "batch"}
         return pl.DataFrame(rows, schema=schema, orient="row")
 
-    def write(self, path: Path, *, keep: bool = False, batch: int = 0) -> None:
+    def write(self, path: Path, *, keep: bool = False, batch: int = 0, anew: bool = False) -> None:
         """Write the record as Parquet atomically.
 
         Args:
@@ -115,6 +116,8 @@ class QueueRecord:
             keep: True to keep the other batches in the file, if there is one that can be read.
             batch: Number of these episodes. A batch of this number in the file, with the same
                 policies and domains, is replaced.
+            anew: True to replace all batches of these policies and domains, such as those of
+                another world of that name.
 
         Raises:
             OSError: The file cannot be written, or the record in it cannot be read now, such as
@@ -123,7 +126,7 @@ class QueueRecord:
         frame = self.frame().with_columns(pl.lit(batch, pl.Int64).alias("batch")).select(*_SCHEMA)
         if keep and path.exists():
             with contextlib.suppress(CheckpointError):  # a damaged record is given up
-                kept = _batches(path).join(frame, on=_BATCH, how="anti")
+                kept = _batches(path).join(frame, on=_OWNER if anew else _BATCH, how="anti")
                 frame = pl.concat([kept, frame])
         _write(frame, path)
 
