@@ -561,6 +561,8 @@ class _GrowingTree:
         self._name = name
         self._root: ET.Element | None = None
         self._shallow = 0  # children that are whole, and were looked through
+        self._new = 0  # bytes since the last look
+        self._wait = 0  # bytes until the next one, if a child goes on
         self._builder = ET.TreeBuilder()
         self._parser = _refusing_parser(name)
         self._parser.buffer_text = True
@@ -579,11 +581,19 @@ class _GrowingTree:
             ScenarioError: As for `parse_xml`.
         """
         _parse(self._parser, piece, False, self._name)
+        self._new += len(piece)
+        if self._new >= self._wait:
+            self._look()
+
+    def _look(self) -> None:
+        """Refuse a deep tree. A child that goes on is looked through each time it has doubled."""
         if self._root is None:
             return
         if _are_deep(self._root[self._shallow :]):
             _refuse_depth(self._parser, self._name)
-        self._shallow = max(0, len(self._root) - 1)
+        whole = max(0, len(self._root) - 1)
+        self._wait = self._wait + self._new if whole == self._shallow else 0
+        self._shallow, self._new = whole, 0
 
     def whole_children(self) -> ET.Element | None:
         """Take all children but the last, which may go on, and return them in a copy of the root.
@@ -605,6 +615,7 @@ class _GrowingTree:
             ScenarioError: As for `parse_xml`.
         """
         _parse(self._parser, b"", True, self._name)
+        self._look()
         return self._builder.close()
 
 
