@@ -345,8 +345,8 @@ def _carried(part: Callable[[], Any]) -> Any:
     try:
         return part()
     except Exception as error:
-        try:
-            ForkingPickler.loads(ForkingPickler.dumps(error))
+        try:  # the bytes are our own: nothing foreign is unpickled
+            ForkingPickler.loads(ForkingPickler.dumps(error))  # pyright: ignore[reportAttributeAccessIssue]
         except Exception:  # noqa: BLE001 - whatever its class does when it is made again
             raise JobError(f"{type(error).__name__}: {first_line(error)}") from None
         raise
