@@ -245,8 +245,7 @@ class _Pad(Wrapper):
             if agent in padded and is_phase(action, padded[agent]):
                 own = int(self._own[agent].n)
                 if int(action) >= own:
-                    there = f"{own} to {self._most - 1}" if own < self._most - 1 else f"{own}"
-                    return f"; {there} is padding, and 0 in the action_mask of its info"
+                    return f"; from {own} on they are padding, and 0 in the action_mask of its info"
         return ""
 
     def _told(self, infos: Infos) -> Infos:
