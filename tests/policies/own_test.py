@@ -294,7 +294,7 @@ class Bare(Lazy):
         (NoPolicy, OptionError, "no method policy()"),
         (NeedsMore, OptionError, "called as learn(env, episodes)"),
         (Wild, ActionError, "99"),
-        (Mute, OptionError, "returned a NoneType"),
+        (Mute, OptionError, "returned NoneType"),
         (Unready, OptionError, "no network yet"),
         (Bare, OptionError, "a int has no act"),
         (Lazy(), OptionError, "give its class"),
@@ -704,6 +704,7 @@ def test_names_that_a_module_imports_are_not_among_its_own() -> None:
         load_own("my_algo:Nothing", "learner")
     assert "Cycle" in error.value.allowed
     assert not {"Path", "Any", "np"} & set(error.value.allowed)
+    assert not any(name.islower() for name in error.value.allowed), "functions do not learn"
     with pytest.raises(UnknownNameError) as error:
         load_own("my_algo:Cycle.Nothing", "learner")
     assert {"learn", "policy"} <= set(error.value.allowed)

@@ -135,7 +135,7 @@ class OwnPolicy:
         chosen = act(observations, infos) if self._sees_infos else act(observations)
         if not isinstance(chosen, Mapping):
             raise OptionError(
-                f"policy {self._name!r} returned a {type(chosen).__name__}; it must return a "
+                f"policy {self._name!r} returned {type(chosen).__name__}; it must return a "
                 "dictionary from every agent to the number of a phase"
             )
         actions: dict[str, int] = {}
