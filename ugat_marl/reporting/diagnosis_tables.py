@@ -63,7 +63,7 @@ def _effects(effects: Sequence[NamedEffect], names: LightNames) -> Table:
 
 
 def _where(diagnosis: Diagnosis, names: LightNames) -> Table:
-    table = titled_table("strongest disagreements (measured minus simulated)")
+    table = titled_table("strongest disagreements on the fitted periods (measured minus simulated)")
     table.add_column("where", overflow="fold", max_width=18)
     table.add_column("what", overflow="fold", max_width=36)
     table.add_column("size", justify="right", no_wrap=True)
