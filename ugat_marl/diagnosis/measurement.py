@@ -317,9 +317,9 @@ def _twins(
 ) -> Array:
     """Count passages with twins on the next lanes, and passages alone: ``(detectors, 2)``.
 
-    Only moments count at which nothing else passes on the lanes side by side, within the time of a
-    free gap. Within less, leaders of queues that start side by side would look like twins.
-    Otherwise a quiet lane beside a busy one would show more splash than vehicles, but few twins.
+    Only moments count at which nothing else passes on the lanes side by side. Otherwise the splash
+    of a platoon would look like a lone vehicle without a twin on its other side. These moments last
+    for a free gap: within less, leaders of queues that start side by side look like twins.
     """
     counts = np.zeros((len(detectors), 2))
     number = {one.id: index for index, one in enumerate(detectors)}
