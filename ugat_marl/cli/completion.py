@@ -48,7 +48,7 @@ def completion_script(
     program: str,
     commands: Mapping[str, tuple[str, str]],
     shell: str,
-    short: Mapping[str, tuple[str, ...]] | None = None,
+    short: Mapping[str, tuple[str, ...]],
 ) -> str:
     """Return the script of a shell.
 
@@ -64,7 +64,7 @@ def completion_script(
     if shell not in SHELLS:
         raise UnknownNameError("shell", shell, SHELLS)
     verbs = {name: _verb(place, text) for name, (place, text) in commands.items()}
-    for name, words in (short or {}).items():
+    for name, words in short.items():
         verbs[name] = verbs[" ".join(word for word in words if not word.startswith("-"))]
     verbs[COMPLETION] = Verb("print the completion script of a shell", {}, (*SHELLS,), (), ())
     return _SCRIPTS[shell](program, verbs)

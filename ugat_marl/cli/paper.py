@@ -87,17 +87,16 @@ class _Paper:
                 "leave --ray or --device out"
             )
         device_of(self.config.device)  # a missing device is an error now, not in a job's log
-        for scenario in self.config.scenario:  # a wrong one is an error before any is trained in
-            load_scenario(scenario, self.config.duration_s)
-        for scenario in self.config.scenario:
+        config = self.config
+        # A wrong one is an error before any is trained in.
+        scenarios = [load_scenario(name, config.duration_s) for name in config.scenario]
+        for scenario, loaded in zip(config.scenario, scenarios, strict=True):
             folder = self.out / file_stem(scenario) / self.table
             require_writable(folder / "table.md")
             with workers_of(self.jobs, self.ray, "--jobs") as workers:
                 comparison = compare(
-                    self.table, scenario, self.config, self.runs, workers, Bars(console)
+                    self.table, scenario, config, self.runs, workers, Bars(console)
                 )
-            config = self.config
-            loaded = load_scenario(scenario, config.duration_s)
             judging = Judging.of(loaded, config.evaluation_seeds, config.duration_s)
             _write(comparison, judging, self.title or self.table, folder)
             console.print(terminal_tables(comparison, DIRECT))

@@ -295,25 +295,24 @@ def read_quietly(
             `PanicException` and ``OSError``.
     """
     with _ONE_AT_A_TIME, _without_standard_error():
-        _refuse_repeated_rows(source)
-        for name, kind in pl.scan_parquet(_again(source)).collect_schema().items():
-            if not nested and kind.is_nested():
-                raise pl.exceptions.SchemaError(f"column {name!r} holds lists ({kind})")
+        _refuse_what_fills_memory(source, nested=nested)
         frame = pl.read_parquet(_again(source))
         return frame, pl.read_parquet_metadata(_again(source))
 
 
-def _refuse_repeated_rows(source: Path | io.BytesIO) -> None:
-    """Refuse a small file of very many equal rows, which would fill the memory.
+def _refuse_what_fills_memory(source: Path | io.BytesIO, *, nested: bool) -> None:
+    """Refuse a small file of very many equal rows, and columns of lists if `nested` is False.
 
     Only the footer is read. Equal rows take next to no space. So do those of a quiet street, but
     they are not that many.
     """
     size = source.stat().st_size if isinstance(source, Path) else len(source.getbuffer())
     table = pl.scan_parquet(_again(source))
-    cells = sum(
-        _NESTED_CELLS if kind.is_nested() else 1 for kind in table.collect_schema().dtypes()
-    )
+    schema = table.collect_schema()
+    for name, kind in schema.items():
+        if kind.is_nested() and not nested:
+            raise pl.exceptions.SchemaError(f"column {name!r} holds lists ({kind})")
+    cells = sum(_NESTED_CELLS if kind.is_nested() else 1 for kind in schema.dtypes())
     rows = table.select(pl.len()).collect().item()
     if rows > size and rows * cells > _FEW_CELLS:
         raise pl.exceptions.ComputeError(f"{rows} rows in {size} bytes")

@@ -14,9 +14,10 @@ those of the scenario as it is. No hypothesis is simulated.
 from __future__ import annotations
 
 import math
+from collections import Counter
 from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass, fields
-from itertools import product
+from itertools import chain, product
 from typing import Literal, Self
 
 import numpy as np
@@ -322,11 +323,7 @@ def _twins(
     for a free gap: within less, leaders of queues that start side by side look like twins.
     """
     counts = np.zeros((len(detectors), 2))
-    number = {one.id: index for index, one in enumerate(detectors)}
-    beside = {
-        number[name]: frozenset(number[other] for other in others)
-        for name, others in next_detectors(detectors).items()
-    }
+    beside = _beside(detectors)
     for members in _side_by_side(beside):
         parts = [tracks[detectors[index].id] for index in members]
         on, over = (np.concatenate(x) for x in ([t.on for t in parts], [t.over for t in parts]))
@@ -349,6 +346,15 @@ def _twins(
             if len(passed) == end - start and beside_one:
                 counts[min(passed), 0] += 1.0
     return counts
+
+
+def _beside(detectors: Sequence[Detector]) -> dict[int, frozenset[int]]:
+    """Return the indices of the next detectors of each one, as `next_detectors` names them."""
+    number = {one.id: index for index, one in enumerate(detectors)}
+    return {
+        number[name]: frozenset(number[other] for other in others)
+        for name, others in next_detectors(detectors).items()
+    }
 
 
 def _side_by_side(beside: Mapping[int, frozenset[int]]) -> list[list[int]]:
@@ -915,11 +921,8 @@ class Measurement:
     def _splashes(self) -> list[DetectorError]:
         """Return the places of detectors that report vehicles of the next lane."""
         limit = self._thresholds
-        reported = [0] * len(self._detectors)  # by how many detectors beside it
-        number = {one.id: index for index, one in enumerate(self._detectors)}
-        for others in next_detectors(self._detectors).values():
-            for other in others:
-                reported[number[other]] += 1
+        # By how many detectors beside it the vehicles of each one are reported.
+        reported = Counter(chain.from_iterable(_beside(self._detectors).values()))
         equations: dict[Group, list[Equation]] = {}
         for group, members in self._groups.items():
             beside = np.array([reported[index] for index in members])

@@ -101,8 +101,8 @@ def load_own(name: str, what: str) -> Any:
                 for key, value in getattr(found, "__dict__", {}).items()
                 if callable(value) and getattr(value, "__module__", own) == own
             ]
-            learners = [name for name in names if hasattr(getattr(found, name), "learn")]
-            names = (what == "learner" and learners) or names
+            if what == "learner":
+                names = [key for key in names if hasattr(getattr(found, key), "learn")] or names
             raise UnknownNameError(f"{what} in {module_name}", part, names)
         found = getattr(found, part)
     return found

@@ -69,6 +69,11 @@ class Episode:
         """The actions of all steps."""
         return [moment.actions for moment in self.moments if moment.actions is not None]
 
+    def agrees(self, other: Episode) -> bool:
+        """Return True if all moments that both have are equal."""
+        pairs = zip(self.moments, other.moments, strict=False)
+        return not any(different(a.parts, b.parts) for a, b in pairs)
+
 
 class EnvironmentCase:
     """Environment that is checked. Work that several checks need is done once.
@@ -118,10 +123,8 @@ class EnvironmentCase:
     @functools.cached_property
     def is_repeatable(self) -> bool:
         """True if the episode is the same when it is played again."""
-        moments = self.episode.moments
-        again = self.play(self.make(), self.seed)
-        pairs = zip(moments, again.moments, strict=False)
-        return not any(different(a.parts, b.parts) for a, b in pairs)
+        episode = self.episode
+        return episode.agrees(self.play(self.make(), self.seed))
 
     def need_episode(self) -> None:
         """Skip a check if no whole episode can be run.
