@@ -44,6 +44,16 @@ def write_checkpoint(path: Path, kind: str, content: Mapping[str, Any]) -> None:
             raise
 
 
+def require_checkpoint(path: Path) -> None:
+    """Refuse a checkpoint that is not there, before its content is blamed.
+
+    Raises:
+        CheckpointError: There is no such file.
+    """
+    if not path.is_file():
+        raise CheckpointError(f"{path}: no such checkpoint file")
+
+
 def read_checkpoint(path: Path, *kinds: str) -> dict[str, Any]:
     """Read a file of `write_checkpoint`; no code from the file is executed.
 
@@ -55,8 +65,7 @@ def read_checkpoint(path: Path, *kinds: str) -> dict[str, Any]:
         CheckpointError: The file is missing, cut short, of another kind, or holds a number that is
             not finite.
     """
-    if not path.is_file():
-        raise CheckpointError(f"{path}: no such checkpoint file")
+    require_checkpoint(path)
     try:
         _require_sums(path)
         with warnings.catch_warnings():  # torch warns of its own old kinds of tensors

@@ -26,6 +26,7 @@ from typing import Any, get_type_hints
 
 from pettingzoo.utils import BaseParallelWrapper
 
+from ugat_marl.data import require_checkpoint
 from ugat_marl.envs import (
     Actions,
     AnyParallelEnv,
@@ -441,8 +442,7 @@ def check_own_learner(
 
 def _counters(path: Path) -> dict[str, Any]:
     """Return the counters in a file of `OwnLearner.save`."""
-    if not path.is_file():
-        raise CheckpointError(f"{path}: no such checkpoint file")
+    require_checkpoint(path)
     try:
         with zipfile.ZipFile(path) as packed:
             require_stored(packed)
