@@ -31,7 +31,7 @@ from pathlib import Path
 from typing import Any, BinaryIO, NamedTuple
 from xml.parsers import expat
 
-from ugat_marl.errors import OptionError, OutputError, ScenarioError, UgatMarlError
+from ugat_marl.errors import CheckpointError, OptionError, OutputError, ScenarioError, UgatMarlError
 from ugat_marl.progress import Reporter, Silent, usual, watched
 
 _PIECE = 1 << 20
@@ -299,6 +299,16 @@ def _bounded(pieces: Iterator[bytes], path: Path, packed: int) -> Iterator[bytes
                 "network or demand does; unpack it yourself if you trust it"
             )
         yield piece
+
+
+def require_checkpoint(path: Path) -> None:
+    """Refuse a checkpoint that is not there, before its content is blamed.
+
+    Raises:
+        CheckpointError: There is no such file.
+    """
+    if not path.is_file():
+        raise CheckpointError(f"{path}: no such checkpoint file")
 
 
 def require_stored(archive: zipfile.ZipFile) -> None:

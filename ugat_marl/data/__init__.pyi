@@ -1,6 +1,5 @@
 from .checkpoints import checked_tensors as checked_tensors
 from .checkpoints import read_checkpoint as read_checkpoint
-from .checkpoints import require_checkpoint as require_checkpoint
 from .checkpoints import write_checkpoint as write_checkpoint
 from .layouts import AgentLayout as AgentLayout
 from .level_of_service import level_of_service as level_of_service

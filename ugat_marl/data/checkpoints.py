@@ -12,7 +12,7 @@ from typing import Any
 import torch
 
 from ugat_marl.errors import CheckpointError, first_line
-from ugat_marl.files import replacing, require_stored
+from ugat_marl.files import replacing, require_checkpoint, require_stored
 
 _UNREADABLE = (
     OSError, EOFError, RuntimeError, ValueError, LookupError, TypeError, AttributeError,
@@ -42,16 +42,6 @@ def write_checkpoint(path: Path, kind: str, content: Mapping[str, Any]) -> None:
             if isinstance(error.__context__, OSError):
                 raise error.__context__ from None
             raise
-
-
-def require_checkpoint(path: Path) -> None:
-    """Refuse a checkpoint that is not there, before its content is blamed.
-
-    Raises:
-        CheckpointError: There is no such file.
-    """
-    if not path.is_file():
-        raise CheckpointError(f"{path}: no such checkpoint file")
 
 
 def read_checkpoint(path: Path, *kinds: str) -> dict[str, Any]:

@@ -26,7 +26,6 @@ from typing import Any, get_type_hints
 
 from pettingzoo.utils import BaseParallelWrapper
 
-from ugat_marl.data import require_checkpoint
 from ugat_marl.envs import (
     Actions,
     AnyParallelEnv,
@@ -37,7 +36,13 @@ from ugat_marl.envs import (
     checked_phases,
 )
 from ugat_marl.errors import CheckpointError, OptionError, UgatMarlError
-from ugat_marl.files import MALFORMED, parse_json, require_stored, write_whole
+from ugat_marl.files import (
+    MALFORMED,
+    parse_json,
+    require_checkpoint,
+    require_stored,
+    write_whole,
+)
 from ugat_marl.policies.learner_settings import parsed_settings
 from ugat_marl.policies.own_names import load_own
 from ugat_marl.policies.protocols import EpisodeCallback, Policy
