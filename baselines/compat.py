@@ -83,6 +83,10 @@ class Compat:
     only: str = ""
     need_all: bool = False
 
+    def __post_init__(self) -> None:
+        for name in self.learners:
+            learner_library(name)  # an unknown name is an error before anything trains
+
     def run(self) -> int:
         """Run the command; return 1 if something failed."""
         if self.only:

@@ -21,11 +21,12 @@ import torch
 import tyro
 from torch import Tensor, nn
 
+from ugat_marl.cli import baseline_command
 from ugat_marl.data import read_checkpoint, write_checkpoint
 from ugat_marl.envs import AgentSet
 from ugat_marl.envs import AnyParallelEnv as Env
 from ugat_marl.errors import CheckpointError, EpisodeError, OptionError
-from ugat_marl.experiments import BaselineArgs, BaselineResult, baseline_command, train_baseline
+from ugat_marl.experiments import BaselineArgs, BaselineResult, train_baseline
 from ugat_marl.policies import (
     BatchedMLP,
     InputScale,

@@ -54,7 +54,8 @@ class Results:
 
     def run(self) -> int:
         """Train, judge and write; return 1 if a training failed."""
-        console, failures = Console(), dict[str, str]()
+        console = Console(markup=False, emoji=False, highlight=False)
+        failures: dict[str, str] = {}
         scenarios = {name: load_scenario(name) for name in self.scenarios}
         for name in scenarios:  # a folder that is not writable is an error before the trainings
             require_writable(self.out / f"{file_stem(name)}.md")
@@ -67,7 +68,7 @@ class Results:
                 write_csv(page.with_suffix(".csv"), curves_as_csv(found.curves))
                 console.print(f"page: {page}, each evaluation: {page.with_suffix('.csv')}")
         for name, reason in failures.items():
-            console.print(f"{name}: {reason}", markup=False, soft_wrap=True)
+            console.print(f"{name}: {reason}", soft_wrap=True)
         return int(bool(failures))
 
 

@@ -29,9 +29,10 @@ from ray.rllib.env.wrappers.pettingzoo_env import ParallelPettingZooEnv
 from ray.rllib.examples.rl_modules.classes.action_masking_rlm import ActionMaskingTorchRLModule
 from torch import Tensor, nn
 
+from ugat_marl.cli import baseline_command
 from ugat_marl.envs import AnyParallelEnv, agent_groups, agent_indicator, masked_observation
 from ugat_marl.errors import UgatMarlError
-from ugat_marl.experiments import BaselineArgs, BaselineResult, baseline_command, train_baseline
+from ugat_marl.experiments import BaselineArgs, BaselineResult, train_baseline
 from ugat_marl.policies import (
     EpisodeCallback,
     LibraryLearner,

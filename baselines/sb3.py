@@ -32,10 +32,11 @@ from stable_baselines3.dqn.policies import DQNPolicy as LibraryPolicy
 from stable_baselines3.dqn.policies import QNetwork
 from torch import Tensor, nn
 
+from ugat_marl.cli import baseline_command
 from ugat_marl.envs import AnyParallelEnv, agent_indicator, pad_spaces
 from ugat_marl.envs.adapters.sb3 import AgentsVecEnv
 from ugat_marl.errors import EpisodeError, UnknownNameError
-from ugat_marl.experiments import BaselineArgs, BaselineResult, baseline_command, train_baseline
+from ugat_marl.experiments import BaselineArgs, BaselineResult, train_baseline
 from ugat_marl.policies import (
     EpisodeCallback,
     LibraryLearner,

@@ -31,9 +31,10 @@ from skrl.multi_agents.torch.mappo import MAPPO, MAPPO_CFG
 from skrl.trainers.torch import SequentialTrainer
 from torch import Tensor, nn
 
+from ugat_marl.cli import baseline_command
 from ugat_marl.envs import AnyParallelEnv, agent_groups, appended_mask
 from ugat_marl.errors import OptionError
-from ugat_marl.experiments import BaselineArgs, BaselineResult, baseline_command, train_baseline
+from ugat_marl.experiments import BaselineArgs, BaselineResult, train_baseline
 from ugat_marl.policies import (
     EpisodeCallback,
     LibraryLearner,

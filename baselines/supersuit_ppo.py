@@ -27,8 +27,9 @@ import tyro
 from supersuit.vector import MarkovVectorEnv
 from supersuit.vector.sb3_vector_wrapper import SB3VecEnvWrapper
 
+from ugat_marl.cli import baseline_command
 from ugat_marl.envs import AnyParallelEnv, agent_indicator, appended_mask, pad_spaces
-from ugat_marl.experiments import BaselineArgs, BaselineResult, baseline_command, train_baseline
+from ugat_marl.experiments import BaselineArgs, BaselineResult, train_baseline
 from ugat_marl.policies import EpisodeCallback, load_baseline
 
 _sb3: Any = load_baseline("sb3-ppo")

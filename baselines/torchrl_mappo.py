@@ -25,9 +25,10 @@ from torchrl.envs.utils import ExplorationType, set_exploration_type
 from torchrl.modules import MaskedCategorical, ProbabilisticActor
 from torchrl.objectives import ClipPPOLoss, ValueEstimators
 
+from ugat_marl.cli import baseline_command
 from ugat_marl.envs import AnyParallelEnv, agent_indicator, pad_spaces
 from ugat_marl.errors import OptionError
-from ugat_marl.experiments import BaselineArgs, BaselineResult, baseline_command, train_baseline
+from ugat_marl.experiments import BaselineArgs, BaselineResult, train_baseline
 from ugat_marl.policies import (
     EpisodeCallback,
     LibraryLearner,

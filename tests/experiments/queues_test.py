@@ -180,8 +180,8 @@ def test_a_damaged_file_is_one_line(content: bytes, tmp_path: Path) -> None:
     pl.DataFrame({"a": [1]}).write_parquet(tmp_path / "q.parquet")
     with pytest.raises(CheckpointError, match="not the queues of a run"):
         read_queues(tmp_path / "q.parquet")
-    for minute, queue in ((0, math.nan), (10**12, 1.0), (-1, 1.0)):
-        row = ("policy", "sim", 0, minute, "A", queue, 1)
+    for minute, queue, looks in ((0, math.nan, 1), (10**12, 1.0, 1), (-1, 1.0, 1), (0, 0.0, 0)):
+        row = ("policy", "sim", 0, minute, "A", queue, looks)
         pl.DataFrame([row], schema=_SCHEMA, orient="row").write_parquet(tmp_path / "q.parquet")
-        with pytest.raises(CheckpointError, match="a queue or a minute is impossible"):
+        with pytest.raises(CheckpointError, match="a number of looks is impossible"):
             read_queues(tmp_path / "q.parquet")

@@ -42,7 +42,7 @@ def table(direct_s: float, rules_s: dict[str, float]) -> Comparison:
     rows = [
         Trial(setting, target, domain, seed, 1, replace(BLANK, att_s=att_s, backlog=12.0))
         for setting, target, seed, att_s in [
-            *(("direct transfer", target, 0, direct_s) for target in ("V1", "V4")),
+            *(("direct transfer", target, 0, direct_s) for target in {"V1": 0, "V4": 0} | rules_s),
             *(("best rule, tuned there", target, None, rules_s[target]) for target in rules_s),
         ]
         for domain in ("sim", target)
@@ -90,6 +90,14 @@ def test_a_table_is_judged_by_its_fastest_rule() -> None:
         assert "Not trained yet: in sim direct transfer needs 84 s, the best rule, tuned" in text
         assert "ehicles due that never entered" in text
     assert slow.rows()[0]["backlog"] == 12.0
+
+
+def test_a_table_of_many_domains_loses_no_number() -> None:
+    text = printed(
+        terminal_tables(table(84.0, {f"V{k}": 100.0 + k for k in range(9)}), "direct transfer")
+    )
+    assert "…" not in text
+    assert all(f" V{k}" in text for k in range(9))
 
 
 def test_a_table_without_rules_says_so() -> None:

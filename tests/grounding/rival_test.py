@@ -1,4 +1,4 @@
-"""The rival of a fitted street: its greens are as late as the street's, and it survives a stop."""
+"""Rivals of a fitted street: greens are as late as the street's, and a stop changes nothing."""
 
 from __future__ import annotations
 
@@ -18,8 +18,15 @@ from ugat_marl.effects import load_scenario
 from ugat_marl.envs import parallel_env
 from ugat_marl.errors import UnknownNameError
 from ugat_marl.experiments import transfer
-from ugat_marl.grounding import DIRECT_LEARNER, Simulation, StreetConfig, StreetTraining
-from ugat_marl.grounding.rival import ROLL_OUTS, late_world, matched_delays
+from ugat_marl.grounding import (
+    DIRECT_LEARNER,
+    JUDGED,
+    RIVALS,
+    Simulation,
+    StreetConfig,
+    StreetTraining,
+)
+from ugat_marl.grounding.rival import ROLL_OUTS, Rival, late_world, matched_delays
 from ugat_marl.grounding.street import StreetWorld
 from ugat_marl.policies import DQNConfig, EpsilonGreedy, make_rule, observer_of, roll_out
 
@@ -31,7 +38,7 @@ LATE_S = 2.5
 
 
 def rivals_win(patch: pytest.MonkeyPatch) -> None:
-    """Let rewards ask for late greens, and the rival win each comparison without rules."""
+    """Let rewards ask for late greens, and the last rival win each comparison without rules."""
     compare = Simulation.compare
 
     def matched(real: TransitionLog, *_: object) -> dict[str, float]:
@@ -41,7 +48,7 @@ def rivals_win(patch: pytest.MonkeyPatch) -> None:
         self: Simulation, worlds: Any, policies: Any, seeds: Any, on_done: Any
     ) -> NDArray[np.float64]:
         times_s = compare(self, worlds, policies, seeds, on_done)
-        times_s[-1] = times_s.min() - 1.0  # the policies end with the rival's
+        times_s[-1] = times_s.min() - 1.0  # the policies end with those of rivals
         return times_s
 
     patch.setattr("ugat_marl.grounding.street_training.matched_delays", matched)
@@ -76,9 +83,12 @@ def test_each_light_is_late_by_its_own_delay() -> None:
 
 
 @pytest.mark.slow
-def test_the_rival_is_direct_transfer_trained_further_with_late_greens(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+@pytest.mark.parametrize(("rival", "late_s"), [("matched", LATE_S), ("several", 5.0)])
+def test_a_rival_is_direct_transfer_trained_further_with_late_greens(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, rival: Any, late_s: float
 ) -> None:
+    street = replace(QUICK, rival=rival)
+    config = replace(CONFIG, ugat=replace(CONFIG.ugat, street=street))
     play_nothing(monkeypatch)
     rivals_win(monkeypatch)
     trainings: list[StreetTraining] = []
@@ -89,11 +99,11 @@ def test_the_rival_is_direct_transfer_trained_further_with_late_greens(
         return train(self, state)
 
     monkeypatch.setattr(StreetTraining, "train", seen)
-    transfer(CONFIG, tmp_path, workers=1)
+    transfer(config, tmp_path, workers=1)
     (direct,) = tmp_path.glob(f"trainings/*/{DIRECT_LEARNER}")
     with contextlib.closing(
         parallel_env(
-            load_scenario("single-v1"), f"late_green=*,{LATE_S}", duration_s=CONFIG.duration_s
+            load_scenario("single-v1"), f"late_green=*,{late_s}", duration_s=CONFIG.duration_s
         )
     ) as env:
         learner = trainings[0].make(env, CONFIG.seed)
@@ -102,7 +112,10 @@ def test_the_rival_is_direct_transfer_trained_further_with_late_greens(
         policy: Any = learner.policy()
     assert np.array_equal(weights(tmp_path, "fitted-street"), policy.parameters)
     logged = numbers(tmp_path)
-    assert logged[1, "judged/of_the_rival"] < logged[1, "judged/after"]
+    best = "of_the_rival" if rival == "matched" else "of_the_rival_5_s_late"
+    times_s = {name: value for (_, name), value in logged.items() if name.startswith("judged/")}
+    assert min(times_s, key=lambda name: times_s[name]) == f"judged/{best}"
+    assert len(times_s) == 2 + len(street.late_s)  # direct transfer and the policy of the street
     assert logged[1, "rival/late_s/signal_0"] == LATE_S
 
 
@@ -112,12 +125,14 @@ def test_an_interrupted_rival_ends_as_an_unbroken_one(
 ) -> None:
     play_nothing(monkeypatch)
     rivals_win(monkeypatch)
-    config = replace(CONFIG, ugat=replace(CONFIG.ugat, iterations=2))
+    street = replace(QUICK, rival="several")
+    config = replace(CONFIG, ugat=replace(CONFIG.ugat, iterations=2, street=street))
     transfer(config, tmp_path / "whole", workers=1)
-    for task in ("late greens, iteration 1", "comparing, iteration 2"):
+    for task in ("late greens of 3 s, iteration 1", "comparing, iteration 2"):
         with pytest.raises(KeyboardInterrupt):
             transfer(config, tmp_path / "broken", resume=True, reporter=KillAt(task), workers=1)
-    assert (checkpoint_of(tmp_path / "broken") / "rival.pt").exists()
+    files = {path.name for path in checkpoint_of(tmp_path / "broken").glob("rival*.pt")}
+    assert files == {"rival.pt", "rival-3-s-late.pt", "rival-5-s-late.pt"}
     transfer(config, tmp_path / "broken", resume=True, workers=1)
     one, other = (weights(tmp_path / run, "fitted-street") for run in ("whole", "broken"))
     assert np.array_equal(one, other)
@@ -136,13 +151,25 @@ def test_late_commands_leave_no_rival(tmp_path: Path, monkeypatch: pytest.Monkey
 
 
 @pytest.mark.parametrize(
-    ("street", "has"),
-    [(QUICK, True), (replace(QUICK, rival="none"), False), (replace(QUICK, judged=0), False)],
+    ("street", "late_s"),
+    [
+        (QUICK, (None,)),
+        (replace(QUICK, rival="several"), (None, 3.0, 5.0)),
+        (replace(QUICK, rival="none"), ()),
+        (replace(QUICK, judged=0), ()),
+    ],
 )
-def test_only_a_street_in_which_policies_are_compared_has_a_rival(
-    street: StreetConfig, has: bool
+def test_only_a_street_in_which_policies_are_compared_has_rivals(
+    street: StreetConfig, late_s: tuple[float | None, ...]
 ) -> None:
-    assert street.has_rival == has
+    assert street.late_s == late_s
+
+
+def test_every_rival_has_words_for_the_comparison() -> None:
+    learner: Any = None
+    every = {late_s for several in RIVALS.values() for late_s in several}
+    names = {Rival(learner, Path(), late_s).judged for late_s in every}
+    assert names == {name for name in JUDGED if "rival" in name}
 
 
 def test_an_unknown_rival_is_refused() -> None:

@@ -488,3 +488,11 @@ def test_patterns_are_told_in_sentences(network: Network) -> None:
     assert "Patterns in what is left" in page
     assert "the through lanes of S_C discharge 14 % less from vehicle 3 of the queue on" in page
     assert "Patterns in what is left" not in diagnosis_page(diagnosis_of("no_discrepancy"), network)
+
+
+@pytest.mark.parametrize("number", [float("nan"), float("inf")])
+def test_numbers_that_are_none_are_no_diagnosis(number: float) -> None:
+    content = content_of()
+    content["effects"][0]["parameters"]["seconds"]["high"] = number
+    with pytest.raises(ValueError, match="JSON compliant"):
+        Diagnosis.from_json(content)

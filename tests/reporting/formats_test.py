@@ -63,7 +63,13 @@ def test_changes_keep_their_sign() -> None:
 
 @pytest.mark.parametrize(
     ("delay_s", "text"),
-    [(10.0, "10.0 A"), (10.04, "10.04 B"), (55.04, "55.04 E"), (38.2, "38.2 D")],
+    [
+        (10.0, "10.0 A"),
+        (10.04, "10.04 B"),
+        (55.04, "55.04 E"),
+        (38.2, "38.2 D"),
+        (10.004, "10.004 B"),
+    ],
 )
 def test_a_delay_is_shown_on_the_side_of_its_level(delay_s: float, text: str) -> None:
     assert delay_text(delay_s) == text

@@ -27,7 +27,7 @@ from ugat_marl.cli.report import again, train_options
 from ugat_marl.cli.train import Train
 from ugat_marl.data import Metrics, Scores, write_settings
 from ugat_marl.effects import load_scenario
-from ugat_marl.errors import OptionError
+from ugat_marl.errors import CheckpointError, OptionError
 from ugat_marl.experiments import (
     Evaluation,
     Interval,
@@ -49,6 +49,7 @@ from ugat_marl.reporting.figures import NamedFigure, shortened_apart
 from ugat_marl.reporting.formats import command_block, commands_in
 from ugat_marl.reporting.network_maps import minutes_picture, node_map
 from ugat_marl.reporting.page import Page as MadePage
+from ugat_marl.reporting.run_records import read_rows
 from ugat_marl.scenarios import Network
 
 RESULTS = Path(__file__).parents[2] / "results"
@@ -635,6 +636,9 @@ def test_labels_that_would_be_cut_to_the_same_are_cut_in_the_middle() -> None:
         "fitted street: short",
     ]  # fmt: skip
     assert shortened_apart(["a", "a"], 34) == ["a", "a"]
+    alike = [f"{'x' * 30}{middle}{'y' * 20}" for middle in "aba"]
+    first, second, third = shortened_apart(alike, 26)
+    assert first == third != second
 
 
 def test_the_rim_of_a_radar_is_the_best_value() -> None:
@@ -829,3 +833,21 @@ def test_a_run_leaves_all_that_its_page_wants(
     assert record.queues is not None and set(record.queues["domain"]) == {"sim", "V4"}
     assert "run-map-queue" in [picture.name for picture in made.pictures]
     assert tyro.cli(Train, args=["grid2x2-v1", *train_options(record.settings)]).config == config
+
+
+def test_a_table_that_a_spreadsheet_saved_is_read(tmp_path: Path) -> None:
+    path = tmp_path / "table.csv"
+    path.write_text("\ufeffsetting,domain,att_s\na,V4,100\nb,V4,90\n", encoding="utf-8")
+    assert [row["att_s"] for row in read_rows(path)] == [100.0, 90.0]
+    path.write_text("setting,domain,att_s\na,V4,100\na,V4,300\n", encoding="utf-8")
+    with pytest.raises(ValueError, match="setting 'a' in V4 is there 2 times"):
+        read_rows(path)
+
+
+def test_an_episode_that_is_there_twice_is_a_damaged_table(run: Path, tmp_path: Path) -> None:
+    content = json.loads((run / "table.json").read_text())
+    content = {name: value for name, value in content.items() if "hash" not in name}
+    content["episodes"].append(content["episodes"][0])
+    (tmp_path / "table.json").write_text(json.dumps(content))
+    with pytest.raises(CheckpointError, match="an episode is there twice"):
+        Evaluation.read(tmp_path / "table.json")

@@ -61,6 +61,16 @@ def test_the_transfer_table_says_it_all_in_80_columns(found: Evaluation) -> None
     assert "medians in sim" not in text
 
 
+def test_names_and_numbers_are_whole_in_narrow_columns(found: Evaluation) -> None:
+    names = [f"further in headway=1.4,startup_delay={k}" for k in (2, 3)]
+    results = [replace(r, policy=name) for name in names for r in found.results[:6]]
+    domains = [replace(r, domain=f"{r.domain}+{k}") for k in range(5) for r in results]
+    for shown in (results, domains):
+        text = printed(transfer_table(Evaluation("s", "0", tuple(shown), {})))
+        assert "…" not in text
+        assert max(map(len, text.splitlines())) <= 80
+
+
 def test_six_policies_have_room(found: Evaluation) -> None:
     """The table says where the corrected policy was trained."""
     more = ("more plain sim", "corrected sim", "rule max-pressure:20")
@@ -138,6 +148,10 @@ def test_levels_of_service_of_policies_and_approaches(found: Evaluation) -> None
     assert [row[1] for row in rows] == ["eastbound", "northbound"]
     assert "(signal_" in printed(tables)  # the agent stands below the light
     assert service_tables(found, network) == []  # nothing was measured
+    many = tuple(replace(r, domain=f"d{k}") for k in range(20) for r in results[:1])
+    (tables,) = service_tables(replace(found, results=many), network)
+    text = printed(tables)
+    assert all(f" d{k}" in text for k in range(20)) and text.count("50.0 D") == 20
     grid = service_grid(replace(found, results=results), ["phase (the paper's UGAT)"], network)
     assert grid is not None
     assert grid.rows[0] == ["B1 (signal_2)", "eastbound", "A1_B1", "100 F"]

@@ -7,7 +7,10 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
-from ugat_marl.reporting.run_groups import job_labels, seeds_of_one
+from ugat_marl.data import Scores
+from ugat_marl.experiments import RULE, Evaluation
+from ugat_marl.experiments.scores import Result, best_rule_note
+from ugat_marl.reporting.run_groups import groups, job_labels, seeds_of_one
 from ugat_marl.reporting.run_records import RunRecord
 
 
@@ -78,3 +81,58 @@ def test_runs_in_other_worlds_are_not_seeds_of_one() -> None:
     numpy = a_run(5, versions={"libsumo": "1.28.0", "numpy": "2.1"})
     found = seeds_of_one([first, second, longer, newer, other, numpy])
     assert found == [[first, second, numpy], [longer], [newer], [other]]
+
+
+BASE = Scores(0.0, 90.0, 500.0, -3.0, 3.0, 0.4, 50.0, 520.0, 515.0, 0.0)
+
+
+def judged(seed: int, travel_time_s: float, written: float, **settings: Any) -> RunRecord:
+    """A run with direct transfer, corrected simulation and a best rule."""
+    policies = ("direct transfer", "corrected sim", "rule max-pressure:10")
+    results = [
+        Result(policy, domain, 5, replace(BASE, att_s=travel_time_s))
+        for policy in policies
+        for domain in ("sim", "V4")
+    ]
+    notes = {best_rule_note("V4"): "max-pressure:10"}
+    evaluation = Evaluation("single-v1", "", tuple(results), notes)
+    record = a_run(seed, name=f"s{seed}-{written:g}", evaluation=evaluation, written=written)
+    return replace(record, settings={**record.settings, **settings})
+
+
+def test_of_two_trainings_with_one_seed_the_newest_is_shown() -> None:
+    old, new, other = judged(0, 150.0, 1.0), judged(0, 190.0, 2.0), judged(1, 200.0, 0.0)
+    assert seeds_of_one([old, new, other]) == [[new, other]]
+    (group,) = groups([old, new, other])
+    assert group.left_out == ("s0-1",)
+    assert {row["training_seeds"] for row in group.rows if row["setting"] != RULE} == {2}
+    assert {row["att_s"] for row in group.rows} == {195.0}
+
+
+def test_rows_that_depend_on_other_settings_are_apart() -> None:
+    records = [
+        judged(0, 100.0, 1.0, corrected="headway=1.4"),
+        judged(1, 200.0, 1.0, corrected="acceleration=0.5", rule_budget=24),
+    ]
+    (group,) = groups(records)
+    assert {row["setting"] for row in group.rows} == {
+        "direct transfer",
+        "corrected sim (corrected headway=1.4)",
+        "corrected sim (corrected acceleration=0.5)",
+        f"{RULE} (rule_budget as usual)",
+        f"{RULE} (rule_budget 24)",
+    }
+    times_s = {row["setting"]: row["att_s"] for row in group.rows if row["domain"] == "V4"}
+    assert times_s["direct transfer"] == 150.0
+    assert times_s["corrected sim (corrected headway=1.4)"] == 100.0
+
+
+def test_a_seed_that_is_no_number_is_no_seed() -> None:
+    times_s = {"\u00b2": 100.0, "--5": 200.0}
+    records = [
+        replace(one, settings={**one.settings, "seed": seed})
+        for seed, time_s in times_s.items()
+        for one in [judged(0, time_s, 1.0)]
+    ]
+    (group,) = groups(records)
+    assert {row["att_s"] for row in group.rows} == {150.0}

@@ -15,6 +15,7 @@ import textwrap
 import threading
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
+from functools import partial
 from typing import Any
 
 from rich.console import Console
@@ -106,12 +107,12 @@ def run(line: CommandLine, arguments: Sequence[str]) -> int:
         The exit code: 0, 1 (a check or target failed), 2 (wrong call or input; one line names the
         fault), 130 (interrupted), 143 (terminated).
     """
-    console = Console(highlight=False, markup=False)
+    # a path as runs/a:x:b stays one
+    plain = partial(Console, highlight=False, markup=False, emoji=False)
+    console = plain()
     arguments, level = without_loudness(arguments)
     arguments, seconds = without_deadline(arguments)
-    progress = (
-        console if console.is_terminal else Console(stderr=True, highlight=False, markup=False)
-    )
+    progress = console if console.is_terminal else plain(stderr=True)
 
     def perform() -> int:
         with loudness(level), showing(Bars(progress)), _deadline(seconds):

@@ -763,9 +763,10 @@ class Diagnosis:
         """Make the record from the result of `to_json`.
 
         Raises:
-            ValueError: A key is missing or unknown, or a value has another type.
+            ValueError: A key is missing or unknown, a value has another type, or a number is not
+                finite.
         """
-        return _adapter(cls).validate_json(json.dumps(content))
+        return _adapter(cls).validate_json(json.dumps(content, allow_nan=False))
 
     def write(self, directory: Path) -> None:
         """Write the file into a directory atomically."""

@@ -1,6 +1,5 @@
 from .baseline import BaselineArgs as BaselineArgs
 from .baseline import BaselineResult as BaselineResult
-from .baseline import baseline_command as baseline_command
 from .baseline import train_baseline as train_baseline
 from .comparison import LEAST_SHARE_ARRIVED as LEAST_SHARE_ARRIVED
 from .comparison import Comparison as Comparison
@@ -58,6 +57,7 @@ from .scores import best_rule_note as best_rule_note
 from .scores import result_of as result_of
 from .scores import rule_policy as rule_policy
 from .settings import CONTROL as CONTROL
+from .settings import CORRECTED as CORRECTED
 from .settings import DIRECT as DIRECT
 from .settings import GROUNDED_NAME as GROUNDED_NAME
 from .settings import ORACLE as ORACLE

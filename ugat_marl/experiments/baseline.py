@@ -1,4 +1,4 @@
-"""Command line of a baseline's file: train its learner on one scenario and judge it.
+"""Training of a baseline's file: its learner on one scenario, and its evaluation.
 
 This training is not a job of the driver. A job names its learner in the catalogue, so that another
 process can make it from the job's description. A file of baselines/ makes its learner by a function
@@ -11,18 +11,14 @@ from __future__ import annotations
 
 import contextlib
 import json
-import sys
 from collections.abc import Callable, Mapping
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any, NamedTuple
 
-import numpy as np
-import tyro
-
 from ugat_marl.effects import load_scenario
 from ugat_marl.envs import AnyParallelEnv, parallel_env
-from ugat_marl.errors import UgatMarlError, require_least
+from ugat_marl.errors import require_least
 from ugat_marl.experiments.evaluation import FixedPolicy, evaluation_of
 from ugat_marl.experiments.jobs import evaluation_seeds
 from ugat_marl.experiments.training import train_through
@@ -115,19 +111,3 @@ def train_baseline(
         content = {"args": asdict(args), "returns": returns, "att_s": att_s}
         write_whole(args.out / "result.json", json.dumps(content, default=str) + "\n")
     return result
-
-
-def baseline_command(
-    kind: type[BaselineArgs], train: Callable[[Any, EpisodeCallback | None], BaselineResult]
-) -> None:
-    """Read the command line into `kind`, train and print the results; an error is one line."""
-    name = Path(sys.argv[0]).name
-    try:
-        result = train(
-            tyro.cli(kind), lambda n, told: print(n, f"return {told['return']:.1f}", flush=True)
-        )
-    except (UgatMarlError, OSError) as error:
-        print(f"{name}: error: {error}", file=sys.stderr)
-        sys.exit(2)
-    for episodes, att_s in result.att_s.items():
-        print(f"{episodes} episodes: mean travel time {np.mean(att_s):.1f} s, by seed {att_s}")

@@ -113,10 +113,10 @@ def train(
         workers: Simulations at a time, or an executor; None for one per core.
         reporter: Shows progress; None for the one of the program.
         callback: Called as ``callback(stage, step, numbers)`` for what the training across the gap
-            measures: stage "episode" with the number of the episode, "rival episode" with that of
-            the second learner of a fitted street, "iteration" with that of the iteration, and at
-            the end "evaluation" with ``POLICY/DOMAIN/att_s`` in s. What it raises
-            ends the run, which can be resumed.
+            measures: stage "episode" with the number of the episode, "rival episode" (and
+            "rival 3 s late episode") with that of a rival in a fitted street, "iteration" with
+            that of the iteration, and at the end "evaluation" with ``POLICY/DOMAIN/att_s`` in s.
+            What it raises ends the run, which can be resumed.
 
     Returns:
         The table and the folder of the run.

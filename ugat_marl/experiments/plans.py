@@ -162,8 +162,8 @@ def work_of(
             first = lessons if ugat.pretrain_episodes else 0
             later = lesson_episodes(learner.name, learner.dqn, known=known)
             add("lessons", first + ugat.iterations * later)
-            if ugat.grounding == "street" and ugat.street.has_rival:
-                add("lessons", ugat.iterations * lessons)
+            if ugat.grounding == "street":
+                add("lessons", len(ugat.street.late_s) * ugat.iterations * lessons)
     return {
         name: Share(round(count), weights[name] * COSTS.get(name, 1.0))
         for name, count in units.items()
@@ -197,9 +197,9 @@ def _grounded_work(
         work["fitting"] = (worlds if times else 0, short)
         work["fitted street"] = (times * ugat.grounded_episodes, 1.0)
         work["comparing"] = (2 * street.judged * times, 1.0)
-        if street.has_rival:
+        if street.late_s:
             work["under delays"] = (times * ROLL_OUTS, 1.0)
-            work["late greens"] = (times * ugat.grounded_episodes, 1.0)
+            work["late greens"] = (len(street.late_s) * times * ugat.grounded_episodes, 1.0)
         if rule_budget:
             specs = [spec for name in TUNED_RULES for spec in rule_settings(name, rule_budget)]
             work["rules"] = (times * sum(race_fields(len(specs))), 1.0)

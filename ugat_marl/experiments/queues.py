@@ -182,8 +182,10 @@ def _batches(path: Path) -> pl.DataFrame:
     if wrong := damage(frame, metadata):
         raise CheckpointError(f"{path}: damaged, {wrong}")
     possible = pl.col("queue").is_finite() & pl.col("minute").is_between(0, _MOST_MINUTES)
+    possible &= pl.col("looks") > 0
     if not frame.select(possible.all()).item():
         raise CheckpointError(
-            f"{path}: not the queues of a run, since a queue or a minute is impossible"
+            f"{path}: not the queues of a run, since a queue, a minute or a number of looks is "
+            "impossible"
         )
     return frame

@@ -299,11 +299,13 @@ def result_of(row: Mapping[str, Any]) -> Result:
 
 
 def _whole(results: tuple[Result, ...]) -> tuple[Result, ...]:
-    """Raise an error if an episode is missing: every policy plays every seed in every domain."""
+    """Raise an error unless every policy plays every seed in every domain, once."""
     played = {(result.policy, result.domain, result.seed) for result in results}
     policies, domains, seeds = (len(set(part)) for part in zip(*played, strict=True))
     if len(played) < policies * domains * seeds:
         raise ValueError("some episodes are missing")
+    if len(played) < len(results):
+        raise ValueError("an episode is there twice")
     return results
 
 

@@ -150,8 +150,8 @@ def train_grounded(
             )
         algorithm = street_training(make, workers, device=device, **common)
         residual = ugat.residual(env.recorded_layouts, seed, neighbours_of(env))
-        rival = _rival(make, env, real, ugat, seed, start or run.directory / DIRECT_LEARNER)
-        fitted: Any = StreetFit(street_prior(env, ugat.street), residual=residual, rival=rival)
+        rivals = _rivals(make, env, real, ugat, seed, start or run.directory / DIRECT_LEARNER)
+        fitted: Any = StreetFit(street_prior(env, ugat.street), residual=residual, rivals=rivals)
         renew = algorithm.renew
     else:
         fitted = ugat.transform(env.recorded_layouts, seed, neighbours_of(env))
@@ -167,24 +167,23 @@ def train_grounded(
     return state
 
 
-def _rival(
+def _rivals(
     make: LearnerFactory,
     env: TrafficEnv,
     real: TransitionSource,
     config: UgatConfig,
     seed: int,
     start: Path,
-) -> Rival | None:
-    """Return the second learner of a fitted street; None without one, and where none can be.
+) -> tuple[Rival, ...]:
+    """Return the further learners of a fitted street; none where none can be.
 
     A learner that cannot be kept cannot begin where plain training ended. Rewards are matched only
     where one policy acts in both worlds, and with rewards that fall with every delay.
     """
     matches = real.replay() is None and str(env.options.reward) in MATCHED_REWARDS
-    if not config.street.has_rival or not matches:
-        return None
-    learner = make(env, seed)
-    return Rival(learner, start) if is_kept(learner) else None
+    every = config.street.late_s if matches else ()
+    rivals = (Rival(make(env, seed), start, late_s) for late_s in every)
+    return tuple(rival for rival in rivals if is_kept(rival.learner))
 
 
 def _policy_reader(make: LearnerFactory, env: TrafficEnv) -> Callable[[Path], Policy]:

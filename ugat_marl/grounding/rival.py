@@ -1,9 +1,9 @@
-"""Rival of a policy that is trained in a fitted street: one that is trained with late greens.
+"""Rivals of a policy that is trained in a fitted street: policies that train with late greens.
 
 Each episode of a fitted street is another simulation, and a few such episodes are hard to learn
-from. In the plain simulation a learner often gets farther. The rival trains there, with greens that
-are late until the rewards of the street match (`delays`). Worlds of the fitted street tell which of
-the two policies is better.
+from. In the plain simulation a learner often gets farther. A rival trains there, with greens that
+are late until the rewards of the street match (`delays`), or by a constant. Worlds of the fitted
+street tell which of the policies is best.
 """
 
 from __future__ import annotations
@@ -31,17 +31,34 @@ ROLL_OUTS = EPISODES_PER_DELAY * (LONGEST_S + 1)
 
 @dataclass
 class Rival:
-    """A second learner of a training, as a part of a checkpoint.
+    """Another learner of a training, as a part of a checkpoint.
 
     Attributes:
         learner: The learner.
         start: File of the learner after plain training, with which it begins.
+        late_s: Constant delay of all greens, in s; None for the delay that rewards ask for.
         begun: True once it has begun.
     """
 
     learner: Learner
     start: Path
+    late_s: float | None = None
     begun: bool = False
+
+    @property
+    def name(self) -> str:
+        """Name in files and metrics."""
+        return "rival" if self.late_s is None else f"rival {self.late_s:g} s late"
+
+    @property
+    def title(self) -> str:
+        """Name in the display of progress."""
+        return "late greens" if self.late_s is None else f"late greens of {self.late_s:g} s"
+
+    @property
+    def judged(self) -> str:
+        """Name among the policies that are compared, see `street_training.JUDGED`."""
+        return f"of_the_{self.name.replace(' ', '_')}"
 
     def begin(self) -> Learner:
         """Return the learner; it begins with what plain training taught."""
@@ -50,16 +67,19 @@ class Rival:
             self.begun = True
         return self.learner
 
-    def save(self, path: Path) -> None:
-        """Write the learner to a file; nothing if it has not begun."""
+    def save(self, folder: Path) -> None:
+        """Write the learner to a file in a folder; nothing if it has not begun."""
         if self.begun:
-            self.learner.save(path)
+            self.learner.save(self._file(folder))
 
-    def load(self, path: Path) -> None:
+    def load(self, folder: Path) -> None:
         """Restore a file of `save`; without one, the learner has not begun."""
-        if path.exists():
+        if (path := self._file(folder)).exists():
             self.learner.load(path)
             self.begun = True
+
+    def _file(self, folder: Path) -> Path:
+        return folder / f"{self.name.replace(' ', '-')}.pt"
 
 
 def matched_delays(

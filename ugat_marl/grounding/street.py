@@ -72,8 +72,11 @@ PARTS = ("channel", "eyes", "service", "effects")
 """Parts of a street, each of which can be left out."""
 
 
-RIVALS = ("none", "matched")
-"""Policies that may compete with the one that was trained in the fitted street."""
+RIVALS: dict[str, tuple[float | None, ...]] = {
+    "none": (), "matched": (None,), "several": (None, 3.0, 5.0),
+}  # fmt: skip
+"""Policies that may compete with the one that was trained in the fitted street: how late the greens
+are with which they train, in s; None for the delay that rewards ask for."""
 
 RULE_BUDGET = 6
 """Budget of each rule in worlds of the fitted street, with a learner that rules teach."""
@@ -97,7 +100,8 @@ class StreetConfig:
             trained policies. With 0 only trained policies are kept. None stands for 6 with a
             learner that rules teach, and for 0 with others.
         rival: "matched": a second learner trains in the simulation with greens that are late until
-            rewards match, and its policy is compared with the others. "none" goes without.
+            rewards match, and its policy is compared with the others. "several": so do a third and
+            a fourth one, with greens that are 3 and 5 s late. "none" goes without.
         without: Effects left out of the library.
         channel: Numbers of the fit of the command channel.
         eyes: Numbers of the fit of the detectors.
@@ -110,7 +114,7 @@ class StreetConfig:
     simulated_s: float = 1800.0
     judged: int = 8
     rule_budget: int | None = None
-    rival: Literal["none", "matched"] = "matched"
+    rival: Literal["none", "matched", "several"] = "matched"
     without: tuple[str, ...] = ()
     channel: ChannelConfig = field(default_factory=ChannelConfig)
     eyes: EyesConfig = field(default_factory=EyesConfig)
@@ -154,9 +158,9 @@ class StreetConfig:
         return max(1, commands, counts)
 
     @property
-    def has_rival(self) -> bool:
-        """True if a second learner competes with the first one."""
-        return self.rival != "none" and self.judged > 0
+    def late_s(self) -> tuple[float | None, ...]:
+        """Delay of the greens of each rival, in s; see `RIVALS`."""
+        return RIVALS[self.rival] if self.judged > 0 else ()
 
     def of_log(self, real: TransitionLog) -> StreetConfig:
         """Return the settings for a log; estimated vehicles are no readings of detectors."""

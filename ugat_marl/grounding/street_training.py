@@ -10,12 +10,12 @@
      6      find the rule that is best in worlds of the street; watch it, if the learner has a
             teacher; for e = 1, ..., E episodes: draw a world of the street, update pi in it; where
             f is trusted, ground its actions
-     7      train a rival in E_sim with late greens, which begins with pi of line 1 (`rival`)
-     8      keep the best of pi, pi after the lessons, the rival, the rule, and the policy kept so
+     7      train rivals in E_sim with late greens, which begin with pi of line 1 (`rival`)
+     8      keep the best of pi, pi after the lessons, the rivals, the rule, and the policy kept so
             far, in the same worlds of the street; training goes on from pi
 
 Line 5 is an option. Where commands are late, a grounded action would be late as well, and none is
-grounded. There is no rival then, nor where detectors are at fault.
+grounded. There are no rivals then, nor where detectors are at fault.
 
 If commands are late or lost, the policy needs to see its own last commands. If detectors are at
 fault, the numbers that it learnt to read mean something else. A policy that did not see commands,
@@ -25,7 +25,7 @@ or that learnt other numbers, begins anew in the fitted street, with M episodes 
 from __future__ import annotations
 
 import contextlib
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
@@ -65,14 +65,13 @@ from ugat_marl.seeding import derive_seed
 RESIDUAL = "residual.pt"
 """File of the residual, beside that of the street."""
 
-RIVAL = "rival.pt"
-"""File of the rival, beside that of the street."""
-
 JUDGED = {
     "before": "the policy kept so far",
     "after_the_lessons": "the policy after the lessons",
     "after": "the policy after training",
     "of_the_rival": "the policy of late greens",
+    "of_the_rival_3_s_late": "the policy of greens 3 s late",
+    "of_the_rival_5_s_late": "the policy of greens 5 s late",
     "of_the_rule": "the rule",
 }
 """Metrics ``judged/<name>`` of the policies that are compared in the fitted street, in words."""
@@ -87,14 +86,14 @@ class StreetFit:
         street: The street; None before the first fit.
         history: Results of earlier fits.
         residual: f, h and gate on top of the street; None without.
-        rival: A second learner, which trains with late greens; None without.
+        rivals: Further learners, which train with late greens.
     """
 
     worlds: WorldPrior
     street: FittedStreet | None = None
     history: FitHistory = field(default_factory=FitHistory)
     residual: Residual | None = None
-    rival: Rival | None = None
+    rivals: tuple[Rival, ...] = ()
 
     @property
     def view(self) -> tuple[int, bool]:
@@ -110,8 +109,8 @@ class StreetFit:
             self.street.save(path, self.history.simulated)
             if self.residual is not None:
                 self.residual.save(path.with_name(RESIDUAL))
-            if self.rival is not None:
-                self.rival.save(path.with_name(RIVAL))
+            for rival in self.rivals:
+                rival.save(path.parent)
 
     def load(self, path: Path) -> None:
         """Restore a file of `save`; without one, nothing was fitted.
@@ -123,8 +122,8 @@ class StreetFit:
             self.street, self.history = FittedStreet.load(path, self.worlds)
             if self.residual is not None:
                 self.residual.load(path.with_name(RESIDUAL))
-            if self.rival is not None:
-                self.rival.load(path.with_name(RIVAL))
+            for rival in self.rivals:
+                rival.load(path.parent)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -180,8 +179,8 @@ class StreetTraining(Algorithm):
             if residual is not None and residual.acts:
                 gate = residual.end_iteration().as_dict()
                 numbers |= {f"residual/gate/{name}": value for name, value in gate.items()}
-            rival, told = self._train_rival(state, street, policy)  # line 7
-            numbers |= told | self._keep_better(state, street, taught, rival, rule)  # line 8
+            rivals, told = self._train_rivals(state, street, policy)  # line 7
+            numbers |= told | self._keep_better(state, street, taught, rivals, rule)  # line 8
             if self.probe is not None:
                 numbers |= self.probe(state.policy())
             self.run.log("iteration", state.iteration + 1, numbers)
@@ -215,10 +214,10 @@ class StreetTraining(Algorithm):
 
             return rules[next(iter(race(list(rules), len(fields), play)))]
 
-    def _train_rival(
+    def _train_rivals(
         self, state: RunState[StreetFit], street: FittedStreet, policy: Policy
-    ) -> tuple[Policy | None, dict[str, float]]:
-        """Train the rival for an iteration, with greens that are late (line 7).
+    ) -> tuple[dict[str, Policy], dict[str, float]]:
+        """Train the rivals for an iteration, with greens that are late (line 7).
 
         Args:
             state: The state.
@@ -226,34 +225,41 @@ class StreetTraining(Algorithm):
             policy: The policy of the latest log.
 
         Returns:
-            The rival's policy, and numbers for the metrics. The policy is None without a rival,
-            where commands are late or detectors at fault, and where no green has to be late.
+            The rivals' policies by their names in `JUDGED`, and numbers for the metrics. There is
+            no policy without rivals, where commands are late or detectors at fault, and where no
+            green has to be late.
         """
-        rival, name = state.transform.rival, iteration_name(state)
+        rivals, name = state.transform.rivals, iteration_name(state)
         _, detectors_at_fault = state.transform.view
-        if rival is None or street.late or detectors_at_fault:
-            return None, {}
+        if not rivals or street.late or detectors_at_fault:
+            return {}, {}
         with self.run.reporter.task(f"under delays, {name}", ROLL_OUTS) as advance:
             seed = derive_seed(self.seed, "rival", state.iteration)
             delay_s = matched_delays(state.real[-1], self.simulation, policy, seed, advance)
         numbers = {f"rival/late_s/{agent}": late_s for agent, late_s in delay_s.items()}
         if not any(delay_s.values()):
             self.run.reporter.say(f"{name}: no green has to be late, so there is no rival")
-            return None, numbers
-        learner, title = rival.begin(), f"late greens, {name}"
+            return {}, numbers
         plain: Any = self.env.unwrapped
-        world = late_world(delay_s, plain.intersection_of)
-        with contextlib.closing(self.simulation.env(world)) as env:
-            self._attend(learner, env, title)
-            self._learn(learner, env, self.config.grounded_episodes, title, "rival episode")
-        return learner.policy(), numbers
+        policies: dict[str, Policy] = {}
+        for rival in rivals:
+            late_s = delay_s if rival.late_s is None else dict.fromkeys(delay_s, rival.late_s)
+            learner, title = rival.begin(), f"{rival.title}, {name}"
+            with contextlib.closing(
+                self.simulation.env(late_world(late_s, plain.intersection_of))
+            ) as env:
+                self._attend(learner, env, title)
+                episodes, stage = self.config.grounded_episodes, f"{rival.name} episode"
+                self._learn(learner, env, episodes, title, stage)
+            policies[rival.judged] = learner.policy()
+        return policies, numbers
 
     def _keep_better(
         self,
         state: RunState[StreetFit],
         street: FittedStreet,
         taught: Policy | None,
-        rival: Policy | None,
+        rivals: Mapping[str, Policy],
         rule: NamedRule | None,
     ) -> dict[str, float]:
         """Compare the new policies with the kept one in worlds of the street; keep the best.
@@ -262,7 +268,7 @@ class StreetTraining(Algorithm):
             state: The state, with the learner after its training.
             street: The fitted street.
             taught: Policy after the lessons; None if there were none.
-            rival: Policy of the rival; None without one.
+            rivals: Policies of the rivals, by their names in `JUDGED`.
             rule: The best rule; None if rules are left out.
 
         Returns:
@@ -273,10 +279,14 @@ class StreetTraining(Algorithm):
             return {}
         kept = state.best or state.direct
         assert kept is not None  # plain training comes first
-        known = (kept, taught, state.learner.policy(), rival, rule)
-        policies = {
-            name: policy for name, policy in zip(JUDGED, known, strict=True) if policy is not None
+        known = {
+            "before": kept,
+            "after_the_lessons": taught,
+            "after": state.learner.policy(),
+            **rivals,
+            "of_the_rule": rule,
         }
+        policies = {name: policy for name, policy in known.items() if policy is not None}
         seeds = [derive_seed(self.seed, "judged", state.iteration, k) for k in range(count)]
         worlds = [street.world(seed) for seed in seeds]
         title = f"comparing, {iteration_name(state)}"

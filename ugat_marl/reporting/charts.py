@@ -300,7 +300,7 @@ def transfer_picture(evaluation: Evaluation, metrics: Metrics, path: Path) -> No
             # at the left, where direct transfer is far from the rule, and not where curves meet it
             right.annotate(
                 printable(shortened(best_rule_note(domain), 34)), (0.12, level), (0, 3),
-                color=colour, xycoords=("axes fraction", "data"), textcoords="offset points",
+                color=LIGHT["soft"], xycoords=("axes fraction", "data"), textcoords="offset points",
                 ha="left", fontsize=10,
             )  # fmt: skip
     add_legend(picture, labels)

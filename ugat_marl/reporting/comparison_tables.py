@@ -36,6 +36,9 @@ from ugat_marl.reporting.terminal import titled_table
 CERTAIN = 0.05
 """Level of the paired tests in the paragraph that says what the table means."""
 
+MOST_TARGETS = 4
+"""Real domains that stand side by side in a terminal; more are in a table of their own."""
+
 Cell = Callable[[str, str], str]
 """Setting and domain to the text of a cell."""
 
@@ -44,16 +47,16 @@ def terminal_tables(comparison: Comparison, direct: str) -> RenderableType:
     """Return ATT, change of the gap, regret and the share won back, in 80 columns."""
     blocks: list[RenderableType] = []
     for title, cell in _headlines(comparison, direct):
-        table = titled_table(f"{comparison.scenario}: {title}")
-        table.add_column("policy", max_width=28, overflow="fold")
-        for target in comparison.targets:
-            table.add_column(target, justify="right")
-        for setting in comparison.settings:
-            row = [
-                cell(setting, t) if comparison.has(setting, t) else "" for t in comparison.targets
-            ]
-            table.add_row(Text(setting), *row)
-        blocks.append(table)
+        for first in range(0, len(comparison.targets), MOST_TARGETS):
+            targets = comparison.targets[first : first + MOST_TARGETS]
+            table = titled_table(f"{comparison.scenario}: {title}")
+            table.add_column("policy", max_width=28, overflow="fold")
+            for target in targets:
+                table.add_column(target, justify="right", overflow="fold")
+            for setting in comparison.settings:
+                row = [cell(setting, t) if comparison.has(setting, t) else "" for t in targets]
+                table.add_row(Text(setting), *row)
+            blocks.append(table)
     if check := check_table(comparison):
         blocks.append(Text(check.sentence("--episodes")))
     blocks.append(Text(seeds_note(comparison)))

@@ -31,6 +31,8 @@ BAND = 2.0
 """Half of the noise band, in standard deviations."""
 _STRIP = 51.0
 """Height of the strip of one statistic, in points."""
+_WIDEST = 1e12
+"""Largest end of an axis, in standard deviations: a file may hold larger numbers."""
 
 
 @styled()
@@ -46,7 +48,7 @@ def statistics_picture(rows: Sequence[Deviation], most: float, name: str) -> Nam
     """
     from matplotlib.ticker import FixedLocator, FuncFormatter, NullLocator
 
-    most = max(most, 10.0)
+    most = min(max(most, 10.0), _WIDEST)
     title = "Measured minus simulated, in standard deviations"
     picture = new_picture(name, title, TOP + 24 + _STRIP * len(rows))
     axes = add_axes(picture, 10, TOP + 22, 10, 2)

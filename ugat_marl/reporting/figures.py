@@ -224,12 +224,23 @@ def shortened(text: str, most: int) -> str:
 
 
 def shortened_apart(texts: Sequence[str], most: int) -> list[str]:
-    """Return texts as `shortened`, or cut in the middle where two would be the same."""
+    """Return texts as `shortened`, or cut in the middle where two would be the same.
+
+    Texts that are still the same have a number.
+    """
     short = [shortened(text, most) for text in texts]
     counts, begin = Counter(short), most // 2
-    return [
+    cut = [
         label
         if counts[label] == 1 or len(text) <= most
         else f"{text[:begin]}…{text[begin + 1 - most :]}"
         for text, label in zip(texts, short, strict=True)
+    ]
+    every: dict[str, list[str]] = {}
+    for text, label in zip(texts, cut, strict=True):
+        own = every.setdefault(label, [])
+        own += [] if text in own else [text]
+    return [
+        label if len(every[label]) == 1 else f"{label} ({every[label].index(text) + 1})"
+        for text, label in zip(texts, cut, strict=True)
     ]

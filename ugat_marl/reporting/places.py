@@ -10,6 +10,7 @@ from typing import Any
 from ugat_marl.effects import load_scenario, scenario_in_domain
 from ugat_marl.envs import Observer
 from ugat_marl.errors import UgatMarlError
+from ugat_marl.files import MALFORMED
 from ugat_marl.reporting.run_records import RunRecord
 from ugat_marl.scenarios import Network
 
@@ -43,7 +44,7 @@ def places_of(record: RunRecord) -> tuple[AgentPlaces | None, str]:
         network, own_hash = _network(record.scenario, record.sim, duration_s)
         neighbours = int(options.get("neighbours") or 0)
         agents = Observer(network, str(options.get("observation") or "count"), neighbours).agents
-    except (UgatMarlError, OSError, ValueError, TypeError) as error:
+    except (UgatMarlError, OSError, *MALFORMED) as error:
         reason = " ".join(str(error).split())
         return None, f"no map: scenario {record.scenario!r} cannot be read here ({reason[:200]})"
     tls = [each.id for each in network.intersections]

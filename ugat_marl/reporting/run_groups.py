@@ -2,13 +2,23 @@
 
 from __future__ import annotations
 
+import itertools
 import json
+import math
 from collections import Counter
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
-from ugat_marl.experiments import DIRECT, RULE, Comparison, Trial, is_grounded, rule_policy
+from ugat_marl.experiments import (
+    CORRECTED,
+    DIRECT,
+    RULE,
+    Comparison,
+    Trial,
+    is_grounded,
+    rule_policy,
+)
 from ugat_marl.reporting.comparison_tables import seeds_note
 from ugat_marl.reporting.formats import flat_settings
 from ugat_marl.reporting.run_records import RunRecord
@@ -19,6 +29,8 @@ _APART = (
     "scenario_hash", "domains",
 )  # fmt: skip
 """Settings in which trainings of one group may differ, since they do not change UGAT itself."""
+_NAMED = {CORRECTED: "corrected", RULE: "rule_budget"}
+"""Rows whose policies depend on a setting in which trainings of one group may differ."""
 _SIMULATING = ("ugat-marl", "eclipse-sumo", "libsumo")
 """Packages whose versions decide how vehicles move."""
 
@@ -57,13 +69,28 @@ def groups(records: Sequence[RunRecord]) -> list[Group]:
 
 
 def seeds_of_one(records: Sequence[RunRecord]) -> list[list[RunRecord]]:
-    """Return lists of trainings that differ in their seed alone; one curve shows each list."""
+    """Return lists of trainings that differ in their seed alone; one curve shows each list.
+
+    Of trainings that have one seed the newest is kept.
+    """
 
     def alike(record: RunRecord) -> tuple[Any, ...]:
         trained = json.dumps(_trained(record), sort_keys=True)
         return (*_common(record), record.real, _ugat(record), record.setting, trained)
 
-    return list(_parted(records, alike).values())
+    return [_one_of_a_seed(members) for members in _parted(records, alike).values()]
+
+
+def _one_of_a_seed(records: Sequence[RunRecord]) -> list[RunRecord]:
+    newest: dict[str, RunRecord] = {}
+    for record in sorted(records, key=_age):
+        newest.setdefault(record.seed or record.name, record)
+    return [record for record in records if record in newest.values()]
+
+
+def _age(record: RunRecord) -> float:
+    """Return a number that is less for newer trainings."""
+    return math.inf if math.isnan(record.written) else -record.written
 
 
 def _common(record: RunRecord) -> tuple[Any, ...]:
@@ -87,18 +114,41 @@ def _parted(records: Iterable[RunRecord], key: Any) -> dict[Any, list[RunRecord]
 
 def _trials(records: Sequence[RunRecord]) -> tuple[list[Trial], tuple[str, ...]]:
     """Return trials that were scored in both domains, and names of the other records."""
-    names = job_labels(records)
-    trials: list[Trial] = []
-    left_out: list[str] = []
-    for record, name in zip(records, names, strict=True):
-        of_record = list(_of_job(record, name)) if record.job else list(_of_run(record))
-        trials += of_record
-        if not of_record:
-            left_out.append(record.name)
-    return trials, tuple(left_out)
+    names, told = job_labels(records), _told(records)
+    known: dict[tuple[Any, ...], int] = {}
+    trials: list[list[Trial]] = [[] for _ in records]
+    for index, record in sorted(enumerate(records), key=lambda pair: _age(pair[1])):
+        of_record = _of_job(record, names[index]) if record.job else _of_run(record, told)
+        training = record.seed or record.name
+        trials[index] = [
+            trial
+            for trial in of_record
+            # an older training of the same seed says nothing about chance
+            if known.setdefault((*_episode(trial), training), index) == index
+        ]
+    left_out = [record.name for record, own in zip(records, trials, strict=True) if not own]
+    return list(itertools.chain(*trials)), tuple(left_out)
 
 
-def _of_run(record: RunRecord) -> Iterable[Trial]:
+def _episode(trial: Trial) -> tuple[str, str, str, int]:
+    return trial.setting, trial.target, trial.domain, trial.seed
+
+
+def _told(records: Sequence[RunRecord]) -> Mapping[str, str]:
+    """Return the settings of `_NAMED` in which runs differ, by the row that depends on them."""
+    values = {
+        row: {
+            str(record.settings.get(key))
+            for record in records
+            # every run has a best rule, and only some have a corrected simulation
+            if row == RULE or record.settings.get(key)
+        }
+        for row, key in _NAMED.items()
+    }
+    return {row: _NAMED[row] for row, several in values.items() if len(several) > 1}
+
+
+def _of_run(record: RunRecord, told: Mapping[str, str]) -> Iterable[Trial]:
     evaluation = record.evaluation
     if evaluation is None or len(evaluation.domains) != 2:
         return
@@ -108,6 +158,9 @@ def _of_run(record: RunRecord) -> Iterable[Trial]:
         if r.policy.startswith(rule_policy("")) and r.policy != rule:
             continue
         setting = RULE if r.policy == rule else r.policy
+        if setting in told:
+            key = told[setting]
+            setting += f" ({key} {record.settings.get(key) or 'as usual'})"
         domain = record.sim if r.domain == evaluation.domains[0] else r.domain
         yield Trial(setting, real, domain, _seed(record), r.seed, r.scores)
 
@@ -132,13 +185,16 @@ def _rank(setting: str) -> int:
     """Return the place of a setting: direct transfer, groundings, other settings, rules."""
     if setting.startswith(DIRECT):
         return 0
-    if setting == RULE:
+    if setting.startswith(RULE):
         return 3
     return 1 if is_grounded(setting) else 2
 
 
 def _seed(record: RunRecord) -> int | None:
-    return int(record.seed) if record.seed.lstrip("-").isdigit() else None
+    try:
+        return int(record.seed)
+    except ValueError:
+        return None
 
 
 def job_labels(records: Sequence[RunRecord]) -> list[str]:

@@ -12,6 +12,7 @@ import contextlib
 import csv
 import functools
 import math
+from collections import Counter
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -385,9 +386,14 @@ def read_rows(path: Path) -> list[dict[str, Any]]:
         raise ValueError(f"not a table: {error}") from None
     if wrong:
         raise ValueError(f"damaged, {wrong}")
-    with path.open(newline="", encoding="utf-8", errors="replace") as file:
+    # a table that was saved as CSV by a spreadsheet begins with a mark
+    with path.open(newline="", encoding="utf-8-sig", errors="replace") as file:
         rows = [row for row in csv.DictReader(file) if row.get("setting") and row.get("domain")]
     if not rows:
         raise ValueError("no rows with a setting and a domain in it")
+    cells = Counter((row.get("scenario"), row["setting"], row["domain"]) for row in rows)
+    for (_, setting, domain), times in cells.items():
+        if times > 1:
+            raise ValueError(f"setting {setting!r} in {domain} is there {times} times")
     texts = ("scenario", "setting", "domain")
     return [{k: str(v) if k in texts else as_number(v) for k, v in row.items()} for row in rows]

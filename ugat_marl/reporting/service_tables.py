@@ -20,6 +20,8 @@ MOST_APPROACHES = 8
 """Most approaches in a table of the terminal."""
 MOST_CONTROLLERS = 3
 """Most controllers side by side in a table of the terminal: more leave names no room."""
+MOST_DOMAINS = 6
+"""Most domains side by side, for the same reason."""
 LEGEND = (
     "Mean control delay in s per vehicle that passed the light, and the level of service of the "
     "Highway Capacity Manual: A to 10 s, B to 20, C to 35, D to 55, E to 80, F above. Vehicles "
@@ -49,8 +51,10 @@ def delay_text(delay_s: float) -> str:
     Where rounding would pass the limit of the level, there are more decimals, as in ``10.04 B``.
     """
     level, text = level_of_service(delay_s), number_text(delay_s)
-    if level and level_of_service(float(text)) != level:
-        text = fixed(delay_s, 2)
+    for decimals in range(2, 17):
+        if not level or level_of_service(float(text)) == level:
+            break
+        text = fixed(delay_s, decimals)
     return f"{text} {level}".strip()
 
 
@@ -69,19 +73,24 @@ def service_tables(evaluation: Evaluation, network: Network) -> list[RenderableT
     }
     if not measured:
         return []
-    table = titled_table(f"{evaluation.scenario}: control delay and level of service (HCM)")
-    table.add_column("policy", max_width=22, overflow="fold")
-    for domain in evaluation.domains:
-        table.add_column(domain, justify="right", overflow="fold")
-    for policy in evaluation.policies:
-        own = [measured.get((policy, domain), {}) for domain in evaluation.domains]
-        table.add_row(Text(policy), *(delay_text(mean_delay_s(d.values())) for d in own))
-        worst = [max(delays.values(), key=_badness, default=None) for delays in own]
-        cells = ["-" if at is None else approach_text(*at) for at in worst]
-        table.add_row(*(Text(text, style="dim") for text in ("  worst approach", *cells)))
+    tables: list[RenderableType] = []
+    for first in range(0, len(evaluation.domains), MOST_DOMAINS):
+        domains = evaluation.domains[first : first + MOST_DOMAINS]
+        table = titled_table(f"{evaluation.scenario}: control delay and level of service (HCM)")
+        table.add_column("policy", max_width=22, overflow="fold")
+        for domain in domains:
+            table.add_column(domain, justify="right", overflow="fold")
+        for policy in evaluation.policies:
+            own = [measured.get((policy, domain), {}) for domain in domains]
+            table.add_row(Text(policy), *(delay_text(mean_delay_s(d.values())) for d in own))
+            worst = [max(delays.values(), key=_badness, default=None) for delays in own]
+            cells = ["-" if at is None else approach_text(*at) for at in worst]
+            table.add_row(*(Text(text, style="dim") for text in ("  worst approach", *cells)))
+        tables.append(table)
     last = evaluation.domains[-1]
     delays = {policy: measured.get((policy, last), {}) for policy in evaluation.policies}
-    return [Group(table, approach_table(f"The same by approach, in {last}", delays, network))]
+    by_approach = approach_table(f"The same by approach, in {last}", delays, network)
+    return [Group(*tables, by_approach)]
 
 
 def approach_table(title: str, delays: Mapping[str, Delays], network: Network) -> RenderableType:

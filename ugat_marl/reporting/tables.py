@@ -20,11 +20,11 @@ def transfer_table(evaluation: Evaluation) -> RenderableType:
     """Return ATT of every policy in the simulation and the real domains, with gap and regret."""
     first, *others = evaluation.domains
     table = titled_table(f"{evaluation.scenario}: average travel time in s (95 % interval)")
-    table.add_column("policy", max_width=22)
-    table.add_column(first, justify="right")
+    table.add_column("policy", max_width=22, overflow="fold")
+    table.add_column(first, justify="right", overflow="fold")
     for domain in others:
         for heading in (domain, "Δ", "regret"):
-            table.add_column(heading, justify="right")
+            table.add_column(heading, justify="right", overflow="fold")
     for policy in evaluation.policies:
         cells = [mean_text(evaluation.estimate(policy, first, "att_s"))]
         for domain in others:
