@@ -380,8 +380,11 @@ def _boxes(record: RunRecord) -> list[tuple[str, str]]:
     if grounded is not None:
         start, now = (evaluation.gap(p, real, "att_s").mean for p in (direct, grounded))
         if start > 0 and math.isfinite(now):
-            gone, word = 1 - now / start, "gone" if now <= start else "added"
-            boxes.append((share(abs(gone)), f"of the gap Δ is {word} with {grounded}"))
+            if now <= start:
+                box = share(1 - now / start), f"of the gap Δ is gone with {grounded}"
+            else:  # a share of a small gap would say little
+                box = f"{number(now - start)} s", f"longer gap Δ with {grounded}"
+            boxes.append(box)
         times = [evaluation.values(policy, real, "att_s") for policy in (direct, grounded)]
         saved, word = Estimate.of(times[0] - times[1]), "less"
         if saved.mean < 0:
