@@ -530,3 +530,9 @@ def test_calls_at_the_wrong_moment(env: object) -> None:
     env.reset(seed=0)  # type: ignore[attr-defined]
     with pytest.raises(EpisodeError, match="whole episode of 20 steps"):
         env.scores()  # type: ignore[attr-defined]
+
+
+def test_a_file_that_is_no_scenario_is_not_called_an_unknown_name(tmp_path: Path) -> None:
+    (tmp_path / "trips.xml").write_text("<routes/>")
+    with pytest.raises(ScenarioError, match=r"trips\.xml: is no scenario; give a directory"):
+        parallel_env(tmp_path / "trips.xml")

@@ -6,11 +6,13 @@ import errno
 import os
 import signal
 import time
+from pathlib import Path
 from typing import Any
 
 import pytest
 from rich.console import Console
 
+from ugat_marl.__main__ import main
 from ugat_marl.cli import CommandLine, frame, run
 from ugat_marl.parallel import DEADLINE_VARIABLE, usual_deadline_s
 
@@ -89,3 +91,15 @@ def test_an_impossible_deadline_of_a_command(
     assert run(CommandLine("prog", "", {}), ["go", "--deadline-s", seconds]) == 2
     said = f"prog: error: --deadline-s {seconds}".rstrip()
     assert capsys.readouterr().err == f"{said}: give a number of seconds above 0\n"
+
+
+def test_a_warning_of_the_suite_is_a_note(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    (tmp_path / "c.csv").write_text("edge,count,begin_s,end_s\nwest1_A1,5,3000,3600\n")
+    made = ["scenario", "new", str(tmp_path / "late"), "--grid", "1x1", "--counts"]
+    assert main([*made, str(tmp_path / "c.csv")]) == 0
+    assert main(["scenario", "check", str(tmp_path / "late")]) in (0, 1)
+    said = capsys.readouterr().err
+    assert "note: scenario 'late': no vehicle has entered the network in the first" in said
+    assert "UserWarning" not in said

@@ -55,3 +55,7 @@ def test_a_traffic_engineer_s_way(python: list[str], tmp_path: Path) -> None:
     found = json.loads((clone / "found" / "diagnosis.json").read_text(encoding="utf-8"))
     assert found["verdict"] == "explained"
     assert [effect["name"] for effect in found["effects"]] == ["startup_delay"]
+    page = " ".join((TUTORIALS / "your-town.md").read_text(encoding="utf-8").split())
+    seconds = found["effects"][0]["parameters"]["seconds"]
+    assert f'"{found["sentence"].partition(". ")[0].rstrip(".")}."' in page
+    assert f"interval is {seconds['low']:.2f} to {seconds['high']:.2f} s" in page

@@ -466,8 +466,8 @@ def test_the_verdict_is_told_in_terms_of_traffic(network: Network) -> None:
     assert "In terms of traffic" in page
     for text in ("capacity, veh/h per lane in green", "1 410", "1 790"):
         assert text in page.replace("\u00a0", " "), text
-    assert "travel time and queue come nearer" in page
-    assert "48 % before, 5 % after" in page
+    assert "Simulated travel time and queue against data that no fit used" in page
+    assert "48 % before the effects named and 5 % after, nearer." in page
     shown = printed(diagnosis)
     assert "approach W_C" in shown, "its delay differs most"
     unknown = {**diagnosis.to_json()["approaches"][0], "approach": "N_C"}

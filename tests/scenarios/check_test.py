@@ -283,6 +283,12 @@ def test_clearance_that_differs_from_the_file_is_told(single: Scenario) -> None:
     )
 
 
+def test_lights_with_the_same_clearance_share_a_note() -> None:
+    facts = survey(load_scenario("grid2x2-v1").with_control(yellow_s=4.0))
+    (text,) = [text for text in remarks(facts, ()) if "of yellow and" in text]
+    assert text.startswith("traffic lights 'A1', 'A2', 'B1', 'B2': the file has")
+
+
 def test_phases_are_told_by_the_greens_of_the_file(single: Scenario) -> None:
     """Listed in the other order, phase n is green 3 - n of the file."""
     (item,) = Network.read(single).intersections

@@ -111,6 +111,8 @@ def test_counts_come_back_with_their_geh(draft: Path, capsys: pytest.CaptureFixt
         assert float(fit["geh"]) == pytest.approx(wanted, abs=0.005)
     assert (draft / "counts.csv").read_bytes() == filled
     assert len([*(draft / "pictures").iterdir()]) > 0, "the drawings of the same roads are kept"
+    assert made(draft, "--counts", draft / "counts.csv", "--force") == 0
+    assert (draft / "pictures").is_dir(), "also where vehicles are made once more"
 
 
 def test_counts_that_cannot_all_be_met_come_first(

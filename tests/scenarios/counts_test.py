@@ -100,6 +100,12 @@ def test_origins_and_destinations(tmp_path: Path) -> None:
         ("--od", "edge,count\na,1\n", "t.csv, line 1: the columns from, to and count are needed"),
         ("--counts", "sep=;\nedge;count\nwest1_A1;5\n", "line 1: 'sep=' is for a spreadsheet; del"),
         ("--counts", "edge,count\nwest1_A1,many\n", "line 2: count = 'many' is not a number"),
+        (
+            "--counts",
+            "edge,count,begin_s,end_s\nwest1_A1,5,07:00,8:00:00\n",
+            "begin_s = '07:00' is not a number of at least 0; write seconds: 25200",
+        ),
+        ("--counts", "edge,count\nwest1_A1,n/a\n", "of at least 0; leave it blank where nobody"),
         ("--counts", "edge,count\nwest1_A1,-1\n", "line 2: count = '-1' is not a number of at"),
         ("--counts", "edge,count\nwest1_A1,1_000\n", "line 2: count = '1_000' is not a number"),
         ("--counts", "edge,count\nwest1_A1,١٢\n", "line 2: count = '١٢' is not a number"),
@@ -325,3 +331,35 @@ def test_names_may_hold_marks_that_end_lines_elsewhere(tmp_path: Path, mark: str
     (tmp_path / "c.csv").write_bytes(end.join(lines).encode())
     rows = read_rows(tmp_path / "c.csv", 0, 3600, Silent(), pairs=False)
     assert [(row.roads, row.count, row.line) for row in rows] == [(("a",), 5, 2), (("b",), 7, 3)]
+
+
+@pytest.mark.parametrize("kind", ["--counts", "--od"])
+def test_the_flow_of_the_first_interval_fills_the_roads_before_it(
+    tmp_path: Path, kind: str, capsys: pytest.CaptureFixture[str]
+) -> None:
+    ends = ("west1_A1", "A1_B1") if kind == "--counts" else ("west1_A1", "B1_east1")
+    lines = [f"{','.join(ends)},600,25200,28800", f"{','.join(ends)},300,28800,32400"]
+    (tmp_path / "c.csv").write_text("from,to,count,begin_s,end_s\n" + "\n".join(lines) + "\n")
+    words = [kind, tmp_path / "c.csv", "--duration-s", "7800", "--begin-s"]
+    assert made(tmp_path / "city", *words, "24600") == 0
+    departs = [depart for depart, _ in drives(tmp_path / "city")]
+    assert sum(depart < 25200 for depart in departs) == pytest.approx(100, abs=3)
+    assert sum(25200 <= depart < 28800 for depart in departs) == pytest.approx(600, abs=12)
+    assert len({depart // 60 for depart in departs if depart < 25200}) > 5  # not at once
+    assert "fill the roads from 24600 to 25200 s" in capsys.readouterr().out
+    if kind == "--counts":
+        fits = (tmp_path / "city" / "counts-fit.csv").read_text(encoding="utf-8-sig")
+        assert len(fits.splitlines()) == 3  # those vehicles are no counts
+    assert made(tmp_path / "long", *words, "10000", "--duration-s", "30000") == 0
+    assert "no vehicle drives before 25200 s" in capsys.readouterr().out
+    assert min(depart for depart, _ in drives(tmp_path / "long")) >= 25200
+
+
+def test_counts_that_are_spread_over_an_odd_time_are_told(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    (tmp_path / "c.csv").write_text("edge,count\nwest1_A1,60\n")
+    assert made(tmp_path / "odd", "--counts", tmp_path / "c.csv", "--duration-s", "4200") == 0
+    assert "are of the whole episode, 4200 s" in capsys.readouterr().out
+    assert made(tmp_path / "hour", "--counts", tmp_path / "c.csv") == 0
+    assert "whole episode" not in capsys.readouterr().out

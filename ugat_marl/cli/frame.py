@@ -13,6 +13,7 @@ import signal
 import sys
 import textwrap
 import threading
+import warnings
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import partial
@@ -115,10 +116,28 @@ def run(line: CommandLine, arguments: Sequence[str]) -> int:
     progress = console if console.is_terminal else plain(stderr=True)
 
     def perform() -> int:
-        with loudness(level), showing(Bars(progress)), _deadline(seconds):
+        with loudness(level), showing(Bars(progress)), _deadline(seconds), _warnings_as_notes():
             return _dispatch(line, list(arguments), console)
 
     return guarded(line.program, perform)
+
+
+@contextlib.contextmanager
+def _warnings_as_notes() -> Iterator[None]:
+    """Show warnings of the suite to users as notes, without the place in the code."""
+    usual = warnings.showwarning
+
+    def show(message: Warning | str, category: type[Warning], *place: Any) -> None:
+        if category is UserWarning:
+            print(f"note: {_in_one_line(str(message))}", file=sys.stderr)
+        else:
+            usual(message, category, *place)
+
+    warnings.showwarning = show
+    try:
+        yield
+    finally:
+        warnings.showwarning = usual
 
 
 def guarded(program: str, call: Callable[[], int | None]) -> int:

@@ -90,12 +90,17 @@ def measured_variation(
     return day_to_day_variation(np.array(rows), thresholds, numbers)
 
 
-def variation_findings(variation: float) -> tuple[Finding, ...]:
-    """Return a finding on the variation from day to day; none without one."""
+def variation_findings(variation: float, days: int) -> tuple[Finding, ...]:
+    """Return a finding on the variation from day to day; none without one.
+
+    Args:
+        variation: Standard deviation as a share of the mean.
+        days: Number of days that tell it.
+    """
     if not variation:
         return ()
-    share = f"{100 * variation:.0f} %"
     text = (
-        f"demand differs from day to day by about {share}, on top of chance; so do simulated days"
+        f"as far as {days} days tell, demand differs from day to day by about "
+        f"{100 * variation:.0f} %, on top of chance; so do simulated days"
     )
     return (Finding(text),)

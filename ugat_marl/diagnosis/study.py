@@ -183,7 +183,7 @@ class Study:
         fit = _tallies(layout, measured, periods, thresholds, supplementary)
         heldout = _tallies(layout, measured, measured.of("heldout"), thresholds, supplementary)
         variation = measured_variation(layout, measured, (fit, heldout), thresholds)
-        measured = _noted(measured, variation_findings(variation))
+        measured = _noted(measured, variation_findings(variation, len(measured.periods)))
 
         def simulating(answering: bool, base_days: int) -> Engine:
             return Engine(

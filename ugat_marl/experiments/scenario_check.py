@@ -212,6 +212,7 @@ def remarks(facts: Survey, runs: Sequence[RuleEpisode]) -> list[str]:
         runs: Results of `play_check_rules`.
     """
     notes = list(facts.notes)
+    clearances: dict[str, list[str]] = {}
     for light in facts.intersections:
         if not light.unserved_links:
             notes += _other_phases(light)
@@ -219,16 +220,21 @@ def remarks(facts: Survey, runs: Sequence[RuleEpisode]) -> list[str]:
         file = (light.file_yellow_s or shown[0], light.file_all_red_s or (0.0,))
         if light.file_yellow_s and file != shown:
             times = ["/".join(f"{seconds:g}" for seconds in own) for own in file]
-            notes.append(
-                f"traffic light {light.id!r}: the file has {times[0]} s of yellow and {times[1]} s "
-                f"of red between greens; agents' greens get {facts.yellow_s:g} s and "
-                f"{facts.all_red_s:g} s ([control] yellow_s, all_red_s)"
+            text = (
+                f"the file has {times[0]} s of yellow and {times[1]} s of red between greens; "
+                f"agents' greens get {facts.yellow_s:g} s and {facts.all_red_s:g} s ([control] "
+                "yellow_s, all_red_s)"
             )
+            clearances.setdefault(text, []).append(repr(light.id))
         if far := [road.edge for road in light.approaches if road.first_s is None]:
             notes.append(
                 f"traffic light {light.id!r}: no vehicle can be there within the episode on "
                 f"{', '.join(far)}; agents never see traffic on these roads"
             )
+    notes += [
+        f"traffic light{'s' if len(lights) > 1 else ''} {', '.join(lights)}: {text}"
+        for text, lights in clearances.items()
+    ]
     return notes + _compared(facts, runs)
 
 

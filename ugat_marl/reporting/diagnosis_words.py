@@ -172,17 +172,17 @@ def traffic_check_line(diagnosis: Diagnosis) -> str | None:
     check = diagnosis.traffic_check
     if check is None:
         return None
-    nearer = "come nearer" if check.better else "do not come nearer"
+    nearer = "nearer" if check.better else "no nearer"
     if check.undecided:
-        nearer = "come nearer, by no more than chance could do,"
+        nearer = "nearer by no more than chance could do"
     unfitted = check.measure == "travel time and queue"
-    apart = "which no fit used" if unfitted else "of periods that no fit used"
+    apart = "that no fit used" if unfitted else "of periods that no fit used"
     if diagnosis.verified_on_fitted_periods:
         apart = "of the fitted periods, as none is held out"
     before, after = share(check.error_before), share(check.error_after)
     return (
-        f"By the effects named, simulated {check.measure} {nearer} to the data, {apart}: "
-        f"sum of relative errors {before} before, {after} after."
+        f"Simulated {check.measure} against data {apart}: sum of relative errors {before} before "
+        f"the effects named and {after} after, {nearer}."
     )
 
 

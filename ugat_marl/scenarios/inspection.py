@@ -54,8 +54,8 @@ class ApproachFacts:
     Attributes:
         edge: SUMO id of the road.
         lanes: Number of its lanes for cars at the light.
-        vph: Vehicles per hour whose routes use the road, mean of the episode.
-        worst_vph: The same in the worst quarter of an hour, by free flow to the light.
+        vph: Vehicles per hour at the end of the road by free flow, mean of the episode.
+        worst_vph: The same in the worst quarter of an hour.
         worst_from_s: Start of this quarter of an hour, s from the start of the episode.
         flow_ratio: Traffic of its fullest lanes in that quarter of an hour, divided by the flow
             that they would discharge in permanent green. Drivers divide among the lanes from which
@@ -402,7 +402,7 @@ def _approaches(intersection: Intersection, traffic: _Traffic) -> Sequence[Appro
     approaches: list[ApproachFacts] = []
     for edge, links in roads.items():
         edge_lanes = tuple(dict.fromkeys(link.from_lane for link in links_for_cars(links)))
-        vph, (worst_vph, worst_from_s, flows) = traffic.vph[edge], traffic.worst(edge)
+        vph, (worst_vph, worst_from_s, flows) = traffic.mean_vph(edge), traffic.worst(edge)
         lanes_of = _lanes_by_turn(links)
         used = frozenset(edge_lanes).union(*lanes_of.values())
         ratio = fullest(flows, lanes_of, dict.fromkeys(used, SATURATION_VPH))
@@ -499,7 +499,6 @@ class _Traffic:
 
     Attributes:
         duration_s: Length of the episode.
-        vph: Road to the vehicles per hour whose routes use it.
         passes: Road and quarter of an hour to the vehicles that reach its end.
         turns: Quarter of an hour in which the end of the first road is reached, to the vehicles
             from road to road.
@@ -511,7 +510,6 @@ class _Traffic:
     """
 
     duration_s: float
-    vph: Counter[str]
     passes: dict[str, Counter[int]]
     turns: dict[int, Counter[tuple[str, str]]]
     departing: Counter[int]
@@ -532,6 +530,10 @@ class _Traffic:
         """Return vehicles per hour, from vehicles in a quarter of an hour."""
         end_s = self.duration_s if quarter == self._last else (quarter + 1) * QUARTER_S
         return count * 3600 / (end_s - quarter * QUARTER_S)
+
+    def mean_vph(self, edge: str) -> float:
+        """Return the mean flow of a road over the episode, vehicles per hour."""
+        return sum(self.passes.get(edge, {}).values()) * 3600 / self.duration_s
 
     def worst(self, edge: str) -> tuple[float, float, dict[str, float]]:
         """Return the flow of a road in its worst quarter of an hour, vehicles per hour.
@@ -579,20 +581,15 @@ class _Traffic:
     ) -> _Traffic:
         seconds = free_flow_s(network.lanes.values())
         begin, length_s = scenario.settings.begin_s, scenario.settings.duration_s
-        passes: Counter[str] = Counter()
         lengths_s: list[float] = []
         traffic = cls(
-            length_s, Counter(), defaultdict(Counter), defaultdict(Counter), Counter(), {},
-            length_s, 0.0, 0.0,
-        )  # fmt: skip
+            length_s, defaultdict(Counter), defaultdict(Counter), Counter(), {}, length_s, 0.0, 0.0
+        )
         for _, depart, edges in departures(scenario, routed=demand.routed, reporter=reporter):
             if begin <= depart < begin + length_s:
-                passes.update(edges)
                 traffic._drive(depart - begin, edges, seconds)
                 lengths_s.append(sum(seconds.get(edge, 0.0) for edge in edges))
-        hours = length_s / 3600
         lengths_s.sort()
-        traffic.vph = Counter({e: n / hours for e, n in passes.items()})
         traffic.fill_s = lengths_s[math.ceil(0.95 * len(lengths_s)) - 1] if lengths_s else 0.0
         return traffic
 

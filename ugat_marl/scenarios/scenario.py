@@ -170,6 +170,10 @@ def read_scenario(name: str | Path) -> Scenario:
         )
     if text and _is_folder(path):
         raise ScenarioError(f"{path}: a directory without scenario.toml is not a scenario")
+    if text and _is_file(path):
+        raise ScenarioError(
+            f"{path}: is no scenario; give a directory with scenario.toml, or a .sumocfg file"
+        )
     raise UnknownNameError(
         "scenario", text, shipped, "A directory, a .sumocfg file and resco:<map> work as well."
     )

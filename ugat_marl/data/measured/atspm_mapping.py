@@ -11,7 +11,7 @@ import pydantic
 from pydantic import Field
 
 from ugat_marl.data.measured.local_time import require_time_zone
-from ugat_marl.errors import MeasuredDataError
+from ugat_marl.errors import MeasuredDataError, nearest
 from ugat_marl.files import read_toml
 from ugat_marl.scenarios import DetectorKind, Real, Split
 
@@ -161,9 +161,9 @@ def read_mapping(
     try:
         mapping = AtspmMapping.model_validate(read_toml(path, MeasuredDataError))
     except pydantic.ValidationError as error:
-        said = [f"{'.'.join(map(str, e['loc']))}: {e['msg']}" for e in error.errors()[:4]]
+        said = "; ".join(_faults(error)[:4])
         raise MeasuredDataError(
-            f"{path}: {'; '.join(said)}; docs/reference/measured-data.md has the keys"
+            f"{path}: {said}; docs/reference/measured-data.md has the keys"
         ) from None
     if bool(mapping.zero) == bool(mapping.periods):
         raise MeasuredDataError(
@@ -175,6 +175,39 @@ def read_mapping(
         raise MeasuredDataError(f"{path}: zero has a time zone; write local time without one")
     _check_devices(path, mapping.devices, widths, driven)
     return mapping
+
+
+_TABLES: dict[str, type[pydantic.BaseModel]] = {
+    "devices": Device, "detectors": DetectorChannel, "periods": Span,
+    "phases": Links, "overlaps": Links,
+}  # fmt: skip
+"""Key of a table in the file to its content."""
+
+
+def _faults(error: pydantic.ValidationError) -> list[str]:
+    """Return the faults of a mapping file in its own terms."""
+    problems = error.errors()
+    # pydantic calls a list too short if its items have faults
+    faulty = {
+        problem["loc"][:length] for problem in problems for length in range(len(problem["loc"]))
+    }
+    return [_explain(problem) for problem in problems if problem["loc"] not in faulty]
+
+
+def _explain(problem: Any) -> str:
+    *table, name = problem["loc"] or ("",)
+    key = ".".join(map(str, problem["loc"]))
+    if problem["type"] == "extra_forbidden":
+        inside = [part for part in table if part in _TABLES]
+        known = (_TABLES[inside[-1]] if inside else AtspmMapping).model_fields
+        guess = nearest(str(name), known)
+        hint = f"did you mean {guess!r}?" if guess else f"known: {', '.join(known)}"
+        return f"unknown key {key!r}; {hint}"
+    if problem["type"] == "missing":
+        return f"key {key!r} is missing"
+    if problem["type"].startswith("datetime"):
+        return f"{key} = {problem['input']!r}: write a local time such as 2024-03-04 07:00:00"
+    return f"{key}: {problem['msg'][:1].lower()}{problem['msg'][1:]}"
 
 
 def _check_devices(

@@ -79,8 +79,9 @@ def read_measured(directory: Path, scenario: Scenario, network: Network) -> Meas
     """
     directory = Path(directory)
     if not directory.is_dir():
+        there = "is a file, and no" if directory.exists() else "no such"
         raise MeasuredDataError(
-            f"{directory}: no such directory; measured data are a directory with periods.csv, "
+            f"{directory}: {there} directory; measured data are a directory with periods.csv, "
             "detectors.csv, signals and detections (docs/reference/measured-data.md)"
         )
     files = _Files(directory)
@@ -551,7 +552,7 @@ def signals_of(
         log = _log(
             list(zip(time[begin:end].tolist(), states[begin:end], strict=True)),
             period,
-            f"{path.name}: {name(stream)}",
+            f"{path}: {name(stream)}",
             findings,
         )
         logs[stream // len(names)][names[stream % len(names)]] = log

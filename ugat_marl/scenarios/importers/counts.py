@@ -201,13 +201,23 @@ def _refuse_all_outside(rows: Sequence[Row], path: Path, begin_s: float, end_s: 
         )
 
 
+_CLOCK = re.compile(r"(\d{1,2}):([0-5]\d)(?::([0-5]\d))?", re.ASCII)
+"""A time of day such as 7:00 or 07:00:00."""
+
+
 def _number(text: str | None, key: str, where: str) -> float:
     try:
         value = parse_decimal(text or "")
     except ValueError:
         value = math.nan
     if not (math.isfinite(value) and value >= 0):
-        raise ScenarioError(f"{where}: {key} = {text!r} is not a number of at least 0")
+        way_out = ""
+        if key == "count":
+            way_out = "; leave it blank where nobody counted"
+        elif clock := _CLOCK.fullmatch((text or "").strip()):
+            hours, minutes, seconds = (int(part or 0) for part in clock.groups())
+            way_out = f"; write seconds: {3600 * hours + 60 * minutes + seconds}"
+        raise ScenarioError(f"{where}: {key} = {text!r} is not a number of at least 0{way_out}")
     return value
 
 
@@ -238,10 +248,11 @@ def from_counts(path: Path, begin_s: float, length_s: float, seed: int) -> Vehic
             _require_reached(rows, drives, path)
             write_drives(work / "candidates.rou.xml", drives)
             rows = _closed(rows)
-            grid_s = _grid_s(rows, path)
-            options = _counts_for_sumo(rows, grid_s, work, seed)
+            every = [*_filling(rows, begin_s), *rows]
+            grid_s = _grid_s(every, path)
+            options = _counts_for_sumo(every, grid_s, work, seed)
             out = work / "sampled.rou.xml"
-            begin, end = min(row.begin_s for row in rows), max(row.end_s for row in rows)
+            begin, end = min(row.begin_s for row in every), max(row.end_s for row in every)
             convert(
                 "routeSampler.py",
                 ["-r", str(work / "candidates.rou.xml"), *options, "-o", str(out),
@@ -260,7 +271,7 @@ def from_counts(path: Path, begin_s: float, length_s: float, seed: int) -> Vehic
         notes = (
             _summary(fits, path),
             *_on_the_way(rows, sampled, root),
-            *_outside(rows, path, begin_s, begin_s + length_s),
+            *_about_times(rows, path, begin_s, begin_s + length_s),
         )
         return VehicleFiles((ROUTES,), notes, fits=fits)
 
@@ -349,6 +360,37 @@ def _closed(rows: Sequence[Row]) -> list[Row]:
     return [
         replace(row, end_s=row.end_s + 1.0) if row.end_s - row.begin_s in lengths else row
         for row in rows
+    ]
+
+
+_MOST_FILLING_S = 1800.0
+"""Longest time before the first interval, s, that gets vehicles by itself: roads are full then."""
+
+
+def _filling(rows: Sequence[Row], begin_s: float) -> list[Row]:
+    """Return rows with the flow of the first interval for the whole minutes before it.
+
+    They fill the roads. There are none where the episode begins with the first interval, or long
+    before it.
+
+    Args:
+        rows: The counted rows.
+        begin_s: Start of the episode, s.
+    """
+    first_s = min(row.begin_s for row in rows)
+    before_s = (first_s - begin_s) // 60.0 * 60.0
+    if not 0 < before_s <= _MOST_FILLING_S:
+        return []
+    return [
+        replace(
+            row,
+            count=row.count * before_s / (row.end_s - row.begin_s),
+            begin_s=first_s - before_s,
+            end_s=first_s,
+            line=-row.line,  # no two vehicles have one name
+        )
+        for row in rows
+        if row.begin_s == first_s
     ]
 
 
@@ -520,10 +562,44 @@ def from_od(path: Path, begin_s: float, length_s: float, seed: int) -> VehicleSo
                     f"{path}, line {row.line}: there is no way from {row.roads[0]!r} to "
                     f"{row.roads[1]!r}"
                 )
-        _route(_trips(rows, seed), network, folder / ROUTES, seed)
-        return VehicleFiles((ROUTES,), tuple(_outside(rows, path, begin_s, begin_s + length_s)))
+        trips = _trips([*_filling(rows, begin_s), *rows], seed)
+        _route(trips, network, folder / ROUTES, seed)
+        return VehicleFiles((ROUTES,), tuple(_about_times(rows, path, begin_s, begin_s + length_s)))
 
     return vehicles
+
+
+_USUAL_S = 900.0
+"""Counts are of multiples of this time, s."""
+
+
+def _about_times(rows: Sequence[Row], path: Path, begin_s: float, end_s: float) -> Iterator[str]:
+    """Yield notes on vehicles before the first interval, outside, and spread over an odd time.
+
+    Args:
+        rows: Rows of the table.
+        path: The table.
+        begin_s: Start of the episode, s.
+        end_s: End of the episode, s.
+    """
+    first_s = min(row.begin_s for row in rows)
+    if filling := _filling(rows, begin_s):
+        yield (
+            f"vehicles with the flow of the first interval fill the roads from "
+            f"{filling[0].begin_s:g} to {first_s:g} s; they are not among the counts"
+        )
+    elif first_s - begin_s > _MOST_FILLING_S:
+        yield (
+            f"no vehicle drives before {first_s:g} s, where the first interval begins; with "
+            f"--begin-s {first_s - 600:g} vehicles fill the roads for ten minutes before it"
+        )
+    spread = [row for row in rows if (row.begin_s, row.end_s) == (begin_s, end_s)]
+    if spread and (end_s - begin_s) % _USUAL_S:
+        yield (
+            f"{path.name}: rows without begin_s and end_s are of the whole episode, "
+            f"{end_s - begin_s:g} s; fill in both if their counts are of another time, as an hour"
+        )
+    yield from _outside(rows, path, begin_s, end_s)
 
 
 def _outside(rows: Iterable[Row], path: Path, begin_s: float, end_s: float) -> Iterator[str]:

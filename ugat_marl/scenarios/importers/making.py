@@ -377,9 +377,9 @@ def _require_counts_kept(made: Path, target: Path) -> None:
 
 
 def _keep_pictures(made: Path, target: Path) -> None:
-    """Keep the drawings of a folder without vehicles if its network stays the same."""
+    """Keep the drawings of a folder if its network stays the same."""
     pictures, networks = target / PICTURES, [folder / NETWORK for folder in (target, made)]
-    if (target / "scenario.toml").exists() or not pictures.is_dir() or (made / PICTURES).exists():
+    if not pictures.is_dir() or (made / PICTURES).exists():
         return
     if all(map(Path.is_file, networks)) and filecmp.cmp(*networks, shallow=False):
         shutil.copytree(pictures, made / PICTURES)
