@@ -201,3 +201,16 @@ def test_mean_speeds_that_nobody_drives_are_named(
         read = read_measured(write_measured(data, tmp_path / str(named)), scenario, network)
         texts = [finding.text for finding in read.findings]
         assert any("mean_speed_mps is above" in text for text in texts) == named, texts
+
+
+@pytest.mark.parametrize(("factor", "named"), [(1, False), (3, True)])
+def test_vehicles_per_hour_in_place_of_counts_are_named(
+    tmp_path: Path, scenario: Scenario, network: Network, factor: int, named: bool
+) -> None:
+    given = as_counts(recording(), 10.0)
+    assert given.counts is not None
+    counts = given.counts.with_columns(count=pl.int_range(pl.len()) % 7 // 2 * factor)
+    data = replace(given, counts=counts.with_columns(occupancy=None, mean_speed_mps=None))
+    read = read_measured(write_measured(data, tmp_path / "street"), scenario, network)
+    texts = [finding.text for finding in read.findings]
+    assert any("every count is a multiple of 3;" in text for text in texts) == named, texts

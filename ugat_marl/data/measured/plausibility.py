@@ -49,6 +49,7 @@ def implausible(measured: MeasuredData, network: Network) -> list[Finding]:
         *_on_red(measured, network),
         *_swapped_events(measured),
         *_speeds(measured, network),
+        *_rates(measured),
         *_lengths(measured),
         *_places(measured.detectors, network),
     ]
@@ -173,6 +174,20 @@ def _speeds(measured: MeasuredData, network: Network) -> Iterator[Finding]:
                 f"{where} is above {fast:.1f} times the speed limit of the network in 15 % of the "
                 "rows; is it in km/h or mph, or is the limit wrong?"
             )
+
+
+def _rates(measured: MeasuredData) -> Iterator[Finding]:
+    """Yield a finding if counts have a common factor, as vehicles per hour have."""
+    if measured.counts is None:
+        return
+    counted = measured.counts.filter(pl.col("count") > 0)["count"].cast(pl.Int64).to_numpy()
+    if len(counted) < FEWEST or len(np.unique(counted)) < 3:
+        return
+    if (factor := int(np.gcd.reduce(counted))) > 1:
+        yield Finding(
+            f"counts.csv: every count is a multiple of {factor}; are they vehicles per hour? count "
+            "is the number of vehicles in the interval"
+        )
 
 
 def _lengths(measured: MeasuredData) -> Iterator[Finding]:
