@@ -159,8 +159,8 @@ def test_what_is_read_is_what_was_written(
         read_measured(tmp_path / "wrong", crossing_scenario, network)
     assert after.lanes is not None and after.lanes["mean_speed_mps"].to_list() == [None, 3.5]
     assert [finding.text.split(" (")[0] for finding in after.findings] == [
-        "periods.csv: 3 periods",  # of 200 s
         "detectors.csv: 2 stop detectors",  # 400 m upstream
+        "periods.csv: 3 periods",  # of 200 s
     ]
 
 

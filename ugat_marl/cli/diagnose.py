@@ -180,20 +180,13 @@ class Diagnose:
 
 
 def _say_what_cannot_be_seen(measured: MeasuredData, console: Console) -> None:
-    """Print the effects that the data cannot show, before the first simulation."""
+    """Print the effects that the data cannot show, before the first simulation.
+
+    Without single vehicles a note of the data says it, with what can be examined.
+    """
     ruled_out = {name for finding in measured.findings for name in finding.rules_out}
-    if not ruled_out:
-        return
-    listed = ", ".join(sorted(ruled_out))
-    if not measured.has_events:
-        rest = ", ".join(sorted(set(known_effects()) - ruled_out))
-        text = (
-            f"No single vehicles are seen: no more than {rest} can be examined. "
-            f"Ruled out: {listed}."
-        )
-    else:
-        text = f"Ruled out by what the data lack: {listed}."
-    console.print(text)
+    if ruled_out and measured.has_events:
+        console.print(f"Ruled out by what the data lack: {', '.join(sorted(ruled_out))}.")
 
 
 def _in_the_model(effect: NamedEffect) -> bool:

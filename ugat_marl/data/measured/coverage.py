@@ -100,15 +100,15 @@ NEEDS_TWO_KINDS = ("undercount",)
 
 
 def coverage(measured: MeasuredData, scenario: Scenario, network: Network) -> list[Finding]:
-    """Return findings on all missing data, most important first."""
+    """Return findings on mistaken and on missing data, most important first."""
     return [
+        *implausible(measured, network),
         *_of_periods(measured),
         *_of_signals(measured, scenario, network),
         *_of_kinds(measured, network),
         *_of_clocks(measured),
         *_of_places(measured.detectors, network),
         *_of_silence(measured),
-        *implausible(measured, network),
     ]
 
 
