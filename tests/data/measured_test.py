@@ -608,15 +608,24 @@ def test_local_times_become_seconds_of_the_scenario(
     assert reread(in_local_time(zone)).hash == recording().hash
 
 
-def test_local_counts_become_seconds(reread: Callable[..., MeasuredData], tmp_path: Path) -> None:
+@pytest.mark.parametrize(
+    ("begin", "end"),
+    [
+        ("2024-03-05 07:00:00", "2024-03-05 07:01:00"),
+        ("2024-03-05 07:00", "2024-03-05 07:01"),
+        ("2024-03-05T07:00", "2024-03-05T07:01"),
+        ("03/05/2024 07:00", "03/05/2024 07:01"),
+    ],
+)
+def test_local_counts_become_seconds(
+    reread: Callable[..., MeasuredData], begin: str, end: str
+) -> None:
     counts = pl.DataFrame(
         {"period_id": ["day0"], "begin_s": [0.0], "end_s": [60.0], "detector_id": ["s"],
          "count": [7]}
     )  # fmt: skip
     given = replace(recording(), counts=counts)
-    local = (
-        "period_id,begin,end,detector_id,count\nday0,2024-03-05 07:00:00,2024-03-05 07:01:00,s,7\n"
-    )
+    local = f"period_id,begin,end,detector_id,count\nday0,{begin},{end},s,7\n"
     changes = {**in_local_time(), "counts.csv": lambda _: local}
     read = reread(changes, given)
     assert read.counts is not None

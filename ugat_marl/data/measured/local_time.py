@@ -17,6 +17,9 @@ _FORMATS = (
     "%Y-%m-%dT%H:%M:%S%.f",
     "%m/%d/%Y %H:%M:%S%.f",
     "%m/%d/%Y %I:%M:%S%.f %p",
+    "%Y-%m-%d %H:%M",
+    "%Y-%m-%dT%H:%M",
+    "%m/%d/%Y %H:%M",
 )
 
 
