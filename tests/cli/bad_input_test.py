@@ -16,6 +16,7 @@ from pathlib import Path
 import pytest
 
 from ugat_marl import parallel_env
+from ugat_marl.__main__ import main
 from ugat_marl.errors import (
     ActionError,
     EpisodeError,
@@ -536,3 +537,17 @@ def test_a_file_that_is_no_scenario_is_not_called_an_unknown_name(tmp_path: Path
     (tmp_path / "trips.xml").write_text("<routes/>")
     with pytest.raises(ScenarioError, match=r"trips\.xml: is no scenario; give a directory"):
         parallel_env(tmp_path / "trips.xml")
+
+
+@pytest.mark.parametrize("was_there", [False, True])
+def test_an_interrupted_recording_leaves_no_new_folder(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, was_there: bool
+) -> None:
+    def interrupted(*_: object, **__: object) -> None:
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr("ugat_marl.cli.record.record", interrupted)
+    if was_there:
+        (tmp_path / "measured").mkdir()
+    assert main(["record", "single-v1", "--out", str(tmp_path / "measured")]) == 130
+    assert (tmp_path / "measured").exists() == was_there

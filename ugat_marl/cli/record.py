@@ -74,23 +74,29 @@ class Record:
         require_numbers(1, periods=self.periods, workers=self.workers)
         require_numbers(0, seed=self.seed)
         require_replaceable(self.out)
+        is_new = not self.out.exists()
         require_writable(self.out / "periods.csv")
-        measured = record(
-            scenario,
-            self.domain,
-            policy,
-            periods=self.periods,
-            seed=self.seed,
-            duration_s=self.duration_s,
-            same_demand=self.same_demand,
-            day_to_day=self.day_to_day,
-            detector_length_m=self.detector_length_m,
-            speeds=self.speeds,
-            lanes=self.lanes,
-            trajectories=self.trajectories,
-            workers=self.workers,
-            reporter=Bars(console),
-        )
+        try:
+            measured = record(
+                scenario,
+                self.domain,
+                policy,
+                periods=self.periods,
+                seed=self.seed,
+                duration_s=self.duration_s,
+                same_demand=self.same_demand,
+                day_to_day=self.day_to_day,
+                detector_length_m=self.detector_length_m,
+                speeds=self.speeds,
+                lanes=self.lanes,
+                trajectories=self.trajectories,
+                workers=self.workers,
+                reporter=Bars(console),
+            )
+        except BaseException:  # an interruption, too, leaves no empty folder
+            if is_new:
+                self.out.rmdir()
+            raise
         seen = sum(len(log) for period in measured.periods for log in period.passages.values())
         if self.counts_every_s is not None:
             measured = as_counts(measured, self.counts_every_s)
