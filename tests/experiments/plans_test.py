@@ -48,9 +48,9 @@ def test_a_fitted_street_simulates_shorter_worlds(tmp_path: Path) -> None:
     config = replace(SMALL, ugat=ugat)
     work = work_of(planned_jobs(config), tmp_path, 7200.0)
     assert (work["fitting"].units, work["fitting"].weight) == (60, 0.25 * 1.5)
-    assert work["comparing"].units == 2 * 3 * 2
+    assert work["comparing"].units == (2 + 3) * 3 * 2
     assert work["under delays"].units == 2 * 6 * 2
-    assert work["late greens"].units == 2 * ugat.grounded_episodes
+    assert work["late greens"].units == 3 * 2 * ugat.grounded_episodes
 
 
 def test_lessons_are_work(tmp_path: Path) -> None:
@@ -65,6 +65,7 @@ def test_lessons_are_work(tmp_path: Path) -> None:
     assert lessons(4, UNIVERSAL_NAME) == (14 + 3 * 2 + 3) + 2 * 3
     # the rival looks for the rule that is best with late greens
     assert lessons(4, UNIVERSAL_NAME, "matched") == lessons(4, UNIVERSAL_NAME) + 2 * 23
+    assert lessons(4, UNIVERSAL_NAME, "several") == lessons(4, UNIVERSAL_NAME) + 3 * 2 * 23
     assert lessons(0, DQN_NAME) == 0
 
 

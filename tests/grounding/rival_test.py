@@ -30,7 +30,9 @@ from ugat_marl.grounding.rival import ROLL_OUTS, Rival, late_world, matched_dela
 from ugat_marl.grounding.street import StreetWorld
 from ugat_marl.policies import DQNConfig, EpsilonGreedy, make_rule, observer_of, roll_out
 
-QUICK = StreetConfig(simulations=20, further=4, simulated_s=60.0, judged=1, rule_budget=0)
+QUICK = StreetConfig(
+    simulations=20, further=4, simulated_s=60.0, judged=1, rule_budget=0, rival="matched"
+)
 CONFIG = replace(
     SMALL, ugat=replace(SMALL.ugat, grounding="street", street=QUICK, iterations=1)
 )  # fmt: skip

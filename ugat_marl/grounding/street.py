@@ -114,7 +114,7 @@ class StreetConfig:
     simulated_s: float = 1800.0
     judged: int = 8
     rule_budget: int | None = None
-    rival: Literal["none", "matched", "several"] = "matched"
+    rival: Literal["none", "matched", "several"] = "several"
     without: tuple[str, ...] = ()
     channel: ChannelConfig = field(default_factory=ChannelConfig)
     eyes: EyesConfig = field(default_factory=EyesConfig)

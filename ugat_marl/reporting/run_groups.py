@@ -82,10 +82,10 @@ def seeds_of_one(records: Sequence[RunRecord]) -> list[list[RunRecord]]:
 
 
 def _one_of_a_seed(records: Sequence[RunRecord]) -> list[RunRecord]:
-    newest: dict[str, RunRecord] = {}
-    for record in sorted(records, key=_age):
-        newest.setdefault(record.seed or record.name, record)
-    return [record for record in records if record in newest.values()]
+    newest: dict[str, int] = {}
+    for index, record in sorted(enumerate(records), key=lambda pair: _age(pair[1])):
+        newest.setdefault(record.seed or record.name, index)
+    return [records[index] for index in sorted(newest.values())]
 
 
 def _age(record: RunRecord) -> float:
