@@ -9,7 +9,7 @@ from __future__ import annotations
 import contextlib
 import difflib
 import re
-from collections.abc import Iterable, Sequence
+from collections.abc import Collection, Iterable, Sequence
 from typing import Literal, get_args, get_origin, get_type_hints
 
 LISTED = 32
@@ -181,6 +181,19 @@ def joined(texts: Sequence[str]) -> str:
 def listed(names: Sequence[str], noun: str) -> str:
     """Return how many things there are with their first names, such as "2 lanes ('a', 'b')"."""
     return f"{counted(len(names), noun)} ({first_names([*map(repr, names)])})"
+
+
+def unknown_key(key: str, name: str, known: Collection[str]) -> str:
+    """Return that a file has an unknown key, and the key that was meant or those that there are.
+
+    Args:
+        key: The key with the tables that it is in.
+        name: The key alone.
+        known: Keys that its table has.
+    """
+    guess = nearest(name, known)
+    hint = f"did you mean {guess!r}?" if guess else f"known: {', '.join(known)}"
+    return f"unknown key {key!r}; {hint}"
 
 
 def nearest(name: str, allowed: Iterable[str]) -> str | None:

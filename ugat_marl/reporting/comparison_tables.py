@@ -31,7 +31,7 @@ from ugat_marl.reporting.formats import (
     share_text,
     signed_text,
 )
-from ugat_marl.reporting.terminal import titled_table
+from ugat_marl.reporting.terminal import in_tables, titled_table
 
 CERTAIN = 0.05
 """Level of the paired tests in the paragraph that says what the table means."""
@@ -47,8 +47,7 @@ def terminal_tables(comparison: Comparison, direct: str) -> RenderableType:
     """Return ATT, change of the gap, regret and the share won back, in 80 columns."""
     blocks: list[RenderableType] = []
     for title, cell in _headlines(comparison, direct):
-        for first in range(0, len(comparison.targets), MOST_TARGETS):
-            targets = comparison.targets[first : first + MOST_TARGETS]
+        for targets in in_tables(comparison.targets, MOST_TARGETS):
             table = titled_table(f"{comparison.scenario}: {title}")
             table.add_column("policy", max_width=28, overflow="fold")
             for target in targets:

@@ -83,14 +83,19 @@ def seeds_of_one(records: Sequence[RunRecord]) -> list[list[RunRecord]]:
 
 def _one_of_a_seed(records: Sequence[RunRecord]) -> list[RunRecord]:
     newest: dict[str, int] = {}
-    for index, record in sorted(enumerate(records), key=lambda pair: _age(pair[1])):
+    for index, record in _newest_first(records):
         newest.setdefault(record.seed or record.name, index)
     return [records[index] for index in sorted(newest.values())]
 
 
-def _age(record: RunRecord) -> float:
-    """Return a number that is less for newer trainings."""
-    return math.inf if math.isnan(record.written) else -record.written
+def _newest_first(records: Sequence[RunRecord]) -> list[tuple[int, RunRecord]]:
+    """Return the trainings with their indices; those of unknown age come last."""
+
+    def age(pair: tuple[int, RunRecord]) -> float:
+        written = pair[1].written
+        return math.inf if math.isnan(written) else -written
+
+    return sorted(enumerate(records), key=age)
 
 
 def _common(record: RunRecord) -> tuple[Any, ...]:
@@ -117,7 +122,7 @@ def _trials(records: Sequence[RunRecord]) -> tuple[list[Trial], tuple[str, ...]]
     names, told = job_labels(records), _told(records)
     known: dict[tuple[Any, ...], int] = {}
     trials: list[list[Trial]] = [[] for _ in records]
-    for index, record in sorted(enumerate(records), key=lambda pair: _age(pair[1])):
+    for index, record in _newest_first(records):
         of_record = _of_job(record, names[index]) if record.job else _of_run(record, told)
         training = record.seed or record.name
         trials[index] = [

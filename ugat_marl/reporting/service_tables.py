@@ -13,7 +13,7 @@ from ugat_marl.experiments import Evaluation
 from ugat_marl.reporting.formats import fixed, number_text
 from ugat_marl.reporting.light_names import LIGHT_HEADING, LightNames
 from ugat_marl.reporting.page import Grid
-from ugat_marl.reporting.terminal import titled_table
+from ugat_marl.reporting.terminal import in_tables, titled_table
 from ugat_marl.scenarios import Network, named_approaches
 
 MOST_APPROACHES = 8
@@ -74,8 +74,7 @@ def service_tables(evaluation: Evaluation, network: Network) -> list[RenderableT
     if not measured:
         return []
     tables: list[RenderableType] = []
-    for first in range(0, len(evaluation.domains), MOST_DOMAINS):
-        domains = evaluation.domains[first : first + MOST_DOMAINS]
+    for domains in in_tables(evaluation.domains, MOST_DOMAINS):
         table = titled_table(f"{evaluation.scenario}: control delay and level of service (HCM)")
         table.add_column("policy", max_width=22, overflow="fold")
         for domain in domains:
@@ -107,8 +106,8 @@ def approach_table(title: str, delays: Mapping[str, Delays], network: Network) -
     shown = roads[:MOST_APPROACHES]
     more = f", the worst {len(shown)} of {len(roads)}" if len(roads) > len(shown) else ""
     tables: list[RenderableType] = []
-    for first in range(0, len(delays), MOST_CONTROLLERS):
-        part = dict([*delays.items()][first : first + MOST_CONTROLLERS])
+    for controllers in in_tables([*delays], MOST_CONTROLLERS):
+        part = {controller: delays[controller] for controller in controllers}
         table = titled_table(f"{title}{more}")
         for heading in (LIGHT_HEADING, "approach", "road"):
             table.add_column(heading, overflow="fold", max_width=22)

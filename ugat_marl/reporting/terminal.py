@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 
 from rich import box
 from rich.console import Console, ConsoleOptions, RenderResult
@@ -37,6 +37,12 @@ class WholeWords(Table):
             yield title if isinstance(title, Text) else Text(title)
         yield from super().__rich_console__(console, options)
         self.title = title
+
+
+def in_tables(names: Sequence[str], most: int) -> Iterator[Sequence[str]]:
+    """Yield the columns of tables beneath each other, which have at most so many side by side."""
+    for first in range(0, len(names), most):
+        yield names[first : first + most]
 
 
 def _span(console: Console, options: ConsoleOptions, column: Column) -> Measurement:

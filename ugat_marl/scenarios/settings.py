@@ -9,7 +9,7 @@ from typing import Annotated, Any, Literal
 import pydantic
 from pydantic import Field
 
-from ugat_marl.errors import ScenarioError, nearest
+from ugat_marl.errors import ScenarioError, nearest, unknown_key
 from ugat_marl.scenarios.admission import DECIMAL, OPTIONS, option_fault
 
 PhaseSource = Literal["programme", "conflict-free", "permitted"] | tuple[str, ...]
@@ -201,12 +201,9 @@ def _explain(problem: Any) -> str:
         return f"{key}: give {allowed}"
     key = ".".join(names)
     if problem["type"] == "extra_forbidden":
-        known = _known_keys(names[:-1])
-        guess = nearest(names[-1], known)
         if len(names) == 1 and names[0] in ControlSettings.model_fields:
             return f"unknown key {key!r}; it belongs under [control]"
-        hint = f"did you mean {guess!r}?" if guess else f"known: {', '.join(known)}"
-        return f"unknown key {key!r}; {hint}"
+        return unknown_key(key, names[-1], _known_keys(names[:-1]))
     if problem["type"] == "missing":
         return f"key {key!r} is missing"
     return f"{key} = {problem['input']!r}: {problem['msg'][:1].lower()}{problem['msg'][1:]}"

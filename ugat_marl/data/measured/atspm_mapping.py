@@ -11,7 +11,7 @@ import pydantic
 from pydantic import Field
 
 from ugat_marl.data.measured.local_time import require_time_zone
-from ugat_marl.errors import MeasuredDataError, nearest
+from ugat_marl.errors import MeasuredDataError, unknown_key
 from ugat_marl.files import read_toml
 from ugat_marl.scenarios import DetectorKind, Real, Split
 
@@ -200,9 +200,7 @@ def _explain(problem: Any) -> str:
     if problem["type"] == "extra_forbidden":
         inside = [part for part in table if part in _TABLES]
         known = (_TABLES[inside[-1]] if inside else AtspmMapping).model_fields
-        guess = nearest(str(name), known)
-        hint = f"did you mean {guess!r}?" if guess else f"known: {', '.join(known)}"
-        return f"unknown key {key!r}; {hint}"
+        return unknown_key(key, str(name), known)
     if problem["type"] == "missing":
         return f"key {key!r} is missing"
     if problem["type"].startswith("datetime"):

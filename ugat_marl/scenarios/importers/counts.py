@@ -248,7 +248,8 @@ def from_counts(path: Path, begin_s: float, length_s: float, seed: int) -> Vehic
             _require_reached(rows, drives, path)
             write_drives(work / "candidates.rou.xml", drives)
             rows = _closed(rows)
-            every = [*_filling(rows, begin_s), *rows]
+            filling = _filling(rows, begin_s)
+            every = [*filling, *rows]
             grid_s = _grid_s(every, path)
             options = _counts_for_sumo(every, grid_s, work, seed)
             out = work / "sampled.rou.xml"
@@ -271,7 +272,7 @@ def from_counts(path: Path, begin_s: float, length_s: float, seed: int) -> Vehic
         notes = (
             _summary(fits, path),
             *_on_the_way(rows, sampled, root),
-            *_about_times(rows, path, begin_s, begin_s + length_s),
+            *_about_times(rows, filling, path, begin_s, begin_s + length_s),
         )
         return VehicleFiles((ROUTES,), notes, fits=fits)
 
@@ -562,9 +563,10 @@ def from_od(path: Path, begin_s: float, length_s: float, seed: int) -> VehicleSo
                     f"{path}, line {row.line}: there is no way from {row.roads[0]!r} to "
                     f"{row.roads[1]!r}"
                 )
-        trips = _trips([*_filling(rows, begin_s), *rows], seed)
-        _route(trips, network, folder / ROUTES, seed)
-        return VehicleFiles((ROUTES,), tuple(_about_times(rows, path, begin_s, begin_s + length_s)))
+        filling = _filling(rows, begin_s)
+        _route(_trips([*filling, *rows], seed), network, folder / ROUTES, seed)
+        notes = _about_times(rows, filling, path, begin_s, begin_s + length_s)
+        return VehicleFiles((ROUTES,), tuple(notes))
 
     return vehicles
 
@@ -573,17 +575,20 @@ _USUAL_S = 900.0
 """Counts are of multiples of this time, s."""
 
 
-def _about_times(rows: Sequence[Row], path: Path, begin_s: float, end_s: float) -> Iterator[str]:
+def _about_times(
+    rows: Sequence[Row], filling: Sequence[Row], path: Path, begin_s: float, end_s: float
+) -> Iterator[str]:
     """Yield notes on vehicles before the first interval, outside, and spread over an odd time.
 
     Args:
         rows: Rows of the table.
+        filling: Rows that `_filling` adds to them.
         path: The table.
         begin_s: Start of the episode, s.
         end_s: End of the episode, s.
     """
     first_s = min(row.begin_s for row in rows)
-    if filling := _filling(rows, begin_s):
+    if filling:
         yield (
             f"vehicles with the flow of the first interval fill the roads from "
             f"{filling[0].begin_s:g} to {first_s:g} s; they are not among the counts"
