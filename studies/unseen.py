@@ -109,6 +109,14 @@ def main(arguments: Sequence[str] | None = None) -> None:
     parser.add_argument("--seeds", type=int, default=1, help="trainings of each row")
     parser.add_argument("--domains", nargs="+", default=DOMAINS)
     parser.add_argument("--largest", type=int, default=9, help="most intersections of a network")
+    parser.add_argument(
+        "--load",
+        type=float,
+        nargs=2,
+        default=NetworkRanges.load,
+        metavar=("LEAST", "MOST"),
+        help="degree of saturation of the busiest intersection",
+    )
     parser.add_argument("--simulations", type=int, default=80)
     parser.add_argument("--rule-budget", type=int, default=6)
     parser.add_argument(
@@ -155,9 +163,9 @@ def scenarios(given: argparse.Namespace) -> list[Path]:
         UnknownNameError: No network has a name in `given.only`.
     """
     folders: list[Path] = []
-    ranges = NetworkRanges(intersections=(1, given.largest))
+    ranges = NetworkRanges(intersections=(1, given.largest), load=tuple(given.load))
     networks, towns = given.out / "networks", given.out / "towns"
-    draw = {"seed": given.seed, "largest": given.largest}
+    draw = {"seed": given.seed, "largest": given.largest, "load": list(given.load)}
     require_same(networks / "draw.json", draw, begun=networks.exists())
     for k in range(given.networks):
         folder = networks / f"drawn-{k}"

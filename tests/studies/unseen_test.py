@@ -10,6 +10,7 @@ import pytest
 from studies import unseen
 from studies.unseen import Outcome, scenarios, summary
 from ugat_marl.errors import OutputError, UnknownNameError
+from ugat_marl.scenarios import NetworkRanges
 
 
 def outcome(network: str, direct: float, street: float, rule: float, sim: float = 50.0) -> Outcome:
@@ -37,12 +38,15 @@ def test_some_of_the_drawn_networks_are_run(
 ) -> None:
     drawn: list[int] = []
 
-    def draw(folder: Path, seed: int, _ranges: object) -> None:
+    def draw(folder: Path, seed: int, ranges: NetworkRanges) -> None:
+        assert ranges.intersections == (1, 2) and ranges.load == (0.8, 1.1)
         folder.mkdir(parents=True)
         drawn.append(seed)
 
     monkeypatch.setattr(unseen, "draw_scenario", draw)
-    given = argparse.Namespace(out=tmp_path, seed=1, networks=3, largest=2, pbf=None, only=None)
+    given = argparse.Namespace(
+        out=tmp_path, seed=1, networks=3, largest=2, load=[0.8, 1.1], pbf=None, only=None
+    )
     assert [folder.name for folder in scenarios(given)] == ["drawn-0", "drawn-1", "drawn-2"]
     given.only = ["drawn-2"]
     assert [folder.name for folder in scenarios(given)] == ["drawn-2"]
@@ -51,5 +55,8 @@ def test_some_of_the_drawn_networks_are_run(
         scenarios(given)
     given.only, given.seed = None, 2
     with pytest.raises(OutputError, match="made with seed = 1, not 2"):
+        scenarios(given)
+    given.seed, given.load = 1, [0.3, 1.1]
+    with pytest.raises(OutputError, match=r"made with load = \[0.8, 1.1\], not \[0.3, 1.1\]"):
         scenarios(given)
     assert len(set(drawn)) == len(drawn) == 3  # those that exist are kept
