@@ -3,8 +3,11 @@
 from __future__ import annotations
 
 import argparse
+import re
 from pathlib import Path
 
+import numpy as np
+import polars as pl
 import pytest
 
 from studies import unseen
@@ -60,3 +63,30 @@ def test_some_of_the_drawn_networks_are_run(
     with pytest.raises(OutputError, match=r"made with load = \[0.8, 1.1\], not \[0.3, 1.1\]"):
         scenarios(given)
     assert len(set(drawn)) == len(drawn) == 3  # those that exist are kept
+
+
+def test_the_note_counts_what_the_numbers_hold() -> None:
+    """Table of all draws, against the travel times of each row."""
+    results = Path(__file__).parents[2] / "results"
+    if not results.is_dir():
+        pytest.skip("results/ is not part of the package")
+    cases: dict[tuple[str, str, str], dict[str, float]] = {}
+    for row in pl.read_csv(results / "unseen" / "seeds.csv").iter_rows(named=True):
+        case = cases.setdefault((str(row["draw"]), row["network"], row["domain"]), {})
+        case[row["setting"]] = row["att_s"]
+    page = results / "notes" / "what-is-won-on-networks-nobody-tuned-on.md"
+    told = re.findall(r"^\| (\d{8}) \| (.*) \|$", page.read_text(encoding="utf-8"), re.MULTILINE)
+    assert {draw for draw, _ in told} == {draw for draw, _, _ in cases}
+    rows = ("fitted street", "constant delay 3 s", "constant delay 5 s", unseen.RULE)
+    for draw, cells in told:
+        outcomes = [Outcome(c[1], c[2], att_s, {}) for c, att_s in cases.items() if c[0] == draw]
+        counted = [x for x in outcomes if x.counts]
+        ahead = sum(
+            x.att_s["fitted street"] > 1.02 * min(x.att_s[constant] for constant in rows[1:3])
+            for x in outcomes
+        )
+        cases_told, *won, ahead_told = cells.replace("−", "-").split(" | ")[2:]
+        assert cases_told == f"{len(outcomes)}, {len(counted)}" and ahead_told == str(ahead)
+        # the newest draw's travel times have one decimal
+        shares = [float(np.mean([x.won_back(row) for x in counted])) for row in rows]
+        assert [float(x) for x in won] == pytest.approx(shares, abs=0.011)
