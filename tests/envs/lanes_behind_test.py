@@ -18,7 +18,7 @@ from ugat_marl.experiments.training import simulated_worlds
 from ugat_marl.field import LaneCount, Site
 from ugat_marl.files import Document
 from ugat_marl.grounding import UgatConfig
-from ugat_marl.policies import make_rule
+from ugat_marl.policies import ControlledNetwork, make_rule
 from ugat_marl.scenarios import NO_UPSTREAM_LANES, Network, Scenario, survey
 from ugat_marl.scenarios.junctions import Upstream, behind_of
 
@@ -52,6 +52,17 @@ def test_a_short_lane_has_the_lane_behind(split: Scenario) -> None:
     assert network.lanes["NM_0"].behind == Upstream()
     (item,) = survey(split).intersections
     assert item.lanes_behind == ("wM_0",)
+    assert network.straight == {"Ww": "wM"}  # all other roads end at the light or at the edge
+
+
+def test_rules_measure_the_length_on_which_vehicles_are_counted(split: Scenario) -> None:
+    """A stream of few vehicles on 6 m would hold each green to its end."""
+    env = ugat_marl.parallel_env(split)
+    rules, lane = ControlledNetwork.of(env), env.network.lanes["wM_0"]
+    assert rules.free_flow_s["wM_0"] == pytest.approx(lane.room_m / 13)
+    assert rules.free_flow_s["wM_0"] * 13 == pytest.approx(7.5 * rules.capacity["wM_0"])
+    assert rules.road_s["wM"] == pytest.approx(lane.length_m / 13)
+    env.close()
 
 
 def test_who_waits_behind_is_counted(split: Scenario) -> None:

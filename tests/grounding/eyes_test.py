@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 
 from ugat_marl.data import AgentLayout, Provenance, TransitionLog, TransitionRecorder
+from ugat_marl.errors import OptionError
 from ugat_marl.grounding.eyes import Eyes, EyesConfig, _dead, _noise, fit_eyes
 from ugat_marl.grounding.summaries import LaneRows, LaneView
 
@@ -188,6 +189,12 @@ def test_coarse_counts_are_found_by_their_step() -> None:
         return np.round(counts / 5) * 5
 
     assert found(coarse).step == 5.0
+
+
+@pytest.mark.parametrize("name", ["least_served", "least_stays"])
+def test_nothing_is_estimated_from_no_decisions(name: str) -> None:
+    with pytest.raises(OptionError, match=rf"eyes {name} is 0; allowed: >= 1"):
+        EyesConfig(**{name: 0})
 
 
 def test_eyes_survive_their_checkpoint() -> None:

@@ -118,6 +118,15 @@ def test_static_and_infinite_do_not_move() -> None:
     assert np.isinf(infinite.alpha).all()
 
 
+def test_a_fixed_alpha_stays_with_the_state_of_another_gate() -> None:
+    """Models fitted behind a dynamic gate are judged behind the one that was asked for."""
+    fitted = Gate(AGENTS, GateConfig())
+    for config, alpha in ((GateConfig("static", 0.3), 0.3), (GateConfig("infinite"), np.inf)):
+        gate = Gate(AGENTS, config)
+        gate.load_state_dict(fitted.state_dict())
+        assert gate.alpha.tolist() == [alpha, alpha]
+
+
 def test_no_decision_no_change_of_alpha() -> None:
     gate = Gate(AGENTS, GateConfig())
     gate.update()

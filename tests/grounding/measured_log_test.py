@@ -5,7 +5,7 @@ from __future__ import annotations
 import contextlib
 from dataclasses import replace
 from pathlib import Path
-from typing import Any
+from typing import Any, cast
 
 import numpy as np
 import polars as pl
@@ -21,10 +21,13 @@ from ugat_marl.grounding import (
     LaneView,
     RecordedWorld,
     StreetConfig,
+    TimedConfig,
+    UgatConfig,
     log_of_measured,
 )
 from ugat_marl.grounding.measured_log import phases_shown
 from ugat_marl.grounding.summaries import NAMES, OF_COUNTS
+from ugat_marl.grounding.ugat import Ugat
 from ugat_marl.grounding.worlds import RecordedCommands
 from ugat_marl.policies import observer_of, roll_out
 from ugat_marl.scenarios import Network, Scenario
@@ -186,6 +189,16 @@ def test_a_learner_and_a_fit_take_the_log(crossing: Scenario, measured: Measured
     assert taken is not None and taken.frame.equals(log.frame)
     summary = LaneView.of(Network.read(crossing), "movements").summary(log)
     assert np.isfinite(summary.values[:, NAMES.index("mean")]).all()
+
+
+def test_rewards_of_a_log_are_not_matched(crossing: Scenario, measured: MeasuredData) -> None:
+    """They are those of whoever set the lights, and those of the simulation the learner's."""
+    env = parallel_env(crossing, observation="count")
+    world, nothing = RecordedWorld(imported(measured, crossing), env), cast(Any, None)
+    config = UgatConfig("timed", timed=TimedConfig(match=True))
+    ugat = Ugat(env=env, sim=nothing, real=world, config=config, seed=0, run=nothing)
+    with pytest.raises(OptionError, match="the street's log is of another policy"):
+        ugat.train(nothing)
 
 
 def test_a_replay_repeats_the_commands_of_the_street(

@@ -3,10 +3,12 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 import pytest
 
+from tests.crossroads import build_crossroads
 from ugat_marl.data import AgentLayout, Provenance, TransitionLog, TransitionRecorder
 from ugat_marl.effects import load_scenario
 from ugat_marl.grounding.oversaturation import Oversaturation
@@ -79,6 +81,42 @@ def test_shares_are_those_planted() -> None:
 def test_free_traffic_is_not_called_oversaturated() -> None:
     found = Oversaturation.of(VIEW, VIEW.rows(log_of(0.0)), ["a_0", "b_0"])
     assert found.describe() == []
+
+
+def test_a_jam_behind_a_node_of_the_map_is_seen(tmp_path: Path) -> None:
+    """With `movements`, where the lane behind the light ends at no light."""
+    build_crossroads(tmp_path, 60)
+    (tmp_path / "r.rou.xml").write_text("<routes/>")
+    (tmp_path / "scenario.toml").write_text(
+        'network = "n.net.xml"\nroutes = ["r.rou.xml"]\nduration_s = 200\n'
+    )
+    network = Network.read(load_scenario(tmp_path))
+    (item,) = network.intersections
+    own, out = len(item.incoming_lanes), len(item.outgoing_lanes)
+    jammed = item.outgoing_lanes.index("ME_0")
+    layout = AgentLayout(2 * own + out, len(item.phases))
+    recorder = TransitionRecorder(
+        Provenance("by hand", "", "street", (), 10.0, "movements", {"a_0": layout})
+    )
+    for t in range(10):
+        seen = np.zeros(layout.features + layout.phases)
+        seen[layout.features] = 1.0
+        seen[2 * own + jammed] = 0.95 if t < 4 else 0.5
+        seen[2 * own + (jammed + 1) % out] = 0.85
+        recorder.record(0, t, {"a_0": seen}, {"a_0": 0}, {"a_0": 0}, {"a_0": 0.0}, {"a_0": seen})
+    log = recorder.log()
+    held = {
+        lane: row.held
+        for lane, row in zip(
+            item.incoming_lanes, LaneView.of(network, "movements").rows(log), strict=True
+        )
+    }
+    leads = {link.from_lane for link in item.links if link.to_lane == "ME_0"}
+    assert leads and {lane for lane in held if held[lane].any()} == leads
+    assert all(held[lane].tolist() == [True] * 4 + [False] * 6 for lane in leads)
+    few = {name: replace(lane, length_m=20.0) for name, lane in network.lanes.items()}
+    short = LaneView.of(replace(network, lanes=few), "movements")
+    assert not any(row.held.any() for row in short.rows(log)), "one vehicle would fill it"
 
 
 def test_lanes_of_a_network_know_where_they_lead() -> None:

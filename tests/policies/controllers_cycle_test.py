@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -13,7 +14,7 @@ from ugat_marl.policies import ControlledNetwork
 from ugat_marl.policies.rules.actuated import Actuated, DelayActuated
 from ugat_marl.policies.rules.green_wave import GreenWave, main_roads
 from ugat_marl.policies.rules.webster import Webster, webster_plan
-from ugat_marl.scenarios import Intersection, Link
+from ugat_marl.scenarios import Intersection, Link, edge_of_lane
 
 # Two lanes with a phase each, and one for a third that nobody needs to leave by.
 INCOMING = ("n_0", "w_0", "e_0")
@@ -153,7 +154,10 @@ def row_of(lights: int, apart_s: float) -> ControlledNetwork:
         items[f"signal_{k}"] = Intersection(
             f"x{k}", incoming, outgoing, links, phases, (), (), (0.0, 0.0)
         )
-    return ControlledNetwork(items, dict.fromkeys(free_flow_s, 40.0), free_flow_s, 10.0, 5.0)
+    road_s = dict.fromkeys(map(edge_of_lane, free_flow_s), apart_s)
+    return ControlledNetwork(
+        items, dict.fromkeys(free_flow_s, 40.0), free_flow_s, 10.0, 5.0, road_s
+    )
 
 
 def test_the_main_road_runs_through_all_lights():
@@ -162,6 +166,26 @@ def test_the_main_road_runs_through_all_lights():
     assert road.edges == ("r0", "r1", "r2")
     assert road.arrival_s == (0.0, 21.0, 42.0)
     assert len(main_roads(streets())) == 1
+
+
+def test_a_node_between_two_lights_does_not_end_the_road():
+    """Maps cut roads where something changes; travel times then are those of all pieces."""
+    whole = row_of(3, apart_s=21)
+    cut = whole.intersections["signal_0"]
+    links = tuple(
+        replace(link, to_lane="piece_0") if link.to_edge == "r1" else link for link in cut.links
+    )
+    pieces = replace(
+        whole,
+        intersections={**whole.intersections, "signal_0": replace(cut, links=links)},
+        road_s={**whole.road_s, "piece": 8.0, "other": 1.0, "r1": 12.0},
+        straight={"piece": "other", "other": "r1"},
+    )
+    (road,) = main_roads(pieces)
+    assert road.agents == ("signal_0", "signal_1", "signal_2")
+    assert road.edges == ("r0", "r1", "r2") and road.arrival_s == (0.0, 21.0, 42.0)
+    around = replace(pieces, straight={"piece": "other", "other": "piece"})
+    assert {len(each.agents) for each in main_roads(around)} == {3}  # westwards it is whole
 
 
 def test_the_green_travels_with_the_vehicles():

@@ -354,6 +354,12 @@ def test_damaged_and_foreign_checkpoints_are_refused_and_change_nothing(tmp_path
     for other in (DQN.of(CueEnv((2, 3)), QUICK), DQN.of(CueEnv((3, 3, 4)), QUICK)):
         with pytest.raises(CheckpointError, match="agents"):
             other.load(path)
+    counts = DQN.of(CueEnv(), QUICK, env_options={"observation": "count"})
+    counts.load(path)  # a file that does not tell its observation is taken
+    counts.save(tmp_path / "counts.pt")
+    for options in ({"observation": "queue"}, {"observation": "count", "neighbours": 1}):
+        with pytest.raises(CheckpointError, match=r"counts\.pt: learned from observations with"):
+            DQN.of(CueEnv(), QUICK, env_options=options).load(tmp_path / "counts.pt")
     with pytest.raises(CheckpointError, match="hidden"):
         DQN.of(CueEnv(), DQNConfig(hidden=(8,))).load(path)
     with pytest.raises(CheckpointError, match="shape"):

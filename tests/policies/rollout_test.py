@@ -133,6 +133,21 @@ def test_greens_that_no_action_means_are_not_recorded() -> None:
             env.close()
 
 
+def test_a_programme_was_asked_for_what_it_ran() -> None:
+    """Else a log of the lights as they are would say that nearly all commands are lost."""
+    env = parallel_env("grid2x2-v1", "sim", signals="programme", duration_s=400)
+    try:
+        exploring = EpsilonGreedy(make_rule("programme", env), 0.3)  # the default of `rollout`
+        log = roll_out(env, exploring, 3, record=observer_of(env)).log
+        assert log is not None
+        for agent in log.agents:
+            rows = log.transitions(agent)
+            assert set(rows.executed.tolist()) > {0}
+            assert np.array_equal(rows.action, rows.executed)
+    finally:
+        env.close()
+
+
 def test_a_stopped_episode_leaves_no_measurement_for_the_next_one(env: TrafficEnv) -> None:
     def stop(step: int) -> None:
         raise RollOutStopped

@@ -231,6 +231,8 @@ def test_learns_toy_traffic_and_its_weights_serve_as_a_start(tmp_path: Path):
     )
     begun = toy_learner(5, replace(QUICK, start=str(tmp_path / "start.pt")))
     assert played(env, begun.policy()) == trained
+    with pytest.raises(OptionError, match=r"observation = 'toy', not 'count'"):
+        DQN(AgentSet.of(env), begun.config, 0, {"observation": "count"}, toy_structure())
     wider = replace(QUICK, hidden=(13, 16), start=str(tmp_path / "start.pt"))
     with pytest.raises(OptionError, match=r"learned with observation=toy: use the same"):
         toy_learner(0, wider)

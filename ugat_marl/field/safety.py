@@ -135,11 +135,6 @@ def fixed_time(
         clearance_s: Yellow and all-red together, s.
         green_s: Time of a phase, s, its clearance included.
     """
-    streets = ControlledNetwork(
-        {intersection.id: intersection for intersection in network.intersections},
-        {name: lane.storage_veh for name, lane in network.lanes.items()},
-        {name: lane.length_m / lane.speed_mps for name, lane in network.lanes.items()},
-        decision_interval_s,
-        clearance_s,
-    )
+    intersections = {intersection.id: intersection for intersection in network.intersections}
+    streets = ControlledNetwork.of_network(network, intersections, decision_interval_s, clearance_s)
     return FixedTime(streets, green_s)

@@ -656,7 +656,7 @@ class LaneEstimate:
         assert reference is not None
         first = self._crossings(period, reference)
         free_mps = self._free_speed(first, lane.speed_mps)
-        upstream_m = reference.position_m + max(lane.room_m - lane.length_m, 0.0)
+        upstream_m = reference.position_m + lane.counted_m - lane.length_m
         pace = np.where(first.speed_mps >= 0.8 * free_mps, first.speed_mps, free_mps)
         pace = np.minimum(pace, self.config.fastest * lane.speed_mps)
         come = np.maximum.accumulate(first.on_s - upstream_m / pace)
@@ -675,7 +675,7 @@ class LaneEstimate:
         come, beyond, jams = spread
         stops = seen.crossings if own.advance is None else self._crossings(period, own.stop)
         assert own.stop is not None
-        pace, ahead_m = seen.pace_mps, lane.length_m + max(lane.room_m - lane.length_m, 0.0)
+        pace, ahead_m = seen.pace_mps, lane.counted_m
         sigma = np.where(seen.free, self.config.speed_spread * seen.upstream_m / pace, 0.0)
         arrive = come + ahead_m / pace
         leave = self._left(stops, own.stop, lane.length_m)

@@ -96,9 +96,9 @@ class EyesConfig:
     least_lost: float = 0.08
 
     def __post_init__(self) -> None:
-        for name in ("most_lag", "least_served", "least_stays"):
-            if getattr(self, name) < 0:
-                raise OptionError(f"eyes {name} is {getattr(self, name)}; allowed: >= 0")
+        for name, least in (("most_lag", 0), ("least_served", 1), ("least_stays", 1)):
+            if getattr(self, name) < least:
+                raise OptionError(f"eyes {name} is {getattr(self, name)}; allowed: >= {least}")
         for name in ("surprise", "together", "pull"):
             if not 0 < getattr(self, name) < math.inf:
                 raise OptionError(f"eyes {name} is {getattr(self, name)}; allowed: > 0, finite")

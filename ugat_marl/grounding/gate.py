@@ -246,7 +246,7 @@ class Gate:
         }
 
     def load_state_dict(self, state: Mapping[str, Any]) -> None:
-        """Restore `state_dict`.
+        """Restore `state_dict`; a gate whose alpha does not move keeps its own.
 
         Raises:
             CheckpointError: The state has other agents, is incomplete or has impossible numbers.
@@ -271,7 +271,8 @@ class Gate:
         iteration = state.get("iteration")
         if not isinstance(iteration, int) or iteration < 0:
             raise CheckpointError(f"the gate in the checkpoint has iteration {iteration!r}")
-        self.alpha = np.where(arrays["open"] > 0, np.inf, arrays["alpha"])
+        if self.config.mode == "dynamic":
+            self.alpha = np.where(arrays["open"] > 0, np.inf, arrays["alpha"])
         self.trusted = arrays["trusted"] > 0
         self._running, self._counts = arrays["running"], arrays["counts"]
         self._epochs = deque(arrays["epochs"], maxlen=self.config.window_epochs)

@@ -28,6 +28,9 @@ CLOSE = 1e-4
 FULL = 0.9
 """Share of the vehicles that fit on a lane from which it is full. At 0.8 long queues that still
 move are taken for full; at 1.0 trucks and gaps keep a jam from being seen."""
+LEAST_HOLDS = 3.0
+"""Fewest vehicles that a lane behind an intersection holds for it to be called full. In a shorter
+one, as between two nodes of a map, a single vehicle that passes looks like a jam."""
 MOST_DEVIATION = 1.5
 """Standard deviation of the vehicles on a lane, in vehicles, above which only the service of its
 greens is used: the fall of a queue by two or three vehicles would be lost in it. At 3.0 lanes are
@@ -143,6 +146,9 @@ class LaneView:
         first: For each intersection, the position of the first count among its features.
         holds: Vehicles that each lane holds, as far as the observation can tell, ``(lanes,)``.
         onward: For each lane, the positions of the lanes at lights that its links lead to.
+        beyond: For each intersection, the lanes at no light that its links lead to, as far as the
+            observation shows them: position among its features, and places of the lanes that lead
+            there among its own.
     """
 
     lanes: tuple[str, ...]
@@ -151,6 +157,7 @@ class LaneView:
     first: tuple[int, ...]
     holds: Floats
     onward: tuple[tuple[int, ...], ...]
+    beyond: tuple[tuple[tuple[int, tuple[int, ...]], ...], ...] = ()
 
     @classmethod
     def of(cls, network: Network, observation: str) -> LaneView:
@@ -179,7 +186,10 @@ class LaneView:
             holds += np.minimum(capacity, scale[-1]).tolist()
             first.append(len(own) if observation == "movements" else 0)
         onward = _onward(network, lanes)
-        return cls(tuple(lanes), tuple(green), tuple(scale), tuple(first), np.array(holds), onward)
+        beyond = _beyond(network, lanes) if observation == "movements" else ()
+        return cls(
+            tuple(lanes), tuple(green), tuple(scale), tuple(first), np.array(holds), onward, beyond
+        )
 
     def lanes_of(self, agents: Sequence[str]) -> dict[str, range]:
         """Return the positions of the lanes of each agent.
@@ -210,9 +220,9 @@ class LaneView:
             replace(
                 row,
                 full=jam,
-                held=np.isin(row.key, np.concatenate([jams[k] for k in ways]))
+                held=row.held | np.isin(row.key, np.concatenate([jams[k] for k in ways]))
                 if ways
-                else np.zeros_like(jam),
+                else row.held,
             )
             for row, jam, ways in zip(rows, full, self.onward, strict=True)
         ]
@@ -243,8 +253,11 @@ class LaneView:
         phase = rows.observation[:, layout.features : layout.features + layout.phases].argmax(1)
         had, has = green[:, phase], green[:, rows.executed]
         age_s = interval_s * _ages(had, consecutive(rows.episode, rows.step))
+        held = np.zeros(before.shape, dtype=np.bool_)
+        for feature, ways in self.beyond[place] if self.beyond else ():
+            filled = np.maximum(rows.observation[:, feature], rows.next_observation[:, feature])
+            held[:, ways] |= (filled >= FULL)[:, None]
         for k in range(len(scale)):
-            none = np.zeros(len(before), dtype=np.bool_)
             yield LaneRows(
                 rows.episode,
                 rows.step,
@@ -253,8 +266,8 @@ class LaneView:
                 left[:, k],
                 age_s[k],
                 has[k],
-                none,
-                none,
+                np.zeros(len(before), dtype=np.bool_),
+                held[:, k],
             )
 
 
@@ -311,6 +324,27 @@ def _onward(network: Network, lanes: Sequence[str]) -> tuple[tuple[int, ...], ..
             if link.to_lane in places:
                 ways[places[link.from_lane]][places[link.to_lane]] = None
     return tuple(map(tuple, ways))
+
+
+def _beyond(
+    network: Network, lanes: Sequence[str]
+) -> tuple[tuple[tuple[int, tuple[int, ...]], ...], ...]:
+    """Return `LaneView.beyond` for the observation `movements`, which shows outgoing lanes last."""
+    at_lights = frozenset(lanes)
+    found: list[tuple[tuple[int, tuple[int, ...]], ...]] = []
+    for item in network.intersections:
+        own = {lane: k for k, lane in enumerate(item.incoming_lanes)}
+        ways: dict[str, set[int]] = {}
+        for link in item.links:
+            ways.setdefault(link.to_lane, set()).add(own[link.from_lane])
+        found.append(
+            tuple(
+                (2 * len(own) + place, tuple(sorted(ways[lane])))
+                for place, lane in enumerate(item.outgoing_lanes)
+                if lane not in at_lights and network.lanes[lane].storage_veh >= LEAST_HOLDS
+            )
+        )
+    return tuple(found)
 
 
 def _greens(item: Intersection) -> NDArray[np.bool_]:

@@ -52,6 +52,7 @@ import numpy as np
 import torch
 
 from ugat_marl.data import TransitionLog
+from ugat_marl.errors import OptionError
 from ugat_marl.grounding.algorithm import Algorithm, iteration_name
 from ugat_marl.grounding.delays import EpisodeRewards, episode_rewards
 from ugat_marl.grounding.fitting import Fitter
@@ -85,8 +86,16 @@ class Ugat(Algorithm):
 
         Returns:
             The policy after the last iteration.
+
+        Raises:
+            OptionError: Rewards are to be matched, and the street is a log.
         """
         device = device_of(self.device)  # refuses a missing GPU before anything runs
+        if self.config.matches and self.real.replay() is not None:
+            raise OptionError(
+                "timed match compares the rewards of one policy in both worlds, and the street's "
+                "log is of another policy; leave the match or the log out"
+            )
         self._pretrain(state)  # line 1
         grounded_env = GroundedEnv(self.env, state.transform)
         while state.iteration < self.config.iterations:  # line 2

@@ -168,6 +168,24 @@ def checkpoint_header(
     }
 
 
+def other_observation(saved: Mapping[str, Any], own: Mapping[str, Any]) -> str:
+    """Say in what the observations of two environments differ; "" if in nothing that is known.
+
+    Observations of equal sizes may have other meanings, such as queues and counts.
+
+    Args:
+        saved: Options of the one environment, as in a checkpoint.
+        own: Options of the other one.
+    """
+    if "observation" not in saved or "observation" not in own:
+        return ""
+    for name, usual in (("observation", None), ("neighbours", 0)):
+        there, here = saved.get(name, usual), own.get(name, usual)
+        if there != here:
+            return f"{name} = {there!r}, not {here!r}"
+    return ""
+
+
 def parse_header(
     content: Mapping[str, Any],
 ) -> tuple[AgentSet, tuple[int, ...], dict[str, Any], bool]:

@@ -144,6 +144,8 @@ class _Recording:
         then = self._look()
         self._refuse_other_greens()
         executed = {agent: int(infos[agent]["executed_action"]) for agent in self._names}
+        if self._base.options.signals == "programme":
+            actions = executed  # nobody asks a programme, so what it runs is what was asked for
         delay_s = {agent: float(infos[agent].get("delay_s", 0.0)) for agent in self._names}
         self._recorder.record(
             episode=0,

@@ -63,6 +63,7 @@ from .naming import member_names as member_names
 from .network import Intersection as Intersection
 from .network import Lane as Lane
 from .network import Network as Network
+from .network import free_flow_s as free_flow_s
 from .network import signal_widths as signal_widths
 from .network import within_hops as within_hops
 from .periods import DETECTOR_CLOCKS as DETECTOR_CLOCKS

@@ -5,7 +5,7 @@ from __future__ import annotations
 import heapq
 import xml.etree.ElementTree as ET
 from collections import Counter, defaultdict
-from collections.abc import Container, Mapping, Sequence
+from collections.abc import Container, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 
 from ugat_marl.scenarios.naming import edge_of_lane
@@ -178,10 +178,8 @@ def neighbours_of(
     """Return the neighbours of each traffic light: roads join them with no light in between."""
     enters = {link.from_edge: tls for tls, light_links in links.items() for link in light_links}
     following: dict[str, set[str]] = defaultdict(set)
-    no_light = {None, *rail_signals_of(root)}
-    for element in root.iter("connection"):
-        if not element.get("from", ":").startswith(":") and element.get("tl") in no_light:
-            following[element.get("from", "")].add(element.get("to", ""))
+    for element in _connections_without_light(root):
+        following[element.get("from", "")].add(element.get("to", ""))
     adjacent: dict[str, set[str]] = {tls: set() for tls in links}
     for tls, own in links.items():
         edges = {link.to_edge for link in own}
@@ -196,6 +194,23 @@ def neighbours_of(
                 adjacent[tls].add(other)
                 adjacent[other].add(tls)
     return {tls: tuple(sorted(beside)) for tls, beside in adjacent.items()}
+
+
+def straight_roads_of(root: ET.Element) -> dict[str, str]:
+    """Return road (SUMO's edge) to the road straight ahead of it, where no light is in between."""
+    ahead: dict[str, str] = {}
+    for element in _connections_without_light(root):
+        if element.get("dir") == "s":
+            ahead.setdefault(element.get("from", ""), element.get("to", ""))
+    return ahead
+
+
+def _connections_without_light(root: ET.Element) -> Iterator[ET.Element]:
+    """Yield the connections between roads that no traffic light controls."""
+    no_light = {None, *rail_signals_of(root)}
+    for element in root.iter("connection"):
+        if not element.get("from", ":").startswith(":") and element.get("tl") in no_light:
+            yield element
 
 
 def right_on_red_of(root: ET.Element) -> frozenset[str]:

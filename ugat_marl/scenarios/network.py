@@ -20,6 +20,7 @@ from ugat_marl.scenarios.junctions import (
     links_of,
     neighbours_of,
     right_on_red_of,
+    straight_roads_of,
     yields_of,
 )
 from ugat_marl.scenarios.lanes import NO_UPSTREAM_LANES, LaneTable, Turns, UpstreamLanes
@@ -63,9 +64,14 @@ class Lane:
     room_m: float = 0.0
 
     @property
+    def counted_m(self) -> float:
+        """Length on which vehicles are counted, m: its own, and that of its upstream lanes."""
+        return max(self.length_m, self.room_m)
+
+    @property
     def storage_veh(self) -> float:
         """Number of default vehicles that fit on the lane and its upstream lanes, at least one."""
-        return max(1.0, max(self.length_m, self.room_m) / VEHICLE_SPACE_M)
+        return max(1.0, self.counted_m / VEHICLE_SPACE_M)
 
 
 @dataclass(frozen=True)
@@ -111,6 +117,7 @@ class Network:
         streets: Road (SUMO's edge) to the name of its street; roads without a name are left out.
         reasons: Light of `uncontrolled` to the reason why it is not an agent.
         notes: Changes to the programmes of the file, for the user.
+        straight: Road (SUMO's edge) to the road straight ahead of it, where no light is in between.
     """
 
     lanes: Mapping[str, Lane]
@@ -119,6 +126,7 @@ class Network:
     streets: Mapping[str, str] = field(default_factory=dict[str, str])
     reasons: Mapping[str, str] = field(default_factory=dict[str, str])
     notes: tuple[str, ...] = ()
+    straight: Mapping[str, str] = field(default_factory=dict[str, str])
 
     @classmethod
     def read(cls, scenario: Scenario) -> Network:
@@ -199,6 +207,7 @@ class Network:
             streets_of(root),
             reasons,
             (*notes, *_unknown_conflicts(agents_found)),
+            straight_roads_of(root),
         )
 
     def intersection(self, tls: str) -> Intersection:

@@ -32,7 +32,12 @@ from ugat_marl.policies.learners.initial_weights import InitialWeights
 from ugat_marl.policies.learners.lessons import BEST, OnPlay, find_teacher, plays
 from ugat_marl.policies.learners.replay import ReplayBuffer
 from ugat_marl.policies.learners.scaling import ceilings, input_factors
-from ugat_marl.policies.network_policy import NetworkPolicy, checkpoint_header, parse_header
+from ugat_marl.policies.network_policy import (
+    NetworkPolicy,
+    checkpoint_header,
+    other_observation,
+    parse_header,
+)
 from ugat_marl.policies.networks.batched import one_thread, size_mask
 from ugat_marl.policies.networks.q_network import (
     bind_parameters,
@@ -535,10 +540,16 @@ class DQN:
         """Take weights that were learned elsewhere.
 
         Raises:
-            OptionError: The network is not "universal", or has another number of weights.
+            OptionError: The network is not "universal", or has another number of weights. Or they
+                were learned from another observation.
         """
         if not self._is_universal:
             raise OptionError('only a network "universal" begins with the weights of another')
+        if other := other_observation(initial.env_options, self.env_options):
+            raise OptionError(
+                f"the start was learned from observations with {other}; make the environment with "
+                "the same, or leave out the start"
+            )
         weights = initial.weights_for(self._online)
         self._weights.data.copy_(weights)
         self._target_weights.data.copy_(weights)
@@ -596,12 +607,14 @@ class DQN:
 
         Raises:
             CheckpointError: The file is missing, cut short, not finite, or belongs to another
-                network or other agents. The learner does not change then.
+                network, another observation or other agents. The learner does not change then.
         """
         content = read_checkpoint(path, _KIND)
         try:
             agents, hidden, env_options, shared = parse_header(content)
             _require_same(path, "agents", agents, self.agents)
+            if other := other_observation(env_options, self.env_options):
+                raise CheckpointError(f"{path}: learned from observations with {other}")
             _require_same(path, "hidden sizes", hidden, self.config.hidden)
             _require_same(path, "settings 'shared'", shared, self.config.shared)
             structure = structure_in(content, agents)
@@ -621,7 +634,7 @@ class DQN:
                 raise ValueError("counters below 0, or actions that no agent has")
         except MALFORMED as error:
             raise CheckpointError(f"{path}: not a whole checkpoint ({error!r})") from None
-        self.env_options = env_options
+        self.env_options = env_options or self.env_options
         for name in _COUNTERS:
             setattr(self, name, counters[name])
         for name, tensor in self._tensors().items():

@@ -71,7 +71,8 @@ class DQNConfig:
         hidden: Sizes of the hidden layers of every network.
         learning_rate: Step size of Adam.
         discount: Weight of the next decision's value (gamma), 0.95-0.98 in the literature. With
-            "universal" it is that of 10 s, so that values compare between decision intervals.
+            "universal" it is that of 10 s, so that it looks equally far ahead at any decision
+            interval. A value is a sum over decisions all the same: half the interval doubles it.
         steps: Decisions whose rewards a target sums before it takes a value (n-step returns, Sutton
             1988). With "universal" they are decisions of 10 s as well.
         batch_size: Transitions per update and agent.

@@ -27,7 +27,12 @@ from ugat_marl.envs import AgentSet, AnyParallelEnv, ResetResult, StepResult
 from ugat_marl.errors import ActionError, CheckpointError, EpisodeError, OptionError
 from ugat_marl.files import MALFORMED
 from ugat_marl.policies.learners.scaling import InputScale, RewardScale, observation_mask
-from ugat_marl.policies.network_policy import NetworkPolicy, checkpoint_header, parse_header
+from ugat_marl.policies.network_policy import (
+    NetworkPolicy,
+    checkpoint_header,
+    other_observation,
+    parse_header,
+)
 from ugat_marl.policies.networks.batched import one_thread
 from ugat_marl.policies.protocols import EpisodeCallback
 from ugat_marl.seeding import derive_seed, numpy_generator
@@ -100,9 +105,11 @@ class LibraryLearner(abc.ABC):
         """
         content = read_checkpoint(path, self._kind)
         try:
-            agents, *_ = parse_header(content)
+            agents, _, env_options, _ = parse_header(content)
             if agents != self.agents:
                 raise CheckpointError(f"{path}: its agents are {agents}, not {self.agents}")
+            if other := other_observation(env_options, self.env_options):
+                raise CheckpointError(f"{path}: learned from observations with {other}")
             _require_like(path, content["networks"], self._networks())
             episodes, sums = int(content["episodes"]), [one.numpy() for one in content["sums"]]
             if [one.shape for one in sums] != [one.sums.shape for one in self._scales]:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Hashable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from functools import cached_property
 from itertools import combinations
 from typing import Any, NamedTuple
@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 
 from ugat_marl.envs import WAITING_SCALE_S, AnyParallelEnv, Infos
 from ugat_marl.errors import OptionError
-from ugat_marl.scenarios import GREEN, Intersection, Network
+from ugat_marl.scenarios import GREEN, Intersection, Network, free_flow_s
 
 MOST_SEARCHED_PHASES = 12
 """Largest number of phases for an exhaustive search of the smallest cover.
@@ -31,9 +31,12 @@ class ControlledNetwork:
         intersections: Agent to intersection.
         capacity: Lane to the number of vehicles that fit on it. The observation `movements` holds
             vehicles divided by this number.
-        free_flow_s: Lane to the seconds that a vehicle needs along it at the speed limit.
+        free_flow_s: Lane to the seconds that a vehicle needs, at the speed limit, along the length
+            on which vehicles are counted.
         decision_interval_s: Seconds from one decision to the next.
         clearance_s: Seconds of yellow and all-red between two greens.
+        road_s: Road (SUMO's edge) to the seconds that a vehicle needs along it at the speed limit.
+        straight: Road to the road straight ahead of it, where no light is in between.
     """
 
     intersections: Mapping[str, Intersection]
@@ -41,6 +44,8 @@ class ControlledNetwork:
     free_flow_s: Mapping[str, float]
     decision_interval_s: float
     clearance_s: float
+    road_s: Mapping[str, float] = field(default_factory=dict[str, float])
+    straight: Mapping[str, str] = field(default_factory=dict[str, str])
 
     @classmethod
     def of(cls, env: AnyParallelEnv) -> ControlledNetwork:
@@ -48,12 +53,31 @@ class ControlledNetwork:
         base: Any = env.unwrapped
         network: Network = base.network
         tls_of: Mapping[str, str] = base.intersection_of
-        return cls(
+        return cls.of_network(
+            network,
             {agent: network.intersection(tls_of[agent]) for agent in base.possible_agents},
-            {name: lane.storage_veh for name, lane in network.lanes.items()},
-            {name: lane.length_m / lane.speed_mps for name, lane in network.lanes.items()},
             base.decision_interval_s,
             base.scenario.timing.clearance_s,
+        )
+
+    @classmethod
+    def of_network(
+        cls,
+        network: Network,
+        intersections: Mapping[str, Intersection],
+        decision_interval_s: float,
+        clearance_s: float,
+    ) -> ControlledNetwork:
+        """Collect the facts about a network whose intersections have these names."""
+        lanes = network.lanes
+        return cls(
+            intersections,
+            {name: lane.storage_veh for name, lane in lanes.items()},
+            {name: lane.counted_m / lane.speed_mps for name, lane in lanes.items()},
+            decision_interval_s,
+            clearance_s,
+            free_flow_s(lanes.values()),
+            network.straight,
         )
 
     @cached_property
@@ -93,7 +117,7 @@ class Approach:
         lanes: The lanes, in the order of the observation.
         outgoing: Number of outgoing lanes.
         capacity: Vehicles that fit on each lane, ``(lanes,)``.
-        free_flow_s: Seconds along each lane at the speed limit, ``(lanes,)``.
+        free_flow_s: Seconds along the counted length of each lane at the speed limit, ``(lanes,)``.
         served: True where a phase shows green to a link of a lane, ``(phases, lanes)``.
         cycle: A smallest set of phases that serves every link.
     """

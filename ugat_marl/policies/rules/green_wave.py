@@ -66,14 +66,22 @@ def _roads_from(
         while True:
             straight = _straight(free[agents[-1]], edges[-1])
             lanes += len({link.from_lane for link in straight})
-            ahead = [link for link in straight if link.to_edge in entered]
-            following = entered[ahead[0].to_edge] if ahead else agents[-1]
-            if following in agents:
+            ways = (_onward(link.to_edge, network) for link in straight)
+            ahead = next((way for way in ways if way[-1] in entered), None)
+            if ahead is None or entered[ahead[-1]] in agents:
                 break
-            agents.append(following)
-            edges.append(ahead[0].to_edge)
-            arrival_s.append(arrival_s[-1] + network.free_flow_s[ahead[0].to_lane])
+            agents.append(entered[ahead[-1]])
+            edges.append(ahead[-1])
+            arrival_s.append(arrival_s[-1] + sum(network.road_s[road] for road in ahead))
         yield Corridor(tuple(agents), tuple(edges), tuple(arrival_s), lanes)
+
+
+def _onward(road: str, network: ControlledNetwork) -> list[str]:
+    """Return a road and those straight ahead of it, up to a light or the end of the network."""
+    way = [road]
+    while (following := network.straight.get(way[-1])) is not None and following not in way:
+        way.append(following)
+    return way
 
 
 class GreenWave:
