@@ -25,5 +25,10 @@ def test_the_only_name_that_begins_so_is_meant() -> None:
     assert "Did you mean" not in str(UnknownNameError("option", "ob", names))
 
 
+def test_what_is_only_a_little_alike_is_not_meant() -> None:
+    for name, known in (("learning", ["flag", "lr"]), ("nope", ["EnvOpt"]), ("V5", ["V1", "V2"])):
+        assert "Did you mean" not in str(UnknownNameError("setting", name, known))
+
+
 def test_where_nothing_is_known_nothing_is_listed() -> None:
     assert str(UnknownNameError("learner in math", "x", [])) == "unknown learner in math 'x'."

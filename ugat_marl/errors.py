@@ -16,6 +16,11 @@ LISTED = 32
 """Most names in one error message. If there are more, the message lists the nearest ones."""
 
 
+_CLOSE = 0.62
+"""Likeness from which a name is close to a known one. At 0.5 words that share a few letters are
+taken for each other, such as "learning" and "flag"; at 0.7 slips in short words are lost."""
+
+
 def first_line(error: BaseException) -> str:
     """Return the first line of an error's text, or its type; libraries add stacks and hints."""
     return (str(error).splitlines() or [type(error).__name__])[0][:200]
@@ -199,11 +204,22 @@ def unknown_key(key: str, name: str, known: Collection[str]) -> str:
 def nearest(name: str, allowed: Iterable[str]) -> str | None:
     """Return the name in `allowed` closest to `name`, or None if none is close.
 
-    The only name that begins with three letters or more of `name` is close.
+    The only name that begins with three letters or more of `name` is close. A name of several words
+    is as close as the closest of them.
     """
     by_lower = {candidate.lower(): candidate for candidate in allowed}
     longer = [lower for lower in by_lower if lower.startswith(name.lower())]
     if len(longer) == 1 and len(name) > 2:
         return by_lower[longer[0]]
-    found = difflib.get_close_matches(name.lower(), by_lower, n=1, cutoff=0.5)
-    return by_lower[found[0]] if found else None
+    matcher = difflib.SequenceMatcher(b=name.lower())
+
+    def likeness(lower: str) -> float:
+        matcher.set_seq1(lower)
+        return matcher.ratio()
+
+    close = {
+        lower: max(likeness(word) for word in (lower, *re.split(r"[\s,:/_-]+", lower)))
+        for lower in by_lower
+    }
+    best = max(close, key=lambda lower: (close[lower], likeness(lower)), default="")
+    return by_lower[best] if best and close[best] >= _CLOSE else None

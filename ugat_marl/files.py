@@ -58,6 +58,9 @@ _TOO_LONG = "a number is far too long, which no such file needs"
 MALFORMED = (ArithmeticError, AttributeError, LookupError, TypeError, ValueError)
 """Exceptions that parsed data of another form than expected raises where it is taken apart."""
 
+OWN_COUNTERS = "counters.json"
+"""Entry that the state of a user's learner has, and no other checkpoint."""
+
 _NO_ROOM = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG)
 _SPECIAL = re.compile('[&<>"\\r\\n\\t]')
 _IN_TEXT = str.maketrans({"&": "&amp;", "<": "&lt;", ">": "&gt;"})

@@ -28,6 +28,7 @@ from concurrent.futures import (
 )
 from concurrent.futures.process import BrokenProcessPool
 from multiprocessing.reduction import ForkingPickler
+from numbers import Integral
 from pathlib import Path
 from typing import Any, NamedTuple, TypeVar
 
@@ -186,8 +187,11 @@ def parts_at_a_time(workers: Workers) -> int:
         return getattr(workers, "parts_at_a_time", None) or getattr(
             workers, "_max_workers", usable_cores()
         )
-    if workers is not None and workers < 1:
-        raise OptionError(f"workers = {workers}: must be at least 1, or None for all cores")
+    number: Any = workers
+    if number is not None and not (isinstance(number, Integral) and int(number) >= 1):
+        raise OptionError(
+            f"workers = {workers!r}: must be a whole number from 1 on, or None for all cores"
+        )
     return workers or usable_cores()
 
 

@@ -164,6 +164,9 @@ def test_keywords_are_shown_with_their_defaults_and_documented() -> None:
     wrong: dict[str, Any] = {"obsrevation": "count"}
     with pytest.raises(UnknownNameError, match="'observation'"):
         ugat_marl.parallel_env("single-v1", **wrong)
+    wrong = {"domian": "V4"}
+    with pytest.raises(UnknownNameError, match="Did you mean 'domain'"):
+        ugat_marl.parallel_env("single-v1", **wrong)
 
 
 def test_one_light_is_an_environment_of_gymnasium() -> None:
@@ -182,6 +185,7 @@ def test_one_light_is_an_environment_of_gymnasium() -> None:
             assert not ended and info["action_mask"].shape == (env.action_space.n,)  # pyright: ignore[reportAttributeAccessIssue]
         light: Any = env.unwrapped
         assert str(light.describe()) == str(same.describe())
+        assert light.scores() == same.scores()
         env.close()
         same.close()
     with pytest.raises(OptionError, match=r"has 4 intersections.*parallel_env"):

@@ -112,6 +112,13 @@ def is_list(vector: Any, expected: list[float]) -> bool:
 # --- closed forms -------------------------------------------------------------------------------
 
 
+@pytest.mark.parametrize("given", [None, "mixed-v1", lambda: ugat_marl.env("single-v1")])
+def test_only_environments_of_parallel_agents_are_wrapped(given: Any) -> None:
+    given = given() if callable(given) else given
+    with pytest.raises(OptionError, match=r"no environment of PettingZoo .* aec_to_parallel"):
+        pad_spaces(given)
+
+
 def test_padding_in_closed_form() -> None:
     env = pad_spaces(Steep())
     observations, infos = env.reset()

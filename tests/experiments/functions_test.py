@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
@@ -14,8 +15,9 @@ import ugat_marl
 from tests.runs import search_few_rules
 from ugat_marl.data import Scores
 from ugat_marl.effects import Headway
-from ugat_marl.errors import OptionError, UnknownNameError
+from ugat_marl.errors import CheckpointError, OptionError, UnknownNameError
 from ugat_marl.experiments import Evaluation, PaperConfig, TransferConfig, run_folder
+from ugat_marl.experiments.functions import _texts
 from ugat_marl.experiments.scores import Result as Episode
 from ugat_marl.grounding import UgatConfig
 from ugat_marl.policies import DQNConfig
@@ -104,6 +106,53 @@ def test_wrong_calls_are_refused() -> None:
         ugat_marl.evaluate("single-v1", "largst-queue", ["sim"])
     with pytest.raises(UnknownNameError, match="universal"):
         ugat_marl.train("single-v1", learner="univrsal")
+
+
+@pytest.mark.parametrize(
+    ("wrong", "says"),
+    [
+        ({"seed": "1"}, "seed = '1': must be a whole number"),
+        ({"seed": None}, "seed = None"),
+        ({"reward": len}, "reward = .*: train takes the name of one"),
+        ({"observation": len}, "observation = .*: train takes the name of one"),
+        ({"callback": 5}, "callback = 5"),
+        ({"real": ["V3", "V4"]}, r"real = \['V3', 'V4'\]: train takes one domain"),
+        ({"sim": ["V4"]}, "sim = .*one domain"),
+        ({"workers": "2"}, "workers = '2': must be a whole number"),
+        ({"workers": 1.5}, "workers = 1.5"),
+    ],
+)
+def test_wrong_arguments_of_a_training_leave_no_folder(
+    wrong: dict[str, Any], says: str, tmp_path: Path
+) -> None:
+    with pytest.raises(OptionError, match=says):
+        ugat_marl.train("single-v1", duration_s=60, out=tmp_path / "run", **wrong)
+    assert not (tmp_path / "run" / "settings.json").exists()
+
+
+def test_numbers_of_numpy_are_numbers(tmp_path: Path) -> None:
+    one: Any = np.int64(1)
+    run = ugat_marl.train(
+        "single-v1", grounding="phase", pretrain_episodes=one, iterations=np.int64(0), seed=one,  # type: ignore[arg-type]
+        duration_s=np.float64(100), evaluation_seeds=one, control=np.bool_(False), workers=one,  # type: ignore[arg-type]
+        ugat=None, dqn=DQNConfig(batch_size=np.int64(8)), out=tmp_path / "run",  # type: ignore[arg-type]
+    )  # fmt: skip
+    written = json.loads((run.folder / "settings.json").read_text())
+    asked = written["settings"]
+    assert (asked["seed"], asked["duration_s"], asked["control"]) == (1, 100.0, False)
+    assert (asked["ugat"]["pretrain_episodes"], asked["dqn"]["batch_size"]) == (1, 8)
+    assert run.table["low_s"].null_count() == run.table.height  # of one episode nothing is known
+    with pytest.raises(CheckpointError, match=r"its ugat\.pretrain_episodes is 1, asked for is 2;"):
+        ugat_marl.train(
+            "single-v1", grounding="phase", pretrain_episodes=2, iterations=0, seed=1,
+            duration_s=100.0, evaluation_seeds=1, control=False, workers=1,
+            dqn=DQNConfig(batch_size=8), resume=True, out=tmp_path / "run",
+        )  # fmt: skip
+
+
+def test_settings_may_be_a_dictionary() -> None:
+    assert _texts({"rate": 0.1, "sizes": (8, 16)}) == ("rate=0.1", "sizes=8,16")
+    assert _texts("rate=0.1") == _texts(["rate=0.1"]) == ("rate=0.1",)
 
 
 def test_what_the_package_offers_is_listed() -> None:

@@ -643,6 +643,34 @@ def test_settings_have_the_type_of_the_argument() -> None:
         OwnLearnerFactory("my_algo:Cycle", ["frist=2"])
 
 
+def test_an_argument_without_a_default_is_asked_for() -> None:
+    class Tuned(NoPolicy):
+        def __init__(self, env: Any, rate: float, *, depth: int, width: int = 3) -> None: ...
+
+        def policy(self) -> Any: ...
+
+    name = own_name(Tuned)
+    with pytest.raises(OptionError, match=r"needs rate and depth; .* rate=VALUE depth=VALUE, or"):
+        OwnLearnerFactory(name)(ToyTraffic(), 0)
+    OwnLearnerFactory(name, ["rate=0.1", "depth=2"])(ToyTraffic(), 0)
+
+
+@pytest.mark.parametrize("policy", [lambda o, i, extra: {}, lambda *, observations: {}])
+def test_a_policy_that_cannot_be_called_is_refused_before_it_plays(policy: Any) -> None:
+    with pytest.raises(OptionError, match=r"takes \(.*\), and is called with the observations"):
+        own_policy(policy, "odd", ToyTraffic())
+
+
+@pytest.mark.usefixtures("algorithm")
+def test_what_a_learner_has_saved_is_told_from_damage(tmp_path: Path) -> None:
+    learner = OwnLearnerFactory("my_algo:Kept")(ToyTraffic(), 0)
+    learner.save(tmp_path / "own.pt")
+    with pytest.raises(CheckpointError, match=r"own\.pt: what a learner of yours .*CLASS@FILE"):
+        ugat_marl.load_policy(tmp_path / "own.pt")
+    with pytest.raises(CheckpointError, match="commands that play policies take it as it is"):
+        ugat_marl.load_policy(f"my_algo:Kept@{tmp_path / 'own.pt'}")
+
+
 @pytest.mark.usefixtures("algorithm")
 def test_options_that_continue_a_learner_need_one_that_can_be_kept(
     capsys: pytest.CaptureFixture[str], tmp_path: Path

@@ -150,6 +150,9 @@ def test_unknown_policies_are_refused(tmp_path: Path, capsys: pytest.CaptureFixt
         ugat_marl.load_policy("single-v1/no-such")
     assert main(["evaluate", "single-v1", "--policies", "single-v1/no-such"]) == 2
     assert "unknown policy 'single-v1/no-such'" in capsys.readouterr().err
+    assert main(["policy", "card", "policies/some.pt"]) == 2
+    said = " ".join(capsys.readouterr().err.split())
+    assert "unknown shipped policy" in said and "works as well" not in said
     assert main(["policy", "pack", str(tmp_path), "--out", str(tmp_path / "packed")]) == 2
     assert "no finished training" in capsys.readouterr().err
 

@@ -12,7 +12,13 @@ from typing import Any
 import torch
 
 from ugat_marl.errors import CheckpointError, first_line
-from ugat_marl.files import replacing, require_checkpoint, require_stored
+from ugat_marl.files import (
+    MALFORMED,
+    OWN_COUNTERS,
+    replacing,
+    require_checkpoint,
+    require_stored,
+)
 
 _UNREADABLE = (
     OSError, EOFError, RuntimeError, ValueError, LookupError, TypeError, AttributeError,
@@ -67,10 +73,14 @@ def read_checkpoint(path: Path, *kinds: str) -> dict[str, Any]:
                 f"{path}: an exported model, which other programs read; give the .pt that it was "
                 "made from"
             ) from None
+        if _is_own(path):
+            raise CheckpointError(
+                f"{path}: what a learner of yours has saved, which commands that play policies "
+                "take as MODULE:CLASS@FILE; no other program can read it, so it is not exported"
+            ) from None
         raise CheckpointError(
             f"{path}: not a readable checkpoint ({first_line(error)}); it may have been cut short: "
-            "use an earlier one or train again. What a learner of yours has saved is given as "
-            "MODULE:CLASS@FILE"
+            "use an earlier one or train again"
         ) from None
     kind_read = content.get("kind") if isinstance(content, dict) else None
     if kind_read not in kinds:
@@ -90,6 +100,15 @@ def read_checkpoint(path: Path, *kinds: str) -> dict[str, Any]:
         raise CheckpointError(f"{path}: nested too deeply; save it with write_checkpoint") from None
     _require_finite(content, path, "cannot be used: take an earlier checkpoint or train again")
     return content
+
+
+def _is_own(path: Path) -> bool:
+    """Return True for the state of a learner of a user (`policies.own`)."""
+    try:
+        with zipfile.ZipFile(path) as archive:
+            return OWN_COUNTERS in archive.namelist()
+    except (OSError, zipfile.BadZipFile, *MALFORMED):
+        return False
 
 
 def _require_sums(path: Path) -> None:

@@ -287,13 +287,26 @@ def _refuse_other(file: Path, identity: Mapping[str, Any]) -> None:
             raise CheckpointError(f"{file}: not an object of JSON")
     except CheckpointError as error:
         raise CheckpointError(f"{error}; use another --out") from None
-    different = [key for key in {*held, *identity} if held.get(key) != identity.get(key)]
-    if different:
-        key = sorted(different)[0]
+    if different := _difference(held, identity):
+        name, there, here = different
         raise CheckpointError(
-            f"{file.parent} holds another run: its {key} is {_short(held.get(key))}, asked for is "
-            f"{_short(identity.get(key))}; repeat its options, or use another --out"
+            f"{file.parent} holds another run: its {name} is {_short(there)}, asked for is "
+            f"{_short(here)}; repeat its options, or use another --out"
         )
+
+
+def _difference(held: Mapping[str, Any], asked: Mapping[str, Any]) -> tuple[str, Any, Any] | None:
+    """Return the first option that differs, with the names it is in, and both values."""
+    for key in sorted({*held, *asked}):
+        there, here = held.get(key), asked.get(key)
+        if there == here:
+            continue
+        if isinstance(there, Mapping) and isinstance(here, Mapping):
+            inner = _difference(there, here)
+            if inner is not None:
+                return f"{key}.{inner[0]}", *inner[1:]
+        return key, there, here
+    return None
 
 
 def _short(value: Any) -> str:

@@ -155,7 +155,7 @@ class EnvOptions:
                     "vector_env takes domains"
                 )
             if name not in known:
-                raise UnknownNameError("option", name, known)
+                raise UnknownNameError("option", name, ["domain", *known])
         return cls(**options)
 
 

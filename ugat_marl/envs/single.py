@@ -20,6 +20,7 @@ from ugat_marl.errors import OptionError
 from ugat_marl.scenarios import Scenario
 
 if TYPE_CHECKING:
+    from ugat_marl.data import Scores
     from ugat_marl.envs.description import Description
 
 
@@ -73,6 +74,10 @@ class SingleEnv(gymnasium.Env[NDArray[np.float32], int]):
         agent = self._agent
         seen, rewards, ended, cut, infos = self.parallel.step({agent: action})
         return seen[agent], float(rewards[agent]), ended[agent], cut[agent], infos[agent]
+
+    def scores(self) -> Scores:
+        """Return the scores of the episode: travel time, throughput, reward, queue, delay."""
+        return self.parallel.scores()
 
     def describe(self) -> Description:
         """Return tables of the observed numbers and of the phases; ``print`` shows them whole."""

@@ -16,6 +16,7 @@ from typing import Any, SupportsIndex
 import numpy as np
 from gymnasium import spaces
 from numpy.typing import NDArray
+from pettingzoo import AECEnv
 from pettingzoo.utils import BaseParallelWrapper
 
 from ugat_marl.envs.actions import checked_phases, is_phase, require_mapping
@@ -130,6 +131,13 @@ class Wrapper(BaseParallelWrapper[str, Any, Any]):
     action_spaces: dict[str, Any]
 
     def __init__(self, env: AnyParallelEnv) -> None:
+        given: Any = env
+        if isinstance(given, AECEnv) or not hasattr(given, "possible_agents"):
+            raise OptionError(
+                f"{type(env).__name__} is no environment of PettingZoo in which all agents act at "
+                "once; wrap one of ugat_marl.parallel_env, or convert it with pettingzoo's "
+                "aec_to_parallel"
+            )
         super().__init__(env)
         agents = env.possible_agents
         self.observation_spaces = {agent: vector_box(env, agent) for agent in agents}

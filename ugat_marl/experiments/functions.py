@@ -8,10 +8,11 @@ from __future__ import annotations
 
 import re
 from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, fields, is_dataclass, replace
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any, Literal, TypeVar
 
+import numpy as np
 import polars as pl
 
 from ugat_marl.data import LogCallback
@@ -23,7 +24,7 @@ from ugat_marl.experiments.jobs import EVALUATION_SEED, file_stem, shortened
 from ugat_marl.experiments.scores import Evaluation
 from ugat_marl.experiments.transfers import TransferConfig, transfer
 from ugat_marl.grounding import USUAL_REWARD, UgatConfig
-from ugat_marl.parallel import Workers
+from ugat_marl.parallel import Workers, parts_at_a_time
 from ugat_marl.policies import DQNConfig, PolicyFactory, Usual, own_name
 from ugat_marl.progress import Reporter, usual
 from ugat_marl.scenarios import Scenario
@@ -62,7 +63,7 @@ def train(
     real: str = "V4",
     sim: str = "sim",
     learner: str | type[Any] | Any = "",
-    learner_settings: Sequence[str] = (),
+    learner_settings: Mapping[str, Any] | Sequence[str] = (),
     grounding: Literal["street", "timed", "phase"] = "street",
     pretrain_episodes: int = UgatConfig.pretrain_episodes,
     iterations: int = UgatConfig.iterations,
@@ -92,14 +93,15 @@ def train(
         sim: The domain to train in.
         learner: Name of a learner, ``module:name``, or a class with ``learn(env, episodes)`` and
             ``policy()``, or a function of ``env`` and ``seed`` that makes such an object.
-        learner_settings: Settings of the learner as ``NAME=VALUE``.
+        learner_settings: Settings of the learner: a dictionary, or texts ``NAME=VALUE``.
         grounding: "street", "timed" or "phase".
         pretrain_episodes: Episodes of plain training; the policy after them is direct transfer.
         iterations: Number of times to roll out, fit and train.
         grounded_episodes: Episodes of training in each iteration.
         real_rollouts: Episodes recorded in the real domain in each iteration.
-        observation: Kind of observation; None for the one that the learner needs, or "count".
-        reward: Kind of reward.
+        observation: Kind of observation; None for the one that the learner needs, or "count". No
+            function, since a resumed run reads its options from a file.
+        reward: Kind of reward; no function either.
         control: Also train direct transfer for as many further episodes in plain sim.
         evaluation_seeds: Number of evaluation episodes of each policy in each domain.
         duration_s: Length of an episode in s; None for the scenario's own.
@@ -139,12 +141,8 @@ def train(
             "ugat holds all settings of the algorithm; give grounding, pretrain_episodes, "
             "iterations, grounded_episodes and real_rollouts in it"
         )
-    where: Any = scenario
-    if not isinstance(where, str | Path):
-        raise OptionError(
-            "train takes the name or the path of a scenario, since a resumed run reads it again, "
-            f"and not a {type(where).__name__}; scenario.write(folder) makes a folder to name"
-        )
+    _check_arguments(scenario, real, sim, seed, observation, reward, callback)
+    parts_at_a_time(workers)  # refuses what is no number before anything is written
     config = TransferConfig(
         str(scenario),
         real=real,
@@ -158,10 +156,11 @@ def train(
         evaluation_seeds=evaluation_seeds,
         control=control,
         learner=learner if isinstance(learner, str) else own_name(learner),
-        learner_settings=tuple(learner_settings),
+        learner_settings=_texts(learner_settings),
         ugat=ugat or alone,
         dqn=dqn or DQNConfig(),
     )
+    config = _without_numpy(config)
     folder = Path(out) if out is not None else run_folder(config)
     table = transfer(
         config,
@@ -221,6 +220,60 @@ def evaluate(
         reporter=reporter or usual(),
     )
     return played.episodes_frame() if each_episode else played.frame()
+
+
+def _check_arguments(
+    scenario: Any, real: Any, sim: Any, seed: Any, observation: Any, reward: Any, callback: Any
+) -> None:
+    """Refuse arguments of `train` that no command could be given, before anything is written."""
+    if not isinstance(scenario, str | Path):
+        raise OptionError(
+            "train takes the name or the path of a scenario, since a resumed run reads it again, "
+            f"and not a {type(scenario).__name__}; scenario.write(folder) makes a folder to name"
+        )
+    for name, domain in (("real", real), ("sim", sim)):
+        if not is_one_domain(domain):
+            raise OptionError(
+                f"{name} = {domain!r}: train takes one domain; join effects with +, such as "
+                "'V3+headway=1.4', and train for each domain by itself"
+            )
+    if not is_count(seed):
+        raise OptionError(f"seed = {seed!r}: must be a whole number from 0 on")
+    for name, kind in (("observation", observation), ("reward", reward)):
+        if kind is not None and not isinstance(kind, str):
+            raise OptionError(
+                f"{name} = {kind!r}: train takes the name of one, since a resumed run reads its "
+                "options from a file; functions are for environments that you train in yourself"
+            )
+    if callback is not None and not callable(callback):
+        raise OptionError(f"callback = {callback!r}: must be a function, or None")
+
+
+def _texts(settings: Any) -> tuple[str, ...]:
+    """Return settings of a learner as ``NAME=VALUE``."""
+    if isinstance(settings, Mapping):
+        return tuple(f"{name}={_text(value)}" for name, value in settings.items())
+    return (settings,) if isinstance(settings, str) else tuple(settings)
+
+
+def _text(value: Any) -> str:
+    """Return a value as a command takes it: commas separate the parts of a tuple."""
+    return ",".join(map(str, value)) if isinstance(value, list | tuple) else str(value)
+
+
+_Config = TypeVar("_Config")
+
+
+def _without_numpy(value: _Config) -> _Config:
+    """Return settings with numbers of Python in place of NumPy's, which JSON cannot hold."""
+    if isinstance(value, np.generic):
+        return value.item()
+    if not is_dataclass(value) or isinstance(value, type):
+        return value
+    held = {one.name: getattr(value, one.name) for one in fields(value) if one.init}
+    plain = {name: _without_numpy(one) for name, one in held.items()}
+    changed = {name: one for name, one in plain.items() if one is not held[name]}
+    return replace(value, **changed) if changed else value
 
 
 def run_folder(config: TransferConfig) -> Path:

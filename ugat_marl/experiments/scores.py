@@ -183,7 +183,8 @@ class Evaluation:
         Returns:
             Columns ``policy``, ``domain``, ``episodes``, ``att_s`` (average travel time in s),
             ``low_s`` and ``high_s`` (its interval, 95 %), ``gap_s`` (minus that in the first
-            domain, s) and ``regret_s`` (minus that of the best policy in this domain, s).
+            domain, s) and ``regret_s`` (minus that of the best policy in this domain, s). What is
+            not known is null, such as the interval of a single episode.
         """
         rows: list[dict[str, Any]] = []
         for domain in self.domains:
@@ -201,7 +202,7 @@ class Evaluation:
                         "regret_s": self.regret(policy, domain).mean,
                     }
                 )
-        return pl.DataFrame(rows)
+        return pl.DataFrame(rows).fill_nan(None)
 
     def episodes_frame(self) -> pl.DataFrame:
         """Return one row per episode: policy, domain, seed, and a column for every measure."""

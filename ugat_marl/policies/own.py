@@ -19,7 +19,7 @@ import json
 import tempfile
 import warnings
 import zipfile
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Container, Mapping, Sequence
 from pathlib import Path
 from types import CellType, FunctionType
 from typing import Any, get_type_hints
@@ -38,6 +38,7 @@ from ugat_marl.envs import (
 from ugat_marl.errors import CheckpointError, OptionError, UgatMarlError
 from ugat_marl.files import (
     MALFORMED,
+    OWN_COUNTERS,
     parse_json,
     require_checkpoint,
     require_stored,
@@ -51,7 +52,7 @@ from ugat_marl.seeding import derive_seed
 NEEDED = {"learn": ("env", "episodes"), "policy": ()}
 """Methods that a learner must have, and their arguments."""
 
-_STATE, _COUNTERS = "learner.pt", "counters.json"
+_STATE = "learner.pt"
 
 OF_POLICIES = ("observation", "neighbours", "commands", "signals")
 """Options of an environment that a policy may ask for: what it sees, and how signals are shown."""
@@ -118,6 +119,11 @@ class OwnPolicy:
         shown = {key: asked[key] for key in OF_POLICIES if key in asked}
         self.env_options: Mapping[str, Any] = {**env_options, **shown}
         self._given, self._name, self._state, self._shared = given, name, state, shared
+        if not (_takes(act, 1) or _takes(act, 2)):
+            raise OptionError(
+                f"policy {name!r} takes {inspect.signature(act)}, and is called with the "
+                "observations and the infos, or with the observations alone"
+            )
         self._sees_infos = _sees_infos(act)
 
     @property
@@ -295,7 +301,7 @@ class OwnLearner:
             for file in sorted(Path(folder).rglob("*")):
                 packed.write(file, file.relative_to(folder))
             counters = {"episodes": self.episodes, "env_options": self._env_options}
-            packed.writestr(_COUNTERS, json.dumps(counters))
+            packed.writestr(OWN_COUNTERS, json.dumps(counters))
         return memory.getvalue()
 
 
@@ -379,7 +385,14 @@ class OwnLearnerFactory:
 
     def __call__(self, env: AnyParallelEnv, seed: int) -> OwnLearner:
         """Make a learner for the agents of an environment."""
-        given = self._make(**self._settings, **_offered(self._make, {"env": env, "seed": seed}))
+        offered = _offered(self._make, {"env": env, "seed": seed})
+        if lacking := _lacking(self._make, {*self._settings, *offered}):
+            settings = " ".join(f"{argument}=VALUE" for argument in lacking)
+            raise OptionError(
+                f"learner {self.name!r} needs {' and '.join(lacking)}; give --learner-settings "
+                f"{settings}, or defaults to these arguments"
+            )
+        given = self._make(**self._settings, **offered)
         _require_methods(given, self.name)
         return OwnLearner(given, self.name, env)
 
@@ -451,8 +464,8 @@ def _counters(path: Path) -> dict[str, Any]:
     try:
         with zipfile.ZipFile(path) as packed:
             require_stored(packed)
-            text = packed.read(_COUNTERS).decode("utf-8")
-            counters = parse_json(text, f"{path}, {_COUNTERS}", CheckpointError)
+            text = packed.read(OWN_COUNTERS).decode("utf-8")
+            counters = parse_json(text, f"{path}, {OWN_COUNTERS}", CheckpointError)
             episodes = int(counters["episodes"])
             if episodes < 0:
                 raise ValueError(f"{episodes} episodes")
@@ -531,6 +544,17 @@ def _first_argument(function: Callable[..., Any]) -> str:
 def _offered(make: Callable[..., Any], values: Mapping[str, Any]) -> dict[str, Any]:
     """Return those of the values that a class or function has arguments for."""
     return {name: values[name] for name in _arguments(make) if name in values}
+
+
+def _lacking(make: Callable[..., Any], given: Container[str]) -> list[str]:
+    """Return the arguments without a default that a class or function is not given."""
+    return [
+        name
+        for name, argument in _arguments(make).items()
+        if name not in given
+        and argument.default is argument.empty
+        and argument.kind in (argument.POSITIONAL_OR_KEYWORD, argument.KEYWORD_ONLY)
+    ]
 
 
 def _converted(make: Callable[..., Any], settings: Sequence[str], name: str) -> dict[str, Any]:

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import hashlib
 import json
+import re
 from collections.abc import Mapping
 from dataclasses import asdict, dataclass
 from pathlib import Path
@@ -141,6 +142,11 @@ def load_policy(name: str | Path, *, folder: Path = FOLDER) -> NetworkPolicy:
         UnknownNameError: There is no such policy.
         CheckpointError: The file is damaged, no policy, or holds a rule.
     """
+    if re.fullmatch(r".+:.+@.+", str(name)):
+        raise CheckpointError(
+            f"{name} is what a learner of yours has saved, which no other program can read; "
+            "commands that play policies take it as it is"
+        )
     path = Path(name)
     if path.suffix == ".pt" or path.is_file():
         if (spec := rule_in(path)) is not None:
@@ -155,6 +161,13 @@ def load_policy(name: str | Path, *, folder: Path = FOLDER) -> NetworkPolicy:
         raise CheckpointError(
             f"{name} is a rule, which has no network to load or to export; commands that play "
             "policies take it as it is"
+        )
+    if str(name) not in shipped_policies(folder):
+        raise UnknownNameError(
+            "policy",
+            str(name),
+            shipped_policies(folder),
+            "The file of a trained policy (.pt) works as well.",
         )
     card = policy_card(str(name), folder=folder)
     file = shipped_policies(folder)[str(name)]
@@ -179,6 +192,6 @@ def policy_card(name: str, *, folder: Path = FOLDER) -> PolicyCard:
     known = shipped_policies(folder)
     if name not in known:
         raise UnknownNameError(
-            "policy", name, known, "The file of a trained policy (.pt) works as well."
+            "shipped policy", name, known, "`ugat-marl policy pack` makes the card of a training."
         )
     return PolicyCard.read(known[name].with_suffix(".json"))
