@@ -192,6 +192,9 @@ def policy_card(name: str, *, folder: Path = FOLDER) -> PolicyCard:
     known = shipped_policies(folder)
     if name not in known:
         raise UnknownNameError(
-            "shipped policy", name, known, "`ugat-marl policy pack` makes the card of a training."
+            "shipped policy",
+            name,
+            known,
+            "`ugat-marl policy pack FOLDER --out PATH` makes the cards of a training.",
         )
     return PolicyCard.read(known[name].with_suffix(".json"))
