@@ -37,7 +37,13 @@ from ugat_marl.scenarios import (
     resco_maps,
     survey,
 )
-from ugat_marl.scenarios.inspection import SATURATION_VPH, _in_part, fullest
+from ugat_marl.scenarios.inspection import (
+    SATURATION_VPH,
+    ApproachFacts,
+    _green_s,
+    _in_part,
+    fullest,
+)
 from ugat_marl.scenarios.settings import validate_settings
 
 
@@ -168,6 +174,7 @@ def test_a_last_quarter_that_is_shorter_has_its_own_length(
     (road,) = [a for a in facts.intersections[0].approaches if a.edge == start]
     assert (road.worst_vph, road.worst_from_s) == (pytest.approx(worst_vph, abs=0.1), from_s)
     assert (facts.busiest, facts.busiest_s) == (100, from_s)
+    assert facts.busiest_length_s == (duration_s if not from_s else duration_s - 900)
 
 
 def test_a_light_s_own_late_green_belongs_to_every_source_of_phases(single: Scenario) -> None:
@@ -218,6 +225,43 @@ def test_an_approach_that_is_full_for_a_quarter_of_an_hour_is_shown_so(single: S
     assert shares[0] == pytest.approx(shares[1], rel=0.02)
     assert (facts.busiest_s, facts.busiest) == (1800, 700)
     assert facts.intersections[0].degrees["now"] is not None
+
+
+def test_the_road_without_any_green_is_the_fullest() -> None:
+    roads = [
+        ApproachFacts("some", 1, 900.0, 900.0, 0.0, 0.5, 0.9, 0.0),
+        ApproachFacts("none", 1, 90.0, 90.0, 0.0, 0.05, None, 0.0),  # no green for its traffic
+        ApproachFacts("idle", 1, 0.0, 0.0, 0.0, 0.0, None, None),
+    ]
+    names = [road.edge for road in sorted(roads, key=lambda road: road.fullness, reverse=True)]
+    assert names == ["none", "some", "idle"]
+
+
+def test_what_goes_on_red_after_a_stop_has_capacity() -> None:
+    light = next(
+        light
+        for light in Network.read(load_scenario("mixed-v1")).intersections
+        if {x.direction for x in light.links if x.from_lane == light.incoming_lanes[0]}
+        == {"s", "r"}
+    )
+    lane = light.incoming_lanes[0]
+    letters = ["r"] * len(light.phases[0])
+    for link in light.links:
+        if link.from_lane == lane and link.direction == "r":
+            letters[link.index] = "s"
+    programme = ((30.0, "".join(letters)), (10.0, "r" * len(letters)))
+    number = sum(link.from_lane == lane for link in light.links)
+    turning = sum(link.from_lane == lane and link.direction == "r" for link in light.links)
+    assert _green_s(replace(light, programme=programme), lane) == 30.0 * turning / number
+
+
+def test_a_programme_that_follows_the_traffic_is_told(single: Scenario) -> None:
+    facts = survey(single)
+    assert not any("durations in the file" in text for text in remarks(facts, []))
+    (light,) = facts.intersections
+    vague = replace(light, times_vary="it follows the traffic (actuated)")
+    (text,) = [x for x in remarks(replace(facts, intersections=(vague,)), []) if "durations" in x]
+    assert text.startswith("traffic light 'A1': it follows the traffic (actuated), so what its own")
 
 
 def test_a_better_source_of_phases_is_named() -> None:

@@ -24,6 +24,7 @@ from ugat_marl.scenarios import (
     survey,
 )
 from ugat_marl.scenarios.capacity import counted_flows_vph
+from ugat_marl.scenarios.routes import departures
 
 Crossing = Callable[..., Path]
 
@@ -189,6 +190,40 @@ def test_sumo_does_leave_out_what_is_not_sorted(crossing: Crossing) -> None:
         assert set(libsumo.vehicle.getIDList()) == {"a", "c"}
     finally:
         libsumo.close()
+
+
+@pytest.mark.parametrize(
+    "earlier",
+    [
+        '<person id="p" depart="100"><walk edges="S_C C_N"/></person>',
+        '<personFlow id="p" begin="100" end="101" number="1"><walk edges="S_C C_N"/></personFlow>',
+        '<container id="c" depart="100"><transport to="C_N" lines="x"/></container>',
+    ],
+)
+def test_people_stand_in_the_order_of_vehicles(earlier: str, crossing: Crossing) -> None:
+    """SUMO leaves out vehicles behind a later person, as it does behind a later vehicle."""
+    scenario = load_scenario(crossing(vehicles=car("a", 0) + earlier + car("b", 50)))
+    with pytest.raises(ScenarioError, match=r"'b'> departs at 50 s but stands after one of 100"):
+        check_demand(scenario, Network.read(scenario))
+    scenario = load_scenario(crossing(vehicles=car("a", 0) + earlier + car("b", 150)))
+    assert check_demand(scenario, Network.read(scenario)).vehicles == 2
+
+
+def test_a_route_of_a_vehicle_may_have_an_id(crossing: Crossing) -> None:
+    named = car("a", 10).replace("<route ", '<route id="own" ')
+    scenario = load_scenario(crossing(vehicles=named))
+    demand = check_demand(scenario, Network.read(scenario))
+    assert demand.vehicles == len(list(departures(scenario, routed=demand.routed))) == 1
+
+
+def test_trips_between_junctions_are_routed_where_sumo_drives_them(crossing: Crossing) -> None:
+    trips = "".join(
+        f'<trip id="t{n}" depart="{n}" fromJunction="S" toJunction="N"/>' for n in range(5)
+    )
+    scenario = load_scenario(
+        crossing(vehicles=trips, toml=lambda text: text + '[sumo]\njunction-taz = "true"\n')
+    )
+    assert len(list(departures(scenario, routed=False))) == 5
 
 
 def test_additional_files_are_read_whole_and_need_no_order(crossing: Crossing) -> None:

@@ -12,6 +12,8 @@ from ugat_marl import parallel_env
 from ugat_marl.effects import load_scenario, network_places
 from ugat_marl.errors import ScenarioError
 from ugat_marl.files import parse_xml
+from ugat_marl.policies import ControlledNetwork
+from ugat_marl.policies.rules.green_wave import main_roads
 from ugat_marl.scenarios import (
     Intersection,
     Link,
@@ -306,3 +308,45 @@ def test_signals_of_railways_are_no_traffic_lights(phases: str, tmp_path: Path) 
         env.step(dict.fromkeys(env.agents, 0))
     assert env.scores().departed > 5
     env.close()
+
+
+@pytest.mark.parametrize("between", ["priority", "traffic_light"])
+@pytest.mark.parametrize("sidewalks", ["false", "true"])
+def test_agents_are_beside_each_other_across_what_is_no_agent(
+    tmp_path: Path, between: str, sidewalks: str
+) -> None:
+    """A node of a map, or a light of pedestrians, between two agents, with sidewalks or without."""
+    places = {"W": (-300, 0), "A": (0, 0), "P": (150, 0), "B": (300, 0), "E": (600, 0)}
+    places |= {f"{a}{b}": (300 * (a == "B"), 200 if b == "n" else -200) for a in "AB" for b in "ns"}
+    kinds = {"A": "traffic_light", "B": "traffic_light", "P": between}
+    nodes = "".join(
+        f'<node id="{name}" x="{x}" y="{y}" type="{kinds.get(name, "priority")}"/>'
+        for name, (x, y) in places.items()
+    )
+    ways = [("W", "A"), ("A", "P"), ("P", "B"), ("B", "E")]
+    ways += [(light, f"{light}{end}") for light in "AB" for end in "ns"]
+    edges = "".join(
+        f'<edge id="{a}-{b}" from="{a}" to="{b}" speed="10"/>'
+        for way in ways
+        for a, b in (way, way[::-1])
+    )
+    (tmp_path / "n.nod.xml").write_text(f"<nodes>{nodes}</nodes>")
+    (tmp_path / "n.edg.xml").write_text(f"<edges>{edges}</edges>")
+    subprocess.run(
+        [str(sumo_program("netconvert")), "-n", "n.nod.xml", "-e", "n.edg.xml", "-o", "n.net.xml",
+         "--sidewalks.guess", sidewalks, "--crossings.guess", sidewalks],
+        cwd=tmp_path, check=True, capture_output=True,
+    )  # fmt: skip
+    (tmp_path / "r.rou.xml").write_text(
+        '<routes><vehicle id="v" depart="0"><route edges="W-A A-P"/></vehicle></routes>'
+    )
+    (tmp_path / "scenario.toml").write_text(
+        'network = "n.net.xml"\nroutes = ["r.rou.xml"]\nduration_s = 100\n'
+    )
+    network = Network.read(load_scenario(tmp_path))
+    assert [(x.id, x.neighbours) for x in network.intersections] == [("A", ("B",)), ("B", ("A",))]
+    assert network.straight == {"A-P": "P-B", "B-P": "P-A"}
+    items = {f"signal_{k}": item for k, item in enumerate(network.intersections)}
+    (road,) = main_roads(ControlledNetwork.of_network(network, items, 10.0, 5.0))
+    assert road.agents == ("signal_0", "signal_1")
+    assert road.arrival_s[1] == pytest.approx(30.0, abs=4.0)

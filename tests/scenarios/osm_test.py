@@ -528,6 +528,24 @@ def test_crossings_are_where_the_extract_has_them(
             assert crossing <= {"r", "g"}
 
 
+def test_lit_crossings_that_are_joined_keep_their_light(tmp_path: Path) -> None:
+    """Two carriageways cross 10 m apart, and netconvert joins their nodes."""
+    text = crossroads()
+    middle = text[text.index('<node id="9"') :].partition("</node>")[0] + "</node>"
+    lat, lon = (float(re.findall(rf'{key}="([\d.]+)"', middle)[0]) for key in ("lat", "lon"))
+    lit = '<tag k="highway" v="crossing"/><tag k="crossing" v="traffic_signals"/>'
+    nodes = "".join(
+        f'<node id="{name}" lat="{lat}" lon="{lon + metres / 74400:.7f}">{lit}</node>'
+        for name, metres in ((9, 0), (10, 10))
+    )
+    text = text.replace(middle, nodes).replace('<nd ref="9"/>', '<nd ref="9"/><nd ref="10"/>')
+    (tmp_path / "x.osm").write_text(text)
+    assert made(tmp_path / "a", tmp_path / "x.osm") == 0
+    network = Network.read(read_scenario(tmp_path / "a"))
+    assert len(network.intersections) == 1
+    assert network.uncontrolled == ("cluster_10_9",)
+
+
 def test_crossings_are_listed(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     (tmp_path / "x.osm").write_text(crossroads())
     made(tmp_path / "a", tmp_path / "x.osm")

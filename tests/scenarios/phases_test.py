@@ -241,6 +241,16 @@ def test_conflicting_greens(phase: str, pair: tuple[int, int] | None) -> None:
     assert conflicting_greens(phase, CROSS, matrix(4, {(0, 1), (2, 0), (2, 3)})) == pair
 
 
+def test_left_turns_conflict_where_their_roads_cross() -> None:
+    """Those of opposite approaches may touch, as networks draw them; those across never go."""
+    links = [link(k, approach, "l") for k, approach in enumerate("nes")]
+    links += [link(3 + k, approach, "s") for k, approach in enumerate("nes")]
+    foes = matrix(6, {(0, 1), (0, 2), (3, 4), (4, 5)})  # n and s go straight at the same time
+    assert conflicting_greens("GrGrrr", links, foes) is None
+    assert conflicting_greens("GGrrrr", links, foes) == (0, 1)
+    assert conflicting_greens("GGr", links[:3], foes) is None  # nothing tells who is opposite
+
+
 def test_links_of_different_junctions_are_no_foes() -> None:
     a, b = Link(0, "a_0", "x_0", "s", "J", 0), Link(1, "b_0", "y_0", "s", "K", 0)
     assert not are_foes(a, b, {"J": [1], "K": [1]})

@@ -2,13 +2,16 @@
 
 from __future__ import annotations
 
+import contextlib
 import copy
+import math
 import xml.etree.ElementTree as ET
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
+import libsumo
 import pytest
 
 from ugat_marl.__main__ import main
@@ -16,9 +19,11 @@ from ugat_marl.effects import load_scenario
 from ugat_marl.envs import parallel_env
 from ugat_marl.errors import ScenarioError
 from ugat_marl.experiments import rule_factory, typical_plans
+from ugat_marl.experiments.typical_plans import _divided, _shortest_cycle_s
 from ugat_marl.files import Document
 from ugat_marl.progress import Silent
 from ugat_marl.scenarios import (
+    Intersection,
     Network,
     PlanPhase,
     Scenario,
@@ -668,6 +673,61 @@ def test_the_typical_plan_of_the_programme_is_the_programme(single: Scenario) ->
     network = Network.read(single)
     (plan,) = typical_plans(single, rule_factory("programme"), "sim", (1,), Silent())
     assert plan == programme_plan(network.intersections[0], network)
+
+
+def test_the_busiest_phase_gets_what_it_needs() -> None:
+    """Equal phases hide who pays for the least greens."""
+    needs = {0: 0.5, 1: 0.1, 2: 0.1, 3: 0.1}
+    cycle_s = _shortest_cycle_s(needs, 5.0, 10)
+    assert cycle_s == pytest.approx(100.0)  # 4 x 5 / (1 - 0.8)
+    wanted = {phase: 5.0 + need * 100 for phase, need in needs.items()}
+    assert _divided(100, 10, wanted) == {0: 55, 1: 15, 2: 15, 3: 15}
+    # A phase of a short need lasts as long as it must, and the others need a longer cycle for it:
+    # with 20 s for the last one C = (10 + 20) / (1 - 0.7) = 100 s.
+    cycle_s = _shortest_cycle_s({0: 0.5, 1: 0.2, 2: 0.01}, 5.0, 20)
+    assert cycle_s == pytest.approx(100.0)
+    assert _shortest_cycle_s({0: 0.6, 1: 0.4}, 5.0, 10) == math.inf
+    assert _divided(30, 10, {0: 5.0, 1: 5.0}) == {0: 15, 1: 15}
+
+
+def timetable(single: Scenario) -> tuple[Scenario, Intersection]:
+    """The light runs "day" for a minute, then "night"; "late" is defined last and never runs."""
+    (light,) = Network.read(single).intersections
+
+    def logic(name: str, green_s: int) -> str:
+        phases = "".join(
+            f'<phase duration="{green_s}" state="{state}"/>'
+            f'<phase duration="3" state="{state.replace("G", "y")}"/>'
+            for state in light.phases[:2]
+        )
+        return f'<tlLogic id="A1" type="static" programID="{name}" offset="0">{phases}</tlLogic>'
+
+    text = (
+        f"<additional>{logic('day', 30)}{logic('night', 20)}{logic('late', 10)}"
+        '<WAUT id="w" refTime="0" startProg="day"><wautSwitch time="60" to="night"/></WAUT>'
+        '<wautJunction wautID="w" junctionID="A1"/></additional>'
+    )
+    document = Document("waut.add.xml", None, text.encode())
+    return replace(single, additional=(document,)), light
+
+
+def test_a_timetable_begins_with_its_first_programme(single: Scenario) -> None:
+    (light,) = Network.read(timetable(single)[0]).intersections
+    assert [seconds for seconds, _ in light.programme] == [30, 3, 30, 3]
+    assert light.times_vary == "a timetable (WAUT) switches it"
+
+
+def test_a_plan_is_not_switched_off_by_a_timetable(single: Scenario) -> None:
+    planned = with_plans(timetable(single)[0], [dual_ring()], "plans.csv")
+    (light,) = Network.read(planned).intersections
+    assert sum(seconds for seconds, _ in light.programme) == 90 and not light.times_vary
+    with contextlib.closing(
+        parallel_env(planned, signals="programme", simulator="inprocess")
+    ) as env:
+        env.reset(seed=1)
+        for _ in range(12):
+            env.step({"signal_0": 0})
+        assert libsumo.trafficlight.getProgram("A1") == "plan"
 
 
 def test_two_plans_of_one_light_are_refused(single: Scenario) -> None:

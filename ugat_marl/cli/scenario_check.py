@@ -35,7 +35,6 @@ from ugat_marl.progress import Bars, Silent
 from ugat_marl.reporting import LIGHT_HEADING, LightNames, approach_table, titled_table
 from ugat_marl.scenarios import (
     PHASE_SOURCES,
-    QUARTER_S,
     SHORT_LANE_M,
     IntersectionFacts,
     Network,
@@ -192,7 +191,7 @@ def show(
     say(f"demand {counted(facts.vehicles, 'vehicle')}{flows}, the first after {facts.first_s:g} s")
     say(
         f"they depart until {facts.last_s:g} s, most from {facts.busiest_s:g} s on: "
-        f"{facts.busiest} within {min(QUARTER_S, facts.duration_s) / 60:g} min"
+        f"{facts.busiest} within {facts.busiest_length_s / 60:g} min"
     )
     for text in _no_agents(facts):
         say(text)
@@ -318,7 +317,7 @@ def _phase_sources(agents: Sequence[IntersectionFacts], names: LightNames) -> Ta
 
 def _approaches(agents: Sequence[IntersectionFacts], names: LightNames) -> Table:
     all_roads = [(light.id, road) for light in agents for road in light.approaches]
-    all_roads.sort(key=lambda pair: -(pair[1].saturation or pair[1].flow_ratio))
+    all_roads.sort(key=lambda pair: pair[1].fullness, reverse=True)
     shown = all_roads[:MOST_APPROACHES]
     title = f"Saturation by approach, the highest {len(shown)} of {len(all_roads)}"
     headings = ("veh/h", "worst 15 min", "flow ratio", "own programme")

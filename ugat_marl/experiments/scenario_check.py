@@ -226,6 +226,11 @@ def remarks(facts: Survey, runs: Sequence[RuleEpisode]) -> list[str]:
                 "yellow_s, all_red_s)"
             )
             clearances.setdefault(text, []).append(repr(light.id))
+        if light.times_vary:
+            notes.append(
+                f"traffic light {light.id!r}: {light.times_vary}, so what its own programme can "
+                "serve is counted by the durations in the file"
+            )
         if far := [road.edge for road in light.approaches if road.first_s is None]:
             notes.append(
                 f"traffic light {light.id!r}: no vehicle can be there within the episode on "

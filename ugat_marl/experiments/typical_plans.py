@@ -154,11 +154,11 @@ def _plan(light: str, shown: _Shown, scenario: Scenario) -> SignalPlan:
         for movement in sorted(frozenset[str]().union(*shown.served))
     }
     needs = _fewest(shown.served, shares)
-    left = 1.0 - sum(needs.values())
-    cycle_s = clearance_s * len(needs) / left if left > 0 else math.inf
     least_s = math.ceil(control.min_green_s + clearance_s)
+    cycle_s = _shortest_cycle_s(needs, clearance_s, least_s)
     whole_s = max(math.ceil(min(cycle_s, LONGEST_CYCLE_S) - 1e-6), least_s * len(needs))
-    splits_s = _divided(whole_s, least_s, needs)
+    wanted_s = {phase: clearance_s + need * whole_s for phase, need in needs.items()}
+    splits_s = _divided(whole_s, least_s, wanted_s)
     order = _order(list(needs), shown)
     phases = tuple(
         PlanPhase(
@@ -171,10 +171,30 @@ def _plan(light: str, shown: _Shown, scenario: Scenario) -> SignalPlan:
     return SignalPlan(light, float(whole_s), offset_s, phases)
 
 
-def _divided(cycle_s: int, least_s: int, weights: Mapping[int, float]) -> dict[int, int]:
-    """Return whole seconds that add up to the cycle: the least for each, the rest by weight."""
-    rest, total = cycle_s - least_s * len(weights), max(sum(weights.values()), 1e-9)
-    wanted = {phase: rest * weight / total for phase, weight in weights.items()}
+def _shortest_cycle_s(needs: Mapping[int, float], clearance_s: float, least_s: float) -> float:
+    """Return the shortest cycle that gives every phase its need, s; infinite if there is none.
+
+    A phase whose need takes less than `least_s` lasts that long, and the others need more.
+    """
+    longer: set[int] = set()
+    while True:
+        left = 1.0 - sum(needs[phase] for phase in longer)
+        if left <= 0:
+            return math.inf
+        cycle_s = (least_s * (len(needs) - len(longer)) + clearance_s * len(longer)) / left
+        more = {phase for phase, need in needs.items() if clearance_s + need * cycle_s > least_s}
+        if more <= longer:
+            return cycle_s
+        longer |= more
+
+
+def _divided(cycle_s: int, least_s: int, wanted_s: Mapping[int, float]) -> dict[int, int]:
+    """Return whole seconds that add up to the cycle: the least for each, the rest as wanted."""
+    above = {phase: max(seconds - least_s, 0.0) for phase, seconds in wanted_s.items()}
+    if not sum(above.values()):
+        above = dict.fromkeys(above, 1.0)
+    rest, total = cycle_s - least_s * len(above), sum(above.values())
+    wanted = {phase: rest * seconds / total for phase, seconds in above.items()}
     splits = {phase: least_s + math.floor(seconds) for phase, seconds in wanted.items()}
     by_remainder = sorted(wanted, key=lambda phase: math.floor(wanted[phase]) - wanted[phase])
     for place in range(cycle_s - sum(splits.values())):

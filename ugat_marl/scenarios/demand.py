@@ -10,6 +10,7 @@ from ugat_marl.files import Tag
 from ugat_marl.progress import Reporter
 from ugat_marl.scenarios.network import Network
 from ugat_marl.scenarios.routes import (
+    TRAVELLERS,
     OwnEdges,
     demand_scale,
     departs,
@@ -73,8 +74,6 @@ def check_demand(
         latest, in_routes = -math.inf, document in scenario.routes
         singles = OwnEdges()
         for tag in document.scan(reporter):
-            if in_routes:
-                singles.read(tag)
             if tag.name == "vType" and tag.attributes.get("scale", "1") not in ("1", "1.0"):
                 raise ScenarioError(
                     f"{_at(document, tag)}: {_who(tag)} has a scale of its own, which counts of "
@@ -86,11 +85,12 @@ def check_demand(
                 if not edges.issuperset(used):
                     edge = next(edge for edge in used if edge not in edges)
                     raise _unknown_edge(document, tag, edge, scenario)
+            if in_routes:
+                singles.read(tag)
+                latest = _in_order(tag, document, begin, latest)
             if departs(tag):
                 routed &= in_routes
                 depart = _depart_s(tag, document, begin, max(begin, latest))
-                if depart < latest and in_routes:
-                    raise _unsorted(document, tag, depart, latest)
                 latest = max(latest, depart)
                 if tag.name == "flow":
                     flows += depart < end and begin < _end_s(tag, document)
@@ -145,12 +145,27 @@ def _unsorted(document: Document, tag: Tag, depart: float, latest: float) -> Sce
     )
 
 
+def _in_order(tag: Tag, document: Document, begin_s: float, latest_s: float) -> float:
+    """Return the latest departure so far; people and containers are in order among vehicles.
+
+    Raises:
+        ScenarioError: This one is earlier than one before it, and SUMO would leave it out.
+    """
+    if not departs(tag) and (tag.name not in TRAVELLERS or tag.parent != "routes"):
+        return latest_s
+    depart_s = _depart_s(tag, document, begin_s, max(begin_s, latest_s))
+    if depart_s < latest_s:
+        raise _unsorted(document, tag, depart_s, latest_s)
+    return depart_s
+
+
 def _depart_s(tag: Tag, document: Document, begin_s: float, triggered_s: float) -> float:
     """Return the departure in s; `triggered_s` for one that something else triggers.
 
     A flow without a begin starts with the simulation, at `begin_s`.
     """
-    key, default = ("begin", repr(begin_s)) if tag.name == "flow" else ("depart", "")
+    is_flow = tag.name.lower().endswith("flow")
+    key, default = ("begin", repr(begin_s)) if is_flow else ("depart", "")
     text = tag.attributes.get(key, default)
     return triggered_s if text in _NO_TIME else _seconds(text, key, tag, document)
 

@@ -75,6 +75,14 @@ class ApproachFacts:
     saturation: float | None
     first_s: float | None
 
+    @property
+    def fullness(self) -> tuple[float, float]:
+        """Saturation and flow ratio; traffic without green is more than any other."""
+        saturation = self.saturation
+        if saturation is None:
+            saturation = math.inf if self.worst_vph > 0 else 0.0
+        return saturation, self.flow_ratio
+
 
 @dataclass(frozen=True)
 class IntersectionFacts:
@@ -108,6 +116,7 @@ class IntersectionFacts:
         name: Streets that meet there; empty if they have no names.
         file_yellow_s: Different times of yellow in its programme in the file, s.
         file_all_red_s: Different times of red between two greens there, s.
+        times_vary: As in `Intersection`.
         degrees: Source of phases to the degree of saturation of the intersection with these phases,
             in the quarter of an hour with the most traffic in the network; None if no cycle serves
             a lane with traffic. ``now`` are its present phases.
@@ -137,6 +146,7 @@ class IntersectionFacts:
     name: str
     file_yellow_s: tuple[float, ...]
     file_all_red_s: tuple[float, ...]
+    times_vary: str
     degrees: Mapping[str, float | None]
 
 
@@ -160,6 +170,7 @@ class Survey:
         last_s: Seconds until the last vehicle of the episode departs.
         busiest_s: Start of the quarter of an hour with the most departures, s from the start.
         busiest: Number of vehicles that depart in it.
+        busiest_length_s: Its length, s; the last one also has what is left over.
         yellow_s: Yellow that the environment shows, s.
         all_red_s: Red that the environment shows after it, s.
         notes: Changes to the programmes of the file.
@@ -179,6 +190,7 @@ class Survey:
     last_s: float
     busiest_s: float
     busiest: int
+    busiest_length_s: float
     yellow_s: float
     all_red_s: float
     notes: tuple[str, ...]
@@ -223,6 +235,7 @@ def survey(scenario: Scenario, reporter: Reporter | None = None) -> Survey:
         round(traffic.last_s, 2),
         traffic.busiest_s,
         traffic.busiest,
+        traffic.busiest_length_s,
         scenario.control.yellow_s,
         scenario.control.all_red_s,
         network.notes,
@@ -324,6 +337,7 @@ def _facts(
         name=intersection_name(intersection.links, network.streets),
         file_yellow_s=_times_of(intersection, yellow=True),
         file_all_red_s=_times_of(intersection, yellow=False),
+        times_vary=intersection.times_vary,
         degrees={
             source: _finite(lights[intersection.id])
             for source, lights in degrees.items()
@@ -466,11 +480,11 @@ def fullest(
 
 
 def _green_s(intersection: Intersection, lane: str) -> float:
-    """Return the seconds of green of a lane per cycle of the programme, mean over its links."""
-    indices = [link.index for link in intersection.links if link.from_lane == lane]
+    """Return the seconds in which a lane may go per cycle of the programme, mean over its links."""
+    links = [link for link in intersection.links if link.from_lane == lane]
     shown = [
-        sum(seconds for seconds, state in intersection.programme if state[index] in GREEN)
-        for index in indices
+        sum(seconds for seconds, state in intersection.programme if may_go([link], state))
+        for link in links
     ]
     return sum(shown) / len(shown)
 
@@ -528,8 +542,10 @@ class _Traffic:
 
     def _vph(self, count: int, quarter: int) -> float:
         """Return vehicles per hour, from vehicles in a quarter of an hour."""
-        end_s = self.duration_s if quarter == self._last else (quarter + 1) * QUARTER_S
-        return count * 3600 / (end_s - quarter * QUARTER_S)
+        return count * 3600 / self._length_s(quarter)
+
+    def _length_s(self, quarter: int) -> float:
+        return self.duration_s - quarter * QUARTER_S if quarter == self._last else QUARTER_S
 
     def mean_vph(self, edge: str) -> float:
         """Return the mean flow of a road over the episode, vehicles per hour."""
@@ -562,6 +578,11 @@ class _Traffic:
     def busiest_s(self) -> float:
         """Start of the quarter of an hour with the most departures, s."""
         return self._busiest * QUARTER_S
+
+    @property
+    def busiest_length_s(self) -> float:
+        """Length of this quarter of an hour, s."""
+        return self._length_s(self._busiest)
 
     @property
     def busiest(self) -> int:

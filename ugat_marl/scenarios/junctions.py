@@ -175,10 +175,13 @@ def yields_of(root: ET.Element) -> dict[str, list[int]]:
 def neighbours_of(
     links: Mapping[str, Sequence[Link]], root: ET.Element
 ) -> dict[str, tuple[str, ...]]:
-    """Return the neighbours of each traffic light: roads join them with no light in between."""
+    """Return the neighbours of each traffic light: roads join them with none of these in between.
+
+    Other lights, as those of pedestrians, are passed like plain nodes.
+    """
     enters = {link.from_edge: tls for tls, light_links in links.items() for link in light_links}
     following: dict[str, set[str]] = defaultdict(set)
-    for element in _connections_without_light(root):
+    for element in _connections_between(root, links):
         following[element.get("from", "")].add(element.get("to", ""))
     adjacent: dict[str, set[str]] = {tls: set() for tls in links}
     for tls, own in links.items():
@@ -196,20 +199,20 @@ def neighbours_of(
     return {tls: tuple(sorted(beside)) for tls, beside in adjacent.items()}
 
 
-def straight_roads_of(root: ET.Element) -> dict[str, str]:
-    """Return road (SUMO's edge) to the road straight ahead of it, where no light is in between."""
+def straight_roads_of(root: ET.Element, lights: Container[str]) -> dict[str, str]:
+    """Return road to the road straight ahead of it, where none of these lights is in between."""
     ahead: dict[str, str] = {}
-    for element in _connections_without_light(root):
+    for element in _connections_between(root, lights):
         if element.get("dir") == "s":
             ahead.setdefault(element.get("from", ""), element.get("to", ""))
     return ahead
 
 
-def _connections_without_light(root: ET.Element) -> Iterator[ET.Element]:
-    """Yield the connections between roads that no traffic light controls."""
-    no_light = {None, *rail_signals_of(root)}
+def _connections_between(root: ET.Element, lights: Container[str]) -> Iterator[ET.Element]:
+    """Yield the connections from road to road (SUMO's edges) that none of these lights controls."""
     for element in root.iter("connection"):
-        if not element.get("from", ":").startswith(":") and element.get("tl") in no_light:
+        ends = element.get("from", ":"), element.get("to", ":")  # ":" begins those in a junction
+        if element.get("tl", "") not in lights and not any(end.startswith(":") for end in ends):
             yield element
 
 

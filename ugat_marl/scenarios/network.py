@@ -117,7 +117,7 @@ class Network:
         streets: Road (SUMO's edge) to the name of its street; roads without a name are left out.
         reasons: Light of `uncontrolled` to the reason why it is not an agent.
         notes: Changes to the programmes of the file, for the user.
-        straight: Road (SUMO's edge) to the road straight ahead of it, where no light is in between.
+        straight: Road (SUMO's edge) to the road straight ahead of it, where no agent is in between.
     """
 
     lanes: Mapping[str, Lane]
@@ -161,7 +161,6 @@ class Network:
         _check_lanes(links, lanes, document.source)
         rules = RightOfWay(foes_of(root), yields_of(root), right_on_red_of(root))
         crossings = crossings_of(root)
-        reachable = neighbours_of(links, root)
         positions = _positions(root)
         agents_found: list[Intersection] = []
         uncontrolled: list[str] = []
@@ -189,7 +188,7 @@ class Network:
                     links=light_links,
                     phases=phases,
                     programme=programme,
-                    neighbours=reachable[tls],
+                    neighbours=(),
                     position=_centre([positions[link.junction] for link in light_links]),
                     crossings=walks,
                     offset_s=own.offset_s,
@@ -197,17 +196,18 @@ class Network:
                 )
             )
         _require_agents(agents_found, links, document.source)
-        agents = {intersection.id for intersection in agents_found}
-        pruned = tuple(_with_neighbours(light, agents) for light in agents_found)
+        agents = {light.id: links[light.id] for light in agents_found}
+        beside = neighbours_of(agents, root)
+        intersections = tuple(replace(x, neighbours=beside[x.id]) for x in agents_found)
         reach_m = scenario.control.reach_m
         return cls(
             _with_room(lanes, root, agents, reach_m),
-            pruned,
+            intersections,
             tuple(uncontrolled),
             streets_of(root),
             reasons,
             (*notes, *_unknown_conflicts(agents_found)),
-            straight_roads_of(root),
+            straight_roads_of(root, agents),
         )
 
     def intersection(self, tls: str) -> Intersection:
@@ -525,9 +525,13 @@ _NO_PROGRAMME = _Programme("", (), 0.0)
 def _programmes(root: ET.Element, scenario: Scenario) -> dict[str, _Programme]:
     """Return the programmes SUMO runs: the last definition, additional files after the network.
 
-    A definition without phases gives a known programme another offset.
+    A definition without phases gives a known programme another offset. A timetable of programmes
+    (WAUT) begins with one of them, wherever that is defined.
     """
     programmes: dict[str, _Programme] = {}
+    defined: dict[tuple[str, str], _Programme] = {}
+    timetables: dict[str, ET.Element] = {}
+    timed: dict[str, str] = {}
     trees = [(scenario.network.source, root)]
     parts = ((each.source, part) for each in scenario.additional for part in each.parts())
     for source, tree in chain(trees, parts):
@@ -550,7 +554,35 @@ def _programmes(root: ET.Element, scenario: Scenario) -> dict[str, _Programme]:
                 programmes[tls] = _Programme(name, states, offset_s, _times_vary(logic))
             elif tls in programmes and programmes[tls].id == name:
                 programmes[tls] = replace(programmes[tls], offset_s=offset_s)
-    return programmes
+            if tls in programmes:
+                defined[tls, programmes[tls].id] = programmes[tls]
+        timetables |= {table.get("id", ""): table for table in tree.iter("WAUT")}
+        timed |= {x.get("junctionID", ""): x.get("wautID", "") for x in tree.iter("wautJunction")}
+    return programmes | _begun_with(timed, timetables, defined)
+
+
+def _begun_with(
+    timed: Mapping[str, str],
+    timetables: Mapping[str, ET.Element],
+    defined: Mapping[tuple[str, str], _Programme],
+) -> dict[str, _Programme]:
+    """Return light to the programme with which its timetable begins.
+
+    Args:
+        timed: Light to the id of its timetable.
+        timetables: Timetables by id.
+        defined: Light and id of a programme to the programme.
+    """
+    begun: dict[str, _Programme] = {}
+    for light, name in timed.items():
+        table = timetables.get(name)
+        first = None if table is None else defined.get((light, table.get("startProg", "")))
+        if table is not None and first is not None:
+            switched = table.find("wautSwitch") is not None
+            begun[light] = (
+                replace(first, times_vary="a timetable (WAUT) switches it") if switched else first
+            )
+    return begun
 
 
 def _times_vary(logic: ET.Element) -> str:
@@ -594,9 +626,3 @@ def _centre(points: list[tuple[float, float]]) -> tuple[float, float]:
 
 def _unique(names: Iterable[str]) -> tuple[str, ...]:
     return tuple(dict.fromkeys(names))
-
-
-def _with_neighbours(intersection: Intersection, agents: set[str]) -> Intersection:
-    return replace(
-        intersection, neighbours=tuple(n for n in intersection.neighbours if n in agents)
-    )

@@ -53,8 +53,9 @@ def are_foes(a: Link, b: Link, foes: Matrix) -> bool:
 def conflicting_greens(phase: str, links: Sequence[Link], foes: Matrix) -> tuple[int, int] | None:
     """Return the indices of two links with protected green whose paths cross, or None.
 
-    Only conflicts with a through movement count. In many networks opposing left turns are drawn so
-    tightly that the matrix calls them foes, and merging right turns are always green.
+    Conflicts with a through movement count, and those of turns whose through movements conflict as
+    well. In many networks left turns of opposite approaches are drawn so tightly that the matrix
+    calls them foes, and merging right turns are always green.
     """
     green = [link for link in links if phase[link.index] == "G"]
     for position, a in enumerate(green):
@@ -62,11 +63,20 @@ def conflicting_greens(phase: str, links: Sequence[Link], foes: Matrix) -> tuple
             if (
                 a.from_edge != b.from_edge
                 and a.to_edge != b.to_edge
-                and "s" in (a.direction, b.direction)
                 and are_foes(a, b, foes)
+                and ("s" in (a.direction, b.direction) or _roads_cross(a, b, links, foes))
             ):
                 return a.index, b.index
     return None
+
+
+def _roads_cross(a: Link, b: Link, links: Sequence[Link], foes: Matrix) -> bool:
+    """Return True if the ways straight on from the roads of two links cross."""
+    straight = [
+        [link for link in links if link.from_edge == own.from_edge and link.direction == "s"]
+        for own in (a, b)
+    ]
+    return any(are_foes(one, other, foes) for one in straight[0] for other in straight[1])
 
 
 def yielding(state: str, links: Sequence[Link], rules: RightOfWay) -> str:

@@ -211,7 +211,7 @@ def departures(
                 blocks = is_blocker(name, tag.attributes.get("type", ""))
                 if depart >= end:  # vehicles are sorted by departure
                     break
-            elif tag.name == "route" and "id" not in tag.attributes and not blocks:
+            elif tag.name == "route" and tag.parent == "vehicle" and not blocks:
                 edges = tag.attributes.get("edges", "").split()
                 yield name, depart, laps_of(tag.attributes) * edges
 
@@ -307,6 +307,8 @@ def _routed_by_duarouter(scenario: Scenario) -> tuple[Document, ...]:
             "--no-step-log", "true",
             "--seed", "1",
         ]  # fmt: skip
+        if "junction-taz" in settings.sumo:  # trips may name junctions
+            arguments += ["--junction-taz", settings.sumo["junction-taz"]]
         if scenario.additional:
             arguments += ["--additional-files", files(scenario.additional)]
         try:

@@ -13,7 +13,7 @@ import io
 import math
 import xml.etree.ElementTree as ET
 from collections import defaultdict
-from collections.abc import Collection, Iterable, Mapping, Sequence
+from collections.abc import Collection, Container, Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from itertools import accumulate, combinations, pairwise
 from pathlib import Path
@@ -417,8 +417,25 @@ def with_plans(scenario: Scenario, plans: Iterable[SignalPlan], source: str) -> 
                 if other.tag != "tlLogic" or other.get("id") not in planned
             )
             top.extend(kept)
-    others = tuple(document for document in scenario.additional if document.name != name)
+    others = tuple(
+        _without_timetable(document, planned)
+        for document in scenario.additional
+        if document.name != name
+    )
     return replace(scenario, additional=(*others, Document(name, None, xml_bytes(top))))
+
+
+def _without_timetable(document: Document, lights: Container[str]) -> Document:
+    """Return a file in which no timetable (WAUT) switches the programmes of these lights."""
+
+    def is_timed(element: ET.Element) -> bool:
+        return element.tag == "wautJunction" and element.get("junctionID", "") in lights
+
+    def drop(part: ET.Element) -> None:
+        part[:] = [element for element in part if not is_timed(element)]
+
+    timed = any(is_timed(element) for part in document.parts() for element in part)
+    return document.changed(drop) if timed else document
 
 
 def programme_plan(light: Intersection, network: Network) -> SignalPlan:

@@ -29,6 +29,7 @@ from ugat_marl.scenarios.importers.osm_restrictions import (
     Restriction,
     deleted_connections,
     forbidden_turns,
+    nodes_of,
     restriction_of,
 )
 from ugat_marl.scenarios.junctions import crossings_of, foes_of, links_of
@@ -291,7 +292,7 @@ def _reconnect(connections: bytes, made: Path, work: Path) -> None:
 
 
 def _idle_lights(network: Path, walks: Iterable[str]) -> list[str]:
-    """Return the junctions of lights without conflicting streams, except those in `walks`."""
+    """Return the junctions of lights without conflicting streams, except those with `walks`."""
     root = read_xml(network)
     foes = foes_of(root)
     kept = set(walks)
@@ -301,7 +302,8 @@ def _idle_lights(network: Path, walks: Iterable[str]) -> list[str]:
         contended = any(
             are_foes(a, b, foes) and a.from_edge != b.from_edge for a in links for b in links
         )
-        if not contended and not junctions & kept:
+        nodes = {node for junction in junctions for node in nodes_of(junction)}
+        if not contended and not nodes & kept:
             idle += sorted(junctions)
     return idle
 

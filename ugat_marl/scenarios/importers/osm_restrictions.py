@@ -70,6 +70,11 @@ def restriction_of(tags: Mapping[str, str], members: Iterable[Tag]) -> Restricti
             return None
 
 
+def nodes_of(junction: str) -> list[str]:
+    """Return the nodes of the map in a junction; the name of a joined one tells at most four."""
+    return junction.removeprefix("cluster_").split("_") if "cluster" in junction else [junction]
+
+
 def forbidden_turns(root: ET.Element, restrictions: Iterable[Restriction]) -> ForbiddenTurns:
     """Find the turns of a network that restrictions forbid.
 
@@ -88,7 +93,7 @@ def forbidden_turns(root: ET.Element, restrictions: Iterable[Restriction]) -> Fo
             leaving[edge.get("from", ""), way].append(name)
     for junction in root.iter("junction"):
         name = junction.get("id", "")
-        for node in name.removeprefix("cluster_").split("_") if "cluster" in name else (name,):
+        for node in nodes_of(name):
             junctions[node].append(name)
     turns: dict[str, set[str]] = defaultdict(set)
     for link in root.iter("connection"):
