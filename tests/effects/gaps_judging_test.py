@@ -10,7 +10,13 @@ import pytest
 
 import ugat_marl
 from ugat_marl.data import Scores
-from ugat_marl.effects import OBJECTIVES, load_scenario, parse_domain, scenario_in_domain
+from ugat_marl.effects import (
+    OBJECTIVES,
+    apply_effects,
+    load_scenario,
+    parse_domain,
+    scenario_in_domain,
+)
 from ugat_marl.effects.objectives import NORMS
 from ugat_marl.envs import OBJECTIVE_MEASURES
 from ugat_marl.envs.objectives import PERSONS, PERSONS_IN_A_CAR, Objectives, gini, hidden_measures
@@ -33,6 +39,18 @@ def objectives(wanted: str, scenario: str) -> Objectives:
     made = Objectives.of(parse_domain(f"objective={wanted}"), load_scenario(scenario))
     assert made is not None
     return made
+
+
+def test_trucks_of_the_effect_are_trucks() -> None:
+    effects = parse_domain("heavy_share=0.3+objective=person-delay")
+    mixed = apply_effects(load_scenario("single-v1"), effects)
+    made = Objectives.of(effects, mixed)
+    assert made is not None
+    heavy = {name: persons for name, persons in made.persons.items() if name.startswith("heavy.")}
+    assert set(heavy.values()) == {1.0} and made.persons[""] == PERSONS_IN_A_CAR
+    types = [tag for document in (*mixed.additional, *mixed.routes) for tag in document.scan()
+             if tag.name == "vType" and tag.attributes["id"] in heavy]  # fmt: skip
+    assert types and all("/RT_" in tag.attributes["emissionClass"] for tag in types)
 
 
 # --- by hand

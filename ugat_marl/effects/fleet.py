@@ -29,7 +29,7 @@ from ugat_marl.effects.vehicles import driven_types
 from ugat_marl.files import xml_bytes
 from ugat_marl.scenarios import Scenario, SpeedFactors
 
-_HEAVY = "heavy."
+HEAVY = "heavy."
 
 
 @dataclass(frozen=True)
@@ -111,7 +111,7 @@ class HeavyShare(Effect):
             if not is_demand(element) or kind not in cars:
                 return [element]
             name = element.get("id", "")
-            truck = f"{_HEAVY}{cars[kind].get('id')}"
+            truck = f"{HEAVY}{cars[kind].get('id')}"
             if element.tag != "flow":
                 if hashed_uniform(salt, name) < self.share:
                     used[truck] = cars[kind]
@@ -160,7 +160,7 @@ def _cars(
     passenger_cars = {
         name: element
         for name, element in types.items()
-        if element.get("vClass", "passenger") == "passenger" and not name.startswith(_HEAVY)
+        if element.get("vClass", "passenger") == "passenger" and not name.startswith(HEAVY)
     }
     for distribution, names in members.items():
         if names and all(name in passenger_cars for name in names):
@@ -188,7 +188,7 @@ def _mix_trucks_in(
     trucks: dict[str, ET.Element] = {}
     for name, chance in (listed | nested).items():
         if name in cars:
-            truck = f"{_HEAVY}{name}"
+            truck = f"{HEAVY}{name}"
             trucks[truck] = cars[name]
             chances[truck] = chances.get(truck, 0.0) + chance * share
     for name in set(listed) & set(cars):
@@ -220,6 +220,8 @@ def _truck(car: ET.Element, name: str) -> ET.Element:
     truck.attrib |= {
         "id": name, "length": "12", "accel": f"{least['accel']:g}", "decel": f"{least['decel']:g}",
         "guiShape": "truck", "maxSpeed": f"{least['maxSpeed']:g}",
+        # that of SUMO's class of trucks, which may not use every lane of cars
+        "emissionClass": "HBEFA4/RT_le7.5t_Euro-VI_A-C",
     }  # fmt: skip
     return truck
 

@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ugat_marl.data import Scores
-from ugat_marl.effects import Cost, Effect
+from ugat_marl.effects import HEAVY, Cost, Effect
 from ugat_marl.scenarios import Scenario
 from ugat_marl.simulation import Trips
 
@@ -59,8 +59,9 @@ class Objectives:
         for document in (*scenario.additional, *scenario.routes):
             for tag in document.scan():
                 if tag.name == "vType":
-                    carried = PERSONS.get(tag.attributes.get("vClass", ""), PERSONS_IN_A_CAR)
-                    self.persons[tag.attributes.get("id", "")] = carried
+                    name, kind = (tag.attributes.get(key, "") for key in ("id", "vClass"))
+                    kind = "truck" if name.startswith(HEAVY) else kind  # they drive as cars may
+                    self.persons[name] = PERSONS.get(kind, PERSONS_IN_A_CAR)
 
     @classmethod
     def of(cls, effects: Sequence[Effect], scenario: Scenario) -> Objectives | None:
