@@ -26,8 +26,9 @@ def test_the_only_name_that_begins_so_is_meant() -> None:
 
 
 def test_what_is_only_a_little_alike_is_not_meant() -> None:
-    for name, known in (("learning", ["flag", "lr"]), ("nope", ["EnvOpt"]), ("V5", ["V1", "V2"])):
+    for name, known in (("learning", ["flag", "lr"]), ("nope", ["EnvOpt"])):
         assert "Did you mean" not in str(UnknownNameError("setting", name, known))
+    assert "Did you mean 'V1'?" in str(UnknownNameError("domain", "V5", ["V1", "noise-5"]))
 
 
 def test_where_nothing_is_known_nothing_is_listed() -> None:

@@ -21,6 +21,10 @@ _CLOSE = 0.62
 taken for each other, such as "learning" and "flag"; at 0.7 slips in short words are lost."""
 
 
+_CLOSE_IF_SHORT = 0.5
+"""The same for names of one or two letters: one of two letters is right, as in V5 for V4."""
+
+
 def first_line(error: BaseException) -> str:
     """Return the first line of an error's text, or its type; libraries add stacks and hints."""
     return (str(error).splitlines() or [type(error).__name__])[0][:200]
@@ -217,9 +221,10 @@ def nearest(name: str, allowed: Iterable[str]) -> str | None:
         matcher.set_seq1(lower)
         return matcher.ratio()
 
-    close = {
-        lower: max(likeness(word) for word in (lower, *re.split(r"[\s,:/_-]+", lower)))
-        for lower in by_lower
-    }
+    def words(lower: str) -> list[str]:
+        return [word for word in re.split(r"[\s,:/_-]+", lower) if len(word) > 2]
+
+    close = {lower: max(map(likeness, (lower, *words(lower)))) for lower in by_lower}
     best = max(close, key=lambda lower: (close[lower], likeness(lower)), default="")
-    return by_lower[best] if best and close[best] >= _CLOSE else None
+    least = _CLOSE if len(name) > 2 else _CLOSE_IF_SHORT
+    return by_lower[best] if best and close[best] >= least else None

@@ -617,6 +617,28 @@ def test_parking_rounds_half_a_vehicle_up() -> None:
         assert text.count(b'<vehicle id="parking.') == number
 
 
+def test_two_effects_on_a_lane_park_at_different_times() -> None:
+    scenario = with_routes(vehicles([1.0]))
+    once, twice = (
+        {tag.attributes["depart"] for document in apply_effects(scenario, effects).routes
+         for tag in document.scan() if tag.name == "vehicle" and "parking" in tag.attributes["id"]}
+        for effects in ([Parking("west1_A1_0", 4, 60)],
+                        [Parking("west1_A1_0", 4, 60), Parking("west1_A1_0", 4, 120)])
+    )  # fmt: skip
+    assert len(once) == 4 and len(twice) == 8 and once < twice
+
+
+def test_a_distribution_of_its_own_is_no_way_to_turn_from() -> None:
+    inner = (
+        '<vehicle id="v" depart="1"><routeDistribution>'
+        f'<route edges="{EDGE} A1_southA" probability="1"/></routeDistribution></vehicle>'
+    )
+    with pytest.raises(ScenarioError, match="'v' draws its way from 'a distribution of its own'"):
+        apply_effects(with_routes(inner), [Turning(EDGE, "A1_northA", 1.0)])
+    grown = apply_effects(with_routes(inner), [DemandLevel(EDGE, 2.0)])  # it begins there anyway
+    assert len(departing(grown)) == 2
+
+
 def test_a_truck_is_no_faster_than_the_car_it_replaces() -> None:
     types = '<vType id="slow" maxSpeed="8"/><vType id="car" maxSpeed="55.55"/>'
     both = '<flow id="{0}" type="{0}" begin="0" end="10" number="5" from="west1_A1" to="A1_east1"/>'

@@ -5,15 +5,18 @@ from __future__ import annotations
 import re
 from collections.abc import Callable, Mapping
 from dataclasses import fields, replace
+from pathlib import Path
 from typing import Any
 
 import libsumo
 import numpy as np
 import pytest
 from numpy.typing import NDArray
+from rich.console import Console
 
 import ugat_marl
 from ugat_marl.__main__ import main
+from ugat_marl.cli.evaluate import Evaluate
 from ugat_marl.effects import (
     DOMAIN_ALIASES,
     GAP_KINDS,
@@ -68,7 +71,28 @@ def test_names_are_spelled_as_one_likes() -> None:
     assert len(
         {scenario_in_domain(load_scenario("single-v1"), name).hash for name in NAMED_DOMAINS}
     ) == len(NAMED_DOMAINS)
+    assert domain_label("rain+ zone-50") == domain_label("V3+zone-50") == "V3+zone-50"
     assert domain_label("sim") == "sim" and domain_label("startup_delay=1") == "startup_delay=1"
+
+
+def test_a_folder_of_the_name_of_a_domain_takes_its_place_nowhere(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, crossing: Callable[..., Path]
+) -> None:
+    scenario = load_scenario("single-v1")
+    known = {name: scenario_in_domain(scenario, name).hash for name in ("sim", "V4", "Snow")}
+    monkeypatch.chdir(tmp_path)
+    for name in ("sim", "V4", "Snow"):
+        crossing().rename(tmp_path / name)
+        assert scenario_in_domain(scenario, name).hash == known[name]
+        with pytest.raises(ScenarioError, match="has other roads"):
+            scenario_in_domain(scenario, f"./{name}")
+
+
+def test_domains_that_do_not_fit_are_left_out(capsys: pytest.CaptureFixture[str]) -> None:
+    reached = load_scenario("single-v1").with_control(reach_m=100.0)
+    names = Evaluate("single-v1", domains=("observation",))._domains(reached, Console(width=200))
+    assert "zone-50 is left out" in capsys.readouterr().out
+    assert names and not [name for name in names if "detection_zone" in NAMED_DOMAINS[name].effects]
 
 
 def test_no_name_is_that_of_an_effect_or_of_a_gap() -> None:

@@ -299,6 +299,9 @@ def test_a_job_starts_from_the_learner_at_the_end_of_its_training(tmp_path: Path
     start.unlink()
     perform_here([PLAIN], tmp_path, reporter=Silent())
     assert driver._is_final(start)
+    long = replace(PLAIN, every=0, episodes=40)  # it keeps its learner every ten episodes
+    long.write(start.parent)
+    assert not driver._is_final(start)
 
 
 @needs_forks

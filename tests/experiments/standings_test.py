@@ -14,7 +14,7 @@ from ugat_marl.__main__ import main
 from ugat_marl.cli.compare import Compare
 from ugat_marl.data import write_csv
 from ugat_marl.errors import CheckpointError, OptionError, OutputError
-from ugat_marl.experiments import as_standings, ranked, read_standings, require_kept, with_standings
+from ugat_marl.experiments import ranked, read_standings, require_kept, with_standings
 from ugat_marl.experiments.standings import SCHEMA, Judging, judged_in
 
 HEAD = ",".join(SCHEMA)
@@ -89,10 +89,10 @@ def test_a_table_is_not_replaced_by_one_that_lacks_its_trainings(tmp_path: Path)
     folder.mkdir(parents=True)
     file = written(folder)
     for kept in (TABLE, TABLE + "fast,V1,0,70,60,960\n"):
-        require_kept(file, as_standings(kept.encode(), ""), "")
+        require_kept(file, read_standings(written(tmp_path, kept)), "")
     for fewer in (TABLE.replace("fast,V4,2,85,62,952\n", ""), TABLE.replace("85", "86")):
         with pytest.raises(OutputError, match="'fast' in V4 with seed 2"):
-            require_kept(file, as_standings(fewer.encode(), ""), "give another")
+            require_kept(file, read_standings(written(tmp_path, fewer)), "give another")
     assert file.read_text() == TABLE
     other = tmp_path / "other.csv"
     other.write_text("a,b\n1,2\n")
@@ -180,9 +180,13 @@ def test_rules_are_put_into_a_table(
     assert main([*call, "--table", str(table)]) == 2
     assert "a table of grid4x4-v1, not of single-v1" in capsys.readouterr().err
     table.with_name("table.csv").write_text("scenario,setting\nsingle-v1,fast\n")
-    # The table that was written says how it was judged.
-    assert main([*call, "--table", str(out)]) == 0
-    assert "note:" not in capsys.readouterr().out
+    # The table that was written says how the new rows were judged, and nothing of the others.
+    assert main([*call, "--table", str(out), "--out", str(out)]) == 0
+    assert "does not say in which episodes" in capsys.readouterr().out
+    cells = pl.read_csv(out).select("setting", "episodes", "scenario").unique()
+    assert {*cells.iter_rows()} == {
+        ("mine", 2, "single-v1"), ("fast", None, None), ("direct transfer", None, None)
+    }  # fmt: skip
     for changed, said in (
         (["--duration-s", "240"], "duration_s = 300.0, not 240; give --duration-s 300.0"),
         (["--evaluation-seeds", "1"], "episodes = 2, not 1; give --evaluation-seeds 2"),

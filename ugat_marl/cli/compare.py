@@ -168,7 +168,9 @@ class Compare:
             if extended:  # another call may have added rows meanwhile
                 whole = with_standings(read_standings(out), own)
             self._require_kept(whole)
-            return judging.written_to(whole).write_csv()
+            if self.table is None:
+                return judging.written_to(whole).write_csv()
+            return judging.written_beside(whole, self.name, self.table).write_csv()
 
         write_csv(out, text)
         return whole

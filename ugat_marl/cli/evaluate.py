@@ -117,9 +117,10 @@ def _may_not_fit(name: str) -> bool:
     """Return true if a domain may not fit the network or the episode.
 
     Not every network has a barrier order of phases or a lane long enough for an incident. With late
-    demand, all vehicles may come after the end of a short episode.
+    demand, all vehicles may come after the end of a short episode. A detection zone does not go
+    with a reach, nor with the queue model.
     """
-    words = ("phase_order=barrier", "incident=", "demand_timing=")
+    words = ("phase_order=barrier", "incident=", "demand_timing=", "detection_zone=")
     return any(word in NAMED_DOMAINS[name].effects for word in words)
 
 

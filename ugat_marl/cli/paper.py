@@ -2,24 +2,25 @@
 
 from __future__ import annotations
 
+import warnings
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, ClassVar
 
+import polars as pl
 from rich.console import Console
 from tyro.conf import arg
 
 from ugat_marl.cli.arguments import RayAddress, require_numbers, workers_of
 from ugat_marl.data import write_csv
 from ugat_marl.effects import load_scenario
-from ugat_marl.errors import OptionError
+from ugat_marl.errors import OptionError, counted
 from ugat_marl.experiments import (
     DIRECT,
     Comparison,
     Judging,
     PaperConfig,
     all_standings,
-    as_standings,
     compare,
     file_stem,
     machine_facts,
@@ -171,9 +172,18 @@ class Gap(_Paper):
 
 
 def _write(comparison: Comparison, judging: Judging, title: str, folder: Path) -> None:
-    seeds = judging.written_to(all_standings(comparison)).write_csv()
+    rows = all_standings(comparison)
+    unknown = rows.filter(pl.any_horizontal(pl.col("att_s", "att_s_sim").is_nan()))
+    if unknown.height:
+        warnings.warn(
+            f"no vehicle was due for {counted(unknown.height, 'row')}, such as "
+            f"{unknown['setting'][0]!r} in {unknown['domain'][0]}; {SEEDS} is without them",
+            stacklevel=2,
+        )
+        rows = rows.filter(~pl.any_horizontal(pl.col("att_s", "att_s_sim").is_nan()))
+    seeds = judging.written_to(rows).write_csv()
     remedy = "give the same command with another --out, it trains nothing again"
-    require_kept(folder / SEEDS, as_standings(seeds.encode(), "the new table"), remedy)
+    require_kept(folder / SEEDS, rows, remedy)
     page = comparison_page(comparison, DIRECT, title, machine_facts())
     write_whole(folder / "table.md", page + "\n")
     write_csv(folder / "table.csv", comparison_csv(comparison))

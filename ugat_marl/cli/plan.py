@@ -16,7 +16,7 @@ from tyro.conf import Positional, arg
 from ugat_marl.cli.arguments import refuse_options, unused
 from ugat_marl.effects import load_scenario, scenario_in_domain
 from ugat_marl.errors import OptionError, counted, listed
-from ugat_marl.experiments import policy_factory, typical_plans
+from ugat_marl.experiments import TUNING_SEED, policy_factory, typical_plans
 from ugat_marl.files import require_writable
 from ugat_marl.progress import Bars
 from ugat_marl.reporting import LIGHT_HEADING, LightNames, titled_table
@@ -57,7 +57,7 @@ class Plan:
         policy: Rule, or file of a policy, whose typical behaviour becomes a plan.
         domain: Domain in which the policy is played.
         seeds: Number of episodes of the policy.
-        first_seed: Seed of the first episode.
+        first_seed: Seed of the first episode; the default is none of those that `evaluate` plays.
         apply: Table of plans, or combined UTDF file of Synchro.
         lights: Lights of the intersections of a UTDF file, as INTID=LIGHT.
         force: Replace a table or scenario of the name --out.
@@ -70,7 +70,7 @@ class Plan:
     )
     domain: str = "sim"
     seeds: int = 3
-    first_seed: int = 1000
+    first_seed: int = TUNING_SEED
     apply: Annotated[Path | None, unused("FILE")] = None
     lights: tuple[str, ...] = ()
     force: bool = False

@@ -116,6 +116,9 @@ class NamedRoutes:
         inner = element.find("route")
         if inner is not None:
             return next(iter(_edges(inner)), None)
+        drawn = self.drawn(element)
+        if len(drawn) == 1:
+            return next(iter(drawn))
         return self.first.get(element.get("route", "")) or element.get("from")
 
 
@@ -223,7 +226,7 @@ def _refuse_unknown_origin(
             distribution of routes that begin on that edge and on others.
     """
     drawn = routes.drawn(element)
-    if edge in drawn:
+    if edge in drawn and len(drawn) > 1:
         raise OptionError(
             f"{effect}: {element.tag} {element.get('id')!r} draws one of several routes, which "
             f"begin on {', '.join(sorted(drawn))}, so its first edge is not known; give it a route "

@@ -294,9 +294,12 @@ def _parts(domain: str) -> list[str]:
 
 
 def domain_label(domain: Domain) -> str:
-    """Return the short name of a domain for tables."""
+    """Return the short name of a domain for tables, the same for all spellings of its names."""
     if isinstance(domain, str):
-        return {"sim": "sim", **_names()}.get(domain.strip().lower(), domain)
+        if domain_path(domain) is not None:
+            return domain
+        names = {"sim": "sim", **_names()}
+        return "+".join(names.get(part.lower(), part) for part in _parts(domain))
     return "+".join(map(str, domain)) or "sim"
 
 
@@ -412,8 +415,11 @@ def _greens(scenario: Scenario) -> dict[str, tuple[str, ...]]:
 
 
 def domain_path(domain: Domain) -> Path | None:
-    """Return the path if a domain is a scenario directory or a SUMO configuration, else None."""
-    if not isinstance(domain, str):
+    """Return the path if a domain is a scenario directory or a SUMO configuration, else None.
+
+    A folder of the name of a domain, such as ``V4``, is given as ``./V4``.
+    """
+    if not isinstance(domain, str) or domain.strip().lower() in {"sim", *_names()}:
         return None
     path = with_home(domain)
     try:

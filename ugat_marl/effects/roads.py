@@ -20,6 +20,7 @@ from ugat_marl.effects.base import (
     NumberParameter,
     TextParameter,
     hashed_uniform,
+    salt_of,
 )
 from ugat_marl.effects.documents import edit, seconds_text
 from ugat_marl.effects.places import network_places
@@ -137,7 +138,10 @@ class Parking(Effect):
         _refuse_queues(scenario, self)
         settings = scenario.settings
         number = math.floor(self.per_hour * settings.duration_s / 3600.0 + 0.5)
-        parts = [(n + hashed_uniform(self.name, self.lane, str(n))) / number for n in range(number)]
+        # a second effect on the lane parks at other times
+        again = salt_of(scenario, self, self.lane).removeprefix(f"{self.name} {self.lane}").split()
+        names = (self.name, self.lane, *again)
+        parts = [(n + hashed_uniform(*names, str(n))) / number for n in range(number)]
         departs = [settings.begin_s + part * settings.duration_s for part in parts]
         stand = {"duration": seconds_text(self.dwell_s)}
         return _with_blockers(scenario, self, self.lane, departs, stand)

@@ -74,7 +74,9 @@ class Turning(Effect):
                         f"effect {self.name!r}: {element.tag} {element.get('id')!r} has {end} = "
                         f"{district!r}, so its way is not known; give it a route, or from and to"
                     )
-            if not edges and (drawn := element.get("route")) is not None:
+            inner = element.find("routeDistribution")
+            drawn = element.get("route") if inner is None else "a distribution of its own"
+            if not edges and drawn is not None:
                 raise ScenarioError(
                     f"effect {self.name!r}: {element.tag} {element.get('id')!r} draws its way from "
                     f"{drawn!r}; give it a route of its own, or from and to"

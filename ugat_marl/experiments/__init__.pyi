@@ -72,7 +72,6 @@ from .sim_check import check_run as check_run
 from .sim_check import check_table as check_table
 from .standings import Judging as Judging
 from .standings import all_standings as all_standings
-from .standings import as_standings as as_standings
 from .standings import judged_in as judged_in
 from .standings import ranked as ranked
 from .standings import read_standings as read_standings

@@ -226,13 +226,13 @@ def _is_ready(job: Job, folder: Path, stop: Stop, wanted: threading.Event) -> bo
 def _is_final(start: Path) -> bool:
     """Return True if a file holds the learner at the end of its training.
 
-    A training that is judged several times keeps its learner each time.
+    A training keeps its own learner now and then, to go on after an interruption.
     """
     if not start.exists():
         return False
-    base = Job.read(start.parent)
-    kept_often = start.name == LEARNER and (base.every or base.last > 1)
-    return not kept_often or JobRecord.read(start.parent).is_whole(base)
+    if start.name != LEARNER:
+        return True
+    return JobRecord.read(start.parent).is_whole(Job.read(start.parent))
 
 
 def _perform_apart(folder: str, stop: Stop, forked: bool) -> None:

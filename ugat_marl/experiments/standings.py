@@ -10,7 +10,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 from pathlib import Path
 from typing import Any
 
@@ -90,9 +90,23 @@ class Judging:
         """Return a table with columns that say this."""
         return table.with_columns(
             scenario=pl.lit(self.scenario),
-            episodes=pl.lit(self.episodes),
-            duration_s=pl.lit(self.duration_s),
+            episodes=pl.lit(str(self.episodes)),
+            duration_s=pl.lit(str(self.duration_s)),
         )
+
+    def written_beside(self, table: pl.DataFrame, name: str, file: Path) -> pl.DataFrame:
+        """Return a table with columns that say this of one setting.
+
+        Args:
+            table: The table.
+            name: The setting.
+            file: File of the other settings. They say what they say there, which may be nothing.
+        """
+        own = pl.col("setting") == name
+        others = table.filter(~own).join(
+            _told_in(file), on=_TRAINING, how="left", maintain_order="left"
+        )
+        return pl.concat([others, self.written_to(table.filter(own))])
 
     def require_in(self, path: Path) -> bool:
         """Refuse the file of a table that was judged otherwise.
@@ -100,7 +114,7 @@ class Judging:
         The ``table.csv`` beside a table of `paper` tells its scenario.
 
         Returns:
-            True if the file tells episodes and their length.
+            True if the file tells episodes and their length in every row.
 
         Raises:
             OptionError: Scenario, number or length of the episodes is another one.
@@ -117,7 +131,8 @@ class Judging:
                         f"{path}: judged with {name} = {given}, not {wanted:g}; "
                         f"give --{option} {given}"
                     )
-        return bool(_values_in(own, "episodes"))
+        told = own.get_column("episodes", default=None)
+        return told is not None and not told.is_in(["", None], nulls_equal=True).any()
 
 
 def _cells(path: Path) -> pl.DataFrame:
@@ -130,7 +145,21 @@ def _values_in(texts: pl.DataFrame, column: str) -> list[str]:
     """Return the different texts of a column; none without the column."""
     if column not in texts.columns:
         return []
-    return texts[column].drop_nulls().unique(maintain_order=True).to_list()
+    told = texts[column].drop_nulls().unique(maintain_order=True).to_list()
+    return [text for text in told if text]
+
+
+def _told_in(path: Path) -> pl.DataFrame:
+    """Return what the rows of a table's file say of how they were judged, as texts."""
+    cells = _cells(path)
+    names = [field.name for field in fields(Judging) if field.name != "length_s"]
+    return cells.select(
+        *(pl.col(name).cast(SCHEMA[name]) for name in _TRAINING),
+        *(
+            pl.col(name) if name in cells.columns else pl.lit(None, pl.String).alias(name)
+            for name in names
+        ),
+    )
 
 
 def judged_in(path: Path) -> dict[str, float]:
@@ -149,19 +178,6 @@ def _number_in(text: str) -> float:
         return math.nan
 
 
-def as_standings(content: bytes, name: str) -> pl.DataFrame:
-    """Return the table of standings in a file of CSV.
-
-    Args:
-        content: Content of the file.
-        name: Name of the file in errors.
-
-    Raises:
-        CheckpointError: It is no such table, or a number is missing.
-    """
-    return _standings_in(_texts(content), name)
-
-
 def _texts(content: bytes) -> pl.DataFrame | None:
     """Return the cells of a file of CSV as texts; None if it is none."""
     try:
@@ -171,7 +187,7 @@ def _texts(content: bytes) -> pl.DataFrame | None:
 
 
 def _standings_in(texts: pl.DataFrame | None, name: str) -> pl.DataFrame:
-    """Return the table of standings in cells; see `as_standings`."""
+    """Return the table of standings in cells; `name` is that of the file in errors."""
     if texts is None:
         raise CheckpointError(f"{name}: not a table of CSV; name a seeds.csv of a table")
     if missing := [column for column in SCHEMA if column not in texts.columns]:
