@@ -89,7 +89,7 @@ def test_an_executor_that_was_given_stays_open() -> None:
         own.submit(int, "3")
     assert parts_at_a_time(None) == usable_cores()
     assert parts_at_a_time(5) == 5
-    with pytest.raises(OptionError, match="workers = 0: must be at least 1"):
+    with pytest.raises(OptionError, match="workers = 0: must be a whole number from 1 on"):
         parts_at_a_time(0)
 
 
