@@ -130,7 +130,8 @@ def test_wrong_arguments_of_a_training_leave_no_folder(
     assert not (tmp_path / "run" / "settings.json").exists()
 
 
-def test_numbers_of_numpy_are_numbers(tmp_path: Path) -> None:
+def test_numbers_of_numpy_are_numbers(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    search_few_rules(monkeypatch, "programme")
     one: Any = np.int64(1)
     run = ugat_marl.train(
         "single-v1", grounding="phase", pretrain_episodes=one, iterations=np.int64(0), seed=one,  # type: ignore[arg-type]
