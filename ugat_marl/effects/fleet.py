@@ -30,6 +30,7 @@ from ugat_marl.files import xml_bytes
 from ugat_marl.scenarios import Scenario, SpeedFactors
 
 HEAVY = "heavy."
+"""Begin of the names of types that are trucks, though they may drive where cars may."""
 
 
 @dataclass(frozen=True)
