@@ -9,6 +9,7 @@ import shutil
 import signal
 import subprocess
 import sys
+import threading
 import time
 from collections.abc import Iterator
 from concurrent.futures import ThreadPoolExecutor
@@ -302,6 +303,23 @@ def test_a_job_starts_from_the_learner_at_the_end_of_its_training(tmp_path: Path
     long = replace(PLAIN, every=0, episodes=40)  # it keeps its learner every ten episodes
     long.write(start.parent)
     assert not driver._is_final(start)
+
+
+def test_a_learner_that_ends_while_its_job_is_wanted_is_not_overlooked(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """It ends between the look at it and the look at who wants the job."""
+    wanted, looks = threading.Event(), iter([False, True])
+
+    def look(_: Path) -> bool:
+        wanted.set()
+        return next(looks)
+
+    monkeypatch.setattr(driver, "_is_final", look)
+    job = replace(PLAIN, start=f"{PLAIN.name}/{LEARNER}")
+    assert driver._is_ready(job, tmp_path, Stop(), wanted)
+    monkeypatch.setattr(driver, "_is_final", lambda _: False)
+    assert not driver._is_ready(job, tmp_path, Stop(), wanted)
 
 
 @needs_forks

@@ -218,7 +218,9 @@ def _is_ready(job: Job, folder: Path, stop: Stop, wanted: threading.Event) -> bo
     """Wait for the learner that a job starts from; False if somebody wants the job before."""
     start = None if job.start is None else folder / job.start
     while start is not None and not _is_final(start):
-        if wanted.is_set() or stop.wait(0.5):
+        if wanted.is_set():
+            return _is_final(start)  # it may have ended since the last look
+        if stop.wait(0.5):
             return False
     return True
 
