@@ -11,8 +11,9 @@ import numpy as np
 import polars as pl
 import pytest
 
+from ugat_marl.cli.paper import _write
 from ugat_marl.data import Scores
-from ugat_marl.experiments import Comparison, Trial, all_standings
+from ugat_marl.experiments import Comparison, Judging, Trial, all_standings, read_standings
 from ugat_marl.reporting import comparison_csv, comparison_page, gap_picture
 
 BLANK = Scores(0, 0, 0, 0, 0, 0, 0, 0, 0, 0)
@@ -63,6 +64,24 @@ def test_regret_won_back_by_hand(found: Comparison) -> None:
     assert found.reduction("phase (the paper's UGAT)", "V4", "direct transfer") == pytest.approx(
         1 - 69 / 149
     )
+
+
+def test_a_table_with_an_unknown_travel_time_is_written(found: Comparison, tmp_path: Path) -> None:
+    """No vehicle was due in a domain: the other results of hours are kept all the same."""
+    unknown = [
+        replace(
+            trial,
+            target="late-demand",
+            domain="late-demand" if trial.domain == "V4" else "sim",
+            scores=trial.scores if trial.domain == "sim" else replace(BLANK, att_s=math.nan),
+        )
+        for trial in found.trials
+    ]
+    table = replace(found, trials=(*found.trials, *unknown))
+    with pytest.warns(UserWarning, match="for 8 rows, such as 'direct transfer' in late-demand"):
+        _write(table, Judging("toy", 2, 100.0), "title", tmp_path)
+    assert set(read_standings(tmp_path / "seeds.csv")["domain"]) == {"V4"}
+    assert "late-demand" in (tmp_path / "table.md").read_text()
 
 
 def test_settings_are_compared_by_the_seeds_that_both_have(found: Comparison) -> None:
