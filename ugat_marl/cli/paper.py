@@ -172,15 +172,15 @@ class Gap(_Paper):
 
 
 def _write(comparison: Comparison, judging: Judging, title: str, folder: Path) -> None:
-    rows = all_standings(comparison)
-    unknown = rows.filter(pl.any_horizontal(pl.col("att_s", "att_s_sim").is_nan()))
+    every = all_standings(comparison)
+    is_unknown = pl.col("att_s").is_nan() | pl.col("att_s_sim").is_nan()
+    rows, unknown = every.filter(~is_unknown), every.filter(is_unknown)
     if unknown.height:
         warnings.warn(
             f"no vehicle was due for {counted(unknown.height, 'row')}, such as "
             f"{unknown['setting'][0]!r} in {unknown['domain'][0]}; {SEEDS} is without them",
             stacklevel=2,
         )
-        rows = rows.filter(~pl.any_horizontal(pl.col("att_s", "att_s_sim").is_nan()))
     seeds = judging.written_to(rows).write_csv()
     remedy = "give the same command with another --out, it trains nothing again"
     require_kept(folder / SEEDS, rows, remedy)

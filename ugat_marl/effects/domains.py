@@ -296,10 +296,9 @@ def _parts(domain: str) -> list[str]:
 def domain_label(domain: Domain) -> str:
     """Return the short name of a domain for tables, the same for all spellings of its names."""
     if isinstance(domain, str):
-        if domain_path(domain) is not None:
-            return domain
         names = {"sim": "sim", **_names()}
-        return "+".join(names.get(part.lower(), part) for part in _parts(domain))
+        label = "+".join(names.get(part.lower(), part) for part in _parts(domain))
+        return domain if label != domain and domain_path(domain) is not None else label
     return "+".join(map(str, domain)) or "sim"
 
 

@@ -253,6 +253,7 @@ class LaneView:
         phase = rows.observation[:, layout.features : layout.features + layout.phases].argmax(1)
         had, has = green[:, phase], green[:, rows.executed]
         age_s = interval_s * _ages(had, consecutive(rows.episode, rows.step))
+        none = np.zeros(len(before), dtype=np.bool_)
         held = np.zeros(before.shape, dtype=np.bool_)
         for feature, ways in self.beyond[place] if self.beyond else ():
             filled = np.maximum(rows.observation[:, feature], rows.next_observation[:, feature])
@@ -266,7 +267,7 @@ class LaneView:
                 left[:, k],
                 age_s[k],
                 has[k],
-                np.zeros(len(before), dtype=np.bool_),
+                none,
                 held[:, k],
             )
 

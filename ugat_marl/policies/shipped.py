@@ -8,7 +8,6 @@ from __future__ import annotations
 
 import hashlib
 import json
-import re
 from collections.abc import Mapping
 from dataclasses import asdict, dataclass
 from pathlib import Path
@@ -19,6 +18,7 @@ from pydantic import TypeAdapter, ValidationError
 from ugat_marl.errors import CheckpointError, UnknownNameError
 from ugat_marl.files import read_json, write_whole
 from ugat_marl.policies.network_policy import NetworkPolicy
+from ugat_marl.policies.own_names import is_own
 from ugat_marl.policies.rules.catalogue import RULES
 from ugat_marl.policies.rules.named import rule_in
 
@@ -142,7 +142,8 @@ def load_policy(name: str | Path, *, folder: Path = FOLDER) -> NetworkPolicy:
         UnknownNameError: There is no such policy.
         CheckpointError: The file is damaged, no policy, or holds a rule.
     """
-    if re.fullmatch(r".+:.+@.+", str(name)):
+    own, at, _ = str(name).partition("@")
+    if at and is_own(own):
         raise CheckpointError(
             f"{name} is what a learner of yours has saved, which no other program can read; "
             "commands that play policies take it as it is"
@@ -162,15 +163,13 @@ def load_policy(name: str | Path, *, folder: Path = FOLDER) -> NetworkPolicy:
             f"{name} is a rule, which has no network to load or to export; commands that play "
             "policies take it as it is"
         )
-    if str(name) not in shipped_policies(folder):
+    known = shipped_policies(folder)
+    if str(name) not in known:
         raise UnknownNameError(
-            "policy",
-            str(name),
-            shipped_policies(folder),
-            "The file of a trained policy (.pt) works as well.",
+            "policy", str(name), known, "The file of a trained policy (.pt) works as well."
         )
-    card = policy_card(str(name), folder=folder)
-    file = shipped_policies(folder)[str(name)]
+    file = known[str(name)]
+    card = _card_of(file)
     if hashlib.sha256(file.read_bytes()).hexdigest() != card.sha256:
         raise CheckpointError(
             f"{file}: not the policy of its card (the hashes differ); install the package again"
@@ -197,4 +196,8 @@ def policy_card(name: str, *, folder: Path = FOLDER) -> PolicyCard:
             known,
             "`ugat-marl policy pack FOLDER --out PATH` makes the cards of a training.",
         )
-    return PolicyCard.read(known[name].with_suffix(".json"))
+    return _card_of(known[name])
+
+
+def _card_of(policy: Path) -> PolicyCard:
+    return PolicyCard.read(policy.with_suffix(".json"))

@@ -74,24 +74,17 @@ def check_demand(
         latest, in_routes = -math.inf, document in scenario.routes
         singles = OwnEdges()
         for tag in document.scan(reporter):
-            if tag.name == "vType" and tag.attributes.get("scale", "1") not in ("1", "1.0"):
-                raise ScenarioError(
-                    f"{_at(document, tag)}: {_who(tag)} has a scale of its own, which counts of "
-                    'the demand would miss; repeat its vehicles, or set "scale" under [sumo] in '
-                    "scenario.toml for all"
-                )
-            if tag.name in ("vehicle", "trip", "flow", "route"):
-                used = edges_used(tag)
-                if not edges.issuperset(used):
-                    edge = next(edge for edge in used if edge not in edges)
-                    raise _unknown_edge(document, tag, edge, scenario)
             if in_routes:
                 singles.read(tag)
-                latest = _in_order(tag, document, begin, latest)
+            _refuse_undrivable(tag, document, edges, scenario)
+            if not departs(tag) and not (in_routes and _travels(tag)):
+                continue
+            depart = _depart_s(tag, document, begin, max(begin, latest))
+            if depart < latest and in_routes:
+                raise _unsorted(document, tag, depart, latest)
+            latest = max(latest, depart)
             if departs(tag):
                 routed &= in_routes
-                depart = _depart_s(tag, document, begin, max(begin, latest))
-                latest = max(latest, depart)
                 if tag.name == "flow":
                     flows += depart < end and begin < _end_s(tag, document)
                 else:
@@ -145,18 +138,24 @@ def _unsorted(document: Document, tag: Tag, depart: float, latest: float) -> Sce
     )
 
 
-def _in_order(tag: Tag, document: Document, begin_s: float, latest_s: float) -> float:
-    """Return the latest departure so far; people and containers are in order among vehicles.
+def _travels(tag: Tag) -> bool:
+    """Return True for people and containers, which SUMO wants in order among vehicles."""
+    return tag.name in TRAVELLERS and tag.parent == "routes"
 
-    Raises:
-        ScenarioError: This one is earlier than one before it, and SUMO would leave it out.
-    """
-    if not departs(tag) and (tag.name not in TRAVELLERS or tag.parent != "routes"):
-        return latest_s
-    depart_s = _depart_s(tag, document, begin_s, max(begin_s, latest_s))
-    if depart_s < latest_s:
-        raise _unsorted(document, tag, depart_s, latest_s)
-    return depart_s
+
+def _refuse_undrivable(tag: Tag, document: Document, edges: set[str], scenario: Scenario) -> None:
+    """Refuse a type with a scale of its own, and a route over an edge that does not exist."""
+    if tag.name == "vType" and tag.attributes.get("scale", "1") not in ("1", "1.0"):
+        raise ScenarioError(
+            f"{_at(document, tag)}: {_who(tag)} has a scale of its own, which counts of "
+            'the demand would miss; repeat its vehicles, or set "scale" under [sumo] in '
+            "scenario.toml for all"
+        )
+    if tag.name in ("vehicle", "trip", "flow", "route"):
+        used = edges_used(tag)
+        if not edges.issuperset(used):
+            edge = next(edge for edge in used if edge not in edges)
+            raise _unknown_edge(document, tag, edge, scenario)
 
 
 def _depart_s(tag: Tag, document: Document, begin_s: float, triggered_s: float) -> float:

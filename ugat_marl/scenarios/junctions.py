@@ -5,7 +5,7 @@ from __future__ import annotations
 import heapq
 import xml.etree.ElementTree as ET
 from collections import Counter, defaultdict
-from collections.abc import Container, Iterator, Mapping, Sequence
+from collections.abc import Container, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 
 from ugat_marl.scenarios.naming import edge_of_lane
@@ -173,15 +173,19 @@ def yields_of(root: ET.Element) -> dict[str, list[int]]:
 
 
 def neighbours_of(
-    links: Mapping[str, Sequence[Link]], root: ET.Element
+    links: Mapping[str, Sequence[Link]], between: Iterable[ET.Element]
 ) -> dict[str, tuple[str, ...]]:
     """Return the neighbours of each traffic light: roads join them with none of these in between.
 
     Other lights, as those of pedestrians, are passed like plain nodes.
+
+    Args:
+        links: Traffic light to its links.
+        between: The `connections_between` these lights.
     """
     enters = {link.from_edge: tls for tls, light_links in links.items() for link in light_links}
     following: dict[str, set[str]] = defaultdict(set)
-    for element in _connections_between(root, links):
+    for element in between:
         following[element.get("from", "")].add(element.get("to", ""))
     adjacent: dict[str, set[str]] = {tls: set() for tls in links}
     for tls, own in links.items():
@@ -199,21 +203,24 @@ def neighbours_of(
     return {tls: tuple(sorted(beside)) for tls, beside in adjacent.items()}
 
 
-def straight_roads_of(root: ET.Element, lights: Container[str]) -> dict[str, str]:
-    """Return road to the road straight ahead of it, where none of these lights is in between."""
+def straight_roads_of(between: Iterable[ET.Element]) -> dict[str, str]:
+    """Return road to the road straight ahead of it, by the `connections_between` lights."""
     ahead: dict[str, str] = {}
-    for element in _connections_between(root, lights):
+    for element in between:
         if element.get("dir") == "s":
             ahead.setdefault(element.get("from", ""), element.get("to", ""))
     return ahead
 
 
-def _connections_between(root: ET.Element, lights: Container[str]) -> Iterator[ET.Element]:
-    """Yield the connections from road to road (SUMO's edges) that none of these lights controls."""
-    for element in root.iter("connection"):
-        ends = element.get("from", ":"), element.get("to", ":")  # ":" begins those in a junction
-        if element.get("tl", "") not in lights and not any(end.startswith(":") for end in ends):
-            yield element
+def connections_between(root: ET.Element, lights: Container[str]) -> list[ET.Element]:
+    """Return the connections from road to road (SUMO's edges) that no light of these controls."""
+    return [
+        element
+        for element in root.iter("connection")
+        if element.get("tl", "") not in lights
+        # ":" begins the names of roads inside of a junction
+        and not any(element.get(end, ":").startswith(":") for end in ("from", "to"))
+    ]
 
 
 def right_on_red_of(root: ET.Element) -> frozenset[str]:

@@ -15,6 +15,7 @@ from ugat_marl.scenarios.junctions import (
     Link,
     Upstream,
     behind_of,
+    connections_between,
     crossings_of,
     foes_of,
     links_of,
@@ -197,7 +198,8 @@ class Network:
             )
         _require_agents(agents_found, links, document.source)
         agents = {light.id: links[light.id] for light in agents_found}
-        beside = neighbours_of(agents, root)
+        between = connections_between(root, agents)
+        beside = neighbours_of(agents, between)
         intersections = tuple(replace(x, neighbours=beside[x.id]) for x in agents_found)
         reach_m = scenario.control.reach_m
         return cls(
@@ -207,7 +209,7 @@ class Network:
             streets_of(root),
             reasons,
             (*notes, *_unknown_conflicts(agents_found)),
-            straight_roads_of(root, agents),
+            straight_roads_of(between),
         )
 
     def intersection(self, tls: str) -> Intersection:
@@ -530,7 +532,7 @@ def _programmes(root: ET.Element, scenario: Scenario) -> dict[str, _Programme]:
     """
     programmes: dict[str, _Programme] = {}
     defined: dict[tuple[str, str], _Programme] = {}
-    timetables: dict[str, ET.Element] = {}
+    timetables: dict[str, tuple[str, bool]] = {}
     timed: dict[str, str] = {}
     trees = [(scenario.network.source, root)]
     parts = ((each.source, part) for each in scenario.additional for part in each.parts())
@@ -556,32 +558,32 @@ def _programmes(root: ET.Element, scenario: Scenario) -> dict[str, _Programme]:
                 programmes[tls] = replace(programmes[tls], offset_s=offset_s)
             if tls in programmes:
                 defined[tls, programmes[tls].id] = programmes[tls]
-        timetables |= {table.get("id", ""): table for table in tree.iter("WAUT")}
+        for table in tree.iter("WAUT"):
+            switches = table.find("wautSwitch") is not None
+            timetables[table.get("id", "")] = table.get("startProg", ""), switches
         timed |= {x.get("junctionID", ""): x.get("wautID", "") for x in tree.iter("wautJunction")}
     return programmes | _begun_with(timed, timetables, defined)
 
 
 def _begun_with(
     timed: Mapping[str, str],
-    timetables: Mapping[str, ET.Element],
+    timetables: Mapping[str, tuple[str, bool]],
     defined: Mapping[tuple[str, str], _Programme],
 ) -> dict[str, _Programme]:
     """Return light to the programme with which its timetable begins.
 
     Args:
         timed: Light to the id of its timetable.
-        timetables: Timetables by id.
+        timetables: Id of a timetable to its first programme, and whether it switches to others.
         defined: Light and id of a programme to the programme.
     """
     begun: dict[str, _Programme] = {}
     for light, name in timed.items():
-        table = timetables.get(name)
-        first = None if table is None else defined.get((light, table.get("startProg", "")))
-        if table is not None and first is not None:
-            switched = table.find("wautSwitch") is not None
-            begun[light] = (
-                replace(first, times_vary="a timetable (WAUT) switches it") if switched else first
-            )
+        if name in timetables and (light, timetables[name][0]) in defined:
+            start, switches = timetables[name]
+            begun[light] = defined[light, start]
+            if switches:
+                begun[light] = replace(begun[light], times_vary="a timetable (WAUT) switches it")
     return begun
 
 

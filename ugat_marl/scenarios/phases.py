@@ -64,19 +64,19 @@ def conflicting_greens(phase: str, links: Sequence[Link], foes: Matrix) -> tuple
                 a.from_edge != b.from_edge
                 and a.to_edge != b.to_edge
                 and are_foes(a, b, foes)
-                and ("s" in (a.direction, b.direction) or _roads_cross(a, b, links, foes))
+                and (
+                    "s" in (a.direction, b.direction)
+                    or (a.from_edge, b.from_edge) in _crossing_approaches(links, foes)
+                )
             ):
                 return a.index, b.index
     return None
 
 
-def _roads_cross(a: Link, b: Link, links: Sequence[Link], foes: Matrix) -> bool:
-    """Return True if the ways straight on from the roads of two links cross."""
-    straight = [
-        [link for link in links if link.from_edge == own.from_edge and link.direction == "s"]
-        for own in (a, b)
-    ]
-    return any(are_foes(one, other, foes) for one in straight[0] for other in straight[1])
+def _crossing_approaches(links: Sequence[Link], foes: Matrix) -> set[tuple[str, str]]:
+    """Return the pairs of approaches, in both orders, whose ways straight on cross."""
+    through = [link for link in links if link.direction == "s"]
+    return {(a.from_edge, b.from_edge) for a in through for b in through if are_foes(a, b, foes)}
 
 
 def yielding(state: str, links: Sequence[Link], rules: RightOfWay) -> str:
@@ -190,15 +190,12 @@ def permitted_clash(links: Sequence[Link], rules: RightOfWay) -> Clash:
 
 def opposite_approaches(links: Sequence[Link], rules: RightOfWay) -> Clash:
     """Return a test if links have opposite approaches: both go straight on and do not cross."""
-    through = [link for link in links if link.direction == "s"]
-    crossing = {
-        (a.from_edge, b.from_edge) for a in through for b in through if are_foes(a, b, rules.foes)
-    }
-    straight = {link.from_edge for link in through}
+    crossing = _crossing_approaches(links, rules.foes)
+    straight = {link.from_edge for link in links if link.direction == "s"}
 
     def opposite(a: Link, b: Link) -> bool:
         approaches = (a.from_edge, b.from_edge)
-        return set(approaches) <= straight and not {approaches, approaches[::-1]} & crossing
+        return set(approaches) <= straight and approaches not in crossing
 
     return opposite
 
