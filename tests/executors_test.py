@@ -5,13 +5,16 @@ from __future__ import annotations
 import contextlib
 import copy
 import os
+import pickle
+import shutil
 import signal
 import subprocess
 import sys
 import threading
 import time
-from collections.abc import Iterator
-from concurrent.futures import Executor, ThreadPoolExecutor
+import types
+from collections.abc import Callable, Iterator
+from concurrent.futures import Executor, Future, ThreadPoolExecutor
 from concurrent.futures.process import BrokenProcessPool
 from dataclasses import dataclass
 from pathlib import Path
@@ -19,6 +22,7 @@ from typing import Any
 
 import pytest
 
+import ugat_marl
 from ugat_marl.cli.arguments import workers_of
 from ugat_marl.data import TransitionLog
 from ugat_marl.diagnosis.engine import Engine
@@ -27,8 +31,9 @@ from ugat_marl.diagnosis.replay import Replay
 from ugat_marl.diagnosis.thresholds import Thresholds
 from ugat_marl.effects import StartupDelay, load_scenario
 from ugat_marl.envs import TrafficEnv
-from ugat_marl.errors import JobError, OptionError, SimulatorCrashed
+from ugat_marl.errors import JobError, OptionError, ScenarioError, SimulatorCrashed
 from ugat_marl.experiments import evaluation_of, rule_factory
+from ugat_marl.files import files_sent_whole
 from ugat_marl.grounding import RollOutSettings, roll_outs
 from ugat_marl.parallel import (
     DEADLINE_VARIABLE,
@@ -323,6 +328,40 @@ def test_ray_and_workers_exclude_each_other() -> None:
         pass
     with workers_of(2, None) as workers:
         assert workers == 2
+
+
+def test_a_scenario_for_another_machine_is_sent_with_its_files(
+    crossing: Callable[..., Path],
+) -> None:
+    directory = crossing()
+    scenario = load_scenario(directory)
+    path_alone = copy.deepcopy(scenario)  # by the same function as a pickle
+    with files_sent_whole():
+        whole = copy.deepcopy(scenario)
+    shutil.rmtree(directory)
+    with pytest.raises(ScenarioError, match="no such file"):
+        path_alone.network.read()
+    env = ugat_marl.parallel_env(whole, duration_s=20)
+    env.reset(seed=1)
+    env.step(dict.fromkeys(env.agents, 0))
+    env.close()
+
+
+def test_ray_sends_files_whole(monkeypatch: pytest.MonkeyPatch, data: Path) -> None:
+    """With a stand-in for Ray, which pickles as Ray does: in the call."""
+    scenario, sent = load_scenario(data / "crossing"), []
+
+    class Task:
+        def remote(self, *parts: Any) -> Any:
+            sent.append(pickle.dumps(parts[2]))
+            return types.SimpleNamespace(future=Future)
+
+    executor = RayExecutor.__new__(RayExecutor)
+    executor._is_open, executor._task, executor._signs = True, Task(), None
+    executor._running, executor._lock = {}, threading.Lock()
+    executor.submit(len, scenario)
+    assert scenario.network.read() in sent[0]
+    assert scenario.network.read() not in pickle.dumps((scenario,))
 
 
 @pytest.fixture(scope="module")

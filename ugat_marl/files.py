@@ -26,6 +26,8 @@ import xml.etree.ElementTree as ET
 import zipfile
 import zlib
 from collections.abc import Callable, Iterable, Iterator, Mapping
+from contextlib import contextmanager
+from contextvars import ContextVar
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, BinaryIO, NamedTuple
@@ -721,6 +723,22 @@ def _element_text(element: ET.Element, margin: str) -> str:
     return f"{''.join(parts)}</{tag}>"
 
 
+_SENT_WHOLE: ContextVar[bool] = ContextVar("sent_whole", default=False)
+
+
+@contextmanager
+def files_sent_whole() -> Iterator[None]:
+    """Pickle documents with their content within a ``with`` block, for machines without the files.
+
+    Elsewhere an unchanged file is pickled as its path, since other processes here can read it.
+    """
+    before = _SENT_WHOLE.set(True)
+    try:
+        yield
+    finally:
+        _SENT_WHOLE.reset(before)
+
+
 @dataclass(frozen=True)
 class Document:
     """One SUMO input file: unchanged on disk, or edited.
@@ -741,9 +759,10 @@ class Document:
     in_rows: bool = field(default=False, compare=False, repr=False)
 
     def __reduce__(self) -> tuple[Any, ...]:
-        content = self.content if self.home is None else self.read()  # a copy may outlive the file
-        path = self.path if self.home is None else None
-        return Document, (self.name, path, content, None, self.in_rows)
+        if self.home is None and not _SENT_WHOLE.get():
+            return Document, (self.name, self.path, self.content, None, self.in_rows)
+        unpacked = self.name.removesuffix(".gz")  # a copy may outlive the file, or be elsewhere
+        return Document, (unpacked, None, self.read(), None, self.in_rows)
 
     @property
     def source(self) -> str:

@@ -39,6 +39,7 @@ from ugat_marl.errors import (
     first_line,
     install_command,
 )
+from ugat_marl.files import files_sent_whole
 
 Workers = int | Executor | None
 """Number of parts at a time, None for the number of usable cores, or an executor."""
@@ -425,7 +426,8 @@ class RayExecutor(Executor):
         if not self._is_open:
             raise RuntimeError("cannot schedule new futures after shutdown")
         future: Future[Any] = Future()
-        reference = self._task.remote(self._signs, fn, args, kwargs)
+        with files_sent_whole():
+            reference = self._task.remote(self._signs, fn, args, kwargs)
         with self._lock:
             self._running[future] = reference
         reference.future().add_done_callback(lambda found: self._settle(future, found))

@@ -119,11 +119,11 @@ SAFETY = '<statistics><safety collisions="2" emergencyStops="1" emergencyBraking
 def test_what_sumo_reports(tmp_path: Path) -> None:
     (tmp_path / "trips.xml").write_text(TRIPINFO)
     (tmp_path / STATISTICS).write_text(SAFETY)
-    found = read_trips(tmp_path / "trips.xml", {"": 1.5, "bus": 25.0})
+    found = read_trips(tmp_path / "trips.xml", 100.0, {"": 1.5, "bus": 25.0})
     assert found.co2_g.tolist() == [120.0, 800.5, 0.0]
     assert found.persons.tolist() == [1.5, 25.0, 1.5]
     assert found.dangers.tolist() == [2.0, 7.0]
-    plain = read_trips(tmp_path / "trips.xml")
+    plain = read_trips(tmp_path / "trips.xml", 100.0)
     assert not (plain.co2_g.size or plain.persons.size or plain.dangers.size)
     assert np.array_equal(plain.delay_s, found.delay_s)
 

@@ -16,8 +16,9 @@ import numpy as np
 import pytest
 
 import ugat_marl
-from ugat_marl.effects import StartupDelay
+from ugat_marl.effects import StartupDelay, load_scenario
 from ugat_marl.envs import EnvOptions, TrafficEnv, parallel_env, rewards
+from ugat_marl.envs.signal_programmes import ProgrammePhases
 from ugat_marl.errors import (
     ActionError,
     EpisodeError,
@@ -413,6 +414,34 @@ def test_under_a_programme_the_observation_shows_the_green_of_the_light() -> Non
         env.step({"signal_0": 0})
         shown.add(env.phases[0])
     assert shown == {0, 1, 2, 3}
+    env.close()
+
+
+@pytest.mark.parametrize("letter", ["y", "Y", "u"])
+def test_a_light_that_changes_shows_no_other_green(letter: str) -> None:
+    """One link stays green while the others change, in any of SUMO's letters for that."""
+    network = Network.read(load_scenario("single-v1"))
+    light = network.intersections[0]
+    green = light.phases[0]
+    changing = list(green.replace("G", letter).replace("g", letter))
+    changing[green.index("G")] = "G"
+    seen = ProgrammePhases(network)
+    for state in (green, "".join(changing)):
+        seen.look({light.id: state})
+        assert seen.shown == [0]
+    seen.look({light.id: "".join(changing).replace(letter, "r")})
+    assert seen.shown == [-1]
+
+
+def test_a_scenario_is_found_after_a_change_of_folder(
+    crossing: Callable[..., Path], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    directory = crossing()
+    monkeypatch.chdir(directory.parent)
+    env = ugat_marl.parallel_env(directory.name)
+    (tmp_path / "elsewhere").mkdir()
+    monkeypatch.chdir(tmp_path / "elsewhere")
+    env.reset(seed=1)
     env.close()
 
 

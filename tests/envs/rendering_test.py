@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import copy
 from pathlib import Path
 from typing import Any
 
@@ -104,6 +105,17 @@ def test_a_long_network_is_not_a_thread() -> None:
     network = Network.read(load_scenario("arterial1x5-v1"))
     pixels = NetworkRenderer(network, size_px=600).pixels()
     assert pixels.shape[1] == 600 and pixels.shape[0] >= 220
+
+
+def test_an_environment_can_be_copied_after_it_was_drawn() -> None:
+    env = parallel_env("single-v1", duration_s=30, render_mode="rgb_array")
+    env.reset(seed=1)
+    picture = env.render()
+    env.close()
+    copied = copy.deepcopy(env)
+    copied.reset(seed=1)
+    assert np.array_equal(copied.render(), picture)
+    copied.close()
 
 
 def test_a_large_network_is_drawn_with_all_its_vehicles() -> None:

@@ -993,14 +993,61 @@ def test_a_step_that_a_reset_of_other_halves_dropped_is_not_waited_for() -> None
         actions = chosen(env.reset(seed=3).masks, 0, 0)
         first.step_async(actions[:1])
         env.reset(seed=3)
-        with pytest.raises(EpisodeError, match="a reset dropped the step of environment 0"):
+        with pytest.raises(EpisodeError, match="dropped the step of environment 0"):
             first.step_wait()
         env.step_async(actions)
         first.reset(seed=3)
-        with pytest.raises(EpisodeError, match="a reset dropped the step of environment 0"):
+        with pytest.raises(EpisodeError, match="dropped the step of environment 0"):
             env.step_wait()
         env.reset(seed=3)
         env.step(actions)
+
+
+@pytest.mark.timeout(60)
+@pytest.mark.parametrize("end", ["reset", "close"])
+def test_a_step_that_other_halves_dropped_is_not_received(end: str) -> None:
+    with vector_env("single-v1", 2, duration_s=60) as env:
+        first, _ = env.halves()
+        actions = chosen(env.reset(seed=3).masks, 0, 0)
+        env.send(actions)
+        getattr(first, end)()
+        with pytest.raises(EpisodeError, match="dropped the step of environment 0"):
+            env.recv(2)
+        assert env.recv(1).numbers.tolist() == [1]
+        env.reset(seed=3)
+        if end == "reset":
+            first.send(actions[:1])
+        getattr(env, end)()
+        with pytest.raises(EpisodeError, match="0 environments|dropped the step of environment 0"):
+            first.recv(1)
+
+
+def test_an_edited_reward_is_the_edited_one_while_another_vector_is_open(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.syspath_prepend(str(tmp_path))
+    module = tmp_path / "edited_reward.py"
+
+    def paid(amount: float) -> Any:
+        module.write_text(f"def reward(before, after):\n    return {amount}\n")
+        importlib.invalidate_caches()
+        loaded = sys.modules.get("edited_reward")
+        own = importlib.reload(loaded) if loaded else importlib.import_module("edited_reward")
+        return vector_env("single-v1", 1, duration_s=20, reward=own.reward)
+
+    def rewards(env: Any) -> list[float]:
+        found: list[float] = []
+        for _ in range(3):
+            env.reset(1)
+            found.append(float(env.step([[0]]).rewards[0, 0]))
+        return found
+
+    with paid(1.0) as before:
+        assert rewards(before) == [1.0] * 3
+        with paid(222.0) as after:
+            assert rewards(after) == [222.0] * 3
+            assert rewards(before) == [1.0] * 3
+    sys.modules.pop("edited_reward", None)
 
 
 def test_a_step_that_is_interrupted_is_over_in_all_environments(

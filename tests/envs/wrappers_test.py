@@ -455,6 +455,24 @@ def test_the_page_names_every_wrapper_and_its_example_runs() -> None:
     names["env"].close()
 
 
+def test_an_action_that_a_light_lacks_is_told_with_its_name() -> None:
+    named = intersection_names(pad_spaces(ugat_marl.parallel_env("mixed-v1", duration_s=20)))
+    named.reset(seed=3)
+    spaces_: dict[str, Any] = {light: named.action_space(light) for light in named.agents}
+    light = next(light for light, space in spaces_.items() if space.own < space.n)
+    with pytest.raises(ActionError, match=f"action of agent '{light}' is"):
+        named.step({**dict.fromkeys(named.agents, 0), light: spaces_[light].own})
+    named.close()
+
+
+def test_names_of_lights_fail_the_checks_that_the_page_says() -> None:
+    report = check_environment(lambda: intersection_names(ToyTraffic()))
+    failed = {check.name for check in failed_checks(report)}
+    page = (Path(__file__).parents[2] / "docs" / "how-to" / "wrappers.md").read_text("utf-8")
+    told = page.partition("Under `intersection_names` three fail, ")[2].partition(", because")[0]
+    assert failed == {*re.findall(r"`(\w+)`", told)}
+
+
 def test_agents_are_named_by_their_lights_and_nothing_else_changes() -> None:
     plain = ugat_marl.parallel_env("mixed-v1", duration_s=300)
     named = intersection_names(ugat_marl.parallel_env("mixed-v1", duration_s=300))
@@ -481,6 +499,10 @@ def test_agents_are_named_by_their_lights_and_nothing_else_changes() -> None:
     first = named.possible_agents[0]
     with pytest.raises(ActionError, match=f"action of agent '{first}' is 99"):
         named.step({**dict.fromkeys(named.agents, 0), first: 99})
+    with pytest.raises(ActionError, match=f"delay of agent '{first}' is -1"):
+        named.delay_greens({first: -1.0})
+    with pytest.raises(ActionError, match=f"no action for agent '{named.possible_agents[1]}'"):
+        named.remember({first: 0})
     groups = {group: [light[a] for a in own] for group, own in plain.agent_groups.items()}
     assert named.agent_groups == groups
     assert {*named.layouts} == {*named.recorded_layouts} == {*light.values()}

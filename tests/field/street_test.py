@@ -72,6 +72,7 @@ class SumoServer:
                 port = int(probe.getsockname()[1])
         self.port, self._directory = port, directory
         launch = launch_of(scenario, 3, directory, ())
+        self.end_s = launch.end_s
         launch.write()
         self.process = subprocess.Popen(
             [str(sumo_program("sumo")), *launch.arguments, "--remote-port", str(port)],
@@ -82,7 +83,7 @@ class SumoServer:
 
     def trips(self) -> Trips:
         self.process.wait(20)
-        return read_trips(self._directory / "trips.xml")
+        return read_trips(self._directory / "trips.xml", self.end_s)
 
     def end(self) -> None:
         self.process.kill()

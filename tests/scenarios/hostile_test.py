@@ -17,7 +17,7 @@ from pathlib import Path
 import pytest
 
 from ugat_marl.envs import parallel_env, vector_env
-from ugat_marl.errors import UgatMarlError
+from ugat_marl.errors import ScenarioError, UgatMarlError
 from ugat_marl.files import Document
 from ugat_marl.scenarios import admission, read_scenario, scenario, settings
 from ugat_marl.scenarios.confinement import MEMORY_VARIABLE, confinement_missing
@@ -290,6 +290,15 @@ def test_numbers_that_fill_the_memory_are_refused(
         settings_file = directory / "scenario.toml"
         settings_file.write_text(f'additional = ["extra.add.xml"]\n{settings_file.read_text()}')
     with pytest.raises(UgatMarlError, match=rf"line \d+: <.* is {fault}"):
+        read_scenario(directory)
+
+
+def test_a_vaporizer_is_refused_since_its_vehicles_are_in_no_report(crossing: Crossing) -> None:
+    directory = crossing(toml=lambda text: f'additional = ["a.add.xml"]\n{text}')
+    (directory / "a.add.xml").write_text(
+        '<additional><vaporizer id="W_C" begin="0" end="9"/></additional>'
+    )
+    with pytest.raises(ScenarioError, match="line 1: <vaporizer> removes vehicles"):
         read_scenario(directory)
 
 

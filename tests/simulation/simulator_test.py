@@ -8,6 +8,7 @@ import xml.etree.ElementTree as ET
 from collections.abc import Callable, Iterator
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import libsumo
 import numpy as np
@@ -352,7 +353,7 @@ def test_trips_are_read_as_sumo_writes_them(tmp_path: Path) -> None:
         'departDelay="0.00" duration="95.00" timeLoss="1.00"/><tripinfo id="c" depart="-1.00" '
         'arrival="-1.00" departDelay="60.00" duration="0.00" timeLoss="0.00"/></tripinfos>'
     )
-    trips = read_trips(file)
+    trips = read_trips(file, 100.0)
     assert trips.travel_time_s.tolist() == [105, 95, 60]
     assert trips.delay_s.tolist() == [17, 1, 60]
     assert trips.finished.tolist() == [True, False, False]
@@ -369,13 +370,56 @@ def test_emissions_of_a_blocker_are_nobody_else_s(tmp_path: Path) -> None:
         '<tripinfo id="b" depart="-1" arrival="-1"/></tripinfos>'
     )
     (tmp_path / "statistics.xml").write_text("<statistics/>")
-    assert read_trips(file, {"": 1.3}).co2_g.tolist() == [1, 0]
+    assert read_trips(file, 100.0, {"": 1.3}).co2_g.tolist() == [1, 0]
+
+
+CARELESS = (
+    '<vType id="bad" length="5" minGap="0.5" tau="0.1" sigma="1" accel="4" decel="3" '
+    'emergencyDecel="3" apparentDecel="9" actionStepLength="3" speedFactor="1.5"/>'
+)
+
+
+def held(scenario: Path, domain: str) -> Any:
+    """The scores of an episode in which the first phase is held."""
+    env = parallel_env(scenario, domain, simulator="inprocess")
+    env.reset(seed=1)
+    while env.agents:
+        env.step(dict.fromkeys(env.agents, 0))
+    scores = env.scores()
+    env.close()
+    return scores
+
+
+@pytest.mark.parametrize("action", ["warn", "remove"])
+def test_vehicles_that_sumo_removes_have_not_arrived(crossing: Crossing, action: str) -> None:
+    """Careless drivers collide at the red light. Removed at once, they had the shortest trips."""
+    due = "".join(
+        f'<vehicle id="v{k}" type="bad" depart="{3 * k}" route="east" departSpeed="max"/>'
+        for k in range(30)
+    )
+    scenario = crossing(
+        types=CARELESS,
+        vehicles=due,
+        toml=lambda text: f'{text}\n[sumo]\n"collision.action" = "{action}"\n',
+    )
+    scores = held(scenario, "sim")
+    assert (scores.due, scores.departed, scores.throughput) == (30, 30, 0)
+    assert scores.att_s == pytest.approx(200 - 1.5 * 29, abs=1.0)
+
+
+@pytest.mark.parametrize(
+    "option", ["emergencydecel.warning-threshold", "device.emissions.probability"]
+)
+def test_options_of_a_scenario_that_an_objective_sets_too(crossing: Crossing, option: str) -> None:
+    """SUMO refuses an option that is given twice."""
+    scenario = crossing(toml=lambda text: f'{text}\n[sumo]\n"{option}" = "0.5"\n')
+    assert held(scenario, "objective=emissions").hidden["co2_g"] > 0
 
 
 def test_no_trips_are_empty_arrays(tmp_path: Path) -> None:
     file = tmp_path / "trips.xml"
     file.write_text("<tripinfos/>")
-    trips = read_trips(file)
+    trips = read_trips(file, 100.0)
     assert trips.travel_time_s.shape == trips.finished.shape == (0,)
 
 
@@ -387,7 +431,7 @@ def test_a_report_cut_short_is_an_error_of_the_simulator(
     if content is not None:
         file.write_text(content)
     with pytest.raises(SimulatorError, match="report on its vehicles cannot be read .*room left"):
-        read_trips(file)
+        read_trips(file, 100.0)
 
 
 def test_trips_add_up_to_sumo_s_own_statistics(crossing: Crossing, tmp_path: Path) -> None:

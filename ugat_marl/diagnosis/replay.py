@@ -289,7 +289,7 @@ class Replay:
             # a negative exit code means that a signal of the system ended SUMO
             kind = SimulatorCrashed if done.returncode < 0 else SimulatorError
             raise kind(f"SUMO failed in a replay of period {period.id!r}: {said}")
-        trips = read_trips(directory / "trips.xml")
+        trips = read_trips(directory / "trips.xml", period.end_s)
         seen = read_passages(loops, true, period.begin_s, period.end_s, step)
         travel = float(np.mean(trips.travel_time_s)) if len(trips.travel_time_s) else np.nan
         point_to_point: tuple[Array, ...] = ()

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 
-from ugat_marl.scenarios import GREEN, Intersection, Network
+from ugat_marl.scenarios import GREEN, YELLOW, Intersection, Network
 
 NO_PHASE = -1
 """Place of a light whose green is none of its phases."""
@@ -13,9 +13,9 @@ NO_PHASE = -1
 class ProgrammePhases:
     """The phases that the lights of a network show while SUMO runs their programmes.
 
-    A state belongs to the phase in which the same links for vehicles are green. During yellow and
-    all-red the phase before goes on, because only SUMO knows which one an actuated programme takes
-    next.
+    A state belongs to the phase in which the same links for vehicles are green. During yellow,
+    red-amber and all-red the phase before goes on, because only SUMO knows which one an actuated
+    programme takes next.
 
     Args:
         network: The network.
@@ -43,7 +43,7 @@ class ProgrammePhases:
         for place, (light, phases) in enumerate(zip(self._lights, self._phases, strict=True)):
             state = states[light.id]
             letters = {state[link.index] for link in light.links}
-            if "y" in letters or not letters & GREEN:
+            if letters & YELLOW or not letters & GREEN:
                 continue
             self.shown[place] = phases.get(_green(light, state), NO_PHASE)
             if self.shown[place] != NO_PHASE:

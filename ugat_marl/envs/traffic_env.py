@@ -408,7 +408,7 @@ class TrafficEnv(ParallelEnv[str, Any, Any]):
                 "an environment cannot be copied after reset(), as its simulation cannot; make "
                 "another one, or copy it before"
             )
-        return self.__dict__
+        return {**self.__dict__, "_renderer": None}  # a drawing cannot be copied; it is made anew
 
     def __copy__(self) -> TrafficEnv:
         """Return a deep copy: two environments do not share files and sensors."""

@@ -9,8 +9,10 @@ lengthens or adds ``action_mask``, and `legal_actions` adds ``action_replaced``.
 
 from __future__ import annotations
 
+import re
 from collections import deque
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
 from typing import Any, SupportsIndex
 
 import numpy as np
@@ -22,7 +24,7 @@ from pettingzoo.utils import BaseParallelWrapper
 from ugat_marl.envs.actions import checked_phases, is_phase, require_mapping
 from ugat_marl.envs.agents import discrete_actions, vector_box
 from ugat_marl.envs.types import AnyParallelEnv, ResetResult, StepResult
-from ugat_marl.errors import ActionError, EpisodeError, OptionError
+from ugat_marl.errors import ActionError, EpisodeError, OptionError, UgatMarlError
 
 Vectors = Mapping[str, NDArray[np.float32]]
 Infos = dict[str, dict[str, Any]]
@@ -462,12 +464,14 @@ class _IntersectionNames(Wrapper):
     def remember(self, commands: Mapping[str, int]) -> None:
         """Let observations show these commands, see `TrafficEnv.remember`."""
         base: Any = self.env.unwrapped
-        base.remember({self._agent.get(light, light): c for light, c in commands.items()})
+        with self._errors_name_lights():
+            base.remember({self._agent.get(light, light): c for light, c in commands.items()})
 
     def delay_greens(self, seconds: Mapping[str, float]) -> None:
         """Delay greens of the next step, see `TrafficEnv.delay_greens`."""
         base: Any = self.env.unwrapped
-        base.delay_greens({self._agent.get(light, light): s for light, s in seconds.items()})
+        with self._errors_name_lights():
+            base.delay_greens({self._agent.get(light, light): s for light, s in seconds.items()})
 
     def reset(self, seed: int | None = None, options: dict[str, Any] | None = None) -> ResetResult:
         """Start an episode of the wrapped environment."""
@@ -485,14 +489,24 @@ class _IntersectionNames(Wrapper):
             raise ActionError(
                 f"action for {unknown[0]!r}: the traffic lights are {', '.join(self._agent)}"
             )
-        if self.agents:
-            checked_phases(actions, self.agents, self.action_spaces)  # errors name the light
-        result = self.env.step({self._agent[light]: a for light, a in actions.items()})
+        with self._errors_name_lights():
+            result = self.env.step({self._agent[light]: a for light, a in actions.items()})
         observations, rewards, terminations, truncations, infos = map(self._renamed, result)
         return observations, rewards, terminations, truncations, infos
 
     def _renamed(self, values: Mapping[str, Any]) -> dict[str, Any]:
         return {self._light[agent]: value for agent, value in values.items()}
+
+    @contextmanager
+    def _errors_name_lights(self) -> Iterator[None]:
+        """Replace the agents in an error by their lights, the only names that the user knows."""
+        try:
+            yield
+        except UgatMarlError as error:
+            light = self._light
+            told = re.sub(r"'([^']+)'", lambda name: f"'{light.get(name[1], name[1])}'", str(error))
+            error.args = (told,)
+            raise
 
 
 class _MaskedObservation(_Masking):

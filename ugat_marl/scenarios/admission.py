@@ -464,10 +464,19 @@ def _is_positive(text: str) -> bool:
     return bool(DECIMAL.fullmatch(text)) and 0 < float(text) < math.inf
 
 
+def _vaporizer_fault(tag: Tag) -> str:
+    """Refuse every vaporizer, for the reason for which ``max-depart-delay`` is no option."""
+    return (
+        f"<{tag.name}> removes vehicles that SUMO reports nowhere, so that jams would have shorter "
+        "travel times; leave it out"
+    )
+
+
 _CHECKS: Mapping[str, Callable[[Tag], str]] = {
     "lane": _lane_fault,
     "param": _parameter_fault,
     "request": _request_fault,
+    "vaporizer": _vaporizer_fault,
 }
 
 

@@ -199,7 +199,7 @@ def _load_directory(directory: Path) -> Scenario:
         path = directory / name
         if not _is_file(path):
             raise ScenarioError(f"{file}: {key} names {name!r}, but {path} does not exist")
-        return admitted(Document(path.name, path))
+        return admitted(Document(path.name, path.absolute()))  # users may change their folder
 
     return Scenario(
         id=directory.resolve().name,
@@ -315,7 +315,8 @@ def _load_sumocfg(path: Path, scenario_id: str) -> Scenario:
                 raise ScenarioError(
                     f"{path}: <{key}> names {name!r}, but {path.parent / name} does not exist"
                 )
-        return tuple(admitted(Document(Path(name).name, path.parent / name)) for name in names)
+        files = [(path.parent / name).absolute() for name in names]
+        return tuple(admitted(Document(file.name, file)) for file in files)
 
     begin_s, duration_s = configuration.times()
     network = documents("net-file", "a network")[0]

@@ -233,8 +233,10 @@ def launch_of(
             paths = [_on_disk(document, directory, written) for document in documents]
             reads += paths
             arguments += [option, ",".join(paths)]
+    measuring = [] if persons is None else measuring_options(directory)
     for option, value in settings.sumo.items():
-        arguments += [f"--{option}", value]
+        if f"--{option}" not in measuring:  # SUMO refuses an option that is given twice
+            arguments += [f"--{option}", value]
     arguments += [
         "--begin", repr(settings.begin_s),
         "--step-length", repr(settings.step_length_s),
@@ -248,8 +250,7 @@ def launch_of(
         "--duration-log.disable", "true",
         "--no-warnings", "true",
     ]  # fmt: skip
-    if persons is not None:
-        arguments += measuring_options(directory)
+    arguments += measuring
     if gui:
         arguments += ["--start", "true", "--quit-on-end", "true"]
     return Launch(

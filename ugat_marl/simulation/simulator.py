@@ -162,7 +162,7 @@ class LibsumoSimulator:
         assert self._launch is not None, "finish before start"
         directory, persons = Path(self._launch.directory), dict(self._launch.persons)
         self.close()
-        return read_trips(directory / TRIPS, persons)
+        return read_trips(directory / TRIPS, self._time_s, persons)
 
     def close(self) -> None:
         """End the simulation of this object, if there is one."""

@@ -25,13 +25,15 @@ def measuring_options(directory: Path) -> list[str]:
     ]  # fmt: skip
 
 
-def read_trips(path: Path, persons: Mapping[str, float] | None = None) -> Trips:
+def read_trips(path: Path, end_s: float, persons: Mapping[str, float] | None = None) -> Trips:
     """Read SUMO's tripinfo file, unfinished and undeparted vehicles included.
 
-    Vehicles that block a lane for an effect are no travellers and are left out.
+    Vehicles that block a lane for an effect are no travellers and are left out. Vehicles that SUMO
+    takes off the road, after a collision say, have not arrived: their times count to the end.
 
     Args:
         path: The file.
+        end_s: Time at which the simulation ended, s on the scenario's clock.
         persons: Vehicle type to the persons in each vehicle, "" for all other types. If given, SUMO
             must have run with `measuring_options`, and emissions and dangers are read too.
 
@@ -39,7 +41,7 @@ def read_trips(path: Path, persons: Mapping[str, float] | None = None) -> Trips:
         SimulatorError: The file is missing or incomplete.
     """
     try:
-        return _trips_in(path, persons or {})
+        return _trips_in(path, end_s, persons or {})
     except (OSError, ET.ParseError) as error:
         raise SimulatorError(
             f"SUMO's report on its vehicles cannot be read ({error}); is there room left in "
@@ -47,7 +49,7 @@ def read_trips(path: Path, persons: Mapping[str, float] | None = None) -> Trips:
         ) from None
 
 
-def _trips_in(path: Path, persons: Mapping[str, float]) -> Trips:
+def _trips_in(path: Path, end_s: float, persons: Mapping[str, float]) -> Trips:
     rows: list[tuple[float, float, bool, bool]] = []
     emitted_g: list[float] = []
     carried: list[float] = []
@@ -58,11 +60,14 @@ def _trips_in(path: Path, persons: Mapping[str, float]) -> Trips:
         blocks = is_blocker(element.get("id", ""), element.get("vType", ""))
         if element.tag == "tripinfo" and not blocks:
             entered = float(element.get("depart", "-1")) >= 0
-            finished = float(element.get("arrival", "-1")) >= 0
+            arrival_s = float(element.get("arrival", "-1"))
+            ended = arrival_s >= 0
+            removed = ended and bool(element.get("vaporized"))  # by a collision or a calibrator
             waited = float(element.get("departDelay", "0"))
             inside = float(element.get("duration", "0"))
             lost = float(element.get("timeLoss", "0"))
-            rows.append((waited + inside, waited + lost, finished, entered))
+            missing = waited + (end_s - arrival_s if removed else 0.0)
+            rows.append((missing + inside, missing + lost, ended and not removed, entered))
             if persons:
                 emitted_g.append(co2_mg / 1000.0)
                 carried.append(persons.get(element.get("vType", ""), persons[""]))

@@ -262,12 +262,9 @@ class VectorEnv:
         stepped, begun = self._stepped, self._begun
         self._stepped, self._begun = [], []
         asked = [*stepped, *begun]
-        dropped = [index for index in asked if not self._environments[index].pending]
-        if dropped:  # by a reset of a `vector_env` with other halves
+        if dropped := self._dropped(asked):
             self._drop(asked)
-            raise EpisodeError(
-                f"a reset dropped the step of environment {dropped[0]}; call reset()"
-            )
+            raise dropped
         answers, failed = self._arrived(asked)
         memory = self._memory
         memory.rewards[begun] = 0.0
@@ -311,7 +308,8 @@ class VectorEnv:
             count: Number of environments, at most as many as were sent and not received.
 
         Raises:
-            EpisodeError: So many steps are not under way.
+            EpisodeError: So many steps are not under way, or a reset or `close` by other halves
+                dropped one of them; the others can still be received.
             SimulatorError: SUMO failed in one environment, which has no episode now. The steps of
                 the others can still be received, with the episode that it had ended before.
         """
@@ -321,6 +319,12 @@ class VectorEnv:
                 f"recv({count}): {len(self._sent)} environments are in the middle of a step; "
                 "send() begins one"
             )
+        under_way = [index for index, step in self._sent.items() if not step.arrived]
+        if dropped := self._dropped(under_way):
+            for index in under_way:
+                if not self._environments[index].pending:
+                    del self._sent[index]
+            raise dropped
         texts: list[str] = []
         try:
             while len(ready := [i for i, step in self._sent.items() if step.arrived]) < count:
@@ -373,6 +377,16 @@ class VectorEnv:
         if self._arrays is None:
             raise EpisodeError("this vector_env is closed; make another one")
         return self._arrays
+
+    def _dropped(self, asked: Sequence[int]) -> EpisodeError | None:
+        """Return the error of steps that a `vector_env` with other halves dropped, if there are."""
+        for index in asked:
+            if not self._environments[index].pending:
+                return EpisodeError(
+                    f"a reset or close() by other halves dropped the step of environment {index}; "
+                    "call reset()"
+                )
+        return None
 
     def _ask(self, chosen: list[int], requested: NDArray[np.int64]) -> tuple[list[int], list[int]]:
         """Begin a step; return the environments that make it, and those that begin an episode."""

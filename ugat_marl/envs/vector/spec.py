@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 import importlib
+import sys
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import asdict, dataclass, replace
+from dataclasses import asdict, dataclass, field, replace
+from pathlib import Path
 from typing import Any
 
 from ugat_marl.effects import (
@@ -44,6 +46,7 @@ class Spec:
         functions: Option to ``"module:name"``, for a reward or an observation that is a function.
         fitted: ``"module:name"`` of each fitted change, with its values.
         wraps: ``"module:name"`` of each wrapper.
+        modules: Modules of the user that these names are in, each with `file_version`.
     """
 
     scenario: str
@@ -52,6 +55,7 @@ class Spec:
     functions: Mapping[str, str]
     fitted: Sequence[tuple[str, Mapping[str, Any]]]
     wraps: Sequence[str]
+    modules: Mapping[str, Sequence[int]] = field(default_factory=dict[str, Sequence[int]])
 
     @classmethod
     def of(cls, scenario: Scenario, options: Mapping[str, Any], wraps: Wraps) -> Spec:
@@ -63,17 +67,18 @@ class Spec:
             for name in ("reward", "observation")
             if callable(plain.get(name))
         }
-        return cls(
-            "",
-            scenario.applied,
-            plain,
-            functions,
-            [
-                (spelling("fitted", type(part)), part.state_dict())
-                for part in plain.pop("fitted", ())
-            ],
-            [spelling("wrap", each) for each in listed(wraps)],
-        )
+        fitted = [
+            (spelling("fitted", type(part)), part.state_dict()) for part in plain.pop("fitted", ())
+        ]
+        around = [spelling("wrap", each) for each in listed(wraps)]
+        names = [*functions.values(), *(name for name, _ in fitted), *around]
+        modules = {name.partition(":")[0] for name in names}
+        versions = {
+            module: file_version(module)
+            for module in sorted(modules)
+            if module.partition(".")[0] != "ugat_marl"
+        }
+        return cls("", scenario.applied, plain, functions, fitted, around, versions)
 
     def as_dict(self) -> dict[str, Any]:
         """Return the fields for JSON."""
@@ -169,6 +174,16 @@ def imported(text: str) -> Any:
             "ugat_marl.envs.wrappers:pad_spaces"
         ) from None
     return imported_object
+
+
+def file_version(module: str) -> list[int]:
+    """Return time of change, ns, and size of an imported module's file; nothing without a file."""
+    file = getattr(sys.modules.get(module), "__file__", None)
+    try:
+        status = Path(file).stat() if file else None
+    except OSError:
+        status = None
+    return [] if status is None else [status.st_mtime_ns, status.st_size]
 
 
 def sent(domain: Domain) -> Any:

@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import contextlib
 import gc
+import importlib
 import json
 import os
 import shutil
@@ -16,7 +17,7 @@ import sys
 import tempfile
 import warnings
 from collections import OrderedDict
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict
 from pathlib import Path
 from typing import Any
@@ -49,6 +50,7 @@ class Episodes:
         del LibsumoSimulator
         self._kept: OrderedDict[str, tuple[str, AnyParallelEnv | None]] = OrderedDict()
         self._folders: set[str] = set()
+        self._versions: dict[str, Sequence[int]] = {}
         self._ready: AnyParallelEnv | None = None
 
     def prepare(self, order: dict[str, Any]) -> None:
@@ -60,6 +62,8 @@ class Episodes:
         folder = order["folder"]
         self._folders.add(folder)
         key = json.dumps([order["spec"], order["domain"]], sort_keys=True)
+        if self._kept.get(key, (folder, None))[1] is None:
+            self._forget_edited(order["spec"]["modules"])
         if key not in self._kept:
             self._kept[key] = folder, None
         elif self._kept[key][1] is None:
@@ -84,6 +88,14 @@ class Episodes:
         folder = order["forget"]
         self._folders.discard(folder)
         self._drop([key for key, (owner, _) in self._kept.items() if owner == folder])
+
+    def _forget_edited(self, modules: Mapping[str, Sequence[int]]) -> None:
+        """Forget modules that the user has edited since this process imported them."""
+        for module, version in modules.items():
+            if self._versions.setdefault(module, version) != version:
+                self._versions[module] = version
+                sys.modules.pop(module, None)
+                importlib.invalidate_caches()
 
     def _drop(self, keys: Sequence[str]) -> None:
         dropped = [self._kept.pop(key) for key in keys]
