@@ -5,11 +5,13 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import polars as pl
 import pytest
 
+from ugat_marl.data.measured import passages
 from ugat_marl.data.measured.copies import FEWEST, refuse_copies
 from ugat_marl.errors import MeasuredDataError
 from ugat_marl.scenarios import Period
@@ -60,3 +62,37 @@ def test_two_days_of_equally_sparse_traffic_pass() -> None:
 def test_one_recording_in_periods_that_follow_each_other_is_allowed() -> None:
     early, late = replace(DAYS[0], end_s=1800.0), replace(DAYS[1], begin_s=1800.0)
     check(counted(COUNTS, COUNTS), (early, late))
+
+
+def discharges(seed: int, tick_s: float) -> Any:
+    """Two days of queues that leave under one fixed plan, in stamps of so many seconds."""
+    generator = np.random.default_rng(seed)
+    rows: list[tuple[int, float, bool]] = []
+    for key in range(16):  # eight detectors on two days
+        for cycle in range(40):
+            green_s = 90.0 * cycle + 45.0 * (key % 2)
+            off_s = green_s + 2.0 + abs(generator.normal(0.0, 0.3))
+            while off_s < green_s + 35.0:
+                on_s = off_s - 10.5 / max(2.0 + 1.2 * (off_s - green_s), 3.0)
+                rows += [(key, round(t / tick_s) * tick_s, t == on_s) for t in (on_s, off_s)]
+                off_s += max(generator.normal(2.0, 0.35), 1.2)
+    rows.sort()
+    keys, times, on = (np.array(column) for column in zip(*rows, strict=True))
+    nothing = np.full(len(rows), np.nan)
+    return passages._Stream(keys, times, on, nothing, nothing)
+
+
+@pytest.mark.parametrize("tick_s", [0.1, 1.0])
+def test_queues_under_a_fixed_plan_are_no_copy(tick_s: float) -> None:
+    days, stream = DAYS[:2], discharges(1, tick_s)
+    passages._refuse_copies(Path("detections.csv"), stream, days, 8)
+    first = stream.key < 8
+    twice = passages._Stream(
+        np.concatenate([stream.key[first], stream.key[first] + 8]),
+        *(
+            np.tile(column[first], 2)
+            for column in (stream.time, stream.is_on, stream.speed, stream.length)
+        ),
+    )
+    with pytest.raises(MeasuredDataError, match="100% of the detections .* are the same"):
+        passages._refuse_copies(Path("detections.csv"), twice, days, 8)

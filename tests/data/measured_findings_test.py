@@ -20,6 +20,7 @@ from ugat_marl.data import (
     CSV_HASHES,
     Finding,
     MeasuredData,
+    is_actuated,
     read_measured,
     split_periods,
     write_measured,
@@ -456,6 +457,32 @@ def test_greens_of_many_lengths_follow_the_traffic(
         assert findings == {}
     else:
         assert only(findings, "('C') with greens of many lengths", "arrivals they answered") == ()
+
+
+def fixed_plan(begin_s: float, end_s: float, green_s: float, cycle_s: float) -> list[Any]:
+    starts = np.arange(begin_s, end_s, cycle_s).tolist()
+    return [
+        row for t in starts for row in ((t, "Gr"), (t + green_s, "yr"), (t + green_s + 3, "rG"))
+    ]
+
+
+@pytest.mark.parametrize("log", ["of the night too", "with two losses of rows"])
+def test_a_fixed_plan_does_not_follow_the_traffic(log: str) -> None:
+    """One cycle between two plans, and lost rows, give a few greens of other lengths."""
+    begin_s, end_s = 25200.0, 28800.0
+    if log == "of the night too":
+        night = fixed_plan(0.0, 21600.0, 20.0, 60.0)
+        changing = [(21600.0, "Gr"), (21626.0, "yr"), (21629.0, "rG")]
+        rows = [*night, *changing, *fixed_plan(21673.0, end_s, 35.0, 90.0)]
+    else:
+        lost = ((begin_s + 200, begin_s + 290), (begin_s + 820, begin_s + 860))
+        rows = [
+            row
+            for row in fixed_plan(begin_s, end_s, 35.0, 90.0)
+            if not any(first < row[0] < last for first, last in lost)
+        ]
+    signals = {"A": tuple(row for row in rows if row[0] <= end_s)}
+    assert not is_actuated([Period("day", begin_s, end_s, "fit", signals, {})], "A")
 
 
 def test_a_state_every_second_is_the_log_of_its_changes(read: Read) -> None:

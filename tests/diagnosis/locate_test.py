@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import re
 from dataclasses import asdict, replace
 from types import SimpleNamespace
 from typing import Any
@@ -24,6 +25,7 @@ from ugat_marl.diagnosis.locate import _stretches, locate
 from ugat_marl.diagnosis.records import Disagreement
 from ugat_marl.diagnosis.statistics import Pools
 from ugat_marl.diagnosis.thresholds import Thresholds
+from ugat_marl.diagnosis.verdict import _separating
 
 THRESHOLDS = Thresholds()
 
@@ -157,6 +159,34 @@ def test_periods_of_different_spans_have_no_windows(reference: Reference) -> Non
     data = days(6, 5, bump=bump)
     items = locate(SITE, reference, reference.distance(data), 0.05, None)
     assert [item for item in items if item.window] == []
+
+
+def test_size_and_z_of_a_stretch_are_both_beside_the_rest(reference: Reference) -> None:
+    """More vehicles all the time, and fewer more for a quarter of an hour."""
+    bump = np.zeros((len(BIN_FEATURES), PLACES, BINS))
+    bump[:2, 0] = 20.0
+    bump[:2, 0, 6:9] = 6.0
+    distance = reference.distance(days(7, 5, bump=bump))
+    one = next(each for each in _stretches(SITE, reference, distance, SPAN) if each.lane == "in0_0")
+    assert one.window == (1800.0, 2700.0)
+    assert one.z < -3.0
+    assert -60.0 < one.size < -20.0  # 42 fewer, and chance
+
+
+def test_what_tells_two_lanes_apart_is_a_statistic_of_a_lane() -> None:
+    """The same effect on one lane or on the other: the network as a whole is the same."""
+    pools = Pools.of(SITE, THRESHOLDS)
+
+    def model(lane: int) -> Any:
+        shift = np.zeros((len(USED), LANES))
+        shift[1, lane] = 1.2
+        return SimpleNamespace(reference=Reference(pools, days(1, 60, shift=shift)))
+
+    told = _separating(model(0), model(2), USED, THRESHOLDS.deciding_z, SITE)
+    assert re.search(r"\(discharge\) on lane in[02]_0 differs most between them", told)
+    assert int(told.partition("about ")[2].split()[0]) <= 25
+    same = _separating(model(0), model(0), USED, THRESHOLDS.deciding_z, SITE)
+    assert same == "other data: no statistic of these detectors tells them apart"
 
 
 def test_the_strongest_statistic_speaks_for_its_regime(reference: Reference) -> None:

@@ -114,6 +114,23 @@ def test_days_of_the_same_stretches_have_the_datas_proportions() -> None:
     assert len(of_the_same_stretches(model, [replace(model[0], window=(0.0, 1.0))])) == 20
 
 
+@pytest.mark.parametrize("periods", [1, 2, 4, 5, 6])
+def test_other_signals_are_no_chance(periods: int) -> None:
+    """Days run the signals of the measured periods in turn; each half of them has all of these."""
+    generator = np.random.default_rng(3)
+    own = generator.standard_normal((periods, len(USED), 1))
+
+    def days(seed: int, count: int) -> list[Tally]:
+        values = gaussian(seed, count) + own[np.arange(count) % periods]
+        found = days_of(values)
+        return [replace(day, period=str(k % periods)) for k, day in enumerate(found)]
+
+    pools = Pools({"network": np.ones((1, 1)), "lane": np.eye(1)}, THRESHOLDS)
+    null = Null(pools, days(9, 60), 4, speeds=True)
+    assert null.expected < 4 * len(USED)
+    assert null.test(days(10, 4)).p > 0.05
+
+
 def test_other_stretches_are_no_chance() -> None:
     """A shift of two standard errors or so is seen as well as within one stretch."""
     pools = Pools({"network": np.ones((1, 1)), "lane": np.eye(1)}, THRESHOLDS)

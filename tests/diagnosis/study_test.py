@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import re
+from collections import Counter
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
@@ -23,14 +24,16 @@ from ugat_marl.diagnosis.compared_detectors import (
 )
 from ugat_marl.diagnosis.demand_variation import day_to_day_variation, measured_variation
 from ugat_marl.diagnosis.engine import Engine
-from ugat_marl.diagnosis.features import BIN_FEATURES, FEATURES, INDEX
+from ugat_marl.diagnosis.features import BIN_FEATURES, FEATURES, INDEX, DetectorLayout
+from ugat_marl.diagnosis.replay import Replay
 from ugat_marl.diagnosis.statistics import Pools
 from ugat_marl.diagnosis.study import effort_for
 from ugat_marl.diagnosis.thresholds import Effort, Thresholds
-from ugat_marl.effects import Effect, Headway
+from ugat_marl.effects import Effect, Headway, load_scenario
 from ugat_marl.errors import MeasuredDataError
 from ugat_marl.progress import Silent
-from ugat_marl.scenarios import Detector, Passages, Period
+from ugat_marl.scenarios import Detector, Network, Passages, Period
+from ugat_marl.simulation import standard_detectors
 
 THRESHOLDS = Thresholds()
 
@@ -141,6 +144,29 @@ def test_each_stretch_of_the_day_has_some_days() -> None:
     assert effort_for(1, hours[:1]) == effort_for(1, [*hours[:3], *hours[10:13]]) == Effort()
     assert (effort_for(9, hours).base, effort_for(9, hours).test) == (60, 60)
     assert effort_for(9, hours).fit == effort_for(9).fit
+
+
+@pytest.mark.parametrize(
+    ("lights", "mornings", "evenings"), [(9, 9, 1), (4, 19, 1), (9, 24, 6), (9, 5, 5)]
+)
+def test_days_go_round_the_stretches_whatever_periods_there_are(
+    data: Path, lights: int, mornings: int, evenings: int
+) -> None:
+    times = [*[(25200.0, 28800.0)] * mornings, *[(61200.0, 64800.0)] * evenings]
+    periods = [Period(str(k), *time, "fit", {}, {}) for k, time in enumerate(times)]
+    scenario = load_scenario(data / "crossing")
+    network = Network.read(scenario)
+    detectors = standard_detectors(network)
+    layout = DetectorLayout.of(network, detectors)
+    replay = Replay(scenario, network, detectors, layout.owner, THRESHOLDS)
+    engine = Engine(scenario, layout, replay, periods, 0, THRESHOLDS)
+    effort = effort_for(lights, periods)
+    for days in (effort.base, effort.test):
+        runs = Counter(engine.place_of(number) for number in range(days))
+        of_stretch = Counter(periods[place].window for place in runs.elements())
+        assert min(of_stretch.values()) >= 6 and len(of_stretch) == 2
+        assert max(runs.values()) - min(runs.values()) <= days // 2
+    assert [engine.place_of(k) for k in range(2)] == [0, mornings]
 
 
 @dataclass

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Mapping
 from dataclasses import replace
 from pathlib import Path
 
@@ -146,6 +147,30 @@ def test_a_planted_turn_is_proposed_with_its_share_and_no_other() -> None:
     (found,) = turned(reference, reference.distance(other))
     assert found.fixed == (("from_edge", "a"), ("to_edge", "y"))
     assert found.levels[0][0] == pytest.approx(0.25, abs=0.05)
+
+
+@pytest.mark.parametrize("periods", [5, 6, 10])
+def test_turns_counted_in_one_of_many_periods_are_compared(periods: int) -> None:
+    """A quarter of an hour in which twice as many turned as are expected."""
+    days = tuple(Period(str(k), 0.0, 3600.0, "fit", {}, {}) for k in range(periods))
+    rows = [("0", 0.0, 900.0, "a", "x", 120.0), ("0", 0.0, 900.0, "a", "y", 60.0)]
+    own = SupplementaryData.of(MeasuredData((), days, turning=turning(*rows)))
+    assert own is not None
+    pools = Pools({"network": np.ones((1, 1))}, THRESHOLDS, 1, own.labels)
+    generator = np.random.default_rng(1)
+
+    def day(sums: Mapping[str, np.ndarray]) -> Tally:
+        empty = np.zeros((len(FEATURES), 1, 2)), np.zeros((len(BIN_FEATURES), 1, 1))
+        return Tally(*empty, supplementary=sums)
+
+    def came() -> np.ndarray:
+        times = np.sort(generator.uniform(0.0, 3600.0, generator.poisson(240)))
+        return np.c_[times, np.zeros_like(times)]
+
+    simulated = [day(own.simulated(days[r % periods], [came(), came()], None)) for r in range(60)]
+    distance = Reference(pools, simulated).distance([day(own.measured(d.id)) for d in days])
+    more, same = distance.z[TURNING].ravel()
+    assert more > 5.0 and abs(same) < 2.0
 
 
 # --- states of lanes ------------------------------------------------------------------------------

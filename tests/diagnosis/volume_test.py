@@ -91,6 +91,17 @@ def test_counts_that_share_vehicles_and_disagree_are_no_demand() -> None:
     assert found["demand"] == pytest.approx(0.0, abs=1e-9)
 
 
+def test_exits_towards_another_light_are_counted_there_too() -> None:
+    """An edge whose end has no detectors of its own is known from those at its begin."""
+    layout = a_layout(("a", "b"), ("b",))
+    distance = a_distance(layout, {"b": (60.0, 20.0)})
+    row = INDEX["count_stop"]
+    for values in (distance.difference["lane"], distance.z["lane"]):
+        values[1, row] = 0.0  # nothing at the stop line of b
+    found = Volume(layout, routes({("a", "b"): 400.0}), THRESHOLDS).directed(distance)
+    assert found["demand"] == pytest.approx(9.0)
+
+
 WAYS: dict[Way, float] = {
     ("a", "x"): 100.0, ("a", "y"): 300.0, ("b", "x"): 240.0, ("b", "y"): 80.0, ("b", "z"): 60.0,
 }  # fmt: skip

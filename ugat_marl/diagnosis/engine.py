@@ -188,8 +188,7 @@ class Engine:
         scenario: The scenario without effects.
         layout: Lanes and detectors.
         replay: Simulator of one day with SUMO.
-        periods: Measured periods; day ``r`` runs under the signals of period
-            ``r mod len(periods)``.
+        periods: Measured periods; day ``r`` runs under the signals of that at `place_of` r.
         seed: Root seed of the days.
         thresholds: Numbers of the method.
         cache: Folder of the cached tallies; None for no cache on disk.
@@ -222,6 +221,10 @@ class Engine:
         self._supplementary = supplementary
         self.layout = layout
         self.periods = tuple(periods)
+        stretches: dict[tuple[float, float], list[int]] = {}
+        for place, period in enumerate(periods):
+            stretches.setdefault(period.window, []).append(place)
+        self._stretches = list(stretches.values())
         self._budget = budget or Budget()
         self._replay = replay
         self._seed = seed
@@ -253,6 +256,15 @@ class Engine:
         self._signals = [_signals_hash(period, replay.answering) for period in periods]
         self._known_by: Callable[[], None] | None = None
         self._detection: tuple[Effect, ...] = ()
+
+    def place_of(self, number: int) -> int:
+        """Return the place of the period under whose signals a day runs.
+
+        Days go round the stretches of the day, and within a stretch round its periods, so that few
+        days are enough for some of each stretch.
+        """
+        own = self._stretches[number % len(self._stretches)]
+        return own[number // len(self._stretches) % len(own)]
 
     def detecting(self, errors: Sequence[Effect]) -> Engine:
         """Return a simulator of the same days, seen by detectors with errors of measurement.
@@ -313,8 +325,9 @@ class Engine:
             arrays = self._stored(key)
             if arrays is None:
                 period = self._unmeasured.kept_from(self._day(every, number).period)
-                arrays = reduce(period, self._greens[number % len(self.periods)])
+                arrays = reduce(period, self._greens[self.place_of(number)])
                 self._store(key, arrays)
+                self._one(every, number)  # while the day is at hand; else it is simulated again
             advance()
             return arrays
 
@@ -485,13 +498,11 @@ class Engine:
         """Simulate a day and count it."""
         day = self._day(effects, number)
         period = self._unmeasured.kept_from(day.period)
-        counted = tally(
-            self.layout, period, self._greens[number % len(self.periods)], self._thresholds
-        )
+        counted = tally(self.layout, period, self._greens[self.place_of(number)], self._thresholds)
         if self._interval_s is not None:
             counted = with_intervals(counted, self.layout, period, self._interval_s)
         if self._supplementary is not None:
-            measured = self.periods[number % len(self.periods)]
+            measured = self.periods[self.place_of(number)]
             supplementary = self._supplementary.simulated(
                 measured, day.point_to_point, day.lane_states
             )
@@ -505,7 +516,7 @@ class Engine:
         if given.counted is None or given.due is None:
             return self._counted(effects, number)
         physics = [effect for effect in effects if not effect.on_detectors]
-        period = self.periods[number % len(self.periods)]
+        period = self.periods[self.place_of(number)]
         seed = derive_seed(self._seed, "replicate", number)
         due = DemandBalance(self._replay.asked(physics, period, seed), given.due.given)
         return self._with_due(given.counted, given.travel_time_s, due)
@@ -521,7 +532,7 @@ class Engine:
         """Return a day as the detectors saw it; faults of detectors need no new simulation."""
         faults = tuple(effect for effect in effects if _after_simulation(effect))
         physics = tuple(effect for effect in effects if not _after_simulation(effect))
-        key, period = self._key(physics, number), self.periods[number % len(self.periods)]
+        key, period = self._key(physics, number), self.periods[self.place_of(number)]
         if self._replay.answering:  # an error of detectors changes the arrivals that are answered
             key += repr(tuple(map(str, self._detection)))
         with self._of_days:
@@ -553,7 +564,7 @@ class Engine:
         return self._workers.submit(self._replay.simulate, effects, period, seed).result()
 
     def _key(self, effects: Sequence[Effect], number: int) -> str:
-        place = number % len(self.periods)
+        place = self.place_of(number)
         of_period = (self._signals[place],)
         if self._supplementary is not None:  # its spans are those of the period
             of_period += (self.periods[place].id,)
@@ -565,6 +576,7 @@ class Engine:
         if stored is None:
             return None
         try:
+            period = self.periods[self.place_of(number)]
             counted = Tally(
                 stored["sums"].astype(np.float64),
                 stored["bins"].astype(np.float64),
@@ -574,7 +586,8 @@ class Engine:
                     for name, sums in stored.items()
                     if name.startswith(_SUPPLEMENTARY)
                 },
-                window=self.periods[number % len(self.periods)].window,
+                window=period.window,
+                period=period.id,
             )
             due = None
             if "asked" in stored:

@@ -359,6 +359,7 @@ class Tally:
         supplementary: Turning counts, travel times between places and states of lanes: sums and
             numbers of observations, ``(members, measures, 2)``, by block; see `supplementary_data`.
         window: Begin and end of the period, s; None if unknown, or for sums of different ones.
+        period: Id of the measured period, of simulated days that whose signals ran; None likewise.
     """
 
     sums: Array
@@ -368,6 +369,7 @@ class Tally:
     journeys: Array | None = None
     supplementary: Mapping[str, Array] = field(default_factory=dict)
     window: tuple[float, float] | None = None
+    period: str | None = None
 
     @property
     def counted(self) -> Array:
@@ -403,6 +405,7 @@ class Tally:
             None if mine is None or others is None else mine + others,
             {name: sums + other.supplementary[name] for name, sums in self.supplementary.items()},
             self.window if self.window == other.window else None,
+            self.period if self.period == other.period else None,
         )
 
 
@@ -453,7 +456,9 @@ def tally(
         exits[index] = counter.volume("count_exit", period.of_detector(name))
     _conserved(counter, layout, advances, stops, exits)
     journeys = _journeys(layout, period, greens, thresholds)
-    return Tally(counter.sums, counter.bins, journeys=journeys, window=period.window)
+    return Tally(
+        counter.sums, counter.bins, journeys=journeys, window=period.window, period=period.id
+    )
 
 
 @dataclass

@@ -289,7 +289,7 @@ def counts_tally(
             bins[line] = occupied_s[measured] @ share[measured]
             covered[line] = inside[measured].sum(axis=0)
     known = (covered > thresholds.whole * np.diff(edges)).astype(np.float64)
-    return Tally(sums, bins * known, known=known, window=period.window)
+    return Tally(sums, bins * known, known=known, window=period.window, period=period.id)
 
 
 def _reports(rows: pl.DataFrame) -> Intervals:

@@ -186,7 +186,8 @@ def _stretches(
         value, first, last = best
         kind, place = divmod(row, places)
         tls, approach, lane = _place(layout, "lane", place)
-        size = float(difference[row, first:last].sum())
+        noise = np.where(used[row], difference[row] / np.where(used[row], z[row], 1.0), 0.0)
+        size = float((difference[row] - middle * noise)[first:last].sum())  # as z: beside the rest
         stretches = bins * (bins + 1) / 2
         rows.append(
             Disagreement(

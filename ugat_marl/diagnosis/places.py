@@ -547,14 +547,12 @@ class Volume:
 
     def _counts(self, distance: Distance) -> _Counts:
         hour = 60.0
-        lanes = len(self._layout.lanes)
         place: dict[str, int] = {}
         differences: list[float] = []
         errors: list[float] = []
         for edge in dict.fromkeys(self._edges):
             members = [i for i, name in enumerate(self._edges) if name == edge]
-            kinds = ("count_stop", "count_advance") if members[0] < lanes else ("count_exit",)
-            for kind in kinds:
+            for kind in ("count_stop", "count_advance", "count_exit"):
                 row = INDEX[kind]
                 difference = distance.difference["lane"][members, row]
                 z = distance.z["lane"][members, row]

@@ -32,7 +32,7 @@ from ugat_marl.diagnosis.features import (
     Tally,
     bins_in,
 )
-from ugat_marl.diagnosis.supplementary_data import LANES, TRAVEL_TIME, Label
+from ugat_marl.diagnosis.supplementary_data import LANES, TRAVEL_TIME, TURNING, Label
 from ugat_marl.diagnosis.thresholds import Thresholds
 
 Array = NDArray[np.float64]
@@ -255,7 +255,8 @@ class Reference:
         if timed:
             used = mean > self._thresholds.least_count
         else:
-            used = (weight >= self._thresholds.least_observations) & np.isfinite(mean)
+            seen = _observations(name, mean, weight)
+            used = (seen >= self._thresholds.least_observations) & np.isfinite(mean)
             if name in self.pools.blocks:
                 used &= ~_constant(self._speeds)[None, : used.shape[1]]
         if timed:
@@ -292,10 +293,13 @@ class Reference:
             sums = {name: several.sum(axis=0) for name, several in days.items()}
         else:
             sums = self.pools.pool(sum_of(data))
-        # The mean of a stretch comes from the days of that stretch alone. Over all stretches these
-        # errors cancel; over k of W they leave W / k - 1 times the error of the mean of all days.
-        measured = {day.window for day in data}
-        missing = max(1, len(self.stretches)) / len(measured) - 1.0 if self.stretches else 0.0
+        # The mean of a stretch comes from the days of that stretch alone. Over all W stretches
+        # alike these errors cancel. Where each has a share s of the data, they leave W times the
+        # sum of all s ** 2, minus one, times the error of the mean of all days.
+        missing = 0.0
+        if self.stretches:
+            shares = np.array([*Counter(day.window for day in data).values()]) / len(data)
+            missing = len(self.stretches) * float((shares**2).sum()) - 1.0
         total = penalty = 0.0
         parts: dict[str, float] = {}
         compared: dict[str, NDArray[np.bool_]] = {}
@@ -304,7 +308,8 @@ class Reference:
         for name, block in self.blocks.items():
             other = relative_to.blocks[name] if relative_to else block
             weight = sums[name][..., 1] / len(data)
-            used = other.used & (weight >= self._thresholds.least_measured)
+            seen = _observations(name, other.mean, weight)
+            used = other.used & (seen >= self._thresholds.least_measured)
             compared[name] = used
             value = sums[name][..., 0] / np.maximum(sums[name][..., 1], 1e-9)
             variance = block.noise(weight, len(data)) + missing * self._of_stretches[name]
@@ -323,6 +328,11 @@ class Reference:
                 )
                 penalty += float(ratio[used].sum())
         return Distance(total, parts, penalty, compared, z, difference)
+
+
+def _observations(block: str, mean: Array, weight: Array) -> Array:
+    """Return observations per day: weights, but vehicles of turning counts, which weigh minutes."""
+    return np.nan_to_num(mean) * weight if block == TURNING else weight
 
 
 def softened(block: str, z: Array, thresholds: Thresholds) -> Array:
@@ -369,8 +379,8 @@ def means(sums: Array) -> Array:
 
 
 def by_turns(tallies: Sequence[Tally]) -> list[Tally]:
-    """Return days ordered by stretch, so that every other day is of every stretch."""
-    return sorted(tallies, key=lambda day: day.window or (0.0, 0.0))
+    """Return days ordered by stretch and period, so that every other day has some of each."""
+    return sorted(tallies, key=lambda day: (day.window or (0.0, 0.0), day.period or ""))
 
 
 def of_the_same_stretches(days: Sequence[Tally], data: Sequence[Tally]) -> list[Tally]:

@@ -10,6 +10,7 @@ from dataclasses import dataclass, field, replace
 from pathlib import Path
 
 import numpy as np
+import polars as pl
 
 from ugat_marl.data import Finding, MeasuredData, is_actuated
 from ugat_marl.diagnosis.compared_detectors import compared_detectors
@@ -306,7 +307,8 @@ class Study:
         length_s = usual_length(counts)
         if counts is None or length_s is None:
             return self
-        here = seeming_lengths(reports_of_counts(self.layout, counts), thresholds)
+        fitted = counts.filter(pl.col("period_id").is_in([p.id for p in self.measured.of("fit")]))
+        here = seeming_lengths(reports_of_counts(self.layout, fitted), thresholds)
         if not any(vehicles for _, vehicles in here.values()):
             return self  # no occupancies, or no speeds
 
@@ -414,7 +416,8 @@ class Study:
         def cells(period: Period, greens: Sequence[Greens]) -> dict[str, Array]:
             return cells_of(self.layout, period, greens, thresholds)
 
-        numbers = self.engine.first(thresholds.pattern_days)
+        # By periods, so that every other day has some of each, as in `by_turns`.
+        numbers = sorted(self.engine.first(thresholds.pattern_days), key=self.engine.place_of)
         with reporter.task("patterns in what is left", len(numbers)) as advance:
             simulated = self.engine.reduced(
                 effects,
@@ -469,6 +472,7 @@ class Study:
                     name: sums * supplied[name] for name, sums in day.supplementary.items()
                 },
                 window=day.window,
+                period=day.period,
             )
             for day in tallies
         ]
@@ -607,7 +611,7 @@ def effort_for(intersections: int, periods: Sequence[Period] = ()) -> Effort:
             need some days of each.
     """
     effort = next((effort for most, effort in EFFORTS if intersections <= most), LEAST_EFFORT)
-    stretches = len({(period.begin_s, period.end_s) for period in periods})
+    stretches = len({period.window for period in periods})
     if stretches < 2:
         return effort
     least = DAYS_OF_A_STRETCH * stretches

@@ -203,7 +203,7 @@ def _sufficient(
             best,
             rivals,
             sentence,
-            _separating(best.model, rivals[0], selector.held, config.thresholds.deciding_z),
+            _separating(best.model, rivals[0], selector.held, config.thresholds.deciding_z, layout),
         )
     them = "it" if len(best.model.members) == 1 else "them"
     sentence = f"The street has {names}; with {them}, what is left is no more than chance."
@@ -274,26 +274,38 @@ _SOURCES = {"volume": "counts", "occupancy": "occupancies", "mean speed": "mean 
 """Data that hold the statistics of a regime; the others need detections of single vehicles."""
 
 
-def _separating(best: Fitted, rival: Fitted, held: Collection[int], deciding_z: float) -> str:
+def _separating(
+    best: Fitted, rival: Fitted, held: Collection[int], deciding_z: float, layout: DetectorLayout
+) -> str:
     """Name the statistic in which two models differ most, and the number of periods to decide.
+
+    A single lane is named if it tells them apart twice as well as the network as a whole.
 
     Args:
         best: A model.
         rival: Another model.
         held: Indices of the statistics that the data hold.
         deciding_z: Standardised difference that would decide.
+        layout: Lanes and detectors.
     """
-    block, other = best.reference.blocks["network"], rival.reference.blocks["network"]
-    difference = (block.mean - other.mean)[0]
-    deviation = np.sqrt(block.variance[0])
-    z = np.nan_to_num(np.where(block.used[0], difference / deviation, 0.0))
-    index = int(np.argmax(np.abs(z)))
-    name, regime, _ = ALL_FEATURES[index]
-    periods = int(np.ceil((deciding_z / max(abs(float(z[index])), LEAST_Z)) ** 2))
+    largest, index, lane = 0.0, 0, ""
+    for name in ("network", "lane"):
+        block, other = best.reference.blocks[name], rival.reference.blocks[name]
+        difference = np.where(block.used, block.mean - other.mean, 0.0)
+        z = np.abs(np.nan_to_num(difference / np.sqrt(block.variance)))
+        member, feature = np.unravel_index(int(np.argmax(z)), z.shape)
+        if z[member, feature] > 2.0 * largest:  # of many lanes some one differs by chance
+            largest, index = float(z[member, feature]), int(feature)
+            lane = "" if name == "network" else f" on lane {layout.places[member][2]}"
+    if largest < LEAST_Z:
+        return "other data: no statistic of these detectors tells them apart"
+    feature_name, regime, _ = ALL_FEATURES[index]
+    periods = int(np.ceil((deciding_z / largest) ** 2))
     many = "one period" if periods == 1 else f"{periods} periods"
     source = "" if index in held else f" of {_SOURCES.get(regime, 'detections of single vehicles')}"
     return (
-        f"{statistic(name)} ({regime}) differs most between them: about {many}{source} would decide"
+        f"{statistic(feature_name)} ({regime}){lane} differs most between them: about "
+        f"{many}{source} would decide"
     )
 
 

@@ -277,7 +277,8 @@ def _unnamed(
         with reporter.task("unnamed correction", len(numbers)) as advance:
             days = study.engine.ordinary((*named, *effects), numbers, advance)
     except OutOfTime:
-        return None
+        told = "The budget ended before the unnamed correction was tried."
+        return replace(diagnosis, sentence=f"{diagnosis.sentence} {told}"), ()
     before = [base.model.days[number] for number in days]
     after = [day.tally for day in days.values()]
     check = traffic_check(study.heldout, before, after, study.config.thresholds)
@@ -302,7 +303,8 @@ def _with_patterns(
     try:
         patterns = study.left_over(_explained_by(base, conclusion), reporter)
     except OutOfTime:
-        return diagnosis
+        told = "The budget ended before patterns in what is left were looked for."
+        return replace(diagnosis, sentence=f"{diagnosis.sentence} {told}")
     if not patterns:
         return diagnosis
     told = f"What is left shows most in this: {describe_pattern(patterns[0])}."

@@ -39,6 +39,9 @@ EXPECTED = 10.0
 """Least number of vehicles expected during a silence for a report."""
 MANY_LENGTHS = 3
 """Number of different lengths of one green, in whole s, from which a programme is not fixed."""
+CHANGING_SHARE = 0.25
+"""Share of successive greens of other lengths above which that is so. Fixed plans have few: where
+the plan changes, and where rows were lost."""
 
 COUNTABLE = (
     "demand_level",
@@ -176,17 +179,21 @@ def _of_signals(measured: MeasuredData, scenario: Scenario, network: Network) ->
 def is_actuated(periods: Sequence[Period], tls: str) -> bool:
     """Return True if a green has more different lengths than a fixed programme gives it.
 
-    Lengths are compared within a period: plans of the day differ from one to the other.
+    Lengths are compared within a period, since plans of the day differ. A change of plan and rows
+    that were lost give a few odd lengths, but lengths that follow the traffic change all the time.
     """
     for period in periods:
-        lengths: dict[str, set[float]] = {}
+        lengths: dict[str, list[float]] = {}
         changes = period.signals.get(tls, ())
-        # The ends of the period cut the first and the last state short.
+        # The begin of a log and the end of the period cut the first and the last state short.
         for (begin_s, state), (end_s, _) in itertools.pairwise(changes[1:]):
-            if set(state) & GREEN:
-                lengths.setdefault(state, set()).add(round(end_s - begin_s))
-        if any(len(distinct) >= MANY_LENGTHS for distinct in lengths.values()):
-            return True
+            if set(state) & GREEN and end_s > period.begin_s:
+                lengths.setdefault(state, []).append(round(end_s - begin_s))
+        for of_state in lengths.values():
+            changed = sum(abs(one - other) > 1 for one, other in itertools.pairwise(of_state))
+            often = changed > CHANGING_SHARE * (len(of_state) - 1)
+            if len({*of_state}) >= MANY_LENGTHS and often:
+                return True
     return False
 
 

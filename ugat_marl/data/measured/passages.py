@@ -26,6 +26,9 @@ LONGEST_M = 40.0
 """Largest plausible length of a vehicle."""
 MOST_SHARED = 0.5
 """From this share of equal detections on, two periods hold the same recording."""
+MOST_SHARED_SECONDS = 0.9
+"""The same if all times are whole seconds. A queue leaves a fixed programme in nearly the same ones
+every day."""
 
 DOUBLED_PART_S = 900.0
 """Length of the parts of a period in which two recordings on top of each other are looked for."""
@@ -321,14 +324,16 @@ def _refuse_copies(path: Path, stream: _Stream, periods: Sequence[Period], detec
         one.id: np.sort(code[a:b])
         for one, a, b in zip(periods, bounds[:-1], bounds[1:], strict=True)
     }
+    whole = bool((stream.time == np.round(stream.time)).all())
+    most = MOST_SHARED_SECONDS if whole else MOST_SHARED
     for one, other in overlapping(periods):
         begin, end = max(one.begin_s, other.begin_s), min(one.end_s, other.end_s)
         a, b = (_between(events[each.id], begin, end, detectors) for each in (one, other))
         few, many = (a, b) if len(a) <= len(b) else (b, a)
         sample = few[:: max(len(few) // 200, 1)]
-        if len(few) < FEWEST or _share(sample, many) < MOST_SHARED:
+        if len(few) < FEWEST or _share(sample, many) < most:
             continue
-        if (share := _share(few, many)) >= MOST_SHARED:
+        if (share := _share(few, many)) >= most:
             raise MeasuredDataError(
                 f"{path}: {share:.0%} of the detections from {begin:g} s to {end:g} s are the "
                 f"same in the periods {one.id!r} and {other.id!r}: {TWICE}"

@@ -436,6 +436,7 @@ def _refuse_impossible_detectors(path: Path, frame: pl.DataFrame) -> None:
         "is unknown",
         f"write one of {', '.join(kinds)}",
     )
+    _refuse_names_of_groups(path, frame, kinds)
     for column, allowed in (("speed_at", SPEED_POINTS), ("clock", DETECTOR_CLOCKS)):
         refuse(
             path,
@@ -444,6 +445,24 @@ def _refuse_impossible_detectors(path: Path, frame: pl.DataFrame) -> None:
             "is unknown",
             f"write one of {', '.join(allowed)}, or leave it empty where it is not known",
         )
+
+
+def _refuse_names_of_groups(path: Path, frame: pl.DataFrame, kinds: Sequence[str]) -> None:
+    """Refuse detectors with the name of a group of others, which effects on it would miss."""
+    rows = frame.select("detector_id", "kind").rows()
+    others = {own: {kind for other, kind in rows if other != own} for own, _ in rows}
+    groups = [
+        own
+        for own, kinds_of_others in others.items()
+        if own == "*" or own in kinds_of_others or own.partition("@")[0] in {*kinds} - {own}
+    ]
+    refuse(
+        path,
+        frame.filter(pl.col("detector_id").is_in(groups)),
+        "detector_id",
+        "is also the name of several detectors, such as all of a kind",
+        "rename it, here and in the detections",
+    )
 
 
 def _lane_of(where: str, name: str, network: Network) -> Lane:
