@@ -26,6 +26,7 @@ from ugat_marl.files import (
     parse_xml,
     read_bytes,
     replacing,
+    require_writable,
     write_whole,
     xml_bytes,
 )
@@ -38,6 +39,15 @@ def test_write_whole_writes_and_leaves_nothing_else(tmp_path: Path) -> None:
     write_whole(file, b"\x00\x01")
     assert file.read_bytes() == b"\x00\x01"
     assert list(file.parent.iterdir()) == [file]
+
+
+def test_a_name_of_another_kind_is_refused_before_and_after_there_is_a_file(tmp_path: Path) -> None:
+    path = tmp_path / "episodes.csv"
+    for told in (r"a \.parquet file is written here; give", r"there is a file of this name"):
+        with pytest.raises(OutputError, match=told):
+            require_writable(path, ".parquet")
+        path.write_text("kept")
+    require_writable(tmp_path / "episodes.parquet", ".parquet")
 
 
 def test_a_failed_block_leaves_the_old_file(tmp_path: Path) -> None:

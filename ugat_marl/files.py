@@ -135,12 +135,11 @@ def require_writable(path: Path, suffix: str | None = None) -> None:
 
     Args:
         path: The file to write.
-        suffix: Suffix of such files, such as ".json". A file that exists and has another one is
-            something else, and is not replaced. None allows every name.
+        suffix: Suffix of such files, such as ".json"; None allows every name.
 
     Raises:
-        OutputError: The path is a folder, a file of another kind is there, or the folder cannot be
-            made or written to.
+        OutputError: The path is a folder, the name is that of a file of another kind, or the folder
+            cannot be made or written to.
     """
     try:
         is_there, is_file, is_folder = path.exists(), path.is_file(), path.is_dir()
@@ -152,10 +151,10 @@ def require_writable(path: Path, suffix: str | None = None) -> None:
         raise OutputError(f"{str(path)!r} is a folder; give the name of a file")
     if is_there and not is_file:
         raise OutputError(f"{path}: is no file, but a device or a pipe; give the name of a file")
-    if suffix is not None and is_file and path.suffix.lower() != suffix:
+    if suffix is not None and path.suffix.lower() != suffix:
+        replaced = "; there is a file of this name, and it would be replaced" if is_file else ""
         raise OutputError(
-            f"{path}: there is a file of this name, and it would be replaced by a {suffix} file; "
-            f"give a name that ends in {suffix}"
+            f"{path}: a {suffix} file is written here{replaced}; give a name that ends in {suffix}"
         )
     try:
         path.parent.mkdir(parents=True, exist_ok=True)

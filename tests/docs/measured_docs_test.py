@@ -30,9 +30,9 @@ def test_the_example_is_measured_data(tmp_path: Path) -> None:
         ("monday", "fit"),
         ("tuesday", "heldout"),
     ]
-    vehicle = read.periods[0].passages["advance"]
+    vehicle = read.periods[0].passages["a12"]
     assert (vehicle.on_s[0], vehicle.off_s[0], vehicle.speed_mps[0]) == (3.1, 3.6, 13.2)
-    assert np.isnan(read.periods[1].passages["stop"].speed_mps[0])
+    assert np.isnan(read.periods[1].passages["s12"].speed_mps[0])
     assert read.periods[1].signals["A1"] == ((-4.5, "GGGGrrrrrrGGGGrrrrrr"),)
 
 

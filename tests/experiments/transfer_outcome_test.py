@@ -42,6 +42,8 @@ def test_a_shown_difference_has_its_interval() -> None:
 def test_long_times_are_whole_seconds() -> None:
     text = outcome([500.0, 520.0, 540.0], [302.0, 302.0, 302.0]).sentence()
     assert "218 s less than with direct transfer (95 % interval 168 to 268 s" in text
+    text = outcome([2450.0, 2461.0, 2472.0], [1450.4, 1450.4, 1450.4]).sentence()
+    assert text.startswith("In V4 vehicles need 1450 s with fitted street, ")
 
 
 def test_the_same_policy_is_no_difference_of_zero() -> None:

@@ -656,6 +656,19 @@ def test_the_summary_adds_up() -> None:
     assert summary.latency_ms(0.0) <= summary.latency_ms(0.5) <= summary.latency_ms(1.0)
 
 
+def test_the_time_in_which_the_street_sets_the_lights_is_logged() -> None:
+    class Slow(MadeUpStreet):
+        def show(self, states: Any) -> None:
+            time.sleep(0.08)
+            super().show(states)
+
+    told: list[Any] = []
+    loop = FieldLoop(SITE, Scripted(), Slow(), QUICK)
+    summary = loop.drive(20.0, told.append)
+    assert summary.latency_ms(0.0) >= 80.0
+    assert min(decision.latency_ms for decision in told) == summary.latency_ms(0.0)
+
+
 @pytest.mark.parametrize(
     ("options", "says"),
     [({"observation": "waiting"}, "waiting times"), ({"signals": "programme"}, "programme")],

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import re
+import shutil
 import subprocess
 import sys
 import warnings
@@ -192,7 +193,17 @@ def test_two_formats_share_their_side_car(tmp_path: Path) -> None:
     path = exported(policy, ".npz", tmp_path)
     exported(policy, ".ts", tmp_path)
     assert NumpyPolicy.load(path).agents == AGENTS
-    exported(policy_of(False, agents=AgentSet.of(ToyTraffic())), ".ts", tmp_path)
+    other = policy_of(False, agents=AgentSet.of(ToyTraffic()))
+    with pytest.raises(OptionError, match=r"policy.json belongs to another policy.*policy.npz"):
+        exported(other, ".ts", tmp_path)
+    assert NumpyPolicy.load(path).agents == AGENTS
+    mixed_with(other, path)
+
+
+def mixed_with(other: NetworkPolicy, path: Path) -> None:
+    """Puts the side-car of another policy beside a model, which is refused."""
+    (path.parent / "other").mkdir()
+    shutil.copy(exported(other, ".ts", path.parent / "other").with_suffix(".json"), path.parent)
     with pytest.raises(CheckpointError, match="belongs to another model"):
         NumpyPolicy.load(path)
 
@@ -216,9 +227,7 @@ def test_files_of_two_policies_of_one_shape_do_not_belong_together(
     if changed == "weights":
         arguments = (other.agents, other.hidden, -policy.parameters, other.env_options)
         other = NetworkPolicy(*arguments, False, None, policy.ceiling)
-    exported(other, ".ts", tmp_path)
-    with pytest.raises(CheckpointError, match="belongs to another model"):
-        NumpyPolicy.load(path)
+    mixed_with(other, path)
 
 
 # --- the side-car -------------------------------------------------------------------------------
@@ -245,7 +254,9 @@ def test_the_side_car_says_what_the_rows_are(tmp_path: Path) -> None:
     }
     keys = re.findall(r"`(\w+)`", PAGE.partition("| key of")[2].partition("\n\n")[0])
     assert {*about, "kind", "sha256", "parameters"} <= set(keys)
-    without = json.loads(export_policy(policy, path).read_text())
+    again = json.loads(export_policy(policy, path.with_suffix(".ts")).read_text())
+    assert again["decision_interval_s"] == 10.0  # what is known of the site stays
+    without = json.loads(export_policy(policy, tmp_path / "policy.npz").read_text())
     assert without["decision_interval_s"] is without["intersections"] is None
 
 

@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import sys
 from pathlib import Path
-from typing import Any
+from types import SimpleNamespace
+from typing import Any, cast
 
 import numpy as np
 import pytest
@@ -54,6 +55,17 @@ def test_the_camera_changes_nothing() -> None:
     assert max(counts) > 5
     way = [np.abs(a - b).sum() for a, b in zip(counts, counts[1:], strict=False)]
     assert max(way) <= 8  # a second, not a decision, lies between two scenes
+
+
+def test_scenes_are_a_second_apart_whatever_a_decision_takes() -> None:
+    inner: Any = SimpleNamespace(
+        start=lambda launch: None, advance=lambda *_: None, vehicles=list, signals=dict
+    )
+    camera = Filmed(inner, 60.0, 90.0)
+    camera.start(cast("Any", SimpleNamespace(begin_s=100.0)))
+    for _ in range(16):
+        camera.advance(7.5, {})
+    assert [scene.time_s for scene in camera.scenes] == [160.0 + k for k in range(1, 31)]
 
 
 def test_two_policies_stand_side_by_side(tmp_path: Path) -> None:

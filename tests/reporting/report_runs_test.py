@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import html
 import json
+import os
 import re
 import shlex
 import shutil
@@ -427,6 +428,64 @@ def test_seeds_are_put_together_with_intervals(tmp_path: Path) -> None:
     assert curves == [f"grid2x2-v1-V4-phase-seeds-{w}" for w in ("learning", "att", "gate")]
 
 
+def test_of_many_trainings_those_that_miss_something_keep_their_section(tmp_path: Path) -> None:
+    for seed in range(14):
+        run = make_run(tmp_path / "runs" / f"s{seed}", seed=seed)
+        for file in ("metrics.parquet", "trainings/ugat/checkpoint/metrics.parquet"):
+            Metrics([("episode", 0, "return", -1.0)]).write(run / file)  # no gate
+    (tmp_path / "runs" / "s3" / "table.json").write_text("{bad")
+    _, page = page_of(tmp_path / "runs")
+    assert "table.json cannot be used" in page.text
+    assert "13 trainings without a gate, whose files are whole" in page.text
+
+
+def test_why_a_training_is_not_compared(tmp_path: Path) -> None:
+    old = make_run(tmp_path / "runs" / "old")
+    for file in old.rglob("*"):
+        os.utime(file, (1.0, 1.0))
+    make_run(tmp_path / "runs" / "new")
+    make_run(tmp_path / "runs" / "other", seed=1)
+    assert (
+        "Left out: old (an older training of the same seed)." in page_of(tmp_path / "runs")[1].text
+    )
+    rule = Setting("best rule, tuned there", "rule")
+    for target in ("sim", "V4"):
+        make_job(tmp_path / "jobs", f"rule-{target}", ("sim", "V4"), rule, target=target)
+    _, page = page_of(tmp_path / "jobs")
+    assert "Left out: rule-sim (made for sim alone)." in page.text
+    assert "single-v1: sim, best rule, tuned there" in page.text
+    assert "single-v1: sim → V4, best rule, tuned there" in page.text
+
+
+def test_a_gap_that_turns_longer_the_other_way_is_not_gone(run: Path) -> None:
+    found = evaluation()
+    times = {("sim", False): 100.0, ("V4", False): 100.5, ("sim", True): 100.0, ("V4", True): 90.0}
+    results = tuple(
+        replace(r, scores=replace(r.scores, att_s=times[r.domain, r.policy != "direct transfer"]))
+        for r in found.results
+    )
+    replace(found, results=results).write(run / "table.json")
+    _, page = page_of(run)
+    assert "of the gap Δ is gone" not in page.text and "longer gap Δ" in page.text
+
+
+def test_one_episode_has_no_interval(run: Path) -> None:
+    found = evaluation()
+    replace(found, results=tuple(r for r in found.results if r.seed == 1000)).write(
+        run / "table.json"
+    )
+    _, page = page_of(run)
+    assert "one episode. Δ:" in page.text
+    head = page.text.partition("All measures")[0]
+    assert "95 % interval over them" not in head and "One episode." in page.text
+
+
+def test_tables_alone_are_no_trainings(tmp_path: Path) -> None:
+    results = Path(__file__).parents[2] / "results"
+    made, _ = page_of(results / "single-v1" / "main-race", results / "mixed-v1" / "main-effects")
+    assert "<title>2 tables</title>" in made.text
+
+
 def test_domains_stand_in_columns_and_what_differs_stays_apart(tmp_path: Path) -> None:
     make_run(tmp_path / "rain", real="V3")
     make_run(tmp_path / "snow", real="V4")
@@ -468,7 +527,7 @@ def test_jobs_of_a_paper_make_a_table(tmp_path: Path) -> None:
     interval = Interval.of(np.array([150.5, 160.5]))
     assert row[1] == f"156 ({words.number(interval.low)} to {words.number(interval.high)})"
     assert next(r for r in page.cells if r[:1] == ["timed (gate.mode static)"])[2] == "150"
-    assert "Left out, since not judged in both domains: half, waiting" in page.text
+    assert "Left out: half, waiting (not judged in both domains)." in page.text
     assert page.row("waiting")[5] == "not finished"
     assert page.row("direct-0")[2] == "sim → V1, V4"
     times = page.row("direct-0")[8]

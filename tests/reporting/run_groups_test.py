@@ -104,7 +104,7 @@ def test_of_two_trainings_with_one_seed_the_newest_is_shown() -> None:
     old, new, other = judged(0, 150.0, 1.0), judged(0, 190.0, 2.0), judged(1, 200.0, 0.0)
     assert seeds_of_one([old, new, other]) == [[new, other]]
     (group,) = groups([old, new, other])
-    assert group.left_out == ("s0-1",)
+    assert group.left_out == {"s0-1": "an older training of the same seed"}
     assert {row["training_seeds"] for row in group.rows if row["setting"] != RULE} == {2}
     assert {row["att_s"] for row in group.rows} == {195.0}
 

@@ -111,3 +111,11 @@ def test_a_value_that_no_line_reaches_has_a_marker(markers: bool, points: list[f
     charts._draw_curve(picture, axes, 0, rows, markers=markers)
     _, *dots = axes.lines
     assert [float(dot.get_ydata()[0]) for dot in dots] == points
+
+
+def test_a_single_point_has_its_interval_and_whole_ticks() -> None:
+    picture, axes = charts._plot("curve", "A curve", "episode", "return")
+    charts._draw_curve(picture, axes, 0, [(1.5, 5.0, 4.0, 7.0)])
+    (line,) = axes.collections[-1].get_segments()
+    assert line[:, 1].tolist() == [4.0, 7.0]
+    assert all(float(tick).is_integer() for tick in axes.get_xticks())

@@ -6,6 +6,8 @@ import re
 import subprocess
 import sys
 
+import pytest
+
 from ugat_marl.simulation.channel import Message
 from ugat_marl.simulation.worker import _answered
 
@@ -27,6 +29,17 @@ def test_a_process_ends_with_its_input() -> None:
     process = started("import time; time.sleep(600)")
     process.communicate(timeout=60)
     assert process.returncode == 1
+
+
+@pytest.mark.parametrize("redirected", ["</dev/null", "<&-"])
+def test_a_command_without_an_input_is_not_ended(redirected: str) -> None:
+    """As under nohup or cron."""
+    program = START + "import time; time.sleep(0.5); print('done')"
+    command = f'exec "$0" -c "$1" {redirected}'
+    done = subprocess.run(
+        ["sh", "-c", command, sys.executable, program], capture_output=True, text=True, check=False
+    )
+    assert (done.returncode, done.stdout, done.stderr) == (0, "done\n", "")
 
 
 def test_a_full_memory_is_told_as_what_it_is() -> None:

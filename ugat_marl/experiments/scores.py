@@ -40,6 +40,11 @@ def rule_policy(rule: str) -> str:
     return f"rule {rule}"
 
 
+def seconds_text(time_s: float) -> str:
+    """Return a travel time with three digits, or in whole seconds."""
+    return f"{time_s:.0f}" if abs(time_s) >= 99.95 else f"{time_s:.3g}"
+
+
 @dataclass(frozen=True)
 class Result:
     """One episode of a policy in a domain.

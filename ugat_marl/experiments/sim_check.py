@@ -10,7 +10,7 @@ import math
 from dataclasses import dataclass
 
 from ugat_marl.experiments.comparison import Comparison
-from ugat_marl.experiments.scores import Evaluation
+from ugat_marl.experiments.scores import Evaluation, seconds_text
 from ugat_marl.experiments.settings import DIRECT, RULE
 
 MARGIN = 0.02
@@ -48,8 +48,8 @@ class SimCheck:
             option: Option of the command line that makes the training longer.
         """
         times = (
-            f"in {self.sim} {self.policy} needs {self.policy_s:.3g} s, {self.rule} "
-            f"{self.rule_s:.3g} s"
+            f"in {self.sim} {self.policy} needs {seconds_text(self.policy_s)} s, "
+            f"{self.rule} {seconds_text(self.rule_s)} s"
         )
         if self.trained:
             return f"Trained: {times}."

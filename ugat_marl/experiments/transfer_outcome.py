@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass
 
-from ugat_marl.experiments.scores import Evaluation
+from ugat_marl.experiments.scores import Evaluation, seconds_text
 from ugat_marl.experiments.settings import DIRECT, GROUNDED_NAME
 from ugat_marl.experiments.statistics import PairedTest
 
@@ -41,7 +41,7 @@ class TransferOutcome:
     def sentence(self) -> str:
         """Return the outcome in words."""
         change, n = self.test.difference, self.test.count
-        begin = f"In {self.real} vehicles need {self.att_s:.3g} s with {self.policy}"
+        begin = f"In {self.real} vehicles need {seconds_text(self.att_s)} s with {self.policy}"
         if self.shown:
             low, high = sorted((abs(change.low), abs(change.high)))
             text = (
@@ -65,7 +65,7 @@ class TransferOutcome:
         else:
             text = f"{begin}; some of the {n} episodes have no travel time, so no test is possible"
         if self.rule:
-            text += f"; the best rule there, {self.rule}, needs {self.rule_s:.3g} s"
+            text += f"; the best rule there, {self.rule}, needs {seconds_text(self.rule_s)} s"
         return f"{text}."
 
 

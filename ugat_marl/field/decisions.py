@@ -42,7 +42,8 @@ class Decision:
         phases: Traffic light to the phase asked for.
         fallback: Traffic light that follows the fixed-time plan to the reason.
         read_ms: Time spent on reading and checking the counts, ms.
-        latency_ms: Time from the start of reading until every light had its plan, ms.
+        latency_ms: Time from the start of reading until every light was set, ms; until every light
+            had its plan in what `FieldLoop.decide` returns.
     """
 
     time_s: float

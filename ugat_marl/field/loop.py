@@ -12,7 +12,7 @@ import time
 from array import array
 from collections import Counter
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Any
 
 import numpy as np
@@ -131,11 +131,12 @@ class FieldLoop:
         """
         until = self._street.now_s() + seconds - 1e-6
         while (now := self._street.now_s()) < until:
+            begun = time.perf_counter()
             decision, plans = self.decide()
-            self._lights.act(plans, functools.partial(self._record, decision, plans))
+            self._lights.act(plans, functools.partial(self._record, begun, decision, plans))
             self.driven_s += self._street.now_s() - now
             if on_decision is not None:
-                on_decision(decision)
+                on_decision(self._recorded)
         return self.summary
 
     def decide(self) -> tuple[Decision, dict[str, list[Segment]]]:
@@ -168,11 +169,12 @@ class FieldLoop:
         decision = Decision(now, phases, fallback, read_ms, _ms_since(begun))
         return decision, plans
 
-    def _record(self, decision: Decision, plans: Mapping[str, list[Segment]]) -> None:
+    def _record(self, begun: float, decision: Decision, plans: Mapping[str, list[Segment]]) -> None:
         """Log and count a decision, after its first states are set: no light waits for a disk.
 
         A signal may end the loop in between. So every decision that is counted is in the log.
         """
+        self._recorded = decision = replace(decision, latency_ms=_ms_since(begun))
         if self._log is not None:
             self._log.add(decision)
         self.summary.add(decision)

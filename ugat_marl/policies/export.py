@@ -70,7 +70,8 @@ def export_policy(policy: NetworkPolicy, path: Path, env: AnyParallelEnv | None 
 
     Raises:
         OptionError: The suffix is unknown, the extra is missing, the environment has other agents,
-            or FRAP or CoLight is to be written to another format than ``.ts``.
+            FRAP or CoLight is to be written to another format than ``.ts``, or another policy's
+            model has the same name.
         CheckpointError: An option of the environment is not plain data.
         OutputError: A file cannot be written.
     """
@@ -84,10 +85,16 @@ def export_policy(policy: NetworkPolicy, path: Path, env: AnyParallelEnv | None 
         require_writable(place)
     _refuse_other(side_car)
     about = _about(policy, env)
+    held = _held(side_car)
+    same = _of_the_policy(held) == json.loads(json.dumps(_of_the_policy(about)))
+    if held and not same:
+        _refuse_models_beside(path)
+    if same and env is None:  # what an earlier export told of the site holds for the policy
+        about |= {key: held.get(key) for key in _OF_THE_SITE}
     model = FORMATS[path.suffix][1](policy)
     write_whole(path, model)
     sums = {path.suffix: _sum(model), ".json": _sum_of(about)}
-    about["sha256"] = _sums_beside(side_car, about) | sums
+    about["sha256"] = (held["sha256"] if same else {}) | sums
     write_whole(side_car, json.dumps(about, indent=1) + "\n")
     return side_car
 
@@ -119,18 +126,27 @@ _OF_THE_SITE = ("decision_interval_s", "intersections")
 """What a side-car tells only if the environment was given."""
 
 
-def _sums_beside(side_car: Path, about: Mapping[str, Any]) -> dict[str, str]:
-    """Return the check sums of the same policy's other formats; none if the file is another's."""
+def _of_the_policy(content: Mapping[str, Any]) -> dict[str, Any]:
+    return {k: v for k, v in content.items() if k not in (*_OF_THE_SITE, "sha256")}
 
-    def of_the_policy(content: Mapping[str, Any]) -> dict[str, Any]:
-        return {k: v for k, v in content.items() if k not in (*_OF_THE_SITE, "sha256")}
 
+def _held(side_car: Path) -> dict[str, Any]:
+    """Return the content of a side-car that is there; empty without one, or if it is damaged."""
     try:
         held = dict(read_json(side_car, CheckpointError))
-        sums = dict(held["sha256"])
+        return {**held, "sha256": dict(held["sha256"])}
     except (CheckpointError, *MALFORMED):
         return {}
-    return sums if of_the_policy(held) == json.loads(json.dumps(of_the_policy(about))) else {}
+
+
+def _refuse_models_beside(path: Path) -> None:
+    """Refuse to replace the side-car of another policy's models, which could not be loaded then."""
+    beside = [path.with_suffix(suffix) for suffix in FORMATS if suffix != path.suffix]
+    if others := [model.name for model in beside if model.exists()]:
+        raise OptionError(
+            f"{path.with_suffix('.json')} belongs to another policy, of which {others[0]} is "
+            f"there; give the model another name, or remove {others[0]}"
+        )
 
 
 def portable_network(policy: NetworkPolicy) -> PortableNetwork:

@@ -186,6 +186,10 @@ def _draw_curve(
     axes.plot(x, mean, **style)
     known = np.isfinite(mean)
     alone = known & ~np.r_[known[1:], False] & ~np.r_[False, known[:-1]]  # no line reaches it
+    bounded = alone & np.isfinite(low) & np.isfinite(high)
+    axes.vlines(x[bounded], low[bounded], high[bounded], color=style["color"], alpha=0.5)
+    if len(x) == 1:  # ticks of an axis without a length are no whole numbers
+        axes.set_xlim(x[0] - 1.0, x[0] + 1.0)
     shown = known if markers else alone
     for place, value in zip(x[shown], mean[shown], strict=True):
         (dot,) = axes.plot(place, value, marker=marker, color=style["color"], zorder=3)
@@ -318,7 +322,8 @@ def travel_times(evaluation: Evaluation) -> dict[str, list[Estimated]]:
 def _draw_policies(axes: Any, evaluation: Evaluation) -> None:
     _draw_estimates(axes, evaluation.policies, travel_times(evaluation), "s")
     seeds = len({result.seed for result in evaluation.results})
-    title = f"final policies, {counted(seeds, 'seed')}, 95 % intervals, s"
+    intervals = ", 95 % intervals" if seeds > 1 else ""
+    title = f"final policies, {counted(seeds, 'seed')}{intervals}, s"
     axes.set_title(title, color=LIGHT["soft"], x=-178 / _points_wide(axes))
 
 

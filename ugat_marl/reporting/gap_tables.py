@@ -12,7 +12,7 @@ from rich.text import Text
 from ugat_marl.envs import OBJECTIVE_MEASURES
 from ugat_marl.experiments import Evaluation, domains_by_gap, gap_matrix
 from ugat_marl.reporting.formats import fixed, number_text
-from ugat_marl.reporting.terminal import titled_table
+from ugat_marl.reporting.terminal import in_tables, titled_table
 
 
 def gap_matrix_table(evaluation: Evaluation) -> RenderableType:
@@ -66,6 +66,8 @@ def objective_tables(evaluation: Evaluation) -> list[RenderableType]:
     ]
 
 
+_SIDE_BY_SIDE = 8
+"""Largest number of policies beside each other, so that numbers stay whole in 80 columns."""
 _SHORT = {
     "co2_g": "CO2",
     "delay_gini": "Gini",
@@ -100,16 +102,17 @@ def _measured(evaluation: Evaluation, domains: Sequence[str]) -> list[Table]:
 
 
 def _by_domain(evaluation: Evaluation) -> RenderableType:
-    table = titled_table("average travel time in s, domain by domain")
-    table.add_column("domain", max_width=22, overflow="fold")
-    for policy in evaluation.policies:
-        table.add_column(policy, justify="right", overflow="fold")
-    for domain in evaluation.domains:
-        values = (
-            evaluation.estimate(policy, domain, "att_s").mean for policy in evaluation.policies
-        )
-        table.add_row(Text(domain), *map(number_text, values))
-    return table
+    tables: list[Table] = []
+    for policies in in_tables(evaluation.policies, _SIDE_BY_SIDE):
+        table = titled_table("average travel time in s, domain by domain")
+        table.add_column("domain", max_width=22, overflow="fold")
+        for policy in policies:
+            table.add_column(policy, justify="right", overflow="fold")
+        for domain in evaluation.domains:
+            values = (evaluation.estimate(policy, domain, "att_s").mean for policy in policies)
+            table.add_row(Text(domain), *map(number_text, values))
+        tables.append(table)
+    return Group(*tables)
 
 
 def _change(percent: float) -> str:

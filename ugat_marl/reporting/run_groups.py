@@ -7,7 +7,7 @@ import json
 import math
 from collections import Counter
 from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Any
 
 from ugat_marl.experiments import (
@@ -43,13 +43,13 @@ class Group:
         title: Scenario and settings that all of them share.
         rows: Rows as returned by `Comparison.rows`.
         note: Number of seeds and kind of intervals, in a sentence.
-        left_out: Names of trainings that were not judged in both domains.
+        left_out: Name of each training that is not compared, to the reason.
     """
 
     title: str
     rows: Sequence[Mapping[str, Any]]
     note: str
-    left_out: tuple[str, ...] = ()
+    left_out: Mapping[str, str] = field(default_factory=dict[str, str])
 
 
 def groups(records: Sequence[RunRecord]) -> list[Group]:
@@ -117,13 +117,14 @@ def _parted(records: Iterable[RunRecord], key: Any) -> dict[Any, list[RunRecord]
     return parts
 
 
-def _trials(records: Sequence[RunRecord]) -> tuple[list[Trial], tuple[str, ...]]:
-    """Return trials that were scored in both domains, and names of the other records."""
+def _trials(records: Sequence[RunRecord]) -> tuple[list[Trial], dict[str, str]]:
+    """Return trials that were scored in both domains; and why other records have none, by name."""
     names, told = job_labels(records), _told(records)
     known: dict[tuple[Any, ...], int] = {}
     trials: list[list[Trial]] = [[] for _ in records]
+    left_out: dict[str, str] = {}
     for index, record in _newest_first(records):
-        of_record = _of_job(record, names[index]) if record.job else _of_run(record, told)
+        of_record = [*(_of_job(record, names[index]) if record.job else _of_run(record, told))]
         training = record.seed or record.name
         trials[index] = [
             trial
@@ -131,8 +132,17 @@ def _trials(records: Sequence[RunRecord]) -> tuple[list[Trial], tuple[str, ...]]
             # an older training of the same seed says nothing about chance
             if known.setdefault((*_episode(trial), training), index) == index
         ]
-    left_out = [record.name for record, own in zip(records, trials, strict=True) if not own]
-    return list(itertools.chain(*trials)), tuple(left_out)
+        if not trials[index]:
+            left_out[record.name] = _reason_without_trials(record, older=bool(of_record))
+    return list(itertools.chain(*trials)), left_out
+
+
+def _reason_without_trials(record: RunRecord, *, older: bool) -> str:
+    if older:
+        return "an older training of the same seed"
+    if record.job and record.settings.get("target") == record.sim:
+        return f"made for {record.sim} alone"
+    return "not judged in both domains"
 
 
 def _episode(trial: Trial) -> tuple[str, str, str, int]:

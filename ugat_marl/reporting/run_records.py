@@ -91,9 +91,11 @@ class RunRecord:
     @property
     def real(self) -> str:
         """The real domain; "" for none."""
+        if self.job and self.settings.get("target"):
+            return str(self.settings["target"])
         if self.evaluation is not None and len(self.evaluation.domains) == 2:
             return self.evaluation.domains[1]
-        return str(self.settings.get("target" if self.job else "real") or "")
+        return "" if self.job else str(self.settings.get("real") or "")
 
     @property
     def seed(self) -> str:

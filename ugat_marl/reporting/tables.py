@@ -19,7 +19,9 @@ from ugat_marl.reporting.terminal import titled_table
 def transfer_table(evaluation: Evaluation) -> RenderableType:
     """Return ATT of every policy in the simulation and the real domains, with gap and regret."""
     first, *others = evaluation.domains
-    table = titled_table(f"{evaluation.scenario}: average travel time in s (95 % interval)")
+    several = len({result.seed for result in evaluation.results}) > 1
+    interval = " (95 % interval)" if several else ""
+    table = titled_table(f"{evaluation.scenario}: average travel time in s{interval}")
     table.add_column("policy", max_width=22, overflow="fold")
     table.add_column(first, justify="right", overflow="fold")
     for domain in others:

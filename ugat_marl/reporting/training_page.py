@@ -49,7 +49,8 @@ Cells = Mapping[tuple[str, str], Mapping[str, Any]]
 """Setting and domain to a row of a table."""
 
 _ARTICLES = 12
-"""Largest number of trainings of which each has a section; of more, only those with a gate do."""
+"""Largest number of trainings of which each has a section. Of more, those do that have a gate, are
+not finished, or miss a file."""
 _OPEN = 4
 """Largest number of sections that are shown unfolded."""
 _WORST = 10
@@ -71,12 +72,17 @@ def runs_page(records: Sequence[RunRecord | TableRecord], commands: Commands) ->
     tables = [record for record in records if isinstance(record, TableRecord)]
     alone = len(records) == 1
     few = len(runs) <= _ARTICLES
-    shown = [r for r in runs if few or r.series("iteration", "gate/acceptance")]
+    shown = [
+        run
+        for run in runs
+        if few or run.missing or not run.finished or run.series("iteration", "gate/acceptance")
+    ]
     heading, note = _heading(runs, tables)
+    heading = _title(records[0]) if alone else heading
     page.text = render(
         "training.html.j2",
-        title=_title(records),
-        heading=_title(records) if alone else heading,
+        title=heading,
+        heading=heading,
         note="" if alone else note,
         single=alone,
         overview=_overview(runs) if len(runs) > 1 else None,
@@ -113,10 +119,9 @@ def _file_name(*parts: str) -> str:
 # --- the head -------------------------------------------------------------------------------------
 
 
-def _title(records: Sequence[RunRecord | TableRecord]) -> str:
-    if len(records) == 1 and isinstance(records[0], RunRecord):
-        return printable(f"Training {records[0].name}")
-    return printable(records[0].name if len(records) == 1 else f"{len(records)} trainings")
+def _title(record: RunRecord | TableRecord) -> str:
+    kind = "Training " * isinstance(record, RunRecord)
+    return printable(f"{kind}{record.name}")
 
 
 def _heading(runs: Sequence[RunRecord], tables: Sequence[TableRecord]) -> tuple[str, str]:
@@ -132,8 +137,12 @@ def _heading(runs: Sequence[RunRecord], tables: Sequence[TableRecord]) -> tuple[
     return text, f"{unfinished} of them are not finished." if unfinished else ""
 
 
-def _left_out(names: Sequence[str]) -> str:
-    return f" Left out, since not judged in both domains: {', '.join(names)}." if names else ""
+def _left_out(reasons: Mapping[str, str]) -> str:
+    named: dict[str, list[str]] = {}
+    for name, reason in reasons.items():
+        named.setdefault(reason, []).append(name)
+    texts = [f"{', '.join(names)} ({reason})" for reason, names in named.items()]
+    return f" Left out: {'; '.join(texts)}." if texts else ""
 
 
 def _status(record: RunRecord) -> tuple[str, str]:
@@ -169,7 +178,7 @@ def _headline(record: RunRecord) -> str:
     """Return the outcome of a training in one sentence."""
     evaluation = record.evaluation
     title = f"{record.scenario or record.name}: {record.sim}"
-    title += f" → {record.real}" if record.real else ""
+    title += f" → {record.real}" if record.real not in ("", record.sim) else ""
     if evaluation is None or not evaluation.policies:
         return f"{title}, no result yet"
     if record.job:
@@ -287,7 +296,11 @@ def _settings(page: Page, title: str, rows: Sequence[Mapping[str, Any]]) -> dict
         )
         for domain in domains
     ]
-    caption = f"Mean over training seeds with its 95 % interval.{_fewer_seeds(rows)}"
+    several = any(math.isfinite(as_number(row.get("att_s_low"))) for row in rows)
+    caption = (
+        "Mean over training seeds with its 95 % interval." if several else "One training seed."
+    )
+    caption += _fewer_seeds(rows)
     return {
         "att": grid("att_s"),
         "gap": grid("att_s_gap", sign=True),
@@ -380,10 +393,10 @@ def _boxes(record: RunRecord) -> list[tuple[str, str]]:
     if grounded is not None:
         start, now = (evaluation.gap(p, real, "att_s").mean for p in (direct, grounded))
         if start > 0 and math.isfinite(now):
-            if now <= start:
-                box = share(1 - now / start), f"of the gap Δ is gone with {grounded}"
+            if abs(now) <= start:  # below 0 the street is faster than the simulation says
+                box = share(1 - abs(now) / start), f"of the gap Δ is gone with {grounded}"
             else:  # a share of a small gap would say little
-                box = f"{number(now - start)} s", f"longer gap Δ with {grounded}"
+                box = f"{number(abs(now) - start)} s", f"longer gap Δ with {grounded}"
             boxes.append(box)
         times = [evaluation.values(policy, real, "att_s") for policy in (direct, grounded)]
         saved, word = Estimate.of(times[0] - times[1]), "less"
@@ -446,14 +459,15 @@ def _scores(
         charts.travel_times(evaluation),
         _file_name(record.name, "travel-times"),
     )
-    caption = "Mean over the episodes with its 95 % interval."
+    seeds = len({result.seed for result in evaluation.results})
+    caption = "Mean over the episodes with its 95 % interval." if seeds > 1 else "One episode."
     network = places.network if places is not None else None
     check, outcome = check_run(evaluation), outcome_of(evaluation)
     return {
         "sim": first,
         "outcome": None if outcome is None else outcome.sentence(),
         "trained": None if check is None else check.sentence("--pretrain-episodes"),
-        "episodes": len({result.seed for result in evaluation.results}),
+        "episodes": seeds,
         "table": Grid(headings, rows, headings[1:]),
         "measures": _measures(evaluation),
         "service": service_grid(evaluation, _main_policies(evaluation), network),

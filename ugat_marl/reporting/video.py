@@ -39,6 +39,8 @@ _PILLOW = {".gif": "GIF", ".webp": "WEBP"}
 _FFMPEG = {".mp4": "mp4", ".mkv": "matroska", ".mov": "mov"}
 _CAPTION_PX = 46
 _GIF_PER_S = 50
+_MOMENT_S = 1e-6
+"""Largest difference of two equal times, s."""
 _WIDE = 1.6
 """Ratio of width to height above which pictures stand below each other, not side by side."""
 
@@ -109,14 +111,17 @@ class Filmed:
             return self._inner.advance(seconds, plans, meanwhile)
         done = 0.0
         while True:
-            length = min(1.0, seconds - done)
+            passed = self._now_s - self._start_s
+            whole = math.floor(passed + _MOMENT_S) + 1.0 - passed  # until the next whole second
+            length = min(whole, seconds - done)
             plan = between(plans, done, done + length)
             snapshot = self._inner.advance(length, plan, None if done else meanwhile)
             done += length
             self._now_s += length
-            if begin_s < self._now_s <= end_s:
+            is_whole = abs(length - whole) < _MOMENT_S
+            if is_whole and begin_s < self._now_s <= end_s + _MOMENT_S:
                 self.scenes.append(Scene(self._now_s, self.vehicles(), self.signals()))
-            if done >= seconds:
+            if done >= seconds - _MOMENT_S:
                 return snapshot
 
     def vehicles(self) -> VehiclePositions:

@@ -15,6 +15,7 @@ import os
 import shutil
 import signal
 import socket
+import stat
 import sys
 import threading
 import time
@@ -43,8 +44,16 @@ _MOST_DESCRIPTORS = 8
 def exit_when_input_ends() -> None:
     """End this process with exit code 1 when standard input ends, because its starter has ended.
 
+    Starters give a pipe. Other inputs, such as that of a command under ``nohup``, are not watched.
+
     The thread reads the descriptor, not `sys.stdin`: the lock of `sys.stdin` could block the exit.
     """
+    try:
+        kind = os.fstat(0).st_mode
+    except OSError:  # it is closed
+        return
+    if not stat.S_ISFIFO(kind) and not stat.S_ISSOCK(kind):
+        return
 
     def watch() -> None:
         while os.read(0, 1024):
