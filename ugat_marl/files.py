@@ -760,8 +760,8 @@ class Document:
     def __reduce__(self) -> tuple[Any, ...]:
         if self.home is None and not _SENT_WHOLE.get():
             return Document, (self.name, self.path, self.content, None, self.in_rows)
-        unpacked = self.name.removesuffix(".gz")  # a copy may outlive the file, or be elsewhere
-        return Document, (unpacked, None, self.read(), None, self.in_rows)
+        copy = self.edited(self.read())  # it may outlive the file, or be elsewhere
+        return Document, (copy.name, None, copy.content, None, self.in_rows)
 
     @property
     def source(self) -> str:

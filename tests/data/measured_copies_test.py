@@ -82,9 +82,11 @@ def discharges(seed: int, tick_s: float) -> Any:
     return passages._Stream(keys, times, on, nothing, nothing)
 
 
-@pytest.mark.parametrize("tick_s", [0.1, 1.0])
-def test_queues_under_a_fixed_plan_are_no_copy(tick_s: float) -> None:
+@pytest.mark.parametrize(("tick_s", "late_s"), [(0.1, 0.0), (1.0, 0.0), (1.0, 0.5)])
+def test_queues_under_a_fixed_plan_are_no_copy(tick_s: float, late_s: float) -> None:
     days, stream = DAYS[:2], discharges(1, tick_s)
+    stream = replace(stream, time=stream.time + late_s)
+    stream.time[0] += 0.1
     passages._refuse_copies(Path("detections.csv"), stream, days, 8)
     first = stream.key < 8
     twice = passages._Stream(

@@ -485,6 +485,23 @@ def test_a_fixed_plan_does_not_follow_the_traffic(log: str) -> None:
     assert not is_actuated([Period("day", begin_s, end_s, "fit", signals, {})], "A")
 
 
+@pytest.mark.parametrize("usual_s", [5.0, 50.0])
+def test_a_controller_that_mostly_gives_one_length_follows_the_traffic(usual_s: float) -> None:
+    """Nearly all greens are of the shortest length in light traffic, of the longest in heavy."""
+    generator = np.random.default_rng(2)
+    rows: list[tuple[float, str]] = []
+    now = 0.0
+    while now < 3600.0:
+        odd = generator.random() < 0.15
+        green_s = usual_s + odd * float(
+            generator.choice([-10.0, -20.0] if usual_s > 9 else [10, 30])
+        )
+        rows += [(now, "Gr"), (now + green_s, "yr"), (now + green_s + 3, "rG")]
+        now += green_s + 40.0
+    signals = {"A": tuple(row for row in rows if row[0] <= 3600.0)}
+    assert is_actuated([Period("day", 0.0, 3600.0, "fit", signals, {})], "A")
+
+
 def test_a_state_every_second_is_the_log_of_its_changes(read: Read) -> None:
     lengths = np.random.default_rng(1).choice([14.0, 20.0, 30.0, 47.0], 400)
     times = np.cumsum([0.0, *lengths])

@@ -413,15 +413,15 @@ WRONG: dict[str, tuple[dict[str, Change], str]] = {
     ),
     "the name of all": (
         {"detectors.csv": added("*,S_C_0,10,0,stop,signals")},
-        r"line 6: detector_id '\*' is also the name of several detectors.*rename it",
+        r"line 6: detector_id '\*' would mean several detectors.*rename it",
     ),
     "the name of a kind": (
         {"detectors.csv": added("stop,S_C_0,10,0,stop,signals")},
-        r"line 6: detector_id 'stop' is also the name of several detectors.*rename it",
+        r"line 6: detector_id 'stop' would mean several detectors.*rename it",
     ),
     "the name of a kind on a road": (
         {"detectors.csv": added("stop@S_C,S_C_0,10,0,stop,signals")},
-        r"line 6: detector_id 'stop@S_C' is also the name of several detectors.*rename it",
+        r"line 6: detector_id 'stop@S_C' would mean several detectors.*rename it",
     ),
     "detector beyond the lane": ({"detectors.csv": replaced("90.0", "900")}, r"position_m 900"),
     "zone beyond the lane": ({"detectors.csv": replaced("40.0,2.0", "40,460")}, r"at most"),

@@ -379,6 +379,23 @@ CARELESS = (
 )
 
 
+def test_what_a_calibrator_removes_is_no_traveller(tmp_path: Path) -> None:
+    file = tmp_path / "trips.xml"
+    rows = [(name, f'arrival="12" vaporized="{name}"') for name in ("calibrator", "collision", "")]
+    file.write_text(
+        "<tripinfos>"
+        + "".join(
+            f'<tripinfo id="{n}" depart="2" {a} departDelay="1" duration="10" timeLoss="3"/>'
+            for n, a in rows
+        )
+        + "</tripinfos>"
+    )
+    trips = read_trips(file, 100.0)
+    assert trips.travel_time_s.tolist() == [99.0, 11.0]
+    assert trips.delay_s.tolist() == [92.0, 4.0]
+    assert trips.finished.tolist() == [False, True]
+
+
 def held(scenario: Path, domain: str) -> Any:
     """The scores of an episode in which the first phase is held."""
     env = parallel_env(scenario, domain, simulator="inprocess")

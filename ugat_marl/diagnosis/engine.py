@@ -327,7 +327,8 @@ class Engine:
                 period = self._unmeasured.kept_from(self._day(every, number).period)
                 arrays = reduce(period, self._greens[self.place_of(number)])
                 self._store(key, arrays)
-                self._one(every, number)  # while the day is at hand; else it is simulated again
+                if not effects:  # while the day is at hand; else it is simulated again
+                    self._one(every, number)
             advance()
             return arrays
 

@@ -208,6 +208,7 @@ class Reference:
         stacked = _stack(pools, tallies)
         self.stretches = prior.stretches if prior else _stretches(stacked, tallies)
         self._of_stretches = prior._of_stretches if prior else {}
+        self._of_window = prior._of_window if prior else Counter(day.window for day in tallies)
         stacked = self._level(stacked, tallies)
         partners = self._level(_stack(pools, paired), paired) if paired else {}
         self.blocks: dict[str, Block] = {}
@@ -293,13 +294,15 @@ class Reference:
             sums = {name: several.sum(axis=0) for name, several in days.items()}
         else:
             sums = self.pools.pool(sum_of(data))
-        # The mean of a stretch comes from the days of that stretch alone. Over all W stretches
-        # alike these errors cancel. Where each has a share s of the data, they leave W times the
-        # sum of all s ** 2, minus one, times the error of the mean of all days.
+        # The mean of a stretch comes from its own n of all N days. If it has a share s of the data,
+        # the errors of these means add up to the sum of N s ** 2 / n times that of the mean of all
+        # days: once where data and days are divided alike.
         missing = 0.0
         if self.stretches:
-            shares = np.array([*Counter(day.window for day in data).values()]) / len(data)
-            missing = len(self.stretches) * float((shares**2).sum()) - 1.0
+            days, usual = self._of_window.total(), self._of_window.total() / len(self.stretches)
+            shares = {w: n / len(data) for w, n in Counter(day.window for day in data).items()}
+            errors = [s**2 / self._of_window.get(w, usual) for w, s in shares.items()]
+            missing = days * sum(errors) - 1.0
         total = penalty = 0.0
         parts: dict[str, float] = {}
         compared: dict[str, NDArray[np.bool_]] = {}

@@ -298,7 +298,7 @@ def _separating(
             largest, index = float(z[member, feature]), int(feature)
             lane = "" if name == "network" else f" on lane {layout.places[member][2]}"
     if largest < LEAST_Z:
-        return "other data: no statistic of these detectors tells them apart"
+        return "other data: over whole periods no statistic of these detectors tells them apart"
     feature_name, regime, _ = ALL_FEATURES[index]
     periods = int(np.ceil((deciding_z / largest) ** 2))
     many = "one period" if periods == 1 else f"{periods} periods"

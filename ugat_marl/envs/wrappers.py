@@ -503,8 +503,8 @@ class _IntersectionNames(Wrapper):
         try:
             yield
         except UgatMarlError as error:
-            light = self._light
-            told = re.sub(r"'([^']+)'", lambda name: f"'{light.get(name[1], name[1])}'", str(error))
+            lights = {repr(agent): repr(light) for agent, light in self._light.items()}
+            told = re.sub("|".join(map(re.escape, lights)), lambda m: lights[m[0]], str(error))
             error.args = (told,)
             raise
 

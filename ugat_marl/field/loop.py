@@ -98,6 +98,7 @@ class FieldLoop:
         self._plan = fixed_time(site.network, interval, clearance, limits.green_s)
         self.summary = LoopSummary()
         self.driven_s = 0.0
+        self._recorded = Decision(0.0, {}, {}, 0.0, 0.0)
         self._answer = _answer_of(policy, site)
         lights = Lights(site, street, limits)  # a street that does not answer leaves no thread
         self._asked = Answering()

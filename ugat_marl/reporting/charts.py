@@ -189,7 +189,8 @@ def _draw_curve(
     bounded = alone & np.isfinite(low) & np.isfinite(high)
     axes.vlines(x[bounded], low[bounded], high[bounded], color=style["color"], alpha=0.5)
     if len(x) == 1:  # ticks of an axis without a length are no whole numbers
-        axes.set_xlim(x[0] - 1.0, x[0] + 1.0)
+        axes.update_datalim([(x[0] - 1.0, mean[0]), (x[0] + 1.0, mean[0])])
+        axes.autoscale_view()
     shown = known if markers else alone
     for place, value in zip(x[shown], mean[shown], strict=True):
         (dot,) = axes.plot(place, value, marker=marker, color=style["color"], zorder=3)

@@ -28,8 +28,9 @@ def measuring_options(directory: Path) -> list[str]:
 def read_trips(path: Path, end_s: float, persons: Mapping[str, float] | None = None) -> Trips:
     """Read SUMO's tripinfo file, unfinished and undeparted vehicles included.
 
-    Vehicles that block a lane for an effect are no travellers and are left out. Vehicles that SUMO
-    takes off the road, after a collision say, have not arrived: their times count to the end.
+    Vehicles that block a lane for an effect are no travellers and are left out, and so are those
+    that a calibrator of the scenario removes. Vehicles that SUMO takes off the road otherwise, such
+    as after a collision, have not arrived: their times count to the end.
 
     Args:
         path: The file.
@@ -58,11 +59,12 @@ def _trips_in(path: Path, end_s: float, persons: Mapping[str, float]) -> Trips:
         if element.tag == "emissions":  # ends before the trip it belongs to
             co2_mg = float(element.get("CO2_abs", "0"))
         blocks = is_blocker(element.get("id", ""), element.get("vType", ""))
-        if element.tag == "tripinfo" and not blocks:
+        removed_by = element.get("vaporized", "")
+        if element.tag == "tripinfo" and not blocks and removed_by != "calibrator":
             entered = float(element.get("depart", "-1")) >= 0
             arrival_s = float(element.get("arrival", "-1"))
             ended = arrival_s >= 0
-            removed = ended and bool(element.get("vaporized"))  # by a collision or a calibrator
+            removed = ended and bool(removed_by)
             waited = float(element.get("departDelay", "0"))
             inside = float(element.get("duration", "0"))
             lost = float(element.get("timeLoss", "0"))

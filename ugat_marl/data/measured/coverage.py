@@ -39,9 +39,10 @@ EXPECTED = 10.0
 """Least number of vehicles expected during a silence for a report."""
 MANY_LENGTHS = 3
 """Number of different lengths of one green, in whole s, from which a programme is not fixed."""
-CHANGING_SHARE = 0.25
-"""Share of successive greens of other lengths above which that is so. Fixed plans have few: where
-the plan changes, and where rows were lost."""
+FEW_CHANGES, CHANGING_SHARE = 4, 0.05
+"""Number and share of successive greens of other lengths above which that is so. Fixed plans have
+few: two where the plan changes, and two where rows were lost. Greens that follow the traffic may
+nearly all be of the shortest length, or of the longest."""
 
 COUNTABLE = (
     "demand_level",
@@ -191,7 +192,7 @@ def is_actuated(periods: Sequence[Period], tls: str) -> bool:
                 lengths.setdefault(state, []).append(round(end_s - begin_s))
         for of_state in lengths.values():
             changed = sum(abs(one - other) > 1 for one, other in itertools.pairwise(of_state))
-            often = changed > CHANGING_SHARE * (len(of_state) - 1)
+            often = changed > max(FEW_CHANGES, CHANGING_SHARE * (len(of_state) - 1))
             if len({*of_state}) >= MANY_LENGTHS and often:
                 return True
     return False

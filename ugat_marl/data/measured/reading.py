@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections import Counter
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
@@ -449,18 +450,17 @@ def _refuse_impossible_detectors(path: Path, frame: pl.DataFrame) -> None:
 
 def _refuse_names_of_groups(path: Path, frame: pl.DataFrame, kinds: Sequence[str]) -> None:
     """Refuse detectors with the name of a group of others, which effects on it would miss."""
-    rows = frame.select("detector_id", "kind").rows()
-    others = {own: {kind for other, kind in rows if other != own} for own, _ in rows}
+    of_kind = Counter(frame["kind"])
     groups = [
         own
-        for own, kinds_of_others in others.items()
-        if own == "*" or own in kinds_of_others or own.partition("@")[0] in {*kinds} - {own}
+        for own, kind in frame.select("detector_id", "kind").rows()
+        if own == "*" or own.partition("@")[0] in {*kinds} - {own} or of_kind[own] > (kind == own)
     ]
     refuse(
         path,
         frame.filter(pl.col("detector_id").is_in(groups)),
         "detector_id",
-        "is also the name of several detectors, such as all of a kind",
+        "would mean several detectors, such as all of a kind",
         "rename it, here and in the detections",
     )
 
