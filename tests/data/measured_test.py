@@ -449,6 +449,10 @@ WRONG: dict[str, tuple[dict[str, Change], str]] = {
     ),
     "period twice": ({"periods.csv": added("day0,0,200,fit")}, r"'day0' occurs twice"),
     "period backwards": ({"periods.csv": replaced("0.0,200.0", "200,100")}, r"not after begin_s"),
+    "period of another clock": (
+        {"periods.csv": replaced("0.0,200.0", "25200,25400")},
+        r"begin_s '25200.0' is after the end of the scenario .*--begin-s at that time",
+    ),
     "period without demand": ({"periods.csv": replaced("200.0", "900")}, r"demand from 0 s to 200"),
     "unknown split": ({"periods.csv": replaced("heldout", "test")}, r"'test' is unknown"),
     "split for some": ({"periods.csv": replaced("heldout", "")}, r"no split, though others"),

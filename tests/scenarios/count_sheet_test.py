@@ -159,6 +159,15 @@ def test_filled_sheets_are_never_lost(draft: Path, capsys: pytest.CaptureFixture
     assert "would be lost" in capsys.readouterr().err
     assert made(draft, "--force") == 2, "a blank sheet in place of a filled one"
     assert "would be lost" in capsys.readouterr().err
+    another = draft.parent / "another.csv"
+    another.write_bytes(before.replace(b"200", b"210"))
+    for number in (1, 2):
+        held = (draft / "counts.csv").read_bytes()
+        assert made(draft, "--counts", another, "--force") == 0
+        assert (draft / "counts.csv").read_bytes() == another.read_bytes()
+        assert (draft / f"counts-before-{number}.csv").read_bytes() == held
+        another.write_bytes(held.replace(b"200", b"190"))
+    assert (draft / "counts-before-1.csv").read_bytes() == before
 
 
 @pytest.mark.parametrize("head", ["sep=,\n", " ", "my "])

@@ -105,7 +105,7 @@ def test_origins_and_destinations(tmp_path: Path) -> None:
             "edge,count,begin_s,end_s\nwest1_A1,5,07:00,8:00:00\n",
             "begin_s = '07:00' is not a number of at least 0; write seconds: 25200",
         ),
-        ("--counts", "edge,count\nwest1_A1,n/a\n", "of at least 0; leave it blank where nobody"),
+        ("--counts", "edge,count\nwest1_A1,n/a\n", "of at least 0; write whole numbers w"),
         ("--counts", "edge,count\nwest1_A1,-1\n", "line 2: count = '-1' is not a number of at"),
         ("--counts", "edge,count\nwest1_A1,1_000\n", "line 2: count = '1_000' is not a number"),
         ("--counts", "edge,count\nwest1_A1,١٢\n", "line 2: count = '١٢' is not a number"),

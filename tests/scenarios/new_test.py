@@ -415,6 +415,10 @@ def test_nothing_is_overwritten_by_accident(
     assert read_scenario(tmp_path / "a").hash == before
     assert made(tmp_path / "a", *words, "--seed", "9", "--force") == 0
     assert read_scenario(tmp_path / "a").hash != before
+    (tmp_path / "a" / "report.html").touch()
+    error = refused(capsys, tmp_path / "a", *words, "--force")
+    assert "report.html was not made with the scenario, and would be lost" in error
+    (tmp_path / "a" / "report.html").unlink()
     (tmp_path / "photos").mkdir()
     (tmp_path / "photos" / "one.jpg").touch()
     error = refused(capsys, tmp_path / "photos", *words, "--force")

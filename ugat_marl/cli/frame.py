@@ -46,6 +46,9 @@ _PLAIN_WORDS = {
         r"\1 \2: not a whole number"
     ),
     r"^Error parsing (\S+): could not convert string to float: (.*)": r"\1 \2: not a number",
+    r"^Error parsing (\S+): no type matching \{None\}\|FLOAT .* from \['(.*?)'\].*": (
+        r"\1 \2: not a number, such as 600 or 7.5"
+    ),
     r"^invalid choice (.*) for argument '(.*)'\. Expected one of \((.*)\)": (
         r"\2 \1: must be one of \3"
     ),

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import html
 import xml.etree.ElementTree as ET
 from collections import defaultdict
 from collections.abc import Container, Iterable, Mapping, Sequence
@@ -482,7 +483,8 @@ def free_flow_s(lanes: Iterable[Lane]) -> dict[str, float]:
 
 def streets_of(root: ET.Element) -> dict[str, str]:
     """Return road (SUMO's edge) to the name of its street, without roads that have no name."""
-    names = {edge.get("id", ""): edge.get("name", "") for edge in root.iter("edge")}
+    # netconvert escapes the names of a map once more
+    names = {edge.get("id", ""): html.unescape(edge.get("name", "")) for edge in root.iter("edge")}
     return {edge: name for edge, name in names.items() if name}
 
 

@@ -163,7 +163,12 @@ def read_scenario(name: str | Path) -> Scenario:
     shipped = dict(shipped_scenarios())
     if text in shipped:
         return _load_directory(shipped[text])
-    if text and _is_file(path / COUNT_SHEET):
+    if text and _is_file(path / "periods.csv"):
+        raise ScenarioError(
+            f"{path}: is measured data, no scenario; give a directory with scenario.toml (commands "
+            "that read both take the scenario first)"
+        )
+    if text and _is_file(path / COUNT_SHEET) and _is_file(path / "network.net.xml"):
         raise ScenarioError(
             f"{path}: has roads and no vehicles yet; fill in {path / COUNT_SHEET}, and make it "
             "again with --counts, as its README.md says"

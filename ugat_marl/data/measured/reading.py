@@ -371,6 +371,14 @@ def periods_of(path: Path, frame: pl.DataFrame, scenario: Scenario) -> tuple[Per
 def _check_times(path: Path, frame: pl.DataFrame, scenario: Scenario) -> None:
     settings = scenario.settings
     first, last = settings.begin_s, settings.begin_s + settings.duration_s
+    refuse(
+        path,
+        frame.filter(pl.col("begin_s") >= last),
+        "begin_s",
+        f"is after the end of the scenario {scenario.id!r}, which has demand from {first:g} s to "
+        f"{last:g} s",
+        "make the scenario with --begin-s at that time, or write times from its own 0 s on",
+    )
     for column, bad in (
         ("begin_s", pl.col("begin_s") < first),
         ("end_s", pl.col("end_s") > last + 1e-6),
@@ -468,7 +476,12 @@ def _refuse_names_of_groups(path: Path, frame: pl.DataFrame, kinds: Sequence[str
 def _lane_of(where: str, name: str, network: Network) -> Lane:
     lane = network.lanes.get(name)
     if lane is None:
-        near = nearest(name, network.lanes)
+        at_lights = [
+            lane
+            for light in network.intersections
+            for lane in (*light.incoming_lanes, *light.outgoing_lanes)
+        ]
+        near = nearest(name, at_lights or network.lanes)  # where there are detectors: no sidewalks
         raise MeasuredDataError(
             f"{where} lies on lane {name!r}, which the network does not have"
             + (f"; did you mean {near!r}?" if near else "; lanes are called <edge>_<number>")

@@ -213,7 +213,9 @@ def _number(text: str | None, key: str, where: str) -> float:
     if not (math.isfinite(value) and value >= 0):
         way_out = ""
         if key == "count":
-            way_out = "; leave it blank where nobody counted"
+            way_out = (
+                "; write whole numbers without separators, and leave it blank where nobody counted"
+            )
         elif clock := _CLOCK.fullmatch((text or "").strip()):
             hours, minutes, seconds = (int(part or 0) for part in clock.groups())
             way_out = f"; write seconds: {3600 * hours + 60 * minutes + seconds}"
@@ -420,7 +422,7 @@ def _grid_s(rows: Sequence[Row], path: Path) -> float:
         raise ScenarioError(
             f"{path}, line {odd.line}: the interval {odd.begin_s:g} to {odd.end_s:g} s and the "
             f"others have no common step longer than {grid_s:g} s, and {_FINEST_S:g} s are the "
-            "least; write begins and ends in whole minutes"
+            "least; write begin_s and end_s in seconds, as 25200 for 7:00, and in whole minutes"
         )
     return grid_s
 

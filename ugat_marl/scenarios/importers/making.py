@@ -9,17 +9,22 @@ import shutil
 import signal
 import tempfile
 import threading
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence, Set
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
 from ugat_marl.errors import OutputError, ScenarioError, counted
-from ugat_marl.files import put_folder, write_whole
+from ugat_marl.files import put_folder, read_toml, write_whole
 from ugat_marl.progress import Reporter
 from ugat_marl.scenarios.admission import admitted
 from ugat_marl.scenarios.demand import Demand, check_demand
-from ugat_marl.scenarios.importers.count_sheet import CountFit, is_filled, write_template
+from ugat_marl.scenarios.importers.count_sheet import (
+    FIT_SHEET,
+    CountFit,
+    is_filled,
+    write_template,
+)
 from ugat_marl.scenarios.network import Network
 from ugat_marl.scenarios.phases import suited
 from ugat_marl.scenarios.scenario import (
@@ -34,6 +39,8 @@ from ugat_marl.scenarios.settings import validate_settings
 
 NETWORK, ROUTES = "network.net.xml", "demand.rou.xml"
 PICTURES = "pictures"
+KEPT_SHEETS = "counts-before"
+"""Begin of the names of sheets of counts that another one has replaced."""
 """Folder with drawings of the lights, in a folder without vehicles."""
 
 
@@ -363,13 +370,18 @@ def _stopped_in_order() -> Iterator[None]:
 
 
 def _require_counts_kept(made: Path, target: Path) -> None:
-    """Refuse to lose a sheet that was filled in, even with --force."""
+    """Keep a sheet that was filled in: under another name beside a new one, else refuse."""
+    for kept in target.glob(f"{KEPT_SHEETS}*.csv"):
+        shutil.copy2(kept, made)
     old, new = target / COUNT_SHEET, made / COUNT_SHEET
-    if not old.is_file():
+    if not old.is_file() or not is_filled(old):
+        return
+    if new.is_file() and new.read_bytes() == old.read_bytes():
         return
     if new.is_file() and is_filled(new) and (target / "scenario.toml").is_file():
-        return
-    if is_filled(old) and not (new.is_file() and new.read_bytes() == old.read_bytes()):
+        number = len([*made.glob(f"{KEPT_SHEETS}*.csv")]) + 1
+        shutil.copy2(old, made / f"{KEPT_SHEETS}-{number}.csv")
+    else:
         raise OutputError(
             f"{old} would be lost; move it away first, write to another folder, or give it with "
             "--counts where a scenario is made from roads"
@@ -408,14 +420,29 @@ def require_free(target: Path, *, force: bool) -> None:
     if not target.is_dir() or not any(target.iterdir()):
         return
     if (target / COUNT_SHEET).is_file() and not (target / "scenario.toml").exists():
-        known = {COUNT_SHEET, NETWORK, PICTURES, "README.md"}
-        if others := sorted({path.name for path in target.iterdir()} - known):
-            raise OutputError(
-                f"{target / others[0]} was not made with the sheet of counts, and would be lost; "
-                "move it away first"
-            )
+        _require_nothing_else(target, {COUNT_SHEET, NETWORK}, "the sheet of counts")
         return
     if not (target / "scenario.toml").is_file():
         raise OutputError(f"{target} exists and is not a scenario; choose another name")
     if not force:
         raise OutputError(f"scenario {str(target)!r} exists; --force replaces it")
+    with contextlib.suppress(ScenarioError):  # a damaged one names no files
+        named = read_toml(target / "scenario.toml", ScenarioError)
+        files = {"scenario.toml", str(named.get("network")), COUNT_SHEET, FIT_SHEET}
+        for key in ("routes", "additional"):
+            files.update(map(str, named.get(key, ())))
+        _require_nothing_else(target, files, "the scenario")
+
+
+def _require_nothing_else(target: Path, made: Set[str], what: str) -> None:
+    """Refuse to replace a folder that holds files of the user, beside those made with it."""
+    known = {*made, "README.md", PICTURES}
+    others = sorted(
+        name
+        for name in {path.name for path in target.iterdir()} - known
+        if not name.startswith((".", KEPT_SHEETS))
+    )
+    if others:
+        raise OutputError(
+            f"{target / others[0]} was not made with {what}, and would be lost; move it away first"
+        )
