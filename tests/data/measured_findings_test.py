@@ -648,14 +648,27 @@ def counts() -> pl.DataFrame:
     return pl.DataFrame(rows, schema=names, orient="row")
 
 
-def counted(tmp_path: Path) -> Path:
-    base = recording(counts=counts())
+def counted(tmp_path: Path, **columns: float) -> Path:
+    made = counts().with_columns(**{name: pl.lit(value) for name, value in columns.items()})
+    base = recording(counts=made)
     days = tuple(replace(p, signals={}, passages={}) for p in base.periods)
     directory = write_measured(replace(base, periods=days), tmp_path / "street")
     assert not (directory / "detections.parquet").exists()
     assert not (directory / "signals.parquet").exists()
     (directory / CSV_HASHES).unlink()  # tests edit the tables by hand
     return directory
+
+
+def test_what_a_log_of_signals_would_show_is_not_said_to_be_examined(
+    tmp_path: Path, scenario: Scenario, network: Network
+) -> None:
+    read = read_measured(counted(tmp_path, occupancy=0.1), scenario, network)
+    findings = {item.text: item.rules_out for item in read.findings}
+    ruled_out = {name for names in findings.values() for name in names}
+    text = next(text for text in findings if "sums of intervals" in text)
+    examined = text.partition("examined are ")[2].partition(";")[0].split(", ")
+    assert examined and not ruled_out & {*examined}
+    assert "a log of signals would show acceleration" in text
 
 
 def test_counts_alone_can_tell_a_few_things(

@@ -233,8 +233,9 @@ def test_spellings():
             parse_rule(spec)
     with pytest.raises(OptionError, match="headway that ends a green.*'actuated:40:3'"):
         parse_rule("actuated:40:-1")
-    with pytest.raises(OptionError, match="vehicles an hour and lane above 0.*'webster:1800'"):
-        parse_rule("webster:much")
+    for spec in ("webster:much", "webster:90"):  # 90 is meant as a cycle
+        with pytest.raises(OptionError, match="hour and lane of at least 300.*'webster:1800'"):
+            parse_rule(spec)
     with pytest.raises(OptionError, match="random takes no number; write 'random'"):
         parse_rule("random:3")
     with pytest.raises(

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import csv
 import subprocess
 from collections import Counter
 from itertools import pairwise
@@ -248,6 +249,9 @@ def test_intervals_are_on_the_clock_of_the_begin(
     assert within == pytest.approx(inside, abs=2 if lost in (0, 100) else 20)
     note = f"{lost} of the 160 vehicles of c.csv are outside of the episode (25200 to 28800 s)"
     assert (note in (tmp_path / "city" / "README.md").read_text()) is (lost > 0)
+    if kind == "--counts":  # what never drives meets no count
+        with (tmp_path / "city" / "counts-fit.csv").open(encoding="utf-8-sig") as file:
+            assert sum(float(row["driven"]) for row in csv.DictReader(file)) == within
 
 
 @pytest.mark.parametrize(

@@ -302,6 +302,8 @@ def test_blank_rows_of_a_spreadsheet_are_left_out(tmp_path: Path) -> None:
         (HEAD, "no row holds a phase"),
         (HEAD + GOOD.replace("A1,60,0,1,1,E", "A1,70,0,1,1,E"), "line 3: light 'A1' has another"),
         (HEAD + GOOD.replace("A1,60", "A1,70"), "its splits make 60 s and its cycle_s is 70"),
+        (HEAD + GOOD + GOOD.replace(",30,3,2", ",20,3,2", 1).replace(",30,3,2", ",40,3,2", 1),
+         "make them equal; NBT NBR SBT SBR NBL SBL is there twice: a light has one plan"),
         (HEAD + GOOD.replace(",30,3,2\nA1", ",5,3,2\nA1"), "phase 1 (NBT NBR"),
         (HEAD + GOOD.replace(",30,3,2", ",many,3,2", 1), "line 2: split_s = 'many' is not a time"),
         (HEAD + GOOD.replace("60,0,1,1", "60,0,x,1", 1), "line 2: ring = 'x' is not a number"),

@@ -23,9 +23,10 @@ MOST_CONTROLLERS = 3
 MOST_DOMAINS = 6
 """Most domains side by side, for the same reason."""
 LEGEND = (
-    "Mean control delay in s per vehicle that passed the light, and the level of service of the "
-    "Highway Capacity Manual: A to 10 s, B to 20, C to 35, D to 55, E to 80, F above. Vehicles "
-    "that wait outside the network do not count."
+    "Mean control delay in s: what all vehicles on an approach lose, those that still wait at the "
+    "end included, per vehicle that passed the light. Level of service of the Highway Capacity "
+    "Manual: A to 10 s, B to 20, C to 35, D to 55, E to 80, F above. Vehicles that wait outside "
+    "the network do not count, nor do approaches that nobody passed."
 )
 
 Delays = Mapping[str, tuple[float, float]]

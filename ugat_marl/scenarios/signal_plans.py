@@ -147,9 +147,12 @@ def check_plan(plan: SignalPlan, source: str) -> None:
             )
     total = sum(max(rings.values()) for rings in lengths.values())
     if abs(total - plan.cycle_s) > _SAME_S:
+        told = [(phase.ring, phase.barrier, phase.movements) for phase in plan.phases]
+        twice = next((" ".join(one[2]) for one in told if told.count(one) > 1), "")
+        hint = f"; {twice} is there twice: a light has one plan" if twice else ""
         raise ScenarioError(
             f"{where}: its splits make {total:g} s and its cycle_s is {plan.cycle_s:g}; make them "
-            "equal"
+            f"equal{hint}"
         )
 
 

@@ -231,9 +231,14 @@ def _of_counts(measured: MeasuredData, network: Network) -> Iterator[Finding]:
     others = _has_rows(measured.travel_times) or _has_rows(measured.lanes)
     summed = len(missing) < len(more) or others
     shown = {*COUNTABLE, *(SUMMED if summed else ())}
+    unlogged: set[str] = set()
     if any(period.signals for period in measured.periods):
         shown |= {"yellow_time", "all_red_time"}  # they are read off the signals
-    hidden = tuple(sorted(set(known_effects()) - shown))
+    else:
+        unlogged = shown & {*NEEDS_SIGNALS}
+        shown -= unlogged
+    hidden = tuple(sorted(set(known_effects()) - shown - unlogged))
+    with_signals = f"; a log of signals would show {', '.join(sorted(unlogged))} too"
     if not summed:
         yield Finding(
             "counts only, no detections of single vehicles: only "
@@ -244,7 +249,8 @@ def _of_counts(measured: MeasuredData, network: Network) -> Iterator[Finding]:
     else:
         yield Finding(
             "no detections of single vehicles, but sums of intervals: examined are "
-            f"{', '.join(sorted(shown))}; detections would show {', '.join(hidden)} too",
+            f"{', '.join(sorted(shown))}; detections would show {', '.join(hidden)} too"
+            + (with_signals if unlogged else ""),
             hidden,
         )
     if counts is None:

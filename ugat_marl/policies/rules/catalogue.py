@@ -37,12 +37,14 @@ class RuleParameter:
         unit: Unit of the number.
         default: Value if the spelling leaves it out.
         choices: Values that tuning tries.
+        least: Smallest plausible value; smaller ones are mistaken for another number.
     """
 
     name: str
     unit: str
     default: float
     choices: tuple[float, ...]
+    least: float = 0.0
 
 
 @dataclass(frozen=True)
@@ -108,7 +110,11 @@ RULES: Mapping[str, Rule] = {
         Webster,
         (
             RuleParameter(
-                "saturation flow", "vehicles an hour and lane", 1800, (900, 1200, 1500, 1800, 2100)
+                "saturation flow",
+                "vehicles an hour and lane",
+                1800,
+                (900, 1200, 1500, 1800, 2100),
+                300,
             ),
         ),
     ),
@@ -174,10 +180,12 @@ def parse_rule(spec: str) -> tuple[str, tuple[float, ...]]:
             values[place] = parse_decimal(text)
         except ValueError:
             values[place] = math.nan
-        if not 0 < values[place] < math.inf:
+        one = parameters[place]
+        if not 0 < values[place] < math.inf or values[place] < one.least:
+            bound = f"of at least {one.least:g}" if one.least else "above 0"
             raise OptionError(
-                f"rule {spec!r}: {text!r} is not a number of {parameters[place].unit} "
-                f"above 0 ({parameters[place].name}); write for example {example_of(name)!r}"
+                f"rule {spec!r}: {text!r} is not a number of {one.unit} {bound} ({one.name}); "
+                f"write for example {example_of(name)!r}"
             )
     return name, tuple(values)
 

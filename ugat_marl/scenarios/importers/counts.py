@@ -268,13 +268,14 @@ def from_counts(path: Path, begin_s: float, length_s: float, seed: int) -> Vehic
             raise ScenarioError(f"{path}: SUMO's routeSampler found no vehicle for these counts")
         write_drives(folder / ROUTES, sorted(sampled, key=lambda d: (d.depart_s, d.id)))
         names = NamedNetwork(root)
-        fits = _fits(rows, sampled, names)
+        end_s = begin_s + length_s
+        fits = _fits(rows, [d for d in sampled if begin_s <= d.depart_s < end_s], names)
         write_fit(folder / FIT_SHEET, fits, names)
         write_whole(folder / COUNT_SHEET, b"".join(chunks_of(path)))
         notes = (
             _summary(fits, path),
             *_on_the_way(rows, sampled, root),
-            *_about_times(rows, filling, path, begin_s, begin_s + length_s),
+            *_about_times(rows, filling, path, begin_s, end_s),
         )
         return VehicleFiles((ROUTES,), notes, fits=fits)
 
