@@ -223,6 +223,6 @@ def _told(summary: LoopSummary, lights: int) -> str:
     reasons = ", ".join(f"{kind} {count}" for kind, count in summary.reasons.most_common())
     return (
         f"{counted(summary.decisions, 'decision')} for {counted(lights, 'light')}; "
-        f"ready after {low:.1f} ms (median), {high:.1f} ms (95 %), {most:.1f} ms (longest); "
+        f"set after {low:.1f} ms (median), {high:.1f} ms (95 %), {most:.1f} ms (longest); "
         f"fixed time in {summary.fallback_share:.1%}{f' ({reasons})' if reasons else ''}"
     )
