@@ -188,7 +188,7 @@ class Engine:
         scenario: The scenario without effects.
         layout: Lanes and detectors.
         replay: Simulator of one day with SUMO.
-        periods: Measured periods; day ``r`` runs under the signals of that at `place_of` r.
+        periods: Measured periods; `place_of` says under whose signals a day runs.
         seed: Root seed of the days.
         thresholds: Numbers of the method.
         cache: Folder of the cached tallies; None for no cache on disk.
