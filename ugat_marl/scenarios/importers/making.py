@@ -428,10 +428,11 @@ def require_free(target: Path, *, force: bool) -> None:
         raise OutputError(f"scenario {str(target)!r} exists; --force replaces it")
     with contextlib.suppress(ScenarioError):  # a damaged one names no files
         named = read_toml(target / "scenario.toml", ScenarioError)
-        files = {"scenario.toml", str(named.get("network")), COUNT_SHEET, FIT_SHEET}
-        for key in ("routes", "additional"):
-            files.update(map(str, named.get(key, ())))
-        _require_nothing_else(target, files, "the scenario")
+        files = [named.get("network"), *named.get("routes", ()), *named.get("additional", ())]
+        folders = {part for name in files for part in Path(str(name)).parts[:1]}
+        _require_nothing_else(
+            target, {"scenario.toml", COUNT_SHEET, FIT_SHEET, *folders}, "the scenario"
+        )
 
 
 def _require_nothing_else(target: Path, made: Set[str], what: str) -> None:
