@@ -411,18 +411,13 @@ WRONG: dict[str, tuple[dict[str, Change], str]] = {
         {"detectors.csv": added('"a,b",S_C_0,10,0,stop,signals')},
         r"line 6: detector_id 'a,b' has characters that no effect .*leave out commas",
     ),
-    "the name of all": (
-        {"detectors.csv": added("*,S_C_0,10,0,stop,signals")},
-        r"line 6: detector_id '\*' would mean several detectors.*rename it",
-    ),
-    "the name of a kind": (
-        {"detectors.csv": added("stop,S_C_0,10,0,stop,signals")},
-        r"line 6: detector_id 'stop' would mean several detectors.*rename it",
-    ),
-    "the name of a kind on a road": (
-        {"detectors.csv": added("stop@S_C,S_C_0,10,0,stop,signals")},
-        r"line 6: detector_id 'stop@S_C' would mean several detectors.*rename it",
-    ),
+    **{
+        f"the name of a group: {name}": (
+            {"detectors.csv": added(f"{name},S_C_0,10,0,stop,signals")},
+            rf"line 6: detector_id '{re.escape(name)}' would mean several detectors.*rename it",
+        )
+        for name in ("*", "stop", "stop@S_C")
+    },
     "detector beyond the lane": ({"detectors.csv": replaced("90.0", "900")}, r"position_m 900"),
     "zone beyond the lane": ({"detectors.csv": replaced("40.0,2.0", "40,460")}, r"at most"),
     "unknown kind": ({"detectors.csv": replaced("advance", "advanced")}, r"advance, stop, exit"),

@@ -101,6 +101,11 @@ class Evaluation:
         """Names of the domains, in the order they were evaluated."""
         return list(dict.fromkeys(result.domain for result in self.results))
 
+    @property
+    def seeds(self) -> list[int]:
+        """Seeds of the episodes, in the order they were played."""
+        return list(dict.fromkeys(result.seed for result in self.results))
+
     def best_rule(self, domain: str) -> str | None:
         """Return the best rule of a domain, such as ``"sotl:1:2"``; None if none is noted."""
         return self.notes.get(best_rule_note(domain))

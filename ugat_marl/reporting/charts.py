@@ -322,7 +322,7 @@ def travel_times(evaluation: Evaluation) -> dict[str, list[Estimated]]:
 
 def _draw_policies(axes: Any, evaluation: Evaluation) -> None:
     _draw_estimates(axes, evaluation.policies, travel_times(evaluation), "s")
-    seeds = len({result.seed for result in evaluation.results})
+    seeds = len(evaluation.seeds)
     intervals = ", 95 % intervals" if seeds > 1 else ""
     title = f"final policies, {counted(seeds, 'seed')}{intervals}, s"
     axes.set_title(title, color=LIGHT["soft"], x=-178 / _points_wide(axes))

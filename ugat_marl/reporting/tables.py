@@ -19,7 +19,7 @@ from ugat_marl.reporting.terminal import titled_table
 def transfer_table(evaluation: Evaluation) -> RenderableType:
     """Return ATT of every policy in the simulation and the real domains, with gap and regret."""
     first, *others = evaluation.domains
-    several = len({result.seed for result in evaluation.results}) > 1
+    several = len(evaluation.seeds) > 1
     interval = " (95 % interval)" if several else ""
     table = titled_table(f"{evaluation.scenario}: average travel time in s{interval}")
     table.add_column("policy", max_width=22, overflow="fold")
@@ -179,7 +179,7 @@ def _legend(evaluation: Evaluation) -> str:
 
 
 def _seeds(evaluation: Evaluation) -> str:
-    return counted(len({result.seed for result in evaluation.results}), "seed")
+    return counted(len(evaluation.seeds), "seed")
 
 
 def _dim(*cells: str) -> list[Text]:

@@ -459,7 +459,7 @@ def _scores(
         charts.travel_times(evaluation),
         _file_name(record.name, "travel-times"),
     )
-    seeds = len({result.seed for result in evaluation.results})
+    seeds = len(evaluation.seeds)
     caption = "Mean over the episodes with its 95 % interval." if seeds > 1 else "One episode."
     network = places.network if places is not None else None
     check, outcome = check_run(evaluation), outcome_of(evaluation)

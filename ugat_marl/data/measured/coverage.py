@@ -238,7 +238,8 @@ def _of_counts(measured: MeasuredData, network: Network) -> Iterator[Finding]:
         unlogged = shown & {*NEEDS_SIGNALS}
         shown -= unlogged
     hidden = tuple(sorted(set(known_effects()) - shown - unlogged))
-    with_signals = f"; a log of signals would show {', '.join(sorted(unlogged))} too"
+    names = ", ".join(sorted(unlogged))
+    with_signals = f"; a log of signals would show {names} too" if unlogged else ""
     if not summed:
         yield Finding(
             "counts only, no detections of single vehicles: only "
@@ -250,7 +251,7 @@ def _of_counts(measured: MeasuredData, network: Network) -> Iterator[Finding]:
         yield Finding(
             "no detections of single vehicles, but sums of intervals: examined are "
             f"{', '.join(sorted(shown))}; detections would show {', '.join(hidden)} too"
-            + (with_signals if unlogged else ""),
+            f"{with_signals}",
             hidden,
         )
     if counts is None:

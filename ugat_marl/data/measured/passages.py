@@ -316,7 +316,8 @@ def _split(
 def _refuse_copies(path: Path, stream: _Stream, periods: Sequence[Period], detectors: int) -> None:
     """Refuse two periods with the same detections."""
     # One whole number per event: its time in ms, its detector, and whether it is an on.
-    code = np.round(stream.time * 1000).astype(np.int64) * detectors + stream.key % detectors
+    time_ms = np.round(stream.time * 1000).astype(np.int64)
+    code = time_ms * detectors + stream.key % detectors
     code = code * 2 + stream.is_on
     period = stream.key // detectors
     bounds = np.searchsorted(period, np.arange(len(periods) + 1))
@@ -324,8 +325,8 @@ def _refuse_copies(path: Path, stream: _Stream, periods: Sequence[Period], detec
         one.id: np.sort(code[a:b])
         for one, a, b in zip(periods, bounds[:-1], bounds[1:], strict=True)
     }
-    moments = np.bincount(np.round(stream.time * 1000).astype(np.int64) % 1000)
-    most = MOST_SHARED_SECONDS if moments.max() >= 0.9 * len(code) else MOST_SHARED
+    in_seconds = np.bincount(time_ms % 1000).max() >= 0.9 * len(time_ms)
+    most = MOST_SHARED_SECONDS if in_seconds else MOST_SHARED
     for one, other in overlapping(periods):
         begin, end = max(one.begin_s, other.begin_s), min(one.end_s, other.end_s)
         a, b = (_between(events[each.id], begin, end, detectors) for each in (one, other))
