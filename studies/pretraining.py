@@ -2,6 +2,11 @@
 
     python -m studies.pretraining OUT --networks 150 --episodes 800
 
+Every road network has a learner with its own replay memory. All learners share their weights. A
+few road networks are played at a time, and then updates follow, each from the memory of a drawn
+one. So no network is forgotten while others are played (Oroojlooy et al. 2020 train one policy on
+many intersections in the same way).
+
 Road networks are drawn by seeds from `FIRST_SEED` on. Each episode takes the next one of a random
 order, in a world drawn for it: the plain simulation, one of random vehicles and drivers, or one
 with late commands. Every so many episodes the greedy policy plays road networks that it never
@@ -14,7 +19,10 @@ import argparse
 import contextlib
 import sys
 import time
-from collections.abc import Sequence
+from collections.abc import Callable, Mapping, Sequence
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import replace
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -24,20 +32,23 @@ from numpy.typing import NDArray
 from studies.same_options import require_same
 from ugat_marl.cli import guarded
 from ugat_marl.effects import Domain
-from ugat_marl.envs import TrafficEnv, parallel_env
+from ugat_marl.envs import AnyParallelEnv, TrafficEnv, parallel_env
 from ugat_marl.experiments import drawn_effects, effect_ranges
 from ugat_marl.files import write_whole
 from ugat_marl.policies import (
+    DQN,
     UNIVERSAL_NAME,
     DQNConfig,
+    InitialWeights,
+    NetworkPolicy,
     Policy,
-    Pretraining,
     make_rule,
     observed_options,
+    one_thread,
     roll_out,
 )
 from ugat_marl.scenarios import NetworkRanges, Scenario, draw_scenario, read_scenario
-from ugat_marl.seeding import derive_seed, numpy_generator
+from ugat_marl.seeding import derive_seed, numpy_generator, torch_generator
 from ugat_marl.simulation import kept_warm
 
 FIRST_SEED = 100_000
@@ -53,7 +64,10 @@ RULES = ("max-pressure:20", "largest-queue:30")
 """Rules that are played beside the policy in a check."""
 
 OPTIONS = observed_options(UNIVERSAL_NAME)
-"""Options of the environments."""
+"""Options of the environments of the network."""
+
+RULE_OPTIONS = {"observation": "movements"}
+"""Options of the environments of the rules."""
 
 SETTINGS = DQNConfig(
     network="universal",
@@ -70,6 +84,100 @@ AT_A_TIME = 4
 
 SHARES = (0.5, 0.3, 0.2)
 """Shares of episodes in the plain simulation, with random vehicles, and with late commands."""
+
+NEVER = 10**9
+"""Decisions between updates while an episode is played: all updates follow it."""
+
+
+class Pretraining:
+    """A network "universal" that learns on many road networks in turn.
+
+    Args:
+        config: Settings of the learners; ``batch_size`` counts transitions of all agents together,
+            so that an update costs the same on every road network.
+        seed: Root of every random choice.
+
+    Attributes:
+        learners: Learner of each road network that has been played, by its name.
+        episodes: Episodes so far.
+    """
+
+    def __init__(self, config: DQNConfig, seed: int) -> None:
+        self._config = config
+        self._seed = seed
+        self.learners: dict[str, DQN] = {}
+        self.episodes = 0
+
+    def play(self, envs: Mapping[str, AnyParallelEnv], updates: int, epsilon: float) -> None:
+        """Play an episode on each of some road networks, then update from the memories of all.
+
+        The episodes run in threads, all with the same weights, so that the result does not depend
+        on which one ends first.
+
+        Args:
+            envs: Name of each road network, and the network in any domain; its memory goes on.
+            updates: Number of updates.
+            epsilon: Share of exploratory decisions.
+        """
+        playing = {
+            name: self.learners.get(name) or self._new(name, env) for name, env in envs.items()
+        }
+        for learner in playing.values():
+            learner.config = replace(learner.config, epsilon_start=epsilon, epsilon_end=epsilon)
+        with one_thread(), ThreadPoolExecutor(len(playing)) as threads:
+            played = [
+                threads.submit(learner.learn, envs[name], 1, self._seed_of(name))
+                for name, learner in playing.items()
+            ]
+            for episode in played:
+                episode.result()
+            self._update(updates)
+        self.episodes += len(playing)
+
+    def start(self, origin: str) -> InitialWeights:
+        """Return the weights so far.
+
+        Args:
+            origin: How they were learned.
+        """
+        learner = next(iter(self.learners.values()))
+        return InitialWeights(learner.running_weights, learner.env_options, origin)
+
+    def policy(self, env: AnyParallelEnv) -> NetworkPolicy:
+        """Return the greedy policy of the weights so far, for any road network."""
+        learner = DQN.of(env, self._config, self._seed)
+        if self.learners:
+            learner.load_initial_weights(self.start(""))
+        return learner.policy()
+
+    def set_learning_rate(self, rate: float) -> None:
+        """Change the step size of all learners."""
+        for learner in self.learners.values():
+            learner.set_learning_rate(rate)
+
+    def _seed_of(self, name: str) -> int:
+        return derive_seed(self._seed, "pretraining", name)
+
+    def _new(self, name: str, env: AnyParallelEnv) -> DQN:
+        agents = len(env.possible_agents)
+        config = replace(
+            self._config,
+            update_every=NEVER,
+            batch_size=max(1, self._config.batch_size // agents),
+        )
+        learner = DQN.of(env, config, self._seed)
+        if self.learners:
+            learner.share_weights(next(iter(self.learners.values())))
+        self.learners[name] = learner
+        return learner
+
+    def _update(self, updates: int) -> None:
+        """Update from the memories of drawn road networks, one after the other."""
+        known: Sequence[DQN] = list(self.learners.values())
+        choose = numpy_generator(self._seed, "pretraining", "order", self.episodes)
+        sample = torch_generator(self._seed, "pretraining", "sample", self.episodes)
+        for place in choose.integers(len(known), size=updates):
+            known[int(place)].update(sample)
 
 
 @kept_warm()
@@ -88,7 +196,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
     ranges = NetworkRanges(intersections=(1, given.largest))
     networks = drawn_networks(given.out / "networks", FIRST_SEED, given.networks, ranges)
     checked = drawn_networks(given.out / "checked", FIRST_CHECK_SEED, CHECKED, ranges)
-    bars = {rule: played(checked, rule) for rule in RULES}
+    bars = {rule: played(checked, partial(make_rule, rule), RULE_OPTIONS) for rule in RULES}
     best = np.min(list(bars.values()), axis=0)
     lines = ["| episodes | minutes | ATT, s | over the better rule |", "|---:|---:|---:|---:|"]
     for rule, att_s in bars.items():
@@ -101,7 +209,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
         episode, minutes = pretraining.episodes, (time.monotonic() - begin) / 60
         ends = episode >= given.episodes or minutes > given.minutes
         if episode % given.every < AT_A_TIME or ends:
-            att_s = played(checked, pretraining)
+            att_s = played(checked, pretraining.policy, OPTIONS)
             lines.append(
                 f"| {episode} | {minutes:.0f} | {att_s.mean():.1f} | {np.mean(att_s / best):.3f} |"
             )
@@ -159,19 +267,16 @@ def drawn_domain(scenario: Scenario, seed: int) -> Domain:
     return f"execution_delay={decisions * scenario.control.decision_interval_s:g}"
 
 
-def played(scenarios: Sequence[Scenario], policy: str | Pretraining) -> NDArray[np.float64]:
-    """Return the ATT of a rule, or of the network so far, on each road network, in s."""
+def played(
+    scenarios: Sequence[Scenario],
+    policy_for: Callable[[TrafficEnv], Policy],
+    options: Mapping[str, Any],
+) -> NDArray[np.float64]:
+    """Return the ATT of a policy on each road network, in s."""
     att_s: list[float] = []
     for scenario in scenarios:
-        plain: dict[str, Any] = {"observation": "movements"}
-        options = OPTIONS if isinstance(policy, Pretraining) else plain
         with contextlib.closing(parallel_env(scenario, "sim", **options)) as env:
-            acting: Policy
-            if isinstance(policy, Pretraining):
-                acting = policy.policy(env)
-            else:
-                acting = make_rule(policy, env)
-            roll_out(env, acting, 1)
+            roll_out(env, policy_for(env), 1)
             att_s.append(env.scores().att_s)
     return np.array(att_s)
 

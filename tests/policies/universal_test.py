@@ -1,4 +1,4 @@
-"""The network "universal": its definition, its invariances, its start, and pretraining."""
+"""The network "universal": its definition, its invariances, and its start."""
 
 from __future__ import annotations
 
@@ -21,7 +21,6 @@ from ugat_marl.policies import (
     DQNConfig,
     InitialWeights,
     NetworkPolicy,
-    Pretraining,
     export_policy,
     has_first_lessons,
     observed_options,
@@ -191,7 +190,7 @@ def test_an_observation_without_vehicles_is_refused():
         DQN.of(parallel_env("single-v1", observation="pressure"), QUICK)
 
 
-# --- learning, starts and pretraining ------------------------------------------------------------
+# --- learning and starts -------------------------------------------------------------------------
 
 
 def toy_structure() -> Structure:
@@ -281,27 +280,6 @@ def test_learners_that_share_weights_update_the_same_ones():
     dqn = DQN.of(env)
     with pytest.raises(OptionError, match=r"only learners with network = \"universal\""):
         dqn.share_weights(first)
-
-
-def test_pretraining_learns_on_several_networks_and_keeps_a_memory_of_each():
-    envs = {name: parallel_env(name, **OBSERVED) for name in ("single-v1", "arterial1x5-v1")}
-    pretraining = Pretraining(replace(QUICK, warmup_decisions=5, batch_size=20), seed=0)
-    pretraining.play(envs, updates=12, epsilon=0.5)
-    pretraining.play({"single-v1": envs["single-v1"]}, updates=6, epsilon=0.5)
-    assert {name: x.decisions for name, x in pretraining.learners.items()} == {
-        "single-v1": 2 * DECISIONS, "arterial1x5-v1": DECISIONS,
-    }  # fmt: skip
-    assert sum(learner.updates for learner in pretraining.learners.values()) == 18
-    # a batch holds as many transitions of one agent as of five together
-    sizes = {name: x.config.batch_size for name, x in pretraining.learners.items()}
-    assert sizes == {"single-v1": 20, "arterial1x5-v1": 4}
-    start = pretraining.start("a test")
-    assert start.env_options["commands"] == OBSERVED["commands"]
-    elsewhere = DQN.of(parallel_env("mixed-v1", **OBSERVED), QUICK)
-    elsewhere.load_initial_weights(start)
-    assert torch.equal(elsewhere.running_weights, start.weights)
-    for env in envs.values():
-        env.close()
 
 
 OBSERVED = {**observed_options(UNIVERSAL_NAME), "duration_s": 200.0}

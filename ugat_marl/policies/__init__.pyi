@@ -35,7 +35,6 @@ from .learners.library import perceptron as perceptron
 from .learners.library import preserve_random_state as preserve_random_state
 from .learners.library import roll_out_length as roll_out_length
 from .learners.library import seed_generators as seed_generators
-from .learners.pretraining import Pretraining as Pretraining
 from .learners.scaling import InputScale as InputScale
 from .learners.scaling import observation_mask as observation_mask
 from .network_policy import NetworkPolicy as NetworkPolicy
