@@ -270,20 +270,22 @@ class Engine:
         """Return a simulator of the same days, seen by detectors with errors of measurement.
 
         Args:
-            errors: Errors of measurement, which then belong to every model.
+            errors: Errors of measurement, which then belong to every model, and those of `self` no
+                more.
         """
-        if not errors:
-            return self
         other = copy.copy(self)
         other.__dict__.pop("ordinary_days", None)
         other._detection = tuple(errors)
         other._replay = self._replay.detecting(errors)
         return other
 
-    def sightings(self, numbers: Sequence[int], advance: Callable[[], None]) -> list[Sightings]:
-        """Return what single vehicles did at the detectors on days of the scenario as it is.
+    def sightings(
+        self, effects: Sequence[Effect], numbers: Sequence[int], advance: Callable[[], None]
+    ) -> list[Sightings]:
+        """Return what single vehicles did at the detectors on days of a model.
 
         Args:
+            effects: Effects of the model.
             numbers: Numbers of the days.
             advance: Function to call after each day.
 
@@ -295,7 +297,7 @@ class Engine:
             return Sightings.of(self.layout, period, greens, self._thresholds).arrays()
 
         name = f"vehicles-{self._thresholds.of_sightings()}"
-        days = self.reduced((), numbers, name, reduce, advance)
+        days = self.reduced(effects, numbers, name, reduce, advance)
         return [Sightings.from_arrays(arrays) for arrays in days]
 
     def reduced(

@@ -8,7 +8,8 @@ over a zone of length z at speed v needs the time ``d = (L + z) / v``, whoever d
 distance between two detectors is speed times travel time.
 
 The same estimators are applied to simulated days, so that only the differences count. The days are
-those of the scenario as it is. No hypothesis is simulated.
+those of the scenario as it is, and later those of effects that a search has found: slow drivers
+hide where speeds are measured.
 """
 
 from __future__ import annotations
@@ -440,6 +441,11 @@ class DetectorError:
     effect: Effect
     margin: float | None = None
     rival: Effect | None = None
+
+    @property
+    def kind_and_place(self) -> tuple[str | None, ...]:
+        """Name and place of the error, and the point of measurement of speeds."""
+        return (self.effect.name, *(getattr(self.effect, key, None) for key in ("place", "point")))
 
 
 @dataclass(frozen=True)

@@ -102,8 +102,19 @@ class Selector:
         null = self._null(base.model.tallies, len(data), directions, ())
         return replace(base, residual=null.test(data))
 
-    def select(self, located: Located) -> Selected:
-        """Search from the scenario as it is."""
+    def know(self, members: Members) -> None:
+        """Simulate effects that another search has found, so that they are among the rivals."""
+        if members:
+            with contextlib.suppress(OutOfTime):
+                self.kept(self._fitter.simulate(members))
+
+    def select(self, located: Located, ends: Callable[[Tested], bool] | None = None) -> Selected:
+        """Search from the scenario as it is.
+
+        Args:
+            located: The scenario as it is.
+            ends: Function of a better model that does not explain the data; True ends the search.
+        """
         base = best = located.base
         complete = True
         try:
@@ -114,6 +125,8 @@ class Selector:
                 best = improved
                 if best.residual.p > self._alpha:
                     break
+                if ends is not None and ends(best):
+                    return self._selected(best, located, complete=False)
             best = Pruner(self._fitter, self, self._alpha, self._reporter).pruned(best, base)
         except OutOfTime:
             complete = False
@@ -122,6 +135,9 @@ class Selector:
                 best = self._untested(self._that_matter(cheapest, base.model), base)
             elif doubtful(best, self._thresholds.half_interval):
                 best = self._without_doubtful(best, base)
+        return self._selected(best, located, complete=complete)
+
+    def _selected(self, best: Tested, located: Located, *, complete: bool) -> Selected:
         rivals = tuple(sorted(self._seen.values(), key=cost_of))
         return Selected(best, rivals, complete, located.examined | self.examined)
 

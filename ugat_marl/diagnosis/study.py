@@ -158,6 +158,11 @@ class Study:
     _doubts: dict[tuple[Effect, ...], Mapping[str, Array]] = field(default_factory=dict, init=False)
 
     @property
+    def errors_of_detectors(self) -> tuple[Effect, ...]:
+        """The errors of `detection`."""
+        return tuple(error.effect for error in self.detection)
+
+    @property
     def all_days(self) -> tuple[Tally, ...]:
         """Tallies of every measured period, each once."""
         return self.fit + self.heldout if self.measured.of("heldout") else self.fit
@@ -276,26 +281,57 @@ class Study:
             return self
         if not self.measured.has_events:
             return self._occupancies_as_they_are(reporter)
-        numbers = range(min(thresholds.measurement_days, self.effort.base))
-        with reporter.task("the detectors", len(numbers)) as advance:
-            simulated = together(self.engine.sightings(numbers, advance))
-        seen = [
-            Sightings.of(self.layout, period, self.layout.greens(period), thresholds)
-            for period in self.measured.of("fit")
-        ]
-        measurement = Measurement(self.layout.detectors, together(seen), simulated, thresholds)
-        errors = measurement.errors(self.config.leave_out)
+        measurement = self._measurement((), reporter)
         measured = self.measured
         if (points := measurement.contradicted_point()) is not None:
             finding = _of_speed_points(*points)
             reporter.say(f"note: {finding.text}")
             measured = _noted(measured, [finding])
-        if not errors:
-            return replace(self, measured=measured)
+        errors = measurement.errors(self.config.leave_out)
+        return replace(self._detecting(errors) if errors else self, measured=measured)
+
+    def detectors_beside(self, effects: tuple[Effect, ...], reporter: Reporter) -> Study | None:
+        """Find errors of measurement again, on days with the effects that a search has found.
+
+        Errors show where vehicles accelerate, so that drivers who are slower than those of the
+        scenario hide them: speeds at both ends of a passage then differ less.
+
+        Args:
+            effects: The effects, with their values.
+            reporter: Display of progress.
+
+        Returns:
+            The study with these errors; None if the kinds and places of errors are known.
+
+        Raises:
+            OutOfTime: The budget does not suffice for the days to compare with.
+        """
+        if not self.config.thresholds.measurement_days or not self.measured.has_events:
+            return None
+        errors = self._measurement(effects, reporter).errors(self.config.leave_out)
+        known = {error.kind_and_place for error in self.detection}
+        if {error.kind_and_place for error in errors} == known:
+            return None
+        return self._detecting(errors)
+
+    def _measurement(self, effects: tuple[Effect, ...], reporter: Reporter) -> Measurement:
+        """Compare single vehicles of the fitted periods with days of correct detectors."""
+        thresholds = self.config.thresholds
+        numbers = range(min(thresholds.measurement_days, self.effort.base))
+        with reporter.task("the detectors", len(numbers)) as advance:
+            days = self.engine.detecting(()).sightings(effects, numbers, advance)
+        seen = [
+            Sightings.of(self.layout, period, self.layout.greens(period), thresholds)
+            for period in self.measured.of("fit")
+        ]
+        return Measurement(self.layout.detectors, together(seen), together(days), thresholds)
+
+    def _detecting(self, errors: tuple[DetectorError, ...]) -> Study:
+        """Return a study whose simulated days are all seen by detectors with these errors."""
         effects = tuple(error.effect for error in errors)
         other = None if self.other_days is None else self.other_days.detecting(effects)
         engine = self.engine.detecting(effects)
-        return replace(self, measured=measured, engine=engine, other_days=other, detection=errors)
+        return replace(self, engine=engine, other_days=other, detection=errors)
 
     def _occupancies_as_they_are(self, reporter: Reporter) -> Study:
         """Set occupancies aside that do not fit counts and speeds, see `intervals.implausible`.

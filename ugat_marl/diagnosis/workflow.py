@@ -10,14 +10,14 @@ from __future__ import annotations
 
 import shutil
 from collections.abc import Collection, Sequence
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
 
 from ugat_marl.data import MeasuredData, installed_versions
 from ugat_marl.diagnosis.engine import OutOfTime
-from ugat_marl.diagnosis.hypotheses import WINDOW
+from ugat_marl.diagnosis.hypotheses import WINDOW, Members
 from ugat_marl.diagnosis.locate import disagreements, locate_gap
 from ugat_marl.diagnosis.patterns import unnamed_effects
 from ugat_marl.diagnosis.places import Routes
@@ -46,6 +46,7 @@ from ugat_marl.diagnosis.records import (
     Verdict,
     Verified,
 )
+from ugat_marl.diagnosis.select import Selector
 from ugat_marl.diagnosis.signal_timing import IN_THE_LOG, timing_effects
 from ugat_marl.diagnosis.study import DiagnosisConfig, Study
 from ugat_marl.diagnosis.traffic import traffic_check
@@ -178,34 +179,95 @@ def _diagnosed(
     Returns:
         The record, and the effects of the corrected scenario besides those of the signal log.
     """
-    errors: tuple[Effect, ...] = ()
     try:
         study = study.detectors_as_they_are(reporter)
-        errors = tuple(error.effect for error in study.detection)
         base = study.base(reporter)
         study = study.with_empty_start_finding(base, reporter)
     except OutOfTime:
-        return _nothing_simulated(study, timing), errors
-    diagnosis, searched = _all_stages(study, base, timing, reporter)
-    return diagnosis, (*errors, *searched)
+        return _nothing_simulated(study, timing), study.errors_of_detectors
+    search = _searched(study, base, reporter)
+    diagnosis, effects = _concluded(search, timing, reporter)
+    return diagnosis, (*search.study.errors_of_detectors, *effects)
 
 
-def _all_stages(
-    study: Study, base: Tested, timing: tuple[Effect, ...], reporter: Reporter
+@dataclass(frozen=True, eq=False)
+class _Search:
+    """A search for effects.
+
+    Attributes:
+        study: The study, with the errors of detectors that all of its days have.
+        located: The scenario as it is, and where the data contradict it.
+        selector: What searched.
+        selected: What it found; None if the scenario as it is could have made the data.
+    """
+
+    study: Study
+    located: Located
+    selector: Selector
+    selected: Selected | None
+
+
+def _searched(
+    study: Study,
+    base: Tested,
+    reporter: Reporter,
+    known: Members = (),
+    *,
+    once_more: bool = True,
+) -> _Search:
+    """Search for effects, and once more if those found show other errors of the detectors.
+
+    Args:
+        study: The study.
+        base: The scenario as it is.
+        reporter: Display of progress.
+        known: Effects that an earlier search has found.
+        once_more: False to take the errors of the detectors as they are.
+    """
+    selector = study.selector(base, reporter)
+    located = locate_gap(study, base, selector)
+    if located.base.residual.p > study.config.alpha:
+        return _Search(study, located, selector, None)
+    selector.know(known)
+    others: list[tuple[Study, Tested]] = []
+
+    def shows_others(best: Tested) -> bool:
+        """Return True if the effects show other errors, with which the data are nearer."""
+        other = study.detectors_beside(best.model.effects, reporter)
+        if other is None:
+            return False
+        its_base = other.base(reporter)
+        cost, its_cost = (
+            one.fitter(start).simulate(best.model.members).cost
+            for one, start in ((study, base), (other, its_base))
+        )
+        if cost - its_cost > study.config.thresholds.price:
+            others.append((other, its_base))
+        return bool(others)
+
+    selected = selector.select(located, shows_others if once_more else None)
+    for other, its_base in others:
+        errors = describe_errors(other.detection) if other.detection else "no detector errs"
+        reporter.say(f"note: beside these effects {errors}; the search begins again")
+        members = selected.best.model.members
+        return _searched(other, its_base, reporter, members, once_more=False)
+    return _Search(study, located, selector, selected)
+
+
+def _concluded(
+    search: _Search, timing: tuple[Effect, ...], reporter: Reporter
 ) -> tuple[Diagnosis, tuple[Effect, ...]]:
-    """Run all stages after the simulation of the scenario as it is.
+    """Verify what a search found, and conclude.
 
     Returns:
         The record, and the effects of the corrected scenario besides those of the signal log and
         of the detectors; none if it is not corrected.
     """
-    selector = study.selector(base, reporter)
-    located = locate_gap(study, base, selector)
-    if located.base.residual.p > study.config.alpha:
+    study, located, selected = search.study, search.located, search.selected
+    if selected is None:
         verified = verify_model(study, located.base, located.base)
         conclusion = _unchallenged(study, located, verified, timing)
         return _record(study, timing, located, None, verified, conclusion), ()
-    selected = selector.select(located)
 
     def told(conclusion: Conclusion) -> Conclusion:
         """Say first what is wrong with the detectors."""
@@ -220,7 +282,7 @@ def _all_stages(
             conclude(
                 located,
                 selected,
-                selector,
+                search.selector,
                 verified,
                 study.config,
                 study.layout,

@@ -8,7 +8,7 @@ import pytest
 
 from ugat_marl.diagnosis import DiagnosisConfig, Study
 from ugat_marl.diagnosis.thresholds import Effort
-from ugat_marl.effects import load_scenario
+from ugat_marl.effects import load_scenario, parse_domain
 from ugat_marl.experiments import policy_factory, record
 from ugat_marl.progress import Silent
 
@@ -23,12 +23,22 @@ FAMILIES = {
 DRIVERS = ("acceleration=1.2", "headway=1.5", "desired_speed=0.8", "heavy_share=0.2")
 
 
-def read_off(street, domain: str) -> list[str]:
-    measured = street.measure(domain, periods=3)
+SLOW_STARTERS = "acceleration=0.8"
+
+
+def study_of(street, domain: str) -> Study:
     effort = Effort(base=32, bank=2, fit=5, test=16)
     config = DiagnosisConfig(effort=effort, cache=street.cache, budget_s=3600.0)
-    study = Study.of(street.scenario, measured, config).detectors_as_they_are(Silent())
+    study = Study.of(street.scenario, street.measure(domain, periods=3), config)
+    return study.detectors_as_they_are(Silent())
+
+
+def errors_in(study: Study) -> list[str]:
     return [str(error.effect) for error in study.detection]
+
+
+def read_off(street, domain: str) -> list[str]:
+    return errors_in(study_of(street, domain))
 
 
 @pytest.mark.parametrize("family", FAMILIES)
@@ -45,6 +55,23 @@ def test_an_error_of_measurement_is_read_off(street, family: str) -> None:
 @pytest.mark.parametrize("domain", ["sim", *DRIVERS])
 def test_drivers_are_no_error_of_measurement(street, domain: str) -> None:
     assert read_off(street, domain) == []
+
+
+def test_drivers_that_are_found_are_no_error_of_measurement(street) -> None:
+    for domain in DRIVERS:
+        study = study_of(street, domain)
+        assert study.detectors_beside(parse_domain(domain), Silent()) is None, domain
+
+
+def test_slow_drivers_hide_where_speeds_are_measured_until_they_are_found(street) -> None:
+    domain = f"{SLOW_STARTERS}+detector_speeds=stop@S_C,front"
+    study = study_of(street, domain)
+    assert errors_in(study) == []
+    beside = study.detectors_beside(parse_domain(SLOW_STARTERS), Silent())
+    assert beside is not None
+    assert errors_in(beside) == ["detector_speeds=stop@S_C,front"]
+    # from here on they are known, and days are not seen by two of them
+    assert beside.detectors_beside(parse_domain(SLOW_STARTERS), Silent()) is None
 
 
 def test_splash_is_read_off_where_lanes_lie_side_by_side(street) -> None:
