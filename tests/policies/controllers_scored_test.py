@@ -8,7 +8,13 @@ import numpy as np
 import pytest
 
 from ugat_marl.policies import ControlledNetwork
-from ugat_marl.policies.rules.phase_scores import LongestWaiting, MaxPressure, MaxPressureLoss
+from ugat_marl.policies.rules.actuated import Actuated
+from ugat_marl.policies.rules.phase_scores import (
+    LargestQueue,
+    LongestWaiting,
+    MaxPressure,
+    MaxPressureLoss,
+)
 from ugat_marl.policies.rules.sotl import SelfOrganising
 from ugat_marl.scenarios import Intersection, Link
 
@@ -100,3 +106,30 @@ def test_impatience_waits_for_the_shortest_green():
     rule = SelfOrganising(streets(), threshold=10, hold_s=30)
     busy = movements(9, 9, 9)
     assert shown_by(rule, *[busy] * 8) == [1, 1, 1, 0, 0, 0, 1, 1]
+
+
+@pytest.mark.parametrize("hold_s", [10, 20])
+@pytest.mark.parametrize(
+    "kind", [LargestQueue, MaxPressure, LongestWaiting, SelfOrganising, Actuated]
+)
+def test_a_right_turn_that_is_always_green_does_not_serve_those_who_go_straight_on(
+    kind: Any, hold_s: float
+) -> None:
+    links = (
+        Link(0, "n_0", "out_0", "s"),
+        Link(1, "n_0", "out_0", "r"),
+        Link(2, "w_0", "out_0", "s"),
+    )
+    item = Intersection("x", ("n_0", "w_0"), ("out_0",), links, ("GGr", "rGG"), (), (), (0.0, 0.0))
+    network = ControlledNetwork({AGENT: item}, CAPACITY, dict.fromkeys(CAPACITY, 20.0), 10.0, 5.0)
+    options = {"threshold": 100} if kind is SelfOrganising else {}
+    rule = kind(network, hold_s=hold_s, **options) if kind is not Actuated else kind(network)
+
+    def seen(north: int, west: int, shown: int) -> dict[str, Any]:
+        counts = np.array([north / 40, west / 20])
+        features = [counts] if kind is LongestWaiting else [counts, counts, [0.0]]
+        return {AGENT: np.concatenate([*features, np.eye(2)[shown]]).astype(np.float32)}
+
+    chosen = shown_by(rule, *[seen(0, 5, 1)] * 2, *[seen(8, 0, 1)] * 6)
+    assert chosen[:2] == [1, 1]
+    assert 0 in chosen

@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 
 from ugat_marl.envs import WAITING_SCALE_S, AnyParallelEnv, Infos
 from ugat_marl.errors import OptionError
-from ugat_marl.scenarios import GREEN, Intersection, Network, free_flow_s
+from ugat_marl.scenarios import GREEN, Intersection, Link, Network, free_flow_s
 
 MOST_SEARCHED_PHASES = 12
 """Largest number of phases for an exhaustive search of the smallest cover.
@@ -118,7 +118,8 @@ class Approach:
         outgoing: Number of outgoing lanes.
         capacity: Vehicles that fit on each lane, ``(lanes,)``.
         free_flow_s: Seconds along the counted length of each lane at the speed limit, ``(lanes,)``.
-        served: True where a phase shows green to a link of a lane, ``(phases, lanes)``.
+        served: True where a phase shows green to a link for which a lane waits, see
+            `awaited_links`, ``(phases, lanes)``.
         cycle: A smallest set of phases that serves every link.
     """
 
@@ -132,15 +133,16 @@ class Approach:
     @classmethod
     def of(cls, intersection: Intersection, network: ControlledNetwork) -> Approach:
         """Collect the lanes and phases of one intersection."""
-        lanes = list(intersection.incoming_lanes)
-        served = np.zeros((len(intersection.phases), len(lanes)), np.bool_)
-        for row, phase in enumerate(intersection.phases):
-            green = green_indices(intersection, phase)
-            for link in intersection.links:
-                if link.index in green:
-                    served[row, lanes.index(link.from_lane)] = True
+        lanes = intersection.incoming_lanes
+        awaited = awaited_links(intersection)
+        served = np.array(
+            [
+                [any(phase[link.index] in GREEN for link in awaited[lane]) for lane in lanes]
+                for phase in intersection.phases
+            ]
+        )
         return cls(
-            tuple(lanes),
+            lanes,
             len(intersection.outgoing_lanes),
             np.array([network.capacity[lane] for lane in lanes]),
             np.array([network.free_flow_s[lane] for lane in lanes]),
@@ -192,6 +194,23 @@ def permitted(wanted: int, allowed: NDArray[np.bool_]) -> int:
 def green_indices(intersection: Intersection, phase: str) -> frozenset[int]:
     """Return the indices of the links that are green in a phase."""
     return frozenset(link.index for link in intersection.links if phase[link.index] in GREEN)
+
+
+def awaited_links(intersection: Intersection) -> dict[str, list[Link]]:
+    """Return the links of each incoming lane for which its vehicles wait.
+
+    A right turn that every phase of the cycle serves is none of them. On a lane that it shares,
+    vehicles that go straight on wait all the same, and others behind them. A lane that has only
+    such links keeps them.
+    """
+    cycle = covering_phases(intersection)
+    phases = [intersection.phases[i] for i in cycle] if len(cycle) > 1 else intersection.phases
+    always = frozenset.intersection(*(green_indices(intersection, phase) for phase in phases))
+    awaited: dict[str, list[Link]] = {}
+    for lane in intersection.incoming_lanes:
+        links = [link for link in intersection.links if link.from_lane == lane]
+        awaited[lane] = [link for link in links if link.index not in always] or links
+    return awaited
 
 
 def covering_phases(intersection: Intersection) -> tuple[int, ...]:

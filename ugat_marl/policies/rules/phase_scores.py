@@ -10,12 +10,13 @@ from numpy.typing import NDArray
 
 from ugat_marl.envs import WAITING_SCALE_S, Actions, Infos, Observations
 from ugat_marl.policies.rules.approaches import (
+    Approach,
     ControlledNetwork,
     allowed_phases,
+    awaited_links,
     check_length,
-    green_indices,
 )
-from ugat_marl.scenarios import Intersection
+from ugat_marl.scenarios import GREEN, Intersection
 
 
 class _Scored:
@@ -81,7 +82,7 @@ class _Scored:
 class LargestQueue(_Scored):
     """Serve the phase whose incoming lanes hold the most halting vehicles.
 
-    A phase serves a lane when one of the lane's links is green in it; a lane counts once.
+    A phase serves a lane when a link is green in it for which the lane waits; a lane counts once.
 
     Args:
         network: The controlled network.
@@ -91,8 +92,8 @@ class LargestQueue(_Scored):
     def __init__(self, network: ControlledNetwork, hold_s: float = 20.0) -> None:
         self.hold_s = hold_s
         weights = {
-            agent: _queue_weights(intersection, network.capacity)
-            for agent, intersection in network.intersections.items()
+            agent: _of_halting(approach, approach.served * approach.capacity)
+            for agent, approach in network.approaches.items()
         }
         super().__init__(network, weights, hold_s)
 
@@ -101,9 +102,10 @@ class MaxPressure(_Scored):
     """Serve the phase of highest pressure (Varaiya 2013).
 
     The pressure of a phase is a sum over the incoming lanes that it serves. Each lane adds its
-    vehicles minus the mean number of vehicles on the lanes that its green links lead to. The mean
-    replaces the turning shares, which a controller does not know. If every lane has one link, the
-    pressure is the sum over links of upstream minus downstream vehicles.
+    vehicles minus the mean number of vehicles on the lanes that its green links lead to; links that
+    every phase serves are left out. The mean replaces the turning shares, which a controller does
+    not know. If every lane has one link, the pressure is the sum over links of upstream minus
+    downstream vehicles.
 
     Args:
         network: The controlled network.
@@ -164,22 +166,12 @@ class LongestWaiting(_Scored):
         super().__init__(network, weights, hold_s)
 
 
-def _queue_weights(
-    intersection: Intersection, capacity: Mapping[str, float]
-) -> NDArray[np.float64]:
-    """Return weights that add up the halting vehicles a phase serves.
+def _of_halting(approach: Approach, weights: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Return weights of halting vehicles, ``(phases, lanes)``, as those of `movements`.
 
-    The shape is ``(phases, 2 * incoming + outgoing)``, as the features of `movements`.
+    The shape is ``(phases, 2 * incoming + outgoing)``.
     """
-    incoming = list(intersection.incoming_lanes)
-    weights = np.zeros(
-        (len(intersection.phases), 2 * len(incoming) + len(intersection.outgoing_lanes))
-    )
-    for row, phase in enumerate(intersection.phases):
-        green = green_indices(intersection, phase)
-        for lane in {link.from_lane for link in intersection.links if link.index in green}:
-            weights[row, incoming.index(lane)] = capacity[lane]
-    return weights
+    return np.pad(weights, ((0, 0), (0, len(approach.lanes) + approach.outgoing)))
 
 
 def _pressure_weights(
@@ -191,14 +183,10 @@ def _pressure_weights(
     """
     incoming, outgoing = list(intersection.incoming_lanes), list(intersection.outgoing_lanes)
     weights = np.zeros((len(intersection.phases), 2 * len(incoming) + len(outgoing)))
+    awaited = awaited_links(intersection)
     for row, phase in enumerate(intersection.phases):
-        green = green_indices(intersection, phase)
         for lane in incoming:
-            links = [
-                link
-                for link in intersection.links
-                if link.from_lane == lane and link.index in green
-            ]
+            links = [link for link in awaited[lane] if phase[link.index] in GREEN]
             targets = sorted({link.to_lane for link in links})
             if targets:
                 weights[row, len(incoming) + incoming.index(lane)] = capacity[lane]
