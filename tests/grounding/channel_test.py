@@ -34,14 +34,16 @@ def obeyed(command: int | None, running: int, allowed: Sequence[int]) -> int:
 
 
 def log_of(
-    lag: int = 0,
+    lag: int | dict[str, int] = 0,
     lost: float = 0.0,
     mask: Mask = anything,
     told: bool = True,
     rows: dict[str, int] | None = None,
     seed: int = 0,
+    hold: int = 1,
 ) -> TransitionLog:
-    """Return a log of random commands that a street with these faults executed."""
+    """Return a log of random commands, each of `hold` decisions, that a street with faults ran."""
+    lags = lag if isinstance(lag, dict) else dict.fromkeys(AGENTS, lag)
     generator = np.random.default_rng(seed)
     recorder = TransitionRecorder(
         Provenance("by hand", "", "street", (), INTERVAL_S, "count", LAYOUTS)
@@ -55,9 +57,11 @@ def log_of(
         executed: dict[str, int] = {}
         for agent in AGENTS:
             choices = np.flatnonzero(masks[agent]) if told else np.arange(PHASES)
-            asked[agent] = int(generator.choice(choices))
+            holds = step % hold > 0 and given[agent][-1] in choices
+            asked[agent] = given[agent][-1] if holds else int(generator.choice(choices))
             given[agent].append(asked[agent])
-            arrives = given[agent][-1 - lag] if len(given[agent]) > lag else None
+            late = lags[agent]
+            arrives = given[agent][-1 - late] if len(given[agent]) > late else None
             if generator.random() < lost:
                 arrives = None
             executed[agent] = obeyed(arrives, running[agent], mask(running[agent], age[agent]))
@@ -100,6 +104,27 @@ def test_a_delay_of_two_decisions_with_lost_commands_is_recovered(told: bool) ->
     assert channel.network[2] == pytest.approx(0.8, abs=0.05)
     assert channel.memory == 2
     assert "2 decisions late" in channel.describe()
+
+
+@pytest.mark.parametrize("told", [True, False])
+@pytest.mark.parametrize("punctual", AGENTS)
+def test_a_light_with_late_commands_tells_nothing_of_a_punctual_one(
+    punctual: str, told: bool
+) -> None:
+    lags = {agent: 0 if agent == punctual else 2 for agent in AGENTS}
+    channel = fit_channel(log_of(lag=lags, told=told, hold=3))
+    for agent, weights, table in zip(AGENTS, channel.weights, channel.tables, strict=True):
+        assert weights[lags[agent]] > 0.8, agent
+        assert table[1:].all(), agent
+
+
+def test_masks_of_each_light_are_read_with_its_own_delay() -> None:
+    lags = {"a_0": 0, "b_0": 2}
+    following = fit_channel(
+        log_of(lag=lags, mask=lambda running, _: (running, (running + 1) % PHASES), hold=2)
+    )
+    wanted = np.eye(PHASES, dtype=bool) | np.roll(np.eye(PHASES, dtype=bool), 1, axis=1)
+    assert np.array_equal(following.tables[0][2], wanted)
 
 
 def test_an_order_of_phases_is_read_off_the_masks() -> None:

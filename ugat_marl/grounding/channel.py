@@ -40,6 +40,8 @@ LEAST_WHOLE = 0.2
 of their episode as the longest delay of a command."""
 UNEXPLAINED = 1e-3
 """Chance of a decision that no lag explains."""
+ROUNDS = 200
+"""Most rounds of expectation-maximisation, which ends when the weights stay as they are."""
 Table = NDArray[np.bool_]
 """Permitted phases of an intersection, bool ``(ages, phases, phases)``: entry (a, p, j) is True if
 phase j may run next while p has run for a decisions; row 0 is not used."""
@@ -337,13 +339,17 @@ def fit_channel(
     masked = all(course.mask is not None for course in courses)
     tables = [course.table_of_masks(0) if masked else course.free_table() for course in courses]
     network, counts = _mixture(courses, tables, config)
-    lag = int(network[:-1].argmax())
-    if masked and lag:  # a mask is of the state in which the command will arrive
-        tables = [course.table_of_masks(lag) for course in courses]
-    elif not masked:
-        obeyed = float(network[lag])
-        tables = [course.table_of_refusals(lag, obeyed, config) for course in courses]
-    if not masked or lag:
+    weights = config.pull * network + counts
+    weights /= weights.sum(1, keepdims=True)
+    lags = [int(own[:-1].argmax()) for own in weights]
+    if not masked:
+        tables = [
+            course.table_of_refusals(lag, float(own[lag]), config)
+            for course, own, lag in zip(courses, weights, lags, strict=True)
+        ]
+    elif any(lags):  # a mask is of the state in which the command will arrive
+        tables = [course.table_of_masks(lag) for course, lag in zip(courses, lags, strict=True)]
+    if not masked or any(lags):
         network, counts = _mixture(courses, tables, config)
     return CommandChannel(tuple(log.agents), network, counts, tuple(tables), config.pull)
 
@@ -522,7 +528,7 @@ def _mixture(
     rows = np.concatenate(explains, axis=1)
     if not rows.shape[1]:
         weights = np.eye(kinds)[0]
-        return weights, _shares(explains, weights)
+        return weights, np.zeros((len(courses), kinds))
     # A lost command keeps the phase of the decision before, which a further lag explains almost as
     # well. So lags are added one by one, as long as they explain more than chance does.
     support: set[int] = {kinds - 1}
@@ -538,7 +544,7 @@ def _mixture(
             break
     weights = np.where(weights >= min(config.least_share, weights.max()), weights, 0.0)
     weights /= weights.sum()
-    return weights, _shares(explains, weights)
+    return weights, np.stack([_own_counts(same, weights, config.pull) for same in explains])
 
 
 def _maximum(rows: NDArray[np.bool_], support: set[int]) -> tuple[float, Floats]:
@@ -549,8 +555,8 @@ def _maximum(rows: NDArray[np.bool_], support: set[int]) -> tuple[float, Floats]
         support: Kinds that may have a weight.
     """
     weights = np.array([float(kind in support) for kind in range(len(rows))]) / len(support)
-    for _ in range(200):
-        weights, before = _shares([rows], weights)[0], weights
+    for _ in range(ROUNDS):
+        weights, before = _counts(rows, weights), weights
         weights = weights / weights.sum() if weights.sum() else before
         if np.abs(weights - before).max() < 1e-6:
             break
@@ -558,11 +564,29 @@ def _maximum(rows: NDArray[np.bool_], support: set[int]) -> tuple[float, Floats]
     return float(np.log(np.maximum(chances, UNEXPLAINED)).sum()), weights
 
 
-def _shares(explains: Sequence[NDArray[np.bool_]], weights: Floats) -> Floats:
-    """Return the expected number of decisions of each kind, ``(agents, kinds)`` (the E step)."""
-    found = np.zeros((len(explains), len(weights)))
-    for row, same in zip(found, explains, strict=True):
-        chances = same * weights[:, None]
-        total = chances.sum(0)
-        row += (chances[:, total > 0] / total[total > 0]).sum(1)
-    return found
+def _own_counts(rows: NDArray[np.bool_], network: Floats, pull: float) -> Floats:
+    """Return the expected number of decisions of each kind at an intersection, ``(kinds,)``.
+
+    Its own weights say which of several lags made a decision. Those of the network would say of a
+    light with late commands that most of them came in time.
+
+    Args:
+        rows: Kinds that explain each decision, ``(kinds, n)``.
+        network: Weights of the network.
+        pull: Number of decisions that the weights of the network count as.
+    """
+    counts, weights = np.zeros(len(rows)), network
+    for _ in range(ROUNDS):
+        counts = _counts(rows, weights)
+        after = (pull * network + counts) / (pull + counts.sum())
+        if np.abs(after - weights).max() < 1e-6:
+            break
+        weights = after
+    return counts
+
+
+def _counts(rows: NDArray[np.bool_], weights: Floats) -> Floats:
+    """Return the expected number of decisions of each kind, ``(kinds,)`` (the E step)."""
+    chances = rows * weights[:, None]
+    total = chances.sum(0)
+    return (chances[:, total > 0] / total[total > 0]).sum(1)
