@@ -28,7 +28,12 @@ from rich.table import Table
 from ugat_marl.cli import guarded
 from ugat_marl.envs import parallel_env
 from ugat_marl.errors import OptionError, UgatMarlError
-from ugat_marl.policies import BASELINES, learner_factory, learner_library
+from ugat_marl.policies import (
+    BASELINES,
+    learner_factory,
+    learner_library,
+    require_known_learner,
+)
 from ugat_marl.testing import ToyTraffic
 
 EPISODES = 3
@@ -85,7 +90,7 @@ class Compat:
 
     def __post_init__(self) -> None:
         for name in self.learners:
-            learner_library(name)  # an unknown name is an error before anything trains
+            require_known_learner(name)  # an unknown name is an error before anything trains
 
     def run(self) -> int:
         """Run the command; return 1 if something failed."""

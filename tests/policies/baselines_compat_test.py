@@ -11,6 +11,7 @@ from typing import Any
 
 import pytest
 
+from ugat_marl.errors import UnknownNameError
 from ugat_marl.policies import BASELINES
 from ugat_marl.policies.learners.catalogue import baselines_folder
 
@@ -81,6 +82,11 @@ def test_what_crashes_or_hangs_is_a_cell(monkeypatch: pytest.MonkeyPatch) -> Non
     monkeypatch.setattr(compat, "__file__", str(FILE))
     monkeypatch.setattr(compat, "PATIENCE_S", 0.01)
     assert all("no end within" in text for text in compat.in_a_process("ippo").values())
+
+
+def test_an_unknown_learner_is_refused_before_anything_trains() -> None:
+    with pytest.raises(UnknownNameError, match="ipo"):
+        compat.Compat(learners=("ipo",))
 
 
 def test_every_learner_is_in_the_matrix() -> None:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import importlib.util
+import json
 import pickle
 from dataclasses import replace
 from pathlib import Path
@@ -211,6 +212,10 @@ def test_what_cannot_be_read_is_refused_with_the_way_out():
     for wrapped in (frame_stack(env, 2), pad_spaces(parallel_env("mixed-v1"))):
         with pytest.raises(OptionError, match=r"network 'frap'"):
             DQN.of(wrapped, QUICK)
+    for size in (2, 40):
+        own = parallel_env("single-v1", observation=lambda _, n=size: np.zeros(n, np.float32))
+        with pytest.raises(OptionError, match=r"'frap' cannot tell what .* function are"):
+            DQN.of(own, QUICK)
     with pytest.raises(OptionError, match=r"network = 'frap' with the structure of 'mlp'"):
         DQN(BOTH, QUICK)
     assert isinstance(learner_factory("dqn", dqn=QUICK)(env, 1), DQN)
@@ -327,6 +332,18 @@ def test_a_policy_file_with_a_broken_structure_is_refused(tmp_path: Path):
         torch.save({**whole, "structure": structure}, path)
         with pytest.raises(CheckpointError, match=r"policy\.pt: (not a whole policy|.* holds NaN)"):
             NetworkPolicy.load(path)
+
+
+def test_exports_of_equal_weights_at_other_junctions_are_two_policies(tmp_path: Path):
+    agents, structure = AgentSet.of(ToyTraffic()), toy_structure()
+    first, *rest = structure.junctions
+    other = replace(structure, junctions=(replace(first, greens=first.greens[::-1]), *rest))
+    sums: set[str] = set()
+    for number, one in enumerate((structure, structure, other)):
+        policy = DQN(agents, QUICK, 0, structure=one).policy()
+        about = export_policy(policy, tmp_path / f"policy{number}.ts")
+        sums.add(json.loads(about.read_text())["parameters"])
+    assert len(sums) == 2
 
 
 def test_it_is_exported_to_torchscript_and_refused_elsewhere(tmp_path: Path):

@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 import torch
 
-from ugat_marl.envs import TrafficEnv, parallel_env
+from ugat_marl.envs import TrafficEnv, frame_stack, parallel_env
 from ugat_marl.errors import OptionError, UnknownNameError
 from ugat_marl.policies import (
     DQN,
@@ -75,6 +75,13 @@ def test_where_no_rule_reads_the_observations_there_are_no_lessons() -> None:
         named = DQN.of(env, SETTINGS, 0)
         with pytest.raises(OptionError, match="train in such ones, or leave the teacher out"):
             named.attend(env, 0)
+
+
+def test_no_rule_teaches_where_observations_are_stacked(env: TrafficEnv) -> None:
+    stacked = frame_stack(env, 3)
+    learner = DQN.of(stacked, replace(SETTINGS, network="mlp", teacher=BEST), 0)
+    assert learner.plays(stacked) == 0
+    assert learner.attend(stacked, 0) is None
 
 
 def test_a_learner_acts_as_its_teacher_before_its_first_episode(env: TrafficEnv) -> None:

@@ -12,6 +12,7 @@ import re
 import subprocess
 import sys
 from collections import OrderedDict, deque
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from types import SimpleNamespace
@@ -350,9 +351,31 @@ class Closing:
         return lambda observations: chosen(observations)
 
 
-def test_later_learning_does_not_change_a_policy_that_is_a_function() -> None:
+class Holder:
+    """A policy that asks a function it holds, as many layers down as it is told."""
+
+    def __init__(self, choose: Any, layers: int = 1) -> None:
+        self.choose = Holder(choose, layers - 1).act if layers > 1 else choose
+
+    def act(self, observations: Any) -> Any:
+        return self.choose(observations)
+
+
+class ClosingPartly(Closing):
+    def policy(self) -> Any:
+        chosen = super().policy()
+        return functools.partial(lambda add, observations: chosen(observations), 1)
+
+
+class ClosingInside(Closing):
+    def policy(self) -> Any:
+        return Holder(super().policy(), layers=2)
+
+
+@pytest.mark.parametrize("kind", [Closing, ClosingPartly, ClosingInside])
+def test_later_learning_does_not_change_a_policy_that_is_a_function(kind: Any) -> None:
     env = ToyTraffic()
-    learner = OwnLearnerFactory(own_name(Closing))(env, 0)
+    learner = OwnLearnerFactory(own_name(kind))(env, 0)
     before = learner.policy()
     after = learner.learn(env, 1, 0)
     observations, infos = env.reset(seed=0)
@@ -463,6 +486,23 @@ def test_an_environment_that_a_learner_holds_is_known_by_what_it_is_made_of() ->
     one, other = values_of("sim"), values_of("V4")
     assert all(values == one[0] for values in one)
     assert one[0] != other[0]
+
+
+@pytest.mark.parametrize(
+    ("hint", "text", "value"),
+    [
+        (list[int], "8,8", [8, 8]),
+        (list[int], "[8, 8]", [8, 8]),
+        (Sequence[float], "0.5", [0.5]),
+        (tuple[int, ...], "8,4", (8, 4)),
+        (str, "none", "none"),
+        (str | None, "None", None),
+        (np.float32, "0.25", 0.25),
+        (np.ndarray, "[1, 2]", [1, 2]),
+    ],
+)
+def test_settings_come_in_the_forms_of_their_types(hint: Any, text: str, value: Any) -> None:
+    assert parsed_settings([f"x={text}"], ["x"], {"x": hint}, "mine") == {"x": value}
 
 
 @pytest.mark.parametrize("text", ["{[1]:2}", "-" * 20_000 + "1", "some words"])
@@ -677,6 +717,52 @@ def test_options_that_continue_a_learner_need_one_that_can_be_kept(
 ) -> None:
     assert trained(tmp_path / "run", "my_algo:Cycle", "--fine-tuned") == 2
     assert "fine_tuned starts from the learner of direct transfer" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize(
+    ("asked", "says"),
+    [
+        ({"neighbours": 1}, "'neighbours', which the command decides; .* observation, commands"),
+        ({"reward": "pressure"}, "'reward', which the command decides"),
+        ({"duration_s": 100.0}, "'duration_s', which the command decides"),
+        ({"observation": len}, "a function as observation, which no run can write down"),
+    ],
+)
+def test_a_learner_asks_for_what_it_sees_and_no_more(
+    algorithm: Any, monkeypatch: pytest.MonkeyPatch, asked: dict[str, Any], says: str
+) -> None:
+    monkeypatch.setattr(algorithm.Cycle, "env_options", asked, raising=False)
+    with pytest.raises(OptionError, match=says):
+        ugat_marl.train("single-v1", learner="my_algo:Cycle", duration_s=100.0)
+
+
+@pytest.mark.usefixtures("algorithm")
+@pytest.mark.parametrize("words", [[], ["first=4"]])
+def test_a_learner_is_restored_with_the_settings_of_its_training(
+    algorithm: Any, monkeypatch: pytest.MonkeyPatch, words: list[str]
+) -> None:
+    class Phased(algorithm.Kept):
+        def __init__(self, env: Any, seed: int, phase: int, first: int = 1) -> None:
+            super().__init__(env, seed, first)
+            self.phase = phase
+
+        def policy(self) -> Any:
+            phase = self.phase + self.hold
+            return lambda observations: dict.fromkeys(observations, phase)
+
+    def acts(policy: Any) -> Any:
+        return policy.act(dict.fromkeys("ab"), {})
+
+    monkeypatch.setattr(algorithm, "Phased", Phased, raising=False)
+    learner = OwnLearnerFactory("my_algo:Phased", ["phase=2", *words])(ToyTraffic(), 0)
+    learner.save(Path("kept.pt"))
+    make = OwnLearnerFactory("my_algo:Phased")
+    assert acts(make.read_policy(lambda **_: ToyTraffic(), Path("kept.pt"))) == acts(
+        learner.policy()
+    )
+    other = OwnLearnerFactory("my_algo:Phased", ["phase=1"])
+    restored = other.read_policy(lambda **_: ToyTraffic(), Path("kept.pt"))
+    assert acts(restored)["a"] == acts(learner.policy())["a"] - 1
 
 
 @pytest.mark.usefixtures("algorithm")

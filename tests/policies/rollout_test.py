@@ -158,6 +158,13 @@ def test_a_stopped_episode_leaves_no_measurement_for_the_next_one(env: TrafficEn
     assert len(env.snapshot.waiting_s) == 0
 
 
+def test_a_policy_does_not_read_another_observation_that_is_long_enough() -> None:
+    env = parallel_env("grid2x2-v1", "sim", duration_s=100, observation="count", neighbours=3)
+    with pytest.raises(OptionError, match=r"reads .* 'movements', .* shows 'count'; make it with"):
+        roll_out(env, make_rule("largest-queue:20", env), 1)
+    env.close()
+
+
 def test_an_environment_of_others_is_not_recorded(env: TrafficEnv) -> None:
     other: Any = SimpleNamespace(unwrapped=object())
     with pytest.raises(OptionError, match="object cannot be recorded"):

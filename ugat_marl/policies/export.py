@@ -291,8 +291,11 @@ def _about(policy: NetworkPolicy, env: AnyParallelEnv | None) -> dict[str, Any]:
 
 
 def _parameters(policy: NetworkPolicy) -> bytes:
-    ceiling = policy.ceiling
-    return policy.parameters.tobytes() + (b"" if ceiling is None else ceiling.tobytes())
+    """Return all that decides the values besides the sizes: weights, ceiling and structure."""
+    ceiling, structure = policy.ceiling, policy.structure
+    written = "" if structure is None else json.dumps(structure.written(), sort_keys=True)
+    limits = b"" if ceiling is None else ceiling.tobytes()
+    return policy.parameters.tobytes() + limits + written.encode()
 
 
 def _matrices(policy: NetworkPolicy) -> bytes:

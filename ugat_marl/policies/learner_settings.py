@@ -6,7 +6,7 @@ import ast
 from collections.abc import Mapping, Sequence
 from typing import Any
 
-from pydantic import TypeAdapter, ValidationError
+from pydantic import PydanticUserError, TypeAdapter, ValidationError
 
 from ugat_marl.errors import OptionError, UnknownNameError
 
@@ -19,7 +19,8 @@ def parsed_settings(
     Args:
         settings: The settings; a name may have ``-`` for ``_``.
         names: Known names.
-        hints: Name to type. A value without a type becomes a literal of Python, or text.
+        hints: Name to type. A value without a type that pydantic knows becomes a literal of Python,
+            or text.
         learner: Name of the learner for messages.
 
     Raises:
@@ -34,17 +35,38 @@ def parsed_settings(
             raise OptionError(f"learner setting {setting!r}: must be NAME=VALUE")
         if name not in names:
             raise UnknownNameError(f"setting of {learner}", name, names)
-        if hints.get(name, Any) is Any:
-            values[name] = _plain_value(text)
-            continue
-        whole = text.split(",") if "tuple" in str(hints[name]) else text
-        value = None if text.lower() == "none" else whole
         try:
-            values[name] = TypeAdapter(hints[name]).validate_python(value)
+            values[name] = _converted(text, hints.get(name, Any))
         except ValidationError as error:
             reason = error.errors()[0]["msg"]
             raise OptionError(f"learner setting {setting!r}: {reason}") from None
     return values
+
+
+def _converted(text: str, hint: Any) -> Any:
+    """Return a text in a type: as none, as parts between commas, as it is, or as a literal.
+
+    Raises:
+        ValidationError: It has none of these forms in this type; the error is that of the first.
+    """
+    plain = _plain_value(text)
+    if hint is Any:
+        return plain
+    try:
+        adapter = TypeAdapter(hint)
+    except PydanticUserError:  # such as types of NumPy
+        return plain
+    forms: list[Any] = [None] if text.lower() == "none" else []
+    if any(kind in str(hint) for kind in ("tuple", "list", "Sequence")):
+        forms.append(text.split(","))
+    first: ValidationError | None = None
+    for form in (*forms, text, plain):
+        try:
+            return adapter.validate_python(form)
+        except ValidationError as error:
+            first = first or error
+    assert first is not None
+    raise first
 
 
 def _plain_value(text: str) -> Any:

@@ -19,9 +19,9 @@ import json
 import tempfile
 import warnings
 import zipfile
-from collections.abc import Callable, Container, Mapping, Sequence
+from collections.abc import Callable, Container, Iterator, Mapping, Sequence
 from pathlib import Path
-from types import CellType, FunctionType
+from types import CellType, FunctionType, MethodType, ModuleType
 from typing import Any, get_type_hints
 
 from pettingzoo.utils import BaseParallelWrapper
@@ -56,6 +56,8 @@ _STATE = "learner.pt"
 
 OF_POLICIES = ("observation", "neighbours", "commands", "signals")
 """Options of an environment that a policy may ask for: what it sees, and how signals are shown."""
+OF_LEARNERS = ("observation", "commands", "signals")
+"""The same for a learner; neighbours are an option of the command that trains it."""
 
 
 def asked_options(given: Any, name: str) -> dict[str, Any]:
@@ -220,11 +222,14 @@ class OwnLearner:
         given: The user's learner.
         name: Name for messages.
         env: Environment with the agents of the learner.
+        settings: ``NAME=VALUE`` with which it was made; they stand in the files of `save`.
     """
 
-    def __init__(self, given: Any, name: str, env: AnyParallelEnv) -> None:
+    def __init__(
+        self, given: Any, name: str, env: AnyParallelEnv, settings: Sequence[str] = ()
+    ) -> None:
         self.episodes = 0
-        self._given, self._name = given, name
+        self._given, self._name, self._settings = given, name, list(settings)
         self._env_options = dict(getattr(env.unwrapped, "env_options", {}))
         self._shared: list[Any] = [env, env.unwrapped]
 
@@ -300,7 +305,11 @@ class OwnLearner:
             self._given.save(Path(folder, _STATE))
             for file in sorted(Path(folder).rglob("*")):
                 packed.write(file, file.relative_to(folder))
-            counters = {"episodes": self.episodes, "env_options": self._env_options}
+            counters = {
+                "episodes": self.episodes,
+                "env_options": self._env_options,
+                "settings": self._settings,
+            }
             packed.writestr(OWN_COUNTERS, json.dumps(counters))
         return memory.getvalue()
 
@@ -381,6 +390,7 @@ class OwnLearnerFactory:
                 f"learner {name!r} is a {type(self._make).__name__}; give a class with "
                 "learn(env, episodes) and policy(), or a function that makes such an object"
             )
+        self._texts = tuple(settings)
         self._settings = _converted(self._make, settings, name)
 
     def __call__(self, env: AnyParallelEnv, seed: int) -> OwnLearner:
@@ -394,7 +404,7 @@ class OwnLearnerFactory:
             )
         given = self._make(**self._settings, **offered)
         _require_methods(given, self.name)
-        return OwnLearner(given, self.name, env)
+        return OwnLearner(given, self.name, env, self._texts)
 
     def read_policy(self, make_env: Callable[..., AnyParallelEnv], path: Path) -> OwnPolicy:
         """Return the policy of a file that `OwnPolicy.save` or `OwnLearner.save` wrote.
@@ -406,15 +416,33 @@ class OwnLearnerFactory:
         Raises:
             CheckpointError: The file cannot be read, or is of another learner.
         """
-        with contextlib.closing(make_env(**_counters(path)["env_options"])) as env:
-            learner = self(env, 0)
+        counters = _counters(path)
+        with contextlib.closing(make_env(**counters["env_options"])) as env:
+            learner = OwnLearnerFactory(self.name, [*counters["settings"], *self._texts])(env, 0)
             learner.load(path)
             return learner.policy()
 
 
 def own_learner_options(name: str) -> dict[str, Any]:
-    """Return the options of the environment that a user's learner asks for (``env_options``)."""
-    return _env_options(load_own(name, "learner"), f"learner {name!r}")
+    """Return the options of the environment that a user's learner asks for (``env_options``).
+
+    Raises:
+        OptionError: They hold what the command decides, or an observation that is no name.
+    """
+    asked = _env_options(load_own(name, "learner"), f"learner {name!r}")
+    for key in asked:
+        if key not in OF_LEARNERS:
+            raise OptionError(
+                f"learner {name!r}: its env_options hold {key!r}, which the command decides; a "
+                f"learner may ask for {', '.join(OF_LEARNERS)}"
+            )
+    if callable(asked.get("observation")):
+        raise OptionError(
+            f"learner {name!r}: its env_options have a function as observation, which no run can "
+            "write down; name an observation of the suite, or compute yours in the learner and in "
+            "its policy"
+        )
+    return asked
 
 
 def is_savable(given: Any) -> bool:
@@ -469,7 +497,11 @@ def _counters(path: Path) -> dict[str, Any]:
             episodes = int(counters["episodes"])
             if episodes < 0:
                 raise ValueError(f"{episodes} episodes")
-            return {"episodes": episodes, "env_options": dict(counters["env_options"])}
+            return {
+                "episodes": episodes,
+                "env_options": dict(counters["env_options"]),
+                "settings": [str(setting) for setting in counters["settings"]],
+            }
     except (OSError, zipfile.BadZipFile, *MALFORMED) as error:
         raise CheckpointError(f"{path}: not the state of a learner of a user ({error})") from None
 
@@ -581,9 +613,8 @@ def _resolved(function: Any, key: str, hint: Any) -> dict[str, Any]:
 
 def _copied(given: Any, shared: Sequence[Any], name: str, memo: dict[int, Any]) -> Any:
     """Return a deep copy of a user's policy in which the shared objects stay the same."""
-    kept = {**memo, **{id(item): item for item in shared}}
     try:
-        return _copied_function(given, kept) if _captures(given) else copy.deepcopy(given, kept)
+        return _copy(given, {**memo, **{id(item): item for item in shared}})
     except Exception as error:
         raise OptionError(
             f"policy of {name!r} cannot be copied ({type(error).__name__}: {error}); let policy() "
@@ -598,27 +629,56 @@ def _captures(given: Any) -> bool:
     return bool(given.__closure__ or given.__defaults__ or given.__kwdefaults__)
 
 
-def _copied_function(given: FunctionType, memo: dict[int, Any]) -> FunctionType:
-    """Return a copy of a function that holds copies of its values.
+def _copy(given: Any, memo: dict[int, Any]) -> Any:
+    """Return a deep copy, also of the functions in it that hold values.
 
     `copy.deepcopy` returns functions themselves, so that a policy would go on learning with its
-    learner.
+    learner. It takes them from the memo if they are there.
     """
+    for function in _functions_in(given, set(memo)):
+        _copy_function(function, memo)
+    return copy.deepcopy(given, memo)
+
+
+def _functions_in(given: Any, seen: set[int]) -> Iterator[FunctionType]:
+    """Find the functions that hold values in an object: its attributes, members and arguments.
+
+    What these functions hold themselves is not looked into.
+
+    Args:
+        given: The object.
+        seen: Identities of what is left out; those of all that was looked at are added.
+    """
+    if id(given) in seen or isinstance(given, (type, ModuleType)):
+        return
+    seen.add(id(given))
+    if _captures(given):
+        yield given
+        return
+    held: list[Any] = [*getattr(given, "__dict__", {}).values()]
+    held += [getattr(given, name, None) for name in getattr(type(given), "__slots__", ())]
+    if isinstance(given, functools.partial):
+        held += [given.func, *given.args, *given.keywords.values()]
+    elif isinstance(given, Mapping):
+        held += given.values()
+    elif isinstance(given, (list, tuple, set, frozenset)):
+        held += given
+    elif isinstance(given, MethodType):
+        held.append(given.__self__)
+    for one in held:
+        yield from _functions_in(one, seen)
+
+
+def _copy_function(given: FunctionType, memo: dict[int, Any]) -> None:
+    """Put a copy of a function into the memo, with copies of the values that it holds."""
     if id(given) in memo:
-        return memo[id(given)]
-
-    def copied(value: Any) -> Any:
-        return _copied_function(value, memo) if _captures(value) else copy.deepcopy(value, memo)
-
+        return
     cells = tuple(CellType() for _ in given.__closure__ or ())
     made = FunctionType(given.__code__, given.__globals__, given.__name__, None, cells)
     memo[id(given)] = made  # before its values, which may hold the function itself
     for cell, old in zip(cells, given.__closure__ or (), strict=True):
         with contextlib.suppress(ValueError):  # an empty cell
-            cell.cell_contents = copied(old.cell_contents)
-    made.__defaults__ = given.__defaults__ and tuple(map(copied, given.__defaults__))
-    made.__kwdefaults__ = given.__kwdefaults__ and {
-        key: copied(value) for key, value in given.__kwdefaults__.items()
-    }
+            cell.cell_contents = _copy(old.cell_contents, memo)
+    made.__defaults__ = _copy(given.__defaults__, memo)
+    made.__kwdefaults__ = _copy(given.__kwdefaults__, memo)
     made.__dict__.update(given.__dict__)
-    return made

@@ -71,6 +71,9 @@ def roll_out(
         record: Observer whose observations are recorded; None records nothing. They may differ from
             those that the policy reads. It needs an environment of the suite.
         on_step: Function called after every decision.
+
+    Raises:
+        OptionError: The policy reads another observation than the environment shows.
     """
     if record is None:
         return _played(env, policy, seed, None, on_step)
@@ -93,6 +96,7 @@ def _played(
     record: Observer | None,
     on_step: StepCallback | None,
 ) -> RollOut:
+    _require_same_observation(env, policy)
     observations, infos = env.reset(seed=seed)
     policy.reset(seed)
     recording = _Recording(env, record, seed, infos) if record else None
@@ -108,6 +112,17 @@ def _played(
         if on_step is not None:
             on_step(steps)
     return RollOut(steps, total / max(steps, 1), recording.log() if recording else None)
+
+
+def _require_same_observation(env: AnyParallelEnv, policy: Policy) -> None:
+    """Refuse a policy that would read another observation than its own, if it is long enough."""
+    shown = getattr(env.unwrapped, "env_options", {}).get("observation")
+    read = policy.env_options.get("observation")
+    if isinstance(shown, str) and isinstance(read, str) and shown != read:
+        raise OptionError(
+            f"the policy reads the observation {read!r}, and the environment shows {shown!r}; "
+            f"make it with observation={read!r}"
+        )
 
 
 def observer_of(

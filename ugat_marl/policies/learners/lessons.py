@@ -131,5 +131,8 @@ def most_plays(name: str, shown: int, candidates: int | None = None) -> int:
 
 
 def _candidates(env: AnyParallelEnv) -> Sequence[tuple[str, Policy]]:
+    """Return the rules that read what an environment shows; none reads stacked observations."""
+    if getattr(env.unwrapped, "frames", 1) > 1:
+        return []
     rules = [NamedRule(spec, env.unwrapped) for spec in STANDARD_RULES]
     return [(rule.spec, rule) for rule in rules if rule.reads(env)]

@@ -92,6 +92,11 @@ class Structure:
         agents = AgentSet.of(env)
         if network == "colight":
             return cls(network, neighbours=_neighbours(agents, base.intersection_of, roads))
+        if callable(observation["observation"]):
+            raise OptionError(
+                f"network {network!r} cannot tell what the numbers of an observation function are; "
+                "use an observation of the suite, or the network 'mlp'"
+            )
         layouts: Mapping[str, AgentLayout] = base.layouts
         agent_layouts = [layouts.get(name) for name in agents.names]
         for name, size, layout in zip(
