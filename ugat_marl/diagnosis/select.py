@@ -102,30 +102,34 @@ class Selector:
         null = self._null(base.model.tallies, len(data), directions, ())
         return replace(base, residual=null.test(data))
 
-    def know(self, members: Members) -> None:
-        """Simulate effects that another search has found, so that they are among the rivals."""
-        if members:
-            with contextlib.suppress(OutOfTime):
-                self.kept(self._fitter.simulate(members))
-
-    def select(self, located: Located, ends: Callable[[Tested], bool] | None = None) -> Selected:
-        """Search from the scenario as it is.
+    def select(
+        self,
+        located: Located,
+        known: Members = (),
+        ends: Callable[[Tested], bool] | None = None,
+    ) -> Selected:
+        """Search from the scenario as it is, or from effects that another search has found.
 
         Args:
             located: The scenario as it is.
+            known: Effects to begin with.
             ends: Function of a better model that does not explain the data; True ends the search.
         """
         base = best = located.base
         complete = True
         try:
-            for number in range(self._thresholds.rounds):
+            if known:
+                self._library_directions(base.model, 0)  # along which models are tested
+                best = self._fitted(base, [known], 0, "effects so far") or base
+            first = 0 if best is base else 1  # round 0 looks at the scenario as it is
+            for number in range(first, self._thresholds.rounds):
+                if best.residual.p > self._alpha:
+                    break
                 improved = self._round(best, number)
                 if improved is None:
                     break
                 best = improved
-                if best.residual.p > self._alpha:
-                    break
-                if ends is not None and ends(best):
+                if ends is not None and best.residual.p <= self._alpha and ends(best):
                     return self._selected(best, located, complete=False)
             best = Pruner(self._fitter, self, self._alpha, self._reporter).pruned(best, base)
         except OutOfTime:

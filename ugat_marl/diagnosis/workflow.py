@@ -221,14 +221,13 @@ def _searched(
         study: The study.
         base: The scenario as it is.
         reporter: Display of progress.
-        known: Effects that an earlier search has found.
+        known: Effects that an earlier search has found, to begin with.
         once_more: False to take the errors of the detectors as they are.
     """
     selector = study.selector(base, reporter)
     located = locate_gap(study, base, selector)
     if located.base.residual.p > study.config.alpha:
         return _Search(study, located, selector, None)
-    selector.know(known)
     others: list[tuple[Study, Tested]] = []
 
     def shows_others(best: Tested) -> bool:
@@ -245,10 +244,10 @@ def _searched(
             others.append((other, its_base))
         return bool(others)
 
-    selected = selector.select(located, shows_others if once_more else None)
+    selected = selector.select(located, known, shows_others if once_more else None)
     for other, its_base in others:
         errors = describe_errors(other.detection) if other.detection else "no detector errs"
-        reporter.say(f"note: beside these effects {errors}; the search begins again")
+        reporter.say(f"note: beside the effects so far {errors}; the search begins again")
         members = selected.best.model.members
         return _searched(other, its_base, reporter, members, once_more=False)
     return _Search(study, located, selector, selected)

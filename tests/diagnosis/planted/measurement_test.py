@@ -102,6 +102,16 @@ def test_drivers_are_found_behind_an_error_of_measurement(street, tmp_path: Path
 
 
 @pytest.mark.slow
+def test_an_error_of_measurement_is_found_behind_slow_drivers(street, tmp_path: Path) -> None:
+    data = street.measure(f"{SLOW_STARTERS}+detector_speeds=stop@S_C,front")
+    found = street.diagnose(data, tmp_path)
+    assert [effect["name"] for effect in found["effects"]] == ["acceleration", "detector_speeds"]
+    assert found["effects"][0]["parameters"]["mps2"]["value"] == pytest.approx(0.8, rel=0.03)
+    assert found["verdict"] == "explained", found["sentence"]
+    assert found["sentence"].startswith("Stop detectors of approach S_C measure speeds")
+
+
+@pytest.mark.slow
 def test_an_error_of_measurement_alone_leaves_the_traffic_as_it_is(street, tmp_path: Path) -> None:
     found = street.diagnose(street.measure("detector_offset=advance,-12"), tmp_path)
     assert [effect["name"] for effect in found["effects"]] == ["detector_offset"]
