@@ -469,10 +469,10 @@ def test_the_option_for_blocked_junctions_reaches_sumo_and_no_diagnosis_looks_fo
     importlib.util.find_spec("sumo_rl") is None, reason="the RESCO networks come with sumo-rl"
 )
 def test_vehicles_that_hold_each_other_on_a_junction_let_go() -> None:
-    """Slow vehicles of cologne3 meet on its largest junction after four minutes (actuated)."""
+    """Slow vehicles of cologne3 meet on its largest junction, with this rule and this seed."""
     arrived: dict[str, float] = {}
     for domain in ("V1", "V1+blocker_patience=60"):
-        rule = {"rule": rule_factory("actuated:60:3")}
+        rule = {"rule": rule_factory("sotl:300:20")}
         found = evaluation_of(
             load_scenario("resco:cologne3"), rule, [domain], [1002], duration_s=1200, workers=1
         )
