@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import math
+import subprocess
 import xml.etree.ElementTree as ET
 from collections import Counter
 from collections.abc import Callable
@@ -28,7 +29,7 @@ from ugat_marl.effects import (
 )
 from ugat_marl.envs import parallel_env
 from ugat_marl.errors import OptionError, ScenarioError, UnknownNameError
-from ugat_marl.scenarios import Document, Network, Scenario, check_demand
+from ugat_marl.scenarios import Document, Network, Scenario, check_demand, sumo_program
 
 Crossing = Callable[..., Path]
 EDGE = "east1_A1"
@@ -156,6 +157,27 @@ def test_turning_twice_turns_more() -> None:
         turns(apply_effects(scenario, parse_domain("+".join([turn] * count)))) for count in (1, 2)
     )
     assert twice["A1_southA"] > 1.2 * once["A1_southA"]
+
+
+def test_who_turns_drives_on_until_the_network_ends_though_roads_let_him_turn_around(
+    tmp_path: Path,
+) -> None:
+    grid = "--grid --grid.x-number=2 --grid.y-number=1 --grid.attach-length=200 -o n.net.xml"
+    options = [*grid.split(), "--default-junction-type=traffic_light"]
+    program = str(sumo_program("netgenerate"))
+    subprocess.run([program, *options], cwd=tmp_path, check=True, capture_output=True)
+    cars = "".join(
+        f'<vehicle id="{n}" depart="{n}"><route edges="left0A0 A0top0"/></vehicle>'
+        for n in range(50)
+    )
+    (tmp_path / "r.rou.xml").write_text(f"<routes>{cars}</routes>")
+    (tmp_path / "scenario.toml").write_text(
+        'network = "n.net.xml"\nroutes = ["r.rou.xml"]\nduration_s = 300\n'
+    )
+    turned = apply_effects(load_scenario(tmp_path), [Turning("left0A0", "A0B0", 0.5)])
+    ends = {edges(item)[-1] for item in departing(turned).values() if "A0B0" in edges(item)}
+    assert ends
+    assert ends <= {"B0right0", "B0top1", "B0bottom1"}
 
 
 @pytest.mark.parametrize("space", [" ", "\n", "\t"])

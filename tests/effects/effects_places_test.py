@@ -116,6 +116,21 @@ def test_a_closed_lane_is_blocked_then_and_free_before_and_after(
     assert sum(inside(passed[lane], 620, 1000) for lane in others) > 20
 
 
+@pytest.mark.parametrize("scale", ["0.5", "2"])
+def test_an_option_that_scales_the_demand_leaves_blockers_as_they_are(
+    simulator: LibsumoSimulator, tmp_path: Path, scale: str
+) -> None:
+    plain = load_scenario("single-v1")
+    settings = plain.settings.model_copy(update={"sumo": {"scale": scale}})
+    closed = apply_effects(replace(plain, settings=settings), [LaneClosure(LANE, 300, 600)])
+    passed, stood = passing(simulator, closed, tmp_path / "own", 650)
+    ((begin, end),) = stood.values()
+    assert begin < 400 and end == 599
+    vehicles = sum(map(len, passed.values()))
+    unscaled, _ = passing(simulator, plain, tmp_path / "plain", 650)
+    assert vehicles == pytest.approx(float(scale) * sum(map(len, unscaled.values())), rel=0.35)
+
+
 def test_parking_blocks_a_lane_again_and_again(simulator: LibsumoSimulator, tmp_path: Path) -> None:
     scenario = apply_effects(load_scenario("single-v1"), [Parking(LANE, 30, 40)])
     check_demand(scenario, Network.read(scenario))

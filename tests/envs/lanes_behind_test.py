@@ -245,10 +245,11 @@ def test_a_light_without_an_agent_is_a_plain_node() -> None:
     assert behind_of(root, LENGTHS_M, 7.5, {"T"})["a_0"].lanes == {":b0a0": 1.0, "b_0": 1.0}
 
 
-def test_turning_around_is_no_way() -> None:
+@pytest.mark.parametrize("turn", ["t", "T"])  # right-hand and left-hand traffic
+def test_turning_around_is_no_way(turn: str) -> None:
     root = net("b0>a0", "a0>z0*")
-    extra = ET.fromstring('<connection from="b" fromLane="0" to="y" toLane="0" via=":u" dir="t"/>')
-    root.append(extra)
+    around = f'from="b" fromLane="0" to="y" toLane="0" via=":u" dir="{turn}"'
+    root.append(ET.fromstring(f"<connection {around}/>"))
     assert behind_of(root, LENGTHS_M, 7.5, {"T"})["a_0"].lanes["b_0"] == 1.0
 
 

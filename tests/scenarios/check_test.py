@@ -37,8 +37,8 @@ from ugat_marl.scenarios import (
     resco_maps,
     survey,
 )
+from ugat_marl.scenarios.capacity import discharge_vph
 from ugat_marl.scenarios.inspection import (
-    SATURATION_VPH,
     ApproachFacts,
     _green_s,
     _in_part,
@@ -104,6 +104,24 @@ def test_bus_lanes_add_no_capacity_for_cars(single: Scenario) -> None:
     assert alone == pytest.approx(2 * shared)
 
 
+@pytest.mark.parametrize(
+    ("turns", "speed_mps", "vph"),
+    [
+        ("s", 8.0, 3600 / (1.45 + 8.5 / 8)),  # 2.5 s, as measured
+        ("s", 17.0, 3600 / 1.95),
+        ("l", 17.0, 1600),
+        ("r", 17.0, 3600 / 2.6),
+        ("lr", 17.0, 1600),  # the quicker of both
+        ("rs", 17.0, 3600 / 1.95),
+        ("s", 0.5, 600),
+    ],
+)
+def test_lanes_discharge_what_their_turns_and_limits_let_them(
+    turns: str, speed_mps: float, vph: float
+) -> None:
+    assert discharge_vph(turns, speed_mps) == pytest.approx(vph)
+
+
 def test_traffic_is_counted_by_approach(single: Scenario) -> None:
     network = Network.read(single)
     item = network.intersections[0]
@@ -115,7 +133,8 @@ def test_traffic_is_counted_by_approach(single: Scenario) -> None:
     assert road.vph == 720
     assert road.worst_vph == 1440  # all of them within a quarter of an hour
     serving = {k.from_lane for k in item.links if k.from_edge == lane.edge and k.to_edge == leads}
-    assert road.flow_ratio == pytest.approx(1440 / (len(serving) * SATURATION_VPH), abs=1e-3)
+    each_vph = discharge_vph("r", lane.speed_mps)
+    assert road.flow_ratio == pytest.approx(1440 / (len(serving) * each_vph), abs=1e-3)
     assert (road.worst_from_s, facts.busiest_s, facts.busiest, facts.last_s) == (0, 0, 360, 459)
     assert road.first_s == pytest.approx(100 + lane.length_m / lane.speed_mps)
     others = [a for a in facts.intersections[0].approaches if a.edge != lane.edge]

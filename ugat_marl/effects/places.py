@@ -33,6 +33,7 @@ class Places:
         lanes: Lanes by id.
         edges: Edge to its lanes, from right to left.
         following: Edge to the edges that a car can reach next.
+        exits: Edges from which a car can only turn around, if anything.
         lights: Ids of the traffic lights.
         ends: Lane to the traffic light it leads to.
         begins: Lane to the traffic light it comes from.
@@ -41,6 +42,7 @@ class Places:
     lanes: Mapping[str, LanePlace]
     edges: Mapping[str, tuple[str, ...]]
     following: Mapping[str, tuple[str, ...]]
+    exits: frozenset[str]
     lights: Collection[str]
     ends: Mapping[str, str]
     begins: Mapping[str, str]
@@ -122,6 +124,7 @@ def _places(content: bytes, source: str) -> Places:
                 cars_may_use(lane),
             )
     following: dict[str, dict[str, None]] = defaultdict(dict)
+    onward: set[str] = set()
     lights = {element.get("id", ""): None for element in root.iter("tlLogic")}
     ends: dict[str, str] = {}
     begins: dict[str, str] = {}
@@ -136,6 +139,8 @@ def _places(content: bytes, source: str) -> Places:
             leaving not in lanes or lanes[leaving].cars
         ):
             following[start][end] = None
+            if connection.get("dir", "").lower() != "t":
+                onward.add(start)
         light = connection.get("tl")
         if light and light not in rails:
             lights[light] = None
@@ -144,7 +149,8 @@ def _places(content: bytes, source: str) -> Places:
     return Places(
         lanes,
         edges,
-        {edge: tuple(onward) for edge, onward in following.items()},
+        {edge: tuple(ends) for edge, ends in following.items()},
+        frozenset(edges.keys() - onward),
         tuple(lights),
         ends,
         begins,

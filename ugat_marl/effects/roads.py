@@ -26,7 +26,13 @@ from ugat_marl.effects.documents import edit, seconds_text
 from ugat_marl.effects.places import network_places
 from ugat_marl.errors import OptionError, ScenarioError
 from ugat_marl.files import xml_bytes
-from ugat_marl.scenarios import Document, Scenario, is_blocker
+from ugat_marl.scenarios import (
+    Document,
+    Scenario,
+    demand_as_vehicles,
+    demand_scale,
+    is_blocker,
+)
 from ugat_marl.seeding import numpy_generator
 
 _LENGTH_M = 5.0
@@ -250,6 +256,8 @@ def _with_blockers(
     scenario = replace(scenario, applied=(*scenario.applied, str(effect)))
     if not departs:
         return scenario
+    if demand_scale(scenario) != 1:  # SUMO would scale these vehicles, too
+        scenario = demand_as_vehicles(scenario)
     taken = {document.name for document in scenario.documents}
     stem = f"{effect.name.removeprefix('lane_')}.{lane}"
     names = chain((stem,), (f"{stem}~{number}" for number in count(2)))

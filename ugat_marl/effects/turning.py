@@ -173,8 +173,8 @@ def _fastest(element: ET.Element, places: Places) -> Way:
 
 
 def _way_out(start: str, places: Places) -> Way:
-    """Return the fastest way to an edge from which no other can be reached."""
-    ways = [way for way in places.ways(start).values() if not places.following.get(way[-1])]
+    """Return the fastest way out of the network."""
+    ways = [way for way in places.ways(start).values() if way[-1] in places.exits]
     return min(ways, key=lambda way: sum(map(places.seconds, way)), default=(start,))
 
 

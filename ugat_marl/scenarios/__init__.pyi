@@ -57,6 +57,7 @@ from .lanes import NO_UPSTREAM_LANES as NO_UPSTREAM_LANES
 from .lanes import LaneTable as LaneTable
 from .lanes import Turns as Turns
 from .lanes import UpstreamLanes as UpstreamLanes
+from .naming import drawing_name as drawing_name
 from .naming import edge_of_lane as edge_of_lane
 from .naming import group_names as group_names
 from .naming import member_names as member_names
@@ -84,6 +85,7 @@ from .routes import DEPARTING as DEPARTING
 from .routes import TRAVELLERS as TRAVELLERS
 from .routes import blocker_types as blocker_types
 from .routes import demand_as_vehicles as demand_as_vehicles
+from .routes import demand_scale as demand_scale
 from .routes import departures as departures
 from .routes import driven_routes as driven_routes
 from .routes import is_blocker as is_blocker

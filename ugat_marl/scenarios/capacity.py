@@ -15,7 +15,7 @@ from __future__ import annotations
 
 import math
 from collections import Counter, defaultdict
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -57,6 +57,22 @@ def through_headway_s(speed_mps: float) -> float:
     limits of 8, 10, 13.9 and 17 m/s gave 2.5, 2.3, 2.1 and 2.0 s.
     """
     return min(1.45 + 8.5 / max(speed_mps, 0.1), MOST_HEADWAY_S)
+
+
+def discharge_vph(turns: Iterable[str], speed_mps: float) -> float:
+    """Return the cars per hour that a lane discharges in permanent green.
+
+    Args:
+        turns: What its cars do at the light: ``s``, ``l`` or ``r`` as `kerb_turn_of` says. Lanes of
+            several turns discharge as those of the quickest one.
+        speed_mps: Its speed limit, m/s.
+    """
+    return 3600.0 / min(_headway_s(turn, speed_mps) for turn in turns)
+
+
+def _headway_s(turn: str, speed_mps: float) -> float:
+    least_s = {"l": LEFT_HEADWAY_S, "r": RIGHT_HEADWAY_S}.get(turn, 0.0)
+    return max(least_s, through_headway_s(speed_mps))
 
 
 def degrees_of_saturation(scenario: Scenario, flows_vph: Flows | None = None) -> dict[str, float]:
@@ -199,9 +215,7 @@ def _let_pass(
 
 def _equivalents(turn: str, speed_mps: float, *, yields: bool) -> float:
     """Return the headway of a movement divided by that of `SATURATION_VPH`."""
-    least_s = {"l": LEFT_HEADWAY_S, "r": RIGHT_HEADWAY_S}.get(turn, 0.0)
-    headway_s = max(least_s, through_headway_s(speed_mps))
-    equivalent = headway_s * SATURATION_VPH / 3600
+    equivalent = _headway_s(turn, speed_mps) * SATURATION_VPH / 3600
     return max(equivalent, PERMITTED_EQUIVALENT) if yields else equivalent
 
 

@@ -11,11 +11,17 @@ from itertools import combinations
 
 from ugat_marl.errors import ScenarioError
 from ugat_marl.progress import Reporter
-from ugat_marl.scenarios.capacity import SATURATION_VPH, Flows, degrees_of_saturation, may_go
+from ugat_marl.scenarios.capacity import Flows, degrees_of_saturation, discharge_vph, may_go
 from ugat_marl.scenarios.demand import Demand, check_demand
 from ugat_marl.scenarios.junctions import Link, foes_of, links_for_cars, yields_of
 from ugat_marl.scenarios.network import Intersection, Network, free_flow_s
-from ugat_marl.scenarios.phases import RightOfWay, are_foes, programme_phases, turn_of
+from ugat_marl.scenarios.phases import (
+    RightOfWay,
+    are_foes,
+    kerb_turn_of,
+    programme_phases,
+    turn_of,
+)
 from ugat_marl.scenarios.routes import departures
 from ugat_marl.scenarios.scenario import Scenario
 from ugat_marl.scenarios.signals import AMBER, GREEN, YELLOW
@@ -58,8 +64,8 @@ class ApproachFacts:
         worst_vph: The same in the worst quarter of an hour.
         worst_from_s: Start of this quarter of an hour, s from the start of the episode.
         flow_ratio: Traffic of its fullest lanes in that quarter of an hour, divided by the flow
-            that they would discharge in permanent green. Drivers divide among the lanes from which
-            they may turn as evenly as possible.
+            that they would discharge in permanent green (`discharge_vph`). Drivers divide among the
+            lanes from which they may turn as evenly as possible.
         saturation: The same with the flow that lanes discharge under the network's own programme.
             Above 1 the queue grows. None if there is no programme, or no green for some turn.
         first_s: Time at which the first vehicle can be there, s from the start of the episode; None
@@ -333,7 +339,7 @@ def _facts(
         ),
         clashes=tuple(_clashes(intersection, rules)),
         uncontrolled=sum(free.get(junction, 0) for junction in junctions),
-        approaches=tuple(_approaches(intersection, traffic)),
+        approaches=tuple(_approaches(intersection, network, traffic)),
         name=intersection_name(intersection.links, network.streets),
         file_yellow_s=_times_of(intersection, yellow=True),
         file_all_red_s=_times_of(intersection, yellow=False),
@@ -408,7 +414,9 @@ def green_of_file(intersection: Intersection, state: str) -> int | None:
     return next((n for n, green in enumerate(greens) if going(green) == going(state)), None)
 
 
-def _approaches(intersection: Intersection, traffic: _Traffic) -> Sequence[ApproachFacts]:
+def _approaches(
+    intersection: Intersection, network: Network, traffic: _Traffic
+) -> Sequence[ApproachFacts]:
     roads: dict[str, list[Link]] = defaultdict(list)
     for link in intersection.links:
         roads[link.from_edge].append(link)
@@ -419,11 +427,16 @@ def _approaches(intersection: Intersection, traffic: _Traffic) -> Sequence[Appro
         vph, (worst_vph, worst_from_s, flows) = traffic.mean_vph(edge), traffic.worst(edge)
         lanes_of = _lanes_by_turn(links)
         used = frozenset(edge_lanes).union(*lanes_of.values())
-        ratio = fullest(flows, lanes_of, dict.fromkeys(used, SATURATION_VPH))
+        turns: dict[str, set[str]] = defaultdict(set)
+        for link in links:
+            turns[link.from_lane].add(kerb_turn_of(link))
+        speeds = {lane: network.lanes[lane].speed_mps for lane in used}
+        vehicles = {lane: discharge_vph(turns[lane], speeds[lane]) for lane in used}
+        ratio = fullest(flows, lanes_of, vehicles)
         saturation = math.inf
         if cycle_s:
             greens = {lane: _green_s(intersection, lane) / cycle_s for lane in used}
-            served = {lane: SATURATION_VPH * green for lane, green in greens.items()}
+            served = {lane: vehicles[lane] * green for lane, green in greens.items()}
             saturation = fullest(flows, lanes_of, served)
         approaches.append(
             ApproachFacts(

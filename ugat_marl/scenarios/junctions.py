@@ -352,7 +352,7 @@ def _ways(root: ET.Element, lights: Container[str]) -> _Ways:
             continue
         if ends_at_light:
             at_lights[lane] = None
-        if element.get("dir") != "t":
+        if element.get("dir", "").lower() != "t":  # T where traffic keeps to the left
             number[lane] += 1
             if not ends_at_light:
                 feeds[end_lane(element)].append((lane, [via] if via else []))

@@ -124,7 +124,8 @@ def approach_roads(root: ET.Element, network: Network) -> dict[str, frozenset[st
     }
     for element in root.iter("connection"):
         start, end = element.get("from", ":"), element.get("to", ":")
-        if start.startswith(":") or end.startswith(":") or element.get("dir") == "t":
+        around = element.get("dir", "").lower() == "t"  # T where traffic keeps to the left
+        if around or start.startswith(":") or end.startswith(":"):
             continue
         onward[start].add(end)
         lane = element.get("via", "")
