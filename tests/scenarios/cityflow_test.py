@@ -197,6 +197,27 @@ def test_without_time_between_greens_some_is_put_in(tmp_path: Path) -> None:
     )
 
 
+@pytest.mark.parametrize(
+    ("greens", "said"),
+    [
+        ([[0], [1, 2], [0], [1]], "the greens 0 and 2 of the file, from 0, are equal at 1 light"),
+        ([[0], [1, 2], [0], [1, 2]], "the greens 0 and 2, 1 and 3 of the file, from 0, are equal"),
+        ([[0], [1, 2], [1]], ""),
+    ],
+)
+def test_equal_greens_of_a_light_are_told(
+    greens: list[list[int]], said: str, tmp_path: Path
+) -> None:
+    net = crossroads()
+    light = net["intersections"][0]["trafficLight"]
+    light["lightphases"] = [{"time": 30, "availableRoadLinks": links} for links in greens]
+    assert main(["scenario", "new", str(tmp_path / "city"), *write(tmp_path, net)]) == 0
+    (item,) = Network.read(read_scenario(tmp_path / "city")).intersections
+    assert len(item.phases) == len({*map(tuple, greens)})
+    text = (tmp_path / "city" / "README.md").read_text()
+    assert said in text and ("are equal at 1 light ('M')" in text) == bool(said)
+
+
 def test_roads_between_anchors_are_found(tmp_path: Path) -> None:
     """CityFlow allows routes that name only some of their roads."""
     net = crossroads()

@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import csv
+import gzip
 import math
+import shlex
 import shutil
 from collections import Counter
 from pathlib import Path
@@ -168,6 +170,76 @@ def test_filled_sheets_are_never_lost(draft: Path, capsys: pytest.CaptureFixture
         assert (draft / f"counts-before-{number}.csv").read_bytes() == held
         another.write_bytes(held.replace(b"200", b"190"))
     assert (draft / "counts-before-1.csv").read_bytes() == before
+
+
+@pytest.mark.parametrize(
+    "name",
+    [".git/HEAD", ".notes.md", "counts-before.csv", "old/counts-before-1.csv", "old/README.md",
+     "pictures/crossing.png", "pictures/9.jpg", "pictures/old/9.png", "network.net.xml.gz"],
+)  # fmt: skip
+def test_files_beside_a_draft_are_never_lost(
+    name: str, draft: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    fill_in(draft / "counts.csv")
+    (draft / name).parent.mkdir(exist_ok=True)
+    (draft / name).write_text("other work")
+    assert made(draft, "--counts", draft / "counts.csv") == 2
+    assert "was not made with the sheet of counts, and would be lost" in capsys.readouterr().err
+    assert (draft / name).read_text() == "other work"
+
+
+def test_a_folder_with_counts_of_its_own_is_no_draft(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    names = ("README.md", "counts.csv", "pictures/crossing.jpg")
+    (tmp_path / "own" / "pictures").mkdir(parents=True)
+    for name in names:
+        (tmp_path / "own" / name).write_text("street,count\n")
+    assert made(tmp_path / "own", "--vph", "300") == 2
+    assert "exists and is not a scenario" in capsys.readouterr().err
+    assert all((tmp_path / "own" / name).is_file() for name in names)
+
+
+def test_replaced_sheets_and_what_a_file_manager_leaves_are_no_obstacle(draft: Path) -> None:
+    """The name of a sheet that was replaced is a new one, even if earlier ones were deleted."""
+    fill_in(draft / "counts.csv")
+    assert made(draft, "--counts", draft / "counts.csv") == 0
+    (draft / "pictures" / ".DS_Store").touch()
+    (draft / "counts-before-2.csv").write_text("an earlier one")
+    before = (draft / "counts.csv").read_bytes()
+    another = draft.parent / "another.csv"
+    for number, counted in ((1, b"210"), (3, b"190")):
+        held = (draft / "counts.csv").read_bytes()
+        another.write_bytes(before.replace(b"200", counted))
+        assert made(draft, "--counts", another, "--force") == 0
+        assert (draft / f"counts-before-{number}.csv").read_bytes() == held
+    assert (draft / "counts-before-2.csv").read_text() == "an earlier one"
+
+
+@pytest.mark.parametrize(
+    ("name", "words"),
+    [("x.net.xml", []), ("x.net.xml.gz", []), ("x.net.xml", ["--link"])],
+)
+def test_the_printed_command_makes_the_scenario(
+    name: str, words: list[str], tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    content = load_scenario("single-v1").network.read()
+    packed = gzip.compress(content) if name.endswith(".gz") else content
+    (tmp_path / name).write_bytes(packed)
+    town = tmp_path / "town"
+    given = ["scenario", "new", str(town), "--sumo", str(tmp_path / name), *words]
+    assert main(given) == 0
+    printed = capsys.readouterr().out.partition("next: ugat-marl ")[2].partition(" (or")[0]
+    assert main(["scenario", "check", str(town)]) == 2
+    assert f"no vehicles yet; fill in {town / 'counts.csv'}" in capsys.readouterr().err
+    drawn = {path.name for path in (town / "pictures").iterdir()}
+    fill_in(town / "counts.csv")
+    assert main(shlex.split(printed)) == 0
+    scenario = read_scenario(town)
+    assert (scenario.network.name, scenario.network.read()) == (name, content)
+    assert {path.name for path in (town / "pictures").iterdir()} == drawn
+    assert (town / name).exists() is not bool(words)
+    assert (tmp_path / name).read_bytes() == packed
 
 
 @pytest.mark.parametrize("head", ["sep=,\n", " ", "my "])

@@ -359,6 +359,19 @@ def test_the_flow_of_the_first_interval_fills_the_roads_before_it(
     assert min(depart for depart, _ in drives(tmp_path / "long")) >= 25200
 
 
+def test_small_counts_are_spread_over_their_interval(tmp_path: Path) -> None:
+    """Twelve turns with five vehicles each in an hour that is parted into sixths."""
+    arms = ("west1", "east1", "northA", "southA")
+    turns = [f"{here}_A1,A1_{there}" for here in arms for there in arms if here != there]
+    rows = "".join(f"{turn},5,25200,28800\n" for turn in turns)
+    (tmp_path / "c.csv").write_text(f"from,to,count,begin_s,end_s\n{rows}")
+    words = ["--grid", "1x1", "--counts", str(tmp_path / "c.csv"), "--duration-s", "4200"]
+    assert main(["scenario", "new", str(tmp_path / "city"), *words, "--begin-s", "24600"]) == 0
+    found = Counter((depart - 25200) // 600 for depart, _ in drives(tmp_path / "city"))
+    assert sum(found[part] for part in range(6)) == 60
+    assert [found[part] for part in range(6)] == pytest.approx([10] * 6, abs=6)
+
+
 def test_counts_that_are_spread_over_an_odd_time_are_told(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:

@@ -151,6 +151,19 @@ def test_cars_need_both_lanes_and_the_connection(
     assert streets.entries == (("in",) if ahead else ())
 
 
+def test_roads_may_say_that_they_are_normal() -> None:
+    root = ET.fromstring(
+        '<net><edge id="in" from="x" to="y" function="normal"><lane id="in_0"/></edge>'
+        '<edge id="on" from="y" to="z"><lane id="on_0"/></edge>'
+        '<edge id=":y_0" function="internal"><lane id=":y_0_0"/></edge>'
+        '<connection from="in" to="on" fromLane="0" toLane="0" dir="s"/></net>'
+    )
+    streets = Streets.of(root)
+    assert set(streets.start) == {"in", "on"}
+    assert streets.ahead == {"in": {"s": ("on",)}}
+    assert streets.entries == ("in",)
+
+
 def test_turns_nobody_asked_for_are_taken_where_there_is_no_other_way() -> None:
     streets = Streets({"a": "x", "b": "y"}, {"a": "y", "b": "z"}, {"a": {"r": ("b",)}}, ("a",),
                       frozenset({"b"}))  # fmt: skip
@@ -200,6 +213,22 @@ def files(tmp_path: Path) -> Path:
         '<processing><lateral-resolution value="0.8"/></processing></configuration>'
     )
     return folder
+
+
+@pytest.mark.parametrize("word", ["--sumo", "--routes"])
+def test_a_scenario_is_not_linked_to_files_of_the_folder_it_replaces(
+    word: str, files: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    folder = tmp_path / "a"
+    assert made(folder, "--sumo", files / "city.sumocfg") == 0
+    network, routes = folder / "Netz 1.net.xml", folder / "cars.rou.xml"
+    sources = {"--sumo": files / "Netz 1.net.xml", "--routes": files / "cars.rou.xml"}
+    sources[word] = {"--sumo": network, "--routes": routes}[word]
+    words = [x for pair in sources.items() for x in pair]
+    capsys.readouterr()
+    assert made(folder, *words, "--link", "--force") == 2
+    assert "leave out --link, or write to another folder" in capsys.readouterr().err
+    assert network.is_file() and routes.is_file()
 
 
 @pytest.mark.parametrize("link", [False, True])
@@ -427,6 +456,61 @@ def test_nothing_is_overwritten_by_accident(
     assert "is the name of a scenario of the suite" in refused(capsys, "single-v1", *words)
     assert "is not a name for a scenario" in refused(capsys, "..", *words)
     assert left_over(tmp_path) == ["a", "photos"]
+
+
+ONE_LIGHT = ["--grid", "1x1", "--vph", "100", "--duration-s", "600"]
+
+
+def in_folders(target: Path) -> None:
+    """Make a scenario with drawings, and with its network in a folder of its own."""
+    assert made(target, *ONE_LIGHT) == 0
+    toml = (target / "scenario.toml").read_text()
+    toml = toml.replace('"network.net.xml"', '"net/network.net.xml"')
+    toml = toml.replace('"demand.rou.xml"', '"./demand.rou.xml"')
+    (target / "scenario.toml").write_text(toml)
+    (target / "net").mkdir()
+    (target / "network.net.xml").rename(target / "net" / "network.net.xml")
+    (target / "pictures").mkdir()
+    for drawing in ("network.svg", "A1.png", "A1-2.svg", "A1_.png"):
+        (target / "pictures" / drawing).touch()
+
+
+@pytest.mark.parametrize(
+    "name",
+    ["net/survey.xlsx", "net/network.net.xml.bak", ".notes.md", ".git/HEAD", "network.net.xml",
+     "pictures/A1.jpg", "pictures/A2.png", "pictures/network-1.png"],
+)  # fmt: skip
+def test_files_beside_a_scenario_are_never_lost(
+    name: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    in_folders(tmp_path / "a")
+    file = tmp_path / "a" / name
+    file.parent.mkdir(exist_ok=True)
+    file.write_text("other work")
+    error = refused(capsys, tmp_path / "a", *ONE_LIGHT, "--force")
+    said = "was not made with the scenario, and would be lost; move it away first"
+    assert f"{file} {said}" in error or f"{file.parent} {said}" in error
+    assert file.read_text() == "other work"
+
+
+def test_all_files_of_a_scenario_are_replaced(tmp_path: Path) -> None:
+    in_folders(tmp_path / "a")
+    assert made(tmp_path / "a", *ONE_LIGHT, "--force") == 0
+    assert left_over(tmp_path / "a") == [
+        "README.md", "demand.rou.xml", "network.net.xml", "pictures", "scenario.toml",
+    ]  # fmt: skip
+
+
+def test_a_damaged_scenario_has_files_of_the_usual_names(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert made(tmp_path / "a", *ONE_LIGHT) == 0
+    (tmp_path / "a" / "scenario.toml").write_text("routes = 1")
+    (tmp_path / "a" / "notes.md").touch()
+    error = refused(capsys, tmp_path / "a", *ONE_LIGHT, "--force")
+    assert "notes.md was not made with the scenario" in error
+    (tmp_path / "a" / "notes.md").unlink()
+    assert made(tmp_path / "a", *ONE_LIGHT, "--force") == 0
 
 
 def stop_with(error: BaseException, target: Path) -> None:

@@ -154,6 +154,33 @@ def test_a_movement_of_two_phases_in_turn_stays_green(single: Scenario) -> None:
     assert green_at(planned, 86, "y") == {"NBT", "NBL", "SBT", "SBL", "SBR", "NBR"}
 
 
+IN_TURN = ((1, 1, "EBL WBL EBR", 25), (1, 1, "EBT EBR WBT WBR", 25), (1, 1, "NBL SBL EBR", 25))
+LAST = "NBT NBR SBT SBR EBR"
+AT_A_BARRIER = (
+    (1, 1, "EBL WBL", 15), (1, 1, "EBT WBT WBR", 35), (2, 1, "EBR", 49.96),
+    (1, 2, "NBL SBL", 15), (1, 2, "NBT SBT SBR", 25), (2, 2, "EBR NBR", 40),
+)  # fmt: skip
+
+
+@pytest.mark.parametrize(
+    "listed",
+    [(*IN_TURN, (1, 1, LAST, split_s)) for split_s in (15.0, 14.96, 15.04)] + [AT_A_BARRIER],
+)
+def test_a_movement_of_all_phases_is_always_green(
+    listed: tuple[tuple[int, int, str, float], ...], single: Scenario
+) -> None:
+    """Also where the splits differ from the cycle, or between rings, by what rounding leaves."""
+    phases = tuple(PlanPhase(a, b, tuple(each.split()), s, 3, 2) for a, b, each, s in listed)
+    scenario = with_plans(single, [SignalPlan("A1", 90, 0, phases)], "plans.csv")
+    network = Network.read(scenario)
+    (light,) = network.intersections
+    (index,) = (
+        link.index for link, code in movement_codes(light, network).items() if code == "EBR"
+    )
+    assert {state[index] for _, state in light.programme} <= set("Gg")
+    assert sum(seconds for seconds, _ in light.programme) == pytest.approx(90, abs=1e-9)
+
+
 @pytest.mark.parametrize(("begin_s", "offset_s"), [(0, 0), (0, 25), (100, 40)])
 def test_sumo_shows_the_plan_at_its_offset(
     single: Scenario, begin_s: float, offset_s: float
@@ -360,6 +387,8 @@ def test_a_short_yellow_is_noted(tmp_path: Path, capsys: pytest.CaptureFixture[s
     stays = PlanPhase(1, 1, ("NBT", "SBT"), 30.0, 0.0, 0.0)
     more = PlanPhase(1, 1, ("NBT", "SBT", "NBL"), 30.0, 3.0, 2.0)
     assert not yellow_notes([SignalPlan("A1", 60.0, 0.0, (stays, more))])  # none of them ends
+    rounded = replace(stays, split_s=29.96)
+    assert not yellow_notes([SignalPlan("A1", 60.0, 0.0, (more, rounded))])
     assert yellow_notes([SignalPlan("A1", 60.0, 0.0, (replace(more, yellow_s=1.0), stays))])
 
 
@@ -730,6 +759,26 @@ def test_a_plan_is_not_switched_off_by_a_timetable(single: Scenario) -> None:
         for _ in range(12):
             env.step({"signal_0": 0})
         assert libsumo.trafficlight.getProgram("A1") == "plan"
+
+
+@pytest.mark.parametrize("place", ["network", "signals.add.xml", "plans.add.xml"])
+def test_a_plan_beside_another_of_its_name_is_run(place: str, single: Scenario) -> None:
+    """SUMO refuses two programmes of one light with the same id."""
+    if place == "network":
+        scenario = changed_programmes(single, lambda logic: logic.set("programID", "plan"))
+    else:
+        scenario = with_plans(single, [dual_ring(5.0)], "plans.csv")
+        (before,) = scenario.additional
+        scenario = replace(scenario, additional=(replace(before, name=place),))
+    planned = with_plans(scenario, [dual_ring()], "plans.csv")
+    (light,) = Network.read(planned).intersections
+    assert (sum(seconds for seconds, _ in light.programme), light.offset_s) == (90, 0)
+    with contextlib.closing(
+        parallel_env(planned, signals="programme", simulator="inprocess")
+    ) as env:
+        env.reset(seed=1)
+        program = "plan" if place == "plans.add.xml" else "plan-2"
+        assert libsumo.trafficlight.getProgram("A1") == program
 
 
 def test_two_plans_of_one_light_are_refused(single: Scenario) -> None:

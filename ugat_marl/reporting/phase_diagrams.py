@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-import re
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -16,7 +15,14 @@ from ugat_marl.errors import counted
 from ugat_marl.progress import Reporter
 from ugat_marl.reporting.figures import NamedFigure, printable, shortened
 from ugat_marl.reporting.style import LIGHT, styled
-from ugat_marl.scenarios import Intersection, Link, Network, Scenario, green_of_file
+from ugat_marl.scenarios import (
+    Intersection,
+    Link,
+    Network,
+    Scenario,
+    drawing_name,
+    green_of_file,
+)
 
 STYLES: dict[str, tuple[str, Literal["solid", "dashed", "dotted"], str]] = {
     "G": (LIGHT["c0"], "solid", "protected green"),
@@ -110,7 +116,7 @@ def _crossing_shapes(scenario: Scenario) -> dict[str, NDArray[np.float64]]:
 
 def _file_name(tls: str, taken: set[str]) -> str:
     """Return a new name that is valid in any file system, even if that ignores case."""
-    name = re.sub(r"[^\w-]+", "_", tls).strip("_")[:80] or "intersection"
+    name = drawing_name(tls)
     while name.lower() in taken:
         name += "_"
     taken.add(name.lower())

@@ -1,7 +1,8 @@
-"""Names of agents and of SUMO's lanes."""
+"""Names of agents, of SUMO's lanes, and of the drawings of lights."""
 
 from __future__ import annotations
 
+import re
 from collections.abc import Hashable, Mapping, Sequence
 
 
@@ -41,6 +42,11 @@ def letters(number: int) -> str:
         number, digit = divmod(number - 1, 26)
         text = chr(ord("a") + digit) + text
     return text
+
+
+def drawing_name(light: str) -> str:
+    """Return the name of a light's drawing, without its ending; it is valid in any file system."""
+    return re.sub(r"[^\w-]+", "_", light).strip("_")[:80] or "intersection"
 
 
 def edge_of_lane(lane: str) -> str:

@@ -32,6 +32,8 @@ from ugat_marl.scenarios.signals import SignalTiming
 
 COUNT_SHEET = "counts.csv"
 """Name of the sheet of turning counts in the folder of a scenario."""
+NETWORK = "network.net.xml"
+"""Name of the network that the suite writes into a folder; ``.gz`` follows if it is packed."""
 
 
 @dataclass(frozen=True)
@@ -168,7 +170,7 @@ def read_scenario(name: str | Path) -> Scenario:
             f"{path}: is measured data, no scenario; give a directory with scenario.toml (commands "
             "that read both take the scenario first)"
         )
-    if text and _is_file(path / COUNT_SHEET) and _is_file(path / "network.net.xml"):
+    if text and draft_network(path):
         raise ScenarioError(
             f"{path}: has roads and no vehicles yet; fill in {path / COUNT_SHEET}, and make it "
             "again with --counts, as its README.md says"
@@ -182,6 +184,14 @@ def read_scenario(name: str | Path) -> Scenario:
     raise UnknownNameError(
         "scenario", text, shipped, "A directory, a .sumocfg file and resco:<map> work as well."
     )
+
+
+def draft_network(folder: Path) -> Path | None:
+    """Return the network of a folder with roads and no vehicles; None if it is no such folder."""
+    if not _is_file(folder / COUNT_SHEET) or _is_file(folder / "scenario.toml"):
+        return None
+    packed_or_not = (folder / NETWORK, folder / f"{NETWORK}.gz")
+    return next(filter(_is_file, packed_or_not), None)
 
 
 def shipped_scenarios() -> Iterator[tuple[str, Path]]:

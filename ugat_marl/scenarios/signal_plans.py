@@ -15,7 +15,7 @@ import xml.etree.ElementTree as ET
 from collections import defaultdict
 from collections.abc import Collection, Container, Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
-from itertools import accumulate, combinations, pairwise
+from itertools import accumulate, chain, combinations, count, pairwise
 from pathlib import Path
 from typing import NamedTuple
 
@@ -168,7 +168,7 @@ def plan_states(
       and all-red they stay green if they are green after it, too.
 
     Args:
-        plan: The plan; `check_plan` has accepted it.
+        plan: The plan; `check_plan` has accepted it. Small differences of its times are made up.
         light: Its traffic light.
         network: The network.
         rules: Right of way at its junctions.
@@ -181,7 +181,7 @@ def plan_states(
     _check_movements(plan, set(codes.values()), source)
     width = max(link.index for link in (*light.links, *light.crossings)) + 1
     width = max([width, *(len(state) for _, state in light.programme)])
-    times, shown = _times(plan)
+    times, shown = _times(_fitted(plan))
     states: list[tuple[float, str]] = []
     clash = _plan_clash(light, rules)
     parts = list(pairwise(times))
@@ -246,6 +246,26 @@ def phase_times(plan: SignalPlan) -> list[tuple[float, float, float]]:
     return times
 
 
+def _fitted(plan: SignalPlan) -> SignalPlan:
+    """Return an accepted plan whose rings meet at each barrier, and whose splits make the cycle.
+
+    The last split of a ring before a barrier takes up what rounding leaves, with more or less
+    green. A gap would end the green of movements that stay green across it.
+    """
+    lengths: dict[int, dict[int, float]] = defaultdict(lambda: defaultdict(float))
+    last: dict[tuple[int, int], int] = {}
+    for place, phase in enumerate(plan.phases):
+        lengths[phase.barrier][phase.ring] += phase.split_s
+        last[phase.barrier, phase.ring] = place
+    wanted = {barrier: max(rings.values()) for barrier, rings in lengths.items()}
+    wanted[max(wanted)] += plan.cycle_s - sum(wanted.values())
+    phases = list(plan.phases)
+    for (barrier, ring), place in last.items():
+        lacking_s = wanted[barrier] - lengths[barrier][ring]
+        phases[place] = replace(phases[place], split_s=phases[place].split_s + lacking_s)
+    return replace(plan, phases=tuple(phases))
+
+
 def _staying(plan: SignalPlan) -> list[frozenset[str]]:
     """Return the movements that stay green after each phase, in the order of the phases."""
     begins = [begin for begin, *_ in phase_times(plan)]
@@ -272,7 +292,7 @@ def _times(plan: SignalPlan) -> tuple[list[float], _Shown]:
         shown.append((begin, green_end, yellow_end, end, frozenset(phase.movements), stays))
         if stays:
             shown.append((green_end, end, end, end, stays, stays))
-        # splits may exceed the cycle by what rounding leaves
+        # sums of splits may exceed the cycle by their last digits
         times |= {min(time, plan.cycle_s) for time in (begin, green_end, yellow_end, end)}
     kept: list[float] = []
     for time in sorted(times):
@@ -394,6 +414,9 @@ def with_plans(scenario: Scenario, plans: Iterable[SignalPlan], source: str) -> 
     """
     network, rules = Network.read(scenario), _rules(scenario)
     lights = {light.id: light for light in network.intersections}
+    name = "plans.add.xml"
+    others = tuple(document for document in scenario.additional if document.name != name)
+    taken = _programs((scenario.network, *others))
     top, planned = ET.Element("additional"), set[str]()
     for plan in plans:
         if plan.light not in lights:
@@ -406,12 +429,11 @@ def with_plans(scenario: Scenario, plans: Iterable[SignalPlan], source: str) -> 
         planned.add(plan.light)
         check_plan(plan, source)
         logic = ET.SubElement(
-            top, "tlLogic", id=plan.light, type="static", programID=_PROGRAM,
+            top, "tlLogic", id=plan.light, type="static", programID=_free(taken, plan.light),
             offset=f"{plan.offset_s:g}",
         )  # fmt: skip
         for seconds, state in plan_states(plan, lights[plan.light], network, rules, source):
             ET.SubElement(logic, "phase", duration=f"{seconds:.10g}", state=state)
-    name = "plans.add.xml"
     for document in scenario.additional:
         if document.name == name:
             kept = (
@@ -420,12 +442,24 @@ def with_plans(scenario: Scenario, plans: Iterable[SignalPlan], source: str) -> 
                 if other.tag != "tlLogic" or other.get("id") not in planned
             )
             top.extend(kept)
-    others = tuple(
-        _without_timetable(document, planned)
-        for document in scenario.additional
-        if document.name != name
-    )
-    return replace(scenario, additional=(*others, Document(name, None, xml_bytes(top))))
+    untimed = (_without_timetable(document, planned) for document in others)
+    return replace(scenario, additional=(*untimed, Document(name, None, xml_bytes(top))))
+
+
+def _programs(documents: Iterable[Document]) -> set[tuple[str, str]]:
+    """Return the light and the id of each programme in some files."""
+    return {
+        (logic.get("id", ""), logic.get("programID", ""))
+        for document in documents
+        for part in document.parts()
+        for logic in part.iter("tlLogic")
+    }
+
+
+def _free(taken: Container[tuple[str, str]], light: str) -> str:
+    """Return an id that no programme of a light has: SUMO refuses two programmes of one id."""
+    names = chain((_PROGRAM,), (f"{_PROGRAM}-{number}" for number in count(2)))
+    return next(name for name in names if (light, name) not in taken)
 
 
 def _without_timetable(document: Document, lights: Container[str]) -> Document:
@@ -553,7 +587,9 @@ def yellow_notes(plans: Iterable[SignalPlan]) -> list[str]:
     short = [
         f"{plan.light} (phase {number}: {phase.yellow_s:g} s)"
         for plan in plans
-        for number, (phase, stays) in enumerate(zip(plan.phases, _staying(plan), strict=True), 1)
+        for number, (phase, stays) in enumerate(
+            zip(plan.phases, _staying(_fitted(plan)), strict=True), 1
+        )
         if phase.yellow_s < _LEAST_YELLOW_S and set(phase.movements) - stays
     ]
     usual = f"{_LEAST_YELLOW_S:g} to 6 s are usual"

@@ -13,13 +13,14 @@ import json
 import math
 import tempfile
 import xml.etree.ElementTree as ET
+from collections import defaultdict
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from functools import cached_property
 from itertools import pairwise
 from pathlib import Path
 from typing import Any
 
-from ugat_marl.errors import ScenarioError
+from ugat_marl.errors import ScenarioError, listed
 from ugat_marl.files import parse_xml, read_bytes, write_whole, xml_bytes
 from ugat_marl.progress import Reporter, Silent
 from ugat_marl.scenarios.importers.cityflow_roadnet import (
@@ -35,6 +36,7 @@ from ugat_marl.scenarios.importers.plan import coordinate
 from ugat_marl.scenarios.importers.turning_shares import MOST_VEHICLES, Drive, write_drives
 from ugat_marl.scenarios.junctions import foes_of, links_of, yields_of
 from ugat_marl.scenarios.phases import RightOfWay, state_of
+from ugat_marl.scenarios.signals import GREEN
 from ugat_marl.scenarios.sumo_tools import netconvert
 
 YELLOW_S, ALL_RED_S = 3.0, 2.0
@@ -69,8 +71,9 @@ def from_cityflow(
         return RoadFiles(
             f"CityFlow network {roadnet.name}",
             f"Turned from CityFlow's `{roadnet.name}` and `{flow.name}`: lanes, stop lines, turns "
-            "and light phases are theirs, phase n being the n-th green one of the file. Who made "
-            "them decides what may be done with them; keep their licence beside them.",
+            "and light phases are theirs. Phase n is the n-th green one of the file, from 0, and "
+            "equal greens of a light are one phase. Who made the files decides what may be done "
+            "with them; keep their licence beside them.",
             routes=routes,
             settings={"duration_s": length_s, "control": {"phases": "programme"}},
             notes=tuple(notes),
@@ -245,6 +248,7 @@ def _set_programmes(root: ET.Element, net: Roadnet) -> list[str]:
     links = links_of(root)
     rules = RightOfWay(foes_of(root), yields_of(root))
     without: list[str] = []
+    equal: dict[str, list[str]] = defaultdict(list)
     for logic in root.iter("tlLogic"):
         crossing = net.crossings[logic.get("id", "")]
         crossing_links = links.get(crossing.id, [])
@@ -264,6 +268,8 @@ def _set_programmes(root: ET.Element, net: Roadnet) -> list[str]:
             )
             for _, green in greens
         ]
+        if numbers := _equal_greens(states):
+            equal[numbers].append(crossing.id)
         for place, (seconds, _) in enumerate(greens):
             following = states[(place + 1) % len(states)]
             ET.SubElement(logic, "phase", duration=f"{seconds:g}", state=states[place])
@@ -271,12 +277,25 @@ def _set_programmes(root: ET.Element, net: Roadnet) -> list[str]:
                 states[place], following, clearance_s, _letters(number_of, always)
             ):
                 ET.SubElement(logic, "phase", duration=f"{duration:g}", state=state)
+    notes = [
+        f"the greens {numbers} of the file, from 0, are equal at {listed(lights, 'light')}; they "
+        "are one phase, and those behind have lower numbers"
+        for numbers, lights in equal.items()
+    ]
     if without:
-        return [
+        notes.append(
             f"{len(without)} lights have no phase between two greens (the first: {without[0]!r}); "
             f"{YELLOW_S:g} s of yellow and {ALL_RED_S:g} s of red were put in"
-        ]
-    return []
+        )
+    return notes
+
+
+def _equal_greens(states: Sequence[str]) -> str:
+    """Return the numbers of a light's greens that are equal, as ``0 and 2``; empty if none are."""
+    places: dict[str, list[str]] = defaultdict(list)
+    for place, state in enumerate(state for state in states if set(state) & GREEN):
+        places[state].append(str(place))
+    return ", ".join(" and ".join(numbers) for numbers in places.values() if len(numbers) > 1)
 
 
 def _split(

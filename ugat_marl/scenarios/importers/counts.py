@@ -431,17 +431,21 @@ def _grid_s(rows: Sequence[Row], path: Path) -> float:
 def _counts_for_sumo(rows: Sequence[Row], grid_s: float, work: Path, seed: int) -> list[str]:
     """Write the counts in routeSampler's format, as whole vehicles, and return its options.
 
-    A row is parted into intervals of `grid_s` here: routeSampler would round each part down.
+    A row is parted into intervals of `grid_s` here: routeSampler would round each part down. Where
+    the parts of a row are rounded up is drawn for each row: the sums of many small rows would come
+    late in their interval otherwise.
     """
     turns = any(len(row.roads) > 1 for row in rows)
     by_time: dict[tuple[float, float], list[tuple[Row, int]]] = defaultdict(list)
     for row in rows:
-        whole = _whole(row, numpy_generator(seed, "counts", *row.roads, row.line))
+        random = numpy_generator(seed, "counts", *row.roads, row.line)
+        whole = _whole(row, random)
         parts = round((row.end_s - row.begin_s) / grid_s)
+        offset = int(random.integers(parts))
         edges = [row.begin_s + part * grid_s for part in range(parts)] + [row.end_s]
         for part, span in enumerate(pairwise(edges)):
-            in_part = (part + 1) * whole // parts - part * whole // parts
-            by_time[span].append((row, in_part))
+            before, by_then = ((n * whole + offset) // parts for n in (part, part + 1))
+            by_time[span].append((row, by_then - before))
     root = ET.Element("data")
     for (begin, end), interval_rows in sorted(by_time.items()):
         interval = ET.SubElement(root, "interval", id="counts", begin=f"{begin}", end=f"{end}")

@@ -4,13 +4,16 @@ from __future__ import annotations
 
 import contextlib
 import filecmp
+import os
+import re
 import shlex
 import shutil
 import signal
 import tempfile
 import threading
 from collections.abc import Callable, Iterator, Mapping, Sequence, Set
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
+from itertools import count
 from pathlib import Path
 from typing import Any
 
@@ -25,23 +28,26 @@ from ugat_marl.scenarios.importers.count_sheet import (
     is_filled,
     write_template,
 )
+from ugat_marl.scenarios.naming import drawing_name
 from ugat_marl.scenarios.network import Network
 from ugat_marl.scenarios.phases import suited
 from ugat_marl.scenarios.scenario import (
     COUNT_SHEET,
+    NETWORK,
     Document,
     Scenario,
+    draft_network,
     read_scenario,
     scenario_toml,
     shipped_scenarios,
 )
 from ugat_marl.scenarios.settings import validate_settings
 
-NETWORK, ROUTES = "network.net.xml", "demand.rou.xml"
+ROUTES = "demand.rou.xml"
 PICTURES = "pictures"
-KEPT_SHEETS = "counts-before"
-"""Begin of the names of sheets of counts that another one has replaced."""
 """Folder with drawings of the lights, in a folder without vehicles."""
+KEPT_SHEETS = "counts-before-*.csv"
+"""Names of sheets of counts that another one has replaced, each with a number."""
 
 
 @dataclass(frozen=True)
@@ -167,6 +173,7 @@ def make_scenario(
                 fleet = vehicles(folder, folder / draft.network, reporter)
                 copied |= fleet.copied
             content, notes = _settings(folder, draft, fleet.routes, settings)
+            _require_links_outside(target, content)
             notes += fleet.notes
             write_whole(folder / "scenario.toml", scenario_toml(content))
             scenario = read_scenario(folder)
@@ -206,9 +213,10 @@ def make_draft(
         ScenarioError: The network cannot be controlled.
     """
     with new_folder(target, force=force) as folder:
-        source = roads(folder, reporter)
+        source = _under_usual_name(roads(folder, reporter), folder)
         with _errors_about(source.copied, folder, source.network):
             content, notes = _settings(folder, source, ("none",), settings)
+            _require_links_outside(target, content)
             document = admitted(Document(NETWORK, folder / source.network))
             scenario = Scenario(
                 target.name, document, (), (), validate_settings(content, str(target))
@@ -220,6 +228,28 @@ def make_draft(
         lines = _draft_readme(target, source, command, network, notes)
         write_whole(folder / "README.md", "\n".join(lines) + "\n")
     return Draft(network, target / COUNT_SHEET, turns, notes)
+
+
+def _require_links_outside(target: Path, content: Mapping[str, Any]) -> None:
+    """Refuse links to files in the folder that the new scenario replaces."""
+    names = (content["network"], *content.get("routes", ()), *content.get("additional", ()))
+    for name in filter(os.path.isabs, names):
+        if target.resolve() in Path(name).resolve().parents:
+            raise OutputError(
+                f"{name}: lies in {target}, which would be replaced, and a link to it would lead "
+                "nowhere; leave out --link, or write to another folder"
+            )
+
+
+def _under_usual_name(source: RoadFiles, folder: Path) -> RoadFiles:
+    """Give the network of a draft the name by which a draft is known."""
+    name = NETWORK + ".gz" * source.network.endswith(".gz")
+    if Path(source.network).is_absolute():
+        (folder / name).symlink_to(source.network)  # the draft goes on to use the linked file
+        return source
+    (folder / source.network).rename(folder / name)
+    copied = {name if old == source.network else old: path for old, path in source.copied.items()}
+    return replace(source, network=name, copied=copied)
 
 
 def _settings(
@@ -371,7 +401,7 @@ def _stopped_in_order() -> Iterator[None]:
 
 def _require_counts_kept(made: Path, target: Path) -> None:
     """Keep a sheet that was filled in: under another name beside a new one, else refuse."""
-    for kept in target.glob(f"{KEPT_SHEETS}*.csv"):
+    for kept in target.glob(KEPT_SHEETS):
         shutil.copy2(kept, made)
     old, new = target / COUNT_SHEET, made / COUNT_SHEET
     if not old.is_file() or not is_filled(old):
@@ -379,8 +409,8 @@ def _require_counts_kept(made: Path, target: Path) -> None:
     if new.is_file() and new.read_bytes() == old.read_bytes():
         return
     if new.is_file() and is_filled(new) and (target / "scenario.toml").is_file():
-        number = len([*made.glob(f"{KEPT_SHEETS}*.csv")]) + 1
-        shutil.copy2(old, made / f"{KEPT_SHEETS}-{number}.csv")
+        names = (KEPT_SHEETS.replace("*", str(number)) for number in count(1))
+        shutil.copy2(old, next(made / name for name in names if not (made / name).exists()))
     else:
         raise OutputError(
             f"{old} would be lost; move it away first, write to another folder, or give it with "
@@ -390,11 +420,25 @@ def _require_counts_kept(made: Path, target: Path) -> None:
 
 def _keep_pictures(made: Path, target: Path) -> None:
     """Keep the drawings of a folder if its network stays the same."""
-    pictures, networks = target / PICTURES, [folder / NETWORK for folder in (target, made)]
+    pictures = target / PICTURES
     if not pictures.is_dir() or (made / PICTURES).exists():
         return
+    networks = [_named_files(folder)[0] for folder in (target, made)]
     if all(map(Path.is_file, networks)) and filecmp.cmp(*networks, shallow=False):
         shutil.copytree(pictures, made / PICTURES)
+
+
+def _named_files(folder: Path) -> tuple[Path, ...]:
+    """Return the network of a folder, then the other files that its ``scenario.toml`` names."""
+    toml = folder / "scenario.toml"
+    if network := draft_network(folder):
+        return (network,)
+    try:
+        settings = validate_settings(read_toml(toml, ScenarioError), str(toml))
+    except ScenarioError:  # a damaged one names no files, so they have the usual names
+        return folder / NETWORK, folder / ROUTES
+    names = (settings.network, *settings.routes, *settings.additional)
+    return tuple(folder / name for name in names)
 
 
 def require_free(target: Path, *, force: bool) -> None:
@@ -419,31 +463,53 @@ def require_free(target: Path, *, force: bool) -> None:
         raise OutputError(f"{target} exists and is not a folder; choose another name")
     if not target.is_dir() or not any(target.iterdir()):
         return
-    if (target / COUNT_SHEET).is_file() and not (target / "scenario.toml").exists():
-        _require_nothing_else(target, {COUNT_SHEET, NETWORK}, "the sheet of counts")
+    if draft_network(target):
+        _require_nothing_else(target, {COUNT_SHEET}, "the sheet of counts")
         return
     if not (target / "scenario.toml").is_file():
         raise OutputError(f"{target} exists and is not a scenario; choose another name")
     if not force:
         raise OutputError(f"scenario {str(target)!r} exists; --force replaces it")
-    with contextlib.suppress(ScenarioError):  # a damaged one names no files
-        named = read_toml(target / "scenario.toml", ScenarioError)
-        files = [named.get("network"), *named.get("routes", ()), *named.get("additional", ())]
-        folders = {part for name in files for part in Path(str(name)).parts[:1]}
-        _require_nothing_else(
-            target, {"scenario.toml", COUNT_SHEET, FIT_SHEET, *folders}, "the scenario"
-        )
+    _require_nothing_else(target, {"scenario.toml", COUNT_SHEET, FIT_SHEET}, "the scenario")
 
 
 def _require_nothing_else(target: Path, made: Set[str], what: str) -> None:
     """Refuse to replace a folder that holds files of the user, beside those made with it."""
-    known = {*made, "README.md", PICTURES}
-    others = sorted(
-        name
-        for name in {path.name for path in target.iterdir()} - known
-        if not name.startswith((".", KEPT_SHEETS))
-    )
-    if others:
-        raise OutputError(
-            f"{target / others[0]} was not made with {what}, and would be lost; move it away first"
-        )
+    named = _named_files(target)
+    known = {target / "README.md", *(target / name for name in made)}
+    known |= {target / os.path.relpath(path, target) for path in named}
+    folders = {target / PICTURES, *(folder for path in known for folder in path.parents)}
+    drawings = _drawing_names(named[0]) if (target / PICTURES).is_dir() else frozenset()
+
+    def is_ours(path: Path) -> bool:
+        if path in known or path.name == ".DS_Store" or (path in folders and path.is_dir()):
+            return True
+        if path.parent == target:
+            return path.match(KEPT_SHEETS) and path.is_file()  # these are kept
+        return path.parent == target / PICTURES and _is_drawing(path, drawings)
+
+    for path in sorted(target.rglob("*")):
+        if not is_ours(path):
+            raise OutputError(
+                f"{path} was not made with {what}, and would be lost; move it away first"
+            )
+
+
+def _drawing_names(network: Path) -> frozenset[str]:
+    """Return the names of the drawings of a network's lights; none if it cannot be read."""
+    try:
+        tags = Document(network.name, network).scan()
+        lights = {tag.attributes.get("tl", "") for tag in tags if tag.name == "connection"}
+    except ScenarioError:
+        return frozenset()
+    return frozenset(drawing_name(light).rstrip("_") for light in lights - {""})
+
+
+def _is_drawing(path: Path, lights: Set[str]) -> bool:
+    """Return True for a drawing of the network or of a light, perhaps a numbered page of it.
+
+    Lights whose names are alike have underscores behind them.
+    """
+    name = path.stem.rstrip("_")
+    drawn = path.stem == "network" or name in lights or re.sub(r"-\d+$", "", name) in lights
+    return drawn and path.suffix in (".svg", ".png")

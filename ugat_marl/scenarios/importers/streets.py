@@ -37,7 +37,8 @@ class Streets:
         start: dict[str, str] = {}
         end: dict[str, str] = {}
         for edge in root.iter("edge"):
-            if edge.get("function") is None and any(map(cars_may_use, edge.iter("lane"))):
+            outside = edge.get("function", "normal") == "normal"
+            if outside and any(map(cars_may_use, edge.iter("lane"))):
                 start[edge.get("id", "")] = edge.get("from", "")
                 end[edge.get("id", "")] = edge.get("to", "")
         closed = lanes_without_cars(root)
