@@ -27,6 +27,7 @@ from ugat_marl.effects import load_scenario, scenario_in_domain
 from ugat_marl.envs import parallel_env
 from ugat_marl.errors import CheckpointError, JobError, OptionError, UnknownNameError
 from ugat_marl.experiments import (
+    QUEUES,
     Job,
     JobRecord,
     LearnerSpec,
@@ -35,6 +36,7 @@ from ugat_marl.experiments import (
     forked,
     perform_all,
     perform_here,
+    read_queues,
     record_of,
 )
 from ugat_marl.experiments.driver import LOG
@@ -50,7 +52,7 @@ from ugat_marl.experiments.jobs import (
 )
 from ugat_marl.experiments.paper import TABLES, settings_of
 from ugat_marl.experiments.settings import UNTRAINED
-from ugat_marl.grounding import FitConfig, UgatConfig
+from ugat_marl.grounding import DIRECT_LEARNER, FitConfig, UgatConfig
 from ugat_marl.parallel import DEADLINE_VARIABLE, Heartbeat, Stop
 from ugat_marl.policies import (
     BASELINES,
@@ -94,6 +96,13 @@ UGAT = UgatConfig(
     real_rollouts=2,
     least_accuracy=None,  # so little training proves nothing
     fit=FitConfig(epochs=2),
+)
+GROUNDED = replace(
+    PLAIN,
+    setting=Setting("UGAT", "grounded", learner=QUICK, ugat=UGAT),
+    target="V4",
+    episodes=6,
+    every=0,
 )
 
 
@@ -226,6 +235,20 @@ def test_a_killed_job_goes_on_and_ends_with_the_same_numbers(
     assert (tmp_path / "killed" / SCORES).read_bytes() == played
 
 
+def test_queues_count_each_episode_once_after_the_scores_are_lost(tmp_path: Path) -> None:
+    job = replace(
+        RULE, setting=Setting("rule", "rule", rules=("fixed-time:30",)),
+        options={"duration_s": 60.0}, domains=("V4",),
+    )  # fmt: skip
+    looks: list[set[int]] = []
+    for damaged, seeds in ((False, 1), (False, 2), (True, 2), (True, 1)):
+        if damaged:
+            (tmp_path / SCORES).write_text("{")
+        perform(replace(job, evaluation_seeds=evaluation_seeds(seeds)), tmp_path, Silent())
+        looks.append(set(read_queues(tmp_path / QUEUES)["looks"]))
+    assert looks == [{6}, {12}, {12}, {6}]  # six decisions in a minute
+
+
 def test_scores_that_cannot_be_read_now_are_not_replaced(tmp_path: Path) -> None:
     """An empty record would be written over the scores of episodes that were played."""
     job = replace(PLAIN, episodes=2)
@@ -281,8 +304,9 @@ def test_a_failed_job_says_why_and_the_others_go_on_if_they_shall(tmp_path: Path
 
 @needs_forks
 def test_jobs_beside_others_have_the_same_numbers(tmp_path: Path) -> None:
-    """The grounded job is begun beside plain training, and waits for the learner of that."""
-    plan = [PLAIN, after(PLAIN, Setting("UGAT", "grounded", learner=QUICK, ugat=UGAT)), RULE]
+    """The fine-tuned job is begun beside the grounded one, and waits for its plain training."""
+    tuned = after(GROUNDED, Setting("fine-tuned", "further", learner=QUICK))
+    plan = [GROUNDED, replace(tuned, start=f"{GROUNDED.name}/{DIRECT_LEARNER}"), RULE]
     one = perform_here(plan, tmp_path / "one", reporter=Silent())
     two = perform_here(plan, tmp_path / "two", workers=3, reporter=Silent(), beside=plan[1:])
     assert [record.scores for record in one] == [record.scores for record in two]
@@ -290,36 +314,20 @@ def test_jobs_beside_others_have_the_same_numbers(tmp_path: Path) -> None:
     assert logs == [False, True, True], "the first is done here, the others beside it"
 
 
-def test_a_job_starts_from_the_learner_at_the_end_of_its_training(tmp_path: Path) -> None:
-    """A training that is judged every two episodes keeps its learner as often."""
-    start = tmp_path / PLAIN.name / LEARNER
-    assert not driver._is_final(start)
-    PLAIN.write(start.parent)
-    start.write_bytes(b"after two of four episodes")
-    assert not driver._is_final(start)
-    start.unlink()
-    perform_here([PLAIN], tmp_path, reporter=Silent())
-    assert driver._is_final(start)
-    long = replace(PLAIN, every=0, episodes=40)  # it keeps its learner every ten episodes
-    long.write(start.parent)
-    assert not driver._is_final(start)
-
-
-def test_a_learner_that_ends_while_its_job_is_wanted_is_not_overlooked(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_learner_that_ends_while_its_job_is_wanted_is_not_overlooked(tmp_path: Path) -> None:
     """It ends between the look at it and the look at who wants the job."""
-    wanted, looks = threading.Event(), iter([False, True])
-
-    def look(_: Path) -> bool:
-        wanted.set()
-        return next(looks)
-
-    monkeypatch.setattr(driver, "_is_final", look)
-    job = replace(PLAIN, start=f"{PLAIN.name}/{LEARNER}")
-    assert driver._is_ready(job, tmp_path, Stop(), wanted)
-    monkeypatch.setattr(driver, "_is_final", lambda _: False)
+    wanted = threading.Event()
+    wanted.set()
+    job = replace(PLAIN, start=f"{GROUNDED.name}/{DIRECT_LEARNER}")
     assert not driver._is_ready(job, tmp_path, Stop(), wanted)
+
+    class Ending(threading.Event):
+        def is_set(self) -> bool:
+            (tmp_path / GROUNDED.name).mkdir()
+            (tmp_path / GROUNDED.name / DIRECT_LEARNER).touch()
+            return True
+
+    assert driver._is_ready(job, tmp_path, Stop(), Ending())
 
 
 @needs_forks

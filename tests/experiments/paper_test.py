@@ -12,14 +12,25 @@ import pytest
 from tests.runs import perform_in_this_process
 from ugat_marl.__main__ import main
 from ugat_marl.data import Scores
+from ugat_marl.effects import load_scenario
 from ugat_marl.errors import OptionError, UnknownNameError
-from ugat_marl.experiments import DIRECT, QUEUES, TIMED, PaperConfig, TransferConfig, read_queues
+from ugat_marl.experiments import (
+    DIRECT,
+    QUEUES,
+    TIMED,
+    PaperConfig,
+    TransferConfig,
+    compare,
+    paper,
+    read_queues,
+)
 from ugat_marl.experiments.driver import record_of
 from ugat_marl.experiments.jobs import SCORES, JobRecord
 from ugat_marl.experiments.paper import TABLES, Planner, settings_of
 from ugat_marl.experiments.settings import LearnerSpec, Setting
 from ugat_marl.experiments.transfers import planned_jobs
 from ugat_marl.grounding import FitConfig, GateConfig, InputsConfig, TimedConfig, UgatConfig
+from ugat_marl.progress import Silent
 
 SHORT = PaperConfig(episodes=10, iterations=2, grounded_episodes=5, real_rollouts=3, seeds=2)
 
@@ -207,6 +218,40 @@ def test_impossible_rows_are_refused() -> None:
         settings_of("main", UgatConfig(), "sim", constants=(0, 2))
     with pytest.raises(OptionError, match="phase, timed, street"):
         settings_of("main", UgatConfig(), "sim", groundings=("fase",))
+
+
+@pytest.mark.parametrize(
+    ("table", "options", "says"),
+    [
+        ("main", {"sim": "meso", "groundings": ("street",)}, "queue model"),
+        ("main", {"sim": "lost_commands=0.1", "groundings": ("street",)}, "changes commands"),
+        ("main", {"observation": "pressure", "learner": "dqn"}, "shows no numbers of vehicles"),
+        ("ablation", {"domains": ("min_green=15",)}, "in the decision that asks for it"),
+        (
+            "ablation",
+            {"domains": ("min_green=15",), "groundings": ("street",)},
+            "in the decision that asks for it",
+        ),
+    ],
+)
+def test_rows_that_cannot_be_trained_are_refused_before_all_others_are(
+    table: str, options: dict[str, Any], says: str, monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
+    monkeypatch.setattr(paper, "perform_all", None)
+    with pytest.raises(OptionError, match=says):
+        compare(table, "single-v1", PaperConfig(**options), tmp_path, 1, Silent())
+
+
+def test_tables_of_two_scenarios_do_not_share_a_folder(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(paper, "perform_all", None)
+    towns = [str(tmp_path / folder / "town") for folder in ("a", "b")]
+    for town in towns:
+        load_scenario("single-v1").write(Path(town))
+    assert main(["paper", "gap", "--scenario", *towns, "--out", str(tmp_path / "out")]) == 2
+    said = " ".join(capsys.readouterr().err.split())
+    assert "two have the name 'town'" in said and "another --out" in said
 
 
 def test_greens_are_late_in_the_simulation_that_is_trained_in(tmp_path: Path) -> None:

@@ -126,6 +126,20 @@ def test_two_calls_at_once_keep_both_rows(tmp_path: Path, monkeypatch: pytest.Mo
     assert {"first", "second", "fast"} < {*read_standings(table)["setting"]}
 
 
+def test_a_row_of_the_same_name_is_replaced_in_its_own_file(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    table = written(tmp_path)
+    fast = read_standings(table).filter(pl.col("setting") == "fast")
+    words = ["--policies", "random", "--table", str(table), "--out", str(table)]
+    for att_s in (70.0, 90.0):
+        own = fast.with_columns(setting=pl.lit("mine"), att_s=pl.lit(att_s))
+        monkeypatch.setattr(Compare, "_judged", lambda *_, own=own: own)
+        assert main(["compare", "single-v1", "--name", "mine", *words]) == 0
+        whole = read_standings(table)
+        assert whole.height == 9 and row(whole, "mine")["att_s"] == att_s
+
+
 def test_a_length_is_compared_as_a_number(tmp_path: Path) -> None:
     """A spreadsheet writes 3600 for 3600.0."""
     lines = [f"{line},single-v1,5,3600" for line in TABLE.splitlines()]

@@ -203,6 +203,7 @@ def test_domain_randomisation_resumes(tmp_path: Path) -> None:
         ),
         ({"negative_control": "same-world", "real_log": Path("x")}, "leave out one of them"),
         ({"further": ("V2", "SIM"), "control": True}, "is what the control does"),
+        ({"further": ("sim",), "control": False}, "is what the control does.*use the control"),
         ({"further": ("V4", "snow")}, "further holds one twice: V4 V4"),
     ],
 )

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from ugat_marl.data import AgentLayout, Provenance, TransitionLog, TransitionRecorder
-from ugat_marl.grounding.channel import ChannelConfig, CommandChannel, fit_channel
+from ugat_marl.grounding.channel import ChannelConfig, CommandChannel, _Course, fit_channel
 from ugat_marl.scenarios import SignalState, SignalTiming
 
 PHASES = 4
@@ -23,6 +23,14 @@ Mask = Callable[[int, int], Sequence[int]]
 
 def anything(_running: int, _age: int) -> Sequence[int]:
     return range(PHASES)
+
+
+def held(running: int, age: int) -> Sequence[int]:
+    return [running] if age < 2 else range(PHASES)
+
+
+def ended(running: int, age: int) -> Sequence[int]:
+    return [phase for phase in range(PHASES) if phase != running or age < 4]
 
 
 def obeyed(command: int | None, running: int, allowed: Sequence[int]) -> int:
@@ -41,14 +49,18 @@ def log_of(
     rows: dict[str, int] | None = None,
     seed: int = 0,
     hold: int = 1,
+    begun: int = 1,
 ) -> TransitionLog:
-    """Return a log of random commands, each of `hold` decisions, that a street with faults ran."""
+    """Return a log of random commands that a street with these faults executed.
+
+    A command is given for `hold` decisions. `begun` is the age of the first green, in decisions.
+    """
     lags = lag if isinstance(lag, dict) else dict.fromkeys(AGENTS, lag)
     generator = np.random.default_rng(seed)
     recorder = TransitionRecorder(
         Provenance("by hand", "", "street", (), INTERVAL_S, "count", LAYOUTS)
     )
-    running, age = dict.fromkeys(AGENTS, 0), dict.fromkeys(AGENTS, 1)
+    running, age = dict.fromkeys(AGENTS, 0), dict.fromkeys(AGENTS, begun)
     given: dict[str, list[int]] = {agent: [] for agent in AGENTS}
     for step in range(max((rows or {"": 360}).values())):
         seen = {a: np.array([0.0, *np.eye(PHASES)[running[a]]]) for a in AGENTS}
@@ -75,18 +87,27 @@ def log_of(
     return recorder.log()
 
 
-def after_one_step(channel: CommandChannel, phase: int, age: int) -> list[int]:
+def permitted(channel: CommandChannel, state: SignalState, timing: SignalTiming) -> list[int]:
     """Return the phases that the fitted actuator permits."""
-    actuator = channel.actuator(None, TIMING, INTERVAL_S)  # type: ignore[arg-type]
+    actuator = channel.actuator(None, timing, INTERVAL_S)  # type: ignore[arg-type]
     assert actuator is not None
-    masks: list[list[int]] = []
-    for early_s in (0.0, 1.0):  # a clearance more or less would be another age
-        mask = np.ones(PHASES, dtype=np.int8)
-        elapsed_s = age * INTERVAL_S - TIMING.clearance_s - early_s
-        actuator.restrict(mask, 0, SignalState(phase, phase, elapsed_s))
-        masks.append(np.flatnonzero(mask).tolist())
-    assert masks[0] == masks[1]
-    return masks[0]
+    mask = np.ones(PHASES, dtype=np.int8)
+    actuator.restrict(mask, 0, state)
+    return np.flatnonzero(mask).tolist()
+
+
+def after_one_step(channel: CommandChannel, phase: int, age: int) -> list[int]:
+    """Return the phases that the fitted actuator permits to a green of this age."""
+    one, other = (  # a clearance more or less would be another age
+        permitted(
+            channel,
+            SignalState(phase, phase, age * INTERVAL_S - TIMING.clearance_s - early_s),
+            TIMING,
+        )
+        for early_s in (0.0, 1.0)
+    )
+    assert one == other
+    return one
 
 
 def test_an_obedient_street_has_no_channel() -> None:
@@ -157,10 +178,32 @@ def test_shortest_and_longest_greens_are_entries_of_the_table() -> None:
     assert after_one_step(channel, 2, age=9) == [0, 1, 3]  # not seen: as the oldest that was
 
 
-def test_greens_that_the_simulation_holds_itself_are_not_forbidden() -> None:
-    def held(running: int, age: int) -> Sequence[int]:
-        return [running] if age < 2 else range(PHASES)
+def test_a_longest_green_is_read_off_refused_commands_at_all_later_ages() -> None:
+    """No green is older than the longest one, so that nothing is refused at such an age."""
+    channel = fit_channel(log_of(mask=ended, told=False, rows={"": 4000}))
+    assert after_one_step(channel, 2, age=3) == [0, 1, 2, 3]
+    for age in (4, 5, 9):
+        assert after_one_step(channel, 2, age) == [0, 1, 3]
 
+
+def test_the_age_of_a_green_counts_from_the_beginning_of_its_clearance() -> None:
+    channel = fit_channel(log_of(mask=held))
+    slow = SignalTiming(yellow_s=9.0, all_red_s=3.0, min_green_s=5.0)
+    assert permitted(channel, SignalState(2, 1, 11.0), slow) == [2]
+    assert permitted(channel, SignalState(2, 2, 8.0), slow) == [0, 1, 2, 3]
+
+
+def test_a_green_from_before_the_episode_may_be_of_any_age() -> None:
+    """All commands are obeyed, also the first one, which ends a green of unknown age."""
+    log = log_of(mask=held, begun=5)
+    course = _Course.of(log.transitions("a_0"), LAYOUTS["a_0"], ChannelConfig(), held=0.0)
+    assert course.executed[0] != course.running[0]
+    table = course.table_of_masks(0)
+    assert np.flatnonzero(table[1, 0]).tolist() == [0], "a young green is held"
+    assert np.array_equal(course.obeyed(course.asked[0], table), course.executed)
+
+
+def test_greens_that_the_simulation_holds_itself_are_not_forbidden() -> None:
     log = log_of(mask=held)
     assert fit_channel(log).forbids
     assert not fit_channel(log, held_s=2 * INTERVAL_S).changes

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import replace
 
 import numpy as np
@@ -10,7 +10,16 @@ import pytest
 
 from ugat_marl.data import AgentLayout, Provenance, TransitionLog, TransitionRecorder
 from ugat_marl.errors import OptionError
-from ugat_marl.grounding.eyes import Eyes, EyesConfig, _dead, _noise, fit_eyes
+from ugat_marl.grounding.eyes import (
+    Eyes,
+    EyesConfig,
+    _dead,
+    _fall_in_green,
+    _lost,
+    _noise,
+    _since_green,
+    fit_eyes,
+)
 from ugat_marl.grounding.summaries import LaneRows, LaneView
 
 LANES = 4
@@ -154,6 +163,29 @@ def test_a_street_without_red_has_no_noise_to_tell() -> None:
     )  # fmt: skip
     green = replace(green, age_s=np.full(40, 10.0))
     assert _noise([green], [dark], EyesConfig()) == (0.0, 0.0)
+
+
+def two_episodes(green: Sequence[int], falls: Sequence[float]) -> LaneRows:
+    """Return the rows of a lane with long queues; the second episode is as long as the first."""
+    count = len(falls)
+    episode, step = np.divmod(np.arange(count), count // 2)
+    has, never = np.array(green, dtype=bool), np.zeros(count, dtype=bool)
+    before = np.full(count, 9.0)
+    left, age_s = np.zeros(count), 10.0 * has
+    return LaneRows(episode, step, before, before - falls, left, age_s, has, never, never)
+
+
+def test_no_episode_goes_on_in_the_next_one() -> None:
+    """The queue at the end of one is another one than that at the beginning of the next."""
+    config = EyesConfig(least_served=1, least_stays=1)
+    after_green = two_episodes([1, 1, 0, 0], [4.0, 4.0, 9.0, 0.0])
+    assert _fall_in_green([after_green], 1, config) == 4.0
+    since = _since_green(two_episodes([0, 1, 0, 0, 0, 1], [0.0] * 6))
+    assert since.tolist() == [-1, 0, 1, -1, -1, 0]
+    stays_at_the_end = two_episodes([1] * 6, [2.0, 2.0, 0.0, 6.0, 2.0, 2.0])
+    assert _lost([stays_at_the_end], config) == 0.0
+    within = two_episodes([1] * 6, [2.0, 0.0, 6.0, 2.0, 2.0, 2.0])
+    assert _lost([within], config) > 0.0
 
 
 @pytest.mark.parametrize("lag", [1, 3])

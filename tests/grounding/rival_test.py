@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from tests.interrupts import KillAt
 from tests.runs import SMALL, checkpoint_of, numbers, play_nothing, weights
 from ugat_marl.data import TransitionLog
-from ugat_marl.effects import load_scenario
+from ugat_marl.effects import late_greens, load_scenario
 from ugat_marl.envs import parallel_env
 from ugat_marl.errors import UnknownNameError
 from ugat_marl.experiments import transfer
@@ -26,8 +26,10 @@ from ugat_marl.grounding import (
     StreetConfig,
     StreetTraining,
 )
-from ugat_marl.grounding.rival import ROLL_OUTS, Rival, late_world, matched_delays
+from ugat_marl.grounding.rival import LONGEST_S, ROLL_OUTS, Rival, late_world, matched_delays
 from ugat_marl.grounding.street import StreetWorld
+from ugat_marl.grounding.worlds import EPISODES_PER_DELAY
+from ugat_marl.parallel import Stop
 from ugat_marl.policies import DQNConfig, EpsilonGreedy, make_rule, observer_of, roll_out
 
 QUICK = StreetConfig(
@@ -80,8 +82,38 @@ def test_greens_are_as_late_as_those_of_the_street(
 
 def test_each_light_is_late_by_its_own_delay() -> None:
     world = late_world({"a": 2.5, "b": 0.0, "c": 1.0}, {"a": "A", "b": "B", "c": "C"})
-    assert [str(effect) for effect in world.effects] == ["late_green=A,2.5", "late_green=C,1"]
-    assert late_world({"b": 0.0}, {"b": "B"}) == StreetWorld()
+    late = ["late_green=A,2.5", "late_green=B,0", "late_green=C,1"]
+    assert [str(effect) for effect in world.effects] == late
+
+
+@pytest.mark.parametrize("own_s", [0, 2])
+def test_delays_do_not_depend_on_late_greens_of_the_simulation(
+    own_s: int, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    with contextlib.closing(parallel_env("single-v1", f"late_green=*,{own_s}")) as env:
+        simulation = Simulation(env.scenario, {"duration_s": 100.0}, epsilon=0.0, workers=1)
+        rule = make_rule("max-pressure:10", env)
+    logs, late_s = Simulation.logs, list[float]()
+
+    def seen(self: Simulation, worlds: Any, *others: Any) -> list[TransitionLog]:
+        for world in worlds:
+            with contextlib.closing(self.env(world)) as env:
+                late_s.append(max(late_greens(env.scenario).values(), default=0.0))
+        return logs(self, worlds, *others)
+
+    monkeypatch.setattr(Simulation, "logs", seen)
+    street = simulation.play(StreetWorld(), rule, 1, Stop())
+    matched_delays(street, simulation, rule, 0, lambda: None)
+    assert late_s == [float(s) for s in range(LONGEST_S + 1) for _ in range(EPISODES_PER_DELAY)]
+
+
+def test_greens_that_are_0_s_late_change_no_number() -> None:
+    simulation = Simulation(load_scenario("grid2x2-v1"), {"duration_s": 300.0}, 0.3, workers=1)
+    with contextlib.closing(simulation.plain(0)) as env:
+        rule, lights = make_rule("max-pressure:10", env), env.intersection_of
+    in_time = late_world(dict.fromkeys(lights, 0.0), lights)
+    one, other = (simulation.play(world, rule, 1, Stop()) for world in (StreetWorld(), in_time))
+    assert one.frame.equals(other.frame)
 
 
 @pytest.mark.slow

@@ -21,6 +21,7 @@ from ugat_marl.effects import load_scenario
 from ugat_marl.envs import parallel_env
 from ugat_marl.errors import CheckpointError, LogError, OptionError, UnknownNameError
 from ugat_marl.experiments import transfer
+from ugat_marl.experiments.training import simulated_worlds
 from ugat_marl.grounding import (
     FittedStreet,
     LaneView,
@@ -43,7 +44,8 @@ from ugat_marl.grounding.posterior import Posterior, WorldValues
 from ugat_marl.grounding.state import RunState
 from ugat_marl.grounding.street_training import StreetTraining
 from ugat_marl.grounding.summaries import NAMES
-from ugat_marl.parallel import LocalProcesses
+from ugat_marl.grounding.worlds import RecordedCommands
+from ugat_marl.parallel import LocalProcesses, Stop
 from ugat_marl.policies import (
     DQN,
     DQNConfig,
@@ -355,6 +357,19 @@ def test_worlds_beside_a_log_of_other_commands_get_these_commands(
         assert acted.pop() == expected
 
 
+def test_a_world_ends_with_the_period_whose_commands_it_repeats() -> None:
+    """Else the last command is held to the end of the longest period, and lanes with red jam."""
+    short, whole = recorded("sim", 180.0).first(3), recorded("sim", 180.0, seed=1)
+    replay = RecordedCommands(TransitionLog.concatenate([short, whole]))
+
+    def decisions(seconds: float) -> list[int]:
+        world = simulation(seconds)
+        return [world.play(StreetWorld(), replay, seed, Stop()).decisions for seed in (0, 1)]
+
+    assert decisions(180.0) == [3, 18]
+    assert decisions(100.0) == [3, 10]
+
+
 def test_policies_are_compared_in_processes_as_here() -> None:
     """An executor cannot be sent to its own processes."""
     here = simulation()
@@ -446,6 +461,18 @@ def test_controls_without_a_meaning_are_refused(
     ugat = replace(SMALL.ugat, grounding="street", street=QUICK)
     with pytest.raises(OptionError, match=message):
         transfer(replace(SMALL, negative_control=control, ugat=ugat), tmp_path, workers=1)
+
+
+@pytest.mark.parametrize("own", ["execution_delay=20", "lost_commands=0.2", "phase_order=cyclic"])
+def test_commands_are_not_changed_by_the_simulation_and_by_a_channel(own: str) -> None:
+    """The channel tells all that becomes of a command, and would be added to the simulation's."""
+    fitted = UgatConfig("street")
+    with pytest.raises(OptionError, match=rf"changes commands \({own}\).*--street.parts eyes"):
+        simulated_worlds(SCENARIO, f"V1+{own}", LATE, fitted, {})
+    without = replace(fitted, street=replace(fitted.street, parts=("eyes", "service", "effects")))
+    simulated_worlds(SCENARIO, f"V1+{own}", LATE, without, {})
+    simulated_worlds(SCENARIO, f"V1+{own}", LATE, UgatConfig("phase"), {})
+    simulated_worlds(SCENARIO, "V1+counting_noise=0.1+min_green=10", LATE, fitted, {})
 
 
 def in_part(log: TransitionLog, kept: pl.Expr) -> TransitionLog:

@@ -27,11 +27,13 @@ from ugat_marl.grounding import (
     PhaseTransform,
     RandomDelays,
     SimulatedWorld,
+    StreetConfig,
     TimedConfig,
     TimedTransform,
     UgatConfig,
 )
 from ugat_marl.grounding.forward import ForwardConfig
+from ugat_marl.grounding.residual import ResidualConfig
 from ugat_marl.policies import observer_of, roll_out
 
 MOST_S = 4
@@ -149,6 +151,7 @@ def test_traffic_is_delayed_in_some_episodes_more_often_than_in_others(env: Traf
 
 
 TIMED = UgatConfig("timed")
+TIMED_RESIDUAL = UgatConfig("street", street=StreetConfig(residual=ResidualConfig("timed")))
 
 
 @pytest.mark.parametrize(
@@ -160,14 +163,17 @@ TIMED = UgatConfig("timed")
         ({}, "V4+min_green=15"),
     ],
 )
+@pytest.mark.parametrize("ugat", [TIMED, TIMED_RESIDUAL], ids=["timed", "residual"])
 def test_greens_that_begin_later_than_asked_are_not_delayed(
-    control: dict[str, float], real: str
+    control: dict[str, float], real: str, ugat: UgatConfig
 ) -> None:
     """A delay would be told of one decision and executed in another, or not at all."""
     scenario = load_scenario("grid2x2-v1").with_control(**control)
     with pytest.raises(OptionError, match="in the decision that asks for it"):
-        simulated_worlds(scenario, "sim", real, TIMED, {})
-    simulated_worlds(scenario, "sim", real, UgatConfig("phase"), {})
+        simulated_worlds(scenario, "sim", real, ugat, {})
+    for undelayed in ("phase", "street"):
+        simulated_worlds(scenario, "sim", real, UgatConfig(undelayed), {})
+    simulated_worlds(scenario, "sim", real, replace(TIMED_RESIDUAL, grounding="phase"), {})
 
 
 @pytest.mark.parametrize("reward", ["waiting", "pressure"])

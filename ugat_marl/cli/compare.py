@@ -167,7 +167,8 @@ class Compare:
             nonlocal whole
             if extended:  # another call may have added rows meanwhile
                 whole = with_standings(read_standings(out), own)
-            self._require_kept(whole)
+            else:
+                self._require_kept(whole)
             if self.table is None:
                 return judging.written_to(whole).write_csv()
             return judging.written_beside(whole, self.name, self.table).write_csv()

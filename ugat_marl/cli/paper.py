@@ -89,6 +89,7 @@ class _Paper:
             )
         device_of(self.config.device)  # a missing device is an error now, not in a job's log
         config = self.config
+        self._require_own_folders()
         # A wrong one is an error before any is trained in.
         scenarios = [load_scenario(name, config.duration_s) for name in config.scenario]
         for scenario, loaded in zip(config.scenario, scenarios, strict=True):
@@ -103,6 +104,16 @@ class _Paper:
             console.print(terminal_tables(comparison, DIRECT))
             console.print(f"table and pictures: {folder}\ntrainings: {self.runs}", soft_wrap=True)
         return 0
+
+    def _require_own_folders(self) -> None:
+        """Refuse scenarios of the same name, whose tables would be written to one folder."""
+        names = [file_stem(scenario) for scenario in self.config.scenario]
+        if twice := [name for name in names if names.count(name) > 1]:
+            raise OptionError(
+                f"scenario {' '.join(self.config.scenario)}: two have the name {twice[0]!r}, and "
+                f"{self.out / twice[0]} holds the tables of one; make the tables of the other in "
+                "a call of its own, with another --out"
+            )
 
 
 @dataclass(frozen=True)

@@ -75,6 +75,7 @@ from .roads import shift_parking as shift_parking
 from .sensors import OBSERVATION_EFFECTS as OBSERVATION_EFFECTS
 from .sensors import CountingError as CountingError
 from .sensors import CountingNoise as CountingNoise
+from .sensors import DeadDetectors as DeadDetectors
 from .sensors import DetectionZone as DetectionZone
 from .sensors import DetectorFailure as DetectorFailure
 from .sensors import LostReadings as LostReadings

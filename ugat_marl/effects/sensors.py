@@ -121,15 +121,14 @@ class DeadDetectors(Sensor):
     def reset(self, seed: int) -> None:
         """Draw the dead detectors of the episode."""
         self.dead = _stream(seed, DetectorFailure).random(self._lanes) < self._share
-        self._alive = (~self.dead).astype(np.float64)
 
     def read(self, reading: Reading) -> Reading:
         """Return the reading with zeros at dead detectors."""
-        left = reading.mean_left
+        alive, left = ~self.dead, reading.mean_left
         return replace(
             reading,
-            counts=reading.counts * self._alive,
-            mean_left=left * self._alive if len(left) else left,
+            counts=reading.counts * alive,
+            mean_left=left * alive if len(left) else left,
         )
 
 

@@ -29,7 +29,7 @@ from ugat_marl.experiments.forked import (
     perform_forked,
     say_stopped,
 )
-from ugat_marl.experiments.jobs import LEARNER, Job, JobRecord, perform
+from ugat_marl.experiments.jobs import Job, JobRecord, perform
 from ugat_marl.files import require_writable
 from ugat_marl.parallel import (
     RETRIES,
@@ -145,7 +145,8 @@ def perform_here(
         reporter: Shows progress.
         on_log: See `perform`.
         beside: Jobs of the plan that may be performed meanwhile, each in a process and on a core
-            of its own, at most ``workers - 1`` at a time. What they say is in their logs.
+            of its own, at most ``workers - 1`` at a time. What they say is in their logs. A learner
+            that they start from must be written once, as that of plain training before grounding.
 
     Raises:
         OptionError: Another process performs jobs in that folder.
@@ -217,24 +218,12 @@ def _performed_beside(
 def _is_ready(job: Job, folder: Path, stop: Stop, wanted: threading.Event) -> bool:
     """Wait for the learner that a job starts from; False if somebody wants the job before."""
     start = None if job.start is None else folder / job.start
-    while start is not None and not _is_final(start):
+    while start is not None and not start.exists():
         if wanted.is_set():
-            return _is_final(start)  # it may have ended since the last look
+            return start.exists()  # it may have ended since the last look
         if stop.wait(0.5):
             return False
     return True
-
-
-def _is_final(start: Path) -> bool:
-    """Return True if a file holds the learner at the end of its training.
-
-    A training keeps its own learner now and then, to go on after an interruption.
-    """
-    if not start.exists():
-        return False
-    if start.name != LEARNER:
-        return True
-    return JobRecord.read(start.parent).is_whole(Job.read(start.parent))
 
 
 def _perform_apart(folder: str, stop: Stop, forked: bool) -> None:

@@ -55,6 +55,7 @@ from ugat_marl.experiments.tuning import VERSION, tuned_rule
 from ugat_marl.files import MALFORMED, file_hash, parse_json, read_json, write_whole
 from ugat_marl.grounding import (
     ChangePenalty,
+    LaneView,
     Probe,
     RandomDelays,
     RecordedWorld,
@@ -479,7 +480,8 @@ def _judge(
         # The queues come before the record, which marks these episodes as played. If a process dies
         # between the two, the same episodes are played again; their first seed is their number.
         if mark in job.rows:
-            anew = record.is_other(job, domain)
+            # Without any score, after damage or in another world, earlier batches do not count.
+            anew = len(seeds) == len(job.evaluation_seeds)
             queues.write(folder / QUEUES, keep=True, batch=seeds[0], anew=anew)
         record.add_scores(job, mark, domain, {r.seed: r.scores for r in played.results})
         record.write(folder)
@@ -590,10 +592,13 @@ def worlds_of(
 
     Raises:
         LogError: The job's log does not fit the simulation.
-        OptionError: The two domains cannot be compared, see `simulated_worlds`.
+        OptionError: The two domains cannot be compared, see `simulated_worlds`, or the observation
+            shows no vehicles, from which a street is fitted.
     """
     ugat, recorded = job.setting.ugat, None
     assert ugat is not None
+    if ugat.grounding == "street":
+        LaneView.of(env.network, str(env.options.observation))
     if job.real_log is not None:
         log = TransitionLog.read(Path(job.real_log))
         if ugat.grounding == "street":

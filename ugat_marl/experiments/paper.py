@@ -7,17 +7,19 @@ returns a `Comparison`.
 
 from __future__ import annotations
 
+import contextlib
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any, Literal
 
 from ugat_marl.effects import LateGreen, domain_label, domain_path, load_scenario, parse_domain
+from ugat_marl.envs import parallel_env
 from ugat_marl.errors import OptionError, UnknownNameError, require_distinct, require_least
 from ugat_marl.experiments.comparison import Comparison, Trial
 from ugat_marl.experiments.driver import perform_all, record_of
 from ugat_marl.experiments.evaluation import require_distinct_domains
-from ugat_marl.experiments.jobs import LEARNER, Job, evaluation_seeds
+from ugat_marl.experiments.jobs import LEARNER, Job, evaluation_seeds, worlds_of
 from ugat_marl.experiments.settings import (
     CONTROL,
     DIRECT,
@@ -496,12 +498,13 @@ def compare(
     loaded = load_scenario(scenario, config.duration_s)
     rows = config.settings(table)
     config.spec.factory(config.device)  # a missing library is an error now, not in a job's log
-    timed = any(row.ugat is not None and row.ugat.grounding == "timed" for row in rows)
     for target in config.targets(table):
         # an error now, not in an hour
-        check_worlds(loaded.with_duration(config.duration_s), config.sim, target, timed)
+        check_worlds(loaded.with_duration(config.duration_s), config.sim, target)
     planner = Planner(table, scenario, config)
     plan = [job for row in rows for job in planner.jobs(row)]
+    grounded = [job for job in plan if job.setting.ugat is not None]
+    _refuse_impossible([job for job in grounded if job.seed == config.first_seed])
     perform_all(
         planner.bases + plan, folder, workers=workers, reporter=reporter, title=f"paper {table}"
     )
@@ -516,6 +519,23 @@ def compare(
         constants=tuple(row.name for row in rows if row.name in late),
         grounded=tuple(row.name for row in rows if row.recipe == "grounded"),
     )
+
+
+def _refuse_impossible(jobs: Sequence[Job]) -> None:
+    """Refuse jobs before plain training that would be refused after it.
+
+    Args:
+        jobs: Jobs of grounded rows of one table; they have sim and options in common.
+
+    Raises:
+        OptionError: A job cannot be performed, see `worlds_of`.
+    """
+    if not jobs:
+        return
+    options = dict[str, Any](jobs[0].options)
+    with contextlib.closing(parallel_env(jobs[0].loaded(), jobs[0].sim, **options)) as env:
+        for job in jobs:
+            worlds_of(job, env, None)
 
 
 class Planner:

@@ -117,7 +117,7 @@ class QueueRecord:
             batch: Number of these episodes. A batch of this number in the file, with the same
                 policies and domains, is replaced.
             anew: True to replace all batches of these policies and domains, such as those of
-                another world of that name.
+                another world of that name, or those whose scores were lost.
 
         Raises:
             OSError: The file cannot be written, or the record in it cannot be read now, such as

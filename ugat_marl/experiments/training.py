@@ -15,7 +15,13 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 from ugat_marl.data import Run
-from ugat_marl.effects import Domain, domain_label, scenario_in_domain
+from ugat_marl.effects import (
+    ControllerPart,
+    Domain,
+    controller_effects,
+    domain_label,
+    scenario_in_domain,
+)
 from ugat_marl.envs import AnyParallelEnv, TrafficEnv, parallel_env
 from ugat_marl.errors import OptionError
 from ugat_marl.grounding import (
@@ -230,13 +236,13 @@ def check_worlds(scenario: Scenario, sim: Domain, real: Domain, timed: bool = Fa
         scenario: The network and its traffic.
         sim: The simulation.
         real: The real domain.
-        timed: True for timed grounding: every green must begin in the decision that asks for it,
-            or its delay can be neither measured nor set.
+        timed: True if greens are delayed, by timed grounding or a timed residual: every green must
+            begin in the decision that asks for it, or its delay can be neither measured nor set.
 
     Raises:
         UnknownNameError: A domain does not exist.
-        OptionError: The reaches differ, greens begin too late for timed grounding, or a domain is
-            one of detectors.
+        OptionError: The reaches differ, greens begin too late to be delayed, or a domain is one of
+            detectors.
     """
     here, there = (scenario_in_domain(scenario, world) for world in (sim, real))
     for world in (here, there) if timed else ():
@@ -247,7 +253,7 @@ def check_worlds(scenario: Scenario, sim: Domain, real: Domain, timed: bool = Fa
                 f"begin later: decision_interval_s = {interval_s:g} must be "
                 f"longer than yellow_s + all_red_s = {timing.clearance_s:g} by min_green_s = "
                 f"{timing.min_green_s:g} or more; change them in scenario.toml, or use the "
-                "grounding phase"
+                "grounding phase, or street with a residual of another kind"
             )
     here_m, there_m = here.control.reach_m, there.control.reach_m
     if here_m != there_m:
@@ -255,6 +261,22 @@ def check_worlds(scenario: Scenario, sim: Domain, real: Domain, timed: bool = Fa
             f"agents look {here_m:g} m upstream in {domain_label(sim)!r} and {there_m:g} m in "
             f"{domain_label(real)!r}, so that counts and rewards are not the same; give both the "
             "same reach, such as +reach=100"
+        )
+
+
+def _refuse_own_channel(scenario: Scenario, sim: Domain) -> None:
+    """Refuse a simulation that changes commands, beside a fitted channel that changes them, too.
+
+    Raises:
+        OptionError: The simulation does.
+    """
+    effects = controller_effects(scenario_in_domain(scenario, sim))
+    own = [str(item) for item in effects if type(item).actuator is not ControllerPart.actuator]
+    if own:
+        raise OptionError(
+            f"sim = {domain_label(sim)!r} changes commands ({', '.join(own)}), and the channel of "
+            "a fitted street would change them once more; leave these effects out of the "
+            "simulation, or the channel out of the fit (--street.parts eyes service effects)"
         )
 
 
@@ -277,11 +299,13 @@ def simulated_worlds(
         workers: Simulations at a time, or an executor, see `SimulatedWorld`.
 
     Raises:
-        OptionError: `check_worlds` fails, the rewards cannot be matched, or a domain is SUMO's
-            queue model and the grounding needs crossings.
+        OptionError: `check_worlds` fails, the rewards cannot be matched, commands would be changed
+            twice, or a domain is SUMO's queue model and the grounding needs crossings.
     """
     scenario = scenario.with_duration(options.get("duration_s"))
-    check_worlds(scenario, sim, real, ugat.grounding == "timed")
+    check_worlds(scenario, sim, real, max(ugat.most_delay_s, ugat.residual_delay_s) > 0)
+    if ugat.grounding == "street" and "channel" in ugat.street.parts:
+        _refuse_own_channel(scenario, sim)
     # crossing vehicles show best when a green began, and how fast it serves
     crossings = ugat.most_delay_s > 0 or ugat.grounding == "street"
     for domain in (sim, real) if crossings and ugat.iterations else ():

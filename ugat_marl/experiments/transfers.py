@@ -192,10 +192,10 @@ class TransferConfig:
                 'or ask for the negative control "same-world"'
             )
         require_distinct(further=self.further)
-        if self.control and self.sim in self.further:
+        if self.sim in self.further:  # one training, with queues under the name of one row
             raise OptionError(
-                f"further = {self.sim} is what the control does ({CONTROL!r}); leave out one of "
-                "the two"
+                f"further = {self.sim} is what the control does ({CONTROL!r}); use the control "
+                "for it, and leave it out of further"
             )
         if self.corrected is not None and domain_label(self.corrected) == self.sim:
             raise OptionError(

@@ -79,7 +79,8 @@ class UgatConfig:
     @property
     def residual_delay_s(self) -> int:
         """Longest random delay in the roll-outs of a fitted street, in s; 0 for none."""
-        return self.timed.most_s if self.street.residual.kind == "timed" else 0
+        timed = self.grounding == "street" and self.street.residual.kind == "timed"
+        return self.timed.most_s if timed else 0
 
     def residual(
         self,

@@ -29,13 +29,12 @@ from ugat_marl.effects import (
     ControllerPart,
     CountingError,
     CountingNoise,
+    DeadDetectors,
     DetectionZone,
     LostReadings,
     ObservationDelay,
     QuantisedCounts,
-    Reading,
     Sensor,
-    Stage,
 )
 from ugat_marl.errors import CheckpointError, OptionError, counted
 from ugat_marl.files import MALFORMED
@@ -260,21 +259,20 @@ class DeadLanes(ControllerPart):
     def sensor(self, network: Network, decision_interval_s: float) -> Sensor:
         """Make a sensor with these dead detectors."""
         table = network.lane_table()
-        alive = np.ones(len(table.ids))
-        alive[table.indices(self._lanes)] = 0.0
-        return _DeadSensor(alive)
+        dead = np.zeros(len(table.ids), dtype=np.bool_)
+        dead[table.indices(self._lanes)] = True
+        return _DeadSensor(dead)
 
 
-class _DeadSensor(Sensor):
-    stage = Stage.FAILURE
+class _DeadSensor(DeadDetectors):
+    """Dead detectors that are the same in every episode."""
 
-    def __init__(self, alive: Floats) -> None:
-        self._alive = alive
+    def __init__(self, dead: NDArray[np.bool_]) -> None:
+        super().__init__(1.0, len(dead))
+        self.dead = dead
 
-    def read(self, reading: Reading) -> Reading:
-        left = reading.mean_left
-        left = left * self._alive if len(left) else left
-        return Reading(reading.counts * self._alive, reading.near, left)
+    def reset(self, seed: int) -> None:
+        """Draw nothing."""
 
 
 def fit_eyes(

@@ -125,4 +125,5 @@ def late_world(delay_s: Mapping[str, float], intersection_of: Mapping[str, str])
 
 
 def _late(delay_s: Mapping[str, float]) -> tuple[Effect, ...]:
-    return tuple(LateGreen(place, seconds) for place, seconds in delay_s.items() if seconds > 0)
+    # 0 s as well: it replaces late greens that the simulation has itself
+    return tuple(LateGreen(place, seconds) for place, seconds in delay_s.items())

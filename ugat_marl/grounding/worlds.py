@@ -167,6 +167,7 @@ def recorded(
     seed: int,
     stop: Stop,
     observer: Observer | None = None,
+    decisions: int | None = None,
 ) -> TransitionLog:
     """Run an episode of a policy and return its transitions; a simulation that dies begins again.
 
@@ -176,10 +177,11 @@ def recorded(
         seed: Seed of the episode.
         stop: Flag that ends the episode early.
         observer: What is recorded; None for what agents observe.
+        decisions: Most decisions of the episode; None for all.
     """
-    observer = observer or observer_of(env)
+    observer, check = observer or observer_of(env), stop_callback(stop)
     played = retry_on_crash(
-        lambda: roll_out(env, policy, seed, record=observer, on_step=stop_callback(stop))
+        lambda: roll_out(env, policy, seed, record=observer, on_step=check, decisions=decisions)
     )
     assert played.log is not None
     return played.log
@@ -190,7 +192,9 @@ def explored(
 ) -> TransitionLog:
     """Run an episode of a policy that explores, as `recorded`, and close the environment.
 
-    The policy is copied: policies with a memory must not share it between threads.
+    The policy is copied: policies with a memory must not share it between threads. An episode of
+    recorded commands is no longer than the recording: its last command would be held for the rest,
+    and lanes with red would jam.
 
     Args:
         env: The environment.
@@ -199,8 +203,10 @@ def explored(
         seed: Seed of the episode.
         stop: Flag that ends the episode early.
     """
+    decisions = policy.decisions(seed) if isinstance(policy, RecordedCommands) else None
+    exploring = EpsilonGreedy(copy.deepcopy(policy), epsilon)
     with contextlib.closing(env):
-        return recorded(env, EpsilonGreedy(copy.deepcopy(policy), epsilon), seed, stop)
+        return recorded(env, exploring, seed, stop, decisions=decisions)
 
 
 @dataclass(frozen=True)
@@ -320,19 +326,26 @@ class RecordedCommands:
             {agent: _commands_of(own, episode) for agent, own in rows.items()}
             for episode in sorted(whole)
         ]
-        self._episode, self._step = 0, 0
+        self._episode, self._step = self._chosen(0), 0
+
+    def decisions(self, seed: int) -> int:
+        """Return the number of decisions of the episode of the log that `seed` chooses."""
+        return max(map(len, self._chosen(seed).values()))
 
     def reset(self, seed: int) -> None:
         """Begin an episode of the log; `seed` chooses it."""
-        self._episode, self._step = seed % len(self._commands), 0
+        self._episode, self._step = self._chosen(seed), 0
 
     def act(self, observations: Observations, infos: Infos) -> Actions:
         """Return the commands of the next decision of the log."""
-        commands = self._commands[self._episode]
+        commands = self._episode
         step, self._step = self._step, self._step + 1
         return {
             name: int(commands[name][min(step, len(commands[name]) - 1)]) for name in observations
         }
+
+    def _chosen(self, seed: int) -> Mapping[str, NDArray[np.int64]]:
+        return self._commands[seed % len(self._commands)]
 
 
 def _commands_of(own: Transitions, episode: int) -> NDArray[np.int64]:

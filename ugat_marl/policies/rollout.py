@@ -61,8 +61,9 @@ def roll_out(
     *,
     record: Observer | None = None,
     on_step: StepCallback | None = None,
+    decisions: int | None = None,
 ) -> RollOut:
-    """Play one whole episode.
+    """Play one episode.
 
     Args:
         env: An environment made with the policy's `env_options`.
@@ -71,12 +72,13 @@ def roll_out(
         record: Observer whose observations are recorded; None records nothing. They may differ from
             those that the policy reads. It needs an environment of the suite.
         on_step: Function called after every decision.
+        decisions: Most decisions of the episode; None for a whole one.
 
     Raises:
         OptionError: The policy reads another observation than the environment shows.
     """
     if record is None:
-        return _played(env, policy, seed, None, on_step)
+        return _played(env, policy, seed, None, on_step, decisions)
     base: Any = env.unwrapped
     if not hasattr(base, "measure_for"):
         raise OptionError(
@@ -84,7 +86,7 @@ def roll_out(
         )
     try:
         base.measure_for(record)
-        return _played(env, policy, seed, record, on_step)
+        return _played(env, policy, seed, record, on_step, decisions)
     finally:
         base.measure_for()
 
@@ -95,13 +97,14 @@ def _played(
     seed: int,
     record: Observer | None,
     on_step: StepCallback | None,
+    decisions: int | None,
 ) -> RollOut:
     _require_same_observation(env, policy)
     observations, infos = env.reset(seed=seed)
     policy.reset(seed)
     recording = _Recording(env, record, seed, infos) if record else None
     steps, total = 0, 0.0
-    while env.agents:
+    while env.agents and steps != decisions:
         agents = list(env.agents)
         actions = policy.act(observations, infos)
         observations, rewards, _, _, infos = env.step(actions)
