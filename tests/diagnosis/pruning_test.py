@@ -12,6 +12,7 @@ import numpy as np
 import pytest
 
 from ugat_marl.diagnosis import Hypothesis, global_hypotheses, records, select
+from ugat_marl.diagnosis.engine import OutOfTime
 from ugat_marl.diagnosis.features import FEATURES
 from ugat_marl.diagnosis.fit import Fitter
 from ugat_marl.diagnosis.hypotheses import Members, library
@@ -269,6 +270,24 @@ def test_when_the_budget_ends_no_doubtful_effect_is_named_either() -> None:
     assert selector._without_doubtful(best, base).model.members == (HEADWAY,)
     selector._seen = {"both": best.model}
     assert selector._without_doubtful(best, base) is base
+
+
+def test_when_the_budget_ends_at_once_what_another_search_found_is_not_forgotten(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    def spent(*_: object) -> None:
+        raise OutOfTime("the budget is spent")
+
+    ledger = Ledger({("headway",): 900.0}, {("headway",): 0.0})
+    selector = selector_with(ledger)
+    selector.examined = set()
+    monkeypatch.setattr(Selector, "_library_directions", spent)
+    base = ledger.with_chance(ledger.simulate((HEADWAY,), 16))
+    base = replace(base, model=replace(base.model, members=(), cost=2000.0))
+    located = records.Located(base, (), True, frozenset())
+    selected = selector.select(located, (HEADWAY,))
+    assert selected.best.model.members == (HEADWAY,)
+    assert not selected.complete
 
 
 @pytest.mark.parametrize(("factor", "kept"), [(0.99, (HEADWAY,)), (0.95, (HEADWAY, DEMAND))])

@@ -29,7 +29,14 @@ from ugat_marl.experiments.jobs import SCORES, JobRecord
 from ugat_marl.experiments.paper import TABLES, Planner, settings_of
 from ugat_marl.experiments.settings import LearnerSpec, Setting
 from ugat_marl.experiments.transfers import planned_jobs
-from ugat_marl.grounding import FitConfig, GateConfig, InputsConfig, TimedConfig, UgatConfig
+from ugat_marl.grounding import (
+    FitConfig,
+    GateConfig,
+    InputsConfig,
+    StreetConfig,
+    TimedConfig,
+    UgatConfig,
+)
 from ugat_marl.progress import Silent
 
 SHORT = PaperConfig(episodes=10, iterations=2, grounded_episodes=5, real_rollouts=3, seeds=2)
@@ -91,6 +98,10 @@ def test_the_ablation_of_a_street_has_its_parts_and_its_residuals() -> None:
     kinds = [street.residual.kind for street in rows.values()]
     assert kinds == ["none"] * 5 + ["phase", "timed"]
     assert all(len(street.parts) == 4 for street in list(rows.values())[5:])
+    two = replace(config, street=StreetConfig(parts=("eyes", "service")))
+    names = [s.name.partition(": ")[2] for s in two.settings("ablation") if s.ugat is not None]
+    assert names[:3] == ["", "eyes alone", "service alone"]
+    assert len(names) == 5
 
 
 def test_the_ablation_has_a_row_for_each_departure_from_the_paper() -> None:

@@ -11,6 +11,7 @@ import os
 import re
 import subprocess
 import sys
+import threading
 from collections import OrderedDict, deque
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -372,7 +373,31 @@ class ClosingInside(Closing):
         return Holder(super().policy(), layers=2)
 
 
-@pytest.mark.parametrize("kind", [Closing, ClosingPartly, ClosingInside])
+class WithSlot:
+    __slots__ = ("act",)
+
+
+class Derived(WithSlot):
+    __slots__ = ()
+
+    def __init__(self, act: Any) -> None:
+        self.act = act
+
+
+class ClosingInSlots(Closing):
+    def policy(self) -> Any:
+        return Derived(super().policy())
+
+
+class ClosingInADeque(Closing):
+    def policy(self) -> Any:
+        kept = deque([super().policy()])
+        return functools.partial(lambda held, observations: held[0](observations), kept)
+
+
+@pytest.mark.parametrize(
+    "kind", [Closing, ClosingPartly, ClosingInside, ClosingInSlots, ClosingInADeque]
+)
 def test_later_learning_does_not_change_a_policy_that_is_a_function(kind: Any) -> None:
     env = ToyTraffic()
     learner = OwnLearnerFactory(own_name(kind))(env, 0)
@@ -381,6 +406,21 @@ def test_later_learning_does_not_change_a_policy_that_is_a_function(kind: Any) -
     observations, infos = env.reset(seed=0)
     for policy, phase in ((before, 0), (after, 1), (copy.deepcopy(before), 0)):
         assert set(policy.act(observations, infos).values()) == {phase}
+
+
+def test_functions_of_modules_and_those_with_locks_stay_what_they_are() -> None:
+    lock = threading.Lock()
+
+    def locked(observations: Any) -> Any:
+        with lock:
+            return dict.fromkeys(observations, 0)
+
+    policy = OwnPolicy(Holder(locked), "locked", {})
+    policy._given.relu = torch.nn.functional.relu
+    made = copy.deepcopy(policy)
+    observations, infos = ToyTraffic().reset(seed=0)
+    assert set(made.act(observations, infos).values()) == {0}
+    assert made._given.relu is torch.nn.functional.relu
 
 
 def test_what_a_class_of_a_function_holds_is_part_of_its_identity() -> None:
@@ -497,6 +537,11 @@ def test_an_environment_that_a_learner_holds_is_known_by_what_it_is_made_of() ->
         (tuple[int, ...], "8,4", (8, 4)),
         (str, "none", "none"),
         (str | None, "None", None),
+        (list[str], "['a', 'b']", ["a", "b"]),
+        (list[str], "a,b", ["a", "b"]),
+        (str | list[str], "adam", "adam"),
+        (list[str] | str, "adam,sgd", ["adam", "sgd"]),
+        (tuple[int, ...] | None, "8", (8,)),
         (np.float32, "0.25", 0.25),
         (np.ndarray, "[1, 2]", [1, 2]),
     ],

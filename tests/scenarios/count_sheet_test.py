@@ -242,6 +242,21 @@ def test_the_printed_command_makes_the_scenario(
     assert (tmp_path / name).read_bytes() == packed
 
 
+def test_a_draft_whose_linked_network_has_moved_is_made_again(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """Which pictures are of its lights cannot be told then."""
+    network = tmp_path / "x.net.xml"
+    network.write_bytes(load_scenario("single-v1").network.read())
+    words = ["scenario", "new", str(tmp_path / "town"), "--link", "--sumo"]
+    assert main([*words, str(network)]) == 0
+    moved = network.rename(tmp_path / "moved.net.xml")
+    assert main([*words, str(moved)]) == 2
+    assert "pictures/A1.png was not made with" in capsys.readouterr().err
+    (tmp_path / "town" / "pictures").rename(tmp_path / "pictures")
+    assert main([*words, str(moved)]) == 0
+
+
 @pytest.mark.parametrize("head", ["sep=,\n", " ", "my "])
 def test_sheets_with_another_head_are_never_lost(
     head: str, draft: Path, capsys: pytest.CaptureFixture[str]

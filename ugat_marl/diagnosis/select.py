@@ -119,6 +119,7 @@ class Selector:
         complete = True
         try:
             if known:
+                self.kept(self._fitter.simulate(known))  # in case that the budget ends here
                 self._library_directions(base.model, 0)  # along which models are tested
                 best = self._fitted(base, [known], 0, "effects so far") or base
             first = 0 if best is base else 1  # round 0 looks at the scenario as it is

@@ -43,7 +43,6 @@ from ugat_marl.experiments.training import check_worlds
 from ugat_marl.experiments.tuning import BUDGET, LEAST_BUDGET
 from ugat_marl.grounding import (
     MATCHED_REWARDS,
-    PARTS,
     USUAL_REWARD,
     FitConfig,
     GateConfig,
@@ -213,11 +212,11 @@ def _ablated(name: str, base: UgatConfig) -> list[Setting]:
 
 
 def _streets(base: StreetConfig) -> dict[str, StreetConfig]:
-    """Return fitted streets by their rows: all parts, each alone, and all with a residual."""
+    """Return fitted streets by their rows: the parts, each alone, and all with a residual."""
     residual = base.residual
     plain = replace(base, residual=replace(residual, kind="none"))
     rows = {STREET: plain}
-    rows |= {f"{STREET}: {part} alone": replace(plain, parts=(part,)) for part in PARTS}
+    rows |= {f"{STREET}: {part} alone": replace(plain, parts=(part,)) for part in base.parts}
     return rows | {
         residual_name("phase"): replace(base, residual=replace(residual, kind="phase")),
         residual_name("timed"): replace(base, residual=replace(residual, kind="timed")),

@@ -31,6 +31,7 @@ from pathlib import Path
 from typing import Any
 
 from ugat_marl.data import TransitionLog
+from ugat_marl.effects import late_greens
 from ugat_marl.grounding.algorithm import Algorithm, iteration_name
 from ugat_marl.grounding.fitting import Fitter
 from ugat_marl.grounding.oversaturation import Oversaturation
@@ -227,7 +228,7 @@ class StreetTraining(Algorithm):
         Returns:
             The rivals' policies by their names in `JUDGED`, and numbers for the metrics. There is
             no policy without rivals, where commands are late or detectors at fault, and where no
-            green has to be late.
+            green has to be late nor is late in the simulation.
         """
         rivals, name = state.transform.rivals, iteration_name(state)
         _, detectors_at_fault = state.transform.view
@@ -237,10 +238,10 @@ class StreetTraining(Algorithm):
             seed = derive_seed(self.seed, "rival", state.iteration)
             delay_s = matched_delays(state.real[-1], self.simulation, policy, seed, advance)
         numbers = {f"rival/late_s/{agent}": late_s for agent, late_s in delay_s.items()}
-        if not any(delay_s.values()):
+        plain: Any = self.env.unwrapped
+        if not any(delay_s.values()) and not late_greens(plain.scenario):
             self.run.reporter.say(f"{name}: no green has to be late, so there is no rival")
             return {}, numbers
-        plain: Any = self.env.unwrapped
         policies: dict[str, Policy] = {}
         for rival in rivals:
             late_s = delay_s if rival.late_s is None else dict.fromkeys(delay_s, rival.late_s)

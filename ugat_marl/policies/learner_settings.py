@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import ast
 from collections.abc import Mapping, Sequence
-from typing import Any
+from typing import Any, get_args
 
 from pydantic import PydanticUserError, TypeAdapter, ValidationError
 
@@ -44,7 +44,7 @@ def parsed_settings(
 
 
 def _converted(text: str, hint: Any) -> Any:
-    """Return a text in a type: as none, as parts between commas, as it is, or as a literal.
+    """Return a text in a type: as none, as a list, as parts between commas, or as it is.
 
     Raises:
         ValidationError: It has none of these forms in this type; the error is that of the first.
@@ -57,7 +57,10 @@ def _converted(text: str, hint: Any) -> Any:
     except PydanticUserError:  # such as types of NumPy
         return plain
     forms: list[Any] = [None] if text.lower() == "none" else []
-    if any(kind in str(hint) for kind in ("tuple", "list", "Sequence")):
+    several = any(kind in str(hint) for kind in ("tuple", "list", "Sequence"))
+    if several and isinstance(plain, (tuple, list)):
+        forms.append(plain)
+    if several and ("," in text or str not in get_args(hint)):  # or text may stand for itself
         forms.append(text.split(","))
     first: ValidationError | None = None
     for form in (*forms, text, plain):

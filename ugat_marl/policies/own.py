@@ -16,9 +16,11 @@ import functools
 import inspect
 import io
 import json
+import sys
 import tempfile
 import warnings
 import zipfile
+from collections import deque
 from collections.abc import Callable, Container, Iterator, Mapping, Sequence
 from pathlib import Path
 from types import CellType, FunctionType, MethodType, ModuleType
@@ -635,15 +637,22 @@ def _copy(given: Any, memo: dict[int, Any]) -> Any:
     `copy.deepcopy` returns functions themselves, so that a policy would go on learning with its
     learner. It takes them from the memo if they are there.
     """
+    if _captures(given):
+        _copy_function(given, memo)
+        return memo[id(given)]
     for function in _functions_in(given, set(memo)):
-        _copy_function(function, memo)
+        try:
+            _copy_function(function, memo)
+        except Exception:  # noqa: BLE001 - what it holds cannot be copied, such as a lock
+            memo.pop(id(function), None)
     return copy.deepcopy(given, memo)
 
 
 def _functions_in(given: Any, seen: set[int]) -> Iterator[FunctionType]:
     """Find the functions that hold values in an object: its attributes, members and arguments.
 
-    What these functions hold themselves is not looked into.
+    Functions of modules, such as those of torch, stay what they are. What the others hold is not
+    looked into, and neither are objects that are copied in a way of their own.
 
     Args:
         given: The object.
@@ -652,16 +661,22 @@ def _functions_in(given: Any, seen: set[int]) -> Iterator[FunctionType]:
     if id(given) in seen or isinstance(given, (type, ModuleType)):
         return
     seen.add(id(given))
-    if _captures(given):
-        yield given
+    if isinstance(given, FunctionType):
+        module = sys.modules.get(given.__module__)
+        if _captures(given) and getattr(module, given.__qualname__, None) is not given:
+            yield given
+        return
+    if hasattr(type(given), "__deepcopy__"):
         return
     held: list[Any] = [*getattr(given, "__dict__", {}).values()]
-    held += [getattr(given, name, None) for name in getattr(type(given), "__slots__", ())]
+    for slots in (getattr(kind, "__slots__", ()) for kind in type(given).__mro__):
+        names = (slots,) if isinstance(slots, str) else slots
+        held += [getattr(given, name, None) for name in names]
     if isinstance(given, functools.partial):
         held += [given.func, *given.args, *given.keywords.values()]
     elif isinstance(given, Mapping):
         held += given.values()
-    elif isinstance(given, (list, tuple, set, frozenset)):
+    elif isinstance(given, (list, tuple, set, frozenset, deque)):
         held += given
     elif isinstance(given, MethodType):
         held.append(given.__self__)

@@ -190,8 +190,10 @@ def draft_network(folder: Path) -> Path | None:
     """Return the network of a folder with roads and no vehicles; None if it is no such folder."""
     if not _is_file(folder / COUNT_SHEET) or _is_file(folder / "scenario.toml"):
         return None
-    packed_or_not = (folder / NETWORK, folder / f"{NETWORK}.gz")
-    return next(filter(_is_file, packed_or_not), None)
+    for path in (folder / NETWORK, folder / f"{NETWORK}.gz"):
+        if _is_file(path) or path.is_symlink():  # also if what it links to is gone
+            return path
+    return None
 
 
 def shipped_scenarios() -> Iterator[tuple[str, Path]]:
