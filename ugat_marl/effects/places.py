@@ -11,7 +11,7 @@ from dataclasses import dataclass
 
 from ugat_marl.errors import UnknownNameError
 from ugat_marl.files import parse_xml
-from ugat_marl.scenarios import Scenario, cars_may_use, rail_signals_of
+from ugat_marl.scenarios import Scenario, cars_may_use, rail_signals_of, turns_around
 
 
 @dataclass(frozen=True)
@@ -139,7 +139,7 @@ def _places(content: bytes, source: str) -> Places:
             leaving not in lanes or lanes[leaving].cars
         ):
             following[start][end] = None
-            if connection.get("dir", "").lower() != "t":
+            if not turns_around(connection):
                 onward.add(start)
         light = connection.get("tl")
         if light and light not in rails:

@@ -53,6 +53,7 @@ from .junctions import Link as Link
 from .junctions import cars_may_use as cars_may_use
 from .junctions import rail_signals_of as rail_signals_of
 from .junctions import start_lane as start_lane
+from .junctions import turns_around as turns_around
 from .lanes import NO_UPSTREAM_LANES as NO_UPSTREAM_LANES
 from .lanes import LaneTable as LaneTable
 from .lanes import Turns as Turns

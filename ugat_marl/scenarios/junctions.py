@@ -336,6 +336,11 @@ class _Ways:
     at_lights: Mapping[str, None]
 
 
+def turns_around(connection: ET.Element) -> bool:
+    """Return True for a U-turn; SUMO writes T for t where traffic keeps to the left."""
+    return connection.get("dir", "").lower() == "t"
+
+
 def _ways(root: ET.Element, lights: Container[str]) -> _Ways:
     feeds: dict[str, list[tuple[str, list[str]]]] = defaultdict(list)
     number: dict[str, int] = defaultdict(int)
@@ -352,7 +357,7 @@ def _ways(root: ET.Element, lights: Container[str]) -> _Ways:
             continue
         if ends_at_light:
             at_lights[lane] = None
-        if element.get("dir", "").lower() != "t":  # T where traffic keeps to the left
+        if not turns_around(element):
             number[lane] += 1
             if not ends_at_light:
                 feeds[end_lane(element)].append((lane, [via] if via else []))

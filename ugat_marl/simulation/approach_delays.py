@@ -20,7 +20,15 @@ from pathlib import Path
 
 from ugat_marl.errors import SimulatorError
 from ugat_marl.files import xml_bytes
-from ugat_marl.scenarios import Document, Network, Scenario, blocker_types, edge_of_lane, start_lane
+from ugat_marl.scenarios import (
+    Document,
+    Network,
+    Scenario,
+    blocker_types,
+    edge_of_lane,
+    start_lane,
+    turns_around,
+)
 
 ApproachDelays = Mapping[str, tuple[float, float]]
 """Approach (SUMO's edge at a light) to the number of vehicles that passed the light in an episode,
@@ -124,8 +132,7 @@ def approach_roads(root: ET.Element, network: Network) -> dict[str, frozenset[st
     }
     for element in root.iter("connection"):
         start, end = element.get("from", ":"), element.get("to", ":")
-        around = element.get("dir", "").lower() == "t"  # T where traffic keeps to the left
-        if around or start.startswith(":") or end.startswith(":"):
+        if turns_around(element) or start.startswith(":") or end.startswith(":"):
             continue
         onward[start].add(end)
         lane = element.get("via", "")
