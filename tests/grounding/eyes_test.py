@@ -28,7 +28,7 @@ LAYOUTS = {"a_0": AgentLayout(LANES, PHASES)}
 GREEN = np.array([[True, False], [True, False], [False, True], [False, True]])
 FULL = np.full(LANES, 40.0)
 VIEW = LaneView(
-    tuple(f"lane_{k}" for k in range(LANES)), (GREEN,), (FULL,), (0,), FULL, ((),) * LANES
+    tuple(f"lane_{k}" for k in range(LANES)), (GREEN,), (FULL,), (0,), FULL, FULL, ((),) * LANES
 )
 
 Fault = Callable[[np.ndarray, np.random.Generator], np.ndarray]

@@ -19,7 +19,13 @@ LAYOUTS = {"a_0": AgentLayout(1, 2), "b_0": AgentLayout(1, 2)}
 GREEN = np.array([[True, False]])
 SCALE = np.full(1, 40.0)
 VIEW = LaneView(
-    ("road_0", "next_0"), (GREEN, GREEN), (SCALE, SCALE), (0, 0), np.full(2, 40.0), ((1,), ())
+    ("road_0", "next_0"),
+    (GREEN, GREEN),
+    (SCALE, SCALE),
+    (0, 0),
+    np.full(2, 40.0),
+    np.full(2, 30.0),
+    ((1,), ()),
 )
 """The lane at a leads to the lane at b. Each holds 40 vehicles."""
 SERVED = 4.0

@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 from tests.interrupts import KillAt
 from tests.runs import SMALL, numbers, play_nothing, weights
 from ugat_marl.data import TransitionLog
-from ugat_marl.effects import load_scenario
+from ugat_marl.effects import DetectionZone, load_scenario, scenario_in_domain
 from ugat_marl.envs import parallel_env
 from ugat_marl.errors import CheckpointError, LogError, OptionError, UnknownNameError
 from ugat_marl.experiments import transfer
@@ -524,6 +524,28 @@ def test_a_broken_log_ends_a_training_before_it_begins(tmp_path: Path) -> None:
     config = replace(SMALL, ugat=ugat, real_log=tmp_path / "street.parquet")
     with pytest.raises(LogError, match="decisions right before them"):
         transfer(config, tmp_path / "run", workers=1)
+
+
+@pytest.mark.parametrize("zone_m", [None, 20.0])
+def test_a_zone_is_found_in_light_traffic(zone_m: float | None) -> None:
+    """Queues never fill it there, but vehicles leave lanes that seemed to be empty."""
+    light = scenario_in_domain(SCENARIO, "demand_level=*,0.3")
+    config = replace(QUICK, parts=("eyes",))
+    alone = Simulation(light, {"duration_s": 2400.0}, epsilon=0.3, workers=1)
+    env = parallel_env(light)
+    prior, view = street_prior(env, config), LaneView.of(env.network, env.options.observation)
+    rule = make_rule("fixed-time:20", env)
+    env.close()
+    zone = () if zone_m is None else (DetectionZone(zone_m),)
+    with kept_warm():
+        log = alone.play(StreetWorld(parts=zone), rule, 5, Stop())
+        street, _ = fit_street(log, alone, rule, prior, view, config, seed=0)
+    assert street.eyes is not None
+    if zone_m is None:
+        assert not street.eyes.changes
+    else:
+        low_m, high_m = street.eyes.zone_m
+        assert 10.0 <= low_m < zone_m < high_m <= 30.0
 
 
 def test_detectors_are_compared_over_equally_long_logs(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -9,7 +9,8 @@ from ugat_marl.data import AgentLayout, Provenance, TransitionLog, TransitionRec
 from ugat_marl.grounding.summaries import NAMES, LaneView
 
 GREEN = np.array([[True, False]])
-VIEW = LaneView(("road_0",), (GREEN,), (np.full(1, 40.0),), (0,), np.full(1, 40.0), ((),))
+HOLDS, PASSED_S = np.full(1, 40.0), np.full(1, 30.0)
+VIEW = LaneView(("road_0",), (GREEN,), (HOLDS,), (0,), HOLDS, PASSED_S, ((),))
 SERVED = (1.0, 2.0, 4.0, 4.0)
 """Vehicles that leave in the first, second, ... decision of a green."""
 

@@ -48,7 +48,14 @@ from ugat_marl.grounding.channel import (
     fit_channel,
     require_histories,
 )
-from ugat_marl.grounding.eyes import Eyes, EyesConfig, fit_eyes
+from ugat_marl.grounding.eyes import (
+    ZONES_M,
+    Eyes,
+    EyesConfig,
+    fit_eyes,
+    leave_unseen,
+    zone_of_unseen,
+)
 from ugat_marl.grounding.posterior import (
     LIBRARY,
     FittedService,
@@ -475,13 +482,8 @@ def fit_street(
     channel = fit_channel(real, config.channel, held_s) if "channel" in config.parts else None
     street = FittedStreet(lanes, interval_s, channel)
     if "eyes" in config.parts:
-        seeds = [derive_seed(seed, "street", "baseline", k) for k in range(BASELINE_EPISODES)]
-        plain = [street.world(one) for one in seeds]
-        logs = simulation.logs(plain, policy, seeds, real.decisions * interval_s, on_done)
-        baseline = TransitionLog.concatenate(logs)
-        # Of equal length: queues grow through a peak, and a log that ends before it has none.
-        eyes = fit_eyes(real.first(baseline.decisions), baseline, view, config.eyes)
-        street = FittedStreet(lanes, interval_s, channel, eyes)
+        eyes = _eyes(real, simulation, policy, street, view, config.eyes, seed, on_done)
+        street = replace(street, eyes=eyes)
     if not config.simulates:
         return street, history
     # Queues grow through a peak: worlds of half an hour tell nothing of an hour's second half.
@@ -504,6 +506,36 @@ def fit_street(
         posterior = Posterior.fit(worlds, simulated, seen)
     street = FittedStreet(lanes, interval_s, channel, street.eyes, posterior)
     return street, FitHistory(tuple(simulated), posterior)
+
+
+def _eyes(
+    real: TransitionLog,
+    simulation: Simulation,
+    policy: Policy,
+    street: FittedStreet,
+    view: LaneView,
+    config: EyesConfig,
+    seed: int,
+    on_done: Callable[[], object],
+) -> Eyes:
+    """Fit the detectors of a street of which the command channel is fitted."""
+    seeds = [derive_seed(seed, "street", "baseline", k) for k in range(BASELINE_EPISODES)]
+    duration_s = real.decisions * street.interval_s
+    plain = [street.world(one) for one in seeds]
+    baseline = TransitionLog.concatenate(simulation.logs(plain, policy, seeds, duration_s, on_done))
+    # Of equal length: queues grow through a peak, and a log that ends before it has none.
+    begun = real.first(baseline.decisions)
+    eyes = fit_eyes(begun, baseline, view, config)
+    if eyes.changes or not leave_unseen(begun, baseline, view, config):
+        return eyes
+    first = seeds[0]
+    short = [
+        replace(street, eyes=replace(eyes, zone_m=(length, length))).world(first)
+        for length in ZONES_M
+    ]
+    logs = simulation.logs(short, policy, [first] * len(short), duration_s, lambda: None)
+    tried = dict(zip(ZONES_M, logs, strict=True))
+    return replace(eyes, zone_m=zone_of_unseen(begun, tried, view, config))
 
 
 def street_log(

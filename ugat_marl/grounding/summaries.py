@@ -145,6 +145,8 @@ class LaneView:
         scale: For each intersection, vehicles per unit of its features, ``(lanes,)``.
         first: For each intersection, the position of the first count among its features.
         holds: Vehicles that each lane holds, as far as the observation can tell, ``(lanes,)``.
+        passed_s: Time in which a vehicle at the speed limit passes all that is counted with each
+            lane, in s, ``(lanes,)``.
         onward: For each lane, the positions of the lanes at lights that its links lead to.
         beyond: For each intersection, the lanes at no light that its links lead to, as far as the
             observation shows them: position among its features, and places of the lanes that lead
@@ -156,6 +158,7 @@ class LaneView:
     scale: tuple[Floats, ...]
     first: tuple[int, ...]
     holds: Floats
+    passed_s: Floats
     onward: tuple[tuple[int, ...], ...]
     beyond: tuple[tuple[tuple[int, tuple[int, ...]], ...], ...] = ()
 
@@ -176,6 +179,7 @@ class LaneView:
         scale: list[Floats] = []
         first: list[int] = []
         holds: list[float] = []
+        passed_s: list[float] = []
         for item in network.intersections:
             own = item.incoming_lanes
             lanes += own
@@ -184,11 +188,20 @@ class LaneView:
             fixed = observation in ("count", "queue")
             scale.append(np.full(len(own), COUNT_SCALE) if fixed else capacity)
             holds += np.minimum(capacity, scale[-1]).tolist()
+            along = (network.lanes[lane] for lane in own)
+            passed_s += [lane.counted_m / max(lane.speed_mps, 0.1) for lane in along]
             first.append(len(own) if observation == "movements" else 0)
         onward = _onward(network, lanes)
         beyond = _beyond(network, lanes) if observation == "movements" else ()
         return cls(
-            tuple(lanes), tuple(green), tuple(scale), tuple(first), np.array(holds), onward, beyond
+            tuple(lanes),
+            tuple(green),
+            tuple(scale),
+            tuple(first),
+            np.array(holds),
+            np.array(passed_s),
+            onward,
+            beyond,
         )
 
     def lanes_of(self, agents: Sequence[str]) -> dict[str, range]:
