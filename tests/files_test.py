@@ -13,6 +13,7 @@ import subprocess
 import time
 import weakref
 import xml.etree.ElementTree as ET
+from collections.abc import Callable
 from pathlib import Path
 
 import pytest
@@ -23,6 +24,7 @@ from ugat_marl import files
 from ugat_marl.errors import LogError, MeasuredDataError, OutputError, ScenarioError
 from ugat_marl.files import (
     child_texts,
+    chunks_of,
     parse_xml,
     read_bytes,
     replacing,
@@ -155,11 +157,14 @@ PACKED = gzip.compress(bytes(range(256)) * 200)
     ],
     ids=["cut", "header only", "not packed", "damaged inside", "empty"],
 )
-def test_a_broken_archive_is_named(content: bytes, tmp_path: Path) -> None:
+@pytest.mark.parametrize("read", [read_bytes, lambda file: [*chunks_of(file)]])
+def test_a_broken_archive_is_named(
+    read: Callable[[Path], object], content: bytes, tmp_path: Path
+) -> None:
     file = tmp_path / "net.xml.gz"
     file.write_bytes(content)
     with pytest.raises(ScenarioError, match=r"net\.xml\.gz: not a whole gzip archive"):
-        read_bytes(file)
+        read(file)
 
 
 def test_a_missing_file_and_a_directory_are_named(tmp_path: Path) -> None:

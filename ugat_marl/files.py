@@ -272,24 +272,7 @@ def read_bytes(path: Path) -> bytes:
     Raises:
         ScenarioError: The file is missing, unreadable or a broken archive.
     """
-    refuse_endless(path, ScenarioError)
-    try:
-        data = path.read_bytes()
-    except FileNotFoundError:
-        raise ScenarioError(f"{path}: no such file") from None
-    except OSError as error:
-        raise ScenarioError(f"{path}: cannot be read: {error.strerror}") from None
-    if path.suffix != ".gz":
-        return data
-    try:
-        if not data:
-            raise EOFError("it is empty")
-        with gzip.GzipFile(fileobj=io.BytesIO(data)) as file:
-            return b"".join(_bounded(iter(lambda: file.read(_PIECE), b""), path, len(data)))
-    except (OSError, EOFError, zlib.error) as error:
-        raise ScenarioError(
-            f"{path}: not a whole gzip archive ({error}); it may have been cut short"
-        ) from None
+    return b"".join(chunks_of(path))
 
 
 def _bounded(pieces: Iterator[bytes], path: Path, packed: int) -> Iterator[bytes]:
@@ -469,7 +452,9 @@ def chunks_of(path: Path, reporter: Reporter | None = None) -> Iterator[bytes]:
         with path.open("rb") as raw, gzip.open(raw) if path.suffix == ".gz" else raw as file:
             pieces = iter(lambda: file.read(_PIECE), b"")
             if path.suffix == ".gz":
-                pieces = _bounded(pieces, path, path.stat().st_size)
+                if not (packed := path.stat().st_size):
+                    raise EOFError("it is empty")
+                pieces = _bounded(pieces, path, packed)
             yield from watched(pieces, raw, reporter or Silent())
     except FileNotFoundError:
         raise ScenarioError(f"{path}: no such file") from None

@@ -49,6 +49,8 @@ DEADLINE_S = 900.0
 minutes, so half of it would kill honest simulations on slow machines."""
 DEADLINE_VARIABLE = "UGAT_MARL_DEADLINE_S"
 """Environment variable that replaces `DEADLINE_S`."""
+LONGEST_DEADLINE_S = 2e6
+"""Largest deadline, s: 23 days. The system waits for a connection for 2^31 ms at most."""
 
 _BEAT_S = 1.0
 """Seconds between two signs of life of a process."""
@@ -85,7 +87,8 @@ def usual_deadline_s() -> float:
     """Return the seconds within which a process has to answer.
 
     Raises:
-        OptionError: The variable `DEADLINE_VARIABLE` is not a number of seconds above 0.
+        OptionError: The variable `DEADLINE_VARIABLE` is not a number of seconds above 0, up to
+            `LONGEST_DEADLINE_S`.
     """
     text = os.environ.get(DEADLINE_VARIABLE, "")
     if not text:
@@ -101,7 +104,7 @@ def deadline_of(place: str, text: str) -> float:
         text: The text.
 
     Raises:
-        OptionError: It is not a number of seconds above 0.
+        OptionError: It is not a number of seconds above 0, up to `LONGEST_DEADLINE_S`.
     """
     seconds = None
     with contextlib.suppress(ValueError):  # Python reads 1_000 and digits of other scripts, too
@@ -110,7 +113,7 @@ def deadline_of(place: str, text: str) -> float:
 
 
 def require_deadline(deadline_s: Any) -> None:
-    """Refuse a deadline that is not a number of seconds above 0.
+    """Refuse a deadline that is not a number of seconds above 0, up to `LONGEST_DEADLINE_S`.
 
     Args:
         deadline_s: Seconds, or None for `usual_deadline_s`.
@@ -124,8 +127,10 @@ def require_deadline(deadline_s: Any) -> None:
 
 def _seconds(value: Any, place: str) -> float:
     number = isinstance(value, int | float) and not isinstance(value, bool)
-    if not number or not 0 < value < float("inf"):
-        raise OptionError(f"{place}: give a number of seconds above 0")
+    if not number or not 0 < value <= LONGEST_DEADLINE_S:
+        raise OptionError(
+            f"{place}: give a number of seconds above 0, up to {LONGEST_DEADLINE_S:,.0f}"
+        )
     return value
 
 

@@ -87,6 +87,7 @@ def log(
 
 
 Import = Callable[..., MeasuredData]
+Rows = list[tuple[float, int, int]]
 
 
 @pytest.fixture
@@ -452,10 +453,41 @@ def test_a_summer_night_that_is_there_twice_is_an_error(imported: Import) -> Non
         imported(log(again))
 
 
+SEEN = [row for row in LOG if row[1] in (81, 82)]
+
+
+def cycles(begin_s: float, count: int) -> Rows:
+    """The changes of the signals of `LOG` in some cycles of 50 s."""
+    return [
+        (begin_s + 50.0 * cycle + time, code, number)
+        for cycle in range(count)
+        for time, code, number in LOG[1:]
+        if time < 50.0 and code not in (81, 82)
+    ]
+
+
+def test_a_clock_set_back_out_of_the_period_is_an_error(imported: Import) -> None:
+    """The log begins with the period, so no time occurs twice, but half of the period is lost."""
+    back = [*cycles(0.0, 2), *cycles(100.0 - 3600.0, 2)]
+    with pytest.raises(MeasuredDataError, match=r"row \d+: .* '7' steps back by 3\d+ s"):
+        imported(log([*SEEN, *back]))
+
+
+def test_a_clock_set_back_before_the_period_is_no_error(imported: Import) -> None:
+    """The hour before a period only tells what is shown at its start."""
+    behind = [*cycles(-250.0, 9), *SEEN]
+    read = imported(log([*cycles(-300.0, 3), *behind]))  # back by 98 s
+    assert read.hash == imported(log(behind)).hash
+
+
 def test_what_a_controller_says_of_itself_is_passed_on(imported: Import) -> None:
-    read = imported(log([*LOG, (60.0, 181, 3), (61.0, 84, 5), (62.0, 87, 50)]))
+    faults = [(60.0, 181, 3), (61.0, 84, 5), (62.0, 87, 50)]
+    read = imported(log([*LOG, *faults]))
     assert "the clock of '7' was set once (event 181)" in texts(read)
     assert "device '7' reports faults (events 84 to 88) of its channels 5" in texts(read)
+    earlier = [(time - 3000.0, code, number) for time, code, number in faults]
+    said = texts(imported(log([*earlier, *LOG])))
+    assert "event 181" not in said and "faults" not in said
 
 
 def test_a_clock_that_was_set_once_was_set_once(imported: Import) -> None:

@@ -206,6 +206,34 @@ def test_a_clock_set_back_is_an_error_beside_late_rows(read: Read) -> None:
         read(changes={"detections": back})
 
 
+def moved(frame: pl.DataFrame, choice: pl.Expr, later_s: float) -> pl.DataFrame:
+    """The rows as a logger writes them that delivers the chosen ones late."""
+    return frame.sort(
+        "period_id", pl.col("time_s") + later_s * choice.cast(pl.Float64), maintain_order=True
+    )
+
+
+@pytest.mark.parametrize("rows", [[40], [40, 200]])
+def test_rows_that_are_delivered_late_are_sorted(rows: list[int], read: Read) -> None:
+    ons = of("s") & (pl.col("event") == "on")
+    choice = ons & (ons.cum_sum().over("period_id")).is_in(rows)
+    found, findings = read(changes={"detections": lambda f: moved(f, choice, 75.0)})
+    assert found.hash == recording().hash
+    only(findings, f"{len(rows)} rows are earlier than the row before them; they were sorted")
+
+
+def test_a_clock_set_back_shortly_before_the_end_is_an_error(read: Read) -> None:
+    """Two rows of each stream follow."""
+
+    def back(frame: pl.DataFrame) -> pl.DataFrame:
+        left = pl.int_range(pl.len(), 0, -1).over("period_id", "detector_id", "event")
+        moved = pl.when(left <= 2).then(pl.col("time_s") - 1800).otherwise("time_s")
+        return frame.with_columns(moved.alias("time_s"))
+
+    with pytest.raises(MeasuredDataError, match=r"steps back by [\d.]+ s.*occur twice"):
+        read(changes={"detections": back})
+
+
 def test_a_header_that_is_too_long_is_no_table(tmp_path: Path) -> None:
     path = tmp_path / "periods.csv"
     path.write_text("x" * 140_000 + ",b\n1,2\n")
@@ -637,6 +665,13 @@ def test_lanes_that_are_mixed_up_show_in_who_leaves_on_red(read: Read) -> None:
     assert "1074 of 1074 vehicles leave the stop detectors of traffic light 'C'" in text
 
 
+@pytest.mark.parametrize("letter", ["r", "o", "O", "s"])
+def test_lights_that_flash_or_are_off_are_not_red(letter: str, read: Read) -> None:
+    days = tuple(replace(p, signals={"C": ((0.0, 2 * letter),)}) for p in recording().periods)
+    findings = read(replace(recording(), periods=days))[1]
+    assert any("while their lane has red" in text for text in findings) == (letter == "r")
+
+
 def counts() -> pl.DataFrame:
     rows = [
         (f"day{i}", 900.0 * k, 900.0 * (k + 1), d.id, 40 + k + i)
@@ -681,9 +716,36 @@ def test_counts_alone_can_tell_a_few_things(
     assert set(findings[text]) == set(known_effects()) - set(coverage.COUNTABLE)
     assert "startup_delay" in findings[text]
     assert any("no signals: the network's own programme" in text for text in findings)
+    assert _said(text, "also") == set(coverage.SUMMED) - set(coverage.NEEDS_SIGNALS)
     again = read_measured(write_measured(read, tmp_path / "again"), scenario, network)
     assert [period.signals for period in again.periods] == [{}] * 3
     assert again.counts is not None and again.counts.equals(read.counts)
+
+
+@pytest.mark.parametrize("logged", [True, False])
+def test_counts_alone_are_said_to_show_what_they_show(
+    logged: bool, tmp_path: Path, scenario: Scenario, network: Network
+) -> None:
+    def findings(**columns: float) -> dict[str, tuple[str, ...]]:
+        made = counts().with_columns(**{name: pl.lit(value) for name, value in columns.items()})
+        base = recording(counts=made)
+        days = tuple(
+            replace(p, signals=p.signals if logged else {}, passages={}) for p in base.periods
+        )
+        street = write_measured(replace(base, periods=days), tmp_path / "street")
+        found = read_measured(street, scenario, network).findings
+        return {item.text: item.rules_out for item in found}
+
+    alone = findings()
+    text = next(text for text in alone if text.startswith("counts only"))
+    assert _said(text, "only") == set(known_effects()) - set(alone[text])
+    ruled_out = {name for names in findings(occupancy=0.1).values() for name in names}
+    assert _said(text, "also") and not _said(text, "also") & ruled_out
+
+
+def _said(text: str, word: str) -> set[str]:
+    """Return the effects that a finding on counts lists behind a word."""
+    return {*text.rpartition(f" {word} ")[2].partition(" can be")[0].split(", ")}
 
 
 def test_counts_of_one_kind_of_detectors_show_no_undercount(

@@ -178,6 +178,35 @@ def test_the_hash_counts_milliseconds_and_every_passage() -> None:
     assert with_first(first.at(np.arange(len(first) - 1))) != base.hash
 
 
+def test_times_of_tables_are_rounded_too(reread: Callable[..., MeasuredData]) -> None:
+    moment = {"period_id": ["day0"], "time_s": [0.1 + 0.2]}
+    before = replace(
+        recording(),
+        lanes=pl.DataFrame(
+            {
+                **moment, "lane_id": ["S_C_0"], "vehicles": [2.0], "halting": [1.0],
+                "mean_speed_mps": [3.5],
+            }
+        ),
+        trajectories=pl.DataFrame(
+            {
+                **moment, "vehicle_id": ["v"], "lane_id": ["S_C_0"], "position_m": [1.0],
+                "speed_mps": [2.0],
+            }
+        ).select("period_id", "vehicle_id", "time_s", "lane_id", "position_m", "speed_mps"),
+        travel_times=pl.DataFrame(
+            {
+                **moment, "from_edge": ["S_C"], "from_m": [5.0], "to_edge": ["C_N"], "to_m": [9.0],
+                "travel_s": [40.0],
+            }
+        ),
+    )  # fmt: skip
+    assert reread(given=before).hash == before.hash
+    assert before.trajectories is not None
+    other = before.trajectories.with_columns(pl.col("time_s") + 1e-3)
+    assert replace(before, trajectories=other).hash != before.hash
+
+
 def test_a_vehicle_that_stands_on_the_detector_when_the_period_begins_or_ends(
     reread: Callable[..., MeasuredData],
 ) -> None:
@@ -312,6 +341,20 @@ def test_writing_replaces_measured_data_and_nothing_else(tmp_path: Path) -> None
     (tmp_path / "empty").mkdir()
     write_measured(recording(), tmp_path / "empty")
     assert sorted(path.name for path in tmp_path.iterdir()) == ["empty", "file", "street"]
+
+
+@pytest.mark.parametrize("there", [True, False])
+def test_a_link_to_a_folder_stays_one(there: bool, tmp_path: Path) -> None:
+    link, target = tmp_path / "links" / "street", tmp_path / "disk" / "data"
+    if there:
+        write_measured(recording(3), target)
+    link.parent.mkdir()
+    link.symlink_to(target)
+    assert write_measured(recording(2), link) == link
+    assert link.is_symlink()
+    assert (target / "periods.csv").read_text().count("day") == 2
+    assert [*link.parent.iterdir()] == [link]
+    assert [*target.parent.iterdir()] == [target]
 
 
 @pytest.mark.parametrize(("name", "lose"), [("periods.csv", False), ("detectors.csv", True)])

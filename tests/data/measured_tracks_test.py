@@ -68,21 +68,47 @@ def test_a_stop_line_between_two_positions_is_crossed_though_the_road_ends() -> 
     assert np.isnan(found["exit"].off_s[0]), "the track ends before"
 
 
+@pytest.mark.parametrize(
+    ("speeds", "on_s"),
+    [
+        ([10.0, 0.0, 1.5, 10.0], 12.0),  # it stood at 25 m, and SUMO's cars start at 1.5 m/s
+        ([10.0, 0.0, 0.0, 10.0], 12.0),  # speeds without decimals
+        ([10.0, 10.0, 10.0, 10.0], 11.1),
+    ],
+)
+def test_a_start_from_standing_is_a_passage_though_speeds_tell_less(
+    speeds: list[float], on_s: float
+) -> None:
+    rows = track(["a_0", "a_0", ":j_0", "b_0"], [15.0, 25.0, 7.0, 5.0], 0.0, speed_mps=speeds)
+    assert passages(rows, Detector("d", "a_0", 26.0, 0.0, "stop"))["d"].on_s.tolist() == [on_s]
+
+
 def test_a_vehicle_that_changes_lanes_behind_a_detector_was_not_on_it() -> None:
     rows = track(["a_0", "a_0", "a_1", "a_1"], [0.0, 10.0, 20.0, 30.0], 10.0)
     detectors = [Detector(f"{x}", f"a_{x}", 5.0, 0.0, "advance") for x in (0, 1)]
     assert set(passages(rows, *detectors)) == {"0"}
 
 
-@pytest.mark.parametrize("share", [0.2, 0.5, 0.8])
-def test_a_vehicle_that_changes_lanes_over_a_detector_is_seen_once(share: float) -> None:
-    """It is on the first lane at 10 m and on the second at 20 m, and the detectors lie between."""
-    rows = track(["a_0", "a_0", "a_1", "a_1"], [0.0, 10.0, 20.0, 30.0], 10.0)
-    at_m = 10.0 + 10.0 * share
+@pytest.mark.parametrize("speed", [8.0, 10.0, 12.0])
+@pytest.mark.parametrize(
+    ("at_m", "lane"), [(12.0, "0"), (15.0, "0"), (18.0, "0"), (19.0, "0"), (21.0, "1")]
+)
+def test_a_vehicle_that_changes_lanes_over_a_detector_is_seen_once(
+    at_m: float, lane: str, speed: float
+) -> None:
+    """It is on the first lane until 20 m; positions tell that, and speeds are less exact."""
+    rows = track(["a_0", "a_0", "a_1", "a_1"], [0.0, 10.0, 20.0, 30.0], speed)
     detectors = [Detector(f"{x}", f"a_{x}", at_m, 0.0, "advance") for x in (0, 1)]
     seen = passages(rows, *detectors)
-    assert set(seen) == {"0"}
-    assert seen["0"].on_s.tolist() == pytest.approx([11.0 + share])
+    assert set(seen) == {lane}
+    assert seen[lane].on_s.tolist() == pytest.approx([10.0 + at_m / 10.0])
+
+
+def test_a_vehicle_that_changes_lanes_while_its_position_jitters_is_seen_once() -> None:
+    rows = track(["a_0", "a_0", "a_1", "a_1"], [0.0, 10.4, 10.0, 20.0], 0.2)
+    for at_m in (10.2, 10.4, 10.6):
+        detectors = [Detector(f"{x}", f"a_{x}", at_m, 0.0, "advance") for x in (0, 1)]
+        assert len(passages(rows, *detectors)) == 1
 
 
 def test_a_vehicle_that_stands_on_a_zone_at_the_begin_is_seen_to_leave() -> None:

@@ -236,6 +236,21 @@ def test_tables_by_hand_have_no_hashes(tmp_path: Path) -> None:
     assert csv_fault(by_hand) == ""
 
 
+def test_a_table_has_its_hashes_while_the_next_one_is_made(tmp_path: Path) -> None:
+    path = csv_of(tmp_path, 3)
+    path.write_text(path.read_text().replace("n1,", "n7,"))
+
+    def refusing() -> str:
+        if wrong := csv_fault(path):
+            raise ValueError(wrong)
+        return "name,value\n"
+
+    for _ in range(2):  # the table is kept, and its hashes too
+        with pytest.raises(ValueError, match="line 3 is not what was written"):
+            write_csv(path, refusing)
+    assert "n7," in path.read_text()
+
+
 def test_a_damaged_file_prints_nothing(tmp_path: Path, capfd: pytest.CaptureFixture[str]) -> None:
     """Threads of polars would print their stack traces."""
     path = tmp_path / "a.parquet"

@@ -12,7 +12,7 @@ import pytest
 
 from ugat_marl.data import AgentLayout, Provenance, TransitionLog, TransitionRecorder
 from ugat_marl.data.row_hashes import write_hashed
-from ugat_marl.data.transitions import METADATA_KEY
+from ugat_marl.data.transitions import FORMAT, METADATA_KEY
 from ugat_marl.errors import LogError
 
 LAYOUTS = {"signal_1": AgentLayout(3, 2, 1), "signal_0": AgentLayout(2, 4)}
@@ -143,13 +143,22 @@ def test_missing_file_foreign_parquet_and_no_parquet(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize(
-    "text",
-    ["", "[]", "{}", '{"format": 99}', '{"format": 1, "layouts": {"a": {"features": 0}}}'],
+    ("text", "says"),
+    [
+        ("", ""),
+        ("[]", ""),
+        ("{}", ""),
+        ('{"format": 99}', "has another format"),
+        (
+            json.dumps({"format": FORMAT, "layouts": {"a": {"features": 0}}}),
+            "cannot be understood",
+        ),
+    ],
 )
-def test_broken_provenance_is_refused(tmp_path: Path, text: str) -> None:
+def test_broken_provenance_is_refused(tmp_path: Path, text: str, says: str) -> None:
     path = tmp_path / "log.parquet"
     write_hashed(recorded().frame, path, {METADATA_KEY: text})
-    with pytest.raises(LogError, match=r"log\.parquet: provenance"):
+    with pytest.raises(LogError, match=rf"log\.parquet: provenance.*{says}"):
         TransitionLog.read(path)
 
 

@@ -4,20 +4,16 @@ from __future__ import annotations
 
 import html
 import io
-import json
 import re
-import shutil
-import subprocess
 from collections.abc import Iterator
 from dataclasses import replace
-from html.parser import HTMLParser
 from pathlib import Path
 from typing import Any
 
-import matplotlib.image
 import pytest
 from rich.console import Console
 
+from tests.reporting.pages import Page, assert_drawn, needs_browser, seen_in_browser
 from ugat_marl.diagnosis import Diagnosis, statistic
 from ugat_marl.diagnosis.features import ALL_FEATURES, FEATURES
 from ugat_marl.diagnosis.verdict import STATISTICS
@@ -155,39 +151,6 @@ def content_of(verdict: str = "explained", *, complete: bool = True, **more: Any
 @pytest.fixture(scope="module")
 def network(data: Path) -> Network:
     return Network.read(load_scenario(data / "crossing"))
-
-
-class Page(HTMLParser):
-    """Tags, attributes and texts of a page; every tag must be closed."""
-
-    VOID = ("meta", "br", "img")
-
-    def __init__(self, text: str) -> None:
-        super().__init__()
-        self.tags: list[tuple[str, dict[str, Any]]] = []
-        self.open: list[str] = []
-        self.texts: list[str] = []
-        self.feed(text)
-        assert not self.open, self.open
-
-    def handle_starttag(self, tag: str, attrs: list[tuple[str, Any]]) -> None:
-        self.tags.append((tag, dict(attrs)))
-        if tag not in self.VOID:
-            self.open.append(tag)
-
-    def handle_startendtag(self, tag: str, attrs: list[tuple[str, Any]]) -> None:
-        self.tags.append((tag, dict(attrs)))
-
-    def handle_endtag(self, tag: str) -> None:
-        assert self.open.pop() == tag
-
-    def handle_data(self, data: str) -> None:
-        if "style" not in self.open[-1:]:
-            self.texts.append(data)
-
-    @property
-    def text(self) -> str:
-        return " ".join(" ".join(self.texts).split())
 
 
 def printed(diagnosis: Diagnosis) -> str:
@@ -351,7 +314,9 @@ def test_a_page_tells_its_commands(network: Network, tmp_path: Path) -> None:
 
 def test_nothing_held_out_is_said(network: Network) -> None:
     diagnosis = diagnosis_of(verified_on_fitted_periods=True)
-    assert "the numbers flatter" in Page(diagnosis_page(diagnosis, network)).text
+    text = Page(diagnosis_page(diagnosis, network)).text
+    assert "the numbers flatter" in text
+    assert "Queues that discharge, fitted periods" in text
     assert "flatter" in printed(diagnosis)
 
 
@@ -406,58 +371,24 @@ def test_a_share_is_only_whole_where_nothing_is_missing(value: float, text: str)
     assert formats.share(value) == text
 
 
-CHROMIUM = shutil.which("chromium") or shutil.which("google-chrome")
-FRAME = """<!DOCTYPE html><body style="margin:0"><iframe id="f" width="{width}" height="4000"
-style="border:0" srcdoc="{page}"></iframe><p id="out"></p><script>
-f.onload = () => {{ const d = f.contentDocument, w = d.documentElement;
-  const wide = [...d.querySelectorAll("body *")].filter(
-    e => e.getBoundingClientRect().right > w.clientWidth + 1 && !e.closest("svg, thead")
-  ).map(e => e.tagName + "." + e.className);
-  out.textContent = JSON.stringify({{scroll: w.scrollWidth, width: w.clientWidth, wide,
-    opened: d.querySelectorAll("details").length, height: w.scrollHeight}}); }};
-</script></body>"""
-
-
-def browse(directory: Path, *options: str) -> str:
-    assert CHROMIUM is not None
-    command = [
-        CHROMIUM, "--headless=new", "--no-sandbox", "--disable-gpu", "--disable-dev-shm-usage",
-        "--hide-scrollbars", f"--user-data-dir={directory / 'profile'}", *options,
-    ]  # fmt: skip
-    done = subprocess.run(command, capture_output=True, text=True, check=True, timeout=60)
-    return done.stdout
-
-
-@pytest.mark.skipif(CHROMIUM is None, reason="no chromium to look at the page with")
+@needs_browser
 @pytest.mark.parametrize("width", [360, 390, 700, 1280])
 def test_nothing_sticks_out_in_a_browser(width: int, network: Network, tmp_path: Path) -> None:
     content = content_of(policy_gap=GAP)
     content["effects"][1]["place"] = "cluster_1098574052_1098574061_" * 6
     content["where"][0]["lane"] = "cluster_1098574052_1098574061_" * 4
-    text = diagnosis_page(Diagnosis.from_json(content), network).replace(
-        "<details>", "<details open>"
-    )
-    frame = tmp_path / "frame.html"
-    frame.write_text(FRAME.format(width=width, page=html.escape(text, quote=True)))
-    dom = browse(tmp_path, "--virtual-time-budget=3000", "--dump-dom", frame.as_uri())
-    (found,) = re.findall(r'<p id="out">(.*?)</p>', dom)
-    seen = json.loads(html.unescape(found))
+    page = diagnosis_page(Diagnosis.from_json(content), network)
+    seen = seen_in_browser(page, width, tmp_path, aside="svg, thead")
     assert seen["width"] == width
     assert seen["scroll"] <= width, seen["wide"]
     assert not seen["wide"]
 
 
-@pytest.mark.skipif(CHROMIUM is None, reason="no chromium to look at the page with")
+@needs_browser
 @pytest.mark.parametrize("dark", [False, True])
 def test_the_page_is_drawn_in_a_browser(dark: bool, network: Network, tmp_path: Path) -> None:
-    page, picture = tmp_path / "report.html", tmp_path / "report.png"
-    write_diagnosis_page(diagnosis_of(), network, page)
-    options = ["--blink-settings=preferredColorScheme=0"] if dark else []
-    browse(tmp_path, *options, "--window-size=1280,1600", f"--screenshot={picture}", page.as_uri())
-    pixels = matplotlib.image.imread(picture)
-    assert pixels.shape[:2] == (1600, 1280)
-    assert pixels.std() > 0.05
-    assert (pixels[:, :, :3].mean() < 0.5) == dark
+    write_diagnosis_page(diagnosis_of(), network, tmp_path / "report.html")
+    assert_drawn(tmp_path / "report.html", dark=dark)
 
 
 def test_the_verdict_is_told_in_terms_of_traffic(network: Network) -> None:

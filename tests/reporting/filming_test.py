@@ -143,7 +143,7 @@ def test_ffmpeg_gets_all_frames_and_its_words_are_kept(
     pictures = [np.full((20, 30, 3), k, np.uint8) for k in range(4)]
     video = tmp_path / "out.mp4"
     if fail:
-        with pytest.raises(OutputError, match="ffmpeg failed: no such codec"):
+        with pytest.raises(OutputError, match=r"^out\.mp4: ffmpeg failed: no such codec"):
             write_video(pictures, video, 10)
         assert not video.exists()
         return
@@ -165,7 +165,7 @@ def test_a_stopped_ffmpeg_is_killed(
     monkeypatch.setattr(filming, "_ffmpeg", lambda: str(program))
     monkeypatch.setenv(DEADLINE_VARIABLE, "1.5")
     pictures = [np.zeros((400, 400, 3), np.uint8)] * 3  # more than a pipe holds
-    with pytest.raises(OutputError, match=r"ffmpeg did not go on for 1.5 s and was killed"):
+    with pytest.raises(OutputError, match=r"^out\.mp4: ffmpeg did not go on for 1.5 s and was"):
         write_video(pictures, tmp_path / "out.mp4", 10)
     assert not (tmp_path / "out.mp4").exists()
 
@@ -190,6 +190,7 @@ def test_the_command_films(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -
         (["rollout", "single-v1"], "--out FILE.parquet, --video FILE, or both"),
         (["rollout", "single-v1", "--out", str(tmp_path / "a"), "--beside", "x"], "needs --video"),
         ([*call, "--film.size", "10"], "from 200 to 4000"),
+        ([*call, "--domain", "meso"], "mesoscopic model, in which vehicles have no position"),
     ):
         assert main(wrong) == 2
         assert message in capsys.readouterr().err

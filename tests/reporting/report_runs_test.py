@@ -2,17 +2,14 @@
 
 from __future__ import annotations
 
-import html
 import json
 import os
 import re
 import shlex
 import shutil
-import subprocess
 import xml.etree.ElementTree as ET
 from collections.abc import Sequence
 from dataclasses import replace
-from html.parser import HTMLParser
 from pathlib import Path
 from typing import Any
 
@@ -22,6 +19,7 @@ import polars as pl
 import pytest
 import tyro
 
+from tests.reporting.pages import Page, assert_drawn, needs_browser, seen_in_browser
 from tests.runs import search_few_rules
 from ugat_marl.__main__ import main
 from ugat_marl.cli.report import again, train_options
@@ -50,6 +48,7 @@ from ugat_marl.reporting.figures import NamedFigure, shortened_apart
 from ugat_marl.reporting.formats import command_block, commands_in
 from ugat_marl.reporting.network_maps import minutes_picture, node_map
 from ugat_marl.reporting.page import Page as MadePage
+from ugat_marl.reporting.places import places_of
 from ugat_marl.reporting.run_records import read_rows
 from ugat_marl.scenarios import Network
 
@@ -146,50 +145,6 @@ def quick_pictures(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(NamedFigure, "for_page", lambda _: "<svg></svg>")
 
 
-class Page(HTMLParser):
-    """Tags, attributes and texts of a page; every tag must be closed."""
-
-    VOID = ("meta", "br", "img")
-
-    def __init__(self, text: str) -> None:
-        super().__init__()
-        self.tags: list[tuple[str, dict[str, Any]]] = []
-        self.open: list[str] = []
-        self.texts: list[str] = []
-        self.cells: list[list[str]] = []
-        self.feed(text)
-        assert not self.open, self.open
-
-    def handle_starttag(self, tag: str, attrs: list[tuple[str, Any]]) -> None:
-        self.tags.append((tag, dict(attrs)))
-        if tag == "tr":
-            self.cells.append([])
-        elif tag == "td":
-            self.cells[-1].append("")
-        if tag not in self.VOID:
-            self.open.append(tag)
-
-    def handle_startendtag(self, tag: str, attrs: list[tuple[str, Any]]) -> None:
-        self.tags.append((tag, dict(attrs)))
-
-    def handle_endtag(self, tag: str) -> None:
-        assert self.open.pop() == tag
-
-    def handle_data(self, data: str) -> None:
-        if self.open[-1:] == ["td"]:
-            self.cells[-1][-1] += data.replace("\u00a0", " ")
-        if "style" not in self.open[-1:]:
-            self.texts.append(data)
-
-    @property
-    def text(self) -> str:
-        return " ".join(" ".join(self.texts).split())
-
-    def row(self, first: str) -> list[str]:
-        """The first row of a table that begins with a cell."""
-        return next(row for row in self.cells if row[:1] == [first])
-
-
 def page_of(*paths: Path) -> tuple[MadePage, Page]:
     records = read_records(paths)
     made = runs_page(records, {record.directory: again(record) for record in records})
@@ -229,9 +184,8 @@ def test_a_whole_run_is_shown_with_the_numbers_of_its_records(run: Path) -> None
 
 
 def test_the_page_needs_nothing_else_and_every_picture_has_words(run: Path) -> None:
-    _, page = page_of(run)
-    text = (run / "report.html").read_text() if (run / "report.html").exists() else ""
-    text = text or page_of(run)[0].text
+    made, page = page_of(run)
+    text = made.text
     # A picture refers to its own parts, by their ids; nothing else is referred to.
     assert not re.findall(r'https?:|src=|url\((?!#)|@import|<script|<link|href="(?!#)', text)
     assert "default-src 'none'" in text
@@ -267,10 +221,7 @@ def test_what_is_broken_is_named(run: Path, name: str, how: str) -> None:
         broken = {"empty": b"", "half": content[: len(content) // 2], "other": b"[1, 2]"}
         path.write_bytes(broken[how])
     made, page = page_of(run)
-    if how == "gone" and name == "run.json":
-        assert "Missing here" not in page.text  # its settings are known all the same
-    elif name != "run.json":
-        assert "Missing here" in page.text and name in page.text
+    assert "Missing here" in page.text and name in page.text
     if name == "metrics.parquet":
         assert "trainings/ugat/checkpoint/metrics.parquet is shown instead" in page.text
         assert any(picture.name == "first-gate" for picture in made.pictures)
@@ -370,6 +321,23 @@ def test_an_episode_of_another_length_is_no_change_of_the_scenario(tmp_path: Pat
     assert "The scenario has changed since" not in page_of(run)[1].text
 
 
+@pytest.mark.parametrize(
+    "more",
+    [{"target": "V4", "options": {"duration_s": 600.0}}, {"sim": "V1", "target": "sim"}],
+)
+def test_a_job_of_an_unchanged_scenario_has_no_remark(tmp_path: Path, more: Any) -> None:
+    setting = Setting("timed", "grounded", ugat=UgatConfig(grounding="timed"))
+    make_job(tmp_path, "timed-0", (), setting, **more)
+    identity = Job.read(tmp_path / "timed-0").identity
+    (tmp_path / "timed-0" / "run.json").write_text(json.dumps(identity))
+    (record,) = read_records([tmp_path / "timed-0"])
+    assert isinstance(record, RunRecord) and len(record.hashes) == 2
+    assert places_of(record)[1] == ""
+    (tmp_path / "timed-0" / "run.json").write_text("{bad")
+    (record,) = read_records([tmp_path / "timed-0"])
+    assert any(text.startswith("run.json cannot be used") for text in record.missing)
+
+
 def test_a_scenario_that_is_gone_or_changed_is_said(run: Path) -> None:
     assert "The scenario has changed since" not in page_of(run)[1].text
     settings = json.loads((run / "settings.json").read_text())
@@ -393,7 +361,9 @@ def test_hostile_names_stay_text(tmp_path: Path) -> None:
              for p, d, batch, m, t, *means in queues().rows()]  # fmt: skip
     pl.DataFrame(names, schema=queues().schema, orient="row").write_parquet(run / "queues.parquet")
     numbers = Metrics([(s, n, f"{k}{NASTY}\x07", v) for s, n, k, v in metrics().rows])
-    Metrics([*metrics().rows, *numbers.rows]).write(run / "metrics.parquet")
+    late = [("iteration", 2, f"channel/late_s{end}/{agent}", 5.0)
+            for end in ("", "_low", "_high") for agent in AGENTS]  # fmt: skip
+    Metrics([*metrics().rows, *numbers.rows, *late]).write(run / "metrics.parquet")
     kept = json.loads((run / "settings.json").read_text())
     kept["settings"] |= {NASTY: "\ud800\x00", "real": NASTY}
     kept["versions"] |= {NASTY: NASTY}
@@ -406,7 +376,8 @@ def test_hostile_names_stay_text(tmp_path: Path) -> None:
     made.text.encode()
     for picture in made.pictures:
         ET.fromstring(picture.svg())
-        assert re.fullmatch(r"[\w=+.-]+", picture.name)
+        assert re.fullmatch(r"[\w=+.-]{1,80}", picture.name)
+    assert any("map-channel-late_s" in picture.name for picture in made.pictures)
     write_pictures(made.pictures[:2], tmp_path / "pictures")
 
 
@@ -428,6 +399,22 @@ def test_seeds_are_put_together_with_intervals(tmp_path: Path) -> None:
     assert curves == [f"grid2x2-v1-V4-phase-seeds-{w}" for w in ("learning", "att", "gate")]
 
 
+def test_a_training_without_metrics_is_no_seed_of_a_curve(tmp_path: Path) -> None:
+    runs = [make_run(tmp_path / "runs" / f"s{seed}", seed=seed) for seed in range(2)]
+    (runs[1] / "metrics.parquet").unlink()
+    shutil.rmtree(runs[1] / "trainings")
+    made, _ = page_of(tmp_path / "runs")
+    assert not [picture.name for picture in made.pictures if "seeds" in picture.name]
+
+
+def test_runs_whose_worlds_are_unknown_are_no_group(tmp_path: Path) -> None:
+    for seed in range(2):
+        (make_run(tmp_path / "runs" / f"s{seed}", seed=seed) / "run.json").unlink()
+    _, page = page_of(tmp_path / "runs")
+    assert "run.json is not there: the hash of its scenario is unknown; it is" in page.text
+    assert "Over training seeds" not in page.text
+
+
 def test_of_many_trainings_those_that_miss_something_keep_their_section(tmp_path: Path) -> None:
     for seed in range(14):
         run = make_run(tmp_path / "runs" / f"s{seed}", seed=seed)
@@ -437,6 +424,16 @@ def test_of_many_trainings_those_that_miss_something_keep_their_section(tmp_path
     _, page = page_of(tmp_path / "runs")
     assert "table.json cannot be used" in page.text
     assert "13 trainings without a gate, whose files are whole" in page.text
+
+
+def test_a_training_without_a_real_domain_has_no_time_there(tmp_path: Path) -> None:
+    for seed in range(2):
+        run = make_run(tmp_path / "runs" / f"s{seed}", seed=seed)
+        found = evaluation()
+        results = tuple(result for result in found.results if result.domain == "sim")
+        replace(found, results=results).write(run / "table.json")
+    _, page = page_of(tmp_path / "runs")
+    assert page.row("s0")[7:9] == ["–", "–"]
 
 
 def test_why_a_training_is_not_compared(tmp_path: Path) -> None:
@@ -648,6 +645,16 @@ def test_the_command_on_the_page_makes_the_same_run(change: dict[str, Any], tmp_
     assert again == config and again.as_dict() == config.as_dict()
 
 
+@pytest.mark.parametrize(("inside", "given"), [(".", "."), ("policies", "..")])
+def test_a_run_named_by_dots_is_repeated_beside_its_folder(
+    run: Path, inside: str, given: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    (run / "policies").mkdir()
+    monkeypatch.chdir(run / inside)
+    (record,) = read_records([Path(given)])
+    assert f"--out {run}-again" in again(record)[0]
+
+
 def test_a_learner_that_lies_elsewhere_is_named_all_the_same() -> None:
     settings = {**TransferConfig("x", learner="ippo").as_dict(), "learner": "nowhere:Thing"}
     settings = json.loads(json.dumps(settings, default=str))
@@ -749,100 +756,16 @@ def test_the_same_picture_is_the_same_file_and_has_ids_of_its_own() -> None:
     assert ids[0] and not ids[0] & ids[1]
 
 
-MACHADO = {  # Machado, Oliveira and Fernandes (2009), severity 1
-    "protan": [[0.152286, 1.052583, -0.204868], [0.114503, 0.786281, 0.099216],
-               [-0.003882, -0.048116, 1.051998]],
-    "deutan": [[0.367322, 0.860646, -0.227968], [0.280085, 0.672501, 0.047413],
-               [-0.011820, 0.042940, 0.968881]],
-    "tritan": [[1.255528, -0.076749, -0.178779], [-0.078411, 0.930809, 0.147602],
-               [0.004733, 0.691367, 0.303900]],
-}  # fmt: skip
-
-
-def lab(colour: str, sight: str | None) -> np.ndarray:
-    """CIE L*a*b* of a colour as somebody sees it."""
-    srgb = np.array([int(colour[i : i + 2], 16) / 255 for i in (1, 3, 5)])
-    linear = np.where(srgb <= 0.04045, srgb / 12.92, ((srgb + 0.055) / 1.055) ** 2.4)
-    if sight is not None:
-        linear = np.clip(np.array(MACHADO[sight]) @ linear, 0, 1)
-    to_xyz = np.array(
-        [[0.4124, 0.3576, 0.1805], [0.2126, 0.7152, 0.0722], [0.0193, 0.1192, 0.9505]]
-    )
-    xyz = to_xyz @ linear / (0.9505, 1.0, 1.089)
-    f = np.where(xyz > 0.008856, np.cbrt(xyz), 7.787 * xyz + 16 / 116)
-    return np.array([116 * f[1] - 16, 500 * (f[0] - f[1]), 200 * (f[1] - f[2])])
-
-
-@pytest.mark.parametrize("colours", [style.LIGHT, style.DARK])
-@pytest.mark.parametrize("sight", [None, "protan", "deutan", "tritan"])
-def test_colours_are_told_apart(colours: dict[str, str], sight: str | None) -> None:
-    curves = [lab(colours[name], sight) for name in style.CURVES]
-    for i, one in enumerate(curves):
-        for other in curves[:i]:
-            assert np.linalg.norm(one - other) > 10
-        assert np.linalg.norm(one - lab(colours["paper"], sight)) > 35
-    classes = tuple(f"d{number}" for number in range(len(style.DISAGREEMENT)))
-    for scale in (style.STEPS, classes):
-        changes = np.diff([lab(colours[name], sight)[0] for name in scale])
-        assert (changes < -4).all() or (changes > 4).all()  # lighter or darker all the way
-
-
-def test_every_colour_has_one_name() -> None:
-    assert len(set(style.LIGHT.values())) == len(style.LIGHT)
-    assert style.LIGHT.keys() == style.DARK.keys()
-
-
-def test_red_and_green_would_be_confused() -> None:
-    assert np.linalg.norm(lab("#e45756", "deutan") - lab("#9a9a3a", "deutan")) < 25
-
-
 # --- in a browser -------------------------------------------------------------------------------
 
-CHROMIUM = shutil.which("chromium") or shutil.which("google-chrome")
-FRAME = """<!DOCTYPE html><body style="margin:0"><iframe id="f" width="{width}" height="4000"
-style="border:0" srcdoc="{page}"></iframe><p id="out"></p><script>
-const errors = []; addEventListener("error", e => errors.push(String(e.message)));
-f.onload = () => {{ const d = f.contentDocument, w = d.documentElement;
-  let clicks = 0;
-  for (const s of d.querySelectorAll("summary")) {{ s.click(); clicks += 1; }}
-  const inside = e => e.closest("thead");
-  const wide = [...d.querySelectorAll("body *")].filter(
-    e => e.getBoundingClientRect().right > w.clientWidth + 1 && !inside(e)
-  ).map(e => e.tagName + "." + e.getAttribute("class"));
-  const cut = [...d.querySelectorAll("svg text")].filter(t => {{
-    const a = t.getBoundingClientRect(), b = t.closest("svg").getBoundingClientRect();
-    return a.left < b.left - 1 || a.right > b.right + 1 || a.bottom > b.bottom + 1; }}
-  ).map(t => t.textContent);
-  const small = [...d.querySelectorAll("svg text")].filter(
-    t => t.getBoundingClientRect().height < 8).map(t => t.textContent);
-  out.textContent = JSON.stringify({{scroll: w.scrollWidth, width: w.clientWidth, wide, cut, small,
-    clicks, open: d.querySelectorAll("details[open]").length, errors}}); }};
-</script></body>"""
 
-
-def browse(directory: Path, *options: str) -> str:
-    assert CHROMIUM is not None
-    command = [
-        CHROMIUM, "--headless=new", "--no-sandbox", "--disable-gpu", "--disable-dev-shm-usage",
-        "--hide-scrollbars", "--enable-logging=stderr", f"--user-data-dir={directory / 'profile'}",
-        *options,
-    ]  # fmt: skip
-    done = subprocess.run(command, capture_output=True, text=True, check=True, timeout=60)
-    assert "CONSOLE" not in done.stderr, done.stderr
-    return done.stdout
-
-
-@pytest.mark.skipif(CHROMIUM is None, reason="no chromium to look at the page with")
+@needs_browser
 @pytest.mark.parametrize("width", [390, 700, 1440])
 def test_nothing_is_clipped_in_a_browser(width: int, tmp_path: Path) -> None:
     for seed in (0, 1):
         make_run(tmp_path / "runs" / f"a-rather-long-name-of-a-run-{seed}", seed=seed)
     page = page_of(tmp_path / "runs")[0].text
-    frame = tmp_path / "frame.html"
-    frame.write_text(FRAME.format(width=width, page=html.escape(page, quote=True)))
-    dom = browse(tmp_path, "--virtual-time-budget=3000", "--dump-dom", frame.as_uri())
-    (found,) = re.findall(r'<p id="out">(.*?)</p>', dom)
-    seen = json.loads(html.unescape(found))
+    seen = seen_in_browser(page, width, tmp_path, aside="thead")
     assert seen["width"] == width
     assert seen["scroll"] <= width and not seen["wide"], seen["wide"]
     assert not seen["cut"] and not seen["errors"]
@@ -850,16 +773,11 @@ def test_nothing_is_clipped_in_a_browser(width: int, tmp_path: Path) -> None:
     assert seen["clicks"] == seen["open"] > 3
 
 
-@pytest.mark.skipif(CHROMIUM is None, reason="no chromium to look at the page with")
+@needs_browser
 @pytest.mark.parametrize("dark", [False, True])
 def test_the_page_is_drawn_in_light_and_dark(dark: bool, run: Path, tmp_path: Path) -> None:
-    page, picture = tmp_path / "report.html", tmp_path / "report.png"
-    page.write_text(page_of(run)[0].text)
-    options = ["--blink-settings=preferredColorScheme=0"] if dark else []
-    browse(tmp_path, *options, "--window-size=1280,1600", f"--screenshot={picture}", page.as_uri())
-    pixels = matplotlib.image.imread(picture)
-    assert pixels.std() > 0.05
-    assert (pixels[:, :, :3].mean() < 0.5) == dark
+    (tmp_path / "report.html").write_text(page_of(run)[0].text)
+    assert_drawn(tmp_path / "report.html", dark=dark)
 
 
 # --- a real training ----------------------------------------------------------------------------

@@ -12,7 +12,7 @@ from rich.console import Console, RenderableType
 
 from ugat_marl.data import Metrics, Scores
 from ugat_marl.effects import load_scenario
-from ugat_marl.experiments import Evaluation
+from ugat_marl.experiments import DIRECT, GROUNDED_NAME, ORACLE, RULE, Evaluation
 from ugat_marl.experiments.evaluation import Result
 from ugat_marl.reporting import (
     calibration_picture,
@@ -22,6 +22,7 @@ from ugat_marl.reporting import (
     transfer_picture,
     transfer_table,
 )
+from ugat_marl.reporting.formats import mean_text
 from ugat_marl.reporting.service_tables import service_grid
 from ugat_marl.scenarios import Network
 
@@ -62,13 +63,26 @@ def test_the_transfer_table_says_it_all_in_80_columns(found: Evaluation) -> None
 
 
 def test_names_and_numbers_are_whole_in_narrow_columns(found: Evaluation) -> None:
-    names = [f"further in headway=1.4,startup_delay={k}" for k in (2, 3)]
-    results = [replace(r, policy=name) for name in names for r in found.results[:6]]
-    domains = [replace(r, domain=f"{r.domain}+{k}") for k in range(5) for r in results]
-    for shown in (results, domains):
-        text = printed(transfer_table(Evaluation("s", "0", tuple(shown), {})))
-        assert "…" not in text
-        assert max(map(len, text.splitlines())) <= 80
+    """Two real domains leave the names of policies 14 characters."""
+    shown = [
+        replace(
+            r,
+            policy=r.policy.replace("largest-queue:40", "fixed-time:30"),
+            domain=domain,
+            scores=replace(r.scores, att_s=min(r.scores.att_s, 152.0)),
+        )
+        for r in found.results
+        for domain in ((r.domain, "V3") if r.domain == "V4" else (r.domain,))
+    ]
+    narrow = Evaluation("s", "0", tuple(shown), {})
+    text = printed(transfer_table(narrow))
+    assert max(map(len, text.splitlines())) <= 80
+    words = text.partition("3 seeds")[0].split()
+    for policy in narrow.policies:
+        assert set(policy.split()) <= set(words)
+        for domain in narrow.domains:
+            numbers = mean_text(narrow.estimate(policy, domain, "att_s")).split()
+            assert len(numbers) == 2 and set(numbers) <= set(words)
 
 
 def test_six_policies_have_room(found: Evaluation) -> None:
@@ -156,6 +170,20 @@ def test_levels_of_service_of_policies_and_approaches(found: Evaluation) -> None
     assert grid is not None
     assert grid.rows[0] == ["B1 (signal_2)", "eastbound", "A1_B1", "100 F"]
     assert service_grid(found, ["phase (the paper's UGAT)"], None) is None
+
+
+def test_the_radar_of_a_table_has_every_grounding() -> None:
+    labels = [DIRECT, *GROUNDED_NAME.values(), "more plain sim", ORACLE, RULE]
+    lines = training_page._radar_lines(labels, {(label, "V4"): {} for label in labels}, "V4")
+    assert [*lines] == [
+        "direct transfer in the simulation",
+        "direct transfer in V4",
+        "phase (the paper's UGAT) in V4",
+        "timed in V4",
+        "fitted street in V4",
+        "trained in real in V4",
+        "best rule, tuned there in V4",
+    ]
 
 
 def test_settings_of_fewer_trainings_are_named() -> None:

@@ -109,6 +109,18 @@ def test_of_two_trainings_with_one_seed_the_newest_is_shown() -> None:
     assert {row["att_s"] for row in group.rows} == {195.0}
 
 
+def test_runs_judged_in_two_versions_of_a_real_domain_are_apart() -> None:
+    worlds = ("a" * 64, "b" * 64)
+    records = [
+        replace(judged(seed, 100.0 + seed, 1.0), hashes={"sim": "aaa", "real": world})
+        for seed, world in enumerate(worlds)
+    ]
+    (group,) = groups(records)
+    times_s = {row["domain"]: row["att_s"] for row in group.rows if row["setting"] != RULE}
+    assert times_s == {f"V4 ({'a' * 10})": 100.0, f"V4 ({'b' * 10})": 101.0}
+    assert seeds_of_one(records) == [[record] for record in records]
+
+
 def test_rows_that_depend_on_other_settings_are_apart() -> None:
     records = [
         judged(0, 100.0, 1.0, corrected="headway=1.4"),
@@ -121,6 +133,12 @@ def test_rows_that_depend_on_other_settings_are_apart() -> None:
         "corrected sim (corrected acceleration=0.5)",
         f"{RULE} (rule_budget as usual)",
         f"{RULE} (rule_budget 24)",
+    }
+    tuned = [judged(seed, 100.0, 1.0, tuning_seeds=2 + 3 * seed) for seed in range(2)]
+    (other,) = groups(tuned)
+    assert {row["setting"] for row in other.rows if row["setting"].startswith(RULE)} == {
+        f"{RULE} (tuning_seeds 2)",
+        f"{RULE} (tuning_seeds 5)",
     }
     times_s = {row["setting"]: row["att_s"] for row in group.rows if row["domain"] == "V4"}
     assert times_s["direct transfer"] == 150.0

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from ugat_marl.reporting import charts, formats
 from ugat_marl.reporting.figures import add_axes, new_picture
-from ugat_marl.reporting.style import CURVES, DARK, LIGHT, curve_style
+from ugat_marl.reporting.style import CURVES, DARK, DISAGREEMENT, LIGHT, STEPS, curve_style
 
 # Machado, Oliveira, Fernandes 2009, severity 1: linear RGB as a colour-blind eye sees it.
 EYES = {
@@ -30,6 +30,13 @@ EYES = {
             [-0.003882, -0.048116, 1.051998],
         ]
     ),
+    "tritanopia": np.array(
+        [
+            [1.255528, -0.076749, -0.178779],
+            [-0.078411, 0.930809, 0.147602],
+            [0.004733, 0.691367, 0.303900],
+        ]
+    ),
 }
 TO_XYZ = np.array(
     [
@@ -39,7 +46,7 @@ TO_XYZ = np.array(
     ]
 )
 WHITE = np.array([0.95047, 1.0, 1.08883])
-LEAST = 12.0
+LEAST = {**dict.fromkeys(EYES, 12.0), "tritanopia": 10.0}
 """Smallest CIE76 difference of two curves; 2.3 is just noticeable side by side."""
 
 
@@ -56,10 +63,14 @@ def lab(rgb: NDArray[np.float64]) -> NDArray[np.float64]:
     return np.array([116 * f[1] - 16, 500 * (f[0] - f[1]), 200 * (f[1] - f[2])])
 
 
+def seen(colour: str, eye: str) -> NDArray[np.float64]:
+    """CIELAB of a colour for an eye."""
+    return lab(EYES[eye] @ linear(colour))
+
+
 def difference(one: str, other: str, eye: str) -> float:
     """CIE76 difference of two colours for an eye."""
-    seen = [lab(EYES[eye] @ linear(colour)) for colour in (one, other)]
-    return float(np.linalg.norm(seen[0] - seen[1]))
+    return float(np.linalg.norm(seen(one, eye) - seen(other, eye)))
 
 
 def test_the_measure_is_the_one_of_the_book() -> None:
@@ -74,9 +85,23 @@ def test_the_measure_is_the_one_of_the_book() -> None:
 @pytest.mark.parametrize("palette", [LIGHT, DARK], ids=["light", "dark"])
 def test_colours_of_curves_differ_for_every_eye(palette: dict[str, str], eye: str) -> None:
     for one, other in itertools.combinations(CURVES, 2):
-        assert difference(palette[one], palette[other], eye) > LEAST, (one, other)
+        assert difference(palette[one], palette[other], eye) > LEAST[eye], (one, other)
     for one in CURVES:
         assert difference(palette[one], palette["paper"], eye) > 25
+
+
+@pytest.mark.parametrize("eye", EYES)
+@pytest.mark.parametrize("palette", [LIGHT, DARK], ids=["light", "dark"])
+def test_scales_become_lighter_or_darker_all_the_way(palette: dict[str, str], eye: str) -> None:
+    classes = tuple(f"d{number}" for number in range(len(DISAGREEMENT)))
+    for scale in (STEPS, classes):
+        changes = np.diff([seen(palette[name], eye)[0] for name in scale])
+        assert (changes < -4).all() or (changes > 4).all()
+
+
+def test_every_colour_has_one_name() -> None:
+    assert len(set(LIGHT.values())) == len(LIGHT)
+    assert LIGHT.keys() == DARK.keys()
 
 
 def test_curves_differ_without_colour_too() -> None:

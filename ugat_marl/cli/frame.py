@@ -244,7 +244,7 @@ def _deadline(seconds: str | None) -> Iterator[None]:
     """Set the deadline of simulations, SUMO's programs and jobs, for all processes started here.
 
     Raises:
-        OptionError: It is not a number of seconds above 0.
+        OptionError: It is not a number of seconds above 0, up to `LONGEST_DEADLINE_S`.
     """
     if seconds is None:
         yield

@@ -115,7 +115,10 @@ def _train(record: RunRecord, folder: str) -> list[str]:
         options = train_options(record.settings)
     except (UgatMarlError, *MALFORMED):
         return []  # of a damaged file, or of a learner that this version does not have
-    place = ["--out", f"{folder}-again"] if record.finished else ["--out", folder, "--resume"]
+    directory = record.directory
+    if directory.name in ("", ".."):  # of ".", "..": the folder itself has a name
+        directory = directory.resolve()
+    place = ["--out", f"{directory}-again"] if record.finished else ["--out", folder, "--resume"]
     return [shlex.join(["ugat-marl", "train", record.scenario, *options, *place])]
 
 

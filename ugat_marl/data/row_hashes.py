@@ -118,10 +118,11 @@ def write_csv(path: Path, text: str | Callable[[], str]) -> None:
     """
     require_writable(path)
     with only_writer(path.parent):
+        made = text if isinstance(text, str) else text()  # it can check the table by its hashes
         tables = _known_csv_hashes(path.parent)
         if tables.pop(path.name, None) is not None:
             _store_csv_hashes(path.parent, tables)
-        write_whole(path, text if isinstance(text, str) else text())
+        write_whole(path, made)
         _add_csv_hashes(path.parent, [path.name])
 
 

@@ -92,7 +92,7 @@ def diagnosis_page(diagnosis: Diagnosis, network: Network, commands: Sequence[st
         partial=words.partial(diagnosis),
         meaning=words.meaning(diagnosis),
         effects=_effects(diagnosis.effects, names),
-        judged="fitted" if diagnosis.verified_on_fitted_periods else "held-out",
+        judged=_judged(diagnosis),
         heldout=None if heldout is None else _heldout(heldout),
         expected=number(None if heldout is None else heldout.expected),
         traffic=_traffic(diagnosis),
@@ -124,6 +124,11 @@ def commands_on_page(path: Path) -> list[str]:
     except OSError:
         return []
     return unescape(match[1]).splitlines() if match else []
+
+
+def _judged(diagnosis: Diagnosis) -> str:
+    """Return the word for the periods on which the diagnosis is judged."""
+    return "fitted" if diagnosis.verified_on_fitted_periods else "held-out"
 
 
 def _effects(effects: Sequence[NamedEffect], names: LightNames) -> Grid | None:
@@ -348,7 +353,8 @@ def _headways(page: Page, diagnosis: Diagnosis) -> list[Figure]:
     picture = headway_picture(
         [_POSITIONS[row.statistic] for row in rows], series, [row.noise for row in rows], "headways"
     )
-    caption = "Queues that discharge, held-out periods; bars: twice the chance of the measurement."
+    caption = f"Queues that discharge, {_judged(diagnosis)} periods; "
+    caption += "bars: twice the chance of the measurement."
     return page.figures((picture, caption))
 
 

@@ -33,6 +33,12 @@ _HREF = "{http://www.w3.org/1999/xlink}href"
 _USED = re.compile(r"url\(#([^)]+)\)")
 
 
+def picture_name(*parts: str) -> str:
+    """Return the name of a picture's files made from some texts, without an ending."""
+    text = re.sub(r"[^A-Za-z0-9_=+.]+", "-", "-".join(filter(None, parts)))
+    return text.strip("-.")[-80:].strip("-.") or "picture"
+
+
 @dataclass
 class NamedFigure:
     """One picture.

@@ -6,7 +6,7 @@ import math
 from collections.abc import Mapping
 from dataclasses import dataclass
 
-from ugat_marl.reporting.figures import NamedFigure
+from ugat_marl.reporting.figures import NamedFigure, picture_name
 from ugat_marl.reporting.formats import number
 from ugat_marl.reporting.network_maps import node_map
 from ugat_marl.reporting.page import Grid
@@ -119,7 +119,7 @@ def _map(
     values = {light: (middle, number(middle, 2)) for light, (middle, _, _) in shown.items()}
     intervals = {light: f"{number(x[1], 2)} to {number(x[2], 2)}" for light, x in shown.items()}
     most = max(1.0, *(middle for middle, _ in values.values()))
-    name = f"{record.name}-map-{quantity.metrics[0]}".replace("/", "-")
+    name = picture_name(record.name, "map", quantity.metrics[0])
     title = quantity.title
     ends = (0.0, most)
     picture = node_map(name, title, places.network, values, ends, quantity.unit, intervals)

@@ -8,9 +8,9 @@ from dataclasses import dataclass
 from typing import Any
 
 from ugat_marl.effects import load_scenario, scenario_in_domain
-from ugat_marl.envs import Observer
 from ugat_marl.errors import UgatMarlError
 from ugat_marl.files import MALFORMED
+from ugat_marl.reporting.light_names import LightNames
 from ugat_marl.reporting.run_records import RunRecord
 from ugat_marl.scenarios import Network
 
@@ -38,20 +38,16 @@ def places_of(record: RunRecord) -> tuple[AgentPlaces | None, str]:
     options: Any = record.settings.get("options") if record.job else record.settings
     options = options if isinstance(options, Mapping) else {}
     try:
-        # A job records the hash of the scenario itself. A training records the hash of the scenario
-        # with the training's own duration.
-        duration_s = None if record.job else options.get("duration_s")
-        network, own_hash = _network(record.scenario, record.sim, duration_s)
-        neighbours = int(options.get("neighbours") or 0)
-        agents = Observer(network, str(options.get("observation") or "count"), neighbours).agents
+        network, own_hash = _network(record.scenario, record.sim, options.get("duration_s"))
+        agents = LightNames.of(network).agents
     except (UgatMarlError, OSError, *MALFORMED) as error:
         reason = " ".join(str(error).split())
         return None, f"no map: scenario {record.scenario!r} cannot be read here ({reason[:200]})"
-    tls = [each.id for each in network.intersections]
-    recorded = record.hashes.get("sim") or record.hashes.get(record.sim)
+    # the hashes of a job are named by domain, those of a run sim and real
+    recorded = record.hashes.get(record.sim if record.job else "sim")
     changed = recorded not in (None, own_hash)
     note = "The scenario has changed since; the map shows it as it is now." if changed else ""
-    return AgentPlaces(network, dict(zip(agents, tls, strict=True))), note
+    return AgentPlaces(network, {agent: light for light, agent in agents.items()}), note
 
 
 @functools.lru_cache(maxsize=8)

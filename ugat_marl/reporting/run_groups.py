@@ -29,8 +29,8 @@ _APART = (
     "scenario_hash", "domains",
 )  # fmt: skip
 """Settings in which trainings of one group may differ, since they do not change UGAT itself."""
-_NAMED = {CORRECTED: "corrected", RULE: "rule_budget"}
-"""Rows whose policies depend on a setting in which trainings of one group may differ."""
+_NAMED = {CORRECTED: ("corrected",), RULE: ("rule_budget", "tuning_seeds")}
+"""Rows whose policies depend on settings in which trainings of one group may differ."""
 _SIMULATING = ("ugat-marl", "eclipse-sumo", "libsumo")
 """Packages whose versions decide how vehicles move."""
 
@@ -76,7 +76,8 @@ def seeds_of_one(records: Sequence[RunRecord]) -> list[list[RunRecord]]:
 
     def alike(record: RunRecord) -> tuple[Any, ...]:
         trained = json.dumps(_trained(record), sort_keys=True)
-        return (*_common(record), record.real, _ugat(record), record.setting, trained)
+        real = record.real, record.hashes.get("real")
+        return (*_common(record), *real, _ugat(record), record.setting, trained)
 
     return [_one_of_a_seed(members) for members in _parted(records, alike).values()]
 
@@ -102,7 +103,9 @@ def _common(record: RunRecord) -> tuple[Any, ...]:
     if record.job:
         return True, record.scenario, record.sim
     settings = {k: v for k, v in record.settings.items() if k not in _APART}
-    settings["world"] = record.hashes.get("sim"), *map(record.versions.get, _SIMULATING)
+    # of a run without a hash nobody knows with which other it shares its simulation
+    world = record.hashes.get("sim", record.name)
+    settings["world"] = world, *map(record.versions.get, _SIMULATING)
     return False, record.scenario, record.sim, json.dumps(settings, sort_keys=True, default=str)
 
 
@@ -119,12 +122,15 @@ def _parted(records: Iterable[RunRecord], key: Any) -> dict[Any, list[RunRecord]
 
 def _trials(records: Sequence[RunRecord]) -> tuple[list[Trial], dict[str, str]]:
     """Return trials that were scored in both domains; and why other records have none, by name."""
-    names, told = job_labels(records), _told(records)
+    names, told, targets = job_labels(records), _told(records), _targets(records)
     known: dict[tuple[Any, ...], int] = {}
     trials: list[list[Trial]] = [[] for _ in records]
     left_out: dict[str, str] = {}
     for index, record in _newest_first(records):
-        of_record = [*(_of_job(record, names[index]) if record.job else _of_run(record, told))]
+        found = _of_run(record, told, targets[index])
+        if record.job:
+            found = _of_job(record, names[index])
+        of_record = list(found)
         training = record.seed or record.name
         trials[index] = [
             trial
@@ -149,21 +155,34 @@ def _episode(trial: Trial) -> tuple[str, str, str, int]:
     return trial.setting, trial.target, trial.domain, trial.seed
 
 
-def _told(records: Sequence[RunRecord]) -> Mapping[str, str]:
+def _told(records: Sequence[RunRecord]) -> Mapping[str, list[str]]:
     """Return the settings of `_NAMED` in which runs differ, by the row that depends on them."""
-    values = {
-        row: {
+
+    def values(row: str, key: str) -> set[str]:
+        return {
             str(record.settings.get(key))
             for record in records
             # every run has a best rule, and only some have a corrected simulation
             if row == RULE or record.settings.get(key)
         }
-        for row, key in _NAMED.items()
-    }
-    return {row: _NAMED[row] for row, several in values.items() if len(several) > 1}
+
+    return {row: [key for key in keys if len(values(row, key)) > 1] for row, keys in _NAMED.items()}
 
 
-def _of_run(record: RunRecord, told: Mapping[str, str]) -> Iterable[Trial]:
+def _targets(records: Sequence[RunRecord]) -> list[str]:
+    """Return the real domain of each run, with the start of its hash where runs differ in it."""
+    hashes: dict[str, set[str]] = {}
+    for record in records:
+        hashes.setdefault(record.real, set()).add(record.hashes.get("real", "unknown"))
+    return [
+        record.real
+        if len(hashes[record.real]) == 1
+        else f"{record.real} ({record.hashes.get('real', 'unknown')[:10]})"
+        for record in records
+    ]
+
+
+def _of_run(record: RunRecord, told: Mapping[str, list[str]], target: str) -> Iterable[Trial]:
     evaluation = record.evaluation
     if evaluation is None or len(evaluation.domains) != 2:
         return
@@ -173,11 +192,11 @@ def _of_run(record: RunRecord, told: Mapping[str, str]) -> Iterable[Trial]:
         if r.policy.startswith(rule_policy("")) and r.policy != rule:
             continue
         setting = RULE if r.policy == rule else r.policy
-        if setting in told:
-            key = told[setting]
-            setting += f" ({key} {record.settings.get(key) or 'as usual'})"
-        domain = record.sim if r.domain == evaluation.domains[0] else r.domain
-        yield Trial(setting, real, domain, _seed(record), r.seed, r.scores)
+        if keys := told.get(setting):
+            values = [f"{key} {record.settings.get(key) or 'as usual'}" for key in keys]
+            setting += f" ({', '.join(values)})"
+        domain = record.sim if r.domain == evaluation.domains[0] else target
+        yield Trial(setting, target, domain, _seed(record), r.seed, r.scores)
 
 
 def _of_job(record: RunRecord, name: str) -> Iterable[Trial]:

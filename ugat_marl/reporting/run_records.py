@@ -287,7 +287,7 @@ def _run(directory: Path, name: str) -> RunRecord:
         directory=directory,
         job=job,
         settings=settings,
-        hashes=_texts(_hashes(directory, kept)),
+        hashes=_texts(_hashes(reader, job=job)),
         versions=_texts(kept.get("versions")),
         evaluation=evaluation,
         metrics=_metrics(reader, checkpoint) if grounded else None,
@@ -298,11 +298,13 @@ def _run(directory: Path, name: str) -> RunRecord:
     )
 
 
-def _hashes(directory: Path, kept: Mapping[str, Any]) -> Any:
-    try:
-        identity = _object(directory / RUN)
-    except (CheckpointError, ValueError):
-        identity = kept
+def _hashes(reader: _Reader, *, job: bool) -> Any:
+    without = "the hash of its scenario is unknown"
+    if not job:
+        without += "; it is compared with no other"
+    elif not (reader.directory / RUN).is_file():  # only a grounded job has one
+        return None
+    identity = reader.read(RUN, _object, without) or {}
     return identity.get("scenario_hash") or identity.get("worlds")
 
 

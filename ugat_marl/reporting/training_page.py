@@ -7,7 +7,6 @@ each missing part in its place.
 from __future__ import annotations
 
 import math
-import re
 from collections.abc import Mapping, Sequence
 from datetime import UTC, datetime
 from pathlib import Path
@@ -18,10 +17,9 @@ from ugat_marl.envs import OBJECTIVE_MEASURES
 from ugat_marl.errors import counted
 from ugat_marl.experiments import (
     DIRECT,
+    GROUNDED_NAME,
     ORACLE,
-    PHASE,
     RULE,
-    STREET,
     Estimate,
     Evaluation,
     check_run,
@@ -29,7 +27,7 @@ from ugat_marl.experiments import (
     outcome_of,
 )
 from ugat_marl.reporting import charts
-from ugat_marl.reporting.figures import NamedFigure, printable
+from ugat_marl.reporting.figures import NamedFigure, picture_name, printable
 from ugat_marl.reporting.formats import flat_settings, number, share, signed
 from ugat_marl.reporting.intersection_findings import findings_maps, findings_table
 from ugat_marl.reporting.light_names import LightNames
@@ -55,7 +53,8 @@ _OPEN = 4
 """Largest number of sections that are shown unfolded."""
 _WORST = 10
 """Number of intersections in the table of the longest queues."""
-_RADARS = (DIRECT, PHASE, STREET, ORACLE, RULE)
+_RADARS = (DIRECT, *GROUNDED_NAME.values(), ORACLE, RULE)
+"""Beginnings of the rows on a radar, each with room for one line."""
 _RADAR = "Every axis is scaled by its best value, at the rim; the middle is worst."
 _STRETCH = "Mean of a stretch of episodes, with its 95 % interval over "
 
@@ -108,12 +107,6 @@ def write_pictures(pictures: Sequence[NamedFigure], directory: Path) -> None:
     """Write every picture as SVG and as PNG."""
     for picture in pictures:
         picture.write(directory)
-
-
-def _file_name(*parts: str) -> str:
-    """Return the name of a file made from some texts, without an ending."""
-    text = re.sub(r"[^A-Za-z0-9_=+.]+", "-", "-".join(filter(None, parts)))
-    return text.strip("-.")[-80:].strip("-.") or "picture"
 
 
 # --- the head -------------------------------------------------------------------------------------
@@ -216,7 +209,7 @@ def _overview_row(record: RunRecord) -> list[str]:
         cells["sim"] = _with_interval(evaluation.estimate(policy, sim, "att_s"))
         cells["real"] = _in_each(evaluation, dict.fromkeys(reals, policy))
         if not record.job:
-            direct = dict.fromkeys(reals or [sim], evaluation.policies[0])
+            direct = dict.fromkeys(reals, evaluation.policies[0])
             cells["direct"] = _in_each(evaluation, direct)
         judged = {
             real: rule
@@ -286,13 +279,13 @@ def _settings(page: Page, title: str, rows: Sequence[Mapping[str, Any]]) -> dict
         ]  # fmt: skip
 
     scores = charts.scores_picture(
-        title, labels, {d: estimates(d) for d in domains}, _file_name(title, "travel-times")
+        title, labels, {d: estimates(d) for d in domains}, picture_name(title, "travel-times")
     )
     radars = [
         charts.radar_picture(
-            f"sim against {domain}",
+            f"the simulation against {domain}",
             _radar_lines(labels, cells, domain),
-            _file_name(title, "radar", domain),
+            picture_name(title, "radar", domain),
         )
         for domain in domains
     ]
@@ -320,10 +313,12 @@ def _cell(row: Mapping[str, Any], key: str, *, sign: bool) -> str:
 def _radar_lines(labels: Sequence[str], cells: Cells, domain: str) -> dict[str, list[float]]:
     shown = [label for label in labels if label.startswith(_RADARS) and (label, domain) in cells]
     lines: dict[str, list[float]] = {}
-    for place, label in enumerate(shown[:5]):
+    for place, label in enumerate(shown[: len(_RADARS)]):
         row = cells[label, domain]
         if place == 0:
-            lines[f"{label} in sim"] = [as_number(row.get(f"{m}_sim")) for m in charts.RADAR_AXES]
+            lines[f"{label} in the simulation"] = [
+                as_number(row.get(f"{m}_sim")) for m in charts.RADAR_AXES
+            ]
         lines[f"{label} in {domain}"] = [as_number(row.get(m)) for m in charts.RADAR_AXES]
     return lines
 
@@ -332,10 +327,13 @@ def _seeds(page: Page, runs: Sequence[RunRecord]) -> list[Figure]:
     """Return curves of trainings that differ in their seed alone."""
     figures: list[Figure] = []
     over = "Mean over the seeds, with its 95 % interval."
-    for trainings in seeds_of_one(runs):
+    for members in seeds_of_one(runs):
+        # Without metrics a training has no curve; the interval of a single one is over episodes
+        trainings = [record for record in members if record.series("episode", "return")]
         if len(trainings) < 2:
             continue
-        name = _file_name(trainings[0].scenario, trainings[0].real, trainings[0].grounding, "seeds")
+        first = trainings[0]
+        name = picture_name(first.scenario, first.real, first.grounding, "seeds")
         figures += page.figures(
             (charts.learning_picture(trainings, f"{name}-learning"), f"{_STRETCH}the seeds."),
             (charts.travel_time_picture(trainings, f"{name}-att"), over),
@@ -351,8 +349,8 @@ def _training(page: Page, record: RunRecord, commands: Commands) -> dict[str, An
     places, remark = places_of(record)
     evaluation = record.evaluation
     judged = evaluation is not None and evaluation.policies
-    learning = charts.learning_picture([record], _file_name(record.name, "learning"))
-    travel = charts.travel_time_picture([record], _file_name(record.name, "att"))
+    learning = charts.learning_picture([record], picture_name(record.name, "learning"))
+    travel = charts.travel_time_picture([record], picture_name(record.name, "att"))
     once = "One episode after each iteration, on a seed that decides nothing: no interval."
     hashes = [(f"hash of {name}", text) for name, text in record.hashes.items()]
     versions = [(f"version of {name}", text) for name, text in record.versions.items()]
@@ -449,7 +447,7 @@ def _scores(
         charts.radar_picture(
             f"{first} against {real}",
             charts.radar_lines(evaluation, real),
-            _file_name(record.name, "radar", real),
+            picture_name(record.name, "radar", real),
         )
         for real in others
     ]
@@ -457,7 +455,7 @@ def _scores(
         f"{record.name}: travel time",
         evaluation.policies,
         charts.travel_times(evaluation),
-        _file_name(record.name, "travel-times"),
+        picture_name(record.name, "travel-times"),
     )
     seeds = len(evaluation.seeds)
     caption = "Mean over the episodes with its 95 % interval." if seeds > 1 else "One episode."
@@ -508,7 +506,7 @@ def _found(page: Page, record: RunRecord, places: AgentPlaces | None) -> dict[st
 
 def _gate(page: Page, record: RunRecord, places: AgentPlaces | None) -> dict[str, Any] | None:
     """Return the gate over the iterations and, for the last iteration, by intersection."""
-    curve = charts.gate_picture([record], _file_name(record.name, "gate"))
+    curve = charts.gate_picture([record], picture_name(record.name, "gate"))
     if curve is None:
         return None
     caption = "Means over the intersections. A grounded action is taken where u is below α."
@@ -564,13 +562,13 @@ def _worst(page: Page, record: RunRecord, places: AgentPlaces | None) -> dict[st
     caption = "Longest queues first; the same colours for all policies."
     figures: list[tuple[NamedFigure | None, str]] = []
     for policy, queues in by_policy.items():
-        name = _file_name(record.name, "minutes", policy)
+        name = picture_name(record.name, "minutes", policy)
         figures.append((minutes_picture(name, f"{policy} in {domain}", queues, most), caption))
     first, queues = next(iter(by_policy.items()))
     means = {tls: sum(row) / len(row) for tls, row in queues.items()}
     if places is not None and len(means.keys() & set(places.intersection_of.values())) > 1:
         picture = node_map(
-            _file_name(record.name, "map-queue"), f"mean queue, {first} in {domain}",
+            picture_name(record.name, "map-queue"), f"mean queue, {first} in {domain}",
             places.network, {tls: (mean, f"{mean:.1f}") for tls, mean in means.items()},
             (0.0, max(means.values()) or 1.0), "vehicles standing",
         )  # fmt: skip

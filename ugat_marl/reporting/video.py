@@ -32,6 +32,7 @@ from ugat_marl.simulation import (
     Snapshot,
     Trips,
     VehiclePositions,
+    refuse_in_queues,
 )
 
 Frame = NDArray[np.uint8]
@@ -170,8 +171,10 @@ def film_episode(
         title: Name of the policy in the caption.
 
     Raises:
-        OptionError: The stretch does not lie within the episode, or is shorter than 1 s.
+        OptionError: The stretch does not lie within the episode, or is shorter than 1 s. Or the
+            scenario has SUMO's mesoscopic model, in which vehicles have no positions.
     """
+    refuse_in_queues(env.scenario, pictures=True)
     duration_s = env.scenario.decisions * env.decision_interval_s
     if begin_s < 0 or length_s < 1 or begin_s + length_s > duration_s:
         raise OptionError(
@@ -248,7 +251,8 @@ def write_video(pictures: Iterable[Frame], path: Path, per_second: float) -> Non
         if path.suffix.lower() in _PILLOW:
             _by_pillow(pictures, temporary, _PILLOW[path.suffix.lower()], per_second)
         else:
-            _by_ffmpeg(pictures, temporary, _FFMPEG[path.suffix.lower()], per_second)
+            form = _FFMPEG[path.suffix.lower()]
+            _by_ffmpeg(pictures, temporary, form, per_second, path.name)
 
 
 class _Captions:
@@ -302,7 +306,10 @@ def _timed(images: Iterable[Any], per_second: float) -> Iterator[Any]:
         yield picture
 
 
-def _by_ffmpeg(pictures: Iterable[Frame], path: Path, form: str, per_second: float) -> None:
+def _by_ffmpeg(
+    pictures: Iterable[Frame], path: Path, form: str, per_second: float, name: str
+) -> None:
+    """Write a video to a temporary file; errors name the file `name`, which the user gave."""
     program = _ffmpeg()
     assert program is not None
     stream = iter(pictures)
@@ -344,11 +351,11 @@ def _by_ffmpeg(pictures: Iterable[Frame], path: Path, form: str, per_second: flo
         raise
     if killed.is_set():
         raise OutputError(
-            f"{path.name}: ffmpeg did not go on for {deadline_s:g} s and was killed (stopped, or "
+            f"{name}: ffmpeg did not go on for {deadline_s:g} s and was killed (stopped, or "
             f"too slow for these pictures: set {DEADLINE_VARIABLE})"
         )
     if status:
-        raise OutputError(f"{path.name}: ffmpeg failed: {' '.join(words.split())[-300:]}")
+        raise OutputError(f"{name}: ffmpeg failed: {' '.join(words.split())[-300:]}")
 
 
 @contextlib.contextmanager

@@ -14,6 +14,7 @@ from pathlib import Path
 
 import numpy as np
 import polars as pl
+from numpy.typing import NDArray
 
 from ugat_marl.data.measured.atspm_mapping import AtspmMapping, Device, Span, read_mapping
 from ugat_marl.data.measured.coverage import coverage
@@ -24,6 +25,7 @@ from ugat_marl.data.measured.tables import (
     DETECTORS,
     PERIODS,
     ROW,
+    clock_steps,
     first_row,
     frame_of,
     in_order,
@@ -280,7 +282,8 @@ def _in_periods(
 
 def _report(path: Path, rows: pl.DataFrame, table: AtspmMapping, findings: list[Finding]) -> None:
     """Add findings on faults that the log reports: clocks that were set, and broken detectors."""
-    updates = rows.filter(pl.col("event") == CLOCK_UPDATED, pl.col("begin_s") <= pl.col("time_s"))
+    rows = rows.filter(pl.col("begin_s") <= pl.col("time_s"))  # not of the hour before
+    updates = rows.filter(pl.col("event") == CLOCK_UPDATED)
     if updates.height:
         names = ", ".join(map(repr, updates["device"].unique().sort().to_list()[:6]))
         times = "once" if updates.height == 1 else f"{updates.height} times"
@@ -424,8 +427,12 @@ def _events(
     )
     if device_rows.is_empty():
         return []
+    device_rows = device_rows[_first_of_clock(device_rows["time_s"].to_numpy(), period) :]
     key, time = np.zeros(device_rows.height, np.int64), device_rows["time_s"].to_numpy()
-    refuse_set_back(path, key, time, device_rows[ROW].to_numpy(), lambda _: f"device {device.id!r}")
+    refuse_set_back(
+        path, key, time, device_rows[ROW].to_numpy(), lambda _: f"device {device.id!r}",
+        np.full(len(time), period.begin_s),
+    )  # fmt: skip
     order = in_order(path, key, time, findings)
     device_rows = device_rows[order]
     events = [
@@ -434,6 +441,16 @@ def _events(
         if (_KIND[code], number) in sources
     ]
     return sorted(events, key=lambda event: (event.time_s, _RANK[event.colour]))
+
+
+def _first_of_clock(time: NDArray[np.float64], period: Period) -> int:
+    """Return the first row behind the last time that the clock was set back before a period.
+
+    Rows before it only tell the state at the start of the period, by another clock.
+    """
+    inside = time >= period.begin_s
+    steps = clock_steps(time[: int(inside.argmax()) if inside.any() else None])
+    return int(steps[-1]) if len(steps) else 0
 
 
 def _states(

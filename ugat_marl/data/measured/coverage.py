@@ -232,7 +232,8 @@ def _of_counts(measured: MeasuredData, network: Network) -> Iterator[Finding]:
     summed = len(missing) < len(more) or others
     shown = {*COUNTABLE, *(SUMMED if summed else ())}
     unlogged: set[str] = set()
-    if any(period.signals for period in measured.periods):
+    has_signals = any(period.signals for period in measured.periods)
+    if has_signals:
         shown |= {"yellow_time", "all_red_time"}  # they are read off the signals
     else:
         unlogged = shown & {*NEEDS_SIGNALS}
@@ -241,10 +242,11 @@ def _of_counts(measured: MeasuredData, network: Network) -> Iterator[Finding]:
     names = ", ".join(sorted(unlogged))
     with_signals = f"; a log of signals would show {names} too" if unlogged else ""
     if not summed:
+        further = [name for name in SUMMED if has_signals or name not in NEEDS_SIGNALS]
         yield Finding(
             "counts only, no detections of single vehicles: only "
-            f"{', '.join(COUNTABLE)} can be examined; with occupancy or mean_speed_mps in "
-            f"counts.csv also {', '.join(SUMMED)}",
+            f"{', '.join(sorted(shown))} can be examined; with occupancy or mean_speed_mps in "
+            f"counts.csv also {', '.join(further)}",
             hidden,
         )
     else:

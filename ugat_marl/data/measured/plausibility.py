@@ -23,7 +23,6 @@ from ugat_marl.scenarios import (
     Network,
     Passages,
     Period,
-    deciding_letter,
 )
 
 FEWEST = 20
@@ -96,7 +95,8 @@ def _left_on_red(
         return 0, 0
     links = sorted({link.index for link in light.links if link.from_lane == lane})
     since = np.array([since for since, _ in log])
-    is_red = np.array([deciding_letter([s[i] for i in links]) == "r" for _, s in log])
+    # on links of lights that flash or are off vehicles may go
+    is_red = np.array([all(s[i] == "r" for i in links) for _, s in log])
     red = total = 0
     for name in stops:
         if name in period.passages:

@@ -598,8 +598,9 @@ def refuse_set_back(
 ) -> None:
     """Refuse streams whose clock was set back.
 
-    Two other cases are accepted. Rows out of order step back many times. A file with swapped pieces
-    steps back, but ends before it began, so no time occurs twice; all of it is within its period.
+    Three other cases are accepted. Rows out of order step back many times. A row that was delivered
+    late steps back alone: the next row is ahead again. A file with swapped pieces steps back, but
+    ends before it began, so no time occurs twice; all of it is within its period.
 
     Args:
         path: File of the rows.
@@ -615,13 +616,11 @@ def refuse_set_back(
     """
     as_found = np.argsort(key, kind="stable")
     stream, clock = key[as_found], time[as_found]
-    back = _steps_back(stream, clock)
-    if not len(back):
+    if not len(_steps_back(stream, clock)):
         return
     starts = np.flatnonzero(np.diff(stream, prepend=-1))
     for begin, end in zip(starts, np.append(starts[1:], len(stream)), strict=True):
-        steps = back[(back > begin) & (back < end)]
-        steps = steps[clock[steps - 1] - clock[steps] > CLOCK_JUMP_S]  # others are late rows
+        steps = begin + clock_steps(clock[begin:end])
         if not 1 <= len(steps) <= 2 or end - begin < FEW_ROWS:
             continue
         step = int(steps[0])
@@ -634,6 +633,17 @@ def refuse_set_back(
                 "clock that was set, or a log that was appended twice?); end the period before the "
                 "step, correct the times behind it, or leave the copy out"
             )
+
+
+def clock_steps(clock: NDArray[np.float64]) -> NDArray[np.int64]:
+    """Return the indices of rows before which the clock of a stream may have been set back.
+
+    Args:
+        clock: Time of each row, s, in the order of the file, ``(n,)``.
+    """
+    steps = np.flatnonzero(np.diff(clock) < -CLOCK_JUMP_S) + 1  # others are late rows
+    steps = steps[steps + 1 < len(clock)]
+    return steps[clock[steps + 1] < clock[steps - 1]]  # behind a late row the clock is right again
 
 
 def _steps_back(stream: NDArray[np.int64], clock: NDArray[np.float64]) -> NDArray[np.int64]:

@@ -35,7 +35,7 @@ class _Track:
     Attributes:
         time_s: Time, s.
         lane: Lane of the front.
-        position_m: Position of the front on its lane, m.
+        position_m: Position of the front on its road, m. Without jitter: it never goes back.
         speed_mps: Speed, m/s.
         driven_m: Distance from the first position, m.
         length_m: Length of the vehicle, m.
@@ -56,18 +56,21 @@ class _Track:
             rows[name].to_numpy() for name in ("time_s", "position_m", "speed_mps")
         )
         lane = rows["lane_id"].to_list()
-        same = np.array([a == b for a, b in zip(lane, lane[1:], strict=False)], np.bool_)
+        # The lanes of a road count their metres alike.
+        road = [edge_of_lane(name) for name in lane]
+        same = np.array([a == b for a, b in zip(road, road[1:], strict=False)], np.bool_)
         # Positions of cameras jitter, and a vehicle that stands must not drive by that.
         ahead = position.copy()
         for part in np.split(ahead, np.flatnonzero(~same) + 1):
             np.maximum.accumulate(part, out=part)
-        # Between two lanes, and on the junction between them, only the speed tells the distance.
+        # Between two roads, and on the junction between them, only the speed tells the distance.
         driven = 0.5 * (speed[1:] + speed[:-1]) * np.diff(time)
         step = np.where(same, np.diff(ahead), driven)
-        total = np.concatenate(([0.0], np.cumsum(np.maximum(step, 0.0))))
+        least = np.where(same, 0.0, 1e-6)  # on another road it has driven, even at a speed of 0
+        total = np.concatenate(([0.0], np.cumsum(np.maximum(step, least))))
         known = rows["length_m"].drop_nulls() if "length_m" in rows.columns else []
         length = float(known[0]) if len(known) else USUAL_LENGTH_M
-        return cls(time, lane, position, speed, total, length)
+        return cls(time, lane, ahead, speed, total, length)
 
     def stays(self) -> Iterable[tuple[str, int, int]]:
         """Yield each lane with the first position on it and the first one behind it."""
@@ -100,12 +103,15 @@ class _Track:
             first = begin - 1
             # The speed may tell less of the way than the place on the new lane does.
             start = max(start, self.driven_m[first] + 1e-6 - detector.position_m)
+        at_m = start + detector.position_m
         if end < len(self.lane):
             last = end
-        on = self._when(start + detector.position_m, first, last)
-        rear = start + detector.position_m + detector.length_m + self.length_m
-        off = self._when(rear, first, len(self.lane) - 1)
-        on_it = start + detector.position_m < self.driven_m[0]
+            if self._turned(end):
+                # On another road it has passed all of the lane, even if its speeds tell less.
+                at_m = min(at_m, self.driven_m[end])
+        on = self._when(at_m, first, last)
+        off = self._when(at_m + detector.length_m + self.length_m, first, len(self.lane) - 1)
+        on_it = at_m < self.driven_m[0]
         if on is None and first == 0 and on_it and off is not None:
             on = np.nan
         if on is None:

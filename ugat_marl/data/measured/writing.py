@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import secrets
 import shutil
 from collections.abc import Sequence, Set
@@ -47,7 +48,7 @@ def write_measured(measured: MeasuredData, directory: Path, *, csv: bool = False
     Args:
         measured: The data; their findings are not written.
         directory: A new or empty directory, or one that holds what this function wrote, which is
-            replaced.
+            replaced. A link stays, and what it names is replaced.
         csv: True to write CSV where Parquet is the default.
 
     Returns:
@@ -58,9 +59,10 @@ def write_measured(measured: MeasuredData, directory: Path, *, csv: bool = False
     """
     require_replaceable(directory)
     suffix = ".csv" if csv else ".parquet"
+    place = Path(os.path.realpath(directory))  # a link goes on to point at the data
     try:
-        directory.parent.mkdir(parents=True, exist_ok=True)
-        temporary = directory.with_name(f".{directory.name}.{secrets.token_hex(8)}")
+        place.parent.mkdir(parents=True, exist_ok=True)
+        temporary = place.with_name(f".{place.name}.{secrets.token_hex(8)}")
         temporary.mkdir()
     except OSError as error:
         raise OutputError(
@@ -86,7 +88,7 @@ def write_measured(measured: MeasuredData, directory: Path, *, csv: bool = False
             _write(_ordered(measured.travel_times, TRAVEL_TIMES), temporary / "travel_times.csv")
         write_csv_hashes(temporary, sorted(path.name for path in temporary.glob("*.csv")))
         before = temporary.with_name(f"{temporary.name}.before")
-        put_folder(temporary, directory, before)
+        put_folder(temporary, place, before)
         shutil.rmtree(before, ignore_errors=True)
     except OSError as error:
         raise OutputError(
