@@ -86,6 +86,8 @@ def test_phases_are_described_by_their_movements() -> None:
 def test_phases_say_which_green_of_the_file_they_are(crossing: Callable[..., Path]) -> None:
     """Phases in another order than the file's."""
     folder = crossing()
+    told = str(ugat_marl.parallel_env(folder).describe())  # a folder has no name that commands know
+    assert "scenario draw FOLDER_OR_SUMOCFG --out pictures" in told
     network = ugat_marl.parallel_env(folder).network
     (light,) = network.intersections
     greens = programme_phases(light.programme)

@@ -235,6 +235,48 @@ def test_a_reset_of_some_leaves_the_step_of_the_others() -> None:
         assert env.step(nothing).rewards[1] == other.step(nothing).rewards[1]
 
 
+FIVE = "def reward(before, after):\n    return 5.0\n"
+
+
+def test_a_reset_shows_no_reward_and_no_row_that_is_half_written(
+    module: Callable[[str], str],
+) -> None:
+    """Whether the whole or a half of it has begun the step of the others."""
+    reward = importlib.import_module(module(FIVE)).reward
+    nothing = np.zeros((2, 1), dtype=np.int64)
+    with vector_env("single-v1", 2, duration_s=LENGTH_S, reward=reward) as env:
+        second = env.halves()[1]
+        env.reset(seed=[1, 2])
+        assert env.step(nothing).rewards.tolist() == [[5.0], [5.0]]
+        second.step_async(nothing[:1])
+        anew = env.reset(seed=[7, 8], where=[0])
+        assert [one.seed for one in env.episodes if one is not None] == [7, 2]
+        assert anew.observations[0].any() and not anew.observations[1].any()
+        assert not anew.rewards.any()
+        assert second.step_wait().rewards.tolist() == [[5.0]]
+        env.step_async(nothing)
+        anew = second.reset(seed=3)
+        assert anew.observations.any() and not anew.rewards.any()
+
+
+DRAWS = "import random\nimport numpy\n\ndef reward(before, after):\n"
+DRAWS += "    return random.random() + 10 * numpy.random.random()\n"
+
+
+def test_what_a_function_of_the_user_draws_follows_from_the_seed(
+    module: Callable[[str], str],
+) -> None:
+    reward = importlib.import_module(module(DRAWS)).reward
+    nothing = np.zeros((2, 1), dtype=np.int64)
+    drawn = []
+    for _ in range(2):
+        with vector_env("single-v1", 2, duration_s=20, reward=reward) as env:
+            env.reset(seed=1)
+            drawn.append([env.step(nothing).rewards.tolist() for _ in range(4)])  # two episodes
+    assert drawn[0] == drawn[1]
+    assert len({whole for step in drawn[0] for (whole,) in step}) == 8
+
+
 def test_a_reset_forgets_an_episode_that_was_to_begin() -> None:
     nothing = np.zeros((1, 1), dtype=np.int64)
     with vector_env("single-v1", 1, duration_s=20, autoreset="next-step") as env:
@@ -741,6 +783,8 @@ def test_wrong_calls(crossing: Crossing) -> None:
         ({"domains": ["sim", StartupDelay(1.0)]}, OptionError, "mixes domains and single effects"),
         ({"wrap": lambda env: env}, OptionError, "wrap = .*move it to a module"),
         ({"wrap": "ugat_marl.envs.wrappers:padd"}, OptionError, "cannot be imported .*module:name"),
+        ({"wrap": "ugat_marl.envs.wrappers:frame_stack"}, OptionError, "environment alone .*'k'"),
+        ({"wrap": "ugat_marl.envs:wrappers"}, OptionError, "environment alone .*not a callable"),
         ({"reward": lambda a, b: 0.0}, OptionError, "reward = .*move it to a module"),
     ):
         with pytest.raises(error, match=words):

@@ -252,7 +252,66 @@ def test_a_policy_sees_its_own_command_though_another_one_is_executed() -> None:
     observations, *_, infos = env.step({"signal_0": 5})
     assert infos["signal_0"]["action_replaced"] == 1
     assert observations["signal_0"][-9:-1].tolist() == [0, 0, 0, 0, 0, 1, 0, 0]
+    observations, *_, infos = env.step({"signal_0": 1})  # nothing of before is remembered
+    assert infos["signal_0"]["action_replaced"] == 0
+    assert observations["signal_0"][-9:-1].tolist() == [0, 1, 0, 0, 0, 0, 0, 0]
     env.close()
+
+
+def test_names_of_intersections_pass_delays_and_commands_on() -> None:
+    plain = ugat_marl.parallel_env("grid2x2-v1", commands=1, duration_s=60)
+    named = intersection_names(ugat_marl.parallel_env("grid2x2-v1", commands=1, duration_s=60))
+    lights = plain.unwrapped.intersection_of
+    seen: list[list[list[float]]] = [[], []]
+    for rows, env, name in ((seen[0], plain, str), (seen[1], named, lights.__getitem__)):
+        env.reset(seed=3)
+        for step in range(4):
+            env.delay_greens({name(agent): 3.0 for agent in lights})
+            env.remember({name(agent): 2 for agent in lights})
+            actions = {name(agent): step % 2 for agent in lights}
+            observations, *_ = env.step(actions)
+            rows += [observations[name(agent)].tolist() for agent in lights]
+        env.close()
+    assert seen[0] == seen[1]
+    commands = ugat_marl.parallel_env("grid2x2-v1", duration_s=60)
+    commands.reset(seed=3)
+    for step in range(4):  # without delays traffic differs
+        observations, *_ = commands.step(dict.fromkeys(lights, step % 2))
+    commands.close()
+    features = len(observations["signal_0"])
+    assert observations["signal_0"].tolist() != seen[0][-len(lights)][:features]
+
+
+@pytest.mark.parametrize("given", [None, [0]])
+@pytest.mark.parametrize("what", ["remember", "delay_greens"])
+def test_commands_and_delays_that_are_no_dictionary_are_refused(what: str, given: Any) -> None:
+    env = intersection_names(ugat_marl.parallel_env("single-v1", commands=1, duration_s=60))
+    env.reset(seed=1)
+    with pytest.raises(ActionError, match="give a dictionary"):
+        getattr(env, what)(given)
+    env.close()
+
+
+class Masked(Steep):
+    """Its first agent has a mask of one's choice."""
+
+    def __init__(self, mask: list[int]) -> None:
+        super().__init__()
+        self.mask = np.int8(mask)
+
+    def _see(self) -> tuple[dict[str, Any], dict[str, Any]]:
+        seen, infos = super()._see()
+        infos["a_1"]["action_mask"] = self.mask
+        return seen, infos
+
+
+def test_masks_that_no_agent_can_have_are_refused() -> None:
+    env = legal_actions(Masked([0, 0]))
+    env.reset(seed=0)
+    with pytest.raises(ActionError, match="'a_1' allows no action"):
+        env.step({"a_1": 0, "b_2": 0})
+    with pytest.raises(ActionError, match="'a_1' has 1 entries; it has 2 actions"):
+        pad_spaces(Masked([1])).reset(seed=0)
 
 
 @pytest.mark.parametrize("wrap", [legal_actions, intersection_names])

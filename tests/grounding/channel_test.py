@@ -7,6 +7,7 @@ from collections.abc import Callable, Sequence
 import numpy as np
 import pytest
 
+import ugat_marl
 from ugat_marl.data import AgentLayout, Provenance, TransitionLog, TransitionRecorder
 from ugat_marl.grounding.channel import ChannelConfig, CommandChannel, _Course, fit_channel
 from ugat_marl.scenarios import SignalState, SignalTiming
@@ -297,3 +298,30 @@ def test_a_command_may_be_later_than_by_default_if_the_method_is_told_so() -> No
     log = log_of(lag=8)
     assert fit_channel(log).network.max() < 0.5  # beyond the longest lag all explain a little
     assert fit_channel(log, ChannelConfig(most_lag=8)).lag == 8
+
+
+def test_masks_say_what_is_obeyed_though_commands_are_late_twice() -> None:
+    """By the simulation's own delay, and by a fitted channel behind it."""
+    channel = CommandChannel(
+        ("signal_0",),
+        np.array([0.0, 1.0, 0.0]),
+        np.array([[0.0, 1e9, 0.0]]),
+        (np.ones((3, 8, 8), dtype=bool),),
+        1.0,
+    )
+    env = ugat_marl.parallel_env(
+        "single-v1", "execution_delay=10+phase_order=cyclic", fitted=(channel,), duration_s=600
+    )
+    _, infos = env.reset(seed=1)
+    draws = np.random.default_rng(0)
+    asked, masks, executed = [], [], [infos["signal_0"]["executed_action"]]
+    while env.agents:
+        masks.append(infos["signal_0"]["action_mask"].copy())
+        permitted = np.flatnonzero(masks[-1]).tolist()
+        asked.append(int(draws.choice(permitted if draws.random() < 0.5 else 8)))
+        *_, infos = env.step({"signal_0": asked[-1]})
+        executed.append(infos["signal_0"]["executed_action"])
+    env.close()
+    obeyed = [then == now for now, then in zip(asked, executed[3:], strict=False)]
+    allowed = [bool(mask[now]) for mask, now in zip(masks, asked, strict=True)]
+    assert obeyed == allowed[: len(obeyed)]

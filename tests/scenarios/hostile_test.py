@@ -179,12 +179,15 @@ def test_the_kernel_alone_holds(
 
 
 @pytest.mark.skipif(bool(confinement_missing()), reason="only the list protects here")
-def test_the_kernel_holds_the_workers_of_a_vector(crossing: Crossing, around: Path) -> None:
+@pytest.mark.parametrize("wrap", [None, "ugat_marl.envs.wrappers:pad_spaces"])
+def test_the_kernel_holds_the_workers_of_a_vector(
+    wrap: str | None, crossing: Crossing, around: Path
+) -> None:
     path = hostile(crossing, "additional", "edgeData", around)
     honest = read_scenario(path)
     raw = honest.additional[0].edited((path.parent / "extra.add.xml").read_bytes())
     opened = replace(honest, additional=(raw,))
-    with vector_env(opened, 1) as env:
+    with vector_env(opened, 1, wrap=wrap) as env:
         step = env.reset(seed=0)  # the worker reads the scenario again, and discards the output
         assert step.observations.shape[0] == 1
         worker = env._environments[0]._worker

@@ -80,7 +80,8 @@ class Actuators:
         A delayed command arrives in a later state of the light. This state follows from the
         commands ahead of it, if none of them is lost.
         """
-        ahead = [commands for actuator in self._chain for commands in actuator.under_way]
+        # what is in the last part of the chain arrives first
+        ahead = [commands for part in reversed(self._chain) for commands in part.under_way]
         masks: list[NDArray[np.int8]] = []
         for place, state in enumerate(states):
             for commands in ahead:

@@ -11,7 +11,7 @@ from typing import Any
 import polars as pl
 
 from ugat_marl.envs.observations import OBSERVATION_UNITS, Observer
-from ugat_marl.scenarios import Intersection, Network, green_of_file
+from ugat_marl.scenarios import Intersection, Network, green_of_file, shipped_scenarios
 
 TURNS = {
     "s": "through", "l": "left", "L": "left", "r": "right", "R": "right", "t": "turn-around",
@@ -63,7 +63,9 @@ class Description:
                 ]
                 lines += _wrapped(f"{here}:", "; ".join(ways), width)
         lines.append(f"unit of features: {self.unit}")
-        lines.append(f"as drawings: ugat-marl scenario draw {self.scenario} --out pictures")
+        named = self.scenario.startswith("resco:") or self.scenario in dict(shipped_scenarios())
+        drawn = self.scenario if named else "FOLDER_OR_SUMOCFG"
+        lines.append(f"as drawings: ugat-marl scenario draw {drawn} --out pictures")
         return "\n".join(lines)
 
 

@@ -53,11 +53,14 @@ class IntersectionViews:
 
     Args:
         network: The network.
+
+    Attributes:
+        lanes: Positions of the incoming and of the outgoing lanes of each intersection.
     """
 
     def __init__(self, network: Network) -> None:
         lanes = network.lane_table()
-        self._places = [
+        self.lanes = [
             (lanes.indices(item.incoming_lanes), lanes.indices(item.outgoing_lanes))
             for item in network.intersections
         ]
@@ -74,7 +77,7 @@ class IntersectionViews:
                 snapshot.vehicles[outgoing],
                 snapshot.queued_upstream[incoming],
             )
-            for incoming, outgoing in self._places
+            for incoming, outgoing in self.lanes
         ]
 
 
@@ -100,16 +103,8 @@ class Rewarder:
                 "reward", str(reward), get_args(RewardName), "A function works as well."
             )
         self._reward = reward
-        lanes = network.lane_table()
-        self._incoming = [
-            lanes.indices(intersection.incoming_lanes) for intersection in network.intersections
-        ]
-        self._outgoing = [
-            lanes.indices(intersection.outgoing_lanes) for intersection in network.intersections
-        ]
         self._views = IntersectionViews(network)
-        self._sum_in = _Sums(self._incoming)
-        self._sum_out = _Sums(self._outgoing)
+        self._sum_in, self._sum_out = map(_Sums, zip(*self._views.lanes, strict=True))
 
     @property
     def needs_waiting(self) -> bool:

@@ -264,6 +264,11 @@ class _Pad(Wrapper):
             if agent in infos:
                 mask = np.zeros(self._most, dtype=np.int8)
                 given = infos[agent].get("action_mask")
+                if given is not None and len(given) != space.n:
+                    raise ActionError(
+                        f"action_mask of agent {agent!r} has {len(given)} entries; it has "
+                        f"{space.n} actions"
+                    )
                 mask[: space.n] = 1 if given is None else given
                 told[agent] = {**infos[agent], "action_mask": mask}
         return told
@@ -385,6 +390,8 @@ class _LegalActions(_Masking):
             if int(action) >= len(mask) or mask[int(action)]:
                 continue
             permitted = np.flatnonzero(mask)
+            if not permitted.size:
+                raise ActionError(f"action_mask of agent {agent!r} allows no action")
             executed[agent] = int(permitted[int(action) % len(permitted)])
             self._replaced.add(agent)
         if self._replaced and (remember := getattr(self.env, "remember", None)):
@@ -464,12 +471,14 @@ class _IntersectionNames(Wrapper):
     def remember(self, commands: Mapping[str, int]) -> None:
         """Let observations show these commands, see `TrafficEnv.remember`."""
         base: Any = self.env.unwrapped
+        require_mapping("commands", commands, self.agents)
         with self._errors_name_lights():
             base.remember({self._agent.get(light, light): c for light, c in commands.items()})
 
     def delay_greens(self, seconds: Mapping[str, float]) -> None:
         """Delay greens of the next step, see `TrafficEnv.delay_greens`."""
         base: Any = self.env.unwrapped
+        require_mapping("delays", seconds, self.agents)
         with self._errors_name_lights():
             base.delay_greens({self._agent.get(light, light): s for light, s in seconds.items()})
 

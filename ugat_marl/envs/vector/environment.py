@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import inspect
 import operator
 import warnings
 from collections.abc import Iterable, Iterator, Mapping, Sequence
@@ -23,6 +24,7 @@ from ugat_marl.envs.vector.arrays import Arrays
 from ugat_marl.envs.vector.remote import Answer, Episode, RemoteEnv, Shared
 from ugat_marl.envs.vector.spec import (
     DomainOf,
+    Wrap,
     Wraps,
     checked_options,
     domain_chooser,
@@ -220,9 +222,10 @@ class VectorEnv:
         self._stepped = [index for index in self._stepped if index not in gone]
         self._begun = [index for index in self._begun if index not in gone]
         self._begin(chosen, seeds)
-        self._memory.rewards[chosen] = 0.0  # a step that others have under way shows these, too
         batch = self._batch(np.zeros(self.n, dtype=np.bool_), ())
-        under_way = [*self._stepped, *self._begun, *self._sent]
+        # also those that the whole vector, or a part of it, has begun
+        pending = [index for index, env in enumerate(self._environments) if env.pending]
+        under_way = [*pending, *self._sent]
         for rows in (batch.observations, batch.masks, batch.executed):
             rows[under_way] = 0  # half written
         batch.rewards[:] = 0.0
@@ -267,7 +270,6 @@ class VectorEnv:
             raise dropped
         answers, failed = self._arrived(asked)
         memory = self._memory
-        memory.rewards[begun] = 0.0
         over = [index for index in stepped if index in answers and answers[index].over]
         truncated = np.zeros(self.n, dtype=np.bool_)
         truncated[over] = True
@@ -568,6 +570,23 @@ def _said(answers: Iterable[Answer]) -> Iterator[str]:
         yield from answer.warnings
 
 
+def _wrapped(wrap: Wrap, env: AnyParallelEnv) -> Any:
+    """Return what a wrapper makes of an environment.
+
+    Raises:
+        OptionError: It takes other arguments, or is no function.
+    """
+    wrapper = imported(spelling("wrap", wrap))
+    try:
+        inspect.signature(wrapper).bind(env)
+    except TypeError as error:
+        raise OptionError(
+            f"wrap = {wrap!r}: cannot be called with an environment alone ({error}); write a "
+            "function of your own that gives the other arguments"
+        ) from None
+    return wrapper(env)
+
+
 @with_env_keywords
 def vector_env(
     scenario: str | Path | Scenario,
@@ -610,7 +629,7 @@ def vector_env(
     domain_of = domain_chooser(loaded, domains, n, given.get("duration_s"))
     plain: AnyParallelEnv = parallel_env(loaded, domain_of(0, 0), **given)
     for each in listed(wrap):
-        plain = imported(spelling("wrap", each))(plain)
+        plain = _wrapped(each, plain)
         if not hasattr(plain, "possible_agents"):
             raise OptionError(
                 f"wrap = {each!r}: returned {type(plain).__name__} and not an environment"

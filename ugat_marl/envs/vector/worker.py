@@ -12,6 +12,7 @@ import gc
 import importlib
 import json
 import os
+import random
 import shutil
 import sys
 import tempfile
@@ -154,6 +155,9 @@ class _EpisodeServer:
         self._confine()
         self._agents = AgentSet.of(self._env)
         self._arrays = Arrays.over(self._memory, Shape(**header["shape"]))
+        # Functions of the user may draw from these; a fork has the state of its parent.
+        random.seed(header["seed"])
+        np.random.seed(header["seed"] % 2**32)  # noqa: NPY002
         observations, infos = self._env.reset(seed=header["seed"])
         nothing = dict.fromkeys(self._agents.names, 0.0)
         none_shown = np.zeros(len(self._agents), dtype=np.int64)
@@ -169,8 +173,7 @@ class _EpisodeServer:
             limit_memory()
         except ValueError as error:
             raise OptionError(str(error)) from None
-        spec = self._order["spec"]
-        if not spec["functions"] and not spec["wraps"]:
+        if not self._order["spec"]["modules"]:
             base: Any = self._running.unwrapped
             scenario: Scenario = base.scenario
             files = [str(each.path) for each in scenario.documents if each.path is not None]
