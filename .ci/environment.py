@@ -36,7 +36,11 @@ import gymnasium, jinja2, lazy_loader, libsumo, matplotlib, numpy, pettingzoo, p
 import rich, scipy, sumo, supersuit, tensorboard, torch, tyro
 import ugat_marl
 """
-PROBE_DEV = "import hatchling, hypothesis, osmium, pytest, pytest_timeout, sklearn, xdist"
+PROBES = {
+    "dev": "import hatchling, hypothesis, pytest, pytest_timeout, sklearn, xdist\n",
+    "osm": "import osmium\n",
+}
+"""Imports by the extra that brings what they name."""
 
 
 class Record(TypedDict):
@@ -188,7 +192,7 @@ def runs() -> bool:
 
 def imports(goal: Record, *, quiet: bool) -> bool:
     """Return whether what was installed can be imported."""
-    probe = PROBE + (PROBE_DEV if "dev" in goal["extras"] else "")
+    probe = PROBE + "".join(PROBES.get(extra, "") for extra in goal["extras"])
     return run(PYTHON, "-P", "-c", probe, quiet=quiet)
 
 

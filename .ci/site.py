@@ -54,10 +54,11 @@ def stage() -> None:
             page.write_text(re.sub(r"(\]\([^()\s]*)\.ipynb\)", r"\1.md)", text))
     folder = PAGES / "docs" / "reference" / "python"
     folder.mkdir(parents=True)
-    (folder / "ugat_marl.md").write_text(reference("ugat_marl", PACKAGE / "__init__.pyi"))
+    told: set[str] = set()
     for stub in sorted(PACKAGE.glob("*/__init__.pyi")):
         name = stub.parent.name
-        (folder / f"{name}.md").write_text(reference(f"ugat_marl.{name}", stub))
+        (folder / f"{name}.md").write_text(reference(f"ugat_marl.{name}", stub, told))
+    (folder / "ugat_marl.md").write_text(reference("ugat_marl", PACKAGE / "__init__.pyi", told))
 
 
 def notebook(book: Path) -> str:
@@ -88,12 +89,22 @@ def notebook(book: Path) -> str:
     return f"{title}\n\n{hint}\n\n{rest}\n"
 
 
-def reference(module: str, stub: Path) -> str:
-    """Return the page of a module: its docstring, then every name that its stub exports."""
+def reference(module: str, stub: Path, told: set[str]) -> str:
+    """Return the page of a module: its docstring, then every name that its stub exports.
+
+    Args:
+        module: The module.
+        stub: Its stub.
+        told: Names on the pages before, to which those of this page are added. Links to such a name
+            lead there.
+    """
     docstring = ast.get_docstring(ast.parse(stub.with_suffix(".py").read_text())) or ""
     title = f"# `{module}`\n\n{re.sub(r'``', '`', docstring)}\n"
     homes = [(home(f"{module}.{source}", name), name) for source, name in exports(stub)]
-    blocks = [f"\n::: {place}.{name}\n" for place, name in homes if not unpacked(place, name)]
+    names = [f"{place}.{name}" for place, name in homes if not unpacked(place, name)]
+    again = "    options:\n      skip_local_inventory: true\n"
+    blocks = [f"\n::: {name}\n{again if name in told else ''}" for name in names]
+    told.update(names)
     values = [f"`{name}`" for place, name in homes if unpacked(place, name)]
     more = f"\nValues: {', '.join(values)}.\n" if values else ""
     return title + "".join(blocks) + more
@@ -149,14 +160,18 @@ def environment() -> Path:
 
 
 def main() -> int:
-    """Stage, build, and return MkDocs' exit code."""
+    """Stage, build, and return MkDocs' exit code; its output is shown if it fails."""
     python = environment()
     stage()
-    build = [str(python), "-m", "mkdocs", "build", "--strict", "-q"]
+    # not -q: MkDocs then hears no warnings, and --strict counts those that it hears
+    build = [str(python), "-m", "mkdocs", "build", "--strict"]
     variables = {**os.environ, "NO_MKDOCS_2_WARNING": "1"}
-    done = subprocess.run(build, cwd=ROOT, env=variables, check=False)
+    joined = {"stdout": subprocess.PIPE, "stderr": subprocess.STDOUT}
+    done = subprocess.run(build, cwd=ROOT, env=variables, text=True, check=False, **joined)
     if done.returncode == 0:
         print("the site is in .cache/site/html/index.html")
+    else:
+        print(done.stdout, file=sys.stderr)
     return done.returncode
 
 

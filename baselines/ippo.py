@@ -200,11 +200,12 @@ class IPPO:
         """Restore the state that `save` wrote; raise `CheckpointError` for another learner's."""
         content, own = read_checkpoint(path, "baselines.ippo"), self._content()
         for name, value in own.items():
-            found = content.get(name)
-            if isinstance(value, Tensor) and isinstance(found, Tensor):
-                found, value = (found.shape, found.dtype), (value.shape, value.dtype)
+            found, value = (
+                (x.shape, x.dtype) if isinstance(x, Tensor) else x
+                for x in (content.get(name), value)
+            )
             if type(found) is not type(value) or (found != value and name != "episodes"):
-                raise CheckpointError(f"{path}: {name} is {found}, this learner's {value}")
+                raise CheckpointError(f"{path}: {name} is {found!r}, this learner's {value!r}")
         self.episodes = content["episodes"]
         self._weights.data.copy_(content["weights"])
         self._rewards.copy_(content["rewards"])

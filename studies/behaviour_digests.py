@@ -41,6 +41,8 @@ from numpy.typing import NDArray
 
 import ugat_marl
 from ugat_marl.cli import guarded
+from ugat_marl.errors import OptionError
+from ugat_marl.files import read_json
 from ugat_marl.parallel import import_path
 
 Values = dict[str, list[Any]]
@@ -437,7 +439,6 @@ def parts() -> dict[str, Callable[[], tuple[Values, Values]]]:
         "train/phase": lambda: training("phase"),
         "train/timed": lambda: training("timed", "--timed.match"),
         "diagnose/nothing": lambda: diagnosis("sim"),
-        "diagnose/V4": lambda: diagnosis("V4"),
     }
 
 
@@ -495,6 +496,18 @@ def answer(name: str) -> int:
 # --- write and check ----------------------------------------------------------------------------
 
 
+def read_digests(path: Path) -> tuple[dict[str, Any], dict[str, str]]:
+    """Return the parts of a file, and the versions they were made with.
+
+    Raises:
+        OptionError: There is no such file, or it holds no digests.
+    """
+    content = read_json(path, OptionError)
+    if not (isinstance(content, dict) and {"parts", "made_with"} <= content.keys()):
+        raise OptionError(f"{path}: holds no digests; name a file that `write` made")
+    return content["parts"], content["made_with"]
+
+
 def write(path: Path, chosen: Sequence[str]) -> int:
     """Play every part twice and write the parts that are equal; return 1 if some differ.
 
@@ -503,9 +516,9 @@ def write(path: Path, chosen: Sequence[str]) -> int:
     """
     held: dict[str, Any] = {}
     if path.exists():
-        written = json.loads(path.read_text(encoding="utf-8"))
-        held = {name: part for name, part in written["parts"].items() if name not in chosen}
-        if held and (others := other_versions(written["made_with"])):
+        before, made_with = read_digests(path)
+        held = {name: part for name, part in before.items() if name not in chosen}
+        if held and (others := other_versions(made_with)):
             raise SystemExit(f"{path} was made with other versions ({others}); write all parts")
     bad = 0
     save(path, held)
@@ -562,9 +575,8 @@ def save(path: Path, held: Mapping[str, Any]) -> None:
 
 def check(path: Path, chosen: Sequence[str]) -> int:
     """Play the parts again and print one line for each; return 1 if one differs."""
-    written = json.loads(path.read_text(encoding="utf-8"))
-    held, different = written["parts"], 0
-    if others := other_versions(written["made_with"]):
+    (held, made_with), different = read_digests(path), 0
+    if others := other_versions(made_with):
         print(f"note: numbers may differ because of {others}", flush=True)
     for name in chosen:
         began = time.monotonic()

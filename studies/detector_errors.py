@@ -51,15 +51,17 @@ class Case:
 
     @property
     def right(self) -> bool:
-        """True if the errors hidden were named, by their kinds and places, and no others."""
-        return self.kinds(self.domain.split("+")) == self.kinds(self.found)
+        """True if the errors hidden were named, by their kinds, places and forms, and no others."""
+        hidden, named = self.kinds(self.domain.split("+")), self.kinds(self.found)
+        return hidden.keys() == named.keys() and all(
+            form == named[kind] or "unknown" in (form, named[kind]) for kind, form in hidden.items()
+        )
 
     @staticmethod
-    def kinds(texts: Sequence[str]) -> set[str]:
-        """Return the errors of measurement without their numbers."""
+    def kinds(texts: Sequence[str]) -> dict[str, str]:
+        """Return the form of each error of measurement, without numbers, by its kind and place."""
         errors = (text.split(",") for text in texts if text.startswith("detector_"))
-        point = "detector_speeds"
-        return {",".join(part) if part[0].startswith(point) else part[0] for part in errors}
+        return {kind: ",".join(filter(str.isalpha, more)) for kind, *more in errors}
 
 
 def judged(

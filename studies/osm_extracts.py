@@ -21,7 +21,7 @@ from pathlib import Path
 import osmium
 
 from ugat_marl.cli import guarded
-from ugat_marl.errors import OutputError, ScenarioError
+from ugat_marl.errors import OutputError, ScenarioError, require_least
 from ugat_marl.experiments import problems
 from ugat_marl.progress import Silent
 from ugat_marl.scenarios import (
@@ -257,6 +257,7 @@ def main(words: Sequence[str] | None = None) -> int:
     parser.add_argument("--out", type=Path, required=True, help="folder for the scenarios")
     parser.add_argument("--count", type=int, default=3, help="number of scenarios (3)")
     given = parser.parse_args(words)
+    require_least(1, count=given.count)
     made = make_all(given.file, given.seed, given.out, given.count)
     if made < given.count:
         print(f"only {made} of {given.count} boxes were found", file=sys.stderr)

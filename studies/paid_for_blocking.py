@@ -23,6 +23,7 @@ from ugat_marl import parallel_env
 from ugat_marl.cli import guarded
 from ugat_marl.effects import Domain
 from ugat_marl.envs import Rewarder, TrafficEnv
+from ugat_marl.errors import require_least
 from ugat_marl.policies import Policy, make_rule, roll_out
 from ugat_marl.scenarios import Scenario
 
@@ -169,6 +170,7 @@ def main() -> None:
     parser.add_argument("--seeds", type=int, default=1)
     parser.add_argument("--duration-s", type=float)
     given = parser.parse_args()
+    require_least(1, seeds=given.seeds)
     names = [*RULES, *(f"starving:{phase}" for phase in STARVED)]
     rows: list[Paid] = []
     print(f"{'policy':20}{'ATT s':>9}{'backlog':>9}" + "".join(f"{name:>13}" for name in REWARDS))

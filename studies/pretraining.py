@@ -33,6 +33,7 @@ from studies.same_options import require_same
 from ugat_marl.cli import guarded
 from ugat_marl.effects import Domain
 from ugat_marl.envs import AnyParallelEnv, TrafficEnv, parallel_env
+from ugat_marl.errors import OutputError, require_least
 from ugat_marl.experiments import drawn_effects, effect_ranges
 from ugat_marl.files import write_whole
 from ugat_marl.policies import (
@@ -182,7 +183,12 @@ class Pretraining:
 
 @kept_warm()
 def main(arguments: Sequence[str] | None = None) -> None:
-    """Train and check."""
+    """Train and check.
+
+    Raises:
+        OptionError: There is no network or episode, or no episode between checks.
+        OutputError: The folder holds weights already, or networks of another draw.
+    """
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("out", type=Path)
     parser.add_argument("--networks", type=int, default=150)
@@ -193,6 +199,9 @@ def main(arguments: Sequence[str] | None = None) -> None:
     parser.add_argument("--minutes", type=float, default=1e9, help="stop after so many minutes")
     parser.add_argument("--seed", type=int, default=0)
     given = parser.parse_args(arguments)
+    require_least(1, networks=given.networks, episodes=given.episodes, every=given.every)
+    if (weights := given.out / "start.pt").exists():
+        raise OutputError(f"{weights}: holds weights already; give another folder")
     ranges = NetworkRanges(intersections=(1, given.largest))
     networks = drawn_networks(given.out / "networks", FIRST_SEED, given.networks, ranges)
     checked = drawn_networks(given.out / "checked", FIRST_CHECK_SEED, CHECKED, ranges)
@@ -215,7 +224,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
             )
             print(lines[-1], (att_s / best).round(2), flush=True)
             origin = f"{episode} episodes on {given.networks} networks, seed {given.seed}"
-            pretraining.start(origin).save(given.out / "start.pt")
+            pretraining.start(origin).save(weights)
             write_whole(given.out / "checks.md", "\n".join(lines) + "\n")
         if ends:
             break

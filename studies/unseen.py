@@ -29,7 +29,7 @@ from studies.osm_extracts import make_all
 from studies.same_options import require_same
 from ugat_marl.cli import guarded
 from ugat_marl.data import write_csv
-from ugat_marl.errors import ScenarioError, UnknownNameError
+from ugat_marl.errors import ScenarioError, UnknownNameError, require_least
 from ugat_marl.experiments import (
     DIRECT,
     RULE,
@@ -99,7 +99,11 @@ class Outcome:
 
 
 def main(arguments: Sequence[str] | None = None) -> None:
-    """Draw, train, judge and summarise."""
+    """Draw, train, judge and summarise.
+
+    Raises:
+        OptionError: There is no road network, or another number is too small.
+    """
     parser = argparse.ArgumentParser(description=(__doc__ or "").splitlines()[0])
     parser.add_argument("out", type=Path)
     parser.add_argument("--seed", type=int, required=True, help="seed of the road networks")
@@ -126,6 +130,8 @@ def main(arguments: Sequence[str] | None = None) -> None:
     parser.add_argument("--only", nargs="+", help="names of the networks to run; all are drawn")
     parser.add_argument("--jobs", type=int)
     given = parser.parse_args(arguments)
+    require_least(0 if given.pbf else 1, networks=given.networks)
+    require_least(1, extracts=given.extracts, seeds=given.seeds)
     config = PaperConfig(
         domains=tuple(given.domains),
         seeds=given.seeds,

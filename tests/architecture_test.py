@@ -112,6 +112,17 @@ def every_room_has_a_row(tree: Tree) -> list[str]:
 
 
 @check
+def imports_are_absolute(tree: Tree) -> list[str]:
+    """No module imports by dots: the checks below read absolute names."""
+    return [
+        f"{module}:{node.lineno} imports by dots"
+        for module, parsed in tree.parsed.items()
+        for node in ast.walk(parsed)
+        if isinstance(node, ast.ImportFrom) and node.level
+    ]
+
+
+@check
 def few_stones_lie_at_the_top(tree: Tree) -> list[str]:
     """At most five modules stand at the top, beside the facade and the command line."""
     stones = sorted(m for m in tree.parsed if m not in ("", "__main__") and not tree.room(m))
@@ -317,6 +328,7 @@ SOUND = {
 BROKEN: list[tuple[str, dict[str, str]]] = [
     ("every_room_has_a_row", {"stray": "", "stray.one": ""}),
     ("few_stones_lie_at_the_top", {f"stone{i}": "" for i in range(MAX_STONES)}),
+    ("imports_are_absolute", {"lower.one": "from ..upper import f"}),
     ("imports_go_down", {"lower.one": "from ugat_marl.upper import f"}),
     ("imports_go_down", {"lower.one": "def f():\n    import ugat_marl.upper"}),
     ("imports_go_down", {"stone": "from ugat_marl.lower import a"}),

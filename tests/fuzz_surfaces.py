@@ -45,10 +45,10 @@ from ugat_marl.data import (
 from ugat_marl.diagnosis import Diagnosis
 from ugat_marl.effects import load_scenario, parse_domain, scenario_in_domain
 from ugat_marl.envs import parallel_env
-from ugat_marl.errors import OptionError, UgatMarlError
+from ugat_marl.errors import UgatMarlError
 from ugat_marl.experiments.jobs import JobRecord
 from ugat_marl.experiments.scores import Evaluation
-from ugat_marl.policies import DQN, DQNConfig, NetworkPolicy, export_policy
+from ugat_marl.policies import DQN, DQNConfig, NetworkPolicy, export_policy, load_baseline
 from ugat_marl.policies.export import NumpyPolicy
 from ugat_marl.policies.rules.catalogue import parse_rule
 from ugat_marl.progress import Silent
@@ -56,6 +56,7 @@ from ugat_marl.reporting import read_records, runs_page
 from ugat_marl.scenarios import Network, check_demand, from_cityflow, from_osm, read_scenario
 from ugat_marl.scenarios.importers.counts import read_rows
 from ugat_marl.scenarios.settings import parse_decimal, parse_time
+from ugat_marl.testing import ToyTraffic
 
 FIXTURES = Path(__file__).parent / "fixtures"
 CROSSING = FIXTURES / "crossing"
@@ -111,7 +112,6 @@ record none-v1 --domain late_green=*,2 --periods 2 --out measured
 diagnose none-v1 measured --out out --budget-h 0.1
 export none.pt --out policy.npz
 report none
-scenario new town --grid 2x2 --vph nan
 """
 OD = "from,to,count,begin_s,end_s\nW_C,C_E,100,0,900\nS_C,C_N,40.5,900,1800\n"
 STATE = {"iteration": 2, "pretrained": 14}
@@ -260,6 +260,19 @@ def use_learner(folder: Path) -> None:
     learner().load(folder / "learner.pt")
 
 
+def ippo() -> Any:
+    module: Any = load_baseline("ippo")
+    return module.IPPO(ToyTraffic(), module.IPPOConfig(hidden=(8,)), seed=1)
+
+
+def build_ippo(folder: Path) -> None:
+    ippo().save(folder / "ippo.pt")
+
+
+def use_ippo(folder: Path) -> None:
+    ippo().load(folder / "ippo.pt")
+
+
 def build_export(folder: Path) -> None:
     export_policy(export_test.policy_of(False), folder / "policy.npz")
 
@@ -384,13 +397,17 @@ def use_commands(folder: Path) -> None:
         ):
             continue  # another scenario, which would be simulated
         said = io.StringIO()
-        with contextlib.redirect_stderr(said), contextlib.redirect_stdout(io.StringIO()):
+        with (
+            contextlib.chdir(folder),
+            contextlib.redirect_stderr(said),
+            contextlib.redirect_stdout(io.StringIO()),
+        ):
             try:
-                code = main(words) if "new" not in words else 2
+                code = main(words)
             except SystemExit as end:
                 code = end.code
         if code not in (0, None, 2) or len(said.getvalue().splitlines()) > 1:
-            raise OptionError(f"{line!r} ended with {code}:\n{said.getvalue()}")
+            raise AssertionError(f"{line!r} ended with {code}:\n{said.getvalue()}")
 
 
 TEXT = (damage_bytes, damage_token)
@@ -418,6 +435,7 @@ SURFACES = (
     Surface("transition log", build_log, use_log, TABLE),
     Surface("policy", build_policy, use_policy, (damage_bytes, damage_checkpoint)),
     Surface("learner", build_learner, use_learner, (damage_bytes, damage_checkpoint)),
+    Surface("IPPO", build_ippo, use_ippo, (damage_bytes, damage_checkpoint)),
     Surface("exported policy", build_export, use_export, (damage_bytes, damage_json)),
     Surface("CityFlow", build_cityflow, use_cityflow, (damage_bytes, damage_json), share=0.5),
     Surface("OpenStreetMap", build_osm, use_osm, TEXT, share=0.2),

@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+import sys
 from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
 
+from tests.fuzz_surfaces import use_commands
 from tests.fuzzing import KEPT, Surface, attempt, attempt_kept, built, surfaces
 from ugat_marl.errors import OptionError
 
@@ -64,6 +66,23 @@ def test_the_harness_sees_a_traceback_lines_and_a_hang(
 
 def _with_seed(given: tuple[Surface, Path]) -> tuple[Surface, int, Path]:
     return given[0], 1, given[1]
+
+
+@pytest.mark.parametrize(
+    ("code", "said", "fault"),
+    [(0, "", ""), (2, "one\n", ""), (1, "", "ended with 1"), (2, "one\ntwo\n", "ended with 2")],
+)
+def test_a_command_that_ends_with_another_code_is_seen(
+    code: int, said: str, fault: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def end(_: list[str]) -> int:
+        sys.stderr.write(said)
+        return code
+
+    monkeypatch.setattr("tests.fuzz_surfaces.main", end)
+    (tmp_path / "commands.txt").write_text("domains\n")
+    seen = attempt(Surface("toy", lambda _: None, use_commands, (lambda *_: None,)), 1, tmp_path)
+    assert fault in seen and bool(seen) == bool(fault)
 
 
 def test_the_same_seed_is_the_same_damage(tmp_path: Path) -> None:

@@ -2,18 +2,23 @@
 
 from __future__ import annotations
 
+import ast
 import importlib.metadata
+import importlib.util
 import re
 import subprocess
 import sys
 import sysconfig
 import tarfile
+import tomllib
 import zipfile
 from pathlib import Path
+from typing import Any
 
 import pytest
 
 import ugat_marl
+from tests.docs.readme_test import names as packages_in
 
 PACKAGE = Path(ugat_marl.__file__).parent
 CHECKOUT = Path(__file__).resolve().parent.parent
@@ -67,13 +72,34 @@ def test_the_wheel_holds_what_the_package_reads_and_nothing_else(archives: Path)
     assert sum(Path(name).name == "scenario.toml" for name in names) == len(SCENARIOS) >= 5
 
 
-def test_the_source_archive_builds_the_same_wheel_and_can_be_tested(archives: Path) -> None:
+def test_the_source_archive_holds_the_package_its_tests_and_what_they_read(archives: Path) -> None:
     with tarfile.open(next(archives.glob("*.tar.gz"))) as source:
         names = {name.partition("/")[2] for name in source.getnames()}
     assert {str(path.relative_to(CHECKOUT)) for path in carried().values()} <= names
     assert {"pyproject.toml", "README.md", "LICENSE", "CHANGELOG.md", "constraints.txt"} <= names
     assert "tests/packaging_test.py" in names
+    assert {".ci/environment.py", ".ci/words.py", ".ci/package.py", ".ci/site.py"} <= names
     assert not [name for name in names if name.startswith((".venv", ".git/", "runs/", ".cache"))]
+
+
+def test_what_is_tried_after_an_installation_is_what_its_extras_bring() -> None:
+    """Else a fresh environment counts as damaged and is installed twice."""
+    file = CHECKOUT / ".ci" / "environment.py"
+    spec = importlib.util.spec_from_file_location("environment", file)
+    assert spec is not None and spec.loader is not None
+    environment: Any = importlib.util.module_from_spec(spec)
+    spec.loader.exec_module(environment)
+    project = tomllib.loads((CHECKOUT / "pyproject.toml").read_text(encoding="utf-8"))["project"]
+    extras = project["optional-dependencies"]
+    probes = {"": environment.PROBE, **environment.PROBES}
+    assert {"dev", "osm"} <= set(probes) <= {"", *extras}
+    packages = importlib.metadata.packages_distributions()
+    for extra, probe in probes.items():
+        brought = extras[extra] if extra else [project["name"], *project["dependencies"]]
+        for imported in ast.walk(ast.parse(probe)):
+            if isinstance(imported, ast.alias) and imported.name in packages:
+                found = packages_in(packages[imported.name])
+                assert found & packages_in(brought), (extra, imported.name)
 
 
 def test_the_image_is_made_of_what_is_there() -> None:

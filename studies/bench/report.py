@@ -167,8 +167,9 @@ def _short(number: float) -> str:
     """Return a number with three or more significant digits, without exponent."""
     if not math.isfinite(number):
         return "-"
-    size = abs(number)
-    return f"{number:.0f}" if size >= 1000 else f"{number:.3g}" if size >= 0.001 else f"{number:g}"
+    if abs(number) >= 999.5:
+        return f"{number:.0f}"
+    return np.format_float_positional(number, 3, unique=False, fractional=False, trim="-")
 
 
 def _cell(value: Any) -> str:

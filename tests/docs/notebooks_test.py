@@ -1,4 +1,7 @@
-"""The notebooks run from their first cell to their last, and their outputs are of a whole run."""
+"""The notebooks run from their first cell to their last, and their outputs are of a whole run.
+
+The site that shows them is built strictly.
+"""
 
 from __future__ import annotations
 
@@ -11,6 +14,8 @@ from pathlib import Path
 from typing import Any
 
 import pytest
+
+from tests.docs.links import broken_links, local_links
 
 FOLDER = Path(__file__).resolve().parents[2] / "docs" / "notebooks"
 BOOKS = sorted(FOLDER.glob("*.ipynb"))
@@ -25,6 +30,15 @@ def cells(book: Path) -> list[dict[str, Any]]:
 
 def code(book: Path) -> list[dict[str, Any]]:
     return [cell for cell in cells(book) if cell["cell_type"] == "code"]
+
+
+def site_builder() -> Any:
+    """The module that builds the site."""
+    spec = importlib.util.spec_from_file_location("site_builder", FOLDER.parents[1] / ".ci/site.py")
+    assert spec is not None and spec.loader is not None
+    module = importlib.util.module_from_spec(spec)
+    spec.loader.exec_module(module)
+    return module
 
 
 def test_there_are_notebooks() -> None:
@@ -71,18 +85,14 @@ def test_outputs_are_of_one_whole_run(book: Path) -> None:
 @pytest.mark.parametrize("book", BOOKS, ids=lambda book: book.stem)
 def test_links_of_a_notebook_lead_somewhere(book: Path) -> None:
     texts = ["".join(cell["source"]) for cell in cells(book) if cell["cell_type"] == "markdown"]
-    targets = [target for text in texts for target in re.findall(r"\]\(([^)#]+)\)", text)]
-    assert targets
-    assert not [name for name in targets if not (book.parent / name).exists()]
+    assert local_links("\n".join(texts))
+    assert broken_links("\n".join(texts), book) == []
 
 
 @pytest.mark.parametrize("book", BOOKS, ids=lambda book: book.stem)
 def test_the_site_has_a_page_of_a_notebook(book: Path, tmp_path: Path) -> None:
     """The page has every text, every cell and every output; pictures are files beside it."""
-    spec = importlib.util.spec_from_file_location("site_builder", FOLDER.parents[1] / ".ci/site.py")
-    assert spec is not None and spec.loader is not None
-    site: Any = importlib.util.module_from_spec(spec)
-    spec.loader.exec_module(site)
+    site = site_builder()
     copy = tmp_path / book.name
     copy.write_bytes(book.read_bytes())
     page = site.notebook(copy)
@@ -95,3 +105,31 @@ def test_the_site_has_a_page_of_a_notebook(book: Path, tmp_path: Path) -> None:
     assert page.count("\n```text\n") + page.count("![Output") == len(outputs)
     pictures = re.findall(r"!\[[^]]+\]\(([^)]+)\)", page)
     assert sorted(pictures) == sorted(path.name for path in tmp_path.glob("*.png"))
+
+
+@pytest.mark.parametrize("text", ["", "a link leads nowhere"])
+def test_a_warning_of_mkdocs_fails_the_site(
+    text: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capfd: pytest.CaptureFixture[str]
+) -> None:
+    """With -q MkDocs hears no warnings, so that --strict finds none."""
+    python = tmp_path / "python"
+    python.write_text(
+        f'#!/bin/sh\ncase "$*" in *-q*) exit 0;; esac\necho "{text}"\n[ -z "{text}" ]\n'
+    )
+    python.chmod(0o755)
+    site = site_builder()
+    monkeypatch.setattr(site, "environment", lambda: python)
+    monkeypatch.setattr(site, "stage", lambda: None)
+    assert site.main() == bool(text)
+    told = capfd.readouterr()
+    assert text in told.err and ("the site is in" in told.out) == (not text)
+
+
+def test_a_name_on_two_pages_has_one_address() -> None:
+    site, told = site_builder(), set[str]()
+    room = site.PACKAGE / "experiments" / "__init__.pyi"
+    block = "\n::: ugat_marl.experiments.functions.Training\n"
+    again = f"{block}    options:\n      skip_local_inventory: true\n"
+    assert again not in (first := site.reference("ugat_marl.experiments", room, told))
+    assert block in first
+    assert again in site.reference("ugat_marl", site.PACKAGE / "__init__.pyi", told)

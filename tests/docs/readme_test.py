@@ -11,6 +11,7 @@ from pathlib import Path
 import pytest
 
 import ugat_marl
+from tests.docs.links import broken_links
 
 ROOT = Path(__file__).resolve().parents[2]
 README = (ROOT / "README.md").read_text(encoding="utf-8")
@@ -68,9 +69,30 @@ def test_the_readme_fits_a_screen_or_three() -> None:
 
 @pytest.mark.parametrize("page", PAGES, ids=lambda path: str(path.relative_to(ROOT)))
 def test_links_lead_somewhere(page: Path) -> None:
-    targets = re.findall(r"\]\(([^)#]+)\)", page.read_text(encoding="utf-8"))
-    local = [target for target in targets if not target.startswith(("http:", "https:"))]
-    assert not [target for target in local if not (page.parent / target).exists()]
+    assert broken_links(page.read_text(encoding="utf-8"), page) == []
+
+
+@pytest.mark.parametrize(
+    ("link", "broken"),
+    [
+        ("other.md#two-words", False),
+        ("other.md#two-words-1", False),
+        ("other.md#with---an-option-1", False),
+        ("#here", False),
+        ("https://example.org/gone.md#a", False),
+        ("gone.md", True),
+        ("gone.md#a", True),
+        ("other.md#gone", True),
+        ("other.md#a-remark", True),
+        ("#two-words", True),
+    ],
+)
+def test_a_link_that_leads_nowhere_is_found(link: str, broken: bool, tmp_path: Path) -> None:
+    other = "# Two words\n\n```sh\n# a remark\n```\n\n## Two words\n\n### With `--an` option: 1\n"
+    (tmp_path / "other.md").write_text(other)
+    page = tmp_path / "page.md"
+    page.write_text(f"# Here\n\n[x]({link})\n")
+    assert broken_links(page.read_text(), page) == [link] * broken
 
 
 @pytest.mark.parametrize("file", ["constraints.txt", "constraints-oldest.txt"])

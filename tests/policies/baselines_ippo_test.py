@@ -303,6 +303,22 @@ def test_a_checkpoint_of_another_learner_is_refused(
         learner.load(tmp_path / "policy.pt")
 
 
+@pytest.mark.parametrize(
+    ("name", "value"),
+    [("weights", None), ("rewards", None), ("episodes", torch.zeros(900))],
+)
+def test_the_refusal_of_a_damaged_checkpoint_is_one_line(
+    name: str, value: Any, tmp_path: Path
+) -> None:
+    file = tmp_path / "learner.pt"
+    learner = IPPO(ToyTraffic(), Config(hidden=(4,)))  # few enough to be printed whole
+    learner.save(file)
+    torch.save(torch.load(file, weights_only=True) | {name: value}, file)
+    with pytest.raises(CheckpointError, match=f"{name} is") as refusal:
+        learner.load(file)
+    assert len(str(refusal.value)) < 300 and "\n" not in str(refusal.value)
+
+
 def test_it_keeps_the_protocols_and_its_policies_conform(tmp_path: Path) -> None:
     env = ToyTraffic()
     learner = IPPO(env, Config(**QUICK))

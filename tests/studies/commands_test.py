@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import importlib
+import json
 import os
 import re
 import subprocess
@@ -13,7 +15,8 @@ import torch
 
 import studies.bench.__main__ as bench
 import studies.blind.__main__ as blind
-from ugat_marl.cli import CommandLine, run
+from studies.behaviour_digests import parts
+from ugat_marl.cli import CommandLine, guarded, run
 
 CHECKOUT = Path(__file__).resolve().parents[2]
 COMMANDS = [(line, name) for line in (bench.LINE, blind.LINE) for name in line.commands]
@@ -69,6 +72,54 @@ def test_a_wrong_command_is_one_line(study: str) -> None:
     )
     assert done.returncode == 2
     assert done.stderr.startswith(f"python -m studies.{study}: error: unknown command 'nonsense'")
+
+
+@pytest.mark.parametrize(
+    ("study", "words", "reason"),
+    [
+        ("unseen", "out --seed 1 --networks 0", "networks = 0"),
+        ("unseen", "out --seed 1 --pbf a.osm.pbf --extracts 0", "extracts = 0"),
+        ("unseen", "out --seed 1 --seeds 0", "seeds = 0"),
+        ("osm_extracts", "a.osm.pbf --seed 1 --out out --count 0", "count = 0"),
+        ("paid_for_blocking", "single-v1 --seeds 0", "seeds = 0"),
+        ("pretraining", "out --networks 0", "networks = 0"),
+        ("pretraining", "out --episodes 0", "episodes = 0"),
+        ("pretraining", "out --every 0", "every = 0"),
+        ("pretraining", "held", "start.pt: holds weights already"),
+        ("behaviour_digests", "check broken.json", "not valid JSON"),
+        ("behaviour_digests", "check other.json", "holds no digests"),
+        ("behaviour_digests", "write other.json --only scenarios", "holds no digests"),
+    ],
+)
+def test_a_study_refuses_in_one_line_and_leaves_nothing(
+    study: str,
+    words: str,
+    reason: str,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    if study in ("unseen", "osm_extracts"):
+        pytest.importorskip("osmium")
+    (tmp_path / "broken.json").write_text("{")
+    (tmp_path / "other.json").write_text("[]")
+    (tmp_path / "held").mkdir()
+    (tmp_path / "held" / "start.pt").write_bytes(b"weights")
+    before = {path: path.read_bytes() for path in tmp_path.rglob("*.*")}
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr(sys, "argv", [study, *words.split()])
+    main = importlib.import_module(f"studies.{study}").main
+    assert guarded(f"python -m studies.{study}", main) == 2
+    said = capsys.readouterr().err
+    assert reason in said and said.count("\n") == 1
+    assert {path: path.read_bytes() for path in tmp_path.rglob("*.*")} == before
+    assert not (tmp_path / "out").exists()
+
+
+def test_every_part_of_the_digests_is_written_down() -> None:
+    file = CHECKOUT / "studies" / "behaviour_digests.json"
+    written = set(json.loads(file.read_text(encoding="utf-8"))["parts"])
+    assert set(parts()) == written
 
 
 def test_the_bench_of_devices_refuses_a_missing_one(

@@ -1,4 +1,4 @@
-"""A case is right if the kinds and places of its errors are, and its drivers are left alone."""
+"""A case is right if kinds, places and forms of its errors are, and drivers are left alone."""
 
 from __future__ import annotations
 
@@ -17,6 +17,10 @@ from studies.detector_errors import Case
         ("detector_offset=advance,-10", (), False),
         ("headway=1.4+detector_speeds=*,front", ("detector_speeds=*,front",), True),
         ("headway=1.4+detector_speeds=*,front", ("detector_speeds=*,mean",), False),
+        ("detector_extension=*,1.5,merged", ("detector_extension=*,1.4,merged",), True),
+        ("detector_extension=*,1.5,merged", ("detector_extension=*,1.5,split",), False),
+        ("detector_extension=*,1.5,merged", ("detector_extension=*,1.5,unknown",), True),
+        ("detector_extension=*,1.5,unknown", ("detector_extension=*,1.5,split",), True),
     ],
 )
 def test_right_and_wrong(domain: str, found: tuple[str, ...], right: bool) -> None:

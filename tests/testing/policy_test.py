@@ -164,6 +164,29 @@ class CannotLoad(Good):
         raise OSError("not a policy")
 
 
+@breaks("saving_keeps_its_answers")
+class SavesNothing(Good):
+    def save(self, path):
+        self.place = path
+
+    def load(self, path):
+        if path != self.place:
+            raise FileNotFoundError(path)
+
+
+@breaks("saving_keeps_its_answers")
+class LoadsNothing(Good):
+    def load(self, path):
+        pass
+
+
+@breaks("saving_keeps_its_answers")
+class MakesItselfAnew(Good):
+    @classmethod
+    def load(cls, path):
+        return cls()
+
+
 @pytest.mark.parametrize(
     ("check", "subject"),
     BROKEN,

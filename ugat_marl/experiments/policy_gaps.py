@@ -60,8 +60,9 @@ def policy_gap(
 
         - `before`: |ATT(real) - ATT(sim)| of the means;
         - `after`: |ATT(real) - ATT(corrected)| of the means;
-        - `shrink`: 1 - after / before; None if the 95 % interval of ATT(real) - ATT(sim), paired
-          by seed, holds 0.
+        - `shrink`: 1 - after / before; None if the 95 % interval below holds 0.
+
+        The interval is that of ATT(real) - ATT(sim), paired by seed.
 
     Raises:
         OptionError: The real domain is the simulation, or there are no policies or seeds.

@@ -106,9 +106,16 @@ def state_lies_in_its_space(case: EnvironmentCase) -> None:
 
 def infos_keep_their_keys(case: EnvironmentCase) -> None:
     """Infos have the same keys and shapes at `reset` and at every step."""
+    agents = set(case.fresh.possible_agents)  # another check finds agents without an info
     first = {key: _shapes(info) for key, info in case.episode.moments[0].infos.items()}
     for moment, when in _moments(case):
         now = {key: _shapes(info) for key, info in moment.infos.items()}
+        extra = sorted(map(str, (set(now) ^ set(first)) - agents))
+        require(
+            not extra,
+            f"{when}, only one of infos and those after reset has the key {extra[:1]}; TorchRL and "
+            "BenchMARL need the same keys always",
+        )
         for key in set(now) & set(first):
             require(
                 now[key] == first[key],

@@ -19,7 +19,14 @@ from ugat_marl.testing.episodes import (
     allowed_actions,
     different,
 )
-from ugat_marl.testing.results import CheckResult, ConformanceError, NotChecked, require, run_checks
+from ugat_marl.testing.results import (
+    CheckResult,
+    ConformanceError,
+    Listening,
+    NotChecked,
+    require,
+    run_checks,
+)
 
 Answers = list[Mapping[str, Any]]
 
@@ -215,16 +222,34 @@ def saving_keeps_its_answers(case: PolicyCase) -> None:
     with TemporaryDirectory(prefix="ugat_marl-check-") as folder:
         path = Path(folder) / "policy.pt"
         policy.save(path)
-        # `load` either is a class method that returns a policy, or fills the policy it belongs to.
-        loaded = type(policy).load(path) if _makes(policy) else copy.deepcopy(policy)
-        if not _makes(policy):
-            loaded.load(path)
+        require(
+            any(path.parent.iterdir()),
+            "save(path) wrote no file; write one even if there is nothing to keep, or leave out "
+            "save() and load()",
+        )
+        loaded = _loaded(policy, path)
         for step, (a, b) in enumerate(zip(case.answers, case.ask(loaded), strict=True)):
             require(
                 a == b,
                 f"saved and loaded, the policy answers step {step} with {b}, not {a}; save all "
                 "that decides its answers",
             )
+    # The copy that `load` fills has the answers already: only a missing file shows that it reads.
+    with TemporaryDirectory(prefix="ugat_marl-check-") as folder, Listening() as heard:
+        _loaded(policy, Path(folder) / "policy.pt")
+    require(
+        heard.error is not None,
+        "load(path) of a file that is not there raises nothing; read what save(path) wrote",
+    )
+
+
+def _loaded(policy: Any, path: Path) -> Any:
+    """Return a policy of a file; `load` is a class method, or fills the policy it belongs to."""
+    if _makes(policy):
+        return type(policy).load(path)
+    loaded = copy.deepcopy(policy)
+    loaded.load(path)
+    return loaded
 
 
 def _makes(policy: Any) -> bool:

@@ -54,6 +54,15 @@ def test_a_target_is_met_or_not(measured: float, at_least: bool, met: bool) -> N
     assert Target("t", measured, limit, at_least).met is met
 
 
+@pytest.mark.parametrize(
+    ("number", "text"),
+    [(999.7, "1000"), (999.4, "999"), (0.00005, "0.00005"), (1234.6, "1235"), (0.12345, "0.123"),
+     (7.0, "7"), (0.0, "0"), (math.nan, "-")],
+)  # fmt: skip
+def test_numbers_are_shown_without_exponent(number: float, text: str) -> None:
+    assert str(Spread.of([number])) == f"{text} ({text}-{text})"
+
+
 def test_what_was_not_measured_meets_no_target() -> None:
     assert not Target("t", math.nan, 0.85, at_least=True).met
     assert not Target("t", math.nan, 1.6, at_least=False).met
