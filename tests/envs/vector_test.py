@@ -750,6 +750,38 @@ def test_gymnasium_s_vector_env() -> None:
     assert pids(vector) == []
 
 
+def test_gymnasium_s_final_values_are_those_of_the_vector() -> None:
+    one, two = (vector_env("mixed-v1", 2, "execution_delay=10", duration_s=20) for _ in range(2))
+    env, agents = GymnasiumVectorEnv(one), len(one.agents)
+    _, infos = env.reset(seed=1)
+    batch = two.reset(1)
+    for step in range(2):
+        _, _, _, truncations, infos = env.step(chosen(infos["action_mask"], 1, step))
+        batch = two.step(chosen(batch.masks.reshape(2 * agents, -1), 1, step).reshape(2, agents))
+        np.testing.assert_array_equal(infos["executed_action"], batch.executed.ravel())
+    assert truncations.all() and len(batch.ended) == 2
+    final = infos["final_info"]
+    np.testing.assert_array_equal(final["executed_action"], batch.executed.ravel())
+    for ended in batch.ended:
+        rows = slice(ended.environment * agents, (ended.environment + 1) * agents)
+        np.testing.assert_array_equal(np.stack(infos["final_obs"][rows]), ended.observations)
+        np.testing.assert_array_equal(final["action_mask"][rows], ended.masks)
+        assert ended.observations.any() and ended.masks.any()
+    env.close()
+    two.close()
+
+
+def test_gymnasium_resets_those_of_a_mask() -> None:
+    vector = vector_env("mixed-v1", 2, duration_s=20, autoreset="disabled")
+    env, agents = GymnasiumVectorEnv(vector), len(vector.agents)
+    before, _ = env.reset(seed=1)
+    mask = np.repeat([False, True], agents)
+    after, _ = env.reset(seed=[1, 9], options={"reset_mask": mask})
+    assert [one.seed for one in vector.episodes if one is not None] == [1, 9]
+    np.testing.assert_array_equal(after[~mask], before[~mask])
+    env.close()
+
+
 def test_gymnasium_s_own_wrappers_take_it() -> None:
     vector = GymnasiumVectorEnv(vector_env("grid2x2-v1", 1, duration_s=20))
     env = RecordEpisodeStatistics(vector)
