@@ -37,7 +37,8 @@ import rich, scipy, sumo, supersuit, tensorboard, torch, tyro
 import ugat_marl
 """
 PROBES = {
-    "dev": "import hatchling, hypothesis, pytest, pytest_timeout, sklearn, xdist\n",
+    "dev": "import hatchling, hypothesis, pytest, pytest_timeout, sklearn, xdist\n"
+    "import stable_baselines3\n",
     "osm": "import osmium\n",
 }
 """Imports by the extra that brings what they name."""

@@ -71,12 +71,28 @@ def test_an_end_is_a_truncation_with_what_was_seen_there() -> None:
         seen, _, over, infos = env.step(np.zeros(3, dtype=int))
         last, *_ = twin.step(dict.fromkeys(twin.possible_agents, 0))
         assert over.all() == (number == 2)
-    fresh, _ = twin.reset()
+    fresh, begun = twin.reset()
+    np.testing.assert_equal(env.reset_infos, [begun[agent] for agent in twin.possible_agents])
     for row, agent in enumerate(twin.possible_agents):
         assert infos[row]["TimeLimit.truncated"] is True
         assert np.array_equal(infos[row]["terminal_observation"], last[agent])
         assert np.array_equal(seen[row], fresh[agent])
         assert not np.array_equal(seen[row], last[agent])
+
+
+class Terminating(ToyTraffic):
+    """Its episodes end because the task is over."""
+
+    def step(self, actions: Any) -> Any:
+        seen, rewards, terminations, truncations, infos = super().step(actions)
+        return seen, rewards, truncations, terminations, infos
+
+
+def test_an_end_of_the_task_is_no_truncation() -> None:
+    env = AgentsVecEnv([agent_indicator(pad_spaces(Terminating(steps=1)))])
+    env.reset()
+    *_, over, infos = env.step(np.zeros(3, dtype=int))
+    assert over.all() and not any(info["TimeLimit.truncated"] for info in infos)
 
 
 def test_one_environment_may_end_before_another() -> None:
