@@ -215,6 +215,12 @@ def test_lost_readings_are_told_from_queues_that_stand() -> None:
 
     assert found(lost).lost == pytest.approx(0.2, abs=0.1)
 
+    # A lane that shares the road behind it counts halves, which is no noise that would hide this.
+    shares = np.array([1.0, 1.0, 1.0, 0.5])
+    street = log_of(lambda counts, generator: lost(counts * shares, generator))
+    quiet = log_of(lambda counts, _: counts * shares, seed=99, rate=0.05)
+    assert fit_eyes(street, quiet, VIEW).lost == pytest.approx(0.2, abs=0.1)
+
 
 def test_coarse_counts_are_found_by_their_step() -> None:
     def coarse(counts: np.ndarray, _: np.random.Generator) -> np.ndarray:

@@ -303,7 +303,7 @@ def fit_eyes(
     config = config or EyesConfig()
     rows, perfect = view.rows(street), view.rows(simulated)
     lag = _lag(rows, perfect, config)
-    noisy, step = _fraction(rows) - _fraction(perfect) > config.fraction, _step(rows)
+    noisy, step = _noisy(rows, perfect, config), _step(rows)
     absolute, relative = _noise(rows, perfect, config) if noisy else (0.0, 0.0)
     return Eyes(
         dead=_dead(rows, perfect, config),
@@ -449,6 +449,18 @@ def _fraction(rows: Sequence[LaneRows]) -> float:
     """Return the mean distance of counts from whole numbers."""
     counts = _counts(rows)
     return float(np.abs(counts - np.round(counts)).mean())
+
+
+def _noisy(rows: Sequence[LaneRows], perfect: Sequence[LaneRows], config: EyesConfig) -> bool:
+    """Return True if counts are no whole numbers.
+
+    Lanes that share the road behind them have halves of vehicles even in the simulation, the more
+    the longer queues are. They are compared only where there are no others.
+    """
+    whole = [own for own, usual in zip(rows, perfect, strict=True) if not _fraction([usual])]
+    if whole:
+        return _fraction(whole) > config.fraction
+    return _fraction(rows) - _fraction(perfect) > config.fraction
 
 
 def _noise(
