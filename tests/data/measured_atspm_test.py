@@ -469,8 +469,20 @@ def cycles(begin_s: float, count: int) -> Rows:
 def test_a_clock_set_back_out_of_the_period_is_an_error(imported: Import) -> None:
     """The log begins with the period, so no time occurs twice, but half of the period is lost."""
     back = [*cycles(0.0, 2), *cycles(100.0 - 3600.0, 2)]
-    with pytest.raises(MeasuredDataError, match=r"row \d+: .* '7' steps back by 3\d+ s"):
+    with pytest.raises(MeasuredDataError, match=r"'7' steps back by 3\d+ s, so .* before the per"):
         imported(log([*SEEN, *back]))
+
+
+def test_pieces_in_another_order_are_put_in_order(imported: Import) -> None:
+    """The newest hour first, or two pieces of the hour before swapped: no time occurs twice."""
+    newest, oldest, before = cycles(0.0, 4), cycles(-3000.0, 4), cycles(-150.0, 3)
+    few = cycles(-60.0, 1)[:3], cycles(-300.0, 1)[:3], newest[:3]
+    for found, ordered in (
+        ((newest, oldest, before), (oldest, before, newest)),
+        (few, (few[1], few[0], few[2])),
+    ):
+        one, other = ([row for piece in pieces for row in piece] for pieces in (found, ordered))
+        assert imported(log([*SEEN, *one])).hash == imported(log([*SEEN, *other])).hash
 
 
 def test_a_clock_set_back_before_the_period_is_no_error(imported: Import) -> None:

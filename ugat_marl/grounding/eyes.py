@@ -404,7 +404,7 @@ def zone_of_unseen(
         config: Numbers of the method.
 
     Returns:
-        Zones in m; (0, 0) if none that was simulated is short enough.
+        Zones in m; (0, 0) if fewer leave unseen than from the longest zone that was simulated.
     """
     metres = np.array(sorted(simulated))
     tried = [simulated[length] for length in metres.tolist()]
@@ -417,13 +417,11 @@ def zone_of_unseen(
         return 0.0, 0.0
     low, high = np.interp([-most, -least], -unseen, metres).tolist()
     counts = _counts(view.rows(street))
-    cut = round(float(np.quantile(counts, config.limit)))
-    low = max(low, VEHICLE_M * (cut - 1.0))  # so many stand in it
+    most_seen = float(counts.max())
+    low = max(low, VEHICLE_M * (most_seen - 1.0))  # so many stand in it
     # and in a longer zone more of them would
-    beyond = np.array(
-        [(_counts(view.rows(zone)) > cut + 0.5).mean() * len(counts) for zone in tried]
-    )
-    too_long = metres[beyond > config.surprise]
+    above = [(_counts(view.rows(zone)) > most_seen).mean() for zone in tried]
+    too_long = metres[np.array(above) * len(counts) > config.surprise]
     return low, max(low, min([high, *too_long.tolist()]))
 
 

@@ -465,7 +465,8 @@ def fit_street(
         view: Lanes of the network, as the log shows them.
         config: Settings.
         seed: Root of every random choice.
-        on_done: Called after each simulated episode.
+        on_done: Called after each simulated episode; not after the few with short zones, which
+            only a street needs whose detectors seem to have some.
         history: Results of earlier fits to the same street.
 
     Returns:
@@ -559,7 +560,7 @@ def street_log(
 
 
 def episodes_of_fit(config: StreetConfig, history: FitHistory) -> int:
-    """Return the number of episodes that `fit_street` simulates."""
+    """Return the number of episodes that `fit_street` simulates, without those of short zones."""
     baseline = BASELINE_EPISODES if "eyes" in config.parts else 0
     return baseline + history.new_worlds(config) * config.simulates
 

@@ -22,6 +22,7 @@ from ugat_marl.data.measured.local_time import local_times
 from ugat_marl.data.measured.passages import passages_of
 from ugat_marl.data.measured.reading import detectors_of, periods_of, signals_of
 from ugat_marl.data.measured.tables import (
+    CLOCK_JUMP_S,
     DETECTORS,
     PERIODS,
     ROW,
@@ -429,10 +430,11 @@ def _events(
         return []
     device_rows = device_rows[_first_of_clock(device_rows["time_s"].to_numpy(), period) :]
     key, time = np.zeros(device_rows.height, np.int64), device_rows["time_s"].to_numpy()
-    refuse_set_back(
-        path, key, time, device_rows[ROW].to_numpy(), lambda _: f"device {device.id!r}",
-        np.full(len(time), period.begin_s),
-    )  # fmt: skip
+    # A log whose newest piece comes first ends where it began; all others of a period go on in it.
+    early = time[0] >= period.begin_s and time[0] - time[-1] > CLOCK_JUMP_S
+    begin_s = np.full(len(time), period.begin_s) if early else None
+    name = f"device {device.id!r}"
+    refuse_set_back(path, key, time, device_rows[ROW].to_numpy(), lambda _: name, begin_s)
     order = in_order(path, key, time, findings)
     device_rows = device_rows[order]
     events = [
@@ -449,8 +451,11 @@ def _first_of_clock(time: NDArray[np.float64], period: Period) -> int:
     Rows before it only tell the state at the start of the period, by another clock.
     """
     inside = time >= period.begin_s
-    steps = clock_steps(time[: int(inside.argmax()) if inside.any() else None])
-    return int(steps[-1]) if len(steps) else 0
+    before = time[: int(inside.argmax()) if inside.any() else None]
+    steps = clock_steps(before).tolist()
+    # in swapped pieces no time occurs twice
+    twice = [step for step in steps if before[step:].max() >= before[:step].min()]
+    return twice[-1] if twice else 0
 
 
 def _states(

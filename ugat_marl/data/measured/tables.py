@@ -627,9 +627,10 @@ def refuse_set_back(
         jump = clock[step - 1] - clock[step]
         gone = begin_s is not None and clock[end - 1] < begin_s[as_found[begin]]
         if gone or clock[end - 1] > clock[begin]:
+            lost = "the rows behind it lie before the period" if gone else "some times occur twice"
             raise MeasuredDataError(
                 f"{place(path, int(row[as_found[step]]))}: the clock of {name(int(stream[begin]))} "
-                f"steps back by {jump:g} s, so some times occur twice (daylight saving, a "
+                f"steps back by {jump:g} s, so {lost} (daylight saving, a "
                 "clock that was set, or a log that was appended twice?); end the period before the "
                 "step, correct the times behind it, or leave the copy out"
             )
