@@ -78,7 +78,7 @@ class AgentsVecEnv(VecEnv):
     def seed(self, seed: int | None = None) -> list[int | None]:
         """Set the seeds of the next reset: ``seed + k`` for environment `k`."""
         if seed is None:
-            return super().seed(None)
+            return list(super().seed(None))
         for k in range(len(self.envs)):
             for row in self._agents_of(k):
                 self._seeds[row] = seed + k
