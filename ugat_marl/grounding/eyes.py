@@ -358,8 +358,7 @@ def _zone(
     alive = [place for place, own in enumerate(rows) if own.before.any()]
     if not alive:
         return 0.0, 0.0
-    counts = np.concatenate([rows[place].before for place in alive])
-    usual = np.concatenate([perfect[place].before for place in alive])
+    counts, usual = (_counts([lanes[place] for place in alive]) for lanes in (rows, perfect))
     most = float(np.quantile(counts, config.limit)) - config.margin * noise
     cut = max(1.0, round(most))
     beyond = float((usual > cut + 0.5).mean()) * len(counts)
@@ -384,7 +383,8 @@ def leave_unseen(
         view: Lanes of the network.
         config: Numbers of the method.
     """
-    (seen, passed), (usual, _) = _unseen(street, view), _unseen(simulated, view)
+    long = _long(street, view)
+    (seen, passed), (usual, _) = (_unseen(view.rows(log), long) for log in (street, simulated))
     beyond = seen - usual
     return beyond > config.unseen and beyond * passed > config.surprise
 
@@ -406,21 +406,21 @@ def zone_of_unseen(
     Returns:
         Zones in m; (0, 0) if fewer leave unseen than from the longest zone that was simulated.
     """
-    metres = np.array(sorted(simulated))
-    tried = [simulated[length] for length in metres.tolist()]
-    share, passed = _unseen(street, view)
+    metres, long = np.array(sorted(simulated)), _long(street, view)
+    rows, tried = view.rows(street), [view.rows(simulated[each]) for each in metres.tolist()]
+    share, passed = _unseen(rows, long)
     error = 2.0 * math.sqrt(share * (1.0 - share) / max(passed, 1))
     most, least = (share + error) * (1.0 + config.shift), (share - error) * (1.0 - config.shift)
     # the longer a zone, the fewer leave it unseen
-    unseen = np.minimum.accumulate([_unseen(zone, view)[0] for zone in tried])
+    unseen = np.minimum.accumulate([_unseen(zone, long)[0] for zone in tried])
     if most < unseen[-1]:
         return 0.0, 0.0
     low, high = np.interp([-most, -least], -unseen, metres).tolist()
-    counts = _counts(view.rows(street))
+    counts = _counts(rows)
     most_seen = float(counts.max())
     low = max(low, VEHICLE_M * (most_seen - 1.0))  # so many stand in it
     # and in a longer zone more of them would
-    above = [(_counts(view.rows(zone)) > most_seen).mean() for zone in tried]
+    above = [(_counts(zone) > most_seen).mean() for zone in tried]
     too_long = metres[np.array(above) * len(counts) > config.surprise]
     return low, max(low, min([high, *too_long.tolist()]))
 
@@ -430,16 +430,20 @@ def _counts(rows: Sequence[LaneRows]) -> Floats:
     return np.concatenate([own.before for own in rows])
 
 
-def _unseen(log: TransitionLog, view: LaneView) -> tuple[float, int]:
+def _long(log: TransitionLog, view: LaneView) -> NDArray[np.bool_]:
+    """Return True for the lanes that nobody passes within a decision, ``(lanes,)``."""
+    return view.passed_s > FASTER * log.provenance.decision_interval_s
+
+
+def _unseen(rows: Sequence[LaneRows], long: NDArray[np.bool_]) -> tuple[float, int]:
     """Return how often vehicles pass long lanes, and the share in which these were empty before.
 
     Returns:
         The share, and the number of decisions in which vehicles pass.
     """
-    long = view.passed_s > FASTER * log.provenance.decision_interval_s
-    rows = [own for own, use in zip(view.rows(log), long, strict=True) if use]
-    passed = sum(int((own.left > CLOSE).sum()) for own in rows)
-    empty = sum(int(((own.left > CLOSE) & (own.before == 0)).sum()) for own in rows)
+    used = [own for own, use in zip(rows, long, strict=True) if use]
+    passed = sum(int((own.left > CLOSE).sum()) for own in used)
+    empty = sum(int(((own.left > CLOSE) & (own.before == 0)).sum()) for own in used)
     return empty / max(passed, 1), passed
 
 
