@@ -620,13 +620,13 @@ def refuse_set_back(
         return
     starts = np.flatnonzero(np.diff(stream, prepend=-1))
     for begin, end in zip(starts, np.append(starts[1:], len(stream)), strict=True):
-        begins = None if begin_s is None else begin_s[as_found[begin:end]]
-        steps = begin + clock_steps(clock[begin:end], begins)
+        least = -np.inf if begin_s is None else float(begin_s[as_found[begin]])
+        steps = begin + clock_steps(clock[begin:end], least)
         if not 1 <= len(steps) <= 2 or end - begin < FEW_ROWS:
             continue
         step = int(steps[0])
         jump = clock[step - 1] - clock[step]
-        gone = begins is not None and min(clock[step], clock[end - 1]) < begins[0]
+        gone = min(clock[step], clock[end - 1]) < least
         if gone or clock[end - 1] > clock[begin]:
             lost = "the rows behind it lie before the period" if gone else "some times occur twice"
             raise MeasuredDataError(
@@ -637,22 +637,17 @@ def refuse_set_back(
             )
 
 
-def clock_steps(
-    clock: NDArray[np.float64], begin_s: NDArray[np.float64] | None = None
-) -> NDArray[np.int64]:
+def clock_steps(clock: NDArray[np.float64], begin_s: float = -np.inf) -> NDArray[np.int64]:
     """Return the indices of rows before which the clock of a stream may have been set back.
 
     Args:
         clock: Time of each row, s, in the order of the file, ``(n,)``.
-        begin_s: Start of the period of each row, s, ``(n,)``: a row before it is no late one. None
-            if rows may lie before their period.
+        begin_s: Start of the period, s: a row before it is no late one.
     """
     steps = np.flatnonzero(np.diff(clock) < -CLOCK_JUMP_S) + 1  # others are late rows
     following = np.append(clock, np.inf)[steps + 1]
     late = following >= clock[steps - 1]  # behind a late row the clock is right again
-    if begin_s is not None:
-        late &= clock[steps] >= begin_s[steps]
-    return steps[~late]
+    return steps[~late | (clock[steps] < begin_s)]
 
 
 def _steps_back(stream: NDArray[np.int64], clock: NDArray[np.float64]) -> NDArray[np.int64]:
