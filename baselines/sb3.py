@@ -85,6 +85,11 @@ class SB3Config:
         check_settings(self, "least_exploration", "target_rate")
 
 
+def _allowed(observations: Any, actions: Any) -> Any:
+    """Return the mask at the end of observations, ``(batch, actions)``, of an action space."""
+    return observations[:, -int(actions.n) :] > 0.5
+
+
 class WithoutMask(BaseFeaturesExtractor):
     """Feature extractor: the observation without the mask at its end."""
 
@@ -100,10 +105,12 @@ class WithoutMask(BaseFeaturesExtractor):
 class MaskedActorCritic(ActorCriticPolicy):
     """PPO's policy; actions that the mask at the observation's end forbids have probability 0."""
 
-    def extract_features(self, obs: Tensor, *rest: Any) -> Tensor:
+    def extract_features(
+        self, obs: Any, features_extractor: BaseFeaturesExtractor | None = None
+    ) -> Any:
         """Return the features and keep the mask; the library then makes the distribution."""
-        self._allowed = obs[:, -int(self.action_space.n) :] > 0.5
-        return super().extract_features(obs, *rest)
+        self._allowed = _allowed(obs, self.action_space)
+        return super().extract_features(obs, features_extractor)
 
     def _get_action_dist_from_latent(self, latent_pi: Tensor) -> Any:
         logits = self.action_net(latent_pi).masked_fill(~self._allowed, _FORBIDDEN)
@@ -113,10 +120,9 @@ class MaskedActorCritic(ActorCriticPolicy):
 class MaskedQNetwork(QNetwork):
     """Q-network; actions that the mask at the observation's end forbids have the lowest Q."""
 
-    def forward(self, obs: Tensor) -> Tensor:
+    def forward(self, obs: Any) -> Tensor:
         """Return Q, ``(batch, actions)``, of ``(batch, size + actions)``."""
-        allowed = obs[:, -int(self.action_space.n) :] > 0.5
-        return super().forward(obs).masked_fill(~allowed, _FORBIDDEN)
+        return super().forward(obs).masked_fill(~_allowed(obs, self.action_space), _FORBIDDEN)
 
 
 class MaskedDQNPolicy(LibraryPolicy):
@@ -145,7 +151,7 @@ class MaskedDQN(DQN):
         greedy, state = self.policy.predict(observation, state, episode_start, deterministic=True)
         if deterministic:
             return greedy, state
-        allowed = observation[:, -int(self.action_space.n) :] > 0.5
+        allowed = _allowed(observation, self.action_space)
         drawn = (np.random.random(allowed.shape) * allowed).argmax(1)  # noqa: NPY002 - as SB3 does
         explores = np.random.random(len(drawn)) < self.exploration_rate  # noqa: NPY002
         return np.where(explores, drawn, greedy), state
