@@ -205,12 +205,14 @@ def test_who_draws_a_route_of_several_edges_has_no_first_one() -> None:
         assert departing(elsewhere).keys() == {"v"}
 
 
-def test_who_waits_for_a_person_is_in_no_window() -> None:
+@pytest.mark.parametrize("factor", [0.0, 2.0])
+def test_who_waits_for_a_person_is_left_alone(factor: float) -> None:
+    """A twin would wait for ever, and a person for a vehicle that is taken away."""
     scenario = with_routes(
         f'<vehicle id="v" depart="triggered"><route edges="{EDGE} A1_southA"/></vehicle>'
     )
-    assert departing(apply_effects(scenario, [DemandSurge("*", 10.0, 20.0, 0.0)]))
-    assert not departing(apply_effects(scenario, [DemandLevel("*", 0.0)]))
+    for effect in (DemandSurge("*", 10.0, 20.0, factor), DemandLevel("*", factor)):
+        assert departing(apply_effects(scenario, [effect])).keys() == {"v"}
 
 
 def test_a_surge_stays_in_its_window() -> None:
@@ -480,12 +482,14 @@ def test_those_who_turn_go_on_like_others() -> None:
         and any(pair[0] in way[:-1] and pair not in pairwise(way) for way in ways)
     )
     after = sound(apply_effects(scenario, [Turning(*pair, 0.5)]))
-    for name, item in departing(after).items():
-        way, old = tuple(edges(item)), before[name]
-        if way != old:
-            place = old.index(pair[0])
-            assert way[: place + 1] == old[: place + 1]
-            assert way[place + 1 :] in tails
+    now = {name: tuple(edges(item)) for name, item in departing(after).items()}
+    turned = [name for name, way in now.items() if way != before[name]]
+    assert turned
+    for name in turned:
+        way, old = now[name], before[name]
+        place = old.index(pair[0])
+        assert way[: place + 1] == old[: place + 1]
+        assert way[place + 1 :] in tails
 
 
 def test_where_nobody_turned_they_leave_the_network() -> None:

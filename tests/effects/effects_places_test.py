@@ -243,6 +243,31 @@ def test_traffic_on_an_edge_is_slower(
     assert speeds(both, "twice") == pytest.approx((3, 9))
 
 
+def test_a_speed_sign_of_the_scenario_is_not_overruled_in_silence(crossing: Crossing) -> None:
+    toml = lambda text: 'additional = ["signs.add.xml"]\n' + text  # noqa: E731
+    directory = crossing(toml=toml)
+    (directory / "signs.add.xml").write_text(
+        '<additional><variableSpeedSign id="s" lanes="W_C_0 N_C_0"><step time="50" speed="8"/>'
+        "</variableSpeedSign></additional>"
+    )
+    scenario = load_scenario(directory)
+    with pytest.raises(ScenarioError, match=r"local_speed=W_C,0.5: .* signs.add.xml .* 'W_C_0'"):
+        apply_effects(scenario, [LocalSpeed("W_C", 0.5)])
+    assert apply_effects(scenario, [LocalSpeed("S_C", 0.5)]).applied
+
+
+@pytest.mark.parametrize("queues", ["", "+queue_model=100"])
+def test_empty_lanes_show_the_limit_of_the_sign(
+    queues: str, simulator: LibsumoSimulator, crossing: Crossing, tmp_path: Path
+) -> None:
+    empty = load_scenario(crossing(vehicles=""))
+    scenario = scenario_in_domain(empty, f"local_speed=S_C,0.6{queues}")
+    simulator.start(launch_of(scenario, 1, tmp_path, ("S_C_0", "W_C_0")))
+    shown = simulator.advance(2, {})
+    assert shown.vehicles[0] == 0
+    assert shown.mean_speed_mps[0] == pytest.approx(6)
+
+
 def test_edges_that_differ_in_a_special_character_have_signs_of_their_own(
     crossing: Crossing,
 ) -> None:
@@ -430,6 +455,13 @@ def test_unknown_places(text: str, message: str) -> None:
         apply_effects(load_scenario("single-v1"), parse_domain(text))
 
 
+def test_a_closure_of_an_unknown_lane_is_refused_even_if_it_is_over(crossing: Crossing) -> None:
+    later = load_scenario(crossing(toml=lambda text: "begin_s = 100\n" + text))
+    assert LaneClosure("W_C_0", 0, 10).apply(later).routes == later.routes
+    with pytest.raises(UnknownNameError, match="unknown lane 'x'"):
+        LaneClosure("x", 0, 10).apply(later)
+
+
 @pytest.mark.parametrize(
     "domain",
     [
@@ -493,8 +525,13 @@ def test_only_the_vehicles_of_the_effect_park_at_other_times() -> None:
     assert vehicle.get("depart") == "100"
 
 
-@pytest.mark.parametrize("effect", ["lane_closure=west1_A1_0,100,200", "parking=east1_A1_0,30,20"])
+@pytest.mark.parametrize(
+    "effect", ["lane_closure=west1_A1_0,100,200", "parking=east1_A1_0,30,20", "incident=100,60"]
+)
 def test_nobody_stands_on_lanes_that_are_queues(effect: str) -> None:
     for domain in (f"meso+{effect}", f"{effect}+meso"):
-        with pytest.raises(ScenarioError, match=r"=.*mesoscopic model .* leave out one of the two"):
+        name = effect.partition("=")[0]
+        with pytest.raises(
+            ScenarioError, match=rf"=.*mesoscopic.*{name}.* leave out one of the two"
+        ):
             scenario_in_domain(load_scenario("single-v1"), domain)

@@ -173,6 +173,10 @@ WORLDS: dict[str, dict[str, str]] = {
     "without a type": {},
     "default type by name": {"type": "DEFAULT_VEHTYPE"},
     "default type redefined": {"types": '<vType id="DEFAULT_VEHTYPE" accel="2" length="4"/>'},
+    "default type is a distribution": {
+        "types": '<vTypeDistribution id="DEFAULT_VEHTYPE"><vType id="a" probability="1"/>'
+        "</vTypeDistribution>"
+    },
     "default type redefined elsewhere": {
         "additional": '<vType id="DEFAULT_VEHTYPE" accel="2" length="4"/>'
     },

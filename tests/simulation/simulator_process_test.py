@@ -269,6 +269,14 @@ def test_last_words_are_part_of_the_error(
     simulator.close()
 
 
+def test_an_order_may_be_longer_than_a_command_line() -> None:
+    """Linux takes 128 KiB as one argument; the service of all lanes of a city is more."""
+    host = Host("ugat_marl.simulation.process:Simulations", "spawn")
+    worker = host.start({"directory": None, "more": "x" * 200_000})
+    assert worker.running
+    worker.end()
+
+
 @pytest.mark.parametrize("simulator", ["process", "spawn"])
 def test_sumo_s_words_come_through(simulator: str, crossing: Crossing, temporary: Path) -> None:
     lost = (

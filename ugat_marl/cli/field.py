@@ -86,7 +86,9 @@ class Field:
     def run(self, console: Console) -> int:
         """Drive the lights and print a summary."""
         self._check()
-        length_s = self.seconds if self.seconds is None or math.isfinite(self.seconds) else None
+        # what is simulated has to fit the demand; a street has its own
+        simulated = self.start and self.seconds is not None and math.isfinite(self.seconds)
+        length_s = self.seconds if simulated else None
         scenario = scenario_in_domain(
             load_scenario(self.scenario, length_s), self.domain, duration_s=length_s
         )

@@ -456,9 +456,7 @@ def _scaled(
         if element.tag == "flow":
             return _scaled_window(element, window, factor, over, mark, salt)
         depart = depart_s(element)
-        if math.isnan(depart) and not math.isinf(end):
-            return [element]  # only SUMO knows whether it departs in the window
-        if not (math.isnan(depart) or least <= depart < end):
+        if not least <= depart < end:  # not a number for one that waits for a person or container
             return [element]  # one from before the episode takes no part in it
         name = element.get("id", "")
         count = math.floor(factor) + (hashed_uniform(salt, name) < factor - math.floor(factor))
@@ -466,11 +464,10 @@ def _scaled(
         for number in range(1, count):
             twin = copy.deepcopy(element)
             twin.set("id", f"{name}{mark}{number}")
-            if not math.isnan(depart):
-                shift = TWIN_S * (2 * hashed_uniform(salt, "when", name, str(number)) - 1)
-                times = (depart + shift, depart - shift, depart)
-                time = next(time for time in times if least <= time < end)
-                twin.set("depart", seconds_text(round(time, 2)))
+            shift = TWIN_S * (2 * hashed_uniform(salt, "when", name, str(number)) - 1)
+            times = (depart + shift, depart - shift, depart)
+            time = next(time for time in times if least <= time < end)
+            twin.set("depart", seconds_text(round(time, 2)))
             copies.append(twin)
         return copies
 

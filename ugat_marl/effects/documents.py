@@ -204,7 +204,7 @@ def with_default_types(scenario: Scenario) -> Scenario:
         if not mentions(document, "DEFAULT_"):
             continue
         for tag in document.scan():
-            if tag.name == "vType":
+            if tag.name in ("vType", "vTypeDistribution"):
                 declared.add(tag.attributes.get("id", ""))
             named.add(tag.attributes.get("type", ""))
             named.update(tag.attributes.get("vTypes", "").split())

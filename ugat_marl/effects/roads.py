@@ -22,7 +22,7 @@ from ugat_marl.effects.base import (
     hashed_uniform,
     salt_of,
 )
-from ugat_marl.effects.documents import edit, seconds_text
+from ugat_marl.effects.documents import edit, mentions, seconds_text
 from ugat_marl.effects.places import network_places
 from ugat_marl.errors import OptionError, ScenarioError
 from ugat_marl.files import xml_bytes
@@ -65,10 +65,8 @@ class LaneClosure(Effect):
         """
         _refuse_queues(scenario, self)
         begin = max(self.begin_s, scenario.settings.begin_s)
-        if begin >= self.end_s:
-            return replace(scenario, applied=(*scenario.applied, str(self)))
         stand = {"until": seconds_text(self.end_s)}
-        return _with_blockers(scenario, self, self.lane, [begin], stand)
+        return _with_blockers(scenario, self, self.lane, [begin][: begin < self.end_s], stand)
 
 
 @dataclass(frozen=True)
@@ -92,8 +90,10 @@ class Incident(Effect):
         Times count from the beginning of the scenario, not from midnight.
 
         Raises:
-            ScenarioError: No lane that leads to a signal is long enough.
+            ScenarioError: No lane that leads to a signal is long enough, or the scenario has the
+                queue model, whose lanes cannot be blocked.
         """
+        _refuse_queues(scenario, self)
         places = network_places(scenario)
         lanes = [
             lane
@@ -168,6 +168,7 @@ class LocalSpeed(Effect):
 
         Raises:
             UnknownNameError: No such edge.
+            ScenarioError: The scenario has a speed sign of its own there.
         """
         places = network_places(scenario)
         places.check(self.name, "edge", self.edge, places.edges)
@@ -175,6 +176,7 @@ class LocalSpeed(Effect):
         name = re.sub(r"[^\w.#-]", lambda sign: f"%{ord(sign[0]):x}", self.edge)
         file = f"local-speed.{name}.add.xml"
         before = [added for added in scenario.additional if added.name == file]
+        self._refuse_signs(scenario, file, places.edges[self.edge])
         if before:
             root = before[0].parse()
             for step in root.iter("step"):
@@ -193,6 +195,19 @@ class LocalSpeed(Effect):
         return replace(
             scenario, additional=(*others, document), applied=(*scenario.applied, str(self))
         )
+
+    def _refuse_signs(self, scenario: Scenario, own: str, lanes: Sequence[str]) -> None:
+        """Refuse lanes whose limit a sign of another file sets: the later one of two would hold."""
+        for document in scenario.additional:
+            if document.name == own or not mentions(document, "variableSpeedSign"):
+                continue
+            for tag in document.scan():
+                on = tag.attributes.get("lanes", "").split()
+                if tag.name == "variableSpeedSign" and (both := {*on} & {*lanes}):
+                    raise ScenarioError(
+                        f"{self}: a variableSpeedSign in {document.name} sets the limit of lane "
+                        f"{min(both)!r}; change the speeds of its steps there"
+                    )
 
 
 def shift_parking(scenario: Scenario, seed: int) -> Scenario:
@@ -226,7 +241,8 @@ def no_blockers(effect: str) -> str:
     """Say that an effect, such as ``lane_closure=...``, and the queue model exclude each other."""
     return (
         f"{effect}: in SUMO's mesoscopic model (queue_model, the domain 'meso') a vehicle that "
-        "stands blocks another lane or none; leave out one of the two"
+        "stands (incident, lane_closure, parking) blocks another lane or none; leave out one of "
+        "the two"
     )
 
 

@@ -210,9 +210,12 @@ class Worker:
     def spawn(
         cls, service: str, order: Order, defaults: Mapping[str, str], deadline_s: float
     ) -> Worker:
-        """Start a new interpreter; messages use its standard input and output."""
+        """Start a new interpreter; messages use its standard input and output.
+
+        The order is the first message. A command line may be too short for it.
+        """
         output = tempfile.TemporaryFile()  # noqa: SIM115 - stays open as long as the worker
-        command = _command("spawned", service, str(os.getpid()), json.dumps(order))
+        command = _command("spawned", service, str(os.getpid()))
         variables = _environment(defaults)
         process: subprocess.Popen[bytes]
         if os.name == "nt":  # pipes, and no deadline
@@ -226,7 +229,7 @@ class Worker:
             assert process.stdin is not None
             assert process.stdout is not None
             channel = Channel(process.stdout, process.stdin, process.stdin.close)
-            return cls(channel, output, process.pid, deadline_s, process)
+            return cls(channel, output, process.pid, deadline_s, process)._ordered(order)
         mine, its = socket.socketpair()
         with its:
             process = subprocess.Popen(
@@ -237,7 +240,13 @@ class Worker:
                 env=variables,
                 start_new_session=True,  # so Ctrl-C reaches only the user's process
             )
-        return cls(_channel_of(mine, deadline_s), output, process.pid, deadline_s, process)
+        channel = _channel_of(mine, deadline_s)
+        return cls(channel, output, process.pid, deadline_s, process)._ordered(order)
+
+    def _ordered(self, order: Order) -> Worker:
+        with contextlib.suppress(ChannelClosed):  # the first question finds that it has died
+            self.ask("open", order=dict(order))
+        return self
 
     @property
     def running(self) -> bool:

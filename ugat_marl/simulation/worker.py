@@ -20,7 +20,7 @@ import sys
 import threading
 import time
 import traceback
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, NoReturn
 
@@ -215,12 +215,13 @@ def _end_workers(workers: dict[int, str | None], user: int) -> None:
             shutil.rmtree(folder, ignore_errors=True)
 
 
-def _guard(user: int, folder: str | None) -> int | None:
+def _guard(user: int, folder: str | None, streams: Iterable[int]) -> int | None:
     """Start a process that does for this worker what `_end_workers` does for forked ones.
 
     Args:
         user: Number of the user's process.
         folder: Folder of the worker, which is removed if the worker is killed.
+        streams: Descriptors that lead to the user's process.
 
     Returns:
         Number of the process; None where processes cannot fork.
@@ -231,7 +232,7 @@ def _guard(user: int, folder: str | None) -> int | None:
     if guard := os.fork():
         return guard
     nothing = os.open(os.devnull, os.O_RDWR)
-    for stream in (0, 1, 2):  # the user's process waits until all copies of them are closed
+    for stream in streams:  # the user's process waits until all copies of them are closed
         os.dup2(nothing, stream)
     while os.getppid() == worker and not _abandoned(0, user):
         time.sleep(LOOK_EVERY_S)
@@ -272,29 +273,35 @@ def _exactly(control: socket.socket, count: int) -> bytes:
     return data
 
 
-def _spawned(service: Service, user: int, order: dict[str, Any], guard: int | None) -> None:
-    """Work in a new interpreter.
+def _spawned(name: str, user: int) -> None:
+    """Work in a new interpreter on the order that is the first message.
 
     Messages move to copies of the standard streams, because SUMO may print to standard output.
     """
     reader, writer = os.fdopen(os.dup(0), "rb"), os.fdopen(os.dup(1), "wb")
+    channel = Channel(reader, writer, writer.close)
+    try:
+        order = channel.receive().header["order"]
+    except ChannelClosed:
+        return
+    streams = (0, 1, 2, reader.fileno(), writer.fileno())
+    guard = _guard(user, order.get("directory"), streams)  # before a library starts a thread
     os.dup2(2, 1)
+    service = _service(name)
     service.prepare(order)
-    _work(service, Channel(reader, writer, writer.close), order, [], user, user, guard)
+    _work(service, channel, order, [], user, user, guard)
 
 
-def _main(kind: str, name: str, user: str, argument: str) -> None:
-    module, _, member = name.partition(":")
+def _main(kind: str, name: str, user: str, *control: str) -> None:
     if kind == "parent":
-        _serve(_service(module, member), int(user), int(argument))
+        _serve(_service(name), int(user), *map(int, control))
         os._exit(0)  # unloading SUMO or torch takes long
     else:
-        order = json.loads(argument)
-        guard = _guard(int(user), order.get("directory"))  # before a library starts a thread
-        _spawned(_service(module, member), int(user), order, guard)
+        _spawned(name, int(user))
 
 
-def _service(module: str, member: str) -> Service:
+def _service(name: str) -> Service:
+    module, _, member = name.partition(":")
     return getattr(importlib.import_module(module), member)()
 
 
