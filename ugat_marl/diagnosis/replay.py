@@ -129,9 +129,10 @@ class Replay:
         followed: Sequence[Way] = (),
         watched: Sequence[str] = (),
     ) -> None:
-        self._given = scenario, network, detectors, owner, thresholds
-        self.answering = answering
         self._scenario = demand_as_vehicles(scenario)
+        # with routes: a copy of this simulator need not find them again
+        self._given = self._scenario, network, detectors, owner, thresholds
+        self.answering = answering
         self._network = network
         self._detectors = tuple(detectors)
         self._owner = dict(owner)

@@ -212,9 +212,7 @@ DOMAIN_ALIASES: dict[str, str] = {
 
 
 def expand_domains(names: Sequence[str]) -> list[str]:
-    """Return domains with ``"all"`` and names of gaps replaced by lists, each domain once.
-
-    Of several names of one domain the first one stays.
+    """Return domains with ``"all"`` and names of gaps replaced by lists, each name once.
 
     Args:
         names: Domains. ``"all"`` means ``sim`` and every named domain; the name of a gap means its
@@ -229,10 +227,7 @@ def expand_domains(names: Sequence[str]) -> list[str]:
             expanded += [named.name for named in streets if named.gap == name.lower()]
         else:
             expanded.append(name)
-    first: dict[str, str] = {}
-    for name in expanded:
-        first.setdefault(domain_label(name), name)
-    return list(first.values())
+    return list(dict.fromkeys(expanded))
 
 
 def parse_domain(domain: Domain) -> tuple[Effect, ...]:
