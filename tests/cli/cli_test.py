@@ -190,6 +190,25 @@ def test_scenarios_are_listed(capsys: pytest.CaptureFixture[str]) -> None:
         assert name in text
 
 
+@pytest.mark.parametrize(("content", "beside"), [("{}", ""), ('{"a": 1}', ""), (None, "run.json")])
+def test_evaluate_replaces_its_own_tables_only(
+    content: str | None, beside: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    out = tmp_path / "table.json"
+    call = ["evaluate", "single-v1", "--policies", "random", "--domains", "sim", "--seeds", "1"]
+    call += ["--duration-s", "30", "--out", str(out)]
+    if content is not None:
+        out.write_text(content)
+    else:
+        assert main(call) == 0
+        assert main(call) == 0
+        (tmp_path / beside).write_text("{}")
+    before = out.read_bytes()
+    assert main(call) == 2
+    assert "would be lost" in " ".join(capsys.readouterr().err.split())
+    assert out.read_bytes() == before
+
+
 def test_evaluate_prints_and_writes(
     tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -148,6 +149,27 @@ def test_a_length_is_compared_as_a_number(tmp_path: Path) -> None:
     assert Judging("single-v1", 5, 3600.0).require_in(file)
     with pytest.raises(OptionError, match="duration_s = 3600, not 1800; give --duration-s 3600"):
         Judging("single-v1", 5, 1800.0).require_in(file)
+
+
+def test_a_table_of_another_network_of_the_same_name_is_refused(tmp_path: Path) -> None:
+    own = Judging("town", 5, 3600.0, scenario_hash="one")
+    table = own.written_to(read_standings(written(tmp_path)))
+    file = written(tmp_path, table.write_csv())
+    assert own.require_in(file)
+    with pytest.raises(OptionError, match="judged with other files of town"):
+        replace(own, scenario_hash="other").require_in(file)
+
+
+@pytest.mark.parametrize("other", ["./own.pt", "folder/../own.pt"])
+def test_a_file_by_two_paths_is_one_training(
+    other: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    Path("own.pt").write_bytes(b"")
+    Path("folder").mkdir()
+    words = ["compare", "single-v1", "--name", "mine", "--policies", "own.pt", other]
+    assert main(words) == 2
+    assert "it would count as two trainings" in " ".join(capsys.readouterr().err.split())
 
 
 def test_every_committed_table_can_be_read() -> None:

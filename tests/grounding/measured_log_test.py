@@ -324,5 +324,10 @@ def test_the_command_writes_a_log_that_can_be_read(
     log = TransitionLog.read(out)
     assert log.provenance.domain == "main-street"
     assert log.provenance.observation == "movements"
+    table = tmp_path / "main-street" / "signals.parquet"
+    content = table.read_bytes()
+    assert main([*call, "--out", str(table)]) == 2
+    assert "is no transition log" in capsys.readouterr().err
+    assert table.read_bytes() == content
     assert main([*call, "--out", str(out), "--observation", "waiting"]) == 2
     assert "which detectors do not see" in capsys.readouterr().err

@@ -129,6 +129,17 @@ def test_two_trainings_of_one_name_are_packed_neither(training: Path, tmp_path: 
     assert not (tmp_path / "packed").exists()
 
 
+def test_a_packed_policy_is_not_lost_to_another_training(training: Path, tmp_path: Path) -> None:
+    out = tmp_path / "packed"
+    (card,) = pack(training, out)
+    pack(training, out)  # the same once more
+    packed = (out / f"{card.id}.pt").read_bytes()
+    tiny(2).save(training / POLICY)
+    with pytest.raises(OptionError, match=r"s3\.pt: is the policy of another training"):
+        pack(training, out)
+    assert (out / f"{card.id}.pt").read_bytes() == packed
+
+
 def test_a_training_of_another_version_is_not_packed(training: Path, tmp_path: Path) -> None:
     older = training.with_name(f"{training.name[:-10]}0123456789")
     training.rename(older)

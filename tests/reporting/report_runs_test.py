@@ -655,6 +655,16 @@ def test_a_run_named_by_dots_is_repeated_beside_its_folder(
     assert f"--out {run}-again" in again(record)[0]
 
 
+def test_policies_are_judged_again_with_as_many_seeds(run: Path) -> None:
+    (record,) = read_records([run])
+    assert isinstance(record, RunRecord)
+    (run / "policies").mkdir(exist_ok=True)
+    (run / "policies" / "direct-transfer.pt").write_bytes(b"")
+    judged = replace(record, settings={**record.settings, "evaluation_seeds": 2})
+    (line,) = (line for line in again(judged) if line.startswith("ugat-marl evaluate"))
+    assert "--seeds 2 --policies" in line
+
+
 def test_a_learner_that_lies_elsewhere_is_named_all_the_same() -> None:
     settings = {**TransferConfig("x", learner="ippo").as_dict(), "learner": "nowhere:Thing"}
     settings = json.loads(json.dumps(settings, default=str))

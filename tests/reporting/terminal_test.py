@@ -84,6 +84,15 @@ def test_an_approach_that_nobody_passes_is_the_worst_and_hides_no_other() -> Non
     assert "none passed" in " ".join(found[0])
 
 
+def test_vehicles_that_pass_are_those_of_all_controllers() -> None:
+    network = Network.read(load_scenario("grid2x2-v1"))
+    delays = {"a": {"A1_A2": (19.0, 20.0)}, "b": {"A1_A2": (24.4, 20.0)}, "c": {}}
+    (row,) = (
+        line for line in lines_of(approach_table("Delay", delays, network)) if "A1_A2" in line
+    )
+    assert "19-24" in row.split()
+
+
 def test_an_approach_to_which_nobody_comes_is_not_the_worst() -> None:
     network = Network.read(load_scenario("grid2x2-v1"))
     quiet = {"A1_B1": (0.0, math.nan), "A1_A2": (100.0, 20.0)}

@@ -107,7 +107,8 @@ class Compare:
             raise OptionError(f"--name {self.name!r}: give the new row a name")
         if bool(self.policies) == (self.learner is not None):
             raise OptionError("compare needs --policies or --learner, one of the two")
-        if twice := [each for each in self.policies if self.policies.count(each) > 1]:
+        files = [Path(each).resolve() if Path(each).is_file() else each for each in self.policies]
+        if twice := [each for each in files if files.count(each) > 1]:
             raise OptionError(f"--policies has {twice[0]} twice: it would count as two trainings")
         if self.policies:
             refuse_options(

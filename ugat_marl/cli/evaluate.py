@@ -13,8 +13,8 @@ from tyro.conf import Positional, arg
 from ugat_marl.cli.arguments import RayAddress, require_names, require_numbers, workers_of
 from ugat_marl.effects import NAMED_DOMAINS, expand_domains, load_scenario
 from ugat_marl.envs import parallel_env
-from ugat_marl.errors import OptionError, ScenarioError
-from ugat_marl.experiments import domains_by_gap, evaluation_of, policy_factory
+from ugat_marl.errors import OptionError, OutputError, ScenarioError, UgatMarlError
+from ugat_marl.experiments import Evaluation, domains_by_gap, evaluation_of, policy_factory
 from ugat_marl.files import require_writable
 from ugat_marl.progress import Bars
 from ugat_marl.reporting import (
@@ -69,7 +69,7 @@ class Evaluate:
         """Evaluate and print."""
         require_names(policies=self.policies, domains=self.domains)
         if self.out is not None:
-            require_writable(self.out, ".json")
+            _require_place(self.out)
         require_numbers(0, first_seed=self.first_seed)
         require_numbers(1, seeds=self.seeds, workers=self.workers)
         scenario = load_scenario(self.scenario, self.duration_s)
@@ -111,6 +111,23 @@ class Evaluate:
                     continue
             names.append(name)
         return names
+
+
+def _require_place(out: Path) -> None:
+    """Refuse a path that cannot become a table, or whose file is no earlier one of this command."""
+    require_writable(out, ".json")
+    if not out.exists():
+        return
+    try:
+        Evaluation.read(out)
+    except UgatMarlError:
+        raise OutputError(
+            f"{out}: is no table of `ugat-marl evaluate`, and would be lost; give another name"
+        ) from None
+    if out.with_name("run.json").exists():
+        raise OutputError(
+            f"{out}: is the table of a training, and would be lost; give another name"
+        )
 
 
 def _may_not_fit(name: str) -> bool:

@@ -59,7 +59,7 @@ class Field:
         start: Run a SUMO with the scenario, without a port, for a demonstration.
         domain: Domain of the SUMO that --start runs.
         seed: Seed of the SUMO that --start runs.
-        seconds: Time to drive, s; inf for ever.
+        seconds: Time to drive, s, rounded up to whole decisions; inf for ever.
         detectors: Count on whole lanes, or on SUMO's lane-area detectors.
         sumo_answer_s: Time within which SUMO has to answer, s; else it counts as gone.
         look_for_s: Time to look for a SUMO that is gone, s; inf for ever.

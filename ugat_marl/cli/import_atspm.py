@@ -29,8 +29,8 @@ class ImportAtspm:
         scenario: Id of a shipped scenario, directory, .sumocfg or resco:<map>.
         events: The log, .csv or .parquet.
         mapping: TOML file that maps devices, phases and channels to the network.
-        out: Directory to write. What an earlier call wrote there is replaced; other measured data
-            are refused.
+        out: Directory to write. What import-atspm or record wrote there is replaced; other measured
+            data are refused.
         csv: Write CSV instead of Parquet.
     """
 

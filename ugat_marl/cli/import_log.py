@@ -9,9 +9,8 @@ from typing import Annotated
 from rich.console import Console
 from tyro.conf import Positional, arg
 
-from ugat_marl.data import read_measured
+from ugat_marl.data import read_measured, require_log_place
 from ugat_marl.effects import load_scenario
-from ugat_marl.files import require_writable
 from ugat_marl.grounding import DetectionConfig, MeasuredSource, log_of_measured
 from ugat_marl.scenarios import Network
 
@@ -48,7 +47,7 @@ class ImportLog:
 
     def run(self, console: Console) -> int:
         """Import the data, write the log, and print what it does not know."""
-        require_writable(self.out, ".parquet")
+        require_log_place(self.out)
         scenario = load_scenario(self.scenario)
         network = Network.read(scenario)
         measured = read_measured(self.measured, scenario, network)

@@ -27,8 +27,8 @@ class Record:
 
     Attributes:
         scenario: Id of a shipped scenario, directory, .sumocfg or resco:<map>.
-        out: Directory to write (docs/reference/measured-data.md). What an earlier call wrote there
-            is replaced; other measured data are refused.
+        out: Directory to write (docs/reference/measured-data.md). What record or import-atspm wrote
+            there is replaced; other measured data are refused.
         domain: Domain to measure: sim, V1 to V4, effects (headway=1.4+acceleration=1), or the
             directory of another scenario on the same network.
         policy: Controller of the signals: a rule (fixed-time:30, largest-queue:20,

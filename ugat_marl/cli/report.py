@@ -94,6 +94,8 @@ def again(record: RunRecord | TableRecord) -> list[str]:
         judge = ["ugat-marl", "evaluate", record.scenario, "--domains", *domains]
         if (length_s := record.settings.get("duration_s")) is not None:
             judge += ["--duration-s", str(length_s)]
+        if (seeds := record.settings.get("evaluation_seeds")) is not None:
+            judge += ["--seeds", str(seeds)]
         named = [_policy(path, record.settings.get("learner")) for path in policies]
         lines.append(shlex.join([*judge, "--policies", *named]))
     return [*lines, shlex.join(["tensorboard", "--logdir", folder])]

@@ -19,6 +19,7 @@ from ugat_marl.cli.arguments import (
     workers_of,
 )
 from ugat_marl.cli.evaluate import names_of
+from ugat_marl.data import require_log_place
 from ugat_marl.effects import domain_label, load_scenario
 from ugat_marl.envs import parallel_env
 from ugat_marl.errors import OptionError
@@ -131,7 +132,7 @@ class Rollout:
         if self.video is None:
             refuse_options(self, ("film",), "without --video nothing is filmed")
         if self.out is not None:
-            require_writable(self.out, ".parquet")
+            require_log_place(self.out)
         if self.video is not None:
             require_writable(self.video)
             require_video(self.video)

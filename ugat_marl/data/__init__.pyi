@@ -49,3 +49,4 @@ from .transitions import TransitionLog as TransitionLog
 from .transitions import TransitionRecorder as TransitionRecorder
 from .transitions import Transitions as Transitions
 from .transitions import consecutive as consecutive
+from .transitions import require_log_place as require_log_place

@@ -21,8 +21,8 @@ from numpy.typing import NDArray
 
 from ugat_marl.data.layouts import AgentLayout
 from ugat_marl.data.row_hashes import damage, is_hashed, read_quietly, write_hashed
-from ugat_marl.errors import LogError, first_line
-from ugat_marl.files import MALFORMED, parse_json, refuse_endless, replacing
+from ugat_marl.errors import LogError, OutputError, first_line
+from ugat_marl.files import MALFORMED, parse_json, refuse_endless, replacing, require_writable
 
 FORMAT = 2
 METADATA_KEY = "ugat_marl.data.transitions"
@@ -475,6 +475,22 @@ def _refuse_difference(first: Provenance, other: Provenance) -> None:
                 f"transition logs with different {name} ({one!r} and {two!r}) cannot be "
                 "concatenated; fit them apart"
             )
+
+
+def require_log_place(path: Path) -> None:
+    """Refuse a path that cannot become a transition log, or whose file holds something else.
+
+    Raises:
+        OutputError: No log can be written there, or the file there is another table.
+    """
+    require_writable(path, ".parquet")
+    if path.exists():
+        try:
+            is_log = METADATA_KEY in pl.read_parquet_metadata(path)
+        except (pl.exceptions.PolarsError, pl.exceptions.PanicException, OSError):
+            is_log = False
+        if not is_log:
+            raise OutputError(f"{path}: is no transition log, and would be lost; give another name")
 
 
 def read_parquet(path: Path) -> tuple[pl.DataFrame, dict[str, str]]:

@@ -42,8 +42,7 @@ def pack(
 
     Args:
         training: Folder of a run of ``train``, of the trainings of ``paper``, or of one training.
-        folder: Folder to write to: ``SCENARIO/NAME.pt`` and ``SCENARIO/NAME.json``. Policies of the
-            same name are replaced.
+        folder: Folder to write to: ``SCENARIO/NAME.pt`` and ``SCENARIO/NAME.json``.
         command: Command that trained them, for the cards.
         reporter: Is told of rows that are left out.
 
@@ -51,7 +50,8 @@ def pack(
         The cards, in the order of their folders.
 
     Raises:
-        OptionError: There is no finished training with a policy.
+        OptionError: There is no finished training with a policy, or the folder holds another
+            policy of the same name.
         CheckpointError: A file of a training is damaged.
     """
     found: dict[str, tuple[PolicyCard, bytes]] = {}
@@ -78,6 +78,13 @@ def pack(
             f"{training} holds no finished training with a policy; name the folder of a run of "
             "`ugat-marl train`, or of the trainings of `ugat-marl paper`"
         )
+    for name, (_, policy) in found.items():
+        there = folder / f"{name}.pt"
+        if there.is_file() and there.read_bytes() != policy:
+            raise OptionError(
+                f"{there}: is the policy of another training, which would be lost; give another "
+                "--out, or move it away"
+            )
     for name, (card, policy) in found.items():
         write_whole(folder / f"{name}.pt", policy)
         card.write(folder / f"{name}.json")

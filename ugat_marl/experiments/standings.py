@@ -72,19 +72,21 @@ class Judging:
         episodes: Number of episodes of each policy in each domain.
         duration_s: Length of an episode in s.
         length_s: The same, or None if it is the scenario's own; it is in no file.
+        scenario_hash: Hash of the scenario, as two networks of one's own may have one id.
     """
 
     scenario: str
     episodes: int
     duration_s: float
     length_s: float | None = None
+    scenario_hash: str = ""
 
     @classmethod
     def of(cls, scenario: Scenario, episodes: int, length_s: float | None) -> Judging:
         """Return the conditions in a scenario; None stands for its own length of episodes."""
         own_s = float(scenario.settings.duration_s)
         length_s = None if length_s == own_s else length_s
-        return cls(scenario.id, episodes, float(length_s or own_s), length_s)
+        return cls(scenario.id, episodes, float(length_s or own_s), length_s, scenario.hash)
 
     def written_to(self, table: pl.DataFrame) -> pl.DataFrame:
         """Return a table with columns that say this."""
@@ -92,6 +94,7 @@ class Judging:
             scenario=pl.lit(self.scenario),
             episodes=pl.lit(str(self.episodes)),
             duration_s=pl.lit(str(self.duration_s)),
+            scenario_hash=pl.lit(self.scenario_hash),
         )
 
     def written_beside(self, table: pl.DataFrame, name: str, file: Path) -> pl.DataFrame:
@@ -117,7 +120,8 @@ class Judging:
             True if the file tells episodes and their length in every row.
 
         Raises:
-            OptionError: Scenario, number or length of the episodes is another one.
+            OptionError: Scenario, number or length of the episodes is another one, or the files of
+                the scenario are.
         """
         own, beside = (_cells(file) for file in (path, path.with_name("table.csv")))
         scenarios = _values_in(own, "scenario") or _values_in(beside, "scenario")
@@ -131,6 +135,12 @@ class Judging:
                         f"{path}: judged with {name} = {given}, not {wanted:g}; "
                         f"give --{option} {given}"
                     )
+        hashes = _values_in(own, "scenario_hash")
+        if self.scenario_hash and any(given != self.scenario_hash for given in hashes):
+            raise OptionError(
+                f"{path}: judged with other files of {self.scenario}, such as another demand; "
+                "judge its rows again, or give another table"
+            )
         told = own.get_column("episodes", default=None)
         return told is not None and not told.is_in(["", None], nulls_equal=True).any()
 

@@ -12,6 +12,7 @@ import contextlib
 import csv
 import functools
 import math
+import textwrap
 from collections import Counter
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
@@ -192,8 +193,9 @@ class _Reader:
                 raise ValueError(f"it has more than {_LONGEST // 1_000_000} MB")
             return parse(path)
         except (UgatMarlError, OSError, csv.Error, *MALFORMED) as error:
-            reason = " ".join(str(error).replace(f"{path}: ", "").split())
-            self.missing.append(f"{name} cannot be used ({reason[:160]}): {without}")
+            reason = str(error).replace(f"{path}: ", "")
+            reason = textwrap.shorten(reason, 400, placeholder=" …")
+            self.missing.append(f"{name} cannot be used ({reason}): {without}")
             return None
 
 

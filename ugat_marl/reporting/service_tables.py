@@ -24,7 +24,8 @@ MOST_DOMAINS = 6
 """Most domains side by side, for the same reason."""
 LEGEND = (
     "Mean control delay in s: what all vehicles on an approach lose, those that still wait at the "
-    "end included, per vehicle that passed the light. Level of service of the Highway Capacity "
+    "end included, per vehicle that passed the light (veh: how many, fewest and most of the "
+    "policies). Level of service of the Highway Capacity "
     "Manual: A to 10 s, B to 20, C to 35, D to 55, E to 80, F above. Vehicles that wait outside "
     "the network do not count, nor do approaches that nobody passed."
 )
@@ -121,9 +122,11 @@ def approach_table(title: str, delays: Mapping[str, Delays], network: Network) -
             named = names.get(road)
             light, approach = (lights.text(named.light), named.name) if named else ("", "")
             passed = [own.get(road) for own in part.values()]
-            count = next((at[0] for at in passed if at is not None), 0.0)
+            counts = [round(at[0]) for at in passed if at is not None] or [0]
+            least, most = min(counts), max(counts)
+            count = f"{least}" if least == most else f"{least}-{most}"
             cells = ["-" if at is None else approach_text(*at) for at in passed]
-            table.add_row(Text(light), Text(approach), Text(road), f"{count:.0f}", *cells)
+            table.add_row(Text(light), Text(approach), Text(road), count, *cells)
         tables.append(table)
     return Group(*tables, Text(LEGEND, style="dim"))
 
