@@ -49,13 +49,8 @@ def overlap(window: list[float], truth: tuple[float, float]) -> float:
     return both / (max(window[1], truth[1]) - min(window[0], truth[0]))
 
 
-QUICK = {"detectors"}
-
-
-@pytest.mark.parametrize(
-    "family",
-    [pytest.param(each, marks=() if each in QUICK else pytest.mark.slow) for each in CASES],
-)
+@pytest.mark.slow  # a quicker one is in tests/cli/diagnose_command_test.py
+@pytest.mark.parametrize("family", CASES)
 def test_a_hidden_effect_is_named(street, tmp_path: Path, family: str) -> None:
     case = CASES[family]
     found = street.diagnose(street.measure(case.domain), tmp_path)

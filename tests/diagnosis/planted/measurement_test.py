@@ -57,6 +57,7 @@ def test_drivers_are_no_error_of_measurement(street, domain: str) -> None:
     assert read_off(street, domain) == []
 
 
+@pytest.mark.slow
 def test_drivers_that_are_found_are_no_error_of_measurement(street) -> None:
     for domain in DRIVERS:
         study = study_of(street, domain)

@@ -51,7 +51,8 @@ def test_a_slow_road_is_found_with_its_place(street, tmp_path: Path, length_s: f
     assert factor["low"] <= 0.8 <= factor["high"]
 
 
-@pytest.mark.parametrize("length_s", [pytest.param(60.0, marks=pytest.mark.slow), 300.0])
+@pytest.mark.slow  # workflow_test.py has it with counts alone
+@pytest.mark.parametrize("length_s", [60.0, 300.0])
 def test_sums_of_the_scenario_itself_do_not_contradict_it(
     street, tmp_path: Path, length_s: float
 ) -> None:
