@@ -413,7 +413,7 @@ class Posterior:
         effects, service_s = self.sample(DRAWS)
         lines: list[str] = []
         if self.worlds.library:
-            low, high = np.quantile(effects, (0.05, 0.95), axis=0)
+            low, high = np.quantile(effects, (0.05, 0.95), axis=0).round(4)  # as in a world
             ranges = zip(self.worlds.library, low, high, strict=True)
             named = [
                 f"{x.name} {a:.2g} to {b:.2g} ({chance:.0%})"
