@@ -203,10 +203,13 @@ def test_evaluate_replaces_its_own_tables_only(
         assert main(call) == 0
         assert main(call) == 0
         (tmp_path / beside).write_text("{}")
+    link = tmp_path / "link.json"
+    link.symlink_to(out)
     before = out.read_bytes()
-    assert main(call) == 2
-    assert "would be lost" in " ".join(capsys.readouterr().err.split())
-    assert out.read_bytes() == before
+    for place in (out, link):
+        assert main([*call[:-1], str(place)]) == 2
+        assert "would be lost" in " ".join(capsys.readouterr().err.split())
+        assert out.read_bytes() == before
 
 
 def test_evaluate_prints_and_writes(

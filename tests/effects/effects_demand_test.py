@@ -205,6 +205,14 @@ def test_who_draws_a_route_of_several_edges_has_no_first_one() -> None:
         assert departing(elsewhere).keys() == {"v"}
 
 
+@pytest.mark.parametrize(("factor", "names"), [(0.0, set()), (2.0, {"v", "v+1"})])
+def test_who_departs_at_the_beginning_is_scaled(factor: float, names: set[str]) -> None:
+    scenario = with_routes(
+        f'<vehicle id="v" depart="begin"><route edges="{EDGE} A1_southA"/></vehicle>'
+    )
+    assert departing(apply_effects(scenario, [DemandLevel("*", factor)])).keys() == names
+
+
 @pytest.mark.parametrize("factor", [0.0, 2.0])
 def test_who_waits_for_a_person_is_left_alone(factor: float) -> None:
     """A twin would wait for ever, and a person for a vehicle that is taken away."""

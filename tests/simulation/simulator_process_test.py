@@ -24,7 +24,13 @@ import pytest
 from tests.interrupts import eventually
 from ugat_marl import parallel_env
 from ugat_marl.effects import load_scenario
-from ugat_marl.errors import EpisodeError, OptionError, SimulatorCrashed, SimulatorError
+from ugat_marl.errors import (
+    EpisodeError,
+    OptionError,
+    SimulatorCrashed,
+    SimulatorError,
+    WorkerError,
+)
 from ugat_marl.simulation import (
     Channel,
     ChannelClosed,
@@ -273,8 +279,9 @@ def test_an_order_may_be_longer_than_a_command_line() -> None:
     """Linux takes 128 KiB as one argument; the service of all lanes of a city is more."""
     host = Host("ugat_marl.simulation.process:Simulations", "spawn")
     worker = host.start({"directory": None, "more": "x" * 200_000})
-    assert worker.running
-    worker.end()
+    worker.ask("signals")
+    with pytest.raises(WorkerError):  # of the service, which has read the order
+        worker.answer()
 
 
 @pytest.mark.parametrize("simulator", ["process", "spawn"])

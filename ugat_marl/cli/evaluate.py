@@ -124,7 +124,8 @@ def _require_place(out: Path) -> None:
         raise OutputError(
             f"{out}: is no table of `ugat-marl evaluate`, and would be lost; give another name"
         ) from None
-    if out.with_name("run.json").exists():
+    place = out.resolve()  # a link is followed
+    if place.name == "table.json" and place.with_name("run.json").exists():
         raise OutputError(
             f"{out}: is the table of a training, and would be lost; give another name"
         )

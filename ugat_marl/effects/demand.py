@@ -455,7 +455,7 @@ def _scaled(
     def scaled(element: ET.Element) -> list[ET.Element]:
         if element.tag == "flow":
             return _scaled_window(element, window, factor, over, mark, salt)
-        depart = depart_s(element)
+        depart = settings.begin_s if element.get("depart") == "begin" else depart_s(element)
         if not least <= depart < end:  # not a number for one that waits for a person or container
             return [element]  # one from before the episode takes no part in it
         name = element.get("id", "")

@@ -226,7 +226,7 @@ def is_demand(element: Root) -> bool:
 
 
 def depart_s(element: Root) -> float:
-    """Return the departure of a vehicle or trip, or the start of a flow, in s; NaN if triggered."""
+    """Return the departure of a vehicle or trip, or the start of a flow, in s; NaN for a word."""
     text = (
         element.get("begin", "0")
         if element.tag.lower().endswith("flow")

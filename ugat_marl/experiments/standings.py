@@ -3,7 +3,8 @@
 A table of standings has one row per setting, real domain and training, as ``seeds.csv`` of `paper`
 has: ``setting``, ``domain``, ``training_seed``, ``att_s`` (mean travel time in the domain, s),
 ``att_s_sim`` (in the simulation, s) and ``throughput`` (vehicles that arrived in the domain). Its
-file tells in each row how it was judged: ``scenario``, ``episodes`` and ``duration_s``.
+file tells in each row how it was judged: ``scenario``, ``episodes``, ``duration_s`` and
+``scenario_hash``.
 """
 
 from __future__ import annotations

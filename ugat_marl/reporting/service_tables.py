@@ -122,7 +122,7 @@ def approach_table(title: str, delays: Mapping[str, Delays], network: Network) -
             named = names.get(road)
             light, approach = (lights.text(named.light), named.name) if named else ("", "")
             passed = [own.get(road) for own in part.values()]
-            counts = [round(at[0]) for at in passed if at is not None] or [0]
+            counts = [round(own[road][0]) for own in delays.values() if road in own]
             least, most = min(counts), max(counts)
             count = f"{least}" if least == most else f"{least}-{most}"
             cells = ["-" if at is None else approach_text(*at) for at in passed]

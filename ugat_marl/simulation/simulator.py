@@ -48,8 +48,7 @@ class LibsumoSimulator:
         self._reserve = bytearray()
         self._shown: dict[str, str] = {}
         self._time_s = 0.0
-        self._limits = self._empty_mps = np.empty(0)
-        self._has_signs = False
+        self._limits = np.empty(0)
         self._has_behind = False
         self._mesoscopic: MesoscopicLanes | None = None
         self._upstream: UpstreamQueues | None = None
@@ -86,8 +85,7 @@ class LibsumoSimulator:
             self._fail("SUMO did not start", error)
         self._shown, self._on = {}, []
         self._time_s = launch.begin_s
-        self._limits = self._empty_mps = _limits_mps(launch.lanes)
-        self._has_signs = libsumo.variablespeedsign.getIDCount() > 0
+        self._limits = np.array([libsumo.lane.getMaxSpeed(lane) for lane in launch.lanes])
         lanes, roads = launch.behind
         self._beside = _beside(launch.lanes) if launch.crossings else []
         self._has_behind = any(lanes) or any(roads)
@@ -193,10 +191,8 @@ class LibsumoSimulator:
         departed = int(statistic("", "stats.vehicles.inserted"))
         backlog = int(statistic("", "stats.vehicles.waiting"))
         upstream = np.empty(0) if self._upstream is None else self._upstream.measure(backlog)
-        if self._has_signs:
-            self._empty_mps = _limits_mps(self._launch.lanes)
         if self._mesoscopic is not None:
-            rows = self._mesoscopic.measure(self._time_s, self._empty_mps)
+            rows = self._mesoscopic.measure(self._time_s, self._limits)
             waiting = rows[3] if self._launch.waiting else np.empty(0)
             return Snapshot(
                 self._time_s, rows[0], rows[1], rows[2], waiting, departed, backlog,
@@ -215,7 +211,7 @@ class LibsumoSimulator:
 
         none = np.zeros(len(lanes))
         halting = measure(api.getLastStepHaltingNumber, none)
-        speed_mps = measure(api.getLastStepMeanSpeed, self._empty_mps)
+        speed_mps = measure(api.getLastStepMeanSpeed, self._limits)
         waiting_s = measure(api.getWaitingTime, none) if self._launch.waiting else np.empty(0)
         if self._has_behind:
             _add_those_behind(self._launch.behind, (vehicles, halting, speed_mps, waiting_s))
@@ -242,11 +238,6 @@ class LibsumoSimulator:
         if isinstance(error, MemoryError) or "bad_alloc" in f"{said}{error}":
             said = too_much_memory()
         raise SimulatorError(f"{action}: {said}") from None
-
-
-def _limits_mps(lanes: Sequence[str]) -> _Floats:
-    """Return the speed limits of lanes now; signs change them."""
-    return np.array([libsumo.lane.getMaxSpeed(lane) for lane in lanes])
 
 
 def _near_the_end(
