@@ -158,6 +158,17 @@ def test_a_learner_with_two_methods_is_trained_and_judged_in_every_row(
 
 @pytest.mark.slow
 @pytest.mark.usefixtures("algorithm")
+def test_the_command_says_how_files_of_a_learner_are_named(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    search_few_rules(monkeypatch, "programme")
+    assert trained(tmp_path / "run", "my_algo:Kept", "--learner-settings", "first=2") == 0
+    out = " ".join(capsys.readouterr().out.split())
+    assert out.endswith("Other commands take a file there as my_algo:Kept@FILE.")
+
+
+@pytest.mark.slow
+@pytest.mark.usefixtures("algorithm")
 def test_a_learner_that_can_be_saved_resumes_to_the_numbers_of_an_unbroken_run(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

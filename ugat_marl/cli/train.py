@@ -17,6 +17,7 @@ from ugat_marl.cli.frame import without_deadline, without_loudness
 from ugat_marl.data import METRICS_FILE, Metrics
 from ugat_marl.errors import OptionError
 from ugat_marl.experiments import TransferConfig, outcome_of, run_folder, transfer
+from ugat_marl.policies import is_own
 from ugat_marl.progress import Bars
 from ugat_marl.reporting import calibration_picture, transfer_picture, transfer_table
 
@@ -99,6 +100,10 @@ class Train:
             del places["policies"]
         for name, place in places.items():
             console.print(f"{name}: {place}", soft_wrap=True)
+        if "policies" in places and is_own(config.learner):
+            console.print(
+                f"Other commands take a file there as {config.learner}@FILE.", soft_wrap=True
+            )
         return 0
 
     def _call(self, directory: Path) -> str:
