@@ -365,7 +365,10 @@ def test_a_stopped_command_leaves_its_log_and_nothing_else(
         (["--policy", "random", "--port", "1", "--seed", "7"], "leave out --seed"),
         (["--policy", "random", "--start", "--seconds", "0"], "above 0"),
         (["--policy", "random", "--start", "--seconds", "5"], "shorter than one decision"),
-        (["--policy", "random", "--port", "1", "--seconds", "5"], "localhost:1"),
+        (
+            ["--policy", "random", "--port", "1", "--seconds", "5", "--log", __file__],
+            "something else than decisions",  # after the scenario, before the street
+        ),
         (["--policy", "programme", "--start"], "programme"),
         (["--policy", "longest-waiting", "--start"], "waiting times"),
         (["--policy", "random", "--start", "--limits.answer-ms", "5"], "reserve_ms"),

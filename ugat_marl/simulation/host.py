@@ -244,8 +244,13 @@ class Worker:
         return cls(channel, output, process.pid, deadline_s, process)._ordered(order)
 
     def _ordered(self, order: Order) -> Worker:
-        with contextlib.suppress(ChannelClosed):  # the first question finds that it has died
-            self.ask("open", order=dict(order))
+        try:
+            self._channel.send(Message({"order": dict(order)}, []))
+        except OSError:  # the first question finds that it has died
+            pass
+        except BaseException:  # Ctrl-C in the middle of the order
+            self.end(patience_s=0.0)
+            raise
         return self
 
     @property
