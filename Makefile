@@ -32,8 +32,6 @@ JOBS ?= $(shell "$(PYTHON)" -c 'import os; print((os.cpu_count() or 1) + 1)')
 # Nothing outside .venv is imported: not the source tree, not the user's own packages.
 unexport PYTHONPATH PYTHONHOME SUMO_HOME VIRTUAL_ENV
 export PYTHONSAFEPATH := 1
-# Where it is set, each process that tests compiles every test anew.
-unexport PYTHONDONTWRITEBYTECODE
 export PYTHONNOUSERSITE := 1
 
 .PHONY: help demo test test-slow test-all check static format lint types architecture words docs package notebooks bench scenarios oldest compat python environment environment-dev environment-notebooks

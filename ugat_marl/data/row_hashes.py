@@ -413,22 +413,30 @@ def _groups(frame: pl.DataFrame, rows: int) -> Iterator[str]:
 
 def _pieces(column: pl.Series, rows: int) -> list[list[bytes]]:
     """Return `_bytes` of each group of rows."""
-    starts = range(0, len(column), rows)
-    if not isinstance(column.dtype, pl.String):
-        return [[*_bytes(column.slice(start, rows))] for start in starts]
+    if isinstance(column.dtype, pl.String):
+        return _texts(column, rows)
+    return [[*_bytes(column.slice(start, rows))] for start in range(0, len(column), rows)]
+
+
+def _texts(column: pl.Series, rows: int) -> list[list[bytes]]:
+    """Return `_bytes` of each group of rows of a column of texts; of one without rows, one."""
     none, texts = column.is_null().to_numpy(), column.fill_null("")
     lengths, listed = texts.str.len_bytes().to_numpy(), texts.to_list()
     return [
         [none[k : k + rows].tobytes(), lengths[k : k + rows].tobytes(),
          "".join(listed[k : k + rows]).encode()]
-        for k in starts
+        for k in range(0, max(len(column), 1), rows)
     ]  # fmt: skip
 
 
 def _bytes(column: pl.Series) -> Iterator[bytes]:
     """Yield the values of a column in a form that depends on nothing else."""
-    yield column.is_null().to_numpy().tobytes()
     kind = column.dtype
+    if isinstance(kind, pl.String | pl.Categorical | pl.Enum):
+        (pieces,) = _texts(column.cast(pl.String), max(len(column), 1))
+        yield from pieces
+        return
+    yield column.is_null().to_numpy().tobytes()
     if isinstance(kind, pl.Array):
         column, kind = column.arr.to_list(), pl.List(kind.inner)
     if isinstance(kind, pl.List):
@@ -438,10 +446,6 @@ def _bytes(column: pl.Series) -> Iterator[bytes]:
     elif isinstance(kind, pl.Struct):
         for part in column.struct.fields:
             yield from _bytes(column.struct.field(part))
-    elif isinstance(kind, pl.String | pl.Categorical | pl.Enum):
-        texts = column.cast(pl.String).fill_null("")
-        yield texts.str.len_bytes().to_numpy().tobytes()
-        yield "".join(texts).encode()
     elif isinstance(kind, pl.Boolean):
         yield column.fill_null(value=False).cast(pl.UInt8).to_numpy().tobytes()
     else:

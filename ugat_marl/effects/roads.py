@@ -65,8 +65,9 @@ class LaneClosure(Effect):
         """
         _refuse_queues(scenario, self)
         begin = max(self.begin_s, scenario.settings.begin_s)
+        departs = [begin] if begin < self.end_s else []
         stand = {"until": seconds_text(self.end_s)}
-        return _with_blockers(scenario, self, self.lane, [begin][: begin < self.end_s], stand)
+        return _with_blockers(scenario, self, self.lane, departs, stand)
 
 
 @dataclass(frozen=True)

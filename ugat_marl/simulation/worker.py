@@ -292,9 +292,9 @@ def _spawned(name: str, user: int) -> None:
     _work(service, channel, order, [], user, user, guard)
 
 
-def _main(kind: str, name: str, user: str, *control: str) -> None:
+def _main(kind: str, name: str, user: str, control: str = "") -> None:
     if kind == "parent":
-        _serve(_service(name), int(user), *map(int, control))
+        _serve(_service(name), int(user), int(control))
         os._exit(0)  # unloading SUMO or torch takes long
     else:
         _spawned(name, int(user))
