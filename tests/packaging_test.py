@@ -147,7 +147,7 @@ def test_importing_is_cheap() -> None:
     assert subprocess.run([sys.executable, "-c", code], check=False).returncode == 0
 
 
-@pytest.mark.parametrize("verb", ["scenario_check", "diagnose", "record"])
+@pytest.mark.parametrize("verb", ["scenario_check", "diagnose", "evaluate", "plan", "record"])
 def test_who_trains_nothing_waits_for_no_torch(verb: str) -> None:
     code = f"import sys, ugat_marl.cli.{verb}; sys.exit('torch' in sys.modules)"
     assert subprocess.run([sys.executable, "-c", code], check=False).returncode == 0

@@ -23,25 +23,26 @@ from studies.blind.cases import (
 )
 from studies.blind.strengths import ALL_KINDS, ERRORS
 from studies.errors import BlindTestError
-from ugat_marl.diagnosis import Diagnosis, EffectRecord, LogGrounds, NamedEffect, PolicyGap
+from ugat_marl.diagnosis import (
+    Diagnosis,
+    EffectRecord,
+    Explanation,
+    LogGrounds,
+    NamedEffect,
+    PolicyGap,
+    Thresholds,
+    Verdict,
+)
 from ugat_marl.effects import EVERYWHERE
 from ugat_marl.files import write_whole
 
-Verdict = Literal[
-    "no_discrepancy",
-    "explained",
-    "not_identifiable",
-    "partially_explained",
-    "provisional",
-    "unknown",
-    "failed",
-]
+GradedVerdict = Verdict | Literal["failed"]
 Outcome = Literal["right", "missed", "wrong", "abstained", "failed"]
 
 SEEN = 3.2
 """Standard deviations of a visible effect: a two-sided level of 5 % shared by 32 effects."""
 
-NAMING: frozenset[Verdict] = frozenset({"explained", "partially_explained"})
+NAMING: frozenset[GradedVerdict] = frozenset({"explained", "partially_explained"})
 """Verdicts that name the effects."""
 
 OPTIONAL = frozenset({"emergency_deceleration"})
@@ -117,7 +118,7 @@ class Grade:
     periods: int
     speeds: bool
     lights: int
-    verdict: Verdict
+    verdict: GradedVerdict
     named: tuple[str, ...]
     outcome: Outcome
     among: bool
@@ -204,14 +205,13 @@ def grade(label: Label, diagnosis: Diagnosis | None, wall_s: float | None = None
         diagnosis: The diagnosis; None if it failed.
         wall_s: Wall seconds of the diagnosis.
     """
-    verdict: Verdict = "failed" if diagnosis is None else diagnosis.verdict
+    verdict: GradedVerdict = "failed" if diagnosis is None else diagnosis.verdict
     effects = () if diagnosis is None else diagnosis.effects
     named = canonical(map(hidden_of, effects), label)
     truth = canonical(label.effects, label)
     others = [
         canonical(map(hidden_of, other.effects), label)
-        for other in (() if diagnosis is None else diagnosis.alternatives)
-        if verdict == "not_identifiable"  # with other verdicts these were tried, not named
+        for other in (() if diagnosis is None else _as_near(diagnosis))
     ]
     sets = [{effect.name for effect in answer} for answer in (named, *others)]
     sets += _with_rivals(sets[0], effects)
@@ -253,6 +253,18 @@ def grade(label: Label, diagnosis: Diagnosis | None, wall_s: float | None = None
     )
 
 
+def _as_near(diagnosis: Diagnosis) -> list[Explanation]:
+    """Return the alternatives that a diagnosis cannot tell from what it names.
+
+    The others, and those of other verdicts, were tried and not named.
+    """
+    best = diagnosis.best
+    if diagnosis.verdict != "not_identifiable" or best is None:
+        return []
+    limit = best.cost + Thresholds().indistinct
+    return [other for other in diagnosis.alternatives if other.cost < limit]
+
+
 def _with_rivals(names: set[str], effects: Sequence[NamedEffect]) -> list[set[str]]:
     """Return the names with another error of detectors that is said to look the same."""
     rivals = [
@@ -263,7 +275,7 @@ def _with_rivals(names: set[str], effects: Sequence[NamedEffect]) -> list[set[st
     return [(names - {name}) | {rival} for name, rival in rivals]
 
 
-def _blamed(label: Label, verdict: Verdict, sets: Sequence[set[str]]) -> tuple[str, ...]:
+def _blamed(label: Label, verdict: GradedVerdict, sets: Sequence[set[str]]) -> tuple[str, ...]:
     """Return what is named beside detectors where nothing but a measurement is wrong."""
     if label.group != "measurement" or verdict in ("no_discrepancy", "failed"):
         return ()
@@ -273,7 +285,7 @@ def _blamed(label: Label, verdict: Verdict, sets: Sequence[set[str]]) -> tuple[s
 
 def _outcome(
     label: Label,
-    verdict: Verdict,
+    verdict: GradedVerdict,
     sets: Sequence[set[str]],
     fits: Sequence[bool],
 ) -> Outcome:

@@ -14,7 +14,7 @@ import tyro
 from ugat_marl.__main__ import main
 from ugat_marl.cli import frame
 from ugat_marl.experiments import PaperConfig
-from ugat_marl.experiments.settings import PHASE
+from ugat_marl.experiments.row_names import PHASE
 from ugat_marl.reporting.formats import commands_in
 
 ROOT = Path(__file__).resolve().parents[2]

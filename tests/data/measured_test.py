@@ -469,6 +469,10 @@ WRONG: dict[str, tuple[dict[str, Change], str]] = {
         r"line 2: position_m.*forty",
     ),
     "decimal comma": ({"detectors.csv": replaced("40.0", '"40,5"')}, r"point, not a comma"),
+    "decimal commas": (
+        {"detectors.csv": lambda text: text.replace(".0,", ",0,")},
+        r"line 2: \d+ cells.*decimal",
+    ),
     "semicolons": ({"detectors.csv": lambda text: text.replace(",", ";")}, r"semicolons"),
     "tabs": ({"detectors.csv": lambda text: text.replace(",", "\t")}, r"divided by tabs"),
     "a line for Excel": ({"detectors.csv": lambda text: "sep=,\n" + text}, r"remove it"),

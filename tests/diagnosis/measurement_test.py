@@ -222,6 +222,16 @@ def test_pulses_are_seen(seconds: float) -> None:
     assert named(one_kind, usual) == [f"detector_pulse=advance,{seconds:g}"]
 
 
+@pytest.mark.parametrize(("seconds", "nearest"), [(0.0, "0.01"), (2.5, "2")])
+def test_pulses_of_impossible_lengths_are_the_nearest_possible(
+    seconds: float, nearest: str
+) -> None:
+    pulses = day(7)
+    pulses.passages[:, 2] = seconds
+    found = named(pulses, together([day(seed) for seed in range(3)]))
+    assert {one.split(",")[-1] for one in found} == {nearest}
+
+
 def pairs_only(*distances_m: float) -> Sightings:
     """One period in which vehicles at 10 m/s show these distances, at the first detector."""
     rows = [(0, m / 10.0, 10.0, 10.0) for m in distances_m]

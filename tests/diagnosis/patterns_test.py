@@ -248,5 +248,13 @@ def test_patterns_become_service_and_demand_without_a_name() -> None:
         "lane_service=north_1,1,2",
         "lane_service=north_2,1,0",
     ]
+    # changes of patterns that overlap add up: 1.25 in all, and 2 from 600 to 1200 s
+    beside = replace(surge, place="north", change=0.75)
+    much = replace(more, place="south", change=25.0)
+    level, most, factor = unnamed_effects(
+        [beside, more, much], LAYOUT, ("north", "south"), decision_s=10.0
+    )
+    assert [str(level), str(most)] == ["demand_level=north,1.25", "demand_level=south,20"]
+    assert str(factor) == "demand_surge=north,600,1200,1.6"
     faster = replace(slow, place=None, movement=None, change=0.2)
     assert unnamed_effects([faster], LAYOUT, (), 10.0) == ()

@@ -240,6 +240,13 @@ def test_a_detector_that_sticks(reference: Reference) -> None:
     assert overlap(window_of(item), (1200.0, 2000.0)) > 0.95
 
 
+def test_a_detector_that_is_not_compared_is_no_fault(reference: Reference) -> None:
+    on = Passages(np.array([600.0]), np.array([900.0]), np.array([np.nan]), np.array([np.nan]))
+    days = [street(900 + day) for day in range(5)]
+    beside = [replace(day, passages={**day.passages, "twin": on}) for day in days]
+    assert proposed(reference, beside) == proposed(reference, days)
+
+
 def test_a_detector_that_falls_silent(reference: Reference) -> None:
     item = first(proposed(reference, fault("dropout=exit:c,600,1500")), "dropout")
     assert dict(item.fixed)["detector"] == "exit:c"

@@ -6,18 +6,26 @@ from collections.abc import Sequence
 from contextlib import nullcontext
 from dataclasses import dataclass, field, replace
 from types import SimpleNamespace
-from typing import Any
+from typing import Any, cast
 
 import numpy as np
 import pytest
 
 from ugat_marl.diagnosis import TrafficCheck, workflow
+from ugat_marl.diagnosis.engine import OutOfTime
 from ugat_marl.diagnosis.features import ALL_FEATURES, BIN_FEATURES, FEATURES, INDEX, Tally
 from ugat_marl.diagnosis.thresholds import Thresholds
 from ugat_marl.diagnosis.traffic import approach_table, traffic_check
 from ugat_marl.diagnosis.workflow import _reason_against as reason_against
 from ugat_marl.diagnosis.workflow import _without_search as without_search
-from ugat_marl.effects import DemandSurge, DetectorExtension, Effect, Headway, LaneService
+from ugat_marl.effects import (
+    DemandSurge,
+    DetectorExtension,
+    Effect,
+    Headway,
+    LaneService,
+    parse_domain,
+)
 
 THRESHOLDS = Thresholds()
 LAYOUT: Any = SimpleNamespace(
@@ -203,6 +211,61 @@ def test_what_was_not_fitted_has_no_interval_and_a_window_is_a_window() -> None:
     assert (loops.window, loops.parameters["seconds"].low) == (None, pytest.approx(0.9))
 
 
+@pytest.mark.parametrize(
+    ("verdict", "named", "corrected"),
+    [
+        ("explained", ("headway=1.4", "undercount=advance:a,0.2"), ["headway=1.4"]),
+        ("explained", ("undercount=advance:a,0.2",), []),
+        ("provisional", ("headway=1.4",), ["headway=1.4"]),
+        ("provisional", ("undercount=advance:a,0.2",), None),
+        ("unknown", ("undercount=advance:a,0.2",), None),
+        ("no_discrepancy", (), None),
+    ],
+)
+def test_a_scenario_that_was_not_examined_is_not_called_corrected(
+    verdict: str, named: tuple[str, ...], corrected: list[str] | None
+) -> None:
+    diagnosis: Any = SimpleNamespace(verdict=verdict, not_corrected=None)
+    effects = [effect for domain in named for effect in parse_domain(domain)]
+    found = workflow._corrections(diagnosis, effects)
+    assert (None if found is None else list(map(str, found))) == corrected
+
+
+def test_an_unnamed_correction_that_is_not_tried_takes_no_other_away(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    def too_late(*given: Any) -> None:
+        raise OutOfTime("the budget of time is spent")
+
+    named = (Headway(1.4),)
+    best: Any = SimpleNamespace(model=SimpleNamespace(effects=named, members=named))
+    conclusion = SimpleNamespace(verdict="partially_explained", best=best)
+    for name, given in {
+        "verify_model": None, "conclude": conclusion, "_record": Told(),
+        "_with_patterns": Told(), "judged": "the check", "_reason_against": "a reason",
+    }.items():  # fmt: skip
+        monkeypatch.setattr(workflow, name, lambda *_, given=given, **__: given)
+    monkeypatch.setattr(workflow, "_unnamed", too_late)
+    for anyway in (False, True):
+        study: Any = SimpleNamespace(
+            config=SimpleNamespace(correct_anyway=anyway),
+            measured=SimpleNamespace(of=lambda split: []),
+            layout=LAYOUT,
+            detection=(),
+        )
+        search: Any = SimpleNamespace(
+            study=study,
+            located=SimpleNamespace(base=None),
+            selected=SimpleNamespace(best=best),
+            selector=None,
+        )
+        told: Any
+        told, effects = workflow._concluded(search, (), cast(Any, None))
+        assert effects == (named if anyway else ())
+        assert told.not_corrected == (None if anyway else "a reason")
+        assert "budget ended before the unnamed" in told.sentence
+
+
 @dataclass(frozen=True)
 class Told:
     """What a record says so far."""
@@ -210,6 +273,7 @@ class Told:
     patterns: tuple[str, ...] = ("a pattern",)
     sentence: str = "Nothing explains it."
     traffic_check: Any = None
+    not_corrected: str | None = None
     unnamed: tuple[Any, ...] = field(default=())
 
 

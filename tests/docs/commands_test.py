@@ -17,7 +17,7 @@ from ugat_marl.__main__ import COMMANDS, LINE, main
 from ugat_marl.cli import frame
 from ugat_marl.errors import install_command
 from ugat_marl.experiments.jobs import file_name
-from ugat_marl.experiments.settings import CONTROL, CORRECTED, DIRECT, PHASE, STREET, TIMED
+from ugat_marl.experiments.row_names import CONTROL, CORRECTED, DIRECT, PHASE, STREET, TIMED
 
 ROOT = Path(__file__).resolve().parents[2]
 PAGES = [

@@ -51,7 +51,7 @@ from ugat_marl.experiments.jobs import (
     perform_described,
 )
 from ugat_marl.experiments.paper import TABLES, settings_of
-from ugat_marl.experiments.settings import UNTRAINED
+from ugat_marl.experiments.row_names import UNTRAINED
 from ugat_marl.grounding import DIRECT_LEARNER, FitConfig, UgatConfig
 from ugat_marl.parallel import DEADLINE_VARIABLE, Heartbeat, Stop
 from ugat_marl.policies import (

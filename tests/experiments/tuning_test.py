@@ -31,8 +31,9 @@ from ugat_marl.experiments import (
 )
 from ugat_marl.experiments.evaluation import race_rules
 from ugat_marl.experiments.jobs import EVALUATION_SEED, RULE_FILE, Job, perform
+from ugat_marl.experiments.row_names import RULE
 from ugat_marl.experiments.scores import Result, RuleTrial
-from ugat_marl.experiments.settings import RULE, Setting
+from ugat_marl.experiments.settings import Setting
 from ugat_marl.experiments.tuning import rungs
 from ugat_marl.policies import RULES, format_rule, parse_rule, rule_settings
 from ugat_marl.progress import Silent

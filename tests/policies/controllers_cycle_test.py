@@ -200,6 +200,8 @@ def test_the_green_travels_with_the_vehicles():
     rule.reset(0)
     assert rule.act({}, {}) == seen[0]
     assert GreenWave(row_of(2, 21), 20).main_s == 20
+    endless = GreenWave(row_of(2, 21), green_s=1e15)
+    assert endless.act({}, {}) == {"signal_0": 1, "signal_1": 0}
 
 
 def test_the_roads_of_a_grid_share_no_light():

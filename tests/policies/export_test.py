@@ -323,6 +323,15 @@ def test_a_file_of_something_else_is_not_replaced(tmp_path: Path) -> None:
     assert not (tmp_path / "my.npz").exists()
 
 
+@pytest.mark.parametrize("suffix", [".npz", ".ts"])
+def test_a_model_of_something_else_is_not_replaced(tmp_path: Path, suffix: str) -> None:
+    mine = tmp_path / f"my{suffix}"
+    mine.write_bytes(b"precious")
+    with pytest.raises(OptionError, match=r"my.json tells of no model in it"):
+        export_policy(policy_of(False), mine)
+    assert mine.read_bytes() == b"precious" and not (tmp_path / "my.json").exists()
+
+
 def test_what_has_no_network_or_is_a_model_says_so(tmp_path: Path) -> None:
     path = exported(policy_of(False), ".npz", tmp_path)
     for name, says in (

@@ -166,6 +166,10 @@ def test_unknown_policies_are_refused(tmp_path: Path, capsys: pytest.CaptureFixt
     assert "unknown shipped policy" in said and "works as well" not in said
     assert main(["policy", "pack", str(tmp_path), "--out", str(tmp_path / "packed")]) == 2
     assert "no finished training" in capsys.readouterr().err
+    nowhere = str(tmp_path / "nowhere")
+    assert main(["policy", "pack", nowhere, "--out", str(tmp_path / "packed")]) == 2
+    assert "nowhere: no such folder" in capsys.readouterr().err
+    assert not (tmp_path / "packed").exists()
 
 
 def test_policies_are_listed(capsys: pytest.CaptureFixture[str]) -> None:

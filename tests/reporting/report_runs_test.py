@@ -610,6 +610,7 @@ def test_a_folder_of_nothing_and_a_file_are_refused(tmp_path: Path) -> None:
 def test_the_command_writes_page_and_pictures(run: Path, tmp_path: Path) -> None:
     assert main(["report", str(run), "--pictures", str(tmp_path / "p")]) == 0
     assert Page((run / "report.html").read_text()).text
+    assert main(["report", str(run)]) == 0  # its own page may be replaced
     files = sorted(path.name for path in (tmp_path / "p").iterdir())
     assert len(files) >= 16 and {Path(f).suffix for f in files} == {".svg", ".png"}
     for path in (tmp_path / "p").glob("*.png"):
@@ -788,6 +789,19 @@ def test_nothing_is_clipped_in_a_browser(width: int, tmp_path: Path) -> None:
 def test_the_page_is_drawn_in_light_and_dark(dark: bool, run: Path, tmp_path: Path) -> None:
     (tmp_path / "report.html").write_text(page_of(run)[0].text)
     assert_drawn(tmp_path / "report.html", dark=dark)
+
+
+@pytest.mark.parametrize("words", [("--out", "mine.html"), ()])
+def test_a_page_of_another_program_is_not_replaced(
+    words: tuple[str, ...], run: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    other = tmp_path / "other"
+    shutil.copytree(run, other)
+    monkeypatch.chdir(tmp_path)
+    mine = Path(words[1] if words else "report.html")
+    mine.write_text("<html>mine</html>")
+    assert main(["report", str(run), str(other), *words]) == 2
+    assert mine.read_text() == "<html>mine</html>"
 
 
 # --- a real training ----------------------------------------------------------------------------

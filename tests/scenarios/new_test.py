@@ -151,6 +151,23 @@ def test_cars_need_both_lanes_and_the_connection(
     assert streets.entries == (("in",) if ahead else ())
 
 
+def test_vehicles_enter_and_leave_by_roads_in_several_pieces() -> None:
+    """At the dead end N, SUMO lets vehicles turn back from `out` to the first piece, `in1`."""
+    root = ET.fromstring(
+        '<net><edge id="in1" from="N" to="M"><lane id="in1_0"/></edge>'
+        '<edge id="in2" from="M" to="C"><lane id="in2_0"/></edge>'
+        '<edge id="out" from="C" to="N"><lane id="out_0"/></edge>'
+        '<edge id="on" from="C" to="S"><lane id="on_0"/></edge>'
+        '<connection from="in1" to="in2" fromLane="0" toLane="0" dir="s"/>'
+        '<connection from="in2" to="on" fromLane="0" toLane="0" dir="s"/>'
+        '<connection from="in2" to="out" fromLane="0" toLane="0" dir="t"/>'
+        '<connection from="out" to="in1" fromLane="0" toLane="0" dir="t"/></net>'
+    )
+    streets = Streets.of(root)
+    assert streets.entries == ("in1",)
+    assert streets.exits == {"out", "on"}
+
+
 def test_roads_may_say_that_they_are_normal() -> None:
     root = ET.fromstring(
         '<net><edge id="in" from="x" to="y" function="normal"><lane id="in_0"/></edge>'
@@ -432,6 +449,16 @@ def test_errors_name_the_files_a_configuration_names(
     error = refused(capsys, tmp_path / "a", *words, "--vph", "100")
     assert f"{network}: document types and entities" in error
     assert left_over(tmp_path) == [files.name]
+
+
+def test_errors_name_these_files_for_a_name_without_a_folder_too(
+    files: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    routes = files / "cars.rou.xml"
+    routes.write_text(routes.read_text().replace("A1_east1", "A1_gone", 1))
+    monkeypatch.chdir(tmp_path)
+    error = refused(capsys, Path("a"), "--sumo", files / "city.sumocfg")
+    assert error.startswith(f"ugat-marl: error: {routes}, line ")
 
 
 def test_nothing_is_overwritten_by_accident(

@@ -32,7 +32,12 @@ from ugat_marl.effects import known_effects, load_scenario, measurement_effects
 from ugat_marl.errors import OptionError, OutputError
 from ugat_marl.files import require_writable
 from ugat_marl.progress import Bars
-from ugat_marl.reporting import LightNames, diagnosis_summary, write_diagnosis_page
+from ugat_marl.reporting import (
+    LightNames,
+    diagnosis_summary,
+    require_page_place,
+    write_diagnosis_page,
+)
 from ugat_marl.scenarios import Network
 
 REPORT = "report.html"
@@ -97,6 +102,7 @@ class Diagnose:
         network = Network.read(scenario)
         measured = read_measured(self.measured, scenario, network)
         require_writable(self.out / FILE)
+        require_page_place(self.out / REPORT)  # without a report, an earlier page is removed
         self._check_cache()
         _say_what_cannot_be_seen(measured, console)
         try:

@@ -10,7 +10,6 @@ from rich.console import Console
 from tyro.conf import Positional, arg
 
 from ugat_marl.experiments import pack
-from ugat_marl.files import require_writable
 from ugat_marl.progress import Bars
 
 
@@ -36,7 +35,6 @@ class PolicyPack:
 
     def run(self, console: Console) -> int:
         """Pack, and print the ids."""
-        require_writable(self.out / "card.json")
         for card in pack(self.training, self.out, self.command, Bars(console)):
             console.print(f"{self.out / card.id}.pt", soft_wrap=True)
         return 0

@@ -17,7 +17,14 @@ from ugat_marl.errors import CheckpointError, OptionError, UgatMarlError
 from ugat_marl.experiments import TransferConfig
 from ugat_marl.files import MALFORMED, require_writable, write_whole
 from ugat_marl.policies import is_own, rule_in
-from ugat_marl.reporting import RunRecord, TableRecord, read_records, runs_page, write_pictures
+from ugat_marl.reporting import (
+    RunRecord,
+    TableRecord,
+    read_records,
+    require_page_place,
+    runs_page,
+    write_pictures,
+)
 
 PAGE = "report.html"
 _FLAT = ("ugat",)
@@ -62,7 +69,7 @@ class Report:
             raise OptionError("name at least one folder of a run, such as runs/first")
         records = read_records(self.runs)
         out = self.out or (self.runs[0] / PAGE if len(self.runs) == 1 else Path(PAGE))
-        require_writable(out, ".html")
+        require_page_place(out)
         if self.pictures is not None:
             require_writable(self.pictures / "picture.svg")
         page = runs_page(records, {r.directory: again(r) for r in records})

@@ -6,7 +6,6 @@ import math
 from collections.abc import Sequence
 
 import numpy as np
-from scipy import stats
 
 from ugat_marl.data import Finding, MeasuredData
 from ugat_marl.diagnosis.features import BIN_FEATURES, DetectorLayout, Tally
@@ -46,7 +45,9 @@ def day_to_day_variation(
     squares = max(float(((days - usual) ** 2).sum()), 1e-6)  # counts may be equal
     shares = np.arange(0.0, 1.0, 0.002)
     scale = days.mean() + (shares * days.mean()) ** 2
-    logs = stats.chi2.logpdf(squares / scale, freedom) - np.log(scale)
+    # The density of chi-square, but for a factor that all shares have in common.
+    excess = squares / scale
+    logs = (0.5 * freedom - 1.0) * np.log(excess) - 0.5 * excess - np.log(scale)
     prior = np.exp(-0.5 * (shares / thresholds.usual_variation) ** 2)
     prior[0] = prior[1:].sum()
     posterior = prior * np.exp(logs - logs.max())

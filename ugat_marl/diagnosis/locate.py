@@ -7,7 +7,7 @@ from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
-from scipy import special, stats
+from scipy import special
 
 from ugat_marl.diagnosis.engine import OutOfTime
 from ugat_marl.diagnosis.features import ALL_FEATURES, BIN_FEATURES, DetectorLayout
@@ -89,9 +89,9 @@ def discoveries(chances: Sequence[float], tested: int, alpha: float) -> int:
         tested: Number of all tests; p values that are not given count as 1.
         alpha: Largest expected share of false discoveries.
     """
-    others = [1.0] * (tested - len(chances))
-    every = np.array([*chances, *others])
-    return int((stats.false_discovery_control(every)[: len(chances)] <= alpha).sum())
+    ranks = np.arange(1, len(chances) + 1)
+    small = np.flatnonzero(np.asarray(chances) * (tested / ranks) <= alpha)
+    return int(ranks[small].max(initial=0))
 
 
 def two_sided(z: float, tail: float) -> float:

@@ -610,7 +610,9 @@ class Measurement:
             apart = abs(float(np.median(measured[:, 2]) - np.median(simulated[:, 2])))
             same = alike[0] > self._thresholds.pulse_share > 2.0 * alike[1]
             if same and apart > max(self._grain_s, self._thresholds.touching_s):
-                pulses[group] = round(float(np.median(measured[:, 2])), 2)
+                limits = DetectorPulse.ranges["seconds"]
+                seconds = round(float(np.median(measured[:, 2])), 2)
+                pulses[group] = min(max(seconds, limits.low), limits.high)
         return pulses
 
     def _together(self, pulses: Mapping[Group, float]) -> dict[str, float]:

@@ -19,6 +19,7 @@ from __future__ import annotations
 
 import itertools
 import math
+from collections import defaultdict
 from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 
@@ -541,7 +542,8 @@ def unnamed_effects(
         decision_s: Time between two decisions of a controller, s.
     """
     service: dict[str, tuple[float, float]] = {}  # seconds at the begin, and how much gaps grow
-    demand: list[Effect] = []
+    levels: defaultdict[str, float] = defaultdict(float)  # changes of a whole day's demand by place
+    surges: list[tuple[str, tuple[float, float], float]] = []
     for one in found:
         if one.quantity == "discharge" and one.window is None and not one.long_vehicles:
             until_s = _until_s(one)
@@ -557,12 +559,16 @@ def unnamed_effects(
             and one.movement is None
             and one.detectors != "stop"
         ):
-            factor = max(1.0 + one.change, 0.0)
-            demand.append(
-                DemandLevel(one.place, factor)
-                if one.window is None
-                else DemandSurge(one.place, *one.window, factor)
-            )
+            if one.window is None:
+                levels[one.place] += one.change
+            else:
+                surges.append((one.place, one.window, one.change))
+    # Changes of patterns that overlap add up, the effects multiply.
+    usual = {place: _factor(1.0 + change) for place, change in levels.items()}
+    demand: list[Effect] = [DemandLevel(place, factor) for place, factor in usual.items()]
+    for place, window, change in surges:
+        level = usual.get(place, 1.0) or 1.0  # of no vehicles there can be no surge
+        demand.append(DemandSurge(place, *window, _factor(1.0 + change / level)))
     lost: list[Effect] = []
     for lane, (lost_s, growth) in service.items():
         begin, each = (
@@ -572,6 +578,12 @@ def unnamed_effects(
         if begin or each:
             lost.append(LaneService(lane, begin, each))
     return (*demand, *lost)
+
+
+def _factor(wanted: float) -> float:
+    """Return the factor of a demand that is nearest to the wanted one."""
+    limits = DemandLevel.ranges["factor"]
+    return min(max(wanted, limits.low), limits.high)
 
 
 def _until_s(pattern: Pattern) -> float | None:

@@ -16,7 +16,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ugat_marl.data import occupied_between
-from ugat_marl.diagnosis.features import BIN_FEATURES, INDEX, DetectorLayout, bins_in
+from ugat_marl.diagnosis.features import (
+    BIN_FEATURES,
+    COUNT_FEATURES,
+    INDEX,
+    DetectorLayout,
+    bins_in,
+)
 from ugat_marl.diagnosis.hypotheses import Hypothesis, Members, examined
 from ugat_marl.diagnosis.statistics import Distance, Reference
 from ugat_marl.diagnosis.supplementary_data import TURNING
@@ -674,9 +680,6 @@ def turned(reference: Reference, distance: Distance) -> list[Hypothesis]:
 
 # --- stretches of time ----------------------------------------------------------------------------
 
-_COUNTS = 3
-"""Number of `BIN_FEATURES` that count vehicles; these come first."""
-
 
 def largest_stretches(edges: Sequence[str], distance: Distance) -> dict[str, float]:
     """Return the largest squared standardised difference over any stretch of bins.
@@ -694,7 +697,7 @@ def largest_stretches(edges: Sequence[str], distance: Distance) -> dict[str, flo
     groups = [
         [kind * places + index for index, name in enumerate(edges) if name == edge]
         for edge in dict.fromkeys(edges)
-        for kind in range(_COUNTS)
+        for kind in range(len(COUNT_FEATURES))
     ]
     of_edges = np.stack([difference[rows].sum(axis=0) for rows in groups])
     noise = np.stack([variance[rows].sum(axis=0) for rows in groups])
@@ -796,7 +799,7 @@ def fault_hypotheses(
                     thresholds.least_undercount,
                 )
             )
-    stuck = _stuck(periods, thresholds)
+    stuck = _stuck(periods, places, thresholds)
     on = {dict(fault.fixed)["detector"] for fault in stuck}
     silent = [x for x in _silent(periods, mean, thresholds) if dict(x.fixed)["detector"] not in on]
     hypotheses += stuck + silent
@@ -805,10 +808,12 @@ def fault_hypotheses(
     return hypotheses
 
 
-def _stuck(periods: Sequence[Period], thresholds: Thresholds) -> list[Hypothesis]:
-    """Find detectors that were on for minutes at the same time of every period."""
+def _stuck(
+    periods: Sequence[Period], compared: Collection[str], thresholds: Thresholds
+) -> list[Hypothesis]:
+    """Find compared detectors that were on for minutes at the same time of every period."""
     faults: list[Hypothesis] = []
-    for name in sorted(set.intersection(*(set(p.passages) for p in periods))):
+    for name in sorted(set(compared).intersection(*(p.passages for p in periods))):
         windows: list[tuple[float, float]] = []
         for period in periods:
             seen = period.passages[name]

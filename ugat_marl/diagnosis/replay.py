@@ -30,6 +30,7 @@ from ugat_marl.diagnosis.features import (
 from ugat_marl.diagnosis.thresholds import DayThresholds
 from ugat_marl.effects import (
     Effect,
+    apply_detector_effects,
     controller_effects,
     detector_effects,
     installed_detectors,
@@ -192,16 +193,11 @@ class Replay:
         with tempfile.TemporaryDirectory(prefix="ugat_marl-") as name:
             directory = Path(name)
             done = retry_on_crash(lambda: self._run(scenario, effects, period, seed, directory))
-        seen = done.period
-        for effect in (*self._own, *effects):
-            seen = effect.observe(seen, self._detectors, self._owner)
-        return replace(done, period=_logged(seen), due=due)
+        return replace(done, period=self.observed((*self._own, *effects), done.period), due=due)
 
     def observed(self, effects: Sequence[Effect], period: Period) -> Period:
         """Return a simulated period as detectors with faults see it, without a new simulation."""
-        for effect in effects:
-            period = effect.observe(period, self._detectors, self._owner)
-        return _logged(period)
+        return _logged(apply_detector_effects(period, effects, self._detectors, self._owner))
 
     def shown(self, period: Period) -> Period:
         """Return a period whose lights change when those of its simulation do: with a step."""

@@ -413,7 +413,11 @@ class Study:
         windows = {period.window for period in early}
 
         def first_and_all(days: Sequence[Tally]) -> Array:
-            own = [day.bins[:3].sum(axis=(0, 1)) for day in days if day.window in windows]
+            own = [
+                day.bins[: len(COUNT_FEATURES)].sum(axis=(0, 1))
+                for day in days
+                if day.window in windows
+            ]
             return np.array([(bins[0], bins.sum()) for bins in own])
 
         here, there = first_and_all(self.fit), first_and_all(base.model.tallies)

@@ -7,7 +7,7 @@ from collections.abc import Collection, Sequence
 from typing import Any
 
 import numpy as np
-from scipy import stats
+from scipy.special import chdtrc
 
 from ugat_marl.diagnosis.features import ALL_FEATURES, DetectorLayout
 from ugat_marl.diagnosis.hypotheses import WINDOW, Hypothesis, Members
@@ -219,7 +219,7 @@ def combined(one: float, other: float) -> float:
     -2 ln(p q) has a chi-square distribution with 4 degrees of freedom.
     """
     product = max(one * other, 1e-300)
-    return float(stats.chi2.sf(-2.0 * math.log(product), df=4))
+    return float(chdtrc(4, -2.0 * math.log(product)))
 
 
 def _rivals(selection: Selected, selector: Selector, config: DiagnosisConfig) -> tuple[Fitted, ...]:

@@ -113,11 +113,8 @@ def diagnose(
     with reporter.whole("diagnosis", study.work()):
         diagnosis, named = _diagnosed(study, timing, reporter)
     named = (*timing, *named)
-    # errors of this street's detectors are no part of the model of its traffic
-    traffic = [effect for effect in named if not effect.on_detectors]
-    unexplained = diagnosis.not_corrected is not None or diagnosis.verdict == "unknown"
-    refused = unexplained and not traffic
-    corrected = None if refused or not named else apply_effects(scenario, traffic)
+    traffic = _corrections(diagnosis, named)
+    corrected = None if traffic is None else apply_effects(scenario, traffic)
     if corrected is not None:
         diagnosis = replace(diagnosis, corrected=CORRECTED)
     written = Diagnosis.from_json(diagnosis.to_json())  # numbers rounded like those of the file
@@ -253,6 +250,19 @@ def _searched(
     return _Search(study, located, selector, selected)
 
 
+def _corrections(diagnosis: Diagnosis, named: Sequence[Effect]) -> list[Effect] | None:
+    """Return the effects of the corrected scenario; None if there is no such scenario.
+
+    Errors of this street's detectors are no part of the model of its traffic. The scenario as it is
+    counts as corrected only if nothing but these errors is wrong.
+    """
+    traffic = [effect for effect in named if not effect.on_detectors]
+    open_ended = diagnosis.verdict in ("unknown", "provisional")
+    if not named or (not traffic and (open_ended or diagnosis.not_corrected is not None)):
+        return None
+    return traffic
+
+
 def _concluded(
     search: _Search, timing: tuple[Effect, ...], reporter: Reporter
 ) -> tuple[Diagnosis, tuple[Effect, ...]]:
@@ -298,7 +308,12 @@ def _concluded(
         conclusion = told(unverified(selected))
         diagnosis = _record(study, timing, located, selected, verified, conclusion, tables=False)
     diagnosis = _with_patterns(study, diagnosis, located.base, conclusion, reporter)
-    unnamed = _unnamed(study, diagnosis, located.base, conclusion, reporter)
+    try:
+        unnamed = _unnamed(study, diagnosis, located.base, conclusion, reporter)
+    except OutOfTime:
+        unnamed = None
+        ended = "The budget ended before the unnamed correction was tried."
+        diagnosis = replace(diagnosis, sentence=f"{diagnosis.sentence} {ended}")
     if unnamed is not None:
         return unnamed
     if conclusion.verdict == "unknown" or not conclusion.best.model.members:
@@ -323,6 +338,9 @@ def _unnamed(
     Returns:
         The record and all effects of the corrected scenario; None if it was not asked for, if no
         pattern can be imitated, or if held-out traffic comes no nearer.
+
+    Raises:
+        OutOfTime: The budget ended.
     """
     if not study.config.unnamed or not diagnosis.patterns:
         return None
@@ -334,12 +352,8 @@ def _unnamed(
         return None
     wanted = study.engine.first(study.config.thresholds.settling_days)
     numbers = [number for number in wanted if number in base.model.days]
-    try:
-        with reporter.task("unnamed correction", len(numbers)) as advance:
-            days = study.engine.ordinary((*named, *effects), numbers, advance)
-    except OutOfTime:
-        told = "The budget ended before the unnamed correction was tried."
-        return replace(diagnosis, sentence=f"{diagnosis.sentence} {told}"), ()
+    with reporter.task("unnamed correction", len(numbers)) as advance:
+        days = study.engine.ordinary((*named, *effects), numbers, advance)
     before = [base.model.days[number] for number in days]
     after = [day.tally for day in days.values()]
     check = traffic_check(study.heldout, before, after, study.config.thresholds)

@@ -44,7 +44,8 @@ from ugat_marl.experiments.evaluation import (
 )
 from ugat_marl.experiments.queues import QUEUES, QueueRecord
 from ugat_marl.experiments.randomised import randomised_env
-from ugat_marl.experiments.settings import CHANGE_COST, DIRECT, Setting, short_name
+from ugat_marl.experiments.row_names import DIRECT, short_name
+from ugat_marl.experiments.settings import CHANGE_COST, Setting
 from ugat_marl.experiments.training import (
     TrainingCost,
     simulated_worlds,

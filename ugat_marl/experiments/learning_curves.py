@@ -14,7 +14,8 @@ from statistics import fmean
 from ugat_marl.errors import UgatMarlError, require_distinct, require_least
 from ugat_marl.experiments.driver import perform_all, record_of
 from ugat_marl.experiments.jobs import RULE_FILE, Job, JobRecord, evaluation_seeds
-from ugat_marl.experiments.settings import RULE, LearnerSpec, Setting
+from ugat_marl.experiments.row_names import RULE
+from ugat_marl.experiments.settings import LearnerSpec, Setting
 from ugat_marl.experiments.tuning import LEAST_BUDGET
 from ugat_marl.parallel import Workers
 from ugat_marl.policies import BASELINES, SUITE_LEARNERS, learner_library

@@ -23,9 +23,9 @@ from ugat_marl.experiments.jobs import (
     file_stem,
     shortened,
 )
-from ugat_marl.experiments.settings import DIRECT
+from ugat_marl.experiments.row_names import DIRECT
 from ugat_marl.experiments.statistics import Interval
-from ugat_marl.files import write_whole
+from ugat_marl.files import require_writable, write_whole
 from ugat_marl.policies import CardScores, NetworkPolicy, PolicyCard, is_own, rule_in
 from ugat_marl.progress import Reporter
 
@@ -50,10 +50,13 @@ def pack(
         The cards, in the order of their folders.
 
     Raises:
-        OptionError: There is no finished training with a policy, or the folder holds another
-            policy of the same name.
+        OptionError: There is no such folder, no finished training with a policy in it, or the
+            folder to write to holds another policy of the same name.
+        OutputError: That folder cannot be written to.
         CheckpointError: A file of a training is damaged.
     """
+    if not training.is_dir():
+        raise OptionError(f"{training}: no such folder; name that of a run or of trainings")
     found: dict[str, tuple[PolicyCard, bytes]] = {}
     rules: dict[str, Path] = {}
     for place in sorted(path.parent for path in training.rglob(JOB)):
@@ -78,6 +81,7 @@ def pack(
             f"{training} holds no finished training with a policy; name the folder of a run of "
             "`ugat-marl train`, or of the trainings of `ugat-marl paper`"
         )
+    require_writable(folder / "card.json")
     for name, (_, policy) in found.items():
         there = folder / f"{name}.pt"
         if there.is_file() and there.read_bytes() != policy:

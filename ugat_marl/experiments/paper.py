@@ -20,7 +20,7 @@ from ugat_marl.experiments.comparison import Comparison, Trial
 from ugat_marl.experiments.driver import perform_all, record_of
 from ugat_marl.experiments.evaluation import require_distinct_domains
 from ugat_marl.experiments.jobs import LEARNER, Job, evaluation_seeds, worlds_of
-from ugat_marl.experiments.settings import (
+from ugat_marl.experiments.row_names import (
     CONTROL,
     DIRECT,
     FINE_TUNED,
@@ -31,14 +31,12 @@ from ugat_marl.experiments.settings import (
     RANDOMISED,
     RULE,
     SEEING_ORACLE,
-    SEEN_COMMANDS,
     STREET,
     UNTRAINED,
-    LearnerSpec,
-    Setting,
     short_name,
     variant_name,
 )
+from ugat_marl.experiments.settings import SEEN_COMMANDS, LearnerSpec, Setting
 from ugat_marl.experiments.training import check_worlds
 from ugat_marl.experiments.tuning import BUDGET, LEAST_BUDGET
 from ugat_marl.grounding import (

@@ -10,8 +10,8 @@ import math
 from dataclasses import dataclass
 
 from ugat_marl.experiments.comparison import Comparison
+from ugat_marl.experiments.row_names import DIRECT, RULE
 from ugat_marl.experiments.scores import Evaluation, seconds_text
-from ugat_marl.experiments.settings import DIRECT, RULE
 
 MARGIN = 0.02
 """Share by which a trained policy may be slower than the rule. Halved, chance decides more often:

@@ -24,7 +24,7 @@ from ugat_marl.errors import CheckpointError, OptionError, OutputError
 from ugat_marl.experiments.comparison import Comparison
 from ugat_marl.experiments.evaluation import evaluation_of
 from ugat_marl.experiments.jobs import EVALUATION_SEED
-from ugat_marl.experiments.settings import DIRECT
+from ugat_marl.experiments.row_names import DIRECT
 from ugat_marl.experiments.statistics import Interval, number_or_none, student_p
 from ugat_marl.parallel import Workers
 from ugat_marl.policies import PolicyFactory, policy_card, shipped_policies

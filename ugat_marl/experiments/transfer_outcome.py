@@ -5,8 +5,8 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass
 
+from ugat_marl.experiments.row_names import DIRECT, GROUNDED_NAME
 from ugat_marl.experiments.scores import Evaluation, seconds_text
-from ugat_marl.experiments.settings import DIRECT, GROUNDED_NAME
 from ugat_marl.experiments.statistics import PairedTest
 
 LEVEL = 0.05

@@ -49,8 +49,7 @@ from ugat_marl.experiments.jobs import (
 )
 from ugat_marl.experiments.plans import described_plan, jobs_beside, work_of
 from ugat_marl.experiments.queues import QUEUES, write_queues
-from ugat_marl.experiments.scores import Evaluation, Result, best_rule_note, rule_policy
-from ugat_marl.experiments.settings import (
+from ugat_marl.experiments.row_names import (
     CONTROL,
     CORRECTED,
     FINE_TUNED,
@@ -59,9 +58,9 @@ from ugat_marl.experiments.settings import (
     RANDOM_DELAY,
     RANDOMISED,
     RULE,
-    LearnerSpec,
-    Setting,
 )
+from ugat_marl.experiments.scores import Evaluation, Result, best_rule_note, rule_policy
+from ugat_marl.experiments.settings import LearnerSpec, Setting
 from ugat_marl.experiments.tuning import LEAST_BUDGET
 from ugat_marl.files import file_hash, require_writable, write_whole
 from ugat_marl.grounding import (

@@ -20,6 +20,7 @@ import math
 from collections import deque
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from functools import partial
 from typing import Any, ClassVar
 
 import numpy as np
@@ -252,8 +253,8 @@ class FittedActuator(Actuator):
         self._timing = timing
         self._interval_s = interval_s
         self._given: deque[Commands] = deque(maxlen=len(channel.network) - 1)
-        self._chances = channel.weights.cumsum(1)
-        self._generator = numpy_generator(0)
+        self._chances: Floats
+        self._generator: np.random.Generator
 
     def reset(self, seed: int) -> None:
         """Draw the weights of the episode."""
@@ -339,8 +340,8 @@ def fit_channel(
     masked = all(course.mask is not None for course in courses)
     tables = [course.table_of_masks(0) if masked else course.free_table() for course in courses]
     network, counts = _mixture(courses, tables, config)
-    weights = config.pull * network + counts
-    weights /= weights.sum(1, keepdims=True)
+    fitted = partial(CommandChannel, tuple(log.agents), pull=config.pull)
+    weights = fitted(network=network, counts=counts, tables=tuple(tables)).weights
     lags = [int(own[:-1].argmax()) for own in weights]
     if not masked:
         tables = [
@@ -351,7 +352,7 @@ def fit_channel(
         tables = [course.table_of_masks(lag) for course, lag in zip(courses, lags, strict=True)]
     if not masked or any(lags):
         network, counts = _mixture(courses, tables, config)
-    return CommandChannel(tuple(log.agents), network, counts, tuple(tables), config.pull)
+    return fitted(network=network, counts=counts, tables=tuple(tables))
 
 
 @dataclass(frozen=True)

@@ -30,8 +30,7 @@ from dataclasses import dataclass, field
 import numpy as np
 from numpy.typing import NDArray
 from scipy.integrate import trapezoid
-from scipy.special import gammaln
-from scipy.stats import norm
+from scipy.special import gammaln, ndtr
 
 from ugat_marl.errors import OptionError
 from ugat_marl.scenarios import GREEN, Detector, Lane, Passages, Period, deciding_letter
@@ -201,7 +200,7 @@ class LaneCourse:
         free = self.sigma_s > 0
         for come, sigma in zip(self.come_s[free], self.sigma_s[free], strict=True):
             near = np.abs(times_s - come) < 4.0 * sigma
-            chance = norm.cdf((times_s[near] - come) / sigma)
+            chance = ndtr((times_s[near] - come) / sigma)
             variance[near] += chance * (1.0 - chance)
         begin_s, end_s = self.merging_s.T
         variance += 0.25 * (_passed(begin_s, times_s) - _passed(end_s, times_s))
@@ -341,7 +340,8 @@ class _Rate:
         short = (least - self.value) / sigma
         if short > FAR:
             return least
-        return self.value + sigma * float(norm.pdf(short)) / float(norm.sf(short))
+        density = math.exp(-0.5 * short**2) / math.sqrt(2.0 * math.pi)
+        return self.value + sigma * density / float(ndtr(-short))
 
 
 @dataclass(frozen=True, eq=False)

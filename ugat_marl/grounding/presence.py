@@ -20,7 +20,7 @@ from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.stats import norm
+from scipy.special import ndtr
 
 Floats = NDArray[np.float64]
 
@@ -78,7 +78,7 @@ class Presence:
             density = -0.5 * (distance + np.linalg.slogdet(2.0 * np.pi * within)[1])
             middle = (mean + gain @ off)[there]
             spread = np.sqrt(np.diag(covariance - gain @ covariance[out])[there])
-            share = norm.cdf(high[there], middle, spread) - norm.cdf(low[there], middle, spread)
+            share = ndtr((high[there] - middle) / spread) - ndtr((low[there] - middle) / spread)
             slab = np.log(np.maximum(share, 1e-9) / (high - low)[there]).sum()
             logs.append(float(odds[there].sum() + density + slab))
             absent.append(out)
@@ -119,6 +119,7 @@ def lanes_differ(offsets: Floats, spread: Floats, most: float) -> float:
     tried = np.linspace(0.0, most, SPREADS_TRIED)[:, None]
     if len(offsets) < 2:  # a lane alone is the mean
         return 0.0
-    logs = norm.logpdf(offsets, 0.0, np.hypot(spread, tried)).sum(1)
+    deviation = np.hypot(spread, tried)
+    logs = (-0.5 * (offsets / deviation) ** 2 - np.log(deviation)).sum(1)
     differ = np.log(np.mean(np.exp(logs - logs.max()))) + logs.max()
     return float(differ - logs[0])

@@ -10,12 +10,10 @@ import abc
 import math
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, fields
-from typing import Any
 
 import numpy as np
 import torch
 from numpy.typing import NDArray
-from scipy import stats
 from torch import Tensor
 
 from ugat_marl.errors import first_names
@@ -35,7 +33,7 @@ def spearman(one: Numbers, other: Numbers) -> float:
     """Return the rank correlation of two samples; NaN if one of them is constant, or empty."""
     if not len(one):
         return float("nan")
-    a, b = stats.rankdata(one), stats.rankdata(other)
+    a, b = _ranks(one), _ranks(other)
     a, b = a - a.mean(), b - b.mean()
     norm = float(np.sqrt((a**2).sum() * (b**2).sum()))
     return float((a * b).sum() / norm) if norm > 0 else float("nan")
@@ -50,9 +48,14 @@ def auroc(score: Numbers, positive: NDArray[np.bool_]) -> float:
     pairs = int(positive.sum()) * int((~positive).sum())
     if not pairs:
         return float("nan")
-    exact = score.astype(np.float64)  # scipy would sum ranks in float32 otherwise
-    test: Any = stats.mannwhitneyu(exact[positive], exact[~positive], method="asymptotic")
-    return float(test.statistic / pairs)
+    least = positive.sum() * (positive.sum() + 1) / 2  # of the sum of the positives' ranks
+    return float((_ranks(score)[positive].sum() - least) / pairs)
+
+
+def _ranks(values: Numbers) -> Floats:
+    """Return the rank of each value from 1 on; equal values share their mean rank."""
+    _, place, counts = np.unique(values, return_inverse=True, return_counts=True)
+    return (np.cumsum(counts) - 0.5 * (counts - 1))[place]
 
 
 def rate_by_quantile(score: Numbers, hit: NDArray[np.bool_], bins: int) -> tuple[float, ...]:

@@ -17,12 +17,11 @@ folds, and the larger p counts.
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
-from typing import Any
 
 import numpy as np
 import torch
 from numpy.typing import NDArray
-from scipy import stats
+from scipy.special import stdtr
 from torch import Tensor
 
 from ugat_marl.data import TransitionLog
@@ -258,5 +257,4 @@ def _p(surplus: Floats, group: NDArray[np.int64]) -> float:
     spread = float(np.sqrt((deviation**2).sum() / (len(total) - 1) / len(total)))
     if spread == 0.0:
         return float(mean <= 0.0)
-    result: Any = stats.t.sf(mean / spread, len(total) - 1)
-    return float(result)
+    return float(stdtr(len(total) - 1, -mean / spread))

@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import ast
 from collections.abc import Mapping, Sequence
-from typing import Any, get_args
+from types import UnionType
+from typing import Any, Union, get_args, get_origin
 
 from pydantic import PydanticUserError, TypeAdapter, ValidationError
 
@@ -60,10 +61,11 @@ def _converted(text: str, hint: Any) -> Any:
     several = any(kind in str(hint) for kind in ("tuple", "list", "Sequence"))
     if several and isinstance(plain, (tuple, list)):
         forms.append(plain)
-    if several and ("," in text or str not in get_args(hint)):  # or text may stand for itself
+    alone = get_origin(hint) in (Union, UnionType) and str in get_args(hint)
+    if several and ("," in text or not alone):  # or text may stand for itself
         forms.append(text.split(","))
     first: ValidationError | None = None
-    for form in (*forms, text, plain):
+    for form in (*forms, plain, text):  # a number for `float | str` is no text
         try:
             return adapter.validate_python(form)
         except ValidationError as error:

@@ -18,6 +18,7 @@ from .learning_curves import curves_as_csv as curves_as_csv
 from .learning_curves import curves_page as curves_page
 from .light_names import LIGHT_HEADING as LIGHT_HEADING
 from .light_names import LightNames as LightNames
+from .page import require_page_place as require_page_place
 from .phase_diagrams import draw_network as draw_network
 from .run_records import RunRecord as RunRecord
 from .run_records import TableRecord as TableRecord

@@ -9,8 +9,11 @@ from __future__ import annotations
 import functools
 from collections.abc import Sequence
 from dataclasses import dataclass, field
+from pathlib import Path
 from typing import Any
 
+from ugat_marl.errors import OutputError
+from ugat_marl.files import require_writable
 from ugat_marl.reporting.figures import NamedFigure
 from ugat_marl.reporting.style import DARK, LIGHT, css_variables
 
@@ -85,6 +88,24 @@ def render(template: str, **context: Any) -> str:
     """Return a page made from one of the ``templates/``."""
     text = _environment().get_template(template).render(context)
     return text.encode("utf-8", "replace").decode()  # file names may hold half characters
+
+
+def require_page_place(path: Path) -> None:
+    """Refuse a path that cannot become a page, or whose file holds something else.
+
+    Raises:
+        OutputError: No page can be written there, or the file there is not one of these pages.
+    """
+    require_writable(path, ".html")
+    if not path.exists():
+        return
+    with path.open("rb") as file:
+        begin = file.read(1000)
+    if b'<meta name="generator" content="ugat_marl">' not in begin:
+        raise OutputError(
+            f"{path}: is no page of ugat_marl, or of an earlier version, and would be lost; move "
+            "it, or give another name"
+        )
 
 
 @functools.cache

@@ -41,8 +41,13 @@ def label(*effects: Hidden, group: str = "single", lights: tuple[str, ...] = ("C
     )  # fmt: skip
 
 
-def alternative(*effects: Mapping[str, Any]) -> dict[str, Any]:
-    return {"effects": list(effects), "distance": 1.0, "cost": 1.0}
+def alternative(*effects: Mapping[str, Any], cost: float = 1.0) -> dict[str, Any]:
+    return {"effects": list(effects), "distance": 1.0, "cost": cost}
+
+
+def undecided(*alternatives: Mapping[str, Any]) -> Diagnosis | None:
+    """Return a diagnosis that cannot tell these alternatives apart, if they fit as well."""
+    return says("not_identifiable", best=alternative(), alternatives=alternatives)
 
 
 def gap(before: float, after: float) -> dict[str, Any]:
@@ -100,8 +105,7 @@ THREE = (effect("acceleration"), effect("deceleration"), effect("startup_delay")
         (NONE, says("explained", effect("headway")), "wrong", True),
         (NONE, says("partially_explained", effect("headway")), "wrong", False),
         (NONE, says("not_identifiable", effect("headway")), "wrong", False),
-        (NONE, says("not_identifiable", alternatives=[alternative(effect("headway"))]),
-         "wrong", False),
+        (NONE, undecided(alternative(effect("headway"))), "wrong", False),
         (OFFSET, says("explained", SHIFTED), "right", False),
         (OFFSET, says("explained", effect("detector_offset", "stop")), "right", True),
         (OFFSET, says("no_discrepancy"), "missed", False),
@@ -140,7 +144,10 @@ def test_outcomes(
         (says("explained", effect("undercount", "advance:a")), ()),
         (says("partially_explained", SHIFTED, effect("deceleration")), ("deceleration",)),
         (says("provisional", effect("headway")), ("headway",)),
-        (says("not_identifiable", alternatives=[alternative(effect("min_gap"))]), ("min_gap",)),
+        (
+            undecided(alternative(effect("min_gap")), alternative(effect("headway"), cost=90.0)),
+            ("min_gap",),
+        ),
     ],
 )
 def test_drivers_that_are_blamed_for_detectors(
@@ -230,7 +237,10 @@ def test_swapped_detectors_are_swapped_either_way() -> None:
 
 def test_abstaining_between_right_and_wrong_is_noted() -> None:
     other = alternative(effect("headway"))
-    found = grade(HEADWAY, says("not_identifiable", effect("min_gap"), alternatives=[other]))
+    found = grade(
+        HEADWAY,
+        says("not_identifiable", effect("min_gap"), best=alternative(), alternatives=[other]),
+    )
     assert found.among
     assert not grade(HEADWAY, says("not_identifiable", effect("min_gap"))).among
 

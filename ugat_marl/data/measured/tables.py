@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import csv
 import io
 from collections.abc import Callable, Mapping, Sequence
@@ -16,7 +17,7 @@ from numpy.typing import NDArray
 from ugat_marl.data.measured.local_time import LocalClock
 from ugat_marl.data.measured.values import Finding
 from ugat_marl.data.row_hashes import csv_damage, csv_texts, damage, read_quietly
-from ugat_marl.errors import MeasuredDataError, first_line, nearest
+from ugat_marl.errors import MeasuredDataError, counted, first_line, nearest
 from ugat_marl.files import refuse_endless
 from ugat_marl.scenarios import Period
 
@@ -370,13 +371,29 @@ def _read_csv(path: Path, findings: list[Finding]) -> pl.DataFrame:
         pl.exceptions.PolarsError, pl.exceptions.PanicException, OSError, ValueError, csv.Error
     ) as error:  # fmt: skip
         raise MeasuredDataError(
-            f"{path}: not a table ({first_line(error)}); every line needs the columns of line 1"
+            _wide_line(path, content)
+            or f"{path}: not a table ({first_line(error)}); every line needs the columns of line 1"
         ) from None
     if wrong := csv_damage(path, frame):  # tables of others carry no hashes
         raise MeasuredDataError(f"{path}: damaged, {wrong}")
     if twice := sorted({name for name in written if written.count(name) > 1}):
         raise MeasuredDataError(f"{path}: column {twice[0]!r} is there twice; keep one of them")
     return frame.rename({name: name.strip() for name in frame.columns})
+
+
+def _wide_line(path: Path, content: bytes) -> str | None:
+    """Describe the first line that has more cells than line 1; None without one."""
+    rows = csv.reader(io.StringIO(content.decode()))
+    with contextlib.suppress(csv.Error, StopIteration):
+        named = len(next(rows))
+        for row in rows:
+            if len(row) > named:
+                return (
+                    f"{path}, line {rows.line_num}: {len(row)} cells, but line 1 names "
+                    f"{counted(named, 'column')}; write numbers with a point, not with a decimal "
+                    "comma"
+                )
+    return None
 
 
 def _bytes(path: Path) -> bytes:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from typing import Any
@@ -110,7 +111,7 @@ class GreenWave:
         self._phases = {
             a: len(intersection.phases) for a, intersection in network.intersections.items()
         }
-        self._turns: dict[str, list[int]] = {}
+        self._turns: dict[str, list[tuple[int, int]]] = {}  # phases in order, and decisions of each
         self._offsets: dict[str, int] = {}
         for road in main_roads(network):
             self._plan(road, network)
@@ -125,7 +126,9 @@ class GreenWave:
         actions: Actions = {}
         for agent, phases in self._phases.items():
             turns = self._turns[agent]
-            wanted = turns[(self._time - self._offsets[agent]) % len(turns)]
+            place = (self._time - self._offsets[agent]) % sum(length for _, length in turns)
+            ends = itertools.accumulate(length for _, length in turns)
+            wanted = next(phase for (phase, _), end in zip(turns, ends, strict=True) if place < end)
             allowed = allowed_phases(infos, agent, phases)
             actions[agent] = permitted(wanted, allowed)
         self._time += 1
@@ -146,8 +149,8 @@ class GreenWave:
             )
             at = cycle.index(along)
             others = [*cycle[at + 1 :], *cycle[:at]]
-            turns = [along] * (length - other * len(others))
-            self._turns[agent] = turns + [phase for phase in others for _ in range(other)]
+            first = (along, length - other * len(others))
+            self._turns[agent] = [first, *((phase, other) for phase in others)]
             self._offsets[agent] = round(arrival_s / network.decision_interval_s)
 
 

@@ -351,7 +351,7 @@ def new_folder(target: Path, *, force: bool) -> Iterator[Path]:
     require_free(target, force=force)
     try:
         target.parent.mkdir(parents=True, exist_ok=True)
-        folder = Path(tempfile.mkdtemp(dir=target.parent, prefix=".new-scenario-"))
+        folder = Path(tempfile.mkdtemp(dir=target.parent.resolve(), prefix=".new-scenario-"))
     except OSError as error:
         raise OutputError(
             f"{target}: cannot be written ({error.strerror}); give another place"

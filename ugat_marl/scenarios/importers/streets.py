@@ -21,8 +21,10 @@ class Streets:
         start: Road to the junction at its start.
         end: Road to the junction at its end.
         ahead: Road to the roads ahead, by turn: ``s``, ``l``, ``r`` or ``t`` (back).
-        entries: Roads into the network: no road leads to them except their opposite direction.
-        exits: Roads out of the network: they lead to no road except their opposite direction.
+        entries: Roads into the network: no road leads to them except their opposite direction, and
+            roads from which one can only turn back.
+        exits: Roads out of the network: they lead to no road except their opposite direction, or
+            only back.
     """
 
     start: Mapping[str, str]
@@ -51,6 +53,8 @@ class Streets:
         reached: set[str] = set()
         left: set[str] = set()
         for here, turns in ahead.items():
+            if set(turns) == {"t"}:
+                continue  # the network's edge, where SUMO lets vehicles turn back
             for there in (road for roads in turns.values() for road in roads):
                 if (end[there], start[there]) != (start[here], end[here]):
                     reached.add(there)

@@ -82,8 +82,8 @@ def walked(
         )
     if not streets.entries:
         raise ScenarioError(
-            "no road leads into the network from outside, so --vph has nowhere to let vehicles "
-            "in; give routes (--routes) or origins and destinations (--od)"
+            "no road leads into the network from outside, so there is nowhere to let vehicles in; "
+            "give routes (--routes) or origins and destinations (--od)"
         )
     if vph / 3600 * length_s * len(streets.entries) > MOST_VEHICLES:
         raise OptionError(
