@@ -513,6 +513,21 @@ def test_a_fixed_plan_does_not_follow_the_traffic(log: str) -> None:
     assert not is_actuated([Period("day", begin_s, end_s, "fit", signals, {})], "A")
 
 
+@pytest.mark.parametrize(("share", "follows"), [(0.0, False), (0.15, True)])
+def test_greens_of_one_length_whose_order_changes_follow_the_traffic(
+    share: float, follows: bool
+) -> None:
+    """In heavy traffic every green lasts as long as it must, and a side street is seldom served."""
+    generator = np.random.default_rng(5)
+    rows: list[tuple[float, str]] = []
+    for number, now in enumerate(np.arange(0.0, 3600.0, 20.0).tolist()):
+        first, second = [("Grr", "yrr"), ("rGr", "ryr")][number % 2]
+        if generator.random() < share:
+            first, second = "rrG", "rry"
+        rows += [(now, first), (now + 11.0, second), (now + 14.0, "rrr")]
+    assert is_actuated([Period("day", 0.0, 3600.0, "fit", {"A": tuple(rows)}, {})], "A") == follows
+
+
 @pytest.mark.parametrize("usual_s", [5.0, 50.0])
 def test_a_controller_that_mostly_gives_one_length_follows_the_traffic(usual_s: float) -> None:
     """Nearly all greens are of the shortest length in light traffic, of the longest in heavy."""

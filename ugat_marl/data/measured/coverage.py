@@ -39,6 +39,9 @@ EXPECTED = 10.0
 """Least number of vehicles expected during a silence for a report."""
 MANY_LENGTHS = 3
 """Number of different lengths of one green, in whole s, from which a programme is not fixed."""
+RUN_OF_STATES, CHANGING_ORDER = 16, 0.03
+"""Number of states that tell the next one in a fixed programme, and share of the places at which
+they do not, above which a programme is not fixed."""
 FEW_CHANGES, CHANGING_SHARE = 4, 0.05
 """Number and share of successive greens of other lengths above which that is so. Fixed plans have
 few: two where the plan changes, and two where rows were lost. Greens that follow the traffic may
@@ -178,10 +181,11 @@ def _of_signals(measured: MeasuredData, scenario: Scenario, network: Network) ->
 
 
 def is_actuated(periods: Sequence[Period], tls: str) -> bool:
-    """Return True if a green has more different lengths than a fixed programme gives it.
+    """Return True if greens have other lengths, or another order, than a fixed programme gives.
 
-    Lengths are compared within a period, since plans of the day differ. A change of plan and rows
+    Both are compared within a period, since plans of the day differ. A change of plan and rows
     that were lost give a few odd lengths, but lengths that follow the traffic change all the time.
+    In heavy traffic a controller may give all greens one length, and choose only which comes next.
     """
     for period in periods:
         lengths: dict[str, list[float]] = {}
@@ -195,7 +199,22 @@ def is_actuated(periods: Sequence[Period], tls: str) -> bool:
             often = changed > max(FEW_CHANGES, CHANGING_SHARE * (len(of_state) - 1))
             if len({*of_state}) >= MANY_LENGTHS and often:
                 return True
+        if _order_changes([state for _, state in changes]):
+            return True
     return False
+
+
+def _order_changes(states: Sequence[str]) -> bool:
+    """Return True if what follows a run of states often differs from what followed it before."""
+    followed: dict[tuple[str, ...], str] = {}
+    known = changed = 0
+    for place in range(RUN_OF_STATES, len(states)):
+        run, state = tuple(states[place - RUN_OF_STATES : place]), states[place]
+        before = followed.get(run)
+        known += before is not None
+        changed += before not in (None, state)
+        followed[run] = state
+    return changed > max(FEW_CHANGES, CHANGING_ORDER * known)
 
 
 def _has_yellow(periods: Sequence[Period], tls: str) -> bool:
