@@ -130,6 +130,33 @@ def lock(descriptor: int, *, wait: bool = False) -> None:
     fcntl.flock(descriptor, fcntl.LOCK_EX | (0 if wait else fcntl.LOCK_NB))
 
 
+_made: ContextVar[list[Path] | None] = ContextVar("made", default=None)
+"""Folders made in the block of `without_empty_folders`, those above others first."""
+
+
+@contextlib.contextmanager
+def without_empty_folders() -> Iterator[None]:
+    """Remove at the end of a block the folders that it made for files and wrote nothing into."""
+    folders: list[Path] = []
+    token = _made.set(folders)
+    try:
+        yield
+    finally:
+        _made.reset(token)
+        for folder in reversed(folders):
+            with contextlib.suppress(OSError):  # it holds something
+                folder.rmdir()
+
+
+def _make_folder(folder: Path) -> None:
+    """Make a folder and those above it, and note which were not there."""
+    made = _made.get()
+    if made is not None:
+        whole = folder.absolute()
+        made += [each for each in (*reversed(whole.parents), whole) if not each.exists()]
+    folder.mkdir(parents=True, exist_ok=True)
+
+
 def require_writable(path: Path, suffix: str | None = None) -> None:
     """Refuse a path that cannot become a file, and make its folder.
 
@@ -157,7 +184,7 @@ def require_writable(path: Path, suffix: str | None = None) -> None:
             f"{path}: a {suffix} file is written here{replaced}; give a name that ends in {suffix}"
         )
     try:
-        path.parent.mkdir(parents=True, exist_ok=True)
+        _make_folder(path.parent)
         with tempfile.TemporaryFile(dir=path.parent):
             pass
     except OSError as error:

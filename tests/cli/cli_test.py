@@ -11,6 +11,7 @@ from tests.runs import search_few_rules
 from ugat_marl.__main__ import COMMANDS, main
 from ugat_marl.cli.evaluate import names_of
 from ugat_marl.data import TransitionLog
+from ugat_marl.files import without_empty_folders, write_whole
 
 
 def complaint(capsys: pytest.CaptureFixture[str], *arguments: str) -> str:
@@ -267,3 +268,15 @@ def test_policies_in_a_table_have_short_names_that_differ(
     policies: tuple[str, ...], names: list[str]
 ) -> None:
     assert names_of(policies) == names
+
+
+def test_a_refused_command_leaves_no_empty_folder(tmp_path: Path) -> None:
+    mine = tmp_path / "mine"
+    mine.mkdir()
+    for out in (mine / "log.parquet", tmp_path / "new" / "too" / "log.parquet"):
+        words = ["rollout", "single-v1", "--policy", "no-such-rule", "--out", str(out)]
+        assert main(words) == 2
+    assert list(tmp_path.iterdir()) == [mine]
+    with without_empty_folders():
+        write_whole(tmp_path / "new" / "file", "")
+    assert (tmp_path / "new" / "file").exists()

@@ -31,6 +31,7 @@ from ugat_marl.cli.help import (
     print_help,
 )
 from ugat_marl.errors import UgatMarlError, UnknownNameError, joined, nearest
+from ugat_marl.files import without_empty_folders
 from ugat_marl.progress import Bars, Loudness, loudness, showing
 
 USAGE_ERROR = 2
@@ -119,7 +120,10 @@ def run(line: CommandLine, arguments: Sequence[str]) -> int:
     progress = console if console.is_terminal else plain(stderr=True)
 
     def perform() -> int:
-        with loudness(level), showing(Bars(progress)), _deadline(seconds), _warnings_as_notes():
+        with (
+            loudness(level), showing(Bars(progress)), _deadline(seconds), _warnings_as_notes(),
+            without_empty_folders(),
+        ):  # fmt: skip
             return _dispatch(line, list(arguments), console)
 
     return guarded(line.program, perform)
