@@ -31,7 +31,6 @@ from ugat_marl.cli.help import (
     print_help,
 )
 from ugat_marl.errors import UgatMarlError, UnknownNameError, joined, nearest
-from ugat_marl.files import without_empty_folders
 from ugat_marl.progress import Bars, Loudness, loudness, showing
 
 USAGE_ERROR = 2
@@ -120,10 +119,7 @@ def run(line: CommandLine, arguments: Sequence[str]) -> int:
     progress = console if console.is_terminal else plain(stderr=True)
 
     def perform() -> int:
-        with (
-            loudness(level), showing(Bars(progress)), _deadline(seconds), _warnings_as_notes(),
-            without_empty_folders(),
-        ):  # fmt: skip
+        with loudness(level), showing(Bars(progress)), _deadline(seconds), _warnings_as_notes():
             return _dispatch(line, list(arguments), console)
 
     return guarded(line.program, perform)
@@ -291,7 +287,11 @@ def _dispatch(line: CommandLine, words: list[str], console: Console) -> int:
     if name not in line.commands:
         names = {*(key.split()[0] for key in line.commands), *line.short, COMPLETION}
         raise UnknownNameError("command", name, names, f"{line.program} --help explains them.")
-    return line.perform(_parse(line, name, rest), console)
+    command = _parse(line, name, rest)
+    from ugat_marl.files import without_empty_folders  # which help does not need
+
+    with without_empty_folders():
+        return line.perform(command, console)
 
 
 def _parse(line: CommandLine, name: str, words: list[str]) -> Any:
