@@ -148,7 +148,7 @@ def without_empty_folders() -> Iterator[None]:
                 folder.rmdir()
 
 
-def _make_folder(folder: Path) -> None:
+def make_folder(folder: Path) -> None:
     """Make a folder and those above it, and note which were not there."""
     made = _made.get()
     if made is not None:
@@ -184,7 +184,7 @@ def require_writable(path: Path, suffix: str | None = None) -> None:
             f"{path}: a {suffix} file is written here{replaced}; give a name that ends in {suffix}"
         )
     try:
-        _make_folder(path.parent)
+        make_folder(path.parent)
         with tempfile.TemporaryFile(dir=path.parent):
             pass
     except OSError as error:

@@ -261,8 +261,19 @@ def _as_near(diagnosis: Diagnosis) -> list[Explanation]:
     best = diagnosis.best
     if diagnosis.verdict != "not_identifiable" or best is None:
         return []
-    limit = best.cost + Thresholds().indistinct
-    return [other for other in diagnosis.alternatives if other.cost < limit]
+    limits, own = Thresholds(), _names_and_places(best)
+    near = [
+        other
+        for other in diagnosis.alternatives
+        if other.cost - best.cost < limits.indistinct
+        and len(other.effects) <= len(best.effects)
+        and not _names_and_places(other) >= own
+    ]
+    return near[: limits.rivals_tested]
+
+
+def _names_and_places(explanation: Explanation) -> set[tuple[str, str | None]]:
+    return {(effect.name, effect.place) for effect in explanation.effects}
 
 
 def _with_rivals(names: set[str], effects: Sequence[NamedEffect]) -> list[set[str]]:

@@ -494,6 +494,15 @@ def fixed_plan(begin_s: float, end_s: float, green_s: float, cycle_s: float) -> 
     ]
 
 
+@pytest.mark.parametrize("states", [4, 6, 9])
+def test_a_fixed_plan_of_which_one_row_in_a_hundred_is_lost(states: int) -> None:
+    shown = [f"G{'r' * n}{'y' * (states - n)}" for n in range(states)]
+    for seed in range(20):
+        kept = np.random.default_rng(seed).random(360) > 0.01
+        rows = tuple((10.0 * n, shown[n % states]) for n in np.flatnonzero(kept).tolist())
+        assert not is_actuated([Period("day", 0.0, 3600.0, "fit", {"A": rows}, {})], "A")
+
+
 @pytest.mark.parametrize("log", ["of the night too", "with two losses of rows"])
 def test_a_fixed_plan_does_not_follow_the_traffic(log: str) -> None:
     """One cycle between two plans, and lost rows, give a few greens of other lengths."""

@@ -194,7 +194,7 @@ def test_drivers_who_speed_up_and_slow_down_over_the_loops_make_no_zone(
     def seen(ratio: np.ndarray) -> Sightings:
         over = ratio * CAR_M / speed
         rows = np.column_stack((index, np.full(600, ALONE), over, speed, np.full(600, CAR_M)))
-        return Sightings(rows, np.empty((0, 4)), np.zeros((4, 101)), np.zeros((4, 2)))
+        return Sightings(rows, np.empty((0, 4)), np.zeros((4, 101)), np.zeros((4, 2)), np.zeros(4))
 
     usual = seen(generator.normal(1.0, 0.02, 600))
     street = seen(1.18 + generator.normal(0.0, spread, 600))
@@ -293,7 +293,9 @@ def test_close_vehicles_tell_whether_they_are_merged(merged: bool, least: float,
 def test_splash_onto_three_lanes_by_hand() -> None:
     """Of 1000, 500 and 100 vehicles 0.8, 0.8 * 0.8 and 0.8 are reported once, at a share of 0.2."""
     detectors = [Detector(f"far{n}", f"in_{n}", 100.0, 0.0, "advance") for n in range(3)]
-    empty = Sightings(np.empty((0, 5)), np.empty((0, 4)), np.zeros((3, 101)), np.zeros((3, 2)))
+    empty = Sightings(
+        np.empty((0, 5)), np.empty((0, 4)), np.zeros((3, 101)), np.zeros((3, 2)), np.zeros(3)
+    )
     usual = replace(empty, twins=np.array([(0.0, 1000.0), (0.0, 500.0), (0.0, 100.0)]))
     twins = np.array([(1600 - 800 - 320 - 80, 800), (0, 320), (0, 80)], float)
     (error,) = Measurement(detectors, replace(empty, twins=twins), usual, THRESHOLDS).errors()
@@ -317,6 +319,31 @@ def test_a_quiet_lane_beside_platoons_hides_no_splash() -> None:
     (error,) = Measurement(detectors, street, usual, THRESHOLDS).errors()
     assert str(error.effect).startswith("detector_splash=advance,")
     assert error.effect.share == pytest.approx(0.2, abs=0.04)
+
+
+@pytest.mark.parametrize(
+    ("counts", "share", "margin"),
+    [
+        ((0.0, 0.0, 0.0, 0.0), 0.148, 0.05),  # by lone vehicles alone
+        ((2000.0, 2000.0, 2400.0, 2400.0), 0.189, 0.024),
+        ((1999.0, 2001.0, 2000.0, 2000.0), 0.148, 0.05),  # counts that contradict them
+    ],
+)
+def test_counts_tell_how_large_splash_is(
+    counts: tuple[float, ...], share: float, margin: float
+) -> None:
+    """Two lanes side by side; stop detectors count a fifth more than advance detectors."""
+    nothing = Sightings(
+        np.empty((0, 5)), np.empty((0, 4)), np.zeros((4, 101)), np.zeros((4, 2)), np.zeros(4)
+    )
+    alone = np.array([(0.0, 300.0)] * 4)
+    twins = np.array([(0.0, 300.0), (0.0, 300.0), (45.0, 127.5), (0.0, 127.5)])
+    usual = replace(nothing, twins=alone, counts=np.full(4, 1000.0))
+    street = replace(nothing, twins=twins, counts=np.array(counts))
+    (error,) = Measurement(DETECTORS, street, usual, THRESHOLDS).errors()
+    assert isinstance(error.effect, DetectorSplash) and error.effect.place == "stop"
+    assert error.effect.share == pytest.approx(share, abs=0.002)
+    assert error.margin == pytest.approx(margin, abs=0.004)
 
 
 def test_positions_are_not_examined_where_there_is_splash() -> None:
@@ -389,6 +416,7 @@ def test_pulses_of_a_kind_leave_no_zone_where_vehicles_are_alike() -> None:
             np.empty((0, 4)),
             np.zeros((2, 101)),
             np.zeros((2, 2)),
+            np.full(2, 150.0),
         )
         for times in (over, np.full(300, 0.1))
     )

@@ -251,10 +251,21 @@ def test_patterns_become_service_and_demand_without_a_name() -> None:
     # changes of patterns that overlap add up: 1.25 in all, and 2 from 600 to 1200 s
     beside = replace(surge, place="north", change=0.75)
     much = replace(more, place="south", change=25.0)
-    level, most, factor = unnamed_effects(
-        [beside, more, much], LAYOUT, ("north", "south"), decision_s=10.0
+    later = replace(beside, window=(900.0, 1500.0), change=0.5)
+    none = replace(more, place="east", change=-1.0)
+    added = unnamed_effects(
+        [beside, more, later, much, none, replace(surge, place="east", change=0.5)],
+        LAYOUT,
+        ("north", "south", "east"),
+        decision_s=10.0,
     )
-    assert [str(level), str(most)] == ["demand_level=north,1.25", "demand_level=south,20"]
-    assert str(factor) == "demand_surge=north,600,1200,1.6"
+    assert list(map(str, added)) == [
+        "demand_level=north,1.25",
+        "demand_surge=north,600,900,1.6",
+        "demand_surge=north,900,1200,2",
+        "demand_surge=north,1200,1500,1.4",
+        "demand_level=south,20",
+        "demand_level=east,0",
+    ]
     faster = replace(slow, place=None, movement=None, change=0.2)
     assert unnamed_effects([faster], LAYOUT, (), 10.0) == ()

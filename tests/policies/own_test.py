@@ -554,6 +554,8 @@ def test_an_environment_that_a_learner_holds_is_known_by_what_it_is_made_of() ->
         (tuple[str, ...], "queue", ("queue",)),
         (Sequence[str], "queue", ["queue"]),
         (str, "5", "5"),
+        (str, "'abc'", "'abc'"),
+        (int | list[int], "5", 5),
         (float | str, "0.5", 0.5),
         (float | str, "auto", "auto"),
         (int | str, "5", 5),

@@ -168,6 +168,21 @@ def test_vehicles_enter_and_leave_by_roads_in_several_pieces() -> None:
     assert streets.exits == {"out", "on"}
 
 
+def test_a_hairpin_does_not_end_a_network() -> None:
+    root = ET.fromstring(
+        '<net><edge id="wc" from="w" to="c"><lane id="wc_0"/></edge>'
+        '<edge id="cx" from="c" to="x"><lane id="cx_0"/></edge>'
+        '<edge id="xb" from="x" to="b"><lane id="xb_0"/></edge>'
+        '<edge id="bv" from="b" to="v"><lane id="bv_0"/></edge>'
+        '<connection from="wc" to="cx" fromLane="0" toLane="0" dir="s"/>'
+        '<connection from="cx" to="xb" fromLane="0" toLane="0" dir="t"/>'
+        '<connection from="xb" to="bv" fromLane="0" toLane="0" dir="s"/></net>'
+    )
+    streets = Streets.of(root)
+    assert streets.entries == ("wc",)
+    assert streets.exits == {"bv"}
+
+
 def test_roads_may_say_that_they_are_normal() -> None:
     root = ET.fromstring(
         '<net><edge id="in" from="x" to="y" function="normal"><lane id="in_0"/></edge>'

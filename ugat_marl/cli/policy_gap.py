@@ -17,7 +17,12 @@ from ugat_marl.effects import domain_label, load_scenario, same_for_agents
 from ugat_marl.experiments import policy_factory, policy_gap, read_diagnosis, write_policy_gap
 from ugat_marl.files import require_writable
 from ugat_marl.progress import Bars
-from ugat_marl.reporting import commands_on_page, policy_gap_table, write_diagnosis_page
+from ugat_marl.reporting import (
+    commands_on_page,
+    policy_gap_table,
+    require_page_place,
+    write_diagnosis_page,
+)
 from ugat_marl.scenarios import Network
 
 
@@ -64,6 +69,7 @@ class PolicyGap:
         scenario = load_scenario(self.scenario, self.duration_s)
         diagnosis, corrected = read_diagnosis(self.directory, scenario, self.duration_s)
         require_writable(self.directory / FILE)
+        require_page_place(self.directory / REPORT)
         if same_for_agents(corrected, scenario):
             console.print("note: only detectors were at fault; the traffic was not corrected")
         files = [Path(spec).suffix == ".pt" for spec in self.policies]

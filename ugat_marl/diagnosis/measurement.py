@@ -17,7 +17,7 @@ from __future__ import annotations
 import math
 from collections import Counter
 from collections.abc import Collection, Mapping, Sequence
-from dataclasses import dataclass, fields
+from dataclasses import dataclass, fields, replace
 from itertools import chain, product
 from typing import Literal, Self
 
@@ -84,12 +84,14 @@ class Sightings:
         twins: Rows for every detector, of moments at which nothing else passes beside it:
             passages with twins on the next lanes, counted at the first of their detectors, and
             passages alone: ``(detectors, 2)``.
+        counts: Number of passages over each detector, ``(detectors,)``.
     """
 
     passages: Array
     pairs: Array
     gaps: Array
     twins: Array
+    counts: Array
 
     @classmethod
     def of(
@@ -141,6 +143,7 @@ class Sightings:
             np.concatenate([np.empty((0, 4)), *pairs]),
             np.array([tracks[one.id].gaps for one in layout.detectors]),
             _twins(layout.detectors, tracks, thresholds),
+            np.array([float(len(period.of_detector(one.id))) for one in layout.detectors]),
         )
 
     def __add__(self, other: Sightings) -> Sightings:
@@ -149,6 +152,7 @@ class Sightings:
             np.concatenate([self.pairs, other.pairs]),
             self.gaps + other.gaps,
             self.twins + other.twins,
+            self.counts + other.counts,
         )
 
     def arrays(self) -> dict[str, Array]:
@@ -543,7 +547,7 @@ class Measurement:
         splashes = self._splashes()
         offsets = self._offsets(splashes) if self._pairs_have_speeds else {}
         stated = any(detector.speed_at is not None for detector in self._detectors)
-        zones = self._points_and_zones(pulses, "rear", self._moved(offsets), fixed=stated)
+        zones = self._points_and_zones(pulses, "rear", self._indices(offsets), fixed=stated)
         found += [DetectorError(DetectorSpeeds(at, point)) for at, point in zones.points.items()]
         for number, estimate in zones.estimates.items():
             if self._matters(number, estimate):
@@ -567,9 +571,9 @@ class Measurement:
         known = np.isfinite(self._measured.pairs[:, 2])
         return not len(known) or bool(known.mean() > 0.5)
 
-    def _moved(self, offsets: Collection[str]) -> frozenset[int]:
-        """Return indices of the detectors that stand elsewhere than stated."""
-        return frozenset(index for place in offsets for index in self._members(place))
+    def _indices(self, places: Collection[str]) -> frozenset[int]:
+        """Return the indices of all detectors at some places."""
+        return frozenset(index for place in places for index in self._members(place))
 
     @staticmethod
     def _possible(index: int, estimate: ValueWithError) -> bool:
@@ -730,7 +734,7 @@ class Measurement:
             return None
         offsets = self._offsets(self._splashes()) if self._pairs_have_speeds else {}
         pulses = self._together(self._pulses())
-        shown = self._points_and_zones(pulses, stated, self._moved(offsets)).points
+        shown = self._points_and_zones(pulses, stated, self._indices(offsets)).points
         return next(((stated, point) for point in shown.values()), None)
 
     def _steady(self) -> float:
@@ -941,15 +945,68 @@ class Measurement:
             error = math.hypot(found.error, usual.error, limit.twin_doubt * usual.value)
             equations[group] = [Equation(found.value - usual.value, (1.0,), error)]
         search = ErrorPlaces(equations, (limit.usual_splash,), limit.price_of_an_error)
-        return [
-            DetectorError(
-                DetectorSplash(place, round(share.value, 3)),
-                limit.half_interval * math.hypot(share.error, limit.splash_doubt * share.value),
-            )
+        lone = {
+            place: share
             for (place, _), share in search.choose().estimates.items()
             if share.differs(limit.least_splash, limit.named_deviations)
-            and DetectorSplash.ranges["share"].holds(share.value)
+        }
+        splashed = self._indices(lone)
+        shares = {
+            place: self._agreeing(place, share, reported, splashed) for place, share in lone.items()
+        }
+        return [
+            DetectorError(
+                DetectorSplash(place, round(share.value, 3)), limit.half_interval * share.error
+            )
+            for place, share in shares.items()
+            if DetectorSplash.ranges["share"].holds(share.value)
         ]
+
+    def _agreeing(
+        self,
+        place: str,
+        share: ValueWithError,
+        reported: Mapping[int, int],
+        splashed: frozenset[int],
+    ) -> ValueWithError:
+        """Return the share of splash at a place that lone vehicles and counts speak for together.
+
+        The vehicles over stop detectors are those over the advance detectors of the same lanes.
+        If both count without other errors, n times more passages at one of them are n times more
+        splash. Few vehicles are alone in dense traffic, but all are counted.
+
+        Args:
+            place: Place of the splash.
+            share: Its share, by lone vehicles.
+            reported: By how many detectors beside it the vehicles of each detector are reported.
+            splashed: Indices of all detectors with splash.
+        """
+        limit = self._thresholds
+        lone = replace(share, error=math.hypot(share.error, limit.splash_doubt * share.value))
+        own = self._members(place)
+        lanes = {self._detectors[index].lane for index in own}
+        beside = [
+            index
+            for index, one in enumerate(self._detectors)
+            if one.lane in lanes and index not in own
+        ]
+        here, there = self._simulated.counts[list(own)], self._simulated.counts[beside].sum()
+        counted = self._measured.counts[list(own)].sum(), self._measured.counts[beside].sum()
+        if not here.sum() or not there or not min(counted) or splashed.intersection(beside):
+            return lone
+        twins = float((here * [reported[index] for index in own]).sum() / here.sum())
+        more = float(counted[0] / counted[1] / (here.sum() / there)) - 1.0
+        vehicles = counted[0] / (1.0 + more)
+        chance = math.sqrt(max(more, 0.0) * vehicles + 1.0) / vehicles
+        by_counts = ValueWithError(more / twins, math.hypot(chance, limit.count_doubt) / twins)
+        apart = math.hypot(lone.error, by_counts.error)
+        if abs(by_counts.value - lone.value) > limit.agreeing_deviations * apart:
+            return lone  # one of the two kinds counts wrong for another reason
+        weight = (by_counts.error / apart) ** 2
+        return ValueWithError(
+            weight * lone.value + (1.0 - weight) * by_counts.value,
+            lone.error * by_counts.error / apart,
+        )
 
     @staticmethod
     def _of(rows: Array, members: Sequence[int]) -> Array:

@@ -542,8 +542,7 @@ def unnamed_effects(
         decision_s: Time between two decisions of a controller, s.
     """
     service: dict[str, tuple[float, float]] = {}  # seconds at the begin, and how much gaps grow
-    levels: defaultdict[str, float] = defaultdict(float)  # changes of a whole day's demand by place
-    surges: list[tuple[str, tuple[float, float], float]] = []
+    counts: defaultdict[str, list[Pattern]] = defaultdict(list)
     for one in found:
         if one.quantity == "discharge" and one.window is None and not one.long_vehicles:
             until_s = _until_s(one)
@@ -559,16 +558,8 @@ def unnamed_effects(
             and one.movement is None
             and one.detectors != "stop"
         ):
-            if one.window is None:
-                levels[one.place] += one.change
-            else:
-                surges.append((one.place, one.window, one.change))
-    # Changes of patterns that overlap add up, the effects multiply.
-    usual = {place: _factor(1.0 + change) for place, change in levels.items()}
-    demand: list[Effect] = [DemandLevel(place, factor) for place, factor in usual.items()]
-    for place, window, change in surges:
-        level = usual.get(place, 1.0) or 1.0  # of no vehicles there can be no surge
-        demand.append(DemandSurge(place, *window, _factor(1.0 + change / level)))
+            counts[one.place].append(one)
+    demand = [effect for place, of_place in counts.items() for effect in _demand(place, of_place)]
     lost: list[Effect] = []
     for lane, (lost_s, growth) in service.items():
         begin, each = (
@@ -578,6 +569,23 @@ def unnamed_effects(
         if begin or each:
             lost.append(LaneService(lane, begin, each))
     return (*demand, *lost)
+
+
+def _demand(place: str, found: Sequence[Pattern]) -> Iterator[Effect]:
+    """Yield the effects of patterns in the counts of one road.
+
+    Changes of patterns that overlap add up, but effects multiply. So each stretch of time between
+    two edges of windows has one surge, on top of the level of the day.
+    """
+    level = _factor(1.0 + sum(one.change for one in found if one.window is None))
+    if any(one.window is None for one in found):
+        yield DemandLevel(place, level)
+    surges = [(one.window, one.change) for one in found if one.window is not None]
+    edges = sorted({edge for window, _ in surges for edge in window})
+    for begin_s, end_s in itertools.pairwise(edges):
+        change = sum(c for (first_s, last_s), c in surges if first_s <= begin_s and end_s <= last_s)
+        if change and level:  # of no vehicles there is no surge
+            yield DemandSurge(place, begin_s, end_s, _factor(1.0 + change / level))
 
 
 def _factor(wanted: float) -> float:

@@ -374,6 +374,12 @@ class Thresholds(DayThresholds):
     splash_doubt: float = 0.1
     """Share by which the share of splash may be wrong. By hand: in dense traffic fewer passages are
     alone. Halved: intervals of large shares are too narrow."""
+    count_doubt: float = 0.01
+    """Share by which counts of two kinds of detectors on the same lanes may differ, beside splash.
+    By hand: loops miss a vehicle in a hundred. Halved: such a miss is taken for splash."""
+    agreeing_deviations: float = 3.0
+    """Standard errors up to which counts and lone vehicles speak for one share of splash. By hand:
+    seldom above by chance. Halved: counts are set aside where they would tell more."""
     usual_splash: float = 0.2
     """Prior standard deviation of the share of passages with a twin. By hand: a loop that reports
     every fourth vehicle beside it is soon mended. Halved: large shares are drawn to 0."""

@@ -53,7 +53,12 @@ def auroc(score: Numbers, positive: NDArray[np.bool_]) -> float:
 
 
 def _ranks(values: Numbers) -> Floats:
-    """Return the rank of each value from 1 on; equal values share their mean rank."""
+    """Return the rank of each value from 1 on; equal values share their mean rank.
+
+    All ranks are NaN if a value is.
+    """
+    if np.isnan(values).any():
+        return np.full(len(values), np.nan)
     _, place, counts = np.unique(values, return_inverse=True, return_counts=True)
     return (np.cumsum(counts) - 0.5 * (counts - 1))[place]
 

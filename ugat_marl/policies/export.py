@@ -70,8 +70,8 @@ def export_policy(policy: NetworkPolicy, path: Path, env: AnyParallelEnv | None 
 
     Raises:
         OptionError: The suffix is unknown, the extra is missing, the environment has other agents,
-            FRAP or CoLight is to be written to another format than ``.ts``, or a file of this name
-            holds another policy's model or something else.
+            FRAP or CoLight is to be written to another format than ``.ts``, another policy's model
+            would lose its JSON file, or the file is no model that this function wrote.
         CheckpointError: An option of the environment is not plain data.
         OutputError: A file cannot be written.
     """
@@ -86,7 +86,8 @@ def export_policy(policy: NetworkPolicy, path: Path, env: AnyParallelEnv | None 
     _refuse_other(side_car)
     about = _about(policy, env)
     held = _held(side_car)
-    if path.exists() and path.suffix not in held.get("sha256", {}):
+    written = held.get("sha256", {}).get(path.suffix)
+    if path.exists() and _sum(path.read_bytes()) != written:
         raise OptionError(
             f"{path}: is there, and {side_car.name} tells of no model in it; give the model "
             "another name, or remove the file"

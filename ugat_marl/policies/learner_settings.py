@@ -58,14 +58,14 @@ def _converted(text: str, hint: Any) -> Any:
     except PydanticUserError:  # such as types of NumPy
         return plain
     forms: list[Any] = [None] if text.lower() == "none" else []
-    several = any(kind in str(hint) for kind in ("tuple", "list", "Sequence"))
-    if several and isinstance(plain, (tuple, list)):
+    if not isinstance(plain, (str, bytes)):  # a number for `float | str` is no text
         forms.append(plain)
+    several = any(kind in str(hint) for kind in ("tuple", "list", "Sequence"))
     alone = get_origin(hint) in (Union, UnionType) and str in get_args(hint)
     if several and ("," in text or not alone):  # or text may stand for itself
         forms.append(text.split(","))
     first: ValidationError | None = None
-    for form in (*forms, plain, text):  # a number for `float | str` is no text
+    for form in (*forms, text, plain):
         try:
             return adapter.validate_python(form)
         except ValidationError as error:

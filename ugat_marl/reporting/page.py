@@ -90,6 +90,11 @@ def render(template: str, **context: Any) -> str:
     return text.encode("utf-8", "replace").decode()  # file names may hold half characters
 
 
+_GENERATOR = b'<meta name="generator" content="ugat_marl">'
+_FORBIDS_SCRIPTS = b"content=\"default-src 'none'; style-src 'unsafe-inline'\""
+"""What pages begin with; those of earlier versions have the second line alone."""
+
+
 def require_page_place(path: Path) -> None:
     """Refuse a path that cannot become a page, or whose file holds something else.
 
@@ -101,10 +106,9 @@ def require_page_place(path: Path) -> None:
         return
     with path.open("rb") as file:
         begin = file.read(1000)
-    if b'<meta name="generator" content="ugat_marl">' not in begin:
+    if _GENERATOR not in begin and _FORBIDS_SCRIPTS not in begin:
         raise OutputError(
-            f"{path}: is no page of ugat_marl, or of an earlier version, and would be lost; move "
-            "it, or give another name"
+            f"{path}: is no page of ugat_marl, and would be lost; move it, or give another place"
         )
 
 

@@ -47,7 +47,9 @@ def alternative(*effects: Mapping[str, Any], cost: float = 1.0) -> dict[str, Any
 
 def undecided(*alternatives: Mapping[str, Any]) -> Diagnosis | None:
     """Return a diagnosis that cannot tell these alternatives apart, if they fit as well."""
-    return says("not_identifiable", best=alternative(), alternatives=alternatives)
+    return says(
+        "not_identifiable", best=alternative(effect("acceleration")), alternatives=alternatives
+    )
 
 
 def gap(before: float, after: float) -> dict[str, Any]:
@@ -239,7 +241,12 @@ def test_abstaining_between_right_and_wrong_is_noted() -> None:
     other = alternative(effect("headway"))
     found = grade(
         HEADWAY,
-        says("not_identifiable", effect("min_gap"), best=alternative(), alternatives=[other]),
+        says(
+            "not_identifiable",
+            effect("min_gap"),
+            best=alternative(effect("acceleration")),
+            alternatives=[other],
+        ),
     )
     assert found.among
     assert not grade(HEADWAY, says("not_identifiable", effect("min_gap"))).among

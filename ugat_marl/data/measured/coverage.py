@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import itertools
+from collections import Counter, defaultdict
 from collections.abc import Collection, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 
@@ -168,8 +169,8 @@ def _of_signals(measured: MeasuredData, scenario: Scenario, network: Network) ->
     adaptive = [tls for tls in controlled if is_actuated(periods, tls)]
     if adaptive:
         yield Finding(
-            f"signals: {listed(adaptive, 'traffic light')} with greens of many lengths, as if they "
-            "followed the traffic: "
+            f"signals: {listed(adaptive, 'traffic light')} with greens of many lengths or in an "
+            "order that changes, as if they followed the traffic: "
             + (
                 "simulated days get the arrivals they answered, as the advance detectors saw them; "
                 "where an approach has none, doubt the verdict unknown"
@@ -205,15 +206,19 @@ def is_actuated(periods: Sequence[Period], tls: str) -> bool:
 
 
 def _order_changes(states: Sequence[str]) -> bool:
-    """Return True if what follows a run of states often differs from what followed it before."""
-    followed: dict[tuple[str, ...], str] = {}
-    known = changed = 0
+    """Return True if what follows a run of states often differs from what mostly follows it.
+
+    The state after that one is no change: a row of the log was lost.
+    """
+    followed: defaultdict[tuple[str, ...], Counter[str]] = defaultdict(Counter)
     for place in range(RUN_OF_STATES, len(states)):
-        run, state = tuple(states[place - RUN_OF_STATES : place]), states[place]
-        before = followed.get(run)
-        known += before is not None
-        changed += before not in (None, state)
-        followed[run] = state
+        followed[tuple(states[place - RUN_OF_STATES : place])][states[place]] += 1
+    usual = {run: counts.most_common(1)[0][0] for run, counts in followed.items()}
+    known = changed = 0
+    for run, counts in followed.items():
+        after_next = usual.get((*run[1:], usual[run]))
+        known += counts.total() - 1
+        changed += sum(n for state, n in counts.items() if state not in (usual[run], after_next))
     return changed > max(FEW_CHANGES, CHANGING_ORDER * known)
 
 

@@ -390,8 +390,8 @@ def _wide_line(path: Path, content: bytes) -> str | None:
             if len(row) > named:
                 return (
                     f"{path}, line {rows.line_num}: {len(row)} cells, but line 1 names "
-                    f"{counted(named, 'column')}; write numbers with a point, not with a decimal "
-                    "comma"
+                    f"{counted(named, 'column')}; every line needs the columns of line 1, numbers "
+                    "with a point and no decimal comma, and quotes around a text with a comma"
                 )
     return None
 

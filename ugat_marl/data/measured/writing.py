@@ -35,7 +35,7 @@ from ugat_marl.data.row_hashes import (
     write_hashed,
 )
 from ugat_marl.errors import OutputError
-from ugat_marl.files import put_folder
+from ugat_marl.files import make_folder, put_folder
 from ugat_marl.scenarios import Passages, Period
 
 
@@ -61,7 +61,7 @@ def write_measured(measured: MeasuredData, directory: Path, *, csv: bool = False
     suffix = ".csv" if csv else ".parquet"
     place = Path(os.path.realpath(directory))  # a link goes on to point at the data
     try:
-        place.parent.mkdir(parents=True, exist_ok=True)
+        make_folder(place.parent)
         temporary = place.with_name(f".{place.name}.{secrets.token_hex(8)}")
         temporary.mkdir()
     except OSError as error:

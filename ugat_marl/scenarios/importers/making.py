@@ -18,7 +18,7 @@ from pathlib import Path
 from typing import Any
 
 from ugat_marl.errors import OutputError, ScenarioError, counted
-from ugat_marl.files import put_folder, read_toml, write_whole
+from ugat_marl.files import make_folder, put_folder, read_toml, write_whole
 from ugat_marl.progress import Reporter
 from ugat_marl.scenarios.admission import admitted
 from ugat_marl.scenarios.demand import Demand, check_demand
@@ -350,7 +350,7 @@ def new_folder(target: Path, *, force: bool) -> Iterator[Path]:
     """
     require_free(target, force=force)
     try:
-        target.parent.mkdir(parents=True, exist_ok=True)
+        make_folder(target.parent)
         folder = Path(tempfile.mkdtemp(dir=target.parent.resolve(), prefix=".new-scenario-"))
     except OSError as error:
         raise OutputError(

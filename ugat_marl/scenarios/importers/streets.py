@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import xml.etree.ElementTree as ET
 from collections import defaultdict
-from collections.abc import Mapping
+from collections.abc import Collection, Mapping
 from dataclasses import dataclass
 
 from ugat_marl.scenarios.junctions import cars_may_use, lanes_without_cars, leads_cars
@@ -21,10 +21,9 @@ class Streets:
         start: Road to the junction at its start.
         end: Road to the junction at its end.
         ahead: Road to the roads ahead, by turn: ``s``, ``l``, ``r`` or ``t`` (back).
-        entries: Roads into the network: no road leads to them except their opposite direction, and
-            roads from which one can only turn back.
-        exits: Roads out of the network: they lead to no road except their opposite direction, or
-            only back.
+        entries: Roads into the network: no road leads to them except back from the other direction
+            of the same street.
+        exits: Roads out of the network: they lead to no road except back into their street.
     """
 
     start: Mapping[str, str]
@@ -52,11 +51,19 @@ class Streets:
                 ahead[here][TURNS.get(letter, letter)][there] = None
         reached: set[str] = set()
         left: set[str] = set()
+        onward: dict[str, set[str]] = defaultdict(set)
+        behind: dict[str, set[str]] = defaultdict(set)
         for here, turns in ahead.items():
-            if set(turns) == {"t"}:
-                continue  # the network's edge, where SUMO lets vehicles turn back
+            for there in (road for turn, roads in turns.items() if turn != "t" for road in roads):
+                onward[here].add(there)
+                behind[there].add(here)
+        for here, turns in ahead.items():
+            # At its edge SUMO lets vehicles turn back, into a street that may be in pieces.
+            at_edge = set(turns) == {"t"}
+            came = {start[road] for road in (_in_line(here, behind) if at_edge else [here])}
             for there in (road for roads in turns.values() for road in roads):
-                if (end[there], start[there]) != (start[here], end[here]):
+                goes = {end[road] for road in (_in_line(there, onward) if at_edge else [there])}
+                if start[there] != end[here] or came.isdisjoint(goes):
                     reached.add(there)
                     left.add(here)
         return cls(
@@ -69,3 +76,14 @@ class Streets:
             tuple(road for road in start if road not in reached and road in left),
             frozenset(road for road in start if road not in left),
         )
+
+
+def _in_line(road: str, neighbours: Mapping[str, Collection[str]]) -> list[str]:
+    """Return a road and those that follow one another from it without a choice."""
+    roads = [road]
+    while len(following := neighbours.get(roads[-1], ())) == 1:
+        (after,) = following
+        if after in roads:
+            break
+        roads.append(after)
+    return roads
