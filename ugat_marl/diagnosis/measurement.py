@@ -17,7 +17,7 @@ from __future__ import annotations
 import math
 from collections import Counter
 from collections.abc import Collection, Mapping, Sequence
-from dataclasses import dataclass, fields, replace
+from dataclasses import dataclass, fields
 from itertools import chain, product
 from typing import Literal, Self
 
@@ -935,78 +935,71 @@ class Measurement:
         limit = self._thresholds
         # By how many detectors beside it the vehicles of each one are reported.
         reported = Counter(chain.from_iterable(_beside(self._detectors).values()))
-        equations: dict[Group, list[Equation]] = {}
+        lone: dict[Group, ValueWithError] = {}
         for group, members in self._groups.items():
             beside = np.array([reported[index] for index in members])
             counts = [x.twins[members] for x in (self._measured, self._simulated)]
             if min(x[beside > 0, 1].sum() for x in counts) < limit.least_sightings:
                 continue
             found, usual = (_splash(x, beside) for x in counts)
-            error = math.hypot(found.error, usual.error, limit.twin_doubt * usual.value)
-            equations[group] = [Equation(found.value - usual.value, (1.0,), error)]
+            doubts = limit.twin_doubt * usual.value, limit.splash_doubt * found.value
+            error = math.hypot(found.error, usual.error, *doubts)
+            lone[group] = ValueWithError(found.value - usual.value, error)
+        equations: dict[Group, list[Equation]] = {}
+        for group, share in lone.items():
+            shares = [share]
+            if (counted := self._splash_by_counts(group, reported, lone)) is not None:
+                shares.append(counted)
+            equations[group] = [Equation(one.value, (1.0,), one.error) for one in shares]
         search = ErrorPlaces(equations, (limit.usual_splash,), limit.price_of_an_error)
-        lone = {
-            place: share
-            for (place, _), share in search.choose().estimates.items()
-            if share.differs(limit.least_splash, limit.named_deviations)
-        }
-        splashed = self._indices(lone)
-        shares = {
-            place: self._agreeing(place, share, reported, splashed) for place, share in lone.items()
-        }
         return [
             DetectorError(
                 DetectorSplash(place, round(share.value, 3)), limit.half_interval * share.error
             )
-            for place, share in shares.items()
-            if DetectorSplash.ranges["share"].holds(share.value)
+            for (place, _), share in search.choose().estimates.items()
+            if share.differs(limit.least_splash, limit.named_deviations)
+            and DetectorSplash.ranges["share"].holds(share.value)
         ]
 
-    def _agreeing(
-        self,
-        place: str,
-        share: ValueWithError,
-        reported: Mapping[int, int],
-        splashed: frozenset[int],
-    ) -> ValueWithError:
-        """Return the share of splash at a place that lone vehicles and counts speak for together.
+    def _splash_by_counts(
+        self, group: Group, reported: Mapping[int, int], lone: Mapping[Group, ValueWithError]
+    ) -> ValueWithError | None:
+        """Return the share of splash that the counts of a group speak for.
 
-        The vehicles over stop detectors are those over the advance detectors of the same lanes.
-        If both count without other errors, n times more passages at one of them are n times more
-        splash. Few vehicles are alone in dense traffic, but all are counted.
+        Few vehicles are alone in dense traffic, but all are counted: those over stop detectors are
+        those over the advance detectors of the same lanes. A detector may miss vehicles, though. So
+        counts only say how large a splash is that lone vehicles show, and agree with.
 
         Args:
-            place: Place of the splash.
-            share: Its share, by lone vehicles.
+            group: Detectors of one kind on one road.
             reported: By how many detectors beside it the vehicles of each detector are reported.
-            splashed: Indices of all detectors with splash.
+            lone: Shares of splash by lone vehicles, of all groups.
+
+        Returns:
+            The share; None if counts do not tell.
         """
-        limit = self._thresholds
-        lone = replace(share, error=math.hypot(share.error, limit.splash_doubt * share.value))
-        own = self._members(place)
+        limit, share = self._thresholds, lone[group]
+        own = self._groups[group]
         lanes = {self._detectors[index].lane for index in own}
         beside = [
             index
             for index, one in enumerate(self._detectors)
             if one.lane in lanes and index not in own
         ]
-        here, there = self._simulated.counts[list(own)], self._simulated.counts[beside].sum()
-        counted = self._measured.counts[list(own)].sum(), self._measured.counts[beside].sum()
-        if not here.sum() or not there or not min(counted) or splashed.intersection(beside):
-            return lone
-        twins = float((here * [reported[index] for index in own]).sum() / here.sum())
-        more = float(counted[0] / counted[1] / (here.sum() / there)) - 1.0
-        vehicles = counted[0] / (1.0 + more)
-        chance = math.sqrt(max(more, 0.0) * vehicles + 1.0) / vehicles
-        by_counts = ValueWithError(more / twins, math.hypot(chance, limit.count_doubt) / twins)
-        apart = math.hypot(lone.error, by_counts.error)
-        if abs(by_counts.value - lone.value) > limit.agreeing_deviations * apart:
-            return lone  # one of the two kinds counts wrong for another reason
-        weight = (by_counts.error / apart) ** 2
-        return ValueWithError(
-            weight * lone.value + (1.0 - weight) * by_counts.value,
-            lone.error * by_counts.error / apart,
-        )
+        simulated, measured = self._simulated.counts, self._measured.counts
+        least = min(simulated[own].sum(), simulated[beside].sum(), measured[beside].sum())
+        shown = [share, *(lone[one] for one in lone if set(self._groups[one]) & set(beside))]
+        own_shown, *others_shown = (one.value > limit.shown_deviations * one.error for one in shown)
+        if not least or not own_shown or any(others_shown):
+            return None
+        twins = float((simulated[own] * [reported[index] for index in own]).sum())
+        twins /= float(simulated[own].sum())  # detectors that may report a vehicle as well
+        usual = float(simulated[own].sum() / simulated[beside].sum() * measured[beside].sum())
+        more = float(measured[own].sum()) - usual
+        error = math.hypot(math.sqrt(max(more, 0.0) + 1.0) / usual, limit.count_doubt) / twins
+        counted = ValueWithError(more / usual / twins, error)
+        agree = limit.agreeing_deviations * math.hypot(share.error, counted.error)
+        return counted if abs(counted.value - share.value) <= agree else None
 
     @staticmethod
     def _of(rows: Array, members: Sequence[int]) -> Array:

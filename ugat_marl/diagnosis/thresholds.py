@@ -380,6 +380,9 @@ class Thresholds(DayThresholds):
     agreeing_deviations: float = 3.0
     """Standard errors up to which counts and lone vehicles speak for one share of splash. By hand:
     seldom above by chance. Halved: counts are set aside where they would tell more."""
+    shown_deviations: float = 2.0
+    """Standard errors above which lone vehicles show a splash, of which counts may tell more. By
+    hand: counts alone cannot tell it from missed vehicles. Halved: these become splash."""
     usual_splash: float = 0.2
     """Prior standard deviation of the share of passages with a twin. By hand: a loop that reports
     every fourth vehicle beside it is soon mended. Halved: large shares are drawn to 0."""
