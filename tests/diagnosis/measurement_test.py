@@ -299,8 +299,7 @@ def test_splash_onto_three_lanes_by_hand() -> None:
     usual = replace(empty, twins=np.array([(0.0, 1000.0), (0.0, 500.0), (0.0, 100.0)]))
     twins = np.array([(1600 - 800 - 320 - 80, 800), (0, 320), (0, 80)], float)
     (error,) = Measurement(detectors, replace(empty, twins=twins), usual, THRESHOLDS).errors()
-    assert isinstance(error.effect, DetectorSplash) and error.effect.place == "advance"
-    assert error.effect.share == pytest.approx(0.2, abs=0.003)  # nearly; the prior draws it to 0
+    assert str(error.effect) == "detector_splash=advance,0.2"
 
 
 def test_a_quiet_lane_beside_platoons_hides_no_splash() -> None:
@@ -326,7 +325,7 @@ def test_a_quiet_lane_beside_platoons_hides_no_splash() -> None:
     ("counts", "share", "margin"),
     [
         ((0.0, 0.0, 0.0, 0.0), 0.148, 0.05),  # by lone vehicles alone
-        ((2000.0, 2000.0, 2400.0, 2400.0), 0.189, 0.024),
+        ((2000.0, 2000.0, 2400.0, 2400.0), 0.199, 0.024),
         ((1999.0, 2001.0, 2000.0, 2000.0), 0.148, 0.05),  # counts that contradict them
     ],
 )

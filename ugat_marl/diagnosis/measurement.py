@@ -941,25 +941,25 @@ class Measurement:
             counts = [x.twins[members] for x in (self._measured, self._simulated)]
             if min(x[beside > 0, 1].sum() for x in counts) < limit.least_sightings:
                 continue
-            found, usual = (_splash(x, beside) for x in counts)
-            doubts = limit.twin_doubt * usual.value, limit.splash_doubt * found.value
-            error = math.hypot(found.error, usual.error, *doubts)
-            lone[group] = ValueWithError(found.value - usual.value, error)
-        equations: dict[Group, list[Equation]] = {}
-        for group, share in lone.items():
-            shares = [share]
-            if (counted := self._splash_by_counts(group, reported, lone)) is not None:
-                shares.append(counted)
-            equations[group] = [Equation(one.value, (1.0,), one.error) for one in shares]
+            seen, usual = (_splash(x, beside) for x in counts)
+            error = math.hypot(seen.error, usual.error, limit.twin_doubt * usual.value)
+            lone[group] = ValueWithError(seen.value - usual.value, error)
+        counted = {group: self._splash_by_counts(group, reported, lone) for group in lone}
+        shares = {group: counted[group] or share for group, share in lone.items()}
+        equations = {
+            group: [Equation(share.value, (1.0,), share.error)] for group, share in shares.items()
+        }
         search = ErrorPlaces(equations, (limit.usual_splash,), limit.price_of_an_error)
-        return [
-            DetectorError(
-                DetectorSplash(place, round(share.value, 3)), limit.half_interval * share.error
-            )
-            for (place, _), share in search.choose().estimates.items()
-            if share.differs(limit.least_splash, limit.named_deviations)
-            and DetectorSplash.ranges["share"].holds(share.value)
-        ]
+        found: list[DetectorError] = []
+        for (place, _), share in search.choose().estimates.items():
+            known = share.differs(limit.least_splash, limit.named_deviations)
+            if known and DetectorSplash.ranges["share"].holds(share.value):
+                members = set(self._members(place))
+                sure = all(counted[group] for group in lone if members & set(self._groups[group]))
+                doubt = 0.0 if sure else limit.splash_doubt * share.value
+                margin = limit.half_interval * math.hypot(share.error, doubt)
+                found.append(DetectorError(DetectorSplash(place, round(share.value, 3)), margin))
+        return found
 
     def _splash_by_counts(
         self, group: Group, reported: Mapping[int, int], lone: Mapping[Group, ValueWithError]
