@@ -21,10 +21,11 @@ from ugat_marl.diagnosis.workflow import _without_search as without_search
 from ugat_marl.effects import (
     DemandSurge,
     DetectorExtension,
+    DetectorSplash,
     Effect,
     Headway,
     LaneService,
-    parse_domain,
+    Undercount,
 )
 
 THRESHOLDS = Thresholds()
@@ -211,24 +212,32 @@ def test_what_was_not_fitted_has_no_interval_and_a_window_is_a_window() -> None:
     assert (loops.window, loops.parameters["seconds"].low) == (None, pytest.approx(0.9))
 
 
+SPLASH = DetectorSplash("stop", 0.2)
+FAULT = Undercount("advance:a", 0.2)
+
+
 @pytest.mark.parametrize(
-    ("verdict", "named", "corrected"),
+    ("verdict", "errors", "effects", "corrected"),
     [
-        ("explained", ("headway=1.4", "undercount=advance:a,0.2"), ["headway=1.4"]),
-        ("explained", ("undercount=advance:a,0.2",), []),
-        ("provisional", ("headway=1.4",), ["headway=1.4"]),
-        ("provisional", ("undercount=advance:a,0.2",), None),
-        ("unknown", ("undercount=advance:a,0.2",), None),
-        ("no_discrepancy", (), None),
+        ("explained", (SPLASH,), (Headway(1.4), FAULT), [Headway(1.4)]),
+        ("explained", (SPLASH,), (), []),
+        ("explained", (), (FAULT,), []),
+        ("provisional", (SPLASH,), (Headway(1.4),), [Headway(1.4)]),
+        ("provisional", (), (FAULT,), []),  # the nearest explanation: the traffic is right
+        ("provisional", (SPLASH,), (), None),
+        ("unknown", (SPLASH,), (), None),
+        ("unknown", (), (Headway(1.4),), [Headway(1.4)]),
+        ("no_discrepancy", (), (), None),
     ],
 )
 def test_a_scenario_that_was_not_examined_is_not_called_corrected(
-    verdict: str, named: tuple[str, ...], corrected: list[str] | None
+    verdict: str,
+    errors: tuple[Effect, ...],
+    effects: tuple[Effect, ...],
+    corrected: list[Effect] | None,
 ) -> None:
     diagnosis: Any = SimpleNamespace(verdict=verdict, not_corrected=None)
-    effects = [effect for domain in named for effect in parse_domain(domain)]
-    found = workflow._corrections(diagnosis, effects)
-    assert (None if found is None else list(map(str, found))) == corrected
+    assert workflow._corrections(diagnosis, errors, effects) == corrected
 
 
 def test_an_unnamed_correction_that_is_not_tried_takes_no_other_away(

@@ -111,9 +111,8 @@ def diagnose(
     read = timing_effects(scenario, study.network, measured, config.thresholds)
     timing = tuple(effect for effect in read if effect.name not in config.leave_out)
     with reporter.whole("diagnosis", study.work()):
-        diagnosis, named = _diagnosed(study, timing, reporter)
-    named = (*timing, *named)
-    traffic = _corrections(diagnosis, named)
+        diagnosis, errors, effects = _diagnosed(study, timing, reporter)
+    traffic = _corrections(diagnosis, errors, (*timing, *effects))
     corrected = None if traffic is None else apply_effects(scenario, traffic)
     if corrected is not None:
         diagnosis = replace(diagnosis, corrected=CORRECTED)
@@ -170,21 +169,22 @@ def _put_corrected(corrected: Scenario | None, place: Path) -> None:
 
 def _diagnosed(
     study: Study, timing: tuple[Effect, ...], reporter: Reporter
-) -> tuple[Diagnosis, tuple[Effect, ...]]:
+) -> tuple[Diagnosis, tuple[Effect, ...], tuple[Effect, ...]]:
     """Run all stages.
 
     Returns:
-        The record, and the effects of the corrected scenario besides those of the signal log.
+        The record, the errors of measurement, and the effects of the corrected scenario besides
+        these and those of the signal log.
     """
     try:
         study = study.detectors_as_they_are(reporter)
         base = study.base(reporter)
         study = study.with_empty_start_finding(base, reporter)
     except OutOfTime:
-        return _nothing_simulated(study, timing), study.errors_of_detectors
+        return _nothing_simulated(study, timing), study.errors_of_detectors, ()
     search = _searched(study, base, reporter)
     diagnosis, effects = _concluded(search, timing, reporter)
-    return diagnosis, (*search.study.errors_of_detectors, *effects)
+    return diagnosis, search.study.errors_of_detectors, effects
 
 
 @dataclass(frozen=True, eq=False)
@@ -250,17 +250,24 @@ def _searched(
     return _Search(study, located, selector, selected)
 
 
-def _corrections(diagnosis: Diagnosis, named: Sequence[Effect]) -> list[Effect] | None:
+def _corrections(
+    diagnosis: Diagnosis, errors: Sequence[Effect], effects: Sequence[Effect]
+) -> list[Effect] | None:
     """Return the effects of the corrected scenario; None if there is no such scenario.
 
     Errors of this street's detectors are no part of the model of its traffic. The scenario as it is
-    counts as corrected only if nothing but these errors is wrong.
+    counts as corrected if nothing but these is wrong, but not before a search has found that.
+
+    Args:
+        diagnosis: The record.
+        errors: Errors of measurement.
+        effects: Effects that the signal log or a search has found, faults of detectors among them.
     """
-    traffic = [effect for effect in named if not effect.on_detectors]
-    open_ended = diagnosis.verdict in ("unknown", "provisional")
-    if not named or (not traffic and (open_ended or diagnosis.not_corrected is not None)):
-        return None
-    return traffic
+    traffic = [effect for effect in effects if not effect.on_detectors]
+    if diagnosis.verdict == "unknown" or diagnosis.not_corrected is not None:
+        return traffic or None
+    told = effects if diagnosis.verdict == "provisional" else (*errors, *effects)
+    return traffic if told else None
 
 
 def _concluded(
