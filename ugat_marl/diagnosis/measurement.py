@@ -614,9 +614,8 @@ class Measurement:
             apart = abs(float(np.median(measured[:, 2]) - np.median(simulated[:, 2])))
             same = alike[0] > self._thresholds.pulse_share > 2.0 * alike[1]
             if same and apart > max(self._grain_s, self._thresholds.touching_s):
-                limits = DetectorPulse.ranges["seconds"]
                 seconds = round(float(np.median(measured[:, 2])), 2)
-                pulses[group] = min(max(seconds, limits.low), limits.high)
+                pulses[group] = DetectorPulse.ranges["seconds"].nearest(seconds)
         return pulses
 
     def _together(self, pulses: Mapping[Group, float]) -> dict[str, float]:
@@ -945,10 +944,10 @@ class Measurement:
             error = math.hypot(seen.error, usual.error, limit.twin_doubt * usual.value)
             lone[group] = ValueWithError(seen.value - usual.value, error)
         counted = {group: self._splash_by_counts(group, reported, lone) for group in lone}
-        shares = {group: counted[group] or share for group, share in lone.items()}
-        equations = {
-            group: [Equation(share.value, (1.0,), share.error)] for group, share in shares.items()
-        }
+        equations: dict[Group, list[Equation]] = {}
+        for group, by_lone in lone.items():
+            share = counted[group] or by_lone
+            equations[group] = [Equation(share.value, (1.0,), share.error)]
         search = ErrorPlaces(equations, (limit.usual_splash,), limit.price_of_an_error)
         found: list[DetectorError] = []
         for (place, _), share in search.choose().estimates.items():

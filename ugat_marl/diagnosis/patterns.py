@@ -577,7 +577,8 @@ def _demand(place: str, found: Sequence[Pattern]) -> Iterator[Effect]:
     Changes of patterns that overlap add up, but effects multiply. So each stretch of time between
     two edges of windows has one surge, on top of the level of the day.
     """
-    level = _factor(1.0 + sum(one.change for one in found if one.window is None))
+    factors = DemandLevel.ranges["factor"]
+    level = factors.nearest(1.0 + sum(one.change for one in found if one.window is None))
     if any(one.window is None for one in found):
         yield DemandLevel(place, level)
     surges = [(one.window, one.change) for one in found if one.window is not None]
@@ -585,13 +586,7 @@ def _demand(place: str, found: Sequence[Pattern]) -> Iterator[Effect]:
     for begin_s, end_s in itertools.pairwise(edges):
         change = sum(c for (first_s, last_s), c in surges if first_s <= begin_s and end_s <= last_s)
         if change and level:  # of no vehicles there is no surge
-            yield DemandSurge(place, begin_s, end_s, _factor(1.0 + change / level))
-
-
-def _factor(wanted: float) -> float:
-    """Return the factor of a demand that is nearest to the wanted one."""
-    limits = DemandLevel.ranges["factor"]
-    return min(max(wanted, limits.low), limits.high)
+            yield DemandSurge(place, begin_s, end_s, factors.nearest(1.0 + change / level))
 
 
 def _until_s(pattern: Pattern) -> float | None:

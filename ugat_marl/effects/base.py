@@ -52,6 +52,10 @@ class NumberParameter:
         """Return True if a value is plausible."""
         return self.low <= value <= self.high
 
+    def nearest(self, value: float) -> float:
+        """Return the plausible value nearest to one."""
+        return min(max(value, self.low), self.high)
+
 
 TIME_OF_EPISODE = NumberParameter("s", 0.0, 1e7)
 """Begin or end of a part of the episode."""
