@@ -10,14 +10,15 @@ from typing import Any
 import numpy as np
 import pytest
 
-from ugat_marl.diagnosis import measurement
+from ugat_marl.diagnosis import sightings
 from ugat_marl.diagnosis.features import DetectorLayout, Greens, IncomingLane
-from ugat_marl.diagnosis.measurement import (
+from ugat_marl.diagnosis.measurement import Measurement
+from ugat_marl.diagnosis.sightings import (
     ALONE,
     FOURTH,
     SECOND,
+    SIXTH,
     THIRD,
-    Measurement,
     Sightings,
     _regimes_at_stop,
     _Track,
@@ -194,11 +195,38 @@ def test_drivers_who_speed_up_and_slow_down_over_the_loops_make_no_zone(
     def seen(ratio: np.ndarray) -> Sightings:
         over = ratio * CAR_M / speed
         rows = np.column_stack((index, np.full(600, ALONE), over, speed, np.full(600, CAR_M)))
-        return Sightings(rows, np.empty((0, 4)), np.zeros((4, 101)), np.zeros((4, 2)), np.zeros(4))
+        return replace(nothing_seen(4), passages=rows)
 
     usual = seen(generator.normal(1.0, 0.02, 600))
     street = seen(1.18 + generator.normal(0.0, spread, 600))
     assert bool(Measurement(detectors, street, usual, THRESHOLDS).errors()) == names
+
+
+@pytest.mark.parametrize(
+    ("zone_m", "extension_s", "found"),
+    [
+        (1.9, -0.15, []),  # drivers who start otherwise, as seen with reaction steps of 2 s
+        (4.0, -1.0, ["detector_extension=stop", "detector_zone=stop"]),
+        (1.9, 0.3, ["detector_extension=stop", "detector_zone=stop"]),
+    ],
+)
+def test_numbers_that_change_slow_vehicles_alone_are_no_error(
+    zone_m: float, extension_s: float, found: list[str]
+) -> None:
+    """Vehicles of a queue pass the line at 6 to 11 m/s, lone ones at 13 m/s."""
+    generator = np.random.default_rng(5)
+    regimes = np.tile(np.repeat([ALONE, SECOND, THIRD, FOURTH, SIXTH], 150), 2)
+    index = np.repeat([2, 3], len(regimes) // 2)
+    usual_mps = np.array([13.0, 6.0, 7.6, 9.0, 10.8])[regimes]
+    speed = usual_mps + generator.normal(0.0, 0.3, len(regimes))
+
+    def seen(more_m: float, more_s: float) -> Sightings:
+        over = (CAR_M + more_m) / speed + more_s
+        rows = np.column_stack((index, regimes, over, speed, np.full(len(index), CAR_M)))
+        return replace(nothing_seen(4), passages=rows)
+
+    errors = Measurement(DETECTORS, seen(zone_m, extension_s), seen(0.0, 0.0), THRESHOLDS).errors()
+    assert sorted(f"{one.effect.name}={one.effect.place}" for one in errors) == found
 
 
 def test_extensions_are_seen_without_speeds() -> None:
@@ -290,12 +318,22 @@ def test_close_vehicles_tell_whether_they_are_merged(merged: bool, least: float,
     assert found == [f"detector_extension=*,0.8,{form}"]
 
 
+def nothing_seen(detectors: int) -> Sightings:
+    """Sightings of as many detectors without a vehicle."""
+    return Sightings(
+        np.empty((0, 5)),
+        np.empty((0, 4)),
+        np.zeros((detectors, 101)),
+        np.zeros((detectors, 2)),
+        np.zeros((detectors, 2)),
+        np.zeros(detectors),
+    )
+
+
 def test_splash_onto_three_lanes_by_hand() -> None:
     """Of 1000, 500 and 100 vehicles 0.8, 0.8 * 0.8 and 0.8 are reported once, at a share of 0.2."""
     detectors = [Detector(f"far{n}", f"in_{n}", 100.0, 0.0, "advance") for n in range(3)]
-    empty = Sightings(
-        np.empty((0, 5)), np.empty((0, 4)), np.zeros((3, 101)), np.zeros((3, 2)), np.zeros(3)
-    )
+    empty = nothing_seen(3)
     usual = replace(empty, twins=np.array([(0.0, 1000.0), (0.0, 500.0), (0.0, 100.0)]))
     twins = np.array([(1600 - 800 - 320 - 80, 800), (0, 320), (0, 80)], float)
     (error,) = Measurement(detectors, replace(empty, twins=twins), usual, THRESHOLDS).errors()
@@ -333,17 +371,66 @@ def test_counts_tell_how_large_splash_is(
     counts: tuple[float, ...], share: float, margin: float
 ) -> None:
     """Two lanes side by side; stop detectors count a fifth more than advance detectors."""
-    nothing = Sightings(
-        np.empty((0, 5)), np.empty((0, 4)), np.zeros((4, 101)), np.zeros((4, 2)), np.zeros(4)
-    )
+    nothing = nothing_seen(4)
     alone = np.array([(0.0, 300.0)] * 4)
     twins = np.array([(0.0, 300.0), (0.0, 300.0), (45.0, 127.5), (0.0, 127.5)])
     usual = replace(nothing, twins=alone, counts=np.full(4, 1000.0))
-    street = replace(nothing, twins=twins, counts=np.array(counts))
+    coincidences = np.zeros((4, 2))
+    coincidences[2, 0] = 0.15 * sum(counts[2:])
+    street = replace(nothing, twins=twins, coincidences=coincidences, counts=np.array(counts))
     (error,) = Measurement(DETECTORS, street, usual, THRESHOLDS).errors()
     assert isinstance(error.effect, DetectorSplash) and error.effect.place == "stop"
     assert error.effect.share == pytest.approx(share, abs=0.002)
     assert error.margin == pytest.approx(margin, abs=0.004)
+
+
+@pytest.mark.parametrize(
+    ("together_s", "counted", "found"),
+    [
+        (0.0, True, ["detector_splash=stop,0.2"]),
+        (0.0, False, []),  # drivers who start side by side alike
+        (0.5, True, []),  # advance detectors that miss vehicles
+    ],
+)
+def test_where_nobody_is_alone_coincidences_and_counts_tell_splash(
+    together_s: float, counted: bool, found: list[str]
+) -> None:
+    """Platoons on both lanes at all times; a fifth of the vehicles also beside them at the line."""
+    layout = DetectorLayout(("A",), (), (), DETECTORS, {})
+    rng = np.random.default_rng(5)
+
+    def days(share: float) -> Sightings:
+        passages: dict[str, Passages] = {}
+        for lane in ("", " left"):
+            times = np.cumsum(rng.uniform(1.5, 4.0, 2000))
+            speeds = rng.uniform(6.0, 14.0, 2000)
+            passages[f"far{lane}"] = crossings(times, speeds)
+            passages[f"line{lane}"] = crossings(times + 5.0, speeds)
+        copied = {}
+        for lane, other in (("", " left"), (" left", "")):
+            seen = passages[f"line{other}"].at(rng.random(2000) < share)
+            late = crossings(seen.on_s + together_s, seen.speed_mps)
+            copied[f"line{lane}"] = Passages.concatenated([passages[f"line{lane}"], late])
+            if not counted:  # as many vehicles over the advance detectors
+                times = np.linspace(0.0, 5500.0, len(copied[f"line{lane}"]))
+                copied[f"far{lane}"] = crossings(times, np.full(len(times), 10.0))
+        period = Period("day", 0.0, 9000.0, "fit", {}, passages | copied)
+        return Sightings.of(layout, period, [], THRESHOLDS)
+
+    errors = Measurement(DETECTORS, days(0.2), days(0.0), THRESHOLDS).errors()
+    splashes = [one.effect for one in errors if isinstance(one.effect, DetectorSplash)]
+    assert [f"{one.name}={one.place},{one.share:.1f}" for one in splashes] == found
+
+
+def test_coincidences_by_hand() -> None:
+    """Of four pairs of equal length two begin together and one 0.3 s apart, which halves chance."""
+    layout = DetectorLayout(("A",), (), (), DETECTORS[:2], {})
+    first = np.array([10.0, 20.0, 30.0, 40.0])
+    second = np.array([10.1, 19.9, 30.3, 40.5])
+    speeds = np.full(4, 10.0)
+    passages = {"far": crossings(first, speeds), "far left": crossings(second, speeds)}
+    seen = Sightings.of(layout, Period("day", 0.0, 99.0, "fit", {}, passages), [], THRESHOLDS)
+    assert seen.coincidences.tolist() == [[2.0, 0.5], [0.0, 0.0]]
 
 
 def test_positions_are_not_examined_where_there_is_splash() -> None:
@@ -375,16 +462,19 @@ def test_detectors_farther_upstream_hide_no_position() -> None:
     )
     usual = together([day(seed) for seed in range(3)])
     street = together([day(seed, distance_m=GAP_M + 18.0) for seed in (7, 8)])
-    gaps, twins = (np.vstack((x, np.zeros((2, x.shape[1])))) for x in (usual.gaps, usual.twins))
-    counts = np.append(usual.counts, np.zeros(2))
-    days = (replace(x, gaps=gaps, twins=twins, counts=counts) for x in (street, usual))
+    none = nothing_seen(2)
+    more = {
+        name: np.concatenate((getattr(usual, name), getattr(none, name)))
+        for name in ("gaps", "twins", "coincidences", "counts")
+    }
+    days = (replace(x, **more) for x in (street, usual))
     (error,) = Measurement((*DETECTORS, *second), *days, THRESHOLDS).errors()
     assert str(error.effect).startswith("detector_offset=advance,-18")
 
 
 def test_cached_sightings_depend_on_every_number_they_are_made_with() -> None:
     """Those of a day are in the key of the day already."""
-    source = inspect.getsource(measurement).partition("# --- estimates")[0]
+    source = inspect.getsource(sightings)
     used = set(re.findall(r"(?:thresholds|limit)\.(\w+)", source))
     of_a_day = {name for name, _ in THRESHOLDS.of_a_day()}
     assert used - of_a_day == set(OF_SIGHTINGS)
@@ -412,12 +502,10 @@ def test_pulses_of_a_kind_leave_no_zone_where_vehicles_are_alike() -> None:
     over = CAR_M / speed
     none = np.full(300, ALONE)
     usual, street = (
-        Sightings(
-            np.column_stack((index, none, times, speed, np.full(300, CAR_M))),
-            np.empty((0, 4)),
-            np.zeros((2, 101)),
-            np.zeros((2, 2)),
-            np.full(2, 150.0),
+        replace(
+            nothing_seen(2),
+            passages=np.column_stack((index, none, times, speed, np.full(300, CAR_M))),
+            counts=np.full(2, 150.0),
         )
         for times in (over, np.full(300, 0.1))
     )

@@ -16,7 +16,9 @@ content of ``diagnosis.json``.
     supplementary_data  turning counts, travel times of probes and states of lanes
     journeys    travel times and queues between detectors, which no fit uses
     statistics  statistics of several periods, their noise, distances, whitening
-    measurement errors of the detectors, read off single vehicles before all else
+    sightings   what single vehicles did at the detectors
+    measurement errors of the detectors, read off sightings before all else
+    splash      the share of the vehicles beside theirs that detectors report
     error_places  choice of the detectors that err: as few as the data ask for
     arrivals    the vehicles of a day at the times at which detectors saw the street's
     replay      one simulated day under the measured signals

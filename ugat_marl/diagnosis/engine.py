@@ -34,8 +34,8 @@ from ugat_marl.diagnosis.features import (
     tally,
 )
 from ugat_marl.diagnosis.intervals import with_intervals
-from ugat_marl.diagnosis.measurement import Sightings
 from ugat_marl.diagnosis.replay import Day, Replay
+from ugat_marl.diagnosis.sightings import Sightings
 from ugat_marl.diagnosis.supplementary_data import SupplementaryData
 from ugat_marl.diagnosis.thresholds import Thresholds
 from ugat_marl.diagnosis.unmeasured import Unmeasured
@@ -296,7 +296,7 @@ class Engine:
         def reduce(period: Period, greens: Sequence[Greens]) -> dict[str, Any]:
             return Sightings.of(self.layout, period, greens, self._thresholds).arrays()
 
-        name = f"vehicles2-{self._thresholds.of_sightings()}"
+        name = f"vehicles3-{self._thresholds.of_sightings()}"
         days = self.reduced(effects, numbers, name, reduce, advance)
         return [Sightings.from_arrays(arrays) for arrays in days]
 

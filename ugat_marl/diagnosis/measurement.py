@@ -15,11 +15,10 @@ hide where speeds are measured.
 from __future__ import annotations
 
 import math
-from collections import Counter
 from collections.abc import Collection, Mapping, Sequence
-from dataclasses import dataclass, fields
-from itertools import chain, product
-from typing import Literal, Self
+from dataclasses import dataclass
+from itertools import product
+from typing import Literal
 
 import numpy as np
 from numpy.typing import NDArray
@@ -32,7 +31,8 @@ from ugat_marl.diagnosis.error_places import (
     Number,
     ValueWithError,
 )
-from ugat_marl.diagnosis.features import DetectorLayout, Greens
+from ugat_marl.diagnosis.sightings import ALONE, GAP_EDGES_S, Sightings
+from ugat_marl.diagnosis.splash import Splash
 from ugat_marl.diagnosis.thresholds import Thresholds
 from ugat_marl.effects import (
     EVERYWHERE,
@@ -46,15 +46,10 @@ from ugat_marl.effects import (
     Overlap,
     detectors_at,
     group_name,
-    next_detectors,
 )
-from ugat_marl.scenarios import Detector, Passages, Period, SpeedPoint, edge_of_lane
+from ugat_marl.scenarios import Detector, SpeedPoint, edge_of_lane
 
 Array = NDArray[np.float64]
-
-ALONE, SECOND, THIRD, FOURTH, SIXTH, BRAKING = range(6)
-"""Regimes of a passage: alone in free flow; second, third, fourth to fifth, sixth to eighth of a
-queue at a stop detector; braking alone for a red at an advance detector."""
 
 Form = Literal["excess", "ratio"]
 """What is compared of vehicles with speeds: the excess time over the zone, or the ratio G."""
@@ -62,318 +57,6 @@ FORMS: tuple[Form, ...] = ("excess", "ratio")
 
 _EXTENSION = 0
 """Index of the extension in the numbers of a place; the other one is the length of the zone."""
-
-GAP_EDGES_S = 0.05 * np.arange(101)
-"""Edges of the bins of the time between two passages, s."""
-
-# --- what is seen of single vehicles ------------------------------------------------------------
-
-
-@dataclass(frozen=True, eq=False)
-class Sightings:
-    """Passages and pairs of detections from which errors of measurement are estimated.
-
-    Attributes:
-        passages: Rows of index of the detector, regime, time over the zone in s, speed in m/s (NaN
-            if not measured), length of vehicle and zone in m: ``(passages, 5)``.
-        pairs: Rows of index of the advance detector, travel time to the stop detector in s, mean
-            speed in m/s (NaN if not measured), mean ratio of length to time over the zones in m/s:
-            ``(pairs, 4)``.
-        gaps: Numbers of passages by the time without a vehicle after them, ``(detectors, bins)``:
-            none at all, then bins of `GAP_EDGES_S`.
-        twins: Rows for every detector, of moments at which nothing else passes beside it:
-            passages with twins on the next lanes, counted at the first of their detectors, and
-            passages alone: ``(detectors, 2)``.
-        counts: Number of passages over each detector, ``(detectors,)``.
-    """
-
-    passages: Array
-    pairs: Array
-    gaps: Array
-    twins: Array
-    counts: Array
-
-    @classmethod
-    def of(
-        cls,
-        layout: DetectorLayout,
-        period: Period,
-        greens: Sequence[Greens],
-        thresholds: Thresholds,
-    ) -> Self:
-        """Collect the sightings of one period.
-
-        Args:
-            layout: Lanes and detectors.
-            period: The period.
-            greens: Greens of every lane.
-            thresholds: Numbers of the method.
-        """
-        number = {detector.id: index for index, detector in enumerate(layout.detectors)}
-        tracks = {
-            detector.id: _Track.of(period.of_detector(detector.id), detector, thresholds)
-            for detector in layout.detectors
-        }
-        rows: list[Array] = []
-        pairs: list[Array] = []
-        for lane, green in zip(layout.lanes, greens, strict=True):
-            advance, stop = lane.detectors.get("advance"), lane.detectors.get("stop")
-            if advance:
-                track = tracks[advance]
-                regimes = _regimes_at_advance(track, green, thresholds)
-                rows.append(track.rows(number[advance], regimes))
-            if stop:
-                track = tracks[stop]
-                rows.append(track.rows(number[stop], _regimes_at_stop(track, green, thresholds)))
-            if advance and stop:
-                pairs.append(
-                    _pairs(
-                        number[advance],
-                        tracks[advance],
-                        tracks[stop],
-                        green,
-                        lane.speed_mps,
-                        thresholds,
-                    )
-                )
-        for _, _, name in layout.exits:
-            rows.append(tracks[name].rows(number[name], tracks[name].alone_only()))
-        return cls(
-            np.concatenate([np.empty((0, 5)), *rows]),
-            np.concatenate([np.empty((0, 4)), *pairs]),
-            np.array([tracks[one.id].gaps for one in layout.detectors]),
-            _twins(layout.detectors, tracks, thresholds),
-            np.array([float(len(period.of_detector(one.id))) for one in layout.detectors]),
-        )
-
-    def __add__(self, other: Sightings) -> Sightings:
-        return Sightings(
-            np.concatenate([self.passages, other.passages]),
-            np.concatenate([self.pairs, other.pairs]),
-            self.gaps + other.gaps,
-            self.twins + other.twins,
-            self.counts + other.counts,
-        )
-
-    def arrays(self) -> dict[str, Array]:
-        """Return the arrays by name, as `from_arrays` takes them."""
-        return {item.name: getattr(self, item.name) for item in fields(self)}
-
-    @classmethod
-    def from_arrays(cls, arrays: Mapping[str, Array]) -> Self:
-        """Make the sightings from the result of `arrays`."""
-        return cls(**{item.name: np.asarray(arrays[item.name]) for item in fields(cls)})
-
-
-def together(days: Sequence[Sightings]) -> Sightings:
-    """Return the sightings of several days as one."""
-    total = days[0]
-    for day in days[1:]:
-        total = total + day
-    return total
-
-
-@dataclass(frozen=True, eq=False)
-class _Track:
-    """Whole passages over one detector in time; all arrays ``(passages,)``.
-
-    Attributes:
-        on: Begin, s.
-        over: Time over the zone, s.
-        speed: Speed, m/s.
-        reach: Length of the vehicle and of the zone, m.
-        before: Time since the start of the passage before, s.
-        after: Time until the start of the next passage, s.
-        free: True if the passage ended before the next one began.
-        gaps: Numbers of passages by the time without a vehicle after them, see `Sightings`.
-    """
-
-    on: Array
-    over: Array
-    speed: Array
-    reach: Array
-    before: Array
-    after: Array
-    free: NDArray[np.bool_]
-    gaps: Array
-    thresholds: Thresholds
-
-    @classmethod
-    def of(cls, passages: Passages, detector: Detector, thresholds: Thresholds) -> Self:
-        seen = passages.at(np.isfinite(passages.on_s) & np.isfinite(passages.off_s))
-        on, over = seen.on_s, seen.off_s - seen.on_s
-        gaps = np.diff(on)
-        before, after = np.append(np.inf, gaps), np.append(gaps, np.inf)
-        free = after - over > thresholds.touching_s
-        apart = (after - over)[:-1] > thresholds.no_gap_s
-        length = np.where(np.isfinite(seen.length_m), seen.length_m, thresholds.length_m)
-        counts = np.histogram((after - over)[:-1][apart], GAP_EDGES_S)[0]
-        return cls(
-            on,
-            over,
-            seen.speed_mps,
-            length + detector.length_m,
-            before,
-            after,
-            free,
-            np.append(float((~apart).sum()), counts),
-            thresholds,
-        )
-
-    def leading(self) -> NDArray[np.bool_]:
-        """Mark moving vehicles without another one close ahead."""
-        limit = self.thresholds
-        # The negations are True for unknown speeds (NaN), here and below.
-        moving = ~(self.speed <= limit.moving_mps) & (self.over < limit.longest_alone_s)
-        return (self.before > limit.free_gap_s) & moving
-
-    def alone(self) -> NDArray[np.bool_]:
-        """Mark moving vehicles without another one close ahead or behind."""
-        return self.leading() & (self.after > self.thresholds.free_gap_s)
-
-    def alone_only(self) -> NDArray[np.int64]:
-        """Return regimes with lone vehicles alone; -1 for all others."""
-        return np.where(self.alone(), ALONE, -1)
-
-    def rows(self, index: int, regime: NDArray[np.int64]) -> Array:
-        """Return rows of `Sightings.passages` for the passages with a regime."""
-        kept = (regime >= 0) & self.free
-        columns = (np.full(len(regime), index), regime, self.over, self.speed, self.reach)
-        return np.column_stack(columns)[kept]
-
-
-def _cycles(times: Array, greens: Greens) -> tuple[NDArray[np.int64], NDArray[np.bool_]]:
-    """Return the index of the last green that began before each time, and True inside a green."""
-    cycle = np.searchsorted(greens.start_s, times, "right") - 1
-    if not len(greens.start_s):
-        return np.zeros(len(times), np.int64), np.zeros(len(times), np.bool_)
-    return np.maximum(cycle, 0), (cycle >= 0) & (times < greens.end_s[np.maximum(cycle, 0)])
-
-
-def _regimes_at_advance(track: _Track, greens: Greens, thresholds: Thresholds) -> NDArray[np.int64]:
-    """Return the regimes of passages over an advance detector."""
-    cycle, green = _cycles(track.on, greens)
-    regime = np.full(len(track.on), -1)
-    if not len(greens.start_s):
-        return track.alone_only()
-    settled = green & (track.on > greens.start_s[cycle] + thresholds.settled_green_s)
-    regime[track.alone() & settled] = ALONE
-    red = (track.on > greens.red_s[cycle]) & (
-        track.on < greens.next_s[cycle] - thresholds.before_green_s
-    )
-    lone = (track.before > thresholds.lone_gap_s) & ~(track.speed <= thresholds.least_braking_mps)
-    regime[red & lone & (track.over < thresholds.longest_alone_s)] = BRAKING
-    return regime
-
-
-def _regimes_at_stop(track: _Track, greens: Greens, thresholds: Thresholds) -> NDArray[np.int64]:
-    """Return the regimes of passages over a stop detector."""
-    regime = np.full(len(track.on), -1)
-    if not len(greens.start_s) or not len(track.on):
-        return regime
-    cycle, green = _cycles(track.on + track.over, greens)
-    settled = green & (track.on > greens.start_s[cycle] + thresholds.settled_green_s)
-    crossed = track.on + track.over
-    begun = np.searchsorted(greens.start_s, crossed, "right")  # 0 before the first whole green
-    first = np.searchsorted(begun, begun, "left")
-    number = np.arange(len(cycle)) - first
-    gap = np.where(number == 0, 0.0, np.diff(crossed, prepend=crossed[0]))
-    broken = np.cumsum(gap > thresholds.queue_break_s)
-    waited = track.on[first] < greens.start_s[cycle[first]]
-    moving = ~(track.speed <= thresholds.crawling_mps) & (track.over < thresholds.longest_alone_s)
-    queue = green & waited & (broken == broken[first]) & moving
-    regime[track.alone() & settled & ~queue] = ALONE
-    for name, low, high in ((SECOND, 1, 1), (THIRD, 2, 2), (FOURTH, 3, 4), (SIXTH, 5, 7)):
-        regime[queue & (number >= low) & (number <= high)] = name
-    return regime
-
-
-def _pairs(
-    index: int,
-    advance: _Track,
-    stop: _Track,
-    greens: Greens,
-    limit_mps: float,
-    thresholds: Thresholds,
-) -> Array:
-    """Match lone vehicles at an advance detector with those at the stop detector behind it."""
-    cycle, green = _cycles(advance.on, greens)
-    lone = np.flatnonzero(advance.leading() & green)
-    if not len(lone) or not len(stop.on):
-        return np.empty((0, 4))
-    lone = lone[advance.on[lone] > greens.start_s[cycle[lone]] + thresholds.settled_green_s]
-    after = np.searchsorted(stop.on, advance.on[lone] + thresholds.least_travel_s)
-    known = after < len(stop.on)
-    lone, after = lone[known], after[known]
-    travel = stop.on[after] - advance.on[lone]
-    alone = stop.leading()[after] & (stop.on[after] < greens.end_s[cycle[lone]])
-    alone &= travel < thresholds.longest_travel_s
-    lone, after, travel = lone[alone], after[alone], travel[alone]
-    speed = 0.5 * (advance.speed[lone] + stop.speed[after])
-    pace = [x.reach[i] / np.maximum(x.over[i], 1e-3) for x, i in ((advance, lone), (stop, after))]
-    # A vehicle that changed its speed on the way tells little about the distance.
-    change = np.abs(advance.speed[lone] - stop.speed[after])
-    change = np.where(np.isfinite(change), change, np.abs(pace[0] - pace[1]))
-    rows = np.column_stack((np.full(len(lone), index), travel, speed, 0.5 * (pace[0] + pace[1])))
-    return rows[change < thresholds.steady_share * limit_mps]
-
-
-def _twins(
-    detectors: Sequence[Detector], tracks: Mapping[str, _Track], thresholds: Thresholds
-) -> Array:
-    """Count passages with twins on the next lanes, and passages alone: ``(detectors, 2)``.
-
-    Only moments count at which nothing else passes on the lanes side by side. Otherwise the splash
-    of a platoon would look like a lone vehicle without a twin on its other side. These moments last
-    for a free gap: within less, leaders of queues that start side by side look like twins.
-    """
-    counts = np.zeros((len(detectors), 2))
-    beside = _beside(detectors)
-    for members in _side_by_side(beside):
-        parts = [tracks[detectors[index].id] for index in members]
-        on, over = (np.concatenate(x) for x in ([t.on for t in parts], [t.over for t in parts]))
-        index = np.repeat(members, [len(t.on) for t in parts])
-        order = np.argsort(on, kind="stable")
-        on, over, index = on[order], over[order], index[order]
-        starts = np.flatnonzero(np.diff(on, prepend=-np.inf) > thresholds.free_gap_s)
-        if not len(starts):
-            continue
-        ends = np.append(starts[1:], len(on))
-        alone = index[starts[ends == starts + 1]]
-        counts[:, 1] += np.bincount(alone, minlength=len(counts))
-        spread = [
-            np.maximum.reduceat(x, starts) - np.minimum.reduceat(x, starts) for x in (on, over)
-        ]
-        alike = (ends > starts + 1) & (np.maximum(*spread) < thresholds.twin_s)
-        for start, end in zip(starts[alike].tolist(), ends[alike].tolist(), strict=True):
-            passed = set(index[start:end].tolist())
-            beside_one = any(all(x in {one, *beside[one]} for x in passed) for one in passed)
-            if len(passed) == end - start and beside_one:
-                counts[min(passed), 0] += 1.0
-    return counts
-
-
-def _beside(detectors: Sequence[Detector]) -> dict[int, frozenset[int]]:
-    """Return the indices of the next detectors of each one, as `next_detectors` names them."""
-    number = {one.id: index for index, one in enumerate(detectors)}
-    return {
-        number[name]: frozenset(number[other] for other in others)
-        for name, others in next_detectors(detectors).items()
-    }
-
-
-def _side_by_side(beside: Mapping[int, frozenset[int]]) -> list[list[int]]:
-    """Return the detectors that lie side by side, directly or over others; none that lie alone."""
-    groups: list[set[int]] = []
-    for one, others in beside.items():
-        if others:
-            group = {one, *others}
-            apart = [known for known in groups if known.isdisjoint(group)]
-            groups = [*apart, group.union(*(x for x in groups if not x.isdisjoint(group)))]
-    return [sorted(group) for group in groups]
-
-
-# --- estimates ----------------------------------------------------------------------------------
 
 
 @dataclass(frozen=True)
@@ -402,33 +85,6 @@ def _grain_s(times: Array) -> float:
         if bool((np.abs(steps - np.round(steps)) < 0.01).all()):
             return grain
     return 0.0
-
-
-def _splash(twins: Array, beside: NDArray[np.int64]) -> ValueWithError:
-    """Return the share s of vehicles that each detector beside theirs reports as well.
-
-    Of N vehicles whose lane has n detectors beside, ``N (1 - s)^n`` are alone. So the numbers of
-    passages alone, each divided by ``(1 - s)^n``, sum to the number of vehicles. The error is that
-    of Poisson numbers, with one more twin, since none of a few is no certainty.
-
-    Args:
-        twins: Rows of `Sightings.twins`.
-        beside: Number of detectors beside that may report vehicles of each: ``(detectors,)``.
-    """
-    together, alone = float(twins[:, 0].sum()), twins[:, 1]
-    total = together + float(alone.sum())
-    # Newton's method in x = 1 / (1 - s): the sum is convex in x, so it nears the root from above.
-    x = 1.0
-    for _ in range(50):
-        x -= float((alone * x**beside).sum() - total) / _slope(alone, beside, x)
-    share = 1.0 - 1.0 / x
-    spread = together + 1.0 + float((alone * (x**beside - 1.0) ** 2).sum())
-    return ValueWithError(share, math.sqrt(spread) / (_slope(alone, beside, x) * x**2))
-
-
-def _slope(alone: Array, beside: NDArray[np.int64], x: float) -> float:
-    """Return the derivative of the sum of `alone` by ``x**beside``."""
-    return float((alone * beside * x ** (beside - 1.0)).sum())
 
 
 @dataclass(frozen=True)
@@ -503,6 +159,13 @@ def _cheapest(
         choices = [search.choose(elsewhere, [*best.estimates]) for search in searches]
         best = min(choices, key=lambda choice: choice.cost, default=best)
     return best
+
+
+def _solved(
+    searches: Sequence[ErrorPlaces], numbers: Collection[Number], elsewhere: Mapping[str, float]
+) -> Choice:
+    """Return the cheapest values of given numbers in several searches."""
+    return min((one.solved(numbers, elsewhere) for one in searches), key=lambda one: one.cost)
 
 
 class Measurement:
@@ -673,13 +336,33 @@ class Measurement:
                 if place in (EVERYWHERE, *self._kinds):
                     choice = _cheapest(searches, here)
                 else:
-                    tried = (s.solved(some, here) for s in searches for some in ((), numbers))
+                    tried = (_solved(searches, some, here) for some in ((), numbers))
                     choice = min(tried, key=lambda one: one.cost)
                 cost = choice.cost + searches[0].multiplicity[place]
                 if cost < least - (limit.narrower_place if points else 0.0):
                     least, best = cost, choice
                     points, there = {place: point}, here
+        best = self._without_opposites(searches, best, there)
         return _Zones(points, best.estimates, self._rivals(searches, best, there))
+
+    def _without_opposites(
+        self, searches: Sequence[ErrorPlaces], best: Choice, elsewhere: Mapping[str, float]
+    ) -> Choice:
+        """Return the choice without longer zones that begin late, and the reverse, which cancel.
+
+        Both change slow vehicles, and quick ones hardly at all. So do drivers who speed up and
+        brake otherwise. Such a pair is kept if one of its numbers would matter without the other.
+        """
+        for place in dict.fromkeys(place for place, _ in best.estimates):
+            pair = [(place, 0), (place, 1)]
+            values = [best.estimates[one].value for one in pair if one in best.estimates]
+            if len(values) < len(pair) or math.prod(values) > 0.0:
+                continue
+            others = [one for one in best.estimates if one not in pair]
+            single = {one: _solved(searches, [*others, one], elsewhere) for one in pair}
+            if not any(self._matters(one, single[one].estimates[one]) for one in pair):
+                best = _solved(searches, others, elsewhere)
+        return best
 
     def _rivals(
         self, searches: Sequence[ErrorPlaces], best: Choice, elsewhere: Mapping[str, float]
@@ -692,8 +375,7 @@ class Measurement:
             if other in best.estimates:
                 continue
             numbers = [other if one == number else one for one in best.estimates]
-            tried = (search.solved(numbers, elsewhere) for search in searches)
-            instead = min(tried, key=lambda one: one.cost)
+            instead = _solved(searches, numbers, elsewhere)
             estimate = instead.estimates[other]
             near = instead.cost < best.cost + self._thresholds.told_apart
             if near and self._possible(1 - index, estimate):
@@ -932,73 +614,24 @@ class Measurement:
     def _splashes(self) -> list[DetectorError]:
         """Return the places of detectors that report vehicles of the next lane."""
         limit = self._thresholds
-        # By how many detectors beside it the vehicles of each one are reported.
-        reported = Counter(chain.from_iterable(_beside(self._detectors).values()))
-        lone: dict[Group, ValueWithError] = {}
-        for group, members in self._groups.items():
-            beside = np.array([reported[index] for index in members])
-            counts = [x.twins[members] for x in (self._measured, self._simulated)]
-            if min(x[beside > 0, 1].sum() for x in counts) < limit.least_sightings:
-                continue
-            seen, usual = (_splash(x, beside) for x in counts)
-            error = math.hypot(seen.error, usual.error, limit.twin_doubt * usual.value)
-            lone[group] = ValueWithError(seen.value - usual.value, error)
-        counted = {group: self._splash_by_counts(group, reported, lone) for group in lone}
-        equations: dict[Group, list[Equation]] = {}
-        for group, by_lone in lone.items():
-            share = counted[group] or by_lone
-            equations[group] = [Equation(share.value, (1.0,), share.error)]
+        shares = Splash(
+            self._detectors, self._groups, self._measured, self._simulated, limit
+        ).shares()
+        equations = {
+            group: [Equation(share.value, (1.0,), share.error)] for group, share in shares.items()
+        }
         search = ErrorPlaces(equations, (limit.usual_splash,), limit.price_of_an_error)
         found: list[DetectorError] = []
         for (place, _), share in search.choose().estimates.items():
             known = share.differs(limit.least_splash, limit.named_deviations)
             if known and DetectorSplash.ranges["share"].holds(share.value):
                 members = set(self._members(place))
-                sure = all(counted[group] for group in lone if members & set(self._groups[group]))
+                here = [one for one in shares if members & set(self._groups[one])]
+                sure = all(shares[one].counted for one in here)
                 doubt = 0.0 if sure else limit.splash_doubt * share.value
                 margin = limit.half_interval * math.hypot(share.error, doubt)
                 found.append(DetectorError(DetectorSplash(place, round(share.value, 3)), margin))
         return found
-
-    def _splash_by_counts(
-        self, group: Group, reported: Mapping[int, int], lone: Mapping[Group, ValueWithError]
-    ) -> ValueWithError | None:
-        """Return the share of splash that the counts of a group speak for.
-
-        Few vehicles are alone in dense traffic, but all are counted: those over stop detectors are
-        those over the advance detectors of the same lanes. A detector may miss vehicles, though. So
-        counts only say how large a splash is that lone vehicles show, and agree with.
-
-        Args:
-            group: Detectors of one kind on one road.
-            reported: By how many detectors beside it the vehicles of each detector are reported.
-            lone: Shares of splash by lone vehicles, of all groups.
-
-        Returns:
-            The share; None if counts do not tell.
-        """
-        limit, share = self._thresholds, lone[group]
-        own = self._groups[group]
-        lanes = {self._detectors[index].lane for index in own}
-        beside = [
-            index
-            for index, one in enumerate(self._detectors)
-            if one.lane in lanes and index not in own
-        ]
-        simulated, measured = self._simulated.counts, self._measured.counts
-        least = min(simulated[own].sum(), simulated[beside].sum(), measured[beside].sum())
-        shown = [share, *(lone[one] for one in lone if set(self._groups[one]) & set(beside))]
-        own_shown, *others_shown = (one.value > limit.shown_deviations * one.error for one in shown)
-        if not least or not own_shown or any(others_shown):
-            return None
-        twins = float((simulated[own] * [reported[index] for index in own]).sum())
-        twins /= float(simulated[own].sum())  # detectors that may report a vehicle as well
-        usual = float(simulated[own].sum() / simulated[beside].sum() * measured[beside].sum())
-        more = float(measured[own].sum()) - usual
-        error = math.hypot(math.sqrt(max(more, 0.0) + 1.0) / usual, limit.count_doubt) / twins
-        counted = ValueWithError(more / usual / twins, error)
-        agree = limit.agreeing_deviations * math.hypot(share.error, counted.error)
-        return counted if abs(counted.value - share.value) <= agree else None
 
     @staticmethod
     def _of(rows: Array, members: Sequence[int]) -> Array:

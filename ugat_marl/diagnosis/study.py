@@ -37,13 +37,14 @@ from ugat_marl.diagnosis.intervals import (
     without_gaps,
     without_occupancies,
 )
-from ugat_marl.diagnosis.measurement import DetectorError, Measurement, Sightings, together
+from ugat_marl.diagnosis.measurement import DetectorError, Measurement
 from ugat_marl.diagnosis.patterns import QUANTITIES, cells_of, patterns
 from ugat_marl.diagnosis.places import PlaceFinder, Routes
 from ugat_marl.diagnosis.records import Fitted, Pattern, Tested
 from ugat_marl.diagnosis.replay import Replay
 from ugat_marl.diagnosis.residual import Directed, Directions, Null
 from ugat_marl.diagnosis.select import MOVES_OF_A_VALUE, Selector
+from ugat_marl.diagnosis.sightings import Sightings, together
 from ugat_marl.diagnosis.statistics import Array, Distance, Pools, Reference, change_between, sum_of
 from ugat_marl.diagnosis.supplementary_data import SupplementaryData
 from ugat_marl.diagnosis.thresholds import (

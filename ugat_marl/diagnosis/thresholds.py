@@ -371,6 +371,9 @@ class Thresholds(DayThresholds):
     twin_doubt: float = 0.3
     """Share by which twins of vehicles side by side may differ. By hand: other drivers form other
     platoons. Halved: platoons look like splash."""
+    coincidence_doubt: float = 0.02
+    """Share of vehicles that other drivers may let start beside another one at the same moment. By
+    hand: 0 to 0.03 on simulated days with the usual drivers. Halved: platoons look like splash."""
     splash_doubt: float = 0.1
     """Share by which the share of splash may be wrong. By hand: in dense traffic fewer passages are
     alone. Halved: intervals of large shares are too narrow."""
@@ -378,10 +381,10 @@ class Thresholds(DayThresholds):
     """Share by which counts of two kinds of detectors on the same lanes may differ, beside splash.
     By hand: loops miss a vehicle in a hundred. Halved: such a miss is taken for splash."""
     agreeing_deviations: float = 3.0
-    """Standard errors up to which counts and lone vehicles speak for one share of splash. By hand:
+    """Standard errors up to which counts and their witness speak for one share of splash. By hand:
     seldom above by chance. Halved: counts are set aside where they would tell more."""
     shown_deviations: float = 2.0
-    """Standard errors above which lone vehicles show a splash, of which counts may tell more. By
+    """Standard errors above which a witness shows a splash, of which counts may tell more. By
     hand: counts alone cannot tell it from missed vehicles. Halved: these become splash."""
     usual_splash: float = 0.2
     """Prior standard deviation of the share of passages with a twin. By hand: a loop that reports
