@@ -226,6 +226,30 @@ def test_where_signals_answered_nobody_nothing_is_left_open() -> None:
     assert study(Days({False: 8.0}), None).doubt() is None
 
 
+def test_what_was_seen_on_held_out_days_alone_is_compared_with_like_days() -> None:
+    """A vehicle in twenty is on a second lane, twice as fast; on the fitted days none was seen."""
+    generator = np.random.default_rng(11)
+
+    def day(fast: int) -> Tally:
+        sums = np.zeros((len(FEATURES), 2, 2))
+        speeds = generator.normal(10.0, 0.5, 40)
+        sums[INDEX["speed2"]] = (speeds.sum(), 40.0), (20.0 * fast, float(fast))
+        return Tally(sums, np.zeros((len(BIN_FEATURES), 2, 2)))
+
+    found = replace(
+        study(Days({}), None),
+        measured=cast(Any, SimpleNamespace(has_speeds=True)),
+        pools=Pools({"network": np.ones((1, 2)), "lane": np.eye(2)}, THRESHOLDS),
+        fit=tuple(day(0) for _ in range(3)),
+        heldout=tuple(day(2) for _ in range(2)),
+    )
+    vars(found)["place_finder"] = SimpleNamespace(directed=lambda _: {})
+    model = [day(int(n)) for n in generator.poisson(2.0, 40)]
+    for data in (found.fit, found.heldout):
+        assert found.null(model, data).test(data).p > 0.05
+    assert found.null(model, found.fit).test(found.heldout).p < 0.01  # other vehicles
+
+
 def counts(generator: np.random.Generator, mean: float, share: float, days: int) -> np.ndarray:
     level = generator.gamma(share**-2.0, share**2.0, days) if share else np.ones(days)
     return generator.poisson(mean * level)[None].astype(np.float64)

@@ -69,7 +69,7 @@ class Selector:
         periods: Sequence[Period],
         effort: Effort,
         alpha: float,
-        null: Callable[[Sequence[Tally], int, Directions, tuple[Effect, ...]], Null],
+        null: Callable[[Sequence[Tally], Sequence[Tally], Directions, tuple[Effect, ...]], Null],
         reporter: Reporter,
     ) -> None:
         self._fitter = fitter
@@ -99,7 +99,7 @@ class Selector:
             self._directions(base.model, self._place_finder.everywhere(), 0, "places")
         )
         directions = Directions((*self._library_directions(base.model, 0), *self._places))
-        null = self._null(base.model.tallies, len(data), directions, ())
+        null = self._null(base.model.tallies, data, directions, ())
         return replace(base, residual=null.test(data))
 
     def select(
@@ -174,7 +174,7 @@ class Selector:
             extra[name] = extra[name] + (self._thresholds.tolerance * difference) ** 2
         fitted = tuple(change for change, _ in fitter.changes(model))
         directions = Directions((*self._of_library, *self._places), extra, fitted)
-        null = self._null(days, len(fitter.data), directions, model.effects)
+        null = self._null(days, fitter.data, directions, model.effects)
         return Tested(model, null.test(fitter.data, extra), errors, extra)
 
     def exact(self, tested: Tested) -> Tested:

@@ -397,7 +397,7 @@ class Study:
             )
         distance = reference.distance(self.fit)
         model = Fitted((), known, reference, distance, distance.total)
-        residual = self.null(tallies, len(self.fit)).test(self.fit)
+        residual = self.null(tallies, self.fit).test(self.fit)
         return Tested(model, residual, np.empty(0), {})
 
     def with_empty_start_finding(self, base: Tested, reporter: Reporter) -> Study:
@@ -483,7 +483,7 @@ class Study:
     def null(
         self,
         tallies: Sequence[Tally],
-        periods: int,
+        data: Sequence[Tally],
         directions: Directions | None = None,
         effects: tuple[Effect, ...] = (),
     ) -> Null:
@@ -493,16 +493,16 @@ class Study:
 
         Args:
             tallies: Tallies of the model's days.
-            periods: Number of periods in a data set.
+            data: Tallies of the periods that are to be tested.
             directions: Changes of the statistics under single effects; None to test without them.
             effects: Effects of the model.
 
         Raises:
             OutOfTime: The budget does not suffice for the days that `doubt` needs.
         """
-        data = sum_of(self.fit)
-        supplied = {name: sums[..., 1:] > 0 for name, sums in data.supplementary.items()}
-        counted, known = data.sums[..., 1:] > 0, data.counted >= data.days
+        total = sum_of(data)
+        supplied = {name: sums[..., 1:] > 0 for name, sums in total.supplementary.items()}
+        counted, known = total.sums[..., 1:] > 0, total.counted >= total.days
         width = min(known.shape[-1], *(day.bins.shape[-1] for day in tallies))
         seen = [
             Tally(
@@ -519,7 +519,7 @@ class Study:
         ]
 
         def directed(reference: Reference) -> Directed:
-            filters = {} if directions is None else directions.filters(reference, self.fit)
+            filters = {} if directions is None else directions.filters(reference, data)
 
             def statistics(distance: Distance) -> dict[str, float]:
                 values = self.place_finder.directed(distance)
@@ -530,7 +530,7 @@ class Study:
         return Null(
             self.pools,
             seen,
-            periods,
+            len(data),
             speeds=self.speeds,
             directed=directed,
             doubt=self.doubt(effects),

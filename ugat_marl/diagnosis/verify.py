@@ -50,7 +50,6 @@ def verify_model(study: Study, base: Tested, best: Tested) -> Verified:
     With e the excess of the distance over its expected value, at least 0:
     shrink = 1 - e_after / e_before.
     """
-    count = len(study.heldout)
 
     def null(model: Tested) -> Null:
         days = model.model.tallies
@@ -58,7 +57,7 @@ def verify_model(study: Study, base: Tested, best: Tested) -> Verified:
             numbers = study.engine.first(study.effort.test)
             ordinary = study.engine.ordinary(model.model.effects, numbers)
             days = tuple(day.tally for day in ordinary.values())
-        return study.null(days, count, effects=model.model.effects)
+        return study.null(days, study.heldout, effects=model.model.effects)
 
     before = null(base).test(study.heldout)
     after = null(best).test(study.heldout, best.extra or None) if best.model.members else before
