@@ -374,6 +374,15 @@ def test_the_last_metres_of_a_road_count() -> None:
     assert math.degrees(heading_rad(((0, 0), (5, 0)))) == pytest.approx(90)
 
 
+@pytest.mark.parametrize("between", [(), ((295, 0),), ((290, 0), (299, 0))])
+def test_points_within_a_straight_part_change_no_direction(
+    between: tuple[tuple[float, float], ...],
+) -> None:
+    """The last 30 m are 5 m to the east and 25 m to the north."""
+    heading = heading_rad(((0, 0), *between, (300, 0), (300, 25)))
+    assert heading == pytest.approx(math.atan2(5, 25))
+
+
 def test_an_intersection_is_named_by_its_streets() -> None:
     links = [Link(0, "a_0", "b_0", "s"), Link(1, "c_0", "b_0", "r")]
     assert intersection_name(links, {"a": "Mill Lane", "b": "High Street"}) == (

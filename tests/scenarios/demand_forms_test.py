@@ -19,6 +19,7 @@ from ugat_marl.scenarios import (
     degrees_of_saturation,
     demand_as_vehicles,
     draw_day,
+    survey,
 )
 from ugat_marl.scenarios.importers.osm_crossings import has_light
 
@@ -44,6 +45,39 @@ def test_a_flow_by_chance_may_begin_before_the_episode(monkeypatch: pytest.Monke
     )
     departs = [float(item.get("depart", "")) for item in vehicles(demand_as_vehicles(scenario))]
     assert 120 < len(departs) < 250 and min(departs) >= 3600  # 180 of 3600 s
+
+
+def test_a_flow_by_chance_that_ended_before_the_episode_is_left_out() -> None:
+    scenario = with_routes(
+        '<flow id="f" begin="0" end="50" probability="0.2" from="west1_A1" to="A1_east1"/>'
+        '<trip id="t" depart="3700" from="west1_A1" to="A1_east1"/>',
+        begin_s=3600.0,
+    )
+    assert [item.get("id") for item in vehicles(demand_as_vehicles(scenario))] == ["t"]
+
+
+def test_of_districts_it_is_said_that_ways_differ() -> None:
+    districts = "".join(
+        f'<taz id="{name}" edges="{edges}"/>'
+        for name, edges in (("a", "west1_A1 southA_A1"), ("b", "A1_east1 A1_northA"))
+    )
+    trip = '<trip id="{}" depart="10" {}/>'
+    plain = trip.format("t", 'from="west1_A1" to="A1_east1"')
+    assert survey(with_routes(plain)).notes == ()
+    (note,) = survey(
+        with_routes(districts + plain + trip.format("z", 'fromTaz="a" toTaz="b"'))
+    ).notes
+    assert note.startswith("'z' runs between districts")
+
+
+def test_a_day_with_many_vehicles_has_them_all() -> None:
+    """On this day the demand is seven times the usual one, so some vehicles have nine copies."""
+    route = '<route edges="west1_A1 A1_east1"/>'
+    text = "".join(f'<vehicle id="v{n}" depart="{n}">{route}</vehicle>' for n in range(500))
+    drawn = vehicles(draw_day(with_routes(text), 383, day_to_day=0.9))
+    copies = Counter((item.get("id") or "").partition("~")[0] for item in drawn)
+    assert len({item.get("id") for item in drawn}) == len(drawn) == 3457
+    assert max(copies.values()) > 8
 
 
 def test_a_vehicle_keeps_its_own_speed_factor_on_a_drawn_day() -> None:

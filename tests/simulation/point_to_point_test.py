@@ -28,12 +28,12 @@ def test_vehicles_are_paired_by_name_and_in_order(tmp_path: Path) -> None:
         event(0, 20.0, "b"),  # never comes out
         event(1, 30.0, "c"),  # comes from elsewhere
         event(0, 40.0, "d"), event(1, 49.0, "d"), event(0, 400.0, "d"), event(1, 403.0, "d"),
-        event(0, -5.0, "e"), event(1, 3.0, "e"),
+        event(0, 3.0, "e"), event(1, 8.0, "e"),
         event(0, 895.0, "f"), event(1, 901.0, "f"),
     ]  # fmt: skip
     file = tmp_path / "places.xml"
     file.write_text("\n".join(events))
-    (seen,) = read_between(file, [(HERE, THERE)], 0.0, 900.0)
+    (seen,) = read_between(file, [(HERE, THERE)], 5.0, 900.0)
     assert seen.tolist() == [[10.0, 3.5], [40.0, 9.0], [400.0, 3.0]]
 
 

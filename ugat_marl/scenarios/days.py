@@ -25,6 +25,8 @@ from ugat_marl.seeding import numpy_generator
 
 JITTER_S = 120.0
 """Greatest shift of a departure, earlier or later, s; small enough to keep the profile of a day."""
+_USUALLY = 8
+"""Copies that a vehicle seldom exceeds; their draws do not depend on how many there are."""
 _AGAIN = 100
 _TYPES, _VEHICLES = "types.add.xml", "vehicles.rou.xml"
 _TYPE_TAGS = ("vType", "vTypeDistribution")
@@ -90,13 +92,17 @@ def draw_day(scenario: Scenario, seed: int, day_to_day: float = 0.0) -> Scenario
         level = float(numpy_generator(seed, "level of the day").gamma(shape, 1.0 / shape))
     copies = generator.poisson(level, count)
     copies[vehicles.depart_s < begin] = 0  # SUMO leaves out what departs before the start
-    most = 8
-    shifts = generator.uniform(-JITTER_S, JITTER_S, (most, count))
-    draws = generator.standard_normal((most, count))
+    most = int(copies.max(initial=0))
+    shifts = generator.uniform(-JITTER_S, JITTER_S, (_USUALLY, count))
+    draws = generator.standard_normal((_USUALLY, count))
+    if more := max(most - _USUALLY, 0):  # a stream of its own, too
+        further = numpy_generator(seed, "more copies")
+        shifts = np.vstack((shifts, further.uniform(-JITTER_S, JITTER_S, (more, count))))
+        draws = np.vstack((draws, further.standard_normal((more, count))))
     again = numpy_generator(seed, "speeds again")
     rows: list[tuple[float, str]] = []
     mean, deviation, least, greatest = vehicles.speeds.T
-    for copy in range(min(int(copies.max(initial=0)), most)):
+    for copy in range(most):
         departs = vehicles.depart_s + shifts[copy]
         departs = np.where(departs < begin, 2 * begin - departs, departs)
         crosses = (departs >= end) != (vehicles.depart_s >= end)

@@ -22,7 +22,7 @@ from ugat_marl.scenarios.phases import (
     programme_phases,
     turn_of,
 )
-from ugat_marl.scenarios.routes import departures
+from ugat_marl.scenarios.routes import between_districts, departures
 from ugat_marl.scenarios.scenario import Scenario
 from ugat_marl.scenarios.signals import AMBER, GREEN, YELLOW
 from ugat_marl.scenarios.street_names import intersection_name
@@ -244,7 +244,19 @@ def survey(scenario: Scenario, reporter: Reporter | None = None) -> Survey:
         traffic.busiest_length_s,
         scenario.control.yellow_s,
         scenario.control.all_red_s,
-        network.notes,
+        (*network.notes, *_notes_of_demand(scenario)),
+    )
+
+
+def _notes_of_demand(scenario: Scenario) -> tuple[str, ...]:
+    """Return what makes the demand of this survey differ from that of an episode."""
+    vehicle = between_districts(scenario)
+    if not vehicle:
+        return ()
+    return (
+        f"{vehicle!r} runs between districts (fromTaz, toTaz): in an episode SUMO chooses its "
+        "roads by the travel times of the moment, while this check, drawn days and a diagnosis "
+        "take the quickest free-flow route; routes that duarouter writes are the same in all",
     )
 
 

@@ -77,7 +77,8 @@ def demand_as_vehicles(scenario: Scenario) -> Scenario:
     """Return the same demand as single vehicles with routes; duarouter resolves trips and flows.
 
     Demand in additional files moves to the route files. Vehicle types, named routes, persons and
-    containers stay what they are. SUMO's option ``scale`` is carried out and left out.
+    containers stay what they are. SUMO's option ``scale`` is carried out and left out. Vehicles
+    between districts take the quickest free-flow route, see `between_districts`.
 
     Raises:
         ScenarioError: duarouter refuses; the message quotes it.
@@ -100,6 +101,19 @@ def demand_as_vehicles(scenario: Scenario) -> Scenario:
         for document, holds_demand in zip(scenario.additional, beside, strict=True)
     )
     return replace(scenario, routes=_routed_by_duarouter(scenario), additional=additional)
+
+
+def between_districts(scenario: Scenario) -> str:
+    """Return the id of a trip or flow from district to district; empty if there is none.
+
+    SUMO chooses the roads of such vehicles by the travel times of the moment, and duarouter by
+    those of free flow. So the demand differs.
+    """
+    for document in (*scenario.routes, *scenario.additional):
+        for tag in document.scan():
+            if tag.name in DEPARTING and {"fromTaz", "toTaz"} & tag.attributes.keys():
+                return tag.attributes.get("id", "")
+    return ""
 
 
 def demand_scale(scenario: Scenario) -> float:
@@ -310,7 +324,8 @@ def _routed_by_duarouter(scenario: Scenario) -> tuple[Document, ...]:
         if "junction-taz" in settings.sumo:  # trips may name junctions
             arguments += ["--junction-taz", settings.sumo["junction-taz"]]
         if scenario.additional:
-            arguments += ["--additional-files", files(scenario.additional)]
+            beside = _from_begin(scenario.additional, settings.begin_s)
+            arguments += ["--additional-files", files(beside)]
         try:
             convert("duarouter", arguments, directory, reads)
             if not out.exists():
@@ -347,16 +362,18 @@ def _children(document: Document, tags: frozenset[str]) -> Iterator[list[str]]:
 
 
 def _from_begin(documents: Iterable[Document], begin_s: float) -> tuple[Document, ...]:
-    """Return route files whose flows with a probability begin in the episode.
+    """Return files whose flows with a probability begin in the episode.
 
     duarouter never ends with one that begins earlier. Its seconds are independent, so that those
-    before the episode decide nothing in it.
+    before the episode decide nothing in it. Flows that end before it are left out.
     """
 
     def delay(part: ET.Element) -> None:
-        for element in part:
+        for element in list(part):
             if _is_early(element.tag, element.attrib, begin_s):
                 element.set("begin", f"{begin_s:.3f}")
+                if "end" in element.attrib and parse_time(element.attrib["end"]) < begin_s:
+                    part.remove(element)
 
     return tuple(
         document.changed(delay)

@@ -179,10 +179,12 @@ def heading_rad(shape: Sequence[tuple[float, float]]) -> float:
     """Return the direction of the last metres of a line, clockwise from north, rad."""
     end, start, left_m = shape[-1], shape[-1], _HEADING_M
     for before, after in zip(reversed(shape[:-1]), reversed(shape[1:]), strict=True):
-        start = before
-        left_m -= math.dist(before, after)
-        if left_m <= 0:
+        length_m = math.dist(before, after)
+        if length_m >= left_m:
+            share = left_m / length_m
+            start = tuple(b + share * (a - b) for a, b in zip(before, after, strict=True))
             break
+        start, left_m = before, left_m - length_m
     return math.atan2(end[0] - start[0], end[1] - start[1])
 
 

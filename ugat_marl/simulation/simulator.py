@@ -53,7 +53,6 @@ class LibsumoSimulator:
         self._mesoscopic: MesoscopicLanes | None = None
         self._upstream: UpstreamQueues | None = None
         self._on: list[tuple[str, ...]] = []
-        self._beside: list[list[int]] = []
         self._owner = 0
 
     def start(self, launch: Launch) -> Snapshot:
@@ -87,7 +86,6 @@ class LibsumoSimulator:
         self._time_s = launch.begin_s
         self._limits = np.array([libsumo.lane.getMaxSpeed(lane) for lane in launch.lanes])
         lanes, roads = launch.behind
-        self._beside = _beside(launch.lanes) if launch.crossings else []
         self._has_behind = any(lanes) or any(roads)
         self._mesoscopic = None
         if launch.segment_m:
@@ -182,7 +180,8 @@ class LibsumoSimulator:
             if earlier != later:  # the same in most seconds
                 gone.update(dict.fromkeys(set(earlier).difference(later), index))
         for name, index in gone.items():
-            if not any(name in now[lane] for lane in self._beside[index]):
+            road = edge_of_lane(self._launch.lanes[index])
+            if name not in libsumo.edge.getLastStepVehicleIDs(road):
                 left[index] += 1.0
 
     def _snapshot(self) -> Snapshot:
@@ -322,11 +321,3 @@ def _errors_of(directory: Path) -> str:
 def simulation_runs_here() -> bool:
     """Return True if libsumo runs a simulation in this process."""
     return bool(libsumo.simulation.isLoaded())
-
-
-def _beside(lanes: Sequence[str]) -> list[list[int]]:
-    """Return for each lane the indices of the lanes of its road."""
-    of_road: dict[str, list[int]] = defaultdict(list)
-    for index, lane in enumerate(lanes):
-        of_road[edge_of_lane(lane)].append(index)
-    return [of_road[edge_of_lane(lane)] for lane in lanes]
