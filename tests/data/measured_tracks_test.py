@@ -48,6 +48,13 @@ def test_times_are_interpolated_and_the_rear_leaves_behind_the_zone() -> None:
     assert seen.length_m.tolist() == [4.0]
 
 
+@pytest.mark.parametrize("first", [20.0, 20.01])
+def test_a_vehicle_at_the_begin_of_a_zone_is_on_it(first: float) -> None:
+    rows = track(["a_0"] * 4, [first, first, 30.0, 40.0], 10.0)
+    seen = passages(rows, Detector("z", "a_0", 20.0, 4.0, "stop"))["z"]
+    assert np.isnan(seen.on_s).all() and np.isfinite(seen.off_s).all() and len(seen) == 1
+
+
 def test_a_vehicle_may_leave_a_zone_before_its_first_position_on_the_lane() -> None:
     """It is 3 m before lane b at 10 s and 12 m on it at 11 s, at 15 m/s."""
     rows = track(["a_0", "b_0", "b_0"], [25.0, 12.0, 27.0], 15.0, length_m=[5.0] * 3)

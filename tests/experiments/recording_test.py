@@ -64,6 +64,24 @@ def test_loops_count_the_cars_that_passed(by_hand: MeasuredData) -> None:
     assert counted > 40
 
 
+@pytest.mark.parametrize("step_s", [0.4, 2.0])
+def test_lanes_keep_their_state_until_the_next_step_that_is_seen(
+    crossing: Crossing, step_s: float
+) -> None:
+    """Positions are written at whole seconds that end a step: every second one."""
+    length = f"duration_s = 200\nstep_length_s = {step_s}"
+    directory = crossing(toml=lambda text: text.replace("duration_s = 200", length))
+    found = measure(directory, lanes=True, trajectories=True)
+    assert found.lanes is not None and found.trajectories is not None
+    there = found.trajectories.group_by("lane_id", "time_s").agg(pl.len().alias("seen"))
+    step = (pl.col("time_s") - pl.col("time_s") % 2.0).alias("moment")
+    both = found.lanes.with_columns(step).join(
+        there, left_on=["lane_id", "moment"], right_on=["lane_id", "time_s"], how="left"
+    )
+    assert both["vehicles"].sum() > 20
+    assert (both["vehicles"] == both["seen"].fill_null(0)).all()
+
+
 def test_passages_have_times_speeds_and_lengths(by_hand: MeasuredData) -> None:
     seen = by_hand.periods[0].passages["advance:S_C_0"]
     # The car departs in the first step and is on the road, 5.1 m of it, at the end of the step.

@@ -243,6 +243,21 @@ def test_rules_are_put_into_a_table(
     )
 
 
+def test_episodes_without_a_vehicle_spoil_no_table(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    table = written(tmp_path)
+    before = read_standings(table)
+    row = before.head(1).with_columns(setting=pl.lit("mine"), att_s=pl.lit(math.nan))
+    monkeypatch.setattr("ugat_marl.cli.compare.standings_of", lambda *_, **__: row)
+    call = ["compare", "single-v1", "--name", "mine", "--policies", "random", "--duration-s", "60"]
+    assert main([*call, "--domains", "V4", "--table", str(table), "--out", str(table)]) == 2
+    assert "no vehicle was due in some episode" in capsys.readouterr().err
+    assert read_standings(table).equals(before)
+    order = ranked(pl.concat([row, before])).filter(pl.col("domain") == row["domain"][0])
+    assert order["setting"][-1] == "mine" and order["regret_s"][0] == 0.0
+
+
 def test_a_file_of_another_kind_is_kept_and_a_row_has_a_name(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:

@@ -843,6 +843,9 @@ def test_a_table_that_a_spreadsheet_saved_is_read(tmp_path: Path) -> None:
     path.write_text("setting,domain,att_s\na,V4,100\na,V4,300\n", encoding="utf-8")
     with pytest.raises(ValueError, match="setting 'a' in V4 is there 2 times"):
         read_rows(path)
+    path.write_text("scenario,setting,domain,att_s\nx,a,V4,100\ny,a,V4,300\n", encoding="utf-8")
+    with pytest.raises(ValueError, match="rows of several scenarios .x, y.; give each a table"):
+        read_rows(path)
 
 
 def test_an_episode_that_is_there_twice_is_a_damaged_table(run: Path, tmp_path: Path) -> None:

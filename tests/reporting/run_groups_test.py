@@ -20,6 +20,8 @@ def job(
     episodes: int = 40,
     hidden: int = 48,
     digest: str = "0123456789",
+    control: str | None = None,
+    hashes: dict[str, str] | None = None,
     **options: Any,
 ) -> RunRecord:
     settings = {
@@ -29,9 +31,21 @@ def job(
         "learner": {"name": learner, "settings": [], "dqn": {"hidden": [hidden]}},
         "episodes": episodes,
         "options": options,
+        "negative_control": control,
     }
     return RunRecord(
-        f"job-{digest}", Path(), True, settings, {}, {}, None, None, None, None, (), math.nan
+        f"job-{digest}",
+        Path(),
+        True,
+        settings,
+        hashes or {},
+        {},
+        None,
+        None,
+        None,
+        None,
+        (),
+        math.nan,
     )
 
 
@@ -55,6 +69,20 @@ def test_settings_of_the_suites_learners_part_trainings() -> None:
     records = [job(0), job(1), job(0, hidden=8)]
     assert [len(part) for part in seeds_of_one(records)] == [2, 1]
     assert job_labels(records)[2] == "direct transfer (dqn.hidden 8)"
+
+
+def test_controls_and_other_files_part_trainings() -> None:
+    records = [
+        job(0),
+        job(1),
+        job(2),
+        job(3, control="same-world"),
+        job(4, hashes={"sim": "a" * 64}),
+    ]
+    assert [len(part) for part in seeds_of_one(records)] == [3, 1, 1]
+    assert job_labels(records)[3:] == [
+        "direct transfer (negative_control same-world)", "direct transfer (sim files aaaaaaaaaa)"
+    ]  # fmt: skip
 
 
 def test_trainings_of_two_versions_are_not_one_setting() -> None:

@@ -149,6 +149,11 @@ class Compare:
         require_room(table, self.name, map(domain_label, domains))
         with workers_of(self.workers, self.ray) as workers:
             own = self._judged(scenario, judging, domains, workers, Bars(console))
+        if own.select(pl.any_horizontal(pl.col("att_s", "att_s_sim").is_nan().any())).item():
+            raise OptionError(
+                "no vehicle was due in some episode, so that it has no travel time; give longer "
+                "episodes (--duration-s)"
+            )
         whole = self._written(own, judging, table)
         shown = whole.filter(pl.col("domain").is_in([*map(domain_label, domains)]))
         console.print(standings_table(scenario.id, shown, self.name))

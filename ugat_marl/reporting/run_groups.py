@@ -231,6 +231,12 @@ def _seed(record: RunRecord) -> int | None:
         return None
 
 
+_OF_A_JOB = (
+    "episodes", "rule_budget", "negative_control", "real_log", "world", "commands", "most_delay_s",
+)  # fmt: skip
+"""Settings of a job, beside those of learner and environment, that part trainings."""
+
+
 def job_labels(records: Sequence[RunRecord]) -> list[str]:
     """Return names of jobs; equal names get the settings in which the jobs differ."""
     flat = [dict(flat_settings(record.ugat)) | _trained(record) for record in records]
@@ -264,7 +270,8 @@ def _trained(record: RunRecord) -> dict[str, str]:
         return {}
     learner = record.settings.get("learner")
     options = record.settings.get("options")
-    told = {key: str(record.settings.get(key, "")) for key in ("episodes", "rule_budget")}
+    told = {key: str(record.settings.get(key, "")) for key in _OF_A_JOB}
+    told |= {f"{name} files": digest[:10] for name, digest in record.hashes.items()}
     if isinstance(learner, Mapping):
         own = learner.get("settings")
         told["learner"] = " ".join(map(str, [learner.get("name"), *(own or ())]))

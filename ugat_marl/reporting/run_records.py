@@ -397,8 +397,13 @@ def read_rows(path: Path) -> list[dict[str, Any]]:
         rows = [row for row in csv.DictReader(file) if row.get("setting") and row.get("domain")]
     if not rows:
         raise ValueError("no rows with a setting and a domain in it")
-    cells = Counter((row.get("scenario"), row["setting"], row["domain"]) for row in rows)
-    for (_, setting, domain), times in cells.items():
+    scenarios = sorted({str(row.get("scenario")) for row in rows})
+    if len(scenarios) > 1:
+        raise ValueError(
+            f"rows of several scenarios ({', '.join(scenarios[:3])}); give each a table of its own"
+        )
+    cells = Counter((row["setting"], row["domain"]) for row in rows)
+    for (setting, domain), times in cells.items():
         if times > 1:
             raise ValueError(f"setting {setting!r} in {domain} is there {times} times")
     texts = ("scenario", "setting", "domain")

@@ -11,7 +11,7 @@ from rich.text import Text
 from ugat_marl.data import MEASURES
 from ugat_marl.diagnosis import PolicyGap, TravelTimeEstimate
 from ugat_marl.errors import counted
-from ugat_marl.experiments import Estimate, Evaluation, Tuned, best_rule_note, check_run
+from ugat_marl.experiments import CORRECTED, Estimate, Evaluation, Tuned, best_rule_note, check_run
 from ugat_marl.reporting.formats import ends_text, mean_text, number_text, share, signed_text
 from ugat_marl.reporting.terminal import titled_table
 
@@ -145,8 +145,8 @@ def _caption(evaluation: Evaluation) -> str:
     ]
     if check := check_run(evaluation):
         lines.insert(0, check.sentence("--pretrain-episodes"))
-    if corrected := evaluation.notes.get("corrected sim"):
-        lines.append(f"corrected sim: trained in {corrected}")
+    if corrected := evaluation.notes.get(CORRECTED):
+        lines.append(f"{CORRECTED}: trained in {corrected}")
     lines += _medians(evaluation)
     for domain in evaluation.domains:
         lines += [f"in {domain}, {line}" for line in _backlog(evaluation, domain)]

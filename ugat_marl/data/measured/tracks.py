@@ -111,7 +111,7 @@ class _Track:
                 at_m = min(at_m, self.driven_m[end])
         on = self._when(at_m, first, last)
         off = self._when(at_m + detector.length_m + self.length_m, first, len(self.lane) - 1)
-        on_it = at_m < self.driven_m[0]
+        on_it = at_m <= self.driven_m[0]
         if on is None and first == 0 and on_it and off is not None:
             on = np.nan
         if on is None:

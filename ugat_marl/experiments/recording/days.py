@@ -277,8 +277,10 @@ def _day(street: _Street, index: int, split: Split, stop: Stop) -> _Day:
     lanes = None
     if vehicles is not None and street.lanes:
         named = {detector.lane for detector in street.detectors}
-        every_second = np.arange(np.ceil(begin), end)  # also those without vehicles
-        lanes = traffic_of_lanes(vehicles, sorted(named), period, every_second)
+        seconds = np.arange(np.ceil(begin), end)  # also those without vehicles
+        steps = (seconds - begin) / step
+        seen = seconds[np.abs(steps - np.round(steps)) < 1e-6]
+        lanes = traffic_of_lanes(vehicles, sorted(named), period, seen)
     return _Day(period, lanes, vehicles if street.trajectories else None)
 
 
