@@ -72,17 +72,20 @@ def test_settings_of_the_suites_learners_part_trainings() -> None:
 
 
 def test_controls_and_other_files_part_trainings() -> None:
-    records = [
-        job(0),
-        job(1),
-        job(2),
-        job(3, control="same-world"),
-        job(4, hashes={"sim": "a" * 64}),
-    ]
+    others = job(3, control="same-world"), job(4, hashes={"sim": "a" * 64})
+    records = [job(0), job(1), job(2), *others]
     assert [len(part) for part in seeds_of_one(records)] == [3, 1, 1]
     assert job_labels(records)[3:] == [
         "direct transfer (negative_control same-world)", "direct transfer (sim files aaaaaaaaaa)"
     ]  # fmt: skip
+
+
+def test_jobs_for_two_domains_have_one_name() -> None:
+    records = [job(0, hashes={"sim": "a" * 64, "real": name * 64}) for name in "bc"]
+    records = [
+        replace(one, settings={**one.settings, "target": one.hashes["real"][0]}) for one in records
+    ]
+    assert job_labels(records) == ["direct transfer"] * 2
 
 
 def test_trainings_of_two_versions_are_not_one_setting() -> None:

@@ -271,7 +271,8 @@ def _trained(record: RunRecord) -> dict[str, str]:
     learner = record.settings.get("learner")
     options = record.settings.get("options")
     told = {key: str(record.settings.get(key, "")) for key in _OF_A_JOB}
-    told |= {f"{name} files": digest[:10] for name, digest in record.hashes.items()}
+    if "sim" in record.hashes:  # that of the real domain differs between domains
+        told["sim files"] = record.hashes["sim"][:10]
     if isinstance(learner, Mapping):
         own = learner.get("settings")
         told["learner"] = " ".join(map(str, [learner.get("name"), *(own or ())]))
