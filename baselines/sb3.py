@@ -25,6 +25,7 @@ from gymnasium import spaces
 from sb3_contrib import MaskablePPO
 from stable_baselines3 import DQN, PPO
 from stable_baselines3.common.callbacks import BaseCallback
+from stable_baselines3.common.logger import Logger
 from stable_baselines3.common.policies import ActorCriticPolicy
 from stable_baselines3.common.torch_layers import BaseFeaturesExtractor
 from stable_baselines3.common.vec_env import VecEnv
@@ -187,6 +188,8 @@ class SB3(LibraryLearner):
         with preserve_random_state():
             seed_generators(seed, "sb3", "weights")
             self._model: Any = self._made(env)
+        # Nothing is logged; the library's own logger leaves a folder for each call of `learn`.
+        self._model.set_logger(Logger(folder=None, output_formats=[]))
 
     def _made(self, env: AnyParallelEnv) -> Any:
         config, agents = self.config, len(self.agents)

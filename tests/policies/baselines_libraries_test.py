@@ -6,6 +6,7 @@ A learner whose library is not installed is skipped; `make compat` installs them
 from __future__ import annotations
 
 import importlib.util
+import tempfile
 import warnings
 from collections.abc import Callable
 from pathlib import Path
@@ -221,6 +222,16 @@ def test_what_others_draw_is_left_as_it_was(name: str) -> None:
     torch.manual_seed(3)
     made(name, env).learn(env, 1, 1)
     assert torch.equal(torch.rand(2), expected)
+
+
+@every
+def test_training_leaves_no_temporary_files(
+    name: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(tempfile, "tempdir", str(tmp_path))
+    env = ToyTraffic()
+    made(name, env).learn(env, 1, 1)
+    assert not [*tmp_path.iterdir()]
 
 
 @every
