@@ -73,15 +73,16 @@ def main() -> int:
     for extra in given.extras:
         folder = given.into.with_name(f"{given.into.name}-latest-{extra or 'own'}")
         wheel = f"{given.wheel}[{extra}]" if extra else str(given.wheel)
-        print(f"\n{extra or 'the suite alone'}:", flush=True)
+        named = extra or "the suite alone"
+        print(f"\n{named}:", flush=True)
         try:
             eager = ["--upgrade", "--upgrade-strategy", "eager", wheel]
             python = make(folder, eager, given.wheel)
         except subprocess.CalledProcessError as error:
-            broken.append(f"{extra}: cannot be installed ({error})")
+            broken.append(f"{named}: cannot be installed ({error})")
             continue
         if matrix(python, LEARNERS[extra]):
-            broken.append(f"{extra}: see its matrix above")
+            broken.append(f"{named}: see its matrix above")
     print("\n" + ("\n".join(["broken:", *broken]) if broken else "nothing is broken"))
     return int(bool(broken))
 

@@ -12,10 +12,12 @@ evaluation.
 from __future__ import annotations
 
 import sys
+from collections.abc import Collection
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Annotated
 
+import polars as pl
 import tyro
 from rich.console import Console
 from tyro.conf import arg
@@ -59,17 +61,30 @@ class Results:
         scenarios = {name: load_scenario(name) for name in self.scenarios}
         for name in scenarios:  # a folder that is not writable is an error before the trainings
             require_writable(self.out / f"{file_stem(name)}.md")
+            _require_kept(self.out / f"{file_stem(name)}.csv", self.config.learners)
         for name, scenario in scenarios.items():
             page = self.out / f"{file_stem(name)}.md"
             found = learn_curves(scenario, name, self.config, self.runs, self.jobs, Bars(console))
             failures |= found.failures
             if found.curves and found.best:
+                _require_kept(page.with_suffix(".csv"), {curve.learner for curve in found.curves})
                 write_whole(page, curves_page(found, self.config, machine_facts()) + "\n")
                 write_csv(page.with_suffix(".csv"), curves_as_csv(found.curves))
                 console.print(f"page: {page}, each evaluation: {page.with_suffix('.csv')}")
         for name, reason in failures.items():
             console.print(f"{name}: {reason}", soft_wrap=True)
         return int(bool(failures))
+
+
+def _require_kept(table: Path, learners: Collection[str]) -> None:
+    """Refuse to replace a table by one without some of its learners."""
+    if table.is_file():
+        there = pl.read_csv(table, columns=["learner"])["learner"].unique(maintain_order=True)
+        if lost := [name for name in there if name not in learners]:
+            raise OptionError(
+                f"{table} has rows of {', '.join(lost)}, which would be lost: name these in "
+                "--learners, too (what is trained stays trained), or give another --out"
+            )
 
 
 if __name__ == "__main__":

@@ -42,7 +42,7 @@ from numpy.typing import NDArray
 import ugat_marl
 from ugat_marl.cli import guarded
 from ugat_marl.errors import OptionError
-from ugat_marl.files import read_json
+from ugat_marl.files import read_json, write_whole
 from ugat_marl.parallel import import_path
 
 Values = dict[str, list[Any]]
@@ -516,12 +516,12 @@ def write(path: Path, chosen: Sequence[str]) -> int:
     """
     held: dict[str, Any] = {}
     if path.exists():
-        before, made_with = read_digests(path)
-        held = {name: part for name, part in before.items() if name not in chosen}
-        if held and (others := other_versions(made_with)):
-            raise SystemExit(f"{path} was made with other versions ({others}); write all parts")
+        held, made_with = read_digests(path)
+        if others := other_versions(made_with):
+            if not set(held) <= set(chosen):
+                raise SystemExit(f"{path} was made with other versions ({others}); write all parts")
+            held = {}
     bad = 0
-    save(path, held)
     for name in chosen:
         began = time.monotonic()
         try:
@@ -531,16 +531,19 @@ def write(path: Path, chosen: Sequence[str]) -> int:
             continue
         except RuntimeError as error:
             bad += 1
+            held.pop(name, None)
             say("left out", name, f"{error}")
             continue
         took = f"twice in {time.monotonic() - began:.0f} s"
         if first != second:
             bad += 1
+            held.pop(name, None)
             say("left out", name, f"{took}; the second time: {difference(first, second)}")
             continue
         held[name] = first
         say("written", name, took)
         save(path, held)
+    save(path, held)
     return int(bad > 0)
 
 
@@ -570,7 +573,7 @@ def save(path: Path, held: Mapping[str, Any]) -> None:
             lines += [f'   "{kind}": {{', ",\n".join(rows), "   }" + "," * (kind == "values")]
         lines.append("  }" + "," * (name != list(held)[-1]))
     lines += [" }", "}", ""]
-    path.write_text("\n".join(line for line in lines if line) + "\n", encoding="utf-8")
+    write_whole(path, "\n".join(line for line in lines if line) + "\n")
 
 
 def check(path: Path, chosen: Sequence[str]) -> int:

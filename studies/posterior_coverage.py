@@ -36,7 +36,7 @@ from ugat_marl import parallel_env
 from ugat_marl.cli import guarded
 from ugat_marl.data import TransitionLog, installed_versions
 from ugat_marl.effects import load_scenario
-from ugat_marl.experiments import policy_factory
+from ugat_marl.experiments import file_stem, policy_factory
 from ugat_marl.files import replacing
 from ugat_marl.grounding import (
     FittedService,
@@ -258,7 +258,7 @@ class Network:
             title: Name of the progress bar.
             episodes: Half hours in each world.
         """
-        kept = folder / f"{self.name}-{_digest(self, values, seed, episodes)}.npz"
+        kept = folder / f"{file_stem(self.name)}-{_digest(self, values, seed, episodes)}.npz"
         if not kept.exists():
             logs = self._play([value for value in values for _ in range(episodes)], seed, title)
             parts = range(0, len(logs), episodes)

@@ -261,7 +261,7 @@ def play(pretraining: Pretraining, networks: Sequence[Scenario], given: argparse
             env = parallel_env(networks[place], domain, **OPTIONS)
             envs[networks[place].id] = stack.enter_context(contextlib.closing(env))
         epsilon = float(np.interp(first, (0, 40, 0.5 * given.episodes), (1.0, 0.1, 0.05)))
-        pretraining.play(envs, AT_A_TIME * given.updates, epsilon)
+        pretraining.play(envs, len(envs) * given.updates, epsilon)
 
 
 def drawn_domain(scenario: Scenario, seed: int) -> Domain:

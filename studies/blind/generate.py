@@ -214,7 +214,9 @@ def _begin(directory: Path, blueprint: Blueprint, cases: tuple[Case, ...]) -> No
             f"{directory}: holds another blind test; give another directory, or the options it was "
             "made with"
         )
-    if directory.exists() and not (directory / PLAN).exists() and any(directory.iterdir()):
+    begun = sealed.exists() and sealed.read_text(encoding="utf-8") == text
+    others = [*directory.iterdir()] if directory.exists() else []
+    if others and not (directory / PLAN).exists() and not begun:
         raise BlindTestError(f"{directory}: is not empty and no blind test; give another directory")
     write_whole(sealed, text)
     write_plan(directory, cases)

@@ -23,6 +23,9 @@ from ugat_marl.progress import Reporter, Silent
 _INTERRUPTED = (130, 143, -signal.SIGINT, -signal.SIGTERM)
 """Exit codes of a process that was interrupted or terminated."""
 
+_SPENT = "spent.txt"
+"""File of the seconds that interrupted diagnoses of a case took."""
+
 Diagnose = Callable[[Case, Path, Path], None]
 """Diagnose a case: the case, its measured data, and the folder that gets ``diagnosis.json``."""
 
@@ -89,15 +92,20 @@ def run_cases(
 def _one(directory: Path, case: Case, diagnose: Diagnose) -> bool:
     """Diagnose a case in this process; write the wall time, or the reason of a failure."""
     folder = directory / case.case
-    start = time.monotonic()
+    spent = folder / _SPENT
+    start = time.monotonic() - (float(spent.read_text()) if spent.exists() else 0.0)
     error = None
     try:
         diagnose(case, folder / "measured", folder)
         if not (folder / DIAGNOSIS).exists():
             error = f"no {DIAGNOSIS} was written"
+    except KeyboardInterrupt:
+        write_whole(spent, f"{time.monotonic() - start:.3f}\n")
+        raise
     except Exception as found:  # noqa: BLE001 - a bug in one case is a result, not the end
         error = f"{type(found).__name__}: {found}"
     _note(folder, time.monotonic() - start, error)
+    spent.unlink(missing_ok=True)
     return error is None
 
 

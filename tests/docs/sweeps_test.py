@@ -44,6 +44,7 @@ def test_an_example_uses_the_public_functions_alone(example: Path) -> None:
             assert {word.arg for word in node.keywords} <= set(taken)
             calls += 1
     assert calls == 2
+    assert "tempfile.mkdtemp" in ast.unparse(tree), "two calls must not meet in one folder"
 
 
 @pytest.mark.parametrize("example", EXAMPLES, ids=lambda path: path.stem)

@@ -44,3 +44,15 @@ def test_a_page_and_a_table_are_written_and_failures_are_told(
     assert "vdn: needs benchmarl" in capsys.readouterr().out
     assert "| dqn |" in (tmp_path / "single-v1.md").read_text()
     assert (tmp_path / "single-v1.csv").read_text().count("\n") == 2
+    # A table is not replaced by one without some of its learners, whether unasked or not trained.
+    page = (tmp_path / "single-v1.md").read_bytes()
+    fewer = results.Results(("single-v1",), CurvesConfig(learners=("ippo",)), out=tmp_path)
+    with pytest.raises(OptionError, match="has rows of dqn, which would be lost"):
+        fewer.run()
+    untrained = LearningCurves(
+        "single-v1", "sim", (Curve("vdn", "", 0, {1: 7.0}),), rules, "sotl", {}
+    )
+    monkeypatch.setattr(results, "learn_curves", lambda *_: untrained)
+    with pytest.raises(OptionError, match="has rows of dqn, which would be lost"):
+        given.run()
+    assert (tmp_path / "single-v1.md").read_bytes() == page

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import importlib
 import json
 import os
@@ -15,6 +16,7 @@ import torch
 
 import studies.bench.__main__ as bench
 import studies.blind.__main__ as blind
+from studies import behaviour_digests
 from studies.behaviour_digests import parts
 from ugat_marl.cli import CommandLine, guarded, run
 
@@ -60,6 +62,25 @@ def test_a_long_purpose_goes_on_beside_its_name(
     first = next(place for place, line in enumerate(lines) if line.startswith("  field-soak"))
     start = lines[first].index("drive")
     assert lines[first + 1].startswith(" " * start) and lines[first + 1].strip()
+
+
+@pytest.mark.parametrize("fails", [KeyboardInterrupt, behaviour_digests.NotInstalled("no resco")])
+def test_digests_are_kept_until_a_part_was_played_again(
+    fails: BaseException, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    file = tmp_path / "digests.json"
+    part = {"sha256": "a" * 64, "values": {"one": 1.0}, "names": {"two": "x"}}
+    names = sorted(parts())[:2]
+    behaviour_digests.save(file, dict.fromkeys(names, part))
+    before = file.read_bytes()
+
+    def played(_: str) -> None:
+        raise fails
+
+    monkeypatch.setattr(behaviour_digests, "played", played)
+    with contextlib.suppress(KeyboardInterrupt):
+        assert behaviour_digests.write(file, names) == 0
+    assert file.read_bytes() == before
 
 
 @pytest.mark.parametrize("study", ["bench", "blind"])

@@ -8,6 +8,7 @@ A trial that is behind is pruned: its training is ended by an exception of the c
 from __future__ import annotations
 
 import argparse
+import tempfile
 from collections.abc import Mapping
 from pathlib import Path
 
@@ -54,7 +55,7 @@ def main() -> None:
             control=False,
             evaluation_seeds=1,
             duration_s=given.duration_s,
-            out=given.out / f"trial-{trial.number}",
+            out=Path(tempfile.mkdtemp(prefix="trial-", dir=given.out)) / "run",
             workers=1,
             callback=report,
         )
@@ -70,6 +71,7 @@ def main() -> None:
         # returns, which are reported on the way, and the result are both larger for better trials
         return -float(scores["att_s"].mean())
 
+    given.out.mkdir(parents=True, exist_ok=True)
     study = optuna.create_study(
         direction="maximize",
         pruner=optuna.pruners.MedianPruner(n_startup_trials=3, n_warmup_steps=3),

@@ -6,6 +6,7 @@ import json
 import math
 import shutil
 import subprocess
+import time
 from collections import Counter
 from collections.abc import Callable, Mapping
 from dataclasses import replace
@@ -17,7 +18,7 @@ import pytest
 
 from studies.blind.__main__ import LINE
 from studies.blind.cases import Case, read_label, read_plan
-from studies.blind.generate import Blueprint, Consequences, differing, generate
+from studies.blind.generate import Blueprint, Consequences, _begin, differing, generate
 from studies.blind.outside_effects import BusStops, Driveway
 from studies.blind.places import Busy, busy_places, telling, with_next_lane
 from studies.blind.run import run_cases
@@ -281,6 +282,38 @@ def test_a_case_that_was_interrupted_has_no_result(
     with pytest.raises(KeyboardInterrupt):
         run_cases(directory, lambda *_: None, jobs=2, command=["run", str(directory)])
     assert not list(directory.glob("*/run.json"))
+
+
+def test_the_time_of_an_interrupted_diagnosis_counts(
+    test_folder: tuple[Path, Blueprint], tmp_path: Path
+) -> None:
+    directory = shutil.copytree(test_folder[0], tmp_path / "test")
+
+    def stopped(*_: object) -> None:
+        time.sleep(0.3)
+        raise KeyboardInterrupt
+
+    def quick(_: Case, __: Path, folder: Path) -> None:
+        (folder / "diagnosis.json").write_text("{}")
+
+    for _ in range(2):
+        with pytest.raises(KeyboardInterrupt):
+            run_cases(directory, stopped, only=("case001",))
+    run_cases(directory, quick, only=("case001",))
+    assert json.loads((directory / "case001" / "run.json").read_text())["wall_s"] >= 0.6
+    assert {path.name for path in (directory / "case001").iterdir()} == {
+        "measured", "diagnosis.json", "run.json"
+    }  # fmt: skip
+
+
+def test_a_test_that_was_killed_at_once_is_begun_again(
+    test_folder: tuple[Path, Blueprint], tmp_path: Path
+) -> None:
+    whole, blueprint = test_folder
+    (tmp_path / "labels").mkdir()
+    shutil.copy(whole / "labels" / "blueprint.json", tmp_path / "labels")
+    _begin(tmp_path, blueprint, read_plan(whole))
+    assert read_plan(tmp_path) == read_plan(whole)
 
 
 def test_diagnoses_with_other_options_are_not_mixed(
