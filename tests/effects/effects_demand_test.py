@@ -29,7 +29,14 @@ from ugat_marl.effects import (
 )
 from ugat_marl.envs import parallel_env
 from ugat_marl.errors import OptionError, ScenarioError, UnknownNameError
-from ugat_marl.scenarios import Document, Network, Scenario, check_demand, sumo_program
+from ugat_marl.scenarios import (
+    Document,
+    Network,
+    Scenario,
+    check_demand,
+    demand_as_vehicles,
+    sumo_program,
+)
 
 Crossing = Callable[..., Path]
 EDGE = "east1_A1"
@@ -230,6 +237,10 @@ def test_a_surge_stays_in_its_window() -> None:
     new = set(after) - set(before)
     times = [float(after[name].get("depart", "")) for name in new]
     assert all(600 <= time < 1200 for time in times)
+    # a twin 5 ms before the end of the window is not rounded into it
+    crowd = apply_effects(scenario, [DemandSurge("*", 46.0, 106.0, 20.0)])
+    copies = [x for name, x in departing(crowd).items() if name not in before]
+    assert all(46 <= float(x.get("depart", "")) < 106 for x in copies)
     inside = sum(600 <= float(x.get("depart", "")) < 1200 for x in of_edge(scenario).values())
     assert len(new) == pytest.approx(inside * 0.8, abs=bounds(inside, 0.8))
     assert {name: ET.tostring(after[name]) for name in before} == {
@@ -636,10 +647,13 @@ def test_a_short_surge_stays_in_its_window() -> None:
     assert len(times) == 200 and min(times) >= 600 and max(times) < 610
 
 
-def test_demand_that_starts_in_a_district_has_no_first_edge() -> None:
-    scenario = with_routes('<trip id="t" depart="1" fromTaz="a" toTaz="b"/>')
-    with pytest.raises(OptionError, match="trip 't' starts at fromTaz = 'a'"):
+@pytest.mark.parametrize("kind", ["Taz", "Junction", "XY", "LonLat"])
+def test_demand_that_starts_at_no_edge_has_no_first_edge(kind: str) -> None:
+    scenario = with_routes(f'<trip id="t" depart="1" from{kind}="a" to{kind}="b"/>')
+    with pytest.raises(OptionError, match=f"trip 't' starts at from{kind} = 'a'"):
         apply_effects(scenario, [DemandLevel(EDGE, 2.0)])
+    with pytest.raises(ScenarioError, match=f"trip 't' has from{kind} = 'a'"):
+        apply_effects(scenario, [Turning(EDGE, "A1_northA", 1)])
     assert len(departing(apply_effects(scenario, [DemandLevel("*", 2.0)]))) == 2
 
 
@@ -686,6 +700,21 @@ def test_a_truck_is_no_faster_than_the_car_it_replaces() -> None:
     assert speeds["heavy.slow"] == "8" and speeds["heavy.car"] == "36.11"
 
 
+def test_trucks_of_a_distribution_are_those_of_its_cars() -> None:
+    types = (
+        '<vTypeDistribution id="mix"><vType id="quick" probability="0.1"/>'
+        '<vType id="slow" maxSpeed="5" probability="0.9"/></vTypeDistribution>'
+    )
+    trip = '<trip id="t" type="mix" depart="1" from="west1_A1" to="A1_east1"/>'
+    changed = apply_effects(with_routes(types + trip), [HeavyShare(1.0)])
+    parts = [document.parse() for document in (*changed.routes, *changed.additional)]
+    (mix,) = (x for part in parts for x in part.iter("vTypeDistribution"))
+    shares = zip(mix.get("vTypes", "").split(), mix.get("probabilities", "").split(), strict=True)
+    assert {name: float(share) for name, share in shares} == {"heavy.quick": 0.1, "heavy.slow": 0.9}
+    speeds = {x.get("id"): x.get("maxSpeed") for part in parts for x in part.iter("vType")}
+    assert speeds["heavy.slow"] == "5" and speeds["heavy.quick"] == "36.11"
+
+
 @pytest.mark.parametrize("inside", [True, False])
 def test_a_turned_vehicle_keeps_its_stops_before_the_turn(inside: bool) -> None:
     stops = f'<stop edge="{EDGE}" endPos="20" duration="30"/><stop lane="A1_west1_0" duration="9"/>'
@@ -699,6 +728,45 @@ def test_a_turned_vehicle_keeps_its_stops_before_the_turn(inside: bool) -> None:
     assert edges(turned) == [EDGE, "A1_northA"]
     assert [stop.get("edge") for stop in turned.iter("stop")] == [EDGE]
     assert [child.tag for child in turned] == ["route", "stop"]
+
+
+@pytest.mark.parametrize("tag", ["vehicle", "flow"])
+def test_a_turned_vehicle_keeps_the_stops_of_its_named_route(tag: str) -> None:
+    """There they count from the departure, in the vehicle itself from the start of the clock."""
+    stops = '<stop lane="east1_A1_0" until="90"/><stop lane="A1_west1_0" duration="9"/>'
+    route = f'<route id="r" edges="{EDGE} A1_west1">{stops}</route>'
+    when = 'depart="100"' if tag == "vehicle" else 'begin="100" end="160" number="1"'
+    scenario = with_routes(route + f'<{tag} id="a" route="r" {when}/>')
+    (turned,) = departing(apply_effects(scenario, [Turning(EDGE, "A1_northA", 1)])).values()
+    assert [(x.get("lane"), float(x.get("until", ""))) for x in turned.iter("stop")] == [
+        ("east1_A1_0", 190.0)
+    ]
+
+
+@pytest.mark.parametrize("inside", [True, False])
+@pytest.mark.parametrize(
+    "effect",
+    [DemandTiming("*", 40), DemandTiming("*", -40), DemandSurge("*", 150, 250, 2)],
+    ids=str,
+)
+def test_stops_last_as_long_when_departures_move(effect: Effect, inside: bool) -> None:
+    stop = '<stop lane="west1_A1_0" endPos="50" until="{}"/>'
+    route = '<route edges="west1_A1 A1_east1">{}</route>{}'
+    waits = [
+        route.format(*((stop.format(until), "") if inside else ("", stop.format(until))))
+        for until in (180, 190, 190)
+    ]
+    scenario = with_routes(
+        f'<flow id="random" begin="90" end="400" probability="0.05">{waits[0]}</flow>'
+        f'<flow id="regular" begin="100" end="400" period="30">{waits[1]}</flow>'
+        f'<vehicle id="single" depart="200">{route.format(stop.format(290), "")}</vehicle>'
+    )
+    found = departing(apply_effects(scenario, [effect]))
+    assert len(found) > 3 or isinstance(effect, DemandTiming)
+    for name, item in found.items():
+        begin = float(item.get("begin") or item.get("depart") or "")
+        (until,) = (float(x.get("until", "")) for x in item.iter("stop"))
+        assert until - begin == pytest.approx(90.0, abs=0.01), name
 
 
 def test_laps_of_a_turned_vehicle_count() -> None:
@@ -720,6 +788,17 @@ def test_who_departs_at_once_does_so_at_another_time(effect: Effect, crossing: C
     (flow,) = departing(apply_effects(load_scenario(crossing(vehicles=burst)), [effect])).values()
     at = "130" if effect == DemandTiming("*", 30) else "70"
     assert (flow.get("begin"), flow.get("end"), flow.get("number")) == (at, at, "5")
+
+
+def test_more_of_a_sparse_flow_departs_before_its_end() -> None:
+    flows = "".join(
+        f'<flow id="f{k}" begin="{900 * k}" end="{900 * (k + 1)}" vehsPerHour="1" '
+        'from="west1_A1" to="A1_east1"/>'
+        for k in range(4)
+    )
+    doubled = demand_as_vehicles(apply_effects(with_routes(flows), [DemandLevel("*", 2.0)]))
+    quarters = Counter(int(float(x.get("depart", ""))) // 900 for x in departing(doubled).values())
+    assert quarters == {0: 2, 1: 2, 2: 2, 3: 2}
 
 
 def test_a_surge_has_ended_where_a_burst_begins(crossing: Crossing) -> None:

@@ -152,6 +152,12 @@ def test_domains_a_network_does_not_allow_are_left_out(
     }  # fmt: skip
     assert all(f"{name} is left out: " in capture.get() for name in late)
     assert "no vehicle departs between 0 s and 300 s" in capture.get()
+    given["control"] = given.get("control", {}) | {"decision_interval_s": 60}
+    slow = tmp_path / "slow"
+    replace(found, settings=validate_settings(given, "here")).write(slow)
+    with console.capture() as capture:
+        left = Evaluate(str(slow), domains=("sim", "action"))._domains(load_scenario(slow), console)
+    assert "flexible is left out: " in capture.get() and "flexible" not in left
     named = ["--domains", "sim", "barrier-both", "--seeds", "1", "--policies", "max-pressure"]
     assert main(["evaluate", str(scenario), *named]) == 2, "what one names has to fit"
     assert "have no barrier" in capsys.readouterr().err

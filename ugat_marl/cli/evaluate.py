@@ -136,9 +136,9 @@ def _may_not_fit(name: str) -> bool:
 
     Not every network has a barrier order of phases or a lane long enough for an incident. With late
     demand, all vehicles may come after the end of a short episode. A detection zone does not go
-    with a reach, nor with the queue model.
+    with a reach, nor with the queue model. A longest green has to hold one decision.
     """
-    words = ("phase_order=barrier", "incident=", "demand_timing=", "detection_zone=")
+    words = ("phase_order=barrier", "incident=", "demand_timing=", "detection_zone=", "max_green=")
     return any(word in NAMED_DOMAINS[name].effects for word in words)
 
 

@@ -57,11 +57,13 @@ class NamedRoutes:
         edges: Route to its edges.
         first: Route, or distribution of routes, to its first edge.
         several: Distribution of routes that begin on several edges, to these edges.
+        stops: Route to its stops, if it has any.
     """
 
     edges: dict[str, tuple[str, ...]] = field(default_factory=dict)
     first: dict[str, str] = field(default_factory=dict)
     several: dict[str, set[str]] = field(default_factory=dict)
+    stops: dict[str, list[ET.Element]] = field(default_factory=dict)
 
     @classmethod
     def of(cls, scenario: Scenario) -> NamedRoutes:
@@ -80,6 +82,8 @@ class NamedRoutes:
                     if "id" in element.attrib:
                         edges = _edges(element)
                         routes.edges[element.get("id", "")] = shared.setdefault(edges, edges)
+                        if stops := element.findall("stop"):
+                            routes.stops[element.get("id", "")] = stops
                 distributions += part.iter("routeDistribution")
         routes.first = {name: edges[0] for name, edges in routes.edges.items() if edges}
         for element in distributions:
@@ -210,10 +214,26 @@ class DemandTiming(Effect):
                 begin += self.seconds
             if begin < earliest:
                 return []
+            move_stops(element, begin - depart_s(element))
             element.set("depart", seconds_text(begin))
             return [element]
 
         return replace_departing(scenario, self, self.edge, shifted)
+
+
+def move_stops(element: ET.Element, seconds: float) -> None:
+    """Move the times of a vehicle's own stops by the time by which its departure moves.
+
+    Those of a flow count from its begin. In named routes they are relative to the departure.
+    """
+    if math.isnan(seconds):  # it waits for a person or container
+        return
+    for child in element:
+        for stop in child if child.tag == "route" else [child]:
+            if stop.tag == "stop":
+                for key in ("until", "arrival", "started", "ended"):
+                    if text := stop.get(key):
+                        stop.set(key, seconds_text(parse_time(text) + seconds))
 
 
 def _refuse_unknown_origin(
@@ -232,7 +252,7 @@ def _refuse_unknown_origin(
             f"begin on {', '.join(sorted(drawn))}, so its first edge is not known; give it a route "
             "of its own, or take every edge (*)"
         )
-    for attribute in ("fromTaz", "fromJunction"):
+    for attribute in ("fromTaz", "fromJunction", "fromXY", "fromLonLat"):
         if attribute in element.attrib:
             raise OptionError(
                 f"{effect}: {element.tag} {element.get('id')!r} starts at {attribute} = "
@@ -289,11 +309,13 @@ class _Regular:
         begin_s: First departure, s.
         spacing_s: Time between two departures, s; 0 if the flow has no duration.
         number: Number of vehicles.
+        until_s: Time before which the last one has to depart, s.
     """
 
     begin_s: float
     spacing_s: float
     number: int
+    until_s: float = math.inf
 
     @property
     def end_s(self) -> float:
@@ -315,7 +337,8 @@ class _Regular:
 
     def resized(self, number: int) -> _Regular:
         """Return another number of vehicles in the same time."""
-        return replace(self, spacing_s=(self.end_s - self.begin_s) / number, number=number)
+        end_s = min(self.end_s, self.until_s) if number > self.number else self.end_s
+        return replace(self, spacing_s=(end_s - self.begin_s) / number, number=number)
 
     @classmethod
     def of(cls, flow: ET.Element, over_s: float) -> _Regular | None:
@@ -331,7 +354,7 @@ class _Regular:
         if math.isnan(begin) or period is None or until < begin:
             return None
         if period and text is None:
-            return cls(begin, period, math.ceil((until - begin) / period - 1e-9))
+            return cls(begin, period, math.ceil((until - begin) / period - 1e-9), until)
         number = round(float(text or 0))
         return cls(begin, period or (until - begin) / max(number, 1), number)
 
@@ -340,6 +363,7 @@ class _Regular:
         flow = copy.deepcopy(element)
         for key in FLOW_RATES:
             flow.attrib.pop(key, None)
+        move_stops(flow, self.begin_s - depart_s(element))
         flow.set("begin", seconds_text(self.begin_s))
         flow.set("number", str(self.number))
         if self.spacing_s > 0 or "end" in flow.attrib:
@@ -438,7 +462,9 @@ def _shifted_flow(
         if until <= earliest_s:
             return []
         element.set("end", seconds_text(until))
-    element.set("begin", seconds_text(max(begin, earliest_s)))
+    begin = max(begin, earliest_s)
+    move_stops(element, begin - depart_s(element))
+    element.set("begin", seconds_text(begin))
     return [element]
 
 
@@ -465,9 +491,10 @@ def _scaled(
             twin = copy.deepcopy(element)
             twin.set("id", f"{name}{mark}{number}")
             shift = TWIN_S * (2 * hashed_uniform(salt, "when", name, str(number)) - 1)
-            times = (depart + shift, depart - shift, depart)
+            times = (round(depart + shift, 2), round(depart - shift, 2), depart)
             time = next(time for time in times if least <= time < end)
-            twin.set("depart", seconds_text(round(time, 2)))
+            move_stops(twin, time - depart)
+            twin.set("depart", seconds_text(time))
             copies.append(twin)
         return copies
 
@@ -520,6 +547,7 @@ def _scaled_window(
             if rate != 1:
                 part.set("end", seconds_text(min(some.end_s, stop)))
         else:
+            move_stops(part, start - begin)
             part.set("begin", seconds_text(start))
             part.set("end", seconds_text(stop))
             part.attrib.pop("number", None)

@@ -157,7 +157,7 @@ def _types(scenario: Scenario) -> tuple[dict[str, ET.Element], dict[str, list[st
 def _cars(
     types: Mapping[str, ET.Element], members: Mapping[str, list[str]]
 ) -> dict[str, ET.Element]:
-    """Return types of cars, and distributions of cars alone, each with its first type."""
+    """Return types of cars, and distributions of cars that are alike, each with its first type."""
     passenger_cars = {
         name: element
         for name, element in types.items()
@@ -165,8 +165,19 @@ def _cars(
     }
     for distribution, names in members.items():
         if names and all(name in passenger_cars for name in names):
-            passenger_cars[distribution] = passenger_cars[names[0]]
+            own = [_nameless(passenger_cars[name]) for name in names]
+            if all(one == own[0] for one in own):
+                passenger_cars[distribution] = passenger_cars[names[0]]
     return passenger_cars
+
+
+def _nameless(vehicle_type: ET.Element) -> bytes:
+    """Return all of a type but its name and its share in a distribution."""
+    kind = copy.deepcopy(vehicle_type)
+    kind.tail = None
+    for key in ("id", "probability"):
+        kind.attrib.pop(key, None)
+    return ET.tostring(kind)
 
 
 def _mix_trucks_in(

@@ -6,7 +6,7 @@ import copy
 import xml.etree.ElementTree as ET
 from bisect import bisect_right
 from collections import Counter
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from dataclasses import dataclass
 from itertools import accumulate, chain, pairwise
 from typing import ClassVar
@@ -18,14 +18,18 @@ from ugat_marl.effects.base import (
     hashed_uniform,
     salt_of,
 )
-from ugat_marl.effects.demand import TAGS, NamedRoutes, parted_flow
-from ugat_marl.effects.documents import edit_scenario, free_suffix, is_demand, mentions
+from ugat_marl.effects.demand import TAGS, NamedRoutes, move_stops, parted_flow
+from ugat_marl.effects.documents import depart_s, edit_scenario, free_suffix, is_demand, mentions
 from ugat_marl.effects.places import Places, network_places
 from ugat_marl.errors import ScenarioError, UnknownNameError
 from ugat_marl.scenarios import Scenario, edge_of_lane
 
 Way = tuple[str, ...]
 
+_UNKNOWN_ENDS = tuple(
+    f"{end}{kind}" for kind in ("Taz", "Junction", "XY", "LonLat") for end in ("from", "to")
+)
+"""Attributes of origins and destinations that name no edge."""
 _ENDS = ("arrivalLane", "arrivalPos", "arrivalEdge", "arrivalPosLat", "arrivalSpeed")
 
 
@@ -68,7 +72,7 @@ class Turning(Effect):
 
         def way(element: ET.Element) -> Way:
             edges = routes.edges_of(element) or _fastest(element, places)
-            for end in ("fromTaz", "toTaz", "fromJunction", "toJunction"):
+            for end in _UNKNOWN_ENDS:
                 if not edges and (district := element.get(end)) is not None:
                     raise ScenarioError(
                         f"effect {self.name!r}: {element.tag} {element.get('id')!r} has {end} = "
@@ -83,6 +87,9 @@ class Turning(Effect):
                 )
             return edges
 
+        def turned(element: ET.Element, edges: Way) -> ET.Element:
+            return _with_route(element, edges, routes.stops.get(element.get("route", ""), ()))
+
         tails = self._tails(scenario, way, places)
         over = scenario.settings.begin_s + scenario.settings.duration_s
         suffix = free_suffix(scenario, "+turning")
@@ -91,7 +98,7 @@ class Turning(Effect):
         def change(root: ET.Element) -> bool:
             children: list[ET.Element] = []
             for element in root:
-                children += self._turned(element, way, tails, over, suffix, salt)
+                children += self._turned(element, way, turned, tails, over, suffix, salt)
             changed = len(children) != len(root) or any(
                 a is not b for a, b in zip(children, root, strict=True)
             )
@@ -123,6 +130,7 @@ class Turning(Effect):
         self,
         element: ET.Element,
         way: Callable[[ET.Element], Way],
+        turned: Callable[[ET.Element, Way], ET.Element],
         tails: Counter[Way],
         over_s: float,
         suffix: str,
@@ -139,15 +147,15 @@ class Turning(Effect):
         if element.tag != "flow":
             if hashed_uniform(salt, name) >= self.share:
                 return [element]
-            return [_with_route(element, (*edges[: place + 1], *_drawn(tails, salt, name)))]
+            return [turned(element, (*edges[: place + 1], *_drawn(tails, salt, name)))]
         total = sum(tails.values())
         shares = [self.share * count / total for _, count in sorted(tails.items())]
-        *turned, rest = parted_flow(element, (*shares, 1 - self.share), over_s, salt)
+        *others, rest = parted_flow(element, (*shares, 1 - self.share), over_s, salt)
         parts = [rest]
-        for number, (part, tail) in enumerate(zip(turned, sorted(tails), strict=True)):
+        for number, (part, tail) in enumerate(zip(others, sorted(tails), strict=True)):
             if part is not None:
                 part.set("id", f"{name}{suffix}{number or ''}")
-                parts.append(_with_route(part, (*edges[: place + 1], *tail)))
+                parts.append(turned(part, (*edges[: place + 1], *tail)))
         return [part for part in parts if part is not None]
 
 
@@ -178,8 +186,14 @@ def _way_out(start: str, places: Places) -> Way:
     return min(ways, key=lambda way: sum(map(places.seconds, way)), default=(start,))
 
 
-def _with_route(element: ET.Element, edges: Way) -> ET.Element:
-    """Return the vehicle or flow on another route; stops there that name a lane or edge stay."""
+def _with_route(element: ET.Element, edges: Way, named: Iterable[ET.Element]) -> ET.Element:
+    """Return the vehicle or flow on another route; stops there that name a lane or edge stay.
+
+    Args:
+        element: The vehicle, trip or flow.
+        edges: The other route.
+        named: Stops of its named route.
+    """
     made = copy.deepcopy(element)
     if made.tag == "trip":
         made.tag = "vehicle"
@@ -187,6 +201,10 @@ def _with_route(element: ET.Element, edges: Way) -> ET.Element:
         made.attrib.pop(key, None)
     route = ET.Element("route", {"edges": " ".join(edges)})
     stops = [stop for child in made for stop in (child if child.tag == "route" else [child])]
+    before = ET.Element("vehicle")
+    before.extend(copy.deepcopy(stop) for stop in named)
+    move_stops(before, depart_s(element))  # the times of a named route count from the departure
+    stops = [*before, *stops]
     for child in list(made):
         if child.tag in ("route", "stop"):
             made.remove(child)
