@@ -206,6 +206,7 @@ def test_drivers_who_speed_up_and_slow_down_over_the_loops_make_no_zone(
     ("zone_m", "extension_s", "found"),
     [
         (1.9, -0.15, []),  # drivers who start otherwise, as seen with reaction steps of 2 s
+        (4.1, -0.17, ["detector_zone=stop"]),  # the same beside a longer zone
         (4.0, -1.0, ["detector_extension=stop", "detector_zone=stop"]),
         (1.9, 0.3, ["detector_extension=stop", "detector_zone=stop"]),
     ],
@@ -227,6 +228,28 @@ def test_numbers_that_change_slow_vehicles_alone_are_no_error(
 
     errors = Measurement(DETECTORS, seen(zone_m, extension_s), seen(0.0, 0.0), THRESHOLDS).errors()
     assert sorted(f"{one.effect.name}={one.effect.place}" for one in errors) == found
+
+
+@pytest.mark.parametrize(
+    ("extension_s", "pace", "found"),
+    [(1.2, 1.0, ["detector_extension=advance"]), (0.0, 0.9, []), (0.0, 1.0, [])],
+)
+def test_where_queues_never_end_those_in_them_show_an_extension(
+    extension_s: float, pace: float, found: list[str]
+) -> None:
+    generator = np.random.default_rng(5)
+
+    def seen(more_s: float, pace: float) -> Sightings:
+        period_passages: dict[str, Passages] = {}
+        for name in ("far", "far left"):
+            times = np.cumsum(generator.uniform(3.0, 4.5, 300))
+            speeds = pace * generator.uniform(3.0, 7.0, 300)
+            period_passages[name] = crossings(times, speeds, more_s)
+        period = Period("day", 0.0, 1500.0, "fit", {}, period_passages)
+        return Sightings.of(LAYOUT, period, [GREEN, GREEN], THRESHOLDS)
+
+    errors = Measurement(DETECTORS, seen(extension_s, pace), seen(0.0, 1.0), THRESHOLDS).errors()
+    assert [f"{one.effect.name}={one.effect.place}" for one in errors] == found
 
 
 def test_extensions_are_seen_without_speeds() -> None:

@@ -296,7 +296,7 @@ class Engine:
         def reduce(period: Period, greens: Sequence[Greens]) -> dict[str, Any]:
             return Sightings.of(self.layout, period, greens, self._thresholds).arrays()
 
-        name = f"vehicles3-{self._thresholds.of_sightings()}"
+        name = f"vehicles4-{self._thresholds.of_sightings()}"
         days = self.reduced(effects, numbers, name, reduce, advance)
         return [Sightings.from_arrays(arrays) for arrays in days]
 

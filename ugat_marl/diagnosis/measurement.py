@@ -31,7 +31,7 @@ from ugat_marl.diagnosis.error_places import (
     Number,
     ValueWithError,
 )
-from ugat_marl.diagnosis.sightings import ALONE, GAP_EDGES_S, Sightings
+from ugat_marl.diagnosis.sightings import ALONE, GAP_EDGES_S, QUEUED, Sightings
 from ugat_marl.diagnosis.splash import Splash
 from ugat_marl.diagnosis.thresholds import Thresholds
 from ugat_marl.effects import (
@@ -244,10 +244,10 @@ class Measurement:
         ranges = (DetectorExtension.ranges["seconds"], DetectorZone.ranges["metres"])
         return ranges[index].holds(estimate.value)
 
-    def _matters(self, number: Number, estimate: ValueWithError) -> bool:
+    def _matters(self, number: Number, estimate: ValueWithError, times: float = 1.0) -> bool:
         """Return True if an extension or zone is possible, large enough, and beyond chance."""
         limit, (_, index) = self._thresholds, number
-        least = (limit.least_extension_s, limit.least_zone_m)[index]
+        least = times * (limit.least_extension_s, limit.least_zone_m)[index]
         differs = estimate.differs(least, limit.named_deviations)
         return differs and self._possible(index, estimate)
 
@@ -351,7 +351,8 @@ class Measurement:
         """Return the choice without longer zones that begin late, and the reverse, which cancel.
 
         Both change slow vehicles, and quick ones hardly at all. So do drivers who speed up and
-        brake otherwise. Such a pair is kept if one of its numbers would matter without the other.
+        brake otherwise. Such a pair is kept if both numbers are large, and one of them would matter
+        without the other. Else the better one is kept, if it matters alone.
         """
         for place in dict.fromkeys(place for place, _ in best.estimates):
             pair = [(place, 0), (place, 1)]
@@ -360,8 +361,11 @@ class Measurement:
                 continue
             others = [one for one in best.estimates if one not in pair]
             single = {one: _solved(searches, [*others, one], elsewhere) for one in pair}
-            if not any(self._matters(one, single[one].estimates[one]) for one in pair):
-                best = _solved(searches, others, elsewhere)
+            alone = [single[one] for one in pair if self._matters(one, single[one].estimates[one])]
+            large = all(self._matters(one, best.estimates[one], 2.0) for one in pair)
+            if not (alone and large):
+                none = _solved(searches, others, elsewhere)
+                best = min(alone, key=lambda one: one.cost, default=none)
         return best
 
     def _rivals(
@@ -450,6 +454,8 @@ class Measurement:
             measured, simulated = (x[np.isfinite(x[:, 3])] for x in (measured, simulated))
         equations: list[Equation] = []
         for regime in np.unique(measured[:, 1]).astype(int).tolist():
+            if regime == QUEUED and equations:
+                continue  # drivers differ more in a queue: it counts where there is nothing else
             pair = [x[x[:, 1] == regime] for x in (measured, simulated)]
             parts = {} if moved else {"": pair}
             steadily = regime == ALONE and self._detectors[members[0]].kind != "stop"

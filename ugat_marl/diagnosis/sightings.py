@@ -20,9 +20,10 @@ from ugat_marl.scenarios import Detector, Passages, Period
 
 Array = NDArray[np.float64]
 
-ALONE, SECOND, THIRD, FOURTH, SIXTH, BRAKING = range(6)
+ALONE, SECOND, THIRD, FOURTH, SIXTH, BRAKING, QUEUED = range(7)
 """Regimes of a passage: alone in free flow; second, third, fourth to fifth, sixth to eighth of a
-queue at a stop detector; braking alone for a red at an advance detector."""
+queue at a stop detector; braking alone for a red at an advance detector, and any other moving one
+there."""
 
 GAP_EDGES_S = 0.05 * np.arange(101)
 """Edges of the bins of the time between two passages, s."""
@@ -221,6 +222,8 @@ def _regimes_at_advance(track: _Track, greens: Greens, thresholds: Thresholds) -
     regime = np.full(len(track.on), -1)
     if not len(greens.start_s):
         return track.alone_only()
+    moving = (track.speed > thresholds.crawling_mps) & (track.over < thresholds.longest_alone_s)
+    regime[moving] = QUEUED
     settled = green & (track.on > greens.start_s[cycle] + thresholds.settled_green_s)
     regime[track.alone() & settled] = ALONE
     red = (track.on > greens.red_s[cycle]) & (
