@@ -61,13 +61,20 @@ class Results:
         scenarios = {name: load_scenario(name) for name in self.scenarios}
         for name in scenarios:  # a folder that is not writable is an error before the trainings
             require_writable(self.out / f"{file_stem(name)}.md")
-            _require_kept(self.out / f"{file_stem(name)}.csv", self.config.learners)
+            table = self.out / f"{file_stem(name)}.csv"
+            if lost := _lost(table, self.config.learners):
+                raise OptionError(
+                    f"{table} has rows of {', '.join(lost)}, which would be lost: name these in "
+                    "--learners, too (what is trained stays trained), or give another --out"
+                )
         for name, scenario in scenarios.items():
             page = self.out / f"{file_stem(name)}.md"
             found = learn_curves(scenario, name, self.config, self.runs, self.jobs, Bars(console))
             failures |= found.failures
-            if found.curves and found.best:
-                _require_kept(page.with_suffix(".csv"), {curve.learner for curve in found.curves})
+            lost = _lost(page.with_suffix(".csv"), {curve.learner for curve in found.curves})
+            if lost:
+                failures[str(page)] = f"kept, since it has rows of {', '.join(lost)}, which failed"
+            elif found.curves and found.best:
                 write_whole(page, curves_page(found, self.config, machine_facts()) + "\n")
                 write_csv(page.with_suffix(".csv"), curves_as_csv(found.curves))
                 console.print(f"page: {page}, each evaluation: {page.with_suffix('.csv')}")
@@ -76,15 +83,19 @@ class Results:
         return int(bool(failures))
 
 
-def _require_kept(table: Path, learners: Collection[str]) -> None:
-    """Refuse to replace a table by one without some of its learners."""
-    if table.is_file():
+def _lost(table: Path, learners: Collection[str]) -> list[str]:
+    """Return the learners of a table that others do not include.
+
+    Raises:
+        OptionError: The file is another kind of table.
+    """
+    if not table.is_file():
+        return []
+    try:
         there = pl.read_csv(table, columns=["learner"])["learner"].unique(maintain_order=True)
-        if lost := [name for name in there if name not in learners]:
-            raise OptionError(
-                f"{table} has rows of {', '.join(lost)}, which would be lost: name these in "
-                "--learners, too (what is trained stays trained), or give another --out"
-            )
+    except pl.exceptions.PolarsError:
+        raise OptionError(f"{table} is no table of results.py; give another --out") from None
+    return [name for name in there if name not in learners]
 
 
 if __name__ == "__main__":

@@ -24,6 +24,7 @@ from ugat_marl.diagnosis.sightings import (
     _Track,
     together,
 )
+from ugat_marl.diagnosis.splash import Splash
 from ugat_marl.diagnosis.thresholds import OF_SIGHTINGS, Thresholds
 from ugat_marl.diagnosis.verdict import describe_errors
 from ugat_marl.effects import DetectorSplash
@@ -443,6 +444,29 @@ def test_where_nobody_is_alone_coincidences_and_counts_tell_splash(
     errors = Measurement(DETECTORS, days(0.2), days(0.0), THRESHOLDS).errors()
     splashes = [one.effect for one in errors if isinstance(one.effect, DetectorSplash)]
     assert [f"{one.name}={one.place},{one.share:.1f}" for one in splashes] == found
+
+
+@pytest.mark.parametrize(("grain_s", "told"), [(0.0, True), (0.1, True), (0.2, False)])
+def test_coincidences_need_a_clock_that_tells_them_from_chance(grain_s: float, told: bool) -> None:
+    seen = replace(nothing_seen(2), counts=np.full(2, 1000.0))
+    street = replace(seen, coincidences=np.array([(300.0, 0.0), (0.0, 0.0)]))
+    lanes = [Detector(f"line{n}", f"in_{n}", 150.0, 0.0, "stop") for n in range(2)]
+    others = [Detector(f"far{n}", f"in_{n}", 100.0, 0.0, "advance") for n in range(2)]
+    groups = {("stop", "in"): [0, 1], ("advance", "in"): [2, 3]}
+
+    def four(two: Sightings, count: float) -> Sightings:
+        more = replace(nothing_seen(2), counts=np.full(2, count)).arrays()
+        joined = {name: np.concatenate((own, more[name])) for name, own in two.arrays().items()}
+        return Sightings.from_arrays(joined)
+
+    def shares(usual: Sightings, grain_s: float) -> dict[Any, Any]:
+        days = four(street, 820.0), four(usual, 1000.0)
+        return Splash([*lanes, *others], groups, *days, THRESHOLDS, grain_s).shares()
+
+    found = shares(seen, grain_s)
+    assert (("stop", "in") in found) == told
+    assert not told or found["stop", "in"].counted
+    assert not shares(nothing_seen(2), 0.0), "simulated days without a vehicle there tell nothing"
 
 
 def test_coincidences_by_hand() -> None:

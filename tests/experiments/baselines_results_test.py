@@ -53,6 +53,9 @@ def test_a_page_and_a_table_are_written_and_failures_are_told(
         "single-v1", "sim", (Curve("vdn", "", 0, {1: 7.0}),), rules, "sotl", {}
     )
     monkeypatch.setattr(results, "learn_curves", lambda *_: untrained)
-    with pytest.raises(OptionError, match="has rows of dqn, which would be lost"):
-        given.run()
+    assert given.run() == 1
+    assert "single-v1.md: kept, since it has rows of dqn, which failed" in capsys.readouterr().out
     assert (tmp_path / "single-v1.md").read_bytes() == page
+    (tmp_path / "single-v1.csv").write_text("a,b\n1,2\n")
+    with pytest.raises(OptionError, match="is no table of results.py"):
+        given.run()

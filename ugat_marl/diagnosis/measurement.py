@@ -621,7 +621,7 @@ class Measurement:
         """Return the places of detectors that report vehicles of the next lane."""
         limit = self._thresholds
         shares = Splash(
-            self._detectors, self._groups, self._measured, self._simulated, limit
+            self._detectors, self._groups, self._measured, self._simulated, limit, self._grain_s
         ).shares()
         equations = {
             group: [Equation(share.value, (1.0,), share.error)] for group, share in shares.items()

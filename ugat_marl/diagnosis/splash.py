@@ -49,6 +49,7 @@ class Splash:
         measured: Sightings of the data.
         simulated: Sightings of simulated days.
         thresholds: Numbers of the method.
+        grain_s: Grain of the clock that stamps detections, s.
     """
 
     def __init__(
@@ -58,6 +59,7 @@ class Splash:
         measured: Sightings,
         simulated: Sightings,
         thresholds: Thresholds,
+        grain_s: float,
     ) -> None:
         reported = Counter(chain.from_iterable(beside(detectors).values()))
         # By how many detectors beside it the vehicles of each one are reported.
@@ -70,17 +72,20 @@ class Splash:
         }
         self._measured, self._simulated = measured, simulated
         self._thresholds = thresholds
+        # With fewer stamps within `twin_s`, pairs by chance cannot be told from those a bit apart.
+        self._fine = grain_s < thresholds.twin_s
 
     def shares(self) -> dict[Group, SplashShare]:
         """Return the share of splash of every group that tells one."""
         lone = {group: self._by_lone_vehicles(members) for group, members in self._groups.items()}
-        witnesses = {
-            group: min(filter(None, (lone[group], self._by_coincidences(members))), key=_error)
-            for group, members in self._groups.items()
-        }
+        witnesses: dict[Group, SplashShare] = {}
+        for group, members in self._groups.items():
+            coinciding = self._by_coincidences(members) if self._fine else None
+            if found := [share for share in (lone[group], coinciding) if share is not None]:
+                witnesses[group] = min(found, key=lambda share: share.error)
         shares: dict[Group, SplashShare] = {}
         for group, by_lone in lone.items():
-            share = self._by_counts(group, witnesses) or by_lone
+            share = (self._by_counts(group, witnesses) if group in witnesses else None) or by_lone
             if share is not None:
                 shares[group] = share
         return shares
@@ -130,19 +135,15 @@ class Splash:
         own_shown, *others_shown = (
             one.value > limit.shown_deviations * one.error for one in (witness, *there)
         )
-        if not least or not own_shown or any(others_shown):
+        copies = float(self._reported[own] @ simulated[own]) / max(simulated[own].sum(), 1.0)
+        if not (least and copies and own_shown) or any(others_shown):
             return None
-        copies = float(np.average(self._reported[own], weights=simulated[own]))
         usual = float(simulated[own].sum() / simulated[others].sum() * measured[others].sum())
         more = float(measured[own].sum()) - usual
         error = math.hypot(math.sqrt(max(more, 0.0) + 1.0) / usual, limit.count_doubt) / copies
         counted = SplashShare(more / usual / copies, error, counted=True)
         agree = limit.agreeing_deviations * math.hypot(witness.error, counted.error)
         return counted if abs(counted.value - witness.value) <= agree else None
-
-
-def _error(share: ValueWithError) -> float:
-    return share.error
 
 
 def _of_twins(twins: Array, reported: NDArray[np.int64]) -> ValueWithError:

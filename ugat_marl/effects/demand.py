@@ -224,7 +224,8 @@ class DemandTiming(Effect):
 def move_stops(element: ET.Element, seconds: float) -> None:
     """Move the times of a vehicle's own stops by the time by which its departure moves.
 
-    Those of a flow count from its begin. In named routes they are relative to the departure.
+    Those of a flow with regular departures count from its begin. Those of a flow with random
+    departures are times of the clock, and those of named routes are relative to the departure.
     """
     if math.isnan(seconds):  # it waits for a person or container
         return
@@ -367,18 +368,25 @@ class _Regular:
         flow.set("begin", seconds_text(self.begin_s))
         flow.set("number", str(self.number))
         if self.spacing_s > 0 or "end" in flow.attrib:
-            flow.set("end", seconds_text(self.end_s))
+            # The end of several vehicles tells their spacing; that of a single one is its flow's.
+            end_s = min(self.end_s, self.until_s) if self.number == 1 else self.end_s
+            flow.set("end", seconds_text(end_s))
         return flow
 
 
 def _period_s(flow: ET.Element) -> float | None:
     """Return the time between two departures, s: 0 without a rate, None if random or never."""
-    if "probability" in flow.attrib or _EXPONENTIAL.fullmatch(flow.get("period", "")):
+    if departs_by_chance(flow):
         return None
     if hourly := flow.get("vehsPerHour") or flow.get("perHour"):
         rate = float(hourly)
         return 3600 / rate if rate > 0 else None
     return float(flow.get("period", "0"))
+
+
+def departs_by_chance(flow: ET.Element) -> bool:
+    """Return True if the vehicles of a flow depart at random times."""
+    return "probability" in flow.attrib or bool(_EXPONENTIAL.fullmatch(flow.get("period", "")))
 
 
 def parted_flow(
@@ -449,7 +457,8 @@ def _shifted_flow(
     regular = None if endless else _Regular.of(element, over_s)
     if regular is not None:
         present = regular.cut(regular.before(earliest_s), regular.number)
-        later = replace(present, begin_s=present.begin_s + seconds)
+        until_s = present.until_s + seconds
+        later = replace(present, begin_s=present.begin_s + seconds, until_s=until_s)
         kept = later.cut(later.before(earliest_s), later.number)
         return [kept.written(element)] if kept.number else []
     begin = max(depart_s(element), earliest_s) + seconds
@@ -462,9 +471,8 @@ def _shifted_flow(
         if until <= earliest_s:
             return []
         element.set("end", seconds_text(until))
-    begin = max(begin, earliest_s)
-    move_stops(element, begin - depart_s(element))
-    element.set("begin", seconds_text(begin))
+    move_stops(element, seconds)
+    element.set("begin", seconds_text(max(begin, earliest_s)))
     return [element]
 
 
@@ -545,9 +553,8 @@ def _scaled_window(
             if not some.number:
                 continue
             if rate != 1:
-                part.set("end", seconds_text(min(some.end_s, stop)))
+                part.set("end", seconds_text(min(some.end_s, some.until_s, stop)))
         else:
-            move_stops(part, start - begin)
             part.set("begin", seconds_text(start))
             part.set("end", seconds_text(stop))
             part.attrib.pop("number", None)

@@ -18,8 +18,15 @@ from ugat_marl.effects.base import (
     hashed_uniform,
     salt_of,
 )
-from ugat_marl.effects.demand import TAGS, NamedRoutes, move_stops, parted_flow
-from ugat_marl.effects.documents import depart_s, edit_scenario, free_suffix, is_demand, mentions
+from ugat_marl.effects.demand import TAGS, NamedRoutes, departs_by_chance, move_stops, parted_flow
+from ugat_marl.effects.documents import (
+    depart_s,
+    edit_scenario,
+    free_suffix,
+    is_demand,
+    mentions,
+    seconds_text,
+)
 from ugat_marl.effects.places import Places, network_places
 from ugat_marl.errors import ScenarioError, UnknownNameError
 from ugat_marl.scenarios import Scenario, edge_of_lane
@@ -88,7 +95,16 @@ class Turning(Effect):
             return edges
 
         def turned(element: ET.Element, edges: Way) -> ET.Element:
-            return _with_route(element, edges, routes.stops.get(element.get("route", ""), ()))
+            named = routes.stops.get(element.get("route", ""), [])
+            if named and element.tag == "flow" and departs_by_chance(element):
+                name = element.get("id", "").partition(suffix)[0]
+                raise ScenarioError(
+                    f"effect {self.name!r}: flow {name!r} departs by chance, and its "
+                    f"route {element.get('route')!r} has stops; give it a route of its own"
+                )
+            if named and element.get("depart") == "begin":
+                element.set("depart", seconds_text(scenario.settings.begin_s))
+            return _with_route(element, edges, named)
 
         tails = self._tails(scenario, way, places)
         over = scenario.settings.begin_s + scenario.settings.duration_s

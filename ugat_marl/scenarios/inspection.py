@@ -254,9 +254,10 @@ def _notes_of_demand(scenario: Scenario) -> tuple[str, ...]:
     if not vehicle:
         return ()
     return (
-        f"{vehicle!r} runs between districts (fromTaz, toTaz): in an episode SUMO chooses its "
-        "roads by the travel times of the moment, while this check, drawn days and a diagnosis "
-        "take the quickest free-flow route; routes that duarouter writes are the same in all",
+        f"{vehicle!r} runs between districts (fromTaz, toTaz): in an episode SUMO chooses where "
+        "it begins and ends by the travel times of the moment, while this check, drawn days and a "
+        "diagnosis take the quickest free-flow route; those that duarouter writes are the same in "
+        "all",
     )
 
 

@@ -106,8 +106,8 @@ def demand_as_vehicles(scenario: Scenario) -> Scenario:
 def between_districts(scenario: Scenario) -> str:
     """Return the id of a trip or flow from district to district; empty if there is none.
 
-    SUMO chooses the roads of such vehicles by the travel times of the moment, and duarouter by
-    those of free flow. So the demand differs.
+    SUMO chooses where such vehicles begin and end by the travel times of the moment, and duarouter
+    by those of free flow. So the demand differs.
     """
     for document in (*scenario.routes, *scenario.additional):
         for tag in document.scan():
