@@ -288,6 +288,34 @@ def test_a_right_effect_is_not_exchanged(reference: Reference) -> None:
     assert exchanges(members, above, target, THRESHOLDS) == []
 
 
+def test_of_a_strong_effect_a_near_imitation_may_come_though_worse_is_predicted(
+    reference: Reference,
+) -> None:
+    """Without the strong effect a start-up delay is predicted to leave a fiftieth of it."""
+    among = [
+        replace(one, difference={name: 100.0 * x for name, x in one.difference.items()})
+        for one in directions()
+    ]
+    right, other = among[5], among[2]
+    mixed = right.difference["network"] + 0.15 * other.difference["network"]
+    among[0] = replace(among[0], difference={"network": mixed, "time": NO_TIME})
+    members, above, target = left_by(reference, among, "headway", "headway", 1.0)
+    assert float(target.measured @ target.measured) == pytest.approx(0.0, abs=1e-6)
+    near = exchanges(members, above, target, THRESHOLDS)
+    assert [set(values(one)) for one in near] == [{"headway", "startup_delay"}]
+    assert near[0].expected > THRESHOLDS.near_cost
+    exact = replace(THRESHOLDS, imitation_share=0.0)
+    assert exchanges(members, above, target, exact) == []
+
+
+def test_of_each_effect_only_the_best_exchanges_are_tried(reference: Reference) -> None:
+    among = directions()
+    members, above, target = left_by(reference, among, "startup_delay", "headway", 0.9)
+    wide = replace(THRESHOLDS, near_share=1e6, near_cost=1e6)
+    assert len(exchanges(members, above, target, replace(wide, exchanged=9))) > 2
+    assert len(exchanges(members, above, target, wide)) == 2
+
+
 def test_what_stays_moves_along(reference: Reference) -> None:
     """Beside the imitation another effect is too strong."""
     among = directions()

@@ -195,9 +195,9 @@ def exchanges(
         thresholds: Numbers of the method.
 
     Returns:
-        Changes of the model, each pair of effects once: nominal values of the one that goes, values
-        of the one that comes and of those that stay. Pairs that would leave clearly more than the
-        model does are left out.
+        Changes of the model, the best of each effect that goes: nominal values of the one that
+        goes, values of the one that comes and of those that stay. Pairs that would leave clearly
+        more than the model does are left out. A prediction is less exact the more it moves.
     """
     basis = [whitener(without_noise(x.difference, x.variance, thresholds)) for x in directions]
     gram, match = _products(basis, whitener.measured)
@@ -205,8 +205,9 @@ def exchanges(
     present = {hypothesis.key for hypothesis, _ in members}
     absent = [k for k, one in enumerate(directions) if one.hypothesis.key not in present]
     out, moves = _of_members(members, directions)
-    best: dict[tuple[object, object], Proposed] = {}
+    exchanged: list[Proposed] = []
     for key, gone in out.items():
+        best: dict[object, Proposed] = {}
         stay = [move for other, move in moves.items() if other != key]
         without, left = match - gram[gone], gap - 2 * match[gone] + gram[gone, gone]
         goes = (directions[gone].hypothesis, directions[gone].level)
@@ -220,14 +221,19 @@ def exchanges(
                 continue
             strengths = np.clip(strengths, -thresholds.farthest, thresholds.farthest)
             cost = left - _taken_off(gram, without, chosen, strengths)
-            pair = (key, comes.key)
-            if pair not in best or cost < best[pair].expected:
+            if comes.key not in best or cost < best[comes.key].expected:
                 moved = zip(chosen, strengths.tolist(), strict=True)
                 values = ((directions[k].hypothesis, directions[k].at(x)) for k, x in moved)
-                best[pair] = Proposed((goes, *values), cost)
-    most = thresholds.near_share * gap + thresholds.near_cost
-    near = [proposal for proposal in best.values() if proposal.expected <= most]
-    return sorted(near, key=lambda proposal: proposal.expected)
+                best[comes.key] = Proposed((goes, *values), cost)
+        most = thresholds.near_share * gap + thresholds.near_cost
+        most += thresholds.imitation_share * float(gram[gone, gone])
+        near = [proposal for proposal in best.values() if proposal.expected <= most]
+        exchanged += sorted(near, key=_cost)[: thresholds.exchanged]
+    return sorted(exchanged, key=_cost)
+
+
+def _cost(proposal: Proposed) -> float:
+    return proposal.expected
 
 
 def _products(basis: Sequence[Array], target: Array) -> tuple[Array, Array]:

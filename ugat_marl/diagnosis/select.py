@@ -260,7 +260,7 @@ class Selector:
         else:
             chosen += self._nearer(start.model, number)
             exchanged = exchanges(start.model.members, directions, whitener, self._thresholds)
-            chosen += [one.members for one in exchanged[: self._thresholds.exchanged]]
+            chosen += [one.members for one in exchanged]
         best = self._fitted(start, chosen, number, "candidates")
         if best is None and not near:  # simulations did not confirm the prediction of the library
             chosen = self._at_places(start.model, directions, number)

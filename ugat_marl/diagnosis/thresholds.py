@@ -694,8 +694,12 @@ class Thresholds(DayThresholds):
     """Kinds of effects at places for which the best effect is simulated. By hand, to save time.
     Halved: rarer kinds wait for another round."""
     exchanged: int = 2
-    """Exchanges of an effect of the model for another one that are fitted in a round. By hand: most
-    effects have one or two that imitate them. Halved: an imitation stays more often."""
+    """Exchanges of each effect of the model for another one that are fitted in a round. By hand:
+    most effects have one or two that imitate them. Halved: an imitation stays more often."""
+    imitation_share: float = 0.05
+    """Share of the squared change by an effect that another one may be predicted to leave in its
+    place, beside what is usual. By hand: a fifth of the change itself. Halved: a signal clock stays
+    in the place of a start-up delay beside slow drivers."""
     nearest: int = 3
     """Simulated strengths that are tried unchanged. By hand. Halved: effects that act in steps are
     missed where directions mislead."""
