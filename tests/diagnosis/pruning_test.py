@@ -451,7 +451,7 @@ def tried_in_round(
     monkeypatch.setattr(select, "propose", lambda *_: found)
     monkeypatch.setattr(select, "promising", lambda *_: found)
     swapped = SimpleNamespace(members="exchange")
-    monkeypatch.setattr(select, "exchanges", lambda *_: [swapped] * (THRESHOLDS.exchanged + 1))
+    monkeypatch.setattr(select, "exchanges", lambda *_: [swapped] * 5)
     monkeypatch.setattr(select, "cautious_drivers", lambda library: ["cautious"])
     assert selector._round(SimpleNamespace(model=SimpleNamespace(members=())), number) is None
     return tried
@@ -472,7 +472,7 @@ def test_what_a_round_tries_follows_from_the_distance(
 ) -> None:
     tried = tried_in_round(monkeypatch, number, gap)
     assert [list(dict.fromkeys(each)) for each in tried] == calls
-    assert tried[0].count("exchange") == (THRESHOLDS.exchanged if number else 0)
+    assert tried[0].count("exchange") == (5 if number else 0)  # all that were proposed
 
 
 def test_what_the_library_does_not_explain_at_all_is_looked_for_at_places(
