@@ -205,18 +205,14 @@ def _begin(directory: Path, blueprint: Blueprint, cases: tuple[Case, ...]) -> No
     """Write the plan, and the blueprint beside the labels."""
     sealed = directory / LABELS / "blueprint.json"
     text = json.dumps(asdict(blueprint), indent=1) + "\n"
-    if (directory / PLAN).exists() and (
-        read_plan(directory) != cases
-        or not sealed.exists()
-        or sealed.read_text(encoding="utf-8") != text
-    ):
+    planned = (directory / PLAN).exists()
+    begun = sealed.exists() and sealed.read_text(encoding="utf-8") == text
+    if planned and (read_plan(directory) != cases or not begun):
         raise BlindTestError(
             f"{directory}: holds another blind test; give another directory, or the options it was "
             "made with"
         )
-    begun = sealed.exists() and sealed.read_text(encoding="utf-8") == text
-    others = [*directory.iterdir()] if directory.exists() else []
-    if others and not (directory / PLAN).exists() and not begun:
+    if not planned and not begun and directory.exists() and any(directory.iterdir()):
         raise BlindTestError(f"{directory}: is not empty and no blind test; give another directory")
     write_whole(sealed, text)
     write_plan(directory, cases)

@@ -83,12 +83,8 @@ class Splash:
             coinciding = self._by_coincidences(members) if self._fine else None
             if found := [share for share in (lone[group], coinciding) if share is not None]:
                 witnesses[group] = min(found, key=lambda share: share.error)
-        shares: dict[Group, SplashShare] = {}
-        for group, by_lone in lone.items():
-            share = (self._by_counts(group, witnesses) if group in witnesses else None) or by_lone
-            if share is not None:
-                shares[group] = share
-        return shares
+        shares = {group: self._by_counts(group, witnesses) or lone[group] for group in lone}
+        return {group: share for group, share in shares.items() if share is not None}
 
     def _by_lone_vehicles(self, members: Sequence[int]) -> SplashShare | None:
         """Return the share that lone vehicles show; None if they are too few."""
@@ -123,7 +119,9 @@ class Splash:
             The share; None if no witness shows it, if the other detectors of the same lanes have
             splash, too, or if counts and witness disagree.
         """
-        limit, witness = self._thresholds, witnesses[group]
+        limit, witness = self._thresholds, witnesses.get(group)
+        if witness is None:
+            return None
         own = self._groups[group]
         lanes = {self._lanes[index] for index in own}
         others = [

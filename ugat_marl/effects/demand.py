@@ -10,7 +10,7 @@ import copy
 import math
 import re
 import xml.etree.ElementTree as ET
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, field, replace
 from itertools import accumulate, pairwise
 from typing import ClassVar
@@ -214,27 +214,31 @@ class DemandTiming(Effect):
                 begin += self.seconds
             if begin < earliest:
                 return []
-            move_stops(element, begin - depart_s(element))
+            move_stops(own_stops(element), begin - depart_s(element))
             element.set("depart", seconds_text(begin))
             return [element]
 
         return replace_departing(scenario, self, self.edge, shifted)
 
 
-def move_stops(element: ET.Element, seconds: float) -> None:
-    """Move the times of a vehicle's own stops by the time by which its departure moves.
+def own_stops(element: ET.Element) -> list[ET.Element]:
+    """Return the stops of a vehicle or flow itself, and of the route inside of it."""
+    children = (child if child.tag == "route" else [child] for child in element)
+    return [stop for part in children for stop in part if stop.tag == "stop"]
+
+
+def move_stops(stops: Iterable[ET.Element], seconds: float) -> None:
+    """Move the times of a vehicle's stops by the time by which its departure moves.
 
     Those of a flow with regular departures count from its begin. Those of a flow with random
     departures are times of the clock, and those of named routes are relative to the departure.
     """
     if math.isnan(seconds):  # it waits for a person or container
         return
-    for child in element:
-        for stop in child if child.tag == "route" else [child]:
-            if stop.tag == "stop":
-                for key in ("until", "arrival", "started", "ended"):
-                    if text := stop.get(key):
-                        stop.set(key, seconds_text(parse_time(text) + seconds))
+    for stop in stops:
+        for key in ("until", "arrival", "started", "ended"):
+            if text := stop.get(key):
+                stop.set(key, seconds_text(parse_time(text) + seconds))
 
 
 def _refuse_unknown_origin(
@@ -364,7 +368,7 @@ class _Regular:
         flow = copy.deepcopy(element)
         for key in FLOW_RATES:
             flow.attrib.pop(key, None)
-        move_stops(flow, self.begin_s - depart_s(element))
+        move_stops(own_stops(flow), self.begin_s - depart_s(element))
         flow.set("begin", seconds_text(self.begin_s))
         flow.set("number", str(self.number))
         if self.spacing_s > 0 or "end" in flow.attrib:
@@ -471,7 +475,7 @@ def _shifted_flow(
         if until <= earliest_s:
             return []
         element.set("end", seconds_text(until))
-    move_stops(element, seconds)
+    move_stops(own_stops(element), seconds)
     element.set("begin", seconds_text(max(begin, earliest_s)))
     return [element]
 
@@ -501,7 +505,7 @@ def _scaled(
             shift = TWIN_S * (2 * hashed_uniform(salt, "when", name, str(number)) - 1)
             times = (round(depart + shift, 2), round(depart - shift, 2), depart)
             time = next(time for time in times if least <= time < end)
-            move_stops(twin, time - depart)
+            move_stops(own_stops(twin), time - depart)
             twin.set("depart", seconds_text(time))
             copies.append(twin)
         return copies

@@ -18,7 +18,14 @@ from ugat_marl.effects.base import (
     hashed_uniform,
     salt_of,
 )
-from ugat_marl.effects.demand import TAGS, NamedRoutes, departs_by_chance, move_stops, parted_flow
+from ugat_marl.effects.demand import (
+    TAGS,
+    NamedRoutes,
+    departs_by_chance,
+    move_stops,
+    own_stops,
+    parted_flow,
+)
 from ugat_marl.effects.documents import (
     depart_s,
     edit_scenario,
@@ -216,16 +223,14 @@ def _with_route(element: ET.Element, edges: Way, named: Iterable[ET.Element]) ->
     for key in ("route", "from", "to", "via", *_ENDS):
         made.attrib.pop(key, None)
     route = ET.Element("route", {"edges": " ".join(edges)})
-    stops = [stop for child in made for stop in (child if child.tag == "route" else [child])]
-    before = ET.Element("vehicle")
-    before.extend(copy.deepcopy(stop) for stop in named)
+    before = [copy.deepcopy(stop) for stop in named]
     move_stops(before, depart_s(element))  # the times of a named route count from the departure
-    stops = [*before, *stops]
+    stops = [*before, *own_stops(made)]
     for child in list(made):
         if child.tag in ("route", "stop"):
             made.remove(child)
     made.insert(0, route)
-    made.extend(stop for stop in stops if stop.tag == "stop" and _edge_of(stop) in edges)
+    made.extend(stop for stop in stops if _edge_of(stop) in edges)
     return made
 
 
