@@ -24,13 +24,12 @@ from studies.blind.cases import (
 from studies.blind.strengths import ALL_KINDS, ERRORS
 from studies.errors import BlindTestError
 from ugat_marl.diagnosis import (
+    Alternative,
     Diagnosis,
     EffectRecord,
-    Explanation,
     LogGrounds,
     NamedEffect,
     PolicyGap,
-    Thresholds,
     Verdict,
 )
 from ugat_marl.effects import EVERYWHERE
@@ -253,27 +252,14 @@ def grade(label: Label, diagnosis: Diagnosis | None, wall_s: float | None = None
     )
 
 
-def _as_near(diagnosis: Diagnosis) -> list[Explanation]:
+def _as_near(diagnosis: Diagnosis) -> list[Alternative]:
     """Return the alternatives that a diagnosis cannot tell from what it names.
 
     The others, and those of other verdicts, were tried and not named.
     """
-    best = diagnosis.best
-    if diagnosis.verdict != "not_identifiable" or best is None:
+    if diagnosis.verdict != "not_identifiable":
         return []
-    limits, own = Thresholds(), _names_and_places(best)
-    near = [
-        other
-        for other in diagnosis.alternatives
-        if other.cost - best.cost < limits.indistinct
-        and len(other.effects) <= len(best.effects)
-        and not _names_and_places(other) >= own
-    ]
-    return near[: limits.rivals_tested]
-
-
-def _names_and_places(explanation: Explanation) -> set[tuple[str, str | None]]:
-    return {(effect.name, effect.place) for effect in explanation.effects}
+    return [other for other in diagnosis.alternatives if other.indistinct]
 
 
 def _with_rivals(names: set[str], effects: Sequence[NamedEffect]) -> list[set[str]]:

@@ -207,7 +207,7 @@ LIKE_ANOTHER = ("left", "alternatives[].effects", "best.effects", "unnamed")
 SOMETIMES = (
     {"effects[].evidence.source", "effects[].evidence.rival", "policy_gap", "traffic_check"}
     | {f"patterns[].{field}" for field in Pattern.__dataclass_fields__}
-    | {f"alternatives[].{key}" for key in ("effects", "distance", "cost")}
+    | {f"alternatives[].{key}" for key in ("effects", "distance", "cost", "indistinct")}
 )
 
 

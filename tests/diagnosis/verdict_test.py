@@ -374,6 +374,7 @@ def test_a_set_of_effects_is_told_once_among_the_alternatives() -> None:
 
     best = SimpleNamespace(model=SimpleNamespace(members=((HEADWAY, (1.5,)),)))
     conclusion: Any = SimpleNamespace(best=best, indistinct=(model(2.0),))
-    selection = Selected(best, (model(2.5), best.model), True, examined=frozenset())  # pyright: ignore[reportArgumentType]
-    (told,) = _alternatives(conclusion, selection)
-    assert told.cost == 2.0
+    worse = SimpleNamespace(members=((MODEL, ()),), distance=SimpleNamespace(total=1.0), cost=90.0)
+    rivals: Any = (model(2.5), best.model, worse)
+    told = _alternatives(conclusion, Selected(best, rivals, True, examined=frozenset()))  # pyright: ignore[reportArgumentType]
+    assert [(one.cost, one.indistinct) for one in told] == [(2.0, True), (90.0, False)]

@@ -83,7 +83,7 @@ def content_of(verdict: str = "explained", *, complete: bool = True, **more: Any
         ],
         "left": [disagreement("speed1", "discharge", 4.1, "S_C_0")] if named else [],
         "alternatives": [] if same else [
-            {"effects": [headway], "distance": 4200.0, "cost": 4214.0},
+            {"effects": [headway], "distance": 4200.0, "cost": 4214.0, "indistinct": True},
             {"effects": [effect("swapped", "stop:1>stop:2")], "distance": 9000.0, "cost": 9014.0},
         ],
         "heldout": {
@@ -171,6 +171,7 @@ def test_a_page_for_every_verdict(verdict: str, network: Network) -> None:
     maps = re.findall(r"_0: [\d.]+ standard deviations", page.text)
     assert len(maps) == len(LANES) * (1 if verdict == "no_discrepancy" else 2)
     assert ("does not see this gap" in page.text) == (verdict != "no_discrepancy")
+    assert page.text.count("(fits as well)") == len(diagnosis.alternatives) / 2
     if diagnosis.effects:
         assert "next set of effects is worse by 4 021" in page.text.replace("\u00a0", " ")
         assert "1.451 s (1.443 to 1.459)" in page.text

@@ -9,6 +9,7 @@ from .measurement import DetectorError as DetectorError
 from .places import Routes as Routes
 from .records import CORRECTED as CORRECTED
 from .records import FILE as FILE
+from .records import Alternative as Alternative
 from .records import ApproachRow as ApproachRow
 from .records import Conclusion as Conclusion
 from .records import CriteriaRow as CriteriaRow

@@ -345,6 +345,18 @@ class Explanation:
 
 
 @dataclass(frozen=True)
+class Alternative(Explanation):
+    """A set of effects that was simulated and not selected.
+
+    Attributes:
+        indistinct: Whether it fits as well as the selected set, so that these data cannot tell
+            which of them is right.
+    """
+
+    indistinct: bool = False
+
+
+@dataclass(frozen=True)
 class HeldOut:
     """Distances on the held-out periods.
 
@@ -728,7 +740,7 @@ class Diagnosis:
     effects: tuple[NamedEffect, ...]
     where: tuple[Disagreement, ...]
     left: tuple[Disagreement, ...]
-    alternatives: tuple[Explanation, ...]
+    alternatives: tuple[Alternative, ...]
     best: Explanation | None
     heldout: HeldOut | None
     evidence: FitEvidence | None

@@ -25,6 +25,7 @@ from ugat_marl.diagnosis.records import (
     CORRECTED,
     FILE,
     SCHEMA,
+    Alternative,
     Conclusion,
     Diagnosis,
     EffectRecord,
@@ -638,13 +639,17 @@ def _with_grounds(effect: EffectRecord, grounds: SearchGrounds) -> NamedEffect:
     return NamedEffect(effect.name, effect.place, effect.window, effect.parameters, grounds)
 
 
-def _alternatives(conclusion: Conclusion, selected: Selected) -> tuple[Explanation, ...]:
+def _alternatives(conclusion: Conclusion, selected: Selected) -> tuple[Alternative, ...]:
     """Return the models besides the selected one; models that fit equally well come first."""
     # A set of effects may be simulated several times, with other values and more days.
     told = [keys_of(model.members) for model in (conclusion.best.model, *conclusion.indistinct)]
     others = [rival for rival in selected.rivals if keys_of(rival.members) not in told]
-    ranking = [*conclusion.indistinct, *others][:ALTERNATIVES]
-    return tuple(_explanation(model) for model in ranking)
+    ranking = [(model, True) for model in conclusion.indistinct]
+    ranking += [(model, False) for model in others]
+    return tuple(
+        Alternative(**vars(_explanation(model)), indistinct=indistinct)
+        for model, indistinct in ranking[:ALTERNATIVES]
+    )
 
 
 def _explanation(model: Fitted) -> Explanation:

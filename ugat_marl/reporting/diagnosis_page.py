@@ -283,17 +283,16 @@ def _ranking(diagnosis: Diagnosis, names: LightNames) -> list[dict[str, Any]]:
     """Return the simulated explanations, the chosen one first."""
     if not diagnosis.alternatives:
         return []
-    explanations: list[tuple[str, float | None, float | None, bool]] = []
+    explanations: list[tuple[str, float | None, float | None, bool, bool]] = []
     if diagnosis.effects:
         best = diagnosis.best
         left, cost = (None, None) if best is None else (best.distance, best.cost)
-        explanations.append((_set(diagnosis.effects, names), left, cost, True))
+        explanations.append((_set(diagnosis.effects, names), left, cost, True, False))
     explanations += [
-        (_set(x.effects, names), x.distance, x.cost, False) for x in diagnosis.alternatives
+        (_set(x.effects, names), x.distance, x.cost, False, x.indistinct)
+        for x in diagnosis.alternatives
     ]
-    most = max(
-        (distance for _, distance, _, _ in explanations if distance is not None), default=1.0
-    )
+    most = max((distance for _, distance, *_ in explanations if distance is not None), default=1.0)
     return [
         {
             "effects": text,
@@ -301,8 +300,9 @@ def _ranking(diagnosis: Diagnosis, names: LightNames) -> list[dict[str, Any]]:
             "cost": number(cost),
             "width": f"{_logarithm(distance, most):.1f}",
             "chosen": chosen,
+            "as_good": as_good,
         }
-        for text, distance, cost, chosen in explanations
+        for text, distance, cost, chosen, as_good in explanations
     ]
 
 

@@ -41,15 +41,13 @@ def label(*effects: Hidden, group: str = "single", lights: tuple[str, ...] = ("C
     )  # fmt: skip
 
 
-def alternative(*effects: Mapping[str, Any], cost: float = 1.0) -> dict[str, Any]:
-    return {"effects": list(effects), "distance": 1.0, "cost": cost}
+def alternative(*effects: Mapping[str, Any], as_good: bool = True) -> dict[str, Any]:
+    return {"effects": list(effects), "distance": 1.0, "cost": 1.0, "indistinct": as_good}
 
 
 def undecided(*alternatives: Mapping[str, Any]) -> Diagnosis | None:
     """Return a diagnosis that cannot tell these alternatives apart, if they fit as well."""
-    return says(
-        "not_identifiable", best=alternative(effect("acceleration")), alternatives=alternatives
-    )
+    return says("not_identifiable", alternatives=alternatives)
 
 
 def gap(before: float, after: float) -> dict[str, Any]:
@@ -147,7 +145,9 @@ def test_outcomes(
         (says("partially_explained", SHIFTED, effect("deceleration")), ("deceleration",)),
         (says("provisional", effect("headway")), ("headway",)),
         (
-            undecided(alternative(effect("min_gap")), alternative(effect("headway"), cost=90.0)),
+            undecided(
+                alternative(effect("min_gap")), alternative(effect("headway"), as_good=False)
+            ),
             ("min_gap",),
         ),
     ],
@@ -239,15 +239,7 @@ def test_swapped_detectors_are_swapped_either_way() -> None:
 
 def test_abstaining_between_right_and_wrong_is_noted() -> None:
     other = alternative(effect("headway"))
-    found = grade(
-        HEADWAY,
-        says(
-            "not_identifiable",
-            effect("min_gap"),
-            best=alternative(effect("acceleration")),
-            alternatives=[other],
-        ),
-    )
+    found = grade(HEADWAY, says("not_identifiable", effect("min_gap"), alternatives=[other]))
     assert found.among
     assert not grade(HEADWAY, says("not_identifiable", effect("min_gap"))).among
 
