@@ -123,6 +123,16 @@ def test_webster_counts_what_comes_in_red():
     assert rule.plan(AGENT) == [2, 2, 2]
 
 
+def test_webster_keeps_the_flow_of_a_lane_that_is_full():
+    rule, roads = Webster(streets(), saturation_vph=1800), streets()
+    capacity = roads.approaches[AGENT].capacity
+    for vehicles in np.arange(0.0, 120.0, 2.0):  # n_0 and w_0 have red; n_0 fills, w_0 does not
+        rule.act(movements([0, 0, 0], np.minimum([vehicles, 0, 0], capacity), 2), {})
+    counted = rule._counts[AGENT].flows_per_s()
+    assert counted is not None
+    assert counted == pytest.approx([0.2, 0.0, 0.0], rel=0.05)
+
+
 def test_webster_forgets_old_counts():
     rule = Webster(streets())
     heavy, light = 5.0, 0.5

@@ -6,8 +6,15 @@ import pytest
 import torch
 
 from ugat_marl.envs import AgentSet
-from ugat_marl.policies import BatchedMLP, SharedMLP, parameters_for_unscaled
-from ugat_marl.policies.learners.scaling import LEAST, input_factors
+from ugat_marl.policies import (
+    DQN,
+    BatchedMLP,
+    DQNConfig,
+    SharedMLP,
+    parameters_for_unscaled,
+)
+from ugat_marl.policies.learners.scaling import LEAST, input_factors, observation_mask
+from ugat_marl.policies.networks.structure import Structure
 
 
 @pytest.fixture
@@ -29,6 +36,35 @@ def test_pooled_agents_have_one_factor_for_what_they_have_in_common(agents: Agen
     first, second = (1 / square**0.5 for square in squares)
     # the third number is b's alone; where a has none, its padding stays as it is
     assert torch.allclose(factors, torch.tensor([[first, second, 1.0], [first, second, 2.0]]))
+
+
+@pytest.mark.parametrize(
+    ("config", "structure"),
+    [
+        (DQNConfig(shared=True, hidden=(8,)), None),
+        (
+            DQNConfig(network="colight", hidden=(8, 8)),
+            Structure("colight", neighbours=((1, 2), (0,), (0,))),
+        ),
+    ],
+)
+def test_a_policy_of_one_network_scales_what_the_first_agent_does_not_see(
+    config: DQNConfig, structure: Structure | None
+) -> None:
+    agents = AgentSet(("narrow", "wide", "wider"), (3, 5, 7), (2, 3, 3))
+    learner = DQN(agents, config, 1, structure=structure)
+    there = torch.from_numpy(observation_mask(agents))[:, None]
+    seen = torch.rand((3, 50, 7), generator=torch.Generator().manual_seed(2)) * 0.2 * there
+    learner._inputs.copy_(input_factors(seen, agents, pooled=True)[:, None])
+    expected = learner._target(seen[:, :1] * learner._inputs)[:, 0].numpy()
+    plain = {
+        name: seen[place, 0, :size].numpy()
+        for place, (name, size) in enumerate(
+            zip(agents.names, agents.observation_sizes, strict=True)
+        )
+    }
+    for values, wanted in zip(learner.policy().q_values(plain).values(), expected, strict=True):
+        assert values == pytest.approx(wanted[: len(values)], abs=1e-5)
 
 
 @pytest.mark.parametrize("shared", [False, True])

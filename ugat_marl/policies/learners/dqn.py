@@ -383,7 +383,9 @@ class DQN:
         hidden, shared = self.config.hidden, self.config.shared
         weights, options = self._target_weights, self.env_options
         if self.config.network in _SCALED:
-            factors = self._inputs[0, 0] if self._is_one_network else self._inputs[:, 0]
+            # Only the widest observation has a factor for every place of a network of all agents.
+            widest = int(np.argmax(self.agents.observation_sizes))
+            factors = self._inputs[widest, 0] if self._is_one_network else self._inputs[:, 0]
             weights = parameters_for_unscaled(self._target, factors.to(self.device))
         ceiling = None
         if self.config.ceiling is not None and self._replay.added:

@@ -23,6 +23,9 @@ LONGEST_CYCLE_S = 180.0
 MEMORY_S = 900.0
 """Age in seconds at which the weight of a count has fallen to 1/e."""
 
+FULL = 0.9
+"""Share of its capacity from which a lane counts as full."""
+
 FIRST_PHASE_S = 20.0
 """Time of each phase in seconds before the first count."""
 
@@ -64,8 +67,9 @@ class Webster:
 
     Counts come from the running episode, so the rule follows the demand and works in any domain.
     The arrivals on a lane are the growth of its number of vehicles between two decisions with red,
-    because no vehicle leaves then. A lane that never has red is not counted and needs no green of
-    its own. If several phases of the cycle serve a lane, its flow is divided equally among them.
+    because no vehicle leaves then. A full lane cannot grow, so it keeps the flow counted before. A
+    lane that never has red is not counted and needs no green of its own. If several phases of the
+    cycle serve a lane, its flow is divided equally among them.
 
     Args:
         network: The controlled network.
@@ -128,6 +132,7 @@ class _RedCounts:
         if self._before is not None:
             served = self._approach.served
             red = ~(served[self._shown] | served[seen.shown])
+            red &= self._before < FULL * self._approach.capacity
             kept = math.exp(-interval_s / MEMORY_S)
             self._arrived = kept * self._arrived + red * (seen.vehicles - self._before)
             self._red_s = kept * self._red_s + red * interval_s
