@@ -9,8 +9,10 @@ from __future__ import annotations
 import contextlib
 import difflib
 import re
-from collections.abc import Collection, Iterable, Sequence
-from typing import Literal, get_args, get_origin, get_type_hints
+from collections.abc import Callable, Collection, Iterable, Sequence
+from numbers import Integral, Real
+from types import UnionType
+from typing import Literal, Union, get_args, get_origin, get_type_hints
 
 LISTED = 32
 """Most names in one error message. If there are more, the message lists the nearest ones."""
@@ -144,8 +146,21 @@ def require_least(least: int, **values: int | None) -> None:
             raise OptionError(f"{name} = {value}: must be at least {least}")
 
 
-def require_choices(settings: object, name: str) -> None:
-    """Refuse a field of a data class whose value is none of its ``Literal``.
+_KINDS: dict[object, tuple[Callable[[object], bool], str]] = {
+    bool: (lambda x: isinstance(x, bool), "True or False"),
+    int: (lambda x: not isinstance(x, bool) and isinstance(x, Integral), "a whole number"),
+    float: (lambda x: not isinstance(x, bool) and isinstance(x, Real), "a number"),
+    str: (lambda x: isinstance(x, str), "a text"),
+    type(None): (lambda x: x is None, "None"),
+}
+"""What a value of a simple type is, and its name in messages."""
+
+
+def require_kinds(settings: object, name: str) -> None:
+    """Refuse a field of a data class whose value is not of the annotated kind.
+
+    Numbers, texts, True and False, None, the names of a ``Literal``, and tuples of such values are
+    checked; a list counts as a tuple. Fields of other kinds are not checked.
 
     Args:
         settings: An object of the data class.
@@ -156,9 +171,23 @@ def require_choices(settings: object, name: str) -> None:
     """
     for field, hint in get_type_hints(type(settings)).items():
         value = getattr(settings, field)
-        if get_origin(hint) is Literal and value not in get_args(hint):
-            allowed = ", ".join(get_args(hint))
+        several = get_origin(hint) in (Union, UnionType)
+        kinds = [_kind(kind) for kind in (get_args(hint) if several else (hint,))]
+        if not any(kind is None or kind[0](value) for kind in kinds):
+            allowed = " or ".join(kind[1] for kind in kinds if kind is not None)
             raise OptionError(f"{name} {field} is {value!r}; allowed: {allowed}")
+
+
+def _kind(hint: object) -> tuple[Callable[[object], bool], str] | None:
+    """Return what is a value of an annotated kind, and its name; None for kinds not known."""
+    origin, inner = get_origin(hint), get_args(hint)
+    if origin is Literal:
+        return lambda x: isinstance(x, str) and x in inner, ", ".join(inner)
+    if origin is tuple and len(inner) == 2 and inner[0] in _KINDS and inner[1] is Ellipsis:
+        of_kind, told = _KINDS[inner[0]]
+        each = f"a list, of which each is {told}"
+        return lambda x: isinstance(x, tuple | list) and all(map(of_kind, x)), each
+    return _KINDS.get(hint)
 
 
 def require_distinct(**values: Sequence[object]) -> None:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import errno
 import json
 import math
+import shutil
 import signal
 import socket
 import subprocess
@@ -176,7 +177,15 @@ def test_the_health_file_follows_the_loop(tmp_path: Path) -> None:
 def test_a_health_file_that_cannot_be_written_does_not_stop_the_lights(tmp_path: Path) -> None:
     (tmp_path / "taken").touch()
     for place in (tmp_path, tmp_path / "taken" / "health.json"):  # a folder; below a file
-        assert service(Coming(MadeUpStreet()), health=Health(place)).run(20.0).decisions == 2
+        with pytest.raises(OutputError):
+            Health(place)
+    place = tmp_path / "new" / "health.json"
+    health = Health(str(place))
+    place.mkdir()  # nobody can write such a file any more
+    assert service(Coming(MadeUpStreet()), health=health).run(20.0).decisions == 2
+    shutil.rmtree(place.parent)
+    health.tell("driving")
+    assert json.loads(place.read_text())["state"] == "driving"
 
 
 @pytest.mark.skipif(not hasattr(socket, "AF_UNIX"), reason="has no Unix sockets")

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -34,6 +35,10 @@ def ended(running: int, age: int) -> Sequence[int]:
     return [phase for phase in range(PHASES) if phase != running or age < 4]
 
 
+def ended_young(running: int, age: int) -> Sequence[int]:
+    return [phase for phase in range(PHASES) if phase != running or age < 3]
+
+
 def obeyed(command: int | None, running: int, allowed: Sequence[int]) -> int:
     if command is not None and command in allowed:
         return command
@@ -47,6 +52,7 @@ def log_of(
     lost: float = 0.0,
     mask: Mask = anything,
     told: bool = True,
+    keeps: bool = True,
     rows: dict[str, int] | None = None,
     seed: int = 0,
     hold: int = 1,
@@ -55,6 +61,7 @@ def log_of(
     """Return a log of random commands that a street with these faults executed.
 
     A command is given for `hold` decisions. `begun` is the age of the first green, in decisions.
+    `told` logs masks, and `keeps` gives permitted commands only, where they are logged.
     """
     lags = lag if isinstance(lag, dict) else dict.fromkeys(AGENTS, lag)
     generator = np.random.default_rng(seed)
@@ -69,7 +76,7 @@ def log_of(
         asked: dict[str, int] = {}
         executed: dict[str, int] = {}
         for agent in AGENTS:
-            choices = np.flatnonzero(masks[agent]) if told else np.arange(PHASES)
+            choices = np.flatnonzero(masks[agent]) if told and keeps else np.arange(PHASES)
             holds = step % hold > 0 and given[agent][-1] in choices
             asked[agent] = given[agent][-1] if holds else int(generator.choice(choices))
             given[agent].append(asked[agent])
@@ -146,7 +153,7 @@ def test_masks_of_each_light_are_read_with_its_own_delay() -> None:
         log_of(lag=lags, mask=lambda running, _: (running, (running + 1) % PHASES), hold=2)
     )
     wanted = np.eye(PHASES, dtype=bool) | np.roll(np.eye(PHASES, dtype=bool), 1, axis=1)
-    assert np.array_equal(following.tables[0][2], wanted)
+    assert np.array_equal(following.tables[0][-1], wanted)
 
 
 def test_an_order_of_phases_is_read_off_the_masks() -> None:
@@ -190,8 +197,11 @@ def test_a_longest_green_is_read_off_refused_commands_at_all_later_ages() -> Non
 def test_the_age_of_a_green_counts_from_the_beginning_of_its_clearance() -> None:
     channel = fit_channel(log_of(mask=held))
     slow = SignalTiming(yellow_s=9.0, all_red_s=3.0, min_green_s=5.0)
-    assert permitted(channel, SignalState(2, 1, 11.0), slow) == [2]
+    assert permitted(channel, SignalState(2, 1, 10.0), slow) == [2]
     assert permitted(channel, SignalState(2, 2, 8.0), slow) == [0, 1, 2, 3]
+    # it began between two decisions, and this is the third one in which it runs
+    third = SignalState(2, 2, 2.5 * INTERVAL_S - TIMING.clearance_s)
+    assert permitted(fit_channel(log_of(mask=ended_young)), third, TIMING) == [0, 1, 3]
 
 
 def test_a_green_from_before_the_episode_may_be_of_any_age() -> None:
@@ -201,7 +211,8 @@ def test_a_green_from_before_the_episode_may_be_of_any_age() -> None:
     assert course.executed[0] != course.running[0]
     table = course.table_of_masks(0)
     assert np.flatnonzero(table[1, 0]).tolist() == [0], "a young green is held"
-    assert np.array_equal(course.obeyed(course.asked[0], table), course.executed)
+    kept = replace(course, mask=None)  # so that the table counts
+    assert np.array_equal(kept.obeyed(course.asked[0], kept.permitted(table, 0)), course.executed)
 
 
 def test_greens_that_the_simulation_holds_itself_are_not_forbidden() -> None:
@@ -216,6 +227,42 @@ def test_greens_that_the_simulation_holds_itself_are_not_forbidden() -> None:
         return [running] if age < 2 else [running, (running + 1) % PHASES]
 
     assert fit_channel(log_of(mask=cyclic_and_held), held_s=2 * INTERVAL_S).forbids
+
+
+@pytest.mark.parametrize("told", [True, False])
+def test_commands_refused_in_the_simulations_own_shortest_green_are_neither_late_nor_lost(
+    told: bool,
+) -> None:
+    log = log_of(mask=held, told=told, keeps=False, hold=2)
+    assert not fit_channel(log, held_s=2 * INTERVAL_S).changes
+
+
+@pytest.mark.parametrize("keeps", [True, False])
+def test_a_longest_green_of_many_decisions_is_found(keeps: bool) -> None:
+    def limit(running: int, age: int) -> Sequence[int]:
+        return [phase for phase in range(PHASES) if phase != running or age < 20]
+
+    channel = fit_channel(log_of(mask=limit, keeps=keeps, hold=30, rows={"": 2000}))
+    assert channel.network[0] == 1.0
+    assert after_one_step(channel, 2, age=19) == [0, 1, 2, 3]
+    for age in (20, 21, 50):
+        assert after_one_step(channel, 2, age) == [0, 1, 3]
+
+
+def test_masks_count_where_the_table_is_too_coarse() -> None:
+    """A longest green in seconds ends at one of two ages if greens begin between decisions."""
+    endings = np.random.default_rng(3).integers(4, 6, 10_000).tolist()
+
+    def limit(running: int, age: int) -> Sequence[int]:
+        return [phase for phase in range(PHASES) if phase != running or age < endings[0]]
+
+    def at_random(running: int, age: int) -> Sequence[int]:
+        if age == 1:
+            endings.pop(0)
+        return limit(running, age)
+
+    log = log_of(mask=at_random, keeps=False, hold=7, rows={"": 1000})
+    assert fit_channel(log).network[0] == 1.0
 
 
 def test_the_actuator_repeats_the_street() -> None:

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 import torch
 
-from ugat_marl.data import Provenance, TransitionLog, TransitionRecorder
+from ugat_marl.data import AgentLayout, Provenance, TransitionLog, TransitionRecorder
 from ugat_marl.grounding import (
     FitConfig,
     Fitter,
@@ -18,7 +18,7 @@ from ugat_marl.grounding import (
 )
 from ugat_marl.grounding.controls import shuffled
 from ugat_marl.grounding.fitting import split
-from ugat_marl.grounding.forward import ForwardConfig
+from ugat_marl.grounding.forward import ForwardConfig, ForwardModel
 from ugat_marl.grounding.phase import PhaseReport
 from ugat_marl.testing import ToyTraffic
 
@@ -136,6 +136,15 @@ def test_with_noise_for_f_u_rises_and_a_gate_that_asks_for_proof_stays_shut(hone
     acceptance, changed, u = grounded(made)
     assert acceptance == changed == 0.0
     assert u > 1.2 * grounded(honest[0])[2]
+
+
+def test_noise_of_several_networks_is_as_large() -> None:
+    stack = Stack({"a": AgentLayout(3, 2)})
+    model = ForwardModel(stack, ForwardConfig(members=5), torch.Generator().manual_seed(0))
+    answer_with_noise(model, 0)
+    with torch.no_grad():
+        answer = model(torch.randn(1, 4000, 5), torch.zeros(1, 4000, dtype=torch.long))
+    assert float(answer[..., :3].std()) == pytest.approx(1.0, abs=0.05)
 
 
 def test_another_seed_makes_another_noise() -> None:

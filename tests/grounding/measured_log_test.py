@@ -5,6 +5,7 @@ from __future__ import annotations
 import contextlib
 from dataclasses import replace
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any, cast
 
 import numpy as np
@@ -262,6 +263,15 @@ def test_clearances_lead_to_the_next_phase(crossing: Scenario) -> None:
     shown = ((0.0, "Gr"), (20.0, "yr"), (23.0, "rr"), (25.0, "rG"), (45.0, "ry"))
     phases, strange = phases_shown(shown, light, 50.0, 5.0)
     assert phases.tolist() == [0, 1, 1, 1, 1]
+    assert strange == 0.0
+
+
+def test_links_that_stay_green_in_a_clearance_are_no_phase() -> None:
+    links = [SimpleNamespace(index=i) for i in range(3)]
+    light: Any = SimpleNamespace(id="J", links=links, phases=("GGr", "GrG", "Grr"))
+    shown = ((0.0, "GGr"), (30.0, "Gyr"), (33.0, "Grr"), (35.0, "GrG"), (60.0, "Gry"))
+    phases, strange = phases_shown((*shown, (63.0, "Grr")), light, 80.0, 5.0)
+    assert phases.tolist() == [0, 1, 1, 1, 2, 2]
     assert strange == 0.0
 
 

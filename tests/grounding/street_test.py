@@ -289,13 +289,17 @@ def test_a_log_of_the_simulation_itself_shows_no_fault() -> None:
 def test_unknown_parts_and_too_few_simulations_are_refused() -> None:
     with pytest.raises(UnknownNameError, match="eye"):
         StreetConfig(parts=("eye",))
+    with pytest.raises(
+        OptionError, match="parts is 'eyes'; allowed: a list, of which each is a text"
+    ):
+        StreetConfig(parts="eyes")  # pyright: ignore[reportArgumentType]
     with pytest.raises(OptionError, match="at least 20"):
         StreetConfig(simulations=3)
     with pytest.raises(OptionError, match="simulated_s = nan: must be above 0"):
         StreetConfig(simulated_s=float("nan"))
     for wrong, told in (
         ({"most_lag": -1}, "most_lag is -1"),
-        ({"ages": 1}, "ages is 1; allowed: >= 2"),
+        ({"most_lag": 2.5}, "most_lag is 2.5; allowed: a whole number"),
         ({"pull": 0.0}, "pull is 0.0; allowed: > 0"),
         ({"refused": 1.0}, "refused is 1.0; allowed: from 0 to below 1"),
         ({"gain": float("nan")}, "gain is nan"),

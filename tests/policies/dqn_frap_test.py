@@ -224,13 +224,13 @@ def test_what_cannot_be_read_is_refused_with_the_way_out():
 @pytest.mark.parametrize(
     ("settings", "told"),
     [
-        ({"network": "lstm"}, "network = 'lstm': must be one of mlp, frap, colight"),
+        ({"network": "lstm"}, "network is 'lstm'; allowed: mlp, frap, colight"),
         ({"network": "frap", "hidden": (8,)}, "hidden = .*two sizes"),
         ({"network": "frap", "shared": True}, "shared = True: must be left away"),
     ],
 )
 def test_impossible_settings_are_named(settings: dict[str, Any], told: str):
-    with pytest.raises(OptionError, match=rf"DQNConfig\.{told}"):
+    with pytest.raises(OptionError, match=rf"DQNConfig[. ]{told}"):
         DQNConfig(**settings)
 
 

@@ -43,6 +43,7 @@ from ugat_marl.policies import (
     own_values,
 )
 from ugat_marl.policies.learner_settings import parsed_settings
+from ugat_marl.policies.own import OwnLearner
 from ugat_marl.testing import ToyTraffic
 
 ALGORITHM = '''
@@ -241,6 +242,55 @@ def test_policies_of_every_form_are_evaluated(algorithm: Any) -> None:
         "single-v1", algorithm.holding, ["sim"], seeds=[7], duration_s=200.0, each_episode=True
     )
     assert each.select("policy", "seed").rows() == [("Holding", 7)]
+
+
+class Noted:
+    """A learner that can be saved."""
+
+    def learn(self, env: Any, episodes: int) -> None: ...
+
+    def policy(self) -> Any:
+        return lambda observations: dict.fromkeys(observations, 0)
+
+    def save(self, path: Path) -> None:
+        path.write_text("noted")
+
+    def load(self, path: Path) -> None:
+        assert path.read_text() == "noted"
+
+
+def test_what_sees_through_a_function_can_be_played_and_not_saved(tmp_path: Path) -> None:
+    env = ugat_marl.parallel_env("single-v1", observation=lambda _: [1.0, 2.0])
+    learner = OwnLearner(Noted(), "noted", env)
+    assert learner.policy().act({"a": 0}, {}) == {"a": 0}
+    assert not learner.policy().savable
+    with pytest.raises(CheckpointError, match="keep to plain data"):
+        learner.save(tmp_path / "learner.zip")
+
+
+def test_a_state_is_not_loaded_where_observations_are_others(tmp_path: Path) -> None:
+    for observation in ("count", "queue"):
+        env = ugat_marl.parallel_env("single-v1", observation=observation)
+        learner = OwnLearner(Noted(), "noted", env)
+        if observation == "count":
+            learner.save(tmp_path / "learner.zip")
+            learner.load(tmp_path / "learner.zip")
+    with pytest.raises(CheckpointError, match="observation = 'count', not 'queue'"):
+        learner.load(tmp_path / "learner.zip")
+
+
+def test_infos_may_be_an_argument_by_name_alone() -> None:
+    env = ToyTraffic()
+    observations, infos = env.reset(seed=0)
+
+    def given(observations: Any, *, infos: Any = None) -> Any:
+        return dict.fromkeys(observations, int(infos is None))
+
+    def needed(observations: Any, *, infos: Any) -> Any:
+        return given(observations, infos=infos)
+
+    for act in (given, needed):
+        assert set(own_policy(act, "mine", env).act(observations, infos).values()) == {0}
 
 
 def test_an_option_of_a_policy_does_not_get_the_infos() -> None:
@@ -711,7 +761,7 @@ def test_files_of_one_name_in_two_folders_are_two_modules(
     found = [load_own(f"{tmp_path}/{number}/twice.py:policy", "policy") for number in (1, 2)]
     assert [policy({}) for policy in found] == [1, 2]
     assert load_own(f"{tmp_path}/1/twice.py:policy", "policy") is found[0]
-    with pytest.raises(OptionError, match="no module 'twice'"):
+    with pytest.raises(OptionError, match=r"no file .*3/twice\.py"):
         load_own(f"{tmp_path}/3/twice.py:policy", "policy")
 
 
@@ -720,7 +770,11 @@ def test_files_of_one_name_in_two_folders_are_two_modules(
     ("name", "error", "says"),
     [
         ("my_aglo:Cycle", OptionError, "no module 'my_aglo'"),
-        ("./my_algo:Cycle", OptionError, r"no module './my_algo' .*without .py"),
+        (
+            "./my_algo:Cycle",
+            OptionError,
+            r"'./my_algo'; give the file as my_algo.py:Cycle",
+        ),
         (".my_algo:Cycle", OptionError, "no module '.my_algo'"),
         ("numpy.foo:Cycle", OptionError, "no module 'numpy.foo'"),
         ("my_algo:Cylce", UnknownNameError, "'Cycle'"),
@@ -730,6 +784,12 @@ def test_files_of_one_name_in_two_folders_are_two_modules(
 def test_a_name_that_leads_nowhere_is_refused(name: str, error: type[Exception], says: str) -> None:
     with pytest.raises(error, match=says):
         load_own(name, "learner")
+
+
+def test_a_file_that_is_no_python_is_refused_in_a_line(tmp_path: Path) -> None:
+    (tmp_path / "broken.py").write_text("def policy(:\n    pass\n")
+    with pytest.raises(OptionError, match=r"broken\.py, line 1 is no Python \(invalid syntax\)"):
+        load_own(f"{tmp_path}/broken.py:policy", "policy")
 
 
 def test_a_function_without_a_name_has_one() -> None:

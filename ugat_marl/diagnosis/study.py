@@ -55,7 +55,7 @@ from ugat_marl.diagnosis.thresholds import (
     Thresholds,
 )
 from ugat_marl.effects import Effect
-from ugat_marl.errors import MeasuredDataError, OptionError
+from ugat_marl.errors import MeasuredDataError, OptionError, require_kinds
 from ugat_marl.parallel import Workers
 from ugat_marl.progress import Reporter, Share
 from ugat_marl.scenarios import (
@@ -100,6 +100,7 @@ class DiagnosisConfig:
     thresholds: Thresholds = field(default_factory=Thresholds)
 
     def __post_init__(self) -> None:
+        require_kinds(self, "diagnosis")
         for name in ("budget_h", "budget_s"):
             budget = getattr(self, name)
             if budget is not None and not budget > 0:

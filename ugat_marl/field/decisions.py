@@ -96,7 +96,8 @@ class DecisionLog:
         OptionError: Another loop writes to the file, or the file does not end with a whole line.
     """
 
-    def __init__(self, path: Path) -> None:
+    def __init__(self, path: str | Path) -> None:
+        path = Path(path)
         require_writable(path)
         self.path = path
         self.lost = 0
@@ -247,7 +248,7 @@ class DecisionLog:
         self._segment = self._file = -1
 
 
-def read_decisions(path: Path) -> Iterator[dict[str, Any]]:
+def read_decisions(path: str | Path) -> Iterator[dict[str, Any]]:
     """Yield the decisions of a log, as values of JSON, and refuse a damaged line.
 
     Args:
@@ -257,7 +258,7 @@ def read_decisions(path: Path) -> Iterator[dict[str, Any]]:
         OptionError: There is no such file, or a line is not what was written.
     """
     try:
-        with path.open("rb") as lines:
+        with Path(path).open("rb") as lines:
             for number, line in enumerate(lines, 1):
                 decision = _decision_in(line)
                 if decision is None:

@@ -10,6 +10,8 @@ from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any, Literal
 
+from ugat_marl.files import require_writable
+
 State = Literal["looking", "driving", "ended"]
 """State of the loop: it looks for its street, it drives the lights, or it has ended."""
 
@@ -21,11 +23,16 @@ class Health:
     full disk nor a missing socket disturbs the loop.
 
     Args:
-        path: JSON file, replaced as a whole at each call; None for no file.
+        path: JSON file, replaced as a whole at each call; None for no file. Its folder is made.
+
+    Raises:
+        OutputError: The file cannot be written.
     """
 
-    def __init__(self, path: Path | None = None) -> None:
-        self._path = path
+    def __init__(self, path: str | Path | None = None) -> None:
+        self._path = None if path is None else Path(path)
+        if self._path is not None:
+            require_writable(self._path)
         self._ready = False
 
     def tell(self, state: State, **facts: Any) -> None:
@@ -41,6 +48,7 @@ class Health:
             # One name, not a new one each time: what a killed loop leaves is used up by the next.
             temporary = self._path.with_name(f".{self._path.name}.tmp")
             with contextlib.suppress(OSError):
+                temporary.parent.mkdir(parents=True, exist_ok=True)  # somebody may have removed it
                 temporary.write_text(json.dumps(content, indent=1) + "\n")
                 temporary.replace(self._path)
         lines = [f"STATUS={state}", "STOPPING=1" if state == "ended" else "WATCHDOG=1"]

@@ -25,10 +25,11 @@ from typing import Any, ClassVar
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.special import bdtr
 
 from ugat_marl.data import AgentLayout, TransitionLog, Transitions, consecutive
 from ugat_marl.effects import Actuator, Commands, ControllerPart
-from ugat_marl.errors import CheckpointError, LogError, OptionError, counted
+from ugat_marl.errors import CheckpointError, LogError, OptionError, counted, require_kinds
 from ugat_marl.files import MALFORMED
 from ugat_marl.grounding.draws import DRAWS, with_intervals
 from ugat_marl.scenarios import Network, SignalState, SignalTiming
@@ -41,11 +42,14 @@ LEAST_WHOLE = 0.2
 of their episode as the longest delay of a command."""
 UNEXPLAINED = 1e-3
 """Chance of a decision that no lag explains."""
+CHANCE = 1e-3
+"""Chance of so few obeyed commands below which a phase is forbidden, where the log has no masks."""
 ROUNDS = 200
 """Most rounds of expectation-maximisation, which ends when the weights stay as they are."""
 Table = NDArray[np.bool_]
 """Permitted phases of an intersection, bool ``(ages, phases, phases)``: entry (a, p, j) is True if
-phase j may run next while p has run for a decisions; row 0 is not used."""
+phase j may run next while p has run for a decisions. Row 0 is not used; the last row is of older
+greens, too."""
 
 
 @dataclass(frozen=True)
@@ -55,8 +59,6 @@ class ChannelConfig:
     Attributes:
         most_lag: Longest delay of a command, in decisions. Commands that are later still spread
             over all lags, since none explains them.
-        ages: Number of ages of a green that are told apart, in decisions. Older greens count as the
-            oldest of these.
         pull: Decisions that the network's weights count for at each intersection. Halved,
             intersections with short logs are believed sooner.
         least_rows: Fewest observations of an entry of the table before it may forbid a phase, where
@@ -70,7 +72,6 @@ class ChannelConfig:
     """
 
     most_lag: int = 6
-    ages: int = 12
     pull: float = 30.0
     least_rows: int = 5
     refused: float = 0.2
@@ -78,7 +79,8 @@ class ChannelConfig:
     gain: float = 1.0
 
     def __post_init__(self) -> None:
-        for name, least in (("most_lag", 0), ("ages", 2), ("least_rows", 1)):
+        require_kinds(self, "channel")
+        for name, least in (("most_lag", 0), ("least_rows", 1)):
             if getattr(self, name) < least:
                 raise OptionError(f"channel {name} is {getattr(self, name)}; allowed: >= {least}")
         for name in ("refused", "least_share"):
@@ -283,8 +285,9 @@ class FittedActuator(Actuator):
         """Forbid the phases that the table forbids; a mask never becomes empty."""
         table = self._channel.tables[place]
         begun_s = state.elapsed_s + (0.0 if state.clearing else self._timing.clearance_s)
-        age = min(max(1, round(begun_s / self._interval_s)), len(table) - 1)
-        allowed = table[age, state.phase]
+        # A phase that began between two decisions is of age 1 at the second, as in a log.
+        age = max(1, math.ceil(begun_s / self._interval_s - 1e-6))
+        allowed = table[min(age, len(table) - 1), state.phase]
         if (mask * allowed).any():
             mask *= allowed
 
@@ -338,21 +341,21 @@ def fit_channel(
         for agent, layout in log.provenance.layouts.items()
     ]
     masked = all(course.mask is not None for course in courses)
-    tables = [course.table_of_masks(0) if masked else course.free_table() for course in courses]
-    network, counts = _mixture(courses, tables, config)
+    tables = [course.free_table() for course in courses]
+    network, counts = _mixture(courses, tables, None, config)
     fitted = partial(CommandChannel, tuple(log.agents), pull=config.pull)
     weights = fitted(network=network, counts=counts, tables=tuple(tables)).weights
     lags = [int(own[:-1].argmax()) for own in weights]
-    if not masked:
+    if masked:
+        tables = [course.table_of_masks(lag) for course, lag in zip(courses, lags, strict=True)]
+    else:
         tables = [
             course.table_of_refusals(lag, float(own[lag]), config)
             for course, own, lag in zip(courses, weights, lags, strict=True)
         ]
-    elif any(lags):  # a mask is of the state in which the command will arrive
-        tables = [course.table_of_masks(lag) for course, lag in zip(courses, lags, strict=True)]
     if not masked or any(lags):
-        network, counts = _mixture(courses, tables, config)
-    return fitted(network=network, counts=counts, tables=tuple(tables))
+        network, counts = _mixture(courses, tables, lags, config)
+    return fitted(network=network, counts=counts, tables=tuple(map(_trimmed, tables)))
 
 
 @dataclass(frozen=True)
@@ -368,7 +371,6 @@ class _Course:
         mask: Permitted phases, ``(n, phases)``; None if the log has none.
         left: Decisions until the end of the episode, ``(n,)``.
         phases: Number of phases.
-        ages: Number of ages of the tables.
         held: Decisions for which the simulation keeps a phase by itself.
     """
 
@@ -379,7 +381,6 @@ class _Course:
     mask: NDArray[np.bool_] | None
     left: NDArray[np.int64]
     phases: int
-    ages: int
     held: float
 
     @classmethod
@@ -405,9 +406,12 @@ class _Course:
         for t in range(count - 2, -1, -1):
             left[t] = left[t + 1] + 1 if goes_on[t] else 0
         mask = rows.mask if rows.mask.shape[1] else None
-        age = np.minimum(age, config.ages - 1)
-        ages, phases = config.ages, layout.phases
-        return cls(asked, running, age, rows.executed, mask, left, phases, ages, held)
+        return cls(asked, running, age, rows.executed, mask, left, layout.phases, held)
+
+    @property
+    def ages(self) -> int:
+        """Number of ages of the tables."""
+        return max(2, int(self.age.max()) + 1)
 
     def free_table(self) -> Table:
         """Return a table that permits everything."""
@@ -442,7 +446,7 @@ class _Course:
             config: Numbers of the method.
         """
         command = self.asked[lag]
-        valid = (command >= 0) & (self.age > 0)
+        valid = (command >= 0) & (self.age > 0) & (self.age >= self.held)  # held, as in sim
         changes = valid & (command != self.running)
         stays = valid & (command == self.running)
         obeyed = self.executed == command
@@ -458,8 +462,13 @@ class _Course:
         ]
 
         def refused(numbers: tuple[Floats, Floats]) -> NDArray[np.bool_]:
-            enough = numbers[0] >= config.least_rows
-            return enough & (numbers[1] < config.refused * usual * numbers[0])
+            given, taken = numbers
+            few = taken < config.refused * usual * given
+            return (
+                (given >= config.least_rows)
+                & few
+                & (bdtr(taken, given.astype(int), usual) < CHANCE)
+            )
 
         table = self.free_table()
         table[:, refused(pair)] = False
@@ -469,11 +478,26 @@ class _Course:
         table[must_end] &= other
         return table
 
-    def obeyed(self, arriving: NDArray[np.int64], table: Table) -> NDArray[np.int64]:
-        """Return the phases that run if these commands arrive (-1: none), ``(n,)``."""
-        age = np.maximum(self.age, 1)
-        allowed = table[age, self.running]
+    def permitted(self, table: Table, lag: int) -> NDArray[np.bool_]:
+        """Return the phases that may run next, ``(n, phases)``.
+
+        Args:
+            table: What counts where the log has no mask.
+            lag: Delay of the commands that masks are of, in decisions: a mask is of the state in
+                which the command given with it will arrive.
+        """
+        allowed = table[np.maximum(self.age, 1), self.running]
         allowed[self.age == 0] = True  # the age of a green from before the episode is not known
+        if self.mask is not None:
+            rows = np.flatnonzero(self.asked[lag] >= 0)
+            allowed[rows] = self.mask[rows - lag]
+        else:
+            young = np.flatnonzero((self.age > 0) & (self.age < self.held))
+            allowed[young] = np.eye(self.phases, dtype=np.bool_)[self.running[young]]
+        return allowed
+
+    def obeyed(self, arriving: NDArray[np.int64], allowed: NDArray[np.bool_]) -> NDArray[np.int64]:
+        """Return the phases that run if these commands arrive (-1: none), ``(n,)``."""
         rows = np.arange(len(arriving))
         taken = (arriving >= 0) & allowed[rows, np.maximum(arriving, 0)]
         after = np.arange(self.phases) > self.running[:, None]
@@ -496,34 +520,49 @@ def _filled(table: Table, seen: NDArray[np.bool_]) -> Table:
 
     Without a younger age the nearest older one serves; a phase that was never seen is free.
     """
-    filled = table.copy()
-    for phase in range(table.shape[1]):
-        known = np.flatnonzero(seen[:, phase])
-        if not len(known):
-            filled[:, phase] = True
-            continue
-        for age in range(len(table)):
-            if not seen[age, phase]:
-                younger = known[known < age]
-                filled[age, phase] = table[younger[-1] if len(younger) else known[0], phase]
-    return filled
+    ages = np.arange(len(table))[:, None]
+    younger = np.maximum.accumulate(np.where(seen, ages, -1))
+    nearest = np.where(younger < 0, seen.argmax(0), younger)
+    return table[nearest, np.arange(table.shape[1])] | ~seen.any(0, keepdims=True).T
+
+
+def _trimmed(table: Table) -> Table:
+    """Return the table without the last ages that permit what the age before them does."""
+    differs = np.flatnonzero((table[1:] != table[-1]).any((1, 2)))
+    return table[: 2 + (differs[-1] + 1 if len(differs) else 0)]
 
 
 def _mixture(
-    courses: Sequence[_Course], tables: Sequence[Table], config: ChannelConfig
+    courses: Sequence[_Course],
+    tables: Sequence[Table],
+    lags: Sequence[int] | None,
+    config: ChannelConfig,
 ) -> tuple[Floats, Floats]:
     """Find the weights of lags and of lost commands by expectation-maximisation.
+
+    Args:
+        courses: Decisions of each intersection.
+        tables: Permitted phases of each intersection, where a log has no masks.
+        lags: Delay of commands that the masks of each intersection are of; None where it is not
+            known: then each delay is tried with the masks that it would have.
+        config: Numbers of the method.
 
     Returns:
         The network's weights, and expected numbers of decisions of each kind per intersection.
     """
     kinds = config.most_lag + 2
     explains: list[NDArray[np.bool_]] = []
-    for course, table in zip(courses, tables, strict=True):
+    for place, (course, table) in enumerate(zip(courses, tables, strict=True)):
         nothing = np.full_like(course.running, -1)
         arriving = [*course.asked[: kinds - 1], nothing]
+        shown = [*range(kinds - 1), 0] if lags is None else [lags[place]] * kinds
         known = course.asked[kinds - 2] >= 0  # so that every lag can explain the row
-        same = np.stack([course.obeyed(a, table) == course.executed for a in arriving])
+        same = np.stack(
+            [
+                course.obeyed(command, course.permitted(table, lag)) == course.executed
+                for command, lag in zip(arriving, shown, strict=True)
+            ]
+        )
         use = known & same.any(0) & ~same.all(0)  # other rows tell nothing of the weights
         explains.append(same[:, use])
     rows = np.concatenate(explains, axis=1)

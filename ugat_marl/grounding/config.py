@@ -7,7 +7,7 @@ from dataclasses import dataclass, field, replace
 from typing import Any, Literal
 
 from ugat_marl.data import AgentLayout
-from ugat_marl.errors import OptionError, UnknownNameError, require_least
+from ugat_marl.errors import OptionError, UnknownNameError, require_kinds, require_least
 from ugat_marl.grounding.fitting import FitConfig
 from ugat_marl.grounding.forward import ForwardConfig
 from ugat_marl.grounding.gate import GateConfig
@@ -151,6 +151,7 @@ class UgatConfig:
     def __post_init__(self) -> None:
         if self.grounding not in GROUNDINGS:
             raise UnknownNameError("grounding", self.grounding, GROUNDINGS)
+        require_kinds(self, "ugat")
         require_least(0, pretrain_episodes=self.pretrain_episodes, iterations=self.iterations)
         require_least(1, grounded_episodes=self.grounded_episodes)
         require_least(1, sim_rollouts=self.sim_rollouts, real_rollouts=self.real_rollouts)

@@ -30,7 +30,7 @@ def answer_with_noise(model: ForwardModel, seed: int) -> None:
 
     f answers in units of its scale, the root mean square of the changes it was fitted to. Standard
     normal noise is therefore as large as the changes. Question and seed decide the noise, so a
-    resumed run gets the same answers.
+    resumed run gets the same answers. Several networks give the same noise, whose mean is as large.
 
     Args:
         model: Forward model, changed in place.
@@ -41,7 +41,8 @@ def answer_with_noise(model: ForwardModel, seed: int) -> None:
     def noise(inputs: Tensor) -> Tensor:
         answer = learnt(inputs)
         question = zlib.crc32(inputs.cpu().numpy().tobytes())
-        drawn = torch.randn(answer.shape, generator=torch_generator(seed, "placebo", question))
+        shape = (len(answer), 1, *answer.shape[2:])
+        drawn = torch.randn(shape, generator=torch_generator(seed, "placebo", question))
         # 0 * answer keeps the gradient graph, so training runs without an effect.
         return 0.0 * answer + drawn.to(answer.device) * model.valid_outputs[:, None]
 

@@ -36,7 +36,7 @@ from ugat_marl.effects import (
     QuantisedCounts,
     Sensor,
 )
-from ugat_marl.errors import CheckpointError, OptionError, counted
+from ugat_marl.errors import CheckpointError, OptionError, counted, require_kinds
 from ugat_marl.files import MALFORMED
 from ugat_marl.grounding.draws import DRAWS, with_intervals
 from ugat_marl.grounding.summaries import CLOSE, Floats, LaneRows, LaneView
@@ -106,6 +106,7 @@ class EyesConfig:
     least_lost: float = 0.08
 
     def __post_init__(self) -> None:
+        require_kinds(self, "eyes")
         for name, least in (("most_lag", 0), ("least_served", 1), ("least_stays", 1)):
             if getattr(self, name) < least:
                 raise OptionError(f"eyes {name} is {getattr(self, name)}; allowed: >= {least}")

@@ -1,7 +1,8 @@
 """Training of f and h: settings, held-out episodes, early stopping, and inputs off the data.
 
-Each fit keeps its best weights. The number of an episode alone decides if it is held out. So an
-episode never changes sides when a log grows, and a warm start was never trained on held-out data.
+Each fit keeps its best weights. The number of an episode alone decides if it is held out; of a log
+with one episode it is the last part. So an episode of a longer log never changes sides when the log
+grows, and a warm start was never trained on held-out data.
 
 The evidential loss alone does not limit the confidence far from the data, where a network of ReLUs
 grows more and more confident. On planted dynamics u was 0.26 on the data and 0.10 off it. So h is
@@ -19,7 +20,7 @@ import torch
 from torch import Tensor, nn
 
 from ugat_marl.data import TransitionLog
-from ugat_marl.errors import LogError, OptionError, require_choices
+from ugat_marl.errors import LogError, OptionError, require_kinds
 from ugat_marl.grounding.forward import ForwardModel
 from ugat_marl.grounding.inverse import AnswerModel
 from ugat_marl.grounding.networks import TrainableModel, full_width, rows_at_once
@@ -81,7 +82,7 @@ class FitConfig:
 
     def __post_init__(self) -> None:
         _ = self.method  # refuses what is impossible
-        require_choices(self, "fit")
+        require_kinds(self, "fit")
         for name, least in (("epochs", 1), ("batch_size", 1), ("patience", 1), ("kl_epochs", 0)):
             if getattr(self, name) < least:
                 raise OptionError(f"fit {name} is {getattr(self, name)}; allowed: >= {least}")

@@ -14,7 +14,7 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor, nn
 
-from ugat_marl.errors import OptionError
+from ugat_marl.errors import OptionError, require_kinds
 from ugat_marl.grounding.networks import (
     SMALLEST_SPREAD,
     Standardiser,
@@ -45,6 +45,7 @@ class ForwardConfig:
     members: int = 1
 
     def __post_init__(self) -> None:
+        require_kinds(self, "forward")
         if not self.hidden or min(self.hidden) < 1:
             raise OptionError(f"forward hidden is {self.hidden}; allowed: one or more sizes >= 1")
         if not 1 <= self.members <= MOST_NETWORKS:

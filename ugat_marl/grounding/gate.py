@@ -18,7 +18,7 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
-from ugat_marl.errors import CheckpointError, OptionError, require_choices
+from ugat_marl.errors import CheckpointError, OptionError, require_kinds
 from ugat_marl.grounding.reports import complaint
 
 
@@ -48,7 +48,7 @@ class GateConfig:
     uncertainty_of: Literal["h-after-f", "h"] = "h-after-f"
 
     def __post_init__(self) -> None:
-        require_choices(self, "gate")
+        require_kinds(self, "gate")
         if not 0.0 < self.static_alpha <= 1.0:
             raise OptionError(f"gate static_alpha is {self.static_alpha}; allowed: in (0, 1]")
         if self.window_epochs < 1:

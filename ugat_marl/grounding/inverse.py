@@ -12,7 +12,7 @@ from typing import Literal
 import torch
 from torch import Tensor
 
-from ugat_marl.errors import OptionError, require_choices
+from ugat_marl.errors import OptionError, require_kinds
 from ugat_marl.grounding.networks import Standardiser, TrainableModel, by_member, rows_at_once
 from ugat_marl.grounding.stacked import Stack
 from ugat_marl.grounding.uncertainty import (
@@ -47,7 +47,7 @@ class InverseConfig:
     head: Literal["shared", "own"] = "shared"
 
     def __post_init__(self) -> None:
-        require_choices(self, "inverse")
+        require_kinds(self, "inverse")
         if not self.hidden or min(self.hidden) < 1:
             raise OptionError(f"inverse hidden is {self.hidden}; allowed: one or more sizes >= 1")
         if self.embedding < 1:

@@ -353,7 +353,7 @@ class _Street:
         for step, (before, after) in enumerate(zip(snapshots, snapshots[1:], strict=False)):
             ran = dict(zip(observer.agents, phases[step + 1].tolist(), strict=True))
             rewards = rewarder.rewards(before, after)
-            served = seen(before.less(np.minimum(left[step], before.vehicles)), step)
+            served = seen(before.less(left[step]), step)  # newcomers too, as in a simulated log
             recorder.record(
                 episode,
                 step,
@@ -472,9 +472,9 @@ def phases_shown(
 ) -> tuple[NDArray[np.int64], float]:
     """Return the phase that each state of a traffic light shows or leads to.
 
-    A state with the greens of a phase shows it. Another one that has no yellow and lasts for a
-    minimum green shows the phase with the most similar greens. The rest are clearances, which lead
-    to the next phase.
+    A state with the greens of a phase shows it. Another one that lasts for a minimum green shows
+    the phase with the most similar greens. The rest are clearances, which lead to the next phase:
+    states with yellow, and what follows one for less than a minimum green.
 
     Args:
         shown: States of the light.
@@ -493,12 +493,19 @@ def phases_shown(
     times = np.array([begin for begin, _ in shown] + [max(end_s, shown[-1][0])])
     lengths = np.diff(times)
     phases = np.full(len(shown), -1, dtype=np.int64)
-    strange = 0.0
+    strange, clearing = 0.0, False
     for k, (_, state) in enumerate(shown):
         lit = frozenset(i for i in links if state[i] in GREEN)
+        if any(state[i] in YELLOW for i in links):
+            clearing = True
+            continue
+        short = lengths[k] < max(min_green_s, 1.0)
+        if clearing and short:  # links that stay green may be all the greens of a third phase
+            continue
+        clearing = False
         if lit in greens:
             phases[k] = greens.index(lit)
-        elif lit and lengths[k] >= max(min_green_s, 1.0) and not set(state) & YELLOW:
+        elif lit and not short:
             alike = [len(lit & own) / len(lit | own) for own in greens]
             if max(alike) > 0:
                 phases[k] = int(np.argmax(alike))

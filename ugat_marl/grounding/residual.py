@@ -16,7 +16,7 @@ import numpy as np
 
 from ugat_marl.data import TransitionLog
 from ugat_marl.envs import AnyParallelEnv
-from ugat_marl.errors import UnknownNameError, first_names, require_least
+from ugat_marl.errors import UnknownNameError, first_names, require_kinds, require_least
 from ugat_marl.grounding.fitting import Fitter
 from ugat_marl.grounding.gate import GateReport
 from ugat_marl.grounding.reports import FitReport
@@ -51,6 +51,7 @@ class ResidualConfig:
     def __post_init__(self) -> None:
         if self.kind not in RESIDUALS:
             raise UnknownNameError("residual", self.kind, RESIDUALS)
+        require_kinds(self, "residual")
         require_least(2, **{"residual worlds": self.worlds})
         require_least(1, **{"residual members": self.members, "residual history": self.history})
 

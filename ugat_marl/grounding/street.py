@@ -39,6 +39,7 @@ from ugat_marl.errors import (
     OptionError,
     ScenarioError,
     UnknownNameError,
+    require_kinds,
     require_least,
 )
 from ugat_marl.files import MALFORMED
@@ -128,13 +129,14 @@ class StreetConfig:
     residual: ResidualConfig = field(default_factory=ResidualConfig)
 
     def __post_init__(self) -> None:
+        if self.rival not in RIVALS:
+            raise UnknownNameError("rival", self.rival, RIVALS)
+        require_kinds(self, "street")
         object.__setattr__(self, "parts", tuple(self.parts))
         object.__setattr__(self, "without", tuple(self.without))
         for part in self.parts:
             if part not in PARTS:
                 raise UnknownNameError("part of a street", part, PARTS)
-        if self.rival not in RIVALS:
-            raise UnknownNameError("rival", self.rival, RIVALS)
         require_least(20, **{"street.simulations": self.simulations})
         if self.further < 0:
             raise OptionError(f"further = {self.further}: must not be negative")

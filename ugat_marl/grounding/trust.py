@@ -25,7 +25,7 @@ from scipy.special import stdtr
 from torch import Tensor
 
 from ugat_marl.data import TransitionLog
-from ugat_marl.errors import OptionError
+from ugat_marl.errors import OptionError, require_kinds
 from ugat_marl.grounding.fitting import Changes, Fitter, Split
 from ugat_marl.grounding.forward import ForwardModel
 from ugat_marl.grounding.reports import Floats, flat
@@ -59,6 +59,7 @@ class TrustConfig:
     folds: int = 5
 
     def __post_init__(self) -> None:
+        require_kinds(self, "trust")
         for name in ("margin", "level"):
             if not 0 <= getattr(self, name) < 1:
                 raise OptionError(

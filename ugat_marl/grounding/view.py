@@ -18,7 +18,7 @@ import torch
 from torch import Tensor, nn
 
 from ugat_marl.envs import AnyParallelEnv
-from ugat_marl.errors import LogError, OptionError, first_names
+from ugat_marl.errors import LogError, OptionError, first_names, require_kinds
 from ugat_marl.grounding.stacked import Stack, StackedTransitions
 from ugat_marl.scenarios import within_hops
 
@@ -45,6 +45,7 @@ class InputsConfig:
     hops: int = 0
 
     def __post_init__(self) -> None:
+        require_kinds(self, "inputs")
         if self.history < 1:
             raise OptionError(f"inputs history is {self.history}; allowed: >= 1")
         if self.hops < 0:

@@ -56,7 +56,9 @@ _UNREADABLE = (OSError, EOFError, ValueError, LookupError, TypeError, zipfile.Ba
 """Errors that numpy and JSON raise for a damaged file."""
 
 
-def export_policy(policy: NetworkPolicy, path: Path, env: AnyParallelEnv | None = None) -> Path:
+def export_policy(
+    policy: NetworkPolicy, path: str | Path, env: AnyParallelEnv | None = None
+) -> Path:
     """Write a policy for other programs, and a JSON file beside it.
 
     Args:
@@ -75,6 +77,7 @@ def export_policy(policy: NetworkPolicy, path: Path, env: AnyParallelEnv | None 
         CheckpointError: An option of the environment is not plain data.
         OutputError: A file cannot be written.
     """
+    path = Path(path)
     if path.suffix not in FORMATS:
         known = ", ".join(f"{suffix} ({name})" for suffix, (name, _) in FORMATS.items())
         raise OptionError(
@@ -219,13 +222,14 @@ class NumpyPolicy:
         self.env_options: Mapping[str, Any] = dict(env_options)
 
     @classmethod
-    def load(cls, path: Path) -> NumpyPolicy:
+    def load(cls, path: str | Path) -> NumpyPolicy:
         """Read a policy from the ``.npz`` and JSON files that `export_policy` wrote.
 
         Raises:
             CheckpointError: A file is missing, damaged or not finite, or the two do not belong
                 together.
         """
+        path = Path(path)
         try:
             about = read_json(path.with_suffix(".json"), CheckpointError)
             model = path.read_bytes()

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
@@ -19,6 +18,7 @@ from ugat_marl.files import MALFORMED, parse_json
 from ugat_marl.policies.devices import CPU
 from ugat_marl.policies.networks.q_network import Held, greedy_actions, q_network
 from ugat_marl.policies.networks.structure import Structure, structure_in
+from ugat_marl.policies.saved_options import plain_options
 
 KIND = "ugat_marl.network_policy"
 """Kind of its checkpoints."""
@@ -102,7 +102,7 @@ class NetworkPolicy:
         allowed = torch.from_numpy(self.agents.masks(infos))
         return self.agents.actions(greedy_actions(self._network, stacked, allowed))
 
-    def save(self, path: Path) -> None:
+    def save(self, path: str | Path) -> None:
         """Write the policy to one file; `load` reads it."""
         content = checkpoint_header(
             self.agents, self.hidden, self.env_options, self.shared, self.structure
@@ -110,16 +110,16 @@ class NetworkPolicy:
         content["parameters"] = torch.from_numpy(self.parameters)
         if self._ceiling is not None:
             content["ceiling"] = self._ceiling
-        write_checkpoint(path, KIND, content)
+        write_checkpoint(Path(path), KIND, content)
 
     @classmethod
-    def load(cls, path: Path) -> NetworkPolicy:
+    def load(cls, path: str | Path) -> NetworkPolicy:
         """Read a saved policy.
 
         Raises:
             CheckpointError: The file is missing, cut short, not finite, or not a policy.
         """
-        content = read_checkpoint(path, KIND)
+        content = read_checkpoint(Path(path), KIND)
         try:
             agents, hidden, env_options, shared = parse_header(content)
             structure = structure_in(content, agents)
@@ -151,39 +151,15 @@ def checkpoint_header(
     Raises:
         CheckpointError: An option of the environment is not plain data (for example a callable).
     """
-    try:
-        options = json.dumps(dict(env_options), sort_keys=True)
-    except TypeError as error:
-        raise CheckpointError(
-            f"env_options {dict(env_options)!r} cannot be saved ({error}); keep to plain data"
-        ) from None
     return {
         "agents": list(agents.names),
         "observation_sizes": list(agents.observation_sizes),
         "action_counts": list(agents.action_counts),
         "hidden": list(hidden),
-        "env_options": options,
+        "env_options": plain_options(env_options),
         "shared": shared,
         **({} if structure is None else {"structure": structure.written()}),
     }
-
-
-def other_observation(saved: Mapping[str, Any], own: Mapping[str, Any]) -> str:
-    """Say in what the observations of two environments differ; "" if in nothing that is known.
-
-    Observations of equal sizes may have other meanings, such as queues and counts.
-
-    Args:
-        saved: Options of the one environment, as in a checkpoint.
-        own: Options of the other one.
-    """
-    if "observation" not in saved or "observation" not in own:
-        return ""
-    for name, usual in (("observation", None), ("neighbours", 0)):
-        there, here = saved.get(name, usual), own.get(name, usual)
-        if there != here:
-            return f"{name} = {there!r}, not {here!r}"
-    return ""
 
 
 def parse_header(

@@ -49,6 +49,7 @@ from ugat_marl.files import (
 from ugat_marl.policies.learner_settings import parsed_settings
 from ugat_marl.policies.own_names import load_own
 from ugat_marl.policies.protocols import EpisodeCallback, Policy
+from ugat_marl.policies.saved_options import other_observation, plain_options
 from ugat_marl.seeding import derive_seed
 
 NEEDED = {"learn": ("env", "episodes"), "policy": ()}
@@ -123,7 +124,8 @@ class OwnPolicy:
         shown = {key: asked[key] for key in OF_POLICIES if key in asked}
         self.env_options: Mapping[str, Any] = {**env_options, **shown}
         self._given, self._name, self._state, self._shared = given, name, state, shared
-        if not (_takes(act, 1) or _takes(act, 2)):
+        self._names_infos = _names_infos(act)
+        if not (self._names_infos or _takes(act, 1) or _takes(act, 2)):
             raise OptionError(
                 f"policy {name!r} takes {inspect.signature(act)}, and is called with the "
                 "observations and the infos, or with the observations alone"
@@ -148,7 +150,9 @@ class OwnPolicy:
             OptionError: It returned no mapping from agents to numbers.
         """
         act = getattr(self._given, "act", self._given)
-        chosen = act(observations, infos) if self._sees_infos else act(observations)
+        by_name = {"infos": infos} if self._names_infos else {}
+        in_place = [infos] if self._sees_infos else []
+        chosen = act(observations, *in_place, **by_name)
         if not isinstance(chosen, Mapping):
             raise OptionError(
                 f"policy {self._name!r} returned {type(chosen).__name__}; it must return a "
@@ -274,7 +278,10 @@ class OwnLearner:
     def policy(self) -> OwnPolicy:
         """Return a copy of the user's current policy."""
         given = _copied(self._given.policy(), self._shared, self._name, {})
-        state = self._packed() if self.savable else None
+        try:
+            state = self._packed() if self.savable else None
+        except CheckpointError:  # a function as observation: the policy can be played, not saved
+            state = None
         return OwnPolicy(given, self._name, self._env_options, state, self._shared)
 
     def save(self, path: Path) -> None:
@@ -285,9 +292,12 @@ class OwnLearner:
         """Restore the state from a file of `save`.
 
         Raises:
-            CheckpointError: The file is missing, damaged, or the user's ``load`` refuses it.
+            CheckpointError: The file is missing, damaged, of a learner that saw other observations,
+                or the user's ``load`` refuses it.
         """
-        episodes = _counters(path)["episodes"]
+        counters = _counters(path)
+        if other := other_observation(counters["env_options"], self._env_options):
+            raise CheckpointError(f"{path}: its learner was trained with {other}")
         with tempfile.TemporaryDirectory() as folder:
             try:
                 with zipfile.ZipFile(path) as packed:
@@ -298,10 +308,14 @@ class OwnLearner:
                     f"{path}: the learner {self._name!r} cannot load it "
                     f"({type(error).__name__}: {error})"
                 ) from error
-        self.episodes = episodes
+        self.episodes = counters["episodes"]
 
     def _packed(self) -> bytes:
-        """Return the files that the user's ``save`` writes, and the counters, as a zip file."""
+        """Return the files that the user's ``save`` writes, and the counters, as a zip file.
+
+        Raises:
+            CheckpointError: An option of the environment is not plain data.
+        """
         memory = io.BytesIO()
         with tempfile.TemporaryDirectory() as folder, zipfile.ZipFile(memory, "w") as packed:
             self._given.save(Path(folder, _STATE))
@@ -309,7 +323,7 @@ class OwnLearner:
                 packed.write(file, file.relative_to(folder))
             counters = {
                 "episodes": self.episodes,
-                "env_options": self._env_options,
+                "env_options": json.loads(plain_options(self._env_options)),
                 "settings": self._settings,
             }
             packed.writestr(OWN_COUNTERS, json.dumps(counters))
@@ -526,10 +540,10 @@ def _require_methods(given: Any, name: str) -> None:
             )
 
 
-def _takes(function: Callable[..., Any], number: int) -> bool:
-    """Return True if a function can be called with this number of positional arguments."""
+def _takes(function: Callable[..., Any], number: int, *names: str) -> bool:
+    """Return True if a function can be called with so many positional and these named arguments."""
     try:
-        inspect.signature(function).bind(*range(number))
+        inspect.signature(function).bind(*range(number), **dict.fromkeys(names))
     except TypeError:
         return False
     except ValueError:  # a function in C without a signature
@@ -543,6 +557,12 @@ def _sees_infos(act: Callable[..., Any]) -> bool:
         return False
     second = [*_arguments(act).values()][1:2]
     return all(one.default is one.empty or one.name == "infos" for one in second)
+
+
+def _names_infos(act: Callable[..., Any]) -> bool:
+    """Return True if a policy takes the infos by their name alone, ``act(seen, *, infos)``."""
+    infos = _arguments(act).get("infos")
+    return infos is not None and infos.kind is infos.KEYWORD_ONLY and _takes(act, 1, "infos")
 
 
 def _wants_env(made: Callable[..., Any]) -> bool:

@@ -89,10 +89,19 @@ def load_own(name: str, what: str) -> Any:
             raise OptionError(
                 f"{what} {name!r}: the module needs {error.name}, which is not installed"
             ) from None
-        raise OptionError(
-            f"{what} {name!r}: there is no module {module_name!r} in {folder} or among the "
-            "installed packages; write the name of a file without .py, a colon, and the name in it"
-        ) from None
+        if file is not None:
+            missing = f"there is no file {place}"
+        elif (there := Path(f"{place}.py")).is_file():
+            missing = f"there is no module {place!r}; give the file as {there}:{path or 'NAME'}"
+        else:
+            missing = (
+                f"there is no module {module_name!r} in {folder} or among the installed packages; "
+                "write FILE.py:NAME, or the name of a module, a colon, and the name in it"
+            )
+        raise OptionError(f"{what} {name!r}: {missing}") from None
+    except SyntaxError as error:
+        where = f"{error.filename}, line {error.lineno}"
+        raise OptionError(f"{what} {name!r}: {where} is no Python ({error.msg})") from None
     for part in path.split("."):
         if not hasattr(found, part):
             own = getattr(found, "__module__", getattr(found, "__name__", None))

@@ -151,8 +151,12 @@ def learner_factory(
             raise OptionError(f"learner settings {' '.join(settings)}: those of {name} are --dqn.*")
         from ugat_marl.policies.learners.dqn import DQN
         from ugat_marl.policies.learners.initial_weights import InitialWeights
+        from ugat_marl.policies.learners.lessons import BEST
+        from ugat_marl.policies.rules.catalogue import parse_rule
 
         suite = suite_config(name, dqn)
+        if suite.teacher and suite.teacher != BEST:
+            parse_rule(suite.teacher)  # a slip is an error now
         if suite.start is not None:
             InitialWeights.load(Path(suite.start))  # a damaged file is an error now
         return lambda env, seed: DQN.of(env, suite, seed, device=place)

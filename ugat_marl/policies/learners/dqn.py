@@ -35,7 +35,6 @@ from ugat_marl.policies.learners.scaling import ceilings, input_factors
 from ugat_marl.policies.network_policy import (
     NetworkPolicy,
     checkpoint_header,
-    other_observation,
     parse_header,
 )
 from ugat_marl.policies.networks.batched import one_thread, size_mask
@@ -49,6 +48,7 @@ from ugat_marl.policies.networks.q_network import (
 from ugat_marl.policies.networks.structure import Structure, structure_in
 from ugat_marl.policies.networks.universal import SECONDS
 from ugat_marl.policies.protocols import EpisodeCallback, Policy
+from ugat_marl.policies.saved_options import other_observation
 from ugat_marl.seeding import derive_seed, numpy_generator, torch_generator
 
 _KIND = "ugat_marl.dqn"

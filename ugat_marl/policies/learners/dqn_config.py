@@ -4,9 +4,9 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from numbers import Integral
-from typing import Any, get_args
+from typing import Any
 
-from ugat_marl.errors import OptionError
+from ugat_marl.errors import OptionError, require_kinds
 from ugat_marl.policies.networks.structure import NetworkName
 
 CEILING_DECISIONS = 1_000
@@ -159,6 +159,7 @@ class DQNConfig:
         sizes: Any = self.hidden
         known = isinstance(sizes, tuple) and all(map(_is_size, sizes))
         self._require("hidden", known, "a tuple of whole numbers of at least 1")
+        require_kinds(self, "DQNConfig")
         self._require("learning_rate", 0 < self.learning_rate < 1, "between 0 and 1")
         self._require("discount", 0 <= self.discount < 1, "at least 0 and below 1")
         self._require("target_rate", 0 < self.target_rate <= 1, "above 0, at most 1")
@@ -178,8 +179,6 @@ class DQNConfig:
         )
 
     def _require_network(self) -> None:
-        known = get_args(NetworkName)
-        self._require("network", self.network in known, f"one of {', '.join(known)}")
         if self.network != "mlp":
             two = f"two sizes with network = {self.network!r}"
             self._require("hidden", len(self.hidden) == 2, two)

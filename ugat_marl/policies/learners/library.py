@@ -30,11 +30,11 @@ from ugat_marl.policies.learners.scaling import InputScale, RewardScale, observa
 from ugat_marl.policies.network_policy import (
     NetworkPolicy,
     checkpoint_header,
-    other_observation,
     parse_header,
 )
 from ugat_marl.policies.networks.batched import one_thread
 from ugat_marl.policies.protocols import EpisodeCallback
+from ugat_marl.policies.saved_options import other_observation
 from ugat_marl.seeding import derive_seed, numpy_generator
 
 
