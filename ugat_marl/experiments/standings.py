@@ -27,7 +27,7 @@ from ugat_marl.experiments.jobs import EVALUATION_SEED
 from ugat_marl.experiments.row_names import DIRECT
 from ugat_marl.experiments.statistics import Interval, number_or_none, student_p
 from ugat_marl.parallel import Workers
-from ugat_marl.policies import PolicyFactory, policy_card, shipped_policies
+from ugat_marl.policies import PolicyFactory, nan_last, policy_card, shipped_policies
 from ugat_marl.progress import Reporter
 from ugat_marl.scenarios import Scenario
 
@@ -413,9 +413,9 @@ def ranked(table: pl.DataFrame) -> pl.DataFrame:
             for setting in here["setting"].unique(maintain_order=True)
         }
         att = {setting: part["att_s"].to_numpy() for setting, part in values.items()}
-        best = min((float(own.mean()) for own in att.values()), key=_nan_last)
+        best = min((float(own.mean()) for own in att.values()), key=nan_last)
         regrets = {setting: float(own.mean()) - best for setting, own in att.items()}
-        for setting in sorted(att, key=lambda name: _nan_last(regrets[name])):
+        for setting in sorted(att, key=lambda name: nan_last(regrets[name])):
             own, interval = att[setting], Interval.of(att[setting])
             start = regrets.get(DIRECT, 0.0)
             rows.append(
@@ -433,11 +433,6 @@ def ranked(table: pl.DataFrame) -> pl.DataFrame:
                 }
             )
     return pl.DataFrame(rows, infer_schema_length=None)
-
-
-def _nan_last(value: float) -> tuple[bool, float]:
-    """Return a key that puts numbers in order, and nan behind them."""
-    return math.isnan(value), value
 
 
 def _welch_p(one: Any, other: Any) -> float | None:

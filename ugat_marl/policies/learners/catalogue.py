@@ -248,7 +248,7 @@ def require_known_learner(name: str) -> None:
 
 def learner_library(name: str) -> str:
     """Return a learner's library with its version; "" for the suite's own learners."""
-    library = _library(name)
+    library = BASELINES[name].library if name in BASELINES else ""
     return library and f"{library} {installed_version(library) or '-'}"
 
 
@@ -260,10 +260,6 @@ def learner_is_installed(name: str) -> bool:
         except OptionError:
             return False
     return True
-
-
-def _library(name: str) -> str:
-    return BASELINES[name].library if name in BASELINES else ""
 
 
 def load_baseline(name: str) -> ModuleType:

@@ -8,16 +8,15 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from ugat_marl.envs import Actions, Infos, Observations
 from ugat_marl.policies.rules.approaches import (
     Approach,
     ControlledNetwork,
-    allowed_phases,
+    EachLight,
     permitted,
 )
 
 
-class _Extended:
+class _Extended(EachLight):
     """Show the phases of a smallest cover in turn; extend each up to a longest green.
 
     A phase lasts at least one decision. It goes on while its lanes still use it, and ends at the
@@ -28,6 +27,7 @@ class _Extended:
     env_options: Mapping[str, Any] = {"observation": "movements"}
 
     def __init__(self, network: ControlledNetwork, longest_s: float) -> None:
+        super().__init__(network)
         self._approaches = network.approaches
         self._longest = network.decisions(longest_s)
         self._place: dict[str, int] = {}
@@ -37,18 +37,6 @@ class _Extended:
         """Forget the place in the cycle."""
         self._place, self._age = {}, {}
 
-    def act(self, observations: Observations, infos: Infos) -> Actions:
-        """Return the phase that is due in each cycle; if it is masked, the first allowed one."""
-        return {
-            agent: self._choose(
-                agent,
-                approach,
-                observations[agent],
-                allowed_phases(infos, agent, len(approach.served)),
-            )
-            for agent, approach in self._approaches.items()
-        }
-
     def _demand(
         self, agent: str, approach: Approach, observation: NDArray[np.float32]
     ) -> tuple[NDArray[np.bool_], NDArray[np.bool_]]:
@@ -56,12 +44,9 @@ class _Extended:
         raise NotImplementedError
 
     def _choose(
-        self,
-        agent: str,
-        approach: Approach,
-        observation: NDArray[np.float32],
-        allowed: NDArray[np.bool_],
+        self, agent: str, observation: NDArray[np.float32], allowed: NDArray[np.bool_]
     ) -> int:
+        approach = self._approaches[agent]
         used, calling = self._demand(agent, approach, observation)
         cycle, served = approach.cycle, approach.served
         place = self._place.get(agent, -1)

@@ -12,7 +12,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from ugat_marl.envs import WAITING_SCALE_S, AnyParallelEnv, Infos
+from ugat_marl.envs import WAITING_SCALE_S, Actions, AnyParallelEnv, Infos, Observations
 from ugat_marl.errors import OptionError
 from ugat_marl.scenarios import GREEN, Intersection, Link, Network, free_flow_s
 
@@ -88,11 +88,39 @@ class ControlledNetwork:
             for agent, intersection in self.intersections.items()
         }
 
+    @cached_property
+    def phases(self) -> dict[str, int]:
+        """Agent to the number of its phases."""
+        return {agent: len(item.phases) for agent, item in self.intersections.items()}
+
     def decisions(self, seconds: float) -> int:
         """Return the fewest decisions that last at least `seconds`."""
         if not 0 < seconds < math.inf:
             raise OptionError(f"a phase cannot be held {seconds} s; give a number above 0")
         return max(1, math.ceil(seconds / self.decision_interval_s - 1e-9))
+
+
+class EachLight:
+    """Base of rules that choose for each light from its own observation.
+
+    Args:
+        network: The controlled network.
+    """
+
+    def __init__(self, network: ControlledNetwork) -> None:
+        self._phases = network.phases
+
+    def act(self, observations: Observations, infos: Infos) -> Actions:
+        """Return the phase that the rule chooses for each agent among the allowed ones."""
+        return {
+            agent: self._choose(agent, observations[agent], allowed_phases(infos, agent, phases))
+            for agent, phases in self._phases.items()
+        }
+
+    def _choose(
+        self, agent: str, observation: NDArray[np.float32], allowed: NDArray[np.bool_]
+    ) -> int:
+        raise NotImplementedError
 
 
 class Traffic(NamedTuple):

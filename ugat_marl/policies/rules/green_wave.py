@@ -108,9 +108,7 @@ class GreenWave:
     ) -> None:
         self.env_options: Mapping[str, Any] = {}
         self.green_s, self.main_s = green_s, green_s if main_s is None else main_s
-        self._phases = {
-            a: len(intersection.phases) for a, intersection in network.intersections.items()
-        }
+        self._phases = network.phases
         self._turns: dict[str, list[tuple[int, int]]] = {}  # phases in order, and decisions of each
         self._offsets: dict[str, int] = {}
         for road in main_roads(network):

@@ -26,9 +26,7 @@ class FixedTime:
         self.green_s = green_s
         self._decisions = network.decisions(green_s)
         self._cycle = {a: w.cycle for a, w in network.approaches.items()}
-        self._phases = {
-            a: len(intersection.phases) for a, intersection in network.intersections.items()
-        }
+        self._phases = network.phases
         self._time = 0
 
     def reset(self, seed: int) -> None:
@@ -67,9 +65,7 @@ class Random:
 
     def __init__(self, network: ControlledNetwork) -> None:
         self.env_options: Mapping[str, Any] = {}
-        self._phases = {
-            a: len(intersection.phases) for a, intersection in network.intersections.items()
-        }
+        self._phases = network.phases
         self._generator = numpy_generator(0, "random-controller")
 
     def reset(self, seed: int) -> None:

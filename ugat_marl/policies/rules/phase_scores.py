@@ -8,18 +8,18 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from ugat_marl.envs import WAITING_SCALE_S, Actions, Infos, Observations
+from ugat_marl.envs import WAITING_SCALE_S
 from ugat_marl.policies.rules.approaches import (
     Approach,
     ControlledNetwork,
-    allowed_phases,
+    EachLight,
     awaited_links,
     check_length,
 )
 from ugat_marl.scenarios import GREEN, Intersection
 
 
-class _Scored:
+class _Scored(EachLight):
     """Take the phase of highest score and hold it for at least `hold_s`.
 
     After that time the rule chooses again at every decision. Of equal scores the phase already
@@ -31,6 +31,7 @@ class _Scored:
     def __init__(
         self, network: ControlledNetwork, weights: Mapping[str, NDArray[np.float64]], hold_s: float
     ):
+        super().__init__(network)
         self._weights = weights
         self._hold = network.decisions(hold_s)
         self._shown: dict[str, int] = {}
@@ -39,15 +40,6 @@ class _Scored:
     def reset(self, seed: int) -> None:
         """Forget the phases shown and their ages."""
         self._shown, self._age = {}, {}
-
-    def act(self, observations: Observations, infos: Infos) -> Actions:
-        """Return the phase that the rule chooses for each agent among the allowed ones."""
-        return {
-            agent: self._choose(
-                agent, observations[agent], allowed_phases(infos, agent, weights.shape[0])
-            )
-            for agent, weights in self._weights.items()
-        }
 
     def scores(self, agent: str, observation: NDArray[np.float32]) -> NDArray[np.float64]:
         """Return the score of every phase of an agent, ``(phases,)``.

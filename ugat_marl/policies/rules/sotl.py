@@ -8,11 +8,10 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from ugat_marl.envs import Actions, Infos, Observations
-from ugat_marl.policies.rules.approaches import Approach, ControlledNetwork, allowed_phases
+from ugat_marl.policies.rules.approaches import ControlledNetwork, EachLight
 
 
-class SelfOrganising:
+class SelfOrganising(EachLight):
     """SOTL (Gershenson 2005; Cools, Gershenson and D'Hooghe 2007), for any number of phases.
 
     Each lane keeps a sum. At every decision with red the lane adds its vehicles times the decision
@@ -33,6 +32,7 @@ class SelfOrganising:
     ) -> None:
         self.env_options: Mapping[str, Any] = {"observation": "movements"}
         self.threshold, self.hold_s = threshold, hold_s
+        super().__init__(network)
         self._approaches = network.approaches
         self._interval_s = network.decision_interval_s
         self._hold = network.decisions(hold_s)
@@ -44,25 +44,10 @@ class SelfOrganising:
         self._age: dict[str, int] = {}
         self._sums = {agent: np.zeros(len(a.lanes)) for agent, a in self._approaches.items()}
 
-    def act(self, observations: Observations, infos: Infos) -> Actions:
-        """Return the phase that the rule chooses for each agent among the allowed ones."""
-        return {
-            agent: self._choose(
-                agent,
-                approach,
-                observations[agent],
-                allowed_phases(infos, agent, len(approach.served)),
-            )
-            for agent, approach in self._approaches.items()
-        }
-
     def _choose(
-        self,
-        agent: str,
-        approach: Approach,
-        observation: NDArray[np.float32],
-        allowed: NDArray[np.bool_],
+        self, agent: str, observation: NDArray[np.float32], allowed: NDArray[np.bool_]
     ) -> int:
+        approach = self._approaches[agent]
         seen = approach.traffic(agent, observation)
         shown, age = self._shown.get(agent, seen.shown), self._age.get(agent, self._hold)
         green = approach.served[shown]
