@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import re
 from dataclasses import replace
+from pathlib import Path
 from typing import Any
 
 import pytest
@@ -73,6 +75,52 @@ def test_what_the_preset_decides_cannot_be_given_beside_it() -> None:
         TransferConfig(
             "single-v1", preset="paper", ugat=UgatConfig(gate=GateConfig(mode="infinite"))
         )
+
+
+@pytest.mark.parametrize(
+    ("words", "told"),
+    [
+        (["--rollout-epsilon", "0.3"], "rollout_epsilon = 0.0, not 0.3"),
+        (["--least-accuracy", "0"], "least_accuracy = None, not 0.0"),
+        (["--fit.epochs", "100"], "fit.epochs = 300, not 100"),
+        (["--gate.scope", "intersection"], "gate.scope = pooled, not intersection"),
+        (["--grounding", "street"], "grounding = phase, not street"),
+    ],
+)
+def test_a_usual_value_that_is_given_beside_the_preset_is_not_replaced_without_a_word(
+    words: list[str], told: str
+) -> None:
+    with pytest.raises(SystemExit) as ended:
+        command(TransferConfig, "single-v1", *words)
+    assert told in str(ended.value.__context__)
+
+
+def test_the_page_gives_what_the_preset_stands_for() -> None:
+    import tyro
+
+    page = (Path(__file__).parents[2] / "docs" / "tutorials" / "student.md").read_text()
+    (words,) = [
+        block.replace("\\\n", " ").split()
+        for block in re.findall(r"```sh\n(.*?)```", page, re.DOTALL)
+        if "--gate.static-alpha" in block
+    ]
+    given = tyro.cli(TransferConfig, args=words[2 : words.index("--out")])
+    plain = replace(given.ugat, gate=replace(given.ugat.gate, mode="dynamic", static_alpha=0.5))
+    counts = {name: int(getattr(plain, name)) for name in COUNTS}
+    published = as_published(UgatConfig(**counts))
+    assert replace(plain, gate=replace(plain.gate, window_epochs=published.gate.window_epochs)) == (
+        published
+    )
+    paper = TransferConfig("single-v1", preset="paper")
+    assert (given.learner, given.reward) == (paper.learner, paper.reward)
+
+
+def test_a_threshold_counts_in_its_own_mode_alone() -> None:
+    assert GateConfig(mode="static", static_alpha=0.3).static_alpha == 0.3
+    with pytest.raises(
+        OptionError, match=r"is 0\.3, which counts with gate mode static"
+    ):
+        GateConfig(static_alpha=0.3)
 
 
 def test_the_preset_is_paid_by_the_queue_at_the_light() -> None:

@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
-from dataclasses import dataclass, field, replace
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass, field, fields, is_dataclass, replace
 from typing import Any, Literal
 
 from ugat_marl.data import AgentLayout
@@ -18,9 +18,12 @@ from ugat_marl.grounding.street import StreetConfig
 from ugat_marl.grounding.timed import TimedConfig, TimedTransform
 from ugat_marl.grounding.transform import Transform
 from ugat_marl.grounding.view import InputsConfig, Neighbours
-from ugat_marl.policies import Usual, UsualName
+from ugat_marl.policies import Usual, UsualName, UsualNumber, UsualValue
 
 GROUNDINGS = ("phase", "timed", "street")
+
+
+_STREET: Any = UsualName("street")
 
 
 @dataclass(frozen=True)
@@ -50,14 +53,14 @@ class UgatConfig:
         street: Settings of the fit, with "street".
     """
 
-    grounding: Literal["phase", "timed", "street"] = "street"
+    grounding: Literal["phase", "timed", "street"] = _STREET
     pretrain_episodes: int = Usual(20)
     iterations: int = Usual(2)
     grounded_episodes: int = Usual(10)
     sim_rollouts: int = Usual(3)
     real_rollouts: int = Usual(2)
-    rollout_epsilon: float = 0.3
-    least_accuracy: float | None = 0.0
+    rollout_epsilon: float = UsualNumber(0.3)
+    least_accuracy: float | None = UsualNumber(0.0)
     inputs: InputsConfig = field(default_factory=InputsConfig)
     forward: ForwardConfig = field(default_factory=ForwardConfig)
     inverse: InverseConfig = field(default_factory=InverseConfig)
@@ -213,12 +216,30 @@ def as_published(config: UgatConfig) -> UgatConfig:
         ),
         gate=GateConfig(scope="pooled", window_epochs=counts["grounded_episodes"]),
     )
-    if config not in (UgatConfig(**given), published):
+    for name, value, wanted in _others(config, UgatConfig(**given), published):
         raise OptionError(
             'the preset "paper" decides all settings of the algorithm but the numbers of episodes '
-            f"({', '.join(COUNTS)}); leave the others out, or leave out the preset"
+            f"({', '.join(COUNTS)}), and has {name} = {wanted}, not {value}; leave it out, or, to "
+            "change one of its settings, leave out the preset and give the others one by one "
+            "(docs/tutorials/student.md)"
         )
     return published
+
+
+def _others(given: Any, usual: Any, wanted: Any, of: str = "") -> Iterator[tuple[str, Any, Any]]:
+    """Yield name, value and wanted value of settings that were given and are not the wanted ones.
+
+    A default that a preset replaces is a `UsualValue`, and so differs from the same value given.
+    """
+    for part in fields(wanted):
+        name = f"{of}{part.name}"
+        own, default, needed = (getattr(one, part.name) for one in (given, usual, wanted))
+        if is_dataclass(needed):
+            yield from _others(own, default, needed, f"{name}.")
+            continue
+        untouched = isinstance(own, UsualValue) or not isinstance(default, UsualValue)
+        if own != needed and not (own == default and untouched):
+            yield name, own, needed
 
 
 USUAL_REWARD: str = UsualName("total-queue")

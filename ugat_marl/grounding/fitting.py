@@ -28,7 +28,7 @@ from ugat_marl.grounding.reports import ForwardReport, TrainingRecord, forward_r
 from ugat_marl.grounding.stacked import Stack, StackedTransitions
 from ugat_marl.grounding.uncertainty import LossArguments, Method, MethodName, annealing
 from ugat_marl.grounding.view import View
-from ugat_marl.policies import CPU, on_device
+from ugat_marl.policies import CPU, Usual, UsualNumber, on_device
 from ugat_marl.seeding import torch_generator
 
 
@@ -65,14 +65,14 @@ class FitConfig:
     pairs: Literal["observed", "smoothed"] = "observed"
     members: int = 5
     passes: int = 20
-    epochs: int = 100
+    epochs: int = Usual(100)
     batch_size: int = 64
     learning_rate: float = 1e-3
-    patience: int = 10
+    patience: int = Usual(10)
     held_out_every: int = 4
     kl_epochs: int = 10
-    kl_weight: float = 0.1
-    off_data_weight: float = 0.1
+    kl_weight: float = UsualNumber(0.1)
+    off_data_weight: float = UsualNumber(0.1)
     warm_start: bool = False
 
     @property

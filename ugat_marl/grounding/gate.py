@@ -20,6 +20,9 @@ from numpy.typing import NDArray
 
 from ugat_marl.errors import CheckpointError, OptionError, require_kinds
 from ugat_marl.grounding.reports import complaint
+from ugat_marl.policies import Usual, UsualName
+
+_INTERSECTION: Any = UsualName("intersection")
 
 
 @dataclass(frozen=True)
@@ -42,8 +45,8 @@ class GateConfig:
 
     mode: Literal["infinite", "static", "dynamic"] = "dynamic"
     static_alpha: float = 0.5
-    scope: Literal["intersection", "pooled"] = "intersection"
-    window_epochs: int = 20
+    scope: Literal["intersection", "pooled"] = _INTERSECTION
+    window_epochs: int = Usual(20)
     start: Literal["open", "fitted"] = "open"
     uncertainty_of: Literal["h-after-f", "h"] = "h-after-f"
 
@@ -51,6 +54,11 @@ class GateConfig:
         require_kinds(self, "gate")
         if not 0.0 < self.static_alpha <= 1.0:
             raise OptionError(f"gate static_alpha is {self.static_alpha}; allowed: in (0, 1]")
+        if self.static_alpha != GateConfig.static_alpha and self.mode != "static":
+            raise OptionError(
+                f"gate static_alpha is {self.static_alpha}, which counts with gate mode static "
+                f"alone, not {self.mode}; set both"
+            )
         if self.window_epochs < 1:
             raise OptionError(f"gate window_epochs is {self.window_epochs}; allowed: >= 1")
 

@@ -22,6 +22,8 @@ from .learners.dqn import DQN as DQN
 from .learners.dqn_config import DQNConfig as DQNConfig
 from .learners.dqn_config import Usual as Usual
 from .learners.dqn_config import UsualName as UsualName
+from .learners.dqn_config import UsualNumber as UsualNumber
+from .learners.dqn_config import UsualValue as UsualValue
 from .learners.initial_weights import InitialWeights as InitialWeights
 from .learners.lessons import attended as attended
 from .learners.lessons import has_first_lessons as has_first_lessons

@@ -27,7 +27,11 @@ class UsualValue:
 
 
 class Usual(UsualValue, int):
-    """Default of a number."""
+    """Default of a whole number."""
+
+
+class UsualNumber(UsualValue, float):
+    """Default of a number that need not be whole."""
 
 
 class UsualSizes(UsualValue, tuple[int, ...]):
