@@ -282,7 +282,8 @@ def test_a_short_hole_shows_where_it_was_busy(read: Read) -> None:
         found = read(changes={"detections": lambda f: f.filter(~hole)})[1]
         return [text for text in found if "no detector says anything" in text]
 
-    assert len(without(3000, 3300)) == 3
+    assert len(found := without(3000, 3300)) == 3
+    assert all(text.endswith("A diagnosis leaves this time out of all periods") for text in found)
     assert not without(3000, 3120), "a red may last that long"
     assert not without(0, 300), "the streets may have been empty before"
 

@@ -117,9 +117,7 @@ def test_the_page_gives_what_the_preset_stands_for() -> None:
 
 def test_a_threshold_counts_in_its_own_mode_alone() -> None:
     assert GateConfig(mode="static", static_alpha=0.3).static_alpha == 0.3
-    with pytest.raises(
-        OptionError, match=r"is 0\.3, which counts with gate mode static"
-    ):
+    with pytest.raises(OptionError, match=r"is 0\.3, which counts with gate mode static"):
         GateConfig(static_alpha=0.3)
 
 

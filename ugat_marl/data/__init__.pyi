@@ -6,6 +6,7 @@ from .level_of_service import level_of_service as level_of_service
 from .level_of_service import mean_delay_s as mean_delay_s
 from .measured.atspm import import_atspm as import_atspm
 from .measured.coverage import is_actuated as is_actuated
+from .measured.coverage import recording_holes as recording_holes
 from .measured.intervals import Intervals as Intervals
 from .measured.intervals import as_counts as as_counts
 from .measured.intervals import occupied_between as occupied_between

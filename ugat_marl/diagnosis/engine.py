@@ -198,6 +198,7 @@ class Engine:
             all days are.
         interval_s: Length of the intervals whose features are compared, s; None for none.
         supplementary: Measured turning counts, travel times and states of lanes; None without any.
+        holes: Times in which nothing was recorded, begin and end in s.
     """
 
     def __init__(
@@ -215,6 +216,7 @@ class Engine:
         base_days: int = 0,
         interval_s: float | None = None,
         supplementary: SupplementaryData | None = None,
+        holes: Sequence[tuple[float, float]] = (),
     ) -> None:
         self._base_days = base_days
         self._interval_s = interval_s
@@ -236,7 +238,7 @@ class Engine:
         self._days: OrderedDict[str, Future[Day]] = OrderedDict()
         self._of_days = threading.Lock()
         self._known: dict[str, Replicate] = {}
-        self._unmeasured = Unmeasured.of(periods)
+        self._unmeasured = Unmeasured.of(periods, holes)
         versions = installed_version("eclipse-sumo"), installed_version("numpy")
         head = (
             VERSION,

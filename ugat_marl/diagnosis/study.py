@@ -12,7 +12,7 @@ from pathlib import Path
 import numpy as np
 import polars as pl
 
-from ugat_marl.data import Finding, MeasuredData, is_actuated
+from ugat_marl.data import Finding, MeasuredData, is_actuated, recording_holes
 from ugat_marl.diagnosis.compared_detectors import compared_detectors
 from ugat_marl.diagnosis.demand_variation import measured_variation, variation_findings
 from ugat_marl.diagnosis.engine import Budget, Engine, default_cache
@@ -54,6 +54,7 @@ from ugat_marl.diagnosis.thresholds import (
     Effort,
     Thresholds,
 )
+from ugat_marl.diagnosis.unmeasured import without_holes
 from ugat_marl.effects import Effect
 from ugat_marl.errors import MeasuredDataError, OptionError, require_kinds
 from ugat_marl.parallel import Workers
@@ -124,7 +125,7 @@ class Study:
     Attributes:
         scenario: The scenario as it is.
         network: The network of the scenario.
-        measured: The measured data of the street.
+        measured: The measured data of the street, without times that were not recorded.
         config: Options of the diagnosis.
         layout: Measured lanes, with their signals and detectors.
         engine: Simulator of days.
@@ -139,6 +140,7 @@ class Study:
         ruled_out: Names of the effects that the data cannot show.
         detection: Errors of measurement, which all simulated days have.
         day_to_day: Variation of demand from day to day, which they have too, as a share.
+        data_hash: Hash of the data as they were given.
     """
 
     scenario: Scenario
@@ -157,6 +159,7 @@ class Study:
     ruled_out: frozenset[str] = field(default=frozenset())
     detection: tuple[DetectorError, ...] = ()
     day_to_day: float = 0.0
+    data_hash: str = ""
     _doubts: dict[tuple[Effect, ...], Mapping[str, Array]] = field(default_factory=dict, init=False)
 
     @property
@@ -179,7 +182,10 @@ class Study:
         """
         network, thresholds = Network.read(scenario), config.thresholds
         detectors, findings = compared_detectors(scenario, measured, thresholds)
-        measured = _noted(measured, findings)
+        measured, data_hash = _noted(measured, findings), measured.hash
+        holes = recording_holes(measured.periods)
+        kept = tuple(without_holes(period, holes) for period in measured.periods)
+        measured = replace(measured, periods=kept)
         layout = DetectorLayout.of(network, detectors, scenario.settings.begin_s)
         ruled_out = frozenset(name for finding in measured.findings for name in finding.rules_out)
         allowed = library(config.leave_out) - ruled_out
@@ -217,6 +223,7 @@ class Study:
                 base_days=base_days,
                 interval_s=None if measured.has_events else usual_length(measured.counts),
                 supplementary=supplementary,
+                holes=holes,
             )
 
         return cls(
@@ -235,6 +242,7 @@ class Study:
             other_days=simulating(False, 0) if answering else None,
             ruled_out=ruled_out,
             day_to_day=variation,
+            data_hash=data_hash,
         )
 
     @property

@@ -549,7 +549,7 @@ def _unsearched(
             tuple(period.id for period in measured.of("heldout")),
         ),
         verified_on_fitted_periods=not measured.of("heldout"),
-        hashes={"scenario": study.scenario.hash, "measured": measured.hash},
+        hashes={"scenario": study.scenario.hash, "measured": study.data_hash},
         versions=installed_versions("ugat-marl", "eclipse-sumo"),
         verdict=verdict,
         sentence=sentence,

@@ -11,11 +11,13 @@ import numpy as np
 import polars as pl
 import pytest
 
-from ugat_marl.data import Finding, MeasuredData
+from ugat_marl.data import Finding, MeasuredData, recording_holes
 from ugat_marl.diagnosis import DiagnosisConfig
 from ugat_marl.diagnosis.engine import OutOfTime
 from ugat_marl.diagnosis.thresholds import Effort
+from ugat_marl.diagnosis.unmeasured import without_holes
 from ugat_marl.errors import MeasuredDataError, OptionError, UnknownNameError
+from ugat_marl.scenarios import Passages
 
 FEW = Effort(base=24, bank=2, fit=5, test=16)
 DETECTORS = {"undercount", "dropout", "swapped"}
@@ -54,6 +56,33 @@ def test_the_answer_is_the_file(street, measured: MeasuredData, tmp_path: Path) 
     assert share["low"] < share["value"] < share["high"]
     assert found["seed"] == 0
     assert "NaN" not in (tmp_path / "diagnosis.json").read_text()
+
+
+def test_a_hole_in_the_recording_is_no_effect(
+    street, measured: MeasuredData, tmp_path: Path
+) -> None:
+    """For 300 s of a day nothing is recorded, and a vehicle seems to stand there all the while."""
+    hole = (400.0, 700.0)
+    days = list(measured.periods)
+    day = without_holes(days[3], (hole,))
+    seen = day.passages["advance:W_C_0"]
+    stuck = Passages(np.array([399.9]), np.array([700.1]), np.full(1, 5.0), np.full(1, 5.0))
+    whole = Passages.concatenated([seen, stuck])
+    order = np.argsort(whole.on_s)
+    whole = Passages(
+        whole.on_s[order], whole.off_s[order], whole.speed_mps[order], whole.length_m[order]
+    )
+    days[3] = replace(day, passages={**day.passages, "advance:W_C_0": whole})
+    spoilt = replace(measured, periods=tuple(days))
+    ((begin, end),) = recording_holes(spoilt.periods)
+    assert begin <= hole[0] and hole[1] <= end
+    found = run(street, spoilt, tmp_path)
+    assert found["hashes"]["measured"] == spoilt.hash
+    assert found["verdict"] == "explained"
+    assert not any("differs from day to day" in text for text in found["findings"])
+    (effect,) = found["effects"]
+    assert (effect["name"], effect["place"]) == ("undercount", "stop:S_C_0")
+    assert effect["parameters"]["share"]["value"] == pytest.approx(0.3, abs=0.06)
 
 
 def test_without_held_out_periods_it_is_said(

@@ -422,10 +422,18 @@ def _of_silence(measured: MeasuredData) -> Iterator[Finding]:
         times = {name: _times(period, name) for name in period.passages}
         together = np.concatenate(list(times.values()))
         begin, length = _longest_gap(together, period)
-        if length > ALL_SILENT_S or _is_hole(together, begin, length):
+        hole = _is_hole(together, begin, length)
+        if hole or length > ALL_SILENT_S:
+            left_out = hole and _lights_change(period, begin, begin + length)
+            what_then = (
+                "a diagnosis leaves this time out of all periods"
+                if left_out
+                else ("if it was, end the period before it, in periods.csv")
+            )
             yield Finding(
                 f"detections: no detector says anything for {length / 60:.0f} min from {begin:g} s "
-                f"on in period {period.id!r}; was the recording interrupted, or a clock set ahead?"
+                f"on in period {period.id!r}; was the recording interrupted, or a clock set ahead? "
+                f"{what_then.capitalize()}"
             )
             continue
         for group in roads.values():
@@ -441,6 +449,34 @@ def _of_silence(measured: MeasuredData) -> Iterator[Finding]:
             f"detections: {name!r} {behaviour} for {span} min {where}, while a "
             f"neighbour counts {max(silent.meanwhile for silent in silent_spans)} vehicles"
         )
+
+
+def recording_holes(periods: Sequence[Period]) -> tuple[tuple[float, float], ...]:
+    """Return begin and end of the times, in s, in which a recording of events was interrupted.
+
+    All detectors say nothing for longer than a cycle, they are busy before and after it, and the
+    lights go on changing. The times of all periods are put together, in order and apart.
+    """
+    found: list[tuple[float, float]] = []
+    for period in periods:
+        times = np.sort(
+            np.concatenate([np.empty(0), *(_times(period, x) for x in period.passages)])
+        )
+        for place in np.flatnonzero(np.diff(times) > HOLE_S):
+            begin, end = times[place : place + 2].tolist()
+            if _is_hole(times, begin, end - begin) and _lights_change(period, begin, end):
+                found.append((begin, end))
+    apart: list[tuple[float, float]] = []
+    for begin, end in sorted(found):
+        if apart and begin <= apart[-1][1]:
+            begin, end = apart[-1][0], max(end, apart.pop()[1])
+        apart.append((begin, end))
+    return tuple(apart)
+
+
+def _lights_change(period: Period, begin_s: float, end_s: float) -> bool:
+    """Return True if a light changes its state between two times."""
+    return any(begin_s < time < end_s for log in period.signals.values() for time, _ in log)
 
 
 def _is_hole(times: NDArray[np.float64], begin_s: float, length_s: float) -> bool:
