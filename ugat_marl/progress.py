@@ -273,6 +273,15 @@ def usual() -> Reporter:
     return _shown[-1]
 
 
+def usual_of_long_work() -> Reporter:
+    """Return the default reporter of what takes minutes: bars on standard error if none shows."""
+    if len(_shown) > 1:
+        return usual()
+    from rich.console import Console
+
+    return Bars(Console(stderr=True))
+
+
 @contextlib.contextmanager
 def showing(reporter: Reporter) -> Iterator[None]:
     """Make a reporter the default of the whole program inside the block."""

@@ -176,7 +176,7 @@ def test_names_of_columns_and_times_in_other_spellings(imported: Import) -> None
     assert imported(utc, zoned).hash == expected
     text = utc.with_columns(pl.col("TimeStamp").dt.strftime("%Y-%m-%dT%H:%M:%S%.3fZ"))
     assert imported(text, zoned, csv=True).hash == expected
-    with pytest.raises(MeasuredDataError, match="has the time zone UTC; write the street's"):
+    with pytest.raises(MeasuredDataError, match="has offsets from UTC, .* write the street's"):
         imported(utc)
 
 

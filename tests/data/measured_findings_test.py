@@ -300,6 +300,31 @@ def test_a_few_rows_outside_of_their_period_are_left_out(read: Read) -> None:
         read(changes={"detections": lambda f: f.with_columns(pl.col("time_s") + END)})
 
 
+@pytest.mark.parametrize(
+    ("moved_s", "told"),
+    [
+        (5 * 3600.0, "seems to be 5 hours late: is it in another time zone, such as UTC"),
+        (-3 * 3600.0, "seems to be 3 hours early"),
+        (20 * 3600.0, "or is the period too short"),
+    ],
+)
+def test_a_log_on_another_clock_is_refused_with_a_guess(
+    read: Read, moved_s: float, told: str
+) -> None:
+    with pytest.raises(MeasuredDataError, match=told):
+        read(changes={"detections": lambda f: f.with_columns(pl.col("time_s") + moved_s)})
+
+
+def test_a_log_longer_than_its_period_is_cut(read: Read) -> None:
+    def longer(frame: pl.DataFrame) -> pl.DataFrame:
+        day = [frame.with_columns(pl.col("time_s") + k * END) for k in (-2, -1, 0, 1)]
+        return pl.concat(day)
+
+    found, findings = read(changes={"detections": longer})
+    assert found.hash == recording().hash
+    assert any("lie outside of their periods" in text for text in findings)
+
+
 def test_rows_of_other_periods_and_detectors_are_left_out(read: Read) -> None:
     def more(frame: pl.DataFrame) -> pl.DataFrame:
         other = frame.head(6).with_columns(pl.lit("day9").alias("period_id"))

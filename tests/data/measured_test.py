@@ -712,7 +712,7 @@ def test_local_counts_become_seconds(
         (
             "detections.csv",
             lambda text: in_local_time("America/Chicago")["detections.csv"](text),
-            "time has the time zone UTC; write the street's own in periods.csv, as time_zone",
+            r"offsets from UTC, such as \+01:00; write the street's own time_zone in periods.csv",
         ),
     ],
 )

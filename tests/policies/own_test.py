@@ -826,11 +826,26 @@ def test_a_policy_that_cannot_be_called_is_refused_before_it_plays(policy: Any) 
         own_policy(policy, "odd", ToyTraffic())
 
 
+class Astray(Noted):
+    """A learner that asks for what is no phase."""
+
+    def learn(self, env: Any, episodes: int) -> None:
+        env.reset()
+        env.step(dict.fromkeys(env.agents, float("nan")))
+
+
+def test_a_mistake_inside_a_learner_is_told_with_its_place() -> None:
+    env = ugat_marl.parallel_env("single-v1", duration_s=20)
+    with pytest.raises(ActionError, match=r"learner 'astray' \(.*own_test\.py, line \d+\): action"):
+        OwnLearner(Astray(), "astray", env).learn(env, 1, 0)
+    env.close()
+
+
 @pytest.mark.usefixtures("algorithm")
 def test_what_a_learner_has_saved_is_told_from_damage(tmp_path: Path) -> None:
     learner = OwnLearnerFactory("my_algo:Kept")(ToyTraffic(), 0)
     learner.save(tmp_path / "own.pt")
-    with pytest.raises(CheckpointError, match=r"own\.pt: what a learner of yours .*CLASS@FILE"):
+    with pytest.raises(CheckpointError, match=r"own\.pt: what a learner of .*CLASS@/.*own\.pt;"):
         ugat_marl.load_policy(tmp_path / "own.pt")
     with pytest.raises(CheckpointError, match="commands that play policies take it as it is"):
         ugat_marl.load_policy(f"my_algo:Kept@{tmp_path / 'own.pt'}")

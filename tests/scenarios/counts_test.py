@@ -106,6 +106,11 @@ def test_origins_and_destinations(tmp_path: Path) -> None:
             "edge,count,begin_s,end_s\nwest1_A1,5,07:00,8:00:00\n",
             "begin_s = '07:00' is not a number of at least 0; write seconds: 25200",
         ),
+        (
+            "--counts",
+            "edge,count,begin_s,end_s\nwest1_A1,5,04.03.2024 07:30,04.03.2024 08:00\n",
+            "is not a number of at least 0; write seconds: 27000, counted from midnight",
+        ),
         ("--counts", "edge,count\nwest1_A1,n/a\n", "of at least 0; write whole numbers w"),
         ("--counts", "edge,count\nwest1_A1,-1\n", "line 2: count = '-1' is not a number of at"),
         ("--counts", "edge,count\nwest1_A1,1_000\n", "line 2: count = '1_000' is not a number"),

@@ -319,14 +319,19 @@ def _parse(line: CommandLine, name: str, words: list[str]) -> Any:
         message = _one_line(messages.getvalue(), name)
         raise UgatMarlError(f"{message}; see {line.program} {name} --help") from None
     if unknown:
-        first = unknown[0].partition("=")[0]
+        first, is_value, _ = unknown[0].partition("=")
         if first.startswith("-"):
             guess = nearest(first, sorted(options_of(command_type)))
             hint = f"Did you mean {guess!r}?" if guess else ""
             raise UgatMarlError(
                 f"unknown option {first!r} of {name}. {hint} See {line.program} {name} --help"
             )
-        raise UgatMarlError(f"{name}: unexpected {first!r}; see {line.program} {name} --help")
+        joined_by = (
+            "; effects of one domain are joined by +, as in V1+late_green=2" if is_value else ""
+        )
+        raise UgatMarlError(
+            f"{name}: unexpected {unknown[0]!r}{joined_by}; see {line.program} {name} --help"
+        )
     return command
 
 

@@ -75,8 +75,9 @@ def read_checkpoint(path: Path, *kinds: str) -> dict[str, Any]:
             ) from None
         if _is_own(path):
             raise CheckpointError(
-                f"{path}: what a learner of yours has saved, which commands that play policies "
-                "take as MODULE:CLASS@FILE; no other program can read it, so it is not exported"
+                f"{path}: what a learner of yours has saved, which only the learner can read; "
+                f"commands that play policies, and evaluate() in Python, take it as "
+                f"MODULE:CLASS@{path}; it cannot be exported"
             ) from None
         raise CheckpointError(
             f"{path}: not a readable checkpoint ({first_line(error)}); it may have been cut short: "

@@ -1,4 +1,4 @@
-"""What the detectors of a street do not measure: speeds, lengths, times without a recording."""
+"""Speeds and lengths that detectors do not measure, and times without a recording."""
 
 from __future__ import annotations
 

@@ -10,6 +10,7 @@ from .objectives import OBJECTIVE_MEASURES as OBJECTIVE_MEASURES
 from .observations import COUNT_SCALE as COUNT_SCALE
 from .observations import OBSERVATION_UNITS as OBSERVATION_UNITS
 from .observations import WAITING_SCALE_S as WAITING_SCALE_S
+from .observations import ObservationName as ObservationName
 from .observations import Observer as Observer
 from .options import EnvOptions as EnvOptions
 from .options import is_count as is_count
@@ -17,6 +18,7 @@ from .registration import register_single as register_single
 from .rendering import NetworkRenderer as NetworkRenderer
 from .rewards import IntersectionView as IntersectionView
 from .rewards import Rewarder as Rewarder
+from .rewards import RewardName as RewardName
 from .single import SingleEnv as SingleEnv
 from .traffic_env import TrafficEnv as TrafficEnv
 from .traffic_env import env as env

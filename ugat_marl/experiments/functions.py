@@ -10,15 +10,15 @@ import re
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, fields, is_dataclass, replace
 from pathlib import Path
-from typing import Any, Literal, TypeVar
+from typing import Any, Literal, TypeVar, get_args
 
 import numpy as np
 import polars as pl
 
 from ugat_marl.data import LogCallback
 from ugat_marl.effects import Domain, domain_label, is_one_domain, load_scenario
-from ugat_marl.envs import is_count
-from ugat_marl.errors import OptionError
+from ugat_marl.envs import ObservationName, RewardName, is_count
+from ugat_marl.errors import OptionError, UnknownNameError
 from ugat_marl.experiments.evaluation import OwnPolicyFactory, evaluation_of, policy_factory
 from ugat_marl.experiments.jobs import EVALUATION_SEED, file_stem, shortened
 from ugat_marl.experiments.scores import Evaluation
@@ -26,7 +26,7 @@ from ugat_marl.experiments.transfers import TransferConfig, transfer
 from ugat_marl.grounding import USUAL_REWARD, UgatConfig
 from ugat_marl.parallel import Workers, parts_at_a_time
 from ugat_marl.policies import DQNConfig, PolicyFactory, Usual, own_name
-from ugat_marl.progress import Reporter, usual
+from ugat_marl.progress import Reporter, usual, usual_of_long_work
 from ugat_marl.scenarios import Scenario
 
 
@@ -113,7 +113,8 @@ def train(
         out: Folder of the run; None for runs/SCENARIO-REAL-sSEED.
         resume: Continue the run in that folder.
         workers: Simulations at a time, or an executor; None for one per core.
-        reporter: Shows progress; None for the one of the program.
+        reporter: Shows progress; None for bars on standard error, `ugat_marl.progress.Silent()` for
+            nothing.
         callback: Called as ``callback(stage, step, numbers)`` for what the training across the gap
             measures: stage "episode" with the number of the episode, "rival episode" (and
             "rival 3 s late episode") with that of a rival in a fitted street, "iteration" with
@@ -166,7 +167,7 @@ def train(
         config,
         folder,
         resume=resume,
-        reporter=reporter or usual(),
+        reporter=reporter or usual_of_long_work(),
         workers=workers,
         on_log=callback,
     )
@@ -245,6 +246,12 @@ def _check_arguments(
                 f"{name} = {kind!r}: train takes the name of one, since a resumed run reads its "
                 "options from a file; functions are for environments that you train in yourself"
             )
+    for name, given, known in (
+        ("observation", observation, get_args(ObservationName)),
+        ("reward", reward, get_args(RewardName)),
+    ):
+        if given is not None and given not in known:
+            raise UnknownNameError(name, given, known)
     if callback is not None and not callable(callback):
         raise OptionError(f"callback = {callback!r}: must be a function, or None")
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass
 
-from ugat_marl.experiments.row_names import DIRECT, GROUNDED_NAME
+from ugat_marl.experiments.row_names import CONTROL, DIRECT, GROUNDED_NAME
 from ugat_marl.experiments.scores import Evaluation, seconds_text
 from ugat_marl.experiments.statistics import PairedTest
 
@@ -24,6 +24,7 @@ class TransferOutcome:
         test: Its ATT minus that of direct transfer in episodes with the same vehicles, s.
         rule: Name of the best rule there; "" if none was sought.
         rule_s: Mean ATT of that rule, s; nan without one.
+        control_s: Mean ATT there after as much more training in plain sim, s; nan without it.
     """
 
     real: str
@@ -32,6 +33,7 @@ class TransferOutcome:
     test: PairedTest
     rule: str
     rule_s: float
+    control_s: float = math.nan
 
     @property
     def shown(self) -> bool:
@@ -64,6 +66,8 @@ class TransferOutcome:
             )
         else:
             text = f"{begin}; some of the {n} episodes have no travel time, so no test is possible"
+        if not math.isnan(self.control_s):
+            text += f"; after as many more episodes in plain sim, {seconds_text(self.control_s)} s"
         if self.rule:
             text += f"; the best rule there, {self.rule}, needs {seconds_text(self.rule_s)} s"
         return f"{text}."
@@ -87,6 +91,7 @@ def outcome_of(evaluation: Evaluation) -> TransferOutcome | None:
     own, direct = (evaluation.values(name, real, "att_s") for name in (policy, DIRECT))
     rule = evaluation.best_rule_policy(real)
     rule_s = math.nan if rule is None else evaluation.estimate(rule, real, "att_s").mean
+    plain = CONTROL in evaluation.policies
     return TransferOutcome(
         real,
         policy,
@@ -94,4 +99,5 @@ def outcome_of(evaluation: Evaluation) -> TransferOutcome | None:
         PairedTest.of(own, direct),
         evaluation.best_rule(real) or "",
         rule_s,
+        evaluation.estimate(CONTROL, real, "att_s").mean if plain else math.nan,
     )

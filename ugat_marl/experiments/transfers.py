@@ -331,7 +331,8 @@ def transfer(
         begun = any(path for name in names for path in folder.glob(f"*/{name}"))
         if begun and not resume:
             raise OptionError(
-                f"{directory} holds a run already; use --resume to go on with it, or another --out"
+                f"{directory} holds a run already; resume it (--resume, or resume=True in Python), "
+                "or choose another folder (--out)"
             )
         if resume and not begun:
             reporter.say(f"note: {directory} holds no run to go on with; a new one begins")

@@ -18,6 +18,7 @@ import io
 import json
 import sys
 import tempfile
+import traceback
 import warnings
 import zipfile
 from collections import deque
@@ -37,7 +38,7 @@ from ugat_marl.envs import (
     StepResult,
     checked_phases,
 )
-from ugat_marl.errors import CheckpointError, OptionError, UgatMarlError
+from ugat_marl.errors import ActionError, CheckpointError, OptionError, UgatMarlError
 from ugat_marl.files import (
     MALFORMED,
     OWN_COUNTERS,
@@ -259,7 +260,11 @@ class OwnLearner:
         if episodes > 0:
             counted = CountedEnv(env, self.episodes, seed, on_episode)
             self._shared = [counted, env, env.unwrapped]
-            self._given.learn(counted, episodes)
+            try:
+                self._given.learn(counted, episodes)
+            except ActionError as error:
+                line = _last_line_in(type(self._given), error)
+                raise ActionError(f"learner {self._name!r}{line}: {error}") from error
             played, self.episodes = counted.episodes - self.episodes, counted.episodes
             if played < episodes:
                 raise OptionError(
@@ -549,6 +554,17 @@ def _takes(function: Callable[..., Any], number: int, *names: str) -> bool:
     except ValueError:  # a function in C without a signature
         return True
     return True
+
+
+def _last_line_in(kind: type, error: BaseException) -> str:
+    """Return where in a class's file an error came up, as " (FILE, line 7)"; "" if not there."""
+    try:
+        file = inspect.getsourcefile(kind)
+    except TypeError:  # a class without a source
+        return ""
+    frames = traceback.extract_tb(error.__traceback__)
+    lines = [frame.lineno for frame in frames if frame.filename == file]
+    return f" ({file}, line {lines[-1]})" if lines else ""
 
 
 def _sees_infos(act: Callable[..., Any]) -> bool:

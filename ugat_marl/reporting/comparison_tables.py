@@ -9,6 +9,7 @@ import textwrap
 from collections.abc import Callable, Mapping
 from typing import Any
 
+import numpy as np
 from rich.console import Group, RenderableType
 from rich.text import Text
 
@@ -214,7 +215,8 @@ def _meaning(comparison: Comparison, direct: str) -> list[str]:
     ]
     lowest: dict[str, list[str]] = {}
     for target in comparison.targets:
-        lowest.setdefault(comparison.best(target), []).append(target)
+        best = "all settings alike" if _all_alike(comparison, target) else comparison.best(target)
+        lowest.setdefault(best, []).append(target)
     best = joined([f"`{setting}` in {joined(targets)}" for setting, targets in lowest.items()])
     first = (
         f"Better than direct transfer in every domain, with p < {CERTAIN:g} in each: "
@@ -239,6 +241,13 @@ def _meaning(comparison: Comparison, direct: str) -> list[str]:
         "",
         *textwrap.wrap(f"{first} Lowest mean travel time: {best}.", PAGE_WIDTH),
     ]
+
+
+def _all_alike(comparison: Comparison, target: str) -> bool:
+    """Return True if several settings have the same travel times in a domain, to the last digit."""
+    there = [name for name in comparison.settings if comparison.has(name, target)]
+    values = [comparison.values(name, target, "att_s") for name in there]
+    return len(there) > 1 and all(np.array_equal(values[0], one) for one in values[1:])
 
 
 def _better_everywhere(comparison: Comparison, setting: str, direct: str) -> bool:

@@ -66,8 +66,8 @@ def rows_of(reader: csv.DictReader[str], path: Path) -> Iterator[dict[str, str]]
             cells: dict[Any, Any] = {**row}
             if more := [text for text in cells.get(None) or () if text.strip()]:
                 raise ScenarioError(
-                    f"{path}, line {reader.line_num}: {more[0]!r} is beyond the last column; a "
-                    "decimal comma needs semicolons between the columns"
+                    f"{path}, line {reader.line_num}: {more[0]!r} is beyond the last column; put "
+                    "cells that hold commas in quotes, or semicolons between the columns"
                 )
             if comma_is_point:
                 row = {k: with_point(v) if isinstance(v, str) else v for k, v in cells.items()}

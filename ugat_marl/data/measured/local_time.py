@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 import zoneinfo
 from collections.abc import Mapping
 from dataclasses import dataclass
@@ -148,8 +149,8 @@ def _times(path: Path, cells: pl.Series, time_zone: str, start: int, mapping: st
     if cells.dtype.time_zone is not None:
         if not time_zone:
             raise MeasuredDataError(
-                f"{path}: {cells.name} has the time zone {cells.dtype.time_zone}; write the "
-                f"street's own in {mapping}, such as America/Denver"
+                f"{path}: {cells.name} has offsets from UTC, such as +01:00; write the street's "
+                f"own time_zone in {mapping}, such as America/Denver"
             )
         return cells.dt.convert_time_zone("UTC").dt.cast_time_unit("us")
     return cells.cast(pl.Datetime("us"))
@@ -169,8 +170,11 @@ def _parsed(path: Path, cells: pl.Series, start: int) -> pl.Series:
     if wrong.any():
         at = int(wrong.arg_true()[0])
         unit = "row" if path.suffix == ".parquet" else "line"
+        text = str(cells[at])[:40]
+        dotted = re.fullmatch(r"(\d{1,2})\.(\d{1,2})\.(\d{4})[ T]+(\d.*)", text, re.ASCII)
+        day, month, year, clock = dotted.groups() if dotted else ("05", "03", "2024", "07:00:00.1")
         raise MeasuredDataError(
-            f"{path}, {unit} {at + start}: {cells.name} is {str(cells[at])[:40]!r}; write it as "
-            "2024-03-05 07:00:00.1"
+            f"{path}, {unit} {at + start}: {cells.name} is {text!r}; write it as "
+            f"{year}-{month:0>2}-{day:0>2} {clock}"
         )
     return best

@@ -34,6 +34,8 @@ MOST_OUTSIDE = 0.5
 """Largest share of a period's rows that may lie outside of the period."""
 HOUR_S = 3600.0
 """Step of a clock at the begin and end of daylight saving."""
+QUARTER_S, MOST_HOURS = 900.0, 14
+"""Difference from whole hours, in s, and most hours, at which a log seems to be in another zone."""
 EPOCH = 1e8
 """Times above this are dates, not seconds of a scenario."""
 
@@ -556,20 +558,28 @@ def report_outside(
         findings: Findings.
 
     Raises:
-        MeasuredDataError: Most rows of a period lie outside of it.
+        MeasuredDataError: Most rows of a period lie outside of it, and the others do not reach from
+            its begin to its end, as those of a longer log do.
     """
     total = np.bincount(which, minlength=len(periods))
     outside = np.bincount(which[~inside], minlength=len(periods))
     for period, rows, lost in zip(periods, total, outside, strict=True):
-        if lost > MOST_OUTSIDE * rows:
-            example = time[~inside & (which == periods.index(period))][0]
-            away = max(period.begin_s - example, example - period.end_s)
+        own = which == periods.index(period)
+        if lost > MOST_OUTSIDE * rows and not _reaches_through(time[own & inside], period):
+            example = time[own & ~inside][0]
             if abs(example) > EPOCH:
                 hint = "these are dates; subtract the moment at which the scenario's clock is 0"
-            elif away <= HOUR_S:
-                hint = "is a clock an hour off (daylight saving), or the period too short?"
+            elif hours := _hours_off(time[own], period):
+                hint = (
+                    f"the log seems to be {counted(abs(hours), 'hour')} "
+                    f"{'early' if hours < 0 else 'late'}: is it in another time zone, such as UTC, "
+                    "or was daylight saving forgotten?"
+                )
             else:
-                hint = "write times in seconds of the scenario's clock"
+                hint = (
+                    "write times in seconds of the scenario's clock, or local times with the "
+                    "period's own zero; or is the period too short?"
+                )
             raise MeasuredDataError(
                 f"{path}: {lost} of {rows} rows of period {period.id!r} lie outside of it "
                 f"({period.begin_s:g} s to {period.end_s:g} s), the first at {example:g} s; {hint}"
@@ -579,6 +589,24 @@ def report_outside(
     findings.append(
         Finding(f"{path.name}: {lost} of {len(time)} rows lie outside of their periods ({names})")
     )
+
+
+def _reaches_through(inside_s: NDArray[np.float64], period: Period) -> bool:
+    """Return True if rows reach from the first to the last tenth of a period."""
+    margin = 0.1 * period.length_s
+    return bool(
+        len(inside_s)
+        and inside_s.min() <= period.begin_s + margin
+        and inside_s.max() >= period.end_s - margin
+    )
+
+
+def _hours_off(time_s: NDArray[np.float64], period: Period) -> int:
+    """Return the whole hours by which a log as long as its period is late; 0 for none."""
+    off_s = (time_s.min() + time_s.max() - period.begin_s - period.end_s) / 2
+    hours = round(off_s / HOUR_S)
+    like = abs(off_s - hours * HOUR_S) <= QUARTER_S and abs(hours) <= MOST_HOURS
+    return hours if like else 0
 
 
 def in_order(

@@ -201,8 +201,10 @@ def _refuse_all_outside(rows: Sequence[Row], path: Path, begin_s: float, end_s: 
         )
 
 
-_CLOCK = re.compile(r"(\d{1,2}):([0-5]\d)(?::([0-5]\d))?", re.ASCII)
-"""A time of day such as 7:00 or 07:00:00."""
+_CLOCK = re.compile(
+    r"(?:\d+[-./]\d+[-./]\d+[ T]+)?(\d{1,2}):([0-5]\d)(?::([0-5]\d)(?:\.\d+)?)?", re.ASCII
+)
+"""A time of day such as 7:00 or 07:00:00, with a date before it or without."""
 
 
 def _number(text: str | None, key: str, where: str) -> float:
@@ -217,8 +219,9 @@ def _number(text: str | None, key: str, where: str) -> float:
                 "; write whole numbers without separators, and leave it blank where nobody counted"
             )
         elif clock := _CLOCK.fullmatch((text or "").strip()):
-            hours, minutes, seconds = (int(part or 0) for part in clock.groups())
-            way_out = f"; write seconds: {3600 * hours + 60 * minutes + seconds}"
+            hours, minutes, seconds = (int(part or 0) for part in clock.groups("0"))
+            of_day = ", counted from midnight" if re.search("[-./]", text or "") else ""
+            way_out = f"; write seconds: {3600 * hours + 60 * minutes + seconds}{of_day}"
         raise ScenarioError(f"{where}: {key} = {text!r} is not a number of at least 0{way_out}")
     return value
 
