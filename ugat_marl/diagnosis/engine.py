@@ -199,6 +199,8 @@ class Engine:
         interval_s: Length of the intervals whose features are compared, s; None for none.
         supplementary: Measured turning counts, travel times and states of lanes; None without any.
         holes: Times in which nothing was recorded, begin and end in s.
+        compared: True for the sums that the data hold, ``(features, places, 1)``; None for all.
+            Means over several places are then of the same places in both.
     """
 
     def __init__(
@@ -217,6 +219,7 @@ class Engine:
         interval_s: float | None = None,
         supplementary: SupplementaryData | None = None,
         holes: Sequence[tuple[float, float]] = (),
+        compared: NDArray[np.bool_] | None = None,
     ) -> None:
         self._base_days = base_days
         self._interval_s = interval_s
@@ -253,6 +256,9 @@ class Engine:
         head += (replay.day_to_day,) if replay.day_to_day else ()
         head += ("intervals", interval_s) if interval_s else ()
         head += (supplementary,) if supplementary else ()
+        self._compared = compared
+        if compared is not None and not compared.all():
+            head += (hashlib.sha256(np.packbits(compared).tobytes()).hexdigest(),)
         self._root = hashlib.sha256(repr(head).encode()).hexdigest()
         self._edges = sorted({edge for _, edge, _ in layout.places})
         self._signals = [_signals_hash(period, replay.answering) for period in periods]
@@ -506,6 +512,8 @@ class Engine:
         counted = tally(self.layout, period, self._greens[self.place_of(number)], self._thresholds)
         if self._interval_s is not None:
             counted = with_intervals(counted, self.layout, period, self._interval_s)
+        if self._compared is not None:
+            counted = replace(counted, sums=counted.sums * self._compared)
         if self._supplementary is not None:
             measured = self.periods[self.place_of(number)]
             supplementary = self._supplementary.simulated(

@@ -197,6 +197,8 @@ class Study:
         fit = _tallies(layout, measured, periods, thresholds, supplementary)
         heldout = _tallies(layout, measured, measured.of("heldout"), thresholds, supplementary)
         variation = measured_variation(layout, measured, (fit, heldout), thresholds)
+        # Single vehicles that nobody saw are a finding; counts that nobody made are none.
+        compared = None if measured.has_events else sum_of((*fit, *heldout)).sums[..., 1:] > 0
         measured = _noted(measured, variation_findings(variation, len(measured.periods)))
 
         def simulating(answering: bool, base_days: int) -> Engine:
@@ -224,6 +226,7 @@ class Study:
                 interval_s=None if measured.has_events else usual_length(measured.counts),
                 supplementary=supplementary,
                 holes=holes,
+                compared=compared,
             )
 
         return cls(

@@ -12,8 +12,9 @@ import polars as pl
 import pytest
 
 from ugat_marl.data import Finding, MeasuredData, recording_holes
-from ugat_marl.diagnosis import DiagnosisConfig
+from ugat_marl.diagnosis import DiagnosisConfig, Study
 from ugat_marl.diagnosis.engine import OutOfTime
+from ugat_marl.diagnosis.statistics import sum_of
 from ugat_marl.diagnosis.thresholds import Effort
 from ugat_marl.diagnosis.unmeasured import without_holes
 from ugat_marl.errors import MeasuredDataError, OptionError, UnknownNameError
@@ -83,6 +84,22 @@ def test_a_hole_in_the_recording_is_no_effect(
     (effect,) = found["effects"]
     assert (effect["name"], effect["place"]) == ("undercount", "stop:S_C_0")
     assert effect["parameters"]["share"]["value"] == pytest.approx(0.3, abs=0.06)
+
+
+def test_a_count_that_is_missing_is_missing_in_simulated_days_too(street) -> None:
+    """Else means over lanes would be of other lanes in the data than in the simulation."""
+    counted = counts_of(street.measure("sim"), 300.0)
+    row = (pl.col("detector_id") == "stop:S_C_0") & (pl.col("period_id") == "day2")
+    late = counted.counts.filter(~(row & (pl.col("begin_s") == 300.0)))
+    assert len(late) == len(counted.counts) - 1
+    config = DiagnosisConfig(cache=street.cache, effort=FEW)
+    held = {}
+    for name, counts in (("whole", counted.counts), ("late", late)):
+        study = Study.of(street.scenario, replace(counted, counts=counts), config)
+        (day,) = study.engine.replicates([], [0])
+        held[name] = day.tally.sums[..., 1] > 0
+        assert np.array_equal(held[name], sum_of((*study.fit, *study.heldout)).sums[..., 1] > 0)
+    assert held["whole"].sum() > held["late"].sum()
 
 
 def test_without_held_out_periods_it_is_said(

@@ -422,7 +422,7 @@ def _of_silence(measured: MeasuredData) -> Iterator[Finding]:
         times = {name: _times(period, name) for name in period.passages}
         together = np.concatenate(list(times.values()))
         begin, length = _longest_gap(together, period)
-        hole = _is_hole(together, begin, length)
+        hole = _is_hole(together, begin, length, period)
         if hole or length > ALL_SILENT_S:
             left_out = hole and _lights_change(period, begin, begin + length)
             what_then = (
@@ -454,17 +454,20 @@ def _of_silence(measured: MeasuredData) -> Iterator[Finding]:
 def recording_holes(periods: Sequence[Period]) -> tuple[tuple[float, float], ...]:
     """Return begin and end of the times, in s, in which a recording of events was interrupted.
 
-    All detectors say nothing for longer than a cycle, they are busy before and after it, and the
-    lights go on changing. The times of all periods are put together, in order and apart.
+    All detectors say nothing for longer than a cycle, or to the end of the period, they are busy
+    before and after it, and the lights go on changing. The times of all periods are put together,
+    in order and apart.
     """
     found: list[tuple[float, float]] = []
     for period in periods:
         times = np.sort(
             np.concatenate([np.empty(0), *(_times(period, x) for x in period.passages)])
         )
-        for place in np.flatnonzero(np.diff(times) > HOLE_S):
-            begin, end = times[place : place + 2].tolist()
-            if _is_hole(times, begin, end - begin) and _lights_change(period, begin, end):
+        marks = np.append(times, period.end_s)
+        for place in np.flatnonzero(np.diff(marks) > HOLE_S):
+            begin, end = marks[place : place + 2].tolist()
+            hole = _is_hole(times, begin, end - begin, period)
+            if hole and _lights_change(period, begin, end):
                 found.append((begin, end))
     apart: list[tuple[float, float]] = []
     for begin, end in sorted(found):
@@ -479,12 +482,13 @@ def _lights_change(period: Period, begin_s: float, end_s: float) -> bool:
     return any(begin_s < time < end_s for log in period.signals.values() for time, _ in log)
 
 
-def _is_hole(times: NDArray[np.float64], begin_s: float, length_s: float) -> bool:
+def _is_hole(times: NDArray[np.float64], begin_s: float, length_s: float, period: Period) -> bool:
     """Return True for a silence longer than a cycle with busy times before and after it."""
     end_s = begin_s + length_s
     before = int(((times > begin_s - length_s) & (times <= begin_s)).sum()) // 2
     after = int(((times >= end_s) & (times < end_s + length_s)).sum()) // 2
-    return length_s > HOLE_S and min(before, after) >= BUSY
+    busy_after = after >= BUSY or end_s >= period.end_s
+    return length_s > HOLE_S and before >= BUSY and busy_after
 
 
 def _usual_rates(measured: MeasuredData) -> dict[str, float]:
