@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from ugat_marl.diagnosis import Hypothesis, Reference, Tally
 from ugat_marl.diagnosis.engine import Engine, OrdinaryDays, Replicate
 from ugat_marl.diagnosis.features import BIN_FEATURES, FEATURES
-from ugat_marl.diagnosis.fit import Fitter, _may_move, uncertainty
+from ugat_marl.diagnosis.fit import Fitter, _may_move, _shifted, uncertainty
 from ugat_marl.diagnosis.hypotheses import Members
 from ugat_marl.diagnosis.propose import Direction
 from ugat_marl.diagnosis.records import Fitted
@@ -477,3 +477,12 @@ def test_steps_make_an_interval_wide_and_straight_ways_do_not() -> None:
     seen, same = uncertainty(stepped, model, steps=True)
     assert 3.0 * blind[0] < seen[0] < 0.5
     assert (same["network"] == kept["network"]).all(), "what the model shows is known as it was"
+
+
+@pytest.mark.parametrize("name", ["dropout", "stuck", "lane_closure"])
+def test_windows_that_a_log_shows_are_not_moved(name: str) -> None:
+    place = "detector" if name != "lane_closure" else "lane"
+    fixed = ((place, "S_C_0"), ("begin_s", 300.0), ("end_s", 600.0))
+    hypothesis = Hypothesis(name, fixed, (), ((),), None)
+    moved = _shifted(hypothesis, (60.0, 0.0), 60.0)
+    assert (moved == hypothesis) is (name != "lane_closure")

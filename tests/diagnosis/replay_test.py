@@ -11,7 +11,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from ugat_marl.diagnosis.features import DetectorLayout
-from ugat_marl.diagnosis.replay import Day, Replay, replay_document
+from ugat_marl.diagnosis.replay import Day, Replay, _from, replay_document
 from ugat_marl.diagnosis.thresholds import Thresholds
 from ugat_marl.effects import apply_effects, load_scenario, parse_domain
 from ugat_marl.errors import MeasuredDataError, SimulatorError
@@ -106,6 +106,15 @@ def test_before_the_period_its_own_beginning_is_shown(scenario: Scenario) -> Non
     alone = shown(scenario, period)
     assert seconds[:600] == alone[:600]
     assert seconds[600:] == alone
+
+
+def test_before_a_short_period_it_is_shown_as_often_as_needed(scenario: Scenario) -> None:
+    """Else the lights would stand still for the rest of the warm-up."""
+    log: SignalLog = ((1000.0, "Gr"), (1030.0, "rG"))
+    again = _from(log, a_period(log, 1000.0, 1060.0), 850.0)
+    early = [850.0 + 30.0 * k for k in range(5)]
+    assert [time for time, _ in again] == [*early, 1000.0, 1030.0]
+    assert [state for _, state in again] == ["Gr", "rG", "Gr", "rG", "Gr", "Gr", "rG"]
 
 
 def test_a_lost_time_keeps_links_red_behind_every_start_of_green(scenario: Scenario) -> None:

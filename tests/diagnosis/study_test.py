@@ -27,10 +27,10 @@ from ugat_marl.diagnosis.engine import Engine
 from ugat_marl.diagnosis.features import BIN_FEATURES, FEATURES, INDEX, DetectorLayout
 from ugat_marl.diagnosis.replay import Replay
 from ugat_marl.diagnosis.statistics import Pools
-from ugat_marl.diagnosis.study import effort_for
+from ugat_marl.diagnosis.study import _of_common_windows, effort_for
 from ugat_marl.diagnosis.thresholds import Effort, Thresholds
 from ugat_marl.effects import Effect, Headway, load_scenario
-from ugat_marl.errors import MeasuredDataError
+from ugat_marl.errors import MeasuredDataError, OptionError
 from ugat_marl.progress import Silent
 from ugat_marl.scenarios import Detector, Network, Passages, Period
 from ugat_marl.simulation import standard_detectors
@@ -262,10 +262,44 @@ def test_an_interval_that_was_not_reported_is_no_quieter_day() -> None:
     known[:, :, 2] = 0.0
     sums = np.zeros((len(FEATURES), 1, 2))
     days = [Tally(sums, bins), Tally(sums, bins * known, known=known)]
-    layout = SimpleNamespace(lanes=(SimpleNamespace(intersection=0),), intersections=("C",))
+    layout = SimpleNamespace(
+        lanes=(SimpleNamespace(intersection=0),), exits=(), intersections=("C",)
+    )
     given = SimpleNamespace(periods=measured(NAMES, NAMES).periods)
     found = measured_variation(cast(Any, layout), cast(Any, given), (days, ()), THRESHOLDS)
     assert found == 0.0
+
+
+def test_exit_detectors_alone_tell_how_days_vary() -> None:
+    layout = SimpleNamespace(
+        lanes=(SimpleNamespace(intersection=0),), exits=((0, "C_N_0", "out"),), intersections=("C",)
+    )
+    days = []
+    for level in (0.6, 0.8, 0.9, 1.1, 1.3, 1.3):
+        bins = np.zeros((len(BIN_FEATURES), 2, 4))
+        bins[BIN_FEATURES.index("count_exit"), 1] = 500.0 * level
+        days.append(Tally(np.zeros((len(FEATURES), 2, 2)), bins))
+    given = SimpleNamespace(periods=measured(NAMES, NAMES).periods)
+    found = measured_variation(cast(Any, layout), cast(Any, given), (days, ()), THRESHOLDS)
+    assert found == pytest.approx(0.27, abs=0.08)
+
+
+def test_windows_that_nearly_agree_are_one_time_of_day() -> None:
+    day = measured(NAMES, NAMES).periods[0]
+    begin_s, end_s = day.window
+    ends = (end_s, end_s - 0.2, end_s, end_s - 100.0)
+    found = _of_common_windows(tuple(replace(day, end_s=end) for end in ends))
+    assert [period.window for period in found] == [
+        *[(begin_s, end_s - 0.2)] * 3, (begin_s, end_s - 100.0)
+    ]  # fmt: skip
+
+
+@pytest.mark.parametrize(
+    ("numbers", "told"), [((1, 1, 1, 1), "effort base = 1"), ((8, 0, 1, 8), "effort bank = 0")]
+)
+def test_an_effort_without_days_is_refused(numbers: tuple[int, ...], told: str) -> None:
+    with pytest.raises(OptionError, match=told):
+        Effort(*numbers)
 
 
 @pytest.mark.parametrize(

@@ -339,13 +339,17 @@ def test_two_tests_as_a_whole() -> None:
     assert np.mean([combined(p, 1.0) < 0.05 for p in product]) == pytest.approx(0.05, abs=0.003)
 
 
+def worse_by(rival: Any, best: Any) -> float:
+    return rival.cost - best.cost
+
+
 @pytest.mark.parametrize(("settled", "named"), [(110.0, 1), (140.0, 0)])
 def test_a_rival_is_as_near_after_as_many_days(settled: float, named: int) -> None:
     best: Any = SimpleNamespace(model=SimpleNamespace(members=((HEADWAY, (1.5,)),), cost=100.0))
     rival: Any = SimpleNamespace(members=((PARKING, (20.0,)),), cost=105.0)  # of few days
     again = SimpleNamespace(members=rival.members, cost=settled)
     tested = SimpleNamespace(model=again, residual=SimpleNamespace(p=0.5))
-    selector: Any = SimpleNamespace(test=lambda _model: tested)
+    selector: Any = SimpleNamespace(test=lambda _model: tested, worse_by=worse_by)
     selection = Selected(best, (rival,), True, examined=frozenset())
     assert len(_rivals(selection, selector, DiagnosisConfig())) == named
 
@@ -359,7 +363,8 @@ def test_the_same_effect_elsewhere_is_a_rival(edge: str, named: int) -> None:
     best: Any = SimpleNamespace(model=slow("S_C", 100.0))
     other = slow(edge, 100.1)
     selector: Any = SimpleNamespace(
-        test=lambda model: SimpleNamespace(model=model, residual=SimpleNamespace(p=0.5))
+        test=lambda model: SimpleNamespace(model=model, residual=SimpleNamespace(p=0.5)),
+        worse_by=worse_by,
     )
     selection = Selected(best, (other,), True, examined=frozenset())
     assert len(_rivals(selection, selector, DiagnosisConfig())) == named

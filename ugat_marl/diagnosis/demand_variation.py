@@ -82,9 +82,14 @@ def measured_variation(
     rows: list[Array] = []
     for number in range(len(layout.intersections)):
         lanes = np.flatnonzero(owners == number)
+        exits = [len(owners) + k for k, (own, *_) in enumerate(layout.exits) if own == number]
         by_kind = [
-            np.array([(day.bins * known)[kind, lanes].sum() for day in days])
-            for kind in (BIN_FEATURES.index("count_stop"), BIN_FEATURES.index("count_advance"))
+            np.array([(day.bins * known)[BIN_FEATURES.index(kind), places].sum() for day in days])
+            for kind, places in (
+                ("count_stop", lanes),
+                ("count_advance", lanes),
+                ("count_exit", exits),
+            )
         ]
         rows.append(max(by_kind, key=lambda counts: float(counts.sum())))
     numbers = [number for number, split in enumerate(splits) for _ in split]

@@ -12,7 +12,13 @@ from numpy.typing import NDArray
 
 from ugat_marl.diagnosis.engine import Engine
 from ugat_marl.diagnosis.features import Tally
-from ugat_marl.diagnosis.hypotheses import WINDOW, Hypothesis, Members, effects_of
+from ugat_marl.diagnosis.hypotheses import (
+    WINDOW,
+    WINDOWS_IN_THE_LOG,
+    Hypothesis,
+    Members,
+    effects_of,
+)
 from ugat_marl.diagnosis.propose import Direction
 from ugat_marl.diagnosis.records import Fitted
 from ugat_marl.diagnosis.statistics import (
@@ -378,13 +384,15 @@ def _moved_a_little(
 def _shifted(hypothesis: Hypothesis, move: tuple[float, float], shortest_s: float) -> Hypothesis:
     """Return the hypothesis with a moved window; itself without a window or if it gets too short.
 
+    The silence of a detector, and a time for which it is on, are read off its log and stay.
+
     Args:
         hypothesis: The hypothesis.
         move: Moves of start and end, s.
         shortest_s: Shortest window, s.
     """
     known = dict(hypothesis.fixed)
-    if not set(WINDOW) <= known.keys():
+    if not set(WINDOW) <= known.keys() or hypothesis.name in WINDOWS_IN_THE_LOG:
         return hypothesis
     begin, end = (known[name] + shift for name, shift in zip(WINDOW, move, strict=True))
     if begin < 0 or end - begin < shortest_s:

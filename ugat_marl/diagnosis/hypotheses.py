@@ -21,6 +21,8 @@ from ugat_marl.scenarios import Scenario
 
 WINDOW = ("begin_s", "end_s")
 """Names of the fields of an effect's window."""
+WINDOWS_IN_THE_LOG = frozenset({"dropout", "stuck"})
+"""Effects whose window is exact: single events of a detector say when it began and ended."""
 ORDER = (
     "local_speed", "demand_level", "demand_surge", "demand_timing", "turning", "lane_closure",
     "parking",

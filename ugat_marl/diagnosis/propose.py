@@ -111,7 +111,8 @@ def propose(
             kept = _useful(best, directions, thresholds.most_in_triples)
         for chosen in itertools.combinations(kept, size):
             keys = tuple(sorted(str(directions[index].hypothesis.key) for index in chosen))
-            if len(set(keys)) < size:
+            models = sum(directions[index].hypothesis.name == "driver_model" for index in chosen)
+            if len(set(keys)) < size or models > 1:
                 continue
             signs = tuple(directions[index].hypothesis.both for index in chosen)
             strengths = _least_squares(gram, match, chosen, signs, thresholds)

@@ -199,12 +199,15 @@ class Selected:
         rivals: All sets of effects that were simulated, least cost first.
         complete: True if the search ended by itself, False if the budget ended it.
         examined: Names of effects that were simulated, or for which no place was suspicious.
+        runner_up_is_worse_by: Cost of the best model with other effects, or with the same ones
+            elsewhere, above that of `best` on as many days; None without one.
     """
 
     best: Tested
     rivals: tuple[Fitted, ...]
     complete: bool
     examined: frozenset[str]
+    runner_up_is_worse_by: float | None = None
 
 
 @dataclass(frozen=True)

@@ -10,6 +10,7 @@ Under signals that follow the traffic, days get the measured arrivals (`arrivals
 from __future__ import annotations
 
 import functools
+import math
 import tempfile
 import threading
 import xml.etree.ElementTree as ET
@@ -354,11 +355,21 @@ def replay_document(
 
 
 def _from(log: SignalLog, period: Period, begin_s: float) -> SignalLog:
-    """Return the log from `begin_s` on; the time before the period repeats the log's beginning."""
+    """Return the log from `begin_s` on; the time before the period repeats the log's beginning.
+
+    A period shorter than this time is repeated as often as needed.
+    """
     early = period.begin_s - begin_s
     if early <= 0:
         return log
-    again = [(time - early, state) for time, state in log if time - early < period.begin_s]
+    again = [
+        (shown, state)
+        for turn in range(math.ceil(early / period.length_s))
+        for time, state in log
+        if (shown := (max(time, period.begin_s) if turn else time) - early + turn * period.length_s)
+        < period.begin_s
+        and time < period.end_s
+    ]
     return (*again, *((max(time, period.begin_s), state) for time, state in log))
 
 

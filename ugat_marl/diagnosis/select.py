@@ -144,7 +144,19 @@ class Selector:
 
     def _selected(self, best: Tested, located: Located, *, complete: bool) -> Selected:
         rivals = tuple(sorted(self._seen.values(), key=cost_of))
-        return Selected(best, rivals, complete, located.examined | self.examined)
+        own = {hypothesis.key for hypothesis, _ in best.model.members}
+        others = [x for x in rivals if {hypothesis.key for hypothesis, _ in x.members} != own]
+        worse_by = self.worse_by(others[0], best.model) if others else None
+        return Selected(best, rivals, complete, located.examined | self.examined, worse_by)
+
+    def worse_by(self, rival: Fitted, best: Fitted) -> float:
+        """Return the cost of a model above that of the best one on as many days.
+
+        More days lower the cost of a model, and few models are simulated on many.
+        """
+        days = len(rival.days)
+        alike = best if len(best.days) == days else self._fitter.simulate(best.members, days)
+        return rival.cost - alike.cost
 
     @property
     def held(self) -> frozenset[int]:

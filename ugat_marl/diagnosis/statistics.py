@@ -235,7 +235,13 @@ class Reference:
         """Make a block from sums ``(days, members, features, 2)``."""
         timed = name == "time"
         means = max(1, len(self.stretches)) if prior is None else 1
-        mean, variance, weight, residual = _moments(sums, self._thresholds, means)
+        mean, variance, weight, residual = _moments(sums, means)
+        least = (
+            np.full(sums.shape[2], self._thresholds.grain)
+            if timed
+            else _grain(sums.shape[2], self._thresholds)
+        )
+        variance = np.maximum(variance, (least / np.maximum(weight, 1.0)) ** 2)
         if timed:
             variance = _smoothed(mean, variance, self._thresholds)
         error = variance / len(sums)
@@ -426,9 +432,7 @@ def _smoothed(mean: Array, variance: Array, thresholds: Thresholds) -> Array:
     return np.maximum(mixed, thresholds.least_count_variance)
 
 
-def _moments(
-    sums: Array, thresholds: Thresholds, means: int = 1
-) -> tuple[Array, Array, Array, Array]:
+def _moments(sums: Array, means: int = 1) -> tuple[Array, Array, Array, Array]:
     """Return ratio estimates from sums ``(days, members, features, 2)``.
 
     With sums s and numbers of observations n: mean m = Σs / Σn, residual of a day
@@ -436,7 +440,6 @@ def _moments(
 
     Args:
         sums: Sums and numbers of observations.
-        thresholds: Numbers of the method.
         means: Number of means that were taken off the days: one for each stretch of the day.
 
     Returns:
@@ -448,16 +451,15 @@ def _moments(
     mean = total[..., 0] / np.maximum(total[..., 1], 1e-9)
     residual = (sums[..., 0] - mean * sums[..., 1]) / np.maximum(weight, 1e-9)
     variance = (residual**2).sum(axis=0) / max(len(sums) - means, 1)
-    grain = (_grain(sums.shape[2], thresholds) / np.maximum(weight, 1.0)) ** 2
     mean = np.where(weight > 0, mean, np.nan)
-    return mean, np.maximum(variance, grain), weight, residual
+    return mean, variance, weight, residual
 
 
 def _moved(
     mean: Array, residual: Array, partner: Array, thresholds: Thresholds
 ) -> NDArray[np.bool_]:
     """Mark statistics that differ from those of the same days of the prior model beyond chance."""
-    before, _, _, other = _moments(partner, thresholds)
+    before, _, _, other = _moments(partner)
     days = len(partner)
     noise = ((residual - other) ** 2).sum(axis=0) / max(days - 1, 1) / days
     return np.nan_to_num((mean - before) ** 2, nan=np.inf) > thresholds.certain * noise
@@ -476,7 +478,7 @@ def _controlled(
     The days of the prior model are a control variate: m' = m - b (m_same - m_prior), with b the
     slope of the residuals on those of the prior model.
     """
-    before, _, _, other = _moments(partner, thresholds)
+    before, _, _, other = _moments(partner)
     spread = (other**2).sum(axis=0)
     slope = np.clip(
         (residual * other).sum(axis=0) / np.maximum(spread, 1e-12), 0.0, thresholds.steepest_control
@@ -491,7 +493,7 @@ def _controlled(
 
 @functools.cache
 def _grain(width: int, thresholds: Thresholds) -> Array:
-    """Return the least standard deviation of a sum over a day, by feature or bin of time."""
+    """Return the least standard deviation of a sum over a day, by feature or measure."""
     if width not in (len(FEATURES), len(ALL_FEATURES)):
         return np.full(width, thresholds.grain)
     return np.array(
@@ -569,8 +571,8 @@ def change_between(
     difference: dict[str, Array] = {}
     variance: dict[str, Array] = {}
     for name in new:
-        mean, _, _, left = _moments(new[name], pools.thresholds)
-        base, _, _, right = _moments(old[name], pools.thresholds)
+        mean, _, _, left = _moments(new[name])
+        base, _, _, right = _moments(old[name])
         difference[name] = np.nan_to_num(mean - base)
         days = len(after)
         spread = ((left - right) ** 2).sum(axis=0) / max(days - 1, 1)

@@ -66,6 +66,9 @@ from ugat_marl.scenarios import (
     SpeedPoint,
 )
 
+SAME_TIME_S = 0.5
+"""Difference of the begins, ends or lengths of periods that are meant to be the same, s."""
+
 
 @dataclass(frozen=True)
 class DiagnosisConfig:
@@ -184,8 +187,8 @@ class Study:
         detectors, findings = compared_detectors(scenario, measured, thresholds)
         measured, data_hash = _noted(measured, findings), measured.hash
         holes = recording_holes(measured.periods)
-        kept = tuple(without_holes(period, holes) for period in measured.periods)
-        measured = replace(measured, periods=kept)
+        kept = (without_holes(period, holes) for period in measured.periods)
+        measured = replace(measured, periods=_of_common_windows(tuple(kept)))
         layout = DetectorLayout.of(network, detectors, scenario.settings.begin_s)
         ruled_out = frozenset(name for finding in measured.findings for name in finding.rules_out)
         allowed = library(config.leave_out) - ruled_out
@@ -623,6 +626,24 @@ def _fitted_periods(measured: MeasuredData, thresholds: Thresholds) -> tuple[Per
     return periods
 
 
+def _of_common_windows(periods: tuple[Period, ...]) -> tuple[Period, ...]:
+    """Return the periods with one window where theirs differ by at most `SAME_TIME_S`.
+
+    The window is what they have in common. Exactly equal windows are days of one time of day.
+    """
+    common: list[Period] = []
+    for period in periods:
+        near = [
+            other
+            for other in periods
+            if abs(other.begin_s - period.begin_s) <= SAME_TIME_S
+            and abs(other.end_s - period.end_s) <= SAME_TIME_S
+        ]
+        begin_s, end_s = max(x.begin_s for x in near), min(x.end_s for x in near)
+        common.append(replace(period, begin_s=begin_s, end_s=end_s))
+    return tuple(common)
+
+
 def _refuse_lengths(periods: Sequence[Period], thresholds: Thresholds) -> None:
     """Refuse periods of different lengths: their statistics are not of one kind.
 
@@ -632,7 +653,7 @@ def _refuse_lengths(periods: Sequence[Period], thresholds: Thresholds) -> None:
     lengths = {period.id: period.length_s for period in periods}
     shortest, longest = min(lengths, key=lengths.__getitem__), max(lengths, key=lengths.__getitem__)
     bins = {bins_in(length, thresholds) for length in lengths.values()}
-    if lengths[longest] - lengths[shortest] > 0.5 or len(bins) > 1:
+    if lengths[longest] - lengths[shortest] > SAME_TIME_S or len(bins) > 1:
         raise MeasuredDataError(
             f"periods.csv: {longest!r} is {lengths[longest]:g} s long, and {shortest!r} only "
             f"{lengths[shortest]:g} s; a diagnosis needs periods of one length, so cut the longer "

@@ -10,6 +10,8 @@ from __future__ import annotations
 import hashlib
 from dataclasses import dataclass, fields
 
+from ugat_marl.errors import require_kinds, require_least
+
 
 @dataclass(frozen=True)
 class Effort:
@@ -28,6 +30,11 @@ class Effort:
     bank: int = 3
     fit: int = 6
     test: int = 36
+
+    def __post_init__(self) -> None:
+        require_kinds(self, "effort")
+        require_least(4, **{"effort base": self.base, "effort test": self.test})
+        require_least(1, **{"effort bank": self.bank, "effort fit": self.fit})
 
 
 EFFORTS = ((4, Effort()), (8, Effort(40, 3, 5, 32)))

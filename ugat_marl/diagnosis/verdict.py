@@ -232,11 +232,11 @@ def _rivals(selection: Selected, selector: Selector, config: DiagnosisConfig) ->
         for rival in selection.rivals
         if len(rival.members) <= len(best.members)
         and not keys_of(rival.members) >= keys
-        and rival.cost - best.cost < config.thresholds.indistinct
+        and selector.worse_by(rival, best) < config.thresholds.indistinct
     ]
     for rival in near[: config.thresholds.rivals_tested]:
         tested = selector.test(rival)
-        # Costs of the search are of fewer days; now both models have equally many.
+        # Costs of the search are of fewer days; now both models have many.
         near_still = tested.model.cost - best.cost < config.thresholds.indistinct
         if tested.residual.p > config.alpha and near_still:
             sufficient.append(tested.model)
@@ -524,4 +524,5 @@ def amount(field: str, value: float, unit: str) -> str:
         return f" × {value:.3g}"
     if field == "share":
         return f" of {100 * value:.3g} %"
-    return f" of {value:.3g} {unit.replace('^2', '²')}".rstrip()
+    text = f"{value:.0f}" if abs(value) >= 100 else f"{value:.3g}"
+    return f" of {text} {unit.replace('^2', '²')}".rstrip()

@@ -75,7 +75,7 @@ ALTERNATIVES = 12
 def diagnose(
     scenario: Scenario,
     measured: MeasuredData,
-    directory: Path,
+    directory: str | Path,
     config: DiagnosisConfig | None = None,
     reporter: Reporter | None = None,
 ) -> Diagnosis:
@@ -98,6 +98,7 @@ def diagnose(
         OutputError: The scenario is the corrected one in `directory`, which would be replaced; or
             the folder of that name there holds something else.
     """
+    directory = Path(directory)
     _require_replaceable(scenario, directory / CORRECTED)
     config = config or DiagnosisConfig()
     reporter = reporter or Silent()
@@ -147,6 +148,11 @@ def _require_replaceable(scenario: Scenario, place: Path) -> None:
         raise OutputError(
             f"{place}: is no scenario, and the corrected one would replace it; move it away, or "
             "give another directory"
+        )
+    if any(inside.is_dir() for inside in place.glob("*")):
+        raise OutputError(
+            f"{place}: holds folders, and the corrected scenario would replace them; move them "
+            "away, or give another directory"
         )
 
 
@@ -591,12 +597,7 @@ def _named(best: Tested, selected: Selected, half_interval: float) -> tuple[Name
     or with the same ones elsewhere, is worse. `half_interval` is half the width of a 95 % interval
     in standard errors.
     """
-    keys = keys_of(best.model.members)
-    others = [rival.cost for rival in selected.rivals if keys_of(rival.members) != keys]
-    # costs of as many days: more days lower the cost of the same model
-    alike = [rival.cost for rival in selected.rivals if keys_of(rival.members) == keys]
-    worse_by = min(others) - min(alike, default=best.model.cost) if others else None
-    grounds = SearchGrounds(best.model.distance.total, worse_by)
+    grounds = SearchGrounds(best.model.distance.total, selected.runner_up_is_worse_by)
     effects: list[NamedEffect] = []
     for place, (hypothesis, values) in enumerate(best.model.members):
         errors = best.errors_of(place)

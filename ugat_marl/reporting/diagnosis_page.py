@@ -410,6 +410,8 @@ def _usual_commands(diagnosis: Diagnosis) -> list[str]:
         options = options if value is None else f"--budget-{option} {value:.15g} {options}"
     if diagnosis.left_out:
         options += " --leave-out " + " ".join(diagnosis.left_out)
+    if diagnosis.unnamed:
+        options += " --unnamed"
     scenario = shlex.quote(diagnosis.scenario)
     lines = [f"ugat-marl diagnose {scenario} MEASURED --out DIR {options}"]
     if diagnosis.corrected:

@@ -36,8 +36,8 @@ MEANINGS: dict[Verdict, str] = {
     "is right in what the data do not show.",
     "explained": "With these effects the simulation could have made the data they were judged "
     "on, and no other explanation of the library comes close.",
-    "not_identifiable": "Several explanations fit equally well. The corrected scenario holds the "
-    "one listed here; which one is true takes another measurement.",
+    "not_identifiable": "Several explanations fit equally well. Which one is true takes another "
+    "measurement.",
     "partially_explained": "These effects take off most of the gap, and yet they are not the whole "
     "explanation. What is missing may bend their values.",
     "provisional": "The search has not ended. What is listed here comes nearest so far and is not "
@@ -54,6 +54,8 @@ def meaning(diagnosis: Diagnosis) -> str:
     text = MEANINGS[diagnosis.verdict]
     if diagnosis.verdict == "unknown" and diagnosis.effects:
         text += " What is listed here is read off the signals and detections themselves."
+    if diagnosis.verdict == "not_identifiable" and diagnosis.corrected:
+        text += " The corrected scenario holds the one listed here."
     return text
 
 
@@ -106,11 +108,12 @@ def disagreement_place(disagreement: Disagreement, names: LightNames) -> str:
 
 
 def strongest(diagnosis: Diagnosis, count: int) -> list[Disagreement]:
-    """Return the strongest disagreements, one per statistic: the first one in the record."""
+    """Return the strongest disagreements, one per statistic."""
     first: dict[str, Disagreement] = {}
-    for disagreement in diagnosis.where:
+    ranked = sorted(diagnosis.where, key=lambda each: -abs(each.z))
+    for disagreement in ranked:
         first.setdefault(disagreement.statistic, disagreement)
-    return sorted(first.values(), key=lambda each: -abs(each.z))[:count]
+    return list(first.values())[:count]
 
 
 def partial(diagnosis: Diagnosis) -> str | None:
@@ -196,7 +199,8 @@ def criteria_line(diagnosis: Diagnosis) -> str | None:
         texts[0] += f"; our test {_ours(heldout.p_before)}"
         if heldout.shrink is not None:
             texts.append(f"Corrected: {_usual(criteria.after)}; our test {_ours(heldout.p_after)}")
-    if diagnosis.verdict != "no_discrepancy" and criteria.before.geh_below_5 >= GEH_SHARE:
+    contradicted = heldout is not None and heldout.p_before < OUR_LEAST_P
+    if contradicted and criteria.before.geh_below_5 >= GEH_SHARE:
         texts.append("GEH does not see this gap")
     sides = [(criteria.before, heldout.p_before)] if heldout is not None else []
     if heldout is not None and heldout.shrink is not None:
