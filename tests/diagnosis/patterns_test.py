@@ -11,6 +11,9 @@ from ugat_marl.diagnosis.features import DetectorLayout, Greens, IncomingLane
 from ugat_marl.diagnosis.patterns import (
     AXES,
     QUANTITIES,
+    PatternTerm,
+    Regression,
+    _spread,
     cells_of,
     patterns,
     sets_of,
@@ -269,3 +272,30 @@ def test_patterns_become_service_and_demand_without_a_name() -> None:
     ]
     faster = replace(slow, place=None, movement=None, change=0.2)
     assert unnamed_effects([faster], LAYOUT, (), 10.0) == ()
+
+
+def test_errors_know_that_detectors_count_the_same_vehicles() -> None:
+    """The error of all counts is that of the vehicles, not of the passages."""
+    generator = np.random.default_rng(0)
+
+    def counted() -> np.ndarray:
+        seen: dict[str, Passages] = {}
+        for lane in MOVES:
+            times = np.sort(generator.uniform(0.0, HOUR_S - 60.0, generator.poisson(120)))
+            unknown = np.full(len(times), np.nan)
+            for kind, later_s in (("advance", 0.0), ("stop", 10.0)):
+                seen[f"{kind}:{lane}"] = passages(times + later_s, unknown, unknown)
+        return cells(Period("d", 0.0, HOUR_S, "fit", {}, seen))["count"]
+
+    days = [counted() for _ in range(24)]
+    sets = sets_of(LAYOUT, days[0].shape[:-1])
+    regression = Regression(sets, days, THRESHOLDS, counts=True)
+    term = PatternTerm((0,) * len(sets), 0.0, 0.0, 0.0)
+    shares, errors = zip(
+        *(regression.of(term, np.sum([counted() for _ in range(3)], axis=0)) for _ in range(100)),
+        strict=True,
+    )
+    assert np.mean(errors) < 0.8 * np.std(shares)
+    wide, none = _spread(regression, days, (3, 0), THRESHOLDS, term)
+    assert wide == pytest.approx(np.std(shares), rel=0.35)
+    assert none == 0.0

@@ -17,6 +17,7 @@ the other leaves. Chance is known from simulated days that are treated as data.
 
 from __future__ import annotations
 
+import functools
 import itertools
 import math
 from collections import defaultdict
@@ -412,6 +413,9 @@ def patterns(
             np.sum([day[quantity] for day in measured], axis=0),
             np.sum([day[quantity] for day in heldout], axis=0) if heldout else None,
             lambda gain, moments=moments: log_normal_tail(gain, *moments),
+            functools.partial(
+                _spread, regression, cells, (len(measured), len(heldout)), thresholds
+            ),
             thresholds,
             alpha / len(quantities),
         ):
@@ -425,6 +429,7 @@ def _terms(
     measured: Array,
     heldout: Array | None,
     chance: Callable[[float], float],
+    spread: Callable[[PatternTerm], tuple[float, float]],
     thresholds: Thresholds,
     alpha: float,
 ) -> Iterator[tuple[PatternTerm, float, float | None]]:
@@ -440,8 +445,11 @@ def _terms(
             others = [*terms[:place], *terms[place + 1 :]]
             share, error = regression.of(term, regression.without(measured, others))
             again, holds = None, abs(share) >= thresholds.least_share
+            wide, wide_again = spread(term)
+            error = max(error, wide)
             if heldout is not None:
                 again, doubt = regression.of(term, regression.without(heldout, others))
+                doubt = max(doubt, wide_again)
                 holds &= again * math.copysign(1.0, share) >= thresholds.half_interval * doubt
             found.append((replace(term, share=share, error=error), again) if holds else None)
         return found
@@ -460,6 +468,38 @@ def _terms(
     for one in filter(None, kept):
         term, again = one
         yield term, chance(term.gain), again
+
+
+def _spread(
+    regression: Regression,
+    cells: Sequence[Array],
+    periods: tuple[int, int],
+    thresholds: Thresholds,
+    term: PatternTerm,
+) -> tuple[float, float]:
+    """Return the standard deviation of a term's share over simulated data.
+
+    Cells are no independent observations: several detectors count the same vehicles.
+
+    Args:
+        regression: Regression on the simulated days.
+        cells: Cells of these days.
+        periods: Numbers of the fitted and of the held-out periods.
+        thresholds: Numbers of the method.
+        term: The term.
+
+    Returns:
+        The deviations for as many fitted and for as many held-out periods; 0 without any.
+    """
+    found: list[float] = []
+    for size in periods:
+        generator = np.random.default_rng(6)
+        shares: list[float] = []
+        for _ in range(2 * thresholds.pattern_draws if size else 0):
+            days = drawn_days(generator, len(cells), size, thresholds)
+            shares.append(regression.of(term, np.sum([cells[int(day)] for day in days], axis=0))[0])
+        found.append(float(np.std(shares, ddof=1)) if len(shares) > 1 else 0.0)
+    return found[0], found[1]
 
 
 def _by_chance(

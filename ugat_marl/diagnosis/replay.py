@@ -187,7 +187,7 @@ class Replay:
             others = [effect for effect in effects if not effect.on_departures]
             drivers = scenario if len(others) == len(effects) else Effect.apply_all(day, others)
             came = period
-            for error in self._detection:
+            for error in reversed(self._detection):
                 came = error.undone(came, self._detectors)
             scenario, due = self._arrivals.given(scenario, drivers, self._as_sumo_stamps(came))
         scenario = shift_parking(scenario, derive_seed(seed, "parking"))

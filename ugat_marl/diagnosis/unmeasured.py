@@ -79,12 +79,7 @@ def without_holes(period: Period, holes: Sequence[tuple[float, float]]) -> Perio
         on_s = np.where(np.isfinite(seen.on_s), seen.on_s, period.begin_s)
         off_s = np.where(np.isfinite(seen.off_s), seen.off_s, period.end_s)
         outside = np.all([(off_s <= begin) | (on_s >= end) for begin, end in holes], axis=0)
-        kept[name] = Passages(
-            seen.on_s[outside],
-            seen.off_s[outside],
-            seen.speed_mps[outside],
-            seen.length_m[outside],
-        )
+        kept[name] = seen.at(outside)
     return replace(period, passages=kept)
 
 

@@ -6,7 +6,7 @@ looks for effects on traffic (`ugat_marl.diagnosis.measurement`).
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from typing import ClassVar, Literal
 
@@ -283,6 +283,43 @@ class DetectorSplash(_OfDetectors):
 
         return self._edited(period, detectors, splashed)
 
+    def undone(self, period: Period, detectors: Sequence[Detector]) -> Period:
+        """Take off as many twins of passages on the next lanes as there are by this share.
+
+        With the counts c of the street and the pairs A of a detector and one beside it, detectors
+        with the error report (1 + share A) c. Of a pair of twins one stays.
+        """
+        beside = next_detectors(detectors)
+        names = [detector.id for detector in detectors]
+        own = detectors_at(self.place, detectors, self.name)
+        shares = np.eye(len(names))
+        for name in own:
+            for other in beside.get(name, ()):
+                shares[names.index(name), names.index(other)] += self.share
+        counts = np.array([len(period.of_detector(name)) for name in names], np.float64)
+        street = np.maximum(np.linalg.solve(shares, counts), 0.0)
+        extra = {
+            (name, other): self.share * float(street[names.index(other)])
+            for name in own
+            for other in beside.get(name, ())
+        }
+        gone: dict[str, set[int]] = {name: set() for name in names}
+        for _, one, first, other, second in sorted(_twins(period, extra)):
+            if first in gone[one] or second in gone[other]:
+                continue
+            sides = (((one, other), first), ((other, one), second))
+            side, place = max(sides, key=lambda each: extra.get(each[0], 0.0))
+            if extra.get(side, 0.0) >= 0.5:
+                extra[side] -= 1.0
+                gone[side[0]].add(place)
+
+        def thinned(name: str, passages: Passages) -> Passages:
+            kept = np.ones(len(passages), np.bool_)
+            kept[list(gone[name])] = False
+            return passages.at(kept)
+
+        return self._edited(period, detectors, thinned)
+
     def _chosen(self, name: str, other: str, seen: Passages) -> NDArray[np.bool_]:
         times = np.where(np.isnan(seen.on_s), seen.off_s, seen.on_s)
         return np.array(
@@ -292,6 +329,26 @@ class DetectorSplash(_OfDetectors):
             ],
             dtype=np.bool_,
         )
+
+
+TWIN_S = 0.5
+"""Longest time between the begins of a passage and of its twin on the next lane, s."""
+
+
+def _twins(
+    period: Period, pairs: Iterable[tuple[str, str]]
+) -> Iterator[tuple[float, str, int, str, int]]:
+    """Yield the passages of neighbours that begin together: how far apart, then whose and which."""
+    for one, other in {tuple(sorted(pair)) for pair in pairs}:
+        first, second = period.of_detector(one), period.of_detector(other)
+        ends = np.nan_to_num(second.on_s, nan=-np.inf)
+        order = np.argsort(ends)
+        for number, on_s in enumerate(first.on_s.tolist()):
+            low, high = np.searchsorted(ends[order], (on_s - TWIN_S, on_s + TWIN_S))
+            for place in order[low:high].tolist():
+                apart_s = abs(second.on_s[place] - on_s)
+                apart_s += abs(np.nan_to_num(second.off_s[place] - first.off_s[number]))
+                yield float(apart_s), one, number, other, place
 
 
 def next_detectors(detectors: Sequence[Detector]) -> dict[str, tuple[str, ...]]:
