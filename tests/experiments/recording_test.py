@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 import shutil
+import warnings
 from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any
@@ -350,3 +351,18 @@ def test_impossible_days_are_refused(options: Mapping[str, Any], says: str) -> N
 def test_days_of_the_same_demand_do_not_vary(data: Path) -> None:
     with pytest.raises(OptionError, match="leave day_to_day out"):
         measure(data / "crossing", same_demand=True, day_to_day=0.2)
+
+
+@pytest.mark.parametrize(("metres", "warned"), [(2, False), (6, True)])
+def test_a_zone_that_ends_with_its_lane_is_noted(data: Path, metres: int, warned: bool) -> None:
+    with warnings.catch_warnings(record=True) as told:
+        warnings.simplefilter("always")
+        record(
+            load_scenario(data / "crossing"),
+            f"detector_zone=stop,{metres}",
+            policy_factory("fixed-time:20"),
+            periods=1,
+            workers=1,
+            duration_s=60,
+        )
+    assert any("beyond the end of the lane" in str(one.message) for one in told) is warned

@@ -46,7 +46,7 @@ from ugat_marl.diagnosis.residual import Directed, Directions, Null
 from ugat_marl.diagnosis.select import MOVES_OF_A_VALUE, Selector
 from ugat_marl.diagnosis.sightings import Sightings, together
 from ugat_marl.diagnosis.statistics import Array, Distance, Pools, Reference, change_between, sum_of
-from ugat_marl.diagnosis.supplementary_data import SupplementaryData
+from ugat_marl.diagnosis.supplementary_data import TRAVEL_TIME, SupplementaryData
 from ugat_marl.diagnosis.thresholds import (
     DAYS_OF_A_STRETCH,
     EFFORTS,
@@ -56,7 +56,7 @@ from ugat_marl.diagnosis.thresholds import (
 )
 from ugat_marl.diagnosis.unmeasured import without_holes
 from ugat_marl.effects import Effect
-from ugat_marl.errors import MeasuredDataError, OptionError, require_kinds
+from ugat_marl.errors import MeasuredDataError, OptionError, counted, require_kinds
 from ugat_marl.parallel import Workers
 from ugat_marl.progress import Reporter, Share
 from ugat_marl.scenarios import (
@@ -451,6 +451,34 @@ class Study:
         )
         reporter.say(f"note: {finding.text}")
         return replace(self, measured=_noted(self.measured, (finding,)))
+
+    def with_findings_on_travel_times(self, base: Tested, reporter: Reporter) -> Study:
+        """Note the travel times that cannot be compared."""
+        probes = [day.supplementary.get(TRAVEL_TIME) for day in self.fit]
+        if any(block is None for block in probes):
+            return self
+        measured, simulated = (
+            np.mean([day.supplementary[TRAVEL_TIME][:, 0, 1] for day in days], axis=0)
+            for days in (self.fit, base.model.tallies)
+        )
+        few = measured < self.config.thresholds.least_measured
+        nobody = ~few & (simulated == 0)
+        texts = [
+            f"travel_times: {int(ways.sum())} of {counted(len(ways), 'pair')} of places {what}, "
+            f"and not compared; {way_out}"
+            for ways, what, way_out in (
+                (few, "with less than a vehicle a period", "give the same places in each row"),
+                (
+                    nobody,
+                    "that no simulated vehicle passes in this order",
+                    "are from_edge and to_edge exchanged, or is the way in no route?",
+                ),
+            )
+            if ways.any()
+        ]
+        for text in texts:
+            reporter.say(f"note: {text}")
+        return replace(self, measured=_noted(self.measured, [Finding(text) for text in texts]))
 
     @property
     def shows_patterns(self) -> bool:

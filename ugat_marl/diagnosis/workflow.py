@@ -187,6 +187,7 @@ def _diagnosed(
         study = study.detectors_as_they_are(reporter)
         base = study.base(reporter)
         study = study.with_empty_start_finding(base, reporter)
+        study = study.with_findings_on_travel_times(base, reporter)
     except OutOfTime:
         return _nothing_simulated(study, timing), study.errors_of_detectors, ()
     search = _searched(study, base, reporter)

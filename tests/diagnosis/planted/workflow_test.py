@@ -18,6 +18,7 @@ from ugat_marl.diagnosis.statistics import sum_of
 from ugat_marl.diagnosis.thresholds import Effort
 from ugat_marl.diagnosis.unmeasured import without_holes
 from ugat_marl.errors import MeasuredDataError, OptionError, UnknownNameError
+from ugat_marl.progress import Silent
 from ugat_marl.scenarios import Passages
 
 FEW = Effort(base=24, bank=2, fit=5, test=16)
@@ -100,6 +101,21 @@ def test_a_count_that_is_missing_is_missing_in_simulated_days_too(street) -> Non
         held[name] = day.tally.sums[..., 1] > 0
         assert np.array_equal(held[name], sum_of((*study.fit, *study.heldout)).sums[..., 1] > 0)
     assert held["whole"].sum() > held["late"].sum()
+
+
+def test_travel_times_that_cannot_be_compared_are_noted(street, measured: MeasuredData) -> None:
+    days = [period.id for period in measured.periods]
+    columns = ("period_id", "time_s", "from_edge", "from_m", "to_edge", "to_m", "travel_s")
+    rows = [(day, 60.0 * k, "C_N", 20.0, "S_C", 20.0, 40.0) for day in days for k in range(9)]
+    rows += [("day1", 60.0 * k, "S_C", 10.0 + k, "C_N", 20.0, 40.0) for k in range(9)]
+    probes = pl.DataFrame(rows, schema=columns, orient="row")
+    config = DiagnosisConfig(cache=street.cache, effort=Effort(base=4, bank=1, fit=1, test=4))
+    study = Study.of(street.scenario, replace(measured, travel_times=probes), config)
+    found = study.with_findings_on_travel_times(study.base(Silent()), Silent()).measured.findings
+    texts = [finding.text for finding in found if finding.text.startswith("travel_times")]
+    assert len(texts) == 2
+    assert "9 of 10 pairs of places with less than a vehicle a period" in texts[0]
+    assert "1 of 10 pairs of places that no simulated vehicle passes in this order" in texts[1]
 
 
 def test_without_held_out_periods_it_is_said(

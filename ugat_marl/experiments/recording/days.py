@@ -9,7 +9,8 @@ from __future__ import annotations
 
 import math
 import tempfile
-from collections.abc import Iterable, Mapping
+import warnings
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 
@@ -35,7 +36,7 @@ from ugat_marl.effects import (
     scenario_in_domain,
     shift_parking,
 )
-from ugat_marl.errors import OptionError, require_least
+from ugat_marl.errors import OptionError, listed, require_least
 from ugat_marl.experiments.recording.controller import (
     own_programmes,
     play,
@@ -182,11 +183,13 @@ def record(
         empty, effects, detectors, detector_lights(base, detectors)
     )  # a wrong detector is an error now
     fixed, watched = own_programmes(base, network, policy)
+    installed = installed_detectors(effects, detectors)
+    _warn_of_cut_zones(detectors, installed, network.lanes)
     street = _Street(
         demand_as_vehicles(base),
         effects,
         detectors,
-        installed_detectors(effects, detectors),
+        installed,
         network.lanes,
         fixed,
         watched,
@@ -220,6 +223,24 @@ def _world(
     if domain_path(domain) is not None:
         return changed, detector_effects(changed)
     return scenario, (*detector_effects(scenario), *parse_domain(domain))
+
+
+def _warn_of_cut_zones(
+    stated: Sequence[Detector], installed: Sequence[Detector], lanes: Mapping[str, Lane]
+) -> None:
+    """Warn of effects that would put detectors beyond the end of their lane, where none can be."""
+    beyond = {
+        other.id: other.position_m + other.length_m - lanes[other.lane].length_m
+        for one, other in zip(stated, installed, strict=True)
+        if one != other
+    }
+    cut = [name for name, metres in beyond.items() if metres > 0.0]
+    if cut:
+        warnings.warn(
+            f"{listed(cut, 'detector')} would reach up to {max(beyond.values()):.1f} m beyond the "
+            "end of the lane, and end there; a smaller effect has its full size",
+            stacklevel=3,
+        )
 
 
 def _zone(detector: Detector, length_m: float) -> Detector:
