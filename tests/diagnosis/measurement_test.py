@@ -130,6 +130,11 @@ def test_an_extension_looks_like_a_zone_where_all_drive_at_one_speed(pace: float
     else:
         assert str(error.rival) == "detector_zone=*,3"
         assert said.endswith(", or have zones 3 m longer than stated (here both look the same)")
+        both = Measurement(DETECTORS, street, usual, THRESHOLDS)
+        (other,) = both.errors(("detector_extension",))
+        assert (str(other.effect), other.rival) == ("detector_zone=*,3", None)
+        (alone,) = both.errors(("detector_zone",))
+        assert (alone.effect, alone.rival) == (error.effect, None)
 
 
 @pytest.mark.parametrize("earlier", [(), (20.0, 60.0), (97.0,)])

@@ -15,7 +15,7 @@ hide where speeds are measured.
 from __future__ import annotations
 
 import math
-from collections.abc import Collection, Mapping, Sequence
+from collections.abc import Collection, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from itertools import product
 from typing import Literal
@@ -123,6 +123,20 @@ class _Zones:
     estimates: Mapping[Number, ValueWithError]
     rivals: Mapping[Number, ValueWithError]
 
+    def without(
+        self, left_out: Collection[str]
+    ) -> Iterator[tuple[Number, ValueWithError, ValueWithError | None]]:
+        """Yield the numbers and their rivals; a rival takes the place of one that is left out."""
+        names = DetectorExtension.name, DetectorZone.name
+        for number, estimate in self.estimates.items():
+            place, index = number
+            other = self.rivals.get(number)
+            if names[index] in left_out and other is not None:
+                number, estimate, other = (place, 1 - index), other, None
+            elif names[1 - index] in left_out:
+                other = None
+            yield number, estimate, other
+
 
 def _changed(measured: Array, simulated: Array) -> float:
     """Return the share by which vehicles pass at another speed than simulated, from 0 to 1.
@@ -212,10 +226,9 @@ class Measurement:
         stated = any(detector.speed_at is not None for detector in self._detectors)
         zones = self._points_and_zones(pulses, "rear", self._indices(offsets), fixed=stated)
         found += [DetectorError(DetectorSpeeds(at, point)) for at, point in zones.points.items()]
-        for number, estimate in zones.estimates.items():
+        for number, estimate, other in zones.without(left_out):
             if self._matters(number, estimate):
                 place, index = number
-                other = zones.rivals.get(number)
                 rival = None if other is None else self._of_zone(place, 1 - index, other)
                 margin = limit.half_interval * estimate.error
                 found.append(DetectorError(self._of_zone(*number, estimate), margin, rival))
