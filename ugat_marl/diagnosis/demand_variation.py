@@ -91,6 +91,8 @@ def measured_variation(
                 ("count_exit", exits),
             )
         ]
+        if by_kind[0].any() or by_kind[1].any():  # exits may count vehicles of other lights
+            del by_kind[2]
         rows.append(max(by_kind, key=lambda counts: float(counts.sum())))
     numbers = [number for number, split in enumerate(splits) for _ in split]
     return day_to_day_variation(np.array(rows), thresholds, numbers)
