@@ -441,6 +441,18 @@ def added(row: str) -> Change:
     return lambda text: f"{text}{row}\n"
 
 
+@pytest.mark.parametrize("mark", [";", "\t"])
+def test_spreadsheets_of_other_countries(reread: Any, mark: str) -> None:
+    """Semicolons or tabs between columns, and commas before decimals."""
+
+    def spreadsheet(text: str) -> str:
+        return text.replace(",", mark).replace(".", ",")
+
+    tables = ("detectors", "periods", "signals", "detections")
+    changes = {f"{name}.csv": spreadsheet for name in tables}
+    assert reread(changes).hash == recording().hash
+
+
 WRONG: dict[str, tuple[dict[str, Change], str]] = {
     "lane that is not there": (
         {"detectors.csv": replaced("S_C_0", "S_C_1")},
@@ -473,8 +485,10 @@ WRONG: dict[str, tuple[dict[str, Change], str]] = {
         {"detectors.csv": lambda text: text.replace(".0,", ",0,")},
         r"line 2: \d+ cells.*decimal",
     ),
-    "semicolons": ({"detectors.csv": lambda text: text.replace(",", ";")}, r"semicolons"),
-    "tabs": ({"detectors.csv": lambda text: text.replace(",", "\t")}, r"divided by tabs"),
+    "semicolons and a cell too many": (
+        {"detectors.csv": lambda text: text.replace(",", ";").replace("40.0", "40.0;7")},
+        r"line 2: \d+ cells",
+    ),
     "a line for Excel": ({"detectors.csv": lambda text: "sep=,\n" + text}, r"remove it"),
     "no detectors": ({"detectors.csv": lambda text: text.split("\n")[0] + "\n"}, r"no detectors"),
     "column twice": (

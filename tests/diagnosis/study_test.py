@@ -25,11 +25,18 @@ from ugat_marl.diagnosis.compared_detectors import (
 from ugat_marl.diagnosis.demand_variation import day_to_day_variation, measured_variation
 from ugat_marl.diagnosis.engine import Engine
 from ugat_marl.diagnosis.features import BIN_FEATURES, FEATURES, INDEX, DetectorLayout
+from ugat_marl.diagnosis.measurement import DetectorError
 from ugat_marl.diagnosis.replay import Replay
 from ugat_marl.diagnosis.statistics import Pools
 from ugat_marl.diagnosis.study import _of_common_windows, effort_for
 from ugat_marl.diagnosis.thresholds import Effort, Thresholds
-from ugat_marl.effects import Effect, Headway, load_scenario
+from ugat_marl.effects import (
+    DetectorExtension,
+    DetectorPulse,
+    Effect,
+    Headway,
+    load_scenario,
+)
 from ugat_marl.errors import MeasuredDataError, OptionError
 from ugat_marl.progress import Silent
 from ugat_marl.scenarios import Detector, Network, Passages, Period
@@ -397,3 +404,20 @@ def test_every_task_of_a_diagnosis_is_part_of_the_whole() -> None:
         for number in ("1", "2"):
             name = title.replace("{number + 1}", number).replace("{what}", "library")
             assert any(name.startswith(share) for share in study.work()), name
+
+
+@pytest.mark.parametrize(
+    ("effect", "upstream"),
+    [
+        (DetectorPulse("advance", 0.1), True),
+        (DetectorPulse("*", 0.1), True),
+        (DetectorPulse("stop", 0.1), False),
+        (DetectorExtension("advance", 0.3, "split"), False),
+    ],
+)
+def test_pulses_upstream_are_told_from_others(effect: Any, upstream: bool) -> None:
+    """From pulses without speeds nobody sees who queued on a detector."""
+    study: Any = object.__new__(Study)
+    ahead = Detector("ahead", "one_0", 0.5, 0.0, "advance")
+    object.__setattr__(study, "layout", SimpleNamespace(detectors=(ahead, *DETECTORS)))
+    assert study._pulses_upstream([DetectorError(effect)]) is upstream

@@ -172,13 +172,17 @@ def _json_hashes(content: Mapping[str, Any], rows: str) -> dict[str, Any]:
     return {"rest": _hash(rest), rows: [_hash(row) for row in content[rows]]}
 
 
-def csv_texts(content: bytes) -> pl.DataFrame:
+def csv_texts(content: bytes, separator: str = ",") -> pl.DataFrame:
     """Return the cells of a CSV file as text.
+
+    Args:
+        content: The file.
+        separator: What stands between the cells.
 
     Raises:
         polars.exceptions.PolarsError: The content is not a table.
     """
-    return pl.read_csv(io.BytesIO(content), infer_schema=False)
+    return pl.read_csv(io.BytesIO(content), separator=separator, infer_schema=False)
 
 
 def csv_damage(path: Path, frame: pl.DataFrame) -> str:

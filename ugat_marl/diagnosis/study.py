@@ -55,7 +55,7 @@ from ugat_marl.diagnosis.thresholds import (
     Thresholds,
 )
 from ugat_marl.diagnosis.unmeasured import without_holes
-from ugat_marl.effects import Effect
+from ugat_marl.effects import DetectorPulse, Effect, detectors_at
 from ugat_marl.errors import MeasuredDataError, OptionError, counted, require_kinds
 from ugat_marl.parallel import Workers
 from ugat_marl.progress import Reporter, Share
@@ -304,7 +304,24 @@ class Study:
             reporter.say(f"note: {finding.text}")
             measured = _noted(measured, [finding])
         errors = measurement.errors(self.config.leave_out)
+        if self.other_days is not None and not self.speeds and self._pulses_upstream(errors):
+            finding = Finding(
+                "signals follow the traffic, and advance detectors report pulses without speeds: "
+                "a vehicle that queued on one seems to arrive when it moves on, so queues that "
+                "reach these detectors come out shorter in the simulation"
+            )
+            reporter.say(f"note: {finding.text}")
+            measured = _noted(measured, [finding])
         return replace(self._detecting(errors) if errors else self, measured=measured)
+
+    def _pulses_upstream(self, errors: Sequence[DetectorError]) -> bool:
+        """Return True if advance detectors report pulses in place of presence."""
+        upstream = {item.id for item in self.layout.detectors if item.kind == "advance"}
+        return any(
+            upstream & detectors_at(error.effect.place, self.layout.detectors, error.effect.name)
+            for error in errors
+            if isinstance(error.effect, DetectorPulse)
+        )
 
     def detectors_beside(self, effects: tuple[Effect, ...], reporter: Reporter) -> Study | None:
         """Find errors of measurement again, on days with the effects that a search has found.

@@ -355,25 +355,22 @@ def _read_csv(path: Path, findings: list[Finding]) -> pl.DataFrame:
         raise MeasuredDataError(
             f"{path}: line 1 is {head.strip()!r}, which is for Excel alone; remove it"
         )
-    for mark, name in ((";", "semicolons"), ("\t", "tabs")):
-        if mark in head and "," not in head:
-            raise MeasuredDataError(
-                f"{path}: columns are divided by {name}; save it with commas, and with points in "
-                "numbers"
-            )
+    mark = next((one for one in (";", "\t") if one in head and "," not in head), ",")
     if not content.endswith((b"\n", b"\r")):
         findings.append(
             Finding(f"{path.name}: the last line has no end; the file may have been cut short")
         )
     try:
-        frame = csv_texts(content)
+        frame = csv_texts(content, mark)
+        if mark != ",":  # a spreadsheet of a country with decimal commas
+            frame = frame.with_columns(pl.col(pl.String).str.replace(_DECIMAL_COMMA, "$1.$2"))
         # polars gives the second of two equal names another one
-        written = [name.strip() for name in next(csv.reader([head]), [])]
+        written = [name.strip() for name in next(csv.reader([head], delimiter=mark), [])]
     except (
         pl.exceptions.PolarsError, pl.exceptions.PanicException, OSError, ValueError, csv.Error
     ) as error:  # fmt: skip
         raise MeasuredDataError(
-            _wide_line(path, content)
+            _wide_line(path, content, mark)
             or f"{path}: not a table ({first_line(error)}); every line needs the columns of line 1"
         ) from None
     if wrong := csv_damage(path, frame):  # tables of others carry no hashes
@@ -383,9 +380,13 @@ def _read_csv(path: Path, findings: list[Finding]) -> pl.DataFrame:
     return frame.rename({name: name.strip() for name in frame.columns})
 
 
-def _wide_line(path: Path, content: bytes) -> str | None:
+_DECIMAL_COMMA = r"^([-\d :T]*\d),(\d+)\s*$"
+"""A number or a local time with a comma before its decimals."""
+
+
+def _wide_line(path: Path, content: bytes, mark: str) -> str | None:
     """Describe the first line that has more cells than line 1; None without one."""
-    rows = csv.reader(io.StringIO(content.decode()))
+    rows = csv.reader(io.StringIO(content.decode()), delimiter=mark)
     with contextlib.suppress(csv.Error, StopIteration):
         named = len(next(rows))
         for row in rows:
