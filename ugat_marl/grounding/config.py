@@ -23,9 +23,6 @@ from ugat_marl.policies import Usual, UsualName, UsualNumber, UsualValue
 GROUNDINGS = ("phase", "timed", "street")
 
 
-_STREET: Any = UsualName("street")
-
-
 @dataclass(frozen=True)
 class UgatConfig:
     """Settings of the algorithm.
@@ -53,7 +50,7 @@ class UgatConfig:
         street: Settings of the fit, with "street".
     """
 
-    grounding: Literal["phase", "timed", "street"] = _STREET
+    grounding: Literal["phase", "timed", "street"] = "street"
     pretrain_episodes: int = Usual(20)
     iterations: int = Usual(2)
     grounded_episodes: int = Usual(10)

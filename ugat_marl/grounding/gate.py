@@ -20,9 +20,7 @@ from numpy.typing import NDArray
 
 from ugat_marl.errors import CheckpointError, OptionError, require_kinds
 from ugat_marl.grounding.reports import complaint
-from ugat_marl.policies import Usual, UsualName
-
-_INTERSECTION: Any = UsualName("intersection")
+from ugat_marl.policies import Usual
 
 
 @dataclass(frozen=True)
@@ -45,7 +43,7 @@ class GateConfig:
 
     mode: Literal["infinite", "static", "dynamic"] = "dynamic"
     static_alpha: float = 0.5
-    scope: Literal["intersection", "pooled"] = _INTERSECTION
+    scope: Literal["intersection", "pooled"] = "intersection"
     window_epochs: int = Usual(20)
     start: Literal["open", "fitted"] = "open"
     uncertainty_of: Literal["h-after-f", "h"] = "h-after-f"
