@@ -2,7 +2,13 @@
 
 from __future__ import annotations
 
-from ugat_marl.errors import LISTED, UnknownNameError
+from dataclasses import dataclass
+from typing import Any, Literal
+
+import numpy as np
+import pytest
+
+from ugat_marl.errors import LISTED, OptionError, UnknownNameError, require_kinds
 
 
 def test_a_short_list_is_whole_and_names_with_commas_are_told_apart() -> None:
@@ -33,3 +39,42 @@ def test_what_is_only_a_little_alike_is_not_meant() -> None:
 
 def test_where_nothing_is_known_nothing_is_listed() -> None:
     assert str(UnknownNameError("learner in math", "x", [])) == "unknown learner in math 'x'."
+
+
+@dataclass(frozen=True)
+class Settings:
+    number: float = 1.0
+    count: int | None = None
+    switch: bool = False
+    names: tuple[str, ...] = ()
+    mode: Literal["slow", "fast"] = "slow"
+    other: object = None
+
+
+@pytest.mark.parametrize(
+    "given",
+    [
+        {"number": 1}, {"number": np.float32(2.0)}, {"count": np.int64(3)}, {"count": None},
+        {"switch": np.True_}, {"names": ["a"]}, {"names": {"a"}}, {"names": frozenset()},
+        {"mode": "fast"}, {"other": 3},
+    ],
+)  # fmt: skip
+def test_values_of_their_kinds_pass(given: dict[str, Any]) -> None:
+    require_kinds(Settings(**given), "settings")
+
+
+@pytest.mark.parametrize(
+    ("given", "told"),
+    [
+        ({"number": "1"}, "settings number is '1'; allowed: a number"),
+        ({"number": True}, "number is True"),
+        ({"count": 2.5}, "count is 2.5; allowed: a whole number or None"),
+        ({"switch": 1}, "switch is 1; allowed: True or False"),
+        ({"names": "a"}, "names is 'a'; allowed: a list, of which each is a text"),
+        ({"names": [1]}, r"names is \[1\]"),
+        ({"mode": "quick"}, "mode is 'quick'; allowed: slow, fast"),
+    ],
+)
+def test_values_of_other_kinds_are_refused(given: dict[str, Any], told: str) -> None:
+    with pytest.raises(OptionError, match=told):
+        require_kinds(Settings(**given), "settings")

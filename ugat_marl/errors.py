@@ -9,10 +9,10 @@ from __future__ import annotations
 import contextlib
 import difflib
 import re
-from collections.abc import Callable, Collection, Iterable, Sequence
+from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
 from numbers import Integral, Real
 from types import UnionType
-from typing import Literal, Union, get_args, get_origin, get_type_hints
+from typing import Literal, TypeGuard, Union, get_args, get_origin, get_type_hints
 
 LISTED = 32
 """Most names in one error message. If there are more, the message lists the nearest ones."""
@@ -146,8 +146,13 @@ def require_least(least: int, **values: int | None) -> None:
             raise OptionError(f"{name} = {value}: must be at least {least}")
 
 
+def _dtype_kind(value: object) -> str:
+    """Return NumPy's letter for the kind of a number of its own; "" for other values."""
+    return getattr(getattr(value, "dtype", None), "kind", "")
+
+
 _KINDS: dict[object, tuple[Callable[[object], bool], str]] = {
-    bool: (lambda x: isinstance(x, bool), "True or False"),
+    bool: (lambda x: isinstance(x, bool) or _dtype_kind(x) == "b", "True or False"),
     int: (lambda x: not isinstance(x, bool) and isinstance(x, Integral), "a whole number"),
     float: (lambda x: not isinstance(x, bool) and isinstance(x, Real), "a number"),
     str: (lambda x: isinstance(x, str), "a text"),
@@ -160,7 +165,7 @@ def require_kinds(settings: object, name: str) -> None:
     """Refuse a field of a data class whose value is not of the annotated kind.
 
     Numbers, texts, True and False, None, the names of a ``Literal``, and tuples of such values are
-    checked; a list counts as a tuple. Fields of other kinds are not checked.
+    checked; a list or a set counts as a tuple. Fields of other kinds are not checked.
 
     Args:
         settings: An object of the data class.
@@ -178,6 +183,10 @@ def require_kinds(settings: object, name: str) -> None:
             raise OptionError(f"{name} {field} is {value!r}; allowed: {allowed}")
 
 
+def _is_list(value: object) -> TypeGuard[Collection[object]]:
+    return isinstance(value, Collection) and not isinstance(value, str | bytes | Mapping)
+
+
 def _kind(hint: object) -> tuple[Callable[[object], bool], str] | None:
     """Return what is a value of an annotated kind, and its name; None for kinds not known."""
     origin, inner = get_origin(hint), get_args(hint)
@@ -186,7 +195,7 @@ def _kind(hint: object) -> tuple[Callable[[object], bool], str] | None:
     if origin is tuple and len(inner) == 2 and inner[0] in _KINDS and inner[1] is Ellipsis:
         of_kind, told = _KINDS[inner[0]]
         each = f"a list, of which each is {told}"
-        return lambda x: isinstance(x, tuple | list) and all(map(of_kind, x)), each
+        return lambda x: _is_list(x) and all(map(of_kind, x)), each
     return _KINDS.get(hint)
 
 

@@ -285,6 +285,18 @@ def test_a_short_hole_shows_where_it_was_busy(read: Read) -> None:
     assert len(found := without(3000, 3300)) == 3
     assert all(text.endswith("A diagnosis leaves this time out of all periods") for text in found)
     assert not without(3000, 3120), "a red may last that long"
+    twice = without(3000, 3300), without(4500, 4900)
+    both = read(
+        changes={
+            "detections": lambda f: f.filter(
+                ~((pl.col("time_s") > 3000) & (pl.col("time_s") < 3300))
+                & ~((pl.col("time_s") > 4500) & (pl.col("time_s") < 4900))
+            )
+        }
+    )[1]
+    assert len([text for text in both if "no detector says anything" in text]) == sum(
+        map(len, twice)
+    )
     assert not without(0, 300), "the streets may have been empty before"
 
 

@@ -180,6 +180,23 @@ def test_findings_say_what_one_more_kind_of_data_would_decide(
     assert not read_off_signals & ruled_out(half)
 
 
+def test_counts_of_a_longer_time_are_cut(
+    tmp_path: Path, scenario: Scenario, network: Network
+) -> None:
+    given = sums()
+    counts = given.counts
+    assert counts is not None
+    length = float(given.periods[0].length_s)
+    moved = [
+        counts.with_columns(pl.col("begin_s") + k * length, pl.col("end_s") + k * length)
+        for k in range(4)
+    ]
+    longer = replace(given, counts=pl.concat(moved))
+    read = read_measured(write_measured(longer, tmp_path / "long", csv=True), scenario, network)
+    assert read.counts is not None and len(read.counts) == len(counts)
+    assert any("lie outside of their periods" in finding.text for finding in read.findings)
+
+
 def test_mistaken_hours_of_probes_are_seen(
     tmp_path: Path, scenario: Scenario, network: Network
 ) -> None:

@@ -301,6 +301,13 @@ def test_windows_that_nearly_agree_are_one_time_of_day() -> None:
     ]  # fmt: skip
 
 
+def test_a_chain_of_windows_is_cut_once() -> None:
+    day = measured(NAMES, NAMES).periods[0]
+    begins = (0.0, 0.4, 0.8)
+    moved = tuple(replace(day, begin_s=begin, end_s=begin + 3600.0) for begin in begins)
+    assert {period.window for period in _of_common_windows(moved)} == {(0.8, 3600.0)}
+
+
 @pytest.mark.parametrize(
     ("numbers", "told"), [((1, 1, 1, 1), "effort base = 1"), ((8, 0, 1, 8), "effort bank = 0")]
 )

@@ -142,6 +142,14 @@ def test_splash_reports_a_share_of_the_next_lane() -> None:
     assert (np.diff(on) >= 0).all()
 
 
+def test_splash_of_every_vehicle_can_be_taken_off() -> None:
+    on = np.arange(0.0, 100.0, 10.0)
+    street = period(far=Passages(on, on + 0.4, on, on), far_left=Passages.none())
+    splash = DetectorSplash("advance", 1.0)
+    again = splash.undone(splash.observe(street, DETECTORS, {}), DETECTORS)
+    assert sum(len(again.passages[name]) for name in ("far", "far left")) == len(on)
+
+
 @pytest.mark.parametrize("share", [0.1, 0.3])
 def test_as_many_twins_are_taken_off_as_splash_adds(share: float) -> None:
     """Arrivals are read off detectors, and a twin is no vehicle."""

@@ -10,10 +10,13 @@ from typing import Any
 import pytest
 from tyro.conf import CascadeSubcommandArgs
 
+import ugat_marl
+from ugat_marl.__main__ import main
 from ugat_marl.errors import OptionError
 from ugat_marl.experiments import PaperConfig, TransferConfig
 from ugat_marl.experiments.paper import settings_of
 from ugat_marl.grounding import GateConfig, UgatConfig, as_published
+from ugat_marl.progress import Silent
 
 
 def test_the_preset_restores_every_departure_and_keeps_numbers_of_episodes() -> None:
@@ -114,10 +117,37 @@ def test_the_page_gives_what_the_preset_stands_for() -> None:
     assert (given.learner, given.reward) == (paper.learner, paper.reward)
 
 
-def test_a_threshold_counts_in_its_own_mode_alone() -> None:
-    assert GateConfig(mode="static", static_alpha=0.3).static_alpha == 0.3
-    with pytest.raises(OptionError, match=r"is 0\.3, which counts with gate mode static"):
-        GateConfig(static_alpha=0.3)
+@pytest.mark.parametrize("alpha", ["0.3", "0.5"])
+def test_a_threshold_counts_in_its_own_mode_alone(
+    alpha: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    words = ["train", "single-v1", "--gate.static-alpha", alpha, "--out", str(tmp_path / "run")]
+    assert main(words) == 2
+    assert f"--gate.static-alpha {alpha} counts with --gate.mode static" in capsys.readouterr().err
+    assert GateConfig(mode="infinite", static_alpha=0.3).static_alpha == 0.3
+
+
+@pytest.mark.parametrize("preset", [None, "paper"])
+def test_a_plan_is_made_from_the_defaults(preset: Any, tmp_path: Path) -> None:
+    class Begun(Exception):
+        """The first episode was played."""
+
+    def stop(*_: object) -> None:
+        raise Begun
+
+    with pytest.raises(Begun):
+        ugat_marl.train(
+            "single-v1",
+            preset=preset,
+            pretrain_episodes=1,
+            iterations=1,
+            grounded_episodes=1,
+            duration_s=60.0,
+            out=tmp_path / "run",
+            workers=1,
+            reporter=Silent(),
+            callback=stop,
+        )
 
 
 def test_the_preset_is_paid_by_the_queue_at_the_light() -> None:

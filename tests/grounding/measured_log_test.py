@@ -275,6 +275,17 @@ def test_links_that_stay_green_in_a_clearance_are_no_phase() -> None:
     assert strange == 0.0
 
 
+@pytest.mark.parametrize("end_s", [100.0, 66.0])
+def test_greens_shorter_than_the_scenarios_shortest_are_greens(end_s: float) -> None:
+    """So are those that the end of the log cuts."""
+    links = [SimpleNamespace(index=i) for i in range(3)]
+    light: Any = SimpleNamespace(id="J", links=links, phases=("Grr", "rGr", "rrG"))
+    shown = [(0.0, "Grr"), (20.0, "yrr"), (23.0, "rrr"), (24.0, "rGr"), (28.0, "ryr")]
+    shown += [(31.0, "rrr"), (32.0, "rrG"), (60.0, "rry"), (63.0, "rrr"), (64.0, "Grr")]
+    phases, _ = phases_shown(tuple(shown), light, end_s, 5.0)
+    assert phases.tolist() == [0, 1, 1, 1, 2, 2, 2, 0, 0, 0]
+
+
 def test_greens_of_no_phase_are_the_most_similar_one_and_said(crossing: Scenario) -> None:
     light = Network.read(crossing).intersections[0]
     phases, strange = phases_shown(((0.0, "Gr"), (20.0, "GG"), (30.0, "rG")), light, 40.0, 5.0)

@@ -66,7 +66,7 @@ def content_of(verdict: str = "explained", *, complete: bool = True, **more: Any
     named = verdict in ("explained", "not_identifiable", "partially_explained")
     evidence = {"distance": 118.2, "runner_up_is_worse_by": 4021.0}
     record: dict[str, Any] = {
-        "schema": "ugat-marl/diagnosis/5", "scenario": "crossing-v1", "seed": 0, "alpha": 0.05,
+        "schema": "ugat-marl/diagnosis/6", "scenario": "crossing-v1", "seed": 0, "alpha": 0.05,
         "budget_h": None, "budget_s": 600.0, "left_out": [], "ruled_out": ["speed_spread"],
         "findings": ["detections.csv: no speeds"], "verified_on_fitted_periods": False,
         "periods": {"fit": ["day1", "day2"], "heldout": ["day3"]}, "policy_gap": None,
@@ -84,7 +84,8 @@ def content_of(verdict: str = "explained", *, complete: bool = True, **more: Any
         "left": [disagreement("speed1", "discharge", 4.1, "S_C_0")] if named else [],
         "alternatives": [] if same else [
             {"effects": [headway], "distance": 4200.0, "cost": 4214.0, "indistinct": True},
-            {"effects": [effect("swapped", "stop:1>stop:2")], "distance": 9000.0, "cost": 9014.0},
+            {"effects": [effect("swapped", "stop:1>stop:2")], "distance": 9000.0, "cost": 9014.0,
+             "indistinct": False},
         ],
         "heldout": {
             "before": 120.0 if same else 59688.5, "after": 120.0 if same else 131.4,

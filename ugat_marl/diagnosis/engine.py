@@ -108,7 +108,7 @@ def _counts(tallies: Sequence[Tally]) -> NDArray[np.float64]:
 
 # --- simulated days -------------------------------------------------------------------------------
 
-VERSION = 11
+VERSION = 12
 """Version of features and replays; tallies cached under another version are not used."""
 
 _READING = threading.Lock()
@@ -664,7 +664,7 @@ def _signals_hash(period: Period, answering: bool) -> str:
     content = (period.begin_s, period.end_s, sorted(period.signals.items()))
     digest = hashlib.sha256(repr(content).encode())
     if answering:
-        digest.update(b"arrivals/3")
+        digest.update(b"arrivals/4")
     for name, seen in sorted(period.passages.items()) if answering else ():
         times = (name, seen.on_s.tolist(), seen.off_s.tolist(), seen.speed_mps.tolist())
         digest.update(repr(times).encode())

@@ -35,7 +35,7 @@ FILE = "diagnosis.json"
 """Name of the file that a diagnosis writes into its directory."""
 CORRECTED = "corrected"
 """Name of the folder of the corrected scenario, beside that file."""
-SCHEMA = "ugat-marl/diagnosis/5"
+SCHEMA = "ugat-marl/diagnosis/6"
 """Form of the file; it rises whenever the form changes."""
 
 Verdict = Literal[
@@ -356,7 +356,7 @@ class Alternative(Explanation):
             which of them is right.
     """
 
-    indistinct: bool = False
+    indistinct: bool
 
 
 @dataclass(frozen=True)
@@ -725,7 +725,7 @@ class Diagnosis:
 
     __pydantic_config__ = ConfigDict(extra="forbid")
 
-    schema: Literal["ugat-marl/diagnosis/5"]
+    schema: Literal["ugat-marl/diagnosis/6"]
     scenario: str
     seed: int
     alpha: float

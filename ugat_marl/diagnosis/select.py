@@ -43,6 +43,9 @@ from ugat_marl.scenarios import Period
 MOVES_OF_A_VALUE = 4
 """Approximate number of moves of a free value in the test of its model, for the progress bar."""
 
+ALIKE = 8
+"""Models of least cost that are compared with the best one on as many days."""
+
 
 class Selector:
     """Search for the effects that explain the difference of data and scenario.
@@ -146,7 +149,10 @@ class Selector:
         rivals = tuple(sorted(self._seen.values(), key=cost_of))
         own = {hypothesis.key for hypothesis, _ in best.model.members}
         others = [x for x in rivals if {hypothesis.key for hypothesis, _ in x.members} != own]
-        worse_by = self.worse_by(others[0], best.model) if others else None
+        worse_by = None
+        if others:
+            with contextlib.suppress(OutOfTime):  # the best model was not simulated on those days
+                worse_by = min(self.worse_by(rival, best.model) for rival in others[:ALIKE])
         return Selected(best, rivals, complete, located.examined | self.examined, worse_by)
 
     def worse_by(self, rival: Fitted, best: Fitted) -> float:

@@ -676,17 +676,23 @@ def _of_common_windows(periods: tuple[Period, ...]) -> tuple[Period, ...]:
 
     The window is what they have in common. Exactly equal windows are days of one time of day.
     """
-    common: list[Period] = []
-    for period in periods:
-        near = [
-            other
-            for other in periods
-            if abs(other.begin_s - period.begin_s) <= SAME_TIME_S
-            and abs(other.end_s - period.end_s) <= SAME_TIME_S
-        ]
-        begin_s, end_s = max(x.begin_s for x in near), min(x.end_s for x in near)
-        common.append(replace(period, begin_s=begin_s, end_s=end_s))
-    return tuple(common)
+    groups: list[list[tuple[float, float]]] = []
+    for window in sorted({period.window for period in periods}):
+        last = groups[-1][-1] if groups else (-math.inf, -math.inf)
+        near = all(abs(a - b) <= SAME_TIME_S for a, b in zip(window, last, strict=True))
+        if near:
+            groups[-1].append(window)
+        else:
+            groups.append([window])
+    common = {
+        window: (max(begin for begin, _ in group), min(end for _, end in group))
+        for group in groups
+        for window in group
+    }
+    return tuple(
+        replace(period, begin_s=common[period.window][0], end_s=common[period.window][1])
+        for period in periods
+    )
 
 
 def _refuse_lengths(periods: Sequence[Period], thresholds: Thresholds) -> None:

@@ -297,7 +297,7 @@ class DetectorSplash(_OfDetectors):
             for other in beside.get(name, ()):
                 shares[names.index(name), names.index(other)] += self.share
         counts = np.array([len(period.of_detector(name)) for name in names], np.float64)
-        street = np.maximum(np.linalg.solve(shares, counts), 0.0)
+        street = np.maximum(np.linalg.lstsq(shares, counts)[0], 0.0)
         extra = {
             (name, other): self.share * float(street[names.index(other)])
             for name in own

@@ -20,7 +20,7 @@ from numpy.typing import NDArray
 
 from ugat_marl.errors import CheckpointError, OptionError, require_kinds
 from ugat_marl.grounding.reports import complaint
-from ugat_marl.policies import Usual
+from ugat_marl.policies import Usual, UsualNumber
 
 
 @dataclass(frozen=True)
@@ -42,7 +42,7 @@ class GateConfig:
     """
 
     mode: Literal["infinite", "static", "dynamic"] = "dynamic"
-    static_alpha: float = 0.5
+    static_alpha: float = UsualNumber(0.5)
     scope: Literal["intersection", "pooled"] = "intersection"
     window_epochs: int = Usual(20)
     start: Literal["open", "fitted"] = "open"
@@ -52,11 +52,6 @@ class GateConfig:
         require_kinds(self, "gate")
         if not 0.0 < self.static_alpha <= 1.0:
             raise OptionError(f"gate static_alpha is {self.static_alpha}; allowed: in (0, 1]")
-        if self.static_alpha != GateConfig.static_alpha and self.mode != "static":
-            raise OptionError(
-                f"gate static_alpha is {self.static_alpha}, which counts with gate mode static "
-                f"alone, not {self.mode}; set both"
-            )
         if self.window_epochs < 1:
             raise OptionError(f"gate window_epochs is {self.window_epochs}; allowed: >= 1")
 

@@ -493,16 +493,17 @@ def phases_shown(
     times = np.array([begin for begin, _ in shown] + [max(end_s, shown[-1][0])])
     lengths = np.diff(times)
     phases = np.full(len(shown), -1, dtype=np.int64)
-    strange, clearing = 0.0, False
+    strange, ending = 0.0, None  # greens before a yellow, until another green follows
+    before: frozenset[int] = frozenset()
     for k, (_, state) in enumerate(shown):
         lit = frozenset(i for i in links if state[i] in GREEN)
         if any(state[i] in YELLOW for i in links):
-            clearing = True
+            ending = before if ending is None else ending
             continue
         short = lengths[k] < max(min_green_s, 1.0)
-        if clearing and short:  # links that stay green may be all the greens of a third phase
-            continue
-        clearing = False
+        if ending is not None and lit <= ending and short:
+            continue  # links that stay green may be all the greens of a third phase
+        ending, before = None, lit
         if lit in greens:
             phases[k] = greens.index(lit)
         elif lit and not short:

@@ -49,7 +49,7 @@ def test_the_same_inputs_give_the_same_file(street, measured: MeasuredData, tmp_
 def test_the_answer_is_the_file(street, measured: MeasuredData, tmp_path: Path) -> None:
     found = run(street, measured, tmp_path)
     assert json.loads((tmp_path / "diagnosis.json").read_text()) == found
-    assert found["schema"] == "ugat-marl/diagnosis/5"
+    assert found["schema"] == "ugat-marl/diagnosis/6"
     assert found["hashes"] == {"scenario": street.scenario.hash, "measured": measured.hash}
     assert found["periods"] == {"fit": ["day1", "day2", "day3"], "heldout": ["day4", "day5"]}
     assert not found["verified_on_fitted_periods"]

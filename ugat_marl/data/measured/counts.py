@@ -115,7 +115,8 @@ def _within_periods(
     if not inside.all():
         index = {period.id: i for i, period in enumerate(periods)}
         which = frame["period_id"].replace_strict(index, return_dtype=pl.Int32).to_numpy()
-        report_outside(path, periods, which, frame["begin_s"].to_numpy(), inside, findings)
+        begin_s, end_s = (frame[name].to_numpy() for name in ("begin_s", "end_s"))
+        report_outside(path, periods, which, begin_s, inside, findings, end_s)
         frame = frame.filter(pl.Series(inside))
     for partly, column, complaint in (
         (pl.col("begin_s") < pl.col("period_begin_s"), "begin_s", "is before the period's begin"),

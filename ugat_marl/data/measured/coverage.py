@@ -421,20 +421,25 @@ def _of_silence(measured: MeasuredData) -> Iterator[Finding]:
             continue
         times = {name: _times(period, name) for name in period.passages}
         together = np.concatenate(list(times.values()))
+        silent = [
+            (hole, "A diagnosis leaves this time out of all periods")
+            for hole in recording_holes([period])
+        ]
         begin, length = _longest_gap(together, period)
-        hole = _is_hole(together, begin, length, period)
-        if hole or length > ALL_SILENT_S:
-            left_out = hole and _lights_change(period, begin, begin + length)
-            what_then = (
-                "a diagnosis leaves this time out of all periods"
-                if left_out
-                else ("if it was, end the period before it, in periods.csv")
+        known = [span for span, _ in silent]
+        long = length > ALL_SILENT_S or _is_hole(together, begin, length, period)
+        if long and (begin, begin + length) not in known:
+            way_out = (
+                "begin the period after" if begin <= period.begin_s else "end the period before"
             )
+            silent.append(((begin, begin + length), f"If it was, {way_out} it, in periods.csv"))
+        for (begin, end), what_then in silent:
             yield Finding(
-                f"detections: no detector says anything for {length / 60:.0f} min from {begin:g} s "
-                f"on in period {period.id!r}; was the recording interrupted, or a clock set ahead? "
-                f"{what_then.capitalize()}"
+                f"detections: no detector says anything for {(end - begin) / 60:.0f} min from "
+                f"{begin:g} s on in period {period.id!r}; was the recording interrupted, or a "
+                f"clock set ahead? {what_then}"
             )
+        if silent:
             continue
         for group in roads.values():
             for name, behaviour, silence in _silent(group, times, period, usual):

@@ -547,6 +547,7 @@ def report_outside(
     time: NDArray[np.float64],
     inside: NDArray[np.bool_],
     findings: list[Finding],
+    end_s: NDArray[np.float64] | None = None,
 ) -> None:
     """Add a finding on rows outside of their periods.
 
@@ -557,6 +558,7 @@ def report_outside(
         time: Time of each row, s, ``(n,)``.
         inside: True for rows within their period, ``(n,)``.
         findings: Findings.
+        end_s: End of each row, s, ``(n,)``, where rows are intervals.
 
     Raises:
         MeasuredDataError: Most rows of a period lie outside of it, and the others do not reach from
@@ -566,7 +568,9 @@ def report_outside(
     outside = np.bincount(which[~inside], minlength=len(periods))
     for period, rows, lost in zip(periods, total, outside, strict=True):
         own = which == periods.index(period)
-        if lost > MOST_OUTSIDE * rows and not _reaches_through(time[own & inside], period):
+        last = time if end_s is None else end_s
+        kept = own & inside
+        if lost > MOST_OUTSIDE * rows and not _reaches_through(time[kept], last[kept], period):
             example = time[own & ~inside][0]
             if abs(example) > EPOCH:
                 hint = "these are dates; subtract the moment at which the scenario's clock is 0"
@@ -592,13 +596,15 @@ def report_outside(
     )
 
 
-def _reaches_through(inside_s: NDArray[np.float64], period: Period) -> bool:
+def _reaches_through(
+    begin_s: NDArray[np.float64], end_s: NDArray[np.float64], period: Period
+) -> bool:
     """Return True if rows reach from the first to the last tenth of a period."""
     margin = 0.1 * period.length_s
     return bool(
-        len(inside_s)
-        and inside_s.min() <= period.begin_s + margin
-        and inside_s.max() >= period.end_s - margin
+        len(begin_s)
+        and begin_s.min() <= period.begin_s + margin
+        and end_s.max() >= period.end_s - margin
     )
 
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from numbers import Integral
+from os import PathLike, fspath
 from typing import Any
 
 from ugat_marl.errors import OptionError, require_kinds
@@ -148,6 +149,8 @@ class DQNConfig:
         # JSON gives a list, which would differ from the tuple of a checkpoint
         if isinstance(self.hidden, list):
             object.__setattr__(self, "hidden", tuple(self.hidden))
+        if isinstance(self.start, PathLike):
+            object.__setattr__(self, "start", fspath(self.start))
         for name in (
             "batch_size",
             "replay_capacity",
