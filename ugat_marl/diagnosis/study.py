@@ -11,6 +11,7 @@ from pathlib import Path
 
 import numpy as np
 import polars as pl
+from numpy.typing import NDArray
 
 from ugat_marl.data import Finding, MeasuredData, is_actuated, recording_holes
 from ugat_marl.diagnosis.compared_detectors import compared_detectors
@@ -186,16 +187,13 @@ class Study:
         network, thresholds = Network.read(scenario), config.thresholds
         detectors, findings = compared_detectors(scenario, measured, thresholds)
         measured, data_hash = _noted(measured, findings), measured.hash
-        holes = recording_holes(measured.periods)
-        kept = (without_holes(period, holes) for period in measured.periods)
-        measured = replace(measured, periods=_of_common_windows(tuple(kept)))
+        measured, holes = _without_holes(measured)
         layout = DetectorLayout.of(network, detectors, scenario.settings.begin_s)
         ruled_out = frozenset(name for finding in measured.findings for name in finding.rules_out)
         allowed = library(config.leave_out) - ruled_out
-        periods = _fitted_periods(measured, config.thresholds)
+        periods = _fitted_periods(measured, thresholds)
         answering = _answering(measured, layout.intersections)
         effort = config.effort or effort_for(len(layout.intersections), measured.periods)
-        budget = config.budget()
         supplementary = SupplementaryData.of(measured)
         fit = _tallies(layout, measured, periods, thresholds, supplementary)
         heldout = _tallies(layout, measured, measured.of("heldout"), thresholds, supplementary)
@@ -204,48 +202,33 @@ class Study:
         compared = None if measured.has_events else sum_of((*fit, *heldout)).sums[..., 1:] > 0
         measured = _noted(measured, variation_findings(variation, len(measured.periods)))
 
-        def simulating(answering: bool, base_days: int) -> Engine:
-            return Engine(
-                scenario,
-                layout,
-                Replay(
-                    scenario,
-                    network,
-                    detectors,
-                    layout.owner,
-                    thresholds,
-                    answering=answering,
-                    day_to_day=variation,
-                    followed=supplementary.followed if supplementary else (),
-                    watched=supplementary.lanes if supplementary else (),
-                ),
-                [*periods, *measured.of("heldout")],
-                config.seed,
-                thresholds,
-                cache=config.cache or default_cache(),
-                budget=budget,
-                workers=config.workers,
-                base_days=base_days,
-                interval_s=None if measured.has_events else usual_length(measured.counts),
-                supplementary=supplementary,
-                holes=holes,
-                compared=compared,
-            )
-
+        simulating = functools.partial(
+            _engine,
+            scenario,
+            network,
+            layout,
+            measured,
+            config,
+            budget=config.budget(),
+            day_to_day=variation,
+            supplementary=supplementary,
+            holes=holes,
+            compared=compared,
+        )
         return cls(
             scenario=scenario,
             network=network,
             measured=measured,
             config=config,
             layout=layout,
-            engine=simulating(answering, effort.base),
+            engine=simulating(answering=answering, base_days=effort.base),
             pools=_pools(layout, measured, supplementary, thresholds),
             allowed=allowed,
             hypotheses=tuple(global_hypotheses(scenario, allowed)),
             effort=effort,
             fit=fit,
             heldout=heldout or fit,
-            other_days=simulating(False, 0) if answering else None,
+            other_days=simulating(answering=False, base_days=0) if answering else None,
             ruled_out=ruled_out,
             day_to_day=variation,
             data_hash=data_hash,
@@ -669,6 +652,58 @@ def _fitted_periods(measured: MeasuredData, thresholds: Thresholds) -> tuple[Per
         raise MeasuredDataError("no period has the split 'fit'; there is nothing to fit")
     _refuse_lengths(measured.periods, thresholds)
     return periods
+
+
+def _engine(
+    scenario: Scenario,
+    network: Network,
+    layout: DetectorLayout,
+    measured: MeasuredData,
+    config: DiagnosisConfig,
+    *,
+    answering: bool,
+    base_days: int,
+    budget: Budget,
+    day_to_day: float,
+    supplementary: SupplementaryData | None,
+    holes: Sequence[tuple[float, float]],
+    compared: NDArray[np.bool_] | None,
+) -> Engine:
+    """Return the simulator of days under the signals of the measured periods."""
+    replay = Replay(
+        scenario,
+        network,
+        layout.detectors,
+        layout.owner,
+        config.thresholds,
+        answering=answering,
+        day_to_day=day_to_day,
+        followed=supplementary.followed if supplementary else (),
+        watched=supplementary.lanes if supplementary else (),
+    )
+    return Engine(
+        scenario,
+        layout,
+        replay,
+        [*measured.of("fit"), *measured.of("heldout")],
+        config.seed,
+        config.thresholds,
+        cache=config.cache or default_cache(),
+        budget=budget,
+        workers=config.workers,
+        base_days=base_days,
+        interval_s=None if measured.has_events else usual_length(measured.counts),
+        supplementary=supplementary,
+        holes=holes,
+        compared=compared,
+    )
+
+
+def _without_holes(measured: MeasuredData) -> tuple[MeasuredData, tuple[tuple[float, float], ...]]:
+    """Return the data without times that were not recorded, in common windows, and these times."""
+    holes = recording_holes(measured.periods)
+    kept = tuple(without_holes(period, holes) for period in measured.periods)
+    return replace(measured, periods=_of_common_windows(kept)), holes
 
 
 def _of_common_windows(periods: tuple[Period, ...]) -> tuple[Period, ...]:
