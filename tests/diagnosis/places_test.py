@@ -234,6 +234,43 @@ def test_two_detectors_taken_for_each_other(reference: Reference) -> None:
     assert dict(item.fixed) == {"detector": "stop:a", "other": "stop:d"}
 
 
+def test_exchanged_detectors_are_seen_though_days_differ() -> None:
+    """That all counts of a day are higher says nothing of which detector is which."""
+    generator = np.random.default_rng(7)
+
+    def a_day(seed: int) -> Period:
+        level = float(generator.normal(1.0, 0.1))
+        return street(seed, {arm: lambda t, x=level: np.full_like(t, x) for arm in ARMS})
+
+    usual = Reference(Pools.of(SITE, THRESHOLDS), tallies([a_day(seed) for seed in range(40)]))
+    exchanged = parse_domain("swapped=stop:d,stop:b")
+    data = [
+        apply_detector_effects(a_day(900 + day), exchanged, SITE.detectors, dict(SITE.owner))
+        for day in range(5)
+    ]
+    item = first(proposed(usual, data), "swapped")
+    assert dict(item.fixed) == {"detector": "stop:b", "other": "stop:d"}
+
+
+def test_a_surge_is_seen_on_the_first_measured_road_of_its_origin(reference: Reference) -> None:
+    """Vehicles enter a map of a city far from the detectors."""
+
+    def renamed(flows: dict[str, dict[str, float]]) -> dict[str, dict[str, float]]:
+        own = flows["a_in"]
+        return flows | {"a_far": {"a_far": RATE_PER_HOUR["a"]} | own}
+
+    passing = renamed(ROUTES.passing)
+    del passing["a_in"]
+    far = Routes(ROUTES.origins, passing, ROUTES.turns, renamed(ROUTES.joint))
+    surge = {"a": lambda t: np.where((t >= 600.0) & (t < 1500.0), 1.8, 1.0)}
+    data = [street(320 + i, surge) for i in range(5)]
+    finder = PlaceFinder(SITE, far, library(), THRESHOLDS)
+    found = finder.hypotheses(reference, reference.distance(tallies(data)), data)
+    item = first(found, "demand_surge")
+    assert dict(item.fixed)["edge"] == "a_far"
+    assert overlap(window_of(item), (600.0, 1500.0)) > 0.85
+
+
 def test_a_detector_that_sticks(reference: Reference) -> None:
     item = first(proposed(reference, fault("stuck=advance:b,1200,2000")), "stuck")
     assert dict(item.fixed)["detector"] == "advance:b"

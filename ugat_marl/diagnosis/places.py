@@ -7,6 +7,7 @@ detectors show in their own data.
 
 from __future__ import annotations
 
+import math
 from collections import defaultdict
 from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass
@@ -159,7 +160,8 @@ class PlaceFinder:
         thresholds = self._thresholds
         ranked: list[tuple[float, Hypothesis]] = []
         for origin in self._routes.passing:
-            members = [i for i, edge in enumerate(self._edges) if edge == origin]
+            measured = self._measured_edge(origin)
+            members = [i for i, edge in enumerate(self._edges) if edge == measured]
             window = self._scan(
                 reference, distance, periods, members, "count_advance", "count_exit"
             )
@@ -188,6 +190,15 @@ class PlaceFinder:
         ):
             chosen += list(dict.fromkeys(pair for _, pair in ranked if pair.name == kind))[:most]
         return chosen
+
+    def _measured_edge(self, origin: str) -> str | None:
+        """Return the first measured edge on the ways of an origin that is mostly its own."""
+        measured = set(self._edges)
+        for edge in self._routes.passing[origin]:  # in the order of a route
+            own = edge == origin or self._routes.share(origin, edge) > self._thresholds.mostly
+            if own and edge in measured:
+                return edge
+        return None
 
     def _scan(
         self,
@@ -804,7 +815,8 @@ def fault_hypotheses(
     silent = [x for x in _silent(periods, mean, thresholds) if dict(x.fixed)["detector"] not in on]
     hypotheses += stuck + silent
     kinds = {detector.id: detector.kind for detector in layout.detectors}
-    hypotheses += _swapped(kinds, mean, difference, z, thresholds)
+    minutes = sum(period.length_s for period in periods) / 60.0
+    hypotheses += _swapped(kinds, mean, difference, minutes, thresholds)
     return hypotheses
 
 
@@ -865,16 +877,32 @@ def _swapped(
     kinds: Mapping[str, str],
     mean: Mapping[str, float],
     difference: Mapping[str, float],
-    z: Mapping[str, float],
+    minutes: float,
     thresholds: Thresholds,
 ) -> list[Hypothesis]:
-    """Find pairs of detectors of one kind whose counts fit if they are exchanged."""
+    """Find pairs of detectors of one kind whose counts fit if they are exchanged.
+
+    Their errors are those of counts by chance alone: that days differ changes both alike.
+
+    Args:
+        kinds: Kind of each detector.
+        mean: Expected vehicles per minute at each detector.
+        difference: Measured minus expected ones.
+        minutes: Length of all periods, min.
+        thresholds: Numbers of the method.
+    """
     ranked: list[tuple[float, Hypothesis]] = []
-    suspects = [name for name in mean if abs(z[name]) > thresholds.swap_suspect]
+    chance = {
+        name: math.sqrt(max(rate, rate + difference[name], 0.0) / minutes)
+        for name, rate in mean.items()
+    }
+    suspects = [
+        name for name in mean if abs(difference[name]) > thresholds.swap_suspect * chance[name]
+    ]
     for first in suspects:
         for second in suspects:
             if first < second and kinds[first] == kinds[second]:
-                error = abs(difference[first] / z[first]) + abs(difference[second] / z[second])
+                error = chance[first] + chance[second]
                 change = mean[second] - mean[first]
                 before = difference[first] ** 2 + difference[second] ** 2
                 after = (difference[first] - change) ** 2 + (difference[second] + change) ** 2

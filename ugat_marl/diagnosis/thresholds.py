@@ -535,13 +535,13 @@ class Thresholds(DayThresholds):
     """Share of missed vehicles below which it does not matter. By hand. Halved: chance is named
     more often."""
     swap_suspect: float = 4.0
-    """Standardised difference of a count beyond which two detectors may be exchanged. By hand.
-    Halved: more pairs are compared."""
+    """Difference of a count, in errors of counts by chance, beyond which two detectors may be
+    exchanged. By hand. Halved: more pairs are compared."""
     swap_left: float = 0.3
     """Largest share of the squared differences that an exchange may leave. By hand. Halved: noisy
     counts hide an exchange."""
     swap_errors: float = 3.0
-    """Least difference of the two expected counts, in errors of the measured ones. By hand. Halved:
+    """Least difference of the two expected counts, in such errors of both. By hand. Halved:
     detectors with similar counts are proposed."""
     scan_s: float = 60.0
     """Step of the scan for windows, s. By hand; the fit then uses smaller steps. Halved: slower,
