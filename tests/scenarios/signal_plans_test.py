@@ -666,7 +666,7 @@ def test_a_later_plan_of_another_light_keeps_the_earlier_one() -> None:
 @pytest.mark.parametrize(
     ("text", "told"),
     [
-        ("A1,60,0,NBT,30,3,1,5", "line 2: '5' is beyond the last column; a decimal comma"),
+        ("A1,60,0,NBT,30,3,1,5", "line 2: '5' is beyond the last column; put cells that hold"),
         ("x" * 200_000, "line 2: not CSV"),
     ],
 )
