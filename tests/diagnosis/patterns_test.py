@@ -296,6 +296,6 @@ def test_errors_know_that_detectors_count_the_same_vehicles() -> None:
         strict=True,
     )
     assert np.mean(errors) < 0.8 * np.std(shares)
-    wide, none = _spread(regression, days, (3, 0), THRESHOLDS, term)
+    wide, none = _spread(regression, days, (3, 0), THRESHOLDS, term.chosen)
     assert wide == pytest.approx(np.std(shares), rel=0.35)
     assert none == 0.0

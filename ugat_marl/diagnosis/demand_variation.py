@@ -79,21 +79,19 @@ def measured_variation(
         return 0.0
     owners = np.array([lane.intersection for lane in layout.lanes])
     known = np.all([day.counted > 0 for day in days], axis=0)  # a missing interval is no zero
+
+    def counts(kind: str, places: Sequence[int]) -> Array:
+        row = BIN_FEATURES.index(kind)
+        return np.array([(day.bins[row, places] * known[row, places]).sum() for day in days])
+
     rows: list[Array] = []
     for number in range(len(layout.intersections)):
-        lanes = np.flatnonzero(owners == number)
+        lanes = np.flatnonzero(owners == number).tolist()
         exits = [len(owners) + k for k, (own, *_) in enumerate(layout.exits) if own == number]
-        by_kind = [
-            np.array([(day.bins * known)[BIN_FEATURES.index(kind), places].sum() for day in days])
-            for kind, places in (
-                ("count_stop", lanes),
-                ("count_advance", lanes),
-                ("count_exit", exits),
-            )
-        ]
-        if by_kind[0].any() or by_kind[1].any():  # exits may count vehicles of other lights
-            del by_kind[2]
-        rows.append(max(by_kind, key=lambda counts: float(counts.sum())))
+        by_kind = [counts("count_stop", lanes), counts("count_advance", lanes)]
+        if not np.any(by_kind):  # exits may count vehicles of other lights
+            by_kind = [counts("count_exit", exits)]
+        rows.append(max(by_kind, key=lambda row: float(row.sum())))
     numbers = [number for number, split in enumerate(splits) for _ in split]
     return day_to_day_variation(np.array(rows), thresholds, numbers)
 

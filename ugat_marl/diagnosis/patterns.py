@@ -413,8 +413,10 @@ def patterns(
             np.sum([day[quantity] for day in measured], axis=0),
             np.sum([day[quantity] for day in heldout], axis=0) if heldout else None,
             lambda gain, moments=moments: log_normal_tail(gain, *moments),
-            functools.partial(
-                _spread, regression, cells, (len(measured), len(heldout)), thresholds
+            functools.cache(
+                functools.partial(
+                    _spread, regression, cells, (len(measured), len(heldout)), thresholds
+                )
             ),
             thresholds,
             alpha / len(quantities),
@@ -429,7 +431,7 @@ def _terms(
     measured: Array,
     heldout: Array | None,
     chance: Callable[[float], float],
-    spread: Callable[[PatternTerm], tuple[float, float]],
+    spread: Callable[[tuple[int, ...]], tuple[float, float]],
     thresholds: Thresholds,
     alpha: float,
 ) -> Iterator[tuple[PatternTerm, float, float | None]]:
@@ -445,7 +447,7 @@ def _terms(
             others = [*terms[:place], *terms[place + 1 :]]
             share, error = regression.of(term, regression.without(measured, others))
             again, holds = None, abs(share) >= thresholds.least_share
-            wide, wide_again = spread(term)
+            wide, wide_again = spread(term.chosen)
             error = max(error, wide)
             if heldout is not None:
                 again, doubt = regression.of(term, regression.without(heldout, others))
@@ -475,9 +477,9 @@ def _spread(
     cells: Sequence[Array],
     periods: tuple[int, int],
     thresholds: Thresholds,
-    term: PatternTerm,
+    chosen: tuple[int, ...],
 ) -> tuple[float, float]:
-    """Return the standard deviation of a term's share over simulated data.
+    """Return the standard deviation of the share of a term over simulated data.
 
     Cells are no independent observations: several detectors count the same vehicles.
 
@@ -486,11 +488,12 @@ def _spread(
         cells: Cells of these days.
         periods: Numbers of the fitted and of the held-out periods.
         thresholds: Numbers of the method.
-        term: The term.
+        chosen: Index of the term's set along every axis.
 
     Returns:
         The deviations for as many fitted and for as many held-out periods; 0 without any.
     """
+    term = PatternTerm(chosen, 0.0, 0.0, 0.0)
     found: list[float] = []
     for size in periods:
         generator = np.random.default_rng(6)

@@ -86,6 +86,7 @@ class Selector:
         self._reporter = reporter
         self._first = fitter.base.distance(fitter.data)
         self._seen: dict[str, Fitted] = {}
+        self._costs: dict[tuple[Members, int], float] = {}
         self._of_library: tuple[Direction, ...] = ()
         self._places: tuple[Direction, ...] = ()
         self._of_round: dict[int, list[Direction]] = {}
@@ -160,9 +161,11 @@ class Selector:
 
         More days lower the cost of a model, and few models are simulated on many.
         """
-        days = len(rival.days)
-        alike = best if len(best.days) == days else self._fitter.simulate(best.members, days)
-        return rival.cost - alike.cost
+        key = best.members, len(rival.days)
+        if key not in self._costs:  # many rivals have equally many days
+            same = len(best.days) == key[1]
+            self._costs[key] = best.cost if same else self._fitter.simulate(*key).cost
+        return rival.cost - self._costs[key]
 
     @property
     def held(self) -> frozenset[int]:

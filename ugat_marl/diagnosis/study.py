@@ -283,9 +283,7 @@ class Study:
         measurement = self._measurement((), reporter)
         measured = self.measured
         if (points := measurement.contradicted_point()) is not None:
-            finding = _of_speed_points(*points)
-            reporter.say(f"note: {finding.text}")
-            measured = _noted(measured, [finding])
+            measured = _said(measured, [_of_speed_points(*points)], reporter)
         errors = measurement.errors(self.config.leave_out)
         if self.other_days is not None and not self.speeds and self._pulses_upstream(errors):
             finding = Finding(
@@ -293,8 +291,7 @@ class Study:
                 "a vehicle that queued on one seems to arrive when it moves on, so queues that "
                 "reach these detectors come out shorter in the simulation"
             )
-            reporter.say(f"note: {finding.text}")
-            measured = _noted(measured, [finding])
+            measured = _said(measured, [finding], reporter)
         return replace(self._detecting(errors) if errors else self, measured=measured)
 
     def _pulses_upstream(self, errors: Sequence[DetectorError]) -> bool:
@@ -376,14 +373,12 @@ class Study:
         wrong = implausible(here, there, thresholds)
         if not wrong:
             return self
-        findings = tuple(_of_length(kind, *both) for kind, both in wrong.items())
-        for finding in findings:
-            reporter.say(f"note: {finding.text}")
+        findings = [_of_length(kind, *both) for kind, both in wrong.items()]
         fit, heldout = (
             tuple(without_occupancies(day, wrong) for day in days)
             for days in (self.fit, self.heldout)
         )
-        noted = _noted(self.measured, findings)
+        noted = _said(self.measured, findings, reporter)
         return replace(self, measured=noted, fit=fit, heldout=heldout)
 
     def base(self, reporter: Reporter) -> Tested:
@@ -449,8 +444,7 @@ class Study:
             f"{more:.0f} passages more in the first {thresholds.bin_s / 60:g} minutes. "
             "Begin the scenario ten minutes earlier (begin_s), with its vehicles"
         )
-        reporter.say(f"note: {finding.text}")
-        return replace(self, measured=_noted(self.measured, (finding,)))
+        return replace(self, measured=_said(self.measured, [finding], reporter))
 
     def with_findings_on_travel_times(self, base: Tested, reporter: Reporter) -> Study:
         """Note the travel times that cannot be compared."""
@@ -476,9 +470,8 @@ class Study:
             )
             if ways.any()
         ]
-        for text in texts:
-            reporter.say(f"note: {text}")
-        return replace(self, measured=_noted(self.measured, [Finding(text) for text in texts]))
+        findings = [Finding(text) for text in texts]
+        return replace(self, measured=_said(self.measured, findings, reporter))
 
     @property
     def shows_patterns(self) -> bool:
@@ -652,6 +645,13 @@ def _fitted_periods(measured: MeasuredData, thresholds: Thresholds) -> tuple[Per
         raise MeasuredDataError("no period has the split 'fit'; there is nothing to fit")
     _refuse_lengths(measured.periods, thresholds)
     return periods
+
+
+def _said(measured: MeasuredData, findings: Sequence[Finding], reporter: Reporter) -> MeasuredData:
+    """Say findings as notes, and return the data with them."""
+    for finding in findings:
+        reporter.say(f"note: {finding.text}")
+    return _noted(measured, findings)
 
 
 def _engine(

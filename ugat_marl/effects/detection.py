@@ -290,20 +290,16 @@ class DetectorSplash(_OfDetectors):
         with the error report (1 + share A) c. Of a pair of twins one stays.
         """
         beside = next_detectors(detectors)
-        names = [detector.id for detector in detectors]
+        index = {detector.id: number for number, detector in enumerate(detectors)}
         own = detectors_at(self.place, detectors, self.name)
-        shares = np.eye(len(names))
-        for name in own:
-            for other in beside.get(name, ()):
-                shares[names.index(name), names.index(other)] += self.share
-        counts = np.array([len(period.of_detector(name)) for name in names], np.float64)
+        pairs = [(name, other) for name in own for other in beside[name]]
+        shares = np.eye(len(index))
+        for name, other in pairs:
+            shares[index[name], index[other]] += self.share
+        counts = np.array([len(period.of_detector(name)) for name in index], np.float64)
         street = np.maximum(np.linalg.lstsq(shares, counts)[0], 0.0)
-        extra = {
-            (name, other): self.share * float(street[names.index(other)])
-            for name in own
-            for other in beside.get(name, ())
-        }
-        gone: dict[str, set[int]] = {name: set() for name in names}
+        extra = {(name, other): self.share * float(street[index[other]]) for name, other in pairs}
+        gone: dict[str, set[int]] = {name: set() for name in index}
         for _, one, first, other, second in sorted(_twins(period, extra)):
             if first in gone[one] or second in gone[other]:
                 continue
@@ -341,11 +337,14 @@ def _twins(
     """Yield the passages of neighbours that begin together: how far apart, then whose and which."""
     for one, other in {tuple(sorted(pair)) for pair in pairs}:
         first, second = period.of_detector(one), period.of_detector(other)
-        ends = np.nan_to_num(second.on_s, nan=-np.inf)
-        order = np.argsort(ends)
+        begins = np.nan_to_num(second.on_s, nan=-np.inf)
+        order = np.argsort(begins)
+        low, high = (
+            np.searchsorted(begins[order], first.on_s + shift).tolist()
+            for shift in (-TWIN_S, TWIN_S)
+        )
         for number, on_s in enumerate(first.on_s.tolist()):
-            low, high = np.searchsorted(ends[order], (on_s - TWIN_S, on_s + TWIN_S))
-            for place in order[low:high].tolist():
+            for place in order[low[number] : high[number]].tolist():
                 apart_s = abs(second.on_s[place] - on_s)
                 apart_s += abs(np.nan_to_num(second.off_s[place] - first.off_s[number]))
                 yield float(apart_s), one, number, other, place

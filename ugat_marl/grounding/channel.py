@@ -557,9 +557,10 @@ def _mixture(
         arriving = [*course.asked[: kinds - 1], nothing]
         shown = [*range(kinds - 1), 0] if lags is None else [lags[place]] * kinds
         known = course.asked[kinds - 2] >= 0  # so that every lag can explain the row
+        allowed = {lag: course.permitted(table, lag) for lag in set(shown)}
         same = np.stack(
             [
-                course.obeyed(command, course.permitted(table, lag)) == course.executed
+                course.obeyed(command, allowed[lag]) == course.executed
                 for command, lag in zip(arriving, shown, strict=True)
             ]
         )

@@ -474,7 +474,8 @@ def phases_shown(
 
     A state with the greens of a phase shows it. Another one that lasts for a minimum green shows
     the phase with the most similar greens. The rest are clearances, which lead to the next phase:
-    states with yellow, and what follows one for less than a minimum green.
+    states with yellow, and what follows one for less than a minimum green, with greens that were
+    there before it.
 
     Args:
         shown: States of the light.
