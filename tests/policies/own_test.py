@@ -356,7 +356,7 @@ class Bare(Lazy):
     [
         (NoPolicy, OptionError, "no method policy()"),
         (NeedsMore, OptionError, "called as learn(env, episodes)"),
-        (Wild, ActionError, "99"),
+        (Wild, OptionError, "its phases are 0 to"),
         (Mute, OptionError, "returned NoneType"),
         (Unready, OptionError, "no network yet"),
         (Bare, OptionError, "a int has no act"),

@@ -148,7 +148,7 @@ class OwnPolicy:
         """Return the actions of the user's policy as whole numbers.
 
         Raises:
-            OptionError: It returned no mapping from agents to numbers.
+            OptionError: It returned no mapping from every agent to a phase that the agent has.
         """
         act = getattr(self._given, "act", self._given)
         by_name = {"infos": infos} if self._names_infos else {}
@@ -168,7 +168,21 @@ class OwnPolicy:
                     f"policy {self._name!r} returned {action!r} for {agent!r}; it must be the "
                     "number of a phase, one whole number"
                 ) from None
+        self._require_phases(actions, infos)
         return actions
+
+    def _require_phases(self, actions: Actions, infos: Infos) -> None:
+        for agent, info in infos.items():
+            if agent not in actions:
+                raise OptionError(
+                    f"policy {self._name!r} returned no phase for {agent!r}; every agent needs one"
+                )
+            phases = len(info["action_mask"])
+            if not 0 <= actions[agent] < phases:
+                raise OptionError(
+                    f"policy {self._name!r} returned {actions[agent]} for {agent!r}; its phases "
+                    f"are 0 to {phases - 1}"
+                )
 
     def save(self, path: Path) -> None:
         """Write the state of the learner that made the policy atomically."""
