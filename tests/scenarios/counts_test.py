@@ -76,6 +76,22 @@ def test_a_long_way_to_a_counted_road_is_told(
         assert ("intervals are of departures at the edge of the network" in said) == told
 
 
+@pytest.mark.parametrize(
+    ("columns", "first", "second"),
+    [
+        ("begin,end", ("23:30", "23:45:00"), ("23:45", "0:00")),
+        ("begin_s,end_s", ("4.3.2024 23:30", "4.3.2024 23:45"), ("4.3.2024 23:45", "86400")),
+    ],
+)
+def test_times_of_day_count_from_midnight(
+    tmp_path: Path, columns: str, first: tuple[str, str], second: tuple[str, str]
+) -> None:
+    table = f"edge,count,{columns}\nA1_B1,20,{','.join(first)}\nA1_northA,9,{','.join(second)}\n"
+    (tmp_path / "t.csv").write_text(table)
+    rows = read_rows(tmp_path / "t.csv", 84600, 86400, Silent(), pairs=False)
+    assert [(row.begin_s, row.end_s) for row in rows] == [(84600, 85500), (85500, 86400)]
+
+
 def test_origins_and_destinations(tmp_path: Path) -> None:
     (tmp_path / "od.csv").write_text(
         "from,to,count\nwest1_A1,B1_east1,50\nnorthA_A1,A1_southA,20\nnorthA_A1,A1_west1,0\n"
@@ -103,21 +119,40 @@ def test_origins_and_destinations(tmp_path: Path) -> None:
         ("--counts", "edge,count\nwest1_A1,many\n", "line 2: count = 'many' is not a number"),
         (
             "--counts",
-            "edge,count,begin_s,end_s\nwest1_A1,5,07:00,8:00:00\n",
-            "begin_s = '07:00' is not a number of at least 0; write seconds: 25200",
+            "edge,count,begin,end\nwest1_A1,5,07:00,8:00:00\n",
+            "the first begins at 25200 s (line 2); --begin-s 25200 lets the episode begin there",
         ),
         (
             "--counts",
-            "edge,count,begin_s,end_s\nwest1_A1,5,04.03.2024 07:30,04.03.2024 08:00\n",
-            "is not a number of at least 0; write seconds: 27000, counted from midnight",
+            "edge,count,begin_s,end_s\nwest1_A1,5,4.3.2024 7:30,4.3.2024 8:00\n"
+            "west1_A1,5,5.3.2024 7:30,5.3.2024 8:00\n",
+            "line 3: begin_s is on 5.3.2024, and rows before it on 4.3.2024; a scenario has the",
+        ),
+        (
+            "--counts",
+            "edge,count,begin,end\nwest1_A1,5,7:00,25:10\n",
+            "end = '25:10' is not a time",
+        ),
+        (
+            "--counts",
+            "edge,count,begin,begin_s\nwest1_A1,5,7:00,9\n",
+            "begin and begin_s; keep one",
         ),
         ("--counts", "edge,count\nwest1_A1,n/a\n", "of at least 0; write whole numbers w"),
         ("--counts", "edge,count\nwest1_A1,-1\n", "line 2: count = '-1' is not a number of at"),
         ("--counts", "edge,count\nwest1_A1,1_000\n", "line 2: count = '1_000' is not a number"),
         ("--counts", "edge,count\nwest1_A1,١٢\n", "line 2: count = '١٢' is not a number"),
         ("--counts", "edge,count\nwest1_A1,true\n", "line 2: count = 'true' is not a number"),
-        ("--counts", "edge,count,begin,end\nwest1_A1,5,0,60\n", "line 1: column 'begin' is not kn"),
-        ("--od", "from,to,count,Start\nwest1_A1,B1_east1,5,0\n", "is begin_s to end_s, in seconds"),
+        (
+            "--counts",
+            "edge,count,begin,end\nwest1_A1,5,0,60\n",
+            "begin = '0' is not a time of day such as",
+        ),
+        (
+            "--od",
+            "from,to,count,Start\nwest1_A1,B1_east1,5,0\n",
+            "to end_s, in seconds, or begin to",
+        ),
         ("--counts", "edge,count\nwest1_A1,inf\n", "line 2: count = 'inf' is not a number"),
         ("--counts", "edge,count\nwest1_A1\n", "line 2: count = None is not a number"),
         ("--counts", "edge,count\nwest1_A1,5\nhere,5\n", "line 3: 'here' is not a road for cars"),

@@ -85,10 +85,10 @@ class ScenarioNew:
         routes: Route files for the network.
         vph: Vehicles an hour at every road into the network.
         turns: Shares of left turns, straight on and right turns, for --vph.
-        counts: CSV file of counts: edge,count or from,to,count; also begin_s,end_s. Rows with a
-            blank count are left out. Without any vehicles, counts.csv is written as a sheet to fill
-            in, with a row for every turn at a light and its streets.
-        od: CSV file of origins and destinations: from,to,count; also begin_s,end_s.
+        counts: CSV file of counts: edge,count or from,to,count; also begin_s,end_s or begin,end.
+            Rows with a blank count are left out. Without any vehicles, counts.csv is written as a
+            sheet to fill in, with a row for every turn at a light and its streets.
+        od: CSV file of origins and destinations: from,to,count; also begin_s,end_s or begin,end.
         seed: Seed of the vehicles of --vph, --counts and --od.
         spacing_m: Distance between intersections of a grid or arterial, m.
         speed_mps: Speed limit of a grid or arterial, m/s.

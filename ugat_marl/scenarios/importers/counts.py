@@ -73,9 +73,10 @@ class Row:
     line: int
 
 
-_NOT_OURS = frozenset(
-    {"begin", "start", "start_s", "from_s", "end", "stop", "stop_s", "to_s", "time"}
-)
+_DAY_S = 86_400.0
+_TIMES = {"begin": "begin_s", "end": "end_s"}
+"""Columns of times of day, and those of seconds in whose place they stand."""
+_NOT_OURS = frozenset({"start", "start_s", "from_s", "stop", "stop_s", "to_s", "time"})
 """Names under which other programs write the times of an interval."""
 
 
@@ -85,7 +86,8 @@ def read_rows(
     """Read a CSV file with the column ``count`` and either ``edge`` or ``from`` and ``to``.
 
     The columns ``begin_s`` and ``end_s`` are optional. Without them a row covers the whole episode.
-    They are on the scenario's clock, on which the episode starts at its own ``begin_s``.
+    They are on the scenario's clock, on which the episode starts at its own ``begin_s``. A time of
+    day such as 07:15, perhaps with a date, counts from midnight; ``begin`` and ``end`` hold these.
     A row whose count is blank is left out: nothing was counted there.
 
     Args:
@@ -106,8 +108,11 @@ def read_rows(
     if times := [name for name in columns if name in _NOT_OURS]:
         raise ScenarioError(
             f"{path}, line 1: column {times[0]!r} is not known; the interval of a row is begin_s "
-            "to end_s, in seconds"
+            "to end_s, in seconds, or begin to end, in times of day"
         )
+    for name, seconds in _TIMES.items():
+        if {name, seconds} <= set(columns):
+            raise ScenarioError(f"{path}, line 1: has {name} and {seconds}; keep one of them")
     if "count" not in columns or not (turns or ("edge" in columns and not pairs)):
         wanted = "from, to and count" if pairs else "count and edge, or count, from and to"
         raise ScenarioError(
@@ -117,10 +122,12 @@ def read_rows(
     rows_read: list[Row] = []
     written: dict[int, str] = {}
     total = 0.0
+    date: str | None = None
     for values in rows_of(reader, path):
         counted = values.get("count")
         if counted is not None and not counted.strip():
             continue
+        date = _one_date(values, date, f"{path}, line {reader.line_num}")
         row = _row(values, turns, (begin_s, end_s), reader.line_num, path)
         rows_read.append(row)
         if counted is not None and not counted.strip().isdigit():
@@ -163,9 +170,10 @@ def _row(
             f"{where}: a count without its road; fill it in, or delete the row if it is a total"
         )
     begin_s, end_s = (
-        _number((values.get(key) or "").strip() or f"{usual}", key, where)
-        for key, usual in zip(("begin_s", "end_s"), episode, strict=True)
+        _time_s(values, key, usual, where) for key, usual in zip(_TIMES, episode, strict=True)
     )
+    if end_s == 0 and (values.get("end") or values.get("end_s") or "").count(":"):
+        end_s = _DAY_S  # until midnight
     if end_s <= begin_s:
         raise ScenarioError(f"{where}: end_s ({end_s:g}) is not after begin_s ({begin_s:g})")
     return Row(roads, _number(values.get("count"), "count", where), begin_s, end_s, line)
@@ -202,9 +210,47 @@ def _refuse_all_outside(rows: Sequence[Row], path: Path, begin_s: float, end_s: 
 
 
 _CLOCK = re.compile(
-    r"(?:\d+[-./]\d+[-./]\d+[ T]+)?(\d{1,2}):([0-5]\d)(?::([0-5]\d)(?:\.\d+)?)?", re.ASCII
+    r"(?:(\d+[-./]\d+[-./]\d+)[ T]+)?(\d{1,2}):([0-5]\d)(?::([0-5]\d)(?:\.0*)?)?", re.ASCII
 )
 """A time of day such as 7:00 or 07:00:00, with a date before it or without."""
+
+
+def _one_date(values: Mapping[str, str | None], before: str | None, where: str) -> str | None:
+    """Return the date of the rows so far, None without any; refuse a second one."""
+    for key in ("begin", "begin_s"):  # an interval may end at midnight, on the next date
+        clock = _CLOCK.fullmatch((values.get(key) or "").strip())
+        date = clock and clock[1]
+        if date and before and date != before:
+            raise ScenarioError(
+                f"{where}: {key} is on {date}, and rows before it on {before}; a scenario has the "
+                "vehicles of one day: keep the rows of one, or the means of all"
+            )
+        before = date or before
+    return before
+
+
+def _time_s(values: Mapping[str, str | None], name: str, usual: float, where: str) -> float:
+    """Return a time of an interval, in s.
+
+    Args:
+        values: Column to cell.
+        name: Name of the column of times of day, "begin" or "end".
+        usual: The time of a blank cell, in s.
+        where: File and line.
+    """
+    of_day = (values.get(name) or "").strip()
+    text = of_day or (values.get(_TIMES[name]) or "").strip()
+    if clock := _CLOCK.fullmatch(text):
+        hours, minutes, seconds = (int(part or 0) for part in clock.groups()[1:])
+        of_midnight = 3600 * hours + 60 * minutes + seconds
+        if of_midnight <= _DAY_S:
+            return float(of_midnight)
+    if of_day:
+        raise ScenarioError(
+            f"{where}: {name} = {of_day!r} is not a time of day such as 07:15; seconds belong into "
+            f"the column {_TIMES[name]}"
+        )
+    return _number(text, _TIMES[name], where) if text else usual
 
 
 def _number(text: str | None, key: str, where: str) -> float:
@@ -218,10 +264,6 @@ def _number(text: str | None, key: str, where: str) -> float:
             way_out = (
                 "; write whole numbers without separators, and leave it blank where nobody counted"
             )
-        elif clock := _CLOCK.fullmatch((text or "").strip()):
-            hours, minutes, seconds = (int(part or 0) for part in clock.groups("0"))
-            of_day = ", counted from midnight" if re.search("[-./]", text or "") else ""
-            way_out = f"; write seconds: {3600 * hours + 60 * minutes + seconds}{of_day}"
         raise ScenarioError(f"{where}: {key} = {text!r} is not a number of at least 0{way_out}")
     return value
 
