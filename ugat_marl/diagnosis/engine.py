@@ -198,9 +198,8 @@ class Engine:
             all days are.
         interval_s: Length of the intervals whose features are compared, s; None for none.
         supplementary: Measured turning counts, travel times and states of lanes; None without any.
-        holes: Times in which nothing was recorded, begin and end in s.
-        compared: True for the sums that the data hold, ``(features, places, 1)``; None for all.
-            Means over several places are then of the same places in both.
+        unmeasured: What simulated days do without; None for the speeds and lengths that the periods
+            lack.
     """
 
     def __init__(
@@ -218,8 +217,7 @@ class Engine:
         base_days: int = 0,
         interval_s: float | None = None,
         supplementary: SupplementaryData | None = None,
-        holes: Sequence[tuple[float, float]] = (),
-        compared: NDArray[np.bool_] | None = None,
+        unmeasured: Unmeasured | None = None,
     ) -> None:
         self._base_days = base_days
         self._interval_s = interval_s
@@ -241,7 +239,7 @@ class Engine:
         self._days: OrderedDict[str, Future[Day]] = OrderedDict()
         self._of_days = threading.Lock()
         self._known: dict[str, Replicate] = {}
-        self._unmeasured = Unmeasured.of(periods, holes)
+        self._unmeasured = unmeasured or Unmeasured.of(periods)
         versions = installed_version("eclipse-sumo"), installed_version("numpy")
         head = (
             VERSION,
@@ -252,13 +250,10 @@ class Engine:
             seed,
             thresholds.of_a_day(),
         )
-        head += (self._unmeasured,) if self._unmeasured else ()
+        head += self._unmeasured.key
         head += (replay.day_to_day,) if replay.day_to_day else ()
         head += ("intervals", interval_s) if interval_s else ()
         head += (supplementary,) if supplementary else ()
-        self._compared = compared
-        if compared is not None and not compared.all():
-            head += (hashlib.sha256(np.packbits(compared).tobytes()).hexdigest(),)
         self._root = hashlib.sha256(repr(head).encode()).hexdigest()
         self._edges = sorted({edge for _, edge, _ in layout.places})
         self._signals = [_signals_hash(period, replay.answering) for period in periods]
@@ -512,8 +507,7 @@ class Engine:
         counted = tally(self.layout, period, self._greens[self.place_of(number)], self._thresholds)
         if self._interval_s is not None:
             counted = with_intervals(counted, self.layout, period, self._interval_s)
-        if self._compared is not None:
-            counted = replace(counted, sums=counted.sums * self._compared)
+        counted = self._unmeasured.summed_in(counted)
         if self._supplementary is not None:
             measured = self.periods[self.place_of(number)]
             supplementary = self._supplementary.simulated(

@@ -11,7 +11,6 @@ from pathlib import Path
 
 import numpy as np
 import polars as pl
-from numpy.typing import NDArray
 
 from ugat_marl.data import Finding, MeasuredData, is_actuated, recording_holes
 from ugat_marl.diagnosis.compared_detectors import compared_detectors
@@ -55,7 +54,7 @@ from ugat_marl.diagnosis.thresholds import (
     Effort,
     Thresholds,
 )
-from ugat_marl.diagnosis.unmeasured import without_holes
+from ugat_marl.diagnosis.unmeasured import Unmeasured, without_holes
 from ugat_marl.effects import DetectorPulse, Effect, detectors_at
 from ugat_marl.errors import MeasuredDataError, OptionError, counted, require_kinds
 from ugat_marl.parallel import Workers
@@ -199,7 +198,7 @@ class Study:
         heldout = _tallies(layout, measured, measured.of("heldout"), thresholds, supplementary)
         variation = measured_variation(layout, measured, (fit, heldout), thresholds)
         # Single vehicles that nobody saw are a finding; counts that nobody made are none.
-        compared = None if measured.has_events else sum_of((*fit, *heldout)).sums[..., 1:] > 0
+        summed = None if measured.has_events else sum_of((*fit, *heldout)).sums[..., 1:] > 0
         measured = _noted(measured, variation_findings(variation, len(measured.periods)))
 
         simulating = functools.partial(
@@ -212,8 +211,7 @@ class Study:
             budget=config.budget(),
             day_to_day=variation,
             supplementary=supplementary,
-            holes=holes,
-            compared=compared,
+            unmeasured=Unmeasured.of(_examined(measured), holes, summed),
         )
         return cls(
             scenario=scenario,
@@ -666,8 +664,7 @@ def _engine(
     budget: Budget,
     day_to_day: float,
     supplementary: SupplementaryData | None,
-    holes: Sequence[tuple[float, float]],
-    compared: NDArray[np.bool_] | None,
+    unmeasured: Unmeasured,
 ) -> Engine:
     """Return the simulator of days under the signals of the measured periods."""
     replay = Replay(
@@ -685,7 +682,7 @@ def _engine(
         scenario,
         layout,
         replay,
-        [*measured.of("fit"), *measured.of("heldout")],
+        _examined(measured),
         config.seed,
         config.thresholds,
         cache=config.cache or default_cache(),
@@ -694,9 +691,12 @@ def _engine(
         base_days=base_days,
         interval_s=None if measured.has_events else usual_length(measured.counts),
         supplementary=supplementary,
-        holes=holes,
-        compared=compared,
+        unmeasured=unmeasured,
     )
+
+
+def _examined(measured: MeasuredData) -> list[Period]:
+    return [*measured.of("fit"), *measured.of("heldout")]
 
 
 def _without_holes(measured: MeasuredData) -> tuple[MeasuredData, tuple[tuple[float, float], ...]]:

@@ -1,4 +1,4 @@
-"""Speeds and lengths that detectors do not measure, and times without a recording."""
+"""Values that a street does not measure; simulated days do without them too."""
 
 from __future__ import annotations
 
@@ -8,33 +8,40 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from ugat_marl.scenarios import (
-    Passages,
-    Period,
-)
+from ugat_marl.diagnosis.features import Tally
+from ugat_marl.scenarios import Passages, Period
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class Unmeasured:
-    """Detectors that saw vehicles but never measured their speeds or lengths.
+    """Speeds and lengths of vehicles, times, and sums that the measured periods lack.
 
     Attributes:
-        speeds: Ids of detectors without speeds, sorted.
-        lengths: Ids of detectors without lengths, sorted.
+        speeds: Ids of detectors that saw vehicles but never measured their speeds, sorted.
+        lengths: Ids of detectors that saw vehicles but never measured their lengths, sorted.
         holes: Times in which nothing was recorded, begin and end in s; the same in all periods.
+        summed: True for the sums that the data hold, ``(features, places, 1)``; None for all. Means
+            over several places are then of the same places in both.
     """
 
-    speeds: tuple[str, ...]
-    lengths: tuple[str, ...]
+    speeds: tuple[str, ...] = ()
+    lengths: tuple[str, ...] = ()
     holes: tuple[tuple[float, float], ...] = ()
+    summed: NDArray[np.bool_] | None = None
 
     @classmethod
-    def of(cls, periods: Sequence[Period], holes: Sequence[tuple[float, float]] = ()) -> Unmeasured:
+    def of(
+        cls,
+        periods: Sequence[Period],
+        holes: Sequence[tuple[float, float]] = (),
+        summed: NDArray[np.bool_] | None = None,
+    ) -> Unmeasured:
         """Find the detectors without speeds or lengths in all measured periods.
 
         Args:
             periods: The periods.
             holes: Times in which nothing was recorded.
+            summed: True for the sums that the data hold.
         """
         seen: set[str] = set()
         speeds: set[str] = set()
@@ -47,15 +54,22 @@ class Unmeasured:
                     speeds.add(name)
                 if np.isfinite(passages.length_m).any():
                     lengths.add(name)
-        return cls(tuple(sorted(seen - speeds)), tuple(sorted(seen - lengths)), tuple(holes))
+        return cls(
+            speeds=tuple(sorted(seen - speeds)),
+            lengths=tuple(sorted(seen - lengths)),
+            holes=tuple(holes),
+            summed=None if summed is None or summed.all() else summed,
+        )
 
-    def __bool__(self) -> bool:
-        return bool(self.speeds or self.lengths or self.holes)
+    @property
+    def key(self) -> tuple[object, ...]:
+        """Values that tell it from another one in a cache; empty if nothing is unmeasured."""
+        sums = None if self.summed is None else (self.summed.shape, self.summed.tobytes())
+        values = (self.speeds, self.lengths, self.holes, sums)
+        return values if any(values) else ()
 
     def kept_from(self, period: Period) -> Period:
         """Return a simulated period without what the street lacks."""
-        if not self:
-            return period
         period = without_holes(period, self.holes)
         passages = {
             name: Passages(
@@ -67,6 +81,10 @@ class Unmeasured:
             for name, seen in period.passages.items()
         }
         return replace(period, passages=passages)
+
+    def summed_in(self, tally: Tally) -> Tally:
+        """Return a simulated tally without the sums that the data lack."""
+        return tally if self.summed is None else replace(tally, sums=tally.sums * self.summed)
 
 
 def without_holes(period: Period, holes: Sequence[tuple[float, float]]) -> Period:
