@@ -220,6 +220,63 @@ def test_who_departs_at_the_beginning_is_scaled(factor: float, names: set[str]) 
     assert departing(apply_effects(scenario, [DemandLevel("*", factor)])).keys() == names
 
 
+def test_flows_that_begin_with_the_episode_are_changed(crossing: Crossing) -> None:
+    flow = '<flow id="f" route="east" begin="begin" end="{}" number="10"/>'
+    for effect, numbers in (
+        (DemandLevel("*", 0.5), {"f": 5}),
+        (DemandLevel("*", 0.0), {}),
+        (HeavyShare(1.0), {"f+heavy": 10}),
+    ):
+        scenario = with_routes(
+            '<route id="east" edges="west1_A1 A1_east1"/>' + flow.format(4000), begin_s=3600.0
+        )
+        found = departing(apply_effects(scenario, [effect]))
+        assert {name: int(x.get("number", "")) for name, x in found.items()} == numbers
+    later = departing(apply_effects(scenario, [DemandTiming("*", 30)]))
+    assert later["f"].get("begin") == "3630"
+
+
+def test_who_departs_at_the_beginning_is_shifted() -> None:
+    route = f'<route edges="{EDGE} A1_southA"/>'
+    scenario = with_routes(
+        f'<vehicle id="v" depart="begin">{route}</vehicle>'
+        f'<vehicle id="w" depart="3610">{route}</vehicle>',
+        begin_s=3600.0,
+    )
+    found = departing(apply_effects(scenario, [DemandTiming("*", 30)]))
+    assert [(name, x.get("depart")) for name, x in found.items()] == [("v", "3630"), ("w", "3640")]
+
+
+@pytest.mark.parametrize("rate", ['period="exp(0.1)"', 'probability="0.1"'])
+def test_a_flow_by_chance_keeps_its_number(rate: str) -> None:
+    scenario = with_routes(
+        '<route id="r" edges="west1_A1 A1_east1"/>'
+        f'<flow id="f" route="r" begin="5" number="60" {rate}/>'
+    )
+    for effect, numbers in (
+        (DemandLevel("*", 1.0), [60]),
+        (DemandLevel("*", 0.5), [30]),
+        (HeavyShare(0.0), [60]),
+        (HeavyShare(0.25), [45, 15]),
+    ):
+        found = departing(apply_effects(scenario, [effect])).values()
+        assert sorted(int(x.get("number", "")) for x in found) == sorted(numbers)
+        assert all("end" not in x.attrib for x in found)
+
+
+def test_a_flow_without_an_end_is_shifted_by_as_much() -> None:
+    """Departures of 3600, 3900, ... 100 s earlier: that of 3900 is the first one."""
+    for first in (0, 3600):
+        scenario = with_routes(
+            '<route id="r" edges="west1_A1 A1_east1"/>'
+            f'<flow id="f" route="r" begin="{first}" period="300"/>',
+            begin_s=3650.0,
+        )
+        for seconds, begin in ((-100, "3800"), (50, "3950"), (-300, "3900")):
+            (shifted,) = departing(apply_effects(scenario, [DemandTiming("*", seconds)])).values()
+            assert shifted.get("begin") == begin
+
+
 @pytest.mark.parametrize("factor", [0.0, 2.0])
 def test_who_waits_for_a_person_is_left_alone(factor: float) -> None:
     """A twin would wait for ever, and a person for a vehicle that is taken away."""
@@ -582,19 +639,13 @@ def test_unknown_edges(effect: DemandLevel, message: str) -> None:
         effect.apply(load_scenario("single-v1"))
 
 
-@pytest.mark.parametrize(
-    ("flow", "domain"),
-    [
-        ('vehsPerHour="many"', "demand_level=*,1.2"),
-        ('probability="0" number="5"', "demand_level=*,1.2"),
-    ],
-)
-def test_a_number_that_is_none_is_told_with_the_effect(flow: str, domain: str) -> None:
-    routes = f'<routes><flow id="f" begin="0" end="900" {flow} from="a" to="b"/></routes>'
+def test_a_number_that_is_none_is_told_with_the_effect() -> None:
+    flow = '<flow id="f" begin="0" end="900" vehsPerHour="many" from="a" to="b"/>'
+    routes = f"<routes>{flow}</routes>"
     scenario = load_scenario("single-v1")
     scenario = replace(scenario, routes=(Document("d.rou.xml", None, routes.encode()),))
     with pytest.raises(ScenarioError, match=r"demand_level=.*cannot be applied, because a value"):
-        apply_effects(scenario, parse_domain(domain))
+        apply_effects(scenario, parse_domain("demand_level=*,1.2"))
 
 
 def test_a_flow_that_draws_its_way_cannot_turn() -> None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -21,6 +22,7 @@ from ugat_marl.effects.objectives import NORMS
 from ugat_marl.envs import OBJECTIVE_MEASURES
 from ugat_marl.envs.objectives import PERSONS, PERSONS_IN_A_CAR, Objectives, gini, hidden_measures
 from ugat_marl.errors import UnknownNameError
+from ugat_marl.scenarios import Document
 from ugat_marl.simulation import Trips, read_trips
 from ugat_marl.simulation.trips import STATISTICS
 from ugat_marl.testing.episodes import play, random_actions
@@ -99,7 +101,19 @@ def test_the_cost_is_the_weighted_sum(wanted: str) -> None:
 
 def test_persons_follow_the_vehicle_s_class() -> None:
     persons = objectives("person-delay", "mixed-v1").persons
-    assert persons == {"": PERSONS_IN_A_CAR, "car": PERSONS_IN_A_CAR, "truck": PERSONS["truck"]}
+    own = {"car": PERSONS_IN_A_CAR, "truck": PERSONS["truck"]}
+    assert persons == {"": PERSONS_IN_A_CAR, "DEFAULT_BIKETYPE": PERSONS["bicycle"], **own}
+
+
+def test_a_name_makes_no_truck() -> None:
+    kinds = '<vType id="heavy.bus" vClass="bus"/><vType id="heavy.car" vClass="passenger"/>'
+    document = Document("t.add.xml", None, f"<additional>{kinds}</additional>".encode())
+    scenario = replace(load_scenario("single-v1"), additional=(document,))
+    effects = parse_domain("heavy_share=0.5+objective=person-delay")
+    made = Objectives.of(effects, apply_effects(scenario, effects))
+    assert made is not None
+    assert made.persons["heavy.bus"] == PERSONS["bus"]
+    assert made.persons["heavy.car"] == PERSONS_IN_A_CAR
 
 
 TRIPINFO = """<tripinfos>

@@ -182,6 +182,17 @@ def test_a_delay_at_every_decision_is_late_green() -> None:
     assert trajectory("sim", 0.0) == trajectory("sim", None) != trajectory("sim", 2.0)
 
 
+def test_an_array_of_actions_is_refused(mixed: TrafficEnv) -> None:
+    mixed.reset(seed=1)
+    with pytest.raises(ActionError, match="give a dictionary with the agents as its keys"):
+        mixed.step(np.zeros(7, int))  # type: ignore[arg-type]
+
+
+def test_more_commands_than_an_observation_holds_are_refused() -> None:
+    with pytest.raises(OptionError, match="commands = 5000, neighbours = 0: .* at most 32767"):
+        parallel_env("single-v1", commands=5000)
+
+
 def test_impossible_delays_are_refused(mixed: TrafficEnv) -> None:
     mixed.close()
     for call in (mixed.delay_greens, mixed.remember):

@@ -832,7 +832,7 @@ def test_wrong_calls(crossing: Crossing) -> None:
         for seed in (-1, [1], [1, 2, 3], [1, -2], 1.5, [1.5, 2.5], "ab"):
             with pytest.raises(OptionError, match="seed = .*from 0 on, or 2 of them"):
                 env.reset(seed)
-        for where in ([2], [-1], [0, 0], [], [False, False], 1):
+        for where in ([2], [-1], [0, 0], [], [False, False], 1, [[0, 1], [1]]):
             with pytest.raises(OptionError, match="where = .*different numbers below 2"):
                 env.reset(1, where)
         env.reset(1)

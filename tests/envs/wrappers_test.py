@@ -200,6 +200,8 @@ def test_frames_in_closed_form() -> None:
     assert is_list(one["a_1"], [1, 10])
     with pytest.raises(OptionError, match="a whole number from 1"):
         frame_stack(Steep(), 0)
+    with pytest.raises(OptionError, match="a whole number from 1"):
+        frame_stack(Steep(), np.array([2]))  # type: ignore[arg-type]
 
 
 def test_masked_observations_in_closed_form() -> None:
@@ -289,6 +291,15 @@ def test_commands_and_delays_that_are_no_dictionary_are_refused(what: str, given
     env.reset(seed=1)
     with pytest.raises(ActionError, match="give a dictionary"):
         getattr(env, what)(given)
+    env.close()
+
+
+@pytest.mark.parametrize("what", ["remember", "delay_greens", "step"])
+def test_lights_are_the_only_names(what: str) -> None:
+    env = intersection_names(ugat_marl.parallel_env("single-v1", commands=1, duration_s=60))
+    env.reset(seed=1)
+    with pytest.raises(ActionError, match="for 'signal_0': the traffic lights are A1"):
+        getattr(env, what)({"signal_0": 1})
     env.close()
 
 

@@ -60,10 +60,10 @@ from .domains import scenario_in_domain as scenario_in_domain
 from .engine import BlockerPatience as BlockerPatience
 from .engine import QueueModel as QueueModel
 from .engine import Reach as Reach
-from .fleet import HEAVY as HEAVY
 from .fleet import DesiredSpeed as DesiredSpeed
 from .fleet import HeavyShare as HeavyShare
 from .fleet import SpeedSpread as SpeedSpread
+from .fleet import is_heavy as is_heavy
 from .objectives import OBJECTIVES as OBJECTIVES
 from .objectives import Objective as Objective
 from .places import network_places as network_places

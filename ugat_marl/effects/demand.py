@@ -398,8 +398,8 @@ def parted_flow(
 ) -> list[ET.Element | None]:
     """Return parts of a flow, each with a share of its vehicles.
 
-    Random departures get other rates. Other flows have whole numbers of vehicles. A hash of the
-    flow's id decides which of them are rounded up: the expectation is exact for each part, and
+    Random departures get other rates. Flows with a number of vehicles get whole numbers. A hash of
+    the flow's id decides which of them are rounded up: the expectation is exact for each part, and
     shares that sum up to 1 keep every vehicle.
 
     Args:
@@ -412,15 +412,25 @@ def parted_flow(
         The parts, all with the id of the flow; None for those without vehicles.
     """
     regular = _Regular.of(element, over_s)
-    if regular is None:
-        return [_scaled_rate(element, share, over_s) for share in shares]
+    number = round(float(element.get("number", "0"))) if regular is None else regular.number
     offset = hashed_uniform(salt, "flow", element.get("id", ""))
     sums = [0.0, *accumulate(shares)]
-    counts = [math.floor(round(regular.number * total, 9) + offset) for total in sums]
-    return [
-        regular.resized(last - first).written(element) if last > first else None
-        for first, last in pairwise(counts)
-    ]
+    bounds = [math.floor(round(number * total, 9) + offset) for total in sums]
+    counts = [last - first for first, last in pairwise(bounds)]
+    if regular is not None:
+        return [regular.resized(some).written(element) if some else None for some in counts]
+    if "number" in element.attrib:
+        flows = (_scaled_rate(element, share, over_s) for share in shares)
+        return [_numbered(flow, some) for flow, some in zip(flows, counts, strict=True)]
+    return [_scaled_rate(element, share, over_s) for share in shares]
+
+
+def _numbered(flow: ET.Element | None, number: int) -> ET.Element | None:
+    """Give a flow another number of vehicles; None for one of no vehicles."""
+    if flow is None or not number:
+        return None
+    flow.set("number", str(number))
+    return flow
 
 
 def _scaled_rate(element: ET.Element, factor: float, end_s: float) -> ET.Element | None:
@@ -428,9 +438,6 @@ def _scaled_rate(element: ET.Element, factor: float, end_s: float) -> ET.Element
     if factor <= 0:
         return None
     flow = copy.deepcopy(element)
-    if number := flow.attrib.pop("number", None):
-        seconds = float(number) * _mean_period_s(flow)
-        flow.attrib.setdefault("end", seconds_text(depart_s(flow) + seconds))
     if rate := _EXPONENTIAL.fullmatch(flow.get("period", "")):
         flow.set("period", f"exp({float(rate[1]) * factor:.12g})")
     if text := flow.get("probability"):
@@ -440,7 +447,8 @@ def _scaled_rate(element: ET.Element, factor: float, end_s: float) -> ET.Element
         else:  # a probability per second cannot exceed 1, so use a rate
             del flow.attrib["probability"]
             flow.set("period", f"exp({share:.12g})")
-    flow.attrib.setdefault("end", seconds_text(end_s))
+    if "number" not in flow.attrib:
+        flow.attrib.setdefault("end", seconds_text(end_s))
     return flow
 
 
@@ -465,8 +473,10 @@ def _shifted_flow(
         later = replace(present, begin_s=present.begin_s + seconds, until_s=until_s)
         kept = later.cut(later.before(earliest_s), later.number)
         return [kept.written(element)] if kept.number else []
-    begin = max(depart_s(element), earliest_s) + seconds
-    if begin < earliest_s and (number := element.attrib.pop("number", None)):
+    period_s = _period_s(element) or 0.0  # endless departures keep their spacing
+    first = _not_before(earliest_s, depart_s(element), period_s)
+    begin = _not_before(earliest_s, first + seconds, period_s)
+    if first + seconds < earliest_s and (number := element.attrib.pop("number", None)):
         over = depart_s(element) + float(number) * _mean_period_s(element)
         element.attrib.setdefault("end", seconds_text(over))
     end = element.get("end")
@@ -475,9 +485,16 @@ def _shifted_flow(
         if until <= earliest_s:
             return []
         element.set("end", seconds_text(until))
-    move_stops(own_stops(element), seconds)
-    element.set("begin", seconds_text(max(begin, earliest_s)))
+    move_stops(own_stops(element), begin - depart_s(element) if period_s else seconds)
+    element.set("begin", seconds_text(begin))
     return [element]
+
+
+def _not_before(earliest_s: float, begin_s: float, period_s: float) -> float:
+    """Return the first time from `earliest_s` on of a row of times with a period, or of 0 s."""
+    if begin_s >= earliest_s or not period_s:
+        return max(begin_s, earliest_s)
+    return begin_s + period_s * math.ceil((earliest_s - begin_s) / period_s - 1e-9)
 
 
 def _scaled(
@@ -493,7 +510,7 @@ def _scaled(
     def scaled(element: ET.Element) -> list[ET.Element]:
         if element.tag == "flow":
             return _scaled_window(element, window, factor, over, mark, salt)
-        depart = settings.begin_s if element.get("depart") == "begin" else depart_s(element)
+        depart = depart_s(element)
         if not least <= depart < end:  # not a number for one that waits for a person or container
             return [element]  # one from before the episode takes no part in it
         name = element.get("id", "")

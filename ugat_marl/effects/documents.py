@@ -159,6 +159,8 @@ def edit_scenario(
 ) -> Scenario:
     """Apply `change` to additional files and routes, as `edit` does.
 
+    Vehicles that depart at ``begin``, and flows, have their times in s when `change` sees them.
+
     Args:
         scenario: The scenario; it does not change itself.
         change: Function that edits elements, as for `edit`.
@@ -172,6 +174,8 @@ def edit_scenario(
 
     def complete_and_change(root: Root) -> bool:
         for element in root:
+            if element.get("depart") == "begin":
+                element.set("depart", seconds_text(begin_s))
             if element.tag.lower().endswith("flow"):
                 _complete_flow(element, begin_s, end_s)
         return change(root)
@@ -189,7 +193,8 @@ def edit_scenario(
 
 def _complete_flow(flow: ET.Element, begin_s: float, end_s: float) -> None:
     """Write the times that SUMO takes from its own begin and end into a flow without them."""
-    flow.attrib.setdefault("begin", seconds_text(begin_s))
+    if flow.get("begin", "begin") == "begin":
+        flow.set("begin", seconds_text(begin_s))
     if "number" in flow.attrib and not {"end", *FLOW_RATES} & flow.attrib.keys():
         flow.set("end", seconds_text(end_s))
 

@@ -161,7 +161,7 @@ def _cars(
     passenger_cars = {
         name: element
         for name, element in types.items()
-        if element.get("vClass", "passenger") == "passenger" and not name.startswith(HEAVY)
+        if element.get("vClass", "passenger") == "passenger" and not is_heavy(element.attrib)
     }
     for distribution, names in members.items():
         if names and all(name in passenger_cars for name in names):
@@ -217,6 +217,12 @@ def _mix_trucks_in(
 def _chance(vehicle_type: ET.Element) -> float:
     """Return the probability of a type in a distribution, as SUMO reads it."""
     return float(vehicle_type.get("probability", "1"))
+
+
+def is_heavy(attributes: Mapping[str, str]) -> bool:
+    """Return True if the attributes of a ``<vType>`` are those of a truck that this effect made."""
+    looks = attributes.get("guiShape"), attributes.get("length")
+    return attributes.get("id", "").startswith(HEAVY) and looks == ("truck", "12")
 
 
 def _truck(car: ET.Element, name: str) -> ET.Element:

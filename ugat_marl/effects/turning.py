@@ -32,7 +32,6 @@ from ugat_marl.effects.documents import (
     free_suffix,
     is_demand,
     mentions,
-    seconds_text,
 )
 from ugat_marl.effects.places import Places, network_places
 from ugat_marl.errors import ScenarioError, UnknownNameError
@@ -109,8 +108,6 @@ class Turning(Effect):
                     f"effect {self.name!r}: flow {name!r} departs by chance, and its "
                     f"route {element.get('route')!r} has stops; give it a route of its own"
                 )
-            if named and element.get("depart") == "begin":
-                element.set("depart", seconds_text(scenario.settings.begin_s))
             return _with_route(element, edges, named)
 
         tails = self._tails(scenario, way, places)

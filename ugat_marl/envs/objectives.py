@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ugat_marl.data import Scores
-from ugat_marl.effects import HEAVY, Cost, Effect
+from ugat_marl.effects import Cost, Effect, is_heavy
 from ugat_marl.scenarios import Scenario
 from ugat_marl.simulation import Trips
 
@@ -56,11 +56,12 @@ class Objectives:
     def __init__(self, cost: Cost, scenario: Scenario) -> None:
         self._cost = cost
         self.persons: dict[str, float] = {"": PERSONS_IN_A_CAR}
+        self.persons["DEFAULT_BIKETYPE"] = PERSONS["bicycle"]  # a type that no file declares
         for document in (*scenario.additional, *scenario.routes):
             for tag in document.scan():
                 if tag.name == "vType":
                     name, kind = (tag.attributes.get(key, "") for key in ("id", "vClass"))
-                    kind = "truck" if name.startswith(HEAVY) else kind  # they drive as cars may
+                    kind = "truck" if is_heavy(tag.attributes) else kind  # they drive as cars may
                     self.persons[name] = PERSONS.get(kind, PERSONS_IN_A_CAR)
 
     @classmethod

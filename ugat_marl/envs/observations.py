@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 from ugat_marl.data import AgentLayout
 from ugat_marl.envs.commands import CommandMemory, memory_size
 from ugat_marl.envs.rewards import IntersectionView, IntersectionViews
-from ugat_marl.errors import OptionError, UnknownNameError
+from ugat_marl.errors import LogError, OptionError, UnknownNameError
 from ugat_marl.scenarios import Intersection, Network, group_names, member_names, within_hops
 from ugat_marl.simulation import Snapshot
 
@@ -103,15 +103,15 @@ class Observer:
             _feature_names(item, name, size)
             for item, size in zip(network.intersections, sizes, strict=True)
         ]
-        self.layouts = [
-            AgentLayout(
-                features=size,
-                phases=phases,
-                context=sum(sizes[j] + self._phases[j] for j in near)
-                + memory_size(phases, commands),
-            )
-            for size, phases, near in zip(sizes, self._phases, self.near, strict=True)
+        contexts = [
+            sum(sizes[j] + self._phases[j] for j in near) + memory_size(phases, commands)
+            for phases, near in zip(self._phases, self.near, strict=True)
         ]
+        try:
+            self.layouts = [*map(AgentLayout, sizes, self._phases, contexts)]
+        except LogError as error:
+            given = f"commands = {commands}, neighbours = {neighbours}"
+            raise OptionError(f"{given}: {error}") from None
         sizes_of = [(len(i.incoming_lanes), len(i.outgoing_lanes), len(i.phases)) for i in items]
         kinds = [
             (sizes_of[index], *(sizes_of[j] for j in near)) for index, near in enumerate(self.near)

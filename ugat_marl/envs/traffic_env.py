@@ -28,7 +28,7 @@ from ugat_marl.effects import (
     with_late_green_programmes,
     withheld,
 )
-from ugat_marl.envs.actions import checked_delays, checked_phases
+from ugat_marl.envs.actions import checked_delays, checked_phases, require_mapping
 from ugat_marl.envs.actuators import Actuators
 from ugat_marl.envs.objectives import Objectives
 from ugat_marl.envs.observations import Observer, joint_space
@@ -254,6 +254,7 @@ class TrafficEnv(ParallelEnv[str, Any, Any]):
             EpisodeError: The episode has not begun or is over.
             SimulatorError: SUMO failed.
         """
+        require_mapping("actions", actions, self.agents)
         if not actions and self._scores is not None:  # after the end; SuperSuit's black_death asks
             return {}, {}, {}, {}, {}
         if not self.agents:

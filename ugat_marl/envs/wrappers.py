@@ -13,7 +13,7 @@ import re
 from collections import deque
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
-from typing import Any, SupportsIndex
+from typing import Any
 
 import numpy as np
 from gymnasium import spaces
@@ -23,6 +23,7 @@ from pettingzoo.utils import BaseParallelWrapper
 
 from ugat_marl.envs.actions import checked_phases, is_phase, require_mapping
 from ugat_marl.envs.agents import discrete_actions, vector_box
+from ugat_marl.envs.options import is_count
 from ugat_marl.envs.types import AnyParallelEnv, ResetResult, StepResult
 from ugat_marl.errors import ActionError, EpisodeError, OptionError, UgatMarlError
 
@@ -319,7 +320,7 @@ class _FrameStack(Wrapper):
     def __init__(self, env: AnyParallelEnv, k: int) -> None:
         super().__init__(env)
         given: Any = k
-        if not isinstance(given, SupportsIndex) or k < 1:
+        if not is_count(given) or k < 1:
             raise OptionError(f"frame_stack of {k!r} observations: must be a whole number from 1")
         self.frames = int(k)
         self._frames: dict[str, deque[NDArray[np.float32]]] = {}
@@ -472,15 +473,17 @@ class _IntersectionNames(Wrapper):
         """Let observations show these commands, see `TrafficEnv.remember`."""
         base: Any = self.env.unwrapped
         require_mapping("commands", commands, self.agents)
+        own = self._of_agents("command", commands)
         with self._errors_name_lights():
-            base.remember({self._agent.get(light, light): c for light, c in commands.items()})
+            base.remember(own)
 
     def delay_greens(self, seconds: Mapping[str, float]) -> None:
         """Delay greens of the next step, see `TrafficEnv.delay_greens`."""
         base: Any = self.env.unwrapped
         require_mapping("delays", seconds, self.agents)
+        own = self._of_agents("delay", seconds)
         with self._errors_name_lights():
-            base.delay_greens({self._agent.get(light, light): s for light, s in seconds.items()})
+            base.delay_greens(own)
 
     def reset(self, seed: int | None = None, options: dict[str, Any] | None = None) -> ResetResult:
         """Start an episode of the wrapped environment."""
@@ -494,14 +497,23 @@ class _IntersectionNames(Wrapper):
             ActionError: A name is that of no traffic light, or the environment refuses an action.
         """
         require_mapping("actions", actions, self.agents)
-        if unknown := [name for name in actions if name not in self._agent]:
-            raise ActionError(
-                f"action for {unknown[0]!r}: the traffic lights are {', '.join(self._agent)}"
-            )
+        own = self._of_agents("action", actions)
         with self._errors_name_lights():
-            result = self.env.step({self._agent[light]: a for light, a in actions.items()})
+            result = self.env.step(own)
         observations, rewards, terminations, truncations, infos = map(self._renamed, result)
         return observations, rewards, terminations, truncations, infos
+
+    def _of_agents(self, kind: str, values: Mapping[str, Any]) -> dict[str, Any]:
+        """Return values of traffic lights as values of their agents.
+
+        Raises:
+            ActionError: A name is that of no traffic light.
+        """
+        if unknown := [name for name in values if name not in self._agent]:
+            raise ActionError(
+                f"{kind} for {unknown[0]!r}: the traffic lights are {', '.join(self._agent)}"
+            )
+        return {self._agent[light]: value for light, value in values.items()}
 
     def _renamed(self, values: Mapping[str, Any]) -> dict[str, Any]:
         return {self._light[agent]: value for agent, value in values.items()}

@@ -440,11 +440,11 @@ class VectorEnv:
         numbers = np.arange(self.n)
         if where is None:
             return numbers.tolist()
-        asked = np.asarray(where)
         try:
+            asked = np.asarray(where)
             chosen = numbers[asked]
-        except IndexError:
-            chosen = numbers[:0]
+        except (IndexError, ValueError):  # numpy has no arrays of rows of unequal lengths
+            asked = chosen = numbers[:0]
         if (
             chosen.ndim != 1
             or not chosen.size
