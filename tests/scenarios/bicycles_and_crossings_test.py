@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import re
 import subprocess
+import xml.etree.ElementTree as ET
 from pathlib import Path
 
 import pytest
@@ -80,7 +82,14 @@ def test_both_lights_of_a_crossing_are_green_together(phases: str, tmp_path: Pat
         for n, k in enumerate(ARMS)
     )
     scenario = load_scenario(four_arms(tmp_path / "crossings-v1", lanes, crossings, phases))
-    (links,) = crossings_of(scenario.network.parse()).values()
+    text = scenario.network.read().decode()
+    named = re.sub(
+        r"(?<=[\":])C(?=[_\"])", "town_center", text
+    )  # "_c" stands in it as in crossings
+    assert named.count("town_center_c") == text.count(":C_c")
+    for root in (scenario.network.parse(), ET.fromstring(named)):
+        (links,) = crossings_of(root).values()
+        assert sorted(link.index for link in links) == list(range(12, 20))
     assert sorted(link.index for link in links) == list(range(12, 20))
     (light,) = Network.read(scenario).intersections
     for first in range(12, 20, 2):

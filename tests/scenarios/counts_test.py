@@ -148,6 +148,7 @@ def test_origins_and_destinations(tmp_path: Path) -> None:
             "edge,count,begin,end\nwest1_A1,5,0,60\n",
             "begin = '0' is not a time of day such as",
         ),
+        ("--counts", "edge,count,begin_sec,end_sec\nwest1_A1,5,0,60\n", "'begin_sec' is not known"),
         (
             "--od",
             "from,to,count,Start\nwest1_A1,B1_east1,5,0\n",
@@ -244,7 +245,7 @@ def test_a_decimal_comma_is_a_point_between_semicolons(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     "text",
     [
-        'edge,count,"begin; in s"\na,5,x\n',
+        'edge,count,"seen; in m"\na,5,x\n',
         "edge\tcount\tend_s\na\t5\t60,5\n",
         'edge;count;"x,y,z,u,v"\na;5;x\n',
         "edge;count;begin_s;end_s\na;5; ;  \n",

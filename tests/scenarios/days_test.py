@@ -158,6 +158,8 @@ SPEEDS = {
     'speedFactor="1.2" vClass="truck"': (1.2, 0.05),
     'vClass="bus"': (1.0, 0.0),
     'speedFactor="normc(1,0.3)"': (1.0, 0.3),
+    'speedFactor="normc(1,0.6)"': (1.0627, 0.5416),  # drawn again below 0
+    'speedFactor="normc(1,0.6,0.5)"': (1.2120, 0.4573),  # drawn again below the only limit
     'speedFactor="normc(1,0.5,0.9,1.1)"': (1.0, 0.0573),  # drawn again beyond a limit
     'speedFactor="normc(1.1,0.2,0.5,1.5)" speedDev="0.03"': (1.1, 0.03),
 }
@@ -183,5 +185,6 @@ def test_drivers_are_drawn_from_the_distribution_that_sumo_reads(
     if option is not None and "norm" not in text:
         deviation = option
     assert len(factors) > 1500
+    assert factors.min() > 0
     assert factors.mean() == pytest.approx(mean, abs=0.03)
     assert factors.std() == pytest.approx(deviation, rel=0.08)

@@ -119,7 +119,7 @@ def test_a_crossing_without_signals_has_no_light() -> None:
 
 def test_a_scale_of_a_type_is_refused() -> None:
     route = '<route edges="west1_A1 A1_east1"/>'
-    for scale, refused in (("2", True), ("1", False)):
+    for scale, refused in (("2", True), ("1", False), ("1.00", False), ("1.01", True)):
         text = (
             f'<vType id="t" scale="{scale}"/><vehicle id="v" type="t" depart="1">{route}</vehicle>'
         )

@@ -378,7 +378,10 @@ def test_other_vehicles_drive_at_the_times_of_the_configuration(
         (["--grid", "1x1", "--vph", "100", "--speed-mps", "nan"], "1 to 60 m/s"),
         (["--grid", "1x1", "--vph", "1e9"], "1 to 100000"),
         (["--grid", "1x1", "--vph", "0.001", "--duration-s", "60"], "nobody enters"),
-        (["--grid", "1x1", "--vph", "9999", "--duration-s", "5"], "shorter than one decision"),
+        (
+            ["--grid", "1x1", "--vph", "9999", "--duration-s", "5"],
+            "--duration-s 5: an episode has",
+        ),
         (["--sumo", "gone.net.xml", "--vph", "100"], "gone.net.xml: no such file"),
         (["--sumo", "gone.sumocfg"], "gone.sumocfg: no such file"),
         (["--sumo", "city.shp", "--vph", "100"], "give a .sumocfg or a .net.xml"),

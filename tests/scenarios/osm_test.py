@@ -61,6 +61,26 @@ def test_a_light_at_a_crossing_is_no_agent(town: Scenario) -> None:
     assert Network.read(town).uncontrolled == ("8",)
 
 
+@pytest.mark.parametrize(
+    ("tags", "others"),
+    [
+        ({"highway": "crossing", "crossing": "marked", "crossing:signals": "yes"}, ("8",)),
+        ({"highway": "traffic_signals", "crossing": "no"}, ()),
+    ],
+)
+def test_lights_at_crossings_in_other_words(
+    tags: dict[str, str], others: tuple[str, ...], tmp_path: Path
+) -> None:
+    """A light on a plain road where nobody crosses stops traffic for nothing."""
+    text = TOWN.read_text()
+    former = '<tag k="highway" v="crossing"/><tag k="crossing" v="traffic_signals"/>'
+    assert text.count(former) == 1
+    now = "".join(f'<tag k="{k}" v="{v}"/>' for k, v in tags.items())
+    (tmp_path / "x.osm").write_text(text.replace(former, now))
+    assert made(tmp_path / "a", tmp_path / "x.osm") == 0
+    assert Network.read(read_scenario(tmp_path / "a")).uncontrolled == others
+
+
 def test_the_roundabout_is_one(town: Scenario) -> None:
     roundabouts = list(town.network.parse().iter("roundabout"))
     assert len(roundabouts) == 1
@@ -471,7 +491,7 @@ def test_other_files_are_refused(tmp_path: Path, capsys: pytest.CaptureFixture[s
 # --- crossings ------------------------------------------------------------------------------------
 
 
-def crossroads(kind: str = "traffic_signals") -> str:
+def crossroads(kind: str = "traffic_signals", **more: str) -> str:
     """A signalled crossroads with crossings 13 m from it in the west, east and north.
 
     150 m to the west people cross without a light.
@@ -488,7 +508,7 @@ def crossroads(kind: str = "traffic_signals") -> str:
         return f'<way id="{name}">{inner}</way>'
 
     road = {"highway": "secondary", "lanes": "2", "maxspeed": "50"}
-    walk = {"highway": "crossing", "crossing": kind}
+    walk = {"highway": "crossing", "crossing": kind, **more}
     parts = [
         node(1, 0, 0, highway="traffic_signals"),
         *(node(2 + i, 300 * x, 300 * y) for i, (x, y) in enumerate(COMPASS)),
@@ -503,10 +523,12 @@ def crossroads(kind: str = "traffic_signals") -> str:
 COMPASS = ((-1, 0), (1, 0), (0, 1), (0, -1))
 
 
+@pytest.mark.parametrize("kind", ["traffic_signals", "marked"])
 def test_crossings_are_where_the_extract_has_them(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+    kind: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    (tmp_path / "x.osm").write_text(crossroads())
+    more = {"crossing:signals": "yes"} if kind == "marked" else {}
+    (tmp_path / "x.osm").write_text(crossroads(kind, **more))
     assert made(tmp_path / "a", tmp_path / "x.osm") == 0
     said = capsys.readouterr().out
     assert "3 crossings for people on foot have a light" in said

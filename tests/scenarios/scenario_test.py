@@ -31,7 +31,7 @@ from ugat_marl.scenarios import (
     validate_settings,
 )
 from ugat_marl.scenarios.admission import OPTIONS
-from ugat_marl.scenarios.scenario import scenario_toml
+from ugat_marl.scenarios.scenario import SumoConfiguration, scenario_toml
 
 Crossing = Callable[..., Path]
 MINIMAL = {"network": "n.net.xml", "routes": ["r.rou.xml"]}
@@ -294,6 +294,20 @@ def test_a_sumocfg_may_use_other_names(crossing: Crossing) -> None:
         '<input><n v="network.net.xml"/><r v="demand.rou.xml"/></input><time><e v="100"/></time>',
     )
     assert read_scenario(file).hash == expected
+
+
+def test_options_of_a_sumocfg_may_have_former_names(crossing: Crossing) -> None:
+    directory = crossing()
+    options = {
+        "default.carfollowmodel": ("carfollow.model", "IDM"),
+        "device.rerouting.period": ("device.routing.period", "30"),
+        "device.rerouting.explicit": ("device.routing.knownveh", "a"),
+        "device.emissions.explicit": ("device.emissions.knownveh", "a"),
+    }
+    written = "".join(f'<{former} value="{value}"/>' for former, value in options.values())
+    scenario = read_scenario(configure(directory, INPUT + written + '<srand value="4"/>'))
+    assert scenario.settings.sumo == {name: value for name, (_, value) in options.items()}
+    assert SumoConfiguration(directory / "city.sumocfg").ignored() == ["seed = 4"]
 
 
 def test_options_of_a_sumocfg_count_wherever_they_stand(crossing: Crossing) -> None:

@@ -377,6 +377,33 @@ def test_a_table_that_was_changed_is_not_replaced(
     assert main([*words, "--force"]) == 0
 
 
+@pytest.mark.parametrize(("name", "is_it"), [("rings", "ring"), ("bar", "barrier")])
+def test_a_mistyped_column_is_named(
+    name: str, is_it: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert is_it in HEAD.strip().split(",")
+    (tmp_path / "t.csv").write_text(HEAD.replace(is_it, name) + GOOD)
+    words = ["plan", "single-v1", "--apply", str(tmp_path / "t.csv"), "--out", str(tmp_path / "x")]
+    assert main(words) == 2
+    assert f"line 1: column {name!r} is not known; is it {is_it!r}?" in capsys.readouterr().err
+
+
+def test_a_scenario_with_plans_keeps_its_papers(tmp_path: Path) -> None:
+    new = ["scenario", "new", str(tmp_path / "g"), "--grid", "1x1", "--vph", "200"]
+    assert main([*new, "--duration-s", "100"]) == 0
+    (tmp_path / "g" / "counts-fit.csv").write_text("counted\n")
+    before = (tmp_path / "g" / "README.md").read_text()
+    table, out = str(tmp_path / "p.csv"), str(tmp_path / "h")
+    assert main(["plan", str(tmp_path / "g"), "--out", table]) == 0
+    put = ["plan", str(tmp_path / "g"), "--apply", table, "--out"]
+    assert main([*put, out]) == 0 == main([*put, str(tmp_path / "g"), "--force"])
+    for folder in ("g", "h"):
+        text = (tmp_path / folder / "README.md").read_text()
+        assert text.startswith(f"# {folder}\n\nIts lights have the programmes of `p.csv`")
+        assert text.endswith(before.partition("\n")[2])
+        assert (tmp_path / folder / "counts-fit.csv").read_text() == "counted\n"
+
+
 def test_a_short_yellow_is_noted(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     (tmp_path / "t.csv").write_text(HEAD + GOOD.replace("30,3,2", "30,0,2", 1))
     words = ["plan", "single-v1", "--apply", str(tmp_path / "t.csv"), "--out", str(tmp_path / "x")]

@@ -24,6 +24,7 @@ from ugat_marl.scenarios import (
     Network,
     Scenario,
     SignalPlan,
+    copy_papers,
     is_utdf,
     new_folder,
     programme_notes,
@@ -136,6 +137,8 @@ class Plan:
         network = Network.read(planned)
         with new_folder(self.out, force=self.force) as folder:
             planned.write(folder)
+            programmes = f"Its lights have the programmes of `{table.name}` (`ugat-marl plan`)."
+            copy_papers(Path(self.scenario), folder, self.out.name, programmes)
         console.print(plan_table(plans, LightNames.of(network)))
         lights = {light.id for light in network.intersections}
         without = sorted(lights - {plan.light for plan in plans})

@@ -18,6 +18,7 @@ from ugat_marl.errors import OptionError, counted
 from ugat_marl.progress import Bars
 from ugat_marl.reporting import LIGHT_HEADING, LightNames, draw_network, titled_table
 from ugat_marl.scenarios import (
+    ControlSettings,
     CountFit,
     RoadSource,
     VehicleSource,
@@ -129,6 +130,12 @@ class ScenarioNew:
         for name, value in (("begin_s", self.begin_s), ("duration_s", self.duration_s)):
             if value is not None and not 0 <= value < math.inf:
                 raise OptionError(f"--{name.replace('_', '-')} {value}: give seconds, 0 or more")
+        decision_s = ControlSettings().decision_interval_s
+        if self.duration_s is not None and self.duration_s < decision_s:
+            raise OptionError(
+                f"--duration-s {self.duration_s:g}: an episode has one decision at least, of "
+                f"{decision_s:g} s"
+            )
         roads, vehicles = self._sources()
         if vehicles is None and not self._brings_vehicles():
             return self._draft(roads, console)

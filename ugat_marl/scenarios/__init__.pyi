@@ -23,6 +23,7 @@ from .importers.drawn import draw_scenario as draw_scenario
 from .importers.drawn import drawn_sources as drawn_sources
 from .importers.making import RoadSource as RoadSource
 from .importers.making import VehicleSource as VehicleSource
+from .importers.making import copy_papers as copy_papers
 from .importers.making import make_draft as make_draft
 from .importers.making import make_scenario as make_scenario
 from .importers.making import new_folder as new_folder
@@ -97,6 +98,7 @@ from .scenario import is_configuration as is_configuration
 from .scenario import read_scenario as read_scenario
 from .scenario import resco_maps as resco_maps
 from .scenario import shipped_scenarios as shipped_scenarios
+from .settings import ControlSettings as ControlSettings
 from .settings import Real as Real
 from .settings import ScenarioFile as ScenarioFile
 from .settings import parse_decimal as parse_decimal

@@ -28,6 +28,8 @@ JITTER_S = 120.0
 _USUALLY = 8
 """Copies that a vehicle seldom exceeds; their draws do not depend on how many there are."""
 _AGAIN = 100
+_LEAST_FACTOR = 0.001
+"""SUMO draws no speedFactor of 0 or less, and refuses vehicles with one."""
 _TYPES, _VEHICLES = "types.add.xml", "vehicles.rou.xml"
 _TYPE_TAGS = ("vType", "vTypeDistribution")
 _Speed = tuple[float, float, float, float]
@@ -102,6 +104,7 @@ def draw_day(scenario: Scenario, seed: int, day_to_day: float = 0.0) -> Scenario
     again = numpy_generator(seed, "speeds again")
     rows: list[tuple[float, str]] = []
     mean, deviation, least, greatest = vehicles.speeds.T
+    least = np.maximum(least, _LEAST_FACTOR)
     for copy in range(most):
         departs = vehicles.depart_s + shifts[copy]
         departs = np.where(departs < begin, 2 * begin - departs, departs)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import re
 from dataclasses import dataclass, field
 
 from ugat_marl.errors import ScenarioError
@@ -138,6 +139,9 @@ def _unsorted(document: Document, tag: Tag, depart: float, latest: float) -> Sce
     )
 
 
+_ONE = re.compile(r"\s*1(\.0*)?\s*")
+
+
 def _travels(tag: Tag) -> bool:
     """Return True for people and containers, which SUMO wants in order among vehicles."""
     return tag.name in TRAVELLERS and tag.parent == "routes"
@@ -145,7 +149,7 @@ def _travels(tag: Tag) -> bool:
 
 def _refuse_undrivable(tag: Tag, document: Document, edges: set[str], scenario: Scenario) -> None:
     """Refuse a type with a scale of its own, and a route over an edge that does not exist."""
-    if tag.name == "vType" and tag.attributes.get("scale", "1") not in ("1", "1.0"):
+    if tag.name == "vType" and not _ONE.fullmatch(tag.attributes.get("scale", "1")):
         raise ScenarioError(
             f"{_at(document, tag)}: {_who(tag)} has a scale of its own, which counts of "
             'the demand would miss; repeat its vehicles, or set "scale" under [sumo] in '

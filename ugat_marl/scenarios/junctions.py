@@ -137,10 +137,10 @@ def crossings_of(root: ET.Element) -> dict[str, list[Link]]:
     with a light at each end (``linkIndex2``) gives two links, one for each letter.
     """
     numbers: dict[str, list[int]] = defaultdict(list)
-    for edge in root.iter("edge"):
-        if edge.get("function") == "crossing":
-            junction, number = edge.get("id", ":_c0")[1:].rsplit("_c", 1)
-            numbers[junction].append(int(number))
+    crossed = {e.get("id", ":_c0") for e in root.iter("edge") if e.get("function") == "crossing"}
+    for edge in crossed:
+        junction, number = edge[1:].rsplit("_c", 1)
+        numbers[junction].append(int(number))
     rows = {
         element.get("id", ""): sum(1 for _ in element.iter("request"))
         for element in root.iter("junction")
@@ -148,17 +148,16 @@ def crossings_of(root: ET.Element) -> dict[str, list[Link]]:
     crossings: dict[str, list[Link]] = defaultdict(list)
     for connection in root.iter("connection"):
         tls, ends = connection.get("tl"), (connection.get("to", ""), connection.get("from", ""))
-        target = next((end for end in ends if end.startswith(":") and "_c" in end), None)
+        target = next((end for end in ends if end in crossed), None)
         if tls is None or target is None:
             continue
         junction, number = target[1:].rsplit("_c", 1)
-        if junction in numbers and number.isdigit():
-            first = rows.get(junction, 0) - len(numbers[junction])
-            row = first + sorted(numbers[junction]).index(int(number))
-            index = int(connection.get("linkIndex", "0"))
-            crossings[tls].append(
-                Link(index, start_lane(connection), f"{target}_0", CROSSING, junction, row)
-            )
+        first = rows.get(junction, 0) - len(numbers[junction])
+        row = first + sorted(numbers[junction]).index(int(number))
+        index = int(connection.get("linkIndex", "0"))
+        crossings[tls].append(
+            Link(index, start_lane(connection), f"{target}_0", CROSSING, junction, row)
+        )
     return crossings
 
 

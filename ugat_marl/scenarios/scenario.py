@@ -242,9 +242,27 @@ _SYNONYMS = {
 """Names that SUMO allows for the elements of a configuration."""
 
 
+_FORMER_NAMES = {
+    "abs-rand": "random",
+    "carfollow.model": "default.carfollowmodel",
+    "meso.ignore-lanes.by-vclass": "meso-ignore-lanes-by-vclass",
+    "railsignal.moving-block": "railsignal-moving-block",
+    "s": "route-steps",
+    "srand": "seed",
+    "taxi.vclasses": "device.taxi.vclasses",
+    "with-taz": "device.rerouting.with-taz",
+}
+"""Former names of options that change traffic; SUMO still obeys them."""
+
+
+def _present_name(option: str) -> str:
+    name = option.replace("device.routing.", "device.rerouting.")
+    return _FORMER_NAMES.get(name, re.sub(r"\.knownveh$", ".explicit", name))
+
+
 _IGNORED = ("time-to-teleport", "max-depart-delay", "random", "seed")
 """Settings of SUMO that change traffic and are the same in all scenarios."""
-_LACKING = re.compile(r"load-state.*|(lane-)?weight.*|device\.(toc|stationfinder)\..*")
+_LACKING = re.compile(r"load-state.*|(lane-)?weight.*|w|x|measure|device\.(toc|stationfinder)\..*")
 """Settings of SUMO that change traffic and that no scenario has."""
 
 
@@ -261,7 +279,9 @@ class SumoConfiguration:
     def __init__(self, path: Path) -> None:
         self.path = path
         root = read_xml(path)
-        self.given = {item.tag: item.get("value", item.get("v", "")) for item in root.iter()}
+        self.given = {
+            _present_name(item.tag): item.get("value", item.get("v", "")) for item in root.iter()
+        }
 
     def value(self, key: str, default: str = "") -> str:
         """Return the text of an element; `default` if it is missing."""

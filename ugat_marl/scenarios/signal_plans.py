@@ -685,6 +685,10 @@ def read_plans(path: Path) -> tuple[SignalPlan, ...]:
             f"{path}, line 1: the column {missing[0]} is missing"
             + (f"; is it {guess!r}?" if guess else f"; needed are {', '.join(COLUMNS)}")
         )
+    for name in columns:
+        guess = nearest(name, ("ring", "barrier"))
+        if name not in COLUMNS and guess is not None and guess not in columns:
+            raise ScenarioError(f"{path}, line 1: column {name!r} is not known; is it {guess!r}?")
     phases: dict[str, list[PlanPhase]] = defaultdict(list)
     frames: dict[str, tuple[float, float]] = {}
     for row in rows_of(reader, path):

@@ -22,7 +22,7 @@ _CALM = frozenset({"truck", "trailer", "coach", "delivery", "taxi"})
 
 @dataclass(frozen=True)
 class SpeedFactors:
-    """Distribution of speedFactor in a vehicle type: normal, cut at both ends.
+    """Distribution of speedFactor in a vehicle type: normal, cut at its ends.
 
     Attributes:
         mean: Mean of the normal distribution, as a share of the speed limit.
@@ -40,8 +40,10 @@ class SpeedFactors:
     def text(self) -> str:
         """Attribute speedFactor that declares this distribution."""
         values = [self.mean, self.deviation]
-        if math.isfinite(self.least) and math.isfinite(self.greatest):
-            values += [self.least, self.greatest]
+        if math.isfinite(self.least):
+            values.append(self.least)
+        if math.isfinite(self.greatest):
+            values.append(self.greatest)
         return f"normc({','.join(f'{value:.8g}' for value in values)})"
 
     @classmethod
@@ -61,7 +63,8 @@ class SpeedFactors:
         if normal := _NORMAL.fullmatch(text):
             numbers = [float(part) for part in normal[1].split(",")]
             mean, deviation = numbers[0], numbers[1] if len(numbers) > 1 else 0.0
-            least, greatest = numbers[2:4] if len(numbers) > 3 else (-math.inf, math.inf)
+            least = numbers[2] if len(numbers) > 2 else -math.inf
+            greatest = numbers[3] if len(numbers) > 3 else math.inf
         elif text:
             mean = float(text)
         if own := attributes.get("speedDev"):

@@ -333,6 +333,9 @@ class Worker:
     def _kill_late(self) -> None:
         """Kill a process that is past its deadline; it may be stopped and would not end itself."""
         self._late = True
+        self._kill()
+
+    def _kill(self) -> None:
         with contextlib.suppress(ProcessLookupError):
             os.kill(self._pid, signal.SIGTERM if os.name == "nt" else signal.SIGKILL)
 
@@ -348,8 +351,7 @@ class Worker:
         with contextlib.suppress(OSError, ValueError):
             self._channel.send(Message({"what": "close"}, []))
         if not self._channel.hang_up(patience_s):
-            with contextlib.suppress(ProcessLookupError):
-                os.kill(self._pid, signal.SIGTERM if os.name == "nt" else signal.SIGKILL)
+            self._kill()
             self._channel.hang_up(PATIENCE_S)  # until it is dead
         if self._process is not None:
             try:

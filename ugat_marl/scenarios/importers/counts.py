@@ -76,8 +76,8 @@ class Row:
 _DAY_S = 86_400.0
 _TIMES = {"begin": "begin_s", "end": "end_s"}
 """Columns of times of day, and those of seconds in whose place they stand."""
-_NOT_OURS = frozenset({"start", "start_s", "from_s", "stop", "stop_s", "to_s", "time"})
-"""Names under which other programs write the times of an interval."""
+_LIKE_TIMES = re.compile(r"(begin|start|end|stop|time|interval).*|(from|to)_(s|sec|time)")
+"""Names under which other programs write the times of an interval, and mistyped ones."""
 
 
 def read_rows(
@@ -105,7 +105,8 @@ def read_rows(
     reader = csv.DictReader(chain((first,), texts), delimiter=delimiter_of(first))
     reader.fieldnames = columns = [name.lower() for name in columns_of(reader, path)]
     turns = {"from", "to"} <= set(columns)
-    if times := [name for name in columns if name in _NOT_OURS]:
+    known = {*_TIMES, *_TIMES.values()}
+    if times := [name for name in columns if name not in known and _LIKE_TIMES.fullmatch(name)]:
         raise ScenarioError(
             f"{path}, line 1: column {times[0]!r} is not known; the interval of a row is begin_s "
             "to end_s, in seconds, or begin to end, in times of day"

@@ -399,6 +399,24 @@ def _stopped_in_order() -> Iterator[None]:
         signal.signal(signal.SIGTERM, signal.SIG_DFL)
 
 
+def copy_papers(source: Path, folder: Path, name: str, note: str) -> None:
+    """Copy what says where a scenario is from: its README and its sheets of counts.
+
+    Args:
+        source: Folder of the scenario; nothing is copied from a place that is none.
+        folder: Folder of a scenario that is made from it.
+        name: Name of the new scenario.
+        note: What was changed, as a sentence in Markdown.
+    """
+    for sheet in (COUNT_SHEET, FIT_SHEET):
+        if (source / sheet).is_file():
+            shutil.copy2(source / sheet, folder)
+    readme = source / "README.md"
+    if readme.is_file():
+        _, _, rest = readme.read_text(encoding="utf-8", errors="replace").partition("\n")
+        write_whole(folder / readme.name, f"# {name}\n\n{note}\n{rest}")
+
+
 def _require_counts_kept(made: Path, target: Path) -> None:
     """Keep a sheet that was filled in: under another name beside a new one, else refuse."""
     for kept in target.glob(KEPT_SHEETS):

@@ -23,7 +23,7 @@ from ugat_marl.files import Tag, read_xml, scratch, write_whole
 from ugat_marl.progress import Reporter
 from ugat_marl.scenarios.importers.long_files import scan
 from ugat_marl.scenarios.importers.making import NETWORK, RoadFiles, RoadSource
-from ugat_marl.scenarios.importers.osm_crossings import crossings_for, has_light
+from ugat_marl.scenarios.importers.osm_crossings import LIT, crossings_for, has_light
 from ugat_marl.scenarios.importers.osm_restrictions import (
     ForbiddenTurns,
     Restriction,
@@ -177,9 +177,10 @@ def _look(source: Path, path: Path, reporter: Reporter) -> _Extract:
                 restrictions.append(restriction)
         if element.start.name != "node" or not tags:
             continue
-        light = "traffic_signals" in (tags.get("highway"), tags.get("crossing"))
+        light = LIT in (tags.get("highway"), tags.get("crossing"))
         signals += light
-        if light and ("crossing" in tags or tags.get("highway") == "crossing"):
+        crossed = tags.get("crossing") not in (None, "no") or tags.get("highway") == "crossing"
+        if light and crossed:
             walks.add(element.start.attributes.get("id", ""))
         if has_light(tags):
             crossings.append(place_of(element.start, path))
@@ -321,9 +322,16 @@ class Item(NamedTuple):
 
     @property
     def tags(self) -> dict[str, str]:
-        """Keys and values of its tags."""
-        tag_attributes = (tag.attributes for tag in self.inside if tag.name == "tag")
-        return {tag.get("k", ""): tag.get("v", "") for tag in tag_attributes}
+        """Keys and values of its tags.
+
+        A crossing that is now tagged ``crossing:signals=yes`` also has the former
+        ``crossing=traffic_signals``, the only one that netconvert knows.
+        """
+        attributes = (tag.attributes for tag in self.inside if tag.name == "tag")
+        tags = {tag.get("k", ""): tag.get("v", "") for tag in attributes}
+        if tags.get("crossing:signals") == "yes" and tags.get("crossing") != "no":
+            tags["crossing"] = LIT
+        return tags
 
     @property
     def way_nodes(self) -> list[str]:
@@ -426,8 +434,14 @@ def write_roads(
             if corner:
                 place_of(start, path)  # netconvert would complain without a line
             if corner or start.name == "relation" or element.way_nodes:
-                inside = "".join(f"{_open(tag)}/>" for tag in element.inside)
-                file.write(f"{_open(start)}>{inside}</{start.name}>\n")
+                kept = element.inside
+                lit = (
+                    f'<tag k="crossing" v="{LIT}"/>' if element.tags.get("crossing") == LIT else ""
+                )
+                if lit:
+                    kept = [tag for tag in kept if tag.attributes.get("k") != "crossing"]
+                inside = "".join(f"{_open(tag)}/>" for tag in kept)
+                file.write(f"{_open(start)}>{inside}{lit}</{start.name}>\n")
         file.write("</osm>\n")
 
 

@@ -29,6 +29,10 @@ _WITHOUT_LIGHT = frozenset({"uncontrolled", "zebra", "unmarked", "marked", "no"}
 Point = NDArray[np.float64]
 
 
+LIT = "traffic_signals"
+"""Value of ``highway`` and ``crossing`` of a node with lights."""
+
+
 @dataclass(frozen=True)
 class _Arm:
     """Roads that leave or reach a junction in one direction.
@@ -51,9 +55,9 @@ def has_light(tags: Mapping[str, str]) -> bool:
     highway, kind = tags.get("highway"), tags.get("crossing")
     if tags.get("crossing:signals") == "no":
         return False
-    if kind == "traffic_signals" or tags.get("crossing:signals") == "yes":
+    if kind == LIT:
         return True
-    if highway == "traffic_signals":
+    if highway == LIT:
         return kind not in (None, "no")
     return highway == "crossing" and kind not in _WITHOUT_LIGHT
 
