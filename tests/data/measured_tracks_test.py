@@ -9,7 +9,7 @@ import numpy as np
 import polars as pl
 import pytest
 
-from ugat_marl.data import MeasuredData, read_measured, traffic_of_lanes, write_measured
+from ugat_marl.data import Finding, MeasuredData, read_measured, traffic_of_lanes, write_measured
 from ugat_marl.data.measured.tracks import passages_of_tracks
 from ugat_marl.data.row_hashes import CSV_HASHES
 from ugat_marl.errors import MeasuredDataError
@@ -53,6 +53,37 @@ def test_a_vehicle_at_the_begin_of_a_zone_is_on_it(first: float) -> None:
     rows = track(["a_0"] * 4, [first, first, 30.0, 40.0], 10.0)
     seen = passages(rows, Detector("z", "a_0", 20.0, 4.0, "stop"))["z"]
     assert np.isnan(seen.on_s).all() and np.isfinite(seen.off_s).all() and len(seen) == 1
+
+
+def test_an_id_that_is_given_again_is_another_vehicle() -> None:
+    """Cars 20 s apart at 10 m/s with two ids in turn, as in clips that number anew."""
+    rows = pl.concat(
+        track(["a_0"] * 5, [10.0 * n for n in range(5)], 10.0).with_columns(
+            pl.col("time_s") + 20.0 * car, vehicle_id=pl.lit(f"v{car % 2}")
+        )
+        for car in range(4)
+    )
+    findings: list[Finding] = []
+    (found,) = passages_of_tracks(
+        Path("t"), rows, [DAY], [Detector("d", "a_0", 15.0, 6.0, "advance")], findings
+    )
+    assert found["d"].on_s.tolist() == [11.5, 31.5, 51.5, 71.5]
+    assert found["d"].off_s.tolist() == pytest.approx([12.6, 32.6, 52.6, 72.6])
+    assert "2 times a vehicle_id comes back" in findings[-1].text
+
+
+def test_an_id_that_drives_back_is_another_vehicle() -> None:
+    rows = track(["a_0"] * 6, [0.0, 20.0, 40.0, 0.0, 20.0, 40.0], 20.0)
+    seen = passages(rows, Detector("d", "a_0", 10.0, 1.0, "advance"))["d"]
+    assert seen.on_s.tolist() == [10.5, 13.5]
+
+
+def test_nothing_is_made_up_while_a_vehicle_is_out_of_sight() -> None:
+    rows = track(["a_0"] * 4, [200.0, 210.0, 220.0, 260.0], 10.0).with_columns(
+        time_s=pl.Series([0.0, 1.0, 2.0, 60.0])
+    )
+    with pytest.raises(MeasuredDataError, match="no vehicle comes over a detector"):
+        passages(rows, Detector("d", "a_0", 236.0, 2.0, "advance"))
 
 
 def test_a_vehicle_may_leave_a_zone_before_its_first_position_on_the_lane() -> None:

@@ -27,6 +27,7 @@ from ugat_marl.grounding import (
     log_of_measured,
 )
 from ugat_marl.grounding.measured_log import phases_shown
+from ugat_marl.grounding.street import Simulation, StreetWorld
 from ugat_marl.grounding.summaries import NAMES, OF_COUNTS
 from ugat_marl.grounding.ugat import Ugat
 from ugat_marl.grounding.worlds import RecordedCommands
@@ -217,11 +218,37 @@ def test_a_replay_repeats_the_commands_of_the_street(
     assert set(found[len(wanted) :]) == {wanted[-1]}
 
 
+def test_worlds_repeat_a_log_at_its_own_time_of_day(
+    crossing: Scenario, measured: MeasuredData
+) -> None:
+    """A period that begins with the third decision; the worlds' log has its time, and no other."""
+    (whole, *_) = measured.periods
+    period = replace(whole, begin_s=whole.begin_s + 20.0)
+    later = replace(measured, periods=(period,), lanes=None, trajectories=None)
+    log = imported(later, crossing)
+    assert int(log.frame["step"].to_numpy().min()) == 2
+    env = parallel_env(crossing, observation="count")
+    world = RecordedWorld(log, env)
+    taken = world.collect(RecordedCommands(log), 0, 0)
+    assert taken is not None and int(taken.frame["step"].to_numpy().min()) == 0
+    replay = world.replay()
+    assert replay is not None
+    simulation = Simulation(crossing, {"observation": "count"}, 0.0, workers=1)
+    (again,) = simulation.logs([StreetWorld()], replay, [3], 100.0, lambda: None)
+    wanted = log.transitions(log.agents[0]).executed[:10]
+    assert again.transitions(again.agents[0]).executed.tolist() == wanted.tolist()
+    whole_log = roll_out(env, replay, 3, record=observer_of(env)).log
+    assert whole_log is not None
+    seen = [one.transitions(log.agents[0]).observation for one in (again, whole_log)]
+    assert np.array_equal(seen[0], seen[1][2:12])
+
+
 def test_a_log_whose_steps_count_from_midnight_is_the_same_log(
     crossing: Scenario, measured: MeasuredData
 ) -> None:
     log = imported(measured, crossing)
-    late = TransitionLog(log.provenance, log.frame.with_columns(step=pl.col("step") + 2520))
+    anywhere = replace(log.provenance, from_begin=False)
+    late = TransitionLog(anywhere, log.frame.with_columns(step=pl.col("step") + 2520))
     world = RecordedWorld(late, parallel_env(crossing, observation="count"))
     taken = world.collect(RecordedCommands(log), 0, 0)
     assert taken is not None and taken.frame.equals(log.frame)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -121,6 +122,16 @@ def played(log: TransitionLog, episode: int, decisions: int) -> dict[str, list[i
 def test_a_missing_decision_shifts_no_later_command() -> None:
     log = commanded({"a_0": {0: [1, -1, 0, 1]}, "b_0": {0: [-1, 1, -1, -1]}})
     assert played(log, 0, 6) == {"a_0": [1, 1, 0, 1, 1, 1], "b_0": [1, 1, 1, 1, 1, 1]}
+
+
+def test_what_was_before_a_log_is_filled_with_its_own_commands() -> None:
+    log = commanded({"a_0": {0: [-1, -1, -1, 1, 0]}, "b_0": {0: [-1, -1, -1, 1, 1]}})
+    assert played(log, 0, 3)["a_0"] == [1, 1, 1]  # steps that count from anywhere
+    since = TransitionLog(replace(log.provenance, from_begin=True), log.frame)
+    assert played(since, 0, 6) == {"a_0": [1, 0, 1, 1, 0, 0], "b_0": [1] * 6}
+    replay = RecordedCommands(since)
+    assert (replay.lead(0), replay.decisions(0), replay.longest_lead_s) == (3, 5, 30.0)
+    assert since.since(3).frame["step"].unique().sort().to_list() == [0, 1]
 
 
 def test_episodes_without_commands_of_an_agent_are_not_repeated() -> None:

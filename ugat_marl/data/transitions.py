@@ -38,6 +38,7 @@ SAME_IN_CONCATENATION = (
     "layouts",
     "source",
     "units",
+    "from_begin",
 )
 
 SCHEMA: Mapping[str, pl.DataType] = {
@@ -81,6 +82,8 @@ class Provenance:
         units: Column to unit.
         deviation: Incoming lane to the standard deviation of its vehicles, where they are
             estimated; empty if they were counted.
+        from_begin: True if the steps count from the begin of the scenario, on a log that may begin
+            later.
     """
 
     scenario: str
@@ -94,6 +97,7 @@ class Provenance:
     versions: Mapping[str, str] = field(default_factory=dict)
     units: Mapping[str, str] = field(default_factory=dict)
     deviation: Mapping[str, float] = field(default_factory=dict)
+    from_begin: bool = False
 
     def __post_init__(self) -> None:
         if self.source not in SOURCES:
@@ -226,7 +230,15 @@ class TransitionLog:
     def from_step_0(self) -> TransitionLog:
         """Return the log with the steps of each episode counted from 0."""
         since = pl.col("step") - pl.col("step").min().over("episode")
-        return TransitionLog(self.provenance, self.frame.with_columns(step=since))
+        provenance = dataclasses.replace(self.provenance, from_begin=False)
+        return TransitionLog(provenance, self.frame.with_columns(step=since))
+
+    def since(self, step: int) -> TransitionLog:
+        """Return the log from a step on, which becomes step 0."""
+        if not step:
+            return self
+        later = self.frame.filter(pl.col("step") >= step).with_columns(pl.col("step") - step)
+        return TransitionLog(self.provenance, later)
 
     def transitions(self, agent: str) -> Transitions:
         """Return the rows of one agent, ordered by episode and step.

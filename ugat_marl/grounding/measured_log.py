@@ -345,6 +345,7 @@ class _Street:
             for k, time in enumerate(times_s)
         ]
         rewarder = Rewarder(self.network, REWARD)
+        first = round((times_s[0] - self.scenario.settings.begin_s) / self.interval_s)
 
         def seen(snapshot: Snapshot, row: int) -> dict[str, NDArray[np.float32]]:
             shown = observer.observe(snapshot, phases[row].tolist())
@@ -356,7 +357,7 @@ class _Street:
             served = seen(before.less(left[step]), step)  # newcomers too, as in a simulated log
             recorder.record(
                 episode,
-                step,
+                first + step,
                 seen(before, step),
                 ran,
                 ran,
@@ -380,6 +381,7 @@ class _Street:
             source="measured",
             versions={"ugat-marl": installed_version("ugat-marl") or "not installed"},
             units={"observation": OBSERVATION_UNITS[observer.name], "reward": REWARD},
+            from_begin=True,
         )
 
     def _findings(

@@ -67,7 +67,7 @@ from ugat_marl.grounding.posterior import (
 )
 from ugat_marl.grounding.residual import ResidualConfig, of_one_street
 from ugat_marl.grounding.summaries import LaneView, Summary
-from ugat_marl.grounding.worlds import delayed, explored
+from ugat_marl.grounding.worlds import RecordedCommands, delayed, explored
 from ugat_marl.parallel import Stop, Workers, in_order, retry_on_crash
 from ugat_marl.policies import Policy, roll_out, stop_callback
 from ugat_marl.scenarios import Scenario
@@ -400,10 +400,14 @@ class Simulation:
         stop = Stop()
         options = {**self.options}
         if duration_s is not None:
-            options["duration_s"] = min(duration_s, self.longest_s)
+            lead_s = policy.longest_lead_s if isinstance(policy, RecordedCommands) else 0.0
+            options["duration_s"] = min(duration_s + lead_s, self.longest_s)
         short = replace(self, options=options, workers=None)
         parts = [(world, policy, seed, stop) for world, seed in zip(worlds, seeds, strict=True)]
-        return in_order(self.workers, short.play, parts, stop, lambda _: on_done())
+        logs = in_order(self.workers, short.play, parts, stop, lambda _: on_done())
+        if duration_s is None:
+            return logs
+        return [log.first(round(duration_s / log.provenance.decision_interval_s)) for log in logs]
 
 
 AIMED = 0.4

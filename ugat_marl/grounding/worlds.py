@@ -194,7 +194,7 @@ def explored(
 
     The policy is copied: policies with a memory must not share it between threads. An episode of
     recorded commands is no longer than the recording: its last command would be held for the rest,
-    and lanes with red would jam.
+    and lanes with red would jam. What is before the recording is left out of its log.
 
     Args:
         env: The environment.
@@ -203,10 +203,13 @@ def explored(
         seed: Seed of the episode.
         stop: Flag that ends the episode early.
     """
-    decisions = policy.decisions(seed) if isinstance(policy, RecordedCommands) else None
     exploring = EpsilonGreedy(copy.deepcopy(policy), epsilon)
     with contextlib.closing(env):
-        return recorded(env, exploring, seed, stop, decisions=decisions)
+        if not isinstance(policy, RecordedCommands):
+            return recorded(env, exploring, seed, stop)
+        decisions = policy.decisions(seed)
+        log = recorded(env, exploring, seed, stop, decisions=decisions)
+        return log.since(policy.lead(seed))
 
 
 @dataclass(frozen=True)
@@ -303,7 +306,9 @@ class RecordedCommands:
     """Policy that repeats the commands of a log, decision by decision.
 
     Each episode repeats one in which every agent has a command. A decision that the log lacks
-    repeats the command before it. After the last decision, the last command stays.
+    repeats the command before it. After the last decision, the last command stays. A log that
+    begins later than its scenario is led up to by its own first commands: the streets are then full
+    when it begins.
 
     Args:
         log: The transitions.
@@ -322,36 +327,49 @@ class RecordedCommands:
                 "commands of the log cannot be repeated: no episode has a decision of every "
                 f"agent{'; no row of ' + ', '.join(alone) if alone else ''}"
             )
-        self._commands = [
-            {agent: _commands_of(own, episode) for agent, own in rows.items()}
+        begins = {
+            episode: min(int(own.step[own.episode == episode].min()) for own in rows.values())
             for episode in sorted(whole)
+        }
+        if not log.provenance.from_begin:
+            begins = dict.fromkeys(begins, 0)
+        self._leads = [*begins.values()]
+        self._commands = [
+            {agent: _commands_of(own, episode, lead) for agent, own in rows.items()}
+            for episode, lead in begins.items()
         ]
-        self._episode, self._step = self._chosen(0), 0
+        self.longest_lead_s = max(self._leads) * log.provenance.decision_interval_s
+        self.reset(0)
+
+    def lead(self, seed: int) -> int:
+        """Return the number of decisions before the episode of the log that `seed` chooses."""
+        return self._leads[seed % len(self._leads)]
 
     def decisions(self, seed: int) -> int:
-        """Return the number of decisions of the episode of the log that `seed` chooses."""
-        return max(map(len, self._chosen(seed).values()))
+        """Return the number of decisions of that episode, with those before it."""
+        own = self._commands[seed % len(self._commands)]
+        return self.lead(seed) + max(map(len, own.values()))
 
     def reset(self, seed: int) -> None:
         """Begin an episode of the log; `seed` chooses it."""
-        self._episode, self._step = self._chosen(seed), 0
+        self._episode = self._commands[seed % len(self._commands)]
+        self._step = self._first = -self.lead(seed)
 
     def act(self, observations: Observations, infos: Infos) -> Actions:
         """Return the commands of the next decision of the log."""
-        commands = self._episode
         step, self._step = self._step, self._step + 1
-        return {
-            name: int(commands[name][min(step, len(commands[name]) - 1)]) for name in observations
-        }
+        actions: dict[str, int] = {}
+        for name in observations:
+            own = self._episode[name]
+            early = (step - self._first) % len(own)
+            actions[name] = int(own[early if step < 0 else min(step, len(own) - 1)])
+        return actions
 
-    def _chosen(self, seed: int) -> Mapping[str, NDArray[np.int64]]:
-        return self._commands[seed % len(self._commands)]
 
-
-def _commands_of(own: Transitions, episode: int) -> NDArray[np.int64]:
-    """Return an agent's command at each decision of an episode, ``(decisions,)``."""
+def _commands_of(own: Transitions, episode: int, first: int) -> NDArray[np.int64]:
+    """Return an agent's command at each decision of an episode from one on, ``(decisions,)``."""
     here = own.episode == episode
-    steps, commands = own.step[here], own.action[here]
+    steps, commands = own.step[here] - first, own.action[here]
     before = np.searchsorted(steps, np.arange(steps[-1] + 1), side="right") - 1
     return commands[np.maximum(before, 0)]
 
@@ -388,9 +406,9 @@ class RecordedWorld:
                     f"{env.scenario.id!r} with the same options, or train with those of the log "
                     "(--observation count --learner dqn, for example)"
                 )
-        stack, log = Stack(env.recorded_layouts), log.from_step_0()
-        split(stack_log(log, stack), held_out_every, stack)  # raises now instead of after hours
-        self._log = log
+        stack = Stack(env.recorded_layouts)
+        self._given, self._log = log, log.from_step_0()
+        split(stack_log(self._log, stack), held_out_every, stack)  # raises now, not after hours
 
     def collect(self, policy: Policy, iteration: int, seed: int) -> TransitionLog | None:
         """Return the whole log at the first iteration, nothing afterwards."""
@@ -398,7 +416,7 @@ class RecordedWorld:
 
     def replay(self) -> Policy | None:
         """Return a policy that repeats the log: whoever made it, other worlds get its commands."""
-        return RecordedCommands(self._log)
+        return RecordedCommands(self._given if self._given.provenance.from_begin else self._log)
 
     def stop(self) -> None:
         """Do nothing; `collect` returns at once."""

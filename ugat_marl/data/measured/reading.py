@@ -106,6 +106,8 @@ def read_measured(directory: Path, scenario: Scenario, network: Network) -> Meas
     if trajectories is not None and files.seen_on_tracks:
         path = files.path(tables.TRAJECTORIES)
         passages = passages_of_tracks(path, trajectories, periods, usable, files.findings)
+        empty = [one.id for one, seen in zip(periods, passages, strict=True) if not seen]
+        _refuse_empty(path, "vehicle over a detector", empty)
     periods = tuple(
         replace(period, signals=shown, passages=seen)
         for period, shown, seen in zip(periods, signals, passages, strict=True)

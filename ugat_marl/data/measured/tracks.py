@@ -6,6 +6,7 @@ the street at which the passages are read off.
 
 from __future__ import annotations
 
+import itertools
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -16,12 +17,15 @@ from numpy.typing import NDArray
 
 from ugat_marl.data.measured.passages import passages_as_written
 from ugat_marl.data.measured.values import Finding
-from ugat_marl.errors import MeasuredDataError
+from ugat_marl.errors import MeasuredDataError, counted
 from ugat_marl.scenarios import Detector, Passages, Period, edge_of_lane
 
 COARSEST_S = 2.0
 """Largest usual time between two positions of a vehicle. A vehicle is over a detector for less than
 a second, so positions farther apart say little of the moment."""
+LOST_S = 5.0
+"""Time without a position after which a vehicle counts as another one, if it comes back. By hand.
+Twice as long: places between two positions are guessed over 100 m of a street."""
 USUAL_LENGTH_M = 5.0
 """Length of a vehicle whose length is not stated, m: that of a car in SUMO."""
 
@@ -50,8 +54,7 @@ class _Track:
 
     @classmethod
     def of(cls, rows: pl.DataFrame) -> _Track:
-        """Make a track from the rows of one vehicle in one period."""
-        rows = rows.sort("time_s")
+        """Make a track from the rows of one vehicle in one period, in order of time."""
         time, position, speed = (
             rows[name].to_numpy() for name in ("time_s", "position_m", "speed_mps")
         )
@@ -187,8 +190,17 @@ def passages_of_tracks(
             "times between two places as travel_times"
         )
     found: list[dict[str, Passages]] = []
+    apart = 0
     for period in periods:
-        rows = _crossings(vehicles.filter(pl.col("period_id") == period.id), by_lane)
+        tracks = vehicles.filter(pl.col("period_id") == period.id)
+        parts = [
+            part
+            for whole in tracks.partition_by("vehicle_id", maintain_order=True)
+            for part in _parted(whole.sort("time_s"))
+        ]
+        apart += len(parts) - tracks["vehicle_id"].n_unique()
+        until_s = float(tracks["time_s"].to_numpy().max(initial=-np.inf))
+        rows = _crossings(parts, by_lane, until_s)
         seen = {detector.id: _over(detector, rows) for detector in detectors}
         found.append(
             {
@@ -211,16 +223,39 @@ def passages_of_tracks(
             "demand"
         )
     )
+    if apart:
+        findings.append(
+            Finding(
+                f"{path.name}: {counted(apart, 'time')} a vehicle_id comes back after {LOST_S:g} s "
+                "without a position, or farther back on its road; it counts as another vehicle then"
+            )
+        )
     return tuple(found)
 
 
+def _parted(rows: pl.DataFrame) -> Iterable[pl.DataFrame]:
+    """Yield the rows of one id in parts, each of one vehicle that was never lost from sight."""
+    time, position = (rows[name].to_numpy() for name in ("time_s", "position_m"))
+    road = np.array([edge_of_lane(name) for name in rows["lane_id"]])
+    known = rows["length_m"].drop_nulls() if "length_m" in rows.columns else []
+    back = np.diff(position) < -(float(known[0]) if len(known) else USUAL_LENGTH_M)
+    cuts = np.flatnonzero((np.diff(time) > LOST_S) | ((road[1:] == road[:-1]) & back)) + 1
+    for begin, end in itertools.pairwise((0, *cuts.tolist(), len(rows))):
+        yield rows[begin:end]
+
+
 def _crossings(
-    vehicles: pl.DataFrame, by_lane: Mapping[str, Sequence[Detector]]
+    parts: Iterable[pl.DataFrame], by_lane: Mapping[str, Sequence[Detector]], until_s: float
 ) -> dict[tuple[str, str], list[tuple[float, ...]]]:
-    """Return detector and lane to the passages of all vehicles of a period there."""
+    """Return detector and lane to the passages of all vehicles of a period there.
+
+    Args:
+        parts: Rows of each vehicle, in order of time.
+        by_lane: Lane to its detectors.
+        until_s: Time of the last position of any vehicle, s.
+    """
     rows: dict[tuple[str, str], list[tuple[float, ...]]] = {}
-    until_s = float(vehicles["time_s"].to_numpy().max(initial=-np.inf))
-    for part in vehicles.partition_by("vehicle_id", maintain_order=True):
+    for part in parts:
         track = _Track.of(part)
         for lane, begin, end in track.stays():
             for detector in by_lane.get(lane, ()):
