@@ -280,3 +280,24 @@ def test_a_refused_command_leaves_no_empty_folder(tmp_path: Path) -> None:
     with without_empty_folders():
         write_whole(tmp_path / "new" / "file", "")
     assert (tmp_path / "new" / "file").exists()
+
+
+def test_tune_replaces_no_file_of_another_kind(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    out = tmp_path / "t.json"
+    words = ["tune", "single-v1", "--rules", "fixed-time", "--budget", "3", "--out", str(out)]
+    out.write_text('{"mine": 1}')
+    assert main(words) == 2
+    assert "is no table of `ugat-marl tune`, and would be lost" in capsys.readouterr().err
+    assert out.read_text() == '{"mine": 1}'
+
+
+def test_a_recording_in_which_nobody_came_is_refused(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    out = tmp_path / "r"
+    words = ["record", "single-v1", "--periods", "1", "--duration-s", "10", "--out", str(out)]
+    assert main(words) == 2
+    assert "nobody came over a detector in 1 period ('day1')" in capsys.readouterr().err
+    assert not out.exists()

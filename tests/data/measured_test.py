@@ -711,7 +711,7 @@ def test_local_counts_become_seconds(
         (
             "detections.csv",
             lambda text: in_local_time()["detections.csv"](text).replace("T07:00", " soon", 1),
-            r"detections.csv, line \d+: time is '2024-03-05 soon.*; write it as 2024-03-05",
+            r"detections.csv, line \d+: time is '2024-03-05 soon.*; write it in a form such as",
         ),
         (
             "periods.csv",
@@ -754,6 +754,28 @@ def test_times_with_an_offset_lose_no_hour_where_the_clock_is_changed(
     cells = pl.Series("time", [*texts, ""])
     seconds = clock_from("2024-11-03").seconds(Path("t.csv"), cells, pl.Series(["night"] * 3), 2)
     assert seconds.to_list() == [1800.0, 12600.0, None]
+
+
+@pytest.mark.parametrize(
+    ("texts", "seconds"),
+    [
+        (["2024-03-04", "2024-03-04 00:00:07.5"], [0.0, 7.5]),  # pandas leaves midnight out
+        (["2024-03-04 00:00:07+00", "2024-03-04 01:00:08+01"], [7.0, 8.0]),
+        (["2024-03-04T00:01Z", "2024-03-03T17:02-07:00"], [60.0, 120.0]),
+        (["3/4/2024 12:03 AM", "3/4/2024 1:00 PM"], [180.0, 46800.0]),
+    ],
+)
+def test_forms_of_other_programs_are_read(texts: list[str], seconds: list[float]) -> None:
+    zero = pl.Series("zero", ["2024-03-04 00:00:00"])
+    clock = LocalClock.of(Path("periods.csv"), pl.Series(["day"]), zero, "UTC")
+    cells, periods = pl.Series("time", texts), pl.Series(["day"] * len(texts))
+    assert clock.seconds(Path("t.csv"), cells, periods, 2).to_list() == seconds
+
+
+def test_a_column_in_which_some_times_have_offsets_is_told() -> None:
+    cells = pl.Series("time", ["2024-03-04 07:00:03.6+01:00", "2024-03-04 07:00:03.6"])
+    with pytest.raises(MeasuredDataError, match=r"line 3: .*; other times of the column have an"):
+        clock_from("2024-03-04").seconds(Path("t.csv"), cells, pl.Series(["night"] * 2), 2)
 
 
 def clock_from(zero: str) -> LocalClock:

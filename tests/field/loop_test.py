@@ -263,7 +263,7 @@ def held(
     found: dict[int, dict[str, str]] = {}
     for now in range(0, 3600, 10):
         read = {lane: LaneCount(now, value) for lane, value in counts(now).items()}
-        if faults := watchdog.check(read, float(now), red(now))[1]:
+        if faults := watchdog.check(read, float(now), dict.fromkeys(red(now), 0.0))[1]:
             found[now] = faults
     return found
 
@@ -289,6 +289,16 @@ def test_only_green_counts_against_a_queue_that_stands() -> None:
     half = Watchdog(TWO, False, TrustLimits(frozen_after_s=300))
     found = held(half, counts, lambda now: "a" if now % 20 else "")
     assert min(found) == 620
+
+
+def test_seconds_of_green_count_and_not_the_decisions_that_have_some() -> None:
+    watchdog = Watchdog(TWO, False, TrustLimits(frozen_after_s=300))
+    for now in range(0, 3600, 10):
+        read = {"a": LaneCount(now, 3.0), "b": LaneCount(now, now % 40 / 4)}
+        if faults := watchdog.check(read, float(now), {"a": 4.0, "b": 0.0})[1]:
+            assert (now, faults) == (760, {"a": "frozen: 3 vehicles for 304 s of green on a"})
+            return
+    raise AssertionError("never found")
 
 
 def test_a_full_lane_may_stand_for_long() -> None:

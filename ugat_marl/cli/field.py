@@ -13,7 +13,7 @@ from typing import Annotated
 from rich.console import Console
 from tyro.conf import Positional, arg
 
-from ugat_marl.cli.arguments import LengthS, refuse_options
+from ugat_marl.cli.arguments import LengthS, refuse_options, require_numbers
 from ugat_marl.effects import load_scenario, scenario_in_domain
 from ugat_marl.envs import parallel_env
 from ugat_marl.errors import OptionError, UgatMarlError, counted
@@ -133,10 +133,13 @@ class Field:
                 "--start runs a SUMO of its own that opens no port, ends with the loop and counts "
                 "on whole lanes; leave --port, --look-for-s and --detectors out"
             )
-        if self.seed < 0 or (self.seconds is not None and not self.seconds > 0):
-            raise OptionError("--seed must not be negative, and --seconds must be above 0")
-        if not (self.look_for_s >= 0 and 0 < self.sumo_answer_s < math.inf):
-            raise OptionError("--look-for-s must be 0 or more, and --sumo-answer-s above 0")
+        require_numbers(0, seed=self.seed)
+        if self.seconds is not None and not self.seconds > 0:
+            raise OptionError(f"--seconds {self.seconds}: must be above 0")
+        if not self.look_for_s >= 0:
+            raise OptionError(f"--look-for-s {self.look_for_s}: must be 0 or more")
+        if not 0 < self.sumo_answer_s < math.inf:
+            raise OptionError(f"--sumo-answer-s {self.sumo_answer_s}: must be above 0")
         self._check_files()
 
     def _check_files(self) -> None:

@@ -13,7 +13,7 @@ from rich.table import Table
 from rich.text import Text
 from tyro.conf import Positional, arg
 
-from ugat_marl.cli.arguments import refuse_options, unused
+from ugat_marl.cli.arguments import refuse_options, require_numbers, unused
 from ugat_marl.effects import load_scenario, scenario_in_domain
 from ugat_marl.errors import OptionError, counted, listed
 from ugat_marl.experiments import TUNING_SEED, policy_factory, typical_plans
@@ -96,8 +96,8 @@ class Plan:
                 ("seeds", "first_seed"),
                 "without --policy the programmes are written as they are",
             )
-        if self.seeds < 1 or self.first_seed < 0:
-            raise OptionError("--seeds must be at least 1, and --first-seed not negative")
+        require_numbers(1, seeds=self.seeds)
+        require_numbers(0, first_seed=self.first_seed)
         scenario = load_scenario(self.scenario)
         if self.apply is not None:
             return self._put(scenario, self.apply, console)

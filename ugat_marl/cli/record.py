@@ -12,6 +12,7 @@ from tyro.conf import Positional, arg
 from ugat_marl.cli.arguments import LengthS, Workers, require_numbers
 from ugat_marl.data import as_counts, require_interval, require_replaceable, write_measured
 from ugat_marl.effects import load_scenario, scenario_in_domain
+from ugat_marl.errors import OptionError, listed
 from ugat_marl.experiments import policy_factory, record
 from ugat_marl.files import require_writable
 from ugat_marl.progress import Bars
@@ -98,6 +99,14 @@ class Record:
                 self.out.rmdir()
             raise
         seen = sum(len(log) for period in measured.periods for log in period.passages.values())
+        empty = [p.id for p in measured.periods if not any(map(len, p.passages.values()))]
+        if empty:
+            if is_new:
+                self.out.rmdir()
+            raise OptionError(
+                f"nobody came over a detector in {listed(empty, 'period')}; give longer days with "
+                "--duration-s, or other traffic"
+            )
         if self.counts_every_s is not None:
             measured = as_counts(measured, self.counts_every_s)
         write_measured(measured, self.out)

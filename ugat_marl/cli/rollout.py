@@ -120,9 +120,9 @@ class Rollout:
 
     def run(self, console: Console) -> int:
         """Record, film and write."""
-        if self.episodes < 1 or not 0 <= self.epsilon <= 1:
-            raise OptionError("--episodes must be at least 1 and --epsilon from 0 to 1")
-        require_numbers(1, workers=self.workers)
+        require_numbers(1, episodes=self.episodes, workers=self.workers)
+        if not 0 <= self.epsilon <= 1:
+            raise OptionError(f"--epsilon {self.epsilon}: must be from 0 to 1")
         if self.out is None and self.video is None:
             raise OptionError("nothing to write: give --out FILE.parquet, --video FILE, or both")
         if self.beside is not None and self.video is None:

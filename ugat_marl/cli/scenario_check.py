@@ -105,8 +105,7 @@ class ScenarioCheck:
             return self._kit(console)
         refuse_options(self, ("observation",), "only --conformance reads an observation")
         require_numbers(1, workers=self.workers)
-        if self.headroom < 0:
-            raise OptionError(f"--headroom {self.headroom}: give a number of seeds, or 0")
+        require_numbers(0, headroom=self.headroom)
         if self.headroom and self.domain != "sim":
             raise OptionError("--headroom plays sim and V1 to V4 by itself; leave out --domain")
         scenario = scenario_in_domain(

@@ -19,9 +19,9 @@ from ugat_marl.cli.arguments import (
     workers_of,
 )
 from ugat_marl.effects import domain_label, load_scenario
-from ugat_marl.errors import UnknownNameError
+from ugat_marl.errors import OutputError, UnknownNameError
 from ugat_marl.experiments import BUDGET, LEAST_BUDGET, tune
-from ugat_marl.files import require_writable, write_whole
+from ugat_marl.files import read_json, require_writable, write_whole
 from ugat_marl.policies import RULE_NAMES, RULES, TUNED_RULES
 from ugat_marl.progress import Bars
 from ugat_marl.reporting import tuning_table
@@ -67,6 +67,7 @@ class Tune:
         require_numbers(1, workers=self.workers)
         if self.out is not None:
             require_writable(self.out, ".json")
+            _require_table(self.out)
         scenario, reporter = load_scenario(self.scenario, self.duration_s), Bars(console)
         with workers_of(self.workers, self.ray) as workers:
             tuned = [
@@ -88,3 +89,19 @@ class Tune:
         if self.out is not None:
             console.print(f"table: {self.out}", soft_wrap=True)
         return 0
+
+
+def _require_table(out: Path) -> None:
+    """Refuse a file that is there and no earlier table of this command."""
+    if not out.exists():
+        return
+    try:
+        rows = read_json(out, OutputError)
+    except OutputError:
+        rows = None
+    if not isinstance(rows, list) or not all(
+        isinstance(row, dict) and {"rule", "domain", "trials"} <= row.keys() for row in rows
+    ):
+        raise OutputError(
+            f"{out}: is no table of `ugat-marl tune`, and would be lost; give another name"
+        )

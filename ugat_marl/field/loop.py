@@ -118,7 +118,7 @@ class FieldLoop:
         if self._memory is not None:
             self._memory.reset([light.phase for light in lights.machines.values()])
         self._watchdog = Watchdog(self._site.capacity, self._site.halting, self._limits)
-        self._without_green: frozenset[str] = frozenset()
+        self._green_s: Mapping[str, float] = {}
         self._trust = PolicyTrust(self._site.lights, self._limits.return_after)
         self._warm_up(self._policy)
 
@@ -179,7 +179,7 @@ class FieldLoop:
         if self._log is not None:
             self._log.add(decision)
         self.summary.add(decision)
-        self._without_green = _without_green(self._site, plans)
+        self._green_s = _green_s(self._site, plans)
 
     def close(self) -> None:
         """Let the policy's thread end; the lights keep their states."""
@@ -191,7 +191,7 @@ class FieldLoop:
         A light is at fault if it needs a count that is not trusted, or if it is not taken over yet.
         """
         try:
-            counts, wrong = self._watchdog.check(self._street.read(), now, self._without_green)
+            counts, wrong = self._watchdog.check(self._street.read(), now, self._green_s)
         except (Exception, SystemExit) as error:  # noqa: BLE001 - whatever a detector's driver raises
             self._watchdog.check({}, now)  # what comes after the gap is a change
             reason = f"missing: no counts at all, {type(error).__name__}: {error}"
@@ -267,18 +267,15 @@ def _answer_of(policy: Policy, site: Site) -> Callable[..., list[int]]:
     return answer
 
 
-def _without_green(site: Site, plans: Mapping[str, list[Segment]]) -> frozenset[str]:
-    """Return the lanes in front of lights that have no green in these plans."""
-    held: set[str] = set()
+def _green_s(site: Site, plans: Mapping[str, list[Segment]]) -> dict[str, float]:
+    """Return the time for which each lane in front of a light has green in these plans, s."""
+    green_s: dict[str, float] = {}
     for intersection in site.network.intersections:
-        states = [state for _, state in plans.get(intersection.id, ())]
-        green = {
-            link.from_lane
-            for link in intersection.links
-            if any(state[link.index] in GREEN for state in states)
-        }
-        held.update(lane for lane in intersection.incoming_lanes if lane not in green)
-    return frozenset(held)
+        green_s |= dict.fromkeys(intersection.incoming_lanes, 0.0)
+        for seconds, state in plans.get(intersection.id, ()):
+            for lane in {x.from_lane for x in intersection.links if state[x.index] in GREEN}:
+                green_s[lane] = green_s.get(lane, 0.0) + seconds
+    return green_s
 
 
 def _ms_since(begun: float) -> float:

@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Collection, Mapping
+from collections.abc import Mapping
 from dataclasses import dataclass, fields
+from types import MappingProxyType
 from typing import Any
 
 from ugat_marl.errors import OptionError
@@ -84,14 +85,18 @@ class Watchdog:
         self._counted: set[str] = set()
 
     def check(
-        self, counts: Mapping[str, LaneCount], now_s: float, without_green: Collection[str] = ()
+        self,
+        counts: Mapping[str, LaneCount],
+        now_s: float,
+        green_s: Mapping[str, float] = MappingProxyType({}),
     ) -> tuple[dict[str, LaneCount], dict[str, str]]:
         """Return the trusted counts, and lane to fault, ``<kind>: <details>``, for the others.
 
         Args:
             counts: Lane to its count, whose numbers may be of any type.
             now_s: Time on the street's clock, s.
-            without_green: Lanes without green since the last call; no vehicle could leave them.
+            green_s: Lane to its green since the last call, s, in which vehicles could leave it; all
+                of the time for other lanes.
         """
         trusted: dict[str, LaneCount] = {}
         lane_faults: dict[str, str] = {}
@@ -102,8 +107,9 @@ class Watchdog:
                 count, wrong = self._checked(count, capacity, now_s)
                 wrong = wrong and f"{wrong} on lane {lane}"
             if count is not None and not wrong:
-                waits = lane in without_green or count.vehicles >= _FULL * capacity
-                self._note(lane, count, now_s, 0.0 if waits else elapsed)
+                moving_s = min(green_s.get(lane, elapsed), elapsed)
+                full = count.vehicles >= _FULL * capacity
+                self._note(lane, count, now_s, 0.0 if full else moving_s)
                 trusted[lane] = count
             else:
                 lane_faults[lane] = wrong

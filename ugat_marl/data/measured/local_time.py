@@ -21,7 +21,12 @@ _FORMATS = (
     "%Y-%m-%d %H:%M",
     "%Y-%m-%dT%H:%M",
     "%m/%d/%Y %H:%M",
+    "%m/%d/%Y %I:%M %p",
 )
+
+
+_OFFSET = r"(Z|:\d\d(\.\d+)?[+-]\d\d(:?\d\d)?)$"
+"""End of a time that has an offset from UTC."""
 
 
 @dataclass(frozen=True)
@@ -158,13 +163,20 @@ def _times(path: Path, cells: pl.Series, time_zone: str, start: int, mapping: st
 
 def _parsed(path: Path, cells: pl.Series, start: int) -> pl.Series:
     empty = cells.is_null() | (cells == "")
-    if cells.str.contains(r"(Z|[+-]\d\d:?\d\d)$").any():
-        zoned = cells.str.replace(" ", "T", literal=True).str.to_datetime(
-            "%+", strict=False, time_unit="us", time_zone="UTC"
+    offset = cells.str.contains(_OFFSET)
+    if offset.any():
+        whole = (
+            cells.str.replace(" ", "T", literal=True)
+            .str.replace(r"(T\d\d:\d\d)(Z|[+-])", "${1}:00${2}")  # without seconds
+            .str.replace(r"([+-]\d\d)$", "${1}:00")
         )
-        parsed = [zoned]
+        zoned = whole.str.to_datetime("%+", strict=False, time_unit="us", time_zone="UTC")
+        parsed = [zoned.set(~offset, None)]
     else:
-        parsed = [cells.str.to_datetime(x, strict=False, time_unit="us") for x in _FORMATS]
+        days = cells.str.replace(
+            r"^(\d{4}-\d\d-\d\d)$", "${1} 00:00:00"
+        )  # midnight, as pandas says
+        parsed = [days.str.to_datetime(x, strict=False, time_unit="us") for x in _FORMATS]
     best = min(parsed, key=lambda times: times.null_count())
     wrong = best.is_null() & ~empty.fill_null(True)
     if wrong.any():
@@ -172,9 +184,12 @@ def _parsed(path: Path, cells: pl.Series, start: int) -> pl.Series:
         unit = "row" if path.suffix == ".parquet" else "line"
         text = str(cells[at])[:40]
         dotted = re.fullmatch(r"(\d{1,2})\.(\d{1,2})\.(\d{4})[ T]+(\d.*)", text, re.ASCII)
-        day, month, year, clock = dotted.groups() if dotted else ("05", "03", "2024", "07:00:00.1")
-        raise MeasuredDataError(
-            f"{path}, {unit} {at + start}: {cells.name} is {text!r}; write it as "
-            f"{year}-{month:0>2}-{day:0>2} {clock}"
-        )
+        if dotted:
+            day, month, year, clock = dotted.groups()
+            way_out = f"write it as {year}-{month:0>2}-{day:0>2} {clock}"
+        elif offset.any() and not offset[at]:
+            way_out = "other times of the column have an offset from UTC; write it behind this one"
+        else:
+            way_out = "write it in a form such as 2024-03-05 07:00:00.1"
+        raise MeasuredDataError(f"{path}, {unit} {at + start}: {cells.name} is {text!r}; {way_out}")
     return best
