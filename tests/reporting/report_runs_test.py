@@ -543,6 +543,41 @@ def test_a_job_that_is_judged_further_shows_the_seeds_of_every_domain(tmp_path: 
     page_of(tmp_path / "direct-0")
 
 
+def test_an_earlier_evaluation_is_not_the_last_one(tmp_path: Path) -> None:
+    """Direct transfer is judged in the same job, before the episodes of the method."""
+    timed = Setting("timed", "grounded", ugat=UgatConfig(grounding="timed"))
+    for seed in (0, 1):
+        make_job(tmp_path, f"t{seed}", ("sim", "V4"), timed, target="V4", seed=seed, episodes=3)
+    _, page = page_of(tmp_path)
+    assert page.row("t0")[5] == "not finished"
+    assert "judged after 0 of 3 training episodes" in page.text
+    assert "Over training seeds" not in page.text
+
+
+def test_what_is_still_to_be_judged_is_named(tmp_path: Path) -> None:
+    direct = Setting("direct transfer", "direct")
+    wanted: dict[str, Any] = {"domains": ("sim", "V1"), "evaluation_seeds": (0, 1, 2)}
+    make_job(tmp_path, "d", ("sim",), direct, **wanted)
+    _, page = page_of(tmp_path)
+    assert page.row("d")[5] == "incomplete"
+    assert "not judged yet in 1 domain ('V1') and it is not judged yet in 1 eval" in page.text
+
+
+def test_policies_are_compared_on_the_same_episodes(tmp_path: Path) -> None:
+    direct, other = Setting("direct transfer", "direct"), Setting("more plain sim", "further")
+    for seed in (0, 1):
+        make_job(tmp_path, f"d{seed}", ("sim", "V1"), direct, seed=seed)
+        make_job(tmp_path, f"m{seed}", ("sim", "V1"), other, seed=seed)
+        record = JobRecord.read(tmp_path / f"m{seed}")
+        record.scores[0, "sim", 7], record.scores[0, "V1", 7] = scores(900.0), scores(900.0)
+        record.write(tmp_path / f"m{seed}")
+    _, page = page_of(tmp_path)
+    rows = [next(r for r in page.cells if r[:1] == [s.name] and len(r) == 2)
+            for s in (direct, other)]  # fmt: skip
+    assert rows[0][1] == rows[1][1]
+    assert "Left out: 1 evaluation seed on which some policies were not judged." in page.text
+
+
 def test_a_job_shows_its_worst_minutes(tmp_path: Path) -> None:
     make_job(tmp_path, "direct-0", ("sim", "V4"), Setting("direct transfer", "direct"))
     rows = [("direct transfer", d, 0, m, "A1", 3.0 + m, 6) for d in ("sim", "V4") for m in range(5)]

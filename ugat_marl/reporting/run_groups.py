@@ -10,6 +10,7 @@ from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any
 
+from ugat_marl.errors import counted
 from ugat_marl.experiments import (
     CORRECTED,
     DIRECT,
@@ -60,12 +61,30 @@ def groups(records: Sequence[RunRecord]) -> list[Group]:
         if len(members) < 2 or not trials:
             continue
         first = members[0]
+        trials, apart = _of_shared_episodes(trials)
         trials.sort(key=lambda trial: _rank(trial.setting))
         comparison = Comparison(first.scenario, "", first.sim, tuple(trials), {})
         title = f"{first.scenario}, trained in {first.sim}"
         title += "" if first.job else f", {first.grounding or 'unknown'} grounding"
-        with_several.append(Group(title, comparison.rows(), seeds_note(comparison), left_out))
+        note = f"{seeds_note(comparison)}{apart}"
+        with_several.append(Group(title, comparison.rows(), note, left_out))
     return with_several
+
+
+def _of_shared_episodes(trials: list[Trial]) -> tuple[list[Trial], str]:
+    """Return the episodes that all policies played, and a sentence on the others."""
+    played: dict[tuple[Any, ...], set[int]] = {}
+    for trial in trials:
+        policy = trial.setting, trial.target, trial.domain, trial.training_seed
+        played.setdefault(policy, set()).add(trial.seed)
+    shared, every = set.intersection(*played.values()), set.union(*played.values())
+    if shared == every:
+        return trials, ""
+    if not shared:
+        return trials, " Policies were judged on different episodes."
+    kept = [trial for trial in trials if trial.seed in shared]
+    others = counted(len(every - shared), "evaluation seed")
+    return kept, f" Left out: {others} on which some policies were not judged."
 
 
 def seeds_of_one(records: Sequence[RunRecord]) -> list[list[RunRecord]]:

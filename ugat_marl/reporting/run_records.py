@@ -30,7 +30,7 @@ from ugat_marl.data import (
     csv_texts,
     json_damage,
 )
-from ugat_marl.errors import CheckpointError, OptionError, UgatMarlError
+from ugat_marl.errors import CheckpointError, OptionError, UgatMarlError, listed
 from ugat_marl.experiments import QUEUES, TRAININGS, Evaluation, read_queues, result_of
 from ugat_marl.files import MALFORMED, read_json
 from ugat_marl.reporting.formats import commands_in
@@ -276,6 +276,8 @@ def _run(directory: Path, name: str) -> RunRecord:
         evaluation = reader.read(
             SCORES, lambda path: _scores(path, settings), "it has not been judged (yet)"
         )
+        if evaluation is not None and (gaps := _unjudged(evaluation, settings)):
+            reader.missing.append(f"{SCORES} is not complete: {gaps}")
     else:
         evaluation = reader.read(
             TABLE, Evaluation.read, "the run is under way, or was stopped; no final table"
@@ -360,7 +362,9 @@ def _scores(path: Path, settings: Mapping[str, Any]) -> Evaluation:
     if not isinstance(rows, list) or not rows:
         raise ValueError("no scores in it")
     policy = str(settings.get("name", "unknown"))
-    last = max(int(row["trained"]) for row in rows)
+    last, wanted = max(int(row["trained"]) for row in rows), settings.get("episodes")
+    if isinstance(wanted, int) and last < wanted:
+        raise ValueError(f"judged after {last} of {wanted} training episodes")
     results = [result_of({**row, "policy": policy}) for row in rows if int(row["trained"]) == last]
     seeds: dict[str, set[int]] = {}
     for result in results:
@@ -370,6 +374,20 @@ def _scores(path: Path, settings: Mapping[str, Any]) -> Evaluation:
         raise ValueError("no seed was played in every domain")
     results = [result for result in results if result.seed in everywhere]
     return Evaluation(str(settings.get("scenario", "")), "", tuple(results), {})
+
+
+def _unjudged(evaluation: Evaluation, settings: Mapping[str, Any]) -> str:
+    """Return what a job still has to play to be judged, in words; "" for nothing."""
+    told: list[str] = []
+    for name, played in (
+        ("domains", set(evaluation.domains)),
+        ("evaluation_seeds", {result.seed for result in evaluation.results}),
+    ):
+        wanted = settings.get(name)
+        if isinstance(wanted, list) and (left := set(map(str, wanted)) - set(map(str, played))):
+            what = "domain" if name == "domains" else "evaluation seed"
+            told.append(f"it is not judged yet in {listed(sorted(left), what)}")
+    return " and ".join(told)
 
 
 def _table(directory: Path, name: str) -> TableRecord:
