@@ -41,6 +41,18 @@ def complaint(capsys: pytest.CaptureFixture[str], *arguments: str) -> str:
         (["train", "single-v1", "--observation", "cuont"], "'count'"),
         (["train", "single-v1", "--iterations", "-1"], "at least 0"),
         (["train"], "error: train needs SCENARIO; see ugat-marl train --help"),
+        (
+            ["train", "single-v1", "--rule-budget", "none"],
+            "--rule-budget none: not a whole number, nor None; see ugat-marl train --help-all",
+        ),
+        (
+            ["train", "single-v1", "--gate.mode", "static", "--gate.static-alpha", "0.3"],
+            "settings gate.* count with the grounding phase or timed",
+        ),
+        (
+            ["train", "single-v1", "--grounding", "phase", "--timed.most-s", "3"],
+            "settings timed.* count with the grounding timed",
+        ),
         (["import-log"], "import-log needs SCENARIO, MEASURED and --out PATH; see"),
         (
             ["train", "x", "--grounding", "foo"],

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import re
+import shutil
 import tempfile
 from collections.abc import Callable
 from dataclasses import replace
@@ -835,3 +836,37 @@ def test_moments_that_no_street_shows_are_refused(
     )
     with pytest.raises(MeasuredDataError, match=rf"line 2: {re.escape(says)}"):
         _of_moments(files, table, (Period("p", 0.0, 600.0, "fit", {}, {}),), network)
+
+
+@pytest.mark.parametrize(
+    ("name", "says"),
+    [
+        ("timestamp", r"no column 'time' \(is it 'timestamp'\?\); it has .*, and needs .*, time, "),
+        ("time_s", "time_s holds local times, such as '2024-03-05T07:00:.*'; name the column time"),
+    ],
+)
+def test_a_column_of_local_times_is_called_time(
+    name: str, says: str, reread: Callable[..., MeasuredData]
+) -> None:
+    changes = in_local_time()
+    local = changes["detections.csv"]
+    changes["detections.csv"] = lambda text: local(text).replace("time", name, 1)
+    with pytest.raises(MeasuredDataError, match=says):
+        reread(changes)
+
+
+def test_decimal_commas_before_an_offset_are_read(
+    reread: Callable[..., MeasuredData], tmp_path: Path
+) -> None:
+    def comma(text: str) -> str:
+        return re.sub(r"\.(\d+)(?=-06:00)", r",\1", text.replace(",", ";"))
+
+    changes = in_local_time("America/Chicago")
+    plain = reread(changes)
+    shutil.rmtree(tmp_path / "street")
+    tables = {
+        name: (lambda text, name=name: comma(changes[name](text)))
+        for name in ("detections.csv", "signals.csv")
+    }
+    again = reread({**changes, **tables})
+    assert again.hash == plain.hash

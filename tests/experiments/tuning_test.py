@@ -278,3 +278,15 @@ def test_a_rule_is_tuned_in_real_episodes(
     assert [trial["episodes"] for trial in row["trials"]] == [1, 1]
     assert row["trials"][0]["att_s"] <= row["trials"][1]["att_s"]
     assert tuning.BUDGET >= 24
+
+
+def test_a_result_that_cannot_be_kept_is_there_all_the_same(
+    monkeypatch: pytest.MonkeyPatch, tmp_path: Path, capsys: Any
+) -> None:
+    (tmp_path / "file").write_text("")
+    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "file"))
+    call = ["tune", "single-v1", "--rules", "fixed-time", "--budget", "2", "--duration-s", "60"]
+    assert main(call) == 0
+    said = capsys.readouterr()
+    assert "fixed-time:" in said.out
+    assert "fixed-time are not kept for other runs" in " ".join((said.out + said.err).split())

@@ -326,7 +326,8 @@ def test_the_usual_criteria_stand_first_and_ours_beside_them() -> None:
     """Of FHWA's criteria the first alone is met: 98 % of 95, but 60 % of two thirds."""
     text = " ".join(printed(diagnosis_of("explained")).split())
     assert text.startswith(
-        "As it is: GEH < 5 on 100 % of counts (met, usual: 85 %), FHWA 1 of 4 criteria met; our "
+        "As it is, held-out periods: GEH < 5 on 100 % of counts (met, usual: 85 %), FHWA 1 of 4 "
+        "criteria met; our "
         "test not met, p < 0.001. Corrected: GEH < 5 on 100 % of counts (met, usual: 85 %), FHWA "
         "not known (it needs three whole days of counts at one time of day); our test met, p = "
         "0.33. GEH does not see this gap. Ours is stricter than GEH, which sees how many vehicles "

@@ -559,7 +559,6 @@ def test_what_is_still_to_be_judged_is_named(tmp_path: Path) -> None:
     wanted: dict[str, Any] = {"domains": ("sim", "V1"), "evaluation_seeds": (0, 1, 2)}
     make_job(tmp_path, "d", ("sim",), direct, **wanted)
     _, page = page_of(tmp_path)
-    assert page.row("d")[5] == "incomplete"
     assert "not judged yet in 1 domain ('V1') and it is not judged yet in 1 eval" in page.text
 
 

@@ -80,6 +80,7 @@ def test_a_long_way_to_a_counted_road_is_told(
     ("columns", "first", "second"),
     [
         ("begin,end", ("23:30", "23:45:00"), ("23:45", "0:00")),
+        ("begin,end", ("11:30 PM", "11:45pm"), ("11:45 PM", "12:00 AM")),
         ("begin_s,end_s", ("4.3.2024 23:30", "4.3.2024 23:45"), ("4.3.2024 23:45", "86400")),
     ],
 )
@@ -421,3 +422,12 @@ def test_counts_that_are_spread_over_an_odd_time_are_told(
     assert "are of the whole episode, 4200 s" in capsys.readouterr().out
     assert made(tmp_path / "hour", "--counts", tmp_path / "c.csv") == 0
     assert "whole episode" not in capsys.readouterr().out
+
+
+def test_columns_that_are_not_read_are_named(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    (tmp_path / "t.csv").write_text("edge,count,Von,Bis\nA1_B1,20,07:00,08:00\n")
+    assert made(tmp_path / "city", "--counts", tmp_path / "t.csv", "--duration-s", "600") == 0
+    said = " ".join(capsys.readouterr().out.split())
+    assert "note: t.csv: 2 columns ('von', 'bis') not read" in said

@@ -47,7 +47,10 @@ _PLAIN_WORDS = {
     ),
     r"^Error parsing (\S+): could not convert string to float: (.*)": r"\1 \2: not a number",
     r"^Error parsing (\S+): no type matching \{None\}\|FLOAT .* from \['(.*?)'\].*": (
-        r"\1 \2: not a number, such as 600 or 7.5"
+        r"\1 \2: not a number, such as 600 or 7.5, nor None"
+    ),
+    r"^Error parsing (\S+): no type matching \{None\}\|INT .* from \['(.*?)'\].*": (
+        r"\1 \2: not a whole number, nor None"
     ),
     r"^invalid choice (.*) for argument '(.*)'\. Expected one of \((.*)\)": (
         r"\2 \1: must be one of \3"
@@ -294,6 +297,14 @@ def _dispatch(line: CommandLine, words: list[str], console: Console) -> int:
         return line.perform(command, console)
 
 
+def _help_that_has(command_type: Any, message: str) -> str:
+    """Return the option that shows the help with the option a message begins with."""
+    shown: Sequence[str] = getattr(command_type, "FIRST", ())
+    option = re.match(r"--([\w.-]+)", message)
+    hidden = shown and option and option[1].replace("-", "_") not in shown
+    return HELP_ALL if hidden else HELP[-1]
+
+
 def _parse(line: CommandLine, name: str, words: list[str]) -> Any:
     """Parse the options of a command into its dataclass; turn errors of tyro into one line."""
     import tyro
@@ -317,14 +328,16 @@ def _parse(line: CommandLine, name: str, words: list[str]) -> Any:
         if not end.code:
             raise
         message = _one_line(messages.getvalue(), name)
-        raise UgatMarlError(f"{message}; see {line.program} {name} --help") from None
+        told = _help_that_has(command_type, message)
+        raise UgatMarlError(f"{message}; see {line.program} {name} {told}") from None
     if unknown:
         first, is_value, _ = unknown[0].partition("=")
         if first.startswith("-"):
             guess = nearest(first, sorted(options_of(command_type)))
             hint = f"Did you mean {guess!r}?" if guess else ""
+            told = _help_that_has(command_type, guess or first)
             raise UgatMarlError(
-                f"unknown option {first!r} of {name}. {hint} See {line.program} {name} --help"
+                f"unknown option {first!r} of {name}. {hint} See {line.program} {name} {told}"
             )
         joined_by = (
             "; effects of one domain are joined by +, as in V1+late_green=2" if is_value else ""

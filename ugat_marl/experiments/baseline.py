@@ -18,12 +18,15 @@ from typing import Any, NamedTuple
 
 from ugat_marl.effects import load_scenario
 from ugat_marl.envs import AnyParallelEnv, parallel_env
-from ugat_marl.errors import require_least
+from ugat_marl.errors import OutputError, require_least
 from ugat_marl.experiments.evaluation import FixedPolicy, evaluation_of
 from ugat_marl.experiments.jobs import evaluation_seeds
 from ugat_marl.experiments.training import train_through
 from ugat_marl.files import require_writable, write_whole
 from ugat_marl.policies import EpisodeCallback, NetworkPolicy
+
+KEPT = ("policy.pt", "learner.pt", "result.json")
+"""Files of a training: its policy, its learner and its results."""
 
 
 @dataclass(frozen=True)
@@ -82,8 +85,13 @@ def train_baseline(
         on_episode: Called after every episode of training.
     """
     scenario, length = load_scenario(args.scenario, args.duration_s), args.duration_s
+    require_least(0, seed=args.seed)
     if args.out is not None:
         require_writable(args.out / "policy.pt")
+        if there := [name for name in KEPT if (args.out / name).exists()]:
+            raise OutputError(
+                f"{args.out}: holds {there[0]} of a training already; give another --out"
+            )
     returns: list[float] = []
     att_s: dict[int, list[float]] = {}
 
@@ -106,8 +114,9 @@ def train_baseline(
                 att_s[mark] = [result.scores.att_s for result in evaluation.results]
         result = BaselineResult(learner.policy(), returns, att_s)
     if args.out is not None:
-        result.policy.save(args.out / "policy.pt")
-        learner.save(args.out / "learner.pt")
+        policy, state, results = (args.out / name for name in KEPT)
+        result.policy.save(policy)
+        learner.save(state)
         content = {"args": asdict(args), "returns": returns, "att_s": att_s}
-        write_whole(args.out / "result.json", json.dumps(content, default=str) + "\n")
+        write_whole(results, json.dumps(content, default=str) + "\n")
     return result

@@ -60,7 +60,7 @@ class Training:
 def train(
     scenario: str | Path,
     *,
-    real: str = "V4",
+    real: str | None = "V4",
     sim: str = "sim",
     learner: str | type[Any] | Any = "",
     learner_settings: Mapping[str, Any] | Sequence[str] = (),
@@ -89,7 +89,8 @@ def train(
 
     Args:
         scenario: Id of a shipped scenario, directory, .sumocfg or resco:<map>.
-        real: The real domain, such as "V4" or "startup_delay=1+deceleration=2".
+        real: The real domain, such as "V4" or "startup_delay=1+deceleration=2"; None if only the
+            log of it is known.
         sim: The domain to train in.
         learner: Name of a learner, ``module:name``, or a class with ``learn(env, episodes)`` and
             ``policy()``, or a function of ``env`` and ``seed`` that makes such an object.
@@ -142,7 +143,11 @@ def train(
             "ugat holds all settings of the algorithm; give grounding, pretrain_episodes, "
             "iterations, grounded_episodes and real_rollouts in it"
         )
+    real = "none" if real is None else real
     _check_arguments(scenario, real, sim, seed, observation, reward, callback)
+    _check_kinds(control=control, resume=resume, ugat=ugat, dqn=dqn, out=out, real_log=real_log)
+    if not is_count(evaluation_seeds):
+        raise OptionError(f"evaluation_seeds = {evaluation_seeds!r}: must be a whole number")
     parts_at_a_time(workers)  # refuses what is no number before anything is written
     config = TransferConfig(
         str(scenario),
@@ -208,9 +213,10 @@ def evaluate(
         UgatMarlError: A name or an option is at fault; the message names it.
     """
     numbers = _seeds(seeds)
-    if not numbers or not domains:
+    given: Any = domains.tolist() if isinstance(domains, np.ndarray) else domains
+    if not numbers or not given:
         raise OptionError("seeds and domains need at least one each")
-    listed: Any = [domains] if is_one_domain(domains) else domains
+    listed: Any = [given] if is_one_domain(given) else given
     played = evaluation_of(
         load_scenario(scenario, duration_s),
         _factories(policies),
@@ -221,6 +227,23 @@ def evaluate(
         reporter=reporter or usual(),
     )
     return played.episodes_frame() if each_episode else played.frame()
+
+
+_KINDS: Mapping[str, Any] = {
+    "control": bool | np.bool_,
+    "resume": bool | np.bool_,
+    "ugat": UgatConfig | None,
+    "dqn": DQNConfig | None,
+    "out": str | Path | None,
+    "real_log": str | Path | None,
+}
+"""Kinds of arguments of `train`."""
+
+
+def _check_kinds(**arguments: Any) -> None:
+    for name, given in arguments.items():
+        if not isinstance(given, _KINDS[name]):
+            raise OptionError(f"{name} = {given!r}: train does not take a {type(given).__name__}")
 
 
 def _check_arguments(
@@ -260,7 +283,7 @@ def _texts(settings: Any) -> tuple[str, ...]:
     """Return settings of a learner as ``NAME=VALUE``."""
     if isinstance(settings, Mapping):
         return tuple(f"{name}={_text(value)}" for name, value in settings.items())
-    return (settings,) if isinstance(settings, str) else tuple(settings)
+    return (settings,) if isinstance(settings, str) else tuple(settings or ())
 
 
 def _text(value: Any) -> str:

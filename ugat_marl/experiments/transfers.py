@@ -206,6 +206,23 @@ class TransferConfig:
                 'real = "none" needs real_log, a log of the street; or name a real domain'
             )
         self._refuse_impossible_controls()
+        self._refuse_settings_of_other_groundings()
+
+    def _refuse_settings_of_other_groundings(self) -> None:
+        usual, kind, residual = UgatConfig(), self.ugat.grounding, self.ugat.street.residual.kind
+        acting = residual if kind == "street" else kind  # what changes actions, if anything does
+        unused = {
+            "none": ("forward", "inverse", "gate", "timed"),
+            "phase": ("timed",),
+        }.get(acting, ())
+        for part in unused:
+            if getattr(self.ugat, part) != getattr(usual, part):
+                others = "timed" if part == "timed" else "phase or timed"
+                raise OptionError(
+                    f"settings {part}.* count with the grounding {others}, or with such a residual "
+                    f"of a fitted street, and this is {kind}; leave them out, or ask for another "
+                    "grounding"
+                )
 
     def _refuse_impossible_controls(self) -> None:
         _ = self.spec  # raises an error for an unknown learner, or settings of another one

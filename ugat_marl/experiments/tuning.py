@@ -18,13 +18,13 @@ from typing import Any
 
 from ugat_marl.data import installed_version, json_damage, with_hashes
 from ugat_marl.effects import Domain, domain_label, scenario_in_domain
-from ugat_marl.errors import CheckpointError, UnknownNameError, require_least
+from ugat_marl.errors import CheckpointError, OutputError, UnknownNameError, require_least
 from ugat_marl.experiments.evaluation import TUNING_SEED, best_rule, race_rules
 from ugat_marl.experiments.scores import RuleTrial, Tuned
 from ugat_marl.files import MALFORMED, read_json, user_cache, write_whole
 from ugat_marl.parallel import Workers
 from ugat_marl.policies import RULE_NAMES, RULES, TUNED_RULES, race_fields, rule_settings
-from ugat_marl.progress import Reporter
+from ugat_marl.progress import Reporter, Silent
 from ugat_marl.scenarios import Scenario
 
 VERSION = 2
@@ -90,7 +90,11 @@ def tune(
         title=f"tuning {name}",
     )
     hashed = with_hashes({"trials": [asdict(trial) for trial in trials]}, "trials")
-    write_whole(place, json.dumps(hashed, indent=1) + "\n")
+    try:
+        write_whole(place, json.dumps(hashed, indent=1) + "\n")
+    except OutputError as error:  # the result is there all the same
+        told = f"note: the settings of {name} are not kept for other runs: {error}"
+        (reporter or Silent()).say(f"{told}, in XDG_CACHE_HOME")
     return Tuned(name, domain_label(domain), trials)
 
 

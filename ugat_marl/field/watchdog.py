@@ -5,7 +5,6 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping
 from dataclasses import dataclass, fields
-from types import MappingProxyType
 from typing import Any
 
 from ugat_marl.errors import OptionError
@@ -88,7 +87,7 @@ class Watchdog:
         self,
         counts: Mapping[str, LaneCount],
         now_s: float,
-        green_s: Mapping[str, float] = MappingProxyType({}),
+        green_s: Mapping[str, float] | None = None,
     ) -> tuple[dict[str, LaneCount], dict[str, str]]:
         """Return the trusted counts, and lane to fault, ``<kind>: <details>``, for the others.
 
@@ -96,7 +95,7 @@ class Watchdog:
             counts: Lane to its count, whose numbers may be of any type.
             now_s: Time on the street's clock, s.
             green_s: Lane to its green since the last call, s, in which vehicles could leave it; all
-                of the time for other lanes.
+                of the time for other lanes, and for all if None.
         """
         trusted: dict[str, LaneCount] = {}
         lane_faults: dict[str, str] = {}
@@ -107,7 +106,7 @@ class Watchdog:
                 count, wrong = self._checked(count, capacity, now_s)
                 wrong = wrong and f"{wrong} on lane {lane}"
             if count is not None and not wrong:
-                moving_s = min(green_s.get(lane, elapsed), elapsed)
+                moving_s = min((green_s or {}).get(lane, elapsed), elapsed)
                 full = count.vehicles >= _FULL * capacity
                 self._note(lane, count, now_s, 0.0 if full else moving_s)
                 trusted[lane] = count

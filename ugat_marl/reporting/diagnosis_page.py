@@ -92,7 +92,7 @@ def diagnosis_page(diagnosis: Diagnosis, network: Network, commands: Sequence[st
         partial=words.partial(diagnosis),
         meaning=words.meaning(diagnosis),
         effects=_effects(diagnosis.effects, names),
-        judged=_judged(diagnosis),
+        judged=words.judged(diagnosis),
         heldout=None if heldout is None else _heldout(heldout),
         expected=number(None if heldout is None else heldout.expected),
         traffic=_traffic(diagnosis),
@@ -124,11 +124,6 @@ def commands_on_page(path: Path) -> list[str]:
     except OSError:
         return []
     return unescape(match[1]).splitlines() if match else []
-
-
-def _judged(diagnosis: Diagnosis) -> str:
-    """Return the word for the periods on which the diagnosis is judged."""
-    return "fitted" if diagnosis.verified_on_fitted_periods else "held-out"
 
 
 def _effects(effects: Sequence[NamedEffect], names: LightNames) -> Grid | None:
@@ -353,7 +348,7 @@ def _headways(page: Page, diagnosis: Diagnosis) -> list[Figure]:
     picture = headway_picture(
         [_POSITIONS[row.statistic] for row in rows], series, [row.noise for row in rows], "headways"
     )
-    caption = f"Queues that discharge, {_judged(diagnosis)} periods; "
+    caption = f"Queues that discharge, {words.judged(diagnosis)} periods; "
     caption += "bars: twice the chance of the measurement."
     return page.figures((picture, caption))
 

@@ -108,7 +108,10 @@ def _heldout(heldout: HeldOut, *, fitted: bool) -> RenderableType:
         chance(heldout.p_after) if corrected else "–",
     )
     lines.append(table)
-    lines.append(Text("floor: 99 of 100 data sets of the simulation itself stay below", "dim"))
+    whose = "corrected simulation" if corrected else "simulation"
+    lines.append(Text(f"floor: 99 of 100 data sets of the {whose} itself stay below", "dim"))
+    if corrected:
+        lines.append(Text("shrink: of what is above the mean of such data sets", "dim"))
     if fitted:
         lines.append(Text("No period was held out; on the fitted ones the numbers flatter."))
     return Group(*lines)

@@ -189,12 +189,17 @@ def traffic_check_line(diagnosis: Diagnosis) -> str | None:
     )
 
 
+def judged(diagnosis: Diagnosis) -> str:
+    """Return the word for the periods on which the diagnosis is judged."""
+    return "fitted" if diagnosis.verified_on_fitted_periods else "held-out"
+
+
 def criteria_line(diagnosis: Diagnosis) -> str | None:
     """Return the usual criteria for the model as it is, beside our own; None without counts."""
     criteria, heldout = diagnosis.criteria, diagnosis.heldout
     if criteria is None or criteria.before.geh_below_5 is None:
         return None
-    texts = [f"As it is: {_usual(criteria.before)}"]
+    texts = [f"As it is, {judged(diagnosis)} periods: {_usual(criteria.before)}"]
     if heldout is not None:
         texts[0] += f"; our test {_ours(heldout.p_before)}"
         if heldout.shrink is not None:

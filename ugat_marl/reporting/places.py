@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import functools
 from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any
@@ -12,7 +11,7 @@ from ugat_marl.errors import UgatMarlError
 from ugat_marl.files import MALFORMED
 from ugat_marl.reporting.light_names import LightNames
 from ugat_marl.reporting.run_records import RunRecord
-from ugat_marl.scenarios import Network
+from ugat_marl.scenarios import Network, Scenario
 
 
 @dataclass(frozen=True)
@@ -38,7 +37,11 @@ def places_of(record: RunRecord) -> tuple[AgentPlaces | None, str]:
     options: Any = record.settings.get("options") if record.job else record.settings
     options = options if isinstance(options, Mapping) else {}
     try:
-        network, own_hash = _network(record.scenario, record.sim, options.get("duration_s"))
+        seconds = options.get("duration_s")
+        derived = scenario_in_domain(
+            load_scenario(record.scenario, seconds), record.sim, duration_s=seconds
+        )
+        network, own_hash = _network_of(derived), derived.hash
         agents = LightNames.of(network).agents
     except (UgatMarlError, OSError, *MALFORMED) as error:
         reason = " ".join(str(error).split())
@@ -50,7 +53,12 @@ def places_of(record: RunRecord) -> tuple[AgentPlaces | None, str]:
     return AgentPlaces(network, {agent: light for light, agent in agents.items()}), note
 
 
-@functools.lru_cache(maxsize=8)
-def _network(scenario: str, sim: str, duration_s: float | None) -> tuple[Network, str]:
-    derived = scenario_in_domain(load_scenario(scenario, duration_s), sim, duration_s=duration_s)
-    return Network.read(derived), derived.hash
+_NETWORKS: dict[str, Network] = {}
+
+
+def _network_of(scenario: Scenario) -> Network:
+    """Return the network of a scenario; those of one page are mostly the same."""
+    if scenario.hash not in _NETWORKS:
+        _NETWORKS.clear()
+        _NETWORKS[scenario.hash] = Network.read(scenario)
+    return _NETWORKS[scenario.hash]

@@ -351,7 +351,7 @@ def _training(page: Page, record: RunRecord, commands: Commands) -> dict[str, An
     judged = evaluation is not None and evaluation.policies
     learning = charts.learning_picture([record], picture_name(record.name, "learning"))
     travel = charts.travel_time_picture([record], picture_name(record.name, "att"))
-    once = "One episode after each iteration, on a seed that decides nothing: no interval."
+    once = "One episode after each iteration, on a seed of the search for rules: no interval."
     hashes = [(f"hash of {name}", text) for name, text in record.hashes.items()]
     versions = [(f"version of {name}", text) for name, text in record.versions.items()]
     notes = list(evaluation.notes.items()) if evaluation is not None else []

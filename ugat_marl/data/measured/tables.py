@@ -195,8 +195,8 @@ def read_table(
     """
     raw = read_raw(path, findings)
     wanted = {**table.columns, **table.optional}
+    _check_columns(path, table, raw, findings, clock)
     raw = _in_seconds(path, table, raw, clock)
-    _check_columns(path, table, raw.columns, findings)
     start = first_row(path)
     columns = [pl.int_range(start, raw.height + start, dtype=pl.Int64, eager=True).alias(ROW)]
     for name, kind in wanted.items():
@@ -232,8 +232,6 @@ def _in_seconds(
             f"{path}: {next(iter(local))} holds local times, and periods.csv does not say when the "
             "scenario's clock is 0; add the column zero there, such as 2024-03-05T07:00:00"
         )
-    if "period_id" not in raw.columns:
-        return raw  # refused as a missing column
     start = first_row(path)
     periods = to_texts(path, raw["period_id"])
     seconds = [clock.seconds(path, raw[name], periods, start) for name in local]
@@ -289,17 +287,37 @@ def refuse(path: Path, bad: pl.DataFrame, column: str, complaint: str, way_out: 
     )
 
 
-def _check_columns(path: Path, table: Table, given: list[str], findings: list[Finding]) -> None:
-    wanted = (*table.columns, *table.optional)
+def _check_columns(
+    path: Path,
+    table: Table,
+    raw: pl.DataFrame,
+    findings: list[Finding],
+    clock: LocalClock | None,
+) -> None:
+    given = raw.columns
+    # columns of local times, each in place of one of seconds
+    local = {x: x.removesuffix("_s") for x in table.columns if x in TIMES}
+    local = {} if table.stem == "periods" else local
+    wanted = (*table.columns, *table.optional, *local.values())
     unknown = [name for name in given if name not in wanted]
     for name in table.columns:
-        if name not in given:
-            near = nearest(name, unknown)
+        if name not in given and local.get(name) not in given:
+            own = name if clock is None else local.get(name, name)
+            near = nearest(own, unknown)
             guess = f" (is it {near!r}?)" if near else ""
+            needed = table.columns if clock is None else [local.get(x, x) for x in table.columns]
             raise MeasuredDataError(
-                f"{path}: no column {name!r}{guess}; it has {_listed(given)}, and needs "
-                f"{', '.join(table.columns)}"
+                f"{path}: no column {own!r}{guess}; it has {_listed(given)}, and needs "
+                f"{', '.join(needed)}"
             )
+    for name, own in local.items():
+        if name in given and isinstance(raw[name].dtype, pl.String):
+            shown = raw[name].filter(raw[name].str.contains(r"\d:\d\d"))
+            if len(shown):
+                raise MeasuredDataError(
+                    f"{path}: {name} holds local times, such as {shown[0][:40]!r}; name the column "
+                    f"{own}"
+                )
     for name in unknown:
         missing = [column for column in table.optional if column not in given]
         near = nearest(name, missing)
@@ -363,7 +381,7 @@ def _read_csv(path: Path, findings: list[Finding]) -> pl.DataFrame:
     try:
         frame = csv_texts(content, mark)
         if mark != ",":  # a spreadsheet of a country with decimal commas
-            frame = frame.with_columns(pl.col(pl.String).str.replace(_DECIMAL_COMMA, "$1.$2"))
+            frame = frame.with_columns(pl.col(pl.String).str.replace(_DECIMAL_COMMA, "$1.$2$3"))
         # polars gives the second of two equal names another one
         written = [name.strip() for name in next(csv.reader([head], delimiter=mark), [])]
     except (
@@ -380,7 +398,7 @@ def _read_csv(path: Path, findings: list[Finding]) -> pl.DataFrame:
     return frame.rename({name: name.strip() for name in frame.columns})
 
 
-_DECIMAL_COMMA = r"^([-\d :T]*\d),(\d+)\s*$"
+_DECIMAL_COMMA = r"^([-\d :T]*\d),(\d+)(Z|[+-]\d\d(?::?\d\d)?)?\s*$"
 """A number or a local time with a comma before its decimals."""
 
 

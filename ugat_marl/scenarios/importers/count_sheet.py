@@ -24,7 +24,8 @@ from ugat_marl.scenarios.street_names import NamedTurn, intersection_name, named
 FIT_SHEET = "counts-fit.csv"
 """Name of the sheet with the fit in a scenario's folder."""
 
-_NAMES = ("light", "intersection", "street", "approach", "turn", "to_street")
+NAMES = ("light", "intersection", "street", "approach", "turn", "to_street")
+"""Columns of a sheet that are for its reader alone."""
 
 
 @dataclass(frozen=True)
@@ -105,7 +106,7 @@ def write_template(path: Path, root: ET.Element) -> int:
         (*_names(turn, network), "", "", "", turn.from_edge, turn.to_edge)
         for turn in network.choices()
     ]
-    _write(path, (*_NAMES, "count", "begin_s", "end_s", "from", "to"), rows)
+    _write(path, (*NAMES, "count", "begin_s", "end_s", "from", "to"), rows)
     return len(rows)
 
 
@@ -125,14 +126,14 @@ def write_fit(path: Path, fits: Iterable[CountFit], network: NamedNetwork) -> No
     """Write a sheet with a row for every count: counted, driven, GEH."""
     rows = [
         (
-            *(_names(fit.turn, network) if fit.turn else ("",) * len(_NAMES)),
+            *(_names(fit.turn, network) if fit.turn else ("",) * len(NAMES)),
             f"{fit.counted:g}", fit.driven, f"{fit.geh:.2f}", f"{fit.begin_s:g}", f"{fit.end_s:g}",
             fit.roads[0], fit.roads[-1] if len(fit.roads) > 1 else "",
         )
         for fit in fits
     ]  # fmt: skip
     columns = ("counted", "driven", "geh", "begin_s", "end_s", "from", "to")
-    _write(path, (*_NAMES, *columns), rows)
+    _write(path, (*NAMES, *columns), rows)
 
 
 def _names(turn: NamedTurn, network: NamedNetwork) -> tuple[str, ...]:

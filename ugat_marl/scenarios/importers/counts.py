@@ -19,12 +19,13 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from ugat_marl.errors import ScenarioError, nearest
+from ugat_marl.errors import ScenarioError, listed, nearest
 from ugat_marl.files import chunks_of, parse_xml, read_bytes, read_xml, write_whole, xml_bytes
 from ugat_marl.progress import Reporter
 from ugat_marl.scenarios.csv_tables import columns_of, delimiter_of, rows_of
 from ugat_marl.scenarios.importers.count_sheet import (
     FIT_SHEET,
+    NAMES,
     CountFit,
     NamedNetwork,
     write_fit,
@@ -76,6 +77,7 @@ class Row:
 _DAY_S = 86_400.0
 _TIMES = {"begin": "begin_s", "end": "end_s"}
 """Columns of times of day, and those of seconds in whose place they stand."""
+_READ = ("edge", "from", "to", "count")
 _LIKE_TIMES = re.compile(r"(begin|start|end|stop|time|interval).*|(from|to)_(s|sec|time)")
 """Names under which other programs write the times of an interval, and mistyped ones."""
 
@@ -120,6 +122,8 @@ def read_rows(
             f"{path}, line 1: the columns {wanted} are needed in the first line; there "
             f"are: {', '.join(columns)}"
         )
+    if others := [name for name in columns if name not in {*known, *_READ, *NAMES}]:
+        reporter.say(f"note: {path.name}: {listed(others, 'column')} not read")
     rows_read: list[Row] = []
     written: dict[int, str] = {}
     total = 0.0
@@ -211,9 +215,10 @@ def _refuse_all_outside(rows: Sequence[Row], path: Path, begin_s: float, end_s: 
 
 
 _CLOCK = re.compile(
-    r"(?:(\d+[-./]\d+[-./]\d+)[ T]+)?(\d{1,2}):([0-5]\d)(?::([0-5]\d)(?:\.0*)?)?", re.ASCII
+    r"(?:(\d+[-./]\d+[-./]\d+)[ T]+)?(\d{1,2}):([0-5]\d)(?::([0-5]\d)(?:\.0*)?)?(?: ?([AP]M))?",
+    re.ASCII | re.IGNORECASE,
 )
-"""A time of day such as 7:00 or 07:00:00, with a date before it or without."""
+"""A time of day such as 7:00, 07:00:00 or 7:00 AM, with a date before it or without."""
 
 
 def _one_date(values: Mapping[str, str | None], before: str | None, where: str) -> str | None:
@@ -242,9 +247,11 @@ def _time_s(values: Mapping[str, str | None], name: str, usual: float, where: st
     of_day = (values.get(name) or "").strip()
     text = of_day or (values.get(_TIMES[name]) or "").strip()
     if clock := _CLOCK.fullmatch(text):
-        hours, minutes, seconds = (int(part or 0) for part in clock.groups()[1:])
-        of_midnight = 3600 * hours + 60 * minutes + seconds
-        if of_midnight <= _DAY_S:
+        hours, minutes, seconds = (int(part or 0) for part in clock.groups()[1:4])
+        half = (clock[5] or "").upper()
+        hour = hours % 12 + 12 * (half == "PM") if half else hours
+        of_midnight = 3600 * hour + 60 * minutes + seconds
+        if of_midnight <= _DAY_S and (not half or 1 <= hours <= 12):
             return float(of_midnight)
     if of_day:
         raise ScenarioError(
