@@ -446,10 +446,13 @@ class _IntersectionNames(Wrapper):
         return [self._light[agent] for agent in self.env.agents]
 
     @property
+    def _base(self) -> Any:
+        return self.env.unwrapped
+
+    @property
     def agent_groups(self) -> dict[str, list[str]]:
         """Group to its traffic lights."""
-        base: Any = self.env.unwrapped
-        groups: Mapping[str, list[str]] = base.agent_groups
+        groups: Mapping[str, list[str]] = self._base.agent_groups
         return {group: [self._light[agent] for agent in own] for group, own in groups.items()}
 
     @property
@@ -460,30 +463,26 @@ class _IntersectionNames(Wrapper):
     @property
     def layouts(self) -> dict[str, Any]:
         """Traffic light to the parts of its observation."""
-        base: Any = self.env.unwrapped
-        return self._renamed(base.layouts)
+        return self._renamed(self._base.layouts)
 
     @property
     def recorded_layouts(self) -> dict[str, Any]:
         """The same without the memory of commands."""
-        base: Any = self.env.unwrapped
-        return self._renamed(base.recorded_layouts)
+        return self._renamed(self._base.recorded_layouts)
 
     def remember(self, commands: Mapping[str, int]) -> None:
         """Let observations show these commands, see `TrafficEnv.remember`."""
-        base: Any = self.env.unwrapped
         require_mapping("commands", commands, self.agents)
         own = self._of_agents("command", commands)
         with self._errors_name_lights():
-            base.remember(own)
+            self._base.remember(own)
 
     def delay_greens(self, seconds: Mapping[str, float]) -> None:
         """Delay greens of the next step, see `TrafficEnv.delay_greens`."""
-        base: Any = self.env.unwrapped
         require_mapping("delays", seconds, self.agents)
         own = self._of_agents("delay", seconds)
         with self._errors_name_lights():
-            base.delay_greens(own)
+            self._base.delay_greens(own)
 
     def reset(self, seed: int | None = None, options: dict[str, Any] | None = None) -> ResetResult:
         """Start an episode of the wrapped environment."""

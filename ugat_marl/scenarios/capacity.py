@@ -22,7 +22,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy import optimize
 
-from ugat_marl.scenarios.junctions import Link, foes_of, links_for_cars, yields_of
+from ugat_marl.scenarios.junctions import Link, links_for_cars
 from ugat_marl.scenarios.network import Intersection, Network
 from ugat_marl.scenarios.phases import RightOfWay, kerb_turn_of
 from ugat_marl.scenarios.routes import departures
@@ -103,7 +103,7 @@ def degrees_of_saturation(scenario: Scenario, flows_vph: Flows | None = None) ->
     """
     network = Network.read(scenario)
     root = scenario.network.parse()
-    rules = RightOfWay(foes_of(root), yields_of(root))
+    rules = RightOfWay.of(root)
     flows = counted_flows_vph(scenario) if flows_vph is None else flows_vph
     clearance_s = scenario.timing.clearance_s
     return {

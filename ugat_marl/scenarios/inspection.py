@@ -13,7 +13,7 @@ from ugat_marl.errors import ScenarioError
 from ugat_marl.progress import Reporter
 from ugat_marl.scenarios.capacity import Flows, degrees_of_saturation, discharge_vph, may_go
 from ugat_marl.scenarios.demand import Demand, check_demand
-from ugat_marl.scenarios.junctions import Link, foes_of, links_for_cars, yields_of
+from ugat_marl.scenarios.junctions import Link, links_for_cars
 from ugat_marl.scenarios.network import Intersection, Network, free_flow_s
 from ugat_marl.scenarios.phases import (
     RightOfWay,
@@ -218,7 +218,7 @@ def survey(scenario: Scenario, reporter: Reporter | None = None) -> Survey:
     traffic = _Traffic.of(scenario, network, demand, reporter)
     free = _free_links(root)
     short = _short(scenario, network)
-    rules = RightOfWay(foes_of(root), yields_of(root))
+    rules = RightOfWay.of(root)
     interval = scenario.control.decision_interval_s
     shortest = traffic.first_s + FILLINGS * traffic.fill_s
     shortest = -(-shortest // interval) * interval

@@ -18,12 +18,9 @@ from ugat_marl.scenarios.junctions import (
     behind_of,
     connections_between,
     crossings_of,
-    foes_of,
     links_of,
     neighbours_of,
-    right_on_red_of,
     straight_roads_of,
-    yields_of,
 )
 from ugat_marl.scenarios.lanes import NO_UPSTREAM_LANES, LaneTable, Turns, UpstreamLanes
 from ugat_marl.scenarios.phases import (
@@ -161,7 +158,7 @@ class Network:
         programmes = _programmes(root, scenario)
         _check_settings(scenario, links)
         _check_lanes(links, lanes, document.source)
-        rules = RightOfWay(foes_of(root), yields_of(root), right_on_red_of(root))
+        rules = RightOfWay.of(root)
         crossings = crossings_of(root)
         positions = _positions(root)
         agents_found: list[Intersection] = []

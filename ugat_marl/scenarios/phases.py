@@ -21,6 +21,7 @@ from ugat_marl.scenarios.junctions import (
     foes_of,
     has_bit,
     links_of,
+    right_on_red_of,
     yields_of,
 )
 from ugat_marl.scenarios.signals import GREEN, YELLOW
@@ -111,6 +112,11 @@ class RightOfWay:
     foes: Matrix
     yields: Matrix = field(default_factory=dict[str, Sequence[int]])
     right_on_red: frozenset[str] = frozenset()
+
+    @classmethod
+    def of(cls, root: ET.Element) -> RightOfWay:
+        """Read the right of way of a ``<net>``."""
+        return cls(foes_of(root), yields_of(root), right_on_red_of(root))
 
     def waits(self, a: Link, b: Link) -> bool:
         """Return True if `a` must let `b` go first."""
@@ -365,7 +371,7 @@ def suited(network: Path) -> tuple[dict[str, str], list[str]]:
         Light to the source of its phases, and notes for the user.
     """
     root = read_xml(network)
-    rules = RightOfWay(foes_of(root), yields_of(root))
+    rules = RightOfWay.of(root)
     crossings = crossings_of(root)
     programmes = _programmes_of(root)
     sources: dict[str, str] = {}

@@ -298,7 +298,7 @@ def _routed_by_duarouter(scenario: Scenario) -> tuple[Document, ...]:
     """
     with tempfile.TemporaryDirectory(prefix="ugat_marl-") as name:
         directory = Path(name)
-        out = directory / "routed.rou.xml"
+        out = directory / _ROUTED
         reads: list[Path] = []
 
         def files(documents: tuple[Document, ...]) -> str:

@@ -22,7 +22,7 @@ from typing import NamedTuple
 from ugat_marl.errors import ScenarioError, nearest
 from ugat_marl.files import Document, read_bytes, write_whole, xml_bytes
 from ugat_marl.scenarios.csv_tables import as_text, columns_of, delimiter_of, rows_of
-from ugat_marl.scenarios.junctions import Link, foes_of, right_on_red_of, yields_of
+from ugat_marl.scenarios.junctions import Link
 from ugat_marl.scenarios.network import Intersection, Network
 from ugat_marl.scenarios.phases import (
     Clash,
@@ -412,7 +412,7 @@ def with_plans(scenario: Scenario, plans: Iterable[SignalPlan], source: str) -> 
     Raises:
         ScenarioError: A plan is impossible, or names a light that is not an agent.
     """
-    network, rules = Network.read(scenario), _rules(scenario)
+    network, rules = Network.read(scenario), RightOfWay.of(scenario.network.parse())
     lights = {light.id: light for light in network.intersections}
     name = "plans.add.xml"
     others = tuple(document for document in scenario.additional if document.name != name)
@@ -524,7 +524,7 @@ def programme_notes(scenario: Scenario, plans: Iterable[SignalPlan], source: str
         plans: The plans, at most one for each light.
         source: Name of their table.
     """
-    network, rules = Network.read(scenario), _rules(scenario)
+    network, rules = Network.read(scenario), RightOfWay.of(scenario.network.parse())
     notes: list[str] = []
     differing: list[str] = []
     for plan in plans:
@@ -557,7 +557,7 @@ def refusal_notes(scenario: Scenario, plans: Iterable[SignalPlan], source: str) 
         plans: The plans, at most one for each light.
         source: Name of their table.
     """
-    network, rules = Network.read(scenario), _rules(scenario)
+    network, rules = Network.read(scenario), RightOfWay.of(scenario.network.parse())
     notes: list[str] = []
     for plan in plans:
         light = network.intersection(plan.light)
@@ -594,11 +594,6 @@ def yellow_notes(plans: Iterable[SignalPlan]) -> list[str]:
     ]
     usual = f"{_LEAST_YELLOW_S:g} to 6 s are usual"
     return [f"yellow is short at {', '.join(short)}; {usual}"] if short else []
-
-
-def _rules(scenario: Scenario) -> RightOfWay:
-    root = scenario.network.parse()
-    return RightOfWay(foes_of(root), yields_of(root), right_on_red_of(root))
 
 
 _States = Sequence[tuple[float, str]]

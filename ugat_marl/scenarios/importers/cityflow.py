@@ -34,7 +34,7 @@ from ugat_marl.scenarios.importers.long_files import objects
 from ugat_marl.scenarios.importers.making import NETWORK, ROUTES, RoadFiles, RoadSource
 from ugat_marl.scenarios.importers.plan import coordinate
 from ugat_marl.scenarios.importers.turning_shares import MOST_VEHICLES, Drive, write_drives
-from ugat_marl.scenarios.junctions import foes_of, links_of, yields_of
+from ugat_marl.scenarios.junctions import links_of
 from ugat_marl.scenarios.phases import RightOfWay, state_of
 from ugat_marl.scenarios.signals import GREEN
 from ugat_marl.scenarios.sumo_tools import netconvert
@@ -246,7 +246,7 @@ def _set_programmes(root: ET.Element, net: Roadnet) -> list[str]:
     The network must be built first, because ``g`` or ``G`` depends on its right of way.
     """
     links = links_of(root)
-    rules = RightOfWay(foes_of(root), yields_of(root))
+    rules = RightOfWay.of(root)
     without: list[str] = []
     equal: dict[str, list[str]] = defaultdict(list)
     for logic in root.iter("tlLogic"):

@@ -115,9 +115,7 @@ def _crossed(
 
 def _arms_at_lights(root: ET.Element) -> dict[str, list[_Arm]]:
     lights = {
-        element.get("id", ""): np.array(
-            [float(element.get("x", "0")), float(element.get("y", "0"))]
-        )
+        element.get("id", "")
         for element in root.iter("junction")
         if element.get("type", "").startswith("traffic_light")
     }
@@ -131,7 +129,7 @@ def _arms_at_lights(root: ET.Element) -> dict[str, list[_Arm]]:
     arms: dict[str, list[_Arm]] = defaultdict(list)
     for edge in root.iter("edge"):
         start, end, name = edge.get("from", ""), edge.get("to", ""), edge.get("id", "")
-        if edge.get("function") or not {start, end} & set(lights):
+        if edge.get("function") or not {start, end} & lights:
             continue
         line = _line(edge.get("shape", ""))
         if line is None:
