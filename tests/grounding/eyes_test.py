@@ -111,6 +111,22 @@ def test_a_short_zone_is_found_by_what_is_never_counted() -> None:
     assert eyes.lag == 0
 
 
+def test_a_zone_is_found_where_most_lanes_are_shorter() -> None:
+    """Places cut out of a city have one long lane among several of a vehicle's length."""
+    lengths = np.array([30.0, 1.0, 1.0, 1.0])
+
+    def city(counts: np.ndarray, _: np.random.Generator) -> np.ndarray:
+        return np.minimum(counts, lengths)
+
+    def short(counts: np.ndarray, _: np.random.Generator) -> np.ndarray:
+        return np.minimum(counts, np.minimum(lengths, 3.0))
+
+    perfect = log_of(city, episodes=1, seed=99)
+    low_m, high_m = fit_eyes(log_of(short, episodes=1), perfect, VIEW).zone_m
+    assert low_m < 3 * 7.5 < high_m < 40.0
+    assert fit_eyes(log_of(city, episodes=1), perfect, VIEW).zone_m == (0.0, 0.0)
+
+
 @pytest.mark.parametrize("share", [0.05, 0.2, 0.5])
 def test_a_quiet_street_has_no_zone(share: float) -> None:
     def quiet(counts: np.ndarray, generator: np.random.Generator) -> np.ndarray:

@@ -58,9 +58,9 @@ class EyesConfig:
     """Numbers of the method.
 
     Attributes:
-        surprise: Smallest ratio of expected to tolerated decisions before a fault is found: so many
-            decisions of the simulation would have broken the street's limit. Halved, a quiet hour
-            looks like a zone or a dead lane.
+        surprise: Smallest number of observations before a fault is found: on a lane, so many of the
+            simulation would have broken the street's limit. Halved, a quiet hour looks like a zone
+            or a dead lane.
         together: Decisions that count as one observation, because queues change slowly.
         limit: Quantile of the counts that is taken for their limit. By hand: single larger counts
             are noise. At 1 one reading decides.
@@ -362,8 +362,9 @@ def _zone(
     counts, usual = (_counts([lanes[place] for place in alive]) for lanes in (rows, perfect))
     most = float(np.quantile(counts, config.limit)) - config.margin * noise
     cut = max(1.0, round(most))
-    beyond = float((usual > cut + 0.5).mean()) * len(counts)
-    if beyond / config.together < config.surprise * len(alive):
+    # One lane of a city is long, and ten are shorter than a zone: each tells for itself.
+    beyond = [float((perfect[k].before > cut + 0.5).mean()) * len(rows[k].before) for k in alive]
+    if max(beyond) / config.together < config.surprise:
         return 0.0, 0.0
     at_limit, reaching = (float((x > cut - 0.5).mean()) for x in (counts, usual))
     if at_limit < config.filled * reaching:
