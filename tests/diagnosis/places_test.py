@@ -19,7 +19,7 @@ from ugat_marl.diagnosis.features import (
     tally,
 )
 from ugat_marl.diagnosis.hypotheses import library
-from ugat_marl.diagnosis.places import PlaceFinder, _later
+from ugat_marl.diagnosis.places import PlaceFinder, _later, _mixed
 from ugat_marl.diagnosis.statistics import Pools
 from ugat_marl.diagnosis.thresholds import Thresholds
 from ugat_marl.effects import Domain, apply_detector_effects, load_scenario, parse_domain
@@ -453,3 +453,13 @@ def test_parking_is_tried_on_every_lane_of_a_small_site() -> None:
     assert PlaceFinder(SITE, ROUTES, allowed - {"parking"}, THRESHOLDS).everywhere() == []
     many = replace(SITE, lanes=SITE.lanes * 7)
     assert PlaceFinder(many, ROUTES, allowed, THRESHOLDS).everywhere() == []
+
+
+def test_a_closure_may_begin_as_one_detector_saw_and_end_as_another() -> None:
+    """The queue reached the first at 30, and the second had the end of the closure at 50."""
+    windows = [("c", 40.0, 60.0), ("d", 0.0, 9.0), ("c", 30.0, 45.0), ("c", 10.0, 50.0)]
+    mixed = _mixed(windows)
+    assert ("c", 30.0, 50.0) in mixed
+    assert not set(mixed) & set(windows)
+    assert all(lane == "c" and begin < end for lane, begin, end in mixed)
+    assert _mixed([]) == []

@@ -7,6 +7,7 @@ detectors show in their own data.
 
 from __future__ import annotations
 
+import itertools
 import math
 from collections import defaultdict
 from collections.abc import Collection, Mapping, Sequence
@@ -173,6 +174,7 @@ class PlaceFinder:
                     "demand_surge", fixed, ("factor",), ((level,),), (1.0,), thresholds.least_surge
                 )
                 ranked.append((z, surge))
+        scanned: list[tuple[float, str, float, float]] = []
         for index, lane in enumerate(self._layout.lanes):
             # The queue that leaves after a closure differs more than the closure itself, so each
             # kind of count is scanned to the side that a closure changes.
@@ -180,16 +182,14 @@ class PlaceFinder:
                 option = self._scan(reference, distance, periods, [index], kind, kind, side)
                 if option is not None:
                     z, begin, end, _ = option
-                    fixed = (("lane", lane.id), ("begin_s", begin), ("end_s", end))
-                    ranked.append((z, Hypothesis("lane_closure", fixed, (), ((),), None)))
+                    scanned.append((z, lane.id, begin, end))
         ranked.sort(key=lambda pair: -pair[0])
-        chosen: list[Hypothesis] = []
-        for kind, most in (
-            ("demand_surge", thresholds.surges),
-            ("lane_closure", thresholds.closures),
-        ):
-            chosen += list(dict.fromkeys(pair for _, pair in ranked if pair.name == kind))[:most]
-        return chosen
+        scanned.sort(key=lambda option: -option[0])
+        surges = [hypothesis for _, hypothesis in ranked][: thresholds.surges]
+        windows = [option[1:] for option in scanned]
+        places = list(dict.fromkeys(windows))[: thresholds.closures]
+        places += _mixed(windows)[: thresholds.mixed_closures]
+        return [*surges, *itertools.starmap(_closure, dict.fromkeys(places))]
 
     def _measured_edge(self, origin: str) -> str | None:
         """Return the first measured edge on the ways of an origin that is mostly its own."""
@@ -732,6 +732,19 @@ def _largest(difference: Array, variance: Array) -> float:
         squared = (sums[:, length:] - sums[:, :-length]) ** 2 / np.maximum(part, 1e-9)
         largest = max(largest, float(np.where(part > 0, squared, 0.0).max()))
     return largest
+
+
+def _closure(lane: str, begin_s: float, end_s: float) -> Hypothesis:
+    fixed = (("lane", lane), ("begin_s", begin_s), ("end_s", end_s))
+    return Hypothesis("lane_closure", fixed, (), ((),), None)
+
+
+def _mixed(windows: Sequence[tuple[str, float, float]]) -> list[tuple[str, float, float]]:
+    """Return the windows of the first lane with the begin of one and the end of another."""
+    own = [window for window in windows if window[0] == windows[0][0]]
+    pairs = itertools.product(own, repeat=2)
+    mixed = [(lane, begin, end) for (lane, begin, _), (_, _, end) in pairs if begin < end]
+    return [window for window in dict.fromkeys(mixed) if window not in own]
 
 
 def most_unusual(

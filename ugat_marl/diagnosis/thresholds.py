@@ -486,6 +486,10 @@ class Thresholds(DayThresholds):
     closures: int = 4
     """Largest number of closed lanes that are proposed at a time. By hand, to save time. Halved:
     the lane beside a closed one may hide it."""
+    mixed_closures: int = 3
+    """Closures of a lane with the begin of one kind of count and the end of another: a queue comes
+    late to one detector and leaves another late. By hand, to save time. Halved: a closure may get a
+    window that no step leads away from."""
     surge_factors: tuple[float, float] = (0.1, 4.0)
     """Least and largest factor of a surge that is tried first. By hand. Halved: as for
     `demand_factors`."""
