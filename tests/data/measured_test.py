@@ -761,7 +761,8 @@ def test_times_with_an_offset_lose_no_hour_where_the_clock_is_changed(
     ("texts", "seconds"),
     [
         (["2024-03-04", "2024-03-04 00:00:07.5"], [0.0, 7.5]),  # pandas leaves midnight out
-        (["2024-03-04 00:00:07+00", "2024-03-04 01:00:08+01"], [7.0, 8.0]),
+        (["2024-03-04 00:00:07+00", "2024-03-04 01:00:08 +0100"], [7.0, 8.0]),
+        (["2024-03-04", "2024-03-04T00:00:09"], [0.0, 9.0]),
         (["2024-03-04T00:01Z", "2024-03-03T17:02-07:00"], [60.0, 120.0]),
         (["3/4/2024 12:03 AM", "3/4/2024 1:00 PM"], [180.0, 46800.0]),
     ],
@@ -771,6 +772,21 @@ def test_forms_of_other_programs_are_read(texts: list[str], seconds: list[float]
     clock = LocalClock.of(Path("periods.csv"), pl.Series(["day"]), zero, "UTC")
     cells, periods = pl.Series("time", texts), pl.Series(["day"] * len(texts))
     assert clock.seconds(Path("t.csv"), cells, periods, 2).to_list() == seconds
+
+
+def test_a_column_of_dates_alone_has_no_times() -> None:
+    cells = pl.Series("time", ["2024-03-04", "2024-03-05"])
+    with pytest.raises(MeasuredDataError, match="line 2: time is '2024-03-04'; write it in"):
+        clock_from("2024-03-04").seconds(Path("t.csv"), cells, pl.Series(["night"] * 2), 2)
+
+
+def test_a_second_column_of_times_is_named(reread: Callable[..., MeasuredData]) -> None:
+    def twice(text: str) -> str:
+        head, *rows = text.splitlines()
+        return "\n".join([f"{head},time", *(f"{row},x" for row in rows)]) + "\n"
+
+    read = reread({"detections.csv": twice})
+    assert any("column 'time' is not read" in finding.text for finding in read.findings)
 
 
 def test_a_column_in_which_some_times_have_offsets_is_told() -> None:

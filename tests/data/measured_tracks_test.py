@@ -78,6 +78,24 @@ def test_an_id_that_drives_back_is_another_vehicle() -> None:
     assert seen.on_s.tolist() == [10.5, 13.5]
 
 
+@pytest.mark.parametrize(
+    ("times", "positions", "speeds", "expected"),
+    [
+        ([3.0, 9.0], [30.0, 90.0], [10.0, 10.0], (5.0, 5.7)),  # every 6 s
+        ([0.0, 3.0, 33.0, 36.0], [20.0, 50.0, 50.0, 80.0], [10.0, 0.0, 0.0, 10.0], (3.0, 33.7)),
+    ],
+)
+def test_a_vehicle_that_comes_as_far_as_its_speeds_tell_is_the_same(
+    times: list[float], positions: list[float], speeds: list[float], expected: tuple[float, float]
+) -> None:
+    rows = track(["a_0"] * len(times), positions, 10.0).with_columns(
+        time_s=pl.Series(times), speed_mps=pl.Series(speeds)
+    )
+    usual = track(["b_0"] * 20, [float(n) for n in range(20)], 1.0, vehicle_id=["w"] * 20)
+    seen = passages(pl.concat([rows, usual]), Detector("d", "a_0", 50.0, 2.0, "advance"))["d"]
+    assert (*seen.on_s, *seen.off_s) == pytest.approx(expected)
+
+
 def test_nothing_is_made_up_while_a_vehicle_is_out_of_sight() -> None:
     rows = track(["a_0"] * 4, [200.0, 210.0, 220.0, 260.0], 10.0).with_columns(
         time_s=pl.Series([0.0, 1.0, 2.0, 60.0])

@@ -19,7 +19,7 @@ from ugat_marl.errors import CheckpointError, OptionError, UnknownNameError
 from ugat_marl.experiments import Evaluation, PaperConfig, TransferConfig, run_folder
 from ugat_marl.experiments.functions import _texts
 from ugat_marl.experiments.scores import Result as Episode
-from ugat_marl.grounding import UgatConfig
+from ugat_marl.grounding import GateConfig, TimedConfig, UgatConfig
 from ugat_marl.policies import DQNConfig
 
 
@@ -76,6 +76,16 @@ def test_one_domain_may_be_a_text() -> None:
         "single-v1", "random", [Headway(1.4)], seeds=[1], duration_s=100, workers=1
     )
     assert frame["domain"].to_list() == ["headway=1.4"]
+
+
+def test_settings_of_another_grounding_are_refused_in_a_new_run() -> None:
+    """An older run that has some can be resumed, so they make a configuration."""
+    config = TransferConfig("single-v1", ugat=UgatConfig("phase", timed=TimedConfig(most_s=3)))
+    with pytest.raises(OptionError, match=r"settings timed\.\* count with the grounding timed"):
+        config.refuse_settings_of_other_groundings()
+    timed = UgatConfig("timed", timed=TimedConfig(most_s=3), gate=GateConfig("static"))
+    TransferConfig("single-v1", ugat=timed).refuse_settings_of_other_groundings()
+    TransferConfig("single-v1", preset="paper").refuse_settings_of_other_groundings()
 
 
 def test_wrong_calls_are_refused() -> None:

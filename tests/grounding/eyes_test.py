@@ -18,6 +18,7 @@ from ugat_marl.grounding.eyes import (
     _lost,
     _noise,
     _since_green,
+    _zone,
     fit_eyes,
 )
 from ugat_marl.grounding.summaries import LaneRows, LaneView
@@ -125,6 +126,24 @@ def test_a_zone_is_found_where_most_lanes_are_shorter() -> None:
     low_m, high_m = fit_eyes(log_of(short, episodes=1), perfect, VIEW).zone_m
     assert low_m < 3 * 7.5 < high_m < 40.0
     assert fit_eyes(log_of(city, episodes=1), perfect, VIEW).zone_m == (0.0, 0.0)
+
+
+@pytest.mark.parametrize("traffic", [1.0, 0.6])
+def test_a_busy_lane_among_quiet_ones_is_no_zone(traffic: float) -> None:
+    """The largest counts of all lanes are far below those of the busy one, on the street too."""
+    generator = np.random.default_rng(7)
+    decisions = 720
+    number, none = np.arange(decisions), np.zeros(decisions, np.bool_)
+
+    def lanes(share: float) -> list[LaneRows]:
+        quiet = [generator.poisson(share, decisions) for _ in range(199)]
+        busy = generator.integers(0, int(12 * share) + 1, decisions)
+        return [
+            LaneRows(0 * number, number, x.astype(float), *[0.0 * number] * 3, none, none, none)
+            for x in (*quiet, busy)
+        ]
+
+    assert _zone(lanes(traffic), lanes(1.0), 0.0, EyesConfig()) == (0.0, 0.0)
 
 
 @pytest.mark.parametrize("share", [0.05, 0.2, 0.5])

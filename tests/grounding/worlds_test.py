@@ -131,6 +131,8 @@ def test_what_was_before_a_log_is_filled_with_its_own_commands() -> None:
     assert played(since, 0, 6) == {"a_0": [1, 0, 1, 1, 0, 0], "b_0": [1] * 6}
     replay = RecordedCommands(since)
     assert (replay.lead(0), replay.decisions(0), replay.longest_lead_s) == (3, 5, 30.0)
+    assert RecordedCommands(since, longest=4).lead(0) == 2  # with two decisions of the log
+    assert RecordedCommands(since, longest=1).lead(0) == 0
     assert since.since(3).frame["step"].unique().sort().to_list() == [0, 1]
 
 

@@ -81,6 +81,7 @@ def test_a_long_way_to_a_counted_road_is_told(
     [
         ("begin,end", ("23:30", "23:45:00"), ("23:45", "0:00")),
         ("begin,end", ("11:30 PM", "11:45pm"), ("11:45 PM", "12:00 AM")),
+        ("start_street,begin,end", ("x,23:30", "23:45"), ("x,23:45", "24:00")),
         ("begin_s,end_s", ("4.3.2024 23:30", "4.3.2024 23:45"), ("4.3.2024 23:45", "86400")),
     ],
 )
@@ -91,6 +92,17 @@ def test_times_of_day_count_from_midnight(
     (tmp_path / "t.csv").write_text(table)
     rows = read_rows(tmp_path / "t.csv", 84600, 86400, Silent(), pairs=False)
     assert [(row.begin_s, row.end_s) for row in rows] == [(84600, 85500), (85500, 86400)]
+
+
+@pytest.mark.parametrize("day", ["", "2024-03-05 "])
+def test_an_interval_may_go_past_midnight(day: str, tmp_path: Path) -> None:
+    after = "2024-03-06 " if day else ""
+    (tmp_path / "t.csv").write_text(f"edge,count,begin,end\nA1_B1,9,{day}23:45,{after}00:15\n")
+    (row,) = read_rows(tmp_path / "t.csv", 84600, 90000, Silent(), pairs=False)
+    assert (row.begin_s, row.end_s) == (85500, 87300)
+    (tmp_path / "t.csv").write_text("edge,count,begin,end\nA1_B1,9,08:00,07:00\n")
+    with pytest.raises(ScenarioError, match="is not after begin_s"):
+        read_rows(tmp_path / "t.csv", 0, 90000, Silent(), pairs=False)
 
 
 def test_origins_and_destinations(tmp_path: Path) -> None:

@@ -12,6 +12,7 @@ import pytest
 
 from ugat_marl.effects import load_scenario
 from ugat_marl.scenarios import Scenario, demand_as_vehicles, draw_day, read_scenario
+from ugat_marl.scenarios.speed_factors import SpeedFactors
 
 
 def vehicles(share: float, seed: int) -> int:
@@ -188,3 +189,16 @@ def test_drivers_are_drawn_from_the_distribution_that_sumo_reads(
     assert factors.min() > 0
     assert factors.mean() == pytest.approx(mean, abs=0.03)
     assert factors.std() == pytest.approx(deviation, rel=0.08)
+
+
+@pytest.mark.parametrize(
+    ("text", "written"),
+    [
+        ("normc(1,0.1)", "normc(1,0.1)"),
+        ("normc(1,0.1,0.5)", "normc(1,0.1,0.5)"),
+        ("normc(1,0.1,0.5,1.5)", "normc(1,0.1,0.5,1.5)"),
+        ("normc(1,0.1,-inf,1.5)", "normc(1,0.1,0,1.5)"),
+    ],
+)
+def test_a_distribution_of_speeds_is_written_as_it_was_read(text: str, written: str) -> None:
+    assert SpeedFactors.of({"speedFactor": text}, {}).text == written

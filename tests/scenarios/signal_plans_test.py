@@ -28,6 +28,7 @@ from ugat_marl.scenarios import (
     PlanPhase,
     Scenario,
     SignalPlan,
+    copy_papers,
     movement_codes,
     programme_notes,
     programme_plan,
@@ -402,6 +403,15 @@ def test_a_scenario_with_plans_keeps_its_papers(tmp_path: Path) -> None:
         assert text.startswith(f"# {folder}\n\nIts lights have the programmes of `p.csv`")
         assert text.endswith(before.partition("\n")[2])
         assert (tmp_path / folder / "counts-fit.csv").read_text() == "counted\n"
+
+
+def test_a_readme_without_a_title_is_kept_whole(tmp_path: Path) -> None:
+    (tmp_path / "from").mkdir()
+    (tmp_path / "to").mkdir()
+    (tmp_path / "from" / "README.md").write_text("Counts by the city, CC-BY.\n\nMore.\n")
+    copy_papers(tmp_path / "from", tmp_path / "to", "new", "Changed.")
+    text = (tmp_path / "to" / "README.md").read_text()
+    assert text == "# new\n\nChanged.\n\nCounts by the city, CC-BY.\n\nMore.\n"
 
 
 def test_a_short_yellow_is_noted(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:

@@ -9,7 +9,9 @@ from __future__ import annotations
 import re
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, fields, is_dataclass, replace
+from os import PathLike
 from pathlib import Path
+from types import NoneType
 from typing import Any, Literal, TypeVar, get_args
 
 import numpy as np
@@ -234,8 +236,8 @@ _KINDS: Mapping[str, Any] = {
     "resume": bool | np.bool_,
     "ugat": UgatConfig | None,
     "dqn": DQNConfig | None,
-    "out": str | Path | None,
-    "real_log": str | Path | None,
+    "out": (str, PathLike, NoneType),
+    "real_log": (str, PathLike, NoneType),
 }
 """Kinds of arguments of `train`."""
 

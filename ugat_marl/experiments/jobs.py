@@ -181,7 +181,7 @@ class Job:
             "every": self.every,
             "options": dict(self.options),
             "worlds": {world: _hash(self.scenario, world, self.duration_s) for world in worlds},
-            "versions": installed_versions("ugat-marl", "eclipse-sumo", "libsumo", "torch"),
+            "versions": installed_versions("eclipse-sumo", "torch"),
         }
         if self.setting.recipe == "rule":
             parts |= {"target": self.target, "tuning": VERSION, "rule_budget": self.rule_budget}

@@ -206,9 +206,13 @@ class TransferConfig:
                 'real = "none" needs real_log, a log of the street; or name a real domain'
             )
         self._refuse_impossible_controls()
-        self._refuse_settings_of_other_groundings()
 
-    def _refuse_settings_of_other_groundings(self) -> None:
+    def refuse_settings_of_other_groundings(self) -> None:
+        """Refuse settings that would do nothing; an older run that has some can be resumed.
+
+        Raises:
+            OptionError: A part of `ugat` differs from its defaults and is not used.
+        """
         usual, kind, residual = UgatConfig(), self.ugat.grounding, self.ugat.street.residual.kind
         acting = residual if kind == "street" else kind  # what changes actions, if anything does
         unused = {
@@ -335,6 +339,8 @@ def transfer(
         CheckpointError: The folder holds a run with other options.
     """
     reporter = reporter or Silent()
+    if not resume:
+        config.refuse_settings_of_other_groundings()
     scenario = load_scenario(config.scenario, config.duration_s)
     with contextlib.closing(parallel_env(scenario, config.sim, **config.env_options)) as env:
         _check(config, scenario, env, reporter)  # an error now, not in an hour

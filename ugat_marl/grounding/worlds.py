@@ -312,12 +312,14 @@ class RecordedCommands:
 
     Args:
         log: The transitions.
+        longest: Decisions of an episode, into which the log and what leads up to it have to fit;
+            None for as many as they need.
 
     Raises:
         LogError: No episode of the log has commands of every agent.
     """
 
-    def __init__(self, log: TransitionLog) -> None:
+    def __init__(self, log: TransitionLog, longest: int | None = None) -> None:
         self.env_options: Mapping[str, Any] = {"observation": log.provenance.observation}
         rows = {agent: log.transitions(agent) for agent in log.agents}
         whole = set[int].intersection(*(set(own.episode.tolist()) for own in rows.values()))
@@ -333,11 +335,15 @@ class RecordedCommands:
         }
         if not log.provenance.from_begin:
             begins = dict.fromkeys(begins, 0)
-        self._leads = [*begins.values()]
         self._commands = [
-            {agent: _commands_of(own, episode, lead) for agent, own in rows.items()}
-            for episode, lead in begins.items()
+            {agent: _commands_of(own, episode, first) for agent, own in rows.items()}
+            for episode, first in begins.items()
         ]
+        self._leads = [*begins.values()]
+        if longest is not None:
+            lengths = [max(map(len, own.values())) for own in self._commands]
+            rooms = [max(longest - length, 0) for length in lengths]
+            self._leads = [*map(min, self._leads, rooms)]
         self.longest_lead_s = max(self._leads) * log.provenance.decision_interval_s
         self.reset(0)
 
@@ -407,7 +413,10 @@ class RecordedWorld:
                     "(--observation count --learner dqn, for example)"
                 )
         stack = Stack(env.recorded_layouts)
-        self._given, self._log = log, log.from_step_0()
+        self._given = log if provenance.from_begin else log.from_step_0()
+        self._log = log.from_step_0()
+        seconds = env.options.duration_s or env.scenario.settings.duration_s
+        self._longest = int(seconds / provenance.decision_interval_s + 1e-9)
         split(stack_log(self._log, stack), held_out_every, stack)  # raises now, not after hours
 
     def collect(self, policy: Policy, iteration: int, seed: int) -> TransitionLog | None:
@@ -416,7 +425,7 @@ class RecordedWorld:
 
     def replay(self) -> Policy | None:
         """Return a policy that repeats the log: whoever made it, other worlds get its commands."""
-        return RecordedCommands(self._given if self._given.provenance.from_begin else self._log)
+        return RecordedCommands(self._given, self._longest)
 
     def stop(self) -> None:
         """Do nothing; `collect` returns at once."""

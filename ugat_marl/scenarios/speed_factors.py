@@ -40,9 +40,10 @@ class SpeedFactors:
     def text(self) -> str:
         """Attribute speedFactor that declares this distribution."""
         values = [self.mean, self.deviation]
-        if math.isfinite(self.least):
-            values.append(self.least)
-        if math.isfinite(self.greatest):
+        least, greatest = math.isfinite(self.least), math.isfinite(self.greatest)
+        if least or greatest:
+            values.append(self.least if least else 0.0)  # SUMO draws no other than positive ones
+        if greatest:
             values.append(self.greatest)
         return f"normc({','.join(f'{value:.8g}' for value in values)})"
 

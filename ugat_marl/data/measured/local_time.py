@@ -25,7 +25,7 @@ _FORMATS = (
 )
 
 
-_OFFSET = r"(Z|:\d\d(\.\d+)?[+-]\d\d(:?\d\d)?)$"
+_OFFSET = r"(Z|:\d\d(\.\d+)? ?[+-]\d\d(:?\d\d)?)$"
 """End of a time that has an offset from UTC."""
 
 
@@ -166,16 +166,19 @@ def _parsed(path: Path, cells: pl.Series, start: int) -> pl.Series:
     offset = cells.str.contains(_OFFSET)
     if offset.any():
         whole = (
-            cells.str.replace(" ", "T", literal=True)
+            cells.str.replace(r" ([+-])", "$1")
+            .str.replace(" ", "T", literal=True)
             .str.replace(r"(T\d\d:\d\d)(Z|[+-])", "${1}:00${2}")  # without seconds
             .str.replace(r"([+-]\d\d)$", "${1}:00")
         )
         zoned = whole.str.to_datetime("%+", strict=False, time_unit="us", time_zone="UTC")
         parsed = [zoned.set(~offset, None)]
     else:
-        days = cells.str.replace(
-            r"^(\d{4}-\d\d-\d\d)$", "${1} 00:00:00"
-        )  # midnight, as pandas says
+        days = cells
+        if cells.name == "zero" or cells.str.contains(":", literal=True).any():
+            between = "T" if cells.str.contains("T", literal=True).any() else " "
+            midnight = f"${{1}}{between}00:00:00"  # which pandas leaves out
+            days = cells.str.replace(r"^(\d{4}-\d\d-\d\d)$", midnight)
         parsed = [days.str.to_datetime(x, strict=False, time_unit="us") for x in _FORMATS]
     best = min(parsed, key=lambda times: times.null_count())
     wrong = best.is_null() & ~empty.fill_null(True)

@@ -298,7 +298,8 @@ def _check_columns(
     # columns of local times, each in place of one of seconds
     local = {x: x.removesuffix("_s") for x in table.columns if x in TIMES}
     local = {} if table.stem == "periods" else local
-    wanted = (*table.columns, *table.optional, *local.values())
+    in_place = [own for name, own in local.items() if name not in given]
+    wanted = (*table.columns, *table.optional, *in_place)
     unknown = [name for name in given if name not in wanted]
     for name in table.columns:
         if name not in given and local.get(name) not in given:

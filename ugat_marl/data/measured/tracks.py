@@ -24,8 +24,8 @@ COARSEST_S = 2.0
 """Largest usual time between two positions of a vehicle. A vehicle is over a detector for less than
 a second, so positions farther apart say little of the moment."""
 LOST_S = 5.0
-"""Time without a position after which a vehicle counts as another one, if it comes back. By hand.
-Twice as long: places between two positions are guessed over 100 m of a street."""
+"""Time without a position after which a vehicle counts as another one, unless it came as far as its
+speeds tell. By hand. Twice as long: places are guessed over 100 m of a street."""
 USUAL_LENGTH_M = 5.0
 """Length of a vehicle whose length is not stated, m: that of a car in SUMO."""
 
@@ -227,19 +227,28 @@ def passages_of_tracks(
         findings.append(
             Finding(
                 f"{path.name}: {counted(apart, 'time')} a vehicle_id comes back after {LOST_S:g} s "
-                "without a position, or farther back on its road; it counts as another vehicle then"
+                "without a position at a place that its speeds do not tell, or farther back on its "
+                "road; it counts as another vehicle then"
             )
         )
     return tuple(found)
 
 
 def _parted(rows: pl.DataFrame) -> Iterable[pl.DataFrame]:
-    """Yield the rows of one id in parts, each of one vehicle that was never lost from sight."""
-    time, position = (rows[name].to_numpy() for name in ("time_s", "position_m"))
+    """Yield the rows of one id in parts, each of one vehicle that was never lost from sight.
+
+    Where it was unseen for long, it is the same one if it came as far as its speeds tell.
+    """
+    time, position, speed = (
+        rows[name].to_numpy() for name in ("time_s", "position_m", "speed_mps")
+    )
     road = np.array([edge_of_lane(name) for name in rows["lane_id"]])
     known = rows["length_m"].drop_nulls() if "length_m" in rows.columns else []
-    back = np.diff(position) < -(float(known[0]) if len(known) else USUAL_LENGTH_M)
-    cuts = np.flatnonzero((np.diff(time) > LOST_S) | ((road[1:] == road[:-1]) & back)) + 1
+    same, step_s, way = road[1:] == road[:-1], np.diff(time), np.diff(position)
+    back = same & (way < -(float(known[0]) if len(known) else USUAL_LENGTH_M))
+    slow, fast = np.minimum(speed[1:], speed[:-1]), np.maximum(speed[1:], speed[:-1])
+    as_told = same & (way >= (0.5 * slow - 1.0) * step_s) & (way <= (1.5 * fast + 1.0) * step_s)
+    cuts = np.flatnonzero(back | ((step_s > LOST_S) & ~as_told)) + 1
     for begin, end in itertools.pairwise((0, *cuts.tolist(), len(rows))):
         yield rows[begin:end]
 

@@ -78,7 +78,10 @@ _DAY_S = 86_400.0
 _TIMES = {"begin": "begin_s", "end": "end_s"}
 """Columns of times of day, and those of seconds in whose place they stand."""
 _READ = ("edge", "from", "to", "count")
-_LIKE_TIMES = re.compile(r"(begin|start|end|stop|time|interval).*|(from|to)_(s|sec|time)")
+_LIKE_TIMES = re.compile(
+    r"(begin|start|end|stop)[ _]?(s|sec|seconds|time|at)?|time([ _].*)?|interval|"
+    r"(from|to)[ _](s|sec|time)"
+)
 """Names under which other programs write the times of an interval, and mistyped ones."""
 
 
@@ -177,8 +180,9 @@ def _row(
     begin_s, end_s = (
         _time_s(values, key, usual, where) for key, usual in zip(_TIMES, episode, strict=True)
     )
-    if end_s == 0 and (values.get("end") or values.get("end_s") or "").count(":"):
-        end_s = _DAY_S  # until midnight
+    clock = ":" in f"{values.get('end')}{values.get('end_s')}"
+    if clock and end_s <= begin_s and end_s + _DAY_S - begin_s <= _DAY_S / 2:
+        end_s += _DAY_S  # until midnight, or past it
     if end_s <= begin_s:
         raise ScenarioError(f"{where}: end_s ({end_s:g}) is not after begin_s ({begin_s:g})")
     return Row(roads, _number(values.get("count"), "count", where), begin_s, end_s, line)
@@ -272,6 +276,8 @@ def _number(text: str | None, key: str, where: str) -> float:
             way_out = (
                 "; write whole numbers without separators, and leave it blank where nobody counted"
             )
+        elif ":" in (text or ""):
+            way_out = "; write seconds, or a time of day such as 07:15"
         raise ScenarioError(f"{where}: {key} = {text!r} is not a number of at least 0{way_out}")
     return value
 

@@ -413,7 +413,8 @@ def copy_papers(source: Path, folder: Path, name: str, note: str) -> None:
             shutil.copy2(source / sheet, folder)
     readme = source / "README.md"
     if readme.is_file():
-        _, _, rest = readme.read_text(encoding="utf-8", errors="replace").partition("\n")
+        text = readme.read_text(encoding="utf-8", errors="replace")
+        rest = text.partition("\n")[2] if text.startswith("# ") else f"\n{text}"
         write_whole(folder / readme.name, f"# {name}\n\n{note}\n{rest}")
 
 
