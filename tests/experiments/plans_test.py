@@ -19,6 +19,7 @@ from ugat_marl.__main__ import main
 from ugat_marl.data import Run
 from ugat_marl.experiments import LearnerSpec, transfer
 from ugat_marl.experiments.driver import OTHER_PARTS
+from ugat_marl.experiments.jobs import JobRecord
 from ugat_marl.experiments.plans import described_plan, jobs_beside, work_of
 from ugat_marl.experiments.transfers import TRAININGS, planned_jobs
 from ugat_marl.grounding import StreetConfig, UgatConfig
@@ -128,6 +129,14 @@ def test_what_is_done_is_neither_planned_nor_counted(
     lines = described_plan(plan, tmp_path, tmp_path / TRAININGS, 100.0)
     assert lines[0] == f"run: {tmp_path}"
     assert "done before: 3 of 4" in lines[1]
+    assert not any("of other settings" in line for line in lines)
+    (left,) = [
+        job for job in plan if not JobRecord.read(tmp_path / TRAININGS / job.name).is_whole(job)
+    ]
+    former = f"{left.name.rpartition('-')[0]}-0123456789"
+    (tmp_path / TRAININGS / former).mkdir()
+    lines = described_plan(plan, tmp_path, tmp_path / TRAININGS, 100.0)
+    assert lines[2].startswith(f"note: 1 training ('{former}') here is of other settings")
     assert [line for line in lines if "trained in real: 6 episodes" in line]
 
 

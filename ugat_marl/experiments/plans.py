@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 
-from ugat_marl.errors import counted
+from ugat_marl.errors import counted, listed
 from ugat_marl.experiments.driver import OTHER_PARTS
 from ugat_marl.experiments.forked import jobs_fork_on
 from ugat_marl.experiments.jobs import Job, JobRecord
@@ -70,6 +70,14 @@ def jobs_beside(plan: Sequence[Job], folder: Path, episode_s: float, workers: Wo
     return jobs if work(*jobs) >= WORTH else []
 
 
+def _of_other_settings(plan: Sequence[Job], todo: Sequence[Job], folder: Path) -> list[str]:
+    """Return folders of earlier trainings that would be those to do, but for their settings."""
+    planned = {job.name for job in plan}
+    alike = {job.name.rpartition("-")[0] for job in todo}
+    names = [path.name for path in folder.glob("*") if path.is_dir()]
+    return sorted(x for x in names if x.rpartition("-")[0] in alike and x not in planned)
+
+
 def described_plan(
     plan: Sequence[Job],
     directory: Path,
@@ -90,6 +98,11 @@ def described_plan(
     lines = [f"run: {directory}"]
     if len(todo) < len(plan):
         lines.append(f"done before: {len(plan) - len(todo)} of {len(plan)} parts")
+    if others := _of_other_settings(plan, todo, folder):
+        lines.append(
+            f"note: {listed(others, 'training')} here is of other settings, another version or "
+            "another file of the learner; it is not used"
+        )
     for number, job in enumerate(todo, 1):
         setting, evaluated = job.setting, len(job.domains) * len(job.evaluation_seeds)
         if setting.recipe == "rule":
