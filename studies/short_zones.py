@@ -9,7 +9,6 @@ does before it simulates worlds.
 from __future__ import annotations
 
 import argparse
-import contextlib
 import sys
 from collections.abc import Sequence
 
@@ -19,11 +18,10 @@ from rich.table import Table
 from ugat_marl.cli import guarded
 from ugat_marl.data import TransitionLog
 from ugat_marl.effects import load_scenario
-from ugat_marl.envs import parallel_env
 from ugat_marl.experiments import policy_factory
 from ugat_marl.grounding.eyes import fit_eyes
 from ugat_marl.grounding.summaries import LaneView
-from ugat_marl.policies import EpsilonGreedy, observer_of, roll_out
+from ugat_marl.grounding.worlds import RollOutSettings, roll_outs
 from ugat_marl.scenarios import Network, Scenario
 
 DOMAINS = (
@@ -55,15 +53,9 @@ def main(arguments: Sequence[str] | None = None) -> None:
 
 def played(scenario: Scenario, domain: str, policy: str, seeds: Sequence[int]) -> TransitionLog:
     """Return the transitions of an episode for each seed."""
-    logs: list[TransitionLog] = []
-    for seed in seeds:
-        env = parallel_env(scenario, domain, crossings=True, observation="movements")
-        with contextlib.closing(env):
-            acting = EpsilonGreedy(policy_factory(policy)(env), EPSILON)
-            log = roll_out(env, acting, seed, record=observer_of(env)).log
-        assert log is not None
-        logs.append(log)
-    return TransitionLog.concatenate(logs)
+    options = {"crossings": True}
+    each = RollOutSettings(scenario, domain, options, policy_factory(policy), EPSILON, "movements")
+    return roll_outs(each, seeds)[0]
 
 
 if __name__ == "__main__":

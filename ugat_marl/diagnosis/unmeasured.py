@@ -70,6 +70,8 @@ class Unmeasured:
 
     def kept_from(self, period: Period) -> Period:
         """Return a simulated period without what the street lacks."""
+        if not (self.speeds or self.lengths or self.holes):
+            return period
         period = without_holes(period, self.holes)
         passages = {
             name: Passages(

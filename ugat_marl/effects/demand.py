@@ -419,23 +419,22 @@ def parted_flow(
     counts = [last - first for first, last in pairwise(bounds)]
     if regular is not None:
         return [regular.resized(some).written(element) if some else None for some in counts]
-    if "number" in element.attrib:
-        flows = (_scaled_rate(element, share, over_s) for share in shares)
-        return [_numbered(flow, some) for flow, some in zip(flows, counts, strict=True)]
-    return [_scaled_rate(element, share, over_s) for share in shares]
+    numbers = counts if "number" in element.attrib else [None] * len(counts)
+    return [_scaled_rate(element, *part, over_s) for part in zip(shares, numbers, strict=True)]
 
 
-def _numbered(flow: ET.Element | None, number: int) -> ET.Element | None:
-    """Give a flow another number of vehicles; None for one of no vehicles."""
-    if flow is None or not number:
-        return None
-    flow.set("number", str(number))
-    return flow
+def _scaled_rate(
+    element: ET.Element, factor: float, number: int | None, end_s: float
+) -> ET.Element | None:
+    """Return a flow of random departures with another rate; None if nothing is left of it.
 
-
-def _scaled_rate(element: ET.Element, factor: float, end_s: float) -> ET.Element | None:
-    """Return a flow of random departures with another rate; None if nothing is left of it."""
-    if factor <= 0:
+    Args:
+        element: A ``<flow>``.
+        factor: Factor of its rate.
+        number: Number of its vehicles; None if it has none.
+        end_s: End of a flow that has neither a number nor an end, s.
+    """
+    if factor <= 0 or number == 0:
         return None
     flow = copy.deepcopy(element)
     if rate := _EXPONENTIAL.fullmatch(flow.get("period", "")):
@@ -447,8 +446,10 @@ def _scaled_rate(element: ET.Element, factor: float, end_s: float) -> ET.Element
         else:  # a probability per second cannot exceed 1, so use a rate
             del flow.attrib["probability"]
             flow.set("period", f"exp({share:.12g})")
-    if "number" not in flow.attrib:
+    if number is None:
         flow.attrib.setdefault("end", seconds_text(end_s))
+    else:
+        flow.set("number", str(number))
     return flow
 
 

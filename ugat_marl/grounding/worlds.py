@@ -335,15 +335,14 @@ class RecordedCommands:
         }
         if not log.provenance.from_begin:
             begins = dict.fromkeys(begins, 0)
-        self._commands = [
-            {agent: _commands_of(own, episode, first) for agent, own in rows.items()}
-            for episode, first in begins.items()
-        ]
-        self._leads = [*begins.values()]
-        if longest is not None:
-            lengths = [max(map(len, own.values())) for own in self._commands]
-            rooms = [max(longest - length, 0) for length in lengths]
-            self._leads = [*map(min, self._leads, rooms)]
+        self._leads: list[int] = []
+        self._commands: list[Mapping[str, NDArray[np.int64]]] = []
+        for episode, first in begins.items():
+            commands = {agent: _commands_of(own, episode, first) for agent, own in rows.items()}
+            room = first if longest is None else longest - max(map(len, commands.values()))
+            lead = min(first, max(room, 0))
+            self._leads.append(lead)
+            self._commands.append({agent: _led_up(own, lead) for agent, own in commands.items()})
         self.longest_lead_s = max(self._leads) * log.provenance.decision_interval_s
         self.reset(0)
 
@@ -353,23 +352,27 @@ class RecordedCommands:
 
     def decisions(self, seed: int) -> int:
         """Return the number of decisions of that episode, with those before it."""
-        own = self._commands[seed % len(self._commands)]
-        return self.lead(seed) + max(map(len, own.values()))
+        return max(map(len, self._chosen(seed).values()))
 
     def reset(self, seed: int) -> None:
         """Begin an episode of the log; `seed` chooses it."""
-        self._episode = self._commands[seed % len(self._commands)]
-        self._step = self._first = -self.lead(seed)
+        self._episode, self._step = self._chosen(seed), 0
 
     def act(self, observations: Observations, infos: Infos) -> Actions:
         """Return the commands of the next decision of the log."""
+        commands = self._episode
         step, self._step = self._step, self._step + 1
-        actions: dict[str, int] = {}
-        for name in observations:
-            own = self._episode[name]
-            early = (step - self._first) % len(own)
-            actions[name] = int(own[early if step < 0 else min(step, len(own) - 1)])
-        return actions
+        return {
+            name: int(commands[name][min(step, len(commands[name]) - 1)]) for name in observations
+        }
+
+    def _chosen(self, seed: int) -> Mapping[str, NDArray[np.int64]]:
+        return self._commands[seed % len(self._commands)]
+
+
+def _led_up(commands: NDArray[np.int64], lead: int) -> NDArray[np.int64]:
+    """Return commands behind as many of their own first ones."""
+    return np.concatenate((commands[np.arange(lead) % len(commands)], commands))
 
 
 def _commands_of(own: Transitions, episode: int, first: int) -> NDArray[np.int64]:
@@ -413,8 +416,8 @@ class RecordedWorld:
                     "(--observation count --learner dqn, for example)"
                 )
         stack = Stack(env.recorded_layouts)
-        self._given = log if provenance.from_begin else log.from_step_0()
         self._log = log.from_step_0()
+        self._given = log if provenance.from_begin else self._log
         seconds = env.options.duration_s or env.scenario.settings.duration_s
         self._longest = int(seconds / provenance.decision_interval_s + 1e-9)
         split(stack_log(self._log, stack), held_out_every, stack)  # raises now, not after hours

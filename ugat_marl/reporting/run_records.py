@@ -379,13 +379,12 @@ def _scores(path: Path, settings: Mapping[str, Any]) -> Evaluation:
 def _unjudged(evaluation: Evaluation, settings: Mapping[str, Any]) -> str:
     """Return what a job still has to play to be judged, in words; "" for nothing."""
     told: list[str] = []
-    for name, played in (
-        ("domains", set(evaluation.domains)),
-        ("evaluation_seeds", {result.seed for result in evaluation.results}),
+    for name, what, played in (
+        ("domains", "domain", evaluation.domains),
+        ("evaluation_seeds", "evaluation seed", [result.seed for result in evaluation.results]),
     ):
         wanted = settings.get(name)
         if isinstance(wanted, list) and (left := set(map(str, wanted)) - set(map(str, played))):
-            what = "domain" if name == "domains" else "evaluation seed"
             told.append(f"it is not judged yet in {listed(sorted(left), what)}")
     return " and ".join(told)
 

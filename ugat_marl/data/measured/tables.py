@@ -216,20 +216,27 @@ def read_table(
     return pl.DataFrame(columns)
 
 
+def _local_names(table: Table) -> dict[str, str]:
+    """Return columns of seconds, each with the column of local times that may replace it."""
+    if table.stem == "periods":
+        return {}
+    return {name: name.removesuffix("_s") for name in table.columns if name in TIMES}
+
+
 def _in_seconds(
     path: Path, table: Table, raw: pl.DataFrame, clock: LocalClock | None
 ) -> pl.DataFrame:
     """Replace columns of local times by seconds of the scenario's clock."""
-    local = {
-        name.removesuffix("_s"): name
-        for name in table.columns
-        if name in TIMES and name not in raw.columns and name.removesuffix("_s") in raw.columns
-    }
-    if not local or table.stem == "periods":
+    local = [
+        own
+        for name, own in _local_names(table).items()
+        if name not in raw.columns and own in raw.columns
+    ]
+    if not local:
         return raw
     if clock is None:
         raise MeasuredDataError(
-            f"{path}: {next(iter(local))} holds local times, and periods.csv does not say when the "
+            f"{path}: {local[0]} holds local times, and periods.csv does not say when the "
             "scenario's clock is 0; add the column zero there, such as 2024-03-05T07:00:00"
         )
     start = first_row(path)
@@ -294,10 +301,7 @@ def _check_columns(
     findings: list[Finding],
     clock: LocalClock | None,
 ) -> None:
-    given = raw.columns
-    # columns of local times, each in place of one of seconds
-    local = {x: x.removesuffix("_s") for x in table.columns if x in TIMES}
-    local = {} if table.stem == "periods" else local
+    given, local = raw.columns, _local_names(table)
     in_place = [own for name, own in local.items() if name not in given]
     wanted = (*table.columns, *table.optional, *in_place)
     unknown = [name for name in given if name not in wanted]

@@ -71,9 +71,7 @@ class _Track:
         step = np.where(same, np.diff(ahead), driven)
         least = np.where(same, 0.0, 1e-6)  # on another road it has driven, even at a speed of 0
         total = np.concatenate(([0.0], np.cumsum(np.maximum(step, least))))
-        known = rows["length_m"].drop_nulls() if "length_m" in rows.columns else []
-        length = float(known[0]) if len(known) else USUAL_LENGTH_M
-        return cls(time, lane, ahead, speed, total, length)
+        return cls(time, lane, ahead, speed, total, _length_m(rows))
 
     def stays(self) -> Iterable[tuple[str, int, int]]:
         """Yield each lane with the first position on it and the first one behind it."""
@@ -192,15 +190,8 @@ def passages_of_tracks(
     found: list[dict[str, Passages]] = []
     apart = 0
     for period in periods:
-        tracks = vehicles.filter(pl.col("period_id") == period.id)
-        parts = [
-            part
-            for whole in tracks.partition_by("vehicle_id", maintain_order=True)
-            for part in _parted(whole.sort("time_s"))
-        ]
-        apart += len(parts) - tracks["vehicle_id"].n_unique()
-        until_s = float(tracks["time_s"].to_numpy().max(initial=-np.inf))
-        rows = _crossings(parts, by_lane, until_s)
+        rows, again = _crossings(vehicles.filter(pl.col("period_id") == period.id), by_lane)
+        apart += again
         seen = {detector.id: _over(detector, rows) for detector in detectors}
         found.append(
             {
@@ -234,6 +225,12 @@ def passages_of_tracks(
     return tuple(found)
 
 
+def _length_m(rows: pl.DataFrame) -> float:
+    """Return the length of a vehicle from its rows."""
+    known = rows["length_m"].drop_nulls() if "length_m" in rows.columns else []
+    return float(known[0]) if len(known) else USUAL_LENGTH_M
+
+
 def _parted(rows: pl.DataFrame) -> Iterable[pl.DataFrame]:
     """Yield the rows of one id in parts, each of one vehicle that was never lost from sight.
 
@@ -243,9 +240,8 @@ def _parted(rows: pl.DataFrame) -> Iterable[pl.DataFrame]:
         rows[name].to_numpy() for name in ("time_s", "position_m", "speed_mps")
     )
     road = np.array([edge_of_lane(name) for name in rows["lane_id"]])
-    known = rows["length_m"].drop_nulls() if "length_m" in rows.columns else []
     same, step_s, way = road[1:] == road[:-1], np.diff(time), np.diff(position)
-    back = same & (way < -(float(known[0]) if len(known) else USUAL_LENGTH_M))
+    back = same & (way < -_length_m(rows))
     slow, fast = np.minimum(speed[1:], speed[:-1]), np.maximum(speed[1:], speed[:-1])
     as_told = same & (way >= (0.5 * slow - 1.0) * step_s) & (way <= (1.5 * fast + 1.0) * step_s)
     cuts = np.flatnonzero(back | ((step_s > LOST_S) & ~as_told)) + 1
@@ -254,23 +250,23 @@ def _parted(rows: pl.DataFrame) -> Iterable[pl.DataFrame]:
 
 
 def _crossings(
-    parts: Iterable[pl.DataFrame], by_lane: Mapping[str, Sequence[Detector]], until_s: float
-) -> dict[tuple[str, str], list[tuple[float, ...]]]:
+    vehicles: pl.DataFrame, by_lane: Mapping[str, Sequence[Detector]]
+) -> tuple[dict[tuple[str, str], list[tuple[float, ...]]], int]:
     """Return detector and lane to the passages of all vehicles of a period there.
 
-    Args:
-        parts: Rows of each vehicle, in order of time.
-        by_lane: Lane to its detectors.
-        until_s: Time of the last position of any vehicle, s.
+    The second value is how often an id came back as another vehicle.
     """
     rows: dict[tuple[str, str], list[tuple[float, ...]]] = {}
+    until_s = float(vehicles["time_s"].to_numpy().max(initial=-np.inf))
+    wholes = vehicles.partition_by("vehicle_id", maintain_order=True)
+    parts = [part for whole in wholes for part in _parted(whole.sort("time_s"))]
     for part in parts:
         track = _Track.of(part)
         for lane, begin, end in track.stays():
             for detector in by_lane.get(lane, ()):
                 if (passage := track.passage(detector, begin, end, until_s)) is not None:
                     rows.setdefault((detector.id, lane), []).append(passage)
-    return rows
+    return rows, len(parts) - len(wholes)
 
 
 def _over(
