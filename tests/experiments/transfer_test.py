@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 from dataclasses import replace
+from importlib.metadata import version
 from pathlib import Path
 from typing import Any, Literal
 
@@ -15,12 +16,13 @@ import torch
 from tests.interrupts import KillAfter
 from tests.runs import SMALL, checkpoint_of, numbers, play_nothing, weights
 from ugat_marl.__main__ import main
-from ugat_marl.data import TransitionLog
+from ugat_marl.data import CHECKPOINT_FOLDER, SETTINGS_FILE, TransitionLog
 from ugat_marl.errors import CheckpointError, OptionError, UnknownNameError
 from ugat_marl.experiments import Evaluation, run_folder, transfer, transfers
 from ugat_marl.experiments.jobs import file_names
 from ugat_marl.experiments.randomised import RandomisedEnv
 from ugat_marl.grounding import RandomDelays, TimedConfig, UgatConfig
+from ugat_marl.progress import Silent
 
 
 @pytest.fixture(autouse=True)
@@ -166,6 +168,31 @@ def test_the_folder_is_locked_until_the_table_is_written(
     for _ in range(2):  # the first one has freed the folder
         transfer(SMALL, tmp_path / "run", resume=True)
     assert len(refused) == 2
+
+
+def test_a_run_that_goes_on_with_another_libsumo_says_so(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    said: list[str] = []
+
+    class Told(Silent):
+        def say(self, line: str) -> None:
+            said.append(line)
+
+    monkeypatch.setattr(transfers, "perform_here", lambda *_, **_options: [])
+    monkeypatch.setattr(transfers, "_write_results", lambda *_: "table")
+    transfer(SMALL, tmp_path)
+    begun = tmp_path / "trainings" / "any" / CHECKPOINT_FOLDER
+    begun.mkdir(parents=True)
+    transfer(SMALL, tmp_path, resume=True, reporter=Told())
+    assert not [line for line in said if "began with" in line]
+    file = tmp_path / SETTINGS_FILE
+    settings = json.loads(file.read_text())
+    settings["versions"]["libsumo"] = "0.9"
+    file.write_text(json.dumps(settings))
+    transfer(SMALL, tmp_path, resume=True, reporter=Told())
+    (note,) = (line for line in said if "began with" in line)
+    assert note == f"note: this run began with libsumo 0.9, and goes on with {version('libsumo')}"
 
 
 @pytest.mark.slow

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Sequence
 from dataclasses import replace
 
@@ -276,17 +277,24 @@ def test_eyes_survive_their_checkpoint() -> None:
     assert again.state_dict() == eyes.state_dict()
 
 
+def rows_of(counts: np.ndarray, left: float = math.nan) -> LaneRows:
+    """Return one episode of a lane in red, which `left` vehicles leave in each decision."""
+    step, blank = np.arange(len(counts)), np.zeros(len(counts))
+    never, leaving = np.zeros(len(counts), dtype=bool), np.full(len(counts), left)
+    return LaneRows(np.zeros_like(step), step, counts, counts, leaving, blank, never, never, never)
+
+
+@pytest.mark.parametrize(("left", "dead"), [(math.nan, 1.0), (0.1, 1.0), (0.003, 0.0)])
+def test_a_lane_that_counts_the_queue_of_others_is_not_dead(left: float, dead: float) -> None:
+    """A lane of a metre, that hardly anybody leaves, shows those who wait upstream."""
+    busy, silent = np.full(400, 3.0), np.zeros(400)
+    config = EyesConfig(pull=0.01)
+    assert _dead([rows_of(silent)], [rows_of(busy, left)], config) == pytest.approx(dead, abs=0.05)
+
+
 @pytest.mark.parametrize("pull", [0.25, 2.0])
 def test_a_lane_that_nobody_can_judge_is_dead_as_often_as_the_others(pull: float) -> None:
     config = EyesConfig(pull=pull)
-
-    def rows_of(counts: np.ndarray) -> LaneRows:
-        step, blank = np.arange(len(counts)), np.zeros(len(counts))
-        never = np.zeros(len(counts), dtype=bool)
-        return LaneRows(
-            np.zeros_like(step), step, counts, counts, blank, blank, never, never, never
-        )
-
     busy, silent = np.full(400, 3.0), np.zeros(400)
     rows = [rows_of(busy), rows_of(silent), rows_of(silent[:0])]
     dead = _dead(rows, [rows_of(busy), rows_of(busy), rows_of(busy[:0])], config)

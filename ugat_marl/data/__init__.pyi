@@ -39,6 +39,7 @@ from .runs import Run as Run
 from .runs import installed_version as installed_version
 from .runs import installed_versions as installed_versions
 from .runs import lock_folder as lock_folder
+from .runs import other_versions as other_versions
 from .runs import remove_temporaries as remove_temporaries
 from .runs import write_identity as write_identity
 from .runs import write_settings as write_settings

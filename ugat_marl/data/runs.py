@@ -237,6 +237,18 @@ def write_settings(directory: Path, settings: Mapping[str, Any]) -> None:
     write_whole(directory / SETTINGS_FILE, json.dumps(content, indent=1, default=str) + "\n")
 
 
+def other_versions(directory: Path) -> dict[str, tuple[str | None, str | None]]:
+    """Return package to version in a run's settings and version installed, where they differ."""
+    try:
+        held = read_json(directory / SETTINGS_FILE, CheckpointError)
+    except CheckpointError:  # readers miss it; the run can go on
+        return {}
+    known = held.get("versions") if isinstance(held, dict) else None
+    before = known if isinstance(known, dict) else {}
+    now = installed_versions(*_VERSIONS).items()
+    return {name: (before[name], v) for name, v in now if name in before and before[name] != v}
+
+
 def write_identity(directory: Path, identity: Mapping[str, Any], *, begun: bool) -> None:
     """Write what must be equal to continue a run, or compare it with what the folder holds.
 

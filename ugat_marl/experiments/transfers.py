@@ -22,6 +22,7 @@ from ugat_marl.data import (
     TransitionLog,
     installed_versions,
     lock_folder,
+    other_versions,
     write_identity,
     write_settings,
 )
@@ -360,6 +361,8 @@ def transfer(
         if resume and not begun:
             reporter.say(f"note: {directory} holds no run to go on with; a new one begins")
         write_identity(directory, identity, begun=begun)
+        for name, (before, now) in other_versions(directory).items() if begun else ():
+            reporter.say(f"note: this run began with {name} {before}, and goes on with {now}")
         write_settings(directory, config.as_dict())
         episode_s = config.duration_s or scenario.settings.duration_s
         beside = jobs_beside(plan, folder, episode_s, workers)

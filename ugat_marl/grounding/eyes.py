@@ -323,14 +323,26 @@ def _dead(rows: Sequence[LaneRows], perfect: Sequence[LaneRows], config: EyesCon
     busy_lanes = [float((x.before > 0).mean()) if len(x.before) else 0.0 for x in perfect]
     quiet = _quietness(rows, busy_lanes)
     for place, (lane, busy) in enumerate(zip(rows, busy_lanes, strict=True)):
+        leaving = _leaving(perfect[place])
         for episode in np.unique(lane.episode):
             counts = lane.before[lane.episode == episode]
-            if busy * quiet[int(episode)] * len(counts) / config.together < config.surprise:
+            expected = quiet[int(episode)] * len(counts)
+            if min(busy * expected / config.together, leaving * expected) < config.surprise:
                 continue  # nobody might have come
             episodes[place] += 1
             dead[place] += not counts.any()
     share = dead.sum() / max(episodes.sum(), 1.0)
     return (dead + config.pull * share) / (episodes + config.pull)
+
+
+def _leaving(perfect: LaneRows) -> float:
+    """Return how many vehicles leave a lane in a decision; infinite if that was not measured.
+
+    A lane of a metre counts what waits upstream, in the simulation. Where nobody leaves it, a
+    street that does not see so far reports 0, and has no dead detector.
+    """
+    left = perfect.left[np.isfinite(perfect.left)]
+    return float(left.mean()) if len(left) else math.inf
 
 
 def _quietness(rows: Sequence[LaneRows], busy: Sequence[float]) -> dict[int, float]:
