@@ -11,7 +11,7 @@ from numpy.typing import ArrayLike
 
 from ugat_marl.diagnosis import Tally
 from ugat_marl.diagnosis.features import ALL_FEATURES, BIN_FEATURES, FEATURES, INDEX
-from ugat_marl.diagnosis.statistics import Distance
+from ugat_marl.diagnosis.statistics import Distance, Pools, Reference
 from ugat_marl.diagnosis.thresholds import Thresholds
 from ugat_marl.diagnosis.verify import (
     Criteria,
@@ -149,11 +149,33 @@ def test_a_statistic_without_any_difference_stays_in_the_tables() -> None:
     )
     model: Any = SimpleNamespace(model=SimpleNamespace(reference=reference))
     layout = SimpleNamespace(places=[(0, "in", "in_0")], intersections=("A",))
-    study: Any = SimpleNamespace(heldout=[None], layout=layout)
+    pools = SimpleNamespace(pool=lambda _: {"network": np.ones((1, width, 2))})
+    study: Any = SimpleNamespace(heldout=[day([1])], layout=layout, pools=pools)
     first, second = statistics_table(study, model, model)
     assert (first.z_before, second.z_before) == (0.0, 4.0)
     (lane,) = lanes_table(study, model, model)
     assert lane.before == pytest.approx(np.sqrt(8.0))  # of a 0 and a 4
+
+
+def test_rows_show_the_mean_of_the_held_out_hours() -> None:
+    """The held-out hours are the busy ones, and a tenth busier than in the model."""
+    generator = np.random.default_rng(0)
+    pools = Pools({"network": np.ones((1, 1)), "lane": np.eye(1)}, THRESHOLDS)
+    number = INDEX["count_stop"]
+
+    def of_hour(hour: int, rate: float) -> Tally:
+        sums = np.zeros((len(FEATURES), 1, 2))
+        sums[number] = (generator.poisson(rate * 60), 60)
+        window = (3600.0 * hour, 3600.0 * (hour + 1))
+        return Tally(sums, np.zeros((len(BIN_FEATURES), 1, 12)), window=window)
+
+    quiet_and_busy = [of_hour(i % 2, (4, 12)[i % 2]) for i in range(60)]
+    model: Any = SimpleNamespace(model=SimpleNamespace(reference=Reference(pools, quiet_and_busy)))
+    heldout = [of_hour(1, 13.2), of_hour(1, 13.2)]
+    study: Any = SimpleNamespace(heldout=heldout, pools=pools)
+    (row,) = (x for x in statistics_table(study, model, model) if x.statistic == "count_stop")
+    assert row.measured == pytest.approx(sum(day.sums[number, 0, 0] for day in heldout) / 120)
+    assert row.before == pytest.approx(12, abs=0.3) and row.after == row.before
 
 
 def test_travel_times_ask_for_no_further_days() -> None:

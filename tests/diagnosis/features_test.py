@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -274,6 +275,15 @@ def test_lengths_are_measured_or_follow_from_speed_and_time() -> None:
     assert of(found, "long_vehicles") == (1, 2)
     known = counted({"stop:in_0": passages((20.0,), (20.5,), 10.0, 7.1)})
     assert of(known, "vehicle_length") == (7.1, 1)
+
+
+def test_a_length_is_that_of_the_vehicle_not_of_the_zone() -> None:
+    layout = a_layout()
+    zones = tuple(replace(item, length_m=6.0) for item in layout.detectors)
+    seen = {"stop:in_0": passages((20.0,), (21.05,), 10.0)}
+    found = counted(seen, replace(layout, detectors=zones))
+    assert of(found, "vehicle_length") == (pytest.approx(4.5), 1)
+    assert of(found, "long_vehicles") == (0, 1)
 
 
 def test_a_lane_without_a_stop_detector_tells_of_arrivals_only() -> None:

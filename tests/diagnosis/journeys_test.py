@@ -62,9 +62,20 @@ def test_a_free_vehicle_that_nobody_saw_come_has_no_travel_time() -> None:
 
 def test_the_free_ones_are_quick_apart_and_not_at_the_begin_of_green() -> None:
     stop = passages([31.0, 38.0, 40.0, 47.0], [14.0, 14.0, 14.0, 3.0])
-    seen = Crossings.of(stop, np.array([30.0]), 14.0, 0.85, 5.0)
+    seen = Crossings.of(stop, np.array([30.0]), 0.0, 0.85 * 14.0, 5.0)
     assert seen.time_s.tolist() == [31.5, 38.5, 40.5, 47.5]
     assert seen.free.tolist() == [False, True, False, False]
+
+
+@pytest.mark.parametrize(("zone_m", "limit_mps"), [(0.0, 13.9), (6.0, 8.3), (12.0, 13.9)])
+def test_without_speeds_a_free_vehicle_is_known_on_a_zone_of_any_length(
+    zone_m: float, limit_mps: float
+) -> None:
+    over = (5.0 + zone_m) / np.array([limit_mps, 0.25 * limit_mps])  # the second one crawls
+    on = np.array([40.0, 60.0])
+    stop = Passages(on, on + over, np.full(2, np.nan), np.full(2, np.nan))
+    seen = Crossings.of(stop, np.array([30.0]), zone_m, 0.85 * limit_mps, 5.0)
+    assert seen.free.tolist() == [True, False]
 
 
 def test_sums_of_one_lane() -> None:

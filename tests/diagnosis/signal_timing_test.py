@@ -99,6 +99,19 @@ def test_green_right_behind_yellow_is_no_all_red(scenario: Scenario, network: Ne
     assert found(scenario, network, cycles(30, 3.0, 0.0)) == ["all_red_time=0"]
 
 
+def test_a_red_that_no_clearance_has_is_a_phase_of_others(
+    scenario: Scenario, network: Network
+) -> None:
+    assert found(scenario, network, cycles(30, 4.0, 22.0)) == ["yellow_time=4"]
+
+
+def test_a_single_green_has_no_all_red(scenario: Scenario, network: Network) -> None:
+    """15 s of pedestrians, whose links are not in the network, are no clearance."""
+    shown = [(0, "Gr"), (20, "yr"), (24, "rr")]
+    log = tuple((39.0 * i + time, state) for i in range(30) for time, state in shown)
+    assert found(scenario, network, log) == ["yellow_time=4"]
+
+
 def test_a_few_clearances_prove_nothing(scenario: Scenario, network: Network) -> None:
     assert found(scenario, network, cycles(5, 4.0, 2.0)) == []
 

@@ -132,6 +132,44 @@ def test_without_travel_times_counts_decide() -> None:
     assert check is not None and check.better
 
 
+@pytest.mark.parametrize(("kind", "measure"), [("advance", "counts upstream"), ("", None)])
+def test_where_nobody_was_counted_behind_the_stop_line_counts_upstream_decide(
+    kind: str, measure: str | None
+) -> None:
+    def counted(seed: int, count: int, vehicles: float) -> list[Tally]:
+        made = days(seed, count, 20, 4, served=vehicles)
+        for day in made:
+            rows = day.bins.copy()
+            day.bins[:] = 0.0
+            if kind:
+                day.bins[BIN_FEATURES.index(f"count_{kind}")] = rows[
+                    BIN_FEATURES.index("count_stop")
+                ]
+        return without_journeys(made)
+
+    street, sim, right = counted(1, 2, 30.0), counted(2, 16, 20.0), counted(3, 16, 30.0)
+    check = traffic_check(street, sim, right, THRESHOLDS)
+    assert (check and check.measure) == measure
+    assert check is None or check.better
+
+
+def test_mornings_and_evenings_are_no_chance() -> None:
+    """A perfect correction passes, however much stretches of the day differ."""
+
+    def of_both(seed: int, count: int, share: float) -> list[Tally]:
+        morning = days(seed, count, 20 * share, 4 * share)
+        evening = days(seed + 1, count, 60 * share, 12 * share)
+        stretches = [(0.0, 3600.0)] * count + [(36000.0, 39600.0)] * count
+        both = zip([*morning, *evening], stretches, strict=True)
+        return [replace(day, window=window) for day, window in both]
+
+    street, sim, right = of_both(1, 1, 1.0), of_both(2, 8, 0.85), of_both(2, 8, 1.0)
+    check = traffic_check(street, sim, right, THRESHOLDS)
+    assert check is not None and check.better
+    one = traffic_check(days(1, 2, 20, 4), days(2, 16, 17, 3.4), days(2, 16, 20, 4), THRESHOLDS)
+    assert one is not None and check.noise < 2 * one.noise
+
+
 def test_occupied_times_judge_where_no_speeds_are_known() -> None:
     def of_counts(occupied_s: float, count: int) -> list[Tally]:
         rows: list[Tally] = []

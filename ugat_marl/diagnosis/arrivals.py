@@ -327,7 +327,7 @@ def corrected(counted: Tally, layout: DetectorLayout, due: DemandBalance) -> Tal
 
 def _approaches(layout: DetectorLayout, thresholds: DayThresholds) -> dict[str, tuple[_Lane, ...]]:
     """Find edges with an advance detector on every lane in front of the traffic light."""
-    zones = {detector.id: detector for detector in layout.detectors}
+    zones = layout.by_id
     lanes: dict[str, list[_Lane] | None] = {}
     for lane in layout.lanes:
         advance = lane.detectors.get("advance")

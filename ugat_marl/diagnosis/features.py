@@ -159,6 +159,15 @@ class DetectorLayout:
         return cls(names, tuple(lanes), tuple(exits), tuple(detectors), owner, begin_s)
 
     @functools.cached_property
+    def by_id(self) -> Mapping[str, Detector]:
+        """All detectors by their id."""
+        return {detector.id: detector for detector in self.detectors}
+
+    def zone_m(self, lane: IncomingLane, kind: DetectorKind) -> float:
+        """Return the length of a lane's detector of a kind, m."""
+        return self.by_id[lane.detectors[kind]].length_m
+
+    @functools.cached_property
     def places(self) -> tuple[tuple[int, str, str], ...]:
         """Index of the intersection, edge and lane of every place: incoming lanes, then exits."""
         incoming = [(lane.intersection, lane.edge, lane.id) for lane in self.lanes]
@@ -193,8 +202,7 @@ class DetectorLayout:
     def ride_s(self, lane: int) -> float:
         """Return the time from the advance to the stop detector of a lane at its limit, s."""
         of_lane = self.lanes[lane]
-        zones = {detector.id: detector for detector in self.detectors}
-        begin, end = (zones[of_lane.detectors[kind]] for kind in ("advance", "stop"))
+        begin, end = (self.by_id[of_lane.detectors[kind]] for kind in ("advance", "stop"))
         metres = end.position_m + end.length_m - begin.position_m
         return max(metres, 0.0) / of_lane.speed_mps
 
@@ -443,13 +451,13 @@ def tally(
             stops[index] = counter.volume("count_stop", stop)
             _discharge(counter, stop, green)
             _clearance(counter, stop, green)
-            _lengths(counter, stop)
+            _lengths(counter, stop, layout.zone_m(lane, "stop"))
         if advance is not None:
             advances[index] = counter.volume("count_advance", advance)
             _approach(counter, advance, green, lane.speed_mps)
             _storage(counter, advance, green)
             if stop is None:
-                _lengths(counter, advance)
+                _lengths(counter, advance, layout.zone_m(lane, "advance"))
     exits = np.zeros(len(layout.exits))
     for index, (_, _, name) in enumerate(layout.exits):
         counter.place = len(layout.lanes) + index
@@ -608,10 +616,10 @@ def _clearance(counter: _Counter, stop: Passages, greens: Greens) -> None:
     counter.add("last_crossing", after[counted & (red <= thresholds.last_crossing_s)])
 
 
-def _lengths(counter: _Counter, passages: Passages) -> None:
-    """Add lengths of vehicles: measured ones, else speed times time over the detector."""
+def _lengths(counter: _Counter, passages: Passages, zone_m: float) -> None:
+    """Add lengths of vehicles: measured, else speed times time over the zone, less the zone."""
     quick = (passages.speed_mps > counter.thresholds.measurable_mps) & np.isfinite(passages.on_s)
-    length = np.where(quick, passages.speed_mps * (passages.off_s - passages.on_s), np.nan)
+    length = np.where(quick, passages.speed_mps * (passages.off_s - passages.on_s) - zone_m, np.nan)
     length = np.where(np.isfinite(passages.length_m), passages.length_m, length)
     counter.add("vehicle_length", length)
     counter.add("long_vehicles", _share(length, counter.thresholds.long_vehicle_m))
@@ -738,11 +746,9 @@ def _journeys(
             assert advance is not None and stop is not None
             came.append(np.sort(advance.on_s[np.isfinite(advance.on_s)]))
             starts = greens[lanes[len(came) - 1]].start_s
-            crossed.append(
-                Crossings.of(
-                    stop, starts, lane.speed_mps, thresholds.free, thresholds.settled_green_s
-                )
-            )
+            zone_m = layout.zone_m(lane, "stop")
+            pace_mps, gap_s = thresholds.free * lane.speed_mps, thresholds.settled_green_s
+            crossed.append(Crossings.of(stop, starts, zone_m, pace_mps, gap_s))
         rides = [layout.ride_s(index) for index in lanes]
         pairs, _ = matched(
             came, crossed, [ride / thresholds.fastest for ride in rides], thresholds.slack_s

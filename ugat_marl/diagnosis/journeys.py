@@ -37,15 +37,15 @@ class Crossings:
 
     @classmethod
     def of(
-        cls, stop: Passages, greens_s: Array, limit_mps: float, pace: float, gap_s: float
+        cls, stop: Passages, greens_s: Array, zone_m: float, pace_mps: float, gap_s: float
     ) -> Crossings:
         """Find the crossings and those among them that nothing held up.
 
         Args:
             stop: Passages over the stop detector.
             greens_s: Begins of green, s.
-            limit_mps: Speed limit, m/s.
-            pace: Least share of the limit at which a vehicle is free.
+            zone_m: Length of the stop detector, m.
+            pace_mps: Least speed of a free vehicle, m/s.
             gap_s: Least time after the vehicle before, and after green began, of a free one, s.
         """
         seen = stop.at(np.isfinite(stop.off_s))
@@ -53,10 +53,10 @@ class Crossings:
         time = seen.off_s
         began = np.append(-np.inf, greens_s)[np.searchsorted(greens_s, time, "right")]
         apart = np.diff(time, prepend=-np.inf) > gap_s
-        quick = seen.speed_mps >= pace * limit_mps
-        # Without speeds, a vehicle that is gone within a second drove.
+        quick = seen.speed_mps >= pace_mps
+        # Without speeds, a vehicle that is gone within a second drove; a zone takes its own time.
         over = np.where(np.isfinite(seen.on_s), time - seen.on_s, np.inf)
-        quick |= ~np.isfinite(seen.speed_mps) & (over < 1.0)
+        quick |= ~np.isfinite(seen.speed_mps) & (over < 1.0 + zone_m / pace_mps)
         return cls(time, apart & quick & (time - began > gap_s))
 
 

@@ -943,7 +943,7 @@ def one_behind_the_other(members: Members, layout: DetectorLayout) -> tuple[str,
         for hypothesis, _ in members
         if hypothesis.name == "undercount"
     ]
-    known = {detector.id: detector for detector in layout.detectors}
+    known = layout.by_id
     lanes = {lane.id: lane for lane in layout.lanes}
     suspects = [known[str(name)] for name in short if name in known]
     for one in suspects:

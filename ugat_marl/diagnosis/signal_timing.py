@@ -8,12 +8,11 @@ from collections import Counter
 
 from ugat_marl.data import MeasuredData
 from ugat_marl.diagnosis.thresholds import Thresholds
-from ugat_marl.effects import Effect, effect_from_record
-from ugat_marl.scenarios import GREEN, Network, Scenario, SignalLog
+from ugat_marl.effects import Effect, effect_from_record, known_effects
+from ugat_marl.scenarios import AMBER, GREEN, Network, Scenario, SignalLog
 
 IN_THE_LOG = ("yellow_time", "all_red_time")
 """Effects that are read off the signal log. A replay of the log contains them already."""
-_AMBER = frozenset("yY")
 
 
 def timing_effects(
@@ -21,23 +20,24 @@ def timing_effects(
 ) -> tuple[Effect, ...]:
     """Return effects for yellow and all-red times of the log that differ from the scenario's.
 
-    Logs that show the network's own programme, its states and its clearances, are left out.
+    Logs that show the network's own programme, its states and its clearances, are left out. So are
+    times that no clearance has: a red of 22 s is a phase of others, such as pedestrians.
     """
-    yellow: Counter[float] = Counter()
-    red: Counter[float] = Counter()
+    seen: dict[str, Counter[float]] = {name: Counter() for name in IN_THE_LOG}
+    possible = {name: known_effects()[name].ranges["seconds"] for name in IN_THE_LOG}
     controlled = {intersection.id: intersection for intersection in network.intersections}
     for period in measured.periods:
         for tls, log in period.signals.items():
             if tls in controlled and not _own(log, controlled[tls].programme, thresholds):
-                for kind, duration in _clearances(log):
-                    (yellow if kind == "y" else red)[round(duration, 1)] += 1
+                for name, duration in _clearances(log):
+                    if possible[name].holds(duration):
+                        seen[name][round(duration, 1)] += 1
     effects: list[Effect] = []
-    control = scenario.control
-    clearances = (yellow, control.yellow_s), (red, control.all_red_s)
-    for name, (seen, now) in zip(IN_THE_LOG, clearances, strict=True):
-        total = sum(seen.values())
+    clearances = (scenario.control.yellow_s, scenario.control.all_red_s)
+    for name, now in zip(IN_THE_LOG, clearances, strict=True):
+        total = seen[name].total()
         if total >= thresholds.least_clearances:
-            value, count = seen.most_common(1)[0]
+            value, count = seen[name].most_common(1)[0]
             if (
                 count >= thresholds.usual_share * total
                 and abs(value - now) > thresholds.least_timing_s
@@ -62,20 +62,26 @@ def _own(log: SignalLog, programme: tuple[tuple[float, str], ...], thresholds: T
 
 
 def _clearances(log: SignalLog) -> list[tuple[str, float]]:
-    """Return durations in s of yellow (``y``), and from its end to the next green (``r``).
+    """Return durations in s of yellow and all-red, by the effect that would set them.
 
-    Other links may be green at the same time. Red-yellow does not count as yellow.
+    All-red is from the end of yellow to the next green; other links may be green at the same time.
+    With a single green there is none: what comes in between is a phase of others. Red-yellow does
+    not count as yellow.
     """
+    yellow, all_red = IN_THE_LOG
+    greens = {tuple(link in GREEN for link in state) for _, state in log}
+    alone = sum(map(any, greens)) < 2
     durations: list[tuple[str, float]] = []
     began = ended = math.nan
     for (_, before), (time_s, state) in itertools.pairwise(log):
         pairs = list(zip(before, state, strict=False))
-        if any(new in _AMBER and old not in _AMBER for old, new in pairs):
+        if any(new in AMBER and old not in AMBER for old, new in pairs):
             began = time_s
-        if any(old in _AMBER and new not in _AMBER for old, new in pairs):
-            durations.append(("y", time_s - began))
+        if any(old in AMBER and new not in AMBER for old, new in pairs):
+            durations.append((yellow, time_s - began))
             ended = time_s
         if any(new in GREEN and old not in GREEN for old, new in pairs):
-            durations.append(("r", time_s - ended))
+            if not alone:
+                durations.append((all_red, time_s - ended))
             ended = math.nan
-    return [(kind, duration) for kind, duration in durations if duration == duration]
+    return [(name, duration) for name, duration in durations if duration == duration]

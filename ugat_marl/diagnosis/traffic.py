@@ -6,13 +6,16 @@ makes the simulation a better picture of the street.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections import Counter
+from collections.abc import Callable, Sequence
 
 import numpy as np
+from numpy.typing import NDArray
 
 from ugat_marl.diagnosis.features import (
     ALL_FEATURES,
     BIN_FEATURES,
+    COUNT_FEATURES,
     INDEX,
     SATURATION_GAPS,
     SERVICE_COUNTS,
@@ -20,11 +23,10 @@ from ugat_marl.diagnosis.features import (
     Tally,
 )
 from ugat_marl.diagnosis.records import ApproachRow, Sides, TrafficCheck
-from ugat_marl.diagnosis.statistics import Array, means, sum_of
+from ugat_marl.diagnosis.statistics import Array, Window, means, sum_of
 from ugat_marl.diagnosis.supplementary_data import TRAVEL_TIME
 from ugat_marl.diagnosis.thresholds import Thresholds
 
-_SERVED = [BIN_FEATURES.index(name) for name in SERVICE_COUNTS]
 _PASSING = [
     [INDEX[f"{name}_{kind}"] for kind in ("advance", "stop", "exit")]
     for name in ("mean_speed", "over")
@@ -111,28 +113,27 @@ def traffic_check(
     Returns:
         None if the data hold nothing to judge by.
     """
-    for measure, sums in (
-        ("travel time and queue", _journeys),
-        ("travel times of probes", _timed),
-        ("speed and occupancy", _passing),
-        ("service counts", _served),
-    ):
+    stretches = [[day.window for day in days] for days in (measured, after)]
+    for measure, (sums, vehicles) in _MEASURES.items():
         sides = [sums(days) for days in (measured, before, after)]
         if all(side is not None and side.shape[-2] for side in sides):
             real, old, new = (side for side in sides if side is not None)
-            # of queues there is one per green, vehicles or not
-            seen = real[..., 1].sum(axis=(0, 2))
-            if (seen[0] if sums is _journeys else seen.max()) >= thresholds.least_journeys:
-                return _check(measure, real, old, new, thresholds)
+            if vehicles(real) >= thresholds.least_journeys:
+                return _check(measure, real, old, new, stretches, thresholds)
     return None
 
 
 def _check(
-    measure: str, real: Array, old: Array, new: Array, thresholds: Thresholds
+    measure: str,
+    real: Array,
+    old: Array,
+    new: Array,
+    stretches: Sequence[Sequence[Window]],
+    thresholds: Thresholds,
 ) -> TrafficCheck:
     """Judge by sums of days ``(days, measures, places, 2)`` of the data and of both models.
 
-    Both models have the same days.
+    Both models have the same days. `stretches` are those of the data's days and of the models'.
     """
     street, simulated, repaired = (means(side) for side in (real, old, new))
     weight = real.sum(axis=0)[..., 1]
@@ -149,9 +150,9 @@ def _check(
     generator = np.random.default_rng(_SEED)
     gains: list[float] = []
     for _ in range(thresholds.check_draws):
-        days = generator.choice(len(new), len(real))
+        days = _drawn(generator, stretches[0], stretches[1])
         drawn = street + np.nan_to_num(means(new[days]) - repaired)
-        again = generator.choice(len(new), len(new))  # the same days of both models
+        again = _drawn(generator, stretches[1], stretches[1])  # the same days of both models
         models = (np.nan_to_num(means(side[again])) for side in (old, new))
         first, last = (error(model, drawn) for model in models)
         gains.append(first - last)
@@ -160,6 +161,24 @@ def _check(
     near = last <= thresholds.most_traffic_error
     better = near and first - last > thresholds.check_deviations * noise
     return TrafficCheck(measure, first, last, noise, better)
+
+
+def _drawn(
+    generator: np.random.Generator,
+    wanted: Sequence[Window],
+    there: Sequence[Window],
+) -> NDArray[np.int64]:
+    """Draw days with replacement: of each stretch of the day as many as are wanted.
+
+    Where a stretch has no day, days of all stretches are drawn for it.
+    """
+    drawn = [
+        generator.choice(
+            [k for k, window in enumerate(there) if window == stretch] or len(there), number
+        )
+        for stretch, number in Counter(wanted).items()
+    ]
+    return np.concatenate(drawn)
 
 
 def _journeys(days: Sequence[Tally]) -> Array | None:
@@ -182,11 +201,41 @@ def _passing(days: Sequence[Tally]) -> Array | None:
     return np.stack([day.sums[_PASSING].reshape(len(_PASSING), -1, 2) for day in days])
 
 
-def _served(days: Sequence[Tally]) -> Array | None:
-    """Return vehicles at stop and exit detectors, ``(days, 1, kinds * places * bins, 2)``."""
-    shortest = min(day.bins.shape[-1] for day in days)
-    sums = [
-        np.stack([x[_SERVED, :, :shortest].ravel() for x in (day.bins, day.counted)], axis=-1)
-        for day in days
-    ]
-    return np.stack(sums)[:, None]
+def _counts_of(names: Sequence[str]) -> Callable[[Sequence[Tally]], Array | None]:
+    """Return a function for the vehicles in bins, ``(days, 1, kinds * places * bins, 2)``."""
+    rows = [BIN_FEATURES.index(name) for name in names]
+
+    def counts(days: Sequence[Tally]) -> Array | None:
+        shortest = min(day.bins.shape[-1] for day in days)
+        sums = [
+            np.stack([x[rows, :, :shortest].ravel() for x in (day.bins, day.counted)], axis=-1)
+            for day in days
+        ]
+        return np.stack(sums)[:, None]
+
+    return counts
+
+
+def _most_observed(real: Array) -> float:
+    """Return the number of observations of the measure that has most."""
+    return float(real[..., 1].sum(axis=(0, 2)).max())
+
+
+def _observed_first(real: Array) -> float:
+    """Return the observations of the first measure: of queues there is one per green."""
+    return float(real[:, 0, :, 1].sum())
+
+
+def _counted(real: Array) -> float:
+    """Return the vehicles of counts, which are observed in each bin, vehicles or not."""
+    return float(real[..., 0].sum())
+
+
+_MEASURES = {
+    "travel time and queue": (_journeys, _observed_first),
+    "travel times of probes": (_timed, _most_observed),
+    "speed and occupancy": (_passing, _most_observed),
+    "service counts": (_counts_of(SERVICE_COUNTS), _counted),
+    "counts upstream": (_counts_of(COUNT_FEATURES[:1]), _counted),
+}
+"""Measures of a check, the first that the data have: sums of days, and their vehicles."""

@@ -106,6 +106,10 @@ def statistics_table(study: Study, base: Tested, best: Tested) -> tuple[Statisti
     after = best.model.reference.distance(study.heldout, relative_to=base.model.reference)
     block = base.model.reference.blocks["network"]
     fitted = best.model.reference.blocks["network"]
+    sums = study.pools.pool(sum_of(study.heldout))["network"][0]
+    # A model compares each stretch of the day with its own mean; rows show the held-out ones'.
+    measured = sums[:, 0] / np.maximum(sums[:, 1], 1e-9)
+    shift = measured - (block.mean + before.difference["network"])[0]
     rows: list[StatisticRow] = []
     width = before.z["network"].shape[1]
     for index, (name, regime, unit) in enumerate(ALL_FEATURES[:width]):
@@ -116,9 +120,9 @@ def statistics_table(study: Study, base: Tested, best: Tested) -> tuple[Statisti
                 statistic=name,
                 regime=regime,
                 unit=unit,
-                measured=float(block.mean[0, index] + before.difference["network"][0, index]),
-                before=float(block.mean[0, index]),
-                after=_number(fitted.mean[0, index]),
+                measured=float(measured[index]),
+                before=float(block.mean[0, index] + shift[index]),
+                after=_number(fitted.mean[0, index] + shift[index]),
                 noise=float(np.sqrt(fitted.variance[0, index] / len(study.heldout))),
                 z_before=float(before.z["network"][0, index]),
                 z_after=float(after.z["network"][0, index]),

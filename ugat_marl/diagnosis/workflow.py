@@ -49,6 +49,7 @@ from ugat_marl.diagnosis.records import (
 )
 from ugat_marl.diagnosis.select import Selector
 from ugat_marl.diagnosis.signal_timing import IN_THE_LOG, timing_effects
+from ugat_marl.diagnosis.statistics import of_the_same_stretches
 from ugat_marl.diagnosis.study import DiagnosisConfig, Study
 from ugat_marl.diagnosis.traffic import traffic_check
 from ugat_marl.diagnosis.verdict import (
@@ -369,8 +370,8 @@ def _unnamed(
     numbers = [number for number in wanted if number in base.model.days]
     with reporter.task("unnamed correction", len(numbers)) as advance:
         days = study.engine.ordinary((*named, *effects), numbers, advance)
-    before = [base.model.days[number] for number in days]
-    after = [day.tally for day in days.values()]
+    both = ([base.model.days[number] for number in days], [day.tally for day in days.values()])
+    before, after = (of_the_same_stretches(side, study.heldout) for side in both)
     check = traffic_check(study.heldout, before, after, study.config.thresholds)
     if check is None or not check.better:
         return None

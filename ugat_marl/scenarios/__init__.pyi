@@ -114,6 +114,7 @@ from .signal_plans import refusal_notes as refusal_notes
 from .signal_plans import with_plans as with_plans
 from .signal_plans import write_plans as write_plans
 from .signal_plans import yellow_notes as yellow_notes
+from .signals import AMBER as AMBER
 from .signals import GREEN as GREEN
 from .signals import SIGNAL_LETTERS as SIGNAL_LETTERS
 from .signals import YELLOW as YELLOW
