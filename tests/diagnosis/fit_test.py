@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Sequence
 from dataclasses import replace
 
@@ -10,9 +11,9 @@ import pytest
 from numpy.typing import NDArray
 
 from ugat_marl.diagnosis import Hypothesis, Reference, Tally
-from ugat_marl.diagnosis.engine import Engine, OrdinaryDays, Replicate
-from ugat_marl.diagnosis.features import BIN_FEATURES, FEATURES
-from ugat_marl.diagnosis.fit import Fitter, _may_move, _shifted, uncertainty
+from ugat_marl.diagnosis.engine import Engine, OrdinaryDays, Replicate, spread
+from ugat_marl.diagnosis.features import BIN_FEATURES, FEATURES, INDEX
+from ugat_marl.diagnosis.fit import Fitter, _may_move, _moved_a_little, _shifted, uncertainty
 from ugat_marl.diagnosis.hypotheses import Members
 from ugat_marl.diagnosis.propose import Direction
 from ugat_marl.diagnosis.records import Fitted
@@ -95,6 +96,49 @@ def test_a_planted_value_is_found_from_afar() -> None:
     best = fitter.refine(fitter.simulate(start((HEADWAY, 1.9))))
     assert best.values[0] == pytest.approx(1.43, abs=0.06)
     assert best.cost < fitter.simulate(start((HEADWAY, 1.9))).cost
+
+
+class Hours(World):
+    """Counts of a network over 24 hours, each with its own demand."""
+
+    order = spread(24)
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.demand = 3000 * (1.2 + np.sin(2 * np.pi * (np.arange(24) - 9) / 24))
+
+    def played(self, number: int, effects: Sequence[Effect]) -> Tally:
+        return self.counted(number, math.prod(float(e.record()["factor"]) for e in effects))
+
+    def counted(self, number: int, factor: float, street: int = 0) -> Tally:
+        """One hour, in which as many vehicles come as `factor` says, and chance."""
+        hour = self.order[number % 24]
+        generator = np.random.default_rng([street, number])
+        sums = np.zeros((len(FEATURES), 1, 2))
+        sums[INDEX["count_stop"], 0] = (generator.poisson(factor * self.demand[hour]), 60)
+        bins = np.zeros((len(BIN_FEATURES), 1, 1))
+        return Tally(sums, bins, window=(3600.0 * hour, 3600.0 * (hour + 1)))
+
+
+def test_demand_is_fitted_in_the_hours_of_a_day_of_which_few_are_simulated() -> None:
+    """Hours of the night alone would ask for twice as much as is missing."""
+    world = Hours()
+    demand = Hypothesis(
+        "demand_level", (("edge", "*"),), ("factor",), ((0.8,), (1.2,)), (1.0,), 0.03, both=True
+    )
+    base_days = {number: world.counted(number, 1.0) for number in range(144)}
+    base = Reference(POOLS, list(base_days.values()))
+    data = [world.counted(number, 1.2, street=9) for number in range(24)]
+    fitter = Fitter(world, POOLS, base, base_days, data, days=6, speeds=True)
+    best = fitter.refine(fitter.simulate(start((demand, 1.1))), 6)
+    assert best.values[0] == pytest.approx(1.2, abs=0.04)
+
+
+@pytest.mark.parametrize("value", [0.5, 0.95, 0.99, 0.9999, 1.0])
+def test_a_derivative_near_the_end_of_a_range_is_no_shorter_than_elsewhere(value: float) -> None:
+    sigma = Hypothesis("imperfection", (), ("sigma",), ((0.85,),), (0.5,), 0.05)
+    (moved,) = _moved_a_little(sigma, (value,), 0, 0.1)
+    assert abs(moved - value) >= 0.05 - 1e-9 and 0 <= moved <= 1
 
 
 def test_two_values_are_fitted_at_once() -> None:

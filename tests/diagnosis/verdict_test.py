@@ -45,14 +45,16 @@ PARKING = Hypothesis(
     "parking", (("lane", "S_C_0"), ("dwell_s", 40.0)), ("per_hour",), ((20.0,),), (0.0,)
 )
 MODEL = Hypothesis("driver_model", (("model", "IDM"),), (), ((),), None)
+DETECTORS = [
+    Detector("east", "E_C_0", 10.0, 2.0, "advance"),
+    Detector("line", "E_C_0", 90.0, 2.0, "stop"),
+    Detector("beside", "E_C_1", 90.0, 2.0, "stop"),
+    Detector("out", "C_W_0", 10.0, 2.0, "exit"),
+    Detector("away", "C_N_0", 10.0, 2.0, "exit"),
+]
 SITE: Any = SimpleNamespace(
-    detectors=[
-        Detector("east", "E_C_0", 10.0, 2.0, "advance"),
-        Detector("line", "E_C_0", 90.0, 2.0, "stop"),
-        Detector("beside", "E_C_1", 90.0, 2.0, "stop"),
-        Detector("out", "C_W_0", 10.0, 2.0, "exit"),
-        Detector("away", "C_N_0", 10.0, 2.0, "exit"),
-    ],
+    detectors=DETECTORS,
+    by_id={detector.id: detector for detector in DETECTORS},
     lanes=[
         SimpleNamespace(id="E_C_0", edge="E_C", following={"C_W"}),
         SimpleNamespace(id="E_C_1", edge="E_C", following={"C_W", "C_N"}),

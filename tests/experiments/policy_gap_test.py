@@ -84,7 +84,7 @@ def diagnosed(directory: Path, corrected: str | None = "V4", **changes: Any) -> 
         "traffic_check", "not_corrected",
     )  # fmt: skip
     record = {
-        "schema": "ugat-marl/diagnosis/6",
+        "schema": "ugat-marl/diagnosis/7",
         "scenario": SCENARIO.id,
         "seed": 0,
         "alpha": 0.05,

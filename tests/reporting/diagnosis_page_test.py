@@ -66,7 +66,7 @@ def content_of(verdict: str = "explained", *, complete: bool = True, **more: Any
     named = verdict in ("explained", "not_identifiable", "partially_explained")
     evidence = {"distance": 118.2, "runner_up_is_worse_by": 4021.0}
     record: dict[str, Any] = {
-        "schema": "ugat-marl/diagnosis/6", "scenario": "crossing-v1", "seed": 0, "alpha": 0.05,
+        "schema": "ugat-marl/diagnosis/7", "scenario": "crossing-v1", "seed": 0, "alpha": 0.05,
         "budget_h": None, "budget_s": 600.0, "left_out": [], "ruled_out": ["speed_spread"],
         "findings": ["detections.csv: no speeds"], "verified_on_fitted_periods": False,
         "periods": {"fit": ["day1", "day2"], "heldout": ["day3"]}, "policy_gap": None,

@@ -181,6 +181,18 @@ class Replicate:
     due: DemandBalance | None = None
 
 
+def spread(count: int) -> list[int]:
+    """Return the numbers below `count` in an order whose first ones are far apart.
+
+    Each step is the golden section of the whole, as nearly as all numbers are met. Hours of a
+    morning would have another mean than those of a day, and so would the effects fitted to them.
+    """
+    step = round(count * (math.sqrt(5) - 1) / 2)
+    while math.gcd(step, count) > 1:
+        step += 1
+    return [number * step % count for number in range(count)]
+
+
 class Engine:
     """Simulator of days of models; it reduces days to tallies and caches them.
 
@@ -227,7 +239,8 @@ class Engine:
         stretches: dict[tuple[float, float], list[int]] = {}
         for place, period in enumerate(periods):
             stretches.setdefault(period.window, []).append(place)
-        self._stretches = list(stretches.values())
+        in_order = [stretches[window] for window in sorted(stretches)]
+        self._stretches = [in_order[place] for place in spread(len(in_order))]
         self._budget = budget or Budget()
         self._replay = replay
         self._seed = seed
@@ -264,7 +277,8 @@ class Engine:
         """Return the place of the period under whose signals a day runs.
 
         Days go round the stretches of the day, and within a stretch round its periods, so that few
-        days are enough for some of each stretch.
+        days are enough for some of each stretch. Where there are more stretches than days, those
+        that come are from all over the day, see `spread`.
         """
         own = self._stretches[number % len(self._stretches)]
         return own[number // len(self._stretches) % len(own)]

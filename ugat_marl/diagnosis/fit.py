@@ -369,16 +369,21 @@ def _may_move(members: Members) -> list[NDArray[np.bool_]]:
 def _moved_a_little(
     hypothesis: Hypothesis, values: tuple[float, ...], index: int, share: float
 ) -> tuple[float, ...]:
-    """Return the values with one of them moved for a derivative, inside its range."""
+    """Return the values with one of them moved for a derivative, inside its range.
+
+    It moves up, and down if the range ends before: a slope of too short a move is noise.
+    """
     nominal = hypothesis.nominal[index] if hypothesis.nominal else 0.0
-    delta = max(share * abs(values[index] - nominal), hypothesis.least, 1e-3)
-    changed = list(values)
-    changed[index] += hypothesis.step or delta
-    moved = hypothesis.clipped(changed)
-    if moved == values:
-        changed[index] -= 2 * (hypothesis.step or delta)
-        moved = hypothesis.clipped(changed)
-    return moved
+    delta = hypothesis.step or max(share * abs(values[index] - nominal), hypothesis.least, 1e-3)
+
+    def moved(by: float) -> tuple[float, ...]:
+        changed = list(values)
+        changed[index] += by
+        return hypothesis.clipped(changed)
+
+    up, down = moved(delta), moved(-delta)
+    far, back = (abs(other[index] - values[index]) for other in (up, down))
+    return up if far > delta * (1 - 1e-9) or far >= back else down
 
 
 def _shifted(hypothesis: Hypothesis, move: tuple[float, float], shortest_s: float) -> Hypothesis:
@@ -533,8 +538,8 @@ def uncertainty(
     for name, block in model.reference.blocks.items():
         slopes = np.stack([change[name] / delta for change, delta in changes])
         # variance of a statistic = d' C d, with d its derivatives by the values
-        extra[name] = np.einsum("imf,ij,jmf->mf", slopes, covariance, slopes) + 0.0 * block.mean
-        extra[name] = np.nan_to_num(extra[name])
+        variances = np.einsum("imf,ij,jmf->mf", slopes, covariance, slopes)
+        extra[name] = np.where(np.isfinite(block.mean), np.nan_to_num(variances), 0.0)
     errors = np.sqrt(np.diag(covariance)[:free])
     if steps:
         errors = np.sqrt(errors**2 + _crookedness(fitter, model, errors, response))

@@ -35,7 +35,7 @@ FILE = "diagnosis.json"
 """Name of the file that a diagnosis writes into its directory."""
 CORRECTED = "corrected"
 """Name of the folder of the corrected scenario, beside that file."""
-SCHEMA = "ugat-marl/diagnosis/6"
+SCHEMA = "ugat-marl/diagnosis/7"
 """Form of the file; it rises whenever the form changes."""
 
 Verdict = Literal[
@@ -365,21 +365,22 @@ class HeldOut:
 
     Attributes:
         before: Distance of the data from the scenario as it is.
-        after: Distance of the data from the corrected model.
+        after: Distance of the data from the corrected model; None if it was not tested, since the
+            budget ended.
         floor: Distance that 99 of 100 data sets of the corrected model stay below.
         expected: Mean distance of data sets of the corrected model.
         shrink: Share of the gap that is gone; see `Verified`.
         p_before: Chance of a difference this large under the scenario as it is.
-        p_after: Chance of a difference this large under the corrected model.
+        p_after: Chance of a difference this large under the corrected model; None likewise.
     """
 
     before: float
-    after: float
+    after: float | None
     floor: float
     expected: float
     shrink: float | None
     p_before: float
-    p_after: float
+    p_after: float | None
 
     @classmethod
     def of(cls, verified: Verified) -> HeldOut:
@@ -402,11 +403,12 @@ class FitEvidence:
 
     Attributes:
         p_fit: Chance of a difference this large under the scenario as it is.
-        p_fit_after: Chance of a difference this large under the selected model.
+        p_fit_after: Chance of a difference this large under the selected model; None if it was not
+            tested, since the budget ended.
     """
 
     p_fit: float
-    p_fit_after: float
+    p_fit_after: float | None
 
 
 @dataclass(frozen=True)
@@ -726,7 +728,7 @@ class Diagnosis:
 
     __pydantic_config__ = ConfigDict(extra="forbid")
 
-    schema: Literal["ugat-marl/diagnosis/6"]
+    schema: Literal["ugat-marl/diagnosis/7"]
     scenario: str
     seed: int
     alpha: float

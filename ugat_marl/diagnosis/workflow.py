@@ -490,6 +490,10 @@ def _record(
     searched = _unsearched(
         study, timing, conclusion.verdict, conclusion.sentence, None if complete else examined
     )
+    heldout, evidence = HeldOut.of(verified), FitEvidence(base.residual.p, best.residual.p)
+    if best.model.members and not tables:  # the budget ended before its own test
+        heldout = replace(heldout, after=None, p_after=None)
+        evidence = replace(evidence, p_fit_after=None)
     return replace(
         searched,
         effects=(*named, *searched.effects),
@@ -497,8 +501,8 @@ def _record(
         left=disagreements(study, best) if best.model.members else (),
         alternatives=() if selected is None else _alternatives(conclusion, selected),
         best=_explanation(best.model) if best.model.members else None,
-        heldout=HeldOut.of(verified),
-        evidence=FitEvidence(base.residual.p, best.residual.p),
+        heldout=heldout,
+        evidence=evidence,
         statistics=sides.statistics,
         lanes=sides.lanes,
         criteria=sides.criteria,

@@ -49,7 +49,7 @@ def test_the_same_inputs_give_the_same_file(street, measured: MeasuredData, tmp_
 def test_the_answer_is_the_file(street, measured: MeasuredData, tmp_path: Path) -> None:
     found = run(street, measured, tmp_path)
     assert json.loads((tmp_path / "diagnosis.json").read_text()) == found
-    assert found["schema"] == "ugat-marl/diagnosis/6"
+    assert found["schema"] == "ugat-marl/diagnosis/7"
     assert found["hashes"] == {"scenario": street.scenario.hash, "measured": measured.hash}
     assert found["periods"] == {"fit": ["day1", "day2", "day3"], "heldout": ["day4", "day5"]}
     assert not found["verified_on_fitted_periods"]
@@ -280,6 +280,8 @@ def test_a_search_without_time_for_a_test_keeps_its_nearest_explanation(
     assert (effect["name"], effect["place"]) == ("undercount", "stop:S_C_0")
     assert effect["parameters"]["share"]["low"] is None, "an interval needs a test"
     assert "not verified" in found["sentence"]
+    untested = (found["heldout"]["after"], found["heldout"]["p_after"])
+    assert (*untested, found["evidence"]["p_fit_after"]) == (None, None, None)
     assert (tmp_path / found["corrected"] / "scenario.toml").is_file()
     monkeypatch.undo()
     whole_search = run(street, measured, tmp_path)

@@ -20,7 +20,7 @@ def says(verdict: str, *effects: Mapping[str, Any], **more: Any) -> Diagnosis | 
     grounds = {"distance": 1.0, "runner_up_is_worse_by": None}
     return Diagnosis.from_json(
         nothing | {name: [] for name in many} | {
-            "schema": "ugat-marl/diagnosis/6", "scenario": "single-v1", "seed": 0, "alpha": 0.05,
+            "schema": "ugat-marl/diagnosis/7", "scenario": "single-v1", "seed": 0, "alpha": 0.05,
             "budget_h": None, "budget_s": 1.0,
             "periods": {"fit": [], "heldout": []}, "hashes": {}, "versions": {},
             "verified_on_fitted_periods": True, "sentence": "", "complete": True,
