@@ -317,6 +317,22 @@ def test_weights_of_a_short_log_follow_the_network() -> None:
     assert drawn[:, 1].std(0).max() > 1.5 * drawn[:, 0].std(0).max()
 
 
+@pytest.mark.parametrize("agents", [1, 2])
+def test_intervals_of_lost_commands_hold_the_truth_as_often_as_they_say(
+    agents: int, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Of the 90 % intervals of short logs nine in ten hold the share, of one intersection too."""
+    monkeypatch.setitem(globals(), "AGENTS", AGENTS[:agents])
+    monkeypatch.setitem(globals(), "LAYOUTS", {a: LAYOUTS[a] for a in AGENTS})
+    held: list[bool] = []
+    for seed in range(60):
+        found = fit_channel(log_of(lost=0.2, rows=dict.fromkeys(AGENTS, 60), seed=seed))
+        numbers = found.as_dict(INTERVAL_S)
+        low, high = (numbers.get(f"channel/missing_{end}/a_0", 0.0) for end in ("low", "high"))
+        held.append(low <= 0.2 <= high)
+    assert 50 <= sum(held) <= 59
+
+
 def test_the_largest_weight_stays_however_large_a_weight_must_be() -> None:
     channel = fit_channel(log_of(lag=2, lost=0.4), ChannelConfig(least_share=0.9))
     assert channel.network[2] == 1.0

@@ -59,8 +59,8 @@ class ChannelConfig:
     Attributes:
         most_lag: Longest delay of a command, in decisions. Commands that are later still spread
             over all lags, since none explains them.
-        pull: Decisions that the network's weights count for at each intersection. Halved,
-            intersections with short logs are believed sooner.
+        pull: Decisions that the weights of a network of many count for at each intersection.
+            Halved, intersections with short logs are believed sooner.
         least_rows: Fewest observations of an entry of the table before it may forbid a phase, where
             the log has no masks. Halved, a few lost commands look like a forbidden phase.
         refused: Share of the usual chance of being obeyed below which a phase is forbidden, where
@@ -343,7 +343,7 @@ def fit_channel(
     masked = all(course.mask is not None for course in courses)
     tables = [course.free_table() for course in courses]
     network, counts = _mixture(courses, tables, None, config)
-    fitted = partial(CommandChannel, tuple(log.agents), pull=config.pull)
+    fitted = partial(CommandChannel, tuple(log.agents), pull=_pull(len(log.agents), config))
     weights = fitted(network=network, counts=counts, tables=tuple(tables)).weights
     lags = [int(own[:-1].argmax()) for own in weights]
     if masked:
@@ -585,7 +585,18 @@ def _mixture(
             break
     weights = np.where(weights >= min(config.least_share, weights.max()), weights, 0.0)
     weights /= weights.sum()
-    return weights, np.stack([_own_counts(same, weights, config.pull) for same in explains])
+    pull, found = _pull(len(explains), config), weights > 0
+    # What all kinds that are found explain alike says nothing of their weights.
+    telling = [same[:, ~same[found].all(0)] if found.sum() > 1 else same for same in explains]
+    return weights, np.stack([_own_counts(same, weights, pull) for same in telling])
+
+
+def _pull(agents: int, config: ChannelConfig) -> float:
+    """Return the decisions that the network's weights count for at each of some intersections.
+
+    They count less the more of them is the intersection's own; a single one has them from itself.
+    """
+    return max(1.0, config.pull * (1.0 - 1.0 / agents))
 
 
 def _maximum(rows: NDArray[np.bool_], support: set[int]) -> tuple[float, Floats]:
