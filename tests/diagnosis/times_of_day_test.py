@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
@@ -45,6 +47,36 @@ def test_a_difference_is_seen_however_many_stretches_there_are(stretches: int) -
     assert null.test(data(max(stretches, 5), 1.05)).p < 1e-3
     chances = [null.test(data(max(stretches, 5))).p for _ in range(20)]
     assert min(chances) > 1e-3 and sum(p < 0.05 for p in chances) <= 4
+
+
+def test_an_interval_that_some_days_lack_is_compared_on_the_others() -> None:
+    """Of twenty days each lacks a twentieth of the intervals, and one interval is mostly gone."""
+    generator = np.random.default_rng(5)
+    reference = Reference(POOLS, [drawn_day(generator, 0, 1, 1.0) for _ in range(36)])
+    data: list[Tally] = []
+    for _ in range(20):
+        day = drawn_day(generator, 0, 1, 1.1)
+        known = (generator.random(day.bins.shape) > 0.05).astype(float)
+        known[..., 7] = generator.random() > 0.8
+        data.append(replace(day, bins=day.bins * known, known=known))
+    distance, used = reference.distance(data), reference.blocks["time"].used
+    compared = distance.used["time"][used].reshape(-1, 12)
+    assert compared[:, :7].all() and compared[:, 8:].all() and not compared[:, 7].any()
+    # a tenth more than 40 vehicles, whatever days are missing
+    assert distance.difference["time"][used].mean() == pytest.approx(4 * 11 / 12, abs=0.5)
+
+
+def test_a_group_of_intervals_counts_on_days_that_have_it_whole() -> None:
+    pools = Pools({"network": np.ones((1, 1))}, NUMBERS, together=3)
+
+    def day(missing: int) -> Tally:
+        bins = np.full((len(BIN_FEATURES), 1, 6), 10.0)
+        known = np.ones_like(bins)
+        known[..., missing] = 0.0
+        return Tally(np.zeros((len(FEATURES), 1, 2)), bins * known, known=known)
+
+    sums = pools.pool_all([day(0), day(1), day(4)])["time"]
+    assert (sums == np.array([[30.0, 1.0], [60.0, 2.0]])).all()
 
 
 def test_values_are_as_certain_as_within_a_stretch() -> None:

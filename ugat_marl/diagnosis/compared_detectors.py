@@ -105,9 +105,9 @@ def missing_interval_findings(
     return (
         Finding(
             f"counts.csv: intervals are missing at {len(others)} of "
-            f"{counted(len(compared), 'detector')} ({_few(others)}); there only bins of "
-            "time are compared, and no means over periods. Fill the gaps, or leave the periods "
-            "with gaps out"
+            f"{counted(len(compared), 'detector')} ({_few(others)}); there only times are compared "
+            "that half of the periods have, and no means. Fill the gaps, or leave the periods with "
+            "gaps out"
         ),
     )
 

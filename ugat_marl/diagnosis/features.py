@@ -391,7 +391,8 @@ class Tally:
             together: Number of bins in a group; leftover bins at the end are not used.
 
         Returns:
-            Sums of the groups and numbers of periods, both ``(bin features, places, groups)``.
+            Sums of the groups and numbers of periods, both ``(bin features, places, groups)``; sums
+            of groups that were never counted whole are 0.
         """
         width = min(together, self.bins.shape[-1])
         groups = self.bins.shape[-1] // width
@@ -399,7 +400,8 @@ class Tally:
         bins, counted = (
             values[..., : groups * width].reshape(shape) for values in (self.bins, self.counted)
         )
-        return bins.sum(axis=-1), counted.min(axis=-1)
+        times = counted.min(axis=-1)
+        return np.where(times > 0, bins.sum(axis=-1), 0.0), times
 
     def __add__(self, other: Tally) -> Tally:
         bins = min(self.bins.shape[-1], other.bins.shape[-1])

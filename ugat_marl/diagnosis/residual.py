@@ -28,7 +28,6 @@ from ugat_marl.diagnosis.statistics import (
     by_turns,
     correlation_groups,
     softened,
-    sum_of,
     whitened,
     without_noise,
 )
@@ -219,7 +218,7 @@ class MatchedFilters:
         fitted: Sequence[Mapping[str, Array]] = (),
     ) -> None:
         self._thresholds = thresholds = reference.pools.thresholds
-        sums = reference.pools.pool(sum_of(data))
+        sums = reference.pools.pool_all(data)
         self._parts: list[tuple[str, list[Group]]] = []
         scales: dict[str, Array] = {}
         for name in blocks:
@@ -228,7 +227,7 @@ class MatchedFilters:
             block = reference.blocks[name]
             weight = sums[name][..., 1] / len(data)
             groups = correlation_groups(
-                block.used & (weight >= thresholds.least_measured), block.correlation
+                block.used & (weight >= reference.pools.least_weight(name)), block.correlation
             )
             self._parts.append((name, groups))
             more = 0.0 if extra is None else extra[name]

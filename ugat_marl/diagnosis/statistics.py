@@ -110,6 +110,21 @@ class Pools:
         pooled["time"] = time.reshape(-1, *time.shape[2:])
         return pooled | dict(tally.supplementary)
 
+    def pool_all(self, tallies: Sequence[Tally]) -> dict[str, Array]:
+        """Return the pooled sums of several periods, which may lack bins of time.
+
+        A group of bins counts in the periods that have the whole group.
+        """
+        pooled = self.pool(sum_of(tallies))
+        if any(tally.known is not None for tally in tallies):
+            groups = pooled["time"].shape[1]
+            pooled["time"] = np.sum([self.pool(x)["time"][:, :groups] for x in tallies], axis=0)
+        return pooled
+
+    def least_weight(self, block: str) -> float:
+        """Return the observations per measured period that a statistic of a block needs."""
+        return self.thresholds.least_counted if block == "time" else self.thresholds.least_measured
+
 
 @dataclass(frozen=True, eq=False)
 class Block:
@@ -299,7 +314,7 @@ class Reference:
             days = self._level(_stack(self.pools, data), data)
             sums = {name: several.sum(axis=0) for name, several in days.items()}
         else:
-            sums = self.pools.pool(sum_of(data))
+            sums = self.pools.pool_all(data)
         # The mean of a stretch comes from its own n of all N days. If it has a share s of the data,
         # the errors of these means add up to the sum of N s ** 2 / n times that of the mean of all
         # days: once where data and days are divided alike.
@@ -318,7 +333,7 @@ class Reference:
             other = relative_to.blocks[name] if relative_to else block
             weight = sums[name][..., 1] / len(data)
             seen = _observations(name, other.mean, weight)
-            used = other.used & (seen >= self._thresholds.least_measured)
+            used = other.used & (seen >= self.pools.least_weight(name))
             compared[name] = used
             value = sums[name][..., 0] / np.maximum(sums[name][..., 1], 1e-9)
             variance = block.noise(weight, len(data)) + missing * self._of_stretches[name]
@@ -640,7 +655,7 @@ class Whitener:
     ) -> None:
         chosen = relative_to or reference
         distance = reference.distance(data, relative_to=chosen)
-        sums = reference.pools.pool(sum_of(data))
+        sums = reference.pools.pool_all(data)
         self._parts: list[tuple[str, Array, list[Group]]] = []
         for name, block in reference.blocks.items():
             if blocks is not None and name not in blocks:
@@ -652,7 +667,7 @@ class Whitener:
                 name, reference.pools.thresholds
             )  # 0 for blocks that are not softened
             scale = np.sqrt(noise + (max(tolerance, soft) * difference) ** 2)
-            used = chosen.blocks[name].used & (weight >= reference.pools.thresholds.least_measured)
+            used = chosen.blocks[name].used & (weight >= reference.pools.least_weight(name))
             self._parts.append((name, scale, correlation_groups(used, block.correlation)))
         self.measured = self(distance.difference)
 

@@ -536,7 +536,12 @@ class Study:
         """
         total = sum_of(data)
         supplied = {name: sums[..., 1:] > 0 for name, sums in total.supplementary.items()}
-        counted, known = total.sums[..., 1:] > 0, total.counted >= total.days
+        counted = total.sums[..., 1:] > 0
+        enough = self.pools.pool_all(data)["time"][..., 1] >= self.pools.least_weight("time") * len(
+            data
+        )
+        groups = enough.reshape(*total.bins.shape[:2], -1)
+        known = np.repeat(groups, self.pools.together, axis=-1)
         width = min(known.shape[-1], *(day.bins.shape[-1] for day in tallies))
         seen = [
             Tally(

@@ -216,6 +216,10 @@ class Thresholds(DayThresholds):
     least_measured: float = 1.0
     """Observations per measured period below which a mean is not compared. Halved: means of a
     vehicle in every second period are compared."""
+    least_counted: float = 0.5
+    """Share of the measured periods that have to have counted a bin of time. By hand. Halved: bins
+    are compared that one period in four has.
+    """
     least_count: float = 0.5
     """Vehicles per bin of time below which the bin is not compared. By hand. Halved: bins with a
     vehicle on every fourth day are compared."""
