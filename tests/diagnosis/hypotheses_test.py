@@ -45,11 +45,19 @@ CARS = '<vehicle id="one" type="car" route="north" depart="0"/>'
 
 
 def test_types_that_disagree_are_averaged(crossing: Crossing) -> None:
-    # accel 2.5 and 1.5; sigma 0 on all that say anything.
+    # accel 2.5 and 1.5; sigma 0, and SUMO's 0.5 of the passenger cars that do not say it.
     found = by_name(load_scenario(crossing(vehicles=CARS, types=TYPES)))
     assert found["acceleration"].nominal == (2.0,)
     assert found["deceleration"].nominal == (4.5,)
-    assert found["imperfection"].nominal == (0.0,)
+    assert found["imperfection"].nominal == (0.25,)
+
+
+def test_trucks_alone_do_not_say_how_cars_accelerate(crossing: Crossing) -> None:
+    types = '<vType id="lorry" vClass="truck" accel="1.3"/><vType id="plain"/>'
+    cars = CARS.replace('"car"', '"plain"')
+    found = by_name(load_scenario(crossing(vehicles=cars, types=types)))
+    values = {1.3, 2.6, 2.5}  # the type of the fixture has 2.5
+    assert found["acceleration"].nominal == pytest.approx((sum(values) / 3,))
 
 
 def test_what_is_no_number_is_taken_as_sumos_default(crossing: Crossing) -> None:

@@ -36,12 +36,20 @@ def driven_types(root: ET.Element) -> list[ET.Element]:
     return [element for element in root.iter("vType") if element.get("vClass") not in _NOT_DRIVEN]
 
 
-def type_values(scenario: Scenario, attribute: str) -> set[str]:
-    """Return the values of an attribute in the driven vehicle types of a scenario."""
+def type_values(scenario: Scenario, attribute: str, default: str = "") -> set[str]:
+    """Return the values of an attribute in the driven vehicle types of a scenario.
+
+    Args:
+        scenario: The scenario.
+        attribute: Attribute of vehicle types.
+        default: Value of passenger cars whose type does not name it; "" to leave these out.
+    """
     texts: set[str] = set()
     for document in (*scenario.additional, *scenario.routes):
         for part in parts_with(document, "<vType"):
-            texts |= {_text(kind, attribute) for kind in driven_types(part)}
+            for kind in driven_types(part):
+                usual = default if kind.get("vClass", "passenger") == "passenger" else ""
+                texts.add(_text(kind, attribute) or usual)
     return texts - {""}
 
 
@@ -57,7 +65,7 @@ def nominal_number(scenario: Scenario, attribute: str, default: float) -> float:
         The mean of the different values in the scenario's types.
     """
     try:
-        values = [float(text) for text in type_values(scenario, attribute)]
+        values = {float(text) for text in type_values(scenario, attribute, str(default))}
     except ValueError:
         return default
     return fmean(sorted(values)) if values else default
