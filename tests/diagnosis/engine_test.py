@@ -275,7 +275,9 @@ def test_a_day_that_failed_is_tried_again(
     assert len(made.replicates((), [0])) == len(streets.calls) == 1
 
 
-@pytest.mark.parametrize("damage", ["empty", "half", "text", "flipped", "other"])
+@pytest.mark.parametrize(
+    "damage", ["empty", "half", "text", "flipped", "encrypted", "method", "other"]
+)
 def test_a_damaged_file_is_simulated_again(
     scenario: Scenario, layout: DetectorLayout, tmp_path: Path, damage: str
 ) -> None:
@@ -285,12 +287,23 @@ def test_a_damaged_file_is_simulated_again(
     content = file.read_bytes()
     flipped = bytearray(content)
     flipped[len(content) // 3 : len(content) // 3 + 40] = bytes(40)
+    entry = content.rindex(b"PK\1\2")  # of the archive's directory; flags and method follow
+    encrypted, method = bytearray(content), bytearray(content)
+    encrypted[entry + 8] ^= 1
+    method[entry + 10] ^= 64
     if damage == "other":
         with file.open("wb") as stream:
             np.savez(stream, something=np.zeros(3))
     else:
-        changed = {"empty": b"", "half": content[: len(content) // 2], "text": b"no archive"}
-        file.write_bytes(changed.get(damage, bytes(flipped)))
+        changed = {
+            "empty": b"",
+            "half": content[: len(content) // 2],
+            "text": b"no archive",
+            "flipped": flipped,
+            "encrypted": encrypted,
+            "method": method,
+        }
+        file.write_bytes(changed[damage])
     again, streets = an_engine(scenario, layout, tmp_path)
     assert same(again.replicates((), [0])[0], simulated)
     assert len(streets.calls) == 1
