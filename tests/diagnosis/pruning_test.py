@@ -185,6 +185,15 @@ def test_an_effect_that_is_fitted_to_nothing_is_not_named() -> None:
     assert ledger.left(nothing) == ()
 
 
+def test_what_the_fit_without_another_effect_makes_too_weak_to_matter_is_dropped() -> None:
+    every, weak = ("headway", "demand_level", "desired_speed"), (DEMAND[0], (0.99,))
+    costs: dict[tuple[str, ...], float]
+    costs = {every: 1000.0, every[:2]: 900.0, every[::2]: 9000.0, every[1:]: 9000.0}
+    costs |= {("headway",): 5000.0, ("demand_level",): 9000.0}
+    ledger = Ledger(costs, dict.fromkeys(costs, 0.9), refined={every[:2]: (HEADWAY, weak)})
+    assert ledger.left(HEADWAY, DEMAND, SPEED) == (HEADWAY,)
+
+
 def test_progress_is_told_of_every_smaller_set() -> None:
     both = ("headway", "demand_level")
     ledger = Ledger({both: 1000.0, ("headway",): 1900.0, ("demand_level",): 9000.0}, {both: 0.9})

@@ -7,7 +7,7 @@ from typing import Protocol
 import numpy as np
 
 from ugat_marl.diagnosis.fit import Fitter, cost_of
-from ugat_marl.diagnosis.hypotheses import each_left_out, merged, title_of
+from ugat_marl.diagnosis.hypotheses import Members, each_left_out, merged, title_of
 from ugat_marl.diagnosis.records import Fitted, Tested
 from ugat_marl.progress import Reporter
 
@@ -56,7 +56,7 @@ class Pruner:
             best: The tested set to start from.
             base: The scenario as it is; the result if every effect is fitted to nothing.
         """
-        members = tuple(member for member in best.model.members if member[0].matters(member[1]))
+        members = _that_matter(best.model.members)
         if not members:
             return base
         if len(members) < len(best.model.members):
@@ -64,10 +64,13 @@ class Pruner:
         best = self._tests.exact(best)
         while len(best.model.members) > 1 and (smaller := self._smaller(best)) is not None:
             best = self._tests.exact(smaller)
-        remaining = merged((), best.model.members)
-        if len(remaining) < len(best.model.members):
-            best = self._tested_exactly(self._fitter.simulate(remaining)) if remaining else base
-        return self._sure(best, base)
+        # Every effect that is dropped moves the values of the others.
+        while (members := self._nameable(best)) != best.model.members:
+            if not members:
+                return base
+            refined = self._refined(self._fitter.simulate(members))
+            best = self._tests.exact(self._tests.test(refined))
+        return best
 
     def _smaller(self, best: Tested) -> Tested | None:
         """Return the set with one effect less that suffices; None if every effect is needed."""
@@ -101,18 +104,17 @@ class Pruner:
                 advance(note=title_of(parts[index]))
         return fewer
 
-    def _sure(self, best: Tested, base: Tested) -> Tested:
-        """Drop effects whose intervals hold their usual values, the least certain one first.
+    def _nameable(self, best: Tested) -> Members:
+        """Return the effects without those that do not matter, or else without a doubtful one.
 
-        The errors of `best` are exact.
+        That is the least certain of those whose intervals hold their usual values. The errors of
+        `best` are exact.
         """
-        while unsure := doubtful(best, self._thresholds.half_interval):
-            least = min(unsure, key=lambda index: _deviations(best, index))
-            members = each_left_out(best.model.members)[least]
-            if not members:
-                return base
-            best = self._tested_exactly(self._refined(self._fitter.simulate(members)))
-        return best
+        members = _that_matter(best.model.members)
+        unsure = doubtful(best, self._thresholds.half_interval)
+        if len(members) < len(best.model.members) or not unsure:
+            return members
+        return each_left_out(members)[min(unsure, key=lambda index: _deviations(best, index))]
 
     def _refined(self, model: Fitted) -> Fitted:
         return self._fitter.refine(model, self._thresholds.steps_without)
@@ -120,9 +122,6 @@ class Pruner:
     def _settled(self, model: Fitted) -> Fitted:
         """Return a model with the number of days by which costs are compared."""
         return self._fitter.simulate(model.members, self._thresholds.settling_days)
-
-    def _tested_exactly(self, model: Fitted) -> Tested:
-        return self._tests.exact(self._tests.test(model))
 
     def _beyond_doubt(self, tested: Tested, index: int) -> bool:
         """Return True if the data fit so much worse without the member at `index` that it stays.
@@ -134,6 +133,11 @@ class Pruner:
         certain = bool((tested.errors_of(index) > 0.0).all())
         known = bool(values) and hypothesis.nominal is not None and certain
         return known and _deviations(tested, index) > self._thresholds.beyond_doubt
+
+
+def _that_matter(members: Members) -> Members:
+    """Return the effects that are strong enough to be named."""
+    return tuple(member for member in merged((), members) if member[0].matters(member[1]))
 
 
 def _deviations(tested: Tested, index: int) -> float:
