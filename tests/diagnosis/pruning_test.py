@@ -277,6 +277,8 @@ def test_when_the_budget_ends_no_doubtful_effect_is_named_either() -> None:
     alone = [ledger.simulate((member,), 16) for member in (HEADWAY, DEMAND)]
     selector._seen = {str(number): model for number, model in enumerate([best.model, *alone])}
     assert selector._without_doubtful(best, base).model.members == (HEADWAY,)
+    nearer = replace(base, model=replace(base.model, cost=990.0))
+    assert selector._without_doubtful(best, nearer) is nearer
     selector._seen = {"both": best.model}
     assert selector._without_doubtful(best, base) is base
 
@@ -317,6 +319,9 @@ def test_when_the_budget_ends_nothing_too_small_to_matter_is_named(
     assert selector._that_matter(models[0], base) is models[0]
     if factor == 0.99:
         assert selector._that_matter(models[2], base) is base
+        selector._seen = {str(number): model for number, model in enumerate(models)}
+        nearer = replace(base, cost=990.0)
+        assert selector._that_matter(models[0], nearer) is nearer
         assert ledger.left(weak) == ()
 
 

@@ -227,21 +227,25 @@ class Selector:
         return Tested(model, base.residual, np.full(len(model.values), np.nan), {})
 
     def _without_doubtful(self, best: Tested, base: Tested) -> Tested:
-        """Return the best model that was simulated with none but the certain effects of another."""
+        """Return the best model that was simulated with none but the certain effects of another.
+
+        It is the scenario as it is if that costs no more, or if no such model was simulated.
+        """
         parts = self._parts(best.model, doubtful(best, self._thresholds.half_interval))
-        return self._untested(min(parts, key=cost_of), base) if parts else base
+        nearest = min((base.model, *parts), key=cost_of)
+        return base if nearest is base.model else self._untested(nearest, base)
 
     def _that_matter(self, model: Fitted, base: Fitted) -> Fitted:
         """Return the best model that was simulated with none but the effects that matter.
 
         It is the given model if all of its effects matter, or none was simulated, and the scenario
-        as it is if no effect matters.
+        as it is if no effect matters, or if that costs no more.
         """
         weak = [index for index, (h, values) in enumerate(model.members) if not h.matters(values)]
         if len(weak) == len(model.members):
             return base
         parts = self._parts(model, weak) if weak else ()
-        return min(parts, key=cost_of, default=model)
+        return min((base, *(parts or [model])), key=cost_of)
 
     def _parts(self, model: Fitted, left_out: Sequence[int]) -> list[Fitted]:
         """Return the models that were simulated with none but the other members of a model."""
