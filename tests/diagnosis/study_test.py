@@ -301,11 +301,21 @@ def test_windows_that_nearly_agree_are_one_time_of_day() -> None:
     ]  # fmt: skip
 
 
-def test_a_chain_of_windows_is_cut_once() -> None:
+@pytest.mark.parametrize(
+    ("windows", "common"),
+    [
+        # a chain is no single time of day
+        ([(0.0, 3600.0), (0.4, 3600.4), (0.8, 3600.8)], {(0.4, 3600.0), (0.8, 3600.8)}),
+        # the second and the third differ by more than either from the first
+        ([(0.0, 3600.0), (0.2, 3600.5), (0.3, 3599.9)], {(0.3, 3599.9)}),
+    ],
+)
+def test_windows_are_compared_with_the_first_of_their_time_of_day(
+    windows: list[tuple[float, float]], common: set[tuple[float, float]]
+) -> None:
     day = measured(NAMES, NAMES).periods[0]
-    begins = (0.0, 0.4, 0.8)
-    moved = tuple(replace(day, begin_s=begin, end_s=begin + 3600.0) for begin in begins)
-    assert {period.window for period in _of_common_windows(moved)} == {(0.8, 3600.0)}
+    moved = tuple(replace(day, begin_s=begin_s, end_s=end_s) for begin_s, end_s in windows)
+    assert {period.window for period in _of_common_windows(moved)} == common
 
 
 @pytest.mark.parametrize(
@@ -346,12 +356,27 @@ def test_periods_of_different_lengths_are_refused_by_name() -> None:
     periods = measured(NAMES, NAMES).periods
     longer = replace(periods[1], end_s=160.0)
     with pytest.raises(MeasuredDataError, match="'day1' is 160 s long, and 'day0' only 100 s"):
-        module._refuse_lengths((periods[0], longer), Thresholds())
+        module._refuse_lengths(*[(periods[0], longer)] * 2, Thresholds())
     ends = (0.4999, 0.5001)  # of a bin more: nearly one length, and another number of bins
     bin_s = Thresholds().bin_s
     near = tuple(replace(periods[0], id=str(x), end_s=(3 + x) * bin_s) for x in ends)
     with pytest.raises(MeasuredDataError, match="periods of one length"):
-        module._refuse_lengths(near, Thresholds())
+        module._refuse_lengths(near, near, Thresholds())
+
+
+def test_lengths_are_compared_before_windows_are_joined() -> None:
+    day = measured(NAMES, NAMES).periods[0]
+    windows = ((0.0, 3600.0), (0.5, 3600.2), (0.3, 3599.5), (7200.0, 10800.0))
+    given = tuple(
+        replace(day, id=str(window), begin_s=window[0], end_s=window[1]) for window in windows
+    )
+    common = _of_common_windows(given)
+    assert [period.length_s for period in common] == [3599.0, 3599.0, 3599.0, 3600.0]
+    module._refuse_lengths(given, common, THRESHOLDS)
+    longer = replace(day, id="longer", begin_s=7200.0, end_s=10801.0)
+    told = r"'longer' is 3601 s long, and '\(0.3, 3599.5\)' only 3599.2 s"
+    with pytest.raises(MeasuredDataError, match=told):
+        module._refuse_lengths((*given, longer), (*common, longer), THRESHOLDS)
 
 
 def test_demand_that_varies_from_day_to_day_is_told_from_chance() -> None:

@@ -67,7 +67,7 @@ from ugat_marl.scenarios import (
 )
 
 SAME_TIME_S = 0.5
-"""Difference of the begins, ends or lengths of periods that are meant to be the same, s."""
+"""Difference of the begins or ends of periods that are meant to be the same, s."""
 
 
 @dataclass(frozen=True)
@@ -186,11 +186,12 @@ class Study:
         network, thresholds = Network.read(scenario), config.thresholds
         detectors, findings = compared_detectors(scenario, measured, thresholds)
         measured, data_hash = _noted(measured, findings), measured.hash
+        given = measured.periods
         measured, holes = _without_holes(measured)
         layout = DetectorLayout.of(network, detectors, scenario.settings.begin_s)
         ruled_out = frozenset(name for finding in measured.findings for name in finding.rules_out)
         allowed = library(config.leave_out) - ruled_out
-        periods = _fitted_periods(measured, thresholds)
+        periods = _fitted_periods(measured, given, thresholds)
         answering = _answering(measured, layout.intersections)
         effort = config.effort or effort_for(len(layout.intersections), measured.periods)
         supplementary = SupplementaryData.of(measured)
@@ -643,10 +644,12 @@ def _noted(measured: MeasuredData, findings: Sequence[Finding]) -> MeasuredData:
     return replace(measured, findings=(*measured.findings, *findings))
 
 
-def _fitted_periods(measured: MeasuredData, thresholds: Thresholds) -> tuple[Period, ...]:
+def _fitted_periods(
+    measured: MeasuredData, given: Sequence[Period], thresholds: Thresholds
+) -> tuple[Period, ...]:
     if not (periods := measured.of("fit")):
         raise MeasuredDataError("no period has the split 'fit'; there is nothing to fit")
-    _refuse_lengths(measured.periods, thresholds)
+    _refuse_lengths(given, measured.periods, thresholds)
     return periods
 
 
@@ -712,14 +715,15 @@ def _without_holes(measured: MeasuredData) -> tuple[MeasuredData, tuple[tuple[fl
 
 
 def _of_common_windows(periods: tuple[Period, ...]) -> tuple[Period, ...]:
-    """Return the periods with one window where theirs differ by at most `SAME_TIME_S`.
+    """Return the periods with one window for each time of day: what its periods have in common.
 
-    The window is what they have in common. Exactly equal windows are days of one time of day.
+    Their begins and ends differ from those of the first one by at most `SAME_TIME_S`. Exactly equal
+    windows are days of one time of day.
     """
     groups: list[list[tuple[float, float]]] = []
     for window in sorted({period.window for period in periods}):
-        last = groups[-1][-1] if groups else (-math.inf, -math.inf)
-        near = all(abs(a - b) <= SAME_TIME_S for a, b in zip(window, last, strict=True))
+        first = groups[-1][0] if groups else (-math.inf, -math.inf)
+        near = all(abs(a - b) <= SAME_TIME_S for a, b in zip(window, first, strict=True))
         if near:
             groups[-1].append(window)
         else:
@@ -735,21 +739,30 @@ def _of_common_windows(periods: tuple[Period, ...]) -> tuple[Period, ...]:
     )
 
 
-def _refuse_lengths(periods: Sequence[Period], thresholds: Thresholds) -> None:
+def _refuse_lengths(
+    given: Sequence[Period], common: Sequence[Period], thresholds: Thresholds
+) -> None:
     """Refuse periods of different lengths: their statistics are not of one kind.
 
+    Args:
+        given: The periods as they were given.
+        common: The same periods in common windows.
+        thresholds: Numbers of the method.
+
     Raises:
-        MeasuredDataError: The periods have different lengths.
+        MeasuredDataError: The periods have different lengths, or different numbers of bins.
     """
-    lengths = {period.id: period.length_s for period in periods}
+    lengths = {period.id: period.length_s for period in given}
+    if max(lengths.values()) - min(lengths.values()) <= 2.0 * SAME_TIME_S:  # at both ends
+        lengths = {period.id: period.length_s for period in common}
+        if len({bins_in(length, thresholds) for length in lengths.values()}) == 1:
+            return
     shortest, longest = min(lengths, key=lengths.__getitem__), max(lengths, key=lengths.__getitem__)
-    bins = {bins_in(length, thresholds) for length in lengths.values()}
-    if lengths[longest] - lengths[shortest] > SAME_TIME_S or len(bins) > 1:
-        raise MeasuredDataError(
-            f"periods.csv: {longest!r} is {lengths[longest]:g} s long, and {shortest!r} only "
-            f"{lengths[shortest]:g} s; a diagnosis needs periods of one length, so cut the longer "
-            "ones in begin_s and end_s"
-        )
+    raise MeasuredDataError(
+        f"periods.csv: {longest!r} is {lengths[longest]:g} s long, and {shortest!r} only "
+        f"{lengths[shortest]:g} s; a diagnosis needs periods of one length, so cut the longer "
+        "ones in begin_s and end_s"
+    )
 
 
 def _answering(measured: MeasuredData, lights: Sequence[str]) -> bool:
