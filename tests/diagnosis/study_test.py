@@ -15,7 +15,7 @@ import polars as pl
 import pytest
 
 from ugat_marl.data import MeasuredData
-from ugat_marl.diagnosis import DiagnosisConfig, Study, Tally
+from ugat_marl.diagnosis import DiagnosisConfig, Study, Tally, diagnose
 from ugat_marl.diagnosis import study as module
 from ugat_marl.diagnosis.compared_detectors import (
     detectors_to_compare,
@@ -37,7 +37,7 @@ from ugat_marl.effects import (
     Headway,
     load_scenario,
 )
-from ugat_marl.errors import MeasuredDataError, OptionError
+from ugat_marl.errors import MeasuredDataError, OptionError, OutputError
 from ugat_marl.progress import Silent
 from ugat_marl.scenarios import Detector, Network, Passages, Period
 from ugat_marl.simulation import standard_detectors
@@ -362,6 +362,18 @@ def test_periods_of_different_lengths_are_refused_by_name() -> None:
     near = tuple(replace(periods[0], id=str(x), end_s=(3 + x) * bin_s) for x in ends)
     with pytest.raises(MeasuredDataError, match="periods of one length"):
         module._refuse_lengths(near, near, Thresholds())
+
+
+def test_a_place_that_cannot_be_written_is_refused_before_any_work(tmp_path: Path) -> None:
+    (tmp_path / "file").touch()
+    nothing = cast(Any, None)
+    with pytest.raises(OutputError, match="cannot be written"):
+        diagnose(load_scenario("single-v1"), nothing, tmp_path / "file")
+
+
+def test_the_folder_of_the_cache_may_be_a_text() -> None:
+    folder: Any = "cached"
+    assert DiagnosisConfig(cache=folder).cache == Path("cached")
 
 
 def test_lengths_are_compared_before_windows_are_joined() -> None:

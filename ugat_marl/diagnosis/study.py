@@ -105,6 +105,8 @@ class DiagnosisConfig:
 
     def __post_init__(self) -> None:
         require_kinds(self, "diagnosis")
+        if self.cache is not None:
+            object.__setattr__(self, "cache", Path(self.cache))
         for name in ("budget_h", "budget_s"):
             budget = getattr(self, name)
             if budget is not None and not budget > 0:

@@ -65,7 +65,7 @@ from ugat_marl.diagnosis.verdict import (
 from ugat_marl.diagnosis.verify import judged, tables_of, verify_model
 from ugat_marl.effects import Effect, apply_effects
 from ugat_marl.errors import OutputError
-from ugat_marl.files import put_folder
+from ugat_marl.files import put_folder, require_writable
 from ugat_marl.progress import Reporter, Silent
 from ugat_marl.scenarios import Scenario
 
@@ -96,11 +96,12 @@ def diagnose(
 
     Raises:
         MeasuredDataError: The data hold nothing to compare.
-        OutputError: The scenario is the corrected one in `directory`, which would be replaced; or
-            the folder of that name there holds something else.
+        OutputError: The scenario is the corrected one in `directory`, which would be replaced; the
+            folder of that name there holds something else; or `directory` cannot be written to.
     """
     directory = Path(directory)
     _require_replaceable(scenario, directory / CORRECTED)
+    require_writable(directory / FILE)
     config = config or DiagnosisConfig()
     reporter = reporter or Silent()
     study = Study.of(scenario, measured, config)
