@@ -631,6 +631,17 @@ def test_a_folder_that_no_diagnosis_wrote_is_not_replaced(
     assert notes.read_text() == "mine"
 
 
+def test_a_page_of_something_else_is_not_removed(
+    street: Street, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    page = tmp_path / "report.html"
+    head = '<!DOCTYPE html>\n<meta name="generator" content="ugat_marl">\n<title>{}</title>'
+    page.write_text(text := head.format("Run first: dqn on single-v1"))
+    assert main(street.arguments(tmp_path, "--no-report")) == 2
+    assert "no page of ugat_marl titled 'Diagnosis of ...'" in capsys.readouterr().err
+    assert page.read_text() == text
+
+
 def test_a_cache_that_cannot_be_written_is_named_before_anything_runs(
     street: Street, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:

@@ -33,6 +33,7 @@ from ugat_marl.errors import OptionError, OutputError
 from ugat_marl.files import require_writable
 from ugat_marl.progress import Bars
 from ugat_marl.reporting import (
+    DIAGNOSIS_TITLE,
     LightNames,
     diagnosis_summary,
     require_page_place,
@@ -101,8 +102,8 @@ class Diagnose:
         scenario = load_scenario(self.scenario)
         network = Network.read(scenario)
         measured = read_measured(self.measured, scenario, network)
-        require_writable(self.out / FILE)
-        require_page_place(self.out / REPORT)  # without a report, an earlier page is removed
+        # Without a report, an earlier page is removed.
+        require_page_place(self.out / REPORT, DIAGNOSIS_TITLE)
         self._check_cache()
         _say_what_cannot_be_seen(measured, console)
         try:

@@ -18,6 +18,7 @@ from ugat_marl.experiments import policy_factory, policy_gap, read_diagnosis, wr
 from ugat_marl.files import require_writable
 from ugat_marl.progress import Bars
 from ugat_marl.reporting import (
+    DIAGNOSIS_TITLE,
     commands_on_page,
     policy_gap_table,
     require_page_place,
@@ -69,7 +70,7 @@ class PolicyGap:
         scenario = load_scenario(self.scenario, self.duration_s)
         diagnosis, corrected = read_diagnosis(self.directory, scenario, self.duration_s)
         require_writable(self.directory / FILE)
-        require_page_place(self.directory / REPORT)
+        require_page_place(self.directory / REPORT, DIAGNOSIS_TITLE)
         if same_for_agents(corrected, scenario):
             console.print("note: only detectors were at fault; the traffic was not corrected")
         files = [Path(spec).suffix == ".pt" for spec in self.policies]

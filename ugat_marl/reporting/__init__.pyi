@@ -5,6 +5,7 @@ from .charts import transfer_picture as transfer_picture
 from .comparison_tables import comparison_csv as comparison_csv
 from .comparison_tables import comparison_page as comparison_page
 from .comparison_tables import terminal_tables as terminal_tables
+from .diagnosis_page import DIAGNOSIS_TITLE as DIAGNOSIS_TITLE
 from .diagnosis_page import commands_on_page as commands_on_page
 from .diagnosis_page import write_diagnosis_page as write_diagnosis_page
 from .diagnosis_tables import diagnosis_summary as diagnosis_summary

@@ -34,6 +34,8 @@ from ugat_marl.reporting.page import Figure, Grid, Page, render
 from ugat_marl.reporting.style import DISAGREEMENT
 from ugat_marl.scenarios import Network
 
+DIAGNOSIS_TITLE = "Diagnosis of"
+"""Begin of the titles of these pages."""
 _PLACES = 10
 """Number of places in the table of disagreements that is shown at once."""
 _LOUD, _QUIET = 16, 6
@@ -86,7 +88,7 @@ def diagnosis_page(diagnosis: Diagnosis, network: Network, commands: Sequence[st
     verdict, heldout = words.VERDICTS[diagnosis.verdict], diagnosis.heldout
     return render(
         "diagnosis.html.j2",
-        title=f"Diagnosis of {diagnosis.scenario}: {verdict}",
+        title=f"{DIAGNOSIS_TITLE} {diagnosis.scenario}: {verdict}",
         diagnosis=diagnosis,
         verdict=(_BADGES[diagnosis.verdict], verdict),
         partial=words.partial(diagnosis),

@@ -95,8 +95,12 @@ _FORBIDS_SCRIPTS = b"content=\"default-src 'none'; style-src 'unsafe-inline'\""
 """What pages begin with; those of earlier versions have the second line alone."""
 
 
-def require_page_place(path: Path) -> None:
+def require_page_place(path: Path, title: str = "") -> None:
     """Refuse a path that cannot become a page, or whose file holds something else.
+
+    Args:
+        path: The file to write.
+        title: Begin of the titles of pages that may be replaced; "" for every page.
 
     Raises:
         OutputError: No page can be written there, or the file there is not one of these pages.
@@ -106,9 +110,12 @@ def require_page_place(path: Path) -> None:
         return
     with path.open("rb") as file:
         begin = file.read(1000)
-    if _GENERATOR not in begin and _FORBIDS_SCRIPTS not in begin:
+    ours = _GENERATOR in begin or _FORBIDS_SCRIPTS in begin
+    if not ours or f"<title>{title}".encode() not in begin:
+        titled = f" titled '{title} ...'" if title else ""
         raise OutputError(
-            f"{path}: is no page of ugat_marl, and would be lost; move it, or give another place"
+            f"{path}: is no page of ugat_marl{titled}, and would be lost; move it, or give another "
+            "place"
         )
 
 
