@@ -14,7 +14,7 @@ import pytest
 from rich.console import Console
 
 from tests.reporting.pages import Page, assert_drawn, needs_browser, seen_in_browser
-from ugat_marl.diagnosis import Diagnosis, statistic
+from ugat_marl.diagnosis import Diagnosis, DiagnosisConfig, statistic
 from ugat_marl.diagnosis.features import ALL_FEATURES, FEATURES
 from ugat_marl.diagnosis.verdict import STATISTICS
 from ugat_marl.effects import load_scenario
@@ -26,7 +26,7 @@ from ugat_marl.reporting import (
     write_diagnosis_page,
 )
 from ugat_marl.reporting import diagnosis_words as words
-from ugat_marl.reporting.diagnosis_page import diagnosis_page
+from ugat_marl.reporting.diagnosis_page import _usual_commands, diagnosis_page
 from ugat_marl.scenarios import Network
 
 LANES = ("S_C_0", "W_C_0", "C_N_0", "C_E_0")
@@ -92,7 +92,10 @@ def content_of(verdict: str = "explained", *, complete: bool = True, **more: Any
             "floor": 180.0, "expected": 110.0, "shrink": None if same else 0.99964,
             "p_before": 0.4 if same else 1e-90, "p_after": 0.4 if same else 0.33,
         },
-        "evidence": {"p_fit": 0.4 if same else 1e-99, "p_fit_after": 0.4},
+        "evidence": {
+            "p_fit": 0.4 if same else 1e-99,
+            "p_fit_after": 1e-4 if verdict == "partially_explained" else 0.4,
+        },
         "best": None if same else {"effects": [headway, surge], "distance": 118.2, "cost": 146.2},
         "untried": [],
         "next_measurement": "speeds at the stop line" if verdict == "not_identifiable" else None,
@@ -217,7 +220,10 @@ def test_the_page_does_not_contradict_its_sentence(network: Network) -> None:
     cut = diagnosis_page(diagnosis_of("partially_explained", complete=False), network)
     assert not any(text in Page(cut).text for text in words.MEANINGS.values())
     # A value at its end, where what is left is no more than chance, is partially explained, too.
-    assert "more than chance" not in words.MEANINGS["partially_explained"]
+    chance = {"p_fit": 1e-99, "p_fit_after": 0.4}
+    ends = Page(diagnosis_page(diagnosis_of("partially_explained", evidence=chance), network)).text
+    assert words.AT_AN_END in ends
+    assert words.MEANINGS["partially_explained"] not in ends
     logged = content_of("explained")["effects"][:1]
     logged[0]["evidence"] = {"source": "signal log"}
     found = Page(diagnosis_page(diagnosis_of("unknown", effects=logged), network)).text
@@ -312,6 +318,28 @@ def test_a_page_tells_its_commands(network: Network, tmp_path: Path) -> None:
     assert commands_on_page(page) == commands
     page.write_bytes(b"\xff no page")
     assert commands_on_page(page) == []
+
+
+def test_the_usual_command_is_the_same_run() -> None:
+    def options(verdict: str = "explained", **more: Any) -> str:
+        command = _usual_commands(diagnosis_of(verdict, **more))[0]
+        return command.removeprefix("ugat-marl diagnose crossing-v1 MEASURED --out DIR ")
+
+    assert options() == "--budget-s 600 --budget-h inf --alpha 0.05 --seed 0"
+    assert options(budget_h=900.0, budget_s=None) == "--budget-h 900 --alpha 0.05 --seed 0"
+    assert DiagnosisConfig(budget_h=float("inf")).budget_h == float("inf"), "it is accepted"
+    farther = diagnosis_of().to_json()["traffic_check"] | {"better": False}
+    reason = "The effects named do not bring travel time and queue nearer."
+    pattern: Any = {"unnamed": content_of()["effects"][:1]}
+    for one, anyway in (
+        (options("partially_explained"), True),
+        (options("partially_explained", not_corrected=reason), False),
+        (options("partially_explained", **pattern), False),
+        (options(traffic_check=farther), True),
+        (options(traffic_check=farther, not_corrected=reason), False),
+        (options("unknown", traffic_check=None), False),
+    ):
+        assert ("--correct-anyway" in one) == anyway
 
 
 def test_nothing_held_out_is_said(network: Network) -> None:

@@ -403,12 +403,19 @@ def _provenance(diagnosis: Diagnosis) -> list[tuple[str, str]]:
 def _usual_commands(diagnosis: Diagnosis) -> list[str]:
     """Return the commands with words in capitals for the paths, which no record holds."""
     options = f"--alpha {diagnosis.alpha:g} --seed {diagnosis.seed}"
-    for option, value in (("h", diagnosis.budget_h), ("s", diagnosis.budget_s)):
+    hours = math.inf if diagnosis.budget_h is None else diagnosis.budget_h
+    for option, value in (("h", hours), ("s", diagnosis.budget_s)):
         options = options if value is None else f"--budget-{option} {value:.15g} {options}"
     if diagnosis.left_out:
         options += " --leave-out " + " ".join(diagnosis.left_out)
+    check = diagnosis.traffic_check
+    no_nearer = check is not None and not check.better
     if diagnosis.unnamed:
         options += " --unnamed"
+    elif diagnosis.not_corrected is None and (
+        no_nearer or diagnosis.verdict == "partially_explained"
+    ):
+        options += " --correct-anyway"
     scenario = shlex.quote(diagnosis.scenario)
     lines = [f"ugat-marl diagnose {scenario} MEASURED --out DIR {options}"]
     if diagnosis.corrected:

@@ -13,6 +13,7 @@ from ugat_marl.diagnosis import (
     EffectRecord,
     Parameter,
     Sides,
+    Thresholds,
     Verdict,
     clock,
 )
@@ -46,17 +47,34 @@ MEANINGS: dict[Verdict, str] = {
     "Any name would be a guess.",
 }
 
+AT_AN_END = (
+    "With these effects the simulation could have made the data they were judged on. But a value "
+    "at the end of what is plausible often stands for something else."
+)
+"""Meaning of "partially_explained" where what is left is no more than chance."""
+
 
 def meaning(diagnosis: Diagnosis) -> str:
     """Return the meaning of the verdict; "" if the search is not complete."""
     if not diagnosis.complete:
         return ""
+    if diagnosis.verdict == "partially_explained" and _only_chance_is_left(diagnosis):
+        return AT_AN_END
     text = MEANINGS[diagnosis.verdict]
     if diagnosis.verdict == "unknown" and diagnosis.effects:
         text += " What is listed here is read off the signals and detections themselves."
     if diagnosis.verdict == "not_identifiable" and diagnosis.corrected:
         text += " The corrected scenario holds the one listed here."
     return text
+
+
+def _only_chance_is_left(diagnosis: Diagnosis) -> bool:
+    """Return True if neither the fitted nor the held-out periods contradict the effects named."""
+    fitted = None if diagnosis.evidence is None else diagnosis.evidence.p_fit_after
+    heldout = None if diagnosis.heldout is None else diagnosis.heldout.p_after
+    if fitted is None or heldout is None:
+        return False
+    return heldout > diagnosis.alpha and fitted > Thresholds().fit_level
 
 
 def effect_name(effect: EffectRecord) -> str:
