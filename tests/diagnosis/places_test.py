@@ -22,6 +22,7 @@ from ugat_marl.diagnosis.hypotheses import library
 from ugat_marl.diagnosis.places import PlaceFinder, _later, _mixed
 from ugat_marl.diagnosis.statistics import Pools
 from ugat_marl.diagnosis.thresholds import Thresholds
+from ugat_marl.diagnosis.unmeasured import without_holes
 from ugat_marl.effects import Domain, apply_detector_effects, load_scenario, parse_domain
 from ugat_marl.scenarios import Detector, DetectorKind, Passages, Period
 
@@ -294,6 +295,16 @@ def test_a_detector_that_was_dead_all_day(reference: Reference) -> None:
     item = first(proposed(reference, fault("dropout=stop:b,0,3600")), "dropout")
     assert dict(item.fixed)["detector"] == "stop:b"
     assert window_of(item) == (0.0, 3600.0)
+
+
+def test_a_hole_of_the_recording_is_no_silence_of_detectors(reference: Reference) -> None:
+    holes = ((600.0, 1500.0),)
+    data = [without_holes(day, holes) for day in fault("dropout=exit:c,2500,2900")]
+    finder = PlaceFinder(SITE, ROUTES, library(), THRESHOLDS, holes)
+    found = finder.hypotheses(reference, reference.distance(tallies(data)), data)
+    (item,) = (hypothesis for hypothesis in found if hypothesis.name == "dropout")
+    assert dict(item.fixed)["detector"] == "exit:c"
+    assert overlap(window_of(item), (2500.0, 2900.0)) > 0.95
 
 
 def test_counts_alone_make_no_detector_silent(reference: Reference) -> None:

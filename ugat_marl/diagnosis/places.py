@@ -58,6 +58,7 @@ class PlaceFinder:
         routes: Routes of the scenario.
         allowed: Names of effects to examine.
         thresholds: Numbers of the method.
+        holes: Times in which nothing was recorded, begin and end in s.
     """
 
     def __init__(
@@ -66,7 +67,9 @@ class PlaceFinder:
         routes: Routes,
         allowed: Collection[str],
         thresholds: Thresholds,
+        holes: Sequence[tuple[float, float]] = (),
     ) -> None:
+        self._holes = tuple(holes)
         self._layout = layout
         self._thresholds = thresholds
         self._routes = routes
@@ -90,7 +93,7 @@ class PlaceFinder:
         hypotheses += self._timing(reference, distance, periods[0].end_s - periods[0].begin_s)
         hypotheses += self._windows(reference, distance, periods)
         hypotheses += self._places(reference, distance)
-        hypotheses += fault_hypotheses(self._layout, reference, distance, periods)
+        hypotheses += fault_hypotheses(self._layout, reference, distance, periods, self._holes)
         return [hypothesis for hypothesis in hypotheses if hypothesis.name in self.allowed]
 
     def everywhere(self) -> list[Hypothesis]:
@@ -801,9 +804,21 @@ def most_unusual(
 
 
 def fault_hypotheses(
-    layout: DetectorLayout, reference: Reference, distance: Distance, periods: Sequence[Period]
+    layout: DetectorLayout,
+    reference: Reference,
+    distance: Distance,
+    periods: Sequence[Period],
+    holes: Sequence[tuple[float, float]],
 ) -> list[Hypothesis]:
-    """Propose detectors that count too few, stay on, fall silent, or are exchanged."""
+    """Propose detectors that count too few, stay on, fall silent, or are exchanged.
+
+    Args:
+        layout: Lanes and detectors.
+        reference: Statistics of the model so far.
+        distance: Distance of the data from the model.
+        periods: The fitted periods.
+        holes: Times in which nothing was recorded, begin and end in s.
+    """
     thresholds = reference.pools.thresholds
     hypotheses: list[Hypothesis] = []
     places = {name: (place, INDEX[kind]) for name, (kind, place) in layout.counted.items()}
@@ -825,8 +840,8 @@ def fault_hypotheses(
             )
     stuck = _stuck(periods, places, thresholds)
     on = {dict(fault.fixed)["detector"] for fault in stuck}
-    silent = [x for x in _silent(periods, mean, thresholds) if dict(x.fixed)["detector"] not in on]
-    hypotheses += stuck + silent
+    silent = _silent(periods, mean, thresholds, holes)
+    hypotheses += stuck + [fault for fault in silent if dict(fault.fixed)["detector"] not in on]
     kinds = {detector.id: detector.kind for detector in layout.detectors}
     minutes = sum(period.length_s for period in periods) / 60.0
     hypotheses += _swapped(kinds, mean, difference, minutes, thresholds)
@@ -863,9 +878,20 @@ def _stuck(
 
 
 def _silent(
-    periods: Sequence[Period], rate: Mapping[str, float], thresholds: Thresholds
+    periods: Sequence[Period],
+    rate: Mapping[str, float],
+    thresholds: Thresholds,
+    holes: Sequence[tuple[float, float]],
 ) -> list[Hypothesis]:
-    """Find detectors that were silent at the same time of every period, against expectation."""
+    """Find detectors that were silent at the same time of every period, against expectation.
+
+    Silence in a hole of the recording does not count.
+    """
+
+    def recorded(time: Array) -> Array:
+        """Return the seconds that were recorded before a time, from some origin on."""
+        return time - sum(np.clip(time - begin, 0.0, end - begin) for begin, end in holes)
+
     ranked: list[tuple[float, Hypothesis]] = []
     if not any(period.passages for period in periods):
         return []  # counts alone do not say when a detector was silent
@@ -876,9 +902,10 @@ def _silent(
             times = np.concatenate((seen.on_s, seen.off_s))
             times = np.sort(times[np.isfinite(times)])
             times = np.concatenate(([period.begin_s], times, [period.end_s]))
-            longest = int(np.argmax(np.diff(times)))
+            longest = int(np.argmax(np.diff(recorded(times))))
             begin, end = max(begin, float(times[longest])), min(end, float(times[longest + 1]))
-        missing = expected * (end - begin) / 60.0 * len(periods)
+        silence_s = float(np.diff(recorded(np.array([begin, end])))[0])
+        missing = expected * silence_s / 60.0 * len(periods)
         if end > begin and missing > thresholds.silent:
             fixed = (("detector", name), ("begin_s", round(begin, 1)), ("end_s", round(end, 1)))
             ranked.append((missing, Hypothesis("dropout", fixed, (), ((),), None)))

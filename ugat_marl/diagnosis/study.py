@@ -144,6 +144,7 @@ class Study:
             not follow the traffic, since `engine` does the same then.
         ruled_out: Names of the effects that the data cannot show.
         detection: Errors of measurement, which all simulated days have.
+        holes: Times in which nothing was recorded, begin and end in s; left out of them too.
         day_to_day: Variation of demand from day to day, which they have too, as a share.
         data_hash: Hash of the data as they were given.
     """
@@ -163,6 +164,7 @@ class Study:
     other_days: Engine | None = None
     ruled_out: frozenset[str] = field(default=frozenset())
     detection: tuple[DetectorError, ...] = ()
+    holes: tuple[tuple[float, float], ...] = ()
     day_to_day: float = 0.0
     data_hash: str = ""
     _doubts: dict[tuple[Effect, ...], Mapping[str, Array]] = field(default_factory=dict, init=False)
@@ -231,6 +233,7 @@ class Study:
             heldout=heldout or fit,
             other_days=simulating(answering=False, base_days=0) if answering else None,
             ruled_out=ruled_out,
+            holes=holes,
             day_to_day=variation,
             data_hash=data_hash,
         )
@@ -613,7 +616,11 @@ class Study:
     def place_finder(self) -> PlaceFinder:
         """Finder of places and windows."""
         return PlaceFinder(
-            self.layout, Routes.of(self.scenario), self.allowed, self.config.thresholds
+            self.layout,
+            Routes.of(self.scenario),
+            self.allowed,
+            self.config.thresholds,
+            self.holes,
         )
 
     def fitter(self, base: Tested) -> Fitter:
