@@ -5,6 +5,8 @@ from __future__ import annotations
 import dataclasses
 from collections.abc import Mapping, Sequence
 from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
 
 import numpy as np
 import pytest
@@ -227,6 +229,18 @@ def test_counts_are_those_asked_for(crossing: tuple[Scenario, Network, DetectorL
     assert found.sums[INDEX["count_stop"], place].tolist() == pytest.approx([9.6, 10.0])
     assert found.bins[BIN_FEATURES.index("count_stop"), place].tolist() == pytest.approx([9.2, 0.4])
     assert not found.sums[INDEX["platoon_gap"]].any()
+
+
+def test_of_vehicles_between_two_lights_both_count_all() -> None:
+    """No vehicle was given, so that two lanes share alike."""
+    lanes = [("e", "e_0"), ("e", "e_1")]
+    layout: Any = SimpleNamespace(places=[(light, *lane) for light in (1, 0) for lane in lanes])
+    sums, bins = np.zeros((len(FEATURES), 4, 2)), np.zeros((len(BIN_FEATURES), 4, 2))
+    sums[INDEX["count_stop"], :2, 1] = sums[INDEX["count_exit"], 2:, 1] = 60.0
+    due = DemandBalance({"e": np.array([10.0, 10.0])}, {"e": np.zeros(2)})
+    found = corrected(Tally(sums, bins), layout, due).sums
+    assert found[INDEX["count_stop"], :, 0].tolist() == [10.0, 10.0, 0.0, 0.0]
+    assert found[INDEX["count_exit"], :, 0].tolist() == [0.0, 0.0, 10.0, 10.0]
 
 
 @pytest.mark.slow

@@ -299,7 +299,7 @@ def corrected(counted: Tally, layout: DetectorLayout, due: DemandBalance) -> Tal
     """Return the tally of a day, with counts corrected to the model's demand.
 
     Corrected count = count + share * (asked - given), where the share of a lane is its part of the
-    vehicles given to its edge.
+    vehicles given to its edge. If none were given, the lanes of the edge share alike.
 
     Args:
         counted: Tally of a day with measured arrivals.
@@ -310,7 +310,8 @@ def corrected(counted: Tally, layout: DetectorLayout, due: DemandBalance) -> Tal
         The tally without platoon features, since these repeat the measured arrivals.
     """
     sums, bins = counted.sums.copy(), counted.bins.copy()
-    lanes = Counter(edge for _, edge, _ in layout.places)
+    # A lane between two lights is a place twice: in front of one of them, and behind the other.
+    lanes = Counter(edge for edge, _ in {(edge, lane) for _, edge, lane in layout.places})
     for place, (_, edge, _) in enumerate(layout.places):
         more = due.asked[edge] - due.given[edge]
         given = float(due.given[edge].sum())
