@@ -314,6 +314,20 @@ def test_counts_alone_make_no_detector_silent(reference: Reference) -> None:
     assert "dropout" not in names(place_finder.hypotheses(reference, distance, data))
 
 
+def test_minutes_hold_the_occupation_of_who_was_there_before_as_a_tally_does() -> None:
+    nan = np.nan
+    on, off = np.array([nan, nan, 30.0, 3590.0]), np.array([20.0, 300.0, 32.0, nan])
+    seen = Passages(on, off, np.full(4, nan), np.full(4, nan))
+    index = [lane.id for lane in SITE.lanes].index("b_in_0")
+    period = replace(street(1), passages={"advance:b": seen})
+    finder = PlaceFinder(SITE, ROUTES, library(), THRESHOLDS)
+    minutes = finder._minutes([period], [index], "occupied", "count_exit", 60)
+    # 20 s at the begin, 2 s, and 10 s at the end; 300 s from the begin on are a fault
+    assert (minutes[0], minutes[-1], minutes.sum()) == pytest.approx((22.0, 10.0, 32.0))
+    occupied = tallies([period])[0].bins[BIN_FEATURES.index("occupied"), index]
+    assert occupied.sum() == pytest.approx(minutes.sum())
+
+
 def test_a_closed_lane(reference: Reference) -> None:
     def closed(period: Period) -> Period:
         """From 1200 to 2100 s one vehicle in five comes through, and stands for 30 s."""

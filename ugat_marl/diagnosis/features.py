@@ -497,8 +497,7 @@ class _Counter:
         self.sums[INDEX[name], self.place] += (total, weight)
 
     def volume(self, name: str, passages: Passages) -> float:
-        times = np.where(np.isfinite(passages.on_s), passages.on_s, passages.off_s)
-        times = times[np.isfinite(times)]
+        times = passages.seen_s[np.isfinite(passages.seen_s)]
         self.ratio(name, len(times), self.period.length_s / 60.0)
         counts, _ = np.histogram(times, self.bins.shape[2], self.period.window)
         self.bins[COUNT_FEATURES.index(name), self.place] += counts
@@ -684,13 +683,22 @@ def _share(values: Array, limit: float) -> Array:
     return (values > limit).astype(np.float64)
 
 
+def occupations(seen: Passages, period: Period, thresholds: DayThresholds) -> tuple[Array, Array]:
+    """Return begins and ends of the occupations of a detector in a period, s.
+
+    Vehicles that were there before it begins, or after it ends, occupy the detector from its begin
+    or to its end. One that was there before and stays long is a fault, and is left out.
+    """
+    on = np.where(np.isfinite(seen.on_s), seen.on_s, period.begin_s)
+    off = np.where(np.isfinite(seen.off_s), seen.off_s, period.end_s)
+    known = np.isfinite(seen.on_s) | (off - period.begin_s < thresholds.cut_occupation_s)
+    return on[known], np.maximum(off, on)[known]
+
+
 def _storage(counter: _Counter, advance: Passages, greens: Greens) -> None:
     """Add occupied seconds of the advance detector in green and red, and queues on it."""
     period = counter.period
-    on = np.where(np.isfinite(advance.on_s), advance.on_s, period.begin_s)
-    off = np.where(np.isfinite(advance.off_s), advance.off_s, period.end_s)
-    lone = np.isfinite(advance.on_s) | (off - period.begin_s < counter.thresholds.cut_occupation_s)
-    on, off = on[lone], np.maximum(off[lone], on[lone])
+    on, off = occupations(advance, period, counter.thresholds)
     times = np.concatenate(([period.begin_s], np.sort(on), np.sort(off), [period.end_s]))
     steps = np.concatenate(([0.0], np.ones(len(on)), -np.ones(len(off)), [0.0]))
     order = np.argsort(times, kind="stable")

@@ -24,6 +24,7 @@ from ugat_marl.diagnosis.features import (
     INDEX,
     DetectorLayout,
     bins_in,
+    occupations,
 )
 from ugat_marl.diagnosis.hypotheses import Hypothesis, Members, examined
 from ugat_marl.diagnosis.statistics import Distance, Reference
@@ -269,12 +270,12 @@ class PlaceFinder:
                 )
                 if passages is None or not len(passages):
                     continue
-                on = np.where(np.isfinite(passages.on_s), passages.on_s, passages.off_s)
                 if kind == "occupied":
-                    off = np.where(np.isfinite(passages.off_s), passages.off_s, period.end_s)
+                    on, off = occupations(passages, period, self._thresholds)
                     total += occupied_between(on, off, edges)
                 else:
-                    total += np.histogram(on[np.isfinite(on)], edges)[0]
+                    times = passages.seen_s[np.isfinite(passages.seen_s)]
+                    total += np.histogram(times, edges)[0]
         return total / len(periods)
 
     def _passages(self, period: Period, index: int, kind: str) -> Passages | None:

@@ -127,6 +127,11 @@ class Passages:
             np.where(count == 1, rows[3][starts], np.nan),
         )
 
+    @property
+    def seen_s(self) -> NDArray[np.float64]:
+        """Time of each passage, s: `on_s` where it is known, else `off_s`."""
+        return np.where(np.isfinite(self.on_s), self.on_s, self.off_s)
+
     def spans(self) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
         """Return start and end of each passage, ``(passages,)``, without NaN.
 

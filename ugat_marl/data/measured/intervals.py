@@ -52,8 +52,7 @@ class Intervals:
         count = len(edges) - 1
         on = np.where(np.isfinite(seen.on_s), seen.on_s, begin)
         off = np.where(np.isfinite(seen.off_s), seen.off_s, end)
-        came = np.where(np.isfinite(seen.on_s), seen.on_s, seen.off_s)
-        which = np.clip(np.searchsorted(edges, came, "right") - 1, 0, count - 1)
+        which = np.clip(np.searchsorted(edges, seen.seen_s, "right") - 1, 0, count - 1)
         timed = np.isfinite(seen.speed_mps)
         known = np.bincount(which[timed], minlength=count)
         total = np.bincount(which[timed], seen.speed_mps[timed], minlength=count)
