@@ -20,7 +20,7 @@ from ugat_marl.diagnosis.arrivals import (
     corrected,
     unhindered,
 )
-from ugat_marl.diagnosis.engine import Engine
+from ugat_marl.diagnosis.engine import Budget, Engine
 from ugat_marl.diagnosis.features import BIN_FEATURES, FEATURES, INDEX, DetectorLayout, tally
 from ugat_marl.diagnosis.replay import Replay
 from ugat_marl.diagnosis.statistics import Pools
@@ -179,21 +179,24 @@ def test_effects_on_demand_cost_no_simulation(
     times = np.linspace(20.0, 180.0, 8).tolist()
     period = a_period(passages({"advance:S_C_0": times, "stop:S_C_0": times}))
 
-    def engine() -> Engine:
+    def engine(budget: Budget) -> Engine:
         replay = Replay(
             scenario, network, layout.detectors, layout.owner, THRESHOLDS, answering=True
         )
-        return Engine(scenario, layout, replay, [period], 5, THRESHOLDS, cache=tmp_path)
+        return Engine(
+            scenario, layout, replay, [period], 5, THRESHOLDS, cache=tmp_path, budget=budget
+        )
 
-    first = engine()
+    one_day_h = period.length_s / 3600.0
+    first = engine(budget := Budget())
     more = parse_domain("demand_level=*,3+headway=1.5")
     (found,) = first.replicates(more, [0])
-    assert first.simulated == 1
+    assert budget.spent_h == pytest.approx(one_day_h)
     (plain,) = first.replicates(parse_domain("headway=1.5"), [0])
-    assert first.simulated == 1
-    again = engine()
+    assert budget.spent_h == pytest.approx(one_day_h)
+    again = engine(budget := Budget())
     (remembered,) = again.replicates(parse_domain("demand_level=*,2+headway=1.5"), [0])
-    assert again.simulated == 0
+    assert budget.spent_h == 0.0
     counts = [
         item.tally.sums[INDEX["count_stop"], :, 0].sum() for item in (plain, remembered, found)
     ]

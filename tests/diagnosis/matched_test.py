@@ -218,7 +218,7 @@ def test_filters_are_made_for_each_half_and_for_the_whole() -> None:
     seen: list[int] = []
 
     def factory(reference: Reference) -> Directed:
-        seen.append(reference.days)
+        seen.append(reference._of_window.total())
         return lambda _: {"one effect": 1.0}
 
     null = Null(SEVERAL, days_of(gaussian([7], 41, 3)), PERIODS, speeds=True, directed=factory)

@@ -138,7 +138,6 @@ class Budget:
 
     Attributes:
         spent_h: Simulated hours so far.
-        days: Simulated days so far.
     """
 
     def __init__(self, hours: float = math.inf, deadline: float | None = None) -> None:
@@ -146,7 +145,6 @@ class Budget:
         self._deadline = deadline
         self._lock = threading.Lock()
         self.spent_h = 0.0
-        self.days = 0
 
     def spend(self, period: Period) -> None:
         """Spend the hours of a period.
@@ -159,7 +157,6 @@ class Budget:
             if late or self.spent_h >= self._hours:
                 raise OutOfTime("the budget is spent")
             self.spent_h += period.length_s / 3600.0
-            self.days += 1
 
 
 @dataclass(frozen=True, eq=False)
@@ -351,11 +348,6 @@ class Engine:
 
         (days,) = self._together(one, [numbers])
         return days
-
-    @property
-    def simulated(self) -> int:
-        """Number of days that were simulated, without days from the cache."""
-        return self._budget.days
 
     @property
     def known(self) -> int:

@@ -127,7 +127,7 @@ def propose(
                 )
                 if all(_is_something(hypothesis, values) for hypothesis, values in members):
                     best[keys] = Proposed(members, cost)
-    return sorted(best.values(), key=lambda proposal: proposal.expected)
+    return sorted(best.values(), key=_cost)
 
 
 def _is_something(hypothesis: Hypothesis, values: tuple[float, ...]) -> bool:
@@ -262,7 +262,7 @@ def _useful(
 ) -> list[int]:
     """Return the indices of up to `count` directions, of the hypotheses in the best sets so far."""
     keys: list[str] = []
-    for proposal in sorted(best.values(), key=lambda proposal: proposal.expected):
+    for proposal in sorted(best.values(), key=_cost):
         keys += [str(hypothesis.key) for hypothesis, _ in proposal.members]
     wanted = list(dict.fromkeys(keys))
     indices: list[int] = []

@@ -217,7 +217,6 @@ class Reference:
         doubt: Mapping[str, Array] | None = None,
     ) -> None:
         self.pools = pools
-        self.days = len(tallies)
         self._speeds = speeds
         self._thresholds = pools.thresholds
         stacked = _stack(pools, tallies)

@@ -28,7 +28,6 @@ from ugat_marl.diagnosis.records import (
     Alternative,
     Conclusion,
     Diagnosis,
-    EffectRecord,
     Explanation,
     FitEvidence,
     Fitted,
@@ -610,7 +609,8 @@ def _named(best: Tested, selected: Selected, half_interval: float) -> tuple[Name
         errors = best.errors_of(place)
         known = bool(np.isfinite(errors).all())
         margins = tuple(half_interval * float(error) for error in errors) if known else None
-        effects.append(_with_grounds(effect_record(hypothesis, values, margins), grounds))
+        effect = effect_record(hypothesis, values, margins)
+        effects.append(NamedEffect(**vars(effect), evidence=grounds))
     return tuple(effects)
 
 
@@ -641,10 +641,6 @@ def _without_search(
     }
     grounds = LogGrounds(source, None if rival is None else str(rival))
     return NamedEffect(name, ">".join(texts) or None, window, parameters, grounds)
-
-
-def _with_grounds(effect: EffectRecord, grounds: SearchGrounds) -> NamedEffect:
-    return NamedEffect(effect.name, effect.place, effect.window, effect.parameters, grounds)
 
 
 def _alternatives(conclusion: Conclusion, selected: Selected) -> tuple[Alternative, ...]:
