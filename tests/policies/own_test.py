@@ -392,6 +392,32 @@ def test_later_learning_does_not_change_a_policy(algorithm: Any) -> None:
         assert shown.index({1}) + 1 == changes_at
 
 
+class OwnPlayer(Noted):
+    """A learner that keeps the environment it is made for, and is its own policy."""
+
+    def __init__(self, env: Any) -> None:
+        self.env = env
+
+    def learn(self, env: Any, episodes: int) -> None:
+        for _ in range(episodes):
+            env.reset()
+            while env.agents:
+                env.step(dict.fromkeys(env.agents, 0))
+
+    def policy(self) -> Any:
+        return self.act
+
+    def act(self, observations: Any) -> Any:
+        return dict.fromkeys(observations, 0)
+
+
+def test_a_policy_keeps_the_environment_of_its_learner_after_learning_in_another() -> None:
+    env = ToyTraffic()
+    learner = OwnLearner(OwnPlayer(env), "own player", env)
+    for policy in (learner.policy(), learner.learn(ToyTraffic(), 1, 0), learner.policy()):
+        assert copy.deepcopy(policy)._given.__self__.env is env
+
+
 class Closing:
     """A learner whose policy is a function with the learner in its closure."""
 

@@ -252,7 +252,8 @@ class OwnLearner:
         self.episodes = 0
         self._given, self._name, self._settings = given, name, list(settings)
         self._env_options = dict(getattr(env.unwrapped, "env_options", {}))
-        self._shared: list[Any] = [env, env.unwrapped]
+        self._made_for = [env, env.unwrapped]  # its class may keep them, whatever it learns in
+        self._shared: list[Any] = self._made_for
 
     @property
     def savable(self) -> bool:
@@ -273,7 +274,7 @@ class OwnLearner:
         """
         if episodes > 0:
             counted = CountedEnv(env, self.episodes, seed, on_episode)
-            self._shared = [counted, env, env.unwrapped]
+            self._shared = [*self._made_for, counted, env, env.unwrapped]
             try:
                 self._given.learn(counted, episodes)
             except ActionError as error:
