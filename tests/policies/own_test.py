@@ -30,7 +30,7 @@ from tests.runs import search_few_rules
 from ugat_marl.__main__ import main
 from ugat_marl.data import Metrics
 from ugat_marl.errors import ActionError, CheckpointError, OptionError, UnknownNameError
-from ugat_marl.experiments import PaperConfig, policy_factory
+from ugat_marl.experiments import LearnerSpec, PaperConfig, policy_factory
 from ugat_marl.policies import (
     OwnLearnerFactory,
     OwnPolicy,
@@ -592,6 +592,25 @@ def test_what_is_typed_in_a_notebook_is_known_by_its_code() -> None:
 
     assert hash_of(0) is not None
     assert hash_of(0) == hash_of(0, lines=3) != hash_of(7)
+
+
+def test_a_learner_whose_file_was_edited_after_its_import_begins_no_training(
+    algorithm: Any, tmp_path: Path
+) -> None:
+    file, names = tmp_path / "my_algo.py", ("my_algo:Kept", "my_algo.py:Cycle")
+    run, *_ = [LearnerSpec(name) for name in names]
+    source = run.identity["source"]
+    file.write_text(ALGORITHM.replace("self.hold += 1", "self.hold += 2"))
+    for name in names:
+        with pytest.raises(OptionError, match=r"my_algo\.py was changed .*; restart Python"):
+            LearnerSpec(name)
+    run.factory()
+    assert run.identity["source"] == source  # of what a run trains that has begun
+    importlib.reload(algorithm)
+    assert LearnerSpec("my_algo:Kept").identity["source"] != source
+    file.write_text(ALGORITHM)
+    with pytest.raises(OptionError, match="restart Python"):
+        LearnerSpec(own_name(algorithm.Kept))
 
 
 def test_an_environment_that_a_learner_holds_is_known_by_what_it_is_made_of() -> None:

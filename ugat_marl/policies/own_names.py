@@ -31,6 +31,10 @@ _NAME = re.compile(r"[\w./\\-]+:[A-Za-z_<][\w.<>]*")
 _given: dict[str, Any] = {}
 """Objects that were given in Python, by the name under which settings hold them."""
 
+_loaded: dict[tuple[str, Path], tuple[Any, str]] = {}
+"""Module and file to the specification of the module, which is another one after a reload, and the
+hash of the file as it was loaded."""
+
 
 def is_own(name: str) -> bool:
     """Return True if a name has the form ``module:name``."""
@@ -44,6 +48,7 @@ def own_name(given: Any) -> str:
     if not _is_found(kind, given):
         name += ".<given>"  # no other process may take what it finds by the name for it
     _given[name] = given
+    _file_hash(kind)  # keeps it
     return name
 
 
@@ -114,6 +119,7 @@ def load_own(name: str, what: str) -> Any:
                 names = [key for key in names if hasattr(getattr(found, key), "learn")] or names
             raise UnknownNameError(f"{what} in {module_name}", part, names)
         found = getattr(found, part)
+    _file_hash(_named(found))  # keeps it
     return found
 
 
@@ -264,6 +270,8 @@ def _made_of(env: Any) -> dict[str, Any]:
 def own_source(name: str) -> str | None:
     """Return the hash of the file that defines a user's learner; None if it has no code.
 
+    An edit after the file was loaded changes neither the learner nor the hash.
+
     Args:
         name: Name as for `load_own`.
 
@@ -274,17 +282,42 @@ def own_source(name: str) -> str | None:
     return _file_hash(_named(load_own(name, "learner")))
 
 
-def _file_hash(kind: Any) -> str | None:
-    """Return the hash of the file that defines a class or function, or else of its code.
+def require_unchanged(name: str) -> None:
+    """Refuse a user's learner whose file is no longer the one that was loaded.
 
-    What is typed at a prompt or in a notebook is in no file. None if there is no code either.
+    Args:
+        name: Name as for `load_own`.
+
+    Raises:
+        OptionError: The file was changed, or the module is missing.
+        UnknownNameError: The object is missing in it.
     """
+    kind = _named(load_own(name, "learner"))
+    file = _file_of(kind)
+    if file is not None and file_hash(file) != _file_hash(kind):
+        raise OptionError(f"{file} was changed after it was imported; restart Python")
+
+
+def _file_of(kind: Any) -> Path | None:
+    """Return the file that defines a class or function; None for what is typed at a prompt."""
     try:
         file = inspect.getsourcefile(kind)
     except (TypeError, OSError):
-        file = None
-    if file is not None and Path(file).is_file():
-        return file_hash(Path(file))
+        return None
+    return Path(file) if file is not None and Path(file).is_file() else None
+
+
+def _file_hash(kind: Any) -> str | None:
+    """Return the hash of the file that defines a class or function, or else of its code.
+
+    The hash is that of the file when it was first asked for. None if there is no code either.
+    """
+    if (file := _file_of(kind)) is not None:
+        place = kind.__module__, file
+        specification = getattr(sys.modules.get(kind.__module__), "__spec__", None)
+        if place not in _loaded or _loaded[place][0] is not specification:
+            _loaded[place] = specification, file_hash(file)
+        return _loaded[place][1]
     members = vars(kind).values() if inspect.isclass(kind) else (kind,)
     codes = [getattr(getattr(one, "__func__", one), "__code__", None) for one in members]
     texts = [_code_text(code) for code in codes if code is not None]

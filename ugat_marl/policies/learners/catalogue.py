@@ -27,7 +27,7 @@ from ugat_marl.errors import OptionError, UnknownNameError, install_command
 from ugat_marl.policies.learner_settings import parsed_settings
 from ugat_marl.policies.learners.dqn_config import DQNConfig, UsualValue
 from ugat_marl.policies.own import OwnLearnerFactory, own_learner_options
-from ugat_marl.policies.own_names import is_own, load_own
+from ugat_marl.policies.own_names import is_own, require_unchanged
 from ugat_marl.policies.protocols import Learner
 
 LearnerFactory = Callable[[AnyParallelEnv, int], Learner]
@@ -142,10 +142,10 @@ def learner_factory(
     """
     from ugat_marl.policies.devices import device_of
 
-    require_known_learner(name)
     place = device_of(device)
-    if is_own(name):
+    if is_own(name):  # an edit of its file does not end a run that has begun
         return OwnLearnerFactory(name, settings)
+    require_known_learner(name)
     if name in SUITE_LEARNERS:
         if settings:
             raise OptionError(f"learner settings {' '.join(settings)}: those of {name} are --dqn.*")
@@ -237,10 +237,10 @@ def require_known_learner(name: str) -> None:
 
     Raises:
         UnknownNameError: It is neither one of `SUITE_LEARNERS` nor of `BASELINES`.
-        OptionError: A user's learner cannot be found.
+        OptionError: A user's learner cannot be found, or its file was changed after its import.
     """
     if is_own(name):
-        load_own(name, "learner")
+        require_unchanged(name)
     elif name not in SUITE_LEARNERS and name not in BASELINES:
         hint = "An algorithm of your own: --learner my_module:MyLearner."
         raise UnknownNameError("learner", name, (*SUITE_LEARNERS, *BASELINES), hint)
