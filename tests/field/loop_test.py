@@ -221,8 +221,7 @@ def test_lights_on_the_plan_ask_for_its_phases_and_the_others_for_the_policys() 
     loop = FieldLoop(SITE, Scripted(), street, QUICK)
     street.spoil = replaced(None)
     decisions = decide(loop, street, 12)
-    timing = SITE.timing
-    plan = fixed_time(SITE.network, 10.0, timing.clearance_s, QUICK.green_s)
+    plan = fixed_time(SITE.network, 10.0, SITE.timing, QUICK.green_s)
     planned = [plan.act({}, {})[LIGHT] for _ in decisions]
     last = {item.id: len(item.phases) - 1 for item in SITE.network.intersections}
     assert len(set(planned)) == 4

@@ -156,7 +156,7 @@ def test_a_fault_is_told_and_trust_comes_back_after_good_decisions() -> None:
 
 def test_the_plan_serves_every_link_of_every_light() -> None:
     network = Network.read(load_scenario("grid2x2-v1"))
-    plan = fixed_time(network, 10.0, 5.0, 30.0)
+    plan = fixed_time(network, 10.0, SignalTiming(3.0, 2.0, 5.0), 30.0)
     asked = [plan.act({}, {}) for _ in range(40)]
     for item in network.intersections:
         green = {

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import contextlib
+from collections import Counter
 from dataclasses import replace
 from typing import Any
 
@@ -10,7 +12,7 @@ import pytest
 
 from ugat_marl.envs import parallel_env
 from ugat_marl.errors import OptionError
-from ugat_marl.policies import ControlledNetwork
+from ugat_marl.policies import ControlledNetwork, FixedTime, make_rule
 from ugat_marl.policies.rules.actuated import Actuated, DelayActuated
 from ugat_marl.policies.rules.green_wave import GreenWave, main_roads
 from ugat_marl.policies.rules.webster import Webster, webster_plan
@@ -100,6 +102,30 @@ def test_delay_actuated_ends_when_those_who_waited_move():
 )
 def test_websters_cycle_and_splits(ratios: tuple[float, ...], decisions: list[int]):
     assert webster_plan(ratios, 5.0, 10.0) == decisions
+
+
+def test_no_planned_phase_is_shorter_than_clearance_and_minimum_green():
+    # 7 decisions for phases of 53.6 and 13.1 s; 5 + 15 s are 2 decisions, 5 + 16 s are 3
+    assert webster_plan((0.6, 0.1), 5.0, 10.0, 15.0) == [5, 2]
+    assert webster_plan((0.6, 0.1), 5.0, 10.0, 16.0) == [5, 3]
+    held = replace(streets(), min_green_s=15.0)
+    assert shown_by(FixedTime(held, 10), *[{}] * 7) == [0, 0, 1, 1, 2, 2, 0]
+    assert shown_by(GreenWave(held, 10), *[{}] * 7) == [0, 0, 1, 1, 2, 2, 0]
+    assert Webster(replace(held, min_green_s=25.0)).plan(AGENT) == [3, 3, 3]
+
+
+@pytest.mark.parametrize("spec", ["fixed-time:10", "green-wave:10:10"])
+def test_a_plan_shows_each_of_its_phases_whatever_the_minimum_green(spec: str):
+    env = parallel_env("single-v1", "min_green=15", duration_s=200)
+    with contextlib.closing(env):
+        rule, shown = make_rule(spec, env), Counter[int]()
+        rule.reset(1)
+        observations, infos = env.reset(seed=1)
+        while env.agents:
+            *_, infos = env.step(rule.act(observations, infos))
+            shown.update(env.phases)
+    (approach,) = ControlledNetwork.of(env).approaches.values()
+    assert {*shown} == {*approach.cycle} and min(shown.values()) >= 2
 
 
 def test_webster_counts_what_comes_in_red():

@@ -19,6 +19,7 @@ from ugat_marl.scenarios import (
     Link,
     Network,
     Scenario,
+    SignalTiming,
     degrees_of_saturation,
     kerb_turn_of,
     sumo_program,
@@ -347,6 +348,8 @@ def test_agents_are_beside_each_other_across_what_is_no_agent(
     assert [(x.id, x.neighbours) for x in network.intersections] == [("A", ("B",)), ("B", ("A",))]
     assert network.straight == {"A-P": "P-B", "B-P": "P-A"}
     items = {f"signal_{k}": item for k, item in enumerate(network.intersections)}
-    (road,) = main_roads(ControlledNetwork.of_network(network, items, 10.0, 5.0))
+    (road,) = main_roads(
+        ControlledNetwork.of_network(network, items, 10.0, SignalTiming(3.0, 2.0, 5.0))
+    )
     assert road.agents == ("signal_0", "signal_1")
     assert road.arrival_s[1] == pytest.approx(30.0, abs=4.0)

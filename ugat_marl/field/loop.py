@@ -94,8 +94,8 @@ class FieldLoop:
     ) -> None:
         self._site, self._policy, self._log = site, policy, log
         self._limits = limits = limits or TrustLimits()
-        interval, clearance = site.decision_interval_s, site.timing.clearance_s
-        self._plan = fixed_time(site.network, interval, clearance, limits.green_s)
+        interval = site.decision_interval_s
+        self._plan = fixed_time(site.network, interval, site.timing, limits.green_s)
         self.summary = LoopSummary()
         self.driven_s = 0.0
         self._recorded = Decision(0.0, {}, {}, 0.0, 0.0)

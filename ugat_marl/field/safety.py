@@ -122,7 +122,7 @@ class PolicyTrust:
 
 
 def fixed_time(
-    network: Network, decision_interval_s: float, clearance_s: float, green_s: float
+    network: Network, decision_interval_s: float, timing: SignalTiming, green_s: float
 ) -> FixedTime:
     """Return the fallback plan: a smallest set of phases that serves every link, in turn.
 
@@ -132,9 +132,9 @@ def fixed_time(
     Args:
         network: The network.
         decision_interval_s: Time between decisions, s.
-        clearance_s: Yellow and all-red together, s.
+        timing: Minimum green and clearance, s.
         green_s: Time of a phase, s, its clearance included.
     """
     intersections = {intersection.id: intersection for intersection in network.intersections}
-    streets = ControlledNetwork.of_network(network, intersections, decision_interval_s, clearance_s)
+    streets = ControlledNetwork.of_network(network, intersections, decision_interval_s, timing)
     return FixedTime(streets, green_s)

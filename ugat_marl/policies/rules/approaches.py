@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 
 from ugat_marl.envs import WAITING_SCALE_S, Actions, AnyParallelEnv, Infos, Observations
 from ugat_marl.errors import OptionError
-from ugat_marl.scenarios import GREEN, Intersection, Link, Network, free_flow_s
+from ugat_marl.scenarios import GREEN, Intersection, Link, Network, SignalTiming, free_flow_s
 
 MOST_SEARCHED_PHASES = 12
 """Largest number of phases for an exhaustive search of the smallest cover.
@@ -37,6 +37,7 @@ class ControlledNetwork:
         clearance_s: Seconds of yellow and all-red between two greens.
         road_s: Road (SUMO's edge) to the seconds that a vehicle needs along it at the speed limit.
         straight: Road to the road straight ahead of it, where no light is in between.
+        min_green_s: Seconds for which a light holds each green.
     """
 
     intersections: Mapping[str, Intersection]
@@ -46,6 +47,7 @@ class ControlledNetwork:
     clearance_s: float
     road_s: Mapping[str, float] = field(default_factory=dict[str, float])
     straight: Mapping[str, str] = field(default_factory=dict[str, str])
+    min_green_s: float = 0.0
 
     @classmethod
     def of(cls, env: AnyParallelEnv) -> ControlledNetwork:
@@ -57,7 +59,7 @@ class ControlledNetwork:
             network,
             {agent: network.intersection(tls_of[agent]) for agent in base.possible_agents},
             base.decision_interval_s,
-            base.scenario.timing.clearance_s,
+            base.scenario.timing,
         )
 
     @classmethod
@@ -66,7 +68,7 @@ class ControlledNetwork:
         network: Network,
         intersections: Mapping[str, Intersection],
         decision_interval_s: float,
-        clearance_s: float,
+        timing: SignalTiming,
     ) -> ControlledNetwork:
         """Collect the facts about a network whose intersections have these names."""
         lanes = network.lanes
@@ -75,9 +77,10 @@ class ControlledNetwork:
             {name: lane.storage_veh for name, lane in lanes.items()},
             {name: lane.counted_m / lane.speed_mps for name, lane in lanes.items()},
             decision_interval_s,
-            clearance_s,
+            timing.clearance_s,
             free_flow_s(lanes.values()),
             network.straight,
+            timing.min_green_s,
         )
 
     @cached_property
@@ -98,6 +101,15 @@ class ControlledNetwork:
         if not 0 < seconds < math.inf:
             raise OptionError(f"a phase cannot be held {seconds} s; give a number above 0")
         return max(1, math.ceil(seconds / self.decision_interval_s - 1e-9))
+
+    def planned_decisions(self, seconds: float) -> int:
+        """Return the fewest decisions of a phase in a plan that lasts at least `seconds`.
+
+        No phase is shorter than clearance and minimum green. The light would hold the one before
+        it through its turn, and the plan would skip the same phase in every cycle.
+        """
+        least_s = self.clearance_s + self.min_green_s
+        return max(self.decisions(seconds), math.ceil(least_s / self.decision_interval_s - 1e-9))
 
 
 class EachLight:

@@ -99,7 +99,8 @@ class GreenWave:
 
     Args:
         network: The controlled network.
-        green_s: Time of each other phase (clearance included), rounded up to whole decisions.
+        green_s: Time of each other phase (clearance included), rounded up to whole decisions; at
+            least clearance and minimum green.
         main_s: Time of the phase along the road; None for `green_s`.
     """
 
@@ -133,7 +134,7 @@ class GreenWave:
         return actions
 
     def _plan(self, road: Corridor, network: ControlledNetwork) -> None:
-        main, other = network.decisions(self.main_s), network.decisions(self.green_s)
+        main, other = map(network.planned_decisions, (self.main_s, self.green_s))
         cycles = [network.approaches[agent].cycle for agent in road.agents]
         length = main + other * (max(len(cycle) for cycle in cycles) - 1)
         for agent, edge, arrival_s, cycle in zip(

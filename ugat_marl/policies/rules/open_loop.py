@@ -18,13 +18,13 @@ class FixedTime:
     Args:
         network: The controlled network.
         green_s: Time from one phase to the next (clearance included), rounded up to whole
-            decisions.
+            decisions; at least clearance and minimum green.
     """
 
     def __init__(self, network: ControlledNetwork, green_s: float = 30.0) -> None:
         self.env_options: Mapping[str, Any] = {}
         self.green_s = green_s
-        self._decisions = network.decisions(green_s)
+        self._decisions = network.planned_decisions(green_s)
         self._cycle = {a: w.cycle for a, w in network.approaches.items()}
         self._phases = network.phases
         self._time = 0

@@ -31,7 +31,10 @@ FIRST_PHASE_S = 20.0
 
 
 def webster_plan(
-    ratios: Sequence[float], clearance_s: float, decision_interval_s: float
+    ratios: Sequence[float],
+    clearance_s: float,
+    decision_interval_s: float,
+    min_green_s: float = 0.0,
 ) -> list[int]:
     """Return the decisions of each phase: Webster's cycle, split by the critical flow ratios.
 
@@ -43,6 +46,8 @@ def webster_plan(
         ratios: For each phase, the largest ratio of flow to saturation flow among its lanes.
         clearance_s: Seconds of yellow and all-red.
         decision_interval_s: Seconds of one decision. Each phase lasts at least one decision.
+        min_green_s: Minimum green. Each phase lasts at least clearance and minimum green, which may
+            make the cycle longer.
 
     Source:
         Webster, Traffic Signal Settings, Road Research Technical Paper 39, 1958.
@@ -54,7 +59,8 @@ def webster_plan(
     green_s = max(cycle_s - lost_s, 0.0)
     shares = [ratio / total if total > 0 else 1 / len(ratios) for ratio in ratios]
     wanted = [(clearance_s + share * green_s) / decision_interval_s for share in shares]
-    decisions = [max(1, math.floor(part + 1e-9)) for part in wanted]
+    least = max(1, math.ceil((clearance_s + min_green_s) / decision_interval_s - 1e-9))
+    decisions = [max(least, math.floor(part + 1e-9)) for part in wanted]
     left = max(round(cycle_s / decision_interval_s), len(ratios)) - sum(decisions)
     short = sorted(range(len(wanted)), key=lambda i: decisions[i] - wanted[i])
     for place in short[: max(left, 0)]:
@@ -107,12 +113,15 @@ class Webster:
         network, approach = self._network, self._network.approaches[agent]
         flows = self._counts[agent].flows_per_s()
         if flows is None:
-            return [network.decisions(FIRST_PHASE_S)] * len(approach.cycle)
+            return [network.planned_decisions(FIRST_PHASE_S)] * len(approach.cycle)
         served = approach.served[list(approach.cycle)]
         spread = flows / np.maximum(served.sum(axis=0), 1)
         ratios = (served * spread).max(axis=1) * 3600.0 / self.saturation_vph
         return webster_plan(
-            [float(ratio) for ratio in ratios], network.clearance_s, network.decision_interval_s
+            [float(ratio) for ratio in ratios],
+            network.clearance_s,
+            network.decision_interval_s,
+            network.min_green_s,
         )
 
 
