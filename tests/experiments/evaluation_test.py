@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import copy
 import json
+import warnings
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -16,8 +18,8 @@ from ugat_marl.effects import load_scenario
 from ugat_marl.envs import parallel_env
 from ugat_marl.errors import CheckpointError, OptionError, UnknownNameError
 from ugat_marl.experiments import Evaluation, best_rule, evaluation_of, policy_factory, rule_factory
-from ugat_marl.experiments.evaluation import Result
-from ugat_marl.policies import DQN
+from ugat_marl.experiments.evaluation import Result, TrainedPolicy
+from ugat_marl.policies import DQN, DQNConfig, export_policy
 from ugat_marl.simulation import host
 
 BASE = Scores(100.0, 90.0, 500.0, -3.0, 3.0, 0.4, 50.0, 520.0, 515.0, 5.0)
@@ -139,6 +141,30 @@ def test_a_policy_of_another_scenario_is_refused(tmp_path: Path) -> None:
     factory = policy_factory(str(tmp_path / "policy.pt"))
     with pytest.raises(CheckpointError, match="other intersections than those of scenario"):
         evaluation_of(load_scenario("single-v1"), {"p": factory}, ["sim"], [1], duration_s=100)
+
+
+def test_a_policy_of_other_movements_is_refused_and_one_of_other_intervals_is_noted() -> None:
+    scenario = load_scenario("single-v1")
+    env = parallel_env(scenario, observation="movements")
+    policy = DQN.of(env, DQNConfig(network="universal", hidden=(4, 4))).policy()
+    (junction,) = policy.structure.junctions
+    mirrored = copy.copy(policy)
+    mirrored.structure = replace(
+        policy.structure, junctions=(replace(junction, movements=junction.movements[::-1]),)
+    )
+    with pytest.raises(CheckpointError, match="movements, phases or neighbours are others"):
+        TrainedPolicy(mirrored, "p.pt")(env)
+    with pytest.raises(OptionError, match="movements, phases or neighbours are others"):
+        export_policy(mirrored, "p.npz", env)
+    slow = parallel_env(scenario.with_control(yellow_s=4.0, min_green_s=6.0))
+    fast = parallel_env(scenario.with_control(decision_interval_s=5.0))
+    make = TrainedPolicy(policy, "p.pt")
+    with warnings.catch_warnings(action="error"):  # other clearances are evaluated on purpose
+        assert make(env) is make(slow) is policy
+    with pytest.warns(UserWarning, match="p.pt .*every 10 s; scenario 'single-v1' .* every 5 s"):
+        assert make(fast) is policy
+    with pytest.raises(OptionError, match="every 10 s, the environment takes one every 5 s"):
+        export_policy(policy, "p.npz", parallel_env(fast.scenario, **policy.env_options))
 
 
 def test_a_trained_policy_is_played_from_its_file(tmp_path: Path) -> None:

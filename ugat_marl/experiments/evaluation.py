@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import copy
+import warnings
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
@@ -12,7 +13,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from ugat_marl.effects import Domain, domain_label
-from ugat_marl.envs import AgentSet, TrafficEnv, parallel_env
+from ugat_marl.envs import TrafficEnv, parallel_env
 from ugat_marl.errors import CheckpointError, OptionError
 from ugat_marl.experiments.scores import Evaluation, Result, RuleTrial, best_rule_note
 from ugat_marl.parallel import (
@@ -243,7 +244,7 @@ class FixedPolicy:
 
 @dataclass(frozen=True)
 class TrainedPolicy:
-    """Maker that returns a trained policy if its agents are those of the environment.
+    """Maker that returns a trained policy if its intersections are those of the environment.
 
     Attributes:
         policy: The trained policy.
@@ -254,13 +255,23 @@ class TrainedPolicy:
     path: str
 
     def __call__(self, env: TrafficEnv) -> Policy:
-        """Return the policy; raise `CheckpointError` if it has other agents."""
+        """Return the policy; warn if it was trained for decisions at other times.
+
+        Raises:
+            CheckpointError: It has other agents, movements or phases.
+        """
         fitting = parallel_env(env.scenario, **self.policy.env_options)
-        if AgentSet.of(fitting) != self.policy.agents:
+        if misfit := self.policy.misfit(fitting):
             raise CheckpointError(
                 f"{self.path} was trained for other intersections than those of scenario "
-                f"{env.scenario.id!r}: its agents are {self.policy.agents}, here "
-                f"{AgentSet.of(fitting)}"
+                f"{env.scenario.id!r}: {misfit}"
+            )
+        interval_s = self.policy.decision_interval_s
+        if interval_s not in (None, env.decision_interval_s):
+            warnings.warn(
+                f"{self.path} was trained for a decision every {interval_s:g} s; scenario "
+                f"{env.scenario.id!r} takes one every {env.decision_interval_s:g} s",
+                stacklevel=1,
             )
         return self.policy
 

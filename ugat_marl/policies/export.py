@@ -72,8 +72,9 @@ def export_policy(
 
     Raises:
         OptionError: The suffix is unknown, the extra is missing, the environment has other agents,
-            FRAP or CoLight is to be written to another format than ``.ts``, another policy's model
-            would lose its JSON file, or the file is no model that this function wrote.
+            movements, phases or another decision interval, FRAP or CoLight is to be written to
+            another format than ``.ts``, another policy's model would lose its JSON file, or the
+            file is no model that this function wrote.
         CheckpointError: An option of the environment is not plain data.
         OutputError: A file cannot be written.
     """
@@ -281,12 +282,18 @@ def _about(policy: NetworkPolicy, env: AnyParallelEnv | None) -> dict[str, Any]:
 
     agents = policy.agents
     description = checkpoint_header(agents, policy.hidden, policy.env_options, policy.shared)
-    if env is not None and AgentSet.of(env) != agents:
+    if env is not None and (misfit := policy.misfit(env)):
         raise OptionError(
-            f"the policy acts for {agents}, the environment has {AgentSet.of(env)}; give the "
-            "scenario it was trained in"
+            "the policy was trained for other intersections than those of the environment: "
+            f"{misfit}; give the scenario it was trained in"
         )
     base: Any = env.unwrapped if env is not None else None
+    interval_s, made_for_s = getattr(base, "decision_interval_s", None), policy.decision_interval_s
+    if interval_s is not None and made_for_s not in (None, interval_s):
+        raise OptionError(
+            f"the policy was trained for a decision every {made_for_s:g} s, the environment takes "
+            f"one every {interval_s:g} s; give the scenario it was trained in"
+        )
     return {
         "kind": _KIND,
         "network": _network_name(policy),
@@ -294,7 +301,7 @@ def _about(policy: NetworkPolicy, env: AnyParallelEnv | None) -> dict[str, Any]:
         "observation_width": agents.widest_observation,
         "action_width": agents.most_actions,
         "env_options": json.loads(description["env_options"]),
-        "decision_interval_s": getattr(base, "decision_interval_s", None),
+        "decision_interval_s": interval_s,
         "intersections": getattr(base, "intersection_of", None),
         "parameters": _sum(_parameters(policy)),
     }

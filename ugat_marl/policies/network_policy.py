@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from torch import Tensor, nn
 
 from ugat_marl.data import read_checkpoint, write_checkpoint
-from ugat_marl.envs import Actions, AgentSet, Infos, Observations
+from ugat_marl.envs import Actions, AgentSet, AnyParallelEnv, Infos, Observations
 from ugat_marl.errors import CheckpointError, first_line
 from ugat_marl.files import MALFORMED, parse_json
 from ugat_marl.policies.devices import CPU
@@ -81,6 +81,27 @@ class NetworkPolicy:
     def ceiling(self) -> NDArray[np.float32] | None:
         """Largest numbers the network reads, ``(agents, widest_observation)`` (a copy)."""
         return None if self._ceiling is None else self._ceiling.numpy().copy()
+
+    @property
+    def decision_interval_s(self) -> float | None:
+        """Seconds between the decisions that it was trained for; None if its network reads none."""
+        junctions = () if self.structure is None else self.structure.junctions
+        return next((each.interval_s for each in junctions if each.interval_s > 0), None)
+
+    def misfit(self, env: AnyParallelEnv) -> str:
+        """Return why the intersections of an environment are others; "" if they are the policy's.
+
+        Raises:
+            OptionError: The network reads the road network, and `env` has none.
+        """
+        if (agents := AgentSet.of(env)) != self.agents:
+            return f"its agents are {self.agents}, here {agents}"
+        if self.structure is not None:
+            here = Structure.of(env, self.structure.network)
+            assert here is not None
+            if here.places != self.structure.places:
+                return "its movements, phases or neighbours are others"
+        return ""
 
     def reset(self, seed: int) -> None:
         """Do nothing: the policy is deterministic and has no memory."""

@@ -171,6 +171,15 @@ class Structure:
             ):
                 raise ValueError(f"{junction} is none of {size} numbers and {actions} phases")
 
+    @property
+    def places(self) -> tuple[Any, ...]:
+        """Movements, phases and neighbours, without times and sizes of lanes."""
+        junctions = tuple(
+            (each.movements, each.greens, each.first_phase, each.commands, each.age)
+            for each in self.junctions
+        )
+        return junctions, self.neighbours
+
     def written(self) -> dict[str, Any]:
         """Return the structure as a dictionary of plain values, for a checkpoint."""
         return asdict(self)
