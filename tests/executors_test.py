@@ -32,7 +32,7 @@ from ugat_marl.diagnosis.thresholds import Thresholds
 from ugat_marl.effects import StartupDelay, load_scenario
 from ugat_marl.envs import TrafficEnv
 from ugat_marl.errors import JobError, OptionError, ScenarioError, SimulatorCrashed
-from ugat_marl.experiments import evaluation_of, rule_factory
+from ugat_marl.experiments import evaluation_of, policy_factory, rule_factory
 from ugat_marl.files import files_sent_whole
 from ugat_marl.grounding import RollOutSettings, roll_outs
 from ugat_marl.parallel import (
@@ -164,6 +164,41 @@ def test_an_error_that_cannot_be_sent_is_told_and_nothing_is_repeated(tmp_path: 
             processes.submit(exec, UNPACKED_NOWHERE.format(file=str(file)), {}).result()
         assert processes.submit(int, "1").result() == 1
     assert file.read_text() == "."
+
+
+class NoNumber:
+    """Becomes ``int("x")`` where it is unpickled."""
+
+    def __reduce__(self) -> Any:
+        return int, ("x",)
+
+
+def test_a_part_or_result_that_cannot_be_sent_is_told_and_nothing_is_repeated(
+    tmp_path: Path,
+) -> None:
+    file = tmp_path / "calls"
+    odd = "type('Odd', (), {'__reduce__': lambda self: (int, ('x',))})()"
+    with LocalProcesses(1) as processes:
+        with pytest.raises(JobError, match="^the result of a part cannot be sent .*ValueError"):
+            processes.submit(eval, f"(open({str(file)!r}, 'a').write('.'), {odd})[1]").result()
+        with pytest.raises(JobError, match="^a part cannot be sent between processes .*ValueError"):
+            processes.submit(str, NoNumber()).result()
+        assert processes.submit(int, "1").result() == 1
+    assert file.read_text() == "."
+
+
+def test_a_policy_of_a_file_is_loaded_by_each_process(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    (tmp_path / "sub").mkdir()
+    (tmp_path / "sub" / "mine.py").write_text(
+        "def first(observations): return dict.fromkeys(observations, 0)"
+    )
+    monkeypatch.setattr(sys, "path", [*sys.path])
+    monkeypatch.chdir(tmp_path)
+    policies = {"mine": policy_factory("sub/mine.py:first")}
+    with LocalProcesses(1) as processes:
+        assert results(processes, policies) == results(1, policies)
 
 
 @pytest.mark.slow

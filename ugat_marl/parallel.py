@@ -336,30 +336,54 @@ class _Process(ProcessPoolExecutor):
 
         Raises:
             BrokenProcessPool: The process died, or was stopped and killed.
+            JobError: The part or its result cannot be made again from what pickle sends.
         """
-        future = self.submit(_carried, part)
+        future = self.submit(_carried, _packed(part))
         heartbeat = Heartbeat(lambda: self._beats.value)
         while not wait([future], timeout=_BEAT_S).done:
             if heartbeat.is_lost():
                 for each in [*self._processes.values()]:  # the pool has no method for it
                     each.kill()
-        return future.result()
+        packed = future.result()
+        try:
+            return _unpacked(packed)
+        except Exception as error:
+            raise JobError(_unsendable("the result of a part", error)) from None
 
 
-def _carried(part: Callable[[], Any]) -> Any:
+def _carried(packed: bytes) -> bytes:
     """Do a part; replace an error that pickle does not bring back, which would look like a death.
 
+    Parts and results are packed here, because a pool takes what cannot be unpacked for a death.
+
     Raises:
-        JobError: The part raised such an error.
+        JobError: The part raised such an error, or cannot be unpacked.
     """
     try:
-        return part()
+        part = _unpacked(packed)
     except Exception as error:
-        try:  # the bytes are our own: nothing foreign is unpickled
-            ForkingPickler.loads(ForkingPickler.dumps(error))  # pyright: ignore[reportAttributeAccessIssue]
+        raise JobError(_unsendable("a part", error)) from None
+    try:
+        return _packed(part())
+    except Exception as error:
+        try:
+            _unpacked(_packed(error))
         except Exception:  # noqa: BLE001 - whatever its class does when it is made again
             raise JobError(f"{type(error).__name__}: {first_line(error)}") from None
         raise
+
+
+def _packed(value: Any) -> bytes:
+    return bytes(ForkingPickler.dumps(value))
+
+
+def _unpacked(packed: bytes) -> Any:
+    # the bytes are our own: nothing foreign is unpickled
+    return ForkingPickler.loads(packed)  # pyright: ignore[reportAttributeAccessIssue]
+
+
+def _unsendable(what: str, error: Exception) -> str:
+    return f"{what} cannot be sent between processes ({type(error).__name__}: {first_line(error)})"
 
 
 def _beat(beats: Any) -> None:

@@ -300,7 +300,9 @@ def policy_factory(spec: str) -> PolicyFactory:
     if is_own(name) and name.partition(":")[0] not in RULES:
         if at:
             return OwnLearnerPolicy(name, Path(file))
-        return OwnPolicyFactory(load_own(name, "policy"), name)
+        load_own(name, "policy")  # a wrong name is an error now
+        place, _, found = name.rpartition(":")
+        return NamedPolicy(f"{Path(place).resolve()}:{found}" if place.endswith(".py") else name)
     path = Path(spec)
     if path.is_dir():
         raise CheckpointError(f"{path} is a folder; name the .pt file of a policy in it")
@@ -325,6 +327,21 @@ class OwnPolicyFactory:
         if options := asked_options(self.given, self.name):
             env = parallel_env(env.scenario, **options)
         return copy.deepcopy(own_policy(self.given, self.name, env))
+
+
+@dataclass(frozen=True)
+class NamedPolicy:
+    """Maker of a user's policy by its name, because other processes cannot import a FILE.py.
+
+    Attributes:
+        name: Name as for `load_own`; a file has its whole path.
+    """
+
+    name: str
+
+    def __call__(self, env: TrafficEnv) -> Policy:
+        """Return the policy for an environment, whose options are those that it asks for."""
+        return OwnPolicyFactory(load_own(self.name, "policy"), self.name)(env)
 
 
 @dataclass(frozen=True)

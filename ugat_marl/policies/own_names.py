@@ -79,7 +79,7 @@ def load_own(name: str, what: str) -> Any:
     """
     if name in _given:
         return _given[name]
-    place, _, path = name.partition(":")
+    place, _, path = name.rpartition(":")  # a path of Windows has a colon, too
     file = Path(place).resolve() if place.endswith(".py") else None
     folder = str(Path.cwd() if file is None else file.parent)
     if folder not in sys.path:
