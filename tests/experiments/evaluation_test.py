@@ -135,6 +135,12 @@ def test_a_wrong_name_is_refused_before_anything_runs() -> None:
         policy_factory("largest-que:20")
 
 
+def test_a_file_of_python_is_given_with_the_name_in_it(tmp_path: Path) -> None:
+    (tmp_path / "mine.py").touch()
+    with pytest.raises(OptionError, match=r"give the name in it, .*mine\.py:NAME$"):
+        policy_factory(str(tmp_path / "mine.py"))
+
+
 def test_a_policy_of_another_scenario_is_refused(tmp_path: Path) -> None:
     learner = DQN.of(parallel_env("grid2x2-v1"))
     learner.policy().save(tmp_path / "policy.pt")

@@ -306,6 +306,8 @@ def policy_factory(spec: str) -> PolicyFactory:
     path = Path(spec)
     if path.is_dir():
         raise CheckpointError(f"{path} is a folder; name the .pt file of a policy in it")
+    if path.suffix == ".py" and path.is_file():
+        raise OptionError(f"policy {spec!r}: give the name in it, {spec}:NAME")
     if path.suffix != ".pt" and not path.is_file() and "/" not in spec:
         return rule_factory(spec)
     from ugat_marl.policies import load_policy, rule_in  # torch, which rules do without
