@@ -12,6 +12,7 @@ import re
 import subprocess
 import sys
 import threading
+import zipfile
 from collections import OrderedDict, deque
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -948,6 +949,39 @@ def test_a_learner_is_restored_with_the_settings_of_its_training(
     other = OwnLearnerFactory("my_algo:Phased", ["phase=1"])
     restored = other.read_policy(lambda **_: ToyTraffic(), Path("kept.pt"))
     assert acts(restored)["a"] == acts(learner.policy())["a"] - 1
+
+
+class WithCounters(Noted):
+    """A learner that keeps a file of its own beside the path that it is given."""
+
+    def __init__(self, note: str = "") -> None:
+        self.note = note
+
+    def save(self, path: Path) -> None:
+        super().save(path)
+        path.with_name("counters.json").write_text(self.note)
+
+    def load(self, path: Path) -> None:
+        super().load(path)
+        self.note = path.with_name("counters.json").read_text()
+
+
+def test_files_of_any_name_beside_the_state_come_back(tmp_path: Path) -> None:
+    env, file, given = ToyTraffic(), tmp_path / "learner.zip", WithCounters()
+    OwnLearner(WithCounters("mine"), "kept", env).save(file)
+    OwnLearner(given, "kept", env).load(file)
+    assert given.note == "mine"
+
+
+def test_a_state_of_version_1_is_loaded(tmp_path: Path) -> None:
+    """Its files stood beside the counters."""
+    file, learner = tmp_path / "learner.zip", OwnLearner(Noted(), "noted", ToyTraffic())
+    counters = {"episodes": 3, "env_options": {}, "settings": []}
+    with zipfile.ZipFile(file, "w") as packed:
+        packed.writestr("learner.pt", "noted")
+        packed.writestr("counters.json", json.dumps(counters))
+    learner.load(file)
+    assert learner.episodes == 3
 
 
 @pytest.mark.usefixtures("algorithm")

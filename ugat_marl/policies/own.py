@@ -58,6 +58,9 @@ NEEDED = {"learn": ("env", "episodes"), "policy": ()}
 
 _STATE = "learner.pt"
 
+_FILES = "files"
+"""Folder of the user's files in a checkpoint; in version 1 they stood beside the counters."""
+
 OF_POLICIES = ("observation", "neighbours", "commands", "signals")
 """Options of an environment that a policy may ask for: what it sees, and how signals are shown."""
 OF_LEARNERS = ("observation", "commands", "signals")
@@ -319,10 +322,11 @@ class OwnLearner:
         if other := other_observation(counters["env_options"], self._env_options):
             raise CheckpointError(f"{path}: its learner was trained with {other}")
         with tempfile.TemporaryDirectory() as folder:
+            files = Path(folder, _FILES if counters["version"] > 1 else "")
             try:
                 with zipfile.ZipFile(path) as packed:
                     packed.extractall(folder)
-                self._given.load(Path(folder, _STATE))
+                self._given.load(files / _STATE)
             except Exception as error:
                 raise CheckpointError(
                     f"{path}: the learner {self._name!r} cannot load it "
@@ -338,10 +342,13 @@ class OwnLearner:
         """
         memory = io.BytesIO()
         with tempfile.TemporaryDirectory() as folder, zipfile.ZipFile(memory, "w") as packed:
-            self._given.save(Path(folder, _STATE))
+            files = Path(folder, _FILES)
+            files.mkdir()
+            self._given.save(files / _STATE)
             for file in sorted(Path(folder).rglob("*")):
                 packed.write(file, file.relative_to(folder))
             counters = {
+                "version": 2,
                 "episodes": self.episodes,
                 "env_options": json.loads(plain_options(self._env_options)),
                 "settings": self._settings,
@@ -534,6 +541,7 @@ def _counters(path: Path) -> dict[str, Any]:
             if episodes < 0:
                 raise ValueError(f"{episodes} episodes")
             return {
+                "version": int(counters.get("version", 1)),
                 "episodes": episodes,
                 "env_options": dict(counters["env_options"]),
                 "settings": [str(setting) for setting in counters["settings"]],
