@@ -290,8 +290,34 @@ def test_infos_may_be_an_argument_by_name_alone() -> None:
     def needed(observations: Any, *, infos: Any) -> Any:
         return given(observations, infos=infos)
 
-    for act in (given, needed):
+    def of_one(observations: Any, *, info: Any = None) -> Any:
+        return given(observations, infos=info)
+
+    for act in (given, needed, of_one):
         assert set(own_policy(act, "mine", env).act(observations, infos).values()) == {0}
+
+
+def test_a_policy_that_asks_for_masks_is_told_where_they_are() -> None:
+    def ranked(observations: Any, mask: Any = None) -> Any: ...
+
+    def named(observations: Any, *, action_mask: Any = None) -> Any: ...
+
+    for act in (ranked, named):
+        with pytest.raises(OptionError, match=r"mask' is never given; take the infos"):
+            OwnPolicy(act, "mine", {})
+
+    def of_its_own(observations: Any, infos: Any, mask: Any = None) -> Any:
+        return dict.fromkeys(observations, int(mask is not None))
+
+    assert OwnPolicy(of_its_own, "mine", {}).act({"a": [1]}, {}) == {"a": 0}
+
+
+def test_infos_may_hold_no_masks_and_more_than_the_agents() -> None:
+    """The kit allows both."""
+    policy = OwnPolicy(lambda observations: dict.fromkeys(observations, 2), "mine", {})
+    assert policy.act({"a": [1]}, {"__common__": {"time_s": 1.0}, "a": {}}) == {"a": 2}
+    with pytest.raises(OptionError, match="no phase for 'b'"):
+        OwnPolicy(lambda observations: {"a": 0}, "mine", {}).act({"a": [1], "b": [1]}, {})
 
 
 def test_an_option_of_a_policy_does_not_get_the_infos() -> None:
@@ -301,7 +327,10 @@ def test_an_option_of_a_policy_does_not_get_the_infos() -> None:
     def asks(observations: Any, infos: Any = None) -> Any:
         return dict.fromkeys(observations, int(infos is None))
 
-    for act in (plain, asks):
+    def asks_for_one(observations: Any, info: Any = None) -> Any:
+        return asks(observations, info)
+
+    for act in (plain, asks, asks_for_one):
         assert OwnPolicy(act, "mine", {}).act({"a": [1]}, {"a": {"action_mask": [1]}}) == {"a": 0}
 
 

@@ -61,6 +61,11 @@ _STATE = "learner.pt"
 _FILES = "files"
 """Folder of the user's files in a checkpoint; in version 1 they stood beside the counters."""
 
+_INFOS = ("infos", "info")
+"""Names of the argument with a default that is given the infos."""
+_MASKS = ("mask", "masks", "action_mask", "action_masks")
+"""Names of arguments that are meant for masks, which stand in the infos."""
+
 OF_POLICIES = ("observation", "neighbours", "commands", "signals")
 """Options of an environment that a policy may ask for: what it sees, and how signals are shown."""
 OF_LEARNERS = ("observation", "commands", "signals")
@@ -107,7 +112,7 @@ class OwnPolicy:
         shared: Objects that copies of the policy share, such as the environment of its training.
 
     Raises:
-        OptionError: `given` can neither act nor be called.
+        OptionError: `given` can neither act nor be called, or asks for masks in place of infos.
     """
 
     def __init__(
@@ -128,13 +133,19 @@ class OwnPolicy:
         shown = {key: asked[key] for key in OF_POLICIES if key in asked}
         self.env_options: Mapping[str, Any] = {**env_options, **shown}
         self._given, self._name, self._state, self._shared = given, name, state, shared
-        self._names_infos = _names_infos(act)
-        if not (self._names_infos or _takes(act, 1) or _takes(act, 2)):
+        self._infos_name = _infos_name(act)
+        if not (self._infos_name or _takes(act, 1) or _takes(act, 2)):
             raise OptionError(
                 f"policy {name!r} takes {inspect.signature(act)}, and is called with the "
                 "observations and the infos, or with the observations alone"
             )
         self._sees_infos = _sees_infos(act)
+        asks = [argument for argument in _MASKS if argument in _arguments(act)]
+        if asks and not (self._infos_name or self._sees_infos):
+            raise OptionError(
+                f"policy {name!r}: its argument {asks[0]!r} is never given; take the infos, as "
+                "act(observations, infos), in which infos[agent]['action_mask'] is the mask"
+            )
 
     @property
     def savable(self) -> bool:
@@ -154,7 +165,7 @@ class OwnPolicy:
             OptionError: It returned no mapping from every agent to a phase that the agent has.
         """
         act = getattr(self._given, "act", self._given)
-        by_name = {"infos": infos} if self._names_infos else {}
+        by_name = {self._infos_name: infos} if self._infos_name else {}
         in_place = [infos] if self._sees_infos else []
         chosen = act(observations, *in_place, **by_name)
         if not isinstance(chosen, Mapping):
@@ -171,20 +182,20 @@ class OwnPolicy:
                     f"policy {self._name!r} returned {action!r} for {agent!r}; it must be the "
                     "number of a phase, one whole number"
                 ) from None
-        self._require_phases(actions, infos)
+        self._require_phases(actions, observations, infos)
         return actions
 
-    def _require_phases(self, actions: Actions, infos: Infos) -> None:
-        for agent, info in infos.items():
+    def _require_phases(self, actions: Actions, observations: Observations, infos: Infos) -> None:
+        for agent in observations:
             if agent not in actions:
                 raise OptionError(
                     f"policy {self._name!r} returned no phase for {agent!r}; every agent needs one"
                 )
-            phases = len(info["action_mask"])
-            if not 0 <= actions[agent] < phases:
+            mask = infos.get(agent, {}).get("action_mask")
+            if mask is not None and not 0 <= actions[agent] < len(mask):
                 raise OptionError(
                     f"policy {self._name!r} returned {actions[agent]} for {agent!r}; its phases "
-                    f"are 0 to {phases - 1}"
+                    f"are 0 to {len(mask) - 1}"
                 )
 
     def save(self, path: Path) -> None:
@@ -595,13 +606,15 @@ def _sees_infos(act: Callable[..., Any]) -> bool:
     if not _takes(act, 2):
         return False
     second = [*_arguments(act).values()][1:2]
-    return all(one.default is one.empty or one.name == "infos" for one in second)
+    return all(one.default is one.empty or one.name in _INFOS for one in second)
 
 
-def _names_infos(act: Callable[..., Any]) -> bool:
-    """Return True if a policy takes the infos by their name alone, ``act(seen, *, infos)``."""
-    infos = _arguments(act).get("infos")
-    return infos is not None and infos.kind is infos.KEYWORD_ONLY and _takes(act, 1, "infos")
+def _infos_name(act: Callable[..., Any]) -> str:
+    """Return the name by which alone a policy takes infos, ``act(seen, *, infos)``; "" if none."""
+    for name, one in _arguments(act).items():
+        if name in _INFOS and one.kind is one.KEYWORD_ONLY and _takes(act, 1, name):
+            return name
+    return ""
 
 
 def _wants_env(made: Callable[..., Any]) -> bool:
