@@ -5,6 +5,7 @@ No generator state is saved. A resumed run derives the stream of "iteration 3, e
 
 from __future__ import annotations
 
+import operator
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -19,9 +20,12 @@ def derive_seed(seed: int, *path: int | str) -> int:
     Numbers count modulo 2^32, the root modulo 2^64, and a text of one letter as the letter's code:
     a part that is a number at one call should not be a text at another.
     """
-    words = [seed & 0xFFFFFFFF, (seed >> 32) & 0xFFFFFFFF]
+    root = operator.index(seed)  # of NumPy's integers, which may be too narrow
+    words = [root & 0xFFFFFFFF, (root >> 32) & 0xFFFFFFFF]
     for part in path:
-        words.extend(part.encode() if isinstance(part, str) else [part & 0xFFFFFFFF])
+        words.extend(
+            part.encode() if isinstance(part, str) else [operator.index(part) & 0xFFFFFFFF]
+        )
         words.append(0xFFFFFFFF)  # ends a part, so that ("ab", "c") and ("a", "bc") differ
     return int(np.random.SeedSequence(words).generate_state(1, np.uint32)[0] >> 1)
 
