@@ -76,6 +76,18 @@ def test_the_file_gets_the_rights_any_new_file_gets(tmp_path: Path) -> None:
     assert stat.S_IMODE((tmp_path / "file").stat().st_mode) == 0o640
 
 
+def test_a_file_that_is_replaced_keeps_its_rights(tmp_path: Path) -> None:
+    file = tmp_path / "secret"
+    file.touch()
+    file.chmod(0o600)
+    with replacing(file) as temporary:
+        assert stat.S_IMODE(temporary.stat().st_mode) == 0o600
+    file.chmod(0o444)
+    write_whole(file, b"new")
+    assert stat.S_IMODE(file.stat().st_mode) == 0o444
+    assert file.read_bytes() == b"new"
+
+
 KILLED = """
 import os, sys, time
 from pathlib import Path

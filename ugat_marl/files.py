@@ -74,16 +74,23 @@ _IN_ATTRIBUTE = _IN_TEXT | str.maketrans(
 
 @contextlib.contextmanager
 def replacing(path: Path) -> Iterator[Path]:
-    """Yield a temporary path beside `path`; it replaces `path` if the block ends normally."""
+    """Yield a temporary path beside `path`; it replaces `path` if the block ends normally.
+
+    A file that is replaced keeps its rights.
+    """
     require_writable(path)
     if path.is_symlink():  # it goes on to point at the file
         path = Path(os.path.realpath(path))
         require_writable(path)
     temporary = path.with_name(f".{secrets.token_hex(8)}.tmp")
+    mode = stat.S_IMODE(path.stat().st_mode) if path.exists() else None
     # opened like any new file, so that the system applies the umask
-    os.close(os.open(temporary, os.O_WRONLY | os.O_CREAT | os.O_EXCL, 0o666))
+    rights = 0o666 if mode is None else 0o600
+    os.close(os.open(temporary, os.O_WRONLY | os.O_CREAT | os.O_EXCL, rights))
     try:
         yield temporary
+        if mode is not None:
+            temporary.chmod(mode)
         temporary.replace(path)
     except OSError as error:
         if error.filename is None and error.errno in _NO_ROOM:  # of a write, which has no name
