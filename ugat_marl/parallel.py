@@ -347,7 +347,7 @@ class _Process(ProcessPoolExecutor):
         packed = future.result()
         try:
             return _unpacked(packed)
-        except Exception as error:
+        except Exception as error:  # noqa: BLE001 - whatever its classes do when made again
             raise JobError(_unsendable("the result of a part", error)) from None
 
 
@@ -361,7 +361,7 @@ def _carried(packed: bytes) -> bytes:
     """
     try:
         part = _unpacked(packed)
-    except Exception as error:
+    except Exception as error:  # noqa: BLE001 - as above
         raise JobError(_unsendable("a part", error)) from None
     try:
         return _packed(part())

@@ -695,6 +695,12 @@ def test_settings_come_in_the_forms_of_their_types(hint: Any, text: str, value: 
     assert parsed_settings([f"x={text}"], ["x"], {"x": hint}, "mine") == {"x": value}
 
 
+def test_a_setting_is_given_once() -> None:
+    for other in ("gae_lambda=0.5", "gae-lambda=0.9"):
+        with pytest.raises(OptionError, match="gae_lambda is given twice"):
+            parsed_settings(["gae_lambda=0.9", other], ["gae_lambda"], {}, "mine")
+
+
 @pytest.mark.parametrize("text", ["{[1]:2}", "-" * 20_000 + "1", "some words"])
 def test_words_that_are_no_literal_stay_words(text: str) -> None:
     assert parsed_settings([f"x={text}"], ["x"], {}, "mine") == {"x": text}
@@ -865,6 +871,12 @@ def test_a_file_that_is_no_python_is_refused_in_a_line(tmp_path: Path) -> None:
     (tmp_path / "broken.py").write_text("def policy(:\n    pass\n")
     with pytest.raises(OptionError, match=r"broken\.py, line 1 is no Python \(invalid syntax\)"):
         load_own(f"{tmp_path}/broken.py:policy", "policy")
+
+
+def test_a_file_that_imports_a_missing_name_is_refused_in_a_line(tmp_path: Path) -> None:
+    (tmp_path / "astray.py").write_text("import math\nfrom math import no_such_name\n")
+    with pytest.raises(OptionError, match=r"astray\.py, line 2: cannot import name .*name'[^\n]*$"):
+        load_own(f"{tmp_path}/astray.py:policy", "policy")
 
 
 def test_a_function_without_a_name_has_one() -> None:

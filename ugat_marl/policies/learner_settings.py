@@ -25,23 +25,29 @@ def parsed_settings(
         learner: Name of the learner for messages.
 
     Raises:
-        OptionError: A setting has another form, or a value another type.
+        OptionError: A setting has another form or is given twice, or a value has another type.
         UnknownNameError: A name is unknown.
     """
     values: dict[str, Any] = {}
     for setting in settings:
-        name, equals, text = setting.partition("=")
-        name = name.replace("-", "_")
+        name, (_, equals, text) = setting_name(setting), setting.partition("=")
         if not equals or not text:
             raise OptionError(f"learner setting {setting!r}: must be NAME=VALUE")
         if name not in names:
             raise UnknownNameError(f"setting of {learner}", name, names)
+        if name in values:
+            raise OptionError(f"learner setting {setting!r}: {name} is given twice; give it once")
         try:
             values[name] = _converted(text, hints.get(name, Any))
         except ValidationError as error:
             reason = error.errors()[0]["msg"]
             raise OptionError(f"learner setting {setting!r}: {reason}") from None
     return values
+
+
+def setting_name(setting: str) -> str:
+    """Return the name in ``NAME=VALUE``, with ``_`` for ``-``."""
+    return setting.partition("=")[0].replace("-", "_")
 
 
 def _converted(text: str, hint: Any) -> Any:

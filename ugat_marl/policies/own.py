@@ -47,7 +47,7 @@ from ugat_marl.files import (
     require_stored,
     write_whole,
 )
-from ugat_marl.policies.learner_settings import parsed_settings
+from ugat_marl.policies.learner_settings import parsed_settings, setting_name
 from ugat_marl.policies.own_names import load_own
 from ugat_marl.policies.protocols import EpisodeCallback, Policy
 from ugat_marl.policies.saved_options import other_observation, plain_options
@@ -472,7 +472,8 @@ class OwnLearnerFactory:
         """
         counters = _counters(path)
         with contextlib.closing(make_env(**counters["env_options"])) as env:
-            learner = OwnLearnerFactory(self.name, [*counters["settings"], *self._texts])(env, 0)
+            settings = {setting_name(one): one for one in (*counters["settings"], *self._texts)}
+            learner = OwnLearnerFactory(self.name, [*settings.values()])(env, 0)
             learner.load(path)
             return learner.policy()
 

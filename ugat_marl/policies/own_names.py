@@ -14,6 +14,7 @@ import importlib.util
 import inspect
 import re
 import sys
+import traceback
 from collections import deque
 from collections.abc import Callable, Mapping, Sequence
 from enum import Enum
@@ -23,7 +24,7 @@ from typing import Any
 
 import numpy as np
 
-from ugat_marl.errors import OptionError, UnknownNameError
+from ugat_marl.errors import OptionError, UnknownNameError, first_line
 from ugat_marl.files import file_hash
 
 _NAME = re.compile(r"[\w./\\-]+:[A-Za-z_<][\w.<>]*")
@@ -74,7 +75,7 @@ def load_own(name: str, what: str) -> Any:
         what: Kind of thing for messages, such as "learner".
 
     Raises:
-        OptionError: The module is missing.
+        OptionError: The module is missing, or needs what is missing.
         UnknownNameError: The object is missing in it.
     """
     if name in _given:
@@ -104,9 +105,20 @@ def load_own(name: str, what: str) -> Any:
                 "write FILE.py:NAME, or the name of a module, a colon, and the name in it"
             )
         raise OptionError(f"{what} {name!r}: {missing}") from None
+    except ImportError as error:
+        *_, last = traceback.extract_tb(error.__traceback__)
+        where = f"{last.filename}, line {last.lineno}"
+        raise OptionError(f"{what} {name!r}: {where}: {first_line(error)}") from None
     except SyntaxError as error:
         where = f"{error.filename}, line {error.lineno}"
         raise OptionError(f"{what} {name!r}: {where} is no Python ({error.msg})") from None
+    found = _member(found, path, f"{what} in {module_name}", of_learners=what == "learner")
+    _file_hash(_named(found))  # keeps it
+    return found
+
+
+def _member(found: Any, path: str, what: str, *, of_learners: bool) -> Any:
+    """Return what stands in a module under a dotted name; `what` is for the error."""
     for part in path.split("."):
         if not hasattr(found, part):
             own = getattr(found, "__module__", getattr(found, "__name__", None))
@@ -115,11 +127,10 @@ def load_own(name: str, what: str) -> Any:
                 for key, value in getattr(found, "__dict__", {}).items()
                 if callable(value) and getattr(value, "__module__", own) == own
             ]
-            if what == "learner":
+            if of_learners:
                 names = [key for key in names if hasattr(getattr(found, key), "learn")] or names
-            raise UnknownNameError(f"{what} in {module_name}", part, names)
+            raise UnknownNameError(what, part, names)
         found = getattr(found, part)
-    _file_hash(_named(found))  # keeps it
     return found
 
 

@@ -253,7 +253,12 @@ def learner_library(name: str) -> str:
 
 
 def learner_is_installed(name: str) -> bool:
-    """Return true if the libraries of a learner are installed; the check imports them."""
+    """Return true if the libraries of a learner are installed; the check imports them.
+
+    Raises:
+        UnknownNameError: There is no such learner.
+    """
+    require_known_learner(name)
     if name in BASELINES:
         try:
             load_baseline(name)
