@@ -119,7 +119,7 @@ def test_the_best_of_the_standard_rules_is_found(env: TrafficEnv) -> None:
         rule = make_rule(rival, env)
         assert found >= np.mean([roll_out(env, rule, seed).mean_reward for seed in seeds])
     assert name in heard
-    assert len(heard) == plays(env, BEST, 0)
+    assert len(heard) == plays(BEST, 0, env)
 
 
 def test_rules_that_read_something_else_do_not_teach(env: TrafficEnv) -> None:

@@ -29,7 +29,7 @@ def breaks(check: str) -> Any:
     return mark
 
 
-@breaks("an_episode_runs")
+@breaks("a_seed_repeats_its_episode")
 class FailsHalfWay(ToyTraffic):
     def step(self, actions):
         if self._step == 5:

@@ -87,9 +87,8 @@ def export_policy(
     side_car = path.with_suffix(".json")
     for place in (path, side_car):
         require_writable(place)
-    _refuse_other(side_car)
-    about = _about(policy, env)
     held = _held(side_car)
+    about = _about(policy, env)
     written = held.get("sha256", {}).get(path.suffix)
     if path.exists() and _sum(path.read_bytes()) != written:
         raise OptionError(
@@ -119,13 +118,18 @@ def _sum_of(about: Mapping[str, Any]) -> str:
     return _sum(json.dumps(told, sort_keys=True).encode())
 
 
-def _refuse_other(side_car: Path) -> None:
-    """Refuse to replace a JSON file that is no side-car."""
+def _held(side_car: Path) -> dict[str, Any]:
+    """Return the content of a side-car that is there; empty without one.
+
+    Raises:
+        OptionError: The file is no side-car, and would be lost.
+    """
     if not side_car.exists():
-        return
-    with contextlib.suppress(CheckpointError, TypeError, KeyError):
-        if read_json(side_car, CheckpointError)["kind"] == _KIND:
-            return
+        return {}
+    with contextlib.suppress(CheckpointError, *MALFORMED):
+        held = dict(read_json(side_car, CheckpointError))
+        if held["kind"] == _KIND:
+            return {**held, "sha256": dict(held.get("sha256", {}))}
     raise OptionError(
         f"{side_car}: is there and describes no exported policy; give the model another name, "
         "because this file is written beside it"
@@ -138,15 +142,6 @@ _OF_THE_SITE = ("decision_interval_s", "intersections")
 
 def _of_the_policy(content: Mapping[str, Any]) -> dict[str, Any]:
     return {k: v for k, v in content.items() if k not in (*_OF_THE_SITE, "sha256")}
-
-
-def _held(side_car: Path) -> dict[str, Any]:
-    """Return the content of a side-car that is there; empty without one, or if it is damaged."""
-    try:
-        held = dict(read_json(side_car, CheckpointError))
-        return {**held, "sha256": dict(held["sha256"])}
-    except (CheckpointError, *MALFORMED):
-        return {}
 
 
 def _refuse_models_beside(path: Path) -> None:

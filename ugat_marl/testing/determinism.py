@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from ugat_marl.testing.environment import an_episode_runs
 from ugat_marl.testing.episodes import (
     EnvironmentCase,
     Episode,
@@ -122,7 +121,6 @@ def resets_without_seed_follow_from_the_last(case: EnvironmentCase) -> None:
 
 
 DETERMINISM_CHECKS = (
-    an_episode_runs,
     a_seed_repeats_its_episode,
     other_episodes_leave_no_trace,
     replayed_actions_repeat_the_episode,

@@ -245,15 +245,11 @@ def saving_keeps_its_answers(case: PolicyCase) -> None:
 
 def _loaded(policy: Any, path: Path) -> Any:
     """Return a policy of a file; `load` is a class method, or fills the policy it belongs to."""
-    if _makes(policy):
+    if isinstance(getattr(policy.load, "__self__", None), type):
         return type(policy).load(path)
     loaded = copy.deepcopy(policy)
     loaded.load(path)
     return loaded
-
-
-def _makes(policy: Any) -> bool:
-    return isinstance(getattr(policy.load, "__self__", None), type)
 
 
 POLICY_CHECKS = (

@@ -195,12 +195,12 @@ def lesson_episodes(name: str, given: DQNConfig | None = None, *, known: bool = 
         given: Settings of the user, see `suite_config`.
         known: True if the best rule is known, so that none has to be looked for.
     """
-    from ugat_marl.policies.learners.lessons import most_plays  # torch, which a list does without
+    from ugat_marl.policies.learners.lessons import plays  # torch, which a list does without
 
     config = suite_config(name, given) if name in SUITE_LEARNERS else None
     if config is None or not config.teacher:
         return 0
-    return config.lessons if known else most_plays(config.teacher, config.lessons)
+    return config.lessons if known else plays(config.teacher, config.lessons)
 
 
 _OF_THE_NAME = ("hidden", "network", "steps", "warmup_decisions", "epsilon_decay_decisions")

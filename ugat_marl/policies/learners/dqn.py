@@ -339,7 +339,7 @@ class DQN:
     def plays(self, env: AnyParallelEnv, best: str | None = None) -> int:
         """Return the number of episodes that `attend` plays."""
         teacher = self._teacher(best)
-        return plays(env, teacher, self.config.lessons) if teacher else 0
+        return plays(teacher, self.config.lessons, env) if teacher else 0
 
     def _teacher(self, best: str | None) -> str:
         """Return the teacher's spelling, or `BEST` if it has to be looked for."""

@@ -108,26 +108,18 @@ def find_teacher(
     return running[0], rules[running[0]]
 
 
-def plays(env: AnyParallelEnv, name: str, shown: int) -> int:
+def plays(name: str, shown: int, env: AnyParallelEnv | None = None) -> int:
     """Return the number of episodes that lessons play.
 
     Args:
-        env: The environment.
         name: Spelling of a rule, or `BEST`.
         shown: Episodes that the teacher shows.
+        env: The environment; None for one in which all rules play.
     """
     if name != BEST:
         return shown
-    candidates = len(_candidates(env))
-    return most_plays(name, shown, candidates) if candidates else 0
-
-
-def most_plays(name: str, shown: int, candidates: int | None = None) -> int:
-    """Return the number of episodes of lessons; with `BEST` it depends on `candidates`."""
-    if name != BEST:
-        return shown
-    candidates = len(STANDARD_RULES) if candidates is None else candidates
-    return candidates + FINAL_EPISODES * min(FINALISTS, candidates) + shown
+    candidates = len(STANDARD_RULES if env is None else _candidates(env))
+    return candidates + FINAL_EPISODES * min(FINALISTS, candidates) + shown if candidates else 0
 
 
 def _candidates(env: AnyParallelEnv) -> Sequence[tuple[str, Policy]]:
