@@ -131,9 +131,16 @@ def test_what_was_before_a_log_is_filled_with_its_own_commands() -> None:
     assert played(since, 0, 6) == {"a_0": [1, 0, 1, 1, 0, 0], "b_0": [1] * 6}
     replay = RecordedCommands(since)
     assert (replay.lead(0), replay.decisions(0), replay.longest_lead_s) == (3, 5, 30.0)
-    assert RecordedCommands(since, longest=4).lead(0) == 2  # with two decisions of the log
-    assert RecordedCommands(since, longest=1).lead(0) == 0
     assert since.since(3).frame["step"].unique().sort().to_list() == [0, 1]
+
+
+def test_of_a_log_that_does_not_fit_into_an_episode_the_end_is_left_out() -> None:
+    log = commanded({"a_0": {0: [-1, -1, -1, 1, 0]}, "b_0": {0: [-1, -1, -1, 1, 1]}})
+    since = TransitionLog(replace(log.provenance, from_begin=True), log.frame)
+    replay = RecordedCommands(since, longest=4)
+    assert (replay.lead(0), replay.decisions(0)) == (3, 4)  # at its own time of day
+    with pytest.raises(LogError, match=r"begins 30 s after .* end after 30 s: .*--duration-s"):
+        RecordedCommands(since, longest=3)
 
 
 def test_episodes_without_commands_of_an_agent_are_not_repeated() -> None:

@@ -400,14 +400,18 @@ class Simulation:
         stop = Stop()
         options = {**self.options}
         if duration_s is not None:
-            lead_s = policy.longest_lead_s if isinstance(policy, RecordedCommands) else 0.0
-            options["duration_s"] = min(duration_s + lead_s, self.longest_s)
+            options["duration_s"] = min(duration_s + _lead_s(policy), self.longest_s)
         short = replace(self, options=options, workers=None)
         parts = [(world, policy, seed, stop) for world, seed in zip(worlds, seeds, strict=True)]
         logs = in_order(self.workers, short.play, parts, stop, lambda _: on_done())
         if duration_s is None:
             return logs
         return [log.first(round(duration_s / log.provenance.decision_interval_s)) for log in logs]
+
+
+def _lead_s(policy: Policy) -> float:
+    """Return the seconds that a policy plays before the log whose commands it repeats begins."""
+    return policy.longest_lead_s if isinstance(policy, RecordedCommands) else 0.0
 
 
 AIMED = 0.4
@@ -494,7 +498,7 @@ def fit_street(
     if not config.simulates:
         return street, history
     # Queues grow through a peak: worlds of half an hour tell nothing of an hour's second half.
-    compared_s = min(config.simulated_s, simulation.longest_s)
+    compared_s = min(config.simulated_s, simulation.longest_s - _lead_s(policy))
     decisions = min(real.decisions, max(1, int(compared_s / interval_s)))
     seen = view.summary(real.first(decisions))
     simulated, posterior = list(history.simulated), history.posterior

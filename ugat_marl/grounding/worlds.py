@@ -312,11 +312,12 @@ class RecordedCommands:
 
     Args:
         log: The transitions.
-        longest: Decisions of an episode, into which the log and what leads up to it have to fit;
-            None for as many as they need.
+        longest: Most decisions of an episode; what the log has beyond them is left out. None for
+            as many as it needs.
 
     Raises:
-        LogError: No episode of the log has commands of every agent.
+        LogError: No episode of the log has commands of every agent, or one begins where episodes
+            of `longest` decisions end.
     """
 
     def __init__(self, log: TransitionLog, longest: int | None = None) -> None:
@@ -339,11 +340,16 @@ class RecordedCommands:
         self._commands: list[Mapping[str, NDArray[np.int64]]] = []
         for episode, first in begins.items():
             commands = {agent: _commands_of(own, episode, first) for agent, own in rows.items()}
-            room = first if longest is None else longest - max(map(len, commands.values()))
-            lead = min(first, max(room, 0))
-            self._leads.append(lead)
-            self._commands.append({agent: _led_up(own, lead) for agent, own in commands.items()})
-        self.longest_lead_s = max(self._leads) * log.provenance.decision_interval_s
+            self._leads.append(first)
+            led_up = {agent: _led_up(own, first)[:longest] for agent, own in commands.items()}
+            self._commands.append(led_up)
+        interval_s = log.provenance.decision_interval_s
+        self.longest_lead_s = max(self._leads) * interval_s
+        if longest is not None and max(self._leads) >= longest:
+            raise LogError(
+                f"the log begins {self.longest_lead_s:g} s after its scenario, and episodes end "
+                f"after {longest * interval_s:g} s: choose a longer --duration-s (duration_s)"
+            )
         self.reset(0)
 
     def lead(self, seed: int) -> int:
