@@ -31,8 +31,10 @@ from ugat_marl.grounding.forward import ForwardConfig, ForwardModel
 from ugat_marl.grounding.phase import PhaseReport, _fit_forward
 from ugat_marl.grounding.reports import (
     ForwardReport,
+    TrainingRecord,
     auroc,
     expected_calibration_error,
+    forward_report,
     rate_by_quantile,
     risk_by_coverage,
     spearman,
@@ -222,7 +224,7 @@ def test_a_poor_fit_says_so() -> None:
 
 def test_without_uncertainty_the_report_says_that_all_is_taken() -> None:
     f, h = models()
-    log = planted(0.3, episodes=2, steps=60)
+    log = planted(0.3, episodes=2)
     report = fit(f, h, log, log, dataclasses.replace(QUICK, uncertainty="none"), seed=0)
     (told,) = report.warnings
     assert told == "without uncertainty u is 0, and the gate takes every grounded action"
@@ -387,12 +389,38 @@ def test_the_gap_is_visible_in_actions(fitted) -> None:
     assert report.mean_u_on_real.mean() > report.inverse.mean_u.mean() + 0.05
 
 
+@pytest.mark.parametrize("rows", [30, 90])
+def test_the_best_of_many_epochs_that_learnt_nothing_is_not_trusted(rows: int) -> None:
+    """Every epoch answers with another constant, and the one that fits held-out rows best is kept.
+
+    Rows are scattered around 1 by 1, so that the mean beats no change.
+    """
+    agents, epochs, rng = 24, 20, np.random.default_rng(0)
+    stack = Stack({f"a_{k}": AgentLayout(4, 2) for k in range(agents)})
+    model = ForwardModel(stack, ForwardConfig(**SMALL), torch_generator(0, "f"))
+    happened = torch.from_numpy(rng.normal(1, 1, (agents, rows, 4)))
+    answers = torch.from_numpy(rng.normal(1, 0.2, (epochs, agents, 1, 4)))
+    best = ((answers - happened) ** 2).mean((2, 3)).argmin(0)
+    constant = answers[best, torch.arange(agents)].expand_as(happened)
+    mean = torch.from_numpy(rng.normal(1, 0.1, (agents, 1, 4)))  # of the rows trained on
+
+    def report(predicted: torch.Tensor) -> ForwardReport:
+        held_out, record = torch.ones(agents, rows), TrainingRecord(1, 0.0, 0.0, "steps")
+        return forward_report(model, predicted, happened, happened - mean, held_out, record)
+
+    lucky = report(constant)
+    assert (lucky.error < lucky.mean_outcome).sum() > 2 and lucky.beats_no_change.all()
+    assert lucky.learnt.sum() <= 1
+    assert report(1 + 0.5 * (happened - 1)).learnt.all()
+
+
 def test_only_models_that_learnt_something_are_trusted(fitted) -> None:
     report = fitted[2]
     assert report.trusted().tolist() == [True, True]
     assert report.trusted(least_accuracy=1.1).tolist() == [False, False]
+    beats = np.array([False, True])
     poor = dataclasses.replace(
-        report, forward=dataclasses.replace(report.forward, error=np.array([1.0, 0.01]))
+        report, forward=dataclasses.replace(report.forward, beats_no_change=beats)
     )
     assert poor.trusted().tolist() == [False, True]
     assert any(

@@ -40,9 +40,10 @@ from ugat_marl.grounding import (
     UgatConfig,
 )
 from ugat_marl.grounding.forward import ForwardConfig
+from ugat_marl.grounding.reports import p_of_mean
 from ugat_marl.grounding.residual import ResidualReport
 from ugat_marl.grounding.street_training import RESIDUAL
-from ugat_marl.grounding.trust import Trust, _p, _tested, compare
+from ugat_marl.grounding.trust import Trust, _tested, compare
 from ugat_marl.grounding.uncertainty import mixed_concentration
 from ugat_marl.grounding.view import Moment
 
@@ -201,17 +202,17 @@ def test_p_values_take_groups_for_independent_not_their_rows() -> None:
     shared = np.repeat(generator.normal(0.3, 1.0, 8), 30)
     eight = shared[::30]
     spread = eight.std(ddof=1) / np.sqrt(8)
-    assert _p(shared, group) == pytest.approx(float(stats.t.sf(eight.mean() / spread, 7)))
-    assert _p(np.zeros(240), group) == 1.0
-    assert _p(np.ones(240), group) == 0.0
-    assert _p(np.ones(240), np.zeros(240, dtype=np.int64)) == 1.0, "one group proves nothing"
+    assert p_of_mean(shared, group) == pytest.approx(float(stats.t.sf(eight.mean() / spread, 7)))
+    assert p_of_mean(np.zeros(240), group) == 1.0
+    assert p_of_mean(np.ones(240), group) == 0.0
+    assert p_of_mean(np.ones(240), np.zeros(240, dtype=np.int64)) == 1.0, "one group proves nothing"
 
 
 def test_f_is_trusted_by_chance_no_more_often_than_the_level_says() -> None:
     """Errors of f and its rival are drawn alike; the margin makes it rarer still."""
     generator = np.random.default_rng(1)
     group = np.repeat(np.arange(20), 30)
-    p = [_p(generator.normal(0, 1, 600), group) for _ in range(400)]
+    p = [p_of_mean(generator.normal(0, 1, 600), group) for _ in range(400)]
     assert np.mean(np.array(p) < 0.05) == pytest.approx(0.05, abs=0.03)
 
 
@@ -235,7 +236,7 @@ def test_of_blocks_and_folds_the_more_careful_test_counts() -> None:
     twin, fold = np.ones((1, 240)), np.arange(240) // 48
     own = 0.95 * twin - np.array([0.5, 0.4, -0.3, 0.6, -0.2])[fold]
     surplus = (0.95 * twin - own)[0]
-    by_blocks, by_folds = _p(surplus, np.arange(240) // 30), _p(surplus, fold)
+    by_blocks, by_folds = p_of_mean(surplus, np.arange(240) // 30), p_of_mean(surplus, fold)
     assert by_blocks < 0.9 * by_folds
     assert comparison(own, twin, margin=0.05).p[0] == pytest.approx(by_folds, rel=1e-5)
 

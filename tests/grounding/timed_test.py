@@ -274,8 +274,8 @@ def test_a_report_says_what_is_doubtful(planted) -> None:
     useless = dataclasses.replace(report.inverse.calibration, auroc_off_data=0.5)
     poor = dataclasses.replace(
         report,
-        forward=dataclasses.replace(report.forward, error=np.array([9.0, 0.0])),
-        simulated=dataclasses.replace(report.simulated, error=np.array([0.0, 9.0])),
+        forward=dataclasses.replace(report.forward, beats_no_change=np.array([False, True])),
+        simulated=dataclasses.replace(report.simulated, beats_no_change=np.array([True, False])),
         inverse=dataclasses.replace(report.inverse, calibration=useless),
     )
     assert poor.warnings == (

@@ -21,14 +21,13 @@ from dataclasses import dataclass, replace
 import numpy as np
 import torch
 from numpy.typing import NDArray
-from scipy.special import stdtr
 from torch import Tensor
 
 from ugat_marl.data import TransitionLog
 from ugat_marl.errors import OptionError, require_kinds
 from ugat_marl.grounding.fitting import Changes, Fitter, Split
 from ugat_marl.grounding.forward import ForwardModel
-from ugat_marl.grounding.reports import Floats, flat
+from ugat_marl.grounding.reports import Floats, flat, p_of_mean
 from ugat_marl.grounding.stacked import alike, stack_log
 from ugat_marl.grounding.transform import Transform
 from ugat_marl.policies import one_thread
@@ -238,24 +237,6 @@ def _tested(
         means[:, i] = own[i, counted].mean(), twin[i, counted].mean()
         block, part = (groups[i].numpy()[counted] for groups in (street.block, fold))
         if len(np.unique(block)) >= LEAST_BLOCKS:
-            p[i] = max(_p(surplus[i, counted], groups) for groups in (block, part))
+            p[i] = max(p_of_mean(surplus[i, counted], groups) for groups in (block, part))
     root = np.sqrt(means)
     return Trust(agents, root[0], root[1], p, p < config.level / len(agents))
-
-
-def _p(surplus: Floats, group: NDArray[np.int64]) -> float:
-    """Return the p-value of "the mean is not above 0", if only groups are independent.
-
-    A group with few decisions counts for little: the mean is a ratio of sums, and its deviations
-    are those of its linearisation.
-    """
-    sizes = np.bincount(group)
-    if (sizes > 0).sum() < 2:
-        return 1.0  # one group says nothing of how groups differ
-    total, number = (np.bincount(group, weights=w)[sizes > 0] for w in (surplus, None))
-    mean = float(surplus.mean())
-    deviation = (total - mean * number) / number.mean()
-    spread = float(np.sqrt((deviation**2).sum() / (len(total) - 1) / len(total)))
-    if spread == 0.0:
-        return float(mean <= 0.0)
-    return float(stdtr(len(total) - 1, -mean / spread))
