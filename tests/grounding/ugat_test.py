@@ -469,7 +469,7 @@ def test_a_changed_log_is_another_run(tmp_path: Path) -> None:
 
 
 def test_a_failed_roll_out_ends_the_other_one() -> None:
-    """The street fails at once; the simulation goes on until it is stopped."""
+    """The street fails before the simulation begins, which goes on until it is stopped."""
 
     class Failing:
         def collect(self, *_: object) -> TransitionLog:
@@ -483,6 +483,8 @@ def test_a_failed_roll_out_ends_the_other_one() -> None:
             self.ended = threading.Event()
 
         def collect(self, *_: object) -> None:
+            time.sleep(0.5)
+            self.ended.clear()  # as each roll-out of a simulation does
             if not self.ended.wait(60):
                 raise TimeoutError
 

@@ -9,7 +9,7 @@ from typing import Any
 
 import pytest
 
-from ugat_marl.envs import parallel_env
+from ugat_marl.envs import TrafficEnv, parallel_env
 from ugat_marl.experiments import TransferConfig, transfer
 from ugat_marl.grounding import SimulatedWorld
 from ugat_marl.policies import DQN, DQNConfig, RollOutStopped, make_rule
@@ -38,12 +38,21 @@ def test_an_executor_plays_the_same(most_delay_s: int, rule: str | None) -> None
 
 
 def test_it_can_be_stopped() -> None:
-    env = MAKE()
+    """A stop ends what runs; one that comes too late does not end the next roll-out."""
+    rule, stops = make_rule("fixed-time", MAKE()), [True]
+
+    def make(**options: Any) -> TrafficEnv:
+        if stops:
+            world.stop()
+        return MAKE(**options)
+
     with ThreadPoolExecutor(1) as pool:
-        world = SimulatedWorld(MAKE, "real", 2, 0.0, workers=pool)
+        world = SimulatedWorld(make, "real", 2, 0.0, workers=pool)
+        with pytest.raises(RollOutStopped, match="another roll-out failed"):
+            world.collect(rule, 0, 7)
+        stops.clear()
         world.stop()
-        with pytest.raises(RollOutStopped):
-            world.collect(make_rule("fixed-time", env), 0, 7)
+        assert world.collect(rule, 0, 7) is not None
 
 
 def test_a_run_plays_its_roll_outs_there(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -131,8 +131,9 @@ class Ugat(Algorithm):
                     for future in done:
                         future.result()  # a failed roll-out ends the other one
             except BaseException:
-                for world in worlds:
-                    world.stop()
+                while concurrent.futures.wait(running, timeout=0.2).not_done:
+                    for world in worlds:  # repeated, because a roll-out may begin only now
+                        world.stop()
                 raise
             for future, data in zip(running, (state.simulated, state.real), strict=True):
                 log = future.result()

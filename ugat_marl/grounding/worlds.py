@@ -135,18 +135,16 @@ class SimulatedWorld:
     ) -> list[TransitionLog]:
         """Run a roll-out for each pair of seed and constant delay; return logs in this order."""
         alone = _RollOutAlone(self._make_env, self._most_delay_s, policy, self._epsilon)
-        given = [(*part, self._stop) for part in parts]
-        try:
-            return in_order(self._workers, alone.play, given, self._stop, lambda _: on_done())
-        finally:
-            self._stop = Stop()  # the old one was set at the end
+        self._stop = stop = Stop()
+        given = [(*part, stop) for part in parts]
+        return in_order(self._workers, alone.play, given, stop, lambda _: on_done())
 
     def replay(self) -> Policy | None:
         """Return None: the policy that is given to `collect` acts."""
         return None
 
     def stop(self) -> None:
-        """Stop the running roll-outs."""
+        """Stop the running roll-outs; later ones begin as usual."""
         self._stop.set()
 
 

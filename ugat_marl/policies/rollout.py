@@ -49,7 +49,7 @@ def stop_callback(stop: threading.Event) -> StepCallback:
 
     def check(_step: int) -> None:
         if stop.is_set():
-            raise RollOutStopped
+            raise RollOutStopped("stopped: another roll-out failed, or the run was interrupted")
 
     return check
 
