@@ -353,9 +353,10 @@ def test_an_agent_that_is_missing_in_held_out_episodes_is_split_in_time() -> Non
     assert parts.held_out[1].tolist() == (data.episode[1] == 1).double().tolist()
 
 
-def test_one_episode_is_split_in_time() -> None:
+@pytest.mark.parametrize("first", [0, 5, 400])  # a measured log counts from its scenario's begin
+def test_one_episode_is_split_in_time(first: int) -> None:
     data = stack_log(planted(0.3, episodes=1, steps=20), STACK)
-    parts = split(data, 4, STACK)
+    parts = split(dataclasses.replace(data, step=data.step + first), 4, STACK)
     assert parts.kind == "steps"
     assert parts.train[0].tolist() == [1.0] * 15 + [0.0] * 5
 

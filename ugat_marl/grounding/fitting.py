@@ -130,8 +130,8 @@ def split(data: StackedTransitions, every: int, stack: Stack) -> Split:
     Raises:
         LogError: An agent would have nothing to train on or nothing held out.
     """
-    last = torch.where(data.weight.bool(), data.step, 0).amax(1, keepdim=True)
-    held, kind = data.step > last * (1 - 1 / every), "steps"
+    first, last = (_step_of_episode(data, end) for end in ("amin", "amax"))
+    held, kind = data.step - first > (last - first) * (1 - 1 / every), "steps"
     if int(data.episode.max()) > 0:
         whole, kind = data.episode % every == 1 % every, "episodes"
         both = ((data.weight * whole).sum(1) > 0) & ((data.weight * ~whole).sum(1) > 0)
@@ -144,6 +144,15 @@ def split(data: StackedTransitions, every: int, stack: Stack) -> Split:
                 "record at least two whole episodes"
             )
     return Split(train, held_out, kind)
+
+
+def _step_of_episode(data: StackedTransitions, end: Literal["amin", "amax"]) -> Tensor:
+    """Return the first or the last step of each row's episode, ``(agents, n)``."""
+    rows, step = data.weight.bool(), data.step
+    episode = torch.where(rows, data.episode + 1, 0)  # 0 for all that is no row
+    ends = torch.zeros(len(step), int(episode.max()) + 1, dtype=torch.long)
+    ends.scatter_reduce_(1, episode, step, end, include_self=False)
+    return ends.gather(1, episode)
 
 
 def refuse_mismatch(real: TransitionLog, simulated: TransitionLog) -> None:
