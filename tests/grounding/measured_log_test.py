@@ -16,7 +16,7 @@ from ugat_marl.__main__ import main
 from ugat_marl.data import MeasuredData, TransitionLog, write_measured
 from ugat_marl.effects import load_scenario
 from ugat_marl.envs import parallel_env
-from ugat_marl.errors import MeasuredDataError, OptionError
+from ugat_marl.errors import MeasuredDataError, OptionError, UnknownNameError
 from ugat_marl.experiments import policy_factory, record
 from ugat_marl.grounding import (
     LaneView,
@@ -127,6 +127,28 @@ def test_lanes_that_a_table_lacks_are_said_to_be_estimated(
     config = StreetConfig()
     assert "eyes" not in config.of_log(made.log).parts
     assert "eyes" in config.of_log(whole).parts
+
+
+def test_only_estimated_periods_make_up_the_deviation_of_a_lane(
+    crossing: Scenario, measured: MeasuredData
+) -> None:
+    """Of two equal days, one has the lane in its table."""
+    lanes, network = measured.lanes, Network.read(crossing)
+    assert lanes is not None
+    (day,) = measured.periods
+    other = replace(day, id="another day")
+    some = lanes.filter(pl.col("lane_id") != "S_C_0").with_columns(period_id=pl.lit(other.id))
+    given = replace(
+        measured, periods=(day, other), lanes=pl.concat([lanes, some]), trajectories=None
+    )
+    made = log_of_measured(given, crossing, network, "street", "count", "best")
+    alone = imported(measured, crossing).provenance.deviation["S_C_0"]
+    assert made.log.provenance.deviation == {"S_C_0": pytest.approx(alone)}
+
+
+def test_an_unknown_source_is_refused(crossing: Scenario, measured: MeasuredData) -> None:
+    with pytest.raises(UnknownNameError, match="'detection'.*detections"):
+        imported(measured, crossing, source=cast(Any, "detection"))
 
 
 def test_lanes_that_count_with_those_upstream_are_estimated(

@@ -10,7 +10,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from typing import Literal
+from typing import Literal, get_args
 
 import numpy as np
 import polars as pl
@@ -27,7 +27,7 @@ from ugat_marl.data import (
     traffic_of_lanes,
 )
 from ugat_marl.envs import OBSERVATION_UNITS, Observer, Rewarder
-from ugat_marl.errors import MeasuredDataError, OptionError, listed
+from ugat_marl.errors import MeasuredDataError, OptionError, UnknownNameError, listed
 from ugat_marl.grounding.detected import (
     DetectionConfig,
     LaneCourse,
@@ -75,13 +75,13 @@ class _LaneSeries:
         vehicles: Vehicles on the lane.
         halting: Vehicles that stand.
         mean_left: Vehicles that left after a decision, averaged over the interval.
-        deviation: Standard deviation of `vehicles`.
+        deviation: Standard deviation of `vehicles`; None where they are not estimated.
     """
 
     vehicles: Floats
     halting: Floats
     mean_left: Floats
-    deviation: Floats
+    deviation: Floats | None = None
 
 
 def log_of_measured(
@@ -107,7 +107,10 @@ def log_of_measured(
     Raises:
         MeasuredDataError: Signals or detectors are missing, or no phase of the scenario was shown.
         OptionError: The observation cannot be known from measured data.
+        UnknownNameError: There is no such source.
     """
+    if source not in get_args(MeasuredSource):
+        raise UnknownNameError("source of vehicles", source, get_args(MeasuredSource))
     if observation == "waiting":
         raise OptionError(
             "observation 'waiting' sums up how long each vehicle stands, which detectors do not "
@@ -212,7 +215,8 @@ class _Street:
                 for lane in self._lanes
             ]
             for lane, one in zip(self._lanes, lanes, strict=True):
-                variances.setdefault(lane, []).append(one.deviation**2)
+                if one.deviation is not None:
+                    variances.setdefault(lane, []).append(one.deviation**2)
             self._record(recorder, observer, episode, times_s, np.stack(phases, 1), lanes)
         incoming = [x for item in self.network.intersections for x in item.incoming_lanes]
         deviation = {
@@ -278,7 +282,7 @@ class _Street:
         """Return the traffic of a lane at some times."""
         none = np.zeros(len(times_s))
         if courses is None:  # leads away, and the observation does not read it
-            return _LaneSeries(none, none, none, none)
+            return _LaneSeries(none, none, none)
         course, period = courses[episode], self.measured.periods[episode]
         left = course.mean_left(times_s, self.interval_s)
         seen = table.filter(pl.col("lane_id") == lane).sort("time_s") if table is not None else None
@@ -295,7 +299,7 @@ class _Street:
             # Where nothing was seen the street counts as empty; `_unseen` reports it.
             known = seen.select(pl.col("vehicles", "halting").fill_null(0.0))
             vehicles, halting = (known[x].to_numpy()[rows] for x in ("vehicles", "halting"))
-            return _LaneSeries(vehicles, halting, left, none)
+            return _LaneSeries(vehicles, halting, left)
         vehicles, deviation = course.vehicles(times_s), course.deviation(times_s)
         light = next(
             (item for item in self.network.intersections if lane in item.incoming_lanes), None
