@@ -8,13 +8,14 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+import polars as pl
 import pytest
 import torch
 from hypothesis import given
 from hypothesis import strategies as st
 from sklearn.isotonic import IsotonicRegression
 
-from ugat_marl.data import AgentLayout, Provenance, TransitionRecorder
+from ugat_marl.data import AgentLayout, Provenance, TransitionLog, TransitionRecorder
 from ugat_marl.envs import parallel_env
 from ugat_marl.errors import CheckpointError
 from ugat_marl.experiments import student_p
@@ -90,6 +91,9 @@ def test_rewards_are_means_of_episodes_in_the_order_that_is_asked_for() -> None:
     log = recorder.log()
     assert episode_rewards(log, ["a_0", "b_0"]).tolist() == [[5.0, 1.5], [8.0, 6.0]]
     assert episode_rewards(log, ["b_0", "a_0"]).tolist() == [[1.5, 5.0], [6.0, 8.0]]
+    silent = (pl.col("agent") == "b_0") & (pl.col("episode") == 1)
+    log = TransitionLog(log.provenance, log.frame.filter(~silent))
+    assert episode_rewards(log, ["b_0", "a_0"]).tolist() == [[1.5, 5.0], [1.5, 8.0]]
 
 
 def twice(curve: Floats) -> Floats:

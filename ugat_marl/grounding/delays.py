@@ -223,10 +223,14 @@ def match_delays(rewards: EpisodeRewards, lost_s: Floats) -> MatchedDelays:
 
 
 def episode_rewards(log: TransitionLog, agents: Sequence[str]) -> Floats:
-    """Return mean rewards of these agents in each episode of a log, ``(episodes, agents)``."""
+    """Return mean rewards of these agents in each episode of a log, ``(episodes, agents)``.
+
+    An agent without rows in an episode gets the mean of its other episodes.
+    """
     means = log.frame.group_by("episode", "agent").agg(pl.col("reward").mean())
     table = means.pivot("agent", index="episode", values="reward").sort("episode")
-    return table.select(agents).to_numpy().astype(np.float64)
+    known = table.select(pl.col(agent).fill_null(pl.col(agent).mean()) for agent in agents)
+    return known.to_numpy().astype(np.float64)
 
 
 def chance_of(rewards: EpisodeRewards, delay_s: Floats) -> float:
