@@ -33,7 +33,7 @@ from ugat_marl.parallel import Stop
 from ugat_marl.policies import DQNConfig, EpsilonGreedy, make_rule, observer_of, roll_out
 
 QUICK = StreetConfig(
-    simulations=20, further=4, simulated_s=60.0, judged=1, rule_budget=0, rival="matched"
+    simulations=20, further=4, simulated_s=100.0, judged=1, rule_budget=0, rival="matched"
 )
 CONFIG = replace(
     SMALL, ugat=replace(SMALL.ugat, grounding="street", street=QUICK, iterations=1)

@@ -62,7 +62,7 @@ from ugat_marl.simulation import kept_warm
 
 SCENARIO = load_scenario("single-v1")
 LATE = "execution_delay=20+lost_commands=0.2"
-QUICK = StreetConfig(simulations=20, further=4, simulated_s=60.0, rule_budget=0, rival="none")
+QUICK = StreetConfig(simulations=20, further=4, simulated_s=100.0, rule_budget=0, rival="none")
 
 
 def recorded(domain: str, seconds: float = 900.0, seed: int = 0) -> TransitionLog:
@@ -243,7 +243,7 @@ def test_the_last_worlds_of_a_fit_are_drawn_from_the_posterior_of_the_others(
 @pytest.mark.parametrize(
     ("recorded_s", "simulated_s", "compared_s"),
     [
-        pytest.param(300.0, 200.0, 100.0, marks=pytest.mark.slow),
+        pytest.param(600.0, 400.0, 300.0, marks=pytest.mark.slow),
         (80.0, 200.0, 80.0),
         pytest.param(120.0, 80.0, 80.0, marks=pytest.mark.slow),
     ],
@@ -252,7 +252,7 @@ def test_a_street_is_compared_with_worlds_of_the_same_length(
     recorded_s: float, simulated_s: float, compared_s: float
 ) -> None:
     """Queues of a whole peak are not compared with those of its beginning."""
-    config = replace(QUICK, parts=("effects",), simulated_s=100.0)
+    config = replace(QUICK, parts=("effects",), simulated_s=300.0)
     env = parallel_env(SCENARIO)
     prior, view = street_prior(env, config), LaneView.of(env.network, "count")
     rule = make_rule("fixed-time:20", env)
@@ -316,6 +316,10 @@ def test_unknown_parts_and_too_few_simulations_are_refused() -> None:
     ):
         with pytest.raises(OptionError, match=told):
             EyesConfig(**wrong)
+    short = UgatConfig(street=StreetConfig(simulated_s=299.0))
+    with pytest.raises(OptionError, match=r"have to last 300 s or longer.*--street.simulated-s"):
+        simulated_worlds(SCENARIO, "sim", LATE, short, {})
+    simulated_worlds(SCENARIO, "sim", LATE, short, {"duration_s": 200.0})  # whole episodes
     with pytest.raises(OptionError, match="no transform"):
         UgatConfig(grounding="street").transform({}, 0)
 

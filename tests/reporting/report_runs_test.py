@@ -854,7 +854,7 @@ def test_a_run_leaves_all_that_its_page_wants(
         sim_rollouts=1,
         real_rollouts=1,
         fit=FitConfig(epochs=1),
-        street=StreetConfig(simulations=20, simulated_s=60.0, judged=1, rule_budget=0),
+        street=StreetConfig(simulations=20, simulated_s=100.0, judged=1, rule_budget=0),
     )
     learner = "dqn" if grounding == "phase" else "universal"  # the latter takes lessons first
     config = TransferConfig("grid2x2-v1", duration_s=100, evaluation_seeds=2, tuning_seeds=1,

@@ -89,6 +89,10 @@ are with which they train, in s; None for the delay that rewards ask for."""
 RULE_BUDGET = 6
 """Budget of each rule in worlds of the fitted street, with a learner that rules teach."""
 
+LEAST_DECISIONS = 30
+"""Decisions below which a world is not compared with the street, unless its episodes are as short:
+its statistics would be those of a few phases."""
+
 
 @dataclass(frozen=True)
 class StreetConfig:
@@ -170,6 +174,24 @@ class StreetConfig:
     def late_s(self) -> tuple[float | None, ...]:
         """Delay of the greens of each rival, in s; see `RIVALS`."""
         return RIVALS[self.rival] if self.judged > 0 else ()
+
+    def require_decisions(self, interval_s: float, longest_s: float) -> None:
+        """Refuse worlds of too few decisions to compare.
+
+        Args:
+            interval_s: Seconds from one decision to the next.
+            longest_s: Length of an episode in s; worlds of whole episodes are not refused.
+
+        Raises:
+            OptionError: `simulated_s` is shorter than `LEAST_DECISIONS` and than an episode.
+        """
+        least_s = min(LEAST_DECISIONS * interval_s, longest_s)
+        if self.simulates and self.simulated_s < least_s:
+            raise OptionError(
+                f"street.simulated_s = {self.simulated_s:g}: worlds of a decision every "
+                f"{interval_s:g} s have to last {least_s:g} s or longer to be compared with the "
+                "street (--street.simulated-s)"
+            )
 
     def of_log(self, real: TransitionLog) -> StreetConfig:
         """Return the settings for a log; estimated vehicles are no readings of detectors."""
@@ -484,10 +506,12 @@ def fit_street(
 
     Raises:
         LogError: Too many decisions are missing in the log, or they are not in sequence.
+        OptionError: Simulated worlds are too short, see `StreetConfig.require_decisions`.
     """
     require_histories(real, config.longest_lag)
     history = history or FitHistory()
     lanes, interval_s = worlds.lanes, real.provenance.decision_interval_s
+    config.require_decisions(interval_s, simulation.longest_s)
     timing = simulation.scenario.timing
     held_s = timing.clearance_s + timing.min_green_s
     channel = fit_channel(real, config.channel, held_s) if "channel" in config.parts else None
