@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import copy
 from collections.abc import Callable
 
@@ -13,6 +14,7 @@ from hypothesis import strategies as st
 
 import ugat_marl.grounding.phase as phase_module
 from ugat_marl.data import AgentLayout, Provenance, TransitionLog, TransitionRecorder
+from ugat_marl.envs import parallel_env
 from ugat_marl.grounding import (
     FitConfig,
     Fitter,
@@ -33,11 +35,12 @@ def gate(agents: int, alpha: float = 0.5) -> Gate:
     return Gate([f"x_{i}" for i in range(agents)], GateConfig("static", alpha))
 
 
-def settled_among(answer, gate: Gate, own, permitted=None) -> Settled:
-    """Grounded together; each is a neighbour of the next."""
+def settled_among(answer, gate: Gate, own, permitted=None, current=None) -> Settled:
+    """Grounded together; each is a neighbour of the next, and phase 0 runs where none is given."""
     names = gate.agents
     near = {name: names[i + 1 : i + 2] for i, name in enumerate(names)}
-    return together(answer, gate, turns(names, near), np.array(own), permitted)
+    current = np.zeros(len(names), np.int64) if current is None else current
+    return together(answer, gate, turns(names, near), np.array(own), current, permitted)
 
 
 def asked_of(table: Table, u: float = 0.0):
@@ -111,14 +114,31 @@ def test_the_gate_has_its_say_in_every_pass_and_keeps_its_books() -> None:
 
 def test_a_light_that_may_not_change_is_told_as_it_is() -> None:
     free, held = [True, True, True], [False, False, True]
-    assert running(np.array([0, 1]), None).tolist() == [0, 1]
-    assert running(np.array([0, 1]), np.array([free, held])).tolist() == [0, 2]
-    either = np.array([[True, True, False], held])
-    assert running(np.array([2, 2]), either).tolist() == [2, 2]  # nobody knows which of the two
+    now = np.array([0, 2])
+    assert running(np.array([0, 1]), now, None).tolist() == [0, 1]
+    assert running(np.array([0, 1]), now, np.array([free, held])).tolist() == [0, 2]
     answer, told = asked_of(lambda _: [1, 1])
-    settled = settled_among(answer, gate(2), [0, 0], np.array([free, held]))
+    settled = settled_among(answer, gate(2), [0, 0], np.array([free, held]), now)
     assert told == [[0, 2], [1, 2]]
     assert settled.allowed is not None and settled.allowed.tolist() == [True, False]
+
+
+@pytest.mark.parametrize("domain", ["phase_order=cyclic", "phase_order=barrier-both+max_green=20"])
+def test_what_is_told_is_what_an_environment_runs(domain: str) -> None:
+    """Also where a forbidden phase is asked for and several are permitted."""
+    rng, surprising = np.random.default_rng(0), 0
+    with contextlib.closing(parallel_env("grid2x2-v1", domain, duration_s=200.0)) as env:
+        _, infos = env.reset(seed=0)
+        while env.agents:
+            agents = list(env.agents)
+            permitted = np.array([infos[agent]["action_mask"] for agent in agents], bool)
+            current = np.array([infos[agent]["executed_action"] for agent in agents])
+            asked = rng.integers(permitted.shape[1], size=len(agents))
+            told = running(asked, current, permitted)
+            *_, infos = env.step(dict(zip(agents, asked.tolist(), strict=True)))
+            assert told.tolist() == [infos[agent]["executed_action"] for agent in agents]
+            surprising += int(((told != asked) & (permitted.sum(1) > 1)).sum())
+    assert surprising > 10
 
 
 @given(st.data())
@@ -132,10 +152,10 @@ def test_whatever_the_models_answer_they_were_told_what_runs(data: st.DataObject
     permitted = rng.random((agents, phases)) < 0.7
     own = rng.integers(phases, size=agents)
     permitted[np.arange(agents), own] |= ~permitted.any(1)
-    doors = gate(agents)
-    settled = settled_among(answer, doors, own, permitted)
+    doors, current = gate(agents), rng.integers(phases, size=agents)
+    settled = settled_among(answer, doors, own, permitted, current)
     executed = np.where(doors.accepts(settled.u, settled.allowed), settled.grounded, own)
-    assert running(executed, permitted).tolist() == told[-1]
+    assert running(executed, current, permitted).tolist() == told[-1]
     assert len(told) <= PASSES * (agents + 1)
     changed = executed != own
     assert permitted[np.arange(agents), executed][changed].all()
@@ -237,7 +257,7 @@ def test_fed_what_a_asked_for_f_of_b_expects_what_does_not_come(
 ) -> None:
     """The subject of the test above, broken."""
 
-    def apart(answer, _gate, _in_turn, actions, permitted):
+    def apart(answer, _gate, _in_turn, actions, _current, permitted):
         return alone(answer, actions, permitted)
 
     monkeypatch.setattr(phase_module, "together", apart)

@@ -51,17 +51,25 @@ def turns(agents: Sequence[str], near: Mapping[str, Sequence[str]]) -> NDArray[n
     return np.arange(max(turn.values()) + 1)[:, None] == np.array([turn[a] for a in agents])
 
 
-def running(actions: NDArray[np.int64], permitted: NDArray[np.bool_] | None) -> NDArray[np.int64]:
-    """Return the phases that run if these are asked for; a light that may not change stays.
+def running(
+    actions: NDArray[np.int64], current: NDArray[np.int64], permitted: NDArray[np.bool_] | None
+) -> NDArray[np.int64]:
+    """Return the phases that run if these are asked for, by the rule of environments.
+
+    Where a forbidden phase is asked for, the light stays; if it has to change, the next permitted
+    phase of its list follows.
 
     Args:
         actions: ``(agents,)`` phases asked for.
+        current: ``(agents,)`` phases that run now.
         permitted: ``(agents, phases)`` action masks.
     """
     if permitted is None:
         return actions
-    held = ~_allowed(actions, permitted) & (permitted.sum(1) == 1)
-    return np.where(held, permitted.argmax(1), actions)
+    later = permitted & (np.arange(permitted.shape[1]) > current[:, None])
+    following = np.where(later.any(1), later.argmax(1), permitted.argmax(1))
+    otherwise = np.where(_allowed(current, permitted), current, following)
+    return np.where(_allowed(actions, permitted), actions, otherwise)
 
 
 def alone(
@@ -77,6 +85,7 @@ def together(
     gate: Gate,
     in_turn: NDArray[np.bool_],
     actions: NDArray[np.int64],
+    current: NDArray[np.int64],
     permitted: NDArray[np.bool_] | None,
 ) -> Settled:
     """Ground all agents until the assumed phases are those that will run.
@@ -86,9 +95,10 @@ def together(
         gate: Gate that decides which answers would be taken; nothing is logged.
         in_turn: ``(turns, agents)`` bool, groups of `turns`.
         actions: ``(agents,)`` the policy's actions.
+        current: ``(agents,)`` phases that run now.
         permitted: ``(agents, phases)`` action masks.
     """
-    policy_phases = running(actions, permitted)
+    policy_phases = running(actions, current, permitted)
     told, given_up, turn = policy_phases, np.zeros(len(actions), bool), 0
     while True:
         for count in range(1, PASSES + 1):
@@ -97,7 +107,7 @@ def together(
             if permitted is not None:
                 allowed = allowed & _allowed(grounded, permitted)
             executed = np.where(gate.accepts(u, allowed), grounded, actions)
-            will_run = running(executed, permitted)
+            will_run = running(executed, current, permitted)
             changes = will_run != told
             if not changes.any():
                 return Settled(grounded, u, allowed)

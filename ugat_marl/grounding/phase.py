@@ -140,7 +140,8 @@ class PhaseTransform(Transform):
             return inverse.action[:, 0].numpy(), inverse.u[:, 0].numpy()
 
         if self.local.joint:
-            settled = together(answer, self.gate, self._in_turn, actions, permitted)
+            current = self.stack.current_phase(observations)[:, 0].numpy()
+            settled = together(answer, self.gate, self._in_turn, actions, current, permitted)
         else:
             settled = alone(answer, actions, permitted)
         grounded, u = settled.grounded, settled.u

@@ -313,14 +313,15 @@ class TimedTransform(Transform):
         """
         asked = torch.from_numpy(actions)[:, None]
         usual = self._later(self.constants.delay_s.gather(1, asked))
-        switched = (self.stack.current_phase(observations) != asked)[:, 0].numpy()
+        current = self.stack.current_phase(observations)[:, 0].numpy()
+        switched = current != actions
         if self.timed.answer == "constant":
             delay = np.where(switched, usual[:, 0].numpy(), 0.0).astype(np.float32)
             return GroundedActions(
                 actions, actions, np.zeros_like(delay), np.ones_like(switched), delay
             )
         # Grounding keeps all phases, so those of the neighbours are known in advance.
-        phases = torch.from_numpy(running(actions, permitted))[:, None]
+        phases = torch.from_numpy(running(actions, current, permitted))[:, None]
         delays_s, u = self.delays(  # lines 11 and 12
             self.forward.view.seen(observations, phases, earlier),
             self.local.seen(observations, phases),
