@@ -61,7 +61,7 @@ def measured(
     report = fit_inverse(model, simulated, Fitter(config, seed))
     fitted = time.process_time() - began
     there = stack_log(real, stack)
-    accuracy, mean_u = inverse_accuracy(model, there, there.weight)
+    accuracy, mean_u = inverse_accuracy(model, there, there.next_observation, there.weight)
     calibration = report.calibration
     return {
         "fit_s": fitted,

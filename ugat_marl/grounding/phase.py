@@ -98,9 +98,12 @@ class PhaseTransform(Transform):
         inverse = _fit_inverse(h, d_sim, pairs, fitter)
         held_out = fitter.split(d_sim, self.stack).held_out
         held_out_real = fitter.split(d_real, self.stack).held_out
-        agreement, u_on_predictions = on_predictions(f, h, d_sim, held_out, self.draws)
-        accuracy_on_real, u_on_real = inverse_accuracy(h, d_real, held_out_real)
-        accuracy_on_means, _ = _accuracy(h, d_sim, means, held_out)
+        with torch.no_grad():
+            predicted = _predicted(f, f.view.of(d_sim), d_sim.executed, self.draws)
+        agreement, u_on_predictions = inverse_accuracy(h, d_sim, predicted, held_out, self.draws)
+        following = d_real.next_observation
+        accuracy_on_real, u_on_real = inverse_accuracy(h, d_real, following, held_out_real)
+        accuracy_on_means, _ = inverse_accuracy(h, d_sim, means, held_out)
         return PhaseReport(
             agents=self.stack.agents,
             forward=forward,
@@ -346,27 +349,6 @@ def _inverse_report(
     )
 
 
-@torch.no_grad()
-def on_predictions(
-    forward: ForwardModel,
-    inverse: InverseModel,
-    data: StackedTransitions,
-    held_out: Tensor,
-    draws: int = 1,
-) -> tuple[Floats, Floats]:
-    """Return agreement and mean u, per agent, of h on predictions of f in held-out states.
-
-    Args:
-        forward: Fitted f.
-        inverse: Fitted h.
-        data: Transitions of the simulation.
-        held_out: ``(agents, n)`` weights of the rows.
-        draws: 1 for the mean of the networks of f, or else their number for every prediction.
-    """
-    predicted = _predicted(forward, forward.view.of(data), data.executed, draws)
-    return _accuracy(inverse, data, predicted, held_out, draws)
-
-
 def _predicted(model: ForwardModel, seen: Tensor, actions: Tensor, draws: int) -> Tensor:
     """Return the mean prediction of f, or with more than one draw those of all its networks."""
     return model.predict(seen, actions) if draws == 1 else model.predict_each(seen, actions)
@@ -374,21 +356,21 @@ def _predicted(model: ForwardModel, seen: Tensor, actions: Tensor, draws: int) -
 
 @torch.no_grad()
 def inverse_accuracy(
-    inverse: InverseModel, data: StackedTransitions, held_out: Tensor
-) -> tuple[Floats, Floats]:
-    """Return accuracy and mean u, per agent, of h on recorded transitions."""
-    return _accuracy(inverse, data, data.next_observation, held_out)
-
-
-@torch.no_grad()
-def _accuracy(
     inverse: InverseModel,
     data: StackedTransitions,
     next_features: Tensor,
     held_out: Tensor,
     draws: int = 1,
 ) -> tuple[Floats, Floats]:
-    """Return accuracy and mean u, per agent, of h given `next_features`."""
+    """Return accuracy and mean u, per agent, of h given `next_features`.
+
+    Args:
+        inverse: Fitted h.
+        data: States, and the executed actions that h should name.
+        next_features: ``(agents, draws * n, features or more)``, recorded or predicted.
+        held_out: ``(agents, n)`` weights of the rows.
+        draws: Number of draws of each row's next features.
+    """
     answer = inverse.predict(inverse.view.of(data), next_features, draws)
     share = held_out.double() / held_out.double().sum(1, keepdim=True)
     agreement = ((answer.action == data.executed) * share).sum(1)

@@ -512,11 +512,6 @@ class DropoutNet(AnswerNet):
         own_inputs = torch.arange(widest)[None, :, None] < fan_in[:, None, None]
         self.register_buffer("own_inputs", own_inputs, persistent=False)
 
-    @property
-    def rates(self) -> list[Tensor]:
-        """Learned dropout rates of each layer: ``(agents,)``, and ``(1,)`` for a shared head."""
-        return [torch.sigmoid(logit.detach()).flatten() for logit in self._logits()]
-
     def row_loss(self, outputs: Tensor, target: Tensor, arguments: LossArguments) -> Tensor:
         """Return the cross-entropy of one thinned network per row, plus divergence / rows.
 
