@@ -43,7 +43,7 @@ from ugat_marl.grounding.eyes import Eyes, EyesConfig, fit_eyes
 from ugat_marl.grounding.posterior import Posterior, WorldValues
 from ugat_marl.grounding.state import RunState
 from ugat_marl.grounding.street_training import StreetTraining
-from ugat_marl.grounding.summaries import NAMES
+from ugat_marl.grounding.summaries import NAMES, Summary
 from ugat_marl.grounding.worlds import RecordedCommands
 from ugat_marl.parallel import LocalProcesses, Stop
 from ugat_marl.policies import (
@@ -269,6 +269,29 @@ def test_a_street_is_compared_with_worlds_of_the_same_length(
     again, _ = fit_street(begun, shown, rule, prior, view, config, seed=0)
     assert street.posterior is not None and again.posterior is not None
     assert np.array_equal(street.posterior.effects, again.posterior.effects)
+
+
+def test_a_street_is_compared_with_what_fits_behind_the_lead_of_its_log(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """A log from 40 s to 200 s, and episodes of 120 s."""
+    compared, summary = list[int](), LaneView.summary
+
+    def seen(self: LaneView, log: TransitionLog) -> Summary:
+        compared.append(log.decisions)
+        return summary(self, log)
+
+    monkeypatch.setattr(LaneView, "summary", seen)
+    config = replace(QUICK, parts=("effects",), simulated_s=300.0)
+    env = parallel_env(SCENARIO)
+    prior, view = street_prior(env, config), LaneView.of(env.network, "count")
+    env.close()
+    whole = recorded("sim", 200.0)
+    provenance = replace(whole.provenance, from_begin=True)
+    log = TransitionLog(provenance, whole.frame.filter(pl.col("step") >= 4))
+    replay = RecordedCommands(log, longest=12)
+    fit_street(log.from_step_0(), simulation(120.0), replay, prior, view, config, seed=0)
+    assert set(compared) == {8}
 
 
 def test_a_log_of_the_simulation_itself_shows_no_fault() -> None:
