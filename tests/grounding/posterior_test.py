@@ -126,6 +126,17 @@ def test_worlds_to_learn_from_have_most_effects() -> None:
     assert left_out[:, inside].mean() > 0.5 and not whole[:, inside].any()
 
 
+def test_a_log_that_says_nothing_leaves_the_prior_of_unused_green() -> None:
+    silence = Summary.of(np.full((len(LANES), len(NAMES)), np.nan), np.zeros((len(LANES), 1)))
+    means: list[np.ndarray] = []
+    for seed in range(4):
+        worlds = [WORLDS.draw(1000 * seed + k, LEARNT) for k in range(160)]
+        posterior = Posterior.fit(WORLDS, [SimulatedLog(w, silence) for w in worlds], silence)
+        means.append(posterior.sample(200)[1].mean((0, 1)))
+    prior = np.mean([WORLDS.draw(k).service_s.mean(0) for k in range(400)], axis=0)
+    assert np.mean(means, axis=0) == pytest.approx(prior, rel=0.35)
+
+
 def test_low_accelerations_are_drawn_as_often_as_high_ones_of_the_same_ratio() -> None:
     place = [item.name for item in WORLDS.library].index("acceleration")
     item = WORLDS.library[place]

@@ -185,19 +185,21 @@ class WorldPrior:
 
         Args:
             seed: Seed of the world.
-            chance: Chance of each effect to be there, in place of the prior's.
+            chance: Chance of each effect, and of the red that all lanes share, to be there; None
+                for the prior's.
         """
         generator = numpy_generator(seed, "worlds", "prior")
-        chances = [item.chance if chance is None else chance for item in self.library]
-        there = [generator.random() < each for each in chances]
+
+        def is_there(usual: float) -> bool:
+            return bool(generator.random() < (usual if chance is None else chance))
+
+        there = [is_there(item.chance) for item in self.library]
         low, nominal, high = self.ends
         drawn = self.natural(generator.uniform(self.scaled(low), self.scaled(high)))
         effects = np.where(there, drawn, nominal)
         service_s = np.zeros((len(self.lanes), len(SERVICE)))
         for column, prior in zip(service_s.T, SERVICE, strict=True):
-            mean = (
-                generator.uniform(0.0, prior.high_s) if generator.random() < prior.chance else 0.0
-            )
+            mean = generator.uniform(0.0, prior.high_s) if is_there(prior.chance) else 0.0
             unequal = generator.random() < prior.unequal
             spread = generator.uniform(0.0, prior.high_s / 2) if unequal else 0.0
             column += mean + spread * generator.standard_normal(len(self.lanes))
