@@ -170,6 +170,28 @@ def test_mornings_and_evenings_are_no_chance() -> None:
     assert one is not None and check.noise < 2 * one.noise
 
 
+@pytest.mark.parametrize("each", [1, 2, 6])
+def test_chance_passes_seldom_however_few_days_each_hour_has(each: int) -> None:
+    """Twelve hours, and a model that is no better than the one before."""
+
+    def of_hours(seed: int, count: int) -> list[Tally]:
+        made: list[Tally] = []
+        for hour in range(12):
+            level = 1 + 0.3 * np.sin(hour)
+            own = days(seed + hour, count, 20 * level, 4 * level)
+            window = (3600.0 * hour, 3600.0 * (hour + 1))
+            made += [replace(day, window=window) for day in own]
+        return made
+
+    passed = 0
+    for seed in range(0, 6000, 100):
+        street, one, other = of_hours(seed, 1), of_hours(seed + 33, each), of_hours(seed + 66, each)
+        check = traffic_check(street, one, other, THRESHOLDS)
+        assert check is not None and check.noise > 0
+        passed += check.better
+    assert passed <= 8, "one in twenty, and chance"
+
+
 def test_occupied_times_judge_where_no_speeds_are_known() -> None:
     def of_counts(occupied_s: float, count: int) -> list[Tally]:
         rows: list[Tally] = []

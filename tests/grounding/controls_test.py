@@ -92,7 +92,9 @@ def test_a_gate_that_asks_for_proof_stays_shut_on_shuffled_data(honest) -> None:
     assert (report.forward.ratio < 0.9).all()
     assert (report.forward.error >= report.forward.mean_outcome).all()
     assert (own.forward.error < 0.6 * own.forward.mean_outcome).all()
-    assert any("f is no better than one answer for every state" in w for w in report.warnings)
+    assert any(
+        "f is not shown to be better than one answer for every state" in w for w in report.warnings
+    )
     assert not report.trusted(0.8).any() and own.trusted(0.8).all()
     made.gate.trust(report.trusted(0.8))
     assert grounded(made)[:2] == (0.0, 0.0)
@@ -129,7 +131,7 @@ def test_noise_is_as_large_as_what_happens_and_knows_nothing() -> None:
 def test_with_noise_for_f_u_rises_and_a_gate_that_asks_for_proof_stays_shut(honest) -> None:
     made, report = fitted(played(3, seed=1), noise=True)
     assert (report.forward.ratio > 1.2).all()  # of two independent changes the ratio is sqrt(2)
-    assert any("f is no better than predicting no change" in text for text in report.warnings)
+    assert any("f is not shown to be better than no change" in text for text in report.warnings)
     assert (report.mean_u_on_predictions > 1.1 * honest[1].mean_u_on_predictions).all()
     assert not report.trusted(0.8).any() and honest[1].trusted(0.8).all()
     made.gate.trust(report.trusted(0.8))

@@ -425,7 +425,7 @@ def test_only_models_that_learnt_something_are_trusted(fitted) -> None:
     )
     assert poor.trusted().tolist() == [False, True]
     assert any(
-        "f is no better than predicting no change at 1 of 2 (a_0)" in w for w in poor.warnings
+        "f is not shown to be better than no change at 1 of 2 (a_0)" in w for w in poor.warnings
     )
 
 

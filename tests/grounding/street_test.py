@@ -104,13 +104,13 @@ def test_the_fitted_simulation_executes_as_the_street_does(street: FittedStreet)
     env = street_env(street, simulation(seconds=900.0), street.commands)
     try:
         rule = EpsilonGreedy(make_rule("fixed-time:20", env.env), 0.3)
-        log = roll_out(env, rule, 1, record=observer_of(env)).log
+        logs = [roll_out(env, rule, seed, record=observer_of(env)).log for seed in (1, 2, 3)]
     finally:
         env.close()
-    assert log is not None
-    again = fit_channel(log)
-    assert again.lag == 2
-    assert again.lost == pytest.approx(0.2, abs=0.15)
+    again = [fit_channel(log) for log in logs if log is not None]
+    assert [channel.lag for channel in again] == [2, 2, 2]
+    # Each episode draws its own share.
+    assert np.mean([channel.lost for channel in again]) == pytest.approx(0.2, abs=0.15)
 
 
 def test_every_episode_draws_its_own_world_and_a_seed_repeats_it(street: FittedStreet) -> None:
@@ -170,7 +170,7 @@ def test_metrics_tell_intersections_apart_each_with_its_interval() -> None:
 def test_values_of_the_simulation_s_own_vehicles_change_nothing(
     crossing: Callable[..., Path],
 ) -> None:
-    types = """<vType id="slow" accel="2.5" tau="3" decel="4.5"/>
+    types = """<vType id="slow" accel="2.5" tau="5" decel="4.5"/>
         <vType id="old"><carFollowing-Krauss accel="1.5"/></vType>"""
     car = '<vehicle id="v" type="slow" route="north" depart="0"/>'
     for domain, mean in (("sim", 2.0), ("acceleration=0.7", 0.7)):
@@ -179,7 +179,7 @@ def test_values_of_the_simulation_s_own_vehicles_change_nothing(
         env.close()
         found = {item.name: item for item in prior.library}
         assert found["acceleration"].nominal == mean
-        headway = found["headway"]  # its range grows to hold it
+        headway = found["headway"]  # of 5 and SUMO's 1 s; its range grows to hold the mean
         assert (headway.nominal, headway.high) == (3.0, 3.0)
         assert found["startup_delay"].nominal == 0.0
         nominal = WorldValues(np.array([x.nominal for x in prior.library]), np.zeros((2, 2)))
@@ -274,7 +274,7 @@ def test_a_street_is_compared_with_worlds_of_the_same_length(
 def test_a_street_is_compared_with_what_fits_behind_the_lead_of_its_log(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    """A log from 40 s to 200 s, and episodes of 120 s."""
+    """A log from 40 s to 500 s, and episodes of 400 s, or of 330 s, which are too short."""
     compared, summary = list[int](), LaneView.summary
 
     def seen(self: LaneView, log: TransitionLog) -> Summary:
@@ -282,16 +282,18 @@ def test_a_street_is_compared_with_what_fits_behind_the_lead_of_its_log(
         return summary(self, log)
 
     monkeypatch.setattr(LaneView, "summary", seen)
-    config = replace(QUICK, parts=("effects",), simulated_s=300.0)
+    config = replace(QUICK, parts=("effects",), simulated_s=600.0)
     env = parallel_env(SCENARIO)
     prior, view = street_prior(env, config), LaneView.of(env.network, "count")
     env.close()
-    whole = recorded("sim", 200.0)
+    whole = recorded("sim", 500.0)
     provenance = replace(whole.provenance, from_begin=True)
     log = TransitionLog(provenance, whole.frame.filter(pl.col("step") >= 4))
-    replay = RecordedCommands(log, longest=12)
-    fit_street(log.from_step_0(), simulation(120.0), replay, prior, view, config, seed=0)
-    assert set(compared) == {8}
+    replay = RecordedCommands(log, longest=40)
+    fit_street(log.from_step_0(), simulation(400.0), replay, prior, view, config, seed=0)
+    assert set(compared) == {36}
+    with pytest.raises(LogError, match="only 290 s of an episode are left .*--duration-s"):
+        fit_street(log.from_step_0(), simulation(330.0), replay, prior, view, config, seed=0)
 
 
 def test_a_log_of_the_simulation_itself_shows_no_fault() -> None:
@@ -339,10 +341,6 @@ def test_unknown_parts_and_too_few_simulations_are_refused() -> None:
     ):
         with pytest.raises(OptionError, match=told):
             EyesConfig(**wrong)
-    short = UgatConfig(street=StreetConfig(simulated_s=299.0))
-    with pytest.raises(OptionError, match=r"have to last 300 s or longer.*--street.simulated-s"):
-        simulated_worlds(SCENARIO, "sim", LATE, short, {})
-    simulated_worlds(SCENARIO, "sim", LATE, short, {"duration_s": 200.0})  # whole episodes
     with pytest.raises(OptionError, match="no transform"):
         UgatConfig(grounding="street").transform({}, 0)
 

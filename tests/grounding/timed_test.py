@@ -279,8 +279,8 @@ def test_a_report_says_what_is_doubtful(planted) -> None:
         inverse=dataclasses.replace(report.inverse, calibration=useless),
     )
     assert poor.warnings == (
-        "f is no better than predicting no change at 1 of 2 (a_0)",
-        "the model of the simulation is no better than predicting no change at 1 of 2 (b_0)",
+        "f is not shown to be better than no change at 1 of 2 (a_0)",
+        "the model of the simulation is not shown to be better than no change at 1 of 2 (b_0)",
         "u does not rise off the data (AUROC 0.50)",
     )
     assert poor.trusted().tolist() == [False, False]

@@ -303,7 +303,7 @@ def test_a_policy_that_asks_for_masks_is_told_where_they_are() -> None:
     def named(observations: Any, *, action_mask: Any = None) -> Any: ...
 
     for act in (ranked, named):
-        with pytest.raises(OptionError, match=r"mask' is never given; take the infos"):
+        with pytest.warns(UserWarning, match=r"mask' is never given; take the infos"):
             OwnPolicy(act, "mine", {})
 
     def of_its_own(observations: Any, infos: Any, mask: Any = None) -> Any:

@@ -106,7 +106,7 @@ def _counts(tallies: Sequence[Tally]) -> NDArray[np.float64]:
 
 # --- simulated days -------------------------------------------------------------------------------
 
-VERSION = 12
+VERSION = 13
 """Version of features and replays; tallies cached under another version are not used."""
 
 _READING = threading.Lock()

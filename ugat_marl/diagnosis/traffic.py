@@ -6,11 +6,11 @@ makes the simulation a better picture of the street.
 
 from __future__ import annotations
 
+import math
 from collections import Counter
 from collections.abc import Callable, Sequence
 
 import numpy as np
-from numpy.typing import NDArray
 
 from ugat_marl.diagnosis.features import (
     ALL_FEATURES,
@@ -113,7 +113,7 @@ def traffic_check(
     Returns:
         None if the data hold nothing to judge by.
     """
-    stretches = [[day.window for day in days] for days in (measured, after)]
+    stretches = [day.window for day in after]
     for measure, (sums, vehicles) in _MEASURES.items():
         sides = [sums(days) for days in (measured, before, after)]
         if all(side is not None and side.shape[-2] for side in sides):
@@ -128,12 +128,12 @@ def _check(
     real: Array,
     old: Array,
     new: Array,
-    stretches: Sequence[Sequence[Window]],
+    stretches: Sequence[Window],
     thresholds: Thresholds,
 ) -> TrafficCheck:
     """Judge by sums of days ``(days, measures, places, 2)`` of the data and of both models.
 
-    Both models have the same days. `stretches` are those of the data's days and of the models'.
+    Both models have the same days. `stretches` are those of their days.
     """
     street, simulated, repaired = (means(side) for side in (real, old, new))
     weight = real.sum(axis=0)[..., 1]
@@ -149,11 +149,15 @@ def _check(
 
     generator = np.random.default_rng(_SEED)
     gains: list[float] = []
+    (old, _), (new, wider) = (_levelled(side, stretches) for side in (old, new))
     for _ in range(thresholds.check_draws):
-        days = _drawn(generator, stretches[0], stretches[1])
-        drawn = street + np.nan_to_num(means(new[days]) - repaired)
-        again = _drawn(generator, stretches[1], stretches[1])  # the same days of both models
-        models = (np.nan_to_num(means(side[again])) for side in (old, new))
+        days = generator.choice(len(new), len(real))
+        drawn = street + wider * np.nan_to_num(means(new[days]) - repaired)
+        again = generator.choice(len(new), len(new))  # the same days of both models
+        models = (
+            usual + wider * np.nan_to_num(means(side[again]) - usual)
+            for side, usual in ((old, simulated), (new, repaired))
+        )
         first, last = (error(model, drawn) for model in models)
         gains.append(first - last)
     first, last, noise = error(simulated, street), error(repaired, street), float(np.std(gains))
@@ -163,22 +167,21 @@ def _check(
     return TrafficCheck(measure, first, last, noise, better)
 
 
-def _drawn(
-    generator: np.random.Generator,
-    wanted: Sequence[Window],
-    there: Sequence[Window],
-) -> NDArray[np.int64]:
-    """Draw days with replacement: of each stretch of the day as many as are wanted.
+def _levelled(days: Array, stretches: Sequence[Window]) -> tuple[Array, float]:
+    """Return days as if all stretches of the day had one mean, and a factor of their spread.
 
-    Where a stretch has no day, days of all stretches are drawn for it.
+    What distinguishes a morning from an evening is no chance. Each stretch takes one degree of
+    freedom. Where most have a single day, nothing is known of chance, and the days stay as they
+    are.
     """
-    drawn = [
-        generator.choice(
-            [k for k, window in enumerate(there) if window == stretch] or len(there), number
-        )
-        for stretch, number in Counter(wanted).items()
-    ]
-    return np.concatenate(drawn)
+    numbers = Counter(stretches)
+    if len(numbers) == 1 or len(days) < 2 * len(numbers):
+        return days, 1.0
+    level = days.copy()
+    for stretch in numbers:
+        own = [place for place, other in enumerate(stretches) if other == stretch]
+        level[own] += days.mean(axis=0) - days[own].mean(axis=0)
+    return level, math.sqrt((len(days) - 1) / (len(days) - len(numbers)))
 
 
 def _journeys(days: Sequence[Tally]) -> Array | None:

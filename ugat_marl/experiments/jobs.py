@@ -605,6 +605,8 @@ def worlds_of(
         if ugat.grounding == "street":
             require_histories(log, ugat.street.longest_lag)  # before plain training
         recorded = RecordedWorld(log, env, ugat.fit.held_out_every)
+        if ugat.grounding == "street":
+            recorded.replay()  # a log that begins too late is refused now
     without_street = recorded is not None or job.setting.negative_control == "same-world"
     street = job.sim if without_street else job.target
     assert street is not None

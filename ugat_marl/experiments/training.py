@@ -300,16 +300,12 @@ def simulated_worlds(
 
     Raises:
         OptionError: `check_worlds` fails, the rewards cannot be matched, commands would be changed
-            twice, worlds of a fitted street are too short, or a domain is SUMO's queue model and
-            the grounding needs crossings.
+            twice, or a domain is SUMO's queue model and the grounding needs crossings.
     """
     scenario = scenario.with_duration(options.get("duration_s"))
     check_worlds(scenario, sim, real, max(ugat.most_delay_s, ugat.residual_delay_s) > 0)
-    if ugat.grounding == "street":
-        interval_s = scenario.control.decision_interval_s
-        ugat.street.require_decisions(interval_s, scenario.settings.duration_s)
-        if "channel" in ugat.street.parts:
-            _refuse_own_channel(scenario, sim)
+    if ugat.grounding == "street" and "channel" in ugat.street.parts:
+        _refuse_own_channel(scenario, sim)
     # crossing vehicles show best when a green began, and how fast it serves
     crossings = ugat.most_delay_s > 0 or ugat.grounding == "street"
     for domain in (sim, real) if crossings and ugat.iterations else ():

@@ -124,8 +124,8 @@ class Split:
 def split(data: StackedTransitions, every: int, stack: Stack) -> Split:
     """Hold out episodes 1, 1 + every, ...; of a single episode, the last of `every` parts.
 
-    An agent that is missing in all episodes on one of the sides is split as if there were one
-    episode.
+    Of an agent that is missing in all episodes on one of the sides, the last part of each of its
+    episodes is held out.
 
     Raises:
         LogError: An agent would have nothing to train on or nothing held out.

@@ -219,8 +219,10 @@ class ForwardReport:
         """Yield sentences about problems of the model of this name; some of them are empty."""
         poor = ~self.beats_no_change
         mixed = self.beats_no_change & ~self.beats_mean_outcome
-        yield complaint(f"{model} is no better than predicting no change", poor, agents)
-        yield complaint(f"{model} is no better than one answer for every state", mixed, agents)
+        yield complaint(f"{model} is not shown to be better than no change", poor, agents)
+        yield complaint(
+            f"{model} is not shown to be better than one answer for every state", mixed, agents
+        )
 
     def as_dict(self, prefix: str, agents: Sequence[str]) -> dict[str, float]:
         """Return training and errors as flat numbers."""

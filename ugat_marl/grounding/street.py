@@ -36,6 +36,7 @@ from ugat_marl.effects import ControllerPart, Effect
 from ugat_marl.envs import AgentSet, ResetResult, TrafficEnv, parallel_env
 from ugat_marl.errors import (
     CheckpointError,
+    LogError,
     OptionError,
     ScenarioError,
     UnknownNameError,
@@ -90,8 +91,7 @@ RULE_BUDGET = 6
 """Budget of each rule in worlds of the fitted street, with a learner that rules teach."""
 
 LEAST_DECISIONS = 30
-"""Decisions below which a world is not compared with the street, unless its episodes are as short:
-its statistics would be those of a few phases."""
+"""Least decisions of a world, unless log or episodes are shorter: fewer are a few phases."""
 
 
 @dataclass(frozen=True)
@@ -103,8 +103,9 @@ class StreetConfig:
         simulations: N, worlds that are simulated for the first fit: six in ten from the prior,
             the others near the street, by a fit to these.
         further: Worlds that each further iteration adds, half of them drawn from the posterior.
-        simulated_s: Length of an episode in such a world, in s. Of longer episodes of the street
-            only this first part is compared. Detectors are compared over whole episodes.
+        simulated_s: Length of an episode in such a world, in s, at least `LEAST_DECISIONS`. Of
+            longer episodes of the street only this first part is compared. Detectors are compared
+            over whole episodes.
         judged: Worlds of the fitted street in which policies are compared after each iteration; the
             best one is kept. 0 keeps the last one.
         rule_budget: Budget that decides how many settings of each rule race in worlds of the fitted
@@ -174,24 +175,6 @@ class StreetConfig:
     def late_s(self) -> tuple[float | None, ...]:
         """Delay of the greens of each rival, in s; see `RIVALS`."""
         return RIVALS[self.rival] if self.judged > 0 else ()
-
-    def require_decisions(self, interval_s: float, longest_s: float) -> None:
-        """Refuse worlds of too few decisions to compare.
-
-        Args:
-            interval_s: Seconds from one decision to the next.
-            longest_s: Length of an episode in s; worlds of whole episodes are not refused.
-
-        Raises:
-            OptionError: `simulated_s` is shorter than `LEAST_DECISIONS` and than an episode.
-        """
-        least_s = min(LEAST_DECISIONS * interval_s, longest_s)
-        if self.simulates and self.simulated_s < least_s:
-            raise OptionError(
-                f"street.simulated_s = {self.simulated_s:g}: worlds of a decision every "
-                f"{interval_s:g} s have to last {least_s:g} s or longer to be compared with the "
-                "street (--street.simulated-s)"
-            )
 
     def of_log(self, real: TransitionLog) -> StreetConfig:
         """Return the settings for a log; estimated vehicles are no readings of detectors."""
@@ -505,13 +488,12 @@ def fit_street(
         The street, and the results for a further fit.
 
     Raises:
-        LogError: Too many decisions are missing in the log, or they are not in sequence.
-        OptionError: Simulated worlds are too short, see `StreetConfig.require_decisions`.
+        LogError: Too many decisions are missing in the log, or they are not in sequence; or too few
+            fit into an episode behind its begin.
     """
     require_histories(real, config.longest_lag)
     history = history or FitHistory()
     lanes, interval_s = worlds.lanes, real.provenance.decision_interval_s
-    config.require_decisions(interval_s, simulation.longest_s)
     timing = simulation.scenario.timing
     held_s = timing.clearance_s + timing.min_green_s
     channel = fit_channel(real, config.channel, held_s) if "channel" in config.parts else None
@@ -522,7 +504,14 @@ def fit_street(
     if not config.simulates:
         return street, history
     # Queues grow through a peak: worlds of half an hour tell nothing of an hour's second half.
-    compared_s = min(config.simulated_s, simulation.longest_s - _lead_s(policy))
+    least_s = LEAST_DECISIONS * interval_s
+    left_s = simulation.longest_s - _lead_s(policy)
+    if left_s < min(least_s, real.decisions * interval_s, simulation.longest_s):
+        raise LogError(
+            f"only {left_s:g} s of an episode are left behind the begin of the log: choose a "
+            "longer --duration-s (duration_s)"
+        )
+    compared_s = min(max(config.simulated_s, least_s), left_s)
     decisions = min(real.decisions, max(1, int(compared_s / interval_s)))
     seen = view.summary(real.first(decisions))
     simulated, posterior = list(history.simulated), history.posterior

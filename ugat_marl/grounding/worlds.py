@@ -337,9 +337,11 @@ class RecordedCommands:
         interval_s = log.provenance.decision_interval_s
         self.longest_lead_s = max(self._leads) * interval_s
         if longest is not None and max(self._leads) >= longest:
+            late = list(begins)[int(np.argmax(self._leads))]
             raise LogError(
-                f"the log begins {self.longest_lead_s:g} s after its scenario, and episodes end "
-                f"after {longest * interval_s:g} s: choose a longer --duration-s (duration_s)"
+                f"episode {late} of the log begins {self.longest_lead_s:g} s after its scenario, "
+                f"and episodes end after {longest * interval_s:g} s: choose a longer --duration-s "
+                "(duration_s), or leave that episode out"
             )
         self.reset(0)
 

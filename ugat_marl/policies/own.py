@@ -142,9 +142,10 @@ class OwnPolicy:
         self._sees_infos = _sees_infos(act)
         asks = [argument for argument in _MASKS if argument in _arguments(act)]
         if asks and not (self._infos_name or self._sees_infos):
-            raise OptionError(
+            warnings.warn(
                 f"policy {name!r}: its argument {asks[0]!r} is never given; take the infos, as "
-                "act(observations, infos), in which infos[agent]['action_mask'] is the mask"
+                "act(observations, infos), in which infos[agent]['action_mask'] is the mask",
+                stacklevel=2,
             )
 
     @property

@@ -325,9 +325,10 @@ def _file_hash(kind: Any) -> str | None:
     """
     if (file := _file_of(kind)) is not None:
         place = kind.__module__, file
-        specification = getattr(sys.modules.get(kind.__module__), "__spec__", None)
-        if place not in _loaded or _loaded[place][0] is not specification:
-            _loaded[place] = specification, file_hash(file)
+        # A script that is run again in the same Python makes another object, and has no spec.
+        loaded = getattr(sys.modules.get(kind.__module__), "__spec__", None) or kind
+        if place not in _loaded or _loaded[place][0] is not loaded:
+            _loaded[place] = loaded, file_hash(file)
         return _loaded[place][1]
     members = vars(kind).values() if inspect.isclass(kind) else (kind,)
     codes = [getattr(getattr(one, "__func__", one), "__code__", None) for one in members]
