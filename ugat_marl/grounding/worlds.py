@@ -6,6 +6,7 @@ import contextlib
 import copy
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
+from functools import partial
 from typing import Any, Protocol
 
 import numpy as np
@@ -147,6 +148,12 @@ class SimulatedWorld:
         self._stop.set()
 
 
+def _for_policy(make_env: Callable[..., TrafficEnv], policy: Policy) -> Callable[[], TrafficEnv]:
+    """Return a function that makes environments in which a policy sees the commands it needs."""
+    commands = int(policy.env_options.get("commands", 0))
+    return partial(make_env, commands=commands) if commands else make_env
+
+
 def delayed(env: TrafficEnv, most_delay_s: int, always_s: int | None = None) -> AnyParallelEnv:
     """Return an environment with `RandomDelays`, or as it is if `most_delay_s` is 0."""
     return RandomDelays(env, most_delay_s, always_s) if most_delay_s else env
@@ -208,7 +215,7 @@ class _RollOutAlone:
     """Roll-outs that each have their own environment, in any process.
 
     Attributes:
-        make_env: Function that makes an environment of the domain; options of the policy are added.
+        make_env: Function that makes an environment of the domain.
         most_delay_s: Longest random delay of greens, in s; 0 for none.
         policy: Policy that acts.
         epsilon: Chance of a random phase.
@@ -221,7 +228,7 @@ class _RollOutAlone:
 
     def play(self, seed: int, always_s: int | None, stop: Stop) -> TransitionLog:
         """Run one roll-out, with random delays or with the constant delay `always_s`."""
-        env = delayed(self.make_env(**self.policy.env_options), self.most_delay_s, always_s)
+        env = delayed(_for_policy(self.make_env, self.policy)(), self.most_delay_s, always_s)
         return explored(env, self.policy, self.epsilon, seed, stop)
 
 
