@@ -17,7 +17,7 @@ from collections import OrderedDict, deque
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from types import SimpleNamespace
+from types import ModuleType, SimpleNamespace
 from typing import Any, ClassVar
 
 import numpy as np
@@ -641,6 +641,22 @@ def test_a_learner_whose_file_was_edited_after_its_import_begins_no_training(
     file.write_text(ALGORITHM)
     with pytest.raises(OptionError, match="restart Python"):
         LearnerSpec(own_name(algorithm.Kept))
+
+
+def test_a_script_that_is_run_again_in_the_same_python_is_another_learner(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Consoles run an edited script within the module that is there."""
+    script, module = tmp_path / "script.py", ModuleType("console")
+    module.__file__ = str(script)
+    monkeypatch.setitem(sys.modules, "console", module)
+
+    def run(hold: int) -> str:
+        script.write_text(ALGORITHM.replace("self.hold += 1", f"self.hold += {hold}"))
+        exec(compile(script.read_text(), str(script), "exec"), vars(module))
+        return str(LearnerSpec(own_name(module.Kept)).identity["source"])
+
+    assert run(1) != run(2)
 
 
 def test_an_environment_that_a_learner_holds_is_known_by_what_it_is_made_of() -> None:
