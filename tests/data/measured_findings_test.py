@@ -646,6 +646,13 @@ def test_detectors_that_never_say_anything(read: Read) -> None:
     assert "dropout" in findings[text]
 
 
+def test_a_single_silent_detector_is_told_with_what_to_do(read: Read) -> None:
+    _, findings = read(passages(recording(), "w", lambda _: Passages.none()))
+    text = next(text for text in findings if "nothing of 1 detector ('w'), of 4" in text)
+    assert "compared like a count of 0: leave their rows in detectors.csv out" in text
+    assert not findings[text]
+
+
 def test_a_detector_that_is_silent_while_its_neighbour_counts(read: Read) -> None:
     base = recording()
 

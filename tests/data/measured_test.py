@@ -727,7 +727,7 @@ def test_local_counts_become_seconds(
         (
             "detections.csv",
             lambda text: in_local_time("America/Chicago")["detections.csv"](text),
-            r"offsets from UTC, such as \+01:00; write the street's own time_zone in periods.csv",
+            r"such as Z or \+01:00; write the street's own time_zone in periods.csv",
         ),
     ],
 )

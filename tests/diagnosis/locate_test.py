@@ -21,7 +21,7 @@ from ugat_marl.diagnosis.features import (
     IncomingLane,
     bins_in,
 )
-from ugat_marl.diagnosis.locate import _stretches, locate
+from ugat_marl.diagnosis.locate import _statistics, _stretches, locate
 from ugat_marl.diagnosis.records import Disagreement
 from ugat_marl.diagnosis.statistics import Pools
 from ugat_marl.diagnosis.thresholds import Thresholds
@@ -61,6 +61,14 @@ def days(
             rate = rate + bump
         found.append(Tally(sums, generator.poisson(rate).astype(np.float64)))
     return found
+
+
+def test_what_a_light_or_an_approach_keeps_is_not_put_on_its_first_lane() -> None:
+    z = np.zeros((PLACES, len(FEATURES)))
+    z[0, [INDEX["kept_to_stop"], INDEX["kept_to_exit"], INDEX["lost"]]] = 8.0, 9.0, 7.0
+    rows = _statistics(SITE, "lane", z, z, THRESHOLDS)
+    found = {(row.statistic, row.approach, row.lane) for row in rows}
+    assert found == {("kept_to_stop", "in0", None), ("lost", "in0", "in0_0")}
 
 
 @pytest.fixture(scope="module")

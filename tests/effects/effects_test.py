@@ -116,6 +116,7 @@ def test_unknown_names_get_the_nearest(domain: str, message: str) -> None:
     [
         ("acceleration=soon", "effect 'acceleration': 'soon' is not a number"),
         ("acceleration=1,2", r"'acceleration' takes 1 value\(s\), mps2; got '1,2'"),
+        ("late_green=0.6", r"got '0.6'; everywhere it is late_green=\*,0.6"),
         ("acceleration=", "effect 'acceleration': '' is not a number"),
         ("acceleration=-1", r"'acceleration': mps2 = -1.0 is outside \[0.1, 10\] m/s\^2"),
         ("startup_delay=60", r"'startup_delay': seconds = 60.0 is outside \[0, 10\] s"),

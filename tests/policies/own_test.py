@@ -643,6 +643,23 @@ def test_a_learner_whose_file_was_edited_after_its_import_begins_no_training(
         LearnerSpec(own_name(algorithm.Kept))
 
 
+def test_an_object_that_was_given_leaves_its_class_its_name(algorithm: Any) -> None:
+    given = algorithm.Kept(ugat_marl.parallel_env("single-v1"), 0)
+    with pytest.raises(OptionError, match="is one learner already"):
+        OwnLearnerFactory(own_name(given))
+    assert OwnLearnerFactory("my_algo:Kept").name == "my_algo:Kept"
+
+
+def test_a_learner_whose_save_writes_nothing_is_told_so(algorithm: Any) -> None:
+    class Silent(algorithm.Kept):  # type: ignore[misc]
+        def save(self, path: Path) -> None: ...
+
+    env = ugat_marl.parallel_env("single-v1")
+    learner = OwnLearner(Silent(env, 0), "my_algo:Silent", env)
+    with pytest.raises(OptionError, match=r"save\(path\) wrote nothing"):
+        learner.policy()
+
+
 def test_a_script_that_is_run_again_in_the_same_python_is_another_learner(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

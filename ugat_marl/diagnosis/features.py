@@ -329,6 +329,8 @@ SATURATION_GAPS = tuple(INDEX[name] for name in ("gap4-5", "gap6-8", "gap9+"))
 """Indices of the gaps of queued vehicles from the fourth on: those of saturation flow."""
 SERVICE_COUNTS = ("count_stop", "count_exit")
 """Names of the counts of vehicles that have crossed the stop line."""
+OF_SEVERAL_LANES = frozenset({"kept_to_stop", "kept_to_exit"})
+"""Features of an approach or a light, which are kept with the first of its lanes."""
 SPEED_FEATURES = frozenset(
     {
         "speed1", "speed2", "speed3", "speed4-5", "speed6-8", "free_speed", "free_speed_spread",

@@ -10,7 +10,12 @@ import numpy as np
 from scipy import special
 
 from ugat_marl.diagnosis.engine import OutOfTime
-from ugat_marl.diagnosis.features import ALL_FEATURES, BIN_FEATURES, DetectorLayout
+from ugat_marl.diagnosis.features import (
+    ALL_FEATURES,
+    BIN_FEATURES,
+    OF_SEVERAL_LANES,
+    DetectorLayout,
+)
 from ugat_marl.diagnosis.records import Disagreement, Located, Tested
 from ugat_marl.diagnosis.select import Selector
 from ugat_marl.diagnosis.statistics import Array, Distance, Reference
@@ -114,6 +119,10 @@ def _statistics(
     for member, feature in zip(*np.nonzero(z), strict=True):
         tls, approach, lane = _place(layout, pool, int(member))
         name, regime, unit = ALL_FEATURES[int(feature)]
+        if pool == "lane" and name in OF_SEVERAL_LANES:
+            lane = None  # it is kept with the first of them
+            if name == "kept_to_exit":
+                continue  # the light has it, too
         value = float(z[member, feature])
         size = float(difference[member, feature])
         rows.append(

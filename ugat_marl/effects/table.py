@@ -144,9 +144,12 @@ def effect_from_text(text: str) -> Effect:
     parameters = [field.name for field in fields(kind)]
     parts = [part.strip() for part in values.split(",")]
     if len(parts) != len(parameters):
+        short = len(parts) == len(parameters) - len(kind.texts)
+        there = ",".join([*("*" for _ in kind.texts), *parts])
+        hint = f"; everywhere it is {name}={there}" if short and kind.texts else ""
         raise OptionError(
             f"effect {name!r} takes {len(parameters)} value(s), {', '.join(parameters)}; "
-            f"got {values!r}"
+            f"got {values!r}{hint}"
         )
     given: dict[str, Any] = {}
     for parameter, part in zip(parameters, parts, strict=True):

@@ -30,7 +30,7 @@ def checked_phases(
             last = spaces[agent].n - 1
             raise ActionError(
                 f"action of agent {agent!r} is {action!r}; "
-                f"allowed: the integers 0 to {last}, its green phases"
+                f"allowed: the integers 0 to {last}, its green phases, as int or NumPy's scalar"
             )
         requested.append(int(action))
     return requested

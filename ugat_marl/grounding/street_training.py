@@ -337,7 +337,7 @@ class StreetTraining(Algorithm):
         worlds = len(history.simulated) + history.new_worlds(config)
         if config.simulates and worlds < ENOUGH:
             self.run.reporter.say(
-                f"{iteration_name(state)}: {worlds} simulations are few, so chances are "
+                f"{iteration_name(state)}: {worlds} simulations in all are few, so chances are "
                 f"overconfident and intervals too narrow; --street.simulations {ENOUGH} or more"
             )
         agents = list(real.provenance.layouts)

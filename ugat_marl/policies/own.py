@@ -340,9 +340,11 @@ class OwnLearner:
                     packed.extractall(folder)
                 self._given.load(files / _STATE)
             except Exception as error:
+                written = ", ".join(sorted(file.name for file in files.glob("*"))) or "nothing"
                 raise CheckpointError(
                     f"{path}: the learner {self._name!r} cannot load it "
-                    f"({type(error).__name__}: {error})"
+                    f"({type(error).__name__}: {error}); its save(path), with a path that ends in "
+                    f"{_STATE}, wrote {written}"
                 ) from error
         self.episodes = counters["episodes"]
 
@@ -351,12 +353,19 @@ class OwnLearner:
 
         Raises:
             CheckpointError: An option of the environment is not plain data.
+            OptionError: ``save`` writes no file.
         """
         memory = io.BytesIO()
         with tempfile.TemporaryDirectory() as folder, zipfile.ZipFile(memory, "w") as packed:
             files = Path(folder, _FILES)
             files.mkdir()
             self._given.save(files / _STATE)
+            if not any(files.iterdir()):
+                raise OptionError(
+                    f"learner {self._name!r}: save(path) wrote nothing, neither at the path nor "
+                    "beside it; without load and save the learner cannot go on, so write there, "
+                    "or leave both methods out"
+                )
             for file in sorted(Path(folder).rglob("*")):
                 packed.write(file, file.relative_to(folder))
             counters = {
@@ -454,8 +463,8 @@ class OwnLearnerFactory:
         if lacking := _lacking(self._make, {*self._settings, *offered}):
             settings = " ".join(f"{argument}=VALUE" for argument in lacking)
             raise OptionError(
-                f"learner {self.name!r} needs {' and '.join(lacking)}; give --learner-settings "
-                f"{settings}, or defaults to these arguments"
+                f"learner {self.name!r} needs {' and '.join(lacking)}; it is given env and seed, "
+                f"if it takes them; give --learner-settings {settings}, or defaults to the others"
             )
         given = self._make(**self._settings, **offered)
         _require_methods(given, self.name)

@@ -56,15 +56,13 @@ def own_name(given: Any) -> str:
 def _is_found(kind: Any, given: Any) -> bool:
     """Return False if the name of `kind` leads to another object than was given.
 
-    It does so for a `functools.partial`, a bound method, and a function or class in a decorator
-    that copied its name.
+    It does so for an object of a class, a `functools.partial`, a bound method, and a function or
+    class in a decorator that copied its name.
     """
     found: Any = sys.modules.get(kind.__module__)
     for part in kind.__qualname__.split("."):
         found = getattr(found, part, None)
-    if hasattr(given, "__qualname__") or isinstance(given, functools.partial):
-        return found == given or "<" in kind.__qualname__
-    return found is kind
+    return found == given or "<" in kind.__qualname__
 
 
 def load_own(name: str, what: str) -> Any:

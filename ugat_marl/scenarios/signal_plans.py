@@ -674,11 +674,12 @@ def read_plans(path: Path) -> tuple[SignalPlan, ...]:
     reader = csv.DictReader(io.StringIO(text, newline=""), delimiter=delimiter_of(text))
     columns = columns_of(reader, path)
     optional = {"intersection", "phase", "ring", "barrier"}
-    if missing := [name for name in COLUMNS if name not in columns and name not in optional]:
+    needed = [name for name in COLUMNS if name not in optional]
+    if missing := [name for name in needed if name not in columns]:
         guess = nearest(missing[0], columns)
         raise ScenarioError(
             f"{path}, line 1: the column {missing[0]} is missing"
-            + (f"; is it {guess!r}?" if guess else f"; needed are {', '.join(COLUMNS)}")
+            + (f"; is it {guess!r}?" if guess else f"; needed are {', '.join(needed)}")
         )
     for name in columns:
         guess = nearest(name, ("ring", "barrier"))

@@ -239,7 +239,12 @@ def _of_kinds(measured: MeasuredData, network: Network) -> Iterator[Finding]:
         many = 2 * len(silent) >= len(measured.detectors)
         yield Finding(
             f"detections: nothing of {listed(silent, 'detector')}, of {len(measured.detectors)}"
-            + ("; they are not used, and what happens there stays unknown" if many else ""),
+            + (
+                "; they are not used, and what happens there stays unknown"
+                if many
+                else "; that is compared like a count of 0: leave their rows in detectors.csv out "
+                "if they are broken, or check their lanes"
+            ),
             ("dropout", "swapped", "undercount") if many else (),
         )
     yield from _of_each_kind(measured, network, seen)

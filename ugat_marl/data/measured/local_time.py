@@ -154,8 +154,8 @@ def _times(path: Path, cells: pl.Series, time_zone: str, start: int, mapping: st
     if cells.dtype.time_zone is not None:
         if not time_zone:
             raise MeasuredDataError(
-                f"{path}: {cells.name} has offsets from UTC, such as +01:00; write the street's "
-                f"own time_zone in {mapping}, such as America/Denver"
+                f"{path}: {cells.name} has offsets from UTC, such as Z or +01:00; write the "
+                f"street's own time_zone in {mapping}, such as America/Denver"
             )
         return cells.dt.convert_time_zone("UTC").dt.cast_time_unit("us")
     return cells.cast(pl.Datetime("us"))
