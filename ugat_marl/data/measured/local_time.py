@@ -18,10 +18,12 @@ _FORMATS = (
     "%Y-%m-%dT%H:%M:%S%.f",
     "%m/%d/%Y %H:%M:%S%.f",
     "%m/%d/%Y %I:%M:%S%.f %p",
+    "%d.%m.%Y %H:%M:%S%.f",
     "%Y-%m-%d %H:%M",
     "%Y-%m-%dT%H:%M",
     "%m/%d/%Y %H:%M",
     "%m/%d/%Y %I:%M %p",
+    "%d.%m.%Y %H:%M",
 )
 
 
