@@ -499,7 +499,7 @@ class _Counter:
         self.sums[INDEX[name], self.place] += (total, weight)
 
     def volume(self, name: str, passages: Passages) -> float:
-        times = passages.seen_s[np.isfinite(passages.seen_s)]
+        times = passages.counted_s
         self.ratio(name, len(times), self.period.length_s / 60.0)
         counts, _ = np.histogram(times, self.bins.shape[2], self.period.window)
         self.bins[COUNT_FEATURES.index(name), self.place] += counts

@@ -383,7 +383,7 @@ def _moved_a_little(
 
     up, down = moved(delta), moved(-delta)
     far, back = (abs(other[index] - values[index]) for other in (up, down))
-    return up if far > delta * (1 - 1e-9) or far >= back else down
+    return up if far >= back * (1 - 1e-9) else down
 
 
 def _shifted(hypothesis: Hypothesis, move: tuple[float, float], shortest_s: float) -> Hypothesis:

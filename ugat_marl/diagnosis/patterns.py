@@ -130,9 +130,8 @@ def _free(
 
 def _count(cells: Array, seen: Passages, period: Period) -> None:
     """Add the counts of one detector to cells ``(bins, 3)``."""
-    times = seen.seen_s[np.isfinite(seen.seen_s)]
     span = period.begin_s, period.end_s
-    counts = np.histogram(times, len(cells), span)[0].astype(np.float64)
+    counts = np.histogram(seen.counted_s, len(cells), span)[0].astype(np.float64)
     cells += np.stack([np.ones_like(counts), counts, counts**2], axis=-1)
 
 

@@ -274,8 +274,7 @@ class PlaceFinder:
                     on, off = occupations(passages, period, self._thresholds)
                     total += occupied_between(on, off, edges)
                 else:
-                    times = passages.seen_s[np.isfinite(passages.seen_s)]
-                    total += np.histogram(times, edges)[0]
+                    total += np.histogram(passages.counted_s, edges)[0]
         return total / len(periods)
 
     def _passages(self, period: Period, index: int, kind: str) -> Passages | None:

@@ -322,7 +322,7 @@ def _concluded(
         selected = replace(selected, complete=False)
         verified = verify_model(study, located.base, located.base)
         conclusion = told(unverified(selected))
-        diagnosis = _record(study, timing, located, selected, verified, conclusion, tables=False)
+        diagnosis = _record(study, timing, located, selected, verified, conclusion, tested=False)
     diagnosis = _with_patterns(study, diagnosis, located.base, conclusion, reporter)
     try:
         unnamed = _unnamed(study, diagnosis, located.base, conclusion, reporter)
@@ -475,13 +475,16 @@ def _record(
     verified: Verified,
     conclusion: Conclusion,
     *,
-    tables: bool = True,
+    tested: bool = True,
 ) -> Diagnosis:
-    """Make the record from the results of all stages."""
+    """Make the record from the results of all stages.
+
+    It has neither tables nor chances of a model that was not `tested`, since the budget ended.
+    """
     base, best = located.base, conclusion.best
     complete = located.complete if selected is None else selected.complete
     examined = located.examined if selected is None else selected.examined
-    sides = tables_of(study, base, best) if tables else Tables()
+    sides = tables_of(study, base, best) if tested else Tables()
     named = (
         ()
         if selected is None or conclusion.verdict == "unknown"
@@ -491,7 +494,7 @@ def _record(
         study, timing, conclusion.verdict, conclusion.sentence, None if complete else examined
     )
     heldout, evidence = HeldOut.of(verified), FitEvidence(base.residual.p, best.residual.p)
-    if best.model.members and not tables:  # the budget ended before its own test
+    if best.model.members and not tested:
         heldout = replace(heldout, after=None, p_after=None)
         evidence = replace(evidence, p_fit_after=None)
     return replace(

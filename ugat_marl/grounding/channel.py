@@ -19,7 +19,7 @@ from __future__ import annotations
 import math
 from collections import deque
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import partial
 from typing import Any, ClassVar
 
@@ -340,10 +340,12 @@ def fit_channel(
         _Course.of(log.transitions(agent), layout, config, held_s / interval_s)
         for agent, layout in log.provenance.layouts.items()
     ]
+    # The network's weights count less the more of them is the intersection's own.
+    config = replace(config, pull=max(1.0, config.pull * (1.0 - 1.0 / len(courses))))
     masked = all(course.mask is not None for course in courses)
     tables = [course.free_table() for course in courses]
     network, counts = _mixture(courses, tables, None, config)
-    fitted = partial(CommandChannel, tuple(log.agents), pull=_pull(len(log.agents), config))
+    fitted = partial(CommandChannel, tuple(log.agents), pull=config.pull)
     weights = fitted(network=network, counts=counts, tables=tuple(tables)).weights
     lags = [int(own[:-1].argmax()) for own in weights]
     if masked:
@@ -498,13 +500,28 @@ class _Course:
 
     def obeyed(self, arriving: NDArray[np.int64], allowed: NDArray[np.bool_]) -> NDArray[np.int64]:
         """Return the phases that run if these commands arrive (-1: none), ``(n,)``."""
-        rows = np.arange(len(arriving))
-        taken = (arriving >= 0) & allowed[rows, np.maximum(arriving, 0)]
-        after = np.arange(self.phases) > self.running[:, None]
-        later, first = (allowed & after).argmax(1), allowed.argmax(1)
-        following = np.where((allowed & after).any(1), later, first)
-        stays = np.where(allowed[rows, self.running], self.running, following)
-        return np.where(taken, arriving, stays)
+        return obeyed(arriving, self.running, allowed)
+
+
+def obeyed(
+    commands: NDArray[np.int64], running: NDArray[np.int64], allowed: NDArray[np.bool_]
+) -> NDArray[np.int64]:
+    """Return the phases that run if these are asked for, ``(n,)``, by the rule of environments.
+
+    Where a forbidden phase is asked for, the light stays; if it has to change, the next permitted
+    phase of its list follows.
+
+    Args:
+        commands: ``(n,)`` phases asked for; -1 for none.
+        running: ``(n,)`` phases that run now.
+        allowed: ``(n, phases)`` action masks.
+    """
+    rows = np.arange(len(commands))
+    taken = (commands >= 0) & allowed[rows, np.maximum(commands, 0)]
+    later = allowed & (np.arange(allowed.shape[1]) > running[:, None])
+    following = np.where(later.any(1), later.argmax(1), allowed.argmax(1))
+    stays = np.where(allowed[rows, running], running, following)
+    return np.where(taken, commands, stays)
 
 
 def _tally(
@@ -585,18 +602,10 @@ def _mixture(
             break
     weights = np.where(weights >= min(config.least_share, weights.max()), weights, 0.0)
     weights /= weights.sum()
-    pull, found = _pull(len(explains), config), weights > 0
+    found = weights > 0
     # What all kinds that are found explain alike says nothing of their weights.
     telling = [same[:, ~same[found].all(0)] if found.sum() > 1 else same for same in explains]
-    return weights, np.stack([_own_counts(same, weights, pull) for same in telling])
-
-
-def _pull(agents: int, config: ChannelConfig) -> float:
-    """Return the decisions that the network's weights count for at each of some intersections.
-
-    They count less the more of them is the intersection's own; a single one has them from itself.
-    """
-    return max(1.0, config.pull * (1.0 - 1.0 / agents))
+    return weights, np.stack([_own_counts(same, weights, config.pull) for same in telling])
 
 
 def _maximum(rows: NDArray[np.bool_], support: set[int]) -> tuple[float, Floats]:

@@ -16,6 +16,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from ugat_marl.grounding.channel import obeyed
 from ugat_marl.grounding.gate import Gate
 
 PASSES = 10
@@ -54,22 +55,14 @@ def turns(agents: Sequence[str], near: Mapping[str, Sequence[str]]) -> NDArray[n
 def running(
     actions: NDArray[np.int64], current: NDArray[np.int64], permitted: NDArray[np.bool_] | None
 ) -> NDArray[np.int64]:
-    """Return the phases that run if these are asked for, by the rule of environments.
-
-    Where a forbidden phase is asked for, the light stays; if it has to change, the next permitted
-    phase of its list follows.
+    """Return the phases that run if these are asked for; without masks each is obeyed.
 
     Args:
         actions: ``(agents,)`` phases asked for.
         current: ``(agents,)`` phases that run now.
         permitted: ``(agents, phases)`` action masks.
     """
-    if permitted is None:
-        return actions
-    later = permitted & (np.arange(permitted.shape[1]) > current[:, None])
-    following = np.where(later.any(1), later.argmax(1), permitted.argmax(1))
-    otherwise = np.where(_allowed(current, permitted), current, following)
-    return np.where(_allowed(actions, permitted), actions, otherwise)
+    return actions if permitted is None else obeyed(actions, current, permitted)
 
 
 def alone(

@@ -218,16 +218,17 @@ def criteria_line(diagnosis: Diagnosis) -> str | None:
     if criteria is None or criteria.before.geh_below_5 is None:
         return None
     texts = [f"As it is, {judged(diagnosis)} periods: {_usual(criteria.before)}"]
+    p_after = heldout.p_after if heldout is not None and heldout.shrink is not None else None
     if heldout is not None:
         texts[0] += f"; our test {_ours(heldout.p_before)}"
-        if heldout.shrink is not None and heldout.p_after is not None:
-            texts.append(f"Corrected: {_usual(criteria.after)}; our test {_ours(heldout.p_after)}")
+    if p_after is not None:
+        texts.append(f"Corrected: {_usual(criteria.after)}; our test {_ours(p_after)}")
     contradicted = heldout is not None and heldout.p_before < OUR_LEAST_P
     if contradicted and criteria.before.geh_below_5 >= GEH_SHARE:
         texts.append("GEH does not see this gap")
     sides = [(criteria.before, heldout.p_before)] if heldout is not None else []
-    if heldout is not None and heldout.shrink is not None and heldout.p_after is not None:
-        sides.append((criteria.after, heldout.p_after))
+    if p_after is not None:
+        sides.append((criteria.after, p_after))
     failed_alone = any(p >= OUR_LEAST_P and not all(_fhwa(row)) for row, p in sides)
     return f"{'. '.join(texts)}. {STRICTER}{f' {ONE_DAY}' if failed_alone else ''}"
 

@@ -132,6 +132,12 @@ class Passages:
         """Time of each passage, s: `on_s` where it is known, else `off_s`."""
         return np.where(np.isfinite(self.on_s), self.on_s, self.off_s)
 
+    @property
+    def counted_s(self) -> NDArray[np.float64]:
+        """Times at which vehicles are counted, s: `seen_s` of those that have one."""
+        times = self.seen_s
+        return times[np.isfinite(times)]
+
     def spans(self) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
         """Return start and end of each passage, ``(passages,)``, without NaN.
 

@@ -108,8 +108,13 @@ class ControlledNetwork:
         No phase is shorter than clearance and minimum green. The light would hold the one before
         it through its turn, and the plan would skip the same phase in every cycle.
         """
-        least_s = self.clearance_s + self.min_green_s
-        return max(self.decisions(seconds), math.ceil(least_s / self.decision_interval_s - 1e-9))
+        least = least_decisions(self.clearance_s, self.min_green_s, self.decision_interval_s)
+        return max(self.decisions(seconds), least)
+
+
+def least_decisions(clearance_s: float, min_green_s: float, decision_interval_s: float) -> int:
+    """Return the decisions that clearance and minimum green take, at least 1."""
+    return max(1, math.ceil((clearance_s + min_green_s) / decision_interval_s - 1e-9))
 
 
 class EachLight:

@@ -14,6 +14,7 @@ from ugat_marl.policies.rules.approaches import (
     Approach,
     ControlledNetwork,
     allowed_phases,
+    least_decisions,
     permitted,
 )
 
@@ -59,7 +60,7 @@ def webster_plan(
     green_s = max(cycle_s - lost_s, 0.0)
     shares = [ratio / total if total > 0 else 1 / len(ratios) for ratio in ratios]
     wanted = [(clearance_s + share * green_s) / decision_interval_s for share in shares]
-    least = max(1, math.ceil((clearance_s + min_green_s) / decision_interval_s - 1e-9))
+    least = least_decisions(clearance_s, min_green_s, decision_interval_s)
     decisions = [max(least, math.floor(part + 1e-9)) for part in wanted]
     left = max(round(cycle_s / decision_interval_s), len(ratios)) - sum(decisions)
     short = sorted(range(len(wanted)), key=lambda i: decisions[i] - wanted[i])
