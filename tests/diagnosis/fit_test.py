@@ -523,6 +523,23 @@ def test_steps_make_an_interval_wide_and_straight_ways_do_not() -> None:
     assert (same["network"] == kept["network"]).all(), "what the model shows is known as it was"
 
 
+class Shaken(World):
+    """Any move changes which vehicles meet: all moves have 0.1 s in common."""
+
+    def played(self, number: int, effects: Sequence[Effect]) -> Tally:
+        values = {e.name: float(e.record()["seconds"]) for e in effects}
+        return day(number, {name: value + 0.1 * (value != 1.4) for name, value in values.items()})
+
+
+def test_what_all_moves_have_in_common_makes_no_interval_wide() -> None:
+    shaken = a_fitter({"headway": 1.4}, street=17)
+    shaken.engine = Shaken()
+    model = shaken.simulate(start((HEADWAY, 1.4)))
+    plain, _ = uncertainty(shaken, model)
+    told, _ = uncertainty(shaken, model, steps=True)
+    assert told == pytest.approx(plain, rel=0.05)
+
+
 @pytest.mark.parametrize("name", ["dropout", "stuck", "lane_closure"])
 def test_windows_that_a_log_shows_are_not_moved(name: str) -> None:
     place = "detector" if name != "lane_closure" else "lane"

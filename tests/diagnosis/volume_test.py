@@ -141,9 +141,13 @@ def test_a_planted_turn_comes_out_with_its_share(way: Way, share: float) -> None
     assert sizes["turning"] > sizes["demand"]
 
 
-@pytest.mark.parametrize("origin", ["a", "b"])
-def test_lanes_tell_from_where_vehicles_turn_elsewhere(origin: str) -> None:
-    """Two approaches with a lane for each of two ways: where they go is the same for both."""
+@pytest.mark.parametrize(("origin", "behind"), [("a", 80.0), ("b", 80.0), ("b", 20.0)])
+def test_lanes_tell_from_where_vehicles_turn_elsewhere(origin: str, behind: float) -> None:
+    """Two approaches with a lane for each of two ways: where they go is the same for both.
+
+    Of 200 that go to y, 80 go to x instead. Where demand is lower on these days, counts behind the
+    light may show a part of them.
+    """
     lanes = tuple(
         IncomingLane(f"{edge}_{i}", edge, 0, (i,), 14.0, {}, frozenset({target}))
         for edge in "ab"
@@ -151,7 +155,8 @@ def test_lanes_tell_from_where_vehicles_turn_elsewhere(origin: str) -> None:
     )
     layout = DetectorLayout(("C",), lanes, tuple((0, f"{x}_0", f"exit:{x}") for x in "xy"), (), {})
     ways: dict[Way, float] = {(edge, target): 200.0 for edge in "ab" for target in "xy"}
-    distance = a_distance(layout, {"x": (80.0, 20.0), "y": (-80.0, 20.0)})
+    exits = {"x": (behind, 20.0), "y": (-behind, 20.0)}
+    distance = a_distance(layout, exits)
     row = INDEX["count_stop"]
     for place, lane in enumerate(lanes):
         moved = 80.0 if lane.edge == origin else 1e-6
@@ -164,8 +169,9 @@ def test_lanes_tell_from_where_vehicles_turn_elsewhere(origin: str) -> None:
         if h.name == "turning"
     )
     assert first.fixed == (("from_edge", origin), ("to_edge", "x"))
+    assert first.levels == tuple((share,) for share in dict.fromkeys((0.4, behind / 200.0)))
     # Two lanes, 80 more and 80 fewer, errors of 14: 2 (80 / 14)^2 beside what the exits say.
-    counted = a_distance(layout, {"x": (80.0, 20.0), "y": (-80.0, 20.0)})
+    counted = a_distance(layout, exits)
     gain = Volume(layout, routes(ways), THRESHOLDS).directed(distance)["turning"]
     alone = Volume(layout, routes(ways), THRESHOLDS).directed(counted)["turning"]
     assert gain - alone == pytest.approx(2 * (80.0 / 14.0) ** 2, rel=0.01)

@@ -443,7 +443,8 @@ def _crookedness(
     """Return the squared error of the free values because statistics are not linear in them.
 
     A value that moves by x should move its estimate by x. The error is the mean square of the
-    deviations from the best straight line through these moves.
+    deviations from the best straight line through these moves. What all moves have in common is no
+    part of it: it is noise of the days before the move, which the errors of the values hold.
 
     Args:
         fitter: Simulator of models.
@@ -464,13 +465,17 @@ def _crookedness(
                     change, _ = fitter.difference(model, replaced(model.members, place, moved))
                     moves.append((moved[index] - value, float(response(change)[row])))
             asked, got = np.array(moves).reshape(-1, 2).T
+            size = float(np.mean(asked**2)) if moves else 0.0
+            free = len(moves) - 1
+            if free > 1:  # a line through two moves is exact if it need not begin at 0
+                asked, got, free = asked - asked.mean(), got - got.mean(), free - 1
             slope = float(asked @ got) / max(float(asked @ asked), 1e-12)
-            if len(moves) < 2:
+            if free < 1:
                 squares.append(0.0)
             elif slope < fitter.thresholds.blunt:
-                squares.append(float(np.mean(asked**2)))
+                squares.append(size)
             else:
-                squares.append(float(((got / slope - asked) ** 2).sum()) / (len(moves) - 1))
+                squares.append(float(((got / slope - asked) ** 2).sum()) / free)
     return np.array(squares)
 
 

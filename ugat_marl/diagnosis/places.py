@@ -548,7 +548,7 @@ class Volume:
                             both=True,
                         )
                     )
-        for gain, origin, target, share in sorted(self._turns(counts, distance), reverse=True)[
+        for gain, origin, target, shares in sorted(self._turns(counts, distance), reverse=True)[
             : self._thresholds.places_of_a_kind
         ]:
             fixed = (("from_edge", origin), ("to_edge", target))
@@ -558,7 +558,7 @@ class Volume:
                         "turning",
                         fixed,
                         ("share",),
-                        ((share,),),
+                        tuple((share,) for share in shares),
                         (0.0,),
                         self._thresholds.least_turning,
                     )
@@ -609,14 +609,17 @@ class Volume:
                 origins.append((gain, origin, 1.0 + strength))
         return origins
 
-    def _turns(self, counts: _Counts, distance: Distance) -> list[tuple[float, str, str, float]]:
-        """Return squared z, edge, next edge and share for every turn that may take more vehicles.
+    def _turns(
+        self, counts: _Counts, distance: Distance
+    ) -> list[tuple[float, str, str, tuple[float, ...]]]:
+        """Return squared z, edge, next edge and shares for every turn that may take more vehicles.
 
         Counts behind the intersection show the next edge, but hardly the edge before. The counts of
-        the lanes that vehicles left show that one.
+        the lanes that vehicles left show that one. Each has its own estimate of the share, the
+        larger one first. Where demand varies from day to day, that of the lanes is nearer.
         """
         thresholds = self._thresholds
-        turns: list[tuple[float, str, str, float]] = []
+        turns: list[tuple[float, str, str, tuple[float, ...]]] = []
         approaches = {lane.edge for lane in self._layout.lanes}
         for origin in sorted(approaches & set(self._routes.turns)):
             leaving = self._routes.turns[origin]
@@ -624,14 +627,22 @@ class Volume:
             for target in leaving:
                 change = {other: -rate for other, rate in leaving.items()}
                 change[target] += total
-                strength, gain, size = counts.weighed(change)
-                if size > thresholds.visible_turn and strength > thresholds.least_turn:
-                    gain += self._lanes_left(origin, target, distance)
-                    turns.append((gain, origin, target, min(strength, thresholds.most_turning)))
+                behind, gain, size = counts.weighed(change)
+                left, more = self._lanes_left(origin, target, distance)
+                if size > thresholds.visible_turn and behind > thresholds.least_turn:
+                    told = (x for x in (behind, left) if x > thresholds.least_turn)
+                    shares = {round(min(x, thresholds.most_turning), 2) for x in told}
+                    ordered = tuple(sorted(shares, reverse=True))
+                    turns.append((gain + more, origin, target, ordered))
         return turns
 
-    def _lanes_left(self, origin: str, target: str, distance: Distance) -> float:
-        """Return squared z of more vehicles on those lanes of an edge that lead to the target."""
+    def _lanes_left(self, origin: str, target: str, distance: Distance) -> tuple[float, float]:
+        """Fit more vehicles on those lanes of an edge that lead to the target.
+
+        Returns:
+            Share of the edge's vehicles that would have to turn, and squared z of the fit; zeros if
+            the lanes cannot tell, or there are fewer vehicles.
+        """
         rates = self._routes.turns[origin]
         row = INDEX["count_stop"]
         changes: list[float] = []
@@ -652,11 +663,11 @@ class Volume:
             z.append(score)
             errors.append(60.0 * abs(difference / score))
         if len(changes) < 2:
-            return 0.0
+            return 0.0, 0.0
         scaled = np.array(changes) / np.array(errors)
         scaled -= scaled.mean()  # the total over the lanes is tested by `weighed` already
-        match = float(scaled @ np.array(z))
-        return max(match, 0.0) ** 2 / max(float(scaled @ scaled), 1e-9)
+        match, size = float(scaled @ np.array(z)), max(float(scaled @ scaled), 1e-9)
+        return (match / size, match**2 / size) if match > 0 else (0.0, 0.0)
 
 
 def turned(reference: Reference, distance: Distance) -> list[Hypothesis]:
