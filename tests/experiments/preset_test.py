@@ -87,6 +87,8 @@ def test_what_the_preset_decides_cannot_be_given_beside_it() -> None:
         (["--least-accuracy", "0"], "least_accuracy = None, not 0.0"),
         (["--fit.epochs", "100"], "fit.epochs = 300, not 100"),
         (["--grounding", "timed"], "grounding = phase, not timed"),
+        (["--grounding", "street"], "grounding = phase, not street"),
+        (["--gate.scope", "intersection"], "gate.scope = pooled, not intersection"),
     ],
 )
 def test_a_usual_value_that_is_given_beside_the_preset_is_not_replaced_without_a_word(

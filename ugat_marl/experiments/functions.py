@@ -27,7 +27,7 @@ from ugat_marl.experiments.scores import Evaluation
 from ugat_marl.experiments.transfers import TransferConfig, transfer
 from ugat_marl.grounding import USUAL_REWARD, UgatConfig
 from ugat_marl.parallel import Workers, parts_at_a_time
-from ugat_marl.policies import DQNConfig, PolicyFactory, Usual, own_name
+from ugat_marl.policies import DQNConfig, PolicyFactory, UsualValue, own_name
 from ugat_marl.progress import Reporter, usual, usual_of_long_work
 from ugat_marl.scenarios import Scenario
 
@@ -66,7 +66,7 @@ def train(
     sim: str = "sim",
     learner: str | type[Any] | Any = "",
     learner_settings: Mapping[str, Any] | Sequence[str] = (),
-    grounding: Literal["street", "timed", "phase"] = "street",
+    grounding: Literal["street", "timed", "phase"] = UgatConfig.grounding,
     pretrain_episodes: int = UgatConfig.pretrain_episodes,
     iterations: int = UgatConfig.iterations,
     grounded_episodes: int = UgatConfig.grounded_episodes,
@@ -137,10 +137,8 @@ def train(
         grounded_episodes=grounded_episodes,
         real_rollouts=real_rollouts,
     )
-    numbers = (pretrain_episodes, iterations, grounded_episodes, real_rollouts)
-    if ugat is not None and (
-        grounding != UgatConfig.grounding or not all(isinstance(n, Usual) for n in numbers)
-    ):
+    own = (grounding, pretrain_episodes, iterations, grounded_episodes, real_rollouts)
+    if ugat is not None and not all(isinstance(value, UsualValue) for value in own):
         raise OptionError(
             "ugat holds all settings of the algorithm; give grounding, pretrain_episodes, "
             "iterations, grounded_episodes and real_rollouts in it"

@@ -420,7 +420,7 @@ def planned_jobs(config: TransferConfig) -> list[Job]:
 def _grounded_job(config: TransferConfig) -> Job:
     """Return the job of UGAT with its plain training."""
     setting = Setting(
-        GROUNDED_NAME[config.ugat.grounding],
+        GROUNDED_NAME[str(config.ugat.grounding)],
         "grounded",
         learner=config.spec,
         ugat=config.ugat,

@@ -21,6 +21,7 @@ from ugat_marl.grounding.view import InputsConfig, Neighbours
 from ugat_marl.policies import Usual, UsualName, UsualNumber, UsualValue
 
 GROUNDINGS = ("phase", "timed", "street")
+_STREET: Any = UsualName("street")
 
 
 @dataclass(frozen=True)
@@ -50,7 +51,7 @@ class UgatConfig:
         street: Settings of the fit, with "street".
     """
 
-    grounding: Literal["phase", "timed", "street"] = "street"
+    grounding: Literal["phase", "timed", "street"] = _STREET
     pretrain_episodes: int = Usual(20)
     iterations: int = Usual(2)
     grounded_episodes: int = Usual(10)

@@ -20,7 +20,9 @@ from numpy.typing import NDArray
 
 from ugat_marl.errors import CheckpointError, OptionError, require_kinds
 from ugat_marl.grounding.reports import complaint
-from ugat_marl.policies import Usual, UsualNumber
+from ugat_marl.policies import Usual, UsualName, UsualNumber
+
+_INTERSECTION: Any = UsualName("intersection")
 
 
 @dataclass(frozen=True)
@@ -43,7 +45,7 @@ class GateConfig:
 
     mode: Literal["infinite", "static", "dynamic"] = "dynamic"
     static_alpha: float = UsualNumber(0.5)
-    scope: Literal["intersection", "pooled"] = "intersection"
+    scope: Literal["intersection", "pooled"] = _INTERSECTION
     window_epochs: int = Usual(20)
     start: Literal["open", "fitted"] = "open"
     uncertainty_of: Literal["h-after-f", "h"] = "h-after-f"
