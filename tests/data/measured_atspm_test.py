@@ -180,6 +180,44 @@ def test_names_of_columns_and_times_in_other_spellings(imported: Import) -> None
         imported(utc)
 
 
+BERLIN = 'time_zone = "Europe/Berlin"\n' + MAPPING
+
+
+@pytest.mark.parametrize(
+    ("zero", "utc"),
+    [
+        ("2025-10-26T02:59:00+02:00", dt.datetime(2025, 10, 26, 0, 59)),  # then 2:00 comes again
+        ("2025-03-30T01:59:00", dt.datetime(2025, 3, 30, 0, 59)),  # then it is 3:00
+    ],
+)
+def test_a_log_with_offsets_runs_on_over_a_change_of_the_clock(
+    imported: Import, zero: str, utc: dt.datetime
+) -> None:
+    late = [(time + 30.0, code, number) for time, code, number in LOG]  # to 81 s: over the change
+    frame = log(late, zero=utc).with_columns(pl.col("TimeStamp").dt.replace_time_zone("UTC"))
+    (period,) = imported(frame, BERLIN.replace("2024-03-05T07:00:00", zero)).periods
+    np.testing.assert_array_equal(period.passages["7:5"].on_s, [61.2, 81.0])
+    later = [(since + 30.0, state) for since, state in SIGNALS]
+    assert period.signals == {"C": ((0.0, "rr"), *later)}
+
+
+def test_a_zero_that_clocks_showed_twice_or_never_is_refused(imported: Import) -> None:
+    for zero, told in (("2025-10-26T02:30:00", "twice"), ("2025-03-30T02:30:00", "did not show")):
+        with pytest.raises(MeasuredDataError, match=f"toml, entry 1: zero is .* {told}.* write a"):
+            imported(mapping=BERLIN.replace("2024-03-05T07:00:00", zero))
+
+
+def test_periods_on_both_sides_of_a_change_of_the_clock_overlap_by_true_time(
+    imported: Import,
+) -> None:
+    zeros = "2025-03-30T01:59:00, 2025-03-30T03:00:00"  # a minute apart
+    start = dt.datetime(2025, 3, 30, 0, 59)
+    frame = pl.concat([log(LOG, zero=start), log(LOG, zero=start + dt.timedelta(seconds=60))])
+    utc = frame.with_columns(pl.col("TimeStamp").dt.replace_time_zone("UTC"))
+    with pytest.raises(MeasuredDataError, match="overlap by 140 s"):
+        imported(utc, BERLIN.replace("2024-03-05T07:00:00", zeros))
+
+
 def test_detectors_that_are_stamped_late(imported: Import) -> None:
     read = imported(mapping=MAPPING.replace("channel = 5", "channel = 5\nlatency_s = 0.4"))
     np.testing.assert_array_equal(read.periods[0].passages["7:5"].on_s, [30.8, 50.6])
@@ -400,7 +438,7 @@ def test_a_recording_that_became_a_log_is_the_same_recording(
         ("zero = [2024-03-05T07:00:00]", 'zero = "7:00"', "zero: input should be a valid tuple"),
         ("[2024-03-05T07:00:00]", '["7:00"]', "zero.0 = '7:00': write a local time such as 2024"),
         ("zero = [2024-03-05T07:00:00]", "", "give zero .* or .*periods"),
-        ("07:00:00]", "07:00:00Z]", "write local time without one"),
+        ("07:00:00]", "07:00:00Z]", "zero has offsets from UTC, .* write the street's own time_"),
         ("[2024-03-05T07:00:00]", "[2023-03-05T07:00:00]", "no event in period.*the log goes from"),
         ("[[devices]]", "[[devices", "not valid TOML"),
         ("zero =", 'time_zone = "Denver"\nzero =', "unknown time_zone 'Denver'"),

@@ -10,6 +10,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
+from datetime import datetime
 from pathlib import Path
 
 import numpy as np
@@ -18,7 +19,7 @@ from numpy.typing import NDArray
 
 from ugat_marl.data.measured.atspm_mapping import AtspmMapping, Device, Span, read_mapping
 from ugat_marl.data.measured.coverage import coverage
-from ugat_marl.data.measured.local_time import local_times
+from ugat_marl.data.measured.local_time import LocalClock, local_times
 from ugat_marl.data.measured.passages import passages_of
 from ugat_marl.data.measured.reading import detectors_of, periods_of, signals_of
 from ugat_marl.data.measured.tables import (
@@ -142,8 +143,12 @@ def import_atspm(events: Path, mapping: Path, scenario: Scenario, network: Netwo
     table = read_mapping(mapping, widths, driven)
     spans = table.spans()
     periods = _periods(mapping, spans, scenario)
+    names = pl.Series([period.id for period in periods])
+    zeros = pl.Series("zero", [str(span.zero) for span in spans])
+    clock = LocalClock.of(mapping, names, zeros, table.time_zone, ZONE)
     detectors = detectors_of(mapping, _zones(table), network)
     log = read_log(events, table.time_zone, findings)
+    _refuse_overlap(mapping, periods, clock.zeros_of(log["time"]))
     known = log.filter(pl.col("device").is_in([device.id for device in table.devices]))
     if known.is_empty():
         raise MeasuredDataError(
@@ -151,7 +156,7 @@ def import_atspm(events: Path, mapping: Path, scenario: Scenario, network: Netwo
             f"{', '.join(map(repr, log['device'].unique().sort().to_list()[:8]))}"
         )
     latencies = [zone.latency_s for device in table.devices for zone in device.detectors]
-    stamped = _in_periods(events, known, spans, periods, max(latencies, default=0.0))
+    stamped = _in_periods(events, known, clock, periods, max(latencies, default=0.0))
     rows = stamped.filter(pl.col("time_s") <= pl.col("end_s"))
     _report(events, rows, table, findings)
     signals = _signals(events, rows, table, periods, network, widths, findings)
@@ -209,10 +214,24 @@ def _periods(path: Path, spans: Sequence[Span], scenario: Scenario) -> tuple[Per
         )
         for span in spans
     ]
-    periods = periods_of(path, _numbered(frame_of(PERIODS, rows)), scenario)
-    zeros = [(span.zero - spans[0].zero).total_seconds() for span in spans]
+    return periods_of(path, _numbered(frame_of(PERIODS, rows)), scenario)
+
+
+def _refuse_overlap(path: Path, periods: Sequence[Period], zeros: Mapping[str, datetime]) -> None:
+    """Refuse periods that have some time in common.
+
+    Args:
+        path: The mapping.
+        periods: The periods.
+        zeros: Time at which the scenario's clock is 0 in each.
+
+    Raises:
+        MeasuredDataError: Two periods overlap.
+    """
+    first = zeros[periods[0].id]
+    later = [(zeros[period.id] - first).total_seconds() for period in periods]
     real = sorted(
-        (zero + p.begin_s, zero + p.end_s, p.id) for zero, p in zip(zeros, periods, strict=True)
+        (zero + p.begin_s, zero + p.end_s, p.id) for zero, p in zip(later, periods, strict=True)
     )
     for (_, ends, one), (begins, _, other) in zip(real, real[1:], strict=False):
         if begins < ends:
@@ -220,7 +239,6 @@ def _periods(path: Path, spans: Sequence[Span], scenario: Scenario) -> tuple[Per
                 f"{path}: the periods {one!r} and {other!r} overlap by {ends - begins:g} s; the "
                 "same vehicles would count twice"
             )
-    return periods
 
 
 def _zones(table: AtspmMapping) -> pl.DataFrame:
@@ -247,7 +265,7 @@ def _numbered(frame: pl.DataFrame) -> pl.DataFrame:
 def _in_periods(
     path: Path,
     log: pl.DataFrame,
-    spans: Sequence[Span],
+    clock: LocalClock,
     periods: Sequence[Period],
     late_s: float,
 ) -> pl.DataFrame:
@@ -256,7 +274,7 @@ def _in_periods(
     Args:
         path: The log.
         log: Its events.
-        spans: The periods as the mapping describes them.
+        clock: Times at which the scenario's clock is 0 in each period.
         periods: The periods.
         late_s: Greatest delay of a stamp, s; events that much after a period are kept.
 
@@ -264,18 +282,19 @@ def _in_periods(
         The events with ``period_id``, ``begin_s`` and ``end_s`` of the period, and ``time_s``.
     """
     parts: list[pl.DataFrame] = []
-    for span, period in zip(spans, periods, strict=True):
-        time = (pl.col("time") - pl.lit(span.zero)).dt.total_microseconds() / 1e6
+    for period in periods:
+        names = pl.repeat(period.id, log.height, eager=True)
         part = log.with_columns(
             pl.lit(period.id).alias("period_id"),
             pl.lit(period.begin_s).alias("begin_s"),
             pl.lit(period.end_s).alias("end_s"),
-            time.alias("time_s"),
+            clock.seconds(path, log["time"], names, first_row(path)),
         ).filter(pl.col("time_s").is_between(period.begin_s - LOOK_BACK_S, period.end_s + late_s))
         if part.filter(pl.col("time_s").is_between(period.begin_s, period.end_s)).is_empty():
             raise MeasuredDataError(
-                f"{path}: no event in period {period.id!r}, of which second 0 is {span.zero}; the "
-                f"log goes from {log['time'].min()} to {log['time'].max()}"
+                f"{path}: no event in period {period.id!r}, of which second 0 is "
+                f"{clock.zeros[period.id]}; the log goes from {log['time'].min()} to "
+                f"{log['time'].max()}"
             )
         parts.append(part)
     return pl.concat(parts)
@@ -513,7 +532,7 @@ def read_log(path: Path, time_zone: str, findings: list[Finding]) -> pl.DataFram
         findings: Findings; rows that are left out are added to them.
 
     Returns:
-        Columns ``ROW``, ``time`` (local, microseconds), ``device`` (text), ``event`` and
+        Columns ``ROW``, ``time`` (see `local_times`), ``device`` (text), ``event`` and
         ``parameter``, in the order of the file. Rows with empty cells are left out.
 
     Raises:

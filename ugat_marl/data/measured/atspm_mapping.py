@@ -171,8 +171,6 @@ def read_mapping(
             "[[periods]] with a zero each, and not both"
         )
     require_time_zone(mapping.time_zone, str(path))
-    if any(span.zero.tzinfo for span in mapping.spans()):
-        raise MeasuredDataError(f"{path}: zero has a time zone; write local time without one")
     _check_devices(path, mapping.devices, widths, driven)
     return mapping
 

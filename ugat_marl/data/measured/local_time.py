@@ -46,7 +46,14 @@ class LocalClock:
     time_zone: str = ""
 
     @classmethod
-    def of(cls, path: Path, periods: pl.Series, cells: pl.Series, time_zone: str) -> LocalClock:
+    def of(
+        cls,
+        path: Path,
+        periods: pl.Series,
+        cells: pl.Series,
+        time_zone: str,
+        mapping: str = "the column time_zone",
+    ) -> LocalClock:
         """Return the clock of some periods.
 
         Args:
@@ -54,14 +61,15 @@ class LocalClock:
             periods: Name of each period.
             cells: Local time at which the scenario's clock is 0 in each.
             time_zone: Time zone of the street; "" if it is not known.
+            mapping: Place at which the time zone can be given, for messages.
 
         Raises:
             MeasuredDataError: A time cannot be read, or the clock of the street never showed it.
         """
-        times = _times(path, cells, time_zone, 2, "the column time_zone")
+        times = _times(path, cells, time_zone, 2, mapping)
         local = utc = times
         if _is_zoned(times):
-            local = _shown(times, time_zone)
+            local = times.dt.convert_time_zone(time_zone).dt.replace_time_zone(None)
         else:
             utc = local.dt.replace_time_zone(
                 time_zone or "UTC", ambiguous="null", non_existent="null"
@@ -75,7 +83,7 @@ class LocalClock:
                 else "showed twice, as they were set back"
             )
             raise MeasuredDataError(
-                f"{path}, line {at + 2}: {cells.name} is {local[at]}, which clocks in {time_zone} "
+                f"{_place(path, at, 2)}: {cells.name} is {local[at]}, which clocks in {time_zone} "
                 f"{what}; write a time with its offset"
             )
         return cls(
@@ -95,12 +103,15 @@ class LocalClock:
             MeasuredDataError: A time cannot be read.
         """
         times = _times(path, cells, self.time_zone, start, "periods.csv, as time_zone")
-        # local times would lose or gain an hour where the clock is changed
-        zeros = self.zeros_utc if _is_zoned(times) else self.zeros
-        zero = periods.replace_strict(zeros, default=None, return_dtype=times.dtype)
+        zero = periods.replace_strict(self.zeros_of(times), default=None, return_dtype=times.dtype)
         # a time of an unknown period is left out later, with its row
         seconds = ((times - zero).dt.total_microseconds() / 1e6).fill_null(0.0)
         return seconds.set(times.is_null(), None).alias(f"{cells.name}_s")
+
+    def zeros_of(self, times: pl.Series) -> Mapping[str, datetime]:
+        """Return the times at which the clock is 0, in UTC if `times` have a time zone."""
+        # local times would lose or gain an hour where the clock is changed
+        return self.zeros_utc if _is_zoned(times) else self.zeros
 
 
 def require_time_zone(name: str, where: str) -> None:
@@ -118,9 +129,9 @@ def require_time_zone(name: str, where: str) -> None:
 def local_times(
     path: Path, cells: pl.Series, time_zone: str, start: int, mapping: str
 ) -> pl.Series:
-    """Return local times without a time zone, in microseconds; empty cells stay empty.
+    """Return times in microseconds, in the street's time zone if they have one.
 
-    Over a change of the clock they jump; `LocalClock.seconds` does not.
+    Empty cells stay empty.
 
     Args:
         path: File of the times.
@@ -133,16 +144,17 @@ def local_times(
         MeasuredDataError: The times have an unknown form, or a time zone without `time_zone`.
     """
     times = _times(path, cells, time_zone, start, mapping)
-    return _shown(times, time_zone) if _is_zoned(times) else times
+    return times.dt.convert_time_zone(time_zone) if _is_zoned(times) else times
 
 
 def _is_zoned(times: pl.Series) -> bool:
     return isinstance(times.dtype, pl.Datetime) and times.dtype.time_zone is not None
 
 
-def _shown(times: pl.Series, time_zone: str) -> pl.Series:
-    """Return times of a zone as clocks in `time_zone` show them, without a zone."""
-    return times.dt.convert_time_zone(time_zone).dt.replace_time_zone(None)
+def _place(path: Path, at: int, start: int) -> str:
+    """Return the name of a time's place in its file; a mapping has no rows."""
+    unit = {".parquet": "row", ".toml": "entry"}.get(path.suffix, "line")
+    return f"{path}, {unit} {at + (1 if unit == 'entry' else start)}"
 
 
 def _times(path: Path, cells: pl.Series, time_zone: str, start: int, mapping: str) -> pl.Series:
@@ -186,7 +198,6 @@ def _parsed(path: Path, cells: pl.Series, start: int) -> pl.Series:
     wrong = best.is_null() & ~empty.fill_null(True)
     if wrong.any():
         at = int(wrong.arg_true()[0])
-        unit = "row" if path.suffix == ".parquet" else "line"
         text = str(cells[at])[:40]
         dotted = re.fullmatch(r"(\d{1,2})\.(\d{1,2})\.(\d{4})[ T]+(\d.*)", text, re.ASCII)
         if dotted:
@@ -196,5 +207,5 @@ def _parsed(path: Path, cells: pl.Series, start: int) -> pl.Series:
             way_out = "other times of the column have an offset from UTC; write it behind this one"
         else:
             way_out = "write it in a form such as 2024-03-05 07:00:00.1"
-        raise MeasuredDataError(f"{path}, {unit} {at + start}: {cells.name} is {text!r}; {way_out}")
+        raise MeasuredDataError(f"{_place(path, at, start)}: {cells.name} is {text!r}; {way_out}")
     return best
