@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -27,6 +28,7 @@ from ugat_marl.experiments import (
 from ugat_marl.experiments.driver import record_of
 from ugat_marl.experiments.jobs import SCORES, JobRecord
 from ugat_marl.experiments.paper import TABLES, Planner, settings_of
+from ugat_marl.experiments.row_names import PHASE
 from ugat_marl.experiments.settings import LearnerSpec, Setting
 from ugat_marl.experiments.transfers import planned_jobs
 from ugat_marl.grounding import (
@@ -118,6 +120,33 @@ def test_the_ablation_has_a_row_for_each_departure_from_the_paper() -> None:
 def test_rewards_that_cannot_be_matched_have_no_such_row() -> None:
     names = [setting.name for setting in replace(SHORT, reward="pressure").settings("main")]
     assert "timed" in names and "timed: rewards matched" not in names
+
+
+@pytest.mark.parametrize("table", ["main", "ablation", "alpha", "uncertainty"])
+@pytest.mark.parametrize("preset", [None, "paper"])
+def test_no_two_rows_of_a_table_are_one_training(table: str, preset: Any) -> None:
+    """The preset pools α, and has no off-data loss and a KL weight of 1, as rows beside it do."""
+    rows = PaperConfig(preset=preset).settings(table)
+    identities = [json.dumps(row.identity, sort_keys=True) for row in rows]
+    assert len(set(identities)) == len(identities)
+    assert preset is None or table == "uncertainty" or PHASE in [row.name for row in rows]
+
+
+@pytest.mark.parametrize(
+    ("gate", "what"),
+    [(GateConfig(mode="static", static_alpha=0.3), "α = 0.3"), (GateConfig("infinite"), "no gate")],
+)
+def test_a_row_whose_alpha_follows_no_uncertainty_is_named_by_it(
+    gate: GateConfig, what: str
+) -> None:
+    for table in ("main", "ablation", "alpha"):
+        settings = PaperConfig(gate=gate).settings(table)
+        rows = {row.name: row.ugat for row in settings if row.ugat is not None}
+        own = [rows[name] for name in (PHASE, TIMED) if name in rows]
+        assert all(ugat.gate.mode == "dynamic" for ugat in own)
+        assert len(own) == (2 if table == "alpha" else 0)
+        named = {f"phase: {what}", f"timed: {what}"}
+        assert named <= set(rows) or table == "alpha"
 
 
 @pytest.mark.parametrize("table", TABLES)

@@ -78,7 +78,7 @@ def settings_of(
     constants: Sequence[int] = (1, 2, 3, 4, 5, 6),
     learner: LearnerSpec | None = None,
 ) -> list[Setting]:
-    """Return the rows of a table.
+    """Return the rows of a table, without those that would train what one before them trains.
 
     Args:
         table: One of `TABLES`.
@@ -123,7 +123,11 @@ def settings_of(
         rows = [direct, rule]
     else:
         raise OptionError(f"table {table!r}: allowed are {', '.join(TABLES)}")
-    return [replace(row, learner=learner or LearnerSpec()) for row in rows]
+    return [
+        replace(row, learner=learner or LearnerSpec())
+        for number, row in enumerate(rows)
+        if row.ugat is None or all(row.ugat != other.ugat for other in rows[:number])
+    ]
 
 
 def constant_name(seconds: int) -> str:
@@ -162,8 +166,16 @@ def _ugat(name: str, ugat: UgatConfig) -> Setting:
 
 
 def _grounded(bases: Mapping[str, UgatConfig]) -> list[Setting]:
-    rows = [_ugat(GROUNDED_NAME[name], base) for name, base in bases.items()]
+    rows = [_ugat(_grounded_name(name, base.gate), base) for name, base in bases.items()]
     return rows + [row for name, base in bases.items() for row in _matching(name, base)]
+
+
+def _grounded_name(grounding: str, gate: GateConfig) -> str:
+    """Return the name of the row of a grounding, which tells an α that does not follow u."""
+    other = {"static": f"α = {gate.static_alpha:g}", "infinite": "no gate"}.get(gate.mode)
+    if other is None or grounding == "street":
+        return GROUNDED_NAME[grounding]
+    return variant_name(grounding, other)
 
 
 def _matching(name: str, base: UgatConfig) -> list[Setting]:
@@ -191,7 +203,7 @@ def _ablated(name: str, base: UgatConfig) -> list[Setting]:
         return [_ugat(row, replace(base, street=x)) for row, x in _streets(base.street).items()]
     ungated = replace(base, gate=replace(base.gate, mode="infinite"))
     variants = {
-        GROUNDED_NAME[name]: base,
+        _grounded_name(name, base.gate): base,
         variant_name(name, "α = 0.5"): replace(base, gate=_static(base, 0.5)),
         variant_name(name, "α from the first fit on"): replace(
             base, gate=replace(base.gate, start="fitted")
@@ -253,13 +265,14 @@ def _other_answers(name: str, base: UgatConfig) -> Setting:
 def _alphas(name: str, base: UgatConfig) -> list[Setting]:
     _require_gate(name)
     alphas = (0.2, 0.4, 0.5, 0.6, 0.8)
-    pooled = replace(base, gate=replace(base.gate, scope="pooled"))
+    dynamic = replace(base, gate=replace(base.gate, mode="dynamic"))
+    pooled = replace(dynamic, gate=replace(dynamic.gate, scope="pooled"))
     return [
         *(
             _ugat(variant_name(name, f"α = {a}"), replace(base, gate=_static(base, a)))
             for a in alphas
         ),
-        _ugat(GROUNDED_NAME[name], base),
+        _ugat(GROUNDED_NAME[name], dynamic),
         _ugat(variant_name(name, "α pooled over the network"), pooled),
     ]
 
