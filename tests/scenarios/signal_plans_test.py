@@ -30,6 +30,7 @@ from ugat_marl.scenarios import (
     SignalPlan,
     copy_papers,
     movement_codes,
+    offset_notes,
     programme_notes,
     programme_plan,
     read_plans,
@@ -323,6 +324,13 @@ def test_blank_rows_of_a_spreadsheet_are_left_out(tmp_path: Path) -> None:
     assert read_plans(blank) == read_plans(plain)
 
 
+def test_columns_may_have_capitals(tmp_path: Path) -> None:
+    plain, large = tmp_path / "plain.csv", tmp_path / "large.csv"
+    plain.write_text(HEAD + GOOD)
+    large.write_text(HEAD.title() + GOOD)
+    assert read_plans(large) == read_plans(plain)
+
+
 @pytest.mark.parametrize(
     ("text", "says"),
     [
@@ -427,6 +435,17 @@ def test_a_short_yellow_is_noted(tmp_path: Path, capsys: pytest.CaptureFixture[s
     rounded = replace(stays, split_s=29.96)
     assert not yellow_notes([SignalPlan("A1", 60.0, 0.0, (more, rounded))])
     assert yellow_notes([SignalPlan("A1", 60.0, 0.0, (replace(more, yellow_s=1.0), stays))])
+
+
+def test_an_offset_beyond_the_cycle_is_noted(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    (tmp_path / "t.csv").write_text(HEAD + GOOD.replace("A1,60,0", "A1,60,130"))
+    words = ["plan", "single-v1", "--apply", str(tmp_path / "t.csv"), "--out", str(tmp_path / "x")]
+    assert main(words) == 0
+    told = "note: whole cycles of the offset count nothing, at A1 (130 s of a cycle of 60 s: 10 s)"
+    assert told in capsys.readouterr().out
+    assert offset_notes([dual_ring(90.0)]) and not offset_notes([dual_ring(89.5)])
 
 
 UTDF = """[Network]

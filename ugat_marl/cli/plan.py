@@ -27,6 +27,7 @@ from ugat_marl.scenarios import (
     copy_papers,
     is_utdf,
     new_folder,
+    offset_notes,
     programme_notes,
     read_plans,
     read_utdf,
@@ -144,7 +145,7 @@ class Plan:
         without = sorted(lights - {plan.light for plan in plans})
         if without:
             notes = (*notes, f"{listed(without, 'light')} without a plan; own programme kept")
-        for note in (*notes, *yellow_notes(plans)):
+        for note in (*notes, *offset_notes(plans), *yellow_notes(plans)):
             console.print(f"note: {note}", soft_wrap=True)
         name = shlex.quote(str(self.out))
         console.print(

@@ -107,6 +107,7 @@ from .settings import validate_settings as validate_settings
 from .signal_plans import PlanPhase as PlanPhase
 from .signal_plans import SignalPlan as SignalPlan
 from .signal_plans import movement_codes as movement_codes
+from .signal_plans import offset_notes as offset_notes
 from .signal_plans import programme_notes as programme_notes
 from .signal_plans import programme_plan as programme_plan
 from .signal_plans import read_plans as read_plans

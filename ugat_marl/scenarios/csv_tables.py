@@ -30,14 +30,13 @@ def with_point(cell: str) -> str:
 
 
 def columns_of(reader: csv.DictReader[str], path: Path) -> list[str]:
-    """Read the first line; return the names without blanks, which then name the cells of rows.
+    """Read the first line; return the names in small letters, which then name the cells of rows.
 
     Raises:
-        ScenarioError: It is not CSV, tells a spreadsheet its separator, or holds a name twice,
-            large or small.
+        ScenarioError: It is not CSV, tells a spreadsheet its separator, or holds a name twice.
     """
     try:
-        columns = [name.strip() for name in reader.fieldnames or ()]
+        columns = [name.strip().lower() for name in reader.fieldnames or ()]
     except csv.Error as error:
         raise ScenarioError(f"{path}, line 1: not CSV ({error})") from None
     if columns and columns[0].startswith("sep="):
@@ -45,8 +44,7 @@ def columns_of(reader: csv.DictReader[str], path: Path) -> list[str]:
             f"{path}, line 1: {columns[0]!r} is for a spreadsheet; delete this line, so that the "
             "file begins with the names of its columns"
         )
-    lowered = [name.lower() for name in columns]
-    if twice := [name for name in dict.fromkeys(lowered) if name and lowered.count(name) > 1]:
+    if twice := [name for name in dict.fromkeys(columns) if name and columns.count(name) > 1]:
         raise ScenarioError(f"{path}, line 1: the column {twice[0]} is there twice; keep one")
     reader.fieldnames = columns
     return columns

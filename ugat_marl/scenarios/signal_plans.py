@@ -596,6 +596,18 @@ def yellow_notes(plans: Iterable[SignalPlan]) -> list[str]:
     return [f"yellow is short at {', '.join(short)}; {usual}"] if short else []
 
 
+def offset_notes(plans: Iterable[SignalPlan]) -> list[str]:
+    """Return a note on offsets that are as long as the cycle or longer, or none."""
+    long = [
+        f"{plan.light} ({plan.offset_s:g} s of a cycle of {plan.cycle_s:g} s: "
+        f"{plan.offset_s % plan.cycle_s:g} s)"
+        for plan in plans
+        if plan.offset_s >= plan.cycle_s
+    ]
+    told = "whole cycles of the offset count nothing"
+    return [f"{told}, at {', '.join(long)}; check the table"] if long else []
+
+
 _States = Sequence[tuple[float, str]]
 
 

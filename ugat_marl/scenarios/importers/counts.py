@@ -108,7 +108,7 @@ def read_rows(
     texts = lines(path, reporter)
     first = next(texts, "")
     reader = csv.DictReader(chain((first,), texts), delimiter=delimiter_of(first))
-    reader.fieldnames = columns = [name.lower() for name in columns_of(reader, path)]
+    columns = columns_of(reader, path)
     turns = {"from", "to"} <= set(columns)
     known = {*_TIMES, *_TIMES.values()}
     if times := [name for name in columns if name not in known and _LIKE_TIMES.fullmatch(name)]:
