@@ -17,7 +17,8 @@ from tests.reporting.pages import Page, assert_drawn, needs_browser, seen_in_bro
 from ugat_marl.diagnosis import Diagnosis, DiagnosisConfig, statistic
 from ugat_marl.diagnosis.features import ALL_FEATURES, FEATURES
 from ugat_marl.diagnosis.verdict import STATISTICS
-from ugat_marl.effects import load_scenario
+from ugat_marl.diagnosis.workflow import _without_search
+from ugat_marl.effects import load_scenario, parse_domain
 from ugat_marl.reporting import (
     LightNames,
     commands_on_page,
@@ -184,6 +185,19 @@ def test_a_page_for_every_verdict(verdict: str, network: Network) -> None:
         assert "--sim DIR/corrected" in page.text
     if verdict == "unknown":
         assert "the best attempt, which is not named" in page.text
+
+
+def test_effects_are_told_as_a_domain_takes_them(network: Network) -> None:
+    diagnosis = diagnosis_of("explained")
+    domain = "headway=1.451+demand_surge=S_C,300,900,1.8"
+    assert f"as a domain: {domain}" in printed(diagnosis)
+    assert f"As a domain: {domain}" in Page(diagnosis_page(diagnosis, network)).text
+    effects = parse_domain(
+        "turning=S_C,C_N,0.2+driver_model=IDM+detector_extension=stop@S_C,0.7,merged"
+        "+swapped=S:1,S:2+late_green=*,2+detector_speeds=advance,front"
+    )
+    records = [_without_search(effect, "signal log") for effect in effects]
+    assert parse_domain(words.as_domain(records)) == effects
 
 
 def test_headways_are_drawn_by_position_in_the_queue(network: Network) -> None:

@@ -94,6 +94,7 @@ def diagnosis_page(diagnosis: Diagnosis, network: Network, commands: Sequence[st
         partial=words.partial(diagnosis),
         meaning=words.meaning(diagnosis),
         effects=_effects(diagnosis.effects, names),
+        as_domain=words.as_domain(diagnosis.effects),
         judged=words.judged(diagnosis),
         heldout=None if heldout is None else _heldout(heldout),
         expected=number(None if heldout is None else heldout.expected),

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Iterable
+from dataclasses import fields
 
 from ugat_marl.diagnosis import (
     ApproachRow,
@@ -17,6 +18,7 @@ from ugat_marl.diagnosis import (
     Verdict,
     clock,
 )
+from ugat_marl.effects import known_effects, measurement_effects
 from ugat_marl.reporting.formats import chance, number, share
 from ugat_marl.reporting.light_names import LightNames
 
@@ -100,6 +102,27 @@ def values(effect: EffectRecord, *, intervals: bool = True) -> str:
     """Return the parameters of an effect, with their intervals if wanted."""
     texts = [_parameter(name, value, intervals) for name, value in effect.parameters.items()]
     return "; ".join(texts) or "as such"
+
+
+def as_domain(effects: Iterable[EffectRecord]) -> str:
+    """Return effects as ``--domain`` takes them, such as ``headway=1.451+late_green=*,2``."""
+    return "+".join(map(_as_typed, effects))
+
+
+def _as_typed(effect: EffectRecord) -> str:
+    kind = {**known_effects(), **measurement_effects()}.get(effect.name)
+    if kind is None:  # in a file of another version
+        return effect.name
+    values = dict(zip(kind.texts, (effect.place or "").split(">"), strict=False))
+    if effect.window is not None:
+        begin_s, end_s = effect.window
+        values |= {"begin_s": f"{begin_s:.12g}", "end_s": f"{end_s:.12g}"}
+    for name, limits in kind.ranges.items():
+        if name in effect.parameters:
+            rounded = float(f"{effect.parameters[name].value:.4g}")
+            values[name] = f"{limits.nearest(rounded):.12g}"
+    texts = (values[field.name] for field in fields(kind) if field.name in values)
+    return f"{effect.name}={','.join(texts)}"
 
 
 def _parameter(name: str, parameter: Parameter, intervals: bool) -> str:
