@@ -366,7 +366,7 @@ def test_a_budget_too_small_for_anything_says_so(
     text = " ".join(capsys.readouterr().out.split())
     diagnosed = json.loads((tmp_path / "out" / "diagnosis.json").read_text())
     assert (diagnosed["verdict"], diagnosed["complete"]) == ("provisional", False)
-    assert "Partial result: the budget of 1500 simulated hours or 0.01 s ended" in text
+    assert "Partial result: the budget of 0.01 s (--budget-s) ended" in text
     assert "held-out periods" not in text
     assert "Partial result" in (tmp_path / "out" / "report.html").read_text()
 
@@ -391,7 +391,7 @@ def test_a_budget_that_ends_in_the_search_gives_a_partial_result(
     text = " ".join(capsys.readouterr().out.split())
     diagnosed = json.loads((tmp_path / "out" / "diagnosis.json").read_text())
     assert diagnosed["complete"] is False
-    assert "Partial result: the budget of 1500 simulated hours or 18 s ended" in text
+    assert "Partial result: the budget of 18 s (--budget-s) ended" in text
     assert "Partial result" in (tmp_path / "out" / "report.html").read_text()
 
 

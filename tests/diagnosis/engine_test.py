@@ -364,8 +364,10 @@ def test_a_budget_counts_simulated_hours_and_no_stored_days(
     short, streets = an_engine(scenario, layout, tmp_path, budget=budget)
     short.replicates((), range(2))
     assert budget.spent_h == pytest.approx(2 * hours)
+    assert budget.ended is None
     with pytest.raises(OutOfTime, match="budget"):
         short.replicates((), [2])
+    assert budget.ended == "budget_h"
     again = Budget(0.5 * hours)
     later, _ = an_engine(scenario, layout, tmp_path, budget=again)
     later.replicates((), range(3))
@@ -383,6 +385,7 @@ def test_when_time_is_up_only_what_is_remembered_is_given(
     assert same(late.replicates((), [1])[0], known[1])
     with pytest.raises(OutOfTime, match="budget"):
         late.replicates((), range(3))
+    assert late.budget.ended == "budget_s"
     with pytest.raises(OutOfTime):
         late.replicates(HEADWAY, [0])
     assert streets.calls == []

@@ -16,7 +16,7 @@ from collections.abc import Callable, Iterator, Mapping, Sequence
 from concurrent.futures import Executor, Future, ThreadPoolExecutor
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any, TypeVar
+from typing import Any, Literal, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -123,6 +123,10 @@ Job = TypeVar("Job")
 Done = TypeVar("Done")
 
 
+EndedBudget = Literal["budget_h", "budget_s"]
+"""Setting of a budget that has ended."""
+
+
 class OutOfTime(UgatMarlError):
     """The budget is spent; the diagnosis ends with the results so far."""
 
@@ -138,6 +142,7 @@ class Budget:
 
     Attributes:
         spent_h: Simulated hours so far.
+        ended: Setting of the budget that has ended; None while there is some left.
     """
 
     def __init__(self, hours: float = math.inf, deadline: float | None = None) -> None:
@@ -145,6 +150,7 @@ class Budget:
         self._deadline = deadline
         self._lock = threading.Lock()
         self.spent_h = 0.0
+        self.ended: EndedBudget | None = None
 
     def spend(self, period: Period) -> None:
         """Spend the hours of a period.
@@ -155,6 +161,7 @@ class Budget:
         with self._lock:
             late = self._deadline is not None and time.monotonic() > self._deadline
             if late or self.spent_h >= self._hours:
+                self.ended = "budget_s" if late else "budget_h"
                 raise OutOfTime("the budget is spent")
             self.spent_h += period.length_s / 3600.0
 
@@ -199,7 +206,7 @@ class Engine:
         seed: Root seed of the days.
         thresholds: Numbers of the method.
         cache: Folder of the cached tallies; None for no cache on disk.
-        budget: Work that may be done; None for no limit.
+        budget: Work that may be done; None for no limit. It is an attribute, too.
         workers: Simulations at a time, None for one per core; or an executor that simulates days.
         base_days: Number of days of the scenario as it is that decide which days are ordinary; 0 if
             all days are.
@@ -236,7 +243,7 @@ class Engine:
             stretches.setdefault(period.window, []).append(place)
         in_order = [stretches[window] for window in sorted(stretches)]
         self._stretches = [in_order[place] for place in spread(len(in_order))]
-        self._budget = budget or Budget()
+        self.budget = budget or Budget()
         self._replay = replay
         self._seed = seed
         self._thresholds = thresholds
@@ -550,7 +557,7 @@ class Engine:
             day = self._days.get(key)
             new = day is None
             if day is None:
-                self._budget.spend(period)
+                self.budget.spend(period)
                 day = self._days[key] = Future[Day]()
                 while len(self._days) > _KEPT_DAYS:
                     self._days.popitem(last=False)

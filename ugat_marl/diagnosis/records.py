@@ -24,6 +24,7 @@ from typing import Any, Literal, Self
 import numpy as np
 from pydantic import ConfigDict, TypeAdapter
 
+from ugat_marl.diagnosis.engine import EndedBudget
 from ugat_marl.diagnosis.features import Tally
 from ugat_marl.diagnosis.hypotheses import Members, effects_of
 from ugat_marl.diagnosis.statistics import Array, Distance, Reference
@@ -724,6 +725,7 @@ class Diagnosis:
         not_corrected: Reason why effects of the search are in no corrected scenario; None without
             one.
         policy_gap: Travel times by policy; None until `ugat-marl policy-gap` has measured them.
+        ended_by: Setting of the budget that ended the diagnosis; None if none did.
     """
 
     __pydantic_config__ = ConfigDict(extra="forbid")
@@ -764,13 +766,28 @@ class Diagnosis:
     corrected: str | None
     not_corrected: str | None
     policy_gap: dict[str, PolicyGap] | None = None
+    ended_by: EndedBudget | None = None
 
     @property
     def budget_in_words(self) -> str:
         """The budget with its unit: simulated hours, seconds, or both."""
-        hours = "" if self.budget_h is None else f"{self.budget_h:g} simulated hours"
-        seconds = "" if self.budget_s is None else f"{self.budget_s:g} s"
-        return " or ".join(filter(None, (hours, seconds))) or "no limit"
+        return " or ".join(self._budgets.values()) or "no limit"
+
+    @property
+    def ended_budget_in_words(self) -> str:
+        """The budget that ended, with its option; all of it if that is not known."""
+        if self.ended_by not in self._budgets:
+            return self.budget_in_words
+        return f"{self._budgets[self.ended_by]} (--{self.ended_by.replace('_', '-')})"
+
+    @property
+    def _budgets(self) -> dict[EndedBudget, str]:
+        budgets: dict[EndedBudget, str] = {}
+        if self.budget_h is not None:
+            budgets["budget_h"] = f"{self.budget_h:g} simulated hours"
+        if self.budget_s is not None:
+            budgets["budget_s"] = f"{self.budget_s:g} s"
+        return budgets
 
     def to_json(self) -> dict[str, Any]:
         """Return plain values for JSON: numbers with nine digits, None for NaN and infinity."""

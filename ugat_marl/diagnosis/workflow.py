@@ -596,6 +596,7 @@ def _unsearched(
         untried=tuple(sorted(left)),
         corrected=None,
         not_corrected=None,
+        ended_by=None if examined is None else study.engine.budget.ended,
     )
 
 

@@ -165,7 +165,7 @@ def partial(diagnosis: Diagnosis) -> str | None:
     more = f", … ({len(untried)} in all)" if len(untried) > UNTRIED else ""
     left = f" Not examined yet: {joined(untried[:UNTRIED])}{more}." if untried else ""
     return (
-        f"Partial result: the budget of {diagnosis.budget_in_words} ended before the search "
+        f"Partial result: the budget of {diagnosis.ended_budget_in_words} ended before the search "
         f"did.{left} The same command goes on where this one stopped."
     )
 
