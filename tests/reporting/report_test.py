@@ -12,10 +12,19 @@ from rich.console import Console, RenderableType
 
 from ugat_marl.data import Metrics, Scores
 from ugat_marl.effects import load_scenario
-from ugat_marl.experiments import DIRECT, GROUNDED_NAME, ORACLE, RULE, Evaluation
+from ugat_marl.experiments import (
+    DIRECT,
+    GROUNDED_NAME,
+    ORACLE,
+    RULE,
+    Evaluation,
+    matched_name,
+    variant_name,
+)
 from ugat_marl.experiments.evaluation import Result
 from ugat_marl.reporting import (
     calibration_picture,
+    charts,
     measures_table,
     service_tables,
     training_page,
@@ -184,6 +193,16 @@ def test_the_radar_of_a_table_has_every_grounding() -> None:
         "trained in real in V4",
         "best rule, tuned there in V4",
     ]
+
+
+def test_a_radar_shows_a_grounding_whose_alpha_does_not_follow_u() -> None:
+    fixed, ungated = variant_name("phase", "α = 0.3"), variant_name("timed", "no gate")
+    labels = [DIRECT, fixed, ungated, matched_name("timed")]
+    lines = training_page._radar_lines(labels, {(label, "V4"): {} for label in labels}, "V4")
+    assert [*lines][1:] == [f"{label} in V4" for label in labels]
+    assert charts._row_of("phase", labels) == fixed
+    assert charts._row_of("timed", labels) == ungated
+    assert charts._row_of("timed", ["timed: no gate", "timed"]) == "timed"
 
 
 def test_settings_of_fewer_trainings_are_named() -> None:

@@ -21,6 +21,7 @@ from ugat_marl.experiments import (
     matched_name,
     means_by_step,
     means_by_stretch,
+    variant_name,
 )
 from ugat_marl.reporting.figures import (
     TOP,
@@ -337,10 +338,18 @@ def draw_table(rows: Sequence[Mapping[str, Any]], sim: str, folder: Path) -> Non
         folder: Folder for the pictures.
     """
     settings = _settings_and_targets(rows)[0]
-    grounded = [*GROUNDED_NAME.values(), matched_name("timed")]
-    drawn = [DIRECT, *(name for name in grounded if name in settings)]
+    grounded = [_row_of(kind, settings) for kind in GROUNDED_NAME]
+    named = (*grounded, matched_name("timed"))
+    drawn = [DIRECT, *dict.fromkeys(name for name in named if name in settings)]
     comparison_radar(rows, drawn, sim, folder / "radar.png")
     gap_picture(rows, folder / "gaps.png")
+
+
+def _row_of(grounding: str, settings: Sequence[str]) -> str:
+    """Return the name of the row of a grounding: the usual one, or else its first variant."""
+    usual = GROUNDED_NAME[grounding]
+    variants = (name for name in settings if name.startswith(variant_name(grounding, "")))
+    return usual if usual in settings else next(variants, usual)
 
 
 @styled()

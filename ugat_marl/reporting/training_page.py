@@ -25,6 +25,7 @@ from ugat_marl.experiments import (
     check_run,
     is_grounded,
     outcome_of,
+    short_name,
 )
 from ugat_marl.reporting import charts
 from ugat_marl.reporting.figures import NamedFigure, picture_name, printable
@@ -53,7 +54,7 @@ _OPEN = 4
 """Largest number of sections that are shown unfolded."""
 _WORST = 10
 """Number of intersections in the table of the longest queues."""
-_RADARS = (DIRECT, *GROUNDED_NAME.values(), ORACLE, RULE)
+_RADARS = (DIRECT, *map(short_name, GROUNDED_NAME.values()), ORACLE, RULE)
 """Beginnings of the rows on a radar, each with room for one line."""
 _RADAR = "Every axis is scaled by its best value, at the rim; the middle is worst."
 _STRETCH = "Mean of a stretch of episodes, with its 95 % interval over "
