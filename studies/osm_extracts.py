@@ -100,17 +100,26 @@ class Extract:
 
 
 def read_extract(path: Path) -> Extract:
-    """Read the places of an extract."""
+    """Read the places of an extract.
+
+    Raises:
+        ScenarioError: The file is missing or damaged, or no node is a traffic light.
+    """
     places: dict[int, tuple[float, float]] = {}
     signals: list[tuple[float, float]] = []
     largest = 0
-    for item in osmium.FileProcessor(str(path)):
-        if item.is_node():
-            places[item.id] = (item.location.lon, item.location.lat)
-            if item.tags.get("highway") == "traffic_signals":
-                signals.append(places[item.id])
-        elif item.is_way():
-            largest = max(largest, item.id)
+    try:
+        for item in osmium.FileProcessor(str(path)):
+            if item.is_node():
+                places[item.id] = (item.location.lon, item.location.lat)
+                if item.tags.get("highway") == "traffic_signals":
+                    signals.append(places[item.id])
+            elif item.is_way():
+                largest = max(largest, item.id)
+    except (RuntimeError, osmium.InvalidLocationError) as error:
+        raise ScenarioError(
+            f"{path}: not an OpenStreetMap extract, or damaged ({error}); give an .osm.pbf or .osm"
+        ) from None
     if not signals:
         raise ScenarioError(f"{path}: no node is a traffic light (highway=traffic_signals)")
     return Extract(path, places, tuple(signals), largest)
@@ -219,7 +228,7 @@ def try_box(extract: Extract, box: Box, load: float, target: Path, seed: int, co
     return ""
 
 
-def make_all(path: Path, seed: int, out: Path, count: int) -> int:
+def make_all(extract: Extract, seed: int, out: Path, count: int) -> int:
     """Make the scenarios and return how many there are.
 
     Raises:
@@ -227,7 +236,7 @@ def make_all(path: Path, seed: int, out: Path, count: int) -> int:
     """
     if out.is_dir() and any(out.iterdir()):
         raise OutputError(f"{out}: holds something already; give another folder, or empty it")
-    extract = read_extract(path)
+    path = extract.path
     random = numpy_generator(seed, "osm extracts")
     words = ["python", "-m", "studies.osm_extracts", path.name, "--seed", str(seed)]
     command = shlex.join([*words, "--out", out.name, "--count", str(count)])
@@ -258,7 +267,7 @@ def main(words: Sequence[str] | None = None) -> int:
     parser.add_argument("--count", type=int, default=3, help="number of scenarios (3)")
     given = parser.parse_args(words)
     require_least(1, count=given.count)
-    made = make_all(given.file, given.seed, given.out, given.count)
+    made = make_all(read_extract(given.file), given.seed, given.out, given.count)
     if made < given.count:
         print(f"only {made} of {given.count} boxes were found", file=sys.stderr)
     return int(made < given.count)

@@ -239,7 +239,7 @@ def drawn_networks(
         OutputError: The networks there are of another draw.
     """
     draw = {"first_seed": first_seed, "largest": ranges.intersections[1]}
-    require_same(folder / "draw.json", draw, begun=folder.exists())
+    require_same(folder / "draw.json", draw, begun=any(folder.glob("d[0-9]*")))
     for seed in range(first_seed, first_seed + count):
         if not (folder / f"d{seed}").exists():
             draw_scenario(folder / f"d{seed}", seed, ranges)

@@ -25,7 +25,7 @@ from pathlib import Path
 import numpy as np
 from rich.console import Console
 
-from studies.osm_extracts import make_all
+from studies.osm_extracts import make_all, read_extract
 from studies.same_options import require_same
 from ugat_marl.cli import guarded
 from ugat_marl.data import write_csv
@@ -165,14 +165,16 @@ def scenarios(given: argparse.Namespace) -> list[Path]:
 
     Raises:
         OutputError: The networks there are of another draw.
-        ScenarioError: The extract has too few places.
+        ScenarioError: The extract cannot be read, or has too few places.
         UnknownNameError: No network has a name in `given.only`.
     """
     folders: list[Path] = []
     ranges = NetworkRanges(intersections=(1, given.largest), load=tuple(given.load))
     networks, towns = given.out / "networks", given.out / "towns"
+    is_to_cut = given.pbf is not None and not towns.exists()
+    extract = read_extract(given.pbf) if is_to_cut else None
     draw = {"seed": given.seed, "largest": given.largest, "load": list(given.load)}
-    require_same(networks / "draw.json", draw, begun=networks.exists())
+    require_same(networks / "draw.json", draw, begun=any(networks.glob("drawn-*")))
     for k in range(given.networks):
         folder = networks / f"drawn-{k}"
         if not folder.exists():
@@ -181,14 +183,14 @@ def scenarios(given: argparse.Namespace) -> list[Path]:
     if given.pbf is not None:
         cut = {"pbf": given.pbf.name, "seed": given.seed, "extracts": given.extracts}
         require_same(given.out / "towns.json", cut, begun=towns.exists())
-        if not towns.exists():
+        if extract is not None:
             half = given.out / "towns-half-made"
             shutil.rmtree(half, ignore_errors=True)
-            made = make_all(given.pbf, given.seed, half / towns.name, given.extracts)
+            made = make_all(extract, given.seed, half / towns.name, given.extracts)
             if made < given.extracts:
                 raise ScenarioError(
                     f"{given.pbf}: has {made} places that fit, not {given.extracts}; ask for fewer "
-                    "with --extracts, in a new folder"
+                    "with --extracts"
                 )
             (half / towns.name).rename(towns)
             half.rmdir()

@@ -86,6 +86,14 @@ def test_boxes_that_do_not_fit_are_named(
         main(words)
 
 
+@pytest.mark.parametrize("place", ["", 'lat="500" lon="1"', 'lat="'])
+def test_an_extract_that_is_damaged_is_an_error(tmp_path: Path, place: str) -> None:
+    path = tmp_path / "damaged.osm"
+    path.write_text(f'<osm version="0.6"><node id="1" {place}/></osm>')
+    with pytest.raises(ScenarioError, match=r"damaged\.osm: not an OpenStreetMap extract"):
+        read_extract(path)
+
+
 def test_an_extract_without_lights_is_an_error(tmp_path: Path) -> None:
     path = tmp_path / "dark.osm"
     path.write_text(PLAN.replace("traffic_signals", "crossing"))

@@ -11,8 +11,9 @@ import polars as pl
 import pytest
 
 from studies import unseen
+from studies.osm_extracts import Extract
 from studies.unseen import Outcome, scenarios, summary
-from ugat_marl.errors import OutputError, UnknownNameError
+from ugat_marl.errors import OutputError, ScenarioError, UnknownNameError
 from ugat_marl.scenarios import NetworkRanges
 
 
@@ -63,6 +64,38 @@ def test_some_of_the_drawn_networks_are_run(
     with pytest.raises(OutputError, match=r"made with load = \[0.8, 1.1\], not \[0.3, 1.1\]"):
         scenarios(given)
     assert len(set(drawn)) == len(drawn) == 3  # those that exist are kept
+
+
+def test_a_mistake_before_there_are_results_can_be_corrected(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def make_all(extract: Extract, _: int, out: Path, count: int) -> int:
+        made = count if extract.path.name == "city.osm" else 0
+        for number in range(made):
+            (out / f"city-{number + 1}").mkdir(parents=True)
+        return made
+
+    def refused(*_: object) -> None:
+        raise ScenarioError("too little")
+
+    monkeypatch.setattr(unseen, "make_all", make_all)
+    monkeypatch.setattr(unseen, "read_extract", lambda path: Extract(path, {}, (), 0))
+    given = argparse.Namespace(
+        out=tmp_path, seed=1, networks=1, largest=2, load=[0.8, 1.1], only=None,
+        pbf=Path("village.osm"), extracts=2,
+    )  # fmt: skip
+    monkeypatch.setattr(unseen, "draw_scenario", refused)
+    with pytest.raises(ScenarioError, match="too little"):
+        scenarios(given)
+    monkeypatch.setattr(unseen, "draw_scenario", lambda folder, *_: folder.mkdir(parents=True))
+    given.load = [0.3, 1.1]
+    with pytest.raises(ScenarioError, match="village.osm: has 0 places that fit, not 2"):
+        scenarios(given)
+    given.pbf = Path("city.osm")
+    assert [folder.name for folder in scenarios(given)] == ["drawn-0", "city-1", "city-2"]
+    given.extracts = 3
+    with pytest.raises(OutputError, match="made with extracts = 2, not 3"):
+        scenarios(given)
 
 
 def test_the_note_counts_what_the_numbers_hold() -> None:

@@ -323,11 +323,16 @@ def test_diagnoses_with_other_options_are_not_mixed(
     assert run(LINE, ["run", str(tmp_path / "none")]) == 2
     assert not (tmp_path / "none").exists(), "what is no blind test gets no file"
     words = ["run", str(directory), "--only"]
-    (directory / "run-options.json").write_text('{"budget_s": 600.0, "alpha": 0.05, "seed": 7}')
+
+    def failing(*_: object) -> None:
+        raise RuntimeError
+
+    for seed in (3, 7):  # options without a diagnosis bind nobody
+        run_cases(directory, failing, options={"budget_s": 600.0, "alpha": 0.05, "seed": seed})
+    (directory / "case001" / "diagnosis.json").write_text("{}")
     assert run(LINE, words) == 2
     assert "seed = 7, not 0; give the same options" in capsys.readouterr().err
     (directory / "run-options.json").unlink()
-    (directory / "case001" / "diagnosis.json").write_text("{}")
     assert run(LINE, words) == 2
     assert "no run-options.json tells their options" in capsys.readouterr().err
 
