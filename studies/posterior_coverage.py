@@ -13,7 +13,8 @@ A value is covered if the 90 % interval of its draws holds it. A value at the en
 covered by an interval that ends there.
 
 The statistics of all episodes are kept in the folder ``--out`` and read again by the same command,
-unless the network, its library of effects, the statistics or SUMO have changed.
+unless the network, its effects, the episodes, the source of worlds and statistics, or the installed
+versions have changed. After other changes of the suite's source, give another folder.
 """
 
 from __future__ import annotations
@@ -21,6 +22,7 @@ from __future__ import annotations
 import argparse
 import contextlib
 import hashlib
+import inspect
 import json
 import sys
 from collections.abc import Sequence
@@ -36,8 +38,9 @@ from ugat_marl import parallel_env
 from ugat_marl.cli import guarded
 from ugat_marl.data import TransitionLog, installed_versions
 from ugat_marl.effects import load_scenario
+from ugat_marl.errors import require_least
 from ugat_marl.experiments import file_stem, policy_factory
-from ugat_marl.files import replacing
+from ugat_marl.files import file_hash, replacing
 from ugat_marl.grounding import (
     FittedService,
     LaneView,
@@ -51,7 +54,8 @@ from ugat_marl.grounding import (
     street_prior,
 )
 from ugat_marl.grounding.street import LEARNT, FitHistory
-from ugat_marl.grounding.summaries import NAMES, Summary
+from ugat_marl.grounding.summaries import Summary
+from ugat_marl.grounding.worlds import explored
 from ugat_marl.policies import Policy
 from ugat_marl.progress import Bars
 from ugat_marl.seeding import derive_seed, numpy_generator
@@ -64,6 +68,14 @@ KINDS = ("prior", "alone", "together")
 INTERVAL = (0.05, 0.95)
 EPSILON = 0.1
 """Chance of a random phase in all roll-outs."""
+DURATION_S = 1800.0
+"""Length of an episode, s."""
+SOURCES = tuple(
+    Path(inspect.getfile(kind)) for kind in (Summary, WorldPrior, StreetWorld, explored)
+)
+"""Files that draw worlds, play them and make their statistics."""
+PACKAGES = ("ugat-marl", "eclipse-sumo", "libsumo", "numpy", "polars")
+"""Packages whose versions decide the statistics."""
 
 
 @dataclass(frozen=True)
@@ -199,11 +211,21 @@ def study(network: Network, number: int, simulations: int, seed: int, folder: Pa
 
 
 def _digest(network: Network, values: Sequence[WorldValues], seed: int, episodes: int) -> str:
-    """Return a digest of the network, the episodes and the simulator."""
-    names = [item.name for item in network.worlds.library]
-    versions = installed_versions("eclipse-sumo")
-    told = [network.simulation.scenario.hash, network.policy, names, NAMES, versions]
-    digest = hashlib.sha256(json.dumps([*told, seed, episodes]).encode())
+    """Return a digest of what decides the statistics of worlds."""
+    simulation = network.simulation
+    told = [
+        simulation.scenario.hash,
+        dict(simulation.options),
+        simulation.epsilon,
+        network.policy,
+        [item.name for item in network.worlds.library],
+        [file_hash(source) for source in SOURCES],
+        installed_versions(*PACKAGES),
+        DURATION_S,
+        seed,
+        episodes,
+    ]
+    digest = hashlib.sha256(json.dumps(told).encode())
     for value in values:
         digest.update(value.effects.tobytes() + value.service_s.tobytes())
     return digest.hexdigest()[:16]
@@ -285,7 +307,7 @@ class Network:
         ]
         seeds = [derive_seed(seed, "episode", k) for k in range(len(drawn))]
         with Bars(Console(stderr=True)).task(f"{self.name}, {title}", len(drawn)) as advance:
-            return self.simulation.logs(drawn, self.acting, seeds, 1800.0, advance)
+            return self.simulation.logs(drawn, self.acting, seeds, DURATION_S, advance)
 
 
 def table(asked: Sequence[Asked]) -> str:
@@ -337,6 +359,7 @@ def main() -> None:
     parser.add_argument("--jobs", type=int)
     parser.add_argument("--out", type=Path, default=Path("runs/posterior-coverage"))
     given = parser.parse_args()
+    require_least(1, streets=given.streets)
     for name in given.scenarios:
         given.out.mkdir(parents=True, exist_ok=True)
         network = Network.of(name, given.policy, given.jobs)

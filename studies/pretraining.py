@@ -186,7 +186,8 @@ def main(arguments: Sequence[str] | None = None) -> None:
     """Train and check.
 
     Raises:
-        OptionError: There is no network or episode, or no episode between checks.
+        OptionError: There is no network or episode, no episode between checks, or fewer than no
+            updates.
         OutputError: The folder holds weights already, or networks of another draw.
     """
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
@@ -200,6 +201,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
     parser.add_argument("--seed", type=int, default=0)
     given = parser.parse_args(arguments)
     require_least(1, networks=given.networks, episodes=given.episodes, every=given.every)
+    require_least(0, updates=given.updates)
     if (weights := given.out / "start.pt").exists():
         raise OutputError(f"{weights}: holds weights already; give another folder")
     ranges = NetworkRanges(intersections=(1, given.largest))

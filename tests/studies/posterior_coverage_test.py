@@ -2,11 +2,17 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
 import numpy as np
 import pytest
 
-from studies.posterior_coverage import VEHICLES, Asked, draw_other, streets_of, table
-from ugat_marl.grounding import WorldPrior
+from studies import posterior_coverage
+from studies.posterior_coverage import VEHICLES, Asked, Network, draw_other, streets_of, table
+from ugat_marl.effects import load_scenario
+from ugat_marl.grounding import Simulation, WorldPrior
 
 WORLDS = WorldPrior.of(tuple(f"lane_{k}" for k in range(6)))
 
@@ -48,3 +54,33 @@ def test_effects_alone_are_there_in_half_of_the_streets_and_together_change_by_o
     shares = ((joined - nominal) / (farthest - nominal))[:, places]
     assert np.ptp(shares, axis=1).max() < 1e-9
     assert shares.min() >= 0.0 and shares.max() > 0.9
+
+
+def test_statistics_are_kept_under_all_that_decides_them(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    nobody: Any = None
+    simulation = Simulation(load_scenario("single-v1"), {"observation": "movements"}, 0.1)
+    network = Network("single-v1", WORLDS, nobody, "max-pressure:10", nobody, simulation)
+    values = [WORLDS.draw(1)]
+
+    def digest(network: Network = network) -> str:
+        return posterior_coverage._digest(network, values, 0, 1)
+
+    before = digest()
+    assert digest() == before
+    digests = {before, digest(replace(network, simulation=replace(simulation, epsilon=0.2)))}
+    changed = tmp_path / "summaries.py"
+    changed.touch()
+    for name, value in (
+        ("DURATION_S", 900.0),
+        ("SOURCES", (*posterior_coverage.SOURCES[1:], changed)),
+        ("installed_versions", lambda *_: {"eclipse-sumo": "0.1"}),
+    ):
+        with monkeypatch.context() as other:
+            other.setattr(posterior_coverage, name, value)
+            digests.add(digest())
+    assert len(digests) == 5
+    assert {source.name for source in posterior_coverage.SOURCES} == {
+        "summaries.py", "posterior.py", "street.py", "worlds.py"
+    }  # fmt: skip
