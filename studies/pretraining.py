@@ -249,7 +249,10 @@ def drawn_networks(
 
 
 def play(pretraining: Pretraining, networks: Sequence[Scenario], given: argparse.Namespace) -> None:
-    """Play the next episodes, each in a world drawn for it, and update."""
+    """Play the next episodes, each in a world drawn for it, and update.
+
+    A road network that comes twice among them waits for the next call.
+    """
     first = pretraining.episodes
     progress = first / given.episodes
     rate = float(np.interp(progress, (0.4, 1), (1, 0.1)))
@@ -258,10 +261,12 @@ def play(pretraining: Pretraining, networks: Sequence[Scenario], given: argparse
         envs: dict[str, TrafficEnv] = {}
         for episode in range(first, first + AT_A_TIME):
             order = numpy_generator(given.seed, "order", episode // len(networks))
-            place = int(order.permutation(len(networks))[episode % len(networks)])
-            domain = drawn_domain(networks[place], derive_seed(given.seed, "domain", episode))
-            env = parallel_env(networks[place], domain, **OPTIONS)
-            envs[networks[place].id] = stack.enter_context(contextlib.closing(env))
+            network = networks[int(order.permutation(len(networks))[episode % len(networks)])]
+            if network.id in envs:
+                break
+            domain = drawn_domain(network, derive_seed(given.seed, "domain", episode))
+            env = parallel_env(network, domain, **OPTIONS)
+            envs[network.id] = stack.enter_context(contextlib.closing(env))
         epsilon = float(np.interp(first, (0, 40, 0.5 * given.episodes), (1.0, 0.1, 0.05)))
         pretraining.play(envs, len(envs) * given.updates, epsilon)
 
