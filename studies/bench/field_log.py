@@ -12,6 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from studies.bench.report import Report, Target, require_positive
+from ugat_marl.errors import OptionError
 from ugat_marl.field import Decision, DecisionLog
 from ugat_marl.progress import Reporter, Silent
 
@@ -45,6 +46,16 @@ class FieldLogBench:
         require_positive(
             "field-log", days=self.days, lights=self.lights, interval_s=self.interval_s
         )
+        if self.days * self._per_day < _PARTS:
+            raise OptionError(
+                f"bench field-log: days = {self.days} at interval_s = {self.interval_s} hold fewer "
+                f"than {_PARTS} decisions; give more days, or a shorter interval"
+            )
+
+    @property
+    def _per_day(self) -> int:
+        """Decisions of a day; none if the interval is longer."""
+        return _DAY_S // self.interval_s
 
     def run(self, reporter: Reporter | None = None) -> Report:
         """Measure, and write `out` if it is given.
@@ -83,15 +94,14 @@ class FieldLogBench:
         lights = [f"light{number}" for number in range(self.lights)]
         log = DecisionLog(path)
         taken = array("d")
-        per_day = _DAY_S // self.interval_s
         with reporter.task("days of the log", self.days) as advance:
-            for number in range(self.days * per_day):
+            for number in range(self.days * self._per_day):
                 phases = {light: (number + place) % 4 for place, light in enumerate(lights)}
                 made = Decision(float(number * self.interval_s), phases, {}, 0.1, 1.5)
                 begun = time.perf_counter()
                 log.add(made)
                 taken.append(1e6 * (time.perf_counter() - begun))
-                if (number + 1) % per_day == 0:
+                if (number + 1) % self._per_day == 0:
                     advance()
         log.close()
         return np.array(taken)

@@ -21,7 +21,7 @@ from studies.blind.table import markdown, write_table
 from studies.blind.visibility import judge_visibility
 from ugat_marl.cli import LengthS
 from ugat_marl.diagnosis import DiagnosisConfig, diagnose
-from ugat_marl.errors import OptionError
+from ugat_marl.errors import OptionError, require_distinct
 from ugat_marl.files import require_writable
 from ugat_marl.progress import Bars, Silent
 
@@ -246,6 +246,7 @@ class BlindTable:
         """Print and write."""
         if not self.directories:
             raise OptionError("give at least one blind test")
+        require_distinct(directories=[directory.resolve() for directory in self.directories])
         if self.out is not None:
             require_writable(self.out)
         grades = [item for directory in self.directories for item in read_grades(directory)]

@@ -13,6 +13,7 @@ from rich.console import Console
 
 from studies.bench.env import EnvBench, find_scenario, require_same_work
 from studies.bench.env_program import RecordingSimulator, random_actions
+from studies.bench.field_log import FieldLogBench
 from studies.bench.fitting import FittingBench
 from studies.bench.fresh_process import in_fresh_process
 from studies.bench.learning import LearningBench
@@ -135,6 +136,11 @@ def test_a_measured_program_that_fails_says_why(tmp_path: Path) -> None:
         in_fresh_process([program], {})
 
 
+def test_a_field_log_of_a_decision_a_day_is_measured(tmp_path: Path) -> None:
+    report = FieldLogBench(days=5, lights=1, interval_s=86_400, folder=tmp_path).run()
+    assert [row["days"] for row in report.rows] == [f"{k} to {k + 1}" for k in range(5)]
+
+
 def test_other_work_is_not_compared() -> None:
     same = {"a": {"entered": 5, "arrived": 3}, "b": {"entered": 5, "arrived": 3}}
     require_same_work(same)
@@ -151,6 +157,8 @@ def test_other_work_is_not_compared() -> None:
         (lambda: LearningBench(updates=0), "updates = 0"),
         (lambda: FittingBench(rounds=0), "rounds = 0"),
         (lambda: MemoryBench(resets=20), "more than settled"),
+        (lambda: FieldLogBench(interval_s=86_401), "fewer than 5 decisions"),
+        (lambda: FieldLogBench(days=4, interval_s=86_400), "fewer than 5 decisions"),
     ],
 )
 def test_impossible_options_are_refused(make: object, words: str) -> None:

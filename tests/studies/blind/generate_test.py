@@ -241,7 +241,7 @@ def test_buses_go_where_demand_is_written_as_flows(data: Path) -> None:
 
 @pytest.mark.usefixtures("python")
 def test_cases_are_diagnosed_once_and_a_failure_is_noted(
-    test_folder: tuple[Path, Blueprint], tmp_path: Path
+    test_folder: tuple[Path, Blueprint], tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     directory = shutil.copytree(test_folder[0], tmp_path / "test")  # it is written to
     seen: list[str] = []
@@ -263,6 +263,8 @@ def test_cases_are_diagnosed_once_and_a_failure_is_noted(
     assert run(LINE, ["grade", str(directory)]) == 0
     assert run(LINE, ["table", str(directory), "--out", str(directory / "table.md")]) == 0
     assert "| failed | 4 | 1 of 4" in (directory / "table.md").read_text()
+    assert run(LINE, ["table", str(directory), f"{directory}/../test"]) == 2
+    assert "directories holds one twice" in capsys.readouterr().err
     # In processes of their own; one that does not even start is a failure with a reason.
     (directory / "case004" / "diagnosis.json").unlink()
     command = ("run", str(directory), "--no-such-option")
