@@ -3,12 +3,13 @@
 from __future__ import annotations
 
 from collections.abc import Collection, Mapping, Sequence
-from datetime import datetime
+from datetime import date, datetime, time
 from pathlib import Path
 from typing import Annotated, Any
 
 import pydantic
 from pydantic import Field
+from pydantic_core import PydanticCustomError
 
 from ugat_marl.data.measured.local_time import require_time_zone
 from ugat_marl.errors import MeasuredDataError, unknown_key
@@ -34,9 +35,17 @@ def _digits(value: Any) -> Any:
     return value
 
 
+def _no_number(value: Any) -> Any:
+    """Refuse a number, which would be read as seconds from 1970 on in UTC."""
+    if isinstance(value, int | float):
+        raise PydanticCustomError("datetime_number", "not a local time")
+    return value
+
+
 Number = Annotated[int, pydantic.BeforeValidator(_digits), Field(le=_LARGEST)]
 """Number of a phase, overlap or link that is the key of a table."""
 Name = Annotated[Text, pydantic.BeforeValidator(_name)]
+LocalTime = Annotated[datetime, pydantic.BeforeValidator(_no_number)]
 
 
 class Links(pydantic.BaseModel):
@@ -109,7 +118,7 @@ class Span(pydantic.BaseModel):
     model_config = _STRICT
 
     id: Name = ""
-    zero: datetime
+    zero: LocalTime
     begin_s: Real | None = None
     end_s: Real | None = None
     split: Split | None = None
@@ -121,7 +130,7 @@ class AtspmMapping(pydantic.BaseModel):
     model_config = _STRICT
 
     time_zone: str = ""
-    zero: tuple[datetime, ...] = ()
+    zero: tuple[LocalTime, ...] = ()
     begin_s: Real | None = None
     end_s: Real | None = None
     periods: tuple[Span, ...] = ()
@@ -201,8 +210,12 @@ def _explain(problem: Any) -> str:
         return unknown_key(key, str(name), known)
     if problem["type"] == "missing":
         return f"key {key!r} is missing"
+    given = problem["input"]
     if problem["type"].startswith("datetime"):
-        return f"{key} = {problem['input']!r}: write a local time such as 2024-03-04 07:00:00"
+        return f"{key} = {given!r}: write a local time such as 2024-03-04 07:00:00"
+    if problem["type"] == "tuple_type" and not isinstance(given, dict):
+        shown = given.isoformat() if isinstance(given, date | time) else repr(given)
+        return f"{key}: write a list, as in {name} = [{shown}]"
     return f"{key}: {problem['msg'][:1].lower()}{problem['msg'][1:]}"
 
 
