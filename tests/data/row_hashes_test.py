@@ -203,20 +203,31 @@ def test_flipped_bits_of_the_hashes_of_csv_are_seen_or_harmless(tmp_path: Path) 
 
 
 @pytest.mark.parametrize(
-    ("rows", "says"), [(30, r"^line 12 is not"), (5000, r"^lines 12 to 16 are not")]
+    ("rows", "says"),
+    [
+        (30, r"^row 11 behind the header is not"),
+        (5000, r"^rows 11 to 15 behind the header are not"),
+    ],
 )
-def test_the_damaged_line_of_a_csv_table_is_named(rows: int, says: str, tmp_path: Path) -> None:
+def test_the_damaged_row_of_a_csv_table_is_named(rows: int, says: str, tmp_path: Path) -> None:
     path = csv_of(tmp_path, rows)
     path.write_text(path.read_text().replace("n10,2.5\n", "n10,2.9\n"))
     assert re.match(says, csv_fault(path))
     assert "remove row-hashes.json if you changed it yourself" in csv_fault(path)
 
 
+def test_rows_are_counted_whatever_their_cells_hold(tmp_path: Path) -> None:
+    path = tmp_path / "table.csv"
+    write_csv(path, 'name,text\na,"two\nlines"\nb,x\n')
+    path.write_text(path.read_text().replace("b,x", "b,y"))
+    assert csv_fault(path).startswith("row 2 behind the header is not what was")
+
+
 def test_a_csv_table_that_lost_or_won_rows_is_damaged(tmp_path: Path) -> None:
     path = csv_of(tmp_path, 30)
     whole = path.read_text()
     path.write_text(whole.replace("n10,2.5\n", ""))
-    assert csv_fault(path).startswith("line 12 is not what was written")
+    assert csv_fault(path).startswith("row 11 behind the header is not what was written")
     path.write_text(whole + "n30,1\n")
     assert csv_fault(path).startswith("it has 31 rows, and had 30")
     path.write_text(whole.replace("value", "valve"))
@@ -230,7 +241,7 @@ def test_tables_by_hand_have_no_hashes(tmp_path: Path) -> None:
     assert csv_fault(by_hand) == ""
     write_csv(by_hand, "name\ny\n")
     by_hand.write_text("name\nx\n")
-    assert csv_fault(by_hand).startswith("line 2")
+    assert csv_fault(by_hand).startswith("row 1 ")
     assert csv_fault(tmp_path / "a.csv") == ""
     (tmp_path / CSV_HASHES).unlink()
     assert csv_fault(by_hand) == ""
@@ -246,7 +257,7 @@ def test_a_table_has_its_hashes_while_the_next_one_is_made(tmp_path: Path) -> No
         return "name,value\n"
 
     for _ in range(2):  # the table is kept, and its hashes too
-        with pytest.raises(ValueError, match="line 3 is not what was written"):
+        with pytest.raises(ValueError, match="row 2 behind the header is not"):
             write_csv(path, refusing)
     assert "n7," in path.read_text()
 

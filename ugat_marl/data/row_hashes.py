@@ -211,10 +211,11 @@ def csv_damage(path: Path, frame: pl.DataFrame) -> str:
     now = [*_groups(frame, rows)]
     for number, was in enumerate(stored["groups"]):
         if now[number : number + 1] != [was]:
-            first = number * rows + 2  # line 1 is the header
-            last = min(first + rows - 1, stored["rows"] + 1)
-            lines = f"line {first} is" if first == last else f"lines {first} to {last} are"
-            return f"{lines} not what was written; {way_out}"
+            first = number * rows + 1
+            last = min(first + rows - 1, stored["rows"])
+            several = f"rows {first} to {last} behind the header are"
+            which = f"row {first} behind the header is" if first == last else several
+            return f"{which} not what was written; {way_out}"
     if frame.height != stored["rows"]:
         return f"it has {frame.height} rows, and had {stored['rows']} when written; {way_out}"
     return ""
@@ -276,7 +277,7 @@ def _have_form(rows: Any, head: Any, groups: Any) -> bool:
 
 
 def _rows_of_csv_group(rows: int) -> int:
-    """Return the rows per hash: one in a short table, so that a damaged line is named."""
+    """Return the rows per hash: one in a short table, so that a damaged row is named."""
     return -(-rows // _MOST_CSV_GROUPS) or 1
 
 
