@@ -176,6 +176,19 @@ def test_rows_that_depend_on_other_settings_are_apart() -> None:
     assert times_s["corrected sim (corrected headway=1.4)"] == 100.0
 
 
+def test_jobs_that_were_not_judged_in_their_simulation_are_in_no_table() -> None:
+    def judged_in(*domains: str) -> list[RunRecord]:
+        results = tuple(Result("direct transfer", domain, 5, BASE) for domain in domains)
+        return [
+            replace(job(seed), evaluation=Evaluation("single-v1", "", results, {}))
+            for seed in range(2)
+        ]
+
+    (group,) = groups(judged_in("sim", "V1", "V4"))
+    assert [row["domain"] for row in group.rows] == ["V1", "V4"]
+    assert groups(judged_in("V1", "V4")) == []
+
+
 def test_a_seed_that_is_no_number_is_no_seed() -> None:
     times_s = {"\u00b2": 100.0, "--5": 200.0}
     records = [

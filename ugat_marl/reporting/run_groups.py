@@ -220,15 +220,12 @@ def _of_run(record: RunRecord, told: Mapping[str, list[str]], target: str) -> It
 
 def _of_job(record: RunRecord, name: str) -> Iterable[Trial]:
     evaluation = record.evaluation
-    if evaluation is None:
+    if evaluation is None or record.sim not in evaluation.domains:
         return
-    seeds = {d: {r.seed for r in evaluation.results if r.domain == d} for d in evaluation.domains}
     only = record.settings.get("target")
     for target in evaluation.domains:
         if target == record.sim or (only is not None and target != only):
             continue
-        if seeds[target] != seeds.get(record.sim):
-            continue  # the evaluation is not complete
         for r in evaluation.results:
             if r.domain in (record.sim, target):
                 yield Trial(name, target, r.domain, _seed(record), r.seed, r.scores)
