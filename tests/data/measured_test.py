@@ -591,6 +591,7 @@ def test_damaged_bytes_are_named(
     for content, message in (
         (whole[: len(whole) // 2], "cut short"),
         (b"PAR1" + whole[4:-8] + b"\0\0\0\0PAR1", "damaged Parquet"),
+        (b"PAR1PAR1", "cut short"),
         (b"something else", "not a Parquet file"),
         (b"", "not a Parquet file"),
     ):

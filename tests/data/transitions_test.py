@@ -135,6 +135,9 @@ def test_missing_file_foreign_parquet_and_no_parquet(tmp_path: Path) -> None:
     (tmp_path / "text.parquet").write_text("episode,step\n1,2\n")
     with pytest.raises(LogError, match="not a Parquet file"):
         TransitionLog.read(tmp_path / "text.parquet")
+    (tmp_path / "cut.parquet").write_bytes(b"PAR1PAR1")
+    with pytest.raises(LogError, match=r"cut short \(8 bytes, no footer\); record or copy it"):
+        TransitionLog.read(tmp_path / "cut.parquet")
     pl.DataFrame({"x": [1]}).write_parquet(tmp_path / "other.parquet")
     with pytest.raises(LogError, match=f"other.parquet.*{METADATA_KEY}"):
         TransitionLog.read(tmp_path / "other.parquet")

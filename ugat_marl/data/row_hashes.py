@@ -25,7 +25,7 @@ import tempfile
 import threading
 from collections.abc import Callable, Iterable, Iterator, Mapping
 from pathlib import Path
-from typing import Any
+from typing import Any, BinaryIO
 
 import polars as pl
 
@@ -48,6 +48,13 @@ JSON_HASHES = "row_hashes"
 CSV_HASHES = "row-hashes.json"
 """Name of the file with the hashes of the CSV tables in its folder."""
 
+UNREADABLE = (pl.exceptions.PolarsError, pl.exceptions.PanicException, OSError)
+"""Errors that polars raises for a file that is missing, damaged, or no table."""
+
+_MAGIC = b"PAR1"
+"""First and last bytes of a Parquet file."""
+_LEAST_PARQUET = 12
+"""Bytes of the shortest Parquet file: both magic numbers, and the length of the footer."""
 _GROUP_ROWS = 65536
 """Rows of a row group. Half as many name the damage more closely and make the file longer."""
 _FEW_CELLS = 100_000_000
@@ -286,6 +293,25 @@ def _hash(content: Any) -> str:
     return hashlib.blake2b(text.encode(), digest_size=16).hexdigest()
 
 
+def half_parquet(file: BinaryIO) -> str:
+    """Return what shows that a file is no whole Parquet file; "" if it has both magic numbers.
+
+    Args:
+        file: The file, at its start.
+
+    Returns:
+        The fault as words that follow the name of the file.
+    """
+    head = file.read(4)
+    size = file.seek(0, os.SEEK_END)
+    file.seek(max(0, size - 4))
+    if head != _MAGIC:
+        return "not a Parquet file"
+    if file.read() != _MAGIC or size < _LEAST_PARQUET:
+        return f"the Parquet file is cut short ({size} bytes, no footer)"
+    return ""
+
+
 def read_quietly(
     source: Path | io.BytesIO, *, nested: bool = True
 ) -> tuple[pl.DataFrame, dict[str, str]]:
@@ -298,8 +324,8 @@ def read_quietly(
         nested: False to refuse columns of lists, one of which may hold more than the memory.
 
     Raises:
-        polars.exceptions.PolarsError: The file is damaged, or has more rows than bytes; also
-            `PanicException` and ``OSError``.
+        polars.exceptions.PolarsError: The file is damaged, or has more rows than bytes; also the
+            other errors of `UNREADABLE`.
     """
     with _ONE_AT_A_TIME, _without_standard_error():
         _refuse_what_fills_memory(source, nested=nested)

@@ -20,7 +20,7 @@ from typing import IO, Any
 import polars as pl
 
 from ugat_marl.data.curves import CURVES_FILE, EventFile
-from ugat_marl.data.row_hashes import damage, read_quietly, write_hashed
+from ugat_marl.data.row_hashes import UNREADABLE, damage, read_quietly, write_hashed
 from ugat_marl.errors import CheckpointError, OptionError, first_line
 from ugat_marl.files import lock, read_json, replacing, require_writable, write_whole
 from ugat_marl.progress import Reporter
@@ -89,7 +89,7 @@ class Metrics:
         """
         try:
             frame, metadata = read_quietly(path)
-        except (OSError, pl.exceptions.PolarsError, pl.exceptions.PanicException) as error:
+        except UNREADABLE as error:
             raise CheckpointError(
                 f"{path}: cannot be read ({first_line(error)}); it may have been cut short. "
                 "Remove the run folder and start again"

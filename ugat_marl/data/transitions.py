@@ -20,7 +20,14 @@ import polars as pl
 from numpy.typing import NDArray
 
 from ugat_marl.data.layouts import AgentLayout
-from ugat_marl.data.row_hashes import damage, is_hashed, read_quietly, write_hashed
+from ugat_marl.data.row_hashes import (
+    UNREADABLE,
+    damage,
+    half_parquet,
+    is_hashed,
+    read_quietly,
+    write_hashed,
+)
 from ugat_marl.errors import LogError, OutputError, first_line
 from ugat_marl.files import MALFORMED, parse_json, refuse_endless, replacing, require_writable
 
@@ -499,7 +506,7 @@ def require_log_place(path: Path) -> None:
     if path.exists():
         try:
             is_log = METADATA_KEY in pl.read_parquet_metadata(path)
-        except (pl.exceptions.PolarsError, pl.exceptions.PanicException, OSError):
+        except UNREADABLE:
             is_log = False
         if not is_log:
             raise OutputError(f"{path}: is no transition log, and would be lost; give another name")
@@ -514,7 +521,7 @@ def read_parquet(path: Path) -> tuple[pl.DataFrame, dict[str, str]]:
     _refuse_half_file(path)
     try:
         return read_quietly(path)
-    except (pl.exceptions.PolarsError, pl.exceptions.PanicException, OSError) as error:
+    except UNREADABLE as error:
         raise LogError(
             f"{path}: damaged Parquet file ({first_line(error)}); record or copy it again"
         ) from None
@@ -627,18 +634,9 @@ def _refuse_half_file(path: Path) -> None:
     refuse_endless(path, LogError)
     try:
         with path.open("rb") as file:
-            head = file.read(4)
-            file.seek(0, 2)
-            size = file.tell()
-            file.seek(max(0, size - 4))
-            tail = file.read(4)
+            wrong = half_parquet(file)
     except OSError as error:
         way_out = "check the path" if isinstance(error, FileNotFoundError) else "make it readable"
         raise LogError(f"{path}: cannot be read ({error.strerror}); {way_out}") from None
-    if head != b"PAR1":
-        raise LogError(f"{path}: not a Parquet file; record it with TransitionLog.write")
-    if tail != b"PAR1":
-        raise LogError(
-            f"{path}: the Parquet file is cut short ({size} bytes, no footer); "
-            "record or copy it again"
-        )
+    if wrong:
+        raise LogError(f"{path}: {wrong}; record or copy it again")

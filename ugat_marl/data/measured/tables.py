@@ -16,7 +16,14 @@ from numpy.typing import NDArray
 
 from ugat_marl.data.measured.local_time import LocalClock
 from ugat_marl.data.measured.values import Finding
-from ugat_marl.data.row_hashes import csv_damage, csv_texts, damage, read_quietly
+from ugat_marl.data.row_hashes import (
+    UNREADABLE,
+    csv_damage,
+    csv_texts,
+    damage,
+    half_parquet,
+    read_quietly,
+)
 from ugat_marl.errors import MeasuredDataError, counted, first_line, nearest
 from ugat_marl.files import refuse_endless
 from ugat_marl.scenarios import Period
@@ -337,16 +344,11 @@ def _listed(names: list[str]) -> str:
 
 def _read_parquet(path: Path) -> pl.DataFrame:
     content = _bytes(path)
-    if content[:4] != b"PAR1":
-        raise MeasuredDataError(f"{path}: not a Parquet file; export it again")
-    if content[-4:] != b"PAR1" or len(content) < 12:
-        raise MeasuredDataError(
-            f"{path}: the Parquet file is cut short ({len(content)} bytes, no footer); "
-            "copy it again"
-        )
+    if wrong := half_parquet(io.BytesIO(content)):
+        raise MeasuredDataError(f"{path}: {wrong}; copy or export it again")
     try:
         frame, metadata = read_quietly(io.BytesIO(content), nested=False)
-    except (pl.exceptions.PolarsError, pl.exceptions.PanicException, OSError, ValueError) as error:
+    except (*UNREADABLE, ValueError) as error:
         raise MeasuredDataError(
             f"{path}: damaged Parquet file ({first_line(error)}); copy or export it again"
         ) from None
@@ -389,9 +391,7 @@ def _read_csv(path: Path, findings: list[Finding]) -> pl.DataFrame:
             frame = frame.with_columns(pl.col(pl.String).str.replace(_DECIMAL_COMMA, "$1.$2$3"))
         # polars gives the second of two equal names another one
         written = [name.strip() for name in next(csv.reader([head], delimiter=mark), [])]
-    except (
-        pl.exceptions.PolarsError, pl.exceptions.PanicException, OSError, ValueError, csv.Error
-    ) as error:  # fmt: skip
+    except (*UNREADABLE, ValueError, csv.Error) as error:
         raise MeasuredDataError(
             _wide_line(path, content, mark)
             or f"{path}: not a table ({first_line(error)}); every line needs the columns of line 1"

@@ -29,6 +29,7 @@ from ugat_marl.data.measured.tables import (
 from ugat_marl.data.measured.values import MeasuredData
 from ugat_marl.data.row_hashes import (
     CSV_HASHES,
+    UNREADABLE,
     is_csv_as_written,
     is_parquet_as_written,
     write_csv_hashes,
@@ -143,7 +144,7 @@ def _changed_table(directory: Path, names: Set[str]) -> str | None:
         is_as_written = is_csv_as_written if name.endswith(".csv") else is_parquet_as_written
         try:
             whole = is_as_written(directory / name)
-        except (OSError, pl.exceptions.PolarsError, pl.exceptions.PanicException):
+        except UNREADABLE:
             whole = False
         if not whole:
             return name
