@@ -54,6 +54,8 @@ _ROW = 30.0
 
 Estimated = tuple[float, float, float]
 """Mean, lower end and upper end of its interval."""
+Cells = Mapping[tuple[str, str], Mapping[str, Any]]
+"""Setting and domain to a row of a table."""
 
 
 # --- curves of trainings --------------------------------------------------------------------------
@@ -337,7 +339,7 @@ def draw_table(rows: Sequence[Mapping[str, Any]], sim: str, folder: Path) -> Non
         sim: The simulation.
         folder: Folder for the pictures.
     """
-    settings = _settings_and_targets(rows)[0]
+    settings = cells_of(rows)[0]
     grounded = [_row_of(kind, settings) for kind in GROUNDED_NAME]
     named = (*grounded, matched_name("timed"))
     drawn = [DIRECT, *dict.fromkeys(name for name in named if name in settings)]
@@ -360,13 +362,12 @@ def gap_picture(rows: Sequence[Mapping[str, Any]], path: Path) -> None:
         rows: Rows of a table, as of `Comparison.rows` or `read_rows`.
         path: File to write.
     """
-    settings, targets = _settings_and_targets(rows)
+    settings, targets, cells = cells_of(rows)
     below = legend_height(targets, 2 * WIDTH)
     row_height = max(24.0, 11.0 * len(targets) + 6)
     height = TOP + 8 + row_height * len(settings) + 48 + below
     title = f"{rows[0]['scenario']}: real domain minus simulation"
     picture = new_picture("gaps", title, height, 2 * WIDTH)
-    by_cell = {(row["setting"], row["domain"]): row for row in rows}
     for place, (measure, label, unit) in enumerate(
         (
             ("att_s", "Δ of ATT, s; shorter is better", "s"),
@@ -376,7 +377,7 @@ def gap_picture(rows: Sequence[Mapping[str, Any]], path: Path) -> None:
         side = (242.0, 352.0) if place == 0 else (2 * WIDTH - 335, 16.0)
         axes = add_axes(picture, side[0], TOP + 8, side[1], 48 + below)
         series = {
-            target: [_estimated(by_cell.get((s, target), {}), f"{measure}_gap") for s in settings]
+            target: [_estimated(cells.get((s, target), {}), f"{measure}_gap") for s in settings]
             for target in targets
         }
         _draw_estimates(axes, settings, series, unit, letters=0 if place else 34)
@@ -386,10 +387,11 @@ def gap_picture(rows: Sequence[Mapping[str, Any]], path: Path) -> None:
     write_png(picture, path)
 
 
-def _settings_and_targets(rows: Sequence[Mapping[str, Any]]) -> tuple[list[str], list[str]]:
-    """Return the settings and the domains of a table, in their order."""
-    settings, targets = (dict.fromkeys(row[key] for row in rows) for key in ("setting", "domain"))
-    return list(settings), list(targets)
+def cells_of(rows: Sequence[Mapping[str, Any]]) -> tuple[list[str], list[str], Cells]:
+    """Return the settings and the domains of a table, in their order, and its cells."""
+    cells = {(str(row["setting"]), str(row["domain"])): row for row in rows}
+    settings, domains = (list(dict.fromkeys(cell[place] for cell in cells)) for place in (0, 1))
+    return settings, domains, cells
 
 
 def _estimated(row: Mapping[str, Any], name: str) -> Estimated:
@@ -439,7 +441,7 @@ def comparison_radar(
         sim: The simulation.
         path: File to write.
     """
-    targets = _settings_and_targets(rows)[1]
+    _, targets, by_cell = cells_of(rows)
     columns = min(len(targets), 2)
     lines = math.ceil(len(targets) / columns)
     legend = [f"{settings[0]} in {sim}", *(f"{s} in the real domain" for s in settings)]
@@ -448,7 +450,6 @@ def comparison_radar(
     below = legend_height(legend, width) + 12
     title = f"{rows[0]['scenario']}: sim and real; the rim is the best"
     picture = new_picture("radar", title, TOP + high * lines + below, width)
-    by_cell = {(row["setting"], row["domain"]): row for row in rows}
     for place, target in enumerate(targets):
         left, top = wide * (place % columns), TOP + high * (place // columns)
         axes = add_axes(

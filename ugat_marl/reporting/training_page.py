@@ -44,8 +44,6 @@ Commands = Mapping[Path, Sequence[str]]
 """Folder of a training to the commands that repeat the training."""
 Queues = Mapping[str, Sequence[float]]
 """Intersection to its mean queue in each minute."""
-Cells = Mapping[tuple[str, str], Mapping[str, Any]]
-"""Setting and domain to a row of a table."""
 
 _ARTICLES = 12
 """Largest number of trainings of which each has a section. Of more, those do that have a gate, are
@@ -260,9 +258,7 @@ def _fewer_seeds(rows: Sequence[Mapping[str, Any]]) -> str:
 
 def _settings(page: Page, title: str, rows: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
     """Return tables and pictures of settings in several real domains."""
-    labels = list(dict.fromkeys(str(row["setting"]) for row in rows))
-    domains = list(dict.fromkeys(str(row["domain"]) for row in rows))
-    cells = {(str(row["setting"]), str(row["domain"])): row for row in rows}
+    labels, domains, cells = charts.cells_of(rows)
     headings = [f"{domain}, s" for domain in domains]
 
     def grid(key: str, *, sign: bool = False) -> Grid:
@@ -311,7 +307,7 @@ def _cell(row: Mapping[str, Any], key: str, *, sign: bool) -> str:
     return f"{text} {_ends(low, high)}" if low < high else text
 
 
-def _radar_lines(labels: Sequence[str], cells: Cells, domain: str) -> dict[str, list[float]]:
+def _radar_lines(labels: Sequence[str], cells: charts.Cells, domain: str) -> dict[str, list[float]]:
     shown = [label for label in labels if label.startswith(_RADARS) and (label, domain) in cells]
     lines: dict[str, list[float]] = {}
     for place, label in enumerate(shown[: len(_RADARS)]):
