@@ -305,11 +305,12 @@ def test_tune_replaces_no_file_of_another_kind(
     assert out.read_text() == '{"mine": 1}'
 
 
+@pytest.mark.parametrize("kind", [[], ["--counts-every-s", "5"]])
 def test_a_recording_in_which_nobody_came_is_refused(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], kind: list[str]
 ) -> None:
     out = tmp_path / "r"
     words = ["record", "single-v1", "--periods", "1", "--duration-s", "10", "--out", str(out)]
-    assert main(words) == 2
+    assert main([*words, *kind]) == 2
     assert "nobody came over a detector in 1 period ('day1')" in capsys.readouterr().err
     assert not out.exists()

@@ -217,16 +217,23 @@ def test_effects_on_detectors_may_stand_in_the_scenario_file(
     assert measure(listed, more, same_demand=True).hash == seen
 
 
-def test_a_detector_that_is_not_there_is_told_before_anything_is_simulated(
-    data: Path, monkeypatch: pytest.MonkeyPatch
+@pytest.mark.parametrize(
+    ("domain", "error", "says"),
+    [
+        ("undercount=stop:S_C_7,0.4", UnknownNameError, "'stop:S_C_7'"),
+        ("meso", OptionError, "who comes over a detector.*leave out queue_model"),
+    ],
+)
+def test_what_cannot_be_recorded_is_told_before_anything_is_simulated(
+    data: Path, monkeypatch: pytest.MonkeyPatch, domain: str, error: type[Exception], says: str
 ) -> None:
     def simulated(*_: Any) -> None:
         pytest.fail("it was simulated")
 
     monkeypatch.setattr("ugat_marl.experiments.recording.days.own_programmes", simulated)
     monkeypatch.setattr("ugat_marl.experiments.recording.days.play", simulated)
-    with pytest.raises(UnknownNameError, match="'stop:S_C_7'"):
-        measure(data / "crossing", "undercount=stop:S_C_7,0.4")
+    with pytest.raises(error, match=says):
+        measure(data / "crossing", domain)
 
 
 def test_no_vehicle_comes_on_two_days(data: Path) -> None:

@@ -100,7 +100,7 @@ class Record:
             raise
         seen = sum(len(log) for period in measured.periods for log in period.passages.values())
         empty = [p.id for p in measured.periods if not any(map(len, p.passages.values()))]
-        if empty and self.counts_every_s is None:
+        if empty:
             if is_new:
                 self.out.rmdir()
             raise OptionError(

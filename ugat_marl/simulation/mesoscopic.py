@@ -214,7 +214,7 @@ def refuse_in_queues(scenario: Scenario, **requested: bool) -> None:
 
     Args:
         scenario: The scenario.
-        requested: ``crossings``, ``zone`` and ``pictures``: True if requested.
+        requested: ``crossings``, ``zone``, ``pictures`` and ``detectors``: True if requested.
 
     Raises:
         OptionError: One of them is requested.
@@ -223,6 +223,7 @@ def refuse_in_queues(scenario: Scenario, **requested: bool) -> None:
         "crossings": "when vehicles cross stop lines (crossings, timed grounding)",
         "zone": "who is near a stop line (detection_zone)",
         "pictures": "pictures of vehicles (render_mode, films)",
+        "detectors": "who comes over a detector (record)",
     }
     for name, wanted in requested.items():
         if wanted and scenario.settings.is_mesoscopic:

@@ -65,6 +65,7 @@ from ugat_marl.simulation import (
     detectors_document,
     kept_warm,
     read_passages,
+    refuse_in_queues,
     standard_detectors,
 )
 
@@ -152,7 +153,8 @@ def record(
         reporter: Shows progress.
 
     Raises:
-        OptionError: A number of periods or workers, a seed or a length is impossible.
+        OptionError: A number of periods or workers, a seed or a length is impossible, or the domain
+            is in SUMO's mesoscopic model, whose vehicles have no position on a lane.
         UnknownNameError: A domain, effect or detector does not exist.
         ScenarioError: The scenario cannot be simulated.
         SimulatorError: SUMO failed.
@@ -220,6 +222,7 @@ def _world(
     """
     # a wrong name is an error now
     changed = scenario_in_domain(scenario, domain, recorded=True, duration_s=duration_s)
+    refuse_in_queues(changed, detectors=True)
     if domain_path(domain) is not None:
         return changed, detector_effects(changed)
     return scenario, (*detector_effects(scenario), *parse_domain(domain))
