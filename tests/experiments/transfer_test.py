@@ -17,6 +17,9 @@ from tests.interrupts import KillAfter
 from tests.runs import SMALL, checkpoint_of, numbers, play_nothing, weights
 from ugat_marl.__main__ import main
 from ugat_marl.data import CHECKPOINT_FOLDER, SETTINGS_FILE, TransitionLog
+from ugat_marl.data.runs import IDENTITY_FILE
+from ugat_marl.effects import load_scenario
+from ugat_marl.envs import parallel_env
 from ugat_marl.errors import CheckpointError, OptionError, UnknownNameError
 from ugat_marl.experiments import Evaluation, run_folder, transfer, transfers
 from ugat_marl.experiments.jobs import file_names
@@ -327,3 +330,24 @@ def test_a_queue_model_that_shows_no_crossings_is_refused_at_once(
     with pytest.raises(OptionError, match="use the grounding phase, or no iterations"):
         transfer(config, tmp_path / "run")
     assert not (tmp_path / "run" / "trainings").exists()
+
+
+@pytest.mark.parametrize("place", ["sim", "real"])
+def test_a_directory_is_judged_at_the_length_that_is_played(
+    place: Literal["sim", "real"], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Its demand surges after its own end, and before that of the episodes played."""
+    directory = load_scenario(SMALL.scenario).with_duration(40).write(tmp_path / "surge")
+    with (directory / "scenario.toml").open("a") as file:
+        file.write(
+            '\n[[effects]]\nname = "demand_surge"\n'
+            'edge = "*"\nbegin_s = 50.0\nend_s = 90.0\nfactor = 1.5\n'
+        )
+    monkeypatch.setattr(transfers, "perform_here", lambda *_, **_options: [])
+    monkeypatch.setattr(transfers, "_write_results", lambda *_: "table")
+    street = replace(SMALL.ugat, grounding="street")
+    domain = {"sim": "sim", "real": "V4", place: str(directory)}
+    transfer(replace(SMALL, **domain, ugat=street), tmp_path / "run")
+    hashes = json.loads((tmp_path / "run" / IDENTITY_FILE).read_text())["scenario_hash"]
+    played = parallel_env(SMALL.scenario, str(directory), duration_s=SMALL.duration_s)
+    assert hashes[place] == played.scenario.hash

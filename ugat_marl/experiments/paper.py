@@ -510,7 +510,7 @@ def compare(
     config.spec.factory(config.device)  # a missing library is an error now, not in a job's log
     for target in config.targets(table):
         # an error now, not in an hour
-        check_worlds(loaded.with_duration(config.duration_s), config.sim, target)
+        check_worlds(loaded, config.sim, target, duration_s=config.duration_s)
     planner = Planner(table, scenario, config)
     plan = [job for row in rows for job in planner.jobs(row)]
     grounded = [job for job in plan if job.setting.ugat is not None]

@@ -229,7 +229,14 @@ def street_training(make: LearnerFactory, workers: Workers, **common: Any) -> St
     return StreetTraining(simulation=simulation, make=make, view=view, **common)
 
 
-def check_worlds(scenario: Scenario, sim: Domain, real: Domain, timed: bool = False) -> None:
+def check_worlds(
+    scenario: Scenario,
+    sim: Domain,
+    real: Domain,
+    timed: bool = False,
+    *,
+    duration_s: float | None = None,
+) -> None:
     """Check that observations and rewards are the same in two worlds.
 
     Args:
@@ -238,13 +245,16 @@ def check_worlds(scenario: Scenario, sim: Domain, real: Domain, timed: bool = Fa
         real: The real domain.
         timed: True if greens are delayed, by timed grounding or a timed residual: every green must
             begin in the decision that asks for it, or its delay can be neither measured nor set.
+        duration_s: Length of an episode in s; None for that of each world.
 
     Raises:
         UnknownNameError: A domain does not exist.
         OptionError: The reaches differ, greens begin too late to be delayed, or a domain is one of
             detectors.
     """
-    here, there = (scenario_in_domain(scenario, world) for world in (sim, real))
+    here, there = (
+        scenario_in_domain(scenario, world, duration_s=duration_s) for world in (sim, real)
+    )
     for world in (here, there) if timed else ():
         timing, interval_s = world.timing, world.control.decision_interval_s
         if not green_begins_at_once(timing, interval_s):
@@ -264,13 +274,13 @@ def check_worlds(scenario: Scenario, sim: Domain, real: Domain, timed: bool = Fa
         )
 
 
-def _refuse_own_channel(scenario: Scenario, sim: Domain) -> None:
+def _refuse_own_channel(scenario: Scenario, sim: Domain, duration_s: float | None) -> None:
     """Refuse a simulation that changes commands, beside a fitted channel that changes them, too.
 
     Raises:
         OptionError: The simulation does.
     """
-    effects = controller_effects(scenario_in_domain(scenario, sim))
+    effects = controller_effects(scenario_in_domain(scenario, sim, duration_s=duration_s))
     own = [str(item) for item in effects if type(item).actuator is not ControllerPart.actuator]
     if own:
         raise OptionError(
@@ -302,14 +312,15 @@ def simulated_worlds(
         OptionError: `check_worlds` fails, the rewards cannot be matched, commands would be changed
             twice, or a domain is SUMO's queue model and the grounding needs crossings.
     """
-    scenario = scenario.with_duration(options.get("duration_s"))
-    check_worlds(scenario, sim, real, max(ugat.most_delay_s, ugat.residual_delay_s) > 0)
+    duration_s = options.get("duration_s")
+    timed = max(ugat.most_delay_s, ugat.residual_delay_s) > 0
+    check_worlds(scenario, sim, real, timed, duration_s=duration_s)
     if ugat.grounding == "street" and "channel" in ugat.street.parts:
-        _refuse_own_channel(scenario, sim)
+        _refuse_own_channel(scenario, sim, duration_s)
     # crossing vehicles show best when a green began, and how fast it serves
     crossings = ugat.most_delay_s > 0 or ugat.grounding == "street"
     for domain in (sim, real) if crossings and ugat.iterations else ():
-        if scenario_in_domain(scenario, domain).settings.is_mesoscopic:
+        if scenario_in_domain(scenario, domain, duration_s=duration_s).settings.is_mesoscopic:
             raise OptionError(
                 f"the grounding {ugat.grounding} needs to know when vehicles cross the stop lines, "
                 f"and SUMO's queue model ({domain_label(domain)!r}) cannot tell; use the grounding "

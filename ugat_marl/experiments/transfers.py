@@ -568,9 +568,9 @@ def _identity(config: TransferConfig, scenario: Scenario, env: TrafficEnv) -> di
     log = config.real_log  # identified by its content, so the file may be moved
     settings["real_log"] = file_hash(log) if log else None
     hashes = {"sim": env.scenario.hash}
-    scenario = scenario.with_duration(config.duration_s)
     if config.real != "none":
-        hashes["real"] = scenario_in_domain(scenario, config.real).hash
+        real = scenario_in_domain(scenario, config.real, duration_s=config.duration_s)
+        hashes["real"] = real.hash
     return {
         **settings,
         "scenario_hash": hashes,
