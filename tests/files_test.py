@@ -5,6 +5,7 @@ from __future__ import annotations
 import contextlib
 import gc
 import gzip
+import math
 import os
 import random
 import signal
@@ -25,6 +26,7 @@ from ugat_marl.errors import LogError, MeasuredDataError, OutputError, ScenarioE
 from ugat_marl.files import (
     child_texts,
     chunks_of,
+    json_values,
     parse_xml,
     read_bytes,
     replacing,
@@ -41,6 +43,11 @@ def test_write_whole_writes_and_leaves_nothing_else(tmp_path: Path) -> None:
     write_whole(file, b"\x00\x01")
     assert file.read_bytes() == b"\x00\x01"
     assert list(file.parent.iterdir()) == [file]
+
+
+def test_numbers_that_json_has_not_are_null() -> None:
+    held = {"a": (1.5, math.nan), 2: [{"b": -math.inf}, "nan"]}
+    assert json_values(held) == {"a": [1.5, None], 2: [{"b": None}, "nan"]}
 
 
 def test_a_name_of_another_kind_is_refused_before_and_after_there_is_a_file(tmp_path: Path) -> None:

@@ -14,6 +14,7 @@ import hashlib
 import importlib.util
 import io
 import json
+import math
 import os
 import re
 import secrets
@@ -370,6 +371,15 @@ def read_json(path: Path, fault: type[UgatMarlError]) -> Any:
         UgatMarlError: As for `read_toml`, with JSON.
     """
     return _read_text(path, fault, json.loads, "JSON")
+
+
+def json_values(value: Any) -> Any:
+    """Return values as JSON has them: lists for tuples, null for nan and infinite numbers."""
+    if isinstance(value, Mapping):
+        return {key: json_values(inner) for key, inner in value.items()}
+    if isinstance(value, list | tuple):
+        return [json_values(inner) for inner in value]
+    return None if isinstance(value, float) and not math.isfinite(value) else value
 
 
 def parse_json(text: str, name: str, fault: type[UgatMarlError]) -> Any:

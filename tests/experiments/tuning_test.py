@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import io
 import json
+import math
 from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
@@ -278,6 +279,18 @@ def test_a_rule_is_tuned_in_real_episodes(
     assert [trial["episodes"] for trial in row["trials"]] == [1, 1]
     assert row["trials"][0]["att_s"] <= row["trials"][1]["att_s"]
     assert tuning.BUDGET >= 24
+
+
+def test_a_rule_of_whose_episodes_nothing_is_known_has_null(
+    monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
+    tuned = Tuned("fixed-time", "sim", (RuleTrial("fixed-time:20", math.nan, 2),))
+    monkeypatch.setattr("ugat_marl.cli.tune.tune", lambda *_, **__: tuned)
+    out = tmp_path / "tuned.json"
+    for _ in range(2):  # it replaces its own table
+        assert main(["tune", "single-v1", "--rules", "fixed-time", "--out", str(out)]) == 0
+    (row,) = json.loads(out.read_text())
+    assert row["trials"] == [{"spec": "fixed-time:20", "att_s": None, "episodes": 2}]
 
 
 def test_a_result_that_cannot_be_kept_is_there_all_the_same(

@@ -502,6 +502,29 @@ def test_headroom_is_measured_on_request(
     assert "V4" in text
 
 
+@pytest.mark.parametrize("words", [["--json"], []])
+def test_an_episode_in_which_nobody_is_due_has_no_headroom(
+    single: Scenario,
+    tmp_path: Path,
+    capsys: pytest.CaptureFixture[str],
+    monkeypatch: pytest.MonkeyPatch,
+    words: list[str],
+) -> None:
+    rare = '<flow id="f" begin="0" end="10" probability="1e-9" from="southA_A1" to="A1_northA"/>'
+    routes = Document("r.rou.xml", None, f"<routes>{rare}</routes>".encode())
+    quiet = replace(single, routes=(routes,)).with_duration(10).write(tmp_path / "quiet")
+    sim = functools.partial(measure_headroom, domains=("sim",))
+    monkeypatch.setattr("ugat_marl.cli.scenario_check.measure_headroom", sim)
+    assert main(["scenario", "check", str(quiet), "--headroom", "1", *words]) == 0
+    shown = capsys.readouterr().out
+    assert not re.search(r"\b(nan|NaN|Infinity)\b", shown)
+    if words:
+        (row,) = json.loads(shown)["headroom"]
+        assert row["finished"] is row["lost"] is row["att_s"][0] is None
+    else:
+        assert re.search(r"^ sim( +-){7} *$", shown, re.MULTILINE)
+
+
 def test_old_names_still_work(capsys: pytest.CaptureFixture[str]) -> None:
     assert main(["scenarios"]) == 0
     assert "grid4x4-v1" in capsys.readouterr().out

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import math
 from collections import defaultdict
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
@@ -124,10 +125,8 @@ class ScenarioCheck:
         outside = left_outside(scenario, self.seed) if is_full(runs, facts.duration_s) else {}
         wrong = problems(facts, runs, outside)
         if self.json:
-            text = json.dumps(
-                as_json(facts, runs, rows, wrong, outside), indent=2, ensure_ascii=False
-            )
-            print(text)
+            content = as_json(facts, runs, rows, wrong, outside)
+            print(json.dumps(content, indent=2, ensure_ascii=False, allow_nan=False))
         else:
             network = Network.read(scenario)
             show(console, facts, runs, rows, wrong, network)
@@ -341,7 +340,7 @@ def _runs(runs: Sequence[RuleEpisode]) -> Table:
     )
     for run in runs:
         counts = (run.due, run.departed, run.arrived, run.backlog)
-        table.add_row(run.rule, f"{run.att_s:.1f}", *map(str, counts))
+        table.add_row(run.rule, _shown(run.att_s, ".1f"), *map(str, counts))
     return table
 
 
@@ -354,9 +353,14 @@ def _headroom(rows: Sequence[HeadroomRow]) -> Table:
     )  # fmt: skip
     for row in rows:
         cells = [
-            f"{att_s:.1f}{'*' if hold_s == row.best_hold_s else ''}"
+            _shown(att_s, ".1f", "*" if hold_s == row.best_hold_s else "")
             for hold_s, att_s in zip(HOLDS_S, row.att_s, strict=True)
         ]
-        measures = (f"{row.programme_att_s:.1f}", f"{row.lost:.0%}", f"{row.finished:.1%}")
-        table.add_row(row.domain, *cells, *measures)
+        own, lost = _shown(row.programme_att_s, ".1f"), _shown(row.lost, ".0%")
+        table.add_row(row.domain, *cells, own, lost, _shown(row.finished, ".1%"))
     return table
+
+
+def _shown(value: float, form: str, mark: str = "") -> str:
+    """Return a number with a mark behind it; "-" for nan."""
+    return "-" if math.isnan(value) else f"{value:{form}}{mark}"

@@ -21,7 +21,7 @@ from ugat_marl.cli.arguments import (
 from ugat_marl.effects import domain_label, load_scenario
 from ugat_marl.errors import OutputError, UnknownNameError
 from ugat_marl.experiments import BUDGET, LEAST_BUDGET, tune
-from ugat_marl.files import read_json, require_writable, write_whole
+from ugat_marl.files import json_values, read_json, require_writable, write_whole
 from ugat_marl.policies import RULE_NAMES, RULES, TUNED_RULES
 from ugat_marl.progress import Bars
 from ugat_marl.reporting import tuning_table
@@ -84,7 +84,8 @@ class Tune:
                 for name in self.rules
             ]
         if self.out is not None:
-            write_whole(self.out, json.dumps([asdict(each) for each in tuned], indent=1) + "\n")
+            content = json_values([asdict(each) for each in tuned])
+            write_whole(self.out, json.dumps(content, indent=1, allow_nan=False) + "\n")
         console.print(tuning_table(f"{scenario.id} in {domain_label(self.domain)}", tuned))
         if self.out is not None:
             console.print(f"table: {self.out}", soft_wrap=True)

@@ -22,7 +22,7 @@ from ugat_marl.errors import OutputError, require_least
 from ugat_marl.experiments.evaluation import FixedPolicy, evaluation_of
 from ugat_marl.experiments.jobs import evaluation_seeds
 from ugat_marl.experiments.training import train_through
-from ugat_marl.files import require_writable, write_whole
+from ugat_marl.files import json_values, require_writable, write_whole
 from ugat_marl.policies import EpisodeCallback, NetworkPolicy
 
 KEPT = ("policy.pt", "learner.pt", "result.json")
@@ -117,6 +117,6 @@ def train_baseline(
         policy, state, results = (args.out / name for name in KEPT)
         result.policy.save(policy)
         learner.save(state)
-        content = {"args": asdict(args), "returns": returns, "att_s": att_s}
-        write_whole(results, json.dumps(content, default=str) + "\n")
+        content = json_values({"args": asdict(args), "returns": returns, "att_s": att_s})
+        write_whole(results, json.dumps(content, default=str, allow_nan=False) + "\n")
     return result

@@ -11,7 +11,7 @@ from pathlib import Path
 
 from ugat_marl.experiments.evaluation import evaluation_of, rule_factory
 from ugat_marl.experiments.transfer_headroom import HeadroomRow
-from ugat_marl.files import chunks_of, scan_xml
+from ugat_marl.files import chunks_of, json_values, scan_xml
 from ugat_marl.progress import Reporter
 from ugat_marl.scenarios import (
     IntersectionFacts,
@@ -301,21 +301,12 @@ def as_json(
 ) -> dict[str, object]:
     """Return survey, runs, headroom and faults as values for JSON.
 
-    The delay of an approach is null where nobody passed.
+    What is not known is null, such as the delay of an approach that nobody passed.
     """
     content: dict[str, object] = asdict(facts)
-    content["runs"] = [
-        asdict(run)
-        | {
-            "approaches": {
-                road: (vehicles, delay_s if math.isfinite(delay_s) else None)
-                for road, (vehicles, delay_s) in run.approaches.items()
-            }
-        }
-        for run in runs
-    ]
+    content["runs"] = [asdict(run) for run in runs]
     content["headroom"] = None if rows is None else [asdict(row) for row in rows]
     content["left_outside"] = dict(outside or {})
     content["problems"] = list(wrong)
     content["remarks"] = remarks(facts, runs)
-    return content
+    return json_values(content)

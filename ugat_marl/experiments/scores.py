@@ -23,7 +23,7 @@ from numpy.typing import NDArray
 from ugat_marl.data import MEASURES, Scores, json_damage, mean_delay_s, with_hashes
 from ugat_marl.errors import CheckpointError
 from ugat_marl.experiments.statistics import Interval
-from ugat_marl.files import MALFORMED, read_json, write_whole
+from ugat_marl.files import MALFORMED, json_values, read_json, write_whole
 from ugat_marl.policies import nan_last
 
 _MAPPINGS = ("hidden", "approaches")
@@ -226,7 +226,7 @@ class Evaluation:
 
     def write(self, path: Path) -> None:
         """Write `as_dict` as JSON atomically; nan becomes null."""
-        hashed = with_hashes(_without_nan(self.as_dict()), "episodes")
+        hashed = with_hashes(json_values(self.as_dict()), "episodes")
         content = json.dumps(hashed, indent=1, allow_nan=False)
         write_whole(path, content + "\n")
 
@@ -329,11 +329,3 @@ def _measured(scores: Scores, measure: str) -> float:
     if hasattr(scores, measure):
         return getattr(scores, measure)
     return scores.hidden.get(measure, math.nan)
-
-
-def _without_nan(value: Any) -> Any:
-    if isinstance(value, dict):
-        return {key: _without_nan(inner) for key, inner in value.items()}
-    if isinstance(value, list):
-        return [_without_nan(inner) for inner in value]
-    return None if isinstance(value, float) and math.isnan(value) else value

@@ -6,6 +6,7 @@ in `sim` loses nothing in another domain, no transfer can win anything there.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 
@@ -23,7 +24,7 @@ SEEDS = (0, 1, 2, 3, 4)
 
 @dataclass(frozen=True)
 class HeadroomRow:
-    """Results in one domain, means over the seeds.
+    """Results in one domain, means over the seeds; times and shares are nan if nobody was due.
 
     Attributes:
         domain: Name of the domain.
@@ -91,6 +92,7 @@ def measure_headroom(
         att_s = {hold_s: mean(rule, domain, "att_s") for hold_s, rule in rules.items()}
         best = min(att_s, key=lambda hold_s: att_s[hold_s])
         reference = rows[0].best_hold_s if rows else best
+        due = mean(rules[best], domain, "due")
         rows.append(
             HeadroomRow(
                 domain,
@@ -98,7 +100,7 @@ def measure_headroom(
                 mean("programme", domain, "att_s"),
                 best,
                 att_s[reference] / att_s[best] - 1,
-                mean(rules[best], domain, "throughput") / mean(rules[best], domain, "due"),
+                mean(rules[best], domain, "throughput") / due if due else math.nan,
                 mean(rules[best], domain, "backlog"),
             )
         )
