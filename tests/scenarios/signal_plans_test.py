@@ -17,7 +17,7 @@ import pytest
 from ugat_marl.__main__ import main
 from ugat_marl.effects import load_scenario
 from ugat_marl.envs import parallel_env
-from ugat_marl.errors import ScenarioError
+from ugat_marl.errors import OptionError, ScenarioError
 from ugat_marl.experiments import rule_factory, typical_plans
 from ugat_marl.experiments.typical_plans import _divided, _shortest_cycle_s
 from ugat_marl.files import Document
@@ -426,9 +426,10 @@ def test_a_short_yellow_is_noted(tmp_path: Path, capsys: pytest.CaptureFixture[s
     (tmp_path / "t.csv").write_text(HEAD + GOOD.replace("30,3,2", "30,0,2", 1))
     words = ["plan", "single-v1", "--apply", str(tmp_path / "t.csv"), "--out", str(tmp_path / "x")]
     assert main(words) == 0
-    assert (
-        "note: yellow is short at A1 (phase 1: 0 s); 3 to 6 s are usual" in capsys.readouterr().out
-    )
+    note = "note: yellow is short at A1 (phase 1: 0 s); 3 to 6 s are usual"
+    assert note in capsys.readouterr().out
+    assert main(["plan", str(tmp_path / "x"), "--out", str(tmp_path / "again.csv")]) == 0
+    assert note in capsys.readouterr().out
     stays = PlanPhase(1, 1, ("NBT", "SBT"), 30.0, 0.0, 0.0)
     more = PlanPhase(1, 1, ("NBT", "SBT", "NBL"), 30.0, 3.0, 2.0)
     assert not yellow_notes([SignalPlan("A1", 60.0, 0.0, (stays, more))])  # none of them ends
@@ -760,6 +761,13 @@ def test_the_typical_plan_of_the_programme_is_the_programme(single: Scenario) ->
     network = Network.read(single)
     (plan,) = typical_plans(single, rule_factory("programme"), "sim", (1,), Silent())
     assert plan == programme_plan(network.intersections[0], network)
+
+
+def test_a_plan_from_the_queue_model_would_have_no_yellow(single: Scenario) -> None:
+    with pytest.raises(OptionError, match="no yellow; leave out queue_model"):
+        typical_plans(single, rule_factory("fixed-time:30"), "meso", (1,), Silent())
+    (plan,) = typical_plans(single, rule_factory("programme"), "meso", (1,), Silent())
+    assert [phase.yellow_s for phase in plan.phases] == [3.0] * len(plan.phases)
 
 
 def test_the_busiest_phase_gets_what_it_needs() -> None:

@@ -116,7 +116,7 @@ class Plan:
         console.print(plan_table(plans, LightNames.of(network)))
         out, name = shlex.quote(str(self.out)), shlex.quote(self.scenario)
         notes = programme_notes if self.policy in (None, "programme") else refusal_notes
-        for note in notes(played, plans, str(self.out)):
+        for note in (*notes(played, plans, str(self.out)), *yellow_notes(plans)):
             console.print(f"note: {note}", soft_wrap=True)
         console.print(f"plans: {out}", soft_wrap=True)
         console.print(

@@ -23,8 +23,9 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from itertools import pairwise
 
-from ugat_marl.effects import Domain
+from ugat_marl.effects import Domain, domain_label
 from ugat_marl.envs import TrafficEnv, parallel_env
+from ugat_marl.errors import OptionError
 from ugat_marl.parallel import retry_on_crash
 from ugat_marl.policies import LONGEST_CYCLE_S, Policy, PolicyFactory, roll_out, smallest_covers
 from ugat_marl.progress import Reporter
@@ -106,6 +107,9 @@ def typical_plans(
         A plan for every agent. Splits are whole seconds; no green is below the minimum green.
         The offset is 0 where the light has no steady cycle. A policy that leaves the lights to
         their programmes gives the plans of these.
+
+    Raises:
+        OptionError: The policy would be played in SUMO's queue model.
     """
     world = parallel_env(scenario, domain)
     policy = make(world)
@@ -113,6 +117,12 @@ def typical_plans(
     network, control = env.network, env.scenario.control
     if env.options.signals == "programme":
         return tuple(programme_plan(light, network) for light in network.intersections)
+    if env.scenario.settings.is_mesoscopic:
+        raise OptionError(
+            f"scenario {scenario.id!r} in domain {domain_label(domain)!r} runs in SUMO's queue "
+            "model, where agents show red instead of yellow, so the plan would have no yellow; "
+            "leave out queue_model"
+        )
     shown = [_Shown(_served(light, network)) for light in network.intersections]
     begin_s, clearance_s = env.scenario.settings.begin_s, env.scenario.timing.clearance_s
     try:
