@@ -5,7 +5,9 @@ from __future__ import annotations
 import errno
 import os
 import signal
+import sys
 import time
+import warnings
 from pathlib import Path
 from typing import Any
 
@@ -13,7 +15,9 @@ import pytest
 from rich.console import Console
 
 from ugat_marl.__main__ import main
-from ugat_marl.cli import CommandLine, frame, run
+from ugat_marl.cli import CommandLine, baseline_command, frame, run
+from ugat_marl.errors import OptionError
+from ugat_marl.experiments import BaselineArgs, BaselineResult
 from ugat_marl.parallel import DEADLINE_VARIABLE, usual_deadline_s
 
 
@@ -103,3 +107,41 @@ def test_a_warning_of_the_suite_is_a_note(
     said = capsys.readouterr().err
     assert "note: scenario 'late': no vehicle has entered the network in the first" in said
     assert "UserWarning" not in said
+
+
+@pytest.mark.parametrize(
+    ("words", "said"),
+    [
+        (["--episodes", "many"], "--episodes 'many': not a whole number; see mine.py --help"),
+        (["--epochs", "3"], "unknown option '--epochs' of mine.py. "),
+        (["--episodes", "0"], "episodes = 0: must be at least 1"),
+        ([], "steep"),
+    ],
+)
+def test_errors_and_warnings_of_a_baseline_are_one_line(
+    words: list[str],
+    said: str,
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    def train(*_: Any) -> BaselineResult:
+        warnings.warn("steep", stacklevel=1)
+        raise OptionError("steep")
+
+    monkeypatch.setattr(sys, "argv", ["baselines/mine.py", *words])
+    with pytest.raises(SystemExit) as ended:
+        baseline_command(BaselineArgs, train)
+    assert ended.value.code == 2
+    *notes, error = capsys.readouterr().err.splitlines()
+    assert error.startswith(f"mine.py: error: {said}")
+    assert notes == ([] if words else ["note: steep"])
+
+
+def test_the_help_of_a_baseline_is_printed(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.setattr(sys, "argv", ["baselines/mine.py", "--help"])
+    with pytest.raises(SystemExit) as ended:
+        baseline_command(BaselineArgs, lambda *_: pytest.fail("it was trained"))
+    assert not ended.value.code
+    assert capsys.readouterr().out.startswith("usage: mine.py")

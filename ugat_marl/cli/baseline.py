@@ -8,9 +8,8 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-import tyro
 
-from ugat_marl.cli.frame import guarded
+from ugat_marl.cli.frame import guarded, parse_options
 from ugat_marl.experiments import BaselineArgs, BaselineResult
 from ugat_marl.policies import EpisodeCallback
 
@@ -27,12 +26,14 @@ def baseline_command(
         train: Function that trains with these options; it calls its second argument after every
             episode.
     """
+    program = Path(sys.argv[0]).name
 
     def call() -> None:
         result = train(
-            tyro.cli(kind), lambda n, told: print(n, f"return {told['return']:.1f}", flush=True)
+            parse_options(kind, program, program, sys.argv[1:]),
+            lambda n, told: print(n, f"return {told['return']:.1f}", flush=True),
         )
         for episodes, att_s in result.att_s.items():
             print(f"{episodes} episodes: mean travel time {np.mean(att_s):.1f} s, by seed {att_s}")
 
-    sys.exit(guarded(Path(sys.argv[0]).name, call))
+    sys.exit(guarded(program, call))

@@ -122,7 +122,7 @@ def run(line: CommandLine, arguments: Sequence[str]) -> int:
     progress = console if console.is_terminal else plain(stderr=True)
 
     def perform() -> int:
-        with loudness(level), showing(Bars(progress)), _deadline(seconds), _warnings_as_notes():
+        with loudness(level), showing(Bars(progress)), _deadline(seconds):
             return _dispatch(line, list(arguments), console)
 
     return guarded(line.program, perform)
@@ -147,7 +147,7 @@ def _warnings_as_notes() -> Iterator[None]:
 
 
 def guarded(program: str, call: Callable[[], int | None]) -> int:
-    """Call a program's main function; an error is one line, and SIGTERM ends it in order.
+    """Call a program's main function; errors and warnings are one line, SIGTERM ends it in order.
 
     Args:
         program: Name of the program, as a user types it.
@@ -160,7 +160,7 @@ def guarded(program: str, call: Callable[[], int | None]) -> int:
         if isinstance(stream, io.TextIOWrapper):
             stream.reconfigure(errors="replace")
     try:
-        with _ended_in_order():
+        with _ended_in_order(), _warnings_as_notes():
             return call() or 0
     except UgatMarlError as error:
         print(f"{program}: error: {_in_one_line(str(error))}", file=sys.stderr)
@@ -306,14 +306,30 @@ def _help_that_has(command_type: Any, message: str) -> str:
 
 
 def _parse(line: CommandLine, name: str, words: list[str]) -> Any:
-    """Parse the options of a command into its dataclass; turn errors of tyro into one line."""
-    import tyro
-
+    """Parse the options of a command into its dataclass, or print its help."""
     module, _, attribute = line.commands[name][0].partition(":")
     command_type = getattr(importlib.import_module(module), attribute)
     program = f"{line.program} {name}"
     if any(word in (*HELP, HELP_ALL) for word in words):
         print_help(command_type, program, words)
+    return parse_options(command_type, program, name, words)
+
+
+def parse_options(command_type: Any, program: str, name: str, words: Sequence[str]) -> Any:
+    """Parse options into a dataclass.
+
+    Args:
+        command_type: The dataclass.
+        program: Name of the program with that of the command, as a user types it.
+        name: Name of the command.
+        words: Words after the name.
+
+    Raises:
+        UgatMarlError: An option is unknown, missing or impossible; one line says which.
+        SystemExit: The words ask for help, which is printed.
+    """
+    import tyro
+
     messages = io.StringIO()
     try:
         with contextlib.redirect_stderr(messages):
@@ -329,26 +345,22 @@ def _parse(line: CommandLine, name: str, words: list[str]) -> Any:
             raise
         message = _one_line(messages.getvalue(), name)
         told = _help_that_has(command_type, message)
-        raise UgatMarlError(f"{message}; see {line.program} {name} {told}") from None
+        raise UgatMarlError(f"{message}; see {program} {told}") from None
     if unknown:
         first, is_value, _ = unknown[0].partition("=")
         if first.startswith("-"):
             guess = nearest(first, sorted(options_of(command_type)))
             hint = f"Did you mean {guess!r}?" if guess else ""
             told = _help_that_has(command_type, guess or first)
-            raise UgatMarlError(
-                f"unknown option {first!r} of {name}. {hint} See {line.program} {name} {told}"
-            )
+            raise UgatMarlError(f"unknown option {first!r} of {name}. {hint} See {program} {told}")
         joined_by = (
             "; effects of one domain are joined by +, as in V1+late_green=2" if is_value else ""
         )
-        raise UgatMarlError(
-            f"{name}: unexpected {unknown[0]!r}{joined_by}; see {line.program} {name} --help"
-        )
+        raise UgatMarlError(f"{name}: unexpected {unknown[0]!r}{joined_by}; see {program} --help")
     return command
 
 
-def _with_address(words: list[str]) -> list[str]:
+def _with_address(words: Sequence[str]) -> list[str]:
     """Complete a ``--ray`` without an address to ``--ray local``, the Ray of this machine."""
     complete: list[str] = []
     for word, following in zip(words, [*words[1:], "--"], strict=False):
