@@ -141,6 +141,12 @@ def test_a_programme_is_logged_as_sumo_runs_it(data: Path) -> None:
     assert shown[:4] == ((0.0, "Gr"), (40.0, "rG"), (50.0, "Gr"), (90.0, "rG"))
 
 
+def test_a_programme_is_logged_until_the_last_decision_ends(data: Path) -> None:
+    (period,) = measure(data / "crossing", policy="programme", duration_s=95).periods
+    assert period.end_s == 90.0
+    assert period.signals["C"] == ((0.0, "Gr"), (40.0, "rG"), (50.0, "Gr"))
+
+
 def test_an_offset_shifts_the_programme(crossing: Crossing) -> None:
     directory = crossing(edit=lambda text: text.replace('offset="0"', 'offset="7"'))
     shown = measure(directory, policy="programme").periods[0].signals["C"]

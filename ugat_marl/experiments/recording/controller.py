@@ -85,7 +85,8 @@ def own_programmes(
     watched = tuple(sorted(with_programme - set(fixed)))
     if not fixed:
         return {}, watched
-    end_s = scenario.settings.begin_s + scenario.settings.duration_s
+    interval_s = scenario.control.decision_interval_s
+    end_s = scenario.settings.begin_s + scenario.decisions * interval_s  # the end of a period
     with tempfile.TemporaryDirectory(prefix="ugat_marl-") as name:
         directory = Path(name)
         watching = switch_document(fixed, directory / "signals.xml")
