@@ -85,6 +85,15 @@ def complaint(capsys: pytest.CaptureFixture[str], *arguments: str) -> str:
         (["scenario", "new", "x", "--grid", "1x1", "--vph", "9", "--duration-s", "nan"], "seconds"),
         (["scenario", "new", "x", "--grid", "1x1", "--vph", "9", "--begin-s", "inf"], "--begin-s"),
         (["record", "single-v1", "--out", "x", "--periods", "0"], "--periods 0: must be at least"),
+        (["train", "single-v1", "--seed", "-1"], "seed = -1: must be at least 0"),
+        (["paper", "main", "--first-seed", "-1"], "first_seed = -1: must be at least 0"),
+        (["rollout", "single-v1", "--out", "x", "--seed", "-1"], "--seed -1: must be at least 0"),
+        (["scenario", "new", "x", "--draw", "-1"], "--draw -1: must be at least 0"),
+        (
+            ["scenario", "new", "x", "--grid", "1x1", "--vph", "9", "--seed", "-1"],
+            "--seed -1: must be at least 0",
+        ),
+        (["scenario", "check", "nowhere", "--seed", "-1"], "--seed -1: must be at least 0"),
     ],
 )
 def test_a_wrong_call_is_one_line_with_the_nearest_name(

@@ -217,6 +217,7 @@ def test_domain_randomisation_resumes(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("options", "complaint"),
     [
+        ({"seed": -1}, "seed = -1: must be at least 0"),
         ({"random_delay_s": 0}, "random_delay_s = 0: must be at least 1"),
         ({"real": "none", "real_log": Path("x"), "oracle": True}, "oracle needs a real domain"),
         ({"real": "none", "real_log": Path("x"), "fine_tuned": True}, "needs a real domain"),

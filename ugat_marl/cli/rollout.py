@@ -121,6 +121,7 @@ class Rollout:
     def run(self, console: Console) -> int:
         """Record, film and write."""
         require_numbers(1, episodes=self.episodes, workers=self.workers)
+        require_numbers(0, seed=self.seed)
         if not 0 <= self.epsilon <= 1:
             raise OptionError(f"--epsilon {self.epsilon}: must be from 0 to 1")
         if self.out is None and self.video is None:

@@ -106,7 +106,7 @@ class ScenarioCheck:
             return self._kit(console)
         refuse_options(self, ("observation",), "only --conformance reads an observation")
         require_numbers(1, workers=self.workers)
-        require_numbers(0, headroom=self.headroom)
+        require_numbers(0, headroom=self.headroom, seed=self.seed)
         if self.headroom and self.domain != "sim":
             raise OptionError("--headroom plays sim and V1 to V4 by itself; leave out --domain")
         scenario = scenario_in_domain(

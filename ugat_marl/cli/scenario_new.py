@@ -13,7 +13,13 @@ from rich.console import Console
 from rich.table import Table
 from tyro.conf import Positional, arg
 
-from ugat_marl.cli.arguments import given_words, option_text, refuse_options, unused
+from ugat_marl.cli.arguments import (
+    given_words,
+    option_text,
+    refuse_options,
+    require_numbers,
+    unused,
+)
 from ugat_marl.errors import OptionError, counted
 from ugat_marl.progress import Bars
 from ugat_marl.reporting import LIGHT_HEADING, LightNames, draw_network, titled_table
@@ -127,6 +133,7 @@ class ScenarioNew:
 
     def run(self, console: Console) -> int:
         """Make the scenario and print its facts."""
+        require_numbers(0, draw=self.draw, seed=self.seed)
         for name, value in (("begin_s", self.begin_s), ("duration_s", self.duration_s)):
             if value is not None and not 0 <= value < math.inf:
                 raise OptionError(f"--{name.replace('_', '-')} {value}: give seconds, 0 or more")

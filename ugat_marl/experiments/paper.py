@@ -387,6 +387,7 @@ class PaperConfig:
             self._take_published()
         if not self.learner:
             object.__setattr__(self, "learner", UNIVERSAL_NAME)
+        require_least(0, first_seed=self.first_seed)
         require_least(1, seeds=self.seeds, evaluation_seeds=self.evaluation_seeds)
         require_least(1, episodes=self.episodes)
         require_least(LEAST_BUDGET, rule_budget=self.rule_budget)

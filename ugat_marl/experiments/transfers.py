@@ -184,6 +184,7 @@ class TransferConfig:
         for name in ("real", "sim"):  # V4 and snow are one run
             object.__setattr__(self, name, domain_label(getattr(self, name)))
         object.__setattr__(self, "further", tuple(map(domain_label, self.further)))
+        require_least(0, seed=self.seed)
         require_least(1, evaluation_seeds=self.evaluation_seeds, tuning_seeds=self.tuning_seeds)
         require_least(LEAST_BUDGET, rule_budget=self.rule_budget)
         if self.real == self.sim and self.negative_control != "same-world":
