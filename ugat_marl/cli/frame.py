@@ -413,7 +413,7 @@ def _print_completion(line: CommandLine, words: list[str]) -> int:
 
 def _print_help(line: CommandLine, console: Console, prefix: str = "") -> None:
     console.print(f"{line.purpose}\n")
-    console.print(f"usage: {line.program} {prefix}COMMAND [options]\n", markup=False)
+    console.print(f"usage: {line.program} {prefix}COMMAND [options]\n")
     listed: dict[str, str] = {}
     for name, (_, text) in line.commands.items():
         if name.startswith(prefix):
@@ -425,7 +425,7 @@ def _print_help(line: CommandLine, console: Console, prefix: str = "") -> None:
     for name, text in listed.items():
         begin, later = f"  {name:<{width}}  ", " " * (width + 4)
         entry = textwrap.fill(text, console.width, initial_indent=begin, subsequent_indent=later)
-        console.print(entry, markup=False)
+        console.print(entry)
     console.print(
         f"\n{line.program} {prefix}COMMAND --help shows options and examples of a command."
     )
@@ -437,7 +437,7 @@ def _print_help(line: CommandLine, console: Console, prefix: str = "") -> None:
     if not prefix and line.examples:
         console.print("\nA first try:\n")
         for example in line.examples:
-            console.print(f"  {example}", markup=False)
+            console.print(f"  {example}")
     console.print(
         "\nExit codes: 0 done, 1 a check or target failed, 2 a wrong call or input, "
         "130 and 143 interrupted."

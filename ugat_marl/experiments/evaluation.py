@@ -138,10 +138,8 @@ def evaluation_of(
             results += played
             for _ in played:
                 advance()
-    order = {
-        (name, domain_label(domain)): i
-        for i, (name, domain) in enumerate(_pairs(policies, domains))
-    }
+    pairs = ((name, domain_label(domain)) for name in policies for domain in domains)
+    order = {pair: place for place, pair in enumerate(pairs)}
     results.sort(key=lambda r: (order[r.policy, r.domain], r.seed))
     return Evaluation(scenario.id, scenario.hash, tuple(results), {})
 
@@ -233,13 +231,13 @@ class RuleFactory:
 
 @dataclass(frozen=True)
 class FixedPolicy:
-    """Maker that returns copies of one policy."""
+    """Maker that returns one policy; an evaluation plays copies of it."""
 
     policy: Policy
 
     def __call__(self, env: TrafficEnv) -> Policy:
-        """Return a copy of the policy, because several episodes run at a time."""
-        return copy.deepcopy(self.policy)
+        """Return the policy."""
+        return self.policy
 
 
 @dataclass(frozen=True)
@@ -359,12 +357,6 @@ class OwnLearnerPolicy:
         return OwnLearnerFactory(self.name).read_policy(make_env, self.path)
 
 
-def _pairs(
-    policies: Mapping[str, PolicyFactory], domains: Sequence[Domain]
-) -> list[tuple[str, Domain]]:
-    return [(name, domain) for name in policies for domain in domains]
-
-
 def _play(task: _Task, stop: Stop) -> list[Result]:
     policy = task.make(task.world)
     # The scenario's files hold the effects of the domain already.
@@ -393,7 +385,8 @@ def _episodes(
 
     try:
         for seed in task.seeds:
-            # A user's policy may remember earlier episodes, whose number depends on the workers.
+            # Tasks may share a policy, and a user's may remember earlier episodes, whose number
+            # depends on the workers.
             retry_on_crash(
                 lambda seed=seed: roll_out(env, copy.deepcopy(policy), seed, on_step=on_step)
             )

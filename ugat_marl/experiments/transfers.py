@@ -458,10 +458,9 @@ def _write_results(
     for job, record in zip(plan, records, strict=True):
         for mark, name in job.rows.items():
             if job.setting.recipe == "rule":
-                rules[domain_label(job.target or job.sim)] = (
-                    folder / job.name / RULE_FILE
-                ).read_text()
-                name = rule_policy(rules[domain_label(job.target or job.sim)])
+                rule = (folder / job.name / RULE_FILE).read_text()
+                rules[domain_label(job.target or job.sim)] = rule
+                name = rule_policy(rule)
             rows.setdefault(name, (job, mark, record))  # one rule may be the best of both domains
     trained = {name: row for name, row in rows.items() if row[0].seed is not None}
     policies: set[Path] = set()

@@ -188,7 +188,7 @@ def record(
     installed = installed_detectors(effects, detectors)
     _warn_of_cut_zones(detectors, installed, network.lanes)
     street = _Street(
-        demand_as_vehicles(base),
+        base,
         effects,
         detectors,
         installed,
@@ -218,13 +218,14 @@ def _world(
 ) -> tuple[Scenario, tuple[Effect, ...]]:
     """Return the scenario from which days are drawn, and the effects to add to each day.
 
-    A scenario's documents hold the effects of its file already, except those on detectors.
+    Both scenarios have single vehicles. A scenario's documents hold the effects of its file
+    already, except those on detectors.
     """
     # a wrong name is an error now
     changed = scenario_in_domain(scenario, domain, recorded=True, duration_s=duration_s)
     refuse_in_queues(changed, detectors=True)
     if domain_path(domain) is not None:
-        return changed, detector_effects(changed)
+        return demand_as_vehicles(changed), detector_effects(changed)
     return scenario, (*detector_effects(scenario), *parse_domain(domain))
 
 
