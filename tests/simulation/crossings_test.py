@@ -12,6 +12,7 @@ import numpy as np
 import polars as pl
 import pytest
 
+from tests.crossroads import build_crossroads
 from ugat_marl import parallel_env
 from ugat_marl.data import AgentLayout, Provenance, TransitionLog, TransitionRecorder
 from ugat_marl.data.row_hashes import write_hashed
@@ -180,6 +181,31 @@ def test_on_many_lanes_it_is_who_is_on_another_road_a_second_later(
     for interval in range(20):
         found = simulator.advance(10, {}).mean_left
         np.testing.assert_allclose(found, expected[interval], err_msg=str(interval))
+
+
+def test_who_crosses_a_short_lane_within_a_second_counts_once(
+    simulator: LibsumoSimulator, tmp_path: Path
+) -> None:
+    """A car drives 12 m in a second, and the lane at the light has 7 m."""
+    build_crossroads(tmp_path, 11)
+    cars = "".join(
+        f'<vehicle id="{n}" depart="{4 * n}" departSpeed="max"><route edges="Ww wM ME"/></vehicle>'
+        for n in range(15)
+    )
+    (tmp_path / "r.rou.xml").write_text(f"<routes>{cars}</routes>")
+    (tmp_path / "scenario.toml").write_text(
+        'network = "n.net.xml"\nroutes = ["r.rou.xml"]\nduration_s = 120\n'
+    )
+    scenario = load_scenario(tmp_path)
+    network = Network.read(scenario)
+    (light,) = network.intersections
+    green = "".join("G" if link.from_edge == "wM" else "r" for link in light.links)
+    table = network.lane_table()
+    assert network.lanes["wM_0"].length_m < 7.5
+    simulator.start(launch_of(scenario, 1, tmp_path / "own", table.ids, crossings=True))
+    states = ["r" * len(green)] * 20 + [green] * 80  # some wait, and most drive through
+    left = sum(simulator.advance(1, {"M": [(1.0, state)]}).mean_left for state in states)
+    assert dict(zip(table.ids, left, strict=True))["wM_0"] == 15
 
 
 def test_looking_changes_nothing_else_and_is_not_done_unasked(

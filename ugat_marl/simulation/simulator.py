@@ -18,7 +18,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ugat_marl.errors import SimulatorBusy, SimulatorError
-from ugat_marl.scenarios import UpstreamLanes, edge_of_lane
+from ugat_marl.scenarios import UpstreamLanes
+from ugat_marl.simulation.crossings import Crossings
 from ugat_marl.simulation.host import one_line_message, too_much_memory
 from ugat_marl.simulation.launch import ERRORS, TRIPS, Launch, SignalPlans, VehiclePositions
 from ugat_marl.simulation.mesoscopic import MesoscopicLanes
@@ -52,7 +53,7 @@ class LibsumoSimulator:
         self._has_behind = False
         self._mesoscopic: MesoscopicLanes | None = None
         self._upstream: UpstreamQueues | None = None
-        self._on: list[tuple[str, ...]] = []
+        self._crossings: Crossings | None = None
         self._owner = 0
 
     def start(self, launch: Launch) -> Snapshot:
@@ -82,7 +83,7 @@ class LibsumoSimulator:
             libsumo.start([program, *launch.arguments, "--end", repr(launch.end_s)])
         except _FAULTS as error:
             self._fail("SUMO did not start", error)
-        self._shown, self._on = {}, []
+        self._shown = {}
         self._time_s = launch.begin_s
         self._limits = np.array([libsumo.lane.getMaxSpeed(lane) for lane in launch.lanes])
         lanes, roads = launch.behind
@@ -90,6 +91,7 @@ class LibsumoSimulator:
         self._mesoscopic = None
         if launch.segment_m:
             self._mesoscopic = MesoscopicLanes(libsumo, launch.lanes, launch.segment_m)
+        self._crossings = Crossings(libsumo, launch.lanes) if launch.crossings else None
         self._upstream = None
         if launch.turns:
             self._upstream = UpstreamQueues(
@@ -116,7 +118,7 @@ class LibsumoSimulator:
                 offset += duration
         begin = self._time_s
         widths: dict[float, float] = {}  # of the seconds at whose ends crossings are counted
-        if self._launch.crossings:
+        if self._crossings is not None:
             ends = seconds_of(seconds)
             widths = dict(zip(ends.tolist(), np.diff(ends, prepend=0.0).tolist(), strict=True))
         left = np.zeros(len(self._launch.lanes))
@@ -125,8 +127,8 @@ class LibsumoSimulator:
             for offset in sorted({*changes, *widths}):
                 if offset > 0:
                     libsumo.simulation.step(begin + offset)
-                if offset in widths:
-                    self._count_left(left)
+                if self._crossings is not None and offset in widths:
+                    self._crossings.add_to(left)
                     mean_left += left * widths[offset] / seconds
                 for tls, state in changes.get(offset, ()):
                     if self._shown.get(tls) != state:
@@ -169,20 +171,6 @@ class LibsumoSimulator:
             # A forked child shares the parent's open files, so only the owner may close them.
             if self._owner == os.getpid() and libsumo.simulation.isLoaded():
                 libsumo.simulation.close()
-
-    def _count_left(self, left: NDArray[np.float64]) -> None:
-        """Add to `left`, ``(lanes,)``, the vehicles that left a lane's road since the last call."""
-        assert self._launch is not None
-        now = [libsumo.lane.getLastStepVehicleIDs(lane) for lane in self._launch.lanes]
-        before, self._on = self._on, now
-        gone: dict[str, int] = {}
-        for index, (earlier, later) in enumerate(zip(before, now, strict=False)):
-            if earlier != later:  # the same in most seconds
-                gone.update(dict.fromkeys(set(earlier).difference(later), index))
-        for name, index in gone.items():
-            road = edge_of_lane(self._launch.lanes[index])
-            if name not in libsumo.edge.getLastStepVehicleIDs(road):
-                left[index] += 1.0
 
     def _snapshot(self) -> Snapshot:
         assert self._launch is not None
