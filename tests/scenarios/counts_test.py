@@ -305,7 +305,12 @@ def test_intervals_are_on_the_clock_of_the_begin(
     assert (note in (tmp_path / "city" / "README.md").read_text()) is (lost > 0)
     if kind == "--counts":  # what never drives meets no count
         with (tmp_path / "city" / "counts-fit.csv").open(encoding="utf-8-sig") as file:
-            assert sum(float(row["driven"]) for row in csv.DictReader(file)) == within
+            fits = list(csv.DictReader(file))
+        assert sum(float(row["driven"]) for row in fits) == within
+        # and of a count, the part within the episode is to be met
+        assert sum(float(row["counted"]) for row in fits) == pytest.approx(inside)
+        assert all(25200 <= float(row["begin_s"]) < float(row["end_s"]) <= 28800 for row in fits)
+        assert all(float(row["geh"]) < 5 for row in fits)
 
 
 @pytest.mark.parametrize(

@@ -36,10 +36,10 @@ class CountFit:
         intersection: Streets that meet there; empty if they have no names, or it has no light.
         turn: The counted turn with its names; None for a road, or a turn without a light.
         roads: SUMO ids of the counted road, or of the two roads of the turn.
-        begin_s: Start of the interval of the count.
-        end_s: End of the interval of the count.
-        counted: Number of vehicles counted.
-        driven: Number of vehicles of the scenario that depart within the interval and pass here.
+        begin_s: Start of the part of the count's interval that lies within the episode, s.
+        end_s: End of that part, s.
+        counted: Number of vehicles counted in it: the part's share of the count.
+        driven: Number of vehicles of the scenario that depart in it and pass here.
         geh: GEH of the two as hourly flows.
     """
 

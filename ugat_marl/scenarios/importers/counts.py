@@ -328,7 +328,7 @@ def from_counts(path: Path, begin_s: float, length_s: float, seed: int) -> Vehic
         write_drives(folder / ROUTES, sorted(sampled, key=lambda d: (d.depart_s, d.id)))
         names = NamedNetwork(root)
         end_s = begin_s + length_s
-        fits = _fits(rows, [d for d in sampled if begin_s <= d.depart_s < end_s], names)
+        fits = _fits(_clipped(rows, begin_s, end_s), sampled, names)
         write_fit(folder / FIT_SHEET, fits, names)
         write_whole(folder / COUNT_SHEET, b"".join(chunks_of(path)))
         notes = (
@@ -530,8 +530,23 @@ def _sampled(path: Path) -> Iterator[Drive]:
             yield Drive(f"{edges[0]}_{number}", float(element.get("depart", "0")), edges)
 
 
+def _clipped(rows: Iterable[Row], begin_s: float, end_s: float) -> Iterator[Row]:
+    """Yield the parts of rows within the episode, each with its share of the count.
+
+    Args:
+        rows: Rows of the table.
+        begin_s: Start of the episode, s.
+        end_s: End of the episode, s.
+    """
+    for row in rows:
+        first_s, last_s = max(row.begin_s, begin_s), min(row.end_s, end_s)
+        if first_s < last_s:
+            share = (last_s - first_s) / (row.end_s - row.begin_s)
+            yield replace(row, count=row.count * share, begin_s=first_s, end_s=last_s)
+
+
 def _fits(
-    rows: Sequence[Row], drives: Sequence[Drive], names: NamedNetwork
+    rows: Iterable[Row], drives: Sequence[Drive], names: NamedNetwork
 ) -> tuple[CountFit, ...]:
     passed = _passages(drives)
     fits: list[CountFit] = []
@@ -673,7 +688,7 @@ def _about_times(
     yield from _outside(rows, path, begin_s, end_s)
 
 
-def _outside(rows: Iterable[Row], path: Path, begin_s: float, end_s: float) -> Iterator[str]:
+def _outside(rows: Sequence[Row], path: Path, begin_s: float, end_s: float) -> Iterator[str]:
     """Yield a note if intervals lie outside of the episode, since their vehicles never drive.
 
     Args:
@@ -682,11 +697,8 @@ def _outside(rows: Iterable[Row], path: Path, begin_s: float, end_s: float) -> I
         begin_s: Start of the episode, s.
         end_s: End of the episode, s.
     """
-    total = lost = 0.0
-    for row in rows:
-        inside_s = max(0.0, min(row.end_s, end_s) - max(row.begin_s, begin_s))
-        total += row.count
-        lost += row.count * (1 - inside_s / (row.end_s - row.begin_s))
+    total = sum(row.count for row in rows)
+    lost = total - sum(row.count for row in _clipped(rows, begin_s, end_s))
     if lost >= 0.5:
         yield (
             f"{lost:.0f} of the {total:.0f} vehicles of {path.name} are outside of the episode "
