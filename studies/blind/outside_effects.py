@@ -15,10 +15,9 @@ from ugat_marl.effects import (
     edit_scenario,
     hashed_uniform,
     network_places,
-    seconds_text,
 )
 from ugat_marl.files import xml_bytes
-from ugat_marl.scenarios import Document, Network, Scenario
+from ugat_marl.scenarios import Document, Network, Scenario, seconds_text
 
 STOP_BEFORE_LINE_M = 30.0
 """Metres before the stop line at which buses stop and cars turn off.

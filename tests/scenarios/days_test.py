@@ -11,6 +11,7 @@ import numpy as np
 import pytest
 
 from ugat_marl.effects import load_scenario
+from ugat_marl.errors import ScenarioError
 from ugat_marl.scenarios import Scenario, demand_as_vehicles, draw_day, read_scenario
 from ugat_marl.scenarios.speed_factors import SpeedFactors
 
@@ -89,6 +90,11 @@ def tags(scenario: Scenario) -> list[str]:
     )  # fmt: skip
 
 
+def vehicle_ids(scenario: Scenario) -> list[str]:
+    """Return the ids of all vehicles in the route files."""
+    return [x.get("id", "") for file in scenario.routes for x in file.parse().iter("vehicle")]
+
+
 @pytest.mark.parametrize(
     "demand",
     [
@@ -141,6 +147,36 @@ def test_vehicles_that_block_a_lane_are_the_same_on_every_day(
     days = [draw_day(scenario, seed) for seed in range(8)]
     blocked = [b"".join(x.read() for x in day.routes) for day in days]
     assert all(text.count(b'"closure.S_C_0.0" depart="10"') == 1 for text in blocked)
+
+
+def test_stops_move_with_the_departure(crossing: Callable[..., Path]) -> None:
+    bus = CAR.format(0, 60, "car").replace(
+        "/></vehicle>", '/><stop lane="S_C_0" endPos="100" duration="9" until="150"/></vehicle>'
+    )
+    scenario = with_additional(crossing, "", bus)
+    buses = [x for seed in range(9) for x in draw_day(scenario, seed).routes[0].parse()]
+    assert len(buses) >= 3
+    for drawn in buses:
+        (stop,) = drawn.findall("stop")
+        waits = float(stop.get("until", "")) - float(drawn.get("depart", ""))
+        assert waits == pytest.approx(90, abs=0.011)  # departures are rounded
+        assert stop.get("duration") == "9"
+    assert len({drawn.get("depart") for drawn in buses}) == len(buses)
+    wrong = with_additional(crossing, "", bus.replace("150", "soon"))
+    with pytest.raises(ScenarioError, match="vehicle 'v0': 'soon' of a stop is not a time"):
+        [draw_day(wrong, seed) for seed in range(9)]
+
+
+@pytest.mark.parametrize("beside", [False, True], ids=["routes", "additional"])
+def test_vehicles_that_a_ride_names_keep_their_names(
+    beside: bool, crossing: Callable[..., Path]
+) -> None:
+    rider = '<person id="p" depart="0"><ride from="S_C" to="C_N" lines="v0"/></person>'
+    cars = CAR.format(0, 10, "car") + CAR.format(1, 20, "car")
+    scenario = with_additional(crossing, rider * beside, rider * (not beside) + cars)
+    for seed in range(8):
+        names = [name for name in vehicle_ids(draw_day(scenario, seed)) if "~" not in name]
+        assert names == ["v0"]
 
 
 def test_drivers_without_a_type_follow_a_default_type_of_an_additional_file(

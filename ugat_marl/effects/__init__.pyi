@@ -43,7 +43,6 @@ from .detectors import detector_lights as detector_lights
 from .detectors import installed_detectors as installed_detectors
 from .documents import depart_s as depart_s
 from .documents import edit_scenario as edit_scenario
-from .documents import seconds_text as seconds_text
 from .documents import sort_departures as sort_departures
 from .domains import DOMAIN_ALIASES as DOMAIN_ALIASES
 from .domains import GAP_KINDS as GAP_KINDS

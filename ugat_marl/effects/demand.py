@@ -10,7 +10,7 @@ import copy
 import math
 import re
 import xml.etree.ElementTree as ET
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
 from itertools import accumulate, pairwise
 from typing import ClassVar
@@ -31,12 +31,18 @@ from ugat_marl.effects.documents import (
     edit_scenario,
     is_demand,
     mentions,
-    seconds_text,
     windows,
 )
 from ugat_marl.effects.places import network_places
 from ugat_marl.errors import OptionError
-from ugat_marl.scenarios import Scenario, laps_of, parse_time
+from ugat_marl.scenarios import (
+    Scenario,
+    laps_of,
+    move_stops,
+    own_stops,
+    parse_time,
+    seconds_text,
+)
 
 TAGS = ("<vehicle", "<trip", "<flow")
 """Texts of demand; a document without any of them has no demand."""
@@ -219,26 +225,6 @@ class DemandTiming(Effect):
             return [element]
 
         return replace_departing(scenario, self, self.edge, shifted)
-
-
-def own_stops(element: ET.Element) -> list[ET.Element]:
-    """Return the stops of a vehicle or flow itself, and of the route inside of it."""
-    children = (child if child.tag == "route" else [child] for child in element)
-    return [stop for part in children for stop in part if stop.tag == "stop"]
-
-
-def move_stops(stops: Iterable[ET.Element], seconds: float) -> None:
-    """Move the times of a vehicle's stops by the time by which its departure moves.
-
-    Those of a flow with regular departures count from its begin. Those of a flow with random
-    departures are times of the clock, and those of named routes are relative to the departure.
-    """
-    if math.isnan(seconds):  # it waits for a person or container
-        return
-    for stop in stops:
-        for key in ("until", "arrival", "started", "ended"):
-            if text := stop.get(key):
-                stop.set(key, seconds_text(parse_time(text) + seconds))
 
 
 def _refuse_unknown_origin(

@@ -21,6 +21,7 @@ from ugat_marl.scenarios import (
     Scenario,
     is_blocker,
     parse_time,
+    seconds_text,
 )
 
 DEFAULTS_FILE = "default-types.add.xml"
@@ -291,8 +292,3 @@ class _Sorted:
     def __iter__(self) -> Iterator[str]:
         runs = [map(tuple[float, int, str], map(json.loads, file)) for file in self._runs]
         return (text for _, _, text in heapq.merge(*runs, sorted(self._run)))
-
-
-def seconds_text(value: float) -> str:
-    """Return a time in s as text for a file, rounded to 1 ms, the resolution of SUMO."""
-    return f"{value:.3f}".rstrip("0").rstrip(".")

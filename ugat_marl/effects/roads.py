@@ -22,7 +22,7 @@ from ugat_marl.effects.base import (
     hashed_uniform,
     salt_of,
 )
-from ugat_marl.effects.documents import edit, mentions, seconds_text
+from ugat_marl.effects.documents import edit, mentions
 from ugat_marl.effects.places import network_places
 from ugat_marl.errors import OptionError, ScenarioError
 from ugat_marl.files import xml_bytes
@@ -32,6 +32,7 @@ from ugat_marl.scenarios import (
     demand_as_vehicles,
     demand_scale,
     is_blocker,
+    seconds_text,
 )
 from ugat_marl.seeding import numpy_generator
 

@@ -16,7 +16,7 @@ from ugat_marl.effects.base import (
     NumberParameter,
     TextParameter,
 )
-from ugat_marl.effects.documents import edit, seconds_text
+from ugat_marl.effects.documents import edit
 from ugat_marl.effects.places import network_places
 from ugat_marl.errors import ScenarioError
 from ugat_marl.scenarios import LateGreenMemory as Held
@@ -25,6 +25,7 @@ from ugat_marl.scenarios import (
     Segment,
     Withheld,
     parse_time,
+    seconds_text,
     validate_settings,
     with_late_green,
     withheld_log,

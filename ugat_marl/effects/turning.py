@@ -22,8 +22,6 @@ from ugat_marl.effects.demand import (
     TAGS,
     NamedRoutes,
     departs_by_chance,
-    move_stops,
-    own_stops,
     parted_flow,
 )
 from ugat_marl.effects.documents import (
@@ -35,7 +33,7 @@ from ugat_marl.effects.documents import (
 )
 from ugat_marl.effects.places import Places, network_places
 from ugat_marl.errors import ScenarioError, UnknownNameError
-from ugat_marl.scenarios import Scenario, edge_of_lane
+from ugat_marl.scenarios import Scenario, edge_of_lane, move_stops, own_stops
 
 Way = tuple[str, ...]
 

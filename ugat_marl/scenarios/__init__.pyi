@@ -92,6 +92,8 @@ from .routes import departures as departures
 from .routes import driven_routes as driven_routes
 from .routes import is_blocker as is_blocker
 from .routes import laps_of as laps_of
+from .routes import move_stops as move_stops
+from .routes import own_stops as own_stops
 from .scenario import Document as Document
 from .scenario import Scenario as Scenario
 from .scenario import is_configuration as is_configuration
@@ -103,6 +105,7 @@ from .settings import Real as Real
 from .settings import ScenarioFile as ScenarioFile
 from .settings import parse_decimal as parse_decimal
 from .settings import parse_time as parse_time
+from .settings import seconds_text as seconds_text
 from .settings import validate_settings as validate_settings
 from .signal_plans import PlanPhase as PlanPhase
 from .signal_plans import SignalPlan as SignalPlan

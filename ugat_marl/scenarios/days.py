@@ -9,15 +9,22 @@ from __future__ import annotations
 
 import functools
 import xml.etree.ElementTree as ET
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
+from copy import deepcopy
 from dataclasses import astuple, dataclass, replace
 from xml.sax.saxutils import quoteattr
 
 import numpy as np
 from numpy.typing import NDArray
 
+from ugat_marl.errors import ScenarioError
 from ugat_marl.files import parse_xml, xml_bytes
-from ugat_marl.scenarios.routes import demand_as_vehicles, is_blocker
+from ugat_marl.scenarios.routes import (
+    demand_as_vehicles,
+    is_blocker,
+    move_stops,
+    own_stops,
+)
 from ugat_marl.scenarios.scenario import Document, Scenario
 from ugat_marl.scenarios.settings import parse_time
 from ugat_marl.scenarios.speed_factors import SpeedFactors
@@ -44,11 +51,12 @@ class _Vehicles:
     Attributes:
         types: Additional file with the vehicle types of the route files.
         others: Route files with everything else: persons, containers, named routes, and vehicles
-            that block a lane or wait for a person.
+            that block a lane, wait for a person, or are named by one.
         depart_s: Departures, s, ``(vehicles,)``.
         names: Ids.
         heads: Remaining attributes of each ``<vehicle>`` tag, up to its ``>``.
         tails: Children of each ``<vehicle>``.
+        stopping: Elements of the vehicles with stops, by position.
         speeds: Mean, deviation, least and greatest speedFactor, ``(vehicles, 4)``; the mean is NaN
             if SUMO draws the factor.
     """
@@ -59,7 +67,26 @@ class _Vehicles:
     names: tuple[str, ...]
     heads: tuple[str, ...]
     tails: tuple[str, ...]
+    stopping: Mapping[int, ET.Element]
     speeds: NDArray[np.float64]
+
+    def tail(self, index: int, later_s: float) -> str:
+        """Return the children of a vehicle that departs later than in the demand.
+
+        Raises:
+            ScenarioError: A time of its stops is none.
+        """
+        if index not in self.stopping:
+            return self.tails[index]
+        moved = deepcopy(self.stopping[index])
+        try:
+            move_stops(own_stops(moved), later_s)
+        except ValueError as error:
+            raise ScenarioError(
+                f"vehicle {self.names[index]!r}: {str(error)!r} of a stop is not a time; give "
+                "seconds or h:m:s"
+            ) from None
+        return _children_text(moved)
 
 
 def draw_day(scenario: Scenario, seed: int, day_to_day: float = 0.0) -> Scenario:
@@ -69,20 +96,25 @@ def draw_day(scenario: Scenario, seed: int, day_to_day: float = 0.0) -> Scenario
     change them, so two models can be compared on the same day. Vehicles that depart before the
     scenario's begin are left out, as SUMO leaves them out. A shift across the start or the end of
     the scenario is mirrored there, so the mean number of vehicles within it is that of the demand.
-    Persons, and vehicles that block a lane or wait for a person, are the same every day. A vehicle
-    with a speedFactor of its own keeps it; others draw it from that of their type.
+    Persons, and vehicles that block a lane, wait for a person or are named by one's ride, are the
+    same every day. Times of stops move with the departure. A vehicle with a speedFactor of its own
+    keeps it; others draw it from that of their type.
 
     Args:
         scenario: Any scenario; `demand_as_vehicles` turns its trips and flows into vehicles.
         seed: Number of the day, a non-negative integer.
         day_to_day: Standard deviation of the whole demand of a day, as a share of its mean. It
             comes on top of the Poisson numbers; 0 for none.
+
+    Raises:
+        ScenarioError: A time of a vehicle's stops is none, or duarouter refuses the demand.
     """
     scenario = demand_as_vehicles(scenario)
     vehicles = _vehicles(
         tuple(document.read() for document in scenario.routes),
         _types_beside(scenario),
         tuple(scenario.settings.sumo.items()),
+        _ridden(scenario.additional),
     )
     generator = numpy_generator(seed, "another day")
     begin = scenario.settings.begin_s
@@ -127,7 +159,7 @@ def draw_day(scenario: Scenario, seed: int, day_to_day: float = 0.0) -> Scenario
                 (
                     depart,
                     f'<vehicle id={name} depart="{depart:.2f}"{speed}{vehicles.heads[index]}'
-                    f"{vehicles.tails[index]}</vehicle>",
+                    f"{vehicles.tail(index, depart - vehicles.depart_s[index])}</vehicle>",
                 )
             )
     rows.sort(key=lambda row: row[0])
@@ -148,9 +180,23 @@ def _types_beside(scenario: Scenario) -> bytes:
     return ET.tostring(types)
 
 
+def _ridden(documents: Iterable[Document]) -> frozenset[str]:
+    """Return the vehicles or lines that persons and containers wait for."""
+    return frozenset(
+        name
+        for document in documents
+        for tag in document.scan()
+        if tag.name in ("ride", "transport")
+        for name in tag.attributes.get("lines", "").split()
+    )
+
+
 @functools.lru_cache(maxsize=8)
 def _vehicles(
-    routes: tuple[bytes, ...], types_beside: bytes, sumo: tuple[tuple[str, str], ...]
+    routes: tuple[bytes, ...],
+    types_beside: bytes,
+    sumo: tuple[tuple[str, str], ...],
+    ridden: frozenset[str],
 ) -> _Vehicles:
     """Split route files into single vehicles; cached because many days use the same files."""
     types = ET.Element("additional")
@@ -160,19 +206,27 @@ def _vehicles(
     heads: list[str] = []
     tails: list[str] = []
     kinds: list[str] = []
+    stopping: dict[int, ET.Element] = {}
     own_speeds: list[str | None] = []
+    ridden |= _ridden(Document("routes", None, content) for content in routes)
     for number, content in enumerate(routes):
         rest = ET.Element("routes")
         for element in parse_xml(content, "routes"):
             if element.tag in _TYPE_TAGS:
                 types.append(element)
-            elif element.tag == "vehicle" and (time := _drawn_depart_s(element)) is not None:
+            elif (
+                element.tag == "vehicle"
+                and element.get("id") not in ridden
+                and (time := _drawn_depart_s(element)) is not None
+            ):
+                if own_stops(element):
+                    stopping[len(names)] = element
                 names.append(element.get("id", ""))
                 depart.append(time)
                 kinds.append(element.get("type", ""))
                 own_speeds.append(element.get("speedFactor"))
                 heads.append(_attributes(element))
-                tails.append("".join(ET.tostring(part, "unicode").strip() for part in element))
+                tails.append(_children_text(element))
             else:
                 rest.append(element)
         if len(rest):
@@ -195,6 +249,7 @@ def _vehicles(
         tuple(names),
         tuple(heads),
         tuple(tails),
+        stopping,
         np.array(speeds, dtype=np.float64).reshape(-1, 4),
     )
 
@@ -207,6 +262,10 @@ def _drawn_depart_s(element: ET.Element) -> float | None:
         return parse_time(element.get("depart", "0"))
     except ValueError:
         return None
+
+
+def _children_text(element: ET.Element) -> str:
+    return "".join(ET.tostring(part, "unicode").strip() for part in element)
 
 
 def _attributes(element: ET.Element) -> str:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import functools
+import math
 import tempfile
 import xml.etree.ElementTree as ET
 from collections.abc import Callable, Collection, Iterable, Iterator, Mapping
@@ -13,7 +14,7 @@ from ugat_marl.errors import ScenarioError
 from ugat_marl.files import DocumentDraft, Tag, child_texts, replacing
 from ugat_marl.progress import Reporter
 from ugat_marl.scenarios.scenario import Document, Scenario
-from ugat_marl.scenarios.settings import parse_time
+from ugat_marl.scenarios.settings import parse_time, seconds_text
 from ugat_marl.scenarios.sumo_tools import convert
 
 BLOCKERS = ("closure.", "parking.")
@@ -234,6 +235,26 @@ def laps_of(route: Mapping[str, str]) -> int:
     """Return how often the edges of a route with these attributes are driven."""
     again = route.get("repeat", "")
     return 1 + int(again) if again.isdecimal() else 1
+
+
+def own_stops(element: ET.Element) -> list[ET.Element]:
+    """Return the stops of a vehicle or flow itself, and of the route inside of it."""
+    children = (child if child.tag == "route" else [child] for child in element)
+    return [stop for part in children for stop in part if stop.tag == "stop"]
+
+
+def move_stops(stops: Iterable[ET.Element], seconds: float) -> None:
+    """Move the times of a vehicle's stops by the time by which its departure moves.
+
+    Those of a flow with regular departures count from its begin. Those of a flow with random
+    departures are times of the clock, and those of named routes are relative to the departure.
+    """
+    if math.isnan(seconds):  # it waits for a person or container
+        return
+    for stop in stops:
+        for key in ("until", "arrival", "started", "ended"):
+            if text := stop.get(key):
+                stop.set(key, seconds_text(parse_time(text) + seconds))
 
 
 def _depart_s(text: str, begin_s: float) -> float:

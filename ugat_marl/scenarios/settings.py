@@ -187,6 +187,11 @@ def parse_time(text: str) -> float:
     return seconds
 
 
+def seconds_text(value: float) -> str:
+    """Return a time in s as text for a file, rounded to 1 ms, the resolution of SUMO."""
+    return f"{value:.3f}".rstrip("0").rstrip(".")
+
+
 def _explain(problem: Any) -> str:
     """Return one error of pydantic in the terms of ``scenario.toml``."""
     names = [str(part) for part in problem["loc"]]
