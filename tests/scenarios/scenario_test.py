@@ -20,8 +20,8 @@ import sumo
 from hypothesis import given
 from hypothesis import strategies as st
 
-from ugat_marl.effects import Acceleration, apply_effects, load_scenario
-from ugat_marl.errors import ScenarioError, UnknownNameError
+from ugat_marl.effects import Acceleration, DemandLevel, LateGreen, apply_effects, load_scenario
+from ugat_marl.errors import OutputError, ScenarioError, UnknownNameError
 from ugat_marl.scenarios import (
     Document,
     Scenario,
@@ -204,10 +204,21 @@ def test_written_and_read_again_it_is_the_same(crossing: Crossing, tmp_path: Pat
     assert copy.hash == scenario.hash
     assert copy.settings == scenario.settings
     assert "🚦" in copy.settings.description
-    # And over itself: nothing is lost.
-    before = {file.name: file.read_bytes() for file in (tmp_path / "copy").iterdir()}
-    assert read_scenario(copy.write(tmp_path / "copy")).hash == scenario.hash
-    assert {file.name: file.read_bytes() for file in (tmp_path / "copy").iterdir()} == before
+    # It takes the place of another one.
+    assert read_scenario(copy.write(directory)).hash == scenario.hash
+
+
+def test_a_scenario_is_not_written_over_the_files_it_is_read_from(
+    crossing: Crossing, tmp_path: Path
+) -> None:
+    directory = crossing()
+    before = {file.name: file.read_bytes() for file in directory.iterdir()}
+    (tmp_path / "link").symlink_to(directory)
+    changed = apply_effects(read_scenario(directory), [DemandLevel("*", 0.5), LateGreen("*", 2.0)])
+    for place in (directory, tmp_path / "link"):
+        with pytest.raises(OutputError, match="it there would change them; give another dir"):
+            changed.write(place)
+    assert {file.name: file.read_bytes() for file in directory.iterdir()} == before
 
 
 @given(

@@ -18,7 +18,7 @@ from itertools import takewhile
 from pathlib import Path
 from typing import Any
 
-from ugat_marl.errors import ScenarioError, UnknownNameError, install_command
+from ugat_marl.errors import OutputError, ScenarioError, UnknownNameError, install_command
 from ugat_marl.files import Document, read_toml, read_xml, with_home, write_whole
 from ugat_marl.scenarios.admission import OPTIONS, admitted
 from ugat_marl.scenarios.settings import (
@@ -48,6 +48,8 @@ class Scenario:
         settings: All settings of ``scenario.toml``.
         applied: Descriptions of the effects that made this scenario out of another one.
         outputs: Folders into which measurements of the suite let SUMO write. No file can name one.
+        folder: Folder that it, or the scenario it was made of, was read from; None if it was made
+            in memory.
     """
 
     id: str
@@ -57,6 +59,7 @@ class Scenario:
     settings: ScenarioFile
     applied: tuple[str, ...] = field(default=())
     outputs: tuple[str, ...] = field(default=(), compare=False)
+    folder: Path | None = field(default=None, compare=False)
 
     @property
     def control(self) -> ControlSettings:
@@ -113,9 +116,20 @@ class Scenario:
     def write(self, directory: Path) -> Path:
         """Write a scenario directory that SUMO and `read_scenario` can use.
 
+        Another scenario that is there already is replaced.
+
         Returns:
             `directory`.
+
+        Raises:
+            OutputError: This scenario was read from `directory`.
+            ScenarioError: Two of its files have one name.
         """
+        if self.folder is not None and self.folder.resolve() == directory.resolve():
+            raise OutputError(
+                f"{directory}: holds the files that scenario {self.id!r} was read from, and "
+                "writing it there would change them; give another directory"
+            )
         names = [document.name for document in self.documents]
         if twice := [name for name in names if names.count(name) > 1]:
             raise ScenarioError(
@@ -225,6 +239,7 @@ def _load_directory(directory: Path) -> Scenario:
         additional=tuple(document(name, "additional") for name in settings.additional),
         settings=settings,
         applied=tuple(line.removeprefix(_MADE_BY) for line in first),
+        folder=directory.absolute(),
     )
 
 
@@ -370,7 +385,8 @@ def _load_sumocfg(path: Path, scenario_id: str) -> Scenario:
         },
         str(path),
     )
-    return Scenario(scenario_id, network, routes, additional, settings)
+    folder = path.parent.absolute()
+    return Scenario(scenario_id, network, routes, additional, settings, folder=folder)
 
 
 def _is_file(path: Path) -> bool:
