@@ -23,11 +23,11 @@ from ugat_marl.effects import (
     Incident,
     QueueModel,
     effect_from_record,
-    effects_on_controllers,
     known_effects,
     measurement_effects,
 )
 from ugat_marl.effects.actuators import PHASE_ORDERS
+from ugat_marl.effects.table import ON_CONTROLLERS
 from ugat_marl.envs import OBJECTIVE_MEASURES
 from ugat_marl.envs.observations import OBSERVATION_UNITS
 from ugat_marl.envs.options import EnvOptions
@@ -172,7 +172,7 @@ def test_every_effect_on_controllers_is_documented_with_its_fields_and_ranges() 
     page = (Path(__file__).parents[2] / "docs" / "reference" / "domains.md").read_text()
     rows = dict(re.findall(r"^\| `(\w+)` \| ([^|]+) \|", page, flags=re.MULTILINE))
     others = {kind.name: kind for kind in (Incident, QueueModel, BlockerPatience)}
-    for name, kind in {**effects_on_controllers(), **others}.items():
+    for name, kind in {**ON_CONTROLLERS, **others}.items():
         cell = rows[name]
         assert re.findall(r"`(\w+)`", cell) == [item.name for item in fields(kind)], name
         for parameter in kind.ranges.values():

@@ -14,12 +14,12 @@ from hypothesis import strategies as st
 
 import ugat_marl
 from ugat_marl.effects import (
-    effects_on_controllers,
     load_scenario,
     parse_domain,
     scenario_in_domain,
 )
 from ugat_marl.effects.actuators import ACTING, PHASE_ORDERS, successors
+from ugat_marl.effects.table import ON_CONTROLLERS
 from ugat_marl.envs.actuators import Actuators
 from ugat_marl.errors import OptionError, ScenarioError, UnknownNameError
 from ugat_marl.scenarios import Network, signals, validate_settings
@@ -95,7 +95,7 @@ class Light:
 
 def test_every_effect_has_an_example() -> None:
     assert [text.partition("=")[0] for text in EXAMPLES] == [kind.name for kind in ACTING]
-    assert {kind.name for kind in ACTING} <= set(effects_on_controllers())
+    assert {kind.name for kind in ACTING} <= set(ON_CONTROLLERS)
 
 
 @pytest.mark.parametrize("text", EXAMPLES)

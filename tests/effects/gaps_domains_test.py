@@ -25,7 +25,6 @@ from ugat_marl.effects import (
     Effect,
     StartupDelay,
     domain_label,
-    effects_on_controllers,
     expand_domains,
     load_scenario,
     parse_domain,
@@ -33,6 +32,7 @@ from ugat_marl.effects import (
 )
 from ugat_marl.effects.actuators import successors
 from ugat_marl.effects.sensors import DeadDetectors
+from ugat_marl.effects.table import ON_CONTROLLERS
 from ugat_marl.envs import OBJECTIVE_MEASURES, TrafficEnv
 from ugat_marl.envs.sensors import Sensors
 from ugat_marl.errors import OptionError, ScenarioError, UnknownNameError
@@ -96,7 +96,7 @@ def test_domains_that_do_not_fit_are_left_out(capsys: pytest.CaptureFixture[str]
 
 
 def test_no_name_is_that_of_an_effect_or_of_a_gap() -> None:
-    assert not set(NAMED_DOMAINS) & {*effects_on_controllers(), *GAP_KINDS, "all", "sim"}
+    assert not set(NAMED_DOMAINS) & {*ON_CONTROLLERS, *GAP_KINDS, "all", "sim"}
 
 
 def test_an_unknown_name_gets_the_nearest_of_all() -> None:

@@ -20,13 +20,13 @@ from ugat_marl.effects import (
     apply_effects,
     controller_effects,
     detector_effects,
-    effects_on_controllers,
     known_effects,
     load_scenario,
     parse_domain,
     scenario_in_domain,
 )
 from ugat_marl.effects.sensors import DeadDetectors
+from ugat_marl.effects.table import ON_CONTROLLERS
 from ugat_marl.envs import Infos, Observations
 from ugat_marl.envs.observations import COUNT_SCALE
 from ugat_marl.envs.sensors import Sensors
@@ -82,9 +82,9 @@ def seen(
 
 def test_no_diagnosis_looks_for_them() -> None:
     ours = {kind.name for kind in OBSERVATION_EFFECTS}
-    assert ours <= set(effects_on_controllers())
-    assert not set(effects_on_controllers()) & set(known_effects())
-    assert not set(effects_on_controllers()) & library()
+    assert ours <= set(ON_CONTROLLERS)
+    assert not set(ON_CONTROLLERS) & set(known_effects())
+    assert not set(ON_CONTROLLERS) & library()
 
 
 def test_every_effect_has_an_example() -> None:

@@ -93,7 +93,6 @@ from .table import apply_effects as apply_effects
 from .table import controller_effects as controller_effects
 from .table import detector_effects as detector_effects
 from .table import effect_from_record as effect_from_record
-from .table import effects_on_controllers as effects_on_controllers
 from .table import known_effects as known_effects
 from .table import load_scenario as load_scenario
 from .table import measurement_effects as measurement_effects

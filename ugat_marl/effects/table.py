@@ -2,14 +2,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import fields, replace
 from itertools import groupby
 from pathlib import Path
 from typing import Any
 
 from ugat_marl.effects.actuators import ACTING
-from ugat_marl.effects.base import Effect
+from ugat_marl.effects.base import EVERYWHERE, Effect
 from ugat_marl.effects.demand import DemandLevel, DemandSurge, DemandTiming
 from ugat_marl.effects.detection import (
     DetectorExtension,
@@ -74,15 +74,16 @@ _OF_MEASUREMENT: dict[str, type[Effect]] = {
         DetectorSplash,
     )
 }  # fmt: skip
-_ON_CONTROLLERS: dict[str, type[Effect]] = {
+ON_CONTROLLERS: dict[str, type[Effect]] = {
     kind.name: kind for kind in (*OBSERVATION_EFFECTS, *ACTING, *JUDGING, LaneService)
 }
+"""Effects on controllers by name; no diagnosis looks for them."""
 _OTHERS: dict[str, type[Effect]] = {
     kind.name: kind for kind in (Incident, QueueModel, BlockerPatience, Reach)
 }
 
 EFFECTS: dict[str, type[Effect]] = {
-    **_MEASURABLE, **_OF_MEASUREMENT, **_ON_CONTROLLERS, **_OTHERS
+    **_MEASURABLE, **_OF_MEASUREMENT, **ON_CONTROLLERS, **_OTHERS
 }  # fmt: skip
 """Effects by name."""
 
@@ -95,11 +96,6 @@ def known_effects() -> Mapping[str, type[Effect]]:
 def measurement_effects() -> Mapping[str, type[Effect]]:
     """Return the errors of measurement by name; a diagnosis fits them before other effects."""
     return dict(_OF_MEASUREMENT)
-
-
-def effects_on_controllers() -> Mapping[str, type[Effect]]:
-    """Return the effects on controllers by name; no diagnosis looks for them."""
-    return dict(_ON_CONTROLLERS)
 
 
 def effect_from_record(record: Mapping[str, Any], where: str = "") -> Effect:
@@ -144,12 +140,9 @@ def effect_from_text(text: str) -> Effect:
     parameters = [field.name for field in fields(kind)]
     parts = [part.strip() for part in values.split(",")]
     if len(parts) != len(parameters):
-        short = len(parts) == len(parameters) - len(kind.texts)
-        there = ",".join([*("*" for _ in kind.texts), *parts])
-        hint = f"; everywhere it is {name}={there}" if short and kind.texts else ""
         raise OptionError(
             f"effect {name!r} takes {len(parameters)} value(s), {', '.join(parameters)}; "
-            f"got {values!r}{hint}"
+            f"got {values!r}{_hint(kind, parameters, parts)}"
         )
     given: dict[str, Any] = {}
     for parameter, part in zip(parameters, parts, strict=True):
@@ -158,6 +151,32 @@ def effect_from_text(text: str) -> Effect:
         except ValueError:
             raise OptionError(f"effect {name!r}: {part!r} is not a number") from None
     return kind(**given)
+
+
+def _hint(kind: type[Effect], parameters: Sequence[str], parts: Sequence[str]) -> str:
+    """Return what the parts of a text lack, as the end of an error; "" if there are too many."""
+    left = [part for part in parts if part]
+    completed: list[str] = []
+    missing: list[str] = []
+    for parameter in parameters:
+        if left and _is_number(left[0]) != (parameter in kind.texts):
+            completed.append(left.pop(0))
+        else:
+            completed.append(EVERYWHERE)
+            missing.append(parameter)
+    if left:
+        return ""
+    if all(name in kind.texts and kind.texts[name].everywhere for name in missing):
+        return f"; everywhere it is {kind.name}={','.join(completed)}"
+    return f"; missing: {', '.join(missing)}"
+
+
+def _is_number(text: str) -> bool:
+    try:
+        parse_decimal(text)
+    except ValueError:
+        return False
+    return True
 
 
 def apply_effects(scenario: Scenario, effects: Iterable[Effect]) -> Scenario:
