@@ -871,6 +871,12 @@ def test_more_of_a_sparse_flow_departs_before_its_end() -> None:
         assert len(times) == 2 and max(times) < 910, effects
 
 
+def test_the_period_of_a_flow_may_be_a_time_of_day(crossing: Crossing) -> None:
+    flow = '<flow id="f" begin="0" end="0:01:40" period="0:00:10" route="east"/>'
+    scenario = load_scenario(crossing(vehicles=flow))
+    assert numbers(apply_effects(scenario, [DemandLevel("*", 2.0)])) == {"f": 20}
+
+
 def test_a_surge_has_ended_where_a_burst_begins(crossing: Crossing) -> None:
     burst = '<flow id="b" begin="100" end="100" number="5" route="east"/>'
     scenario = load_scenario(crossing(vehicles=burst))

@@ -371,7 +371,7 @@ def _period_s(flow: ET.Element) -> float | None:
     if hourly := flow.get("vehsPerHour") or flow.get("perHour"):
         rate = float(hourly)
         return 3600 / rate if rate > 0 else None
-    return float(flow.get("period", "0"))
+    return parse_time(flow.get("period", "0"))
 
 
 def departs_by_chance(flow: ET.Element) -> bool:
