@@ -28,6 +28,7 @@ from ugat_marl.effects import (
     load_scenario,
     network_places,
     parse_domain,
+    scenario_in_domain,
 )
 from ugat_marl.envs import parallel_env, vector_env
 from ugat_marl.errors import OptionError, UnknownNameError
@@ -166,11 +167,16 @@ def test_effects_on_detectors_are_written_and_read_with_the_scenario(tmp_path: P
     assert [effect.name for effect in controller_effects(read)] == ["counting_error"]
 
 
-def test_effects_on_detectors_are_no_domain_of_agents() -> None:
+def test_effects_on_detectors_are_no_domain_of_agents(tmp_path: Path) -> None:
     with pytest.raises(OptionError, match="'undercount' changes the reports of detectors, which"):
         parallel_env("single-v1", "V4+undercount=*,0.2")
     with pytest.raises(OptionError, match="'undercount'"):
         vector_env("single-v1", 2, domains=["sim", "undercount=*,0.2"])
+    scenario = load_scenario("single-v1")
+    street = apply_effects(scenario, [Undercount("*", 0.2)]).write(tmp_path / "street")
+    with pytest.raises(OptionError, match="street': 'undercount' changes the reports"):
+        parallel_env("single-v1", str(street))
+    assert detector_effects(scenario_in_domain(scenario, str(street), recorded=True))
 
 
 def test_detectors_belong_to_the_light_they_lead_to_or_stand_behind() -> None:

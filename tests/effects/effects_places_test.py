@@ -474,6 +474,25 @@ def test_an_effect_outside_of_the_episode_is_refused(domain: str) -> None:
         load_scenario(replace(scenario, settings=listed))
 
 
+@pytest.mark.parametrize(
+    ("domain", "least", "message"),
+    [
+        ("parking=east1_A1_0,{},60", (2.99, 3), r"give at least 3 per_hour, or a longer"),
+        ("execution_delay={}", (4.9, 5), "give at least 5 s"),
+        ("observation_delay={}", (4.9, 5), "give at least 5 s"),
+    ],
+)
+def test_an_effect_that_is_rounded_to_nothing_is_refused(
+    domain: str, least: tuple[float, float], message: str
+) -> None:
+    scenario = load_scenario("single-v1").with_duration(600)  # decisions of 10 s
+    below, enough = (domain.format(value) for value in least)
+    with pytest.raises(OptionError, match=f"to none, so it would change nothing; {message}"):
+        scenario_in_domain(scenario, below)
+    for accepted in (enough, domain.format(0)):
+        assert scenario_in_domain(scenario, accepted).applied
+
+
 def test_a_detector_that_errs_outside_of_the_record_is_refused() -> None:
     scenario = load_scenario("single-v1")  # 0 s to 3600 s
     scenario_in_domain(scenario, "stuck=northA_A1_0,3590,3700", recorded=True)

@@ -136,9 +136,13 @@ def _may_not_fit(name: str) -> bool:
 
     Not every network has a barrier order of phases or a lane long enough for an incident. With late
     demand, all vehicles may come after the end of a short episode. A detection zone does not go
-    with a reach, nor with the queue model. A longest green has to hold one decision.
+    with a reach, nor with the queue model. A longest green has to hold one decision, and a delay
+    at least half of one.
     """
-    words = ("phase_order=barrier", "incident=", "demand_timing=", "detection_zone=", "max_green=")
+    words = (
+        "phase_order=barrier", "incident=", "demand_timing=", "detection_zone=", "max_green=",
+        "observation_delay=", "execution_delay=",
+    )  # fmt: skip
     return any(word in NAMED_DOMAINS[name].effects for word in words)
 
 

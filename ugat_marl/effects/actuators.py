@@ -16,7 +16,13 @@ from typing import ClassVar, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from ugat_marl.effects.base import ControllerEffect, Effect, NumberParameter, TextParameter
+from ugat_marl.effects.base import (
+    ControllerEffect,
+    DelayEffect,
+    Effect,
+    NumberParameter,
+    TextParameter,
+)
 from ugat_marl.effects.controllers import Actuator, Commands, whole_decisions
 from ugat_marl.errors import ScenarioError
 from ugat_marl.scenarios import (
@@ -36,12 +42,10 @@ _INSTANT_S = 1e-6
 
 
 @dataclass(frozen=True)
-class ExecutionDelay(ControllerEffect):
+class ExecutionDelay(DelayEffect):
     """Commands take effect after `seconds`, rounded to decisions; until then the light stays."""
 
     name: ClassVar[str] = "execution_delay"
-    ranges: ClassVar[dict[str, NumberParameter]] = {"seconds": NumberParameter("s", 0.0, 600.0)}
-    seconds: float
 
     def actuator(
         self, network: Network, timing: SignalTiming, decision_interval_s: float

@@ -9,7 +9,7 @@ from dataclasses import dataclass, fields, replace
 from numbers import Real
 from typing import Any, ClassVar, Literal
 
-from ugat_marl.effects.controllers import ControllerPart, Cost
+from ugat_marl.effects.controllers import ControllerPart, Cost, whole_decisions
 from ugat_marl.errors import OptionError, UnknownNameError
 from ugat_marl.scenarios import Detector, Period, Scenario
 
@@ -152,6 +152,19 @@ class Effect(ControllerPart):
         begin, end = getattr(self, "begin_s", None), getattr(self, "end_s", None)
         return None if begin is None or end is None else (begin, end)
 
+    def idle_in(self, scenario: Scenario) -> str:
+        """Return why the effect would change nothing in a scenario, and the way out; else ""."""
+        window = self.window(scenario)
+        begin = scenario.settings.begin_s
+        end = begin + scenario.settings.duration_s
+        if window is None or (window[0] < end and window[1] > begin):
+            return ""
+        return (
+            f"it lasts from {window[0]:g} s to {window[1]:g} s, and the episode of scenario "
+            f"{scenario.id!r} from {begin:g} s to {end:g} s, so it would change nothing; give "
+            "times within the episode, or a longer duration_s"
+        )
+
     @staticmethod
     def apply_all(scenario: Scenario, effects: Sequence[Any]) -> Scenario:
         """Apply effects that have this method in common, one after the other."""
@@ -281,6 +294,24 @@ class ControllerEffect(Effect):
         first = [item for item in others if item.get("name") not in names]
         then = sorted([own, *(item for item in others if item.get("name") in names)], key=identity)
         return with_listed_effects(scenario, self, [*first, *then])
+
+
+@dataclass(frozen=True)
+class DelayEffect(ControllerEffect):
+    """Base of delays of `seconds`, rounded to decisions."""
+
+    ranges: ClassVar[dict[str, NumberParameter]] = {"seconds": NumberParameter("s", 0.0, 600.0)}
+    seconds: float
+
+    def idle_in(self, scenario: Scenario) -> str:
+        """Say that the delay is rounded to no decision."""
+        interval_s = scenario.control.decision_interval_s
+        if not self.seconds or whole_decisions(self.seconds, interval_s):
+            return ""
+        return (
+            f"it is rounded to decisions of {interval_s:g} s, to none, so it would change nothing; "
+            f"give at least {interval_s / 2:g} s"
+        )
 
 
 def _names_below(kind: type[Effect]) -> Iterator[str]:

@@ -20,9 +20,10 @@ from ugat_marl.effects.sensors import DetectionZone
 from ugat_marl.effects.table import (
     EFFECTS,
     apply_effects,
+    detector_effects,
     effect_from_text,
     load_scenario,
-    refuse_outside,
+    refuse_idle,
 )
 from ugat_marl.errors import OptionError, ScenarioError, UnknownNameError, nearest
 from ugat_marl.files import with_home
@@ -346,6 +347,8 @@ def scenario_in_domain(
     """
     if (path := domain_path(domain)) is not None:
         other = load_scenario(path, duration_s)
+        if not recorded:
+            _refuse_detectors(domain, detector_effects(other))
         if _signals(other) != _signals(scenario):
             raise ScenarioError(
                 f"domain {domain!r} has other roads or signals than scenario {scenario.id!r}; "
@@ -357,7 +360,7 @@ def scenario_in_domain(
     if not recorded:
         _refuse_detectors(domain, effects)
     scenario = scenario.with_duration(duration_s)
-    refuse_outside(scenario, effects)
+    refuse_idle(scenario, effects)
     return _checked(apply_effects(scenario, effects))
 
 

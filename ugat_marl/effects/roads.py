@@ -144,8 +144,7 @@ class Parking(Effect):
             ScenarioError: The scenario has the queue model, whose lanes cannot be blocked.
         """
         _refuse_queues(scenario, self)
-        settings = scenario.settings
-        number = math.floor(self.per_hour * settings.duration_s / 3600.0 + 0.5)
+        settings, number = scenario.settings, self._vehicles(scenario)
         # a second effect on the lane parks at other times
         again = salt_of(scenario, self, self.lane).removeprefix(f"{self.name} {self.lane}").split()
         names = (self.name, self.lane, *again)
@@ -153,6 +152,21 @@ class Parking(Effect):
         departs = [settings.begin_s + part * settings.duration_s for part in parts]
         stand = {"duration": seconds_text(self.dwell_s)}
         return _with_blockers(scenario, self, self.lane, departs, stand)
+
+    def idle_in(self, scenario: Scenario) -> str:
+        """Say that the rate is rounded to no vehicle in the episode."""
+        if not self.per_hour or self._vehicles(scenario):
+            return ""
+        seconds = scenario.settings.duration_s
+        least = math.ceil(100 * 1800.0 / seconds) / 100
+        return (
+            f"it is rounded to vehicles in the episode of {seconds:g} s, to none, so it would "
+            f"change nothing; give at least {least:g} per_hour, or a longer duration_s"
+        )
+
+    def _vehicles(self, scenario: Scenario) -> int:
+        """Return the number of vehicles in the episode."""
+        return math.floor(self.per_hour * scenario.settings.duration_s / 3600.0 + 0.5)
 
 
 @dataclass(frozen=True)

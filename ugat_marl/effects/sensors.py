@@ -14,7 +14,7 @@ from typing import ClassVar
 import numpy as np
 from numpy.typing import NDArray
 
-from ugat_marl.effects.base import ControllerEffect, NumberParameter
+from ugat_marl.effects.base import ControllerEffect, DelayEffect, NumberParameter
 from ugat_marl.effects.controllers import Reading, Sensor, Stage, whole_decisions
 from ugat_marl.scenarios import Network
 from ugat_marl.seeding import numpy_generator
@@ -165,12 +165,10 @@ class _Zone(Sensor):
 
 
 @dataclass(frozen=True)
-class ObservationDelay(ControllerEffect):
+class ObservationDelay(DelayEffect):
     """Counts arrive after `seconds`, rounded to decisions; phases are known at once."""
 
     name: ClassVar[str] = "observation_delay"
-    ranges: ClassVar[dict[str, NumberParameter]] = {"seconds": NumberParameter("s", 0.0, 600.0)}
-    seconds: float
 
     def sensor(self, network: Network, decision_interval_s: float) -> Sensor:
         """Make a sensor that delays counts by whole decisions."""

@@ -217,27 +217,20 @@ def load_scenario(name: str | Path | Scenario, played_s: float | None = None) ->
     effects = [effect_from_record(record, where) for record in scenario.settings.effects]
     plain = replace(scenario, settings=scenario.settings.model_copy(update={"effects": ()}))
     played = plain.with_duration(played_s)
-    refuse_outside(played, effects)
+    refuse_idle(played, effects)
     changed = apply_effects(played, effects)
     return changed if played_s is None else changed.with_duration(plain.settings.duration_s)
 
 
-def refuse_outside(scenario: Scenario, effects: Iterable[Effect]) -> None:
-    """Refuse effects whose times lie wholly outside of the scenario's.
+def refuse_idle(scenario: Scenario, effects: Iterable[Effect]) -> None:
+    """Refuse effects that would change nothing in a scenario, see `Effect.idle_in`.
 
     Raises:
-        OptionError: An effect would change nothing.
+        OptionError: There is one.
     """
-    begin = scenario.settings.begin_s
-    end = begin + scenario.settings.duration_s
     for effect in effects:
-        window = effect.window(scenario)
-        if window is not None and (window[0] >= end or window[1] <= begin):
-            raise OptionError(
-                f"effect {effect}: it lasts from {window[0]:g} s to {window[1]:g} s, and the "
-                f"episode of scenario {scenario.id!r} from {begin:g} s to {end:g} s, so it would "
-                "change nothing; give times within the episode, or a longer duration_s"
-            )
+        if why := effect.idle_in(scenario):
+            raise OptionError(f"effect {effect}: {why}")
 
 
 def detector_effects(scenario: Scenario) -> tuple[Effect, ...]:
