@@ -321,6 +321,16 @@ def test_options_of_a_sumocfg_may_have_former_names(crossing: Crossing) -> None:
     assert SumoConfiguration(directory / "city.sumocfg").ignored() == ["seed = 4"]
 
 
+@pytest.mark.parametrize("no", ["false", "0", "Off", "-"])
+def test_a_sumocfg_may_say_that_it_has_car_following(no: str, crossing: Crossing) -> None:
+    directory = crossing()
+    expected = read_scenario(configure(directory, INPUT)).hash
+    file = configure(directory, f'{INPUT}<mesosim value="{no}"/>')
+    assert read_scenario(file).hash == expected
+    with pytest.raises(ScenarioError, match="mesosim = 'true': the mesoscopic model"):
+        read_scenario(configure(directory, f'{INPUT}<mesosim value="true"/>'))
+
+
 def test_options_of_a_sumocfg_count_wherever_they_stand(crossing: Crossing) -> None:
     directory = crossing()
     times = '<begin value="100"/><end value="200"/>'

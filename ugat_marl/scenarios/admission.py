@@ -136,11 +136,9 @@ _MOST_OF: Mapping[str, int] = {
 """Largest values of attributes for which SUMO takes memory or time: the vehicles of a flow, the
 laps of a route, the spaces of a parking area, and the places of a stop."""
 
-_YES_OR_NO = _words(
-    """
-    1 0 true false yes no on off t f x -
-    """
-)
+NO = frozenset({"0", "false", "no", "off", "f", "-"})
+"""Words that SUMO reads as false, in small letters."""
+_YES_OR_NO = NO | {"1", "true", "yes", "on", "t", "x"}
 _PLAIN = re.compile(r"(?!-)[\w .,:;+*%#-]*", re.ASCII)
 
 _DEVICES = _words(

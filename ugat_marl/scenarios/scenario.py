@@ -20,7 +20,7 @@ from typing import Any
 
 from ugat_marl.errors import OutputError, ScenarioError, UnknownNameError, install_command
 from ugat_marl.files import Document, read_toml, read_xml, with_home, write_whole
-from ugat_marl.scenarios.admission import OPTIONS, admitted
+from ugat_marl.scenarios.admission import NO, OPTIONS, admitted
 from ugat_marl.scenarios.settings import (
     ControlSettings,
     ScenarioFile,
@@ -332,6 +332,8 @@ class SumoConfiguration:
     def physics(self) -> dict[str, Any]:
         """Return step length, options of SUMO and times of signals, as in ``scenario.toml``."""
         options = {option: self.given[option] for option in self.given if option in OPTIONS}
+        if options.get("mesosim", "").lower() in NO:  # SUMO's own default
+            del options["mesosim"]
         step_s = self.seconds("step-length", "1")
         times = usual_times(step_s) if step_s > 0 else {}
         settings: dict[str, Any] = {"step_length_s": step_s, "sumo": options}
