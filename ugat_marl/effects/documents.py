@@ -19,8 +19,8 @@ from ugat_marl.scenarios import (
     TRAVELLERS,
     Document,
     Scenario,
+    departure_s,
     is_blocker,
-    parse_time,
     seconds_text,
 )
 
@@ -238,10 +238,7 @@ def depart_s(element: Root) -> float:
         if element.tag.lower().endswith("flow")
         else element.get("depart", "")
     )
-    try:
-        return parse_time(text)
-    except ValueError:
-        return math.nan
+    return departure_s(text)
 
 
 def sort_departures(root: Root) -> None:

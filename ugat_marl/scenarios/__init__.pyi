@@ -88,6 +88,7 @@ from .routes import TRAVELLERS as TRAVELLERS
 from .routes import blocker_types as blocker_types
 from .routes import demand_as_vehicles as demand_as_vehicles
 from .routes import demand_scale as demand_scale
+from .routes import departure_s as departure_s
 from .routes import departures as departures
 from .routes import driven_routes as driven_routes
 from .routes import is_blocker as is_blocker

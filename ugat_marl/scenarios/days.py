@@ -21,12 +21,12 @@ from ugat_marl.errors import ScenarioError
 from ugat_marl.files import parse_xml, xml_bytes
 from ugat_marl.scenarios.routes import (
     demand_as_vehicles,
+    departure_s,
     is_blocker,
     move_stops,
     own_stops,
 )
 from ugat_marl.scenarios.scenario import Document, Scenario
-from ugat_marl.scenarios.settings import parse_time
 from ugat_marl.scenarios.speed_factors import SpeedFactors
 from ugat_marl.seeding import numpy_generator
 
@@ -217,7 +217,8 @@ def _vehicles(
             elif (
                 element.tag == "vehicle"
                 and element.get("id") not in ridden
-                and (time := _drawn_depart_s(element)) is not None
+                and not is_blocker(element.get("id", ""), element.get("type", ""))
+                and not np.isnan(time := departure_s(element.get("depart", "0")))
             ):
                 if own_stops(element):
                     stopping[len(names)] = element
@@ -252,16 +253,6 @@ def _vehicles(
         stopping,
         np.array(speeds, dtype=np.float64).reshape(-1, 4),
     )
-
-
-def _drawn_depart_s(element: ET.Element) -> float | None:
-    """Return the departure of a vehicle, s; None if it blocks a lane or something triggers it."""
-    if is_blocker(element.get("id", ""), element.get("type", "")):
-        return None
-    try:
-        return parse_time(element.get("depart", "0"))
-    except ValueError:
-        return None
 
 
 def _children_text(element: ET.Element) -> str:

@@ -59,16 +59,14 @@ def conflicting_greens(phase: str, links: Sequence[Link], foes: Matrix) -> tuple
     calls them foes, and merging right turns are always green.
     """
     green = [link for link in links if phase[link.index] == "G"]
+    crossing = _crossing_approaches(links, foes)
     for position, a in enumerate(green):
         for b in green[position + 1 :]:
             if (
                 a.from_edge != b.from_edge
                 and a.to_edge != b.to_edge
                 and are_foes(a, b, foes)
-                and (
-                    "s" in (a.direction, b.direction)
-                    or (a.from_edge, b.from_edge) in _crossing_approaches(links, foes)
-                )
+                and ("s" in (a.direction, b.direction) or (a.from_edge, b.from_edge) in crossing)
             ):
                 return a.index, b.index
     return None

@@ -222,7 +222,8 @@ def departures(
         for tag in document.scan(reporter):
             if tag.name == "vehicle":
                 name, text = tag.attributes.get("id", ""), tag.attributes.get("depart", "0")
-                depart = _depart_s(text, begin)
+                depart = departure_s(text)
+                depart = begin if math.isnan(depart) else depart
                 blocks = is_blocker(name, tag.attributes.get("type", ""))
                 if depart >= end:  # vehicles are sorted by departure
                     break
@@ -257,12 +258,12 @@ def move_stops(stops: Iterable[ET.Element], seconds: float) -> None:
                 stop.set(key, seconds_text(parse_time(text) + seconds))
 
 
-def _depart_s(text: str, begin_s: float) -> float:
-    """Return the time of a departure; words, such as "triggered", stand for the begin."""
+def departure_s(text: str) -> float:
+    """Return the time of a departure, s; NaN for a word such as "triggered"."""
     try:
         return parse_time(text)
     except ValueError:
-        return begin_s
+        return math.nan
 
 
 def _test_file(document: Document, test: Callable[[Document], bool]) -> bool:
@@ -407,10 +408,7 @@ def _from_begin(documents: Iterable[Document], begin_s: float) -> tuple[Document
 def _is_early(name: str, attributes: Mapping[str, str], begin_s: float) -> bool:
     if name != "flow" or "probability" not in attributes:
         return False
-    try:
-        return parse_time(attributes.get("begin", "0")) < begin_s
-    except ValueError:  # begins with another vehicle
-        return False
+    return departure_s(attributes.get("begin", "0")) < begin_s  # not if another vehicle begins it
 
 
 def _for_sumo(document: Document, directory: Path) -> Path:
