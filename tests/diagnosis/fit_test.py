@@ -5,6 +5,8 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Sequence
 from dataclasses import replace
+from types import SimpleNamespace
+from typing import Any
 
 import numpy as np
 import pytest
@@ -13,7 +15,14 @@ from numpy.typing import NDArray
 from ugat_marl.diagnosis import Hypothesis, Reference, Tally
 from ugat_marl.diagnosis.engine import Engine, OrdinaryDays, Replicate, spread
 from ugat_marl.diagnosis.features import BIN_FEATURES, FEATURES, INDEX
-from ugat_marl.diagnosis.fit import Fitter, _may_move, _moved_a_little, _shifted, uncertainty
+from ugat_marl.diagnosis.fit import (
+    Fitter,
+    _may_move,
+    _moved_a_little,
+    _shifted,
+    _straightness,
+    uncertainty,
+)
 from ugat_marl.diagnosis.hypotheses import Members
 from ugat_marl.diagnosis.propose import Direction
 from ugat_marl.diagnosis.records import Fitted
@@ -531,13 +540,30 @@ class Shaken(World):
         return day(number, {name: value + 0.1 * (value != 1.4) for name, value in values.items()})
 
 
-def test_what_all_moves_have_in_common_makes_no_interval_wide() -> None:
-    shaken = a_fitter({"headway": 1.4}, street=17)
+def test_what_all_moves_have_in_common_changes_no_interval() -> None:
+    """It seems that a value does more than it does, so that its first error is too small."""
+    straight, shaken = (a_fitter({"headway": 1.4}, street=17) for _ in range(2))
     shaken.engine = Shaken()
+    right, _ = uncertainty(straight, straight.simulate(start((HEADWAY, 1.4))))
     model = shaken.simulate(start((HEADWAY, 1.4)))
-    plain, _ = uncertainty(shaken, model)
+    small, _ = uncertainty(shaken, model)
     told, _ = uncertainty(shaken, model, steps=True)
-    assert told == pytest.approx(plain, rel=0.05)
+    assert small[0] < 0.9 * right[0]
+    assert told == pytest.approx(right, rel=0.02)
+
+
+def test_moves_to_both_ends_of_a_range_may_be_crooked() -> None:
+    """Four moves, to 0.1 s and to 10 s twice each, of which those below do nothing."""
+
+    def difference(_model: object, members: Members) -> tuple[dict[str, Any], dict[str, Any]]:
+        return {"moved": members[0][1][0] - 5.0}, {}
+
+    fitter: Any = SimpleNamespace(thresholds=THRESHOLDS, difference=difference)
+    model: Any = SimpleNamespace(members=start((HEADWAY, 5.0)))
+    found = _straightness(fitter, model, np.array([9.0]), lambda x: np.array([max(x["moved"], 0)]))
+    slope = 25.0 / (25.0 + 4.9**2)
+    left = 2 * (4.9**2 + (5.0 / slope - 5.0) ** 2) / 3
+    assert [float(x[0]) for x in found] == pytest.approx([slope, left])
 
 
 @pytest.mark.parametrize("name", ["dropout", "stuck", "lane_closure"])

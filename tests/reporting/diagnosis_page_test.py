@@ -14,7 +14,14 @@ import pytest
 from rich.console import Console
 
 from tests.reporting.pages import Page, assert_drawn, needs_browser, seen_in_browser
-from ugat_marl.diagnosis import Diagnosis, DiagnosisConfig, statistic
+from ugat_marl.diagnosis import (
+    Diagnosis,
+    DiagnosisConfig,
+    EffectRecord,
+    Parameter,
+    ordered,
+    statistic,
+)
 from ugat_marl.diagnosis.features import ALL_FEATURES, FEATURES
 from ugat_marl.diagnosis.verdict import STATISTICS
 from ugat_marl.diagnosis.workflow import _without_search
@@ -189,15 +196,19 @@ def test_a_page_for_every_verdict(verdict: str, network: Network) -> None:
 
 def test_effects_are_told_as_a_domain_takes_them(network: Network) -> None:
     diagnosis = diagnosis_of("explained")
-    domain = "headway=1.451+demand_surge=S_C,300,900,1.8"
+    domain = "demand_surge=S_C,300,900,1.8+headway=1.451"
     assert f"as a domain: {domain}" in printed(diagnosis)
     assert f"As a domain: {domain}" in Page(diagnosis_page(diagnosis, network)).text
     effects = parse_domain(
-        "turning=S_C,C_N,0.2+driver_model=IDM+detector_extension=stop@S_C,0.7,merged"
-        "+swapped=S:1,S:2+late_green=*,2+detector_speeds=advance,front"
+        "turning=S_C,C_N,0.2+driver_model=IDM+detector_extension=stop@S_C,0.7,merged+late_green=*,2"
+        "+undercount=stop@S_C,0.1+heavy_share=0.2+acceleration=1.5"
     )
-    records = [_without_search(effect, "signal log") for effect in effects]
-    assert parse_domain(words.as_domain(records)) == effects
+    records = [_without_search(effect, "signal log") for effect in reversed(effects)]
+    shown = ordered([effect for effect in effects if not effect.on_detectors])
+    assert len(shown) == 5
+    assert parse_domain(words.as_domain(records)) == shown
+    everywhere = EffectRecord("late_green", None, None, {"seconds": Parameter(2, None, None, "s")})
+    assert words.as_domain([everywhere]) == "late_green=*,2"
 
 
 def test_headways_are_drawn_by_position_in_the_queue(network: Network) -> None:

@@ -199,10 +199,15 @@ def test_a_radar_shows_a_grounding_whose_alpha_does_not_follow_u() -> None:
     fixed, ungated = variant_name("phase", "α = 0.3"), variant_name("timed", "no gate")
     labels = [DIRECT, fixed, ungated, matched_name("timed")]
     lines = training_page._radar_lines(labels, {(label, "V4"): {} for label in labels}, "V4")
-    assert [*lines][1:] == [f"{label} in V4" for label in labels]
-    assert charts._row_of("phase", labels) == fixed
-    assert charts._row_of("timed", labels) == ungated
-    assert charts._row_of("timed", ["timed: no gate", "timed"]) == "timed"
+    assert [*lines][1:] == [f"{label} in V4" for label in (DIRECT, fixed, ungated)]
+    variants = [variant_name("phase", f"α = {k}") for k in range(9)]
+    labels_of_alpha = [DIRECT, *variants, *GROUNDED_NAME.values(), RULE]
+    cells = {(label, "V4"): {} for label in labels_of_alpha}
+    alone = training_page._radar_lines(labels_of_alpha, cells, "V4")
+    assert [*alone][1:] == [f"{x} in V4" for x in (DIRECT, *GROUNDED_NAME.values(), RULE)]
+    assert charts.row_of("phase", labels) == fixed
+    assert charts.row_of("timed", labels) == ungated
+    assert charts.row_of("timed", ["timed: no gate", "timed"]) == "timed"
 
 
 def test_settings_of_fewer_trainings_are_named() -> None:

@@ -1,5 +1,6 @@
 from .engine import default_cache as default_cache
 from .features import Tally as Tally
+from .hypotheses import WINDOW as WINDOW
 from .hypotheses import Hypothesis as Hypothesis
 from .hypotheses import free_values as free_values
 from .hypotheses import global_hypotheses as global_hypotheses

@@ -142,7 +142,7 @@ class Budget:
 
     Attributes:
         spent_h: Simulated hours so far.
-        ended: Setting of the budget that has ended; None while there is some left.
+        ended: Setting of the budget that ended first; None while there is some left.
     """
 
     def __init__(self, hours: float = math.inf, deadline: float | None = None) -> None:
@@ -161,7 +161,7 @@ class Budget:
         with self._lock:
             late = self._deadline is not None and time.monotonic() > self._deadline
             if late or self.spent_h >= self._hours:
-                self.ended = "budget_s" if late else "budget_h"
+                self.ended = self.ended or ("budget_s" if late else "budget_h")
                 raise OutOfTime("the budget is spent")
             self.spent_h += period.length_s / 3600.0
 

@@ -437,21 +437,27 @@ def derivatives(changes: Sequence[Change], whitener: Whitener) -> Array:
 # --- intervals ------------------------------------------------------------------------------------
 
 
-def _crookedness(
+def _straightness(
     fitter: Fitter, model: Fitted, errors: Array, response: Callable[[dict[str, Array]], Array]
-) -> Array:
-    """Return the squared error of the free values because statistics are not linear in them.
+) -> tuple[Array, Array]:
+    """Return how the estimates of the free values follow the values.
 
-    A value that moves by x should move its estimate by x. The error is the mean square of the
-    deviations from the best straight line through these moves. What all moves have in common is no
-    part of it: it is noise of the days before the move, which the errors of the values hold.
+    A value that moves by x should move its estimate by x. An estimate that moves by a part of it
+    is as much less certain. Deviations from the best straight line through these moves are errors
+    of the value. What all moves have in common is no such error: it is noise of the days before the
+    move, which `errors` hold.
 
     Args:
         fitter: Simulator of models.
         model: The model.
         errors: Standard errors of its free values, ``(free values,)``.
         response: Function from a change of the statistics to the change of the estimates.
+
+    Returns:
+        Slopes of these lines, up to 1, and mean squares of the deviations, ``(free values,)`` each.
+        Where an estimate does not follow, the slope is 1, and the moves count as deviations.
     """
+    slopes: list[float] = []
     squares: list[float] = []
     for place, (hypothesis, values) in enumerate(model.members):
         for index, value in enumerate(values):
@@ -467,16 +473,16 @@ def _crookedness(
             asked, got = np.array(moves).reshape(-1, 2).T
             size = float(np.mean(asked**2)) if moves else 0.0
             free = len(moves) - 1
-            if free > 1:  # a line through two moves is exact if it need not begin at 0
+            if len(set(asked)) > 2:  # a line through two moves is exact if it need not begin at 0
                 asked, got, free = asked - asked.mean(), got - got.mean(), free - 1
             slope = float(asked @ got) / max(float(asked @ asked), 1e-12)
-            if free < 1:
-                squares.append(0.0)
-            elif slope < fitter.thresholds.blunt:
-                squares.append(size)
-            else:
+            follows = free >= 1 and slope >= fitter.thresholds.blunt
+            slopes.append(min(slope, 1.0) if follows else 1.0)
+            if follows:
                 squares.append(float(((got / slope - asked) ** 2).sum()) / free)
-    return np.array(squares)
+            else:
+                squares.append(size if free >= 1 else 0.0)
+    return np.array(slopes), np.array(squares)
 
 
 def _spread_of_days(
@@ -547,6 +553,6 @@ def uncertainty(
         extra[name] = np.where(np.isfinite(block.mean), np.nan_to_num(variances), 0.0)
     errors = np.sqrt(np.diag(covariance)[:free])
     if steps:
-        errors = np.sqrt(errors**2 + _crookedness(fitter, model, errors, response))
-
+        slopes, squares = _straightness(fitter, model, errors, response)
+        errors = np.sqrt((errors / slopes) ** 2 + squares)
     return errors, extra

@@ -50,7 +50,6 @@ from .row_names import RULE as RULE
 from .row_names import STREET as STREET
 from .row_names import TIMED as TIMED
 from .row_names import is_grounded as is_grounded
-from .row_names import short_name as short_name
 from .row_names import variant_name as variant_name
 from .scenario_check import MUCH_LESS as MUCH_LESS
 from .scenario_check import RuleEpisode as RuleEpisode

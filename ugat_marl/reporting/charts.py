@@ -340,14 +340,14 @@ def draw_table(rows: Sequence[Mapping[str, Any]], sim: str, folder: Path) -> Non
         folder: Folder for the pictures.
     """
     settings = cells_of(rows)[0]
-    grounded = [_row_of(kind, settings) for kind in GROUNDED_NAME]
+    grounded = [row_of(kind, settings) for kind in GROUNDED_NAME]
     named = (*grounded, matched_name("timed"))
     drawn = [DIRECT, *dict.fromkeys(name for name in named if name in settings)]
     comparison_radar(rows, drawn, sim, folder / "radar.png")
     gap_picture(rows, folder / "gaps.png")
 
 
-def _row_of(grounding: str, settings: Sequence[str]) -> str:
+def row_of(grounding: str, settings: Sequence[str]) -> str:
     """Return the name of the row of a grounding: the usual one, or else its first variant."""
     usual = GROUNDED_NAME[grounding]
     variants = (name for name in settings if name.startswith(variant_name(grounding, "")))

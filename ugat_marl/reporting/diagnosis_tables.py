@@ -36,7 +36,8 @@ def diagnosis_summary(diagnosis: Diagnosis, names: LightNames) -> RenderableType
         blocks.append(Text(f"What would tell: {diagnosis.next_measurement}."))
     if diagnosis.effects:
         blocks.append(_effects(diagnosis.effects, names))
-        blocks.append(Text(f"as a domain: {words.as_domain(diagnosis.effects)}"))
+        if domain := words.as_domain(diagnosis.effects):
+            blocks.append(Text(f"as a domain: {domain}"))
     if diagnosis.where:
         blocks.append(_where(diagnosis, names))
     if diagnosis.heldout is not None:

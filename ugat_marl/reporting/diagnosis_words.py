@@ -4,9 +4,9 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Iterable
-from dataclasses import fields
 
 from ugat_marl.diagnosis import (
+    WINDOW,
     ApproachRow,
     CriteriaRow,
     Diagnosis,
@@ -17,8 +17,9 @@ from ugat_marl.diagnosis import (
     Thresholds,
     Verdict,
     clock,
+    ordered,
 )
-from ugat_marl.effects import known_effects, measurement_effects
+from ugat_marl.effects import EVERYWHERE, Effect, known_effects
 from ugat_marl.reporting.formats import chance, number, share
 from ugat_marl.reporting.light_names import LightNames
 
@@ -105,24 +106,24 @@ def values(effect: EffectRecord, *, intervals: bool = True) -> str:
 
 
 def as_domain(effects: Iterable[EffectRecord]) -> str:
-    """Return effects as ``--domain`` takes them, such as ``headway=1.451+late_green=*,2``."""
-    return "+".join(map(_as_typed, effects))
+    """Return effects as ``--domain`` takes them, such as ``headway=1.451+late_green=*,2``.
+
+    They stand in the order in which a corrected scenario has them. Errors of detectors, which no
+    agent sees, and effects of another version are left out.
+    """
+    kinds = known_effects()
+    made = [_effect_of(kinds[effect.name], effect) for effect in effects if effect.name in kinds]
+    return "+".join(map(str, ordered([effect for effect in made if not effect.on_detectors])))
 
 
-def _as_typed(effect: EffectRecord) -> str:
-    kind = {**known_effects(), **measurement_effects()}.get(effect.name)
-    if kind is None:  # in a file of another version
-        return effect.name
-    values = dict(zip(kind.texts, (effect.place or "").split(">"), strict=False))
-    if effect.window is not None:
-        begin_s, end_s = effect.window
-        values |= {"begin_s": f"{begin_s:.12g}", "end_s": f"{end_s:.12g}"}
+def _effect_of(kind: type[Effect], effect: EffectRecord) -> Effect:
+    """Return an effect with four digits of its values."""
+    texts = dict(zip(kind.texts, (effect.place or EVERYWHERE).split(">"), strict=False))
+    numbers = dict(zip(WINDOW, effect.window or (), strict=False))
     for name, limits in kind.ranges.items():
         if name in effect.parameters:
-            rounded = float(f"{effect.parameters[name].value:.4g}")
-            values[name] = f"{limits.nearest(rounded):.12g}"
-    texts = (values[field.name] for field in fields(kind) if field.name in values)
-    return f"{effect.name}={','.join(texts)}"
+            numbers[name] = limits.nearest(float(f"{effect.parameters[name].value:.4g}"))
+    return kind(**texts, **numbers)
 
 
 def _parameter(name: str, parameter: Parameter, intervals: bool) -> str:

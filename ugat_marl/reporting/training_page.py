@@ -25,7 +25,6 @@ from ugat_marl.experiments import (
     check_run,
     is_grounded,
     outcome_of,
-    short_name,
 )
 from ugat_marl.reporting import charts
 from ugat_marl.reporting.figures import NamedFigure, picture_name, printable
@@ -52,8 +51,6 @@ _OPEN = 4
 """Largest number of sections that are shown unfolded."""
 _WORST = 10
 """Number of intersections in the table of the longest queues."""
-_RADARS = (DIRECT, *map(short_name, GROUNDED_NAME.values()), ORACLE, RULE)
-"""Beginnings of the rows on a radar, each with room for one line."""
 _RADAR = "Every axis is scaled by its best value, at the rim; the middle is worst."
 _STRETCH = "Mean of a stretch of episodes, with its 95 % interval over "
 
@@ -308,9 +305,11 @@ def _cell(row: Mapping[str, Any], key: str, *, sign: bool) -> str:
 
 
 def _radar_lines(labels: Sequence[str], cells: charts.Cells, domain: str) -> dict[str, list[float]]:
-    shown = [label for label in labels if label.startswith(_RADARS) and (label, domain) in cells]
+    grounded = (charts.row_of(grounding, labels) for grounding in GROUNDED_NAME)
+    begins = (DIRECT, *grounded, ORACLE, RULE)  # of a row's label, each with room for one line
+    shown = [label for label in labels if label.startswith(begins) and (label, domain) in cells]
     lines: dict[str, list[float]] = {}
-    for place, label in enumerate(shown[: len(_RADARS)]):
+    for place, label in enumerate(shown[: len(begins)]):
         row = cells[label, domain]
         if place == 0:
             lines[f"{label} in the simulation"] = [
