@@ -119,7 +119,8 @@ def as_domain(effects: Iterable[EffectRecord]) -> str:
 def _effect_of(kind: type[Effect], effect: EffectRecord) -> Effect:
     """Return an effect with four digits of its values."""
     texts = dict(zip(kind.texts, (effect.place or EVERYWHERE).split(">"), strict=False))
-    numbers = dict(zip(WINDOW, effect.window or (), strict=False))
+    numbers: dict[str, float] = {}
+    numbers.update(zip(WINDOW, effect.window or (), strict=False))
     for name, limits in kind.ranges.items():
         if name in effect.parameters:
             numbers[name] = limits.nearest(float(f"{effect.parameters[name].value:.4g}"))
