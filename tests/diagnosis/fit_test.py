@@ -19,6 +19,7 @@ from ugat_marl.diagnosis.fit import (
     Fitter,
     _may_move,
     _moved_a_little,
+    _possible,
     _shifted,
     _straightness,
     uncertainty,
@@ -550,6 +551,26 @@ def test_what_all_moves_have_in_common_changes_no_interval() -> None:
     told, _ = uncertainty(shaken, model, steps=True)
     assert small[0] < 0.9 * right[0]
     assert told == pytest.approx(right, rel=0.02)
+
+
+class Jumping(World):
+    """What 1.4 s does is far from what any other value does, and on the same side of it."""
+
+    def played(self, number: int, effects: Sequence[Effect]) -> Tally:
+        values = {e.name: float(e.record()["seconds"]) for e in effects}
+        return day(number, {name: value + 9.0 * (value != 1.4) for name, value in values.items()})
+
+
+def test_values_that_the_data_rule_out_are_in_no_interval() -> None:
+    jumping = a_fitter({"headway": 1.4}, street=17)
+    jumping.engine = Jumping()
+    model = jumping.simulate(start((HEADWAY, 1.4)))
+    for error in (0.01, 3.0):  # below, the range ends within two of the larger one
+        bound = _possible(jumping, model, np.array([error]))
+        assert bound == pytest.approx([2 * error / 1.96], rel=1e-3)
+    straight = a_fitter({"headway": 1.4}, street=17)
+    near = _possible(straight, straight.simulate(start((HEADWAY, 1.4))), np.array([0.001]))
+    assert near == [np.inf], "values so near fit as well"
 
 
 def test_moves_to_both_ends_of_a_range_may_be_crooked() -> None:

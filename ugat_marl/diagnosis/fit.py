@@ -459,30 +459,61 @@ def _straightness(
     """
     slopes: list[float] = []
     squares: list[float] = []
+    for row, moves in enumerate(_moves(fitter, model, errors)):
+        changes = [fitter.difference(model, members)[0] for _, members in moves]
+        asked = np.array([move for move, _ in moves])
+        got = np.array([float(response(change)[row]) for change in changes])
+        size = float(np.mean(asked**2)) if moves else 0.0
+        free = len(moves) - 1
+        if len(set(asked)) > 2:  # a line through two moves is exact if it need not begin at 0
+            asked, got, free = asked - asked.mean(), got - got.mean(), free - 1
+        slope = float(asked @ got) / max(float(asked @ asked), 1e-12)
+        follows = free >= 1 and slope >= fitter.thresholds.blunt
+        slopes.append(min(slope, 1.0) if follows else 1.0)
+        if follows:
+            squares.append(float(((got / slope - asked) ** 2).sum()) / free)
+        else:
+            squares.append(size if free >= 1 else 0.0)
+    return np.array(slopes), np.array(squares)
+
+
+def _possible(fitter: Fitter, model: Fitted, errors: Array) -> Array:
+    """Return the largest standard errors that the data leave possible, ``(free values,)``.
+
+    An interval ends before a value with which the data fit worse beyond doubt. Where no such value
+    was simulated on a side, the error has no bound.
+
+    Args:
+        fitter: Simulator of models.
+        model: The model.
+        errors: Standard errors of its free values, ``(free values,)``.
+    """
+    thresholds, cost = fitter.thresholds, fitter.simulate(model.members).cost
+    bounds: list[float] = []
+    for moves in _moves(fitter, model, errors):
+        nearest = {move > 0: math.inf for move, _ in moves}
+        for move, members in moves:
+            if fitter.simulate(members).cost - cost > thresholds.beyond_doubt**2:
+                nearest[move > 0] = min(nearest[move > 0], abs(move))
+        bounds.append(max(nearest.values(), default=math.inf) / thresholds.half_interval)
+    return np.array(bounds)
+
+
+def _moves(fitter: Fitter, model: Fitted, errors: Array) -> list[list[tuple[float, Members]]]:
+    """Return moves of each free value, within its range, with the members after the move."""
+    moves: list[list[tuple[float, Members]]] = []
     for place, (hypothesis, values) in enumerate(model.members):
         for index, value in enumerate(values):
-            row = len(squares)
-            moves: list[tuple[float, float]] = []
+            error, of_value = errors[len(moves)], list[tuple[float, Members]]()
             for share in fitter.thresholds.straightness_moves:
                 changed = list(values)
-                changed[index] = value + share * errors[row]
+                changed[index] = value + share * error
                 moved = hypothesis.clipped(changed)
                 if moved != values:
-                    change, _ = fitter.difference(model, replaced(model.members, place, moved))
-                    moves.append((moved[index] - value, float(response(change)[row])))
-            asked, got = np.array(moves).reshape(-1, 2).T
-            size = float(np.mean(asked**2)) if moves else 0.0
-            free = len(moves) - 1
-            if len(set(asked)) > 2:  # a line through two moves is exact if it need not begin at 0
-                asked, got, free = asked - asked.mean(), got - got.mean(), free - 1
-            slope = float(asked @ got) / max(float(asked @ asked), 1e-12)
-            follows = free >= 1 and slope >= fitter.thresholds.blunt
-            slopes.append(min(slope, 1.0) if follows else 1.0)
-            if follows:
-                squares.append(float(((got / slope - asked) ** 2).sum()) / free)
-            else:
-                squares.append(size if free >= 1 else 0.0)
-    return np.array(slopes), np.array(squares)
+                    members = replaced(model.members, place, moved)
+                    of_value.append((moved[index] - value, members))
+            moves.append(of_value)
+    return moves
 
 
 def _spread_of_days(
@@ -554,5 +585,6 @@ def uncertainty(
     errors = np.sqrt(np.diag(covariance)[:free])
     if steps:
         slopes, squares = _straightness(fitter, model, errors, response)
-        errors = np.sqrt((errors / slopes) ** 2 + squares)
+        wide = np.sqrt((errors / slopes) ** 2 + squares)
+        errors = np.maximum(errors, np.minimum(wide, _possible(fitter, model, errors)))
     return errors, extra

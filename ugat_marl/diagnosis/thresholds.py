@@ -750,8 +750,8 @@ class Thresholds(DayThresholds):
 
     beyond_doubt: float = 15.0
     """Standard errors from its usual values beyond which no set without an effect is tried: the
-    data would fit worse by the square, which is more than `negligible`. By hand, to save time.
-    Halved: a set that is nearly as good, and smaller, is missed."""
+    data would fit worse by the square, which is more than `negligible`. No interval holds a value
+    with which they do. By hand. Halved: a set that is nearly as good, and smaller, is missed."""
 
     # --- verdict ------------------------------------------------------------------------------
 
