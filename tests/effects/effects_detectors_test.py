@@ -167,16 +167,22 @@ def test_effects_on_detectors_are_written_and_read_with_the_scenario(tmp_path: P
     assert [effect.name for effect in controller_effects(read)] == ["counting_error"]
 
 
-def test_effects_on_detectors_are_no_domain_of_agents(tmp_path: Path) -> None:
+def test_effects_on_detectors_are_no_domain_of_agents() -> None:
     with pytest.raises(OptionError, match="'undercount' changes the reports of detectors, which"):
         parallel_env("single-v1", "V4+undercount=*,0.2")
     with pytest.raises(OptionError, match="'undercount'"):
         vector_env("single-v1", 2, domains=["sim", "undercount=*,0.2"])
-    scenario = load_scenario("single-v1")
-    street = apply_effects(scenario, [Undercount("*", 0.2)]).write(tmp_path / "street")
-    with pytest.raises(OptionError, match="street': 'undercount' changes the reports"):
-        parallel_env("single-v1", str(street))
-    assert detector_effects(scenario_in_domain(scenario, str(street), recorded=True))
+
+
+def test_a_directory_whose_detectors_err_is_a_domain_of_agents(tmp_path: Path) -> None:
+    street = apply_effects(load_scenario("single-v1"), [Undercount("*", 0.2)])
+    street.write(tmp_path / "street")
+    base = load_scenario(tmp_path / "street")
+    apply_effects(base, parse_domain("V4")).write(tmp_path / "corrected")
+    for name in ("street", "corrected"):
+        domain = str(tmp_path / name)
+        assert detector_effects(scenario_in_domain(base, domain)) == detector_effects(base)
+        assert parallel_env(base, domain).scenario == scenario_in_domain(base, domain)
 
 
 def test_detectors_belong_to_the_light_they_lead_to_or_stand_behind() -> None:

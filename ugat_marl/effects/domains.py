@@ -20,7 +20,6 @@ from ugat_marl.effects.sensors import DetectionZone
 from ugat_marl.effects.table import (
     EFFECTS,
     apply_effects,
-    detector_effects,
     effect_from_text,
     load_scenario,
     refuse_idle,
@@ -334,7 +333,8 @@ def scenario_in_domain(
     Args:
         scenario: Scenario from `load_scenario`.
         domain: Effects, a name of effects, or the path of another scenario on the same network.
-        recorded: True if detectors are recorded there, so that effects on them are accepted.
+        recorded: True if detectors are recorded there, so that effects on them are accepted. Those
+            that a scenario lists are accepted anyway.
         duration_s: Length of episodes, s; None for that of the scenario. Effects on demand and
             those with times need to know it.
 
@@ -347,8 +347,6 @@ def scenario_in_domain(
     """
     if (path := domain_path(domain)) is not None:
         other = load_scenario(path, duration_s)
-        if not recorded:
-            _refuse_detectors(domain, detector_effects(other))
         if _signals(other) != _signals(scenario):
             raise ScenarioError(
                 f"domain {domain!r} has other roads or signals than scenario {scenario.id!r}; "
