@@ -56,18 +56,27 @@ class Crossings:
                 left[index] += 1.0
         for road, beyond in self._beyond.items():
             earlier = self._near.get(road, set())
-            self._near[road] = near = set(api.edge.getLastStepVehicleIDs(road))
+            near = set(api.edge.getLastStepVehicleIDs(road))
             for lane, place in beyond.items():
                 names = api.lane.getLastStepVehicleIDs(lane)
                 near.update(names)
                 if place is not None:
                     new = [name for name in names if name not in earlier]
                     left[place] += sum(self._comes_from(name, road) for name in new)
+            # whoever parks beside the next road comes back to it
+            near.update(name for name in earlier - near if self._comes_from(name, road))
+            self._near[road] = near
 
     def _comes_from(self, name: str, road: str) -> bool:
-        """Return True if a vehicle is inside the junction after a road, or on the next road."""
-        at = self._api.vehicle.getRouteIndex(name)  # inside a junction, that of the road before
-        return road in self._api.vehicle.getRoute(name)[max(at - 1, 0) : at + 1]
+        """Return True if a vehicle came by a road to the junction after it, or to the next road."""
+        ask = self._api.vehicle
+        try:
+            at = ask.getRouteIndex(name)  # inside a junction, that of the road before
+        except self._api.TraCIException:  # it has left the simulation
+            return False
+        if road not in ask.getRoute(name)[max(at - 1, 0) : at + 1]:
+            return False
+        return ask.getDistance(name) > ask.getLanePosition(name)  # else it departed on its lane
 
 
 def _beyond(api: Any, road: str, places: dict[str, int]) -> dict[str, int | None]:
