@@ -201,10 +201,25 @@ def test_a_log_with_offsets_runs_on_over_a_change_of_the_clock(
     assert period.signals == {"C": ((0.0, "rr"), *later)}
 
 
-def test_a_zero_that_clocks_showed_twice_or_never_is_refused(imported: Import) -> None:
+def test_a_zero_that_clocks_showed_twice_or_never_is_refused_if_the_log_has_offsets(
+    imported: Import,
+) -> None:
     for zero, told in (("2025-10-26T02:30:00", "twice"), ("2025-03-30T02:30:00", "did not show")):
-        with pytest.raises(MeasuredDataError, match=f"toml, entry 1: zero is .* {told}.* write a"):
-            imported(mapping=BERLIN.replace("2024-03-05T07:00:00", zero))
+        mapping = BERLIN.replace("2024-03-05T07:00:00", zero)
+        frame = log(LOG, zero=dt.datetime.fromisoformat(zero))
+        (period,) = imported(frame, mapping).periods
+        assert period.signals == {"C": SIGNALS}
+        utc = frame.with_columns(pl.col("TimeStamp").dt.replace_time_zone("UTC"))
+        with pytest.raises(MeasuredDataError, match=f"toml, entry 1: zero is .* {told}.* write ze"):
+            imported(utc, mapping)
+
+
+def test_one_zero_of_several_may_have_an_offset(imported: Import) -> None:
+    days = [ZERO, ZERO + dt.timedelta(days=1)]
+    zeros = "2024-03-05T07:00:00+01:00, 2024-03-06T07:00:00"
+    frame = pl.concat([log(LOG, zero=day) for day in days])
+    for period in imported(frame, BERLIN.replace("2024-03-05T07:00:00", zeros)).periods:
+        assert period.signals == {"C": SIGNALS}
 
 
 def test_periods_on_both_sides_of_a_change_of_the_clock_overlap_by_true_time(
@@ -443,6 +458,7 @@ def test_a_recording_that_became_a_log_is_the_same_recording(
         ),
         ("4 = [1]", "4 = {green = 1}", r"green: write a list, as in green = \[1\];"),
         ("[2024-03-05T07:00:00]", "[1709622000]", "zero.0 = 1709622000: write a local time such"),
+        ("[2024-03-05T07:00:00]", '["1709622000"]', "zero.0 = '1709622000': write a local time"),
         ("[2024-03-05T07:00:00]", '["7:00"]', "zero.0 = '7:00': write a local time such as 2024"),
         ("zero = [2024-03-05T07:00:00]", "", "give zero .* or .*periods"),
         ("07:00:00]", "07:00:00Z]", "zero has offsets from UTC, .* write the street's own time_"),

@@ -772,7 +772,7 @@ def test_times_with_an_offset_lose_no_hour_where_the_clock_is_changed(
 )
 def test_forms_of_other_programs_are_read(texts: list[str], seconds: list[float]) -> None:
     zero = pl.Series("zero", ["2024-03-04 00:00:00"])
-    clock = LocalClock.of(Path("periods.csv"), pl.Series(["day"]), zero, "UTC")
+    clock = LocalClock.of(Path("periods.csv"), pl.Series(["day"]), pl.Series([0.0]), zero, "UTC")
     cells, periods = pl.Series("time", texts), pl.Series(["day"] * len(texts))
     assert clock.seconds(Path("t.csv"), cells, periods, 2).to_list() == seconds
 
@@ -798,11 +798,14 @@ def test_a_column_in_which_some_times_have_offsets_is_told() -> None:
         clock_from("2024-03-04").seconds(Path("t.csv"), cells, pl.Series(["night"] * 2), 2)
 
 
-def clock_from(zero: str) -> LocalClock:
-    """The clock of a night in Denver that is 0 at this time."""
-    zero += " 00:00:00" if len(zero) == 10 else ""
-    cells = pl.Series("zero", [zero])
-    return LocalClock.of(Path("periods.csv"), pl.Series(["night"]), cells, "America/Denver")
+def clock_from(*zeros: str, begin_s: float = 0.0) -> LocalClock:
+    """The clock of nights in Denver that is 0 at these times; one of them is called night."""
+    names = ["night", "next"][: len(zeros)]
+    times = [zero + " 00:00:00" * (len(zero) == 10) for zero in zeros]
+    path, begins_s = Path("periods.csv"), pl.Series([begin_s] * len(zeros))
+    return LocalClock.of(
+        path, pl.Series(names), begins_s, pl.Series("zero", times), "America/Denver"
+    )
 
 
 @pytest.mark.parametrize(("offset", "second"), [("-06:00", 10.0), ("-07:00", 10.0)])
@@ -814,16 +817,49 @@ def test_a_zero_within_the_hour_that_comes_twice_keeps_its_offset(
     assert clock.seconds(Path("t.csv"), cells, pl.Series(["night"]), 2).to_list() == [second]
 
 
-def test_a_zero_that_clocks_showed_twice_needs_its_offset() -> None:
-    with pytest.raises(
-        MeasuredDataError, match="showed twice, as they were set back; write a time"
-    ):
-        clock_from("2024-11-03T01:30:00")
+@pytest.mark.parametrize(
+    ("day", "offset"),
+    [("2024-03-09", "-07:00"), ("2024-03-10", "-06:00"), ("2024-11-03", "-07:00")],
+)
+@pytest.mark.parametrize("begin_s", [5 * 3600.0, 7 * 3600.0])
+def test_a_day_is_that_of_the_local_clock_also_where_it_was_changed(
+    day: str, offset: str, begin_s: float
+) -> None:
+    """The clock was set forward on 10 March and back on 3 November, at two."""
+    for text in (f"{day} 07:30:00", f"{day} 07:30:00{offset}"):
+        cells, night = pl.Series("time", [text]), pl.Series(["night"])
+        seconds = clock_from(day, begin_s=begin_s).seconds(Path("t.csv"), cells, night, 2)
+        assert seconds.to_list() == [27000.0]
 
 
-def test_a_zero_that_clocks_did_not_show_is_an_error() -> None:
-    with pytest.raises(MeasuredDataError, match=r"periods.csv, line 2: zero is 2024-03-10 02:30"):
-        clock_from("2024-03-10 02:30:00")
+def test_each_zero_may_have_an_offset_or_none() -> None:
+    clock = clock_from("2024-11-03T01:30:00-07:00", "2024-11-04")
+    cells = pl.Series("time", ["2024-11-03T08:30:10Z", "2024-11-04T07:00:10Z"])
+    nights = pl.Series(["night", "next"])
+    assert clock.seconds(Path("t.csv"), cells, nights, 2).to_list() == [10.0, 10.0]
+
+
+@pytest.mark.parametrize(
+    ("zero", "begin_s", "says"),
+    [
+        ("2024-11-03T01:30:00", 0.0, "showed twice, as they were set back; write zero with its"),
+        ("2024-11-03", 5400.0, "2024-11-03 01:30:00, which clocks in America/Denver showed twice"),
+        ("2024-03-10 02:30:00", 0.0, "csv, line 2: zero is 2024-03-10 02:30:00.* did not show"),
+    ],
+)
+def test_a_begin_that_clocks_showed_twice_or_never_needs_an_offset_if_times_have_one(
+    zero: str, begin_s: float, says: str
+) -> None:
+    clock, night = clock_from(zero, begin_s=begin_s), pl.Series(["night"])
+    local = pl.Series("time", [zero + " 00:00:00" * (len(zero) == 10)])
+    assert clock.seconds(Path("t.csv"), local, night, 2).to_list() == [0.0]
+    with pytest.raises(MeasuredDataError, match=says):
+        clock.seconds(Path("t.csv"), pl.Series("time", ["2024-11-03T08:30:10Z"]), night, 2)
+
+
+def test_a_zero_before_all_dates_is_an_error() -> None:
+    with pytest.raises(MeasuredDataError, match="line 2: zero is too early or too late for a date"):
+        clock_from("0001-01-01T00:00:00+07:00")
 
 
 @pytest.mark.parametrize(

@@ -36,10 +36,12 @@ def _digits(value: Any) -> Any:
 
 
 def _no_number(value: Any) -> Any:
-    """Refuse a number, which would be read as seconds from 1970 on in UTC."""
-    if isinstance(value, int | float):
-        raise PydanticCustomError("datetime_number", "not a local time")
-    return value
+    """Refuse a number, in quotes or not: it would be read as seconds from 1970 on in UTC."""
+    try:
+        float(value)
+    except (TypeError, ValueError):
+        return value
+    raise PydanticCustomError("datetime_number", "not a local time")
 
 
 Number = Annotated[int, pydantic.BeforeValidator(_digits), Field(le=_LARGEST)]

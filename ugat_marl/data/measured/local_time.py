@@ -6,7 +6,7 @@ import re
 import zoneinfo
 from collections.abc import Mapping
 from dataclasses import dataclass
-from datetime import datetime
+from datetime import UTC, datetime, timedelta
 from pathlib import Path
 
 import polars as pl
@@ -39,56 +39,66 @@ class LocalClock:
         zeros: Period to its local time.
         zeros_utc: The same in UTC.
         time_zone: Time zone of the street; "" if the times have none.
+        unsure: What is wrong with a local time that is not one time in UTC; "" if there is none.
     """
 
     zeros: Mapping[str, datetime]
     zeros_utc: Mapping[str, datetime]
     time_zone: str = ""
+    unsure: str = ""
 
     @classmethod
     def of(
         cls,
         path: Path,
         periods: pl.Series,
+        begins_s: pl.Series,
         cells: pl.Series,
         time_zone: str,
         mapping: str = "the column time_zone",
     ) -> LocalClock:
         """Return the clock of some periods.
 
+        A zero with an offset is a time in UTC. Without one, a period begins at its local time, and
+        its clock runs on in UTC from there: a change of the clock before the period shifts nothing.
+
         Args:
             path: File of the times, for messages.
             periods: Name of each period.
+            begins_s: Start of each, s on the scenario's clock.
             cells: Local time at which the scenario's clock is 0 in each.
             time_zone: Time zone of the street; "" if it is not known.
             mapping: Place at which the time zone can be given, for messages.
 
         Raises:
-            MeasuredDataError: A time cannot be read, or the clock of the street never showed it.
+            MeasuredDataError: A time cannot be read.
         """
-        times = _times(path, cells, time_zone, 2, mapping)
-        local = utc = times
-        if _is_zoned(times):
-            local = times.dt.convert_time_zone(time_zone).dt.replace_time_zone(None)
-        else:
-            utc = local.dt.replace_time_zone(
-                time_zone or "UTC", ambiguous="null", non_existent="null"
-            ).dt.convert_time_zone("UTC")
-        if (unsure := utc.is_null() & local.is_not_null()).any():
-            at = int(unsure.arg_true()[0])
-            once = local.dt.replace_time_zone(time_zone, ambiguous="earliest", non_existent="null")
-            what = (
-                "did not show, as they were set forward"
-                if once[at] is None
-                else "showed twice, as they were set back"
-            )
-            raise MeasuredDataError(
-                f"{_place(path, at, 2)}: {cells.name} is {local[at]}, which clocks in {time_zone} "
-                f"{what}; write a time with its offset"
-            )
-        return cls(
-            dict(zip(periods, local, strict=True)), dict(zip(periods, utc, strict=True)), time_zone
-        )
+        zone = zoneinfo.ZoneInfo(time_zone or "UTC")
+        zeros: dict[str, datetime] = {}
+        zeros_utc: dict[str, datetime] = {}
+        unsure = ""
+        for at, (period, begin_s) in enumerate(zip(periods, begins_s, strict=True)):
+            cell = _times(path, cells[at : at + 1], time_zone, at + 2, mapping)
+            where = f"{_place(path, at, 2)}: {cells.name}"
+            try:
+                zeros[period], zeros_utc[period], later = _readings(cell, begin_s, zone)
+            except (OverflowError, ValueError):
+                raise MeasuredDataError(
+                    f"{where} is too early or too late for a date; write one such as "
+                    "2024-03-05 07:00:00"
+                ) from None
+            if later != zeros_utc[period] and not unsure:
+                what = (
+                    "did not show, as they were set forward"
+                    if later < zeros_utc[period]
+                    else "showed twice, as they were set back"
+                )
+                begins = zeros[period] + timedelta(seconds=begin_s)
+                unsure = (
+                    f"{where} is {zeros[period]}, so period {period!r} begins at {begins}, which "
+                    f"clocks in {time_zone} {what}; write {cells.name} with its offset"
+                )
+        return cls(zeros, zeros_utc, time_zone, unsure)
 
     def seconds(self, path: Path, cells: pl.Series, periods: pl.Series, start: int) -> pl.Series:
         """Return times as seconds of the scenario's clock, named as `cells` with ``_s``.
@@ -100,7 +110,7 @@ class LocalClock:
             start: Number of the first row, for messages.
 
         Raises:
-            MeasuredDataError: A time cannot be read.
+            MeasuredDataError: A time cannot be read, or `zeros_of` fails.
         """
         times = _times(path, cells, self.time_zone, start, "periods.csv, as time_zone")
         zero = periods.replace_strict(self.zeros_of(times), default=None, return_dtype=times.dtype)
@@ -109,9 +119,17 @@ class LocalClock:
         return seconds.set(times.is_null(), None).alias(f"{cells.name}_s")
 
     def zeros_of(self, times: pl.Series) -> Mapping[str, datetime]:
-        """Return the times at which the clock is 0, in UTC if `times` have a time zone."""
-        # local times would lose or gain an hour where the clock is changed
-        return self.zeros_utc if _is_zoned(times) else self.zeros
+        """Return the times at which the clock is 0, in UTC if `times` have a time zone.
+
+        Raises:
+            MeasuredDataError: `times` have a time zone, and the street's clock showed the start of
+                a period twice or never.
+        """
+        if not _is_zoned(times):
+            return self.zeros
+        if self.unsure:
+            raise MeasuredDataError(self.unsure)
+        return self.zeros_utc  # local times would lose or gain an hour where the clock is changed
 
 
 def require_time_zone(name: str, where: str) -> None:
@@ -145,6 +163,32 @@ def local_times(
     """
     times = _times(path, cells, time_zone, start, mapping)
     return times.dt.convert_time_zone(time_zone) if _is_zoned(times) else times
+
+
+def _readings(
+    zero: pl.Series, begin_s: float, zone: zoneinfo.ZoneInfo
+) -> tuple[datetime, datetime, datetime]:
+    """Return a period's zero on the street's clock, and in UTC.
+
+    The two times in UTC are unequal only if the street's clock showed the start of the period
+    twice or never.
+
+    Args:
+        zero: One time, in UTC or without a time zone.
+        begin_s: Start of the period, s on the scenario's clock.
+        zone: Time zone of the street.
+
+    Raises:
+        OverflowError: A time is too far off.
+        ValueError: A time is too far off.
+    """
+    (time,) = zero
+    if _is_zoned(zero):
+        return time.astimezone(zone).replace(tzinfo=None), time, time
+    begin = timedelta(seconds=begin_s)
+    shown = (time + begin).replace(tzinfo=zone)
+    first, second = (shown.replace(fold=fold).astimezone(UTC) - begin for fold in (0, 1))
+    return time, first, second
 
 
 def _is_zoned(times: pl.Series) -> bool:

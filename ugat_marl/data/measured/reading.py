@@ -212,7 +212,7 @@ def _clock(path: Path, frame: pl.DataFrame) -> LocalClock | None:
         )
     zone = zones[0] if zones else ""
     require_time_zone(zone, str(path))
-    return LocalClock.of(path, frame["period_id"], frame["zero"], zone)
+    return LocalClock.of(path, frame["period_id"], frame["begin_s"], frame["zero"], zone)
 
 
 def _missing(directory: Path, table: Table) -> MeasuredDataError:
