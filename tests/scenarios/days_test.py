@@ -12,7 +12,7 @@ import pytest
 
 from ugat_marl.effects import load_scenario
 from ugat_marl.errors import ScenarioError
-from ugat_marl.scenarios import Scenario, demand_as_vehicles, draw_day, read_scenario
+from ugat_marl.scenarios import Document, Scenario, demand_as_vehicles, draw_day, read_scenario
 from ugat_marl.scenarios.speed_factors import SpeedFactors
 
 
@@ -168,15 +168,28 @@ def test_stops_move_with_the_departure(crossing: Callable[..., Path]) -> None:
 
 
 @pytest.mark.parametrize("beside", [False, True], ids=["routes", "additional"])
+@pytest.mark.parametrize("lines", ["v0", "7 8"])
 def test_vehicles_that_a_ride_names_keep_their_names(
-    beside: bool, crossing: Callable[..., Path]
+    lines: str, beside: bool, crossing: Callable[..., Path]
 ) -> None:
-    rider = '<person id="p" depart="0"><ride from="S_C" to="C_N" lines="v0"/></person>'
-    cars = CAR.format(0, 10, "car") + CAR.format(1, 20, "car")
+    """A ride names vehicles or their lines."""
+    rider = f'<person id="p" depart="0"><ride from="S_C" to="C_N" lines="{lines}"/></person>'
+    cars = CAR.format(0, 10, 'car" line="8') + CAR.format(1, 20, 'car" line="9')
     scenario = with_additional(crossing, rider * beside, rider * (not beside) + cars)
     for seed in range(8):
         names = [name for name in vehicle_ids(draw_day(scenario, seed)) if "~" not in name]
         assert names == ["v0"]
+
+
+def test_additional_files_are_looked_through_once_for_all_days(
+    crossing: Callable[..., Path], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    scenario = with_additional(
+        crossing, '<vType id="slow" maxSpeed="5"/>', CAR.format(0, 10, "car")
+    )
+    draw_day(scenario, 0)
+    monkeypatch.delattr(Document, "scan")
+    draw_day(scenario, 1)
 
 
 def test_drivers_without_a_type_follow_a_default_type_of_an_additional_file(

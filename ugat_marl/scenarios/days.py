@@ -20,6 +20,7 @@ from numpy.typing import NDArray
 from ugat_marl.errors import ScenarioError
 from ugat_marl.files import parse_xml, xml_bytes
 from ugat_marl.scenarios.routes import (
+    STOP_TIMES,
     demand_as_vehicles,
     departure_s,
     is_blocker,
@@ -51,12 +52,12 @@ class _Vehicles:
     Attributes:
         types: Additional file with the vehicle types of the route files.
         others: Route files with everything else: persons, containers, named routes, and vehicles
-            that block a lane, wait for a person, or are named by one.
+            that block a lane, wait for a person, or are ridden by one.
         depart_s: Departures, s, ``(vehicles,)``.
         names: Ids.
         heads: Remaining attributes of each ``<vehicle>`` tag, up to its ``>``.
         tails: Children of each ``<vehicle>``.
-        stopping: Elements of the vehicles with stops, by position.
+        stopping: Elements of the vehicles whose stops have times, by position.
         speeds: Mean, deviation, least and greatest speedFactor, ``(vehicles, 4)``; the mean is NaN
             if SUMO draws the factor.
     """
@@ -96,9 +97,9 @@ def draw_day(scenario: Scenario, seed: int, day_to_day: float = 0.0) -> Scenario
     change them, so two models can be compared on the same day. Vehicles that depart before the
     scenario's begin are left out, as SUMO leaves them out. A shift across the start or the end of
     the scenario is mirrored there, so the mean number of vehicles within it is that of the demand.
-    Persons, and vehicles that block a lane, wait for a person or are named by one's ride, are the
-    same every day. Times of stops move with the departure. A vehicle with a speedFactor of its own
-    keeps it; others draw it from that of their type.
+    Persons, and vehicles that block a lane, wait for a person or are named by one's ride, or have
+    a line that is, are the same every day. Times of stops move with the departure. A vehicle with a
+    speedFactor of its own keeps it; others draw it from that of their type.
 
     Args:
         scenario: Any scenario; `demand_as_vehicles` turns its trips and flows into vehicles.
@@ -112,9 +113,8 @@ def draw_day(scenario: Scenario, seed: int, day_to_day: float = 0.0) -> Scenario
     scenario = demand_as_vehicles(scenario)
     vehicles = _vehicles(
         tuple(document.read() for document in scenario.routes),
-        _types_beside(scenario),
+        tuple(document.read() for document in scenario.additional),
         tuple(scenario.settings.sumo.items()),
-        _ridden(scenario.additional),
     )
     generator = numpy_generator(seed, "another day")
     begin = scenario.settings.begin_s
@@ -171,34 +171,40 @@ def draw_day(scenario: Scenario, seed: int, day_to_day: float = 0.0) -> Scenario
     )
 
 
-def _types_beside(scenario: Scenario) -> bytes:
-    """Return the vehicle types in the additional files of a scenario, as a document."""
+def _beside(additional: Iterable[bytes]) -> tuple[ET.Element, set[str]]:
+    """Return the types in additional files, and the vehicles or lines that rides in them name."""
     types = ET.Element("additional")
-    for document in scenario.additional:
-        if any(tag.name in _TYPE_TAGS for tag in document.scan()):
-            types.extend(element for element in document.parse() if element.tag in _TYPE_TAGS)
-    return ET.tostring(types)
+    ridden: set[str] = set()
+    for content in additional:
+        names, has_types = _ridden(content)
+        ridden |= names
+        if has_types:
+            root = parse_xml(content, "additional")
+            types.extend(element for element in root if element.tag in _TYPE_TAGS)
+    return types, ridden
 
 
-def _ridden(documents: Iterable[Document]) -> frozenset[str]:
-    """Return the vehicles or lines that persons and containers wait for."""
-    return frozenset(
-        name
-        for document in documents
-        for tag in document.scan()
-        if tag.name in ("ride", "transport")
-        for name in tag.attributes.get("lines", "").split()
-    )
+def _ridden(content: bytes) -> tuple[set[str], bool]:
+    """Return the vehicles or lines that rides in a file name; True if it has types."""
+    names: set[str] = set()
+    has_types = False
+    for tag in Document("demand", None, content).scan():
+        has_types |= tag.name in _TYPE_TAGS
+        if tag.name in ("ride", "transport"):
+            names.update(tag.attributes.get("lines", "").split())
+    return names, has_types
 
 
 @functools.lru_cache(maxsize=8)
 def _vehicles(
     routes: tuple[bytes, ...],
-    types_beside: bytes,
+    additional: tuple[bytes, ...],
     sumo: tuple[tuple[str, str], ...],
-    ridden: frozenset[str],
 ) -> _Vehicles:
     """Split route files into single vehicles; cached because many days use the same files."""
+    types_beside, ridden = _beside(additional)
+    for content in routes:
+        ridden |= _ridden(content)[0]
     types = ET.Element("additional")
     others: list[Document] = []
     depart: list[float] = []
@@ -208,7 +214,6 @@ def _vehicles(
     kinds: list[str] = []
     stopping: dict[int, ET.Element] = {}
     own_speeds: list[str | None] = []
-    ridden |= _ridden(Document("routes", None, content) for content in routes)
     for number, content in enumerate(routes):
         rest = ET.Element("routes")
         for element in parse_xml(content, "routes"):
@@ -216,11 +221,11 @@ def _vehicles(
                 types.append(element)
             elif (
                 element.tag == "vehicle"
-                and element.get("id") not in ridden
+                and ridden.isdisjoint((element.get("id"), element.get("line")))
                 and not is_blocker(element.get("id", ""), element.get("type", ""))
                 and not np.isnan(time := departure_s(element.get("depart", "0")))
             ):
-                if own_stops(element):
+                if any(stop.get(key) for stop in own_stops(element) for key in STOP_TIMES):
                     stopping[len(names)] = element
                 names.append(element.get("id", ""))
                 depart.append(time)
@@ -235,7 +240,7 @@ def _vehicles(
     options = dict(sumo)
     known = {
         element.get("id", ""): _speed_of(element.attrib, options)
-        for root in (parse_xml(types_beside, "additional"), types)
+        for root in (types_beside, types)
         for element in root.iter("vType")
     }
     known.setdefault(_DEFAULT, _speed_of({}, options))

@@ -26,6 +26,9 @@ DEFINITIONS = frozenset({"vType", "vTypeDistribution", "route"})
 TRAVELLERS = frozenset({"person", "personFlow", "container", "containerFlow"})
 """Elements of a route file that depart and are no vehicles."""
 
+STOP_TIMES = ("until", "arrival", "started", "ended")
+"""Attributes of a stop that are times, and no durations."""
+
 _ROUTED = "routed.rou.xml"
 
 
@@ -253,7 +256,7 @@ def move_stops(stops: Iterable[ET.Element], seconds: float) -> None:
     if math.isnan(seconds):  # it waits for a person or container
         return
     for stop in stops:
-        for key in ("until", "arrival", "started", "ended"):
+        for key in STOP_TIMES:
             if text := stop.get(key):
                 stop.set(key, seconds_text(parse_time(text) + seconds))
 
