@@ -313,6 +313,31 @@ def test_intervals_are_on_the_clock_of_the_begin(
         assert all(float(row["geh"]) < 5 for row in fits)
 
 
+def test_a_sliver_of_an_interval_has_no_fit(tmp_path: Path) -> None:
+    rows = (
+        "west1_A1,60,3420,3480",  # a whole interval, though a short one
+        "west1_A1,100,3540,4440",  # a minute of a quarter of an hour
+        "southA_A1,100,3120,4020",  # more than half of one
+        "northA_A1,400,2700,6300",  # a quarter of an hour is enough of every interval
+    )
+    (tmp_path / "c.csv").write_text("\n".join(["edge,count,begin_s,end_s", *rows, ""]))
+    assert made(tmp_path / "city", "--counts", tmp_path / "c.csv") == 0
+    with (tmp_path / "city" / "counts-fit.csv").open(encoding="utf-8-sig") as file:
+        fits = [(row["from"], row["begin_s"], row["end_s"]) for row in csv.DictReader(file)]
+    assert fits == [
+        ("west1_A1", "3420", "3480"),
+        ("southA_A1", "3120", "3600"),
+        ("northA_A1", "2700", "3600"),
+    ]
+
+
+def test_counts_of_which_slivers_lie_in_the_episode_have_no_fit(tmp_path: Path) -> None:
+    (tmp_path / "c.csv").write_text("edge,count,begin_s,end_s\nwest1_A1,100,3540,4440\n")
+    assert made(tmp_path / "city", "--counts", tmp_path / "c.csv") == 0
+    said = "too little of every interval of c.csv is within the episode for a GEH"
+    assert said in (tmp_path / "city" / "README.md").read_text()
+
+
 @pytest.mark.parametrize(
     ("rows", "length_s"),
     [

@@ -328,7 +328,7 @@ def from_counts(path: Path, begin_s: float, length_s: float, seed: int) -> Vehic
         write_drives(folder / ROUTES, sorted(sampled, key=lambda d: (d.depart_s, d.id)))
         names = NamedNetwork(root)
         end_s = begin_s + length_s
-        fits = _fits(_clipped(rows, begin_s, end_s), sampled, names)
+        fits = _fits(rows, begin_s, end_s, sampled, names)
         write_fit(folder / FIT_SHEET, fits, names)
         write_whole(folder / COUNT_SHEET, b"".join(chunks_of(path)))
         notes = (
@@ -546,11 +546,30 @@ def _clipped(rows: Iterable[Row], begin_s: float, end_s: float) -> Iterator[Row]
 
 
 def _fits(
-    rows: Iterable[Row], drives: Sequence[Drive], names: NamedNetwork
+    rows: Iterable[Row],
+    begin_s: float,
+    end_s: float,
+    drives: Sequence[Drive],
+    names: NamedNetwork,
 ) -> tuple[CountFit, ...]:
+    """Return the fit of the parts of rows within the episode.
+
+    A part is left out if it is shorter than half of its interval and than half of `_USUAL_S`: in
+    so short a time, a few vehicles more or less make a large GEH.
+
+    Args:
+        rows: Rows of the table.
+        begin_s: Start of the episode, s.
+        end_s: End of the episode, s.
+        drives: Vehicles of the scenario.
+        names: Names of the turns.
+    """
+    least_s = {row.line: min(row.end_s - row.begin_s, _USUAL_S) / 2 for row in rows}
     passed = _passages(drives)
     fits: list[CountFit] = []
-    for row in rows:
+    for row in _clipped(rows, begin_s, end_s):
+        if row.end_s - row.begin_s < least_s[row.line]:
+            continue
         departs = passed.get(row.roads, [])
         driven = bisect_left(departs, row.end_s) - bisect_left(departs, row.begin_s)
         hours = (row.end_s - row.begin_s) / 3600
@@ -582,6 +601,8 @@ def geh_of(
 
 
 def _summary(fits: Sequence[CountFit], path: Path) -> str:
+    if not fits:
+        return f"too little of every interval of {path.name} is within the episode for a GEH"
     good = sum(fit.geh < GOOD_GEH for fit in fits)
     return (
         f"{good} of {len(fits)} counts of {path.name} are met within a GEH of {GOOD_GEH:g}; "
