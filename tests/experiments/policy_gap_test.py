@@ -81,7 +81,7 @@ def diagnosed(directory: Path, corrected: str | None = "V4", **changes: Any) -> 
     )  # fmt: skip
     none = (
         "best", "heldout", "evidence", "criteria", "travel_time", "next_measurement",
-        "traffic_check", "not_corrected",
+        "traffic_check", "not_corrected", "ended_by",
     )  # fmt: skip
     record = {
         "schema": "ugat-marl/diagnosis/7",
