@@ -791,6 +791,34 @@ def test_counts_alone_can_tell_a_few_things(
     assert again.counts is not None and again.counts.equals(read.counts)
 
 
+@pytest.mark.parametrize(
+    ("count", "occupancy", "told"),
+    [
+        (None, None, "nothing of 1 detector ('w'), of 4; nothing is compared there: leave"),
+        (0, 0.0, "no vehicle at 1 detector ('w'), of 4; that is compared as a count of 0: leave"),
+        (0, 1.0, "no vehicle, and an occupancy of 1 throughout, at 1 detector ('w'), of 4; that"),
+        (1, 1.0, None),
+    ],
+)
+def test_a_detector_that_never_counts_is_told_with_what_to_do(
+    count: int | None, occupancy: float | None, told: str | None,
+    tmp_path: Path, scenario: Scenario, network: Network,
+) -> None:  # fmt: skip
+    directory = counted(tmp_path, occupancy=0.1)
+    rows = pl.read_csv(directory / "counts.csv")
+    dead = pl.col("detector_id") == "w"
+    rows = rows.filter(~dead) if count is None else rows.with_columns(
+        pl.when(dead).then(count).otherwise("count").alias("count"),
+        pl.when(dead).then(occupancy).otherwise("occupancy").alias("occupancy"),
+    )  # fmt: skip
+    rows.write_csv(directory / "counts.csv")
+    read = read_measured(directory, scenario, network)
+    assert len(read.detectors) == 4
+    found = [item for item in read.findings if "('w'), of 4" in item.text]
+    assert [told in item.text for item in found] == [True] if told else not found
+    assert not any(item.rules_out for item in found)
+
+
 @pytest.mark.parametrize("logged", [True, False])
 def test_counts_alone_are_said_to_show_what_they_show(
     logged: bool, tmp_path: Path, scenario: Scenario, network: Network

@@ -287,6 +287,7 @@ def _of_counts(measured: MeasuredData, network: Network) -> Iterator[Finding]:
         )
     if counts is None:
         return
+    yield from _of_silent_counts(counts, measured.detectors)
     whole_s = sum(period.length_s for period in measured.periods)
     length = pl.col("end_s") - pl.col("begin_s")
     covered_s = counts.group_by("detector_id").agg(length.sum().alias("covered_s"))["covered_s"]
@@ -301,6 +302,43 @@ def _of_counts(measured: MeasuredData, network: Network) -> Iterator[Finding]:
             f"counts.csv: no {missing[0]}; several effects change one of occupancy and mean speed "
             "alike, and both together tell them apart"
         )
+
+
+def _of_silent_counts(counts: pl.DataFrame, detectors: Sequence[Detector]) -> Iterator[Finding]:
+    """Yield findings on detectors that have no row, or never counted a vehicle."""
+    of_each = counts.group_by("detector_id")
+    most = dict(of_each.agg(pl.col("count").max()).iter_rows())
+    least_occupancy: dict[str, float | None] = {}
+    if "occupancy" in counts.columns:
+        least_occupancy = dict(of_each.agg(pl.col("occupancy").min()).iter_rows())
+    names = [detector.id for detector in detectors]
+    silent = [name for name in names if most.get(name) == 0]
+    stuck = [name for name in silent if least_occupancy.get(name) == 1]
+    for found, what, treated, otherwise in (
+        (
+            [name for name in names if name not in most],
+            "nothing of",
+            "nothing is compared there",
+            "write their counts",
+        ),
+        (
+            [name for name in silent if name not in stuck],
+            "no vehicle at",
+            "that is compared as a count of 0",
+            "check their lanes",
+        ),
+        (
+            stuck,
+            "no vehicle, and an occupancy of 1 throughout, at",
+            "that is compared as it is",
+            "check the columns",
+        ),
+    ):
+        if found:
+            yield Finding(
+                f"counts.csv: {what} {listed(found, 'detector')}, of {len(names)}; {treated}: "
+                f"leave their rows out, in detectors.csv too, if they are broken, or {otherwise}"
+            )
 
 
 def _has_rows(table: pl.DataFrame | None) -> bool:
