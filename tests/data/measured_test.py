@@ -709,6 +709,47 @@ def test_local_counts_become_seconds(
 
 
 @pytest.mark.parametrize(
+    ("second", "words"),
+    [
+        (
+            "2024-03-05 07:00,2024-03-05 07:02,s,7",
+            "line 3: begin '2024-03-05 07:00' is there twice for its detector; delete the copy",
+        ),
+        (
+            "2024-03-05 07:00,2024-03-05 07:02,s,8",
+            "line 2: begin '2024-03-05 07:00' is there twice for its detector (and 1 row more); "
+            "correct the row",
+        ),
+        (
+            "2024-03-05 07:01,2024-03-05 07:03,s,7",
+            "line 3: begin '2024-03-05 07:01' is before the end of an earlier interval of its "
+            "detector, 2024-03-05 07:02; write",
+        ),
+        (
+            "2024-03-05 07:02,2024-03-05 07:01,s,7",
+            "line 3: end '2024-03-05 07:01' is not after begin; correct",
+        ),
+        (
+            "2024-03-05 06:59,2024-03-05 07:01,s,7",
+            "line 3: begin '2024-03-05 06:59' is before the period's begin; begin and end",
+        ),
+    ],
+)
+def test_wrong_local_counts_are_quoted_as_in_the_file(
+    reread: Callable[..., MeasuredData], second: str, words: str
+) -> None:
+    counts = pl.DataFrame(
+        {"period_id": ["day0"], "begin_s": [0.0], "end_s": [60.0], "detector_id": ["s"],
+         "count": [7]}
+    )  # fmt: skip
+    head, first = "period_id,begin,end,detector_id,count", "2024-03-05 07:00,2024-03-05 07:02,s,7"
+    local = f"{head}\nday0,{first}\nday0,{second}\n"
+    changes = {**in_local_time(), "counts.csv": lambda _: local}
+    with pytest.raises(MeasuredDataError, match=re.escape(words)):
+        reread(changes, replace(recording(), counts=counts))
+
+
+@pytest.mark.parametrize(
     ("name", "change", "words"),
     [
         ("periods.csv", None, "periods.csv does not say when the scenario's clock is"),

@@ -101,7 +101,7 @@ def test_an_interval_may_go_past_midnight(day: str, tmp_path: Path) -> None:
     (row,) = read_rows(tmp_path / "t.csv", 84600, 90000, Silent(), pairs=False)
     assert (row.begin_s, row.end_s) == (85500, 87300)
     (tmp_path / "t.csv").write_text("edge,count,begin,end\nA1_B1,9,08:00,07:00\n")
-    with pytest.raises(ScenarioError, match="is not after begin_s"):
+    with pytest.raises(ScenarioError, match="line 2: end = 07:00 is not after begin = 08:00"):
         read_rows(tmp_path / "t.csv", 0, 90000, Silent(), pairs=False)
 
 
@@ -179,18 +179,23 @@ def test_origins_and_destinations(tmp_path: Path) -> None:
         (
             "--counts",
             "edge,count,begin_s,end_s\nwest1_A1,5,9,9\n",
-            "end_s (9) is not after begin_s",
+            "end_s = 9 is not after begin_s = 9",
         ),
         (
             "--counts",
             "edge,count\nwest1_A1,5\nA1_B1,5\nwest1_A1,7\n",
-            "line 4: begin_s = 0 is before the end of an earlier interval of west1_A1, 3600 s "
-            "(line 2); write intervals that do not overlap",
+            "line 4: begin_s = 0 is before the end of an earlier interval of west1_A1, "
+            "end_s = 3600 (line 2); write intervals that do not overlap",
         ),
         (
             "--counts",
             "from,to,count,begin_s,end_s\nwest1_A1,A1_B1,5,600,1200\nwest1_A1,A1_B1,5,0,900\n",
             "line 2: begin_s = 600 is before the end of an earlier interval of west1_A1 -> A1_B1",
+        ),
+        (
+            "--counts",
+            "edge,count,begin,end\nwest1_A1,5,0:00,0:30\nwest1_A1,5,0:15,0:45\n",
+            "line 3: begin = 0:15 is before the end of an earlier interval of west1_A1, end = 0:30",
         ),
         ("--counts", "edge,count\nwest1_A1,5\n,5\n", "line 3: a count without its road"),
         ("--counts", "edge;count\nwest1_A1;1.250\n", "'1.250' can be 1250 or a little more than 1"),

@@ -14,6 +14,7 @@ from ugat_marl.data.measured.tables import (
     ROW,
     TRAVEL_TIMES,
     TURNING,
+    as_written,
     place,
     refuse,
     report_outside,
@@ -88,18 +89,22 @@ def _checked_intervals(
         "add it there, or leave the rows out",
     )
     wrong = frame.filter(pl.col("end_s") <= pl.col("begin_s"))
-    refuse(path, wrong, "end_s", "is not after begin_s", "correct the row")
+    begin = as_written(frame, "begin_s")
+    refuse(path, wrong, "end_s", f"is not after {begin}", "correct the row")
     frame = _within_periods(path, frame, periods, findings)
-    for bad, column, complaint in (
-        (pl.col("count") < 0, "count", "is negative"),
-        (pl.col("count") % 1 != 0, "count", "is not a whole number"),
+    copy = ~pl.struct(pl.exclude(ROW)).is_first_distinct()
+    for bad, column, complaint, way_out in (
+        (pl.col("count") < 0, "count", "is negative", "correct the row"),
+        (pl.col("count") % 1 != 0, "count", "is not a whole number", "correct the row"),
+        (copy, "begin_s", f"is there twice for {owner}", "delete the copy"),
         (
             pl.struct("period_id", "begin_s", *keys).is_duplicated(),
             "begin_s",
             f"is there twice for {owner}",
+            "correct the row",
         ),
     ):
-        refuse(path, frame.filter(bad), column, complaint, "correct the row")
+        refuse(path, frame.filter(bad), column, complaint, way_out)
     _refuse_overlaps(path, frame, keys, owner)
     refuse_copies(path, frame, periods, (*keys, "begin_s", "end_s"), "count")
     return frame
@@ -137,11 +142,15 @@ def _refuse_overlaps(path: Path, frame: pl.DataFrame, keys: tuple[str, ...], own
         .sort(ROW)
     )
     if overlap.height:
+        first, end = overlap.row(0, named=True), as_written(frame, "end_s")
+        same = [pl.col(key) == first[key] for key in ("period_id", *keys)]
+        last = frame.filter(*same, pl.col("end_s") == first["before"])[end][0]
         refuse(
             path,
             overlap,
             "begin_s",
-            f"is before the end of an earlier interval of {owner}, {overlap['before'][0]:g} s",
+            f"is before the end of an earlier interval of {owner}, "
+            + (f"{last:g} s" if end == "end_s" else last),
             "write intervals that do not overlap, and no totals of several of them",
         )
 

@@ -194,7 +194,8 @@ def read_table(
             ``end`` in place of ``begin_s`` and ``end_s``. None if periods.csv has no ``zero``.
 
     Returns:
-        One row per row of the file, in its order. Missing optional columns are null.
+        One row per row of the file, in its order. Missing optional columns are null. Columns of
+        ``begin`` and ``end`` stay beside the seconds, so that messages can quote the file.
 
     Raises:
         MeasuredDataError: The file is unreadable or cut short. Or a column is missing, has text
@@ -203,7 +204,12 @@ def read_table(
     raw = read_raw(path, findings)
     wanted = {**table.columns, **table.optional}
     _check_columns(path, table, raw, findings, clock)
-    raw = _in_seconds(path, table, raw, clock)
+    local = [
+        own
+        for name, own in _local_names(table).items()
+        if name not in raw.columns and own in raw.columns
+    ]
+    raw = _in_seconds(path, raw, local, clock)
     start = first_row(path)
     columns = [pl.int_range(start, raw.height + start, dtype=pl.Int64, eager=True).alias(ROW)]
     for name, kind in wanted.items():
@@ -220,6 +226,7 @@ def read_table(
                 "fill it in or leave the rows out (an empty last row means a file cut short)"
             )
         columns.append(values)
+    columns += [raw[name] for name in local if name != "time"]  # of events there are millions
     return pl.DataFrame(columns)
 
 
@@ -231,14 +238,9 @@ def _local_names(table: Table) -> dict[str, str]:
 
 
 def _in_seconds(
-    path: Path, table: Table, raw: pl.DataFrame, clock: LocalClock | None
+    path: Path, raw: pl.DataFrame, local: Sequence[str], clock: LocalClock | None
 ) -> pl.DataFrame:
-    """Replace columns of local times by seconds of the scenario's clock."""
-    local = [
-        own
-        for name, own in _local_names(table).items()
-        if name not in raw.columns and own in raw.columns
-    ]
+    """Add seconds of the scenario's clock to the columns of local times."""
     if not local:
         return raw
     if clock is None:
@@ -249,7 +251,7 @@ def _in_seconds(
     start = first_row(path)
     periods = to_texts(path, raw["period_id"])
     seconds = [clock.seconds(path, raw[name], periods, start) for name in local]
-    return raw.drop(*local).with_columns(seconds)
+    return raw.with_columns(seconds)
 
 
 def read_raw(path: Path, findings: list[Finding]) -> pl.DataFrame:
@@ -284,14 +286,23 @@ def place(path: Path, row: int) -> str:
     return f"{path}, {unit} {row}"
 
 
+def as_written(frame: pl.DataFrame, column: str) -> str:
+    """Return the name under which a frame has a column of its file: that of local times, if any."""
+    own = column.removesuffix("_s")
+    return own if column in TIMES and own in frame.columns else column
+
+
 def refuse(path: Path, bad: pl.DataFrame, column: str, complaint: str, way_out: str) -> None:
     """Raise an error for the first of the bad rows, if there are any.
+
+    Local times are quoted as in the file.
 
     Raises:
         MeasuredDataError: `bad` has rows.
     """
     if bad.is_empty():
         return
+    column = as_written(bad, column)
     value = str(bad[column][0])
     shown = value if len(value) <= 60 else f"{value[:57]}..."
     rows = "row" if bad.height == 2 else "rows"

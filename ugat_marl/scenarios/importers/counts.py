@@ -65,6 +65,8 @@ class Row:
         begin_s: Start of the interval of the count.
         end_s: End of the interval of the count.
         line: Line in the file.
+        begin: Column and start as in the file, such as ``begin = 7:15``, for messages.
+        end: The same of the end.
     """
 
     roads: tuple[str, ...]
@@ -72,6 +74,8 @@ class Row:
     begin_s: float
     end_s: float
     line: int
+    begin: str = ""
+    end: str = ""
 
 
 _DAY_S = 86_400.0
@@ -183,9 +187,11 @@ def _row(
     clock = ":" in f"{values.get('end')}{values.get('end_s')}"
     if clock and end_s <= begin_s and end_s + _DAY_S - begin_s <= _DAY_S / 2:
         end_s += _DAY_S  # until midnight, or past it
+    begin, end = _written(values, "begin", begin_s), _written(values, "end", end_s)
     if end_s <= begin_s:
-        raise ScenarioError(f"{where}: end_s ({end_s:g}) is not after begin_s ({begin_s:g})")
-    return Row(roads, _number(values.get("count"), "count", where), begin_s, end_s, line)
+        raise ScenarioError(f"{where}: {end} is not after {begin}")
+    count = _number(values.get("count"), "count", where)
+    return Row(roads, count, begin_s, end_s, line, begin, end)
 
 
 _GROUPED = re.compile(r"[1-9]\d{0,2}[.,]\d{3}", re.ASCII)
@@ -239,6 +245,18 @@ def _one_date(values: Mapping[str, str | None], before: str | None, where: str) 
     return before
 
 
+def _cell(values: Mapping[str, str | None], name: str) -> tuple[str, str]:
+    """Return column and cell of a time of an interval, whose column of times of day is `name`."""
+    of_day = (values.get(name) or "").strip()
+    return (name, of_day) if of_day else (_TIMES[name], (values.get(_TIMES[name]) or "").strip())
+
+
+def _written(values: Mapping[str, str | None], name: str, seconds: float) -> str:
+    """Return column and time as in the file; its `seconds` where that is no time of day."""
+    column, cell = _cell(values, name)
+    return f"{column} = {cell if ':' in cell else f'{seconds:g}'}"
+
+
 def _time_s(values: Mapping[str, str | None], name: str, usual: float, where: str) -> float:
     """Return a time of an interval, in s.
 
@@ -248,8 +266,7 @@ def _time_s(values: Mapping[str, str | None], name: str, usual: float, where: st
         usual: The time of a blank cell, in s.
         where: File and line.
     """
-    of_day = (values.get(name) or "").strip()
-    text = of_day or (values.get(_TIMES[name]) or "").strip()
+    column, text = _cell(values, name)
     if clock := _CLOCK.fullmatch(text):
         hours, minutes, seconds = (int(part or 0) for part in clock.groups()[1:4])
         half = (clock[5] or "").upper()
@@ -257,9 +274,9 @@ def _time_s(values: Mapping[str, str | None], name: str, usual: float, where: st
         of_midnight = 3600 * hour + 60 * minutes + seconds
         if of_midnight <= _DAY_S and (not half or 1 <= hours <= 12):
             return float(of_midnight)
-    if of_day:
+    if column == name:
         raise ScenarioError(
-            f"{where}: {name} = {of_day!r} is not a time of day such as 07:15; seconds belong into "
+            f"{where}: {name} = {text!r} is not a time of day such as 07:15; seconds belong into "
             f"the column {_TIMES[name]}"
         )
     return _number(text, _TIMES[name], where) if text else usual
@@ -371,10 +388,9 @@ def _refuse_overlaps(rows: Iterable[Row], path: Path) -> None:
         before = latest.get(row.roads)
         if before and row.begin_s < before.end_s - 1e-3:  # files hold milliseconds
             raise ScenarioError(
-                f"{path}, line {row.line}: begin_s = {row.begin_s:g} is before the end of an "
-                f"earlier interval of {' -> '.join(row.roads)}, {before.end_s:g} s (line "
-                f"{before.line}); write intervals that do not overlap, and no totals of several "
-                "of them"
+                f"{path}, line {row.line}: {row.begin} is before the end of an earlier interval of "
+                f"{' -> '.join(row.roads)}, {before.end} (line {before.line}); write intervals "
+                "that do not overlap, and no totals of several of them"
             )
         latest[row.roads] = row
 
