@@ -683,6 +683,29 @@ def test_local_times_become_seconds_of_the_scenario(
 
 
 @pytest.mark.parametrize(
+    ("begin_s", "zero", "way_out"),
+    [
+        (0.0, ",2024-03-05T07:00:00", "clock is 0: write 2024-03-05 00:00:00, with begin_s 25200 "
+         "and end_s 25400"),
+        (-60.0, ",2024-03-05T07:00:00", "shorten the period"),
+        (0.0, "", "shorten the period"),
+    ],
+)  # fmt: skip
+def test_a_clock_that_is_0_where_the_scenario_begins_is_told(
+    begin_s: float, zero: str, way_out: str, tmp_path: Path, crossing_scenario: Scenario,
+    network: Network,
+) -> None:  # fmt: skip
+    times = {"begin_s": 25200.0, "duration_s": 200.0}
+    settings = crossing_scenario.settings.model_copy(update=times)
+    later = replace(crossing_scenario, settings=settings)
+    street = write_measured(recording(1), tmp_path / "street", csv=True)
+    head = f"period_id,begin_s,end_s{',zero' if zero else ''}"
+    edit(street / "periods.csv", lambda _: f"{head}\nday0,{begin_s},200{zero}\n")
+    with pytest.raises(MeasuredDataError, match=f"lies outside the scenario .*{way_out}"):
+        read_measured(street, later, network)
+
+
+@pytest.mark.parametrize(
     ("begin", "end"),
     [
         ("2024-03-05 07:00:00", "2024-03-05 07:01:00"),

@@ -6,6 +6,7 @@ import math
 from collections import Counter
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
+from datetime import timedelta
 from pathlib import Path
 from typing import get_args
 
@@ -391,8 +392,24 @@ def _check_times(path: Path, frame: pl.DataFrame, scenario: Scenario) -> None:
             column,
             f"lies outside the scenario {scenario.id!r}, which has demand from {first:g} s to "
             f"{last:g} s",
-            "shorten the period, or use a scenario whose duration_s covers it",
+            _other_zero(path, frame, scenario)
+            or "shorten the period, or use a scenario whose duration_s covers it",
         )
+
+
+def _other_zero(path: Path, frame: pl.DataFrame, scenario: Scenario) -> str | None:
+    """Return what to write where `zero` is the time at which the scenario begins, and not 0 s."""
+    first, length_s = scenario.settings.begin_s, scenario.settings.duration_s
+    early = frame.filter(pl.col("begin_s") < first)
+    fits = early.filter(pl.col("begin_s") >= 0, pl.col("end_s") <= length_s + 1e-6)
+    if not fits.height or fits.height < early.height or not (clock := _clock(path, frame)):
+        return None
+    row = fits.row(0, named=True)
+    zero = clock.zeros[row["period_id"]] - timedelta(seconds=first)
+    return (
+        f"zero is the local time at which the scenario's clock is 0: write {zero}, with begin_s "
+        f"{row['begin_s'] + first:g} and end_s {row['end_s'] + first:g}"
+    )
 
 
 def _splits(path: Path, frame: pl.DataFrame) -> tuple[Split, ...]:
