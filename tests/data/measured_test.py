@@ -832,9 +832,11 @@ def test_times_with_an_offset_lose_no_hour_where_the_clock_is_changed(
         (["2024-03-04", "2024-03-04T00:00:09"], [0.0, 9.0]),
         (["2024-03-04T00:01Z", "2024-03-03T17:02-07:00"], [60.0, 120.0]),
         (["3/4/2024 12:03 AM", "3/4/2024 1:00 PM"], [180.0, 46800.0]),
+        (["2024-03-04 7:00 AM", "2024-03-04 12:01am"], [25200.0, 60.0]),
+        (["4.3.2024 7:00:00.5 AM", "4.3.2024 12:00:01 PM", ""], [25200.5, 43201.0, None]),
     ],
 )
-def test_forms_of_other_programs_are_read(texts: list[str], seconds: list[float]) -> None:
+def test_forms_of_other_programs_are_read(texts: list[str], seconds: list[float | None]) -> None:
     zero = pl.Series("zero", ["2024-03-04 00:00:00"])
     clock = LocalClock.of(Path("periods.csv"), pl.Series(["day"]), pl.Series([0.0]), zero, "UTC")
     cells, periods = pl.Series("time", texts), pl.Series(["day"] * len(texts))

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 import re
 import zoneinfo
 from collections.abc import Mapping
@@ -13,19 +14,11 @@ import polars as pl
 
 from ugat_marl.errors import MeasuredDataError
 
-_FORMATS = (
-    "%Y-%m-%d %H:%M:%S%.f",
-    "%Y-%m-%dT%H:%M:%S%.f",
-    "%m/%d/%Y %H:%M:%S%.f",
-    "%m/%d/%Y %I:%M:%S%.f %p",
-    "%d.%m.%Y %H:%M:%S%.f",
-    "%Y-%m-%d %H:%M",
-    "%Y-%m-%dT%H:%M",
-    "%m/%d/%Y %H:%M",
-    "%m/%d/%Y %I:%M %p",
-    "%d.%m.%Y %H:%M",
-)
-
+_DATES = ("%Y-%m-%d ", "%Y-%m-%dT", "%m/%d/%Y ", "%d.%m.%Y ")
+_OF_DAY = ("%H:%M:%S%.f", "%H:%M")
+_OF_HALF_DAY = ("%I:%M:%S%.f %p", "%I:%M %p")
+_HALF = r"(?i) ?([ap]m)$"
+"""End of a time that has a half of the day."""
 
 _OFFSET = r"(Z|:\d\d(\.\d+)? ?[+-]\d\d(:?\d\d)?)$"
 """End of a time that has an offset from UTC."""
@@ -237,7 +230,13 @@ def _parsed(path: Path, cells: pl.Series, start: int) -> pl.Series:
             between = "T" if cells.str.contains("T", literal=True).any() else " "
             midnight = f"${{1}}{between}00:00:00"  # which pandas leaves out
             days = cells.str.replace(r"^(\d{4}-\d\d-\d\d)$", midnight)
-        parsed = [days.str.to_datetime(x, strict=False, time_unit="us") for x in _FORMATS]
+        times = _OF_DAY
+        if days.str.contains(_HALF).any():
+            days, times = days.str.replace(_HALF, " $1"), _OF_HALF_DAY
+        parsed = [
+            days.str.to_datetime(date + time, strict=False, time_unit="us")
+            for time, date in itertools.product(times, _DATES)
+        ]
     best = min(parsed, key=lambda times: times.null_count())
     wrong = best.is_null() & ~empty.fill_null(True)
     if wrong.any():
