@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import functools
+import io
 import json
 import math
 import re
@@ -13,8 +14,10 @@ from dataclasses import replace
 from pathlib import Path
 
 import pytest
+from rich.console import Console
 
 from ugat_marl.__main__ import main
+from ugat_marl.cli.scenario_check import show
 from ugat_marl.effects import load_scenario
 from ugat_marl.experiments import (
     RuleEpisode,
@@ -458,6 +461,18 @@ def test_the_command_prints_tables(
                  "left outside", "headroom: not measured", "nothing to fix"):  # fmt: skip
         assert word in text
     assert max(len(line) for line in text.splitlines()) <= 80
+
+
+def test_departures_are_told_on_the_clock_of_the_scenario(single: Scenario) -> None:
+    way = "northA_A1 A1_southA"
+    days = driven(single, [(25203, way), (26100, way), (26110, way), (26999, way)])
+    times = {"begin_s": 25200.0, "duration_s": 1800.0}
+    later = replace(days, settings=days.settings.model_copy(update=times))
+    said = io.StringIO()
+    show(Console(file=said), survey(later), 25200.0, (), None, (), Network.read(later))
+    text = said.getvalue()
+    assert "4 vehicles, the first at 7:00:03 on the scenario's clock" in text
+    assert "they depart until 7:29:59, most from 7:15:00 on: 3 within 15 min" in text
 
 
 def test_turns_that_yield_are_said_to_count_whole(capsys: pytest.CaptureFixture[str]) -> None:

@@ -14,6 +14,7 @@ from rich.table import Table
 from tyro.conf import Positional, arg
 
 from ugat_marl.cli.arguments import LengthS, Workers, refuse_options, require_numbers
+from ugat_marl.diagnosis import clock
 from ugat_marl.effects import load_scenario, scenario_in_domain
 from ugat_marl.envs import TrafficEnv, parallel_env
 from ugat_marl.errors import OptionError, counted
@@ -129,7 +130,7 @@ class ScenarioCheck:
             print(json.dumps(content, indent=2, ensure_ascii=False, allow_nan=False))
         else:
             network = Network.read(scenario)
-            show(console, facts, runs, rows, wrong, network)
+            show(console, facts, scenario.settings.begin_s, runs, rows, wrong, network)
             if reason := confinement_missing():
                 console.print(
                     f"note: simulations are not confined, because {reason}; see SECURITY.md before "
@@ -163,12 +164,13 @@ class ScenarioCheck:
 def show(
     console: Console,
     facts: Survey,
+    begin_s: float,
     runs: Sequence[RuleEpisode],
     rows: Sequence[HeadroomRow] | None,
     wrong: Sequence[str],
     network: Network,
 ) -> None:
-    """Print everything as tables that fit 80 columns."""
+    """Print everything as tables that fit 80 columns; `begin_s` is the episode's start, s."""
 
     def say(text: str) -> None:
         console.print(text, soft_wrap=True)
@@ -186,9 +188,15 @@ def show(
         f"{facts.shortest_episode_s:g} s (the network fills in {facts.fill_s:g} s)"
     )
     flows = f" and {counted(facts.flows, 'flow')}" if facts.flows else ""
-    say(f"demand {counted(facts.vehicles, 'vehicle')}{flows}, the first after {facts.first_s:g} s")
+    first, last, busiest = (
+        clock(begin_s + seconds) for seconds in (facts.first_s, facts.last_s, facts.busiest_s)
+    )
     say(
-        f"they depart until {facts.last_s:g} s, most from {facts.busiest_s:g} s on: "
+        f"demand {counted(facts.vehicles, 'vehicle')}{flows}, the first at {first} on the "
+        "scenario's clock"
+    )
+    say(
+        f"they depart until {last}, most from {busiest} on: "
         f"{facts.busiest} within {facts.busiest_length_s / 60:g} min"
     )
     for text in _no_agents(facts):
