@@ -57,6 +57,13 @@ def test_help_lists_what_the_command_takes(
     assert set(listed) == {*named, "--help"}
 
 
+def test_the_start_of_an_episode_is_told_as_a_time_of_day(
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    words = " ".join(help_of(capsys, "scenario", "new", "--help-all").replace("│", "").split())
+    assert "s after midnight: 25200 is 7:00" in words
+
+
 def test_there_are_few_verbs(capsys: pytest.CaptureFixture[str]) -> None:
     assert main(["--help"]) == 0
     listed = re.findall(r"^  ([a-z-]+)  +\S", capsys.readouterr().out, flags=re.MULTILINE)

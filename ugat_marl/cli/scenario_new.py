@@ -101,7 +101,7 @@ class ScenarioNew:
         speed_mps: Speed limit of a grid or arterial, m/s.
         phases: Green phases: as the source gives them; those of the programme; derived from the
             conflicts; derived with permitted left turns.
-        begin_s: Start of an episode on the clock of the routes, s.
+        begin_s: Start of an episode on the clock of the routes, s after midnight: 25200 is 7:00.
         duration_s: Length of an episode, s.
         link: Leave the files of --sumo and --routes where they are.
         force: Replace a scenario of this name.
