@@ -120,10 +120,16 @@ def test_the_page_gives_what_the_preset_stands_for() -> None:
 
 
 @pytest.mark.parametrize("alpha", ["0.3", "0.5"])
+@pytest.mark.parametrize("command", [["train", "single-v1"], ["paper", "main"]])
 def test_a_threshold_counts_in_its_own_mode_alone(
-    alpha: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+    command: list[str],
+    alpha: str,
+    tmp_path: Path,
+    capsys: pytest.CaptureFixture[str],
+    monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    words = ["train", "single-v1", "--gate.static-alpha", alpha, "--out", str(tmp_path / "run")]
+    monkeypatch.setattr("ugat_marl.experiments.paper.perform_all", None)
+    words = [*command, "--gate.static-alpha", alpha, "--out", str(tmp_path / "run")]
     assert main(words) == 2
     assert f"--gate.static-alpha {alpha} counts with --gate.mode static" in capsys.readouterr().err
     assert GateConfig(mode="infinite", static_alpha=0.3).static_alpha == 0.3

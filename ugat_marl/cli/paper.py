@@ -11,7 +11,12 @@ import polars as pl
 from rich.console import Console
 from tyro.conf import arg
 
-from ugat_marl.cli.arguments import RayAddress, require_numbers, workers_of
+from ugat_marl.cli.arguments import (
+    RayAddress,
+    require_numbers,
+    require_threshold_counts,
+    workers_of,
+)
 from ugat_marl.data import write_csv
 from ugat_marl.effects import load_scenario
 from ugat_marl.errors import OptionError, counted
@@ -82,6 +87,7 @@ class _Paper:
     def run(self, console: Console) -> int:
         """Train and evaluate; print the table and write it as Markdown, CSV and PNG."""
         require_numbers(1, jobs=self.jobs)
+        require_threshold_counts(self.config.ugat.gate)
         if self.ray is not None and self.config.device != "cpu":
             raise OptionError(
                 f"device = {self.config.device!r}: trainings on Ray have a core each and no GPU; "

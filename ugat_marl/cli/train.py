@@ -12,12 +12,18 @@ from rich.console import Console
 from rich.text import Text
 from tyro.conf import arg
 
-from ugat_marl.cli.arguments import RayAddress, Workers, require_numbers, workers_of
+from ugat_marl.cli.arguments import (
+    RayAddress,
+    Workers,
+    require_numbers,
+    require_threshold_counts,
+    workers_of,
+)
 from ugat_marl.cli.frame import without_deadline, without_loudness
 from ugat_marl.data import METRICS_FILE, Metrics
 from ugat_marl.errors import OptionError
 from ugat_marl.experiments import TransferConfig, outcome_of, run_folder, transfer
-from ugat_marl.policies import UsualValue, is_own
+from ugat_marl.policies import is_own
 from ugat_marl.progress import Bars
 from ugat_marl.reporting import calibration_picture, transfer_picture, transfer_table
 
@@ -72,12 +78,7 @@ class Train:
         if self.out == Path():
             raise OptionError("--out is the working folder itself, or empty; name a folder")
         require_numbers(1, workers=self.workers)
-        gate = config.ugat.gate
-        if gate.mode != "static" and not isinstance(gate.static_alpha, UsualValue):
-            raise OptionError(
-                f"--gate.static-alpha {gate.static_alpha:g} counts with --gate.mode static alone, "
-                f"not {gate.mode}; give both"
-            )
+        require_threshold_counts(config.ugat.gate)
         directory = self.out or run_folder(config)
         try:
             with workers_of(self.workers, self.ray) as workers:
