@@ -294,6 +294,34 @@ def test_tables_of_two_scenarios_do_not_share_a_folder(
     assert "two have the name 'town'" in said and "another --out" in said
 
 
+def test_trainings_of_a_table_are_kept_before_others_are_made(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def trained(*_: Any, **__: Any) -> None:
+        raise OptionError("the trainings begin")
+
+    monkeypatch.setattr("ugat_marl.cli.paper.compare", trained)
+    file = tmp_path / "single-v1" / "gap" / "seeds.csv"
+    file.parent.mkdir(parents=True)
+    table = pl.DataFrame(
+        {
+            "setting": ["direct transfer", "best rule, tuned there"],
+            "domain": "V4",
+            "training_seed": [1, 1],
+            "att_s": 80.0,
+            "att_s_sim": 60.0,
+            "throughput": 900.0,
+        }
+    )
+    table.write_csv(file)
+    call = ["paper", "gap", "--domains", "V4", "--out", str(tmp_path), "--seeds"]
+    assert main([*call, "1"]) == 2
+    assert "'direct transfer' in V4 with seed 1; give the same" in capsys.readouterr().err
+    assert main([*call, "2"]) == 2
+    assert "the trainings begin" in capsys.readouterr().err
+    assert pl.read_csv(file).equals(table)
+
+
 def test_greens_are_late_in_the_simulation_that_is_trained_in(tmp_path: Path) -> None:
     def worlds(sim: str) -> list[str | None]:
         rows = settings_of("main", UgatConfig(), sim, constants=(3,))

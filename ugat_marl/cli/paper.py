@@ -29,6 +29,7 @@ from ugat_marl.experiments import (
     compare,
     file_stem,
     machine_facts,
+    planned_trainings,
     require_kept,
 )
 from ugat_marl.files import require_writable, write_whole
@@ -43,6 +44,9 @@ from ugat_marl.reporting import (
 
 SEEDS = "seeds.csv"
 """File of a table with a row for each training."""
+
+_REMEDY = "give the same command with another --out, it trains nothing again"
+"""Way out where a table may not be replaced."""
 
 
 @dataclass(frozen=True)
@@ -98,9 +102,11 @@ class _Paper:
         self._require_own_folders()
         # A wrong one is an error before any is trained in.
         scenarios = [load_scenario(name, config.duration_s) for name in config.scenario]
-        for scenario, loaded in zip(config.scenario, scenarios, strict=True):
-            folder = self.out / file_stem(scenario) / self.table
+        folders = [self.out / file_stem(scenario) / self.table for scenario in config.scenario]
+        for folder in folders:
             require_writable(folder / "table.md")
+            require_kept(folder / SEEDS, planned_trainings(self.table, config), _REMEDY)
+        for scenario, loaded, folder in zip(config.scenario, scenarios, folders, strict=True):
             with workers_of(self.jobs, self.ray, "--jobs") as workers:
                 comparison = compare(
                     self.table, scenario, config, self.runs, workers, Bars(console)
@@ -199,8 +205,7 @@ def _write(comparison: Comparison, judging: Judging, title: str, folder: Path) -
             stacklevel=2,
         )
     seeds = judging.written_to(rows).write_csv()
-    remedy = "give the same command with another --out, it trains nothing again"
-    require_kept(folder / SEEDS, rows, remedy)
+    require_kept(folder / SEEDS, rows, _REMEDY)
     page = comparison_page(comparison, DIRECT, title, machine_facts())
     write_whole(folder / "table.md", page + "\n")
     write_csv(folder / "table.csv", comparison_csv(comparison))

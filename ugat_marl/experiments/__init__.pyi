@@ -74,6 +74,7 @@ from .sim_check import check_table as check_table
 from .standings import Judging as Judging
 from .standings import all_standings as all_standings
 from .standings import judged_in as judged_in
+from .standings import planned_trainings as planned_trainings
 from .standings import ranked as ranked
 from .standings import read_standings as read_standings
 from .standings import require_kept as require_kept

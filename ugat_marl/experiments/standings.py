@@ -24,6 +24,7 @@ from ugat_marl.errors import CheckpointError, OptionError, OutputError
 from ugat_marl.experiments.comparison import Comparison
 from ugat_marl.experiments.evaluation import evaluation_of
 from ugat_marl.experiments.jobs import EVALUATION_SEED
+from ugat_marl.experiments.paper import PaperConfig
 from ugat_marl.experiments.row_names import DIRECT
 from ugat_marl.experiments.statistics import Interval, number_or_none, student_p
 from ugat_marl.parallel import Workers
@@ -230,7 +231,7 @@ def require_kept(file: Path, after: pl.DataFrame, remedy: str, keeping: str = ""
 
     Args:
         file: The table; if it is not there, nothing is refused.
-        after: What would replace it.
+        after: What would replace it; without columns of results, trainings alone are compared.
         remedy: What to do instead, for the error.
         keeping: What else would keep the rows, for the error.
 
@@ -243,7 +244,7 @@ def require_kept(file: Path, after: pl.DataFrame, remedy: str, keeping: str = ""
         before = read_standings(file)
     except CheckpointError as error:
         raise OutputError(f"{error}, so it is no table that could be replaced; {remedy}") from None
-    lost = before.join(after, on=list(SCHEMA), how="anti", maintain_order="left")
+    lost = before.join(after, on=after.columns, how="anti", maintain_order="left")
     if not lost.is_empty():
         row = lost.row(0, named=True)
         raise OutputError(
@@ -340,6 +341,29 @@ def standings_of(
             for seed, policy in enumerate(numbered)
         ],
         schema=SCHEMA,
+    )
+
+
+def planned_trainings(table: str, config: PaperConfig) -> pl.DataFrame:
+    """Return the trainings of a table of `paper` that is not made yet.
+
+    Args:
+        table: Name of the table, such as "main".
+        config: Options of the table.
+
+    Returns:
+        One row per setting, real domain and training, without results.
+    """
+    seeds = range(config.first_seed, config.first_seed + config.seeds)
+    return pl.DataFrame(
+        [
+            (setting.name, target, seed)
+            for setting in config.settings(table)
+            for target in config.targets(table)
+            for seed in seeds
+        ],
+        schema=[(name, SCHEMA[name]) for name in _TRAINING],
+        orient="row",
     )
 
 
