@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import math
+import shlex
 import sys
 from collections.abc import Mapping
 from dataclasses import replace
@@ -199,3 +200,33 @@ def test_an_interrupted_training_says_how_to_go_on(
     err = capsys.readouterr().err
     assert err.count("--out") == 1 and err.count("--resume") == 1
     assert f"'{tmp_path}/my run'" in err
+
+
+@pytest.mark.parametrize(
+    ("words", "module"),
+    [
+        (["paper", "gap", "--seeds", "2"], "paper"),
+        (["compare", "single-v1", "--name", "my own", "--learner", "ippo"], "compare"),
+    ],
+)
+def test_interrupted_trainings_of_a_table_say_how_to_go_on(
+    words: list[str],
+    module: str,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    def interrupted(*_: Any, **__: Any) -> None:
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(f"ugat_marl.cli.{module}.compare", interrupted)
+    monkeypatch.chdir(tmp_path)
+    runs = f"runs/{module}"
+    for argv, call in (
+        (["/bin/ugat-marl", *words, "--quiet"], shlex.join(words)),
+        (["/bin/other"], shlex.join(words[:2]) + " ..."),
+    ):
+        monkeypatch.setattr(sys, "argv", argv)
+        assert main(words) == 130
+        err = capsys.readouterr().err
+        assert err.endswith(f"trainings: {runs}; go on with: ugat-marl {call}\n")

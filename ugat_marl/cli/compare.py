@@ -11,6 +11,7 @@ from rich.console import Console
 from tyro.conf import Positional, arg
 
 from ugat_marl.cli.arguments import RayAddress, refuse_options, require_numbers, workers_of
+from ugat_marl.cli.frame import continued_by, given_call
 from ugat_marl.data import write_csv
 from ugat_marl.effects import domain_label, load_scenario
 from ugat_marl.errors import OptionError, counted
@@ -221,5 +222,7 @@ class Compare:
             learner=self.learner,
             learner_settings=self.learner_settings,
         )
-        comparison = compare("main", self.scenario, config, self.runs, workers, reporter)
+        call = given_call("compare") or ["compare", self.scenario, "..."]
+        with continued_by(call, f"trainings: {self.runs}"):
+            comparison = compare("main", self.scenario, config, self.runs, workers, reporter)
         return standings_from(comparison, DIRECT, self.name)

@@ -9,6 +9,7 @@ import io
 import itertools
 import os
 import re
+import shlex
 import signal
 import sys
 import textwrap
@@ -17,6 +18,7 @@ import warnings
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import partial
+from pathlib import Path
 from typing import Any
 
 from rich.console import Console
@@ -240,6 +242,35 @@ def without_deadline(words: Sequence[str]) -> tuple[list[str], str | None]:
         else:
             rest.append(word)
     return rest, seconds
+
+
+def given_call(*command: str) -> list[str] | None:
+    """Return the words with which a command was called; None if another program called it.
+
+    Options that every command has are left out.
+
+    Args:
+        *command: Name of the command, word by word.
+    """
+    program, *words = sys.argv
+    words, _ = without_deadline(without_loudness(words)[0])
+    known = Path(program).name in ("ugat-marl", "__main__.py")
+    return words if known and words[: len(command)] == [*command] else None
+
+
+@contextlib.contextmanager
+def continued_by(words: Sequence[str], place: str) -> Iterator[None]:
+    """Tell at an interruption how the work goes on.
+
+    Args:
+        words: Words of the command that continues the work; "..." stands for unknown ones.
+        place: Folder of the work, with what it holds, as in "run: runs/demo".
+    """
+    try:
+        yield
+    except KeyboardInterrupt as interrupt:
+        call = shlex.join(["ugat-marl", *words]).replace("'...'", "...")
+        raise type(interrupt)(f"{place}; go on with: {call}") from None
 
 
 @contextlib.contextmanager

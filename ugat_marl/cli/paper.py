@@ -17,6 +17,7 @@ from ugat_marl.cli.arguments import (
     require_threshold_counts,
     workers_of,
 )
+from ugat_marl.cli.frame import continued_by, given_call
 from ugat_marl.data import write_csv
 from ugat_marl.effects import load_scenario
 from ugat_marl.errors import OptionError, counted
@@ -107,7 +108,13 @@ class _Paper:
             require_writable(folder / "table.md")
             require_kept(folder / SEEDS, planned_trainings(self.table, config), _REMEDY)
         for scenario, loaded, folder in zip(config.scenario, scenarios, folders, strict=True):
-            with workers_of(self.jobs, self.ray, "--jobs") as workers:
+            with (
+                continued_by(
+                    given_call("paper", self.table) or ["paper", self.table, "..."],
+                    f"trainings: {self.runs}",
+                ),
+                workers_of(self.jobs, self.ray, "--jobs") as workers,
+            ):
                 comparison = compare(
                     self.table, scenario, config, self.runs, workers, Bars(console)
                 )

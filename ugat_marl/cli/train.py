@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import shlex
-import sys
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, ClassVar
@@ -19,7 +17,7 @@ from ugat_marl.cli.arguments import (
     require_threshold_counts,
     workers_of,
 )
-from ugat_marl.cli.frame import without_deadline, without_loudness
+from ugat_marl.cli.frame import continued_by, given_call
 from ugat_marl.data import METRICS_FILE, Metrics
 from ugat_marl.errors import OptionError
 from ugat_marl.experiments import TransferConfig, outcome_of, run_folder, transfer
@@ -80,15 +78,13 @@ class Train:
         require_numbers(1, workers=self.workers)
         require_threshold_counts(config.ugat.gate)
         directory = self.out or run_folder(config)
-        try:
-            with workers_of(self.workers, self.ray) as workers:
-                table = transfer(
-                    config, directory, resume=self.resume, reporter=Bars(console), workers=workers
-                )
-        except KeyboardInterrupt as interrupt:
-            raise type(interrupt)(
-                f"run: {directory}; go on with: {self._call(directory)}"
-            ) from None
+        with (
+            continued_by(self._call(directory), f"run: {directory}"),
+            workers_of(self.workers, self.ray) as workers,
+        ):
+            table = transfer(
+                config, directory, resume=self.resume, reporter=Bars(console), workers=workers
+            )
         picture = directory / "gap.png"
         metrics = Metrics.read(directory / METRICS_FILE)
         transfer_picture(table, metrics, picture)
@@ -113,14 +109,12 @@ class Train:
             )
         return 0
 
-    def _call(self, directory: Path) -> str:
-        """Return the command line that continues the run."""
-        program, *words = sys.argv
-        words, _ = without_deadline(without_loudness(words)[0])
-        given = [word for word in words if word != "--resume"]
-        known = Path(program).name in ("ugat-marl", "__main__.py") and given[:1] == ["train"]
-        if not known:  # called by another program
+    def _call(self, directory: Path) -> list[str]:
+        """Return the words of the command that continues the run."""
+        words = given_call("train")
+        given = [word for word in words or () if word != "--resume"]
+        if words is None:
             given = ["train", self.config.scenario, "..."]
-        if self.out is None or not known:
+        if self.out is None or words is None:
             given += ["--out", str(directory)]
-        return shlex.join(["ugat-marl", *given, "--resume"]).replace("'...'", "...")
+        return [*given, "--resume"]
