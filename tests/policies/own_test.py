@@ -1121,3 +1121,31 @@ def test_names_that_a_module_imports_are_not_among_its_own() -> None:
 def test_tables_need_a_learner_that_can_be_kept(capsys: pytest.CaptureFixture[str]) -> None:
     assert main(["paper", "main", "--learner", "my_algo:Cycle"]) == 2
     assert "rows of a table start from what direct transfer has learnt" in capsys.readouterr().err
+
+
+def test_an_error_in_a_policy_is_told_with_its_name_and_place(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    file = tmp_path / "failing.py"
+    file.write_text(
+        "import json\n"
+        "def act(observations, infos):\n"
+        "    return observations['nobody']\n"
+        "class Reader:\n"
+        "    def reset(self):\n"
+        "        json.loads('{')\n"
+        "    def act(self, observations, infos):\n"
+        "        return {}\n"
+    )
+    call = ["evaluate", "single-v1", "--domains", "sim", "--seeds", "1", "--duration-s", "60"]
+    assert main([*call, "--policies", f"{file}:act"]) == 2
+    said = f"policy '{file}:act': KeyError: 'nobody' ({file}, line 3)\n"
+    assert capsys.readouterr().err.endswith(said)
+    failing = OwnPolicy(load_own(f"{file}:Reader", "policy")(), "mine", {})
+    place = r"failing\.py, line 6\), raised in .*decoder\.py, line \d+$"
+    with pytest.raises(OptionError, match=place) as told:
+        failing.reset(0)
+    assert isinstance(told.value.__cause__, json.JSONDecodeError)
+    learner = SimpleNamespace(policy=lambda: failing)
+    with pytest.raises(OptionError, match=r"before its training \(policy 'mine': JSONDecodeError"):
+        check_own_learner(lambda *_: learner, ToyTraffic(), 0)

@@ -100,6 +100,10 @@ def _env_options(given: Any, what: str) -> dict[str, Any]:
     return dict(asked)
 
 
+class _Raised(OptionError):
+    """A policy of a user raised an exception, which is the cause of this one."""
+
+
 class OwnPolicy:
     """A policy of a user, as a `Policy`.
 
@@ -154,21 +158,28 @@ class OwnPolicy:
         return self._state is not None
 
     def reset(self, seed: int) -> None:
-        """Tell the user's policy that an episode begins, if it has a method ``reset``."""
+        """Tell the user's policy that an episode begins, if it has a method ``reset``.
+
+        Raises:
+            OptionError: It raised an exception.
+        """
         reset = getattr(self._given, "reset", None)
         if reset is not None:
-            reset(*[seed] if _takes(reset, 1) else [])
+            with self._naming_errors():
+                reset(*[seed] if _takes(reset, 1) else [])
 
     def act(self, observations: Observations, infos: Infos) -> Actions:
         """Return the actions of the user's policy as whole numbers.
 
         Raises:
-            OptionError: It returned no mapping from every agent to a phase that the agent has.
+            OptionError: It raised an exception, or returned no mapping from every agent to a phase
+                that the agent has.
         """
         act = getattr(self._given, "act", self._given)
         by_name = {self._infos_name: infos} if self._infos_name else {}
         in_place = [infos] if self._sees_infos else []
-        chosen = act(observations, *in_place, **by_name)
+        with self._naming_errors():
+            chosen = act(observations, *in_place, **by_name)
         if not isinstance(chosen, Mapping):
             raise OptionError(
                 f"policy {self._name!r} returned {type(chosen).__name__}; it must return a "
@@ -185,6 +196,22 @@ class OwnPolicy:
                 ) from None
         self._require_phases(actions, observations, infos)
         return actions
+
+    @contextlib.contextmanager
+    def _naming_errors(self) -> Iterator[None]:
+        """Name the policy, and the line of it, in what it raises."""
+        try:
+            yield
+        except (UgatMarlError, MemoryError):
+            raise
+        except Exception as error:
+            given = self._given
+            kind = given if inspect.isroutine(given) else type(given)
+            said = f"{type(error).__name__}: {error}{_last_line_in(kind, error)}"
+            *_, last = traceback.extract_tb(error.__traceback__)
+            if (raised := f"{last.filename}, line {last.lineno}") not in said:
+                said += f", raised in {raised}"
+            raise _Raised(f"policy {self._name!r}: {said}") from error
 
     def _require_phases(self, actions: Actions, observations: Observations, infos: Infos) -> None:
         for agent in observations:
@@ -539,11 +566,13 @@ def check_own_learner(
         observations, infos = env.reset(seed=seed)
         policy.reset(seed)
         actions = policy.act(observations, infos)
-    except UgatMarlError:
-        raise
     except Exception as error:
+        is_told = isinstance(error, UgatMarlError)
+        if is_told and not isinstance(error, _Raised):
+            raise
+        said = str(error) if is_told else f"{type(error).__name__}: {error}"
         raise OptionError(
-            f"learner {name!r} failed before its training ({type(error).__name__}: {error}); "
+            f"learner {name!r} failed before its training ({said}); "
             "policy() is asked before the first learn(), too, and has to act in the environment"
         ) from error
     spaces: Any = env.unwrapped
@@ -601,8 +630,11 @@ def _takes(function: Callable[..., Any], number: int, *names: str) -> bool:
     return True
 
 
-def _last_line_in(kind: type, error: BaseException) -> str:
-    """Return where in a class's file an error came up, as " (FILE, line 7)"; "" if not there."""
+def _last_line_in(kind: Any, error: BaseException) -> str:
+    """Return where in the file of a class or function an error came up, as " (FILE, line 7)".
+
+    It is "" if the file had no part in it.
+    """
     try:
         file = inspect.getsourcefile(kind)
     except TypeError:  # a class without a source
