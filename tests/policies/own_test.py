@@ -1095,6 +1095,8 @@ def test_a_class_with_settings_of_its_own_keeps_them() -> None:
 def test_a_learner_in_the_place_of_a_policy_is_refused_with_the_way_out() -> None:
     with pytest.raises(OptionError, match="'my_algo:Cycle' is a learner.*my_algo:Cycle@FILE"):
         policy_factory("my_algo:Cycle")(ToyTraffic())
+    with pytest.raises(OptionError, match="'mine' is a learner.*mine@FILE"):
+        own_policy(Noted, "mine", ToyTraffic())  # a class that is made without arguments
 
 
 def test_a_class_that_needs_more_is_refused() -> None:

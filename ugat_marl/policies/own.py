@@ -253,6 +253,8 @@ def own_policy(given: Any, name: str, env: AnyParallelEnv) -> Policy:
         given = given(*[env] if _wants_env(given) else [])
     elif _is_maker(given):
         given = given(env)
+    if not callable(getattr(given, "act", given)) and _is_learner(given):
+        raise OptionError(_in_place_of_policy(name))
     asked_options(given, name)
     return OwnPolicy(given, name, {})
 
@@ -265,14 +267,24 @@ def _is_maker(given: Any) -> bool:
 
 def _not_made(given: Any, name: str) -> str:
     """Return the reason why a class cannot be made into a policy, with the way out."""
-    if all(hasattr(given, method) for method in NEEDED):
-        return (
-            f"policy {name!r} is a learner: train it with --learner {name}, and give the file of "
-            f"its policy, as {name}@FILE"
-        )
+    if _is_learner(given):
+        return _in_place_of_policy(name)
     return (
         f"policy {name!r}: the class is made as {given.__name__}(env) or {given.__name__}(), and "
         f"takes {inspect.signature(given)}; give further arguments defaults"
+    )
+
+
+def _is_learner(given: Any) -> bool:
+    """Return True if an object, or a class, has the methods of a learner."""
+    return all(hasattr(given, method) for method in NEEDED)
+
+
+def _in_place_of_policy(name: str) -> str:
+    """Return that a learner is no policy, with the way out."""
+    return (
+        f"policy {name!r} is a learner: train it with --learner {name}, and give the file of "
+        f"its policy, as {name}@FILE"
     )
 
 
