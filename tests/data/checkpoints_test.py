@@ -61,6 +61,11 @@ def test_half_a_file_another_file_and_no_file(tmp_path: Path) -> None:
         read_checkpoint(path, "toy")
     with pytest.raises(CheckpointError, match="no such"):
         read_checkpoint(tmp_path / "b.pt", "toy")
+    with zipfile.ZipFile(path, "w") as archive:  # as Stable-Baselines3 writes
+        for name in ("data", "policy.pth"):
+            archive.writestr(name, "{}")
+    with pytest.raises(CheckpointError, match=r"of another program \(data, policy\.pth\), not a"):
+        read_checkpoint(path, "toy")
 
 
 def test_what_is_not_finite_is_not_written(tmp_path: Path) -> None:

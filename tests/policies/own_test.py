@@ -1064,6 +1064,10 @@ def test_a_file_of_something_else_is_refused(tmp_path: Path) -> None:
     make = policy_factory("my_algo:Kept@other.pt")
     with pytest.raises(CheckpointError, match=r"other\.pt: not the state of a learner"):
         make(ugat_marl.parallel_env("single-v1"))
+    with zipfile.ZipFile(tmp_path / "other.pt", "w") as archive:
+        archive.writestr("data", "{}")
+    with pytest.raises(CheckpointError, match="only a file that a run of the suite wrote is read"):
+        make(ugat_marl.parallel_env("single-v1"))
 
 
 def test_a_class_of_policies_is_made(algorithm: Any) -> None:

@@ -11,7 +11,7 @@ from typing import Any
 
 import torch
 
-from ugat_marl.errors import CheckpointError, first_line
+from ugat_marl.errors import CheckpointError, first_line, first_names
 from ugat_marl.files import (
     MALFORMED,
     OWN_COUNTERS,
@@ -73,11 +73,17 @@ def read_checkpoint(path: Path, *kinds: str) -> dict[str, Any]:
                 f"{path}: an exported model, which other programs read; give the .pt that it was "
                 "made from"
             ) from None
-        if _is_own(path):
+        entries = _entries(path)
+        if OWN_COUNTERS in entries:
             raise CheckpointError(
                 f"{path}: what a learner of yours has saved, which only the learner can read; "
                 f"commands that play policies, and evaluate() in Python, take it as "
                 f"MODULE:CLASS@{path}; it cannot be exported"
+            ) from None
+        if entries and not any(name.endswith("/data.pkl") for name in entries):
+            raise CheckpointError(
+                f"{path}: an archive of another program ({first_names(entries)}), not a checkpoint "
+                "of this suite; give a file that a command of the suite wrote"
             ) from None
         raise CheckpointError(
             f"{path}: not a readable checkpoint ({first_line(error)}); it may have been cut short: "
@@ -103,13 +109,13 @@ def read_checkpoint(path: Path, *kinds: str) -> dict[str, Any]:
     return content
 
 
-def _is_own(path: Path) -> bool:
-    """Return True for the state of a learner of a user (`policies.own`)."""
+def _entries(path: Path) -> list[str]:
+    """Return the names of the entries of an archive; none if it is no archive, or cut short."""
     try:
         with zipfile.ZipFile(path) as archive:
-            return OWN_COUNTERS in archive.namelist()
+            return archive.namelist()
     except (OSError, zipfile.BadZipFile, *MALFORMED):
-        return False
+        return []
 
 
 def _require_sums(path: Path) -> None:

@@ -598,6 +598,11 @@ def _counters(path: Path) -> dict[str, Any]:
     try:
         with zipfile.ZipFile(path) as packed:
             require_stored(packed)
+            if OWN_COUNTERS not in packed.namelist():
+                raise CheckpointError(
+                    f"{path}: not the state of a learner of a user; only a file that a run of the "
+                    "suite wrote is read: train with --learner MODULE:CLASS"
+                )
             text = packed.read(OWN_COUNTERS).decode("utf-8")
             counters = parse_json(text, f"{path}, {OWN_COUNTERS}", CheckpointError)
             episodes = int(counters["episodes"])
