@@ -180,6 +180,17 @@ def test_pages_hold_the_numbers(found: Comparison) -> None:
     assert '"best rule, tuned there",V4,1,120.0,80.0,0.0' in rows
 
 
+def test_a_page_of_one_training_seed_speaks_of_no_test(found: Comparison) -> None:
+    one = replace(found, trials=tuple(t for t in found.trials if t.training_seed != 1))
+    page, usual = (
+        " ".join(comparison_page(table, "direct transfer", "main", FACTS).split())
+        for table in (one, found)
+    )
+    assert "With one training seed no setting can be tested against direct transfer. Low" in page
+    assert "No setting is better" not in page and "by chance" not in page
+    assert "Each of 3 is tested by itself" in usual
+
+
 def test_a_setting_without_a_training_has_no_row_for_it() -> None:
     rows = [
         *trials("direct transfer", {0: (70.0, 200.0), 1: (72.0, 240.0)}),

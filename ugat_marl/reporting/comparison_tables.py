@@ -218,14 +218,18 @@ def _meaning(comparison: Comparison, direct: str) -> list[str]:
         best = "all settings alike" if _all_alike(comparison, target) else comparison.best(target)
         lowest.setdefault(best, []).append(target)
     best = joined([f"`{setting}` in {joined(targets)}" for setting, targets in lowest.items()])
-    first = (
-        f"Better than direct transfer in every domain, with p < {CERTAIN:g} in each: "
-        f"{joined([f'`{setting}`' for setting in better])}."
-        if better
-        else f"No setting is better than direct transfer in every domain with p < {CERTAIN:g}."
-    )
+    is_tested = len(comparison.training_seeds) > 1
+    if not is_tested:
+        first = "With one training seed no setting can be tested against direct transfer."
+    elif better:
+        first = (
+            f"Better than direct transfer in every domain, with p < {CERTAIN:g} in each: "
+            f"{joined([f'`{setting}`' for setting in better])}."
+        )
+    else:
+        first = f"No setting is better than direct transfer in every domain with p < {CERTAIN:g}."
     tested = len([setting for setting in comparison.settings if setting != direct])
-    if tested > 1:
+    if is_tested and tested > 1:
         first += (
             f" Each of {tested} is tested by itself: of as many that change nothing, "
             f"{tested * CERTAIN / 2:.2g} would pass in one domain by chance."
