@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import os
 from typing import Any
 
@@ -10,7 +11,7 @@ import pytest
 
 from ugat_marl import parallel_env, vector_env
 from ugat_marl.envs import agent_indicator, pad_spaces
-from ugat_marl.errors import OptionError
+from ugat_marl.errors import ActionError, OptionError
 
 pytest.importorskip("stable_baselines3")
 from ugat_marl.envs.adapters.sb3 import AgentsVecEnv
@@ -76,6 +77,21 @@ def test_it_learns() -> None:
     model.learn(300)
     assert model.num_timesteps >= 300
     env.close()
+
+
+def test_a_learner_without_masks_needs_legal_actions() -> None:
+    from stable_baselines3 import PPO
+
+    def learn(wrap: list[str]) -> int:
+        env = SimulationsVecEnv(vector_env("mixed-v1", 1, wrap=wrap, duration_s=100))
+        with contextlib.closing(env):
+            model = PPO("MlpPolicy", env, n_steps=16, batch_size=16, n_epochs=1, seed=1)
+            return model.learn(100).num_timesteps
+
+    pad, indicator = WRAPS
+    with pytest.raises(ActionError, match="put legal_actions outside pad_spaces"):
+        learn(WRAPS)
+    assert learn([pad, "ugat_marl.envs.wrappers:legal_actions", indicator]) >= 100
 
 
 def test_only_the_convention_of_the_library_is_taken() -> None:

@@ -256,7 +256,10 @@ class _Pad(Wrapper):
             if agent in padded and is_phase(action, padded[agent]):
                 own = int(self._own[agent].n)
                 if int(action) >= own:
-                    return f"; from {own} on they are padding, and 0 in the action_mask of its info"
+                    return (
+                        f"; from {own} on they are padding, and 0 in the action_mask of its info; "
+                        "put legal_actions outside pad_spaces for a learner without masks"
+                    )
         return ""
 
     def _told(self, infos: Infos) -> Infos:
