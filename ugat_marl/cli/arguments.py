@@ -11,8 +11,6 @@ from tyro.conf import arg
 
 from ugat_marl import parallel
 from ugat_marl.errors import OptionError, require_distinct
-from ugat_marl.grounding import GateConfig
-from ugat_marl.policies import UsualValue
 
 
 def unused(metavar: str) -> Any:
@@ -110,19 +108,6 @@ def require_names(**options: Sequence[str]) -> None:
         if not values:
             raise OptionError(f"{option_text(name)} needs at least one value")
         require_distinct(**{option_text(name): values})
-
-
-def require_threshold_counts(gate: GateConfig) -> None:
-    """Refuse a static threshold for a gate that would ignore it.
-
-    Raises:
-        OptionError: The threshold is given, and the mode is another one than "static".
-    """
-    if gate.mode != "static" and not isinstance(gate.static_alpha, UsualValue):
-        raise OptionError(
-            f"--gate.static-alpha {gate.static_alpha:g} counts with --gate.mode static alone, "
-            f"not {gate.mode}; give both"
-        )
 
 
 @contextlib.contextmanager

@@ -14,7 +14,6 @@ from tyro.conf import arg
 from ugat_marl.cli.arguments import (
     RayAddress,
     require_numbers,
-    require_threshold_counts,
     workers_of,
 )
 from ugat_marl.cli.frame import continued_by, given_call
@@ -92,7 +91,7 @@ class _Paper:
     def run(self, console: Console) -> int:
         """Train and evaluate; print the table and write it as Markdown, CSV and PNG."""
         require_numbers(1, jobs=self.jobs)
-        require_threshold_counts(self.config.ugat.gate)
+        self.config.ugat.gate.require_threshold_counts()
         if self.ray is not None and self.config.device != "cpu":
             raise OptionError(
                 f"device = {self.config.device!r}: trainings on Ray have a core each and no GPU; "

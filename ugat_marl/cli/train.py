@@ -14,7 +14,6 @@ from ugat_marl.cli.arguments import (
     RayAddress,
     Workers,
     require_numbers,
-    require_threshold_counts,
     workers_of,
 )
 from ugat_marl.cli.frame import continued_by, given_call
@@ -76,7 +75,7 @@ class Train:
         if self.out == Path():
             raise OptionError("--out is the working folder itself, or empty; name a folder")
         require_numbers(1, workers=self.workers)
-        require_threshold_counts(config.ugat.gate)
+        config.ugat.gate.require_threshold_counts()
         directory = self.out or run_folder(config)
         with (
             continued_by(self._call(directory), f"run: {directory}"),

@@ -20,7 +20,7 @@ from numpy.typing import NDArray
 
 from ugat_marl.errors import CheckpointError, OptionError, require_kinds
 from ugat_marl.grounding.reports import complaint
-from ugat_marl.policies import Usual, UsualName, UsualNumber
+from ugat_marl.policies import Usual, UsualName, UsualNumber, UsualValue
 
 _INTERSECTION: Any = UsualName("intersection")
 
@@ -56,6 +56,18 @@ class GateConfig:
             raise OptionError(f"gate static_alpha is {self.static_alpha}; allowed: in (0, 1]")
         if self.window_epochs < 1:
             raise OptionError(f"gate window_epochs is {self.window_epochs}; allowed: >= 1")
+
+    def require_threshold_counts(self) -> None:
+        """Refuse a static threshold that the mode would ignore.
+
+        Raises:
+            OptionError: The threshold is given, and the mode is another one than "static".
+        """
+        if self.mode != "static" and not isinstance(self.static_alpha, UsualValue):
+            raise OptionError(
+                f"--gate.static-alpha {self.static_alpha:g} counts with --gate.mode static alone, "
+                f"not {self.mode}; give both"
+            )
 
 
 @dataclass(frozen=True)
