@@ -11,11 +11,7 @@ import polars as pl
 from rich.console import Console
 from tyro.conf import arg
 
-from ugat_marl.cli.arguments import (
-    RayAddress,
-    require_numbers,
-    workers_of,
-)
+from ugat_marl.cli.arguments import RayAddress, require_numbers, workers_of
 from ugat_marl.cli.frame import continued_by, given_call
 from ugat_marl.data import write_csv
 from ugat_marl.effects import load_scenario

@@ -10,12 +10,7 @@ from rich.console import Console
 from rich.text import Text
 from tyro.conf import arg
 
-from ugat_marl.cli.arguments import (
-    RayAddress,
-    Workers,
-    require_numbers,
-    workers_of,
-)
+from ugat_marl.cli.arguments import RayAddress, Workers, require_numbers, workers_of
 from ugat_marl.cli.frame import continued_by, given_call
 from ugat_marl.data import METRICS_FILE, Metrics
 from ugat_marl.errors import OptionError

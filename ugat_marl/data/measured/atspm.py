@@ -28,7 +28,6 @@ from ugat_marl.data.measured.tables import (
     PERIODS,
     ROW,
     clock_steps,
-    first_row,
     frame_of,
     in_order,
     read_raw,
@@ -38,7 +37,7 @@ from ugat_marl.data.measured.tables import (
     to_texts,
     with_period,
 )
-from ugat_marl.data.measured.values import Finding, MeasuredData
+from ugat_marl.data.measured.values import Finding, MeasuredData, first_row
 from ugat_marl.errors import MeasuredDataError
 from ugat_marl.scenarios import (
     Network,

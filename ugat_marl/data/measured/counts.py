@@ -15,11 +15,10 @@ from ugat_marl.data.measured.tables import (
     TRAVEL_TIMES,
     TURNING,
     as_written,
-    place,
     refuse,
     report_outside,
 )
-from ugat_marl.data.measured.values import Finding
+from ugat_marl.data.measured.values import Finding, place
 from ugat_marl.errors import MeasuredDataError, nearest
 from ugat_marl.scenarios import Detector, Network, Period
 

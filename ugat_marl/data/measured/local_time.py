@@ -12,6 +12,7 @@ from pathlib import Path
 
 import polars as pl
 
+from ugat_marl.data.measured.values import first_row, place
 from ugat_marl.errors import MeasuredDataError
 
 _DATES = ("%Y-%m-%d ", "%Y-%m-%dT", "%m/%d/%Y ", "%d.%m.%Y ")
@@ -70,9 +71,10 @@ class LocalClock:
         zeros: dict[str, datetime] = {}
         zeros_utc: dict[str, datetime] = {}
         unsure = ""
+        start = first_row(path)
         for at, (period, begin_s) in enumerate(zip(periods, begins_s, strict=True)):
-            cell = _times(path, cells[at : at + 1], time_zone, at + 2, mapping)
-            where = f"{_place(path, at, 2)}: {cells.name}"
+            cell = _times(path, cells[at : at + 1], time_zone, at + start, mapping)
+            where = f"{place(path, at + start)}: {cells.name}"
             try:
                 zeros[period], zeros_utc[period], later = _readings(cell, begin_s, zone)
             except (OverflowError, ValueError):
@@ -188,12 +190,6 @@ def _is_zoned(times: pl.Series) -> bool:
     return isinstance(times.dtype, pl.Datetime) and times.dtype.time_zone is not None
 
 
-def _place(path: Path, at: int, start: int) -> str:
-    """Return the name of a time's place in its file; a mapping has no rows."""
-    unit = {".parquet": "row", ".toml": "entry"}.get(path.suffix, "line")
-    return f"{path}, {unit} {at + (1 if unit == 'entry' else start)}"
-
-
 def _times(path: Path, cells: pl.Series, time_zone: str, start: int, mapping: str) -> pl.Series:
     """Return times in microseconds, in UTC if they have a time zone; see `local_times`."""
     if isinstance(cells.dtype, pl.String):
@@ -250,5 +246,5 @@ def _parsed(path: Path, cells: pl.Series, start: int) -> pl.Series:
             way_out = "other times of the column have an offset from UTC; write it behind this one"
         else:
             way_out = "write it in a form such as 2024-03-05 07:00:00.1"
-        raise MeasuredDataError(f"{_place(path, at, start)}: {cells.name} is {text!r}; {way_out}")
+        raise MeasuredDataError(f"{place(path, at + start)}: {cells.name} is {text!r}; {way_out}")
     return best

@@ -24,13 +24,12 @@ from ugat_marl.data.measured.tables import (
     ROW,
     Table,
     in_order,
-    place,
     read_table,
     refuse,
     with_period,
 )
 from ugat_marl.data.measured.tracks import passages_of_tracks
-from ugat_marl.data.measured.values import Finding, MeasuredData, split_periods
+from ugat_marl.data.measured.values import Finding, MeasuredData, place, split_periods
 from ugat_marl.effects import is_detector_name
 from ugat_marl.errors import MeasuredDataError, nearest
 from ugat_marl.scenarios import (

@@ -15,7 +15,7 @@ import polars as pl
 from numpy.typing import NDArray
 
 from ugat_marl.data.measured.local_time import LocalClock
-from ugat_marl.data.measured.values import Finding
+from ugat_marl.data.measured.values import Finding, first_row, place
 from ugat_marl.data.row_hashes import (
     UNREADABLE,
     csv_damage,
@@ -273,17 +273,6 @@ def frame_of(table: Table, rows: Sequence[tuple[object, ...]]) -> pl.DataFrame:
         name: pl.Float64() if kind == "number" else pl.String() for name, kind in kinds.items()
     }
     return pl.DataFrame(rows, schema=schema, orient="row")
-
-
-def first_row(path: Path) -> int:
-    """Return the number of the first row of a table; line 1 of a CSV file is its header."""
-    return 1 if path.suffix.lower() == ".parquet" else 2
-
-
-def place(path: Path, row: int) -> str:
-    """Return the name of a row for messages."""
-    unit = {".csv": "line", ".parquet": "row"}.get(path.suffix.lower(), "entry")
-    return f"{path}, {unit} {row}"
 
 
 def as_written(frame: pl.DataFrame, column: str) -> str:

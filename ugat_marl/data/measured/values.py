@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import hashlib
 from dataclasses import dataclass
+from pathlib import Path
 
 import numpy as np
 import polars as pl
@@ -14,6 +15,17 @@ from ugat_marl.scenarios import Detector, Period, Split
 
 HELD_OUT_SHARE = 0.4
 """Share of the periods that is held out by default. The last periods are held out."""
+
+
+def first_row(path: Path) -> int:
+    """Return the number of the first row of a table; line 1 of a CSV file is its header."""
+    return 1 if path.suffix.lower() in (".parquet", ".toml") else 2
+
+
+def place(path: Path, row: int) -> str:
+    """Return the name of a row for messages; a mapping has entries."""
+    unit = {".parquet": "row", ".toml": "entry"}.get(path.suffix.lower(), "line")
+    return f"{path}, {unit} {row}"
 
 
 @dataclass(frozen=True)
