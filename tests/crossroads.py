@@ -5,7 +5,8 @@ from __future__ import annotations
 import subprocess
 from pathlib import Path
 
-from ugat_marl.scenarios import sumo_program
+from ugat_marl.effects import load_scenario
+from ugat_marl.scenarios import Scenario, sumo_program
 
 NODES = {"M": (0, 0), "N": (0, 200), "S": (0, -200), "W": (-200, 0), "E": (200, 0)}
 ROADS = ("Ww", "wM", "ME", "NM", "MS", "SM", "MN")
@@ -32,3 +33,13 @@ def build_crossroads(folder: Path, before_m: int) -> None:
          "--no-turnarounds"],
         cwd=folder, check=True, capture_output=True,
     )  # fmt: skip
+
+
+def crossroads_with(vehicles: str, folder: Path, before_m: int, duration_s: int) -> Scenario:
+    """Return the crossroads as a scenario in a folder, with vehicles as XML."""
+    build_crossroads(folder, before_m)
+    (folder / "r.rou.xml").write_text(f"<routes>{vehicles}</routes>")
+    (folder / "scenario.toml").write_text(
+        f'network = "n.net.xml"\nroutes = ["r.rou.xml"]\nduration_s = {duration_s}\n'
+    )
+    return load_scenario(folder)

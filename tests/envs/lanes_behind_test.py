@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 import ugat_marl
-from tests.crossroads import build_crossroads
+from tests.crossroads import crossroads_with
 from ugat_marl.__main__ import main
 from ugat_marl.effects import load_scenario, scenario_in_domain
 from ugat_marl.errors import OptionError, ScenarioError
@@ -30,15 +30,10 @@ def split(tmp_path_factory: pytest.TempPathFactory) -> Scenario:
 
 
 def crossroads(folder: Path, before_m: int) -> Scenario:
-    build_crossroads(folder, before_m)
     cars = "".join(
         f'<vehicle id="{i}" depart="{2 * i}"><route edges="Ww wM ME"/></vehicle>' for i in range(8)
     )
-    (folder / "r.rou.xml").write_text(f"<routes>{cars}</routes>")
-    (folder / "scenario.toml").write_text(
-        'network = "n.net.xml"\nroutes = ["r.rou.xml"]\nduration_s = 200\n'
-    )
-    return load_scenario(folder)
+    return crossroads_with(cars, folder, before_m, 200)
 
 
 def test_a_short_lane_has_the_lane_behind(split: Scenario) -> None:

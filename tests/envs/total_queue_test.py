@@ -5,8 +5,7 @@ from __future__ import annotations
 import pytest
 
 import ugat_marl
-from tests.crossroads import build_crossroads
-from ugat_marl.effects import load_scenario
+from tests.crossroads import crossroads_with
 from ugat_marl.envs import Rewarder, TrafficEnv
 from ugat_marl.scenarios import Scenario
 
@@ -14,18 +13,12 @@ from ugat_marl.scenarios import Scenario
 @pytest.fixture(scope="module")
 def short_entry(tmp_path_factory: pytest.TempPathFactory) -> Scenario:
     """A crossroads whose western road is cut 18 m before the light; 60 cars come from there."""
-    folder = tmp_path_factory.mktemp("short")
-    build_crossroads(folder, 18)
     cars = "".join(
         f'<vehicle id="w{i}" depart="{5 * i}"><route edges="Ww wM ME"/></vehicle>'
         f'<vehicle id="n{i}" depart="{5 * i}"><route edges="NM MS"/></vehicle>'
         for i in range(60)
     )
-    (folder / "r.rou.xml").write_text(f"<routes>{cars}</routes>")
-    (folder / "scenario.toml").write_text(
-        'network = "n.net.xml"\nroutes = ["r.rou.xml"]\nduration_s = 600\n'
-    )
-    return load_scenario(folder)
+    return crossroads_with(cars, tmp_path_factory.mktemp("short"), 18, 600)
 
 
 def phase_with(env: TrafficEnv, lane: str) -> int:

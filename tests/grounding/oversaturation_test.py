@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from tests.crossroads import build_crossroads
+from tests.crossroads import crossroads_with
 from ugat_marl.data import AgentLayout, Provenance, TransitionLog, TransitionRecorder
 from ugat_marl.effects import load_scenario
 from ugat_marl.grounding.oversaturation import Oversaturation
@@ -91,12 +91,7 @@ def test_free_traffic_is_not_called_oversaturated() -> None:
 
 def test_a_jam_behind_a_node_of_the_map_is_seen(tmp_path: Path) -> None:
     """With `movements`, where the lane behind the light ends at no light."""
-    build_crossroads(tmp_path, 60)
-    (tmp_path / "r.rou.xml").write_text("<routes/>")
-    (tmp_path / "scenario.toml").write_text(
-        'network = "n.net.xml"\nroutes = ["r.rou.xml"]\nduration_s = 200\n'
-    )
-    network = Network.read(load_scenario(tmp_path))
+    network = Network.read(crossroads_with("", tmp_path, 60, 200))
     (item,) = network.intersections
     own, out = len(item.incoming_lanes), len(item.outgoing_lanes)
     jammed = item.outgoing_lanes.index("ME_0")

@@ -12,7 +12,7 @@ import numpy as np
 import polars as pl
 import pytest
 
-from tests.crossroads import build_crossroads
+from tests.crossroads import crossroads_with
 from ugat_marl import parallel_env
 from ugat_marl.data import AgentLayout, Provenance, TransitionLog, TransitionRecorder
 from ugat_marl.data.row_hashes import write_hashed
@@ -197,17 +197,12 @@ def test_who_crosses_a_short_lane_within_a_second_counts_once(
     attributes: str, stop: str, count: int, simulator: LibsumoSimulator, tmp_path: Path
 ) -> None:
     """A car drives 12 m in a second, and the lane at the light has 7 m."""
-    build_crossroads(tmp_path, 11)
     cars = "".join(
         f'<vehicle id="{n}" depart="{4 * n}" departSpeed="max" {attributes}>'
         f'<route edges="Ww wM ME"/>{stop}</vehicle>'
         for n in range(15)
     )
-    (tmp_path / "r.rou.xml").write_text(f"<routes>{cars}</routes>")
-    (tmp_path / "scenario.toml").write_text(
-        'network = "n.net.xml"\nroutes = ["r.rou.xml"]\nduration_s = 120\n'
-    )
-    scenario = load_scenario(tmp_path)
+    scenario = crossroads_with(cars, tmp_path, 11, 120)
     network = Network.read(scenario)
     (light,) = network.intersections
     green = "".join("G" if link.from_edge == "wM" else "r" for link in light.links)
