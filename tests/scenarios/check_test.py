@@ -8,14 +8,17 @@ import json
 import math
 import re
 import struct
+import subprocess
 import xml.etree.ElementTree as ET
 from collections.abc import Iterable
 from dataclasses import replace
 from pathlib import Path
 
+import numpy as np
 import pytest
 from rich.console import Console
 
+from tests.crossroads import crossroads_with
 from ugat_marl.__main__ import main
 from ugat_marl.cli.scenario_check import show
 from ugat_marl.effects import load_scenario
@@ -38,6 +41,7 @@ from ugat_marl.scenarios import (
     Scenario,
     degrees_of_saturation,
     resco_maps,
+    sumo_program,
     survey,
 )
 from ugat_marl.scenarios.capacity import discharge_vph
@@ -271,10 +275,55 @@ def test_what_goes_on_red_after_a_stop_has_capacity() -> None:
     for link in light.links:
         if link.from_lane == lane and link.direction == "r":
             letters[link.index] = "s"
-    programme = ((30.0, "".join(letters)), (10.0, "r" * len(letters)))
-    number = sum(link.from_lane == lane for link in light.links)
-    turning = sum(link.from_lane == lane and link.direction == "r" for link in light.links)
-    assert _green_s(replace(light, programme=programme), lane) == 30.0 * turning / number
+    stops = replace(light, programme=((30.0, "".join(letters)), (10.0, "r" * len(letters))))
+    to = {link.direction: link.to_edge for link in light.links if link.from_lane == lane}
+    assert _green_s(stops, lane, {}, 2.0) == 15.0  # the mean of both links
+    assert _green_s(stops, lane, {to["r"]: 90.0}, 2.0) == pytest.approx(30.0)
+    assert _green_s(stops, lane, {to["r"]: 90.0, to["s"]: 10.0}, 2.0) == pytest.approx(0.0)
+
+
+def test_a_turn_without_green_holds_up_the_lane_that_it_shares(tmp_path: Path) -> None:
+    """Closed form: vehicles until the first that has to wait; and what SUMO lets through."""
+    cars = "".join(
+        f'<vehicle id="{i}" depart="{i * 2}" departSpeed="max">'
+        f'<route edges="NM {"ME" if number < 0.5 else "MS"}"/></vehicle>'
+        for i, number in enumerate(np.random.default_rng(0).random(1800))
+    )
+    crossing = crossroads_with(cars, tmp_path, 60, 3600)
+    (light,) = Network.read(crossing).intersections
+    index = {link.to_edge: link.index for link in light.links if link.from_edge == "NM"}
+    letters = "r" * len(light.programme[0][1])
+
+    def green(*roads: str) -> str:
+        going = [index[road] for road in roads]
+        return "".join("G" if i in going else letter for i, letter in enumerate(letters))
+
+    def used_s(*programme: tuple[float, str]) -> float:
+        return _green_s(replace(light, programme=programme), "NM_0", {"MS": 50, "ME": 50}, 2.0)
+
+    assert used_s((30.0, green("MS", "ME")), (60.0, letters)) == pytest.approx(30)
+    assert used_s((30.0, green("MS")), (60.0, letters)) == pytest.approx(0)  # a left turn is first
+    # Greens so long that each ends with a vehicle that waits for the other: 1 + 1/2 + 1/4 ... go.
+    assert used_s((60.0, green("MS")), (60.0, green("ME"))) == pytest.approx(2 * 2 * 2)
+    both = used_s((30.0, green("MS", "ME")), (3.0, green("ME")), (60.0, letters))
+    assert both == pytest.approx(30 + 2 * (1 / 2 + 1 / 2 * 1 / 4))  # 1.5 vehicles' time
+
+    programme = ((30.0, green("MS")), (10.0, green("ME")), (50.0, letters))
+    shares = {"MS": 50.0, "ME": 50.0}
+    headway_s = 3600 / discharge_vph("sl", 13.0)
+    each = _green_s(replace(light, programme=programme), "NM_0", shares, headway_s) / headway_s
+    phases = "".join(f'<phase duration="{s}" state="{state}"/>' for s, state in programme)
+    (tmp_path / "p.add.xml").write_text(
+        '<additional><tlLogic id="M" type="static" programID="1" offset="0">'
+        f"{phases}</tlLogic></additional>"
+    )
+    subprocess.run(
+        [str(sumo_program("sumo")), "-n", "n.net.xml", "-r", "r.rou.xml", "-a", "p.add.xml",
+         "--end", "3600", "--tripinfo-output", "out.xml", "--time-to-teleport", "-1"],
+        cwd=tmp_path, check=True, capture_output=True,
+    )  # fmt: skip
+    through = len(ET.parse(tmp_path / "out.xml").findall("tripinfo"))
+    assert through / (3600 / 90) == pytest.approx(each, rel=0.2)
 
 
 def test_a_programme_that_follows_the_traffic_is_told(single: Scenario) -> None:

@@ -9,6 +9,8 @@ from collections.abc import Container, Iterator, Mapping, Sequence, Set
 from dataclasses import dataclass, replace
 from itertools import combinations
 
+import numpy as np
+
 from ugat_marl.errors import ScenarioError
 from ugat_marl.progress import Reporter
 from ugat_marl.scenarios.capacity import Flows, degrees_of_saturation, discharge_vph, may_go
@@ -67,7 +69,8 @@ class ApproachFacts:
             that they would discharge in permanent green (`discharge_vph`). Drivers divide among the
             lanes from which they may turn as evenly as possible.
         saturation: The same with the flow that lanes discharge under the network's own programme.
-            Above 1 the queue grows. None if there is no programme, or no green for some turn.
+            Turns that share a lane hold each other up. Above 1 the queue grows. None if there is no
+            programme, or no green for some turn.
         first_s: Time at which the first vehicle can be there, s from the start of the episode; None
             if no route uses the road, or none can be there before the end.
     """
@@ -448,8 +451,15 @@ def _approaches(
         ratio = fullest(flows, lanes_of, vehicles)
         saturation = math.inf
         if cycle_s:
-            greens = {lane: _green_s(intersection, lane) / cycle_s for lane in used}
-            served = {lane: vehicles[lane] * green for lane, green in greens.items()}
+            served: dict[str, float] = {}
+            for lane in used:
+                share = {
+                    turn: flow / len(lanes_of[turn])
+                    for turn, flow in flows.items()
+                    if lane in lanes_of.get(turn, ())
+                }
+                green_s = _green_s(intersection, lane, share, 3600 / vehicles[lane])
+                served[lane] = vehicles[lane] * green_s / cycle_s
             saturation = fullest(flows, lanes_of, served)
         approaches.append(
             ApproachFacts(
@@ -505,14 +515,44 @@ def fullest(
     return most
 
 
-def _green_s(intersection: Intersection, lane: str) -> float:
-    """Return the seconds in which a lane may go per cycle of the programme, mean over its links."""
+def _green_s(
+    intersection: Intersection, lane: str, flows_vph: Mapping[str, float], headway_s: float
+) -> float:
+    """Return the green that the queue of a lane uses per cycle of the programme, s.
+
+    Vehicles leave one behind the other, so that one without green holds up those behind it. Each
+    road ahead is drawn by its share of the traffic; which vehicle is first is a Markov chain.
+
+    Args:
+        intersection: The intersection with its programme.
+        lane: A lane that leads there.
+        flows_vph: Road ahead to the lane's traffic that goes there. Without traffic the mean over
+            the links is returned.
+        headway_s: Time between two vehicles in permanent green, s.
+    """
     links = [link for link in intersection.links if link.from_lane == lane]
-    shown = [
-        sum(seconds for seconds, state in intersection.programme if may_go([link], state))
-        for link in links
-    ]
-    return sum(shown) / len(shown)
+    ahead = [link for link in links if flows_vph.get(link.to_edge, 0.0) > 0]
+    if not ahead:
+        return sum(
+            seconds * may_go([link], state) / len(links)
+            for seconds, state in intersection.programme
+            for link in links
+        )
+    share = np.array([flows_vph[link.to_edge] for link in ahead], dtype=np.float64)
+    share /= share.sum()
+    count = len(ahead)
+    still = np.eye(count + 1)
+    cycle = still  # probability of the next first vehicle by the present one; last, the green used
+    for seconds, state in intersection.programme:
+        goes = np.array([may_go([link], state) for link in ahead])
+        one_leaves = still.copy()
+        one_leaves[:count, :count] = np.where(goes[:, None], share, np.eye(count))
+        one_leaves[:count, count] = headway_s * goes
+        whole, part = divmod(seconds / headway_s, 1.0)
+        last = (1 - part) * still + part * one_leaves
+        cycle = cycle @ np.linalg.matrix_power(one_leaves, int(whole)) @ last
+    in_the_long_run = np.linalg.matrix_power(cycle[:count, :count], 1024)
+    return float(share @ in_the_long_run @ cycle[:count, count])
 
 
 def _free_links(root: ET.Element) -> Counter[str]:
