@@ -264,13 +264,15 @@ def _other_answers(name: str, base: UgatConfig) -> Setting:
 
 def _alphas(name: str, base: UgatConfig) -> list[Setting]:
     _require_gate(name)
-    alphas = (0.2, 0.4, 0.5, 0.6, 0.8)
+    alphas = {0.2, 0.4, 0.5, 0.6, 0.8}  # those of the paper
+    if base.gate.mode == "static":
+        alphas.add(float(base.gate.static_alpha))
     dynamic = replace(base, gate=replace(base.gate, mode="dynamic"))
     pooled = replace(dynamic, gate=replace(dynamic.gate, scope="pooled"))
     return [
         *(
-            _ugat(variant_name(name, f"α = {a}"), replace(base, gate=_static(base, a)))
-            for a in alphas
+            _ugat(variant_name(name, f"α = {a:g}"), replace(base, gate=_static(base, a)))
+            for a in sorted(alphas)
         ),
         _ugat(GROUNDED_NAME[name], dynamic),
         _ugat(variant_name(name, "α pooled over the network"), pooled),
