@@ -9,8 +9,14 @@ from pathlib import Path
 import pytest
 
 from ugat_marl.diagnosis import Hypothesis, free_values, global_hypotheses, ordered
-from ugat_marl.diagnosis.hypotheses import LOCAL, a_few, cautious_drivers, library
-from ugat_marl.effects import PAPER_WORLDS, known_effects, load_scenario, parse_domain
+from ugat_marl.diagnosis.hypotheses import LOCAL, a_few, cautious_drivers, library, merged
+from ugat_marl.effects import (
+    PAPER_WORLDS,
+    apply_effects,
+    known_effects,
+    load_scenario,
+    parse_domain,
+)
 from ugat_marl.errors import OptionError, UnknownNameError
 from ugat_marl.scenarios import Scenario
 
@@ -58,6 +64,26 @@ def test_trucks_alone_do_not_say_how_cars_accelerate(crossing: Crossing) -> None
     found = by_name(load_scenario(crossing(vehicles=cars, types=types)))
     values = {1.3, 2.6, 2.5}  # the type of the fixture has 2.5
     assert found["acceleration"].nominal == pytest.approx((sum(values) / 3,))
+
+
+def test_of_several_types_no_number_changes_nothing(crossing: Crossing) -> None:
+    found = by_name(load_scenario(crossing(vehicles=CARS, types=TYPES)))
+    mixed, alike = found["acceleration"], found["deceleration"]
+    assert not mixed.is_nothing((2.0,))
+    assert mixed.matters((2.0,))
+    assert merged((), ((mixed, (2.0,)),)) == ((mixed, (2.0,)),)
+    assert alike.is_nothing((4.5,))
+    assert not alike.matters((4.5,))
+    assert merged((), ((alike, (4.5,)),)) == ()
+
+
+def test_the_spread_of_speeds_is_read_off_the_speed_factors(single: Scenario) -> None:
+    even = by_name(apply_effects(single, parse_domain("speed_spread=0.03")))["speed_spread"]
+    assert (even.nominal, even.levels, even.neutral) == ((0.03,), ((0.2,),), True)
+    # normc(1,0.1,0.2,2) of the cars, normc(1,0.05,0.2,2) of the trucks
+    mixed = by_name(load_scenario("mixed-v1"))["speed_spread"]
+    assert mixed.nominal == (pytest.approx(0.075),)
+    assert not mixed.neutral
 
 
 def test_what_is_no_number_is_taken_as_sumos_default(crossing: Crossing) -> None:

@@ -14,7 +14,6 @@ from ugat_marl.diagnosis.features import BIN_FEATURES, FEATURES
 from ugat_marl.diagnosis.hypotheses import Members, merged
 from ugat_marl.diagnosis.propose import (
     Direction,
-    _is_something,
     _useful,
     between,
     exchanges,
@@ -282,6 +281,17 @@ def test_an_imitation_is_exchanged_for_the_right_effect(reference: Reference) ->
     assert merged(members, best.members) == ((right.hypothesis, (0.6,)),)
 
 
+def test_what_has_no_values_that_change_nothing_is_not_exchanged(reference: Reference) -> None:
+    among = directions()
+    mixed = 0.9 * among[5].difference["network"]
+    imitation = {"network": mixed, "time": NO_TIME}
+    for neutral in (True, False):
+        headway = replace(among[0].hypothesis, neutral=neutral)
+        among[0] = replace(among[0], hypothesis=headway, difference=imitation)
+        members, above, target = left_by(reference, among, "startup_delay", "headway", 0.9)
+        assert bool(exchanges(members, above, target, THRESHOLDS)) is neutral
+
+
 def test_a_right_effect_is_not_exchanged(reference: Reference) -> None:
     among = directions()
     members, above, target = left_by(reference, among, "startup_delay", "startup_delay", 1.0)
@@ -425,9 +435,3 @@ def test_the_gap_is_measured_in_units_of_the_noise_of_the_periods(reference: Ref
     ]
     assert gaps[0] == pytest.approx(0.04, rel=0.3), "the noise has a variance of 1"
     assert gaps[1] == pytest.approx(4 * gaps[0], rel=0.05)
-
-
-def test_values_on_their_usual_place_are_nothing() -> None:
-    hypothesis = directions()[0].hypothesis
-    assert _is_something(hypothesis, (1.5,))
-    assert not _is_something(hypothesis, (1.0,))

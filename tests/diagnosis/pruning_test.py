@@ -260,6 +260,17 @@ def test_of_every_effect_the_interval_decides(hypothesis: Hypothesis) -> None:
         assert (doubtful(tested, THRESHOLDS.half_interval) == []) == named
 
 
+def test_a_number_for_types_that_disagree_is_never_in_doubt() -> None:
+    # 1.95 is between cars and trucks, and so slower than the cars and livelier than the trucks.
+    hypotheses = global_hypotheses(load_scenario("mixed-v1"), {"acceleration", "headway"})
+    blank = cast(Any, None)
+    members = tuple((one, cast("tuple[float, ...]", one.nominal)) for one in hypotheses)
+    model = Fitted(members, {}, blank, blank, 0.0)
+    tested = records.Tested(model, blank, np.array([0.1, 0.1]), {})
+    (index,) = doubtful(tested, THRESHOLDS.half_interval)
+    assert members[index][0].name == "headway"
+
+
 def test_every_effect_with_a_number_has_a_usual_value() -> None:
     # Without one, nothing could show that its interval holds it.
     without = {x.name for x in EVERY if x.nominal is None}

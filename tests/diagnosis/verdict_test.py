@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import json
-from dataclasses import asdict
+from dataclasses import asdict, replace
 from types import SimpleNamespace
 from typing import Any
 
@@ -141,6 +141,8 @@ def test_effects_in_words() -> None:
 def test_units_are_written_as_people_write_them() -> None:
     slow = Hypothesis("acceleration", (), ("mps2",), ((1.6,),), (2.6,))
     assert describe_effect(slow, (0.497,)) == "acceleration of 0.497 m/s² (scenario: 2.6)"
+    mixed = replace(slow, neutral=False)
+    assert describe_effect(mixed, (0.497,)) == "acceleration of 0.497 m/s²"
 
 
 def test_what_to_measure_next_is_said_in_words() -> None:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Collection, Sequence
 from dataclasses import dataclass, fields
+from statistics import fmean
 from typing import Any
 
 from ugat_marl.effects import (
@@ -13,7 +14,7 @@ from ugat_marl.effects import (
     ExaminedStrengths,
     known_effects,
     measurement_effects,
-    nominal_number,
+    type_numbers,
     type_values,
 )
 from ugat_marl.errors import OptionError, UnknownNameError
@@ -39,11 +40,14 @@ class Hypothesis:
         fixed: Names and values of the known fields: places, windows, driver models.
         free: Names of the fields to fit.
         levels: Values of the free fields in the first simulations.
-        nominal: Values of the free fields that change nothing; None if there are none.
+        nominal: Values of the free fields in the scenario, the mean if its vehicle types disagree;
+            None if there are none.
         least: Distance from nominal below which the effect does not matter, in the field's unit.
         step: Grid of the values, in the field's unit; 0 for no grid.
         both: True if the effect below nominal is the opposite of the effect above.
         extreme: Members of `levels` that are simulated but too strong for a plausible world.
+        neutral: True if nominal changes nothing. An effect gives all vehicle types one number, so
+            it changes something at their mean.
     """
 
     name: str
@@ -55,11 +59,17 @@ class Hypothesis:
     step: float = 0.0
     both: bool = False
     extreme: tuple[tuple[float, ...], ...] = ()
+    neutral: bool = True
 
     @property
     def key(self) -> tuple[Any, ...]:
         """Name and place: a model holds each such pair once."""
         return (self.name, tuple(field for field in self.fixed if isinstance(field[1], str)))
+
+    @property
+    def nothing(self) -> tuple[float, ...] | None:
+        """Values of the free fields that change nothing; None if there are none."""
+        return self.nominal if self.neutral else None
 
     def effect(self, values: Sequence[float]) -> Effect:
         """Make the effect with these values of the free fields, clipped to their ranges."""
@@ -80,9 +90,13 @@ class Hypothesis:
 
     def matters(self, values: Sequence[float]) -> bool:
         """Return True if the effect is strong enough to be named."""
-        if not self.free or self.nominal is None:
+        if not self.free or self.nothing is None:
             return True
-        return abs(values[0] - self.nominal[0]) >= self.least
+        return abs(values[0] - self.nothing[0]) >= self.least
+
+    def is_nothing(self, values: tuple[float, ...]) -> bool:
+        """Return True if values on the effect's grid change nothing."""
+        return self.nothing is not None and values == self.clipped(self.nothing)
 
 
 Members = tuple[tuple[Hypothesis, tuple[float, ...]], ...]
@@ -141,11 +155,14 @@ def global_hypotheses(scenario: Scenario, allowed: Collection[str]) -> list[Hypo
         if name not in allowed:
             continue
         kind, entry = known_effects()[name], examined(name)
-        nominal = nominal_number(scenario, kind.attribute, entry.nominal)
+        numbers = type_numbers(scenario, kind.attribute, entry.nominal)
+        if name == "reaction_step":  # no driver decides more often than the simulation steps
+            numbers = sorted({max(number, step) for number in numbers})
+        nominal = fmean(numbers)
         extreme = tuple((level,) for level in entry.extreme)
         levels = tuple((level,) for level in entry.levels if abs(level - nominal) > entry.least)
         if name == "reaction_step":
-            nominal, levels = max(nominal, step), ((2 * max(nominal, step),),)
+            levels = ((2 * nominal,),)
         fixed = tuple((place, EVERYWHERE) for place in kind.texts)
         grid = step if name == "reaction_step" else entry.step
         hypotheses.append(
@@ -159,6 +176,7 @@ def global_hypotheses(scenario: Scenario, allowed: Collection[str]) -> list[Hypo
                 grid,
                 entry.both,
                 extreme,
+                neutral=len(numbers) == 1,
             )
         )
     if "driver_model" in allowed:
@@ -233,7 +251,7 @@ def free_values(effect: Effect, hypothesis: Hypothesis) -> tuple[float, ...]:
 def both_ways(
     hypothesis: Hypothesis, values: tuple[float, ...], farther: float
 ) -> list[tuple[Hypothesis, tuple[float, ...], tuple[float, ...]]]:
-    """Return two changes of an effect of the model: to nothing, and farther from nominal.
+    """Return two changes of an effect of the model: to nominal, and farther from it.
 
     Args:
         hypothesis: The effect.
@@ -284,14 +302,14 @@ def each_left_out(members: Members) -> list[Members]:
 
 
 def merged(members: Members, new: Members) -> Members:
-    """Return a model with further effects or other values; effects at nominal are left out."""
+    """Return a model with further effects or other values, without those that change nothing."""
     by_key = {hypothesis.key: (hypothesis, values) for hypothesis, values in members}
     for hypothesis, values in new:
         by_key[hypothesis.key] = (hypothesis, values)
     return tuple(
         (hypothesis, values)
         for hypothesis, values in by_key.values()
-        if hypothesis.nominal is None or values != hypothesis.clipped(hypothesis.nominal)
+        if not hypothesis.is_nothing(values)
     )
 
 

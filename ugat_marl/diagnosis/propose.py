@@ -32,8 +32,8 @@ class Direction:
         level: Values of its free fields.
         difference: Change of the statistics, by block, ``(members, features)``.
         variance: Variance of that change, by block.
-        origin: Values at which nothing changes: nominal values, or those of the model so far; None
-            if there are none.
+        origin: Values from which strengths are measured: nominal values, or those of the model so
+            far; None if there are none.
     """
 
     hypothesis: Hypothesis
@@ -125,14 +125,9 @@ def propose(
                     (directions[index].hypothesis, directions[index].at(float(strength)))
                     for index, strength in zip(chosen, strengths, strict=True)
                 )
-                if all(_is_something(hypothesis, values) for hypothesis, values in members):
+                if not any(hypothesis.is_nothing(values) for hypothesis, values in members):
                     best[keys] = Proposed(members, cost)
     return sorted(best.values(), key=_cost)
-
-
-def _is_something(hypothesis: Hypothesis, values: tuple[float, ...]) -> bool:
-    """Return True if the values differ from nominal once they are on the hypothesis's grid."""
-    return hypothesis.nominal is None or values != hypothesis.clipped(hypothesis.nominal)
 
 
 def _least_squares(
@@ -190,8 +185,8 @@ def exchanges(
 
     Args:
         members: Members of the model.
-        directions: Changes of the statistics on top of the model. Those of a member at its nominal
-            values take it out, the others move it.
+        directions: Changes of the statistics on top of the model. Those of a member at values that
+            change nothing take it out, the others move it.
         whitener: What the model leaves, and its noise.
         thresholds: Numbers of the method.
 
@@ -252,7 +247,7 @@ def _of_members(
     for hypothesis, _ in members:
         for k, one in enumerate(directions):
             if one.hypothesis.key == hypothesis.key and hypothesis.nominal is not None:
-                gone = one.level == hypothesis.clipped(hypothesis.nominal)
+                gone = hypothesis.is_nothing(one.level)
                 (out if gone else moves).setdefault(hypothesis.key, k)
     return out, moves
 

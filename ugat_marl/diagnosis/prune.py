@@ -131,7 +131,7 @@ class Pruner:
         """
         hypothesis, values = tested.model.members[index]
         certain = bool((tested.errors_of(index) > 0.0).all())
-        known = bool(values) and hypothesis.nominal is not None and certain
+        known = bool(values) and hypothesis.nothing is not None and certain
         return known and _deviations(tested, index) > self._thresholds.beyond_doubt
 
 
@@ -144,15 +144,15 @@ def _deviations(tested: Tested, index: int) -> float:
     """Return how many standard errors the member at `index` is away from its usual values."""
     hypothesis, values = tested.model.members[index]
     errors = np.maximum(tested.errors_of(index), 1e-12)
-    return float((np.abs(np.subtract(values, hypothesis.nominal or 0.0)) / errors).max())
+    return float((np.abs(np.subtract(values, hypothesis.nothing or 0.0)) / errors).max())
 
 
 def doubtful(tested: Tested, half_interval: float) -> list[int]:
-    """Return indices of effects whose intervals hold the nominal values: they may be absent."""
+    """Return indices of effects whose intervals hold values that change nothing."""
     indices: list[int] = []
     for index, (hypothesis, values) in enumerate(tested.model.members):
-        if values and hypothesis.nominal is not None:
-            away = np.abs(np.subtract(values, hypothesis.nominal))
+        if values and hypothesis.nothing is not None:
+            away = np.abs(np.subtract(values, hypothesis.nothing))
             if (away <= half_interval * tested.errors_of(index)).all():
                 indices.append(index)
     return indices

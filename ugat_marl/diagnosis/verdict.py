@@ -324,7 +324,7 @@ def describe_effect(hypothesis: Hypothesis, values: tuple[float, ...]) -> str:
         text += f" {place.replace('>', ' → ')}"
     if window:
         text += f" from {clock(window[0])} to {clock(window[1])}"
-    nominal = hypothesis.nominal or (0.0,) * len(values)
+    nominal = hypothesis.nothing or (0.0,) * len(values)
     for name, value, present in zip(hypothesis.free, values, nominal, strict=True):
         text += amount(name, value, ranges[name].unit)
         if present and name not in ("factor", "share"):

@@ -114,4 +114,5 @@ from .vehicles import StartupDelay as StartupDelay
 from .vehicles import VehicleEffect as VehicleEffect
 from .vehicles import YellowRunning as YellowRunning
 from .vehicles import nominal_number as nominal_number
+from .vehicles import type_numbers as type_numbers
 from .vehicles import type_values as type_values

@@ -14,7 +14,7 @@ from typing import ClassVar
 
 from ugat_marl.effects.base import Effect, ExaminedStrengths, NumberParameter, TextParameter
 from ugat_marl.effects.documents import edit_scenario, parts_with, with_default_types
-from ugat_marl.scenarios import Scenario, ScenarioFile
+from ugat_marl.scenarios import Scenario, ScenarioFile, SpeedFactors
 
 _NOT_DRIVEN = frozenset(
     {
@@ -43,32 +43,41 @@ def type_values(scenario: Scenario, attribute: str, default: str = "") -> set[st
         scenario: The scenario.
         attribute: Attribute of vehicle types.
         default: Value of passenger cars whose type does not name it; "" to leave these out.
+
+    Raises:
+        ValueError: A speed is asked for that is not a number.
     """
     texts: set[str] = set()
     for document in (*scenario.additional, *scenario.routes):
         for part in parts_with(document, "<vType"):
             for kind in driven_types(part):
+                if attribute == "speedDev":  # speedFactor may hold it, and classes differ
+                    speeds = SpeedFactors.of(kind.attrib, scenario.settings.sumo)
+                    texts.add(str(speeds.deviation))
+                    continue
                 usual = default if kind.get("vClass", "passenger") == "passenger" else ""
                 texts.add(_text(kind, attribute) or usual)
     return texts - {""}
 
 
-def nominal_number(scenario: Scenario, attribute: str, default: float) -> float:
-    """Return the value of an effect that changes nothing in a scenario.
+def type_numbers(scenario: Scenario, attribute: str, default: float) -> list[float]:
+    """Return the different numbers of an attribute in a scenario's types, in ascending order.
 
     Args:
-        scenario: The scenario without the effect.
-        attribute: Attribute of vehicle types with the effect's number, or "".
-        default: Value without an effect where no type names the attribute, or in words.
-
-    Returns:
-        The mean of the different values in the scenario's types.
+        scenario: The scenario.
+        attribute: Attribute of vehicle types, or "".
+        default: The only number where no type names the attribute, or one names it in words.
     """
     try:
-        values = {float(text) for text in type_values(scenario, attribute, str(default))}
+        numbers = {float(text) for text in type_values(scenario, attribute, str(default))}
     except ValueError:
-        return default
-    return fmean(sorted(values)) if values else default
+        return [default]
+    return sorted(numbers or {default})
+
+
+def nominal_number(scenario: Scenario, attribute: str, default: float) -> float:
+    """Return the mean of `type_numbers`; where they are one number, it changes nothing."""
+    return fmean(type_numbers(scenario, attribute, default))
 
 
 def _text(vehicle_type: ET.Element, attribute: str) -> str:
