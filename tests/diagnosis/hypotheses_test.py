@@ -196,6 +196,17 @@ def test_cautious_drivers_are_starting_points(single: Scenario) -> None:
     assert cautious_drivers([]) == []
 
 
+def test_livelier_drivers_are_no_cautious_ones(single: Scenario) -> None:
+    def starts(*texts: str) -> list[list[float]]:
+        scenario = apply_effects(single, [effect for x in texts for effect in parse_domain(x)])
+        found = cautious_drivers(global_hypotheses(scenario, library()))
+        return [[value for _, (value,) in members] for members in found]
+
+    assert starts("deceleration=2.6", "startup_delay=0.5") == [[1.6, 2.0, 0.6], [0.8, 2.0, 1.2]]
+    assert starts("acceleration=0.7") == []
+    assert starts("startup_delay=1.3") == []
+
+
 def test_no_world_of_the_paper_is_a_starting_point(single: Scenario) -> None:
     # A search that begins at the worlds it is tried on would find them for a wrong reason.
     hypotheses = global_hypotheses(single, library())

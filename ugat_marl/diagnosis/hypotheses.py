@@ -122,8 +122,8 @@ NEAR_ITS_BOUND = 1.3
 """Emergency deceleration that is tried, as a multiple of the model's usual one. By hand. Halved: no
 emergency deceleration is so small."""
 
-CAUTION = ("acceleration", "deceleration", "startup_delay")
-"""Properties of drivers that change together, for `cautious_drivers`."""
+CAUTION = {"acceleration": -1, "deceleration": -1, "startup_delay": 1}
+"""Properties of drivers that change together, and in which direction, for `cautious_drivers`."""
 
 MODELS = ("IDM", "EIDM", "W99")
 """Driver models that are examined."""
@@ -194,25 +194,28 @@ def cautious_drivers(hypotheses: Sequence[Hypothesis]) -> list[Members]:
 
     In bad weather drivers start later, and speed up and brake more gently, all at once. Single
     effects do not lead there. The strengths are those at which the library examines each effect
-    alone: the mildest together, and the strongest together.
+    alone: the mildest together, and the strongest together. Where drivers are so cautious already
+    that a property has none, there is no set.
 
     Args:
         hypotheses: Hypotheses about the whole network.
     """
     known = {hypothesis.name: hypothesis for hypothesis in hypotheses}
-    if not all(name in known for name in CAUTION):
-        return []
-
-    def together(strongest: bool) -> Members:
-        members: list[tuple[Hypothesis, tuple[float, ...]]] = []
-        for hypothesis in (known[name] for name in CAUTION):
-            (usual,) = hypothesis.nominal or (0.0,)
-            levels = [level for level in hypothesis.levels if level not in hypothesis.extreme]
-            levels.sort(key=lambda level: abs(level[0] - usual))
-            members.append((hypothesis, levels[-1 if strongest else 0]))
-        return tuple(members)
-
-    return [together(strongest=False), together(strongest=True)]
+    mild: list[tuple[Hypothesis, tuple[float, ...]]] = []
+    strong: list[tuple[Hypothesis, tuple[float, ...]]] = []
+    for name, sign in CAUTION.items():
+        if name not in known:
+            return []
+        hypothesis = known[name]
+        (usual,) = hypothesis.nominal or (0.0,)
+        plausible = (level for level in hypothesis.levels if level not in hypothesis.extreme)
+        cautious = [level for level in plausible if sign * (level[0] - usual) > 0]
+        if not cautious:
+            return []
+        cautious.sort(reverse=sign < 0)
+        mild.append((hypothesis, cautious[0]))
+        strong.append((hypothesis, cautious[-1]))
+    return [tuple(mild), tuple(strong)]
 
 
 def ordered(effects: Sequence[Effect]) -> tuple[Effect, ...]:
