@@ -297,6 +297,10 @@ def test_stretches_of_the_day_make_no_interval_wider() -> None:
     (alike,), _ = uncertainty(fitter, model, days)
     (error,), _ = uncertainty(fitter, model, apart)
     assert error == pytest.approx(alike, rel=0.5)
+    (alone,), _ = uncertainty(
+        fitter, model, [replace(d, window=(n, 9)) for n, d in enumerate(days)]
+    )
+    assert alone == pytest.approx(alike, rel=0.5)
 
 
 def test_uncertain_values_make_statistics_uncertain() -> None:

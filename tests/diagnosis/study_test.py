@@ -319,9 +319,14 @@ def test_windows_are_compared_with_the_first_of_their_time_of_day(
 
 
 @pytest.mark.parametrize(
-    ("numbers", "told"), [((1, 1, 1, 1), "effort base = 1"), ((8, 0, 1, 8), "effort bank = 0")]
+    ("numbers", "told"),
+    [
+        ((1, 1, 2, 4), "effort base = 1"),
+        ((8, 0, 2, 8), "effort bank = 0"),
+        ((8, 1, 1, 6), "effort fit = 1"),  # one day has no spread
+    ],
 )
-def test_an_effort_without_days_is_refused(numbers: tuple[int, ...], told: str) -> None:
+def test_an_effort_of_too_few_days_is_refused(numbers: tuple[int, ...], told: str) -> None:
     with pytest.raises(OptionError, match=told):
         Effort(*numbers)
 

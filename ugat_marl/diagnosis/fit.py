@@ -521,8 +521,11 @@ def _spread_of_days(
 ) -> Array:
     """Return the covariance of the changes that single days would make in the estimate.
 
-    Each day is compared with the mean of its own stretch of the day.
+    Each day is compared with the mean of its own stretch of the day. If no two days are of the same
+    stretch, the days of the scenario as it is stand in for them.
     """
+    if len({day.window for day in days}) == len(days):
+        days = list(fitter.base_days.values())
     stretches: dict[Window, list[Tally]] = {}
     for day in days:
         stretches.setdefault(day.window, []).append(day)

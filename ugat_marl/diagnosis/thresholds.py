@@ -34,7 +34,8 @@ class Effort:
     def __post_init__(self) -> None:
         require_kinds(self, "effort")
         require_least(4, **{"effort base": self.base, "effort test": self.test})
-        require_least(1, **{"effort bank": self.bank, "effort fit": self.fit})
+        require_least(2, **{"effort fit": self.fit})  # errors of estimates are a spread of days
+        require_least(1, **{"effort bank": self.bank})
 
 
 EFFORTS = ((4, Effort()), (8, Effort(40, 3, 5, 32)))

@@ -109,7 +109,7 @@ def test_travel_times_that_cannot_be_compared_are_noted(street, measured: Measur
     rows = [(day, 60.0 * k, "C_N", 20.0, "S_C", 20.0, 40.0) for day in days for k in range(9)]
     rows += [("day1", 60.0 * k, "S_C", 10.0 + k, "C_N", 20.0, 40.0) for k in range(9)]
     probes = pl.DataFrame(rows, schema=columns, orient="row")
-    config = DiagnosisConfig(cache=street.cache, effort=Effort(base=4, bank=1, fit=1, test=4))
+    config = DiagnosisConfig(cache=street.cache, effort=Effort(base=4, bank=1, fit=2, test=4))
     study = Study.of(street.scenario, replace(measured, travel_times=probes), config)
     found = study.with_findings_on_travel_times(study.base(Silent()), Silent()).measured.findings
     texts = [finding.text for finding in found if finding.text.startswith("travel_times")]
