@@ -238,6 +238,50 @@ def test_faults_of_detectors_cost_no_simulation(scenario: Scenario, layout: Dete
     assert faulty[0].travel_time_s == plain[0].travel_time_s
 
 
+def test_days_that_faults_of_detectors_are_tried_on_are_kept(
+    scenario: Scenario, layout: DetectorLayout, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(module, "_KEPT_DAYS", 2)
+    made, streets = an_engine(scenario, layout, None, base_days=4)
+    made.replicates((), range(4))
+    for number in range(3):
+        made.replicates(HEADWAY, [number])
+    assert len(streets.calls) == 7
+    made.replicates(FAULTY, range(4))
+    assert len(streets.calls) == 7, "days of the scenario as it is"
+    made.replicates((*HEADWAY, *FAULTY), [1])
+    made.replicates(HEADWAY, [3])
+    made.replicates((*HEADWAY, *parse_domain("undercount=*,0.2")), [1])
+    assert len(streets.calls) == 8, "the day that was used last"
+    made.replicates((*HEADWAY, *FAULTY), [0])
+    assert len(streets.calls) == 9, "no more than two days of models"
+
+
+def test_a_day_that_is_being_simulated_is_not_dropped(
+    scenario: Scenario, layout: DetectorLayout, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(module, "_KEPT_DAYS", 1)
+    made, streets = an_engine(scenario, layout, None)
+    begun, go_on, simulate = threading.Event(), threading.Event(), streets.simulate
+
+    def slow(effects: Sequence[Effect], period: Period, seed: int) -> Day:
+        if not effects:
+            begun.set()
+            assert go_on.wait(10)
+        return simulate(effects, period, seed)
+
+    monkeypatch.setattr(streets, "simulate", slow)
+    with ThreadPoolExecutor(2) as pool:
+        first = pool.submit(made.replicates, (), [0])
+        assert begun.wait(10)
+        made.replicates(HEADWAY, range(2))
+        second = pool.submit(made.replicates, FAULTY, [0])
+        go_on.set()
+        first.result()
+        second.result()
+    assert [names for names, *_ in streets.calls].count(()) == 1
+
+
 def test_threads_that_need_the_same_day_simulate_it_once(
     scenario: Scenario, layout: DetectorLayout, monkeypatch: pytest.MonkeyPatch
 ) -> None:
