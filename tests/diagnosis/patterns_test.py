@@ -272,6 +272,9 @@ def test_patterns_become_service_and_demand_without_a_name() -> None:
     ]
     faster = replace(slow, place=None, movement=None, change=0.2)
     assert unnamed_effects([faster], LAYOUT, (), 10.0) == ()
+    twice = replace(faster, change=1.0)
+    assert unnamed_effects([twice] * 2, LAYOUT, (), 10.0) == ()
+    assert unnamed_effects([twice] * 3, LAYOUT, (), 10.0) == ()
 
 
 def test_errors_know_that_detectors_count_the_same_vehicles() -> None:

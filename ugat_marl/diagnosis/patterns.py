@@ -606,7 +606,7 @@ def unnamed_effects(
     for lane, (lost_s, growth) in service.items():
         begin, each = (
             round(min(max(seconds, 0.0), MOST_LOST_S), 1)
-            for seconds in (lost_s, decision_s * (1.0 - 1.0 / (1.0 + growth)))
+            for seconds in (lost_s, decision_s * (1.0 - 1.0 / (1.0 + max(growth, 0.0))))
         )
         if begin or each:
             lost.append(LaneService(lane, begin, each))
