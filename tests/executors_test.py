@@ -25,10 +25,11 @@ import pytest
 import ugat_marl
 from ugat_marl.cli.arguments import workers_of
 from ugat_marl.data import TransitionLog
-from ugat_marl.diagnosis.engine import Engine
+from ugat_marl.diagnosis.engine import Budget, Engine
 from ugat_marl.diagnosis.features import DetectorLayout
 from ugat_marl.diagnosis.replay import Replay
 from ugat_marl.diagnosis.thresholds import Thresholds
+from ugat_marl.diagnosis.unmeasured import Unmeasured
 from ugat_marl.effects import StartupDelay, load_scenario
 from ugat_marl.envs import TrafficEnv
 from ugat_marl.errors import JobError, OptionError, ScenarioError, SimulatorCrashed
@@ -236,7 +237,10 @@ def engine_of(data: Path, workers: Any) -> Engine:
     shown = ((0.0, "Gr"), (30.0, "rG"), (60.0, "Gr"), (90.0, "rG"))
     periods = [Period("day1", 0.0, 120.0, "fit", {"C": shown}, {})]
     replay = Replay(scenario, network, detectors, layout.owner, THRESHOLDS)
-    return Engine(scenario, layout, replay, periods, 3, THRESHOLDS, workers=workers)
+    return Engine(
+        scenario, layout, replay, periods, 3, THRESHOLDS,
+        budget=Budget(), unmeasured=Unmeasured(), workers=workers,
+    )  # fmt: skip
 
 
 def test_days_of_a_diagnosis_are_the_same_in_processes(data: Path) -> None:

@@ -25,6 +25,7 @@ from ugat_marl.diagnosis.features import BIN_FEATURES, FEATURES, INDEX, Detector
 from ugat_marl.diagnosis.replay import Replay
 from ugat_marl.diagnosis.statistics import Pools
 from ugat_marl.diagnosis.thresholds import Thresholds
+from ugat_marl.diagnosis.unmeasured import Unmeasured
 from ugat_marl.effects import Effect, load_scenario, parse_domain
 from ugat_marl.experiments import policy_factory, record
 from ugat_marl.scenarios import Network, Passages, Period, Scenario, draw_day
@@ -184,8 +185,9 @@ def test_effects_on_demand_cost_no_simulation(
             scenario, network, layout.detectors, layout.owner, THRESHOLDS, answering=True
         )
         return Engine(
-            scenario, layout, replay, [period], 5, THRESHOLDS, cache=tmp_path, budget=budget
-        )
+            scenario, layout, replay, [period], 5, THRESHOLDS,
+            budget=budget, unmeasured=Unmeasured.of([period]), cache=tmp_path,
+        )  # fmt: skip
 
     one_day_h = period.length_s / 3600.0
     first = engine(budget := Budget())
@@ -259,7 +261,10 @@ def test_days_under_signals_that_answered_others_are_like_the_measured_one(data:
         replay = Replay(
             scenario, network, measured.detectors, layout.owner, THRESHOLDS, answering=answering
         )
-        engine = Engine(scenario, layout, replay, measured.periods, 5, THRESHOLDS)
+        engine = Engine(
+            scenario, layout, replay, measured.periods, 5, THRESHOLDS,
+            budget=Budget(), unmeasured=Unmeasured.of(measured.periods),
+        )  # fmt: skip
         days = [day.tally for day in engine.replicates(NOTHING, range(16))]
         reference = Reference(Pools.of(layout, THRESHOLDS), days)
         seen = [tally(layout, x, layout.greens(x), THRESHOLDS) for x in measured.periods]

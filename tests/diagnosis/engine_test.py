@@ -99,8 +99,9 @@ def an_engine(
         periods,
         seed,
         thresholds,
+        budget=budget or Budget(),
+        unmeasured=Unmeasured.of(periods),
         cache=cache,
-        budget=budget,
         workers=3,
         base_days=base_days,
     )
@@ -167,16 +168,18 @@ def test_simulated_days_tell_no_more_than_the_measured_ones(
         def simulate(self, effects: Sequence[Effect], period: Period, seed: int) -> Day:
             return Day(day, 50.0)
 
-    made = Engine(
-        scenario, layout, SameDay(layout), [measured], 3, THRESHOLDS, cache=tmp_path, workers=1
-    )
+    def engine(period: Period) -> Engine:
+        periods = [period]
+        return Engine(
+            scenario, layout, SameDay(layout), periods, 3, THRESHOLDS,
+            budget=Budget(), unmeasured=Unmeasured.of(periods), cache=tmp_path, workers=1,
+        )  # fmt: skip
+
+    made = engine(measured)
     (simulated,) = made.replicates((), [0])
     seen = tally(made.layout, measured, made.layout.greens(measured), THRESHOLDS)
     assert np.allclose(simulated.tally.sums, seen.sums)
-    with_all = Engine(
-        scenario, layout, SameDay(layout), [day], 3, THRESHOLDS, cache=tmp_path, workers=1
-    )
-    (other,) = with_all.replicates((), [0])
+    (other,) = engine(day).replicates((), [0])
     assert np.allclose(other.tally.sums, simulated.tally.sums) == (speeds and lengths)
 
 

@@ -23,13 +23,14 @@ from ugat_marl.diagnosis.compared_detectors import (
     one_of_each,
 )
 from ugat_marl.diagnosis.demand_variation import day_to_day_variation, measured_variation
-from ugat_marl.diagnosis.engine import Engine
+from ugat_marl.diagnosis.engine import Budget, Engine
 from ugat_marl.diagnosis.features import BIN_FEATURES, FEATURES, INDEX, DetectorLayout
 from ugat_marl.diagnosis.measurement import DetectorError
 from ugat_marl.diagnosis.replay import Replay
 from ugat_marl.diagnosis.statistics import Pools
 from ugat_marl.diagnosis.study import _of_common_windows, effort_for
 from ugat_marl.diagnosis.thresholds import Effort, Thresholds
+from ugat_marl.diagnosis.unmeasured import Unmeasured
 from ugat_marl.effects import (
     DetectorExtension,
     DetectorPulse,
@@ -166,7 +167,9 @@ def test_days_go_round_the_stretches_whatever_periods_there_are(
     detectors = standard_detectors(network)
     layout = DetectorLayout.of(network, detectors)
     replay = Replay(scenario, network, detectors, layout.owner, THRESHOLDS)
-    engine = Engine(scenario, layout, replay, periods, 0, THRESHOLDS)
+    engine = Engine(
+        scenario, layout, replay, periods, 0, THRESHOLDS, budget=Budget(), unmeasured=Unmeasured()
+    )
     effort = effort_for(lights, periods)
     for days in (effort.base, effort.test):
         runs = Counter(engine.place_of(number) for number in range(days))

@@ -208,15 +208,14 @@ class Engine:
         periods: Measured periods; `place_of` says under whose signals a day runs.
         seed: Root seed of the days.
         thresholds: Numbers of the method.
+        budget: Work that may be done. It is an attribute, too.
+        unmeasured: What simulated days do without.
         cache: Folder of the cached tallies; None for no cache on disk.
-        budget: Work that may be done; None for no limit. It is an attribute, too.
         workers: Simulations at a time, None for one per core; or an executor that simulates days.
         base_days: Number of days of the scenario as it is that decide which days are ordinary; 0 if
             all days are.
         interval_s: Length of the intervals whose features are compared, s; None for none.
         supplementary: Measured turning counts, travel times and states of lanes; None without any.
-        unmeasured: What simulated days do without; None for the speeds and lengths that the periods
-            lack.
     """
 
     def __init__(
@@ -228,13 +227,13 @@ class Engine:
         seed: int,
         thresholds: Thresholds,
         *,
+        budget: Budget,
+        unmeasured: Unmeasured,
         cache: Path | None = None,
-        budget: Budget | None = None,
         workers: Workers = None,
         base_days: int = 0,
         interval_s: float | None = None,
         supplementary: SupplementaryData | None = None,
-        unmeasured: Unmeasured | None = None,
     ) -> None:
         self._base_days = base_days
         self._interval_s = interval_s
@@ -246,7 +245,7 @@ class Engine:
             stretches.setdefault(period.window, []).append(place)
         in_order = [stretches[window] for window in sorted(stretches)]
         self._stretches = [in_order[place] for place in spread(len(in_order))]
-        self.budget = budget or Budget()
+        self.budget = budget
         self._replay = replay
         self._seed = seed
         self._thresholds = thresholds
@@ -258,7 +257,7 @@ class Engine:
         self._days_of_models: OrderedDict[str, Future[Day]] = OrderedDict()
         self._of_days = threading.Lock()
         self._known: dict[str, Replicate] = {}
-        self._unmeasured = unmeasured or Unmeasured.of(periods)
+        self._unmeasured = unmeasured
         versions = installed_version("eclipse-sumo"), installed_version("numpy")
         head = (
             VERSION,

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import itertools
 import math
+import operator
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
 
@@ -41,9 +42,8 @@ WIDE = ("network", "intersection", TRAVEL_TIME, EVERY_LANE)
 information."""
 
 
-def cost_of(model: Fitted) -> float:
-    """Return the cost of a model, as a key for sorting."""
-    return model.cost
+cost_of = operator.attrgetter("cost")
+"""Cost of a model, as a key for sorting."""
 
 
 class Fitter:
@@ -212,7 +212,8 @@ class Fitter:
         if not len(precise.values):
             return precise
         whitener = self.whitener(precise)
-        step = _solve(self.jacobian(model, whitener), whitener.measured, self.thresholds.ridge)
+        jacobian = derivatives(self.changes(model), whitener)
+        step = _solve(jacobian, whitener.measured, self.thresholds.ridge)
         if (np.abs(step) <= self.thresholds.settled_within * errors).all():
             return precise
         moved = self.simulate(self._moved(precise, step), self.thresholds.settling_days)
@@ -264,10 +265,6 @@ class Fitter:
         return Whitener(
             model.reference, self.data, self.thresholds.interpolation, self.base, blocks
         )
-
-    def jacobian(self, model: Fitted, whitener: Whitener) -> Array:
-        """Return derivatives of the whitened statistics, ``(free values, statistics)``."""
-        return derivatives(self.changes(model), whitener)
 
     def changes(self, model: Fitted, *, closely: bool = False) -> list[Change]:
         """Move every free value; return the changes of the statistics and the lengths of the moves.

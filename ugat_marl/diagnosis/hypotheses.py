@@ -301,7 +301,7 @@ def effects_of(members: Members) -> tuple[Effect, ...]:
 
 def each_left_out(members: Members) -> list[Members]:
     """Return the sets that lack one effect each."""
-    return [_without(members, index) for index in range(len(members))]
+    return [(*members[:index], *members[index + 1 :]) for index in range(len(members))]
 
 
 def merged(members: Members, new: Members) -> Members:
@@ -314,10 +314,6 @@ def merged(members: Members, new: Members) -> Members:
         for hypothesis, values in by_key.values()
         if not hypothesis.is_nothing(values)
     )
-
-
-def _without(members: Members, place: int) -> Members:
-    return (*members[:place], *members[place + 1 :])
 
 
 def title_of(members: Members) -> str:

@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import itertools
 import math
+import operator
 from collections.abc import Sequence
 from dataclasses import dataclass
 
@@ -21,6 +22,8 @@ from ugat_marl.diagnosis.statistics import Distance, Reference, Whitener, soften
 from ugat_marl.diagnosis.thresholds import Thresholds
 
 Array = NDArray[np.float64]
+
+_cost = operator.attrgetter("expected")
 
 
 @dataclass(frozen=True, eq=False)
@@ -226,10 +229,6 @@ def exchanges(
         near = [proposal for proposal in best.values() if proposal.expected <= most]
         exchanged += sorted(near, key=_cost)[: thresholds.exchanged]
     return sorted(exchanged, key=_cost)
-
-
-def _cost(proposal: Proposed) -> float:
-    return proposal.expected
 
 
 def _products(basis: Sequence[Array], target: Array) -> tuple[Array, Array]:

@@ -702,13 +702,13 @@ def _engine(
         _examined(measured),
         config.seed,
         config.thresholds,
-        cache=config.cache or default_cache(),
         budget=budget,
+        unmeasured=unmeasured,
+        cache=config.cache or default_cache(),
         workers=config.workers,
         base_days=base_days,
         interval_s=None if measured.has_events else usual_length(measured.counts),
         supplementary=supplementary,
-        unmeasured=unmeasured,
     )
 
 
