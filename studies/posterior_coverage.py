@@ -204,7 +204,7 @@ def study(network: Network, number: int, simulations: int, seed: int, folder: Pa
     for k, ((kind, truth), summary) in enumerate(zip(streets, seen, strict=True)):
         posterior = Posterior.fit(worlds, known, summary)
         aimed_at = [derive_seed(seed, "aimed", k, j) for j in range(aimed)]
-        values = [posterior.draw(one, whole=True) for one in aimed_at]
+        values = [posterior.draw(one, LEARNT) for one in aimed_at]
         near = network.simulated(values, derive_seed(seed, k), folder, f"aimed at {k + 1}")
         asked += answers(Posterior.fit(worlds, [*known, *near], summary), kind, truth, blind)
     return asked

@@ -117,13 +117,34 @@ def test_worlds_to_learn_from_have_most_effects() -> None:
     posterior = Posterior.fit(
         WORLDS, SIMULATED, summary(WorldValues(nominal, np.zeros((len(LANES), 2))), 5)
     )
-    left_out, whole = (
-        np.stack([posterior.draw(seed, whole=whole).effects for seed in range(100)]) == nominal
-        for whole in (False, True)
+    found, learnt, whole = (
+        np.stack([posterior.draw(seed, chance).effects for seed in range(100)]) == nominal
+        for chance in (None, LEARNT, 1.0)
     )
     # A draw beyond the end of its range is at the end, and that may be the nominal value.
     inside = [x.low < x.nominal < x.high for x in WORLDS.library]
-    assert left_out[:, inside].mean() > 0.5 and not whole[:, inside].any()
+    assert found[:, inside].mean() > 0.5 and not whole[:, inside].any()
+    assert learnt[:, inside].mean() == pytest.approx(1 - LEARNT, abs=0.05)
+
+
+def test_worlds_near_a_street_do_not_draw_it_towards_them() -> None:
+    """Half of the worlds have some red in all greens; the street has none, and says it."""
+    nominal = np.array([x.nominal for x in WORLDS.library])
+    generator = np.random.default_rng(0)
+
+    def near(seed: int) -> SimulatedLog:
+        red = np.full((len(LANES), 2), generator.normal((1.0, 1.2), 0.2))
+        values = WorldValues(generator.normal(nominal, 0.02), red)
+        return SimulatedLog(values, summary(values, seed))
+
+    simulated = SIMULATED[:40] + [near(5000 + k) for k in range(40)]
+    street = WorldValues(nominal, np.zeros((len(LANES), 2)))
+    chances = [
+        Posterior.fit(WORLDS, simulated, summary(street, 9000 + k)).presence.chance_of(column)
+        for k in range(10)
+        for column in (-2, -1)
+    ]
+    assert np.mean(chances) < 0.4
 
 
 def test_a_log_that_says_nothing_leaves_the_prior_of_unused_green() -> None:

@@ -11,61 +11,81 @@ from scipy.stats import norm
 
 from ugat_marl.grounding.posterior import ServicePrior
 from ugat_marl.grounding.presence import LEAST_SPREAD, Presence, lanes_differ
+from ugat_marl.grounding.regression import Calibration
 
 ENDS = (np.zeros(2), np.full(2, -3.0), np.full(2, 5.0))
 """Nominal, lowest and highest values of two changes."""
 
 
-def with_floor(covariance: np.ndarray) -> np.ndarray:
-    """Return the covariance that `Presence.of` makes of one."""
-    return covariance + np.eye(2) * (LEAST_SPREAD * 8.0) ** 2
+MIDDLE, VARIANCE = 1.0, 8.0**2 / 12
 
 
-def presence(mean: list[float], covariance: np.ndarray, chance: float = 0.3) -> Presence:
-    log_odds = [math.log(chance / (1.0 - chance)), math.log(1.5)]
-    return Presence.of(log_odds, np.array(mean), covariance, *ENDS)
+def presence(answer: list[float], slopes: np.ndarray, errors: np.ndarray) -> Presence:
+    """Changes that are there with chances of 0.3 and 0.6."""
+    log_odds = [math.log(0.3 / 0.7), math.log(1.5)]
+    calibration = Calibration(np.array([0.5, -0.2]), slopes, errors)
+    return Presence.of(log_odds, calibration, np.array(answer), *ENDS)
+
+
+FLOOR = (LEAST_SPREAD * 8.0) ** 2
+"""Variance that `Presence.of` adds."""
 
 
 @pytest.mark.parametrize("at", [0.0, 0.4, 1.0, 4.8])
-@pytest.mark.parametrize("chance", [0.3, 0.05])
-def test_the_chance_is_that_of_a_prior_with_a_point_of_mass(at: float, chance: float) -> None:
+def test_the_chance_is_that_of_a_prior_with_a_point_of_mass(at: float) -> None:
     """Of values that do not depend on each other, each has the chance of its own integral."""
-    given = presence([at, 3.0], np.diag([0.25, 0.25]), chance)
-    spread = float(np.sqrt(with_floor(np.diag([0.25, 0.25]))[0, 0]))
-    absent = (1.0 - chance) * norm.pdf(0.0, at, spread)
-    present = chance * quad(lambda x: norm.pdf(x, at, spread) / 8.0, -3.0, 5.0, points=[at])[0]
+    slope, variance = 0.6, 0.04
+    given = presence([0.5 + slope * at, 1.6], slope * np.eye(2), variance * np.eye(2))
+    spread = math.sqrt(variance + FLOOR)
+    absent = 0.7 * norm.pdf(slope * at, 0.0, spread)
+    prior = norm(MIDDLE, math.sqrt(VARIANCE))
+    present = (
+        0.3
+        * quad(
+            lambda x: prior.pdf(x) * norm.pdf(slope * at, slope * x, spread), -9, 11, points=[at]
+        )[0]
+    )
     assert given.chance_of(0) == pytest.approx(present / (present + absent), rel=1e-6)
-    assert given.chance_of(1) > 0.999
+    assert given.chance_of(1) > 0.999  # its answer is that of 3
     assert given.chances.sum() == pytest.approx(1.0)
 
 
-def test_what_is_left_of_a_draw_follows_what_is_absent() -> None:
-    """The mean and the variance of a normal distribution whose first value is known."""
-    covariance = np.array([[0.5, 0.4], [0.4, 0.6]])
-    mean = np.array([0.3, 4.0])
-    given = presence(mean.tolist(), covariance)
+def test_draws_have_the_mean_and_the_variance_of_a_normal_distribution() -> None:
+    slopes = np.array([[0.7, 0.3], [-0.2, 0.5]])
+    errors = np.array([[0.5, 0.4], [0.4, 0.6]])
+    answer = np.array([1.0, 2.0])
+    given = presence(answer.tolist(), slopes, errors)
+    errors = errors + FLOOR * np.eye(2)
     generator = np.random.default_rng(2)
-    floor = with_floor(covariance)
-    left: list[float] = []
-    for values in generator.multivariate_normal(mean, floor, size=4000):
-        drawn, out = given.drawn(values, generator)
-        if out.tolist() == [0]:
-            assert drawn[0] == 0.0
-            left.append(drawn[1])
-        elif out.size == 0:
-            assert np.array_equal(drawn, values)
-    ratio = floor[0, 1] / floor[0, 0]
-    assert len(left) > 1000
-    assert np.mean(left) == pytest.approx(4.0 - 0.3 * ratio, abs=0.06)
-    assert np.var(left) == pytest.approx(floor[1, 1] - ratio * floor[0, 1], rel=0.1)
+    drawn = np.array([given.drawn(generator, 1.0)[0] for _ in range(6000)])
+    precision = slopes @ np.linalg.inv(errors) @ slopes.T + np.eye(2) / VARIANCE
+    covariance = np.linalg.inv(precision)
+    off = np.linalg.inv(errors) @ (answer - [0.5, -0.2])
+    mean = covariance @ (slopes @ off + MIDDLE / VARIANCE)
+    assert drawn.mean(0) == pytest.approx(mean, abs=0.06)
+    assert np.cov(drawn.T) == pytest.approx(covariance, rel=0.1, abs=0.02)
+    found = [given.drawn(generator) for _ in range(2000)]
+    absent = np.array([~there for _, there in found])
+    assert absent.mean(0) == pytest.approx([1 - given.chance_of(k) for k in (0, 1)], abs=0.04)
+    assert all(not values[~there].any() for values, there in found)
+    # With the first value known, the second follows from the answer alone.
+    only = np.array([values[1] for values, there in found if there.tolist() == [False, True]])
+    row = slopes[1]
+    variance = 1.0 / (row @ np.linalg.inv(errors) @ row + 1.0 / VARIANCE)
+    assert len(only) > 200
+    assert only.mean() == pytest.approx(variance * (row @ off + MIDDLE / VARIANCE), abs=0.15)
+    assert only.var() == pytest.approx(variance, rel=0.25)
+
+
+def test_a_regression_that_says_nothing_leaves_the_prior() -> None:
+    given = presence([0.5, -0.2], np.zeros((2, 2)), np.eye(2))
+    assert [given.chance_of(0), given.chance_of(1)] == pytest.approx([0.3, 0.6])
 
 
 def test_a_value_that_explains_alone_leaves_the_other_out() -> None:
     """Two values that are known only as a sum: one of them is enough, both are dearer."""
-    covariance = np.array([[1.0, -0.98], [-0.98, 1.0]])
-    given = presence([0.4, 0.6], covariance)
-    both = given.chances[[out.size == 0 for out in given.absent]].sum()
-    assert both < 0.3
+    given = presence([1.5, 0.8], np.full((2, 2), 0.5), 0.01 * np.eye(2))
+    assert given.chances[given.there.all(1)].sum() < 0.35
     assert given.chance_of(1) > given.chance_of(0)
 
 

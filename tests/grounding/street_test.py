@@ -42,6 +42,7 @@ from ugat_marl.grounding.channel import ChannelConfig, CommandChannel
 from ugat_marl.grounding.eyes import Eyes, EyesConfig, fit_eyes
 from ugat_marl.grounding.posterior import Posterior, WorldValues
 from ugat_marl.grounding.state import RunState
+from ugat_marl.grounding.street import LEARNT
 from ugat_marl.grounding.street_training import StreetTraining
 from ugat_marl.grounding.summaries import NAMES, Summary
 from ugat_marl.grounding.worlds import RecordedCommands
@@ -222,9 +223,9 @@ def test_the_last_worlds_of_a_fit_are_drawn_from_the_posterior_of_the_others(
         fitted.append(len(simulated))
         return fit(worlds, simulated, seen)
 
-    def marked(self: Posterior, seed: int, *, whole: bool) -> WorldValues:
-        assert whole  # worlds to learn from leave nothing out
-        values = draw(self, seed, whole=whole)
+    def marked(self: Posterior, seed: int, chance: float) -> WorldValues:
+        assert chance == LEARNT  # worlds to learn from have most effects
+        values = draw(self, seed, chance)
         return replace(values, effects=np.append(values.effects[:-1], 1.0123))
 
     monkeypatch.setattr(Posterior, "fit", counted)
@@ -268,7 +269,7 @@ def test_a_street_is_compared_with_worlds_of_the_same_length(
         return
     again, _ = fit_street(begun, shown, rule, prior, view, config, seed=0)
     assert street.posterior is not None and again.posterior is not None
-    assert np.array_equal(street.posterior.effects, again.posterior.effects)
+    assert np.array_equal(street.posterior.answer, again.posterior.answer)
 
 
 def test_a_street_is_compared_with_what_fits_behind_the_lead_of_its_log(

@@ -1,17 +1,18 @@
 """Posterior over worlds: effects and the service of lanes that explain a log of the street.
 
 Worlds are drawn from a prior over the effects of the library and over the green that single lanes
-do not use. The policy of the log acts in each. A regression from the statistics of these logs
-(`summaries`) to the drawn values, and its residuals on worlds left out, give draws of the worlds
-that the street's log leaves possible (`regression`).
+do not use. The policy of the log acts in each. A regression answers from the statistics of these
+logs (`summaries`) what the drawn values were, and how it answers in worlds left out of it is
+measured (`regression`). Together they give draws of the worlds that the street's log leaves
+possible.
 
 The prior gives each effect a chance to be absent; draws are without those that the log does not ask
 for (`presence`). Worlds to learn from have most effects, whatever their chance: a regression that
-seldom sees an effect says too little of it, and `presence` would count its chance twice.
+seldom sees an effect says too little of it. They are without some, too: near a street without an
+effect, worlds that all have it would answer that it is there.
 
-All values are estimated together: one residual holds the errors of all effects and lanes of one
-simulated world. Lanes share the regression and the network's statistics, so where a lane's log says
-little its draws follow the network.
+All values are estimated together, with the correlation of their errors. Lanes share the regression
+and the network's statistics, so where a lane's log says little its draws follow the network.
 """
 
 from __future__ import annotations
@@ -19,7 +20,7 @@ from __future__ import annotations
 import functools
 import math
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, fields, replace
 from typing import Any, ClassVar
 
 import numpy as np
@@ -37,7 +38,7 @@ from ugat_marl.errors import CheckpointError, UnknownNameError
 from ugat_marl.files import MALFORMED
 from ugat_marl.grounding.draws import DRAWS, with_intervals
 from ugat_marl.grounding.presence import LEAST_SPREAD, Presence, lanes_differ
-from ugat_marl.grounding.regression import Design, Floats, kernel, left_out, ridge
+from ugat_marl.grounding.regression import Calibration, Design, Floats, kernel, left_out, ridge
 from ugat_marl.grounding.summaries import Summary
 from ugat_marl.scenarios import Scenario
 from ugat_marl.seeding import numpy_generator
@@ -289,19 +290,19 @@ class Posterior:
 
     Attributes:
         worlds: The prior.
-        effects: Regression's answer for the street, on the scale of `WorldPrior.scaled`,
-            ``(effects,)``.
-        service_s: The same for the lanes, in s, ``(lanes, 2)``.
-        effect_errors: Residuals of the simulated worlds, ``(n, effects)``.
-        service_errors_s: The same for the lanes, ``(n, lanes, 2)``.
-        chances: Weights of the residuals, ``(n,)``.
+        answer: Regression's answer for the street: effects on the scale of `WorldPrior.scaled`, and
+            the lanes' mean service in s, ``(effects + 2,)``.
+        calibration: How the regression answers.
+        offsets_s: Answer for the distance of each lane from the mean, in s, ``(lanes, 2)``.
+        offset_errors_s: Its residuals in the simulated worlds, ``(n, lanes, 2)``.
+        chances: Weights of these residuals, ``(n,)``.
     """
 
     worlds: WorldPrior
-    effects: Floats
-    service_s: Floats
-    effect_errors: Floats
-    service_errors_s: Floats
+    answer: Floats
+    calibration: Calibration
+    offsets_s: Floats
+    offset_errors_s: Floats
     chances: Floats
 
     @classmethod
@@ -346,53 +347,43 @@ class Posterior:
         )
         answer_s = x_street_lane @ ridge(x_lane, offset_s, lane_penalty)
         lane_errors = (offset_s - found_s).reshape(service_s.shape)
-        split = len(worlds.library)
         return cls(
             worlds,
-            answer[:split],
-            answer[split:] + answer_s,
-            errors[:, :split],
-            errors[:, None, split:] + lane_errors,
+            answer,
+            Calibration.of(wanted, predicted),
+            answer_s - answer_s.mean(0),
+            lane_errors - lane_errors.mean(1, keepdims=True),
             kernel(predicted, answer, errors),
         )
 
-    def draw(self, seed: int, *, whole: bool = False) -> WorldValues:
+    def draw(self, seed: int, chance: float | None = None) -> WorldValues:
         """Draw the values of a world.
 
         Args:
             seed: Seed of the world.
-            whole: True to leave no effect out.
+            chance: Chance of each effect, and of the red that all lanes share, to be there; None
+                for the chances that the log leaves.
         """
-        return self.drawn(numpy_generator(seed, "worlds", "posterior"), whole=whole)
+        return self.drawn(numpy_generator(seed, "worlds", "posterior"), chance)
 
-    def drawn(self, generator: np.random.Generator, *, whole: bool = False) -> WorldValues:
+    def drawn(self, generator: np.random.Generator, chance: float | None = None) -> WorldValues:
         """Draw the values of a world with a generator, see `draw`."""
         row = int(generator.choice(len(self.chances), p=self.chances))
-        service_s = self.service_s + self.service_errors_s[row]
-        mean_s, split = service_s.mean(0), len(self.effects)
-        drawn = np.concatenate((self.effects + self.effect_errors[row], mean_s))
-        if not whole:
-            drawn, absent = self.presence.drawn(drawn, generator)
-            service_s = service_s + drawn[split:] - mean_s
-            service_s[:, absent[absent >= split] - split] = 0.0
-        effects = self.worlds.natural(drawn[:split])
-        return self.worlds.clipped(
-            WorldValues(effects, at_least_0(service_s) * self.worlds.service)
-        )
+        values, there = self.presence.drawn(generator, chance)
+        split = len(self.worlds.library)
+        service_s = values[split:] + self.offsets_s + self.offset_errors_s[row]
+        service_s = at_least_0(service_s) * there[split:] * self.worlds.service
+        return self.worlds.clipped(WorldValues(self.worlds.natural(values[:split]), service_s))
 
     @functools.cached_property
     def presence(self) -> Presence:
         """Chances that the effects, and the red of lanes, are there."""
-        worlds, mean_s = self.worlds, self.service_s.mean(0)
-        errors = np.concatenate((self.effect_errors, self.service_errors_s.mean(1)), axis=1)
-        bias = self.chances @ errors
-        spread = (errors - bias).T @ ((errors - bias) * self.chances[:, None])
-        unlike = self.service_errors_s - self.service_errors_s.mean(1, keepdims=True)
-        lanes_s = np.sqrt(np.einsum("n,nlc->lc", self.chances, unlike**2))
+        worlds = self.worlds
+        lanes_s = np.sqrt(np.einsum("n,nlc->lc", self.chances, self.offset_errors_s**2))
         log_odds = [math.log(item.chance / (1.0 - item.chance)) for item in worlds.library]
         for column, prior in enumerate(SERVICE):
             differ = lanes_differ(
-                self.service_s[:, column] - mean_s[column],
+                self.offsets_s[:, column],
                 lanes_s[:, column] + LEAST_SPREAD * prior.high_s,
                 prior.high_s / 2,
             )
@@ -401,8 +392,7 @@ class Posterior:
         none_s = np.zeros(len(SERVICE))
         low, nominal = (np.concatenate((values, none_s)) for values in (least, usual))
         high = np.concatenate((most, [prior.high_s for prior in SERVICE]))
-        mean = np.concatenate((self.effects, mean_s)) + bias
-        return Presence.of(log_odds, mean, spread, nominal, low, high)
+        return Presence.of(log_odds, self.calibration, self.answer, nominal, low, high)
 
     def sample(self, number: int, seed: int = 0) -> tuple[Floats, Floats]:
         """Return effects ``(number, effects)`` and service ``(number, lanes, 2)`` of draws."""
@@ -459,26 +449,36 @@ class Posterior:
 
     def state_dict(self) -> dict[str, Any]:
         """Return the posterior's numbers as plain values."""
-        return {name: getattr(self, name).tolist() for name in _NUMBERS}
+        own = {name: getattr(self, name) for name in _NUMBERS}
+        return {name: numbers.tolist() for name, numbers in (own | vars(self.calibration)).items()}
 
     @classmethod
     def from_state(cls, worlds: WorldPrior, state: Mapping[str, Any]) -> Posterior:
         """Restore `state_dict`.
 
         Raises:
-            CheckpointError: A value is missing or of a wrong shape.
+            CheckpointError: A value is missing or of a wrong shape, or an older version wrote it.
         """
+        if "effect_errors" in state:
+            raise CheckpointError(
+                "the worlds in the checkpoint are of an older version, which estimated them "
+                "differently: begin the run anew"
+            )
+        names = [*_NUMBERS, *(field.name for field in fields(Calibration))]
         try:
             parts: dict[str, NDArray[np.float64]]
-            parts = {name: np.array(state[name], dtype=np.float64) for name in _NUMBERS}
+            parts = {name: np.array(state[name], dtype=np.float64) for name in names}
         except MALFORMED as error:
             raise CheckpointError(f"the worlds in the checkpoint are damaged: {error}") from None
-        number, effects, lanes = len(parts["chances"]), len(worlds.library), len(worlds.lanes)
+        number, lanes = len(parts["chances"]), len(worlds.lanes)
+        values = len(worlds.library) + len(SERVICE)
         shapes = {
-            "effects": (effects,),
-            "service_s": (lanes, 2),
-            "effect_errors": (number, effects),
-            "service_errors_s": (number, lanes, 2),
+            "answer": (values,),
+            "constant": (values,),
+            "slopes": (values, values),
+            "covariance": (values, values),
+            "offsets_s": (lanes, 2),
+            "offset_errors_s": (number, lanes, 2),
             "chances": (number,),
         }
         for name, shape in shapes.items():
@@ -487,10 +487,12 @@ class Posterior:
                     f"the worlds in the checkpoint are of another network or library: {name} is "
                     f"{parts[name].shape}, expected {shape}"
                 )
-        return cls(worlds, **parts)
+        own = {name: parts[name] for name in _NUMBERS}
+        how = {field.name: parts[field.name] for field in fields(Calibration)}
+        return cls(worlds, calibration=Calibration(**how), **own)
 
 
-_NUMBERS = ("effects", "service_s", "effect_errors", "service_errors_s", "chances")
+_NUMBERS = ("answer", "offsets_s", "offset_errors_s", "chances")
 
 
 def at_least_0(service_s: Floats) -> Floats:

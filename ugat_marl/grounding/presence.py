@@ -1,15 +1,21 @@
-"""Chances of each set of changes of a world, and draws without the changes that are absent.
+"""Chances of each set of changes of a world, and draws of the values of those that are there.
 
-In the prior of worlds a change is absent with some chance: a point of mass at the value that
-changes nothing. A regression spreads that mass: it estimates a small amount of every effect. This
-module restores it. With the normal distribution N(m, C) for what the regression says of all
-values, with A the values of absent changes and F those of present ones:
+In the prior of worlds a change is absent with some chance: its value is then the one that changes
+nothing. Otherwise it is somewhere in its range, here normally distributed with the range's mean and
+variance. What is known of a street is the answer p of a regression. How it answers in worlds of
+known values x was measured (`regression.Calibration`):
 
-    chance(A) ~ prior(A) N(nominal_A; m_A, C_AA) prod_F (share of F's range that N allows) / range_F
-    x_F | A   = x_F + C_FA C_AA^-1 (nominal_A - x_A)
+    p = a + x B + e,   e ~ N(0, S)
 
-The first is the ratio of Dickey (1971), whose factors 1 / range are the price of a further value.
-The second turns a draw x into one in which the absent values are known (Matheron's rule).
+So with m and V, the prior's mean and variance of the values for a set of changes that are there:
+
+    chance(set) ~ prior(set) N(p; a + m B, S + B' V B)
+    x | set     = x0 + (p - p0) (S + B' V B)^-1 B' V,   x0 ~ N(m, V),  p0 = a + x0 B + e
+
+The first is the evidence for the set (Kass and Raftery 1995). The second turns a draw from the
+prior into one in which the answer is known (Matheron's rule). What worlds the regression learned
+from decides how it answers, but not the values that explain an answer (Wood 2010 calls N a
+synthetic likelihood). So worlds may be simulated where an earlier answer points to.
 """
 
 from __future__ import annotations
@@ -20,12 +26,13 @@ from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.special import ndtr
+
+from ugat_marl.grounding.regression import Calibration
 
 Floats = NDArray[np.float64]
 
 LEAST_SPREAD = 0.02
-"""Share of a range that is added to the standard deviation of a value: by hand."""
+"""Share of a range that is added to the standard deviation of an answer: by hand."""
 SPREADS_TRIED = 12
 """Standard deviations over which the chance that lanes differ is averaged. By hand: 100 change its
 logarithm by up to 0.3, 6 by as much again."""
@@ -37,72 +44,83 @@ class Presence:
 
     Attributes:
         nominal: Values that change nothing, ``(k,)``.
+        middle: Mean of each value, if its change is there, ``(k,)``.
+        spread: Its standard deviation, ``(k,)``.
+        calibration: How the regression answers; its covariance has `LEAST_SPREAD`.
+        answer: Its answer for the street, ``(k,)``.
+        there: Sets of changes that are there, ``(sets, k)``.
         chances: Chance of each set, ``(sets,)``.
-        absent: For each set, the places of the values of absent changes.
-        gains: For each set, how the other values follow the absent ones, ``(k, absent)``.
     """
 
     nominal: Floats
+    middle: Floats
+    spread: Floats
+    calibration: Calibration
+    answer: Floats
+    there: NDArray[np.bool_]
     chances: Floats
-    absent: tuple[NDArray[np.int64], ...]
-    gains: tuple[Floats, ...]
 
     @classmethod
     def of(
-        cls, log_odds: Sequence[float], mean: Floats, covariance: Floats, nominal: Floats,
+        cls, log_odds: Sequence[float], calibration: Calibration, answer: Floats, nominal: Floats,
         low: Floats, high: Floats,
     ) -> Presence:  # fmt: skip
-        """Return the chances of a normal distribution and a prior.
+        """Return the chances that an answer leaves of a prior.
 
         Args:
-            log_odds: For the change of each value, the log of its odds to be there, before the
-                mean and the covariance are known, ``(k,)``.
-            mean: Mean of the values, ``(k,)``.
-            covariance: Their covariance, ``(k, k)``.
+            log_odds: For the change of each value, the log of its odds to be there in the prior,
+                ``(k,)``.
+            calibration: How the regression answers.
+            answer: Its answer, ``(k,)``.
             nominal: Values that change nothing, ``(k,)``.
             low: Lowest values, ``(k,)``.
             high: Highest values, ``(k,)``.
         """
-        covariance = covariance + np.diag((LEAST_SPREAD * (high - low)) ** 2)
-        odds = np.array(log_odds)
-        logs: list[float] = []
-        absent: list[NDArray[np.int64]] = []
-        gains: list[Floats] = []
-        for each in itertools.product((True, False), repeat=len(odds)):
-            there = np.array(each, dtype=np.bool_)
-            out = np.flatnonzero(~there)
-            off = nominal[out] - mean[out]
-            within = covariance[np.ix_(out, out)]
-            gain: Floats = np.linalg.solve(within, covariance[out]).T.astype(np.float64)
-            distance = off @ np.linalg.solve(within, off)
-            density = -0.5 * (distance + np.linalg.slogdet(2.0 * np.pi * within)[1])
-            middle = (mean + gain @ off)[there]
-            spread = np.sqrt(np.diag(covariance - gain @ covariance[out])[there])
-            share = ndtr((high[there] - middle) / spread) - ndtr((low[there] - middle) / spread)
-            slab = np.log(np.maximum(share, 1e-9) / (high - low)[there]).sum()
-            logs.append(float(odds[there].sum() + density + slab))
-            absent.append(out)
-            gains.append(gain)
-        weights = np.exp(np.array(logs) - max(logs))
-        return cls(nominal, weights / weights.sum(), tuple(absent), tuple(gains))
+        floor = np.diag((LEAST_SPREAD * (high - low)) ** 2)
+        calibration = Calibration(
+            calibration.constant, calibration.slopes, calibration.covariance + floor
+        )
+        middle, spread = (low + high) / 2.0, (high - low) / np.sqrt(12.0)
+        there = np.array(list(itertools.product((True, False), repeat=len(nominal))), np.bool_)
+        there = there.reshape(-1, len(nominal))
+        slopes = calibration.slopes
+        mean = calibration.constant + np.where(there, middle, nominal) @ slopes
+        variance = np.where(there, spread, 0.0)[:, :, None] ** 2 * slopes
+        covariance = calibration.covariance + slopes.T @ variance
+        off = answer - mean
+        solved = np.linalg.solve(covariance, off[:, :, None])[:, :, 0]
+        logs = -0.5 * ((off * solved).sum(1) + np.linalg.slogdet(covariance)[1])
+        logs += there @ np.array(log_odds)
+        weights = np.exp(logs - logs.max())
+        chances = weights / weights.sum()
+        return cls(nominal, middle, spread, calibration, answer, there, chances)
 
     def drawn(
-        self, values: Floats, generator: np.random.Generator
-    ) -> tuple[Floats, NDArray[np.int64]]:
-        """Draw a set of changes; return the values of a draw given that set, and what is absent.
+        self, generator: np.random.Generator, chance: float | None = None
+    ) -> tuple[Floats, NDArray[np.bool_]]:
+        """Draw a set of changes and their values; return the values, and what is there.
 
         Args:
-            values: A draw of all values, ``(k,)``.
-            generator: Draws the set.
+            generator: Draws both.
+            chance: Chance of each change to be there, whatever the answer; None for the chances
+                that the answer leaves.
         """
-        one = int(generator.choice(len(self.chances), p=self.chances))
-        out = self.absent[one]
-        return values + self.gains[one] @ (self.nominal[out] - values[out]), out
+        if chance is None:
+            there = self.there[int(generator.choice(len(self.chances), p=self.chances))]
+        else:
+            there = generator.random(len(self.nominal)) < chance
+        spread = np.where(there, self.spread, 0.0)
+        values = np.where(there, self.middle, self.nominal)
+        values = values + spread * generator.standard_normal(len(values))
+        slopes, covariance = self.calibration.slopes, self.calibration.covariance
+        error = np.linalg.cholesky(covariance) @ generator.standard_normal(len(values))
+        off = self.answer - self.calibration.constant - values @ slopes - error
+        towards = spread[:, None] ** 2 * slopes
+        return values + towards @ np.linalg.solve(covariance + slopes.T @ towards, off), there
 
     def chance_of(self, column: int) -> float:
         """Return the chance that the change of a value is there."""
-        there = [column not in out for out in self.absent]
-        return float(self.chances[there].sum())
+        return float(self.chances[self.there[:, column]].sum())
 
 
 def lanes_differ(offsets: Floats, spread: Floats, most: float) -> float:

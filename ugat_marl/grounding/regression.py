@@ -1,15 +1,18 @@
-"""Regression posterior: parameters of simulated worlds from their statistics, with residuals.
+"""Regression of the values of simulated worlds on their statistics, and how it answers.
 
-Approximate Bayesian computation with linear regression adjustment (Beaumont, Zhang and Balding
-2002) on summaries that are themselves regressions (Fearnhead and Prangle 2012):
+Approximate Bayesian computation on summaries that are themselves regressions (Fearnhead and Prangle
+2012):
 
-    g      = ridge regression of the parameters on the statistics of simulated worlds
-    w_i    = kernel of the distance |g(s_i) - g(s_obs)|, in units of the spread of its residuals
-    draw   = g(s_obs) + e_i with chance proportional to w_i,   e_i = theta_i - g(s_i)
+    g      = ridge regression of the values on the statistics of simulated worlds
+    g(s)   = a + x B + e, fitted to worlds of known values x that were left out of g
 
-Residuals are those of worlds that were left out of the fit, so the draws are as wide as the
-regression is wrong. A draw takes all parameters of one world i together, so that their correlations
-remain: what one effect explains, another one need not.
+A regression answers too near to the values that it learned from, the more so the less the
+statistics say. The second line measures by how much, and how far its errors go together: what one
+effect explains, another one need not.
+
+Lanes, of which there are many, are drawn with linear regression adjustment (Beaumont, Zhang and
+Balding 2002): the residual of one world is added to the answer, with a chance that falls with the
+distance of that world's answer.
 """
 
 from __future__ import annotations
@@ -99,6 +102,35 @@ def left_out(x: Floats, y: Floats, groups: NDArray[np.int64]) -> tuple[Floats, f
     errors = {p: float((((y - answer) ** 2).mean(0) / scale).mean()) for p, answer in tried.items()}
     best = min(errors, key=lambda penalty: errors[penalty])
     return tried[best], best
+
+
+@dataclass(frozen=True)
+class Calibration:
+    """Answers of a regression to known values: ``constant + values @ slopes + error``.
+
+    Attributes:
+        constant: Answer where all values are 0, ``(k,)``.
+        slopes: Change of each answer with each value, ``(k values, k answers)``.
+        covariance: Covariance of the errors, ``(k, k)``.
+    """
+
+    constant: Floats
+    slopes: Floats
+    covariance: Floats
+
+    @classmethod
+    def of(cls, values: Floats, answers: Floats) -> Calibration:
+        """Fit the calibration to worlds that were left out of the regression.
+
+        Args:
+            values: Values of the worlds, ``(n, k)``; n has to be above k + 1.
+            answers: What the regression answers, ``(n, k)``.
+        """
+        inputs = np.concatenate((np.ones((len(values), 1)), values), axis=1)
+        lines = np.linalg.lstsq(inputs, answers)[0].astype(np.float64)
+        errors = answers - inputs @ lines
+        covariance = errors.T @ errors / max(len(values) - inputs.shape[1], 1)
+        return cls(lines[0], lines[1:], covariance)
 
 
 def kernel(predicted: Floats, observed: Floats, residual: Floats) -> Floats:

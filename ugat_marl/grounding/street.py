@@ -423,7 +423,7 @@ AIMED = 0.4
 """Share of the worlds of a first fit that are drawn from the posterior of the others."""
 
 LEARNT = 0.75
-"""Chance of each effect in worlds of the prior that are simulated: by hand, from tries on streets
+"""Chance of each effect in worlds that are simulated to learn from: by hand, from tries on streets
 of `single-v1` (results/notes/how-often-does-the-posterior-hold-the-truth.md)."""
 
 BASELINE_EPISODES = 2
@@ -520,7 +520,7 @@ def fit_street(
         ids = [derive_seed(seed, "street", "values", first + k) for k in range(number)]
         values = [worlds.draw(one, LEARNT) for one in ids[:prior]]
         if posterior is not None:
-            values += [posterior.draw(one, whole=True) for one in ids[prior:]]
+            values += [posterior.draw(one, LEARNT) for one in ids[prior:]]
         seeds = [derive_seed(seed, "street", "world", first + k) for k in range(number)]
         drawn = [street.around(worlds, *pair) for pair in zip(values, seeds, strict=True)]
         logs = simulation.logs(drawn, policy, seeds, decisions * interval_s, on_done)
