@@ -214,7 +214,8 @@ class Engine:
         workers: Simulations at a time, None for one per core; or an executor that simulates days.
         base_days: Number of days of the scenario as it is that decide which days are ordinary; 0 if
             all days are.
-        interval_s: Length of the intervals whose features are compared, s; None for none.
+        interval_s: Length of the intervals of measured counts, s; None if single vehicles are
+            compared.
         supplementary: Measured turning counts, travel times and states of lanes; None without any.
     """
 
@@ -270,7 +271,7 @@ class Engine:
         )
         head += self._unmeasured.key
         head += (replay.day_to_day,) if replay.day_to_day else ()
-        head += ("intervals", interval_s) if interval_s else ()
+        head += ("intervals/2", interval_s) if interval_s else ()
         head += (supplementary,) if supplementary else ()
         self._root = hashlib.sha256(repr(head).encode()).hexdigest()
         self._edges = sorted({edge for _, edge, _ in layout.places})

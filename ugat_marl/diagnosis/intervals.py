@@ -2,7 +2,8 @@
 
 Detectors of cities and motorways report sums of an interval of 20 s to 15 min, not single vehicles.
 The length of the interval decides what is left in them. So simulated detectors are added up over
-intervals of the same length, and both sides have these features for each kind of detector:
+intervals of the same length. Both sides then share them out to the bins of time alike, and have
+these features for each kind of detector:
 
 - ``over``: occupied time per vehicle, ``Σ o / Σ n``, s;
 - ``mean_speed``: ``Σ n v / Σ n``, m/s;
@@ -66,13 +67,8 @@ def interval_sums(intervals: Intervals, length_s: float) -> dict[str, tuple[floa
 
 
 def usual_length(counts: pl.DataFrame | None) -> float | None:
-    """Return the most frequent length of an interval, s.
-
-    None if the counts have neither occupancies nor mean speeds.
-    """
-    if counts is None or not any(
-        name in counts.columns and counts[name].count() for name in (OCCUPANCY, MEAN_SPEED)
-    ):
+    """Return the most frequent length of an interval, s; None without counts."""
+    if counts is None or counts.is_empty():
         return None
     lengths = (counts["end_s"].cast(pl.Float64) - counts["begin_s"].cast(pl.Float64)).round(3)
     return float(lengths.mode().sort()[0])
@@ -81,7 +77,7 @@ def usual_length(counts: pl.DataFrame | None) -> float | None:
 def with_intervals(
     counted: Tally, layout: DetectorLayout, period: Period, length_s: float
 ) -> Tally:
-    """Return the tally of a period of single vehicles with the features of intervals.
+    """Return the tally of a period of single vehicles with the features and bins of intervals.
 
     Args:
         counted: Tally of the period, with `FEATURES`.
@@ -89,11 +85,13 @@ def with_intervals(
         period: Period with passages.
         length_s: Length of an interval, s.
     """
-    sums = _widened(counted.sums)
+    sums, bins = _widened(counted.sums), np.zeros_like(counted.bins)
+    edges = np.linspace(period.begin_s, period.end_s, bins.shape[-1] + 1)
     for name, (feature, place) in layout.counted.items():
-        seen = period.of_detector(name)
-        _enter(sums, feature, place, Intervals.of(seen, period, length_s), length_s)
-    return replace(counted, sums=sums)
+        reports = Intervals.of(period.of_detector(name), period, length_s)
+        _enter(sums, feature, place, reports, length_s)
+        _share_out(bins, feature, place, reports, _inside(reports, edges))
+    return replace(counted, sums=sums, bins=bins)
 
 
 # --- the detectors as they are --------------------------------------------------------------------
@@ -209,6 +207,28 @@ def _enter(sums: Array, feature: str, place: int, intervals: Intervals, length_s
         sums[INDEX[f"{name}_{kind}"], place] = values
 
 
+def _inside(reports: Intervals, edges: Array) -> Array:
+    """Return how much of each interval lies in each bin, s, ``(intervals, bins)``.
+
+    Args:
+        reports: Reports of a detector.
+        edges: Bounds of the bins, s.
+    """
+    begin = np.maximum(edges[:-1], reports.begin_s[:, None])
+    end = np.minimum(edges[1:], reports.end_s[:, None])
+    return np.clip(end - begin, 0.0, None)
+
+
+def _share_out(bins: Array, feature: str, place: int, reports: Intervals, inside: Array) -> None:
+    """Share vehicles, and occupied times of advance detectors, out to the bins of a place."""
+    share = inside / np.maximum(reports.end_s - reports.begin_s, 1e-9)[:, None]
+    bins[BIN_FEATURES.index(feature), place] = reports.vehicles @ share
+    if feature == "count_advance":
+        measured = np.isfinite(reports.occupied_s)
+        occupied_s = reports.occupied_s[measured] @ share[measured]
+        bins[BIN_FEATURES.index("occupied"), place] = occupied_s
+
+
 # --- measured counts ------------------------------------------------------------------------------
 
 
@@ -261,7 +281,7 @@ def counts_tally(
     bins = np.zeros((len(BIN_FEATURES), places, bins_in(period.length_s, thresholds)))
     covered = np.zeros_like(bins)
     edges = np.linspace(period.begin_s, period.end_s, bins.shape[-1] + 1)
-    length_s = usual_length(counts)
+    length_s = usual_length(counts) if _more_than_vehicles(counts) else None
     sums = np.zeros((len(FEATURES), places, 2))
     if length_s is not None:
         sums = _widened(sums)
@@ -271,25 +291,24 @@ def counts_tally(
         if place < 0:
             continue
         reports = _reports(own)
-        begin, end, count = reports.begin_s, reports.end_s, reports.vehicles
-        occupied_s = reports.occupied_s
         if name in whole:
-            sums[INDEX[feature], place] = count.sum(), (end - begin).sum() / 60.0
+            minutes = (reports.end_s - reports.begin_s).sum() / 60.0
+            sums[INDEX[feature], place] = reports.vehicles.sum(), minutes
         if name in whole and length_s is not None:
             _enter(sums, feature, place, reports, length_s)
-        inside = np.clip(
-            np.minimum(edges[1:], end[:, None]) - np.maximum(edges[:-1], begin[:, None]), 0.0, None
-        )
-        share = inside / np.maximum(end - begin, 1e-9)[:, None]
-        line = BIN_FEATURES.index(feature), place
-        bins[line], covered[line] = count @ share, inside.sum(axis=0)
+        inside = _inside(reports, edges)
+        _share_out(bins, feature, place, reports, inside)
+        covered[BIN_FEATURES.index(feature), place] = inside.sum(axis=0)
         if feature == "count_advance":
-            line = BIN_FEATURES.index("occupied"), place
-            measured = np.isfinite(occupied_s)
-            bins[line] = occupied_s[measured] @ share[measured]
-            covered[line] = inside[measured].sum(axis=0)
+            measured = np.isfinite(reports.occupied_s)
+            covered[BIN_FEATURES.index("occupied"), place] = inside[measured].sum(axis=0)
     known = (covered > thresholds.whole * np.diff(edges)).astype(np.float64)
     return Tally(sums, bins * known, known=known, window=period.window, period=period.id)
+
+
+def _more_than_vehicles(counts: pl.DataFrame) -> bool:
+    """Return True if the counts have occupancies or mean speeds."""
+    return any(name in counts.columns and counts[name].count() for name in (OCCUPANCY, MEAN_SPEED))
 
 
 def _reports(rows: pl.DataFrame) -> Intervals:

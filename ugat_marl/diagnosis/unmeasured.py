@@ -86,7 +86,9 @@ class Unmeasured:
 
     def summed_in(self, tally: Tally) -> Tally:
         """Return a simulated tally without the sums that the data lack."""
-        return tally if self.summed is None else replace(tally, sums=tally.sums * self.summed)
+        if self.summed is None:
+            return tally
+        return replace(tally, sums=tally.sums[: len(self.summed)] * self.summed)
 
 
 def without_holes(period: Period, holes: Sequence[tuple[float, float]]) -> Period:
