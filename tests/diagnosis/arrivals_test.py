@@ -137,12 +137,13 @@ def test_vehicles_depart_so_that_they_come_when_others_came(
     day = draw_day(scenario, 3)
     came = {"advance:S_C_0": [60.0, 75.0, 99.0], "stop:S_C_0": [65.0, 80.0, 105.0]}
     period = a_period(passages(came))
-    found, due = Arrivals(layout, network, THRESHOLDS).given(day, day, period)
+    found, due, earliest_s = Arrivals(layout, network, THRESHOLDS).given(day, day, period)
     position = {item.id: item.position_m for item in layout.detectors}["advance:S_C_0"]
     way = position / network.lanes["S_C_0"].speed_mps
     rows = departs(found)
     assert set(rows) == {"S_C"}, "nobody was seen to come from the west"
     np.testing.assert_allclose(rows["S_C"], np.array([60.0, 75.0, 99.0]) - way, atol=0.006)
+    assert earliest_s == min(rows["S_C"])
     assert due.given["S_C"].sum() == 3
     assert due.given["W_C"].sum() == 0
     assert due.asked["W_C"].sum() > 0, "the demand asks for them all the same"
@@ -153,9 +154,23 @@ def test_more_came_than_the_model_has(crossing: tuple[Scenario, Network, Detecto
     day = draw_day(scenario, 3)
     times = np.linspace(20.0, 180.0, 60).tolist()
     period = a_period(passages({"advance:S_C_0": times, "stop:S_C_0": times}))
-    found, _ = Arrivals(layout, network, THRESHOLDS).given(day, day, period)
+    found, *_ = Arrivals(layout, network, THRESHOLDS).given(day, day, period)
     names = [item.get("id") for item in found.routes[0].parse().iter("vehicle")]
     assert len(names) == len(set(names)) == 60
+
+
+def test_who_departs_before_the_warm_up_comes_all_the_same(
+    crossing: tuple[Scenario, Network, DetectorLayout],
+) -> None:
+    scenario, network, layout = crossing
+    times = np.linspace(101.0, 150.0, 8).tolist()
+    period = dataclasses.replace(
+        a_period(passages({"advance:S_C_0": times, "stop:S_C_0": times})), begin_s=100.0
+    )
+    short = dataclasses.replace(THRESHOLDS, warm_up_s=2.0)
+    replay = Replay(scenario, network, layout.detectors, layout.owner, short, answering=True)
+    came = replay.simulate((), period, 1).period.passages["advance:S_C_0"].on_s
+    np.testing.assert_allclose(came, times, atol=2.0)
 
 
 def test_effects_on_demand_leave_what_is_simulated_alone(
@@ -214,7 +229,7 @@ def test_detectors_that_missed_vehicles_do_not_keep_them_away(
     day = draw_day(scenario, 3)
     times = np.linspace(5.0, 195.0, 40)
     few = {"advance:S_C_0": times[::2].tolist(), "stop:S_C_0": (times + 3).tolist()}
-    found, due = Arrivals(layout, network, THRESHOLDS).given(day, day, a_period(passages(few)))
+    found, due, _ = Arrivals(layout, network, THRESHOLDS).given(day, day, a_period(passages(few)))
     assert len(departs(found)["S_C"]) >= 38
     assert due.given["S_C"].sum() >= 36
 

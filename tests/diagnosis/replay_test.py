@@ -80,6 +80,19 @@ def test_greens_of_simulated_days_are_those_that_the_simulation_shows(scenario: 
     assert drive.shown(a_period(again)).signals["C"] == seen
 
 
+@pytest.mark.parametrize(
+    ("earliest_s", "begin_s"), [(400.0, 400.0), (399.99, 398.0), (390.5, 390.0), (0.0, 0.0)]
+)
+def test_a_simulation_begins_before_the_earliest_departure(
+    scenario: Scenario, earliest_s: float, begin_s: float
+) -> None:
+    network = Network.read(scenario)
+    drive = Replay(scenario, network, standard_detectors(network), {}, THRESHOLDS)
+    period = a_period(((1000.0, "Gr"),), 1000.0, 1100.0)
+    assert drive._begin_s(period) == 400.0
+    assert drive._begin_s(period, earliest_s) == begin_s
+
+
 def test_a_state_shorter_than_a_step_gives_way_to_the_next(scenario: Scenario) -> None:
     log = ((0.0, "Gr"), (30.0, "yr"), (30.3, "rr"), (40.0, "rG"))
     assert phases(scenario, a_period(log))[1][:2] == [(30.0, "Gr"), (10.0, "rr")]

@@ -10,6 +10,7 @@ replaced by counts that are read from the demand itself (`corrected`).
 
 from __future__ import annotations
 
+import math
 import xml.etree.ElementTree as ET
 from collections import Counter, deque
 from collections.abc import Iterable, Mapping, Sequence
@@ -99,7 +100,7 @@ class Arrivals:
 
     def given(
         self, asked: Scenario, drivers: Scenario, period: Period
-    ) -> tuple[Scenario, DemandBalance]:
+    ) -> tuple[Scenario, DemandBalance, float]:
         """Give a day the measured arrivals.
 
         Args:
@@ -109,9 +110,10 @@ class Arrivals:
             period: The measured period.
 
         Returns:
-            The day to simulate, and the vehicles that were asked for and given. Some vehicles stay
-            as they are: those without an approach with advance detectors, those with a stop on
-            their way, and those that arrive before the period.
+            The day to simulate, the vehicles that were asked for and given, and the earliest
+            departure to a measured arrival, s; inf if there is none. Some vehicles stay as they
+            are: those without an approach with advance detectors, those with a stop on their way,
+            and those that arrive before the period.
         """
         document = drivers.routes[0]
         root = document.parse()
@@ -125,14 +127,16 @@ class Arrivals:
                 stay.append(element)
             else:
                 pools[coming.approach].append(coming)
+        filled: list[ET.Element] = []
         for edge, pool in pools.items():
-            stay += _filled(pool, self._came(edge, period), drivers.settings.begin_s, period)
-        root[:] = stay
+            filled += _filled(pool, self._came(edge, period), drivers.settings.begin_s, period)
+        root[:] = [*stay, *filled]
         sort_departures(root)
         changed = Document(document.name, None, xml_bytes(root))
         return (
             replace(drivers, routes=(changed, *drivers.routes[1:])),
             DemandBalance(due, self._by_edge(root, period)),
+            min(map(depart_s, filled), default=math.inf),
         )
 
     def asked(self, day: Scenario, period: Period) -> dict[str, Array]:

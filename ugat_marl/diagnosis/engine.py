@@ -685,7 +685,7 @@ def _signals_hash(period: Period, answering: bool) -> str:
     content = (period.begin_s, period.end_s, sorted(period.signals.items()))
     digest = hashlib.sha256(repr(content).encode())
     if answering:
-        digest.update(b"arrivals/4")
+        digest.update(b"arrivals/5")
     for name, seen in sorted(period.passages.items()) if answering else ():
         times = (name, seen.on_s.tolist(), seen.off_s.tolist(), seen.speed_mps.tolist())
         digest.update(repr(times).encode())

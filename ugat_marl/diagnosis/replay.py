@@ -182,18 +182,22 @@ class Replay:
             SimulatorError: SUMO refused, or its process crashed repeatedly.
         """
         day = self._day(seed)
-        scenario, due = Effect.apply_all(day, effects), None
+        scenario, due, earliest_s = Effect.apply_all(day, effects), None, math.inf
         if self._arrivals is not None:
             others = [effect for effect in effects if not effect.on_departures]
             drivers = scenario if len(others) == len(effects) else Effect.apply_all(day, others)
             came = period
             for error in reversed(self._detection):
                 came = error.undone(came, self._detectors)
-            scenario, due = self._arrivals.given(scenario, drivers, self._as_sumo_stamps(came))
+            came = self._as_sumo_stamps(came)
+            scenario, due, earliest_s = self._arrivals.given(scenario, drivers, came)
+        begin_s = self._begin_s(period, earliest_s)
         scenario = shift_parking(scenario, derive_seed(seed, "parking"))
         with tempfile.TemporaryDirectory(prefix="ugat_marl-") as name:
             directory = Path(name)
-            done = retry_on_crash(lambda: self._run(scenario, effects, period, seed, directory))
+            done = retry_on_crash(
+                lambda: self._run(scenario, effects, period, begin_s, seed, directory)
+            )
         return replace(done, period=self.observed((*self._own, *effects), done.period), due=due)
 
     def observed(self, effects: Sequence[Effect], period: Period) -> Period:
@@ -212,12 +216,22 @@ class Replay:
         }
         return replace(period, signals=signals)
 
-    def _begin_s(self, period: Period) -> float:
-        """Return the start of the simulation of a period, s: a step of the scenario."""
+    def _begin_s(self, period: Period, earliest_s: float = math.inf) -> float:
+        """Return the start of the simulation of a period, s: a step of the scenario.
+
+        Args:
+            period: The measured period.
+            earliest_s: Departure that must not be missed, s; not before the scenario begins.
+        """
         settings = self._scenario.settings
         begin_s = max(settings.begin_s, period.begin_s - self._thresholds.warm_up_s)
         step_s = settings.step_length_s
-        return settings.begin_s + step_s * round((begin_s - settings.begin_s) / step_s)
+        steps = round((begin_s - settings.begin_s) / step_s)
+        earliest = round((earliest_s - settings.begin_s) / step_s, 6)
+        if earliest < steps:
+            # by an even number of steps, so that lights change as `shown` says
+            steps = max(steps - 2 * math.ceil((steps - earliest) / 2), 0)
+        return settings.begin_s + step_s * steps
 
     def asked(self, effects: Sequence[Effect], period: Period, seed: int) -> Mapping[str, Array]:
         """Return the vehicles that a day of a model asks for, without a simulation.
@@ -254,15 +268,16 @@ class Replay:
         scenario: Scenario,
         effects: Sequence[Effect],
         period: Period,
+        begin_s: float,
         seed: int,
         directory: Path,
     ) -> Day:
-        settings, begin = scenario.settings, self._begin_s(period)
+        settings = scenario.settings
         step = settings.step_length_s
         loops = directory / "loops.xml"
         true = installed_detectors((*self._own, *effects), self._detectors)
         red = withheld(self._network, service_of(controller_effects(scenario), ()))
-        signals = replay_document(scenario, period, begin, red)
+        signals = replay_document(scenario, period, begin_s, red)
         detectors = detectors_document(true, self._network.lanes, loops)
         more = [signals, detectors]
         places = directory / "places.xml"
@@ -274,7 +289,7 @@ class Replay:
         scenario = replace(
             scenario,
             additional=(*scenario.additional, *more),
-            settings=settings.model_copy(update={"begin_s": begin}),
+            settings=settings.model_copy(update={"begin_s": begin_s}),
         )
         launch = launch_of(scenario, seed, directory, ())
         launch.write()
