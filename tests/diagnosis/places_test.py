@@ -470,6 +470,20 @@ def test_routes_are_counted_per_hour(data: Path) -> None:
     }
 
 
+def test_routes_are_counted_in_the_periods(data: Path) -> None:
+    scenario = load_scenario(data / "crossing").with_duration(1600.0)  # vehicles up to 400 s
+
+    def north(*windows: tuple[float, float]) -> float:
+        periods = [replace(street(1), begin_s=begin, end_s=end) for begin, end in windows]
+        return Routes.of(scenario, periods).turns["S_C"]["C_N"]
+
+    assert north() == pytest.approx(45.0)
+    assert north((0.0, 1600.0)) == pytest.approx(45.0)
+    assert north((100.0, 300.0), (100.0, 300.0)) == pytest.approx(180.0)
+    assert north((0.0, 200.0), (400.0, 600.0), (400.0, 600.0)) == pytest.approx(60.0)
+    assert Routes.of(scenario, [replace(street(1), begin_s=500.0, end_s=900.0)]).origins == {}
+
+
 def test_parking_is_tried_on_every_lane_of_a_small_site() -> None:
     allowed = library([])
     found = PlaceFinder(SITE, ROUTES, allowed, THRESHOLDS).everywhere()

@@ -58,6 +58,14 @@ def test_edges_without_demand_are_named_with_what_was_counted(northbound: Scenar
     assert study.measured.hash == BOTH.hash
 
 
+def test_changes_of_demand_are_proposed_from_flows_of_the_measured_time(
+    scenario: Scenario,
+) -> None:
+    # A vehicle every 20 s on each of two roads, and none after 400 s.
+    study = Study.of(scenario.with_duration(1600.0), BOTH, DiagnosisConfig())
+    assert study.place_finder._routes.origins == pytest.approx({"S_C": 180.0, "W_C": 180.0})
+
+
 def test_edges_on_which_nobody_was_counted_need_no_demand(northbound: Scenario) -> None:
     quiet = replace(BOTH, periods=(replace(DAY, passages={"s": SEEN}),))
     assert unreached_edge_findings(northbound, quiet, BOTH.detectors) == ()

@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import itertools
 import math
-from collections import defaultdict
+from collections import Counter, defaultdict
 from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass
 from itertools import pairwise
@@ -31,7 +31,7 @@ from ugat_marl.diagnosis.statistics import Distance, Reference
 from ugat_marl.diagnosis.supplementary_data import TURNING
 from ugat_marl.diagnosis.thresholds import Thresholds
 from ugat_marl.effects import ExaminedStrengths
-from ugat_marl.scenarios import Passages, Period, Scenario, driven_routes, edge_of_lane
+from ugat_marl.scenarios import Passages, Period, Scenario, departures, edge_of_lane
 
 Array = NDArray[np.float64]
 
@@ -424,7 +424,7 @@ def _later(counts: Array, bins: float) -> Array:
 
 @dataclass(frozen=True, eq=False)
 class Routes:
-    """Flows of the scenario's vehicles over edges and pairs of edges, vehicles per hour.
+    """Mean flows of the scenario's vehicles over edges and pairs of edges, vehicles per hour.
 
     Attributes:
         origins: Flow that starts on an edge.
@@ -444,14 +444,29 @@ class Routes:
         return flow / self.joint[edge][edge] if flow else 0.0
 
     @classmethod
-    def of(cls, scenario: Scenario) -> Routes:
-        """Count the routes of all vehicles."""
+    def of(cls, scenario: Scenario, periods: Sequence[Period] = ()) -> Routes:
+        """Count the routes of the vehicles that depart within periods.
+
+        Args:
+            scenario: The scenario.
+            periods: Periods over which flows are means; none for the whole scenario.
+        """
         origins: dict[str, float] = defaultdict(float)
         passing: dict[str, dict[str, float]] = defaultdict(lambda: defaultdict(float))
         turns: dict[str, dict[str, float]] = defaultdict(lambda: defaultdict(float))
         joint: dict[str, dict[str, float]] = defaultdict(lambda: defaultdict(float))
-        rate = 3600.0 / scenario.settings.duration_s
-        for edges in driven_routes(scenario):
+        begin_s = scenario.settings.begin_s
+        whole = begin_s, begin_s + scenario.settings.duration_s
+        windows = Counter([period.window for period in periods] or [whole])
+        length_s = sum(times * (end - begin) for (begin, end), times in windows.items())
+        for _, depart, edges in departures(scenario, routed=False):
+            rate = sum(
+                3600.0 * times / length_s
+                for (begin, end), times in windows.items()
+                if begin <= depart < end
+            )
+            if not edges or not rate:
+                continue
             origins[edges[0]] += rate
             passed = dict.fromkeys(edges)
             for edge in passed:

@@ -617,7 +617,7 @@ class Study:
         """Finder of places and windows."""
         return PlaceFinder(
             self.layout,
-            Routes.of(self.scenario),
+            Routes.of(self.scenario, self.measured.of("fit")),
             self.allowed,
             self.config.thresholds,
             self.holes,
