@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import xml.etree.ElementTree as ET
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from types import SimpleNamespace
@@ -16,6 +17,8 @@ from ugat_marl.diagnosis import Reference, Tally
 from ugat_marl.diagnosis.arrivals import (
     Arrivals,
     DemandBalance,
+    _Coming,
+    _filled,
     by_lane_left,
     corrected,
     unhindered,
@@ -26,7 +29,7 @@ from ugat_marl.diagnosis.replay import Replay
 from ugat_marl.diagnosis.statistics import Pools
 from ugat_marl.diagnosis.thresholds import Thresholds
 from ugat_marl.diagnosis.unmeasured import Unmeasured
-from ugat_marl.effects import Effect, load_scenario, parse_domain
+from ugat_marl.effects import Effect, depart_s, load_scenario, parse_domain
 from ugat_marl.experiments import policy_factory, record
 from ugat_marl.scenarios import Network, Passages, Period, Scenario, draw_day
 from ugat_marl.simulation import standard_detectors
@@ -171,6 +174,36 @@ def test_who_departs_before_the_warm_up_comes_all_the_same(
     replay = Replay(scenario, network, layout.detectors, layout.owner, short, answering=True)
     came = replay.simulate((), period, 1).period.passages["advance:S_C_0"].on_s
     np.testing.assert_allclose(came, times, atol=2.0)
+
+
+@pytest.mark.parametrize("count", [360, 720, 1440])
+def test_next_edges_stay_at_their_time_of_day(count: int) -> None:
+    """The model has 720 vehicles, to x in the first half of the hour, and to y in the second."""
+    pool = [
+        _Coming("a", 5.0 * i, 60.0, "x" if i < 360 else "y", ET.Element("vehicle", id=str(i)))
+        for i in range(720)
+    ]
+    times = (np.arange(count) + 0.5) * 3600.0 / count
+    found = _filled(pool, [(time, frozenset("xy")) for time in times], -60.0, THRESHOLDS)
+    following = {str(i): one.following for i, one in enumerate(pool)}
+    names = [item.get("id", "") for item in found]
+    np.testing.assert_allclose([depart_s(item) + 60.0 for item in found], times, atol=0.006)
+    assert len(set(names)) == count
+    away = np.abs(times - 1800.0) > THRESHOLDS.bin_s
+    late = np.array([following[name.partition("+")[0]] == "y" for name in names])
+    np.testing.assert_array_equal(late[away], times[away] > 1800.0)
+
+
+def test_arrivals_get_vehicles_that_turn_where_their_lane_leads_to() -> None:
+    pool = [
+        _Coming("a", 10.0 * i, 0.0, "xyy"[i % 3], ET.Element("vehicle", id=str(i)))
+        for i in range(30)
+    ]
+    lanes = [frozenset("x"), frozenset("y"), frozenset("y"), frozenset("z")]
+    came = [(10.0 * i, lanes[i % 4]) for i in range(28)]
+    for item, (_, edges) in zip(_filled(pool, came, 0.0, THRESHOLDS), came, strict=True):
+        number = int(item.get("id", "").partition("+")[0])
+        assert pool[number].following in edges or edges == {"z"}, "a lane that nobody takes"
 
 
 def test_effects_on_demand_leave_what_is_simulated_alone(

@@ -12,11 +12,12 @@ from __future__ import annotations
 
 import math
 import xml.etree.ElementTree as ET
-from collections import Counter, deque
+from collections import Counter
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
+from numpy.typing import NDArray
 
 from ugat_marl.diagnosis.features import (
     BIN_FEATURES,
@@ -129,7 +130,8 @@ class Arrivals:
                 pools[coming.approach].append(coming)
         filled: list[ET.Element] = []
         for edge, pool in pools.items():
-            filled += _filled(pool, self._came(edge, period), drivers.settings.begin_s, period)
+            came = self._came(edge, period)
+            filled += _filled(pool, came, drivers.settings.begin_s, self._thresholds)
         root[:] = [*stay, *filled]
         sort_departures(root)
         changed = Document(document.name, None, xml_bytes(root))
@@ -257,44 +259,39 @@ def _filled(
     pool: Sequence[_Coming],
     came: Sequence[tuple[float, frozenset[str]]],
     earliest_s: float,
-    period: Period,
+    thresholds: DayThresholds,
 ) -> list[ET.Element]:
     """Return vehicles of the pool that arrive at the measured times.
 
-    Vehicles are taken in their order in time, each on a lane that leads to its next edge. If the
-    pool is too small, it starts again from its first vehicle.
+    Each arrival gets the vehicle that is nearest in time, of those whose next edge its lane leads
+    to. So next edges stay at their time of day. A vehicle counts as a bin of time farther away for
+    each time that it was taken, so that others come first.
 
     Args:
         pool: Vehicles of the model on their way to one approach.
         came: Measured arrival times, s, with the possible next edges.
         earliest_s: Earliest departure, s.
-        period: The measured period.
+        thresholds: Numbers of the method.
     """
-    queues: dict[str | None, deque[_Coming]] = {}
-    for one in sorted(pool, key=lambda one: one.time_s):
-        queues.setdefault(one.following, deque()).append(one)
+    if not pool:
+        return []  # the model has no vehicle on this approach
+    times = np.array([one.time_s for one in pool])
+    taken = np.zeros(len(pool), np.int64)
+    fits: dict[frozenset[str], NDArray[np.bool_]] = {}
+    for edges in {edges for _, edges in came}:
+        led = np.array([one.following is None or one.following in edges for one in pool])
+        fits[edges] = led if led.any() else ~led
     vehicles: list[ET.Element] = []
-    turns: dict[str | None, int] = dict.fromkeys(queues, 0)
-    sizes = {name: len(queue) for name, queue in queues.items()}
     for time, following in came:
-        fitting = [name for name in queues if name is None or name in following] or list(queues)
-        if not fitting:
-            break  # the model has no vehicle on this approach
-
-        def waiting(name: str | None) -> float:
-            rounds = turns[name] // sizes[name]
-            return queues[name][0].time_s + rounds * period.length_s
-
-        name = min(fitting, key=waiting)
-        queue = queues[name]
-        coming = queue[0]
-        queue.rotate(-1)
+        away_s = np.abs(times - time) + thresholds.bin_s * taken
+        nearest = int(np.argmin(np.where(fits[following], away_s, np.inf)))
+        coming, again = pool[nearest], int(taken[nearest])
         vehicle = ET.Element(coming.element.tag, dict(coming.element.attrib))
         vehicle.extend(coming.element)
-        if again := turns[name] // sizes[name]:
+        if again:
             vehicle.set("id", f"{vehicle.get('id')}+{again}")
         vehicle.set("depart", f"{max(time - coming.way_s, earliest_s):.2f}")
-        turns[name] += 1
+        taken[nearest] += 1
         vehicles.append(vehicle)
     return vehicles
 
