@@ -51,7 +51,7 @@ def seen(times: Sequence[float], speeds: Sequence[float]) -> Passages:
 
 def test_who_comes_freely_came_when_he_was_seen() -> None:
     times = [3.0, 50.0, 90.0]
-    found = unhindered(seen(times, [9.0, 10.0, 11.0]), LIMIT, a_period(), THRESHOLDS)
+    found = unhindered(seen(times, [9.0, 10.0, 11.0]), LIMIT, a_period(), THRESHOLDS, 0.0)
     assert found.tolist() == times
 
 
@@ -59,34 +59,36 @@ def test_who_came_through_a_queue_is_spread_between_free_neighbours_and_never_la
     # Free at 20 and at 60; three between them in a queue: evenly at 30, 40, 50, but the first
     # was seen at 25 and cannot have come after that.
     found = unhindered(
-        seen([20.0, 25.0, 45.0, 58.0, 60.0], [9, 1, 2, 3, 9]), LIMIT, a_period(), THRESHOLDS
+        seen([20.0, 25.0, 45.0, 58.0, 60.0], [9, 1, 2, 3, 9]), LIMIT, a_period(), THRESHOLDS, 0.0
     )
     assert found.tolist() == [20.0, 25.0, 40.0, 50.0, 60.0]
 
 
 def test_a_queue_at_the_ends_is_spread_to_the_ends_of_the_period() -> None:
-    found = unhindered(seen([80.0, 190.0], [1.0, 1.0]), LIMIT, a_period(end=300.0), THRESHOLDS)
+    found = unhindered(seen([80.0, 190.0], [1.0, 1.0]), LIMIT, a_period(end=300.0), THRESHOLDS, 0.0)
     np.testing.assert_allclose(found, [80.0, 190.0])  # 100 and 200 would be later than seen
-    found = unhindered(seen([180.0, 190.0], [1.0, 1.0]), LIMIT, a_period(end=240.0), THRESHOLDS)
+    found = unhindered(
+        seen([180.0, 190.0], [1.0, 1.0]), LIMIT, a_period(end=240.0), THRESHOLDS, 0.0
+    )
     np.testing.assert_allclose(found, [80.0, 160.0])
 
 
 def test_who_drives_on_behind_a_queue_belongs_to_it() -> None:
     close = unhindered(
-        seen([20.0, 40.0, 42.0], [9.0, 1.0, 7.0]), LIMIT, a_period(end=80.0), THRESHOLDS
+        seen([20.0, 40.0, 42.0], [9.0, 1.0, 7.0]), LIMIT, a_period(end=80.0), THRESHOLDS, 0.0
     )
     np.testing.assert_allclose(close, [20.0, 40.0, 42.0])  # both spread: 40 and 60, cut to seen
     far = unhindered(
-        seen([20.0, 40.0, 46.0], [9.0, 1.0, 7.0]), LIMIT, a_period(end=80.0), THRESHOLDS
+        seen([20.0, 40.0, 46.0], [9.0, 1.0, 7.0]), LIMIT, a_period(end=80.0), THRESHOLDS, 0.0
     )
     np.testing.assert_allclose(far, [20.0, 33.0, 46.0])  # the last came freely
 
 
 def test_without_speeds_time_on_the_detector_tells() -> None:
     one = dataclasses.replace(seen([20.0, 39.0, 60.0], [9, 1, 9]), speed_mps=np.full(3, np.nan))
-    assert unhindered(one, LIMIT, a_period(), THRESHOLDS).tolist() == [20.0, 39.0, 60.0]
+    assert unhindered(one, LIMIT, a_period(), THRESHOLDS, 0.0).tolist() == [20.0, 39.0, 60.0]
     one = dataclasses.replace(seen([20.0, 50.0, 60.0], [9, 1, 9]), speed_mps=np.full(3, np.nan))
-    assert unhindered(one, LIMIT, a_period(), THRESHOLDS).tolist() == [20.0, 40.0, 60.0]
+    assert unhindered(one, LIMIT, a_period(), THRESHOLDS, 0.0).tolist() == [20.0, 40.0, 60.0]
 
 
 def test_a_long_zone_is_left_later() -> None:
@@ -94,7 +96,7 @@ def test_a_long_zone_is_left_later() -> None:
     on = np.array([150.0, 190.0])
     free = Passages(on, on + 2.0, on * np.nan, on * np.nan)
     assert unhindered(free, LIMIT, a_period(), THRESHOLDS, 15.0).tolist() == [150.0, 190.0]
-    assert unhindered(free, LIMIT, a_period(), THRESHOLDS).tolist() != [150.0, 190.0]
+    assert unhindered(free, LIMIT, a_period(), THRESHOLDS, 0.0).tolist() != [150.0, 190.0]
 
 
 def test_who_changes_lanes_is_counted_where_he_left() -> None:

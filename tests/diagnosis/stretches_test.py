@@ -7,7 +7,7 @@ import pytest
 from numpy.typing import NDArray
 
 from ugat_marl.data import occupied_between
-from ugat_marl.diagnosis.features import BIN_FEATURES
+from ugat_marl.diagnosis.features import BIN_FEATURES, DetectorLayout, IncomingLane
 from ugat_marl.diagnosis.places import largest_stretches, most_unusual
 from ugat_marl.diagnosis.statistics import Distance
 from ugat_marl.diagnosis.thresholds import Thresholds
@@ -16,18 +16,22 @@ THRESHOLDS = Thresholds()
 
 Array = NDArray[np.float64]
 
-EDGES = ("a", "a", "b")
+LANES = tuple(
+    IncomingLane(f"{edge}_{lane}", edge, 0, (0,), 14.0, {})
+    for edge, lane in (("a", 0), ("a", 1), ("b", 0))
+)
+LAYOUT = DetectorLayout(("C",), LANES, (), (), {})
 BINS = 6
 MINUTES = 60
 
 
 def largest(difference: dict[tuple[str, int], list[float]], variance: float) -> dict[str, float]:
     """Of differences by kind of count and lane, each with the same noise; others are unused."""
-    values = np.zeros((len(BIN_FEATURES) * len(EDGES), BINS))
+    values = np.zeros((len(BIN_FEATURES) * len(LANES), BINS))
     for (kind, lane), row in difference.items():
-        values[BIN_FEATURES.index(kind) * len(EDGES) + lane] = row
+        values[BIN_FEATURES.index(kind) * len(LANES) + lane] = row
     z = values / np.sqrt(variance)
-    return largest_stretches(EDGES, Distance(0.0, {}, 0.0, {}, {"time": z}, {"time": values}))
+    return largest_stretches(LAYOUT, Distance(0.0, {}, 0.0, {}, {"time": z}, {"time": values}))
 
 
 def test_lanes_of_an_edge_are_added() -> None:

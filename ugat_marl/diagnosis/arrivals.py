@@ -366,7 +366,7 @@ def _factor(vehicle: ET.Element) -> float:
 
 
 def unhindered(
-    seen: Passages, limit_mps: float, period: Period, thresholds: DayThresholds, zone_m: float = 0.0
+    seen: Passages, limit_mps: float, period: Period, thresholds: DayThresholds, zone_m: float
 ) -> Array:
     """Return the arrival times of vehicles as if no queue had delayed them, s.
 

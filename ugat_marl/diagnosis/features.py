@@ -185,19 +185,30 @@ class DetectorLayout:
         return rows
 
     @functools.cached_property
-    def approaches(self) -> tuple[tuple[int, ...], ...]:
-        """Indices of the lanes of each edge that have an advance and a stop detector.
-
-        Roads with a zone on several lanes are left out: vehicles there cannot be followed by lane.
-        """
+    def places_of_edge(self) -> Mapping[str, tuple[int, ...]]:
+        """Indices of the places on each edge."""
         by_edge: dict[str, list[int]] = {}
-        wide = {edge_of_lane(detector.lane) for detector in self.detectors if detector.beside}
+        for index, (_, edge, _) in enumerate(self.places):
+            by_edge.setdefault(edge, []).append(index)
+        return {edge: tuple(members) for edge, members in by_edge.items()}
+
+    @functools.cached_property
+    def lanes_with_both(self) -> Mapping[str, tuple[int, ...]]:
+        """Indices of the lanes of each edge that have an advance and a stop detector."""
+        by_edge: dict[str, list[int]] = {}
         for index, lane in enumerate(self.lanes):
-            if lane.edge in wide:
-                continue
             if "advance" in lane.detectors and "stop" in lane.detectors:
                 by_edge.setdefault(lane.edge, []).append(index)
-        return tuple(map(tuple, by_edge.values()))
+        return {edge: tuple(lanes) for edge, lanes in by_edge.items()}
+
+    @functools.cached_property
+    def approaches(self) -> tuple[tuple[int, ...], ...]:
+        """The lanes of `lanes_with_both` by edge, for each edge without a zone on several lanes.
+
+        Vehicles on the other edges cannot be followed by lane.
+        """
+        wide = {edge_of_lane(detector.lane) for detector in self.detectors if detector.beside}
+        return tuple(lanes for edge, lanes in self.lanes_with_both.items() if edge not in wide)
 
     def ride_s(self, lane: int) -> float:
         """Return the time from the advance to the stop detector of a lane at its limit, s."""
@@ -730,11 +741,7 @@ def _conserved(
     counter: _Counter, layout: DetectorLayout, advances: Array, stops: Array, exits: Array
 ) -> None:
     """Add the ratios of counts: stop to advance by approach, exit to stop by intersection."""
-    approaches: dict[str, list[int]] = {}
-    for index, lane in enumerate(layout.lanes):
-        if "stop" in lane.detectors and "advance" in lane.detectors:
-            approaches.setdefault(lane.edge, []).append(index)
-    for members in approaches.values():
+    for members in map(list, layout.lanes_with_both.values()):
         counter.place = members[0]
         counter.ratio("kept_to_stop", stops[members].sum(), advances[members].sum())
     for number in range(len(layout.intersections)):

@@ -75,7 +75,6 @@ class PlaceFinder:
         self._thresholds = thresholds
         self._routes = routes
         self.allowed = frozenset(allowed)
-        self._edges = [edge for _, edge, _ in layout.places]
         self._volume = Volume(layout, routes, thresholds)
 
     def hypotheses(
@@ -110,7 +109,7 @@ class PlaceFinder:
 
     def directed(self, distance: Distance) -> dict[str, float]:
         """Return the squared standardised sizes of the best origin, turn and stretch of time."""
-        return self._volume.directed(distance) | largest_stretches(self._edges, distance)
+        return self._volume.directed(distance) | largest_stretches(self._layout, distance)
 
     # --- time ---------------------------------------------------------------------------------
 
@@ -122,7 +121,7 @@ class PlaceFinder:
         block = reference.blocks["time"]
         least, most = self._thresholds.strengths_of_a_shift
         fitting: list[tuple[float, str, float]] = []
-        first = BIN_FEATURES.index("count_advance") * len(self._edges)
+        first = BIN_FEATURES.index("count_advance") * len(self._layout.places)
         width = length_s / bins_in(length_s, self._thresholds) * reference.pools.together
         for origin in self._routes.passing:
             rows = [
@@ -166,7 +165,7 @@ class PlaceFinder:
         ranked: list[tuple[float, Hypothesis]] = []
         for origin in self._routes.passing:
             measured = self._measured_edge(origin)
-            members = [i for i, edge in enumerate(self._edges) if edge == measured]
+            members = self._layout.places_of_edge.get(measured or "", ())
             window = self._scan(
                 reference, distance, periods, members, "count_advance", "count_exit"
             )
@@ -197,10 +196,9 @@ class PlaceFinder:
 
     def _measured_edge(self, origin: str) -> str | None:
         """Return the first measured edge on the ways of an origin that is mostly its own."""
-        measured = set(self._edges)
         for edge in self._routes.passing[origin]:  # in the order of a route
             own = edge == origin or self._routes.share(origin, edge) > self._thresholds.mostly
-            if own and edge in measured:
+            if own and edge in self._layout.places_of_edge:
                 return edge
         return None
 
@@ -231,7 +229,7 @@ class PlaceFinder:
             Standardised size, start and end in s, ratio to the expected; None if all is chance.
         """
         block = reference.blocks["time"]
-        places = len(self._edges)
+        places = len(self._layout.places)
         rows: list[int] = []
         for index in members:
             name = kind if index < len(self._layout.lanes) else other
@@ -334,7 +332,7 @@ class PlaceFinder:
     def _speed_ratio(self, reference: Reference, distance: Distance, edge: str) -> float:
         """Return the free speed on an edge, as a multiple of the simulated one."""
         thresholds = self._thresholds
-        rows = [index for index, name in enumerate(self._edges) if name == edge]
+        rows = self._layout.places_of_edge[edge]
         row = _speed_row(distance)
         mean = reference.blocks["lane"].mean[rows, row]
         difference = distance.difference["lane"][rows, row]
@@ -531,7 +529,6 @@ class Volume:
         self._layout = layout
         self._thresholds = thresholds
         self._routes = routes
-        self._edges = [edge for _, edge, _ in layout.places]
 
     def directed(self, distance: Distance) -> dict[str, float]:
         """Return the squared standardised sizes of the best origin and of the best turn."""
@@ -585,8 +582,7 @@ class Volume:
         place: dict[str, int] = {}
         differences: list[float] = []
         errors: list[float] = []
-        for edge in dict.fromkeys(self._edges):
-            members = [i for i, name in enumerate(self._edges) if name == edge]
+        for edge, members in self._layout.places_of_edge.items():
             for kind in ("count_stop", "count_advance", "count_exit"):
                 row = INDEX[kind]
                 difference = distance.difference["lane"][members, row]
@@ -721,11 +717,11 @@ def turned(reference: Reference, distance: Distance) -> list[Hypothesis]:
 # --- stretches of time ----------------------------------------------------------------------------
 
 
-def largest_stretches(edges: Sequence[str], distance: Distance) -> dict[str, float]:
+def largest_stretches(layout: DetectorLayout, distance: Distance) -> dict[str, float]:
     """Return the largest squared standardised difference over any stretch of bins.
 
     Args:
-        edges: Edge of every place.
+        layout: Lanes and detectors.
         distance: Distance of the data from a model.
 
     Returns:
@@ -733,10 +729,10 @@ def largest_stretches(edges: Sequence[str], distance: Distance) -> dict[str, flo
     """
     z, difference = distance.z["time"], distance.difference["time"]
     variance = np.where(z != 0, (difference / np.where(z != 0, z, 1.0)) ** 2, 0.0)
-    places = len(edges)
+    places = len(layout.places)
     groups = [
-        [kind * places + index for index, name in enumerate(edges) if name == edge]
-        for edge in dict.fromkeys(edges)
+        [kind * places + index for index in members]
+        for members in layout.places_of_edge.values()
         for kind in range(len(COUNT_FEATURES))
     ]
     of_edges = np.stack([difference[rows].sum(axis=0) for rows in groups])
