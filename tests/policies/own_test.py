@@ -624,6 +624,61 @@ def test_what_is_typed_in_a_notebook_is_known_by_its_code() -> None:
     assert hash_of(0) == hash_of(0, lines=3) != hash_of(7)
 
 
+@pytest.mark.parametrize(
+    "code",
+    [
+        "class Typed(Base):\n rate = {}",
+        "class Typed(Base):\n def __init__(self, env, lr={}): pass",
+        "class Typed(Base):\n def __init__(self, env, *, lr={}): pass",
+        "class Typed(Base):\n rate = property(lambda self: {})",
+        "class Typed(Base):\n class Net:\n  width = {}",
+        "Base.phase = {}\nclass Typed(Base): pass",
+        "class Other(Base):\n def policy(self): return {}\nclass Typed(Other): pass",
+        "def Typed(env, lr={}): return Base()",
+        "def wrapped(make):\n return functools.wraps(make)(lambda env: make(env))\n"
+        "@wrapped\ndef Typed(env): return {}",
+        "class Net:\n width = {}\nTyped = functools.partial(Base, Net())",
+    ],
+)
+def test_all_that_is_typed_in_a_notebook_is_a_part_of_its_identity(code: str) -> None:
+    def identity(value: int) -> object:
+        space: dict[str, Any] = {"__name__": "notebook", "functools": functools}
+        typed = "class Base:\n def policy(self): return None\n"
+        exec(typed + code.replace("{}", str(value)), space)
+        return LearnerSpec(own_name(space["Typed"])).identity
+
+    assert identity(1) == identity(1) != identity(2)
+
+
+def test_an_attribute_set_from_outside_is_a_part_of_the_identity_of_a_class(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    (tmp_path / "outside.py").write_text(
+        "class Base:\n"
+        "    phase = 1\n"
+        "class Mine(Base):\n"
+        "    rate: float = 0.1\n"
+        "    made, kept, both = 0, {}, 1\n"
+        "    cache = {}\n"
+        "    count = 0\n"
+        "    width = 1\n"
+        "    if rate < 1:\n"
+        "        width = 2\n"
+        "    def learn(self, env, episodes):\n"
+        "        Mine.count += 1\n"
+        "        self.cache[episodes] = 1\n"
+        "    def policy(self): ...\n"
+    )
+    module = load_own(f"{tmp_path}/outside.py:Mine", "learner")
+    names = own_name(module), f"{tmp_path}/outside.py:Mine"
+    module.learn(module(), None, 1)
+    assert [own_values(name) for name in names] == [[], []]
+    monkeypatch.setattr(module, "rate", 2)
+    assert [own_values(name) for name in names] == [["rate=2"], ["rate=2"]]
+    monkeypatch.setattr(module.__mro__[1], "phase", 7)
+    assert own_values(names[0]) == ["rate=2", "phase=7"]
+
+
 def test_a_learner_whose_file_was_edited_after_its_import_begins_no_training(
     algorithm: Any, tmp_path: Path
 ) -> None:

@@ -6,6 +6,7 @@ working folder, too. An object that was given in Python has a name of the same f
 
 from __future__ import annotations
 
+import ast
 import contextlib
 import dataclasses
 import functools
@@ -14,10 +15,12 @@ import importlib.util
 import inspect
 import re
 import sys
+import textwrap
 import traceback
 from collections import deque
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from enum import Enum
+from operator import itemgetter
 from pathlib import Path, PurePath
 from types import CodeType, FunctionType, MethodType, ModuleType
 from typing import Any
@@ -49,7 +52,7 @@ def own_name(given: Any) -> str:
     if not _is_found(kind, given):
         name += ".<given>"  # no other process may take what it finds by the name for it
     _given[name] = given
-    _file_hash(kind)  # keeps it
+    _keep_source(kind)
     return name
 
 
@@ -111,7 +114,7 @@ def load_own(name: str, what: str) -> Any:
         where = f"{error.filename}, line {error.lineno}"
         raise OptionError(f"{what} {name!r}: {where} is no Python ({error.msg})") from None
     found = _member(found, path, f"{what} in {module_name}", of_learners=what == "learner")
-    _file_hash(_named(found))  # keeps it
+    _keep_source(_named(found))
     return found
 
 
@@ -140,13 +143,25 @@ def _named(given: Any) -> Any:
 
 
 def own_values(name: str) -> list[str]:
-    """Return what an object that was given in Python holds beside its source, as text.
+    """Return what a user's learner or policy holds beside its source, as text.
 
     These are arguments of a `functools.partial`, values captured by an inner function or by the
     methods of an inner class, its defaults, and attributes of such a class or of an instance, those
-    in slots included. Two objects of one name and source differ in nothing else.
+    in slots included. A function or class without a file counts as an inner one. Of any other class
+    these are the attributes that were set from outside. Two objects of one name and source differ
+    in nothing else.
+
+    Args:
+        name: Name as for `load_own`.
+
+    Raises:
+        OptionError: The module is missing.
+        UnknownNameError: The object is missing in it.
     """
-    return _values(_given[name]) if name in _given else []
+    found = load_own(name, "learner")
+    # of a partial, and of what a function made, that a file names, the file says all
+    counts = name in _given or "<" not in getattr(found, "__qualname__", "<")
+    return _values(found) if counts else []
 
 
 def _values(given: Any, inside: tuple[int, ...] = ()) -> list[str]:
@@ -155,7 +170,7 @@ def _values(given: Any, inside: tuple[int, ...] = ()) -> list[str]:
         keywords = [f"{key}={text(value)}" for key, value in sorted(given.keywords.items())]
         return [*_values(given.func, inside), *map(text, given.args), *keywords]
     if isinstance(given, FunctionType):
-        if "<" not in given.__qualname__:  # neither <locals> nor <lambda>: its source says all
+        if _is_of_file(given):
             return []
         defaults = (given.__kwdefaults__ or {}).items()
         return [
@@ -164,11 +179,16 @@ def _values(given: Any, inside: tuple[int, ...] = ()) -> list[str]:
             *(f"{key}={text(value)}" for key, value in sorted(defaults)),
         ]
     if inspect.isclass(given):
-        return _values_of_class(given, inside) if "<" in given.__qualname__ else []
+        return (_set_from_outside if _is_of_file(given) else _values_of_class)(given, inside)
     if isinstance(given, MethodType):
         return [text(given.__self__)]
     held = {} if hasattr(given, "__qualname__") else _attributes(given)
     return [text(held)] if held else []
+
+
+def _is_of_file(kind: Any) -> bool:
+    """Return True if the source of a function or class says all: no other function made it."""
+    return "<" not in kind.__qualname__ and _file_of(kind) is not None
 
 
 def _captured(function: FunctionType) -> dict[str, Any]:
@@ -189,15 +209,77 @@ def _attributes(value: Any) -> dict[str, Any]:
 
 
 def _values_of_class(given: type, inside: tuple[int, ...]) -> list[str]:
-    """Return what a class that a function made holds: attributes, and values in its methods."""
+    """Return what a class holds that no file tells: attributes, and values in its methods."""
     held: list[str] = []
-    for name, member in sorted(vars(given).items()):
+    for name, member in sorted(_members(given), key=itemgetter(0)):
         function = getattr(member, "__func__", member)  # of a static method or a class method
         if isinstance(function, FunctionType):
             held += [f"{name}: {value}" for value in _values(function, inside)]
         elif not name.startswith("__") and not hasattr(member, "__get__"):
             held.append(f"{name}={_stable(member, inside)}")
     return held
+
+
+def _members(kind: type) -> list[tuple[str, Any]]:
+    """Return the members of a class, and of those of its bases that have no file."""
+    kinds = [one for one in kind.__mro__ if one is kind or _file_of(one) is None]
+    return [member for one in kinds for member in vars(one).items()]
+
+
+def _set_from_outside(given: type, inside: tuple[int, ...] = ()) -> list[str]:
+    """Return the attributes of a class of a file that no longer have the values written there.
+
+    Only plain values can be compared. Bases count if they are of the same module.
+    """
+    held: list[str] = []
+    for kind in given.__mro__:
+        written = _written_values(kind) if kind.__module__ == given.__module__ else {}
+        for name, value in written.items():
+            now = vars(kind).get(name, value)
+            if not hasattr(now, "__get__") and (text := _stable(now, inside)) != _stable(value):
+                held.append(f"{name}={text}")
+    return held
+
+
+@functools.cache
+def _written_values(kind: type) -> Mapping[str, Any]:
+    """Return the attributes to which the source of a class assigns numbers, text and the like.
+
+    Empty lists and the like are left out, and so is what a method assigns to the class: such values
+    change while the class works.
+    """
+    try:
+        written: Any = ast.parse(textwrap.dedent(inspect.getsource(kind))).body[0]
+    except (TypeError, OSError, SyntaxError):  # a class without a source
+        return {}
+    values: dict[str, Any] = {}
+    for statement in written.body:
+        match statement:
+            case ast.FunctionDef() | ast.AsyncFunctionDef() | ast.ClassDef():
+                continue
+            case (
+                ast.Assign(targets=[ast.Name(id=name)], value=ast.expr() as value)
+                | ast.AnnAssign(target=ast.Name(id=name), value=ast.expr() as value)
+            ):
+                values.pop(name, None)
+                with contextlib.suppress(ValueError, TypeError):
+                    values[name] = ast.literal_eval(value)
+            case _:  # such as an assignment under a condition
+                for node in _stores(statement, ast.Name):
+                    values.pop(node.id, None)
+    stores = _stores(written, ast.Attribute)
+    changing = {node.attr for node in stores if ast.unparse(node.value) != "self"}
+    return {
+        name: value
+        for name, value in values.items()
+        if name not in changing and value not in ([], {}, set())
+    }
+
+
+def _stores(tree: ast.AST, kind: type) -> list[Any]:
+    """Return the names or attributes to which a piece of source assigns."""
+    found: list[Any] = [node for node in ast.walk(tree) if isinstance(node, kind)]
+    return [node for node in found if isinstance(node.ctx, ast.Store)]
 
 
 def _stable(value: Any, inside: tuple[int, ...] = ()) -> str:
@@ -228,19 +310,19 @@ def _stable(value: Any, inside: tuple[int, ...] = ()) -> str:
         return (
             f"{kind.__module__}.{kind.__qualname__}({_file_hash(kind)}, {_values(value, inside)})"
         )
-    return repr(value) if isinstance(value, _PLAIN) else _stable_object(value, deeper)
+    return repr(value) if isinstance(value, _PLAIN) else _stable_object(value, inside)
 
 
 _PLAIN = (type(None), bool, int, float, complex, str, bytes, range, slice, PurePath, Enum)
 """Types whose `repr` says all."""
 
 
-def _stable_object(value: Any, deeper: Callable[[Any], str]) -> str:
+def _stable_object(value: Any, inside: tuple[int, ...]) -> str:
     """Return any other object as text: its class, and what it holds.
 
     The `repr` of a data class, a tensor or a table may leave out the middle of long arrays.
     """
-    kind = type(value)
+    kind, deeper = type(value), functools.partial(_stable, inside=inside)
     named = f"{kind.__module__}.{kind.__qualname__}"
     if named == "torch.Tensor" or named.startswith("torch.nn.parameter."):
         array = value.detach().cpu()
@@ -257,7 +339,8 @@ def _stable_object(value: Any, deeper: Callable[[Any], str]) -> str:
         held = {field.name: getattr(value, field.name) for field in dataclasses.fields(kind)}
     says_what = kind.__getstate__ is not object.__getstate__  # as a table of polars does
     if not says_what and (held or kind.__repr__ is object.__repr__):
-        return f"{named}({_file_hash(kind)}, {deeper(held)})"
+        of_class = [] if _file_of(kind) else _values(kind, inside)
+        return f"{named}({', '.join([str(_file_hash(kind)), deeper(held), *of_class])})"
     try:  # what a copy is made of
         _, *made_of = value.__reduce_ex__(4)
     except TypeError:
@@ -307,6 +390,13 @@ def require_unchanged(name: str) -> None:
         raise OptionError(f"{file} was changed after it was imported; restart Python")
 
 
+def _keep_source(kind: Any) -> None:
+    """Keep what the file of a class or function says now, because it may be edited later."""
+    _file_hash(kind)
+    if inspect.isclass(kind):
+        _set_from_outside(kind)
+
+
 def _file_of(kind: Any) -> Path | None:
     """Return the file that defines a class or function; None for what is typed at a prompt."""
     try:
@@ -328,10 +418,17 @@ def _file_hash(kind: Any) -> str | None:
         if place not in _loaded or _loaded[place][0] is not loaded:
             _loaded[place] = loaded, file_hash(file)
         return _loaded[place][1]
-    members = vars(kind).values() if inspect.isclass(kind) else (kind,)
-    codes = [getattr(getattr(one, "__func__", one), "__code__", None) for one in members]
+    members = [one for _, one in _members(kind)] if inspect.isclass(kind) else [kind]
+    functions = [
+        one for each in members for one in (each, *(getattr(each, key, None) for key in _HOLDING))
+    ]
+    codes = [getattr(one, "__code__", None) for one in functions]
     texts = [_code_text(code) for code in codes if code is not None]
     return hashlib.sha256("".join(texts).encode()).hexdigest() if texts else None
+
+
+_HOLDING = ("__wrapped__", "fget", "fset", "fdel", "func")
+"""Attributes in which static methods, properties and decorators hold functions."""
 
 
 def _code_text(code: CodeType) -> str:
