@@ -25,8 +25,19 @@ def agents() -> AgentSet:
 def test_each_number_is_divided_by_its_root_mean_square(agents: AgentSet) -> None:
     seen = torch.tensor([[[3.0, 0.0, 0.0], [4.0, 0.0, 0.0]], [[1.0, 2.0, 0.5], [1.0, 2.0, 0.5]]])
     factors = input_factors(seen, agents, pooled=False)
-    expected = [[1 / 12.5**0.5, 1 / LEAST, 1.0], [1.0, 0.5, 2.0]]
+    # a has not seen its second number, and has no third
+    expected = [[1 / 12.5**0.5, 1.0, 1.0], [1.0, 0.5, 2.0]]
     assert torch.allclose(factors, torch.tensor(expected))
+
+
+def test_a_number_that_was_hardly_seen_keeps_its_size(agents: AgentSet) -> None:
+    """A large factor would let it rule the network when it appears."""
+    seen = torch.ones(2, 100, 3)
+    for size, factor in ((2 * LEAST, 0.5 / LEAST), (LEAST / 2, 1.0), (0.0, 1.0)):
+        seen[:, :, 1] = size
+        for pooled in (False, True):
+            factors = input_factors(seen, agents, pooled)[:, 1]
+            assert factors.tolist() == pytest.approx([factor, factor])
 
 
 def test_pooled_agents_have_one_factor_for_what_they_have_in_common(agents: AgentSet) -> None:

@@ -84,13 +84,16 @@ def input_factors(observations: Tensor, agents: AgentSet, pooled: bool) -> Tenso
         pooled: True for one factor per place, from the observations of all agents.
 
     Returns:
-        Factors ``(agents, widest_observation)``; 1 where an agent has no number.
+        Factors ``(agents, widest_observation)``; 1 where an agent has no number, and where the root
+        mean square is below `LEAST`. A number that was never seen has no size, and a large factor
+        would let it rule the network when it appears.
     """
     mask = torch.from_numpy(observation_mask(agents))
     square = observations.square().mean(1) * mask
     if pooled:
         square = (square.sum(0) / mask.sum(0)).expand_as(square)
-    return torch.where(mask, 1 / square.sqrt().clamp_min(LEAST), 1.0)
+    size = square.sqrt()
+    return torch.where(mask & (size >= LEAST), 1 / size, 1.0)
 
 
 def observation_mask(agents: AgentSet) -> NDArray[np.bool_]:
