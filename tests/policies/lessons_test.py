@@ -72,6 +72,10 @@ def test_where_no_rule_reads_the_observations_there_are_no_lessons() -> None:
         assert learner.attend(env, 0) is None
         learner.learn(env, 1, 0)
         assert learner.episodes == 1
+        asked = DQN.of(env, DQNConfig(teacher=BEST), 0)
+        for lessons in (asked.plays, lambda env: asked.attend(env, 0)):
+            with pytest.raises(OptionError, match="best: no standard rule .* --observation movem"):
+                lessons(env)
         named = DQN.of(env, SETTINGS, 0)
         with pytest.raises(OptionError, match="train in such ones, or leave the teacher out"):
             named.attend(env, 0)
@@ -80,8 +84,8 @@ def test_where_no_rule_reads_the_observations_there_are_no_lessons() -> None:
 def test_no_rule_teaches_where_observations_are_stacked(env: TrafficEnv) -> None:
     stacked = frame_stack(env, 3)
     learner = DQN.of(stacked, replace(SETTINGS, network="mlp", teacher=BEST), 0)
-    assert learner.plays(stacked) == 0
-    assert learner.attend(stacked, 0) is None
+    with pytest.raises(OptionError, match="not stacked"):
+        learner.plays(stacked)
 
 
 def test_a_learner_acts_as_its_teacher_before_its_first_episode(env: TrafficEnv) -> None:

@@ -314,13 +314,14 @@ class DQN:
 
         Raises:
             UnknownNameError: No rule has the teacher's name.
-            OptionError: The teacher reads other observations than the environment's.
+            OptionError: The teacher reads other observations than the environment's, or "best" was
+                asked for and no standard rule reads them.
         """
         if not self.config.teacher:
             return None
         root = derive_seed(seed, "dqn", "lessons", self.taught)
         if (found := find_teacher(env, self._teacher(best), root, on_play)) is None:
-            return None
+            return self._without_teacher()
         name, teacher = found
         self._replay.forget_teacher()
         for lesson in range(self.config.lessons):
@@ -337,9 +338,30 @@ class DQN:
         return name
 
     def plays(self, env: AnyParallelEnv, best: str | None = None) -> int:
-        """Return the number of episodes that `attend` plays."""
-        teacher = self._teacher(best)
-        return plays(teacher, self.config.lessons, env) if teacher else 0
+        """Return the number of episodes that `attend` plays.
+
+        Raises:
+            OptionError: The teacher "best" was asked for, and no standard rule reads the
+                environment's observations.
+        """
+        if not (teacher := self._teacher(best)):
+            return 0
+        number = plays(teacher, self.config.lessons, env)
+        if not number:
+            self._without_teacher()
+        return number
+
+    def _without_teacher(self) -> None:
+        """Accept that no rule can teach, with "universal", whose default the teacher "best" is.
+
+        Raises:
+            OptionError: The network is another one, so that "best" was asked for.
+        """
+        if not self._is_universal:
+            raise OptionError(
+                f"teacher {BEST}: no standard rule reads the observations of the environment; "
+                "train with --observation movements, not stacked, or leave the teacher out"
+            )
 
     def _teacher(self, best: str | None) -> str:
         """Return the teacher's spelling, or `BEST` if it has to be looked for."""

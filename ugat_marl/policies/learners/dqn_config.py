@@ -111,7 +111,8 @@ class DQNConfig:
             the last 1000 decisions of training. In a fuller street than in training, a policy then
             acts as in the fullest street it knows. None cuts nothing.
         teacher: Rule that shows the learner its first episodes, such as "max-pressure:20". "best"
-            takes the best of the standard rules in the environment of the training. None for none;
+            takes the best of the standard rules in the environment of the training, and needs the
+            observation "movements". None for none;
             "" for "best" with the learner "universal", and for none with others. After its
             lessons exploration begins at `epsilon_end`.
         lessons: Episodes that the teacher shows.
