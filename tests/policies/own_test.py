@@ -934,6 +934,29 @@ def test_files_of_one_name_in_two_folders_are_two_modules(
         load_own(f"{tmp_path}/3/twice.py:policy", "policy")
 
 
+@pytest.mark.parametrize("folder", ["my folder", "a+b (1)", "with~tilde", "c:d"])
+def test_a_file_may_lie_in_a_folder_of_any_name(
+    folder: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(sys, "path", [*sys.path])
+    monkeypatch.setenv("HOME", str(tmp_path))
+    (tmp_path / folder).mkdir()
+    (tmp_path / folder / "algo.py").write_text(ALGORITHM)
+    for place in (str(tmp_path / folder), f"~/{folder}"):
+        policy_factory(f"{place}/algo.py:first_phase")
+        assert OwnLearnerFactory(LearnerSpec(f"{place}/algo.py:Kept").name).name.startswith(place)
+
+
+@pytest.mark.parametrize("name", [r"C:\Users\me and you\algo.py:Kept", "x.py:Kept.Inner"])
+def test_a_path_and_a_name_in_it_are_a_name(name: str) -> None:
+    assert is_own(name)
+
+
+@pytest.mark.parametrize("name", ["max-pressure:20", "my folder:Kept", "algo.py", "algo.py:", ""])
+def test_what_names_no_object_is_no_name(name: str) -> None:
+    assert not is_own(name)
+
+
 @pytest.mark.usefixtures("algorithm")
 @pytest.mark.parametrize(
     ("name", "error", "says"),

@@ -16,6 +16,7 @@ from ugat_marl.effects import Domain, domain_label
 from ugat_marl.envs import TrafficEnv, parallel_env
 from ugat_marl.errors import CheckpointError, OptionError
 from ugat_marl.experiments.scores import Evaluation, Result, RuleTrial, best_rule_note
+from ugat_marl.files import with_home
 from ugat_marl.parallel import (
     Stop,
     Workers,
@@ -300,7 +301,8 @@ def policy_factory(spec: str) -> PolicyFactory:
             return OwnLearnerPolicy(name, Path(file))
         load_own(name, "policy")  # a wrong name is an error now
         place, _, found = name.rpartition(":")
-        return NamedPolicy(f"{Path(place).resolve()}:{found}" if place.endswith(".py") else name)
+        file = place.endswith(".py")
+        return NamedPolicy(f"{with_home(place).resolve()}:{found}" if file else name)
     path = Path(spec)
     if path.is_dir():
         raise CheckpointError(f"{path} is a folder; name the .pt file of a policy in it")

@@ -28,9 +28,9 @@ from typing import Any
 import numpy as np
 
 from ugat_marl.errors import OptionError, UnknownNameError, first_line
-from ugat_marl.files import file_hash
+from ugat_marl.files import file_hash, with_home
 
-_NAME = re.compile(r"[\w./\\-]+:[A-Za-z_<][\w.<>]*")
+_NAME = re.compile(r"([\w./\\-]+|.+\.py):[A-Za-z_<][\w.<>]*")
 
 _given: dict[str, Any] = {}
 """Objects that were given in Python, by the name under which settings hold them."""
@@ -41,7 +41,7 @@ hash of the file as it was loaded."""
 
 
 def is_own(name: str) -> bool:
-    """Return True if a name has the form ``module:name``."""
+    """Return True if a name has the form ``module:name`` or ``FILE.py:name``."""
     return _NAME.fullmatch(name) is not None
 
 
@@ -82,7 +82,7 @@ def load_own(name: str, what: str) -> Any:
     if name in _given:
         return _given[name]
     place, _, path = name.rpartition(":")  # a path of Windows has a colon, too
-    file = Path(place).resolve() if place.endswith(".py") else None
+    file = with_home(place).resolve() if place.endswith(".py") else None
     folder = str(Path.cwd() if file is None else file.parent)
     if folder not in sys.path:
         sys.path.insert(0, folder)
