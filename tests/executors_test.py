@@ -39,6 +39,7 @@ from ugat_marl.grounding import RollOutSettings, roll_outs
 from ugat_marl.parallel import (
     DEADLINE_VARIABLE,
     RETRIES,
+    Heartbeat,
     LocalProcesses,
     RayExecutor,
     Stop,
@@ -210,6 +211,23 @@ def test_a_stopped_process_is_killed_and_its_part_repeated(
     with LocalProcesses(1) as processes:
         processes.submit(exec, STOPS.format(mark=str(tmp_path / "mark"))).result(120)
         assert (tmp_path / "mark").exists()
+
+
+def test_a_pause_of_the_starter_is_no_silence_of_a_process(monkeypatch: pytest.MonkeyPatch) -> None:
+    clock = types.SimpleNamespace(monotonic=lambda: now_s)
+    monkeypatch.setattr("ugat_marl.parallel.time", clock)
+    monkeypatch.setenv(DEADLINE_VARIABLE, "60")
+    now_s, signs = 0.0, 0
+    heartbeat = Heartbeat(lambda: signs)
+    now_s = 3600.0  # all processes were stopped, and this one is the first to run on
+    assert not heartbeat.is_lost()
+    lost: list[bool] = []
+    for _ in range(59):
+        now_s += 1.0
+        lost.append(heartbeat.is_lost())
+    assert lost == [False] * 58 + [True]
+    signs += 1
+    assert not heartbeat.is_lost()
 
 
 def test_processes_give_what_threads_give() -> None:

@@ -160,20 +160,26 @@ class Heartbeat:
         sign: Returns a number that differs after every sign of `send_heartbeats`.
 
     Attributes:
-        deadline_s: Seconds without a sign after which the process counts as dead.
+        deadline_s: Seconds without a sign after which the process counts as dead. Seconds in which
+            its starter did not run on either do not count.
     """
 
     def __init__(self, sign: Callable[[], int]) -> None:
         self.deadline_s = usual_deadline_s()
         self._sign = sign
         self._last = sign()
-        self._seen_s = time.monotonic()
+        self._silent_s = 0.0
+        self._asked_s = time.monotonic()
 
     def is_lost(self) -> bool:
-        """Return True if the process has given no sign for too long."""
+        """Return True if the process has given no sign for too long; ask about every second."""
+        now_s = time.monotonic()
+        # while the starter itself was stopped, as by Ctrl-Z, it could see no sign
+        self._silent_s += min(now_s - self._asked_s, 2 * _BEAT_S)
+        self._asked_s = now_s
         if (sign := self._sign()) != self._last:
-            self._last, self._seen_s = sign, time.monotonic()
-        return time.monotonic() - self._seen_s > self.deadline_s
+            self._last, self._silent_s = sign, 0.0
+        return self._silent_s > self.deadline_s
 
 
 def usable_cores() -> int:
