@@ -11,8 +11,8 @@ holds:
 - ``agents``, ``observation_sizes``, ``action_counts``: the rows, and how many columns each uses.
 - ``observation_width``, ``action_width``: numbers of columns, padding included.
 - ``env_options``: options of `ugat_marl.parallel_env` that the policy was trained with.
-- ``decision_interval_s``, ``intersections``: seconds between decisions, and agent to traffic light;
-  null for an export without an environment.
+- ``decision_interval_s``, ``intersections``: seconds between decisions, and agent to traffic light,
+  both of the environment that was given; null without one.
 - ``parameters``: hash of the policy's parameters, its ceiling included.
 - ``sha256``: suffix of each format to the hash of its model; it shows which files belong
   together.
@@ -65,16 +65,18 @@ def export_policy(
         policy: Policy to export.
         path: File of the model. Its suffix chooses the format: ``.ts`` TorchScript, ``.onnx`` ONNX
             (needs the extra ``onnx``), ``.npz`` matrices for `NumpyPolicy`.
-        env: Environment of the policy; adds decision interval and traffic lights to the JSON file.
+        env: Environment of the policy; adds its decision interval and traffic lights to the JSON
+            file. Networks other than ``universal`` do not know the interval of their training, so
+            that any is taken.
 
     Returns:
         The path of the JSON file.
 
     Raises:
         OptionError: The suffix is unknown, the extra is missing, the environment has other agents,
-            movements, phases or another decision interval, FRAP or CoLight is to be written to
-            another format than ``.ts``, another policy's model would lose its JSON file, or the
-            file is no model that this function wrote.
+            or other movements, phases or another decision interval than the network holds, FRAP or
+            CoLight is to be written to another format than ``.ts``, another policy's model would
+            lose its JSON file, or the file is no model that this function wrote.
         CheckpointError: An option of the environment is not plain data.
         OutputError: A file cannot be written.
     """

@@ -139,8 +139,9 @@ class LongestWaiting(_Scored):
     """Serve the phase whose incoming lanes have waited longest.
 
     The score of a lane is a sum over its vehicles: the seconds since each vehicle last moved. Many
-    short waits weigh as much as one long wait. The score of a waiting lane keeps growing, so every
-    lane gets green at last.
+    short waits weigh as much as one long wait. The observation is cut at a mean of 100 s per
+    storage place of the lane, where the score stops growing. So a lane may wait for ever if the
+    phase shown keeps a score that no other one exceeds.
 
     Args:
         network: The controlled network.
