@@ -72,8 +72,9 @@ class IPPOConfig:
                 least = 1 if whole else 0
                 if number is not None and (not least <= number <= most or number == math.inf):
                     raise OptionError(f"{name} = {value}: must be from {least} to {most}")
-        if self.reward_scale == 0:
-            raise OptionError("reward_scale = 0: must be above 0, or every reward is 0")
+        for name in ("learning_rate", "reward_scale"):
+            if getattr(self, name) == 0:
+                raise OptionError(f"{name} = 0: must be above 0, or nothing is learnt")
         if self.discount == 1:
             raise OptionError("discount = 1: must be below 1, since traffic has no end")
 

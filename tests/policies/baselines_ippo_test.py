@@ -373,6 +373,7 @@ def test_the_step_size_anneals_to_nothing() -> None:
         {"hidden": (8, 0)},
         {"clip": float("inf")},
         {"reward_scale": 0.0},
+        {"learning_rate": 0.0},
     ],
 )
 def test_settings_are_checked(wrong: dict[str, Any]) -> None:

@@ -259,6 +259,7 @@ def test_global_generators_are_lent_only() -> None:
         {"hidden": (3, 0)},
         {"rate": -1.0},
         {"rate": float("inf")},
+        {"learning_rate": 0.0},
     ],
 )
 def test_settings_are_checked(wrong: dict[str, Any]) -> None:
@@ -269,6 +270,7 @@ def test_settings_are_checked(wrong: dict[str, Any]) -> None:
                 "epochs": 1,
                 "hidden": (3,),
                 "rate": 2.0,
+                "learning_rate": 0.1,
                 "kind": "a",
                 "on": False,
             }

@@ -777,10 +777,29 @@ def test_an_environment_that_a_learner_holds_is_known_by_what_it_is_made_of() ->
         (tuple[int, ...] | None, "8", (8,)),
         (np.float32, "0.25", 0.25),
         (np.ndarray, "[1, 2]", [1, 2]),
+        (bool, "TRUE", True),
+        (int | bool, "true", True),
+        (int, "1", 1),
     ],
 )
 def test_settings_come_in_the_forms_of_their_types(hint: Any, text: str, value: Any) -> None:
     assert parsed_settings([f"x={text}"], ["x"], {"x": hint}, "mine") == {"x": value}
+
+
+@pytest.mark.parametrize(
+    ("hint", "text", "says"),
+    [
+        (int, "true", "valid integer"),
+        (float, "False", "valid number"),
+        (int | None, "true", "valid integer"),
+        (tuple[int, ...], "64.5", "valid integer"),
+        (tuple[int, ...], "64,wide", "valid integer"),
+        (list[float], "{}", "valid number"),
+    ],
+)
+def test_settings_of_another_type_are_refused(hint: Any, text: str, says: str) -> None:
+    with pytest.raises(OptionError, match=f"'x={text}': .*{says}"):
+        parsed_settings([f"x={text}"], ["x"], {"x": hint}, "mine")
 
 
 def test_a_setting_is_given_once() -> None:

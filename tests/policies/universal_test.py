@@ -325,6 +325,7 @@ def test_discount_and_steps_are_those_of_ten_seconds(interval_s: float, steps: i
     ("words", "name", "value"),
     [
         (("--dqn.teacher", "None"), "teacher", None),
+        (("--dqn.teacher", "none"), "teacher", None),
         (("--dqn.hidden", "48", "48"), "hidden", (48, 48)),
         (("--dqn.steps", "1"), "steps", 1),
         (("--dqn.warmup-decisions", "200"), "warmup_decisions", 200),

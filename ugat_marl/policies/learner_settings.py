@@ -54,7 +54,8 @@ def _converted(text: str, hint: Any) -> Any:
     """Return a text in a type: as none, as a list, as parts between commas, or as it is.
 
     Raises:
-        ValidationError: It has none of these forms in this type; the error is that of the first.
+        ValidationError: It has none of these forms in this type; the error is that of the parts, or
+            else of the first form.
     """
     plain = _plain_value(text)
     if hint is Any:
@@ -64,20 +65,26 @@ def _converted(text: str, hint: Any) -> Any:
     except PydanticUserError:  # such as types of NumPy
         return plain
     forms: list[Any] = [None] if text.lower() == "none" else []
+    parts: list[str] | None = None
     if not isinstance(plain, (str, bytes)):  # a number for `float | str` is no text
         forms.append(plain)
     several = any(kind in str(hint) for kind in ("tuple", "list", "Sequence"))
     alone = get_origin(hint) in (Union, UnionType) and str in get_args(hint)
     if several and ("," in text or not alone):  # or text may stand for itself
-        forms.append(text.split(","))
-    first: ValidationError | None = None
+        forms.append(parts := text.split(","))
+    told: ValidationError | None = None
     for form in (*forms, text, plain):
         try:
-            return adapter.validate_python(form)
+            value = adapter.validate_python(form)
         except ValidationError as error:
-            first = first or error
-    assert first is not None
-    raise first
+            if told is None or form is parts:
+                told = error
+        else:
+            # pydantic takes true for the number 1
+            if not (isinstance(form, bool) and type(value) in (int, float)):
+                return value
+    assert told is not None  # text is no number where true became one
+    raise told
 
 
 def _plain_value(text: str) -> Any:

@@ -153,6 +153,8 @@ class DQNConfig:
             object.__setattr__(self, "hidden", tuple(self.hidden))
         if isinstance(self.start, PathLike):
             object.__setattr__(self, "start", fspath(self.start))
+        if isinstance(self.teacher, str) and self.teacher.lower() == "none":
+            object.__setattr__(self, "teacher", None)
         for name in (
             "batch_size",
             "replay_capacity",

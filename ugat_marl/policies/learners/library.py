@@ -316,8 +316,8 @@ def linear_layers(network: nn.Module) -> list[nn.Linear]:
 def check_settings(config: Any, *shares: str) -> None:
     """Refuse impossible settings.
 
-    Whole numbers and tuples begin at 1, other numbers at 0. Shares are at most 1, and ``discount``
-    is below 1.
+    Whole numbers and tuples begin at 1, other numbers at 0, which ``learning_rate`` exceeds. Shares
+    are at most 1, and ``discount`` is below 1.
 
     Args:
         config: A dataclass; settings that are true, false or text are not checked.
@@ -336,6 +336,8 @@ def check_settings(config: Any, *shares: str) -> None:
                 raise OptionError(f"{name} = {value}: must be from {least} to {most}")
     if config.discount == 1:
         raise OptionError("discount = 1: must be below 1, since traffic has no end")
+    if config.learning_rate == 0:
+        raise OptionError("learning_rate = 0: must be above 0, or nothing is learnt")
 
 
 def decisions_per_episode(env: AnyParallelEnv) -> int:
