@@ -1051,6 +1051,50 @@ class Astray(Noted):
         env.step(dict.fromkeys(env.agents, float("nan")))
 
 
+class Failing(Lazy):
+    """A learner that raises an exception where it is asked to."""
+
+    def __init__(self, place: str) -> None:
+        self.place = place
+
+    def learn(self, env: Any, episodes: int) -> None:
+        env.reset()
+        while env.agents:
+            env.step(dict.fromkeys(env.agents, 0))
+        self._fail("learn")
+
+    def policy(self) -> Any:
+        self._fail("policy")
+        return super().policy()
+
+    def save(self, path: Path) -> None:
+        path.touch()
+        self._fail("save")
+
+    def load(self, path: Path) -> None: ...
+
+    def _fail(self, place: str) -> None:
+        if self.place == place:
+            raise ZeroDivisionError(place)
+
+
+@pytest.mark.parametrize("place", ["learn", "policy", "save"])
+def test_an_exception_in_a_learner_is_told_with_its_name_and_place(place: str) -> None:
+    learner = OwnLearner(Failing(place), "mine", ToyTraffic())
+    says = rf"^learner 'mine': ZeroDivisionError: {place} \(.*own_test\.py, line \d+\)$"
+    with pytest.raises(OptionError, match=says) as told:
+        learner.learn(ToyTraffic(), 1, 0)
+    assert isinstance(told.value.__cause__, ZeroDivisionError)
+
+
+def test_what_a_callback_raises_is_no_error_of_the_learner() -> None:
+    def stop(episode: int, numbers: Any) -> None:
+        raise LookupError("enough")
+
+    with pytest.raises(LookupError, match="enough"):
+        OwnLearner(Failing("nowhere"), "mine", ToyTraffic()).learn(ToyTraffic(), 1, 0, stop)
+
+
 def test_a_mistake_inside_a_learner_is_told_with_its_place() -> None:
     env = ugat_marl.parallel_env("single-v1", duration_s=20)
     with pytest.raises(ActionError, match=r"learner 'astray' \(.*own_test\.py, line \d+\): action"):

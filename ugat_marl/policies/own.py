@@ -101,7 +101,32 @@ def _env_options(given: Any, what: str) -> dict[str, Any]:
 
 
 class _Raised(OptionError):
-    """A policy of a user raised an exception, which is the cause of this one."""
+    """An object of a user raised an exception, which is the cause of this one."""
+
+
+@contextlib.contextmanager
+def _naming_errors(given: Any, what: str, env: CountedEnv | None = None) -> Iterator[None]:
+    """Name an object of a user, and the line of it, in what it raises.
+
+    Args:
+        given: The object.
+        what: Its name.
+        env: Environment in which it learns; the exception by which its callback ended the training
+            passes through.
+    """
+    try:
+        yield
+    except (UgatMarlError, MemoryError):
+        raise
+    except Exception as error:
+        if env is not None and error is env.ended_by:
+            raise
+        kind = given if inspect.isroutine(given) else type(given)
+        said = f"{type(error).__name__}: {error}{_last_line_in(kind, error)}"
+        *_, last = traceback.extract_tb(error.__traceback__)
+        if (raised := f"{last.filename}, line {last.lineno}") not in said:
+            said += f", raised in {raised}"
+        raise _Raised(f"{what}: {said}") from error
 
 
 class OwnPolicy:
@@ -165,7 +190,7 @@ class OwnPolicy:
         """
         reset = getattr(self._given, "reset", None)
         if reset is not None:
-            with self._naming_errors():
+            with _naming_errors(self._given, f"policy {self._name!r}"):
                 reset(*[seed] if _takes(reset, 1) else [])
 
     def act(self, observations: Observations, infos: Infos) -> Actions:
@@ -178,7 +203,7 @@ class OwnPolicy:
         act = getattr(self._given, "act", self._given)
         by_name = {self._infos_name: infos} if self._infos_name else {}
         in_place = [infos] if self._sees_infos else []
-        with self._naming_errors():
+        with _naming_errors(self._given, f"policy {self._name!r}"):
             chosen = act(observations, *in_place, **by_name)
         if not isinstance(chosen, Mapping):
             raise OptionError(
@@ -196,22 +221,6 @@ class OwnPolicy:
                 ) from None
         self._require_phases(actions, observations, infos)
         return actions
-
-    @contextlib.contextmanager
-    def _naming_errors(self) -> Iterator[None]:
-        """Name the policy, and the line of it, in what it raises."""
-        try:
-            yield
-        except (UgatMarlError, MemoryError):
-            raise
-        except Exception as error:
-            given = self._given
-            kind = given if inspect.isroutine(given) else type(given)
-            said = f"{type(error).__name__}: {error}{_last_line_in(kind, error)}"
-            *_, last = traceback.extract_tb(error.__traceback__)
-            if (raised := f"{last.filename}, line {last.lineno}") not in said:
-                said += f", raised in {raised}"
-            raise _Raised(f"policy {self._name!r}: {said}") from error
 
     def _require_phases(self, actions: Actions, observations: Observations, infos: Infos) -> None:
         for agent in observations:
@@ -324,13 +333,14 @@ class OwnLearner:
         """Let the user's learner train for `episodes` more episodes.
 
         Raises:
-            OptionError: It played fewer episodes.
+            OptionError: It played fewer episodes, or raised an exception.
         """
         if episodes > 0:
             counted = CountedEnv(env, self.episodes, seed, on_episode)
             self._shared = [*self._made_for, counted, env, env.unwrapped]
             try:
-                self._given.learn(counted, episodes)
+                with _naming_errors(self._given, f"learner {self._name!r}", counted):
+                    self._given.learn(counted, episodes)
             except ActionError as error:
                 line = _last_line_in(type(self._given), error)
                 raise ActionError(f"learner {self._name!r}{line}: {error}") from error
@@ -350,8 +360,14 @@ class OwnLearner:
         return self.policy()
 
     def policy(self) -> OwnPolicy:
-        """Return a copy of the user's current policy."""
-        given = _copied(self._given.policy(), self._shared, self._name, {})
+        """Return a copy of the user's current policy.
+
+        Raises:
+            OptionError: The user's ``policy`` or ``save`` raised an exception.
+        """
+        with _naming_errors(self._given, f"learner {self._name!r}"):
+            current = self._given.policy()
+        given = _copied(current, self._shared, self._name, {})
         try:
             state = self._packed() if self.savable else None
         except CheckpointError:  # a function as observation: the policy can be played, not saved
@@ -392,13 +408,14 @@ class OwnLearner:
 
         Raises:
             CheckpointError: An option of the environment is not plain data.
-            OptionError: ``save`` writes no file.
+            OptionError: ``save`` writes no file, or raised an exception.
         """
         memory = io.BytesIO()
         with tempfile.TemporaryDirectory() as folder, zipfile.ZipFile(memory, "w") as packed:
             files = Path(folder, _FILES)
             files.mkdir()
-            self._given.save(files / _STATE)
+            with _naming_errors(self._given, f"learner {self._name!r}"):
+                self._given.save(files / _STATE)
             if not any(files.iterdir()):
                 raise OptionError(
                     f"learner {self._name!r}: save(path) wrote nothing, neither at the path nor "
@@ -422,6 +439,7 @@ class CountedEnv(BaseParallelWrapper[str, Any, Any]):
 
     Attributes:
         episodes: Number of whole episodes so far, those of earlier calls included.
+        ended_by: Exception that `on_episode` raised to end the training; None if it raised none.
 
     Args:
         env: The environment.
@@ -436,6 +454,7 @@ class CountedEnv(BaseParallelWrapper[str, Any, Any]):
     ) -> None:
         super().__init__(env)
         self.episodes = episodes
+        self.ended_by: Exception | None = None
         self._root, self._on_episode, self._return = seed, on_episode, 0.0
 
     def reset(self, seed: int | None = None, options: dict[str, Any] | None = None) -> ResetResult:
@@ -454,7 +473,11 @@ class CountedEnv(BaseParallelWrapper[str, Any, Any]):
         if running and not self.env.agents:
             self.episodes += 1
             if self._on_episode is not None:
-                self._on_episode(self.episodes - 1, {"return": self._return})
+                try:
+                    self._on_episode(self.episodes - 1, {"return": self._return})
+                except Exception as error:
+                    self.ended_by = error
+                    raise
         return result
 
     def close(self) -> None:
