@@ -79,12 +79,30 @@ def asked_options(given: Any, name: str) -> dict[str, Any]:
         OptionError: They are no mapping, or hold what the evaluation decides, such as the length of
             an episode.
     """
-    asked = _env_options(given, f"policy {name!r}")
+    return _options_among(OF_POLICIES, given, name, "policy", "evaluation")
+
+
+def _options_among(
+    known: Sequence[str], given: Any, name: str, what: str, decides: str
+) -> dict[str, Any]:
+    """Return the ``env_options`` of an object of a user, which may hold the known ones only.
+
+    Args:
+        known: Names of the options that it may ask for.
+        given: The object.
+        name: Its name for messages.
+        what: Kind of object for messages.
+        decides: What decides the other options, for messages.
+
+    Raises:
+        OptionError: They are no mapping, or hold other options.
+    """
+    asked = _env_options(given, f"{what} {name!r}")
     for key in asked:
-        if key not in OF_POLICIES:
+        if key not in known:
             raise OptionError(
-                f"policy {name!r}: its env_options hold {key!r}, which the evaluation decides; a "
-                f"policy may ask for {', '.join(OF_POLICIES)}"
+                f"{what} {name!r}: its env_options hold {key!r}, which the {decides} decides; a "
+                f"{what} may ask for {', '.join(known)}"
             )
     return asked
 
@@ -556,13 +574,7 @@ def own_learner_options(name: str) -> dict[str, Any]:
     Raises:
         OptionError: They hold what the command decides, or an observation that is no name.
     """
-    asked = _env_options(load_own(name, "learner"), f"learner {name!r}")
-    for key in asked:
-        if key not in OF_LEARNERS:
-            raise OptionError(
-                f"learner {name!r}: its env_options hold {key!r}, which the command decides; a "
-                f"learner may ask for {', '.join(OF_LEARNERS)}"
-            )
+    asked = _options_among(OF_LEARNERS, load_own(name, "learner"), name, "learner", "command")
     if callable(asked.get("observation")):
         raise OptionError(
             f"learner {name!r}: its env_options have a function as observation, which no run can "

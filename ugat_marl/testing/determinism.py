@@ -2,14 +2,15 @@
 
 from __future__ import annotations
 
+import itertools
+
 from ugat_marl.testing.episodes import (
     EnvironmentCase,
     Episode,
     MakeEnv,
-    StepReturn,
     begin,
     different,
-    proceed,
+    moments,
     random_actions,
     replaying,
     require_same,
@@ -73,20 +74,9 @@ def live_environments_are_independent(case: EnvironmentCase) -> None:
 
 
 def _in_lock_step(case: EnvironmentCase, seeds: tuple[int, ...]) -> list[Episode]:
-    envs = [case.make() for _ in seeds]
-    chosen = [random_actions(case.seed) for _ in seeds]
-    moments: list[list[StepReturn]] = [
-        [begin(env, seed)] for env, seed in zip(envs, seeds, strict=True)
-    ]
-    while any(env.agents for env in envs):
-        for env, choose, env_moments in zip(envs, chosen, moments, strict=True):
-            if env.agents:
-                env_moments.append(
-                    proceed(env, choose(len(env_moments) - 1, env, env_moments[-1].infos))
-                )
-            if len(env_moments) > case.max_steps:
-                raise ConformanceError(f"no end after {case.max_steps} steps")
-    return [Episode(tuple(env_moments)) for env_moments in moments]
+    runs = [moments(case.make(), seed, random_actions(case.seed), case.max_steps) for seed in seeds]
+    turns = itertools.zip_longest(*runs)  # a step of each in turn
+    return [Episode(tuple(filter(None, run))) for run in zip(*turns, strict=True)]
 
 
 def other_seeds_give_other_episodes(case: EnvironmentCase) -> None:

@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import copy
 import functools
-from collections.abc import Callable, Mapping
+import itertools
+from collections.abc import Callable, Iterator, Mapping
 from dataclasses import asdict, dataclass, is_dataclass
 from typing import Any
 
@@ -181,24 +182,33 @@ def play(
     Raises:
         ConformanceError: The episode does not end, or has no agents after `reset`.
     """
-    moments = [begin(env, seed)]
+    played: list[StepReturn] = []
+    for moment in moments(env, seed, choose, max_steps):
+        played.append(moment)
+        if watch:
+            watch()
+    scores = getattr(env.unwrapped, "scores", None)
+    return Episode(tuple(played), scores() if callable(scores) else None)
+
+
+def moments(
+    env: AnyParallelEnv, seed: int | None, choose: Choose, max_steps: int
+) -> Iterator[StepReturn]:
+    """Yield the moment of `reset`, then one per step to the end of the episode; see `play`."""
+    last = begin(env, seed)
     if not env.agents:
         raise ConformanceError("env.agents is empty after reset(); set it to possible_agents there")
-    if watch:
-        watch()
-    while env.agents:
-        if len(moments) > max_steps:
+    yield last
+    for step in itertools.count():
+        if not env.agents or (step and _all_over(last)):
+            return
+        if step >= max_steps:
             raise ConformanceError(
                 f"the episode has not ended after {max_steps} steps; truncate all agents and "
                 "empty env.agents at its end"
             )
-        moments.append(proceed(env, choose(len(moments) - 1, env, moments[-1].infos)))
-        if watch:
-            watch()
-        if _all_over(moments[-1]):
-            break
-    scores = getattr(env.unwrapped, "scores", None)
-    return Episode(tuple(moments), scores() if callable(scores) else None)
+        last = proceed(env, choose(step, env, last.infos))
+        yield last
 
 
 def begin(env: AnyParallelEnv, seed: int | None) -> StepReturn:
