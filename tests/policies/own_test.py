@@ -650,35 +650,6 @@ def test_all_that_is_typed_in_a_notebook_is_a_part_of_its_identity(code: str) ->
     assert identity(1) == identity(1) != identity(2)
 
 
-def test_an_attribute_set_from_outside_is_a_part_of_the_identity_of_a_class(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    (tmp_path / "outside.py").write_text(
-        "class Base:\n"
-        "    phase = 1\n"
-        "class Mine(Base):\n"
-        "    rate: float = 0.1\n"
-        "    made, kept, both = 0, {}, 1\n"
-        "    cache = {}\n"
-        "    count = 0\n"
-        "    width = 1\n"
-        "    if rate < 1:\n"
-        "        width = 2\n"
-        "    def learn(self, env, episodes):\n"
-        "        Mine.count += 1\n"
-        "        self.cache[episodes] = 1\n"
-        "    def policy(self): ...\n"
-    )
-    module = load_own(f"{tmp_path}/outside.py:Mine", "learner")
-    names = own_name(module), f"{tmp_path}/outside.py:Mine"
-    module.learn(module(), None, 1)
-    assert [own_values(name) for name in names] == [[], []]
-    monkeypatch.setattr(module, "rate", 2)
-    assert [own_values(name) for name in names] == [["rate=2"], ["rate=2"]]
-    monkeypatch.setattr(module.__mro__[1], "phase", 7)
-    assert own_values(names[0]) == ["rate=2", "phase=7"]
-
-
 def test_a_learner_whose_file_was_edited_after_its_import_begins_no_training(
     algorithm: Any, tmp_path: Path
 ) -> None:

@@ -6,7 +6,6 @@ working folder, too. An object that was given in Python has a name of the same f
 
 from __future__ import annotations
 
-import ast
 import contextlib
 import dataclasses
 import functools
@@ -15,7 +14,6 @@ import importlib.util
 import inspect
 import re
 import sys
-import textwrap
 import traceback
 from collections import deque
 from collections.abc import Mapping, Sequence
@@ -52,7 +50,7 @@ def own_name(given: Any) -> str:
     if not _is_found(kind, given):
         name += ".<given>"  # no other process may take what it finds by the name for it
     _given[name] = given
-    _keep_source(kind)
+    _file_hash(kind)  # keeps it
     return name
 
 
@@ -114,7 +112,7 @@ def load_own(name: str, what: str) -> Any:
         where = f"{error.filename}, line {error.lineno}"
         raise OptionError(f"{what} {name!r}: {where} is no Python ({error.msg})") from None
     found = _member(found, path, f"{what} in {module_name}", of_learners=what == "learner")
-    _keep_source(_named(found))
+    _file_hash(_named(found))  # keeps it
     return found
 
 
@@ -143,25 +141,14 @@ def _named(given: Any) -> Any:
 
 
 def own_values(name: str) -> list[str]:
-    """Return what a user's learner or policy holds beside its source, as text.
+    """Return what an object that was given in Python holds beside its source, as text.
 
     These are arguments of a `functools.partial`, values captured by an inner function or by the
     methods of an inner class, its defaults, and attributes of such a class or of an instance, those
-    in slots included. A function or class without a file counts as an inner one. Of any other class
-    these are the attributes that were set from outside. Two objects of one name and source differ
-    in nothing else.
-
-    Args:
-        name: Name as for `load_own`.
-
-    Raises:
-        OptionError: The module is missing.
-        UnknownNameError: The object is missing in it.
+    in slots included. A function or class without a file counts as an inner one. Two objects of one
+    name and source differ in nothing else.
     """
-    found = load_own(name, "learner")
-    # of a partial, and of what a function made, that a file names, the file says all
-    counts = name in _given or "<" not in getattr(found, "__qualname__", "<")
-    return _values(found) if counts else []
+    return _values(_given[name]) if name in _given else []
 
 
 def _values(given: Any, inside: tuple[int, ...] = ()) -> list[str]:
@@ -179,7 +166,7 @@ def _values(given: Any, inside: tuple[int, ...] = ()) -> list[str]:
             *(f"{key}={text(value)}" for key, value in sorted(defaults)),
         ]
     if inspect.isclass(given):
-        return (_set_from_outside if _is_of_file(given) else _values_of_class)(given, inside)
+        return [] if _is_of_file(given) else _values_of_class(given, inside)
     if isinstance(given, MethodType):
         return [text(given.__self__)]
     held = {} if hasattr(given, "__qualname__") else _attributes(given)
@@ -224,62 +211,6 @@ def _members(kind: type) -> list[tuple[str, Any]]:
     """Return the members of a class, and of those of its bases that have no file."""
     kinds = [one for one in kind.__mro__ if one is kind or _file_of(one) is None]
     return [member for one in kinds for member in vars(one).items()]
-
-
-def _set_from_outside(given: type, inside: tuple[int, ...] = ()) -> list[str]:
-    """Return the attributes of a class of a file that no longer have the values written there.
-
-    Only plain values can be compared. Bases count if they are of the same module.
-    """
-    held: list[str] = []
-    for kind in given.__mro__:
-        written = _written_values(kind) if kind.__module__ == given.__module__ else {}
-        for name, value in written.items():
-            now = vars(kind).get(name, value)
-            if not hasattr(now, "__get__") and (text := _stable(now, inside)) != _stable(value):
-                held.append(f"{name}={text}")
-    return held
-
-
-@functools.cache
-def _written_values(kind: type) -> Mapping[str, Any]:
-    """Return the attributes to which the source of a class assigns numbers, text and the like.
-
-    Empty lists and the like are left out, and so is what a method assigns to the class: such values
-    change while the class works.
-    """
-    try:
-        written: Any = ast.parse(textwrap.dedent(inspect.getsource(kind))).body[0]
-    except (TypeError, OSError, SyntaxError):  # a class without a source
-        return {}
-    values: dict[str, Any] = {}
-    for statement in written.body:
-        match statement:
-            case ast.FunctionDef() | ast.AsyncFunctionDef() | ast.ClassDef():
-                continue
-            case (
-                ast.Assign(targets=[ast.Name(id=name)], value=ast.expr() as value)
-                | ast.AnnAssign(target=ast.Name(id=name), value=ast.expr() as value)
-            ):
-                values.pop(name, None)
-                with contextlib.suppress(ValueError, TypeError):
-                    values[name] = ast.literal_eval(value)
-            case _:  # such as an assignment under a condition
-                for node in _stores(statement, ast.Name):
-                    values.pop(node.id, None)
-    stores = _stores(written, ast.Attribute)
-    changing = {node.attr for node in stores if ast.unparse(node.value) != "self"}
-    return {
-        name: value
-        for name, value in values.items()
-        if name not in changing and value not in ([], {}, set())
-    }
-
-
-def _stores(tree: ast.AST, kind: type) -> list[Any]:
-    """Return the names or attributes to which a piece of source assigns."""
-    found: list[Any] = [node for node in ast.walk(tree) if isinstance(node, kind)]
-    return [node for node in found if isinstance(node.ctx, ast.Store)]
 
 
 def _stable(value: Any, inside: tuple[int, ...] = ()) -> str:
@@ -388,13 +319,6 @@ def require_unchanged(name: str) -> None:
     file = _file_of(kind)
     if file is not None and file_hash(file) != _file_hash(kind):
         raise OptionError(f"{file} was changed after it was imported; restart Python")
-
-
-def _keep_source(kind: Any) -> None:
-    """Keep what the file of a class or function says now, because it may be edited later."""
-    _file_hash(kind)
-    if inspect.isclass(kind):
-        _set_from_outside(kind)
 
 
 def _file_of(kind: Any) -> Path | None:
