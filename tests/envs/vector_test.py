@@ -174,7 +174,11 @@ def test_a_fitted_street_is_the_same_as_alone() -> None:
     parts: tuple[ControllerPart, ...] = (
         FittedService(lanes, np.tile([[2.0, 1.0]], (len(lanes), 1))),
         CommandChannel(
-            ("signal_0",), np.array([0.3, 0.5, 0.2]), np.array([[30.0, 50.0, 20.0]]), (phases,), 9.0
+            ("signal_0",),
+            np.array([0.3, 0.5, 0.2]),
+            np.array([[0.3, 0.5, 0.2]]),
+            np.array([[[0.3, 0.5, 0.2]]]),
+            (phases,),
         ),
         DeadLanes(lanes[:2]),
         *parse_domain("counting_error=2"),

@@ -145,11 +145,12 @@ def test_a_street_survives_its_file_and_refuses_another_network(
 
 
 def test_metrics_tell_intersections_apart_each_with_its_interval() -> None:
-    # a: 1,000 commands of which 200 are lost and half of the others are two decisions late; b: none
+    # a: 1,000 commands of which 200 are lost and half of the others are two decisions late; b: ten
     weights = np.array([0.4, 0.0, 0.4, 0.2])
-    counts = np.array([1000 * weights, np.zeros(4)])
+    generator = np.random.default_rng(0)
+    draws = np.stack([generator.dirichlet(n * weights, 200) for n in (1000, 10)], axis=1)
     free = np.ones((3, 2, 2), dtype=bool)
-    channel = CommandChannel(("a", "b"), weights, counts, (free, free), pull=10.0)
+    channel = CommandChannel(("a", "b"), weights, np.array([weights, weights]), draws, (free, free))
     eyes = Eyes(np.array([1.0, 0.5, 0.0, 0.0]), (0.0, 0.0), 0.0, 0.0, 0, 0.0)
     street = FittedStreet(("0", "1", "2", "3"), 10.0, channel, eyes)
     numbers = street.as_dict({"a": (0, 1), "b": (2, 3)})
@@ -162,7 +163,7 @@ def test_metrics_tell_intersections_apart_each_with_its_interval() -> None:
     assert [numbers[f"eyes/unseen{end}/a"] for end in ("_low", "_high")] == [1.0, 2.0]
     assert [numbers[f"eyes/unseen{end}/b"] for end in ("_low", "", "_high")] == [0.0] * 3
 
-    obeyed = replace(channel, network=np.array([1.0, 0, 0, 0]), counts=np.zeros((2, 4)))
+    obeyed = replace(channel, network=np.array([1.0, 0, 0, 0]))
     perfect = FittedStreet(street.lanes, 10.0, obeyed, replace(eyes, dead=np.zeros(4)))
     names = perfect.as_dict({"a": (0, 1), "b": (2, 3)})
     assert not [name for name in names if name.endswith(("/a", "/b"))]

@@ -11,7 +11,8 @@ phase itself must end, the next permitted one follows. A delay of two decisions 
 commands are w_lost; an order of phases and a longest green are entries of the table.
 
 The weights are found by expectation-maximisation, pooled over the network (partial pooling): the
-weights of an intersection have the prior Dirichlet(pull * w of the network).
+weights of an intersection have the prior Dirichlet(pull * w of the network). Their posterior is
+drawn by data augmentation (Tanner, Wong 1987), in which every lag is possible.
 """
 
 from __future__ import annotations
@@ -20,7 +21,6 @@ import math
 from collections import deque
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
-from functools import partial
 from typing import Any, ClassVar
 
 import numpy as np
@@ -46,6 +46,12 @@ CHANCE = 1e-3
 """Chance of so few obeyed commands below which a phase is forbidden, where the log has no masks."""
 ROUNDS = 200
 """Most rounds of expectation-maximisation, which ends when the weights stay as they are."""
+PRIOR_LOST = 0.5
+"""Decisions that the prior of draws counts as lost; all lags together count as one decision."""
+SWEEPS = 3
+"""Sweeps of data augmentation for each draw of the weights."""
+BURN_IN = 20
+"""First draws that are left out, since they are not yet of the posterior."""
 Table = NDArray[np.bool_]
 """Permitted phases of an intersection, bool ``(ages, phases, phases)``: entry (a, p, j) is True if
 phase j may run next while p has run for a decisions. Row 0 is not used; the last row is of older
@@ -102,23 +108,17 @@ class CommandChannel(ControllerPart):
         agents: The agents, in the environment's order.
         network: Weights pooled over the network, ``(most_lag + 2,)``: those of the lags 0, 1, ...
             and, last, of lost commands.
-        counts: Expected number of decisions of each kind, ``(agents, most_lag + 2)``.
+        weights: Most likely weights of each intersection, ``(agents, most_lag + 2)``.
+        draws: Draws of `weights` from their posterior, ``(n, agents, most_lag + 2)``.
         tables: Permitted phases of each intersection.
-        pull: Decisions that `network` counts for at each intersection.
     """
 
     name: ClassVar[str] = "command channel"
     agents: tuple[str, ...]
     network: Floats
-    counts: Floats
+    weights: Floats
+    draws: Floats
     tables: tuple[Table, ...]
-    pull: float
-
-    @property
-    def weights(self) -> Floats:
-        """Mean weights of each intersection, ``(agents, most_lag + 2)``."""
-        total = self.pull * self.network + self.counts
-        return total / total.sum(1, keepdims=True)
 
     @property
     def lag(self) -> int:
@@ -153,12 +153,7 @@ class CommandChannel(ControllerPart):
 
     def drawn(self, seed: int) -> Floats:
         """Draw weights from the posterior, ``(agents, most_lag + 2)``."""
-        generator = numpy_generator(seed, "channel", "weights")
-        rows = np.zeros_like(self.counts)
-        found = self.network > 0
-        for row, counts in zip(rows, self.counts, strict=True):
-            row[found] = generator.dirichlet(self.pull * self.network[found] + counts[found])
-        return rows
+        return numpy_generator(seed, "channel", "weights").choice(self.draws)
 
     def actuator(
         self, network: Network, timing: SignalTiming, decision_interval_s: float
@@ -181,13 +176,12 @@ class CommandChannel(ControllerPart):
         numbers = {f"channel/lag_{k}": float(w) for k, w in lags if w > 0}
         numbers["channel/lost"] = self.lost
         numbers["channel/forbids"] = float(self.forbids)
-        drawn = np.array([self.drawn(seed) for seed in range(DRAWS)])
         if self.late:
-            arrive = drawn[:, :, :-1] / (1.0 - drawn[:, :, -1:]).clip(1e-9)
+            arrive = self.draws[:, :, :-1] / (1.0 - self.draws[:, :, -1:]).clip(1e-9)
             late_s = interval_s * arrive @ np.arange(arrive.shape[-1])
             numbers |= with_intervals("channel/late_s", late_s.T, self.agents)
         if self.lost:
-            numbers |= with_intervals("channel/missing", drawn[:, :, -1].T, self.agents)
+            numbers |= with_intervals("channel/missing", self.draws[:, :, -1].T, self.agents)
         return numbers
 
     def state_dict(self) -> dict[str, Any]:
@@ -195,9 +189,9 @@ class CommandChannel(ControllerPart):
         return {
             "agents": list(self.agents),
             "network": self.network.tolist(),
-            "counts": self.counts.tolist(),
+            "weights": self.weights.tolist(),
+            "draws": self.draws.tolist(),
             "tables": [table.astype(int).tolist() for table in self.tables],
-            "pull": self.pull,
         }
 
     @classmethod
@@ -211,14 +205,15 @@ class CommandChannel(ControllerPart):
             channel = cls(
                 tuple(map(str, state["agents"])),
                 np.array(state["network"], float),
-                np.array(state["counts"], float),
+                np.array(state["weights"], float),
+                np.array(state["draws"], float),
                 tuple(np.array(table, bool) for table in state["tables"]),
-                float(state["pull"]),
             )
         except MALFORMED as error:
             raise CheckpointError(f"the channel in the checkpoint is damaged: {error}") from None
-        agents, kinds = len(channel.agents), len(channel.network)
-        if channel.counts.shape != (agents, kinds) or len(channel.tables) != agents:
+        shape = len(channel.agents), len(channel.network)
+        arrays_fit = channel.weights.shape == channel.draws.shape[1:] == shape
+        if not arrays_fit or not len(channel.draws) or len(channel.tables) != shape[0]:
             raise CheckpointError("the channel in the checkpoint has parts of unequal length")
         return channel
 
@@ -344,9 +339,8 @@ def fit_channel(
     config = replace(config, pull=max(1.0, config.pull * (1.0 - 1.0 / len(courses))))
     masked = all(course.mask is not None for course in courses)
     tables = [course.free_table() for course in courses]
-    network, counts = _mixture(courses, tables, None, config)
-    fitted = partial(CommandChannel, tuple(log.agents), pull=config.pull)
-    weights = fitted(network=network, counts=counts, tables=tuple(tables)).weights
+    explains = _explaining(courses, tables, None, config)
+    network, weights = _mixture(explains, config)
     lags = [int(own[:-1].argmax()) for own in weights]
     if masked:
         tables = [course.table_of_masks(lag) for course, lag in zip(courses, lags, strict=True)]
@@ -356,8 +350,10 @@ def fit_channel(
             for course, own, lag in zip(courses, weights, lags, strict=True)
         ]
     if not masked or any(lags):
-        network, counts = _mixture(courses, tables, lags, config)
-    return fitted(network=network, counts=counts, tables=tuple(map(_trimmed, tables)))
+        explains = _explaining(courses, tables, lags, config)
+        network, weights = _mixture(explains, config)
+    draws = _draws(explains, config.pull)
+    return CommandChannel(tuple(log.agents), network, weights, draws, tuple(map(_trimmed, tables)))
 
 
 @dataclass(frozen=True)
@@ -549,13 +545,13 @@ def _trimmed(table: Table) -> Table:
     return table[: 2 + (differs[-1] + 1 if len(differs) else 0)]
 
 
-def _mixture(
+def _explaining(
     courses: Sequence[_Course],
     tables: Sequence[Table],
     lags: Sequence[int] | None,
     config: ChannelConfig,
-) -> tuple[Floats, Floats]:
-    """Find the weights of lags and of lost commands by expectation-maximisation.
+) -> list[NDArray[np.bool_]]:
+    """Return the kinds that explain each decision of each intersection, ``(kinds, n)``.
 
     Args:
         courses: Decisions of each intersection.
@@ -563,9 +559,6 @@ def _mixture(
         lags: Delay of commands that the masks of each intersection are of; None where it is not
             known: then each delay is tried with the masks that it would have.
         config: Numbers of the method.
-
-    Returns:
-        The network's weights, and expected numbers of decisions of each kind per intersection.
     """
     kinds = config.most_lag + 2
     explains: list[NDArray[np.bool_]] = []
@@ -583,10 +576,24 @@ def _mixture(
         )
         use = known & same.any(0) & ~same.all(0)  # other rows tell nothing of the weights
         explains.append(same[:, use])
+    return explains
+
+
+def _mixture(explains: Sequence[NDArray[np.bool_]], config: ChannelConfig) -> tuple[Floats, Floats]:
+    """Find the weights of lags and of lost commands by expectation-maximisation.
+
+    Args:
+        explains: Kinds that explain each decision of each intersection, ``(kinds, n)``.
+        config: Numbers of the method.
+
+    Returns:
+        The network's weights, ``(kinds,)``, and those of each intersection, ``(agents, kinds)``.
+    """
     rows = np.concatenate(explains, axis=1)
+    kinds = len(rows)
     if not rows.shape[1]:
         weights = np.eye(kinds)[0]
-        return weights, np.zeros((len(courses), kinds))
+        return weights, np.tile(weights, (len(explains), 1))
     # A lost command keeps the phase of the decision before, which a further lag explains almost as
     # well. So lags are added one by one, as long as they explain more than chance does.
     support: set[int] = {kinds - 1}
@@ -605,7 +612,7 @@ def _mixture(
     found = weights > 0
     # What all kinds that are found explain alike says nothing of their weights.
     telling = [same[:, ~same[found].all(0)] if found.sum() > 1 else same for same in explains]
-    return weights, np.stack([_own_counts(same, weights, config.pull) for same in telling])
+    return weights, np.stack([_own_weights(same, weights, config.pull) for same in telling])
 
 
 def _maximum(rows: NDArray[np.bool_], support: set[int]) -> tuple[float, Floats]:
@@ -625,8 +632,8 @@ def _maximum(rows: NDArray[np.bool_], support: set[int]) -> tuple[float, Floats]
     return float(np.log(np.maximum(chances, UNEXPLAINED)).sum()), weights
 
 
-def _own_counts(rows: NDArray[np.bool_], network: Floats, pull: float) -> Floats:
-    """Return the expected number of decisions of each kind at an intersection, ``(kinds,)``.
+def _own_weights(rows: NDArray[np.bool_], network: Floats, pull: float) -> Floats:
+    """Return the weights of an intersection, ``(kinds,)``.
 
     Its own weights say which of several lags made a decision. Those of the network would say of a
     light with late commands that most of them came in time.
@@ -636,14 +643,44 @@ def _own_counts(rows: NDArray[np.bool_], network: Floats, pull: float) -> Floats
         network: Weights of the network.
         pull: Number of decisions that the weights of the network count as.
     """
-    counts, weights = np.zeros(len(rows)), network
+    weights = network
     for _ in range(ROUNDS):
         counts = _counts(rows, weights)
-        after = (pull * network + counts) / (pull + counts.sum())
-        if np.abs(after - weights).max() < 1e-6:
+        weights, before = (pull * network + counts) / (pull + counts.sum()), weights
+        if np.abs(weights - before).max() < 1e-6:
             break
-        weights = after
-    return counts
+    return weights
+
+
+def _draws(explains: Sequence[NDArray[np.bool_]], pull: float) -> Floats:
+    """Draw weights of all intersections from their posterior, ``(n, agents, kinds)``.
+
+    In turn a kind is drawn for each decision, among those that explain it, and weights for these
+    kinds. So weights are as uncertain as the kinds are. The network's weights are drawn, too.
+
+    Args:
+        explains: Kinds that explain each decision of each intersection, ``(kinds, n)``.
+        pull: Number of decisions that the weights of the network count as.
+    """
+    agents, kinds = len(explains), len(explains[0])
+    places = np.repeat(np.arange(agents), [same.shape[1] for same in explains])
+    rows = np.column_stack([places, np.concatenate(explains, axis=1).T])
+    distinct, number = np.unique(rows, axis=0, return_counts=True)
+    place, same = distinct[:, 0], distinct[:, 1:]
+    prior = np.r_[np.full(kinds - 1, 1.0 / (kinds - 1)), PRIOR_LOST]
+    generator = numpy_generator(0, "channel", "draws")
+    weights = np.full((agents, kinds), 1.0 / kinds)
+    draws: list[Floats] = []
+    for _ in range(SWEEPS * (DRAWS + BURN_IN)):
+        chances = same * weights[place]
+        drawn = generator.multinomial(number, chances / chances.sum(1, keepdims=True))
+        counts = np.zeros((agents, kinds))
+        np.add.at(counts, place, drawn)
+        network = generator.dirichlet(prior + counts.sum(0))
+        shares = generator.standard_gamma(prior + pull * network + counts)
+        weights = shares / shares.sum(1, keepdims=True)
+        draws.append(weights)
+    return np.array(draws[SWEEPS * BURN_IN :: SWEEPS])
 
 
 def _counts(rows: NDArray[np.bool_], weights: Floats) -> Floats:
