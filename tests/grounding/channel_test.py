@@ -17,6 +17,7 @@ from ugat_marl.grounding.channel import (
     _draws,
     fit_channel,
 )
+from ugat_marl.grounding.channel import obeyed as obeyed_in
 from ugat_marl.scenarios import SignalState, SignalTiming
 
 PHASES = 4
@@ -221,7 +222,9 @@ def test_a_green_from_before_the_episode_may_be_of_any_age() -> None:
     table = course.table_of_masks(0)
     assert np.flatnonzero(table[1, 0]).tolist() == [0], "a young green is held"
     kept = replace(course, mask=None)  # so that the table counts
-    assert np.array_equal(kept.obeyed(course.asked[0], kept.permitted(table, 0)), course.executed)
+    assert np.array_equal(
+        obeyed_in(course.asked[0], kept.running, kept.permitted(table, 0)), course.executed
+    )
 
 
 def test_greens_that_the_simulation_holds_itself_are_not_forbidden() -> None:

@@ -494,10 +494,6 @@ class _Course:
             allowed[young] = np.eye(self.phases, dtype=np.bool_)[self.running[young]]
         return allowed
 
-    def obeyed(self, arriving: NDArray[np.int64], allowed: NDArray[np.bool_]) -> NDArray[np.int64]:
-        """Return the phases that run if these commands arrive (-1: none), ``(n,)``."""
-        return obeyed(arriving, self.running, allowed)
-
 
 def obeyed(
     commands: NDArray[np.int64], running: NDArray[np.int64], allowed: NDArray[np.bool_]
@@ -570,7 +566,7 @@ def _explaining(
         allowed = {lag: course.permitted(table, lag) for lag in set(shown)}
         same = np.stack(
             [
-                course.obeyed(command, allowed[lag]) == course.executed
+                obeyed(command, course.running, allowed[lag]) == course.executed
                 for command, lag in zip(arriving, shown, strict=True)
             ]
         )
