@@ -42,6 +42,11 @@ def test_where_nothing_is_known_nothing_is_listed() -> None:
 
 
 @dataclass(frozen=True)
+class Inner:
+    """A part of the settings."""
+
+
+@dataclass(frozen=True)
 class Settings:
     number: float = 1.0
     count: int | None = None
@@ -49,6 +54,8 @@ class Settings:
     names: tuple[str, ...] = ()
     mode: Literal["slow", "fast"] = "slow"
     other: object = None
+    inner: Inner = Inner()
+    spare: Inner | None = None
 
 
 @pytest.mark.parametrize(
@@ -56,7 +63,7 @@ class Settings:
     [
         {"number": 1}, {"number": np.float32(2.0)}, {"count": np.int64(3)}, {"count": None},
         {"switch": np.True_}, {"names": ["a"]}, {"names": {"a"}}, {"names": frozenset()},
-        {"mode": "fast"}, {"other": 3},
+        {"mode": "fast"}, {"other": 3}, {"inner": Inner()}, {"spare": None},
     ],
 )  # fmt: skip
 def test_values_of_their_kinds_pass(given: dict[str, Any]) -> None:
@@ -73,6 +80,8 @@ def test_values_of_their_kinds_pass(given: dict[str, Any]) -> None:
         ({"names": "a"}, "names is 'a'; allowed: a list, of which each is a text"),
         ({"names": [1]}, r"names is \[1\]"),
         ({"mode": "quick"}, "mode is 'quick'; allowed: slow, fast"),
+        ({"inner": None}, "inner is None; allowed: an Inner"),
+        ({"spare": {}}, "spare is {}; allowed: an Inner or None"),
     ],
 )
 def test_values_of_other_kinds_are_refused(given: dict[str, Any], told: str) -> None:

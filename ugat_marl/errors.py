@@ -10,6 +10,7 @@ import contextlib
 import difflib
 import re
 from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
+from dataclasses import is_dataclass
 from numbers import Integral, Real
 from types import UnionType
 from typing import Literal, TypeGuard, Union, get_args, get_origin, get_type_hints
@@ -55,11 +56,11 @@ class UnknownNameError(UgatMarlError, ValueError):
         self.name = name
         self.hint = hint
         self.allowed = sorted(set(allowed))
-        near = nearest(name, self.allowed)
+        near = nearest(str(name), self.allowed)
         guess = f" Did you mean {near!r}?" if near else ""
         shown = self.allowed
         if len(shown) > LISTED:
-            close = difflib.get_close_matches(name, shown, n=LISTED, cutoff=0.0)
+            close = difflib.get_close_matches(str(name), shown, n=LISTED, cutoff=0.0)
             shown = [*sorted(close), f"and {len(self.allowed) - LISTED} more"]
         listed = ", ".join(repr(item) if "," in item else item for item in shown)
         known = f" Known: {listed}." if listed else ""
@@ -164,8 +165,9 @@ _KINDS: dict[object, tuple[Callable[[object], bool], str]] = {
 def require_kinds(settings: object, name: str) -> None:
     """Refuse a field of a data class whose value is not of the annotated kind.
 
-    Numbers, texts, True and False, None, the names of a ``Literal``, and tuples of such values are
-    checked; a list or a set counts as a tuple. Fields of other kinds are not checked.
+    Numbers, texts, True and False, None, the names of a ``Literal``, tuples of such values, and
+    data classes are checked; a list or a set counts as a tuple. Fields of other kinds are not
+    checked.
 
     Args:
         settings: An object of the data class.
@@ -196,6 +198,9 @@ def _kind(hint: object) -> tuple[Callable[[object], bool], str] | None:
         of_kind, told = _KINDS[inner[0]]
         each = f"a list, of which each is {told}"
         return lambda x: _is_list(x) and all(map(of_kind, x)), each
+    if isinstance(hint, type) and is_dataclass(hint):
+        article = "an" if hint.__name__[0] in "AEIOU" else "a"
+        return lambda x: isinstance(x, hint), f"{article} {hint.__name__}"
     return _KINDS.get(hint)
 
 

@@ -41,6 +41,7 @@ from ugat_marl.grounding import (
 from ugat_marl.grounding.channel import ChannelConfig, CommandChannel
 from ugat_marl.grounding.eyes import Eyes, EyesConfig, fit_eyes
 from ugat_marl.grounding.posterior import Posterior, WorldValues
+from ugat_marl.grounding.residual import ResidualConfig
 from ugat_marl.grounding.state import RunState
 from ugat_marl.grounding.street import LEARNT
 from ugat_marl.grounding.street_training import StreetTraining
@@ -345,6 +346,24 @@ def test_unknown_parts_and_too_few_simulations_are_refused() -> None:
             EyesConfig(**wrong)
     with pytest.raises(OptionError, match="no transform"):
         UgatConfig(grounding="street").transform({}, 0)
+
+
+@pytest.mark.parametrize(
+    ("config", "given", "told"),
+    [
+        (StreetConfig, {"rival": None}, "unknown rival None"),
+        (StreetConfig, {"rival": ["none"]}, r"unknown rival \['none'\]"),
+        (StreetConfig, {"channel": None}, "channel is None; allowed: a ChannelConfig"),
+        (StreetConfig, {"residual": {"kind": "timed"}}, "allowed: a ResidualConfig"),
+        (StreetConfig, {"eyes": None}, "allowed: an EyesConfig"),
+        (ResidualConfig, {"kind": ["none"]}, r"unknown residual \['none'\]"),
+        (UgatConfig, {"grounding": ["street"]}, r"unknown grounding \['street'\]"),
+        (UgatConfig, {"street": None}, "street is None; allowed: a StreetConfig"),
+    ],
+)
+def test_values_of_other_kinds_are_refused(config: Any, given: dict[str, Any], told: str) -> None:
+    with pytest.raises((OptionError, UnknownNameError), match=told):
+        config(**given)
 
 
 @pytest.mark.slow

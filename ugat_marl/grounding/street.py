@@ -134,7 +134,7 @@ class StreetConfig:
     residual: ResidualConfig = field(default_factory=ResidualConfig)
 
     def __post_init__(self) -> None:
-        if self.rival not in RIVALS:
+        if self.rival not in tuple(RIVALS):  # a list has no hash
             raise UnknownNameError("rival", self.rival, RIVALS)
         require_kinds(self, "street")
         object.__setattr__(self, "parts", tuple(self.parts))
