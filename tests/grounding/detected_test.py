@@ -6,6 +6,7 @@ import math
 import tracemalloc
 from collections.abc import Sequence
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
 import pytest
@@ -325,6 +326,25 @@ def test_late_stamps_are_put_right() -> None:
 def test_a_latency_of_no_detector_is_refused(latency_s: float) -> None:
     with pytest.raises(OptionError, match=r"latency_s = .*: must be from -60 to 60 s"):
         DetectionConfig(latency_s=latency_s)
+
+
+@pytest.mark.parametrize(
+    ("numbers", "told"),
+    [
+        ({"latency_s": "1"}, "latency_s is '1'; allowed: a number"),
+        ({"least_free": 0}, "least_free is 0; allowed: > 0"),
+        ({"gap_s": np.nan}, "gap_s is nan; allowed: > 0, finite"),
+        ({"start_mps": 0.0}, "start_mps is 0.0; allowed: > 0"),
+        ({"speed_spread": -0.1}, "speed_spread is -0.1"),
+        ({"longest_s": np.inf}, "longest_s is inf"),
+        ({"late_s": -1.0}, "late_s is -1.0; allowed: >= 0"),
+        ({"missed": 1.0}, "missed is 1.0; allowed: from 0 to below 1"),
+    ],
+)
+def test_impossible_numbers_of_the_estimate_are_refused(numbers: dict[str, Any], told: str) -> None:
+    with pytest.raises(OptionError, match=told):
+        DetectionConfig(**numbers)
+    DetectionConfig(late_s=0.0, missed=0.0)
 
 
 def test_stamps_of_sumos_output_are_a_step_early() -> None:
