@@ -23,6 +23,7 @@ from ugat_marl.errors import CheckpointError, LogError, OptionError, UnknownName
 from ugat_marl.experiments import transfer
 from ugat_marl.experiments.training import simulated_worlds
 from ugat_marl.grounding import (
+    PARTS,
     FittedStreet,
     LaneView,
     NegativeControl,
@@ -317,6 +318,9 @@ def test_a_log_of_the_simulation_itself_shows_no_fault() -> None:
 def test_unknown_parts_and_too_few_simulations_are_refused() -> None:
     with pytest.raises(UnknownNameError, match="eye"):
         StreetConfig(parts=("eye",))
+    for parts in (PARTS, ("eyes",)):
+        with pytest.raises(UnknownNameError, match="effect of the library 'foo'"):
+            StreetConfig(parts=parts, without=("foo",))
     with pytest.raises(
         OptionError, match="parts is 'eyes'; allowed: a list, of which each is a text"
     ):

@@ -142,6 +142,10 @@ class StreetConfig:
         for part in self.parts:
             if part not in PARTS:
                 raise UnknownNameError("part of a street", part, PARTS)
+        library = [item.name for item in LIBRARY]
+        for effect in self.without:
+            if effect not in library:
+                raise UnknownNameError("effect of the library", effect, library)
         require_least(20, **{"street.simulations": self.simulations})
         if self.further < 0:
             raise OptionError(f"further = {self.further}: must not be negative")
