@@ -28,7 +28,7 @@ STACK = Stack(LAYOUTS)
 CHANCE = np.array([1 / layout.phases for layout in LAYOUTS.values()])
 
 
-def played(served: int, seed: int, episodes: int = 8) -> TransitionLog:
+def played(served: int, seed: int, episodes: int = 12) -> TransitionLog:
     """The toy under random phases."""
     env = ToyTraffic(steps=60, served=served)
     rng = np.random.default_rng(seed)
@@ -90,7 +90,7 @@ def test_a_gate_that_asks_for_proof_stays_shut_on_shuffled_data(honest) -> None:
     # Of two independent numbers one is as far off as sqrt(2) of the other's deviation: the mean
     # beats "no change" without knowing anything.
     assert (report.forward.ratio < 0.9).all()
-    assert (report.forward.error >= report.forward.mean_outcome).all()
+    assert (report.forward.error > 0.99 * report.forward.mean_outcome).all()
     assert (own.forward.error < 0.6 * own.forward.mean_outcome).all()
     assert any(
         "f is not shown to be better than one answer for every state" in w for w in report.warnings

@@ -33,6 +33,8 @@ from ugat_marl.grounding.reports import (
     ForwardReport,
     TrainingRecord,
     auroc,
+    better_than_chance,
+    blocks_of,
     expected_calibration_error,
     forward_report,
     rate_by_quantile,
@@ -390,7 +392,7 @@ def test_the_gap_is_visible_in_actions(fitted) -> None:
     assert report.mean_u_on_real.mean() > report.inverse.mean_u.mean() + 0.05
 
 
-@pytest.mark.parametrize("rows", [30, 90])
+@pytest.mark.parametrize("rows", [60, 90])
 def test_the_best_of_many_epochs_that_learnt_nothing_is_not_trusted(rows: int) -> None:
     """Every epoch answers with another constant, and the one that fits held-out rows best is kept.
 
@@ -413,6 +415,49 @@ def test_the_best_of_many_epochs_that_learnt_nothing_is_not_trusted(rows: int) -
     assert (lucky.error < lucky.mean_outcome).sum() > 2 and lucky.beats_no_change.all()
     assert lucky.learnt.sum() <= 1
     assert report(1 + 0.5 * (happened - 1)).learnt.all()
+
+
+def test_errors_that_hang_together_do_not_pass_for_many_independent_ones() -> None:
+    """An f as good as a trivial answer passes at 30 % of the agents if each row counts alone."""
+    rows, rho, rng = 360, 0.9, np.random.default_rng(0)
+    errors = rng.normal(0, 1, (2, 400, rows))
+    for k in range(1, rows):
+        errors[..., k] = rho * errors[..., k - 1] + math.sqrt(1 - rho**2) * errors[..., k]
+    trivial, own = torch.from_numpy(errors**2)
+    held_out = torch.ones(400, rows)
+    assert better_than_chance(trivial - own, held_out).mean() < 0.1
+    assert better_than_chance(trivial - 0.2 * own, held_out).mean() > 0.8
+    held_out[:, 29:] = 0  # less than two blocks
+    assert not better_than_chance(trivial + 9, held_out).any()
+
+
+def test_blocks_are_of_consecutive_held_out_rows() -> None:
+    rows = torch.tensor([[0, 1, 1, 0, 1, 1, 1], [1, 0, 0, 0, 0, 0, 0]], dtype=torch.float32)
+    assert blocks_of(rows, 2).tolist() == [[-1, 0, 0, -1, 1, 1, 1], [0, *[-1] * 6]]
+
+
+def test_h_that_cannot_know_the_phase_is_not_trusted() -> None:
+    """Nothing depends on the phase here, and by luck h is right more often than one answer."""
+    layouts = {f"a_{k}": AgentLayout(2, 4) for k in range(24)}
+    rng, zero = np.random.default_rng(0), dict.fromkeys(layouts, 0.0)
+    recorder = TransitionRecorder(Provenance("chance", "", "sim", (), 10.0, "count", layouts))
+    for row in range(240):
+        before, after = (
+            {a: np.float32([*rng.random(2), 1, 0, 0, 0]) for a in layouts} for _ in range(2)
+        )
+        ran = {a: int(rng.integers(4)) for a in layouts}
+        recorder.record(row // 120, row % 120, before, ran, ran, zero, after)
+    log = recorder.log()
+    made = PhaseTransform(layouts, 0, ForwardConfig(**SMALL), InverseConfig(**SMALL))
+    report = made.fit(log, log, Fitter(QUICK, seed=0))
+    assert (report.inverse.accuracy > report.inverse.majority).sum() > 6
+    assert report.inverse.beats_majority.sum() <= 2
+    sure = dataclasses.replace(
+        report.forward, beats_no_change=np.ones(24, bool), beats_mean_outcome=np.ones(24, bool)
+    )
+    lucky = dataclasses.replace(report, forward=sure)
+    assert lucky.trusted().tolist() == report.inverse.beats_majority.tolist()
+    assert any("h is not shown to be better than the most frequent" in w for w in lucky.warnings)
 
 
 def test_only_models_that_learnt_something_are_trusted(fitted) -> None:

@@ -221,6 +221,20 @@ def test_h_reads_the_delay_off_the_changes(planted) -> None:
     assert planted[1].trusted(least_accuracy=0.99).tolist() == [False, False]
 
 
+def test_h_that_reads_nothing_off_the_changes_is_not_trusted() -> None:
+    """By luck it is a little nearer to the delays than the middle of the range is."""
+    timed = TimedConfig(most_s=MOST_S, target_noise=100.0)
+    real = street({"a_0": 2.0, "b_0": 2.0}, seed=2)
+    nearer = trusted = 0
+    for seed in range(4):
+        made = TimedTransform(LAYOUTS, seed, **SHAPES, timed=timed)
+        report = made.fit(real, street(MOST_S, seed=20 + seed), Fitter(BRIEF, seed))
+        assert report.forward.learnt.all() and report.simulated.learnt.all()
+        nearer += int((report.inverse.error_s < report.inverse.guess_s).sum())
+        trusted += int(report.trusted().sum())
+    assert nearer > 2 and trusted <= 1
+
+
 def test_h_answers_with_the_delay_of_the_street(planted) -> None:
     """In the mean over the states of a street that h has never seen."""
     made, _ = planted

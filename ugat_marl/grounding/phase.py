@@ -26,6 +26,7 @@ from ugat_marl.grounding.reports import (
     InverseReport,
     TrainingRecord,
     auroc,
+    better_than_chance,
     complaint,
     flat,
 )
@@ -233,6 +234,7 @@ class PhaseInverseReport(InverseReport):
         accuracy: Share of right answers.
         chance: 1 / number of phases.
         majority: Accuracy of the most frequent phase in training as the constant answer.
+        beats_majority: Agents whose h is better than that by more than chance.
         mean_u: Mean uncertainty, in [0, 1].
         auroc: AUROC of u for wrong answers; `calibration` has it pooled over agents.
     """
@@ -240,6 +242,7 @@ class PhaseInverseReport(InverseReport):
     accuracy: Floats
     chance: Floats
     majority: Floats
+    beats_majority: NDArray[np.bool_]
     mean_u: Floats
     auroc: Floats
 
@@ -278,8 +281,11 @@ class PhaseReport(FitReport):
         """Yield sentences about problems; some of them are empty."""
         h, u = self.inverse, self.calibration
         yield from self.forward.doubts("f", self.agents)
-        poor = h.accuracy <= h.majority
-        yield complaint("h is no better than the most frequent phase", poor, self.agents)
+        yield complaint(
+            "h is not shown to be better than the most frequent phase",
+            ~h.beats_majority,
+            self.agents,
+        )
         if h.uncertainty == "none":
             yield "without uncertainty u is 0, and the gate takes every grounded action"
             return
@@ -295,11 +301,10 @@ class PhaseReport(FitReport):
         """Return true for trusted agents, ``(agents,)`` bool, for `Gate.trust`.
 
         An agent is trusted if f has learnt something there, the accuracy of h is above that of the
-        most frequent phase, and it is at least `least_accuracy`.
+        most frequent phase by more than chance, and it is at least `least_accuracy`.
         """
         h = self.inverse
-        better = self.forward.learnt & (h.accuracy > h.majority)
-        return better & (h.accuracy >= least_accuracy)
+        return self.forward.learnt & h.beats_majority & (h.accuracy >= least_accuracy)
 
     def as_dict(self) -> dict[str, float]:
         """Return flat numbers; arrays as their mean over agents and as one entry per agent."""
@@ -335,13 +340,15 @@ def _inverse_report(
     counts = torch.zeros(train.shape[0], model.stack.actions)
     counts.scatter_add_(1, data.executed, train)
     usual = counts.argmax(1)[:, None]
-    majority = ((data.executed == usual) * held_out).sum(1) / held_out.sum(1)
+    right_of_usual = data.executed == usual
+    majority = (right_of_usual * held_out).sum(1) / held_out.sum(1)
     rows = range(len(kept))
     return PhaseInverseReport(
         training=training,
         accuracy=np.array([1.0 - wrong[i][kept[i]].mean() for i in rows]),
         chance=1.0 / np.array(model.stack.phases, float),
         majority=majority.double().numpy(),
+        beats_majority=better_than_chance((~missed).double() - right_of_usual.double(), held_out),
         mean_u=np.array([u[i][kept[i]].mean() for i in rows], float),
         auroc=np.array([auroc(u[i][kept[i]], wrong[i][kept[i]]) for i in rows]),
         calibration=Calibration.of(answer, missed, held_out.bool(), model.answer(drawn)),

@@ -32,8 +32,12 @@ MARGIN = 0.05
 """Share by which the squared error of f must be below that of a trivial answer. Held-out rows
 choose its epoch: on 60 or more shuffled ones it was up to 5 % better than the mean outcome."""
 LEVEL = 0.05
-"""Chance that f passes at an intersection where it is not better by the margin. The margin alone
-does not do: on 30 shuffled rows the best epoch was up to 17 % better."""
+"""Chance that f passes at an intersection where it is not better by the margin, or h where it is
+not better at all. The margin alone does not do: on 30 shuffled rows the best epoch was up to 17 %
+better."""
+BLOCK = 15
+"""Held-out decisions of a block. Neighbouring decisions are not independent, so tests compare the
+means of blocks. An hour holds out 90 decisions, of which doubled blocks would be too few."""
 
 # --- calibration statistics
 
@@ -112,6 +116,34 @@ def p_of_mean(values: Floats, group: NDArray[np.int64]) -> float:
     if spread == 0.0:
         return float(mean <= 0.0)
     return float(stdtr(len(total) - 1, -mean / spread))
+
+
+def blocks_of(rows: Tensor, size: int) -> Tensor:
+    """Return the number of each row's block of consecutive rows, ``(agents, n)`` int64.
+
+    An agent's last block takes the rest. It is -1 for what is no row.
+
+    Args:
+        rows: ``(agents, n)`` weights of the rows, in the order of time; 0 for what is no row.
+        size: Number of rows of a block.
+    """
+    place = rows.bool().cumsum(1) - 1
+    last = (rows.bool().sum(1, keepdim=True) // size - 1).clamp(min=0)
+    return torch.where(rows.bool(), (place // size).minimum(last), -1)
+
+
+def better_than_chance(gain: Tensor, held_out: Tensor) -> NDArray[np.bool_]:
+    """Return the agents whose mean gain is above 0 by more than chance at `LEVEL`, ``(agents,)``.
+
+    An agent with fewer than two blocks of held-out rows is not among them.
+
+    Args:
+        gain: ``(agents, n)`` by how much the answer to each row is better than a trivial one.
+        held_out: ``(agents, n)`` weights of the held-out rows, in the order of time.
+    """
+    blocks, kept = blocks_of(held_out, BLOCK).numpy(), held_out.bool().numpy()
+    each = zip(gain.double().numpy(), blocks, kept, strict=True)
+    return np.array([p_of_mean(own[rows], block[rows]) < LEVEL for own, block, rows in each])
 
 
 def expected_calibration_error(
@@ -248,24 +280,31 @@ def forward_report(
         predicted: ``(agents, n, outputs)`` predicted changes.
         happened: ``(agents, n, outputs)`` true changes.
         off_mean: ``(agents, n, outputs)`` next features minus their mean in training.
-        held_out: ``(agents, n)`` weights of the held-out rows.
+        held_out: ``(agents, n)`` weights of the held-out rows, in the order of time.
         training: Course of the training.
     """
     outputs = model.valid_outputs.sum(-1).double()
     kept = held_out.bool().numpy()
 
-    def squares(error: Tensor) -> list[Floats]:
-        """Return the squared error of each held-out row, for every agent."""
-        by_row = ((error.double() ** 2).sum(-1) / outputs).numpy()
-        return [own[rows] for own, rows in zip(by_row, kept, strict=True)]
+    def squares(error: Tensor) -> Tensor:
+        """Return the squared error of each row, ``(agents, n)``."""
+        return (error.double() ** 2).sum(-1) / outputs
 
-    def beats(trivial: list[Floats]) -> NDArray[np.bool_]:
-        gains = [(1 - MARGIN) * theirs - ours for theirs, ours in zip(trivial, own, strict=True)]
-        return np.array([p_of_mean(gain, np.arange(len(gain))) < LEVEL for gain in gains])
+    def root(rows: Tensor) -> Floats:
+        return np.sqrt([own[on].mean() for own, on in zip(rows.numpy(), kept, strict=True)])
 
-    own, *trivial = map(squares, (predicted - happened, happened, off_mean))
-    roots = (np.sqrt([rows.mean() for rows in each]) for each in (own, *trivial))
-    return ForwardReport(training, *roots, *map(beats, trivial))
+    def beats(trivial: Tensor) -> NDArray[np.bool_]:
+        return better_than_chance((1 - MARGIN) * trivial - own, held_out)
+
+    own, no_change, mean_outcome = map(squares, (predicted - happened, happened, off_mean))
+    return ForwardReport(
+        training=training,
+        error=root(own),
+        no_change=root(no_change),
+        mean_outcome=root(mean_outcome),
+        beats_no_change=beats(no_change),
+        beats_mean_outcome=beats(mean_outcome),
+    )
 
 
 @dataclass(frozen=True)

@@ -39,6 +39,7 @@ from ugat_marl.grounding.reports import (
     ForwardReport,
     InverseReport,
     TrainingRecord,
+    better_than_chance,
     complaint,
     flat,
 )
@@ -278,17 +279,19 @@ class TimedTransform(Transform):
         count = int(held.sum(1).max().clamp(min=1))
         drawn = training_data.off_data.draw(count, generator, state_share=1.0)
         missed = answer.action != training_data.answers
+        asked_s = training_data.answers.float()
+        found_s = (answer.probability * seconds).sum(-1)
+        gain_s = (seconds.mean() - asked_s).abs() - (found_s - asked_s).abs()
         return TimedInverseReport(
             training=record,
             calibration=Calibration.of(answer, missed, held.bool(), model.answer(drawn)),
             uncertainty=model.method.name,
-            error_s=mean_error(
-                (answer.probability * seconds).sum(-1), training_data.answers.float(), held
-            ),
+            error_s=mean_error(found_s, asked_s, held),
             error_on_transitions_s=mean_error(
                 (single.probability * seconds).sum(-1), data.delay_s, held
             ),
             guess_s=float((seconds - seconds.mean()).abs().mean()),
+            beats_guess=better_than_chance(gain_s, held),
         )
 
     @torch.no_grad()
@@ -416,11 +419,13 @@ class TimedInverseReport(InverseReport):
         error_on_transitions_s: Mean absolute error on single held-out transitions. Their noise
             limits every answer.
         guess_s: Mean absolute error of the middle of the range as the constant answer.
+        beats_guess: Agents whose h is better than that by more than chance.
     """
 
     error_s: Floats
     error_on_transitions_s: Floats
     guess_s: float
+    beats_guess: NDArray[np.bool_]
 
     def as_dict(self, agents: Sequence[str]) -> dict[str, float]:
         """Return everything as flat numbers; arrays as their mean and one entry per agent."""
@@ -484,9 +489,12 @@ class TimedReport(FitReport):
         """Return the agents with a trusted h, for `Gate.trust`; the others take the constant delay.
 
         An agent is trusted if f and the model of the simulation have learnt something, a lost time
-        was found, and error_s < (1 - least_accuracy) * guess_s.
+        was found, h is better than a guess by more than chance, and
+        error_s < (1 - least_accuracy) * guess_s.
         """
-        return self._found & (self.inverse.error_s < (1.0 - least_accuracy) * self.inverse.guess_s)
+        h = self.inverse
+        good = h.error_s < (1.0 - least_accuracy) * h.guess_s
+        return self._found & h.beats_guess & good
 
     def as_dict(self) -> dict[str, float]:
         """Return flat numbers; arrays as their mean over agents and as one entry per agent."""

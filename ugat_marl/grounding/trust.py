@@ -27,7 +27,7 @@ from ugat_marl.data import TransitionLog
 from ugat_marl.errors import OptionError, require_kinds
 from ugat_marl.grounding.fitting import Changes, Fitter, Split
 from ugat_marl.grounding.forward import ForwardModel
-from ugat_marl.grounding.reports import Floats, flat, p_of_mean
+from ugat_marl.grounding.reports import Floats, blocks_of, flat, p_of_mean
 from ugat_marl.grounding.stacked import alike, stack_log
 from ugat_marl.grounding.transform import Transform
 from ugat_marl.policies import one_thread
@@ -202,10 +202,8 @@ def compare(
 
 def _part(training_data: tuple[Changes, Tensor], rows: Tensor) -> _Part:
     """Return the data of a fit in blocks; the last block of an agent takes the rest."""
-    block = torch.arange(rows.shape[1]).expand(rows.shape) // BLOCK
-    last = (rows.sum(1, keepdim=True).long() // BLOCK - 1).clamp(min=0)
     learnt, weight = training_data
-    return _Part(learnt, rows, weight, torch.where(rows.bool(), block.minimum(last), -1))
+    return _Part(learnt, rows, weight, blocks_of(rows, BLOCK))
 
 
 def _folds(block: Tensor, first: Tensor, folds: int) -> list[Tensor]:
