@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import json
 from dataclasses import replace
 from importlib.metadata import version
@@ -20,11 +21,12 @@ from ugat_marl.data import CHECKPOINT_FOLDER, SETTINGS_FILE, TransitionLog
 from ugat_marl.data.runs import IDENTITY_FILE
 from ugat_marl.effects import load_scenario
 from ugat_marl.envs import parallel_env
-from ugat_marl.errors import CheckpointError, OptionError, UnknownNameError
+from ugat_marl.errors import CheckpointError, LogError, OptionError, UnknownNameError
 from ugat_marl.experiments import Evaluation, run_folder, transfer, transfers
 from ugat_marl.experiments.jobs import file_names
 from ugat_marl.experiments.randomised import RandomisedEnv
-from ugat_marl.grounding import RandomDelays, TimedConfig, UgatConfig
+from ugat_marl.grounding import InputsConfig, RandomDelays, TimedConfig, UgatConfig
+from ugat_marl.policies import make_rule, observer_of, roll_out
 from ugat_marl.progress import Silent
 
 
@@ -315,6 +317,22 @@ def test_timed_grounding_learns_from_a_log_of_fixed_time(crossings: bool, tmp_pa
     assert not (checkpoint_of(tmp_path / "run") / "real-001.parquet").exists()
     found = numbers(tmp_path / "run")
     assert 0 <= found[1, "lost_time/low_s"] <= found[1, "lost_time/best_s"] <= 5
+
+
+def test_a_log_that_models_of_neighbours_cannot_read_is_refused_before_training(
+    tmp_path: Path,
+) -> None:
+    with contextlib.closing(parallel_env("grid2x2-v1", duration_s=100)) as env:
+        rule = make_rule("fixed-time:20", env)
+        played = [roll_out(env, rule, seed, record=observer_of(env)).log for seed in (1, 2)]
+    log = TransitionLog.concatenate([one for one in played if one is not None])
+    lost = (pl.col("agent") == "signal_1") & (pl.col("step") == 3)
+    TransitionLog(log.provenance, log.frame.filter(~lost)).write(tmp_path / "street.parquet")
+    ugat = replace(SMALL.ugat, inputs=InputsConfig(hops=1))
+    config = replace(SMALL, scenario="grid2x2-v1", real_log=tmp_path / "street.parquet", ugat=ugat)
+    with pytest.raises(LogError, match="at other times than of signal_0"):
+        transfer(config, tmp_path / "run")
+    assert not (tmp_path / "run" / "trainings").exists()
 
 
 def test_names_of_policies_are_names_of_files_of_their_own() -> None:

@@ -39,6 +39,7 @@ from ugat_marl.grounding import (
     street_prior,
     street_training,
 )
+from ugat_marl.grounding import street as street_module
 from ugat_marl.grounding.channel import ChannelConfig, CommandChannel
 from ugat_marl.grounding.eyes import Eyes, EyesConfig, fit_eyes
 from ugat_marl.grounding.posterior import Posterior, WorldValues
@@ -298,6 +299,47 @@ def test_a_street_is_compared_with_what_fits_behind_the_lead_of_its_log(
     assert set(compared) == {36}
     with pytest.raises(LogError, match="only 290 s of an episode are left .*--duration-s"):
         fit_street(log.from_step_0(), simulation(330.0), replay, prior, view, config, seed=0)
+
+
+def test_a_late_period_shortens_the_comparison_of_no_other(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """Of a period from 300 s to 450 s the decisions before 400 s, the end of an episode, count."""
+    compared, summary = list[list[int]](), LaneView.summary
+
+    def seen(self: LaneView, log: TransitionLog) -> Summary:
+        compared.append(log.frame.group_by("episode", maintain_order=True).len()["len"].to_list())
+        return summary(self, log)
+
+    monkeypatch.setattr(LaneView, "summary", seen)
+    config = replace(QUICK, parts=("effects",), simulated_s=600.0)
+    env = parallel_env(SCENARIO)
+    prior, view = street_prior(env, config), LaneView.of(env.network, "count")
+    env.close()
+    whole = recorded("sim", 450.0)
+    log = TransitionLog.concatenate([whole.first(40), whole.first(40), whole])
+    late = (pl.col("episode") < 2) | (pl.col("step") >= 30)
+    log = TransitionLog(replace(log.provenance, from_begin=True), log.frame.filter(late))
+    replay = RecordedCommands(log, longest=40)
+    monkeypatch.setattr(street_module, "LEAST_DECISIONS", 10)
+    fit_street(log.from_step_0(), simulation(400.0), replay, prior, view, config, seed=0)
+    assert compared[0] == [40, 40, 10]
+    assert sorted({length for (length,) in compared[1:]}) == [10, 40]
+
+
+def test_a_log_whose_end_is_all_that_an_episode_reaches_is_refused_before_training(
+    tmp_path: Path,
+) -> None:
+    whole = recorded("sim", 900.0)
+    provenance = replace(whole.provenance, from_begin=True)
+    late = TransitionLog(provenance, whole.frame.filter(pl.col("step") >= 25))
+    late.write(tmp_path / "street.parquet")
+    street = replace(QUICK, parts=("channel", "effects"))
+    ugat = replace(SMALL.ugat, grounding="street", street=street)
+    config = replace(SMALL, ugat=ugat, real_log=tmp_path / "street.parquet", duration_s=300.0)
+    with pytest.raises(LogError, match="only 50 s of an episode are left behind .* episode 0 "):
+        transfer(config, tmp_path / "run", workers=1)
+    assert not (tmp_path / "run" / "trainings").exists()
 
 
 def test_a_log_of_the_simulation_itself_shows_no_fault() -> None:

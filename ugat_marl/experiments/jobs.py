@@ -64,6 +64,7 @@ from ugat_marl.grounding import (
     TransitionSource,
     is_kept,
     require_histories,
+    require_room,
 )
 from ugat_marl.parallel import Workers, in_this_process, send_heartbeats
 from ugat_marl.policies import (
@@ -598,20 +599,25 @@ def worlds_of(
     """
     ugat, recorded = job.setting.ugat, None
     assert ugat is not None
-    if ugat.grounding == "street":
+    street = ugat.grounding == "street"
+    if street:
         LaneView.of(env.network, str(env.options.observation))
     if job.real_log is not None:
         log = TransitionLog.read(Path(job.real_log))
-        if ugat.grounding == "street":
+        if street:
             require_histories(log, ugat.street.longest_lag)  # before plain training
-        recorded = RecordedWorld(log, env, ugat.fit.held_out_every)
-        if ugat.grounding == "street":
-            recorded.replay()  # a log that begins too late is refused now
+        fits_models = not street or ugat.street.residual.kind != "none"
+        inputs = ugat.inputs if fits_models else None
+        recorded = RecordedWorld(log, env, ugat.fit.held_out_every, inputs)
+        if street:
+            replay = recorded.replay()  # a log that begins too late is refused now
+            if ugat.street.of_log(log).simulates:
+                require_room(replay, recorded.longest)
     without_street = recorded is not None or job.setting.negative_control == "same-world"
-    street = job.sim if without_street else job.target
-    assert street is not None
+    target = job.sim if without_street else job.target
+    assert target is not None
     scenario, options = job.loaded(), dict[str, Any](job.options)
-    sim, real = simulated_worlds(scenario, job.sim, street, ugat, options, workers)
+    sim, real = simulated_worlds(scenario, job.sim, target, ugat, options, workers)
     return sim, recorded or real
 
 

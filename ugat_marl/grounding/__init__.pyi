@@ -49,6 +49,7 @@ from .street import Simulation as Simulation
 from .street import StreetConfig as StreetConfig
 from .street import StreetWorld as StreetWorld
 from .street import fit_street as fit_street
+from .street import require_room as require_room
 from .street import street_env as street_env
 from .street import street_prior as street_prior
 from .street_training import JUDGED as JUDGED

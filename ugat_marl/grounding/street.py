@@ -463,6 +463,27 @@ class FitHistory:
         return [(worlds // 2, worlds - worlds // 2)]
 
 
+def require_room(policy: Policy, longest: int) -> None:
+    """Refuse recorded commands of which episodes of the simulation hold too few.
+
+    Args:
+        policy: Policy that acts in the simulated worlds; only one that repeats a log is refused.
+        longest: Decisions of an episode of the simulation.
+
+    Raises:
+        LogError: Behind the begin of an episode of the log too few decisions are left.
+    """
+    if not isinstance(policy, RecordedCommands):
+        return
+    for episode, decisions, left in policy.left(longest):
+        if left < min(LEAST_DECISIONS, decisions, longest):
+            raise LogError(
+                f"only {left * policy.interval_s:g} s of an episode are left behind the begin of "
+                f"episode {episode} of the log: choose a longer --duration-s (duration_s), or "
+                "leave that episode out"
+            )
+
+
 def fit_street(
     real: TransitionLog,
     simulation: Simulation,
@@ -507,17 +528,15 @@ def fit_street(
         street = replace(street, eyes=eyes)
     if not config.simulates:
         return street, history
+    longest = max(1, int(simulation.longest_s / interval_s + 1e-9))
+    require_room(policy, longest)
+    reached = real.first(longest)
+    if isinstance(policy, RecordedCommands):
+        reached = policy.within(real, longest)
     # Queues grow through a peak: worlds of half an hour tell nothing of an hour's second half.
-    least_s = LEAST_DECISIONS * interval_s
-    left_s = simulation.longest_s - _lead_s(policy)
-    if left_s < min(least_s, real.decisions * interval_s, simulation.longest_s):
-        raise LogError(
-            f"only {left_s:g} s of an episode are left behind the begin of the log: choose a "
-            "longer --duration-s (duration_s)"
-        )
-    compared_s = min(max(config.simulated_s, least_s), left_s)
-    decisions = min(real.decisions, max(1, int(compared_s / interval_s)))
-    seen = view.summary(real.first(decisions))
+    wanted = max(int(config.simulated_s / interval_s), LEAST_DECISIONS)
+    decisions = min(wanted, reached.decisions)
+    seen = view.summary(reached.first(decisions))
     simulated, posterior = list(history.simulated), history.posterior
     for prior, aimed in history.rounds(config):
         first, number = len(simulated) - len(history.simulated), prior + aimed

@@ -10,6 +10,7 @@ from functools import partial
 from typing import Any, Protocol
 
 import numpy as np
+import polars as pl
 from numpy.typing import NDArray
 
 from ugat_marl.data import Scores, TransitionLog, Transitions
@@ -26,6 +27,7 @@ from ugat_marl.envs import (
 from ugat_marl.errors import LogError
 from ugat_marl.grounding.fitting import FitConfig, split
 from ugat_marl.grounding.stacked import Stack, stack_log
+from ugat_marl.grounding.view import InputsConfig, View, neighbours_of
 from ugat_marl.grounding.wrappers import RandomDelays
 from ugat_marl.parallel import Stop, Workers, in_order, retry_on_crash
 from ugat_marl.policies import (
@@ -313,6 +315,10 @@ class RecordedCommands:
         longest: Most decisions of an episode; what the log has beyond them is left out. None for
             as many as it needs.
 
+    Attributes:
+        interval_s: Seconds from one decision to the next.
+        longest_lead_s: Seconds before the latest begin of an episode of the log.
+
     Raises:
         LogError: No episode of the log has commands of every agent, or one begins where episodes
             of `longest` decisions end.
@@ -335,16 +341,21 @@ class RecordedCommands:
         if not log.provenance.from_begin:
             begins = dict.fromkeys(begins, 0)
         self._leads: list[int] = []
+        self._lengths: list[int] = []
         self._commands: list[Mapping[str, NDArray[np.int64]]] = []
         for episode, first in begins.items():
             commands = {agent: _commands_of(own, episode, first) for agent, own in rows.items()}
             self._leads.append(first)
+            self._lengths.append(max(map(len, commands.values())))
             led_up = {agent: _led_up(own, first)[:longest] for agent, own in commands.items()}
             self._commands.append(led_up)
-        interval_s = log.provenance.decision_interval_s
+        self.interval_s = interval_s = log.provenance.decision_interval_s
         self.longest_lead_s = max(self._leads) * interval_s
+        self._numbers = list(begins)
+        every = log.frame["episode"].unique().sort().to_list()
+        self._lead_of = {every.index(episode): lead for episode, lead in begins.items()}
         if longest is not None and max(self._leads) >= longest:
-            late = list(begins)[int(np.argmax(self._leads))]
+            late = self._numbers[int(np.argmax(self._leads))]
             raise LogError(
                 f"episode {late} of the log begins {self.longest_lead_s:g} s after its scenario, "
                 f"and episodes end after {longest * interval_s:g} s: choose a longer --duration-s "
@@ -359,6 +370,26 @@ class RecordedCommands:
     def decisions(self, seed: int) -> int:
         """Return the number of decisions of that episode, with those before it."""
         return max(map(len, self._chosen(seed).values()))
+
+    def left(self, longest: int) -> list[tuple[int, int, int]]:
+        """Return number, decisions, and decisions of the simulation that are left, per episode.
+
+        Args:
+            longest: Decisions of an episode of the simulation.
+        """
+        each = zip(self._numbers, self._lengths, self._leads, strict=True)
+        return [(number, length, longest - lead) for number, length, lead in each]
+
+    def within(self, log: TransitionLog, longest: int) -> TransitionLog:
+        """Return the decisions of a log that episodes of the simulation reach.
+
+        Args:
+            log: The log whose commands are repeated, with steps counted from 0.
+            longest: Decisions of an episode of the simulation.
+        """
+        number = pl.col("episode").rank("dense").cast(pl.Int64) - 1
+        lead = number.replace_strict(self._lead_of, default=0, return_dtype=pl.Int64)
+        return TransitionLog(log.provenance, log.frame.filter(pl.col("step") + lead < longest))
 
     def reset(self, seed: int) -> None:
         """Begin an episode of the log; `seed` chooses it."""
@@ -396,14 +427,23 @@ class RecordedWorld:
         log: The transitions.
         env: Simulation to compare them with.
         held_out_every: Held-out share, as in `FitConfig`.
+        inputs: Inputs of the models that are fitted to the log; None if there are no models.
+
+    Attributes:
+        longest: Decisions of an episode of the simulation.
 
     Raises:
-        LogError: The log's agents, observation or decision interval are not those of `env`, or
-            there are too few rows to fit anything to.
+        LogError: The log's agents, observation or decision interval are not those of `env`, there
+            are too few rows to fit anything to, or models see neighbours that were recorded at
+            other times.
     """
 
     def __init__(
-        self, log: TransitionLog, env: TrafficEnv, held_out_every: int = FitConfig.held_out_every
+        self,
+        log: TransitionLog,
+        env: TrafficEnv,
+        held_out_every: int = FitConfig.held_out_every,
+        inputs: InputsConfig | None = None,
     ) -> None:
         provenance = log.provenance
         for fact, given, wanted in (
@@ -425,16 +465,20 @@ class RecordedWorld:
         self._log = log.from_step_0()
         self._given = log if provenance.from_begin else self._log
         seconds = env.options.duration_s or env.scenario.settings.duration_s
-        self._longest = int(seconds / provenance.decision_interval_s + 1e-9)
-        split(stack_log(self._log, stack), held_out_every, stack)  # raises now, not after hours
+        self.longest = int(seconds / provenance.decision_interval_s + 1e-9)
+        # These raise now, not after hours.
+        data = stack_log(self._log, stack)
+        split(data, held_out_every, stack)
+        if inputs is not None:
+            View(stack, near=inputs.near(stack.agents, neighbours_of(env))).of(data)
 
     def collect(self, policy: Policy, iteration: int, seed: int) -> TransitionLog | None:
         """Return the whole log at the first iteration, nothing afterwards."""
         return self._log if iteration == 0 else None
 
-    def replay(self) -> Policy | None:
+    def replay(self) -> RecordedCommands:
         """Return a policy that repeats the log: whoever made it, other worlds get its commands."""
-        return RecordedCommands(self._given, self._longest)
+        return RecordedCommands(self._given, self.longest)
 
     def stop(self) -> None:
         """Do nothing; `collect` returns at once."""
