@@ -201,7 +201,9 @@ def test_constant_answers_are_the_constants() -> None:
     for a in range(4):
         outcome = made(state((3 - a, 1)), np.array([a, 0]))
         assert outcome.delay_s.tolist() == [USUAL_S[0, a], 1.0]
-        assert outcome.accepted.all() and not outcome.u.any()
+        assert outcome.accepted.tolist() == [USUAL_S[0, a] > 0, True] and not outcome.u.any()
+    stays = made(state((2, 0)), np.array([2, 0]))
+    assert not stays.accepted.any() and not stays.delay_s.any()
     assert made.gate.report().decisions.tolist() == [0, 0]  # there is nothing to decide
 
 

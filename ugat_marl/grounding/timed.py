@@ -320,9 +320,7 @@ class TimedTransform(Transform):
         switched = current != actions
         if self.timed.answer == "constant":
             delay = np.where(switched, usual[:, 0].numpy(), 0.0).astype(np.float32)
-            return GroundedActions(
-                actions, actions, np.zeros_like(delay), np.ones_like(switched), delay
-            )
+            return GroundedActions(actions, actions, np.zeros_like(delay), delay > 0, delay)
         # Grounding keeps all phases, so those of the neighbours are known in advance.
         phases = torch.from_numpy(running(actions, current, permitted))[:, None]
         delays_s, u = self.delays(  # lines 11 and 12

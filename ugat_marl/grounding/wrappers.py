@@ -31,7 +31,8 @@ class GroundedEnv(BaseParallelWrapper[str, Any, Any]):
 
     - ``grounded_action``: int, the inverse model's answer; -1 at reset.
     - ``uncertainty``: float, u of this answer in [0, 1]; 1.0 at reset.
-    - ``accepted``: int, 1 if the grounded action was executed.
+    - ``accepted``: int, 1 if the grounded action was executed; with constant delays, 1 if a green
+      begins late.
     - ``delay_s``: float, delay of the agent's green in s; 0.0 at reset.
 
     A grounded action that the agent's action mask forbids is never executed. An epoch of the gate
