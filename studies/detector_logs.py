@@ -79,7 +79,9 @@ def record_street(
 
 def _log(measured: MeasuredData, scenario: Scenario, domain: str, source: str) -> TransitionLog:
     network = Network.read(scenario)
-    return log_of_measured(measured, scenario, network, domain, "movements", source).log
+    return log_of_measured(
+        measured, scenario, network, domain, "movements", source, periods="all"
+    ).log
 
 
 def errors(scenario: Scenario, lanes: TransitionLog, detectors: TransitionLog) -> list[LaneErrors]:

@@ -20,6 +20,7 @@ from ugat_marl.errors import MeasuredDataError, OptionError, UnknownNameError
 from ugat_marl.experiments import policy_factory, record
 from ugat_marl.grounding import (
     LaneView,
+    MeasuredSource,
     RecordedWorld,
     StreetConfig,
     TimedConfig,
@@ -107,6 +108,32 @@ def test_a_table_of_lanes_or_trajectories_takes_the_place_of_the_estimate(
     assert found.observation[1:].tolist() == true.observation[1:].tolist()
     assert found.reward.tolist() == true.reward.tolist()
     assert not log.provenance.deviation
+
+
+@pytest.mark.parametrize("source", ["best", "detections"])
+def test_held_out_periods_are_left_out(
+    crossing: Scenario, measured: MeasuredData, source: MeasuredSource
+) -> None:
+    assert measured.lanes is not None
+    (day,) = measured.periods
+    again = measured.lanes.with_columns(period_id=pl.lit("day2"))
+    both = replace(
+        measured,
+        periods=(day, replace(day, id="day2", split="heldout")),
+        lanes=pl.concat([measured.lanes, again.filter(pl.col("lane_id") != "S_C_0")]),
+        trajectories=None,
+    )
+    network = Network.read(crossing)
+    alone = log_of_measured(measured, crossing, network, "street", "count", source)
+    fit = log_of_measured(both, crossing, network, "street", "count", source)
+    assert fit.log.frame.equals(alone.log.frame)
+    assert fit.log.provenance == alone.log.provenance
+    assert fit.findings[0].startswith("1 held-out period ('day2'): left out")
+    assert fit.findings[1:] == alone.findings
+    every = log_of_measured(both, crossing, network, "street", "count", source, periods="all")
+    assert every.log.episodes == 2 and not any("left out, to" in x for x in every.findings)
+    with pytest.raises(UnknownNameError, match="heldout"):
+        imported(measured, crossing, periods="heldout")
 
 
 def test_lanes_that_a_table_lacks_are_said_to_be_estimated(

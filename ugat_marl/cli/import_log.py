@@ -11,7 +11,7 @@ from tyro.conf import Positional, arg
 
 from ugat_marl.data import read_measured, require_log_place
 from ugat_marl.effects import load_scenario
-from ugat_marl.grounding import DetectionConfig, MeasuredSource, log_of_measured
+from ugat_marl.grounding import DetectionConfig, MeasuredPeriods, MeasuredSource, log_of_measured
 from ugat_marl.scenarios import Network
 
 
@@ -35,6 +35,8 @@ class ImportLog:
             universal reads movements by default.
         vehicles: Source of the vehicles on lanes: best (a table of lanes or trajectories if there
             is one, else detections) or detections.
+        periods: Periods to take: fit (those to which models are fitted) or all (those held out as
+            well, on which they are judged).
         latency_s: Constant delay of the detectors' stamps, in s; it is taken off them.
     """
 
@@ -43,6 +45,7 @@ class ImportLog:
     out: Path
     observation: str = "movements"
     vehicles: MeasuredSource = "best"
+    periods: MeasuredPeriods = "fit"
     latency_s: float = 0.0
 
     def run(self, console: Console) -> int:
@@ -54,7 +57,14 @@ class ImportLog:
         place = self.measured.resolve().name
         numbers = DetectionConfig(latency_s=self.latency_s)
         imported = log_of_measured(
-            measured, scenario, network, place, self.observation, self.vehicles, numbers
+            measured,
+            scenario,
+            network,
+            place,
+            self.observation,
+            self.vehicles,
+            numbers,
+            self.periods,
         )
         imported.log.write(self.out)
         for finding in (*(finding.text for finding in measured.findings), *imported.findings):

@@ -22,6 +22,7 @@ from .fitting import Fitter as Fitter
 from .gate import GateConfig as GateConfig
 from .inverse import InverseConfig as InverseConfig
 from .inverse import InverseModel as InverseModel
+from .measured_log import MeasuredPeriods as MeasuredPeriods
 from .measured_log import MeasuredSource as MeasuredSource
 from .measured_log import log_of_measured as log_of_measured
 from .phase import PhaseTransform as PhaseTransform

@@ -44,6 +44,9 @@ MeasuredSource = Literal["best", "detections"]
 """Where vehicles on lanes come from: a table of lanes or trajectories if there is one, or always
 the detections."""
 
+MeasuredPeriods = Literal["fit", "all"]
+"""Periods that a log is of: those to which models are fitted, or those held out as well."""
+
 WITH_OUTGOING = ("movements", "pressure")
 """Observations that read the lanes that lead away, too."""
 REWARD = "queue"
@@ -92,6 +95,7 @@ def log_of_measured(
     observation: str = "movements",
     source: MeasuredSource = "best",
     config: DetectionConfig | None = None,
+    periods: MeasuredPeriods = "fit",
 ) -> MeasuredLog:
     """Return the transitions of measured data.
 
@@ -103,12 +107,15 @@ def log_of_measured(
         observation: Observation to record; `waiting` cannot be known.
         source: Where vehicles on lanes come from.
         config: Numbers of the estimate.
+        periods: Periods that the log is of.
 
     Raises:
         MeasuredDataError: Signals or detectors are missing, or no phase of the scenario was shown.
         OptionError: The observation cannot be known from measured data.
-        UnknownNameError: There is no such source.
+        UnknownNameError: There is no such source, or there are no such periods.
     """
+    if periods not in get_args(MeasuredPeriods):
+        raise UnknownNameError("periods", periods, get_args(MeasuredPeriods))
     if source not in get_args(MeasuredSource):
         raise UnknownNameError("source of vehicles", source, get_args(MeasuredSource))
     if observation == "waiting":
@@ -116,9 +123,19 @@ def log_of_measured(
             "observation 'waiting' sums up how long each vehicle stands, which detectors do not "
             f"see; use one of {', '.join(name for name in OBSERVATION_UNITS if name != 'waiting')}"
         )
+    left_out = measured.of("heldout") if periods == "fit" else ()
+    if left_out:
+        measured = replace(measured, periods=measured.of("fit"))
     street = _Street(measured, scenario, network, observation, source, config or DetectionConfig())
     street.require_detectors()
-    return street.log(place)
+    made = street.log(place)
+    if not left_out:
+        return made
+    finding = (
+        f"{listed([period.id for period in left_out], 'held-out period')}: left out, to judge on; "
+        "--periods all takes all periods"
+    )
+    return replace(made, findings=(finding, *made.findings))
 
 
 @dataclass(frozen=True)
@@ -142,7 +159,8 @@ class _Street:
         if self.source == "detections":
             return None
         if self.measured.lanes is not None:
-            return self.measured.lanes
+            own = [period.id for period in self.measured.periods]
+            return self.measured.lanes.filter(pl.col("period_id").is_in(own))
         if self.measured.trajectories is None:
             return None
         step = step_of_tracks(self.measured.trajectories)
@@ -168,7 +186,7 @@ class _Street:
                 "counts only: when single vehicles leave a lane stays unknown, so there is no log "
                 "of transitions; add detections (on and off of every vehicle)"
             )
-        incoming = [x for item in self.network.intersections for x in item.incoming_lanes]
+        incoming = self._incoming
         seen = {lane: LaneDetectors.of(self.measured.detectors, lane) for lane in self._lanes}
         blind = [lane for lane in incoming if seen[lane].stop is None]
         if blind:
@@ -218,10 +236,9 @@ class _Street:
                 if one.deviation is not None:
                     variances.setdefault(lane, []).append(one.deviation**2)
             self._record(recorder, observer, episode, times_s, np.stack(phases, 1), lanes)
-        incoming = [x for item in self.network.intersections for x in item.incoming_lanes]
         deviation = {
             x: float(np.sqrt(np.concatenate(variances[x]).mean()))
-            for x in incoming
+            for x in self._incoming
             if x in estimated
         }
         findings = self._findings(estimated, deviation, unlike)
@@ -252,6 +269,11 @@ class _Street:
     @property
     def _lanes(self) -> tuple[str, ...]:
         return self.network.lane_table().ids
+
+    @property
+    def _incoming(self) -> list[str]:
+        """Lanes that lead to a light."""
+        return [lane for item in self.network.intersections for lane in item.incoming_lanes]
 
     def _courses(self) -> dict[str, list[LaneCourse]]:
         """Return the courses of all lanes with detectors."""
