@@ -26,9 +26,9 @@ from ugat_marl.grounding import (
     fit_inverse,
     stack_log,
 )
-from ugat_marl.grounding.fitting import EpochCallback, OffData, split
+from ugat_marl.grounding.fitting import Changes, EpochCallback, OffData, split
 from ugat_marl.grounding.forward import ForwardConfig, ForwardModel
-from ugat_marl.grounding.phase import PhaseReport, _fit_forward
+from ugat_marl.grounding.phase import PhaseReport
 from ugat_marl.grounding.reports import (
     ForwardReport,
     TrainingRecord,
@@ -45,7 +45,9 @@ from ugat_marl.seeding import torch_generator
 
 
 def fit_forward(model: ForwardModel, log: TransitionLog, fitter: Fitter) -> ForwardReport:
-    return _fit_forward(model, stack_log(log, model.stack), fitter)
+    data = stack_log(log, model.stack)
+    changes = Changes("forward", model.view.of(data), data.next_observation, data.asked)
+    return fitter.fit_changes(model, changes, fitter.split(data, model.stack))
 
 
 LAYOUTS = {"a_0": AgentLayout(6, 3), "b_0": AgentLayout(4, 2, 2)}

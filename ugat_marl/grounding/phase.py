@@ -13,7 +13,7 @@ from torch import Tensor
 from ugat_marl.data import AgentLayout, TransitionLog
 from ugat_marl.errors import OptionError
 from ugat_marl.grounding.delays import EpisodeRewards
-from ugat_marl.grounding.fitting import Changes, Fitter, OffData, Questions, refuse_mismatch
+from ugat_marl.grounding.fitting import Changes, Fitter, OffData, Questions, Split, refuse_mismatch
 from ugat_marl.grounding.forward import ForwardConfig, ForwardModel
 from ugat_marl.grounding.gate import GateConfig
 from ugat_marl.grounding.inverse import InverseConfig, InverseModel
@@ -22,7 +22,6 @@ from ugat_marl.grounding.reports import (
     Calibration,
     FitReport,
     Floats,
-    ForwardReport,
     InverseReport,
     TrainingRecord,
     auroc,
@@ -91,20 +90,22 @@ class PhaseTransform(Transform):
         refuse_mismatch(real, simulated)
         f, h = self.forward, self.inverse
         d_real, d_sim = stack_log(real, self.stack), stack_log(simulated, self.stack)
+        real_rows, rows = (fitter.split(data, self.stack) for data in (d_real, d_sim))
         if on_top:
-            f.begin_as(_fit_simulated(f, d_sim, d_sim.asked, fitter, "world"))
-        forward = _fit_forward(f, d_real, fitter.further() if on_top else fitter)
-        means = _expected(f, d_sim, fitter)
+            f.begin_as(_fit_simulated(f, d_sim, d_sim.asked, rows, fitter, "world"))
+        own = fitter.further() if on_top else fitter
+        forward = own.fit_changes(f, self.training_data(d_real)[0], real_rows)
+        means = _expected(f, d_sim, rows, fitter)
         pairs = means if fitter.config.pairs == "smoothed" else d_sim.next_observation
-        inverse = _fit_inverse(h, d_sim, pairs, fitter)
-        held_out = fitter.split(d_sim, self.stack).held_out
-        held_out_real = fitter.split(d_real, self.stack).held_out
+        inverse = _fit_inverse(h, d_sim, pairs, rows, fitter)
         with torch.no_grad():
             predicted = _predicted(f, f.view.of(d_sim), d_sim.executed, self.draws)
-        agreement, u_on_predictions = inverse_accuracy(h, d_sim, predicted, held_out, self.draws)
+        agreement, u_on_predictions = inverse_accuracy(
+            h, d_sim, predicted, rows.held_out, self.draws
+        )
         following = d_real.next_observation
-        accuracy_on_real, u_on_real = inverse_accuracy(h, d_real, following, held_out_real)
-        accuracy_on_means, _ = inverse_accuracy(h, d_sim, means, held_out)
+        accuracy_on_real, u_on_real = inverse_accuracy(h, d_real, following, real_rows.held_out)
+        accuracy_on_means, _ = inverse_accuracy(h, d_sim, means, rows.held_out)
         return PhaseReport(
             agents=self.stack.agents,
             forward=forward,
@@ -170,20 +171,18 @@ def fit_inverse(model: InverseModel, log: TransitionLog, fitter: Fitter) -> Phas
         LogError: The log has other agents, or is too short to be split.
     """
     data = stack_log(log, model.stack)
-    return _fit_inverse(model, data, data.next_observation, fitter)
+    rows = fitter.split(data, model.stack)
+    return _fit_inverse(model, data, data.next_observation, rows, fitter)
 
 
-def _fit_forward(model: ForwardModel, data: StackedTransitions, fitter: Fitter) -> ForwardReport:
-    training_data = Changes("forward", model.view.of(data), data.next_observation, data.asked)
-    return fitter.fit_changes(model, training_data, fitter.split(data, model.stack))
-
-
-def _expected(forward: ForwardModel, data: StackedTransitions, fitter: Fitter) -> Tensor:
+def _expected(
+    forward: ForwardModel, data: StackedTransitions, rows: Split, fitter: Fitter
+) -> Tensor:
     """Return the expected next features of simulated states and actions, ``(agents, n, outputs)``.
 
     They are predictions of a model of the simulation that knows what was executed, as h does.
     """
-    model = _fit_simulated(forward, data, data.executed, fitter, "simulated")
+    model = _fit_simulated(forward, data, data.executed, rows, fitter, "simulated")
     with torch.no_grad():
         return model.predict(forward.view.of(data), data.executed)
 
@@ -192,6 +191,7 @@ def _fit_simulated(
     forward: ForwardModel,
     data: StackedTransitions,
     phases: Tensor,
+    rows: Split,
     fitter: Fitter,
     name: str,
 ) -> ForwardModel:
@@ -201,21 +201,21 @@ def _fit_simulated(
         forward: f.
         data: Transitions of the simulation.
         phases: Phases that the model knows, ``(agents, n)``: those asked for, or those executed.
+        rows: Rows to train on and to hold out.
         fitter: Fits.
         name: Name of the random stream and of the progress bar.
     """
     generator = torch_generator(fitter.seed, name)
     model = ForwardModel(forward.stack, forward.config, generator, view=forward.view)
     training_data = Changes(name, forward.view.of(data), data.next_observation, phases)
-    fitter.fit_changes(model, training_data, fitter.split(data, forward.stack))
+    fitter.fit_changes(model, training_data, rows)
     return model
 
 
 def _fit_inverse(
-    model: InverseModel, data: StackedTransitions, outcome: Tensor, fitter: Fitter
+    model: InverseModel, data: StackedTransitions, outcome: Tensor, rows: Split, fitter: Fitter
 ) -> PhaseInverseReport:
     """Fit h to name the executed action from `outcome`, ``(agents, n, features or more)``."""
-    rows = fitter.split(data, model.stack)
     inputs = model.inputs(model.view.of(data), outcome)
     off_data = OffData.around(inputs, rows.train, model.view)
     record = fitter.fit_answers(model, Questions(inputs, data.executed, off_data), rows)

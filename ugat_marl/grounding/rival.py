@@ -8,7 +8,7 @@ street tell which of the policies is best.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -18,7 +18,7 @@ from ugat_marl.data import TransitionLog
 from ugat_marl.effects import EVERYWHERE, Effect, LateGreen
 from ugat_marl.grounding.delays import episode_rewards, matching_delays
 from ugat_marl.grounding.street import Simulation, StreetWorld
-from ugat_marl.grounding.worlds import EPISODES_PER_DELAY
+from ugat_marl.grounding.worlds import EPISODES_PER_DELAY, under_each_delay
 from ugat_marl.policies import Learner, Policy
 from ugat_marl.seeding import derive_seed
 
@@ -27,6 +27,17 @@ LONGEST_S = 5
 
 ROLL_OUTS = EPISODES_PER_DELAY * (LONGEST_S + 1)
 """Episodes of the simulation with which rewards are matched, per iteration."""
+
+
+def judged_as(late_s: float | None) -> tuple[str, str]:
+    """Return the name of a rival among the policies that are compared, and its words.
+
+    Args:
+        late_s: Constant delay of all greens, in s; None for the delay that rewards ask for.
+    """
+    if late_s is None:
+        return "of_the_rival", "the policy of late greens"
+    return f"of_the_rival_{late_s:g}_s_late", f"the policy of greens {late_s:g} s late"
 
 
 @dataclass
@@ -58,7 +69,7 @@ class Rival:
     @property
     def judged(self) -> str:
         """Name among the policies that are compared, see `street_training.JUDGED`."""
-        return f"of_the_{self.name.replace(' ', '_')}"
+        return judged_as(self.late_s)[0]
 
     def begin(self) -> Learner:
         """Return the learner; it begins with what plain training taught."""
@@ -104,12 +115,14 @@ def matched_delays(
         Agent to delay in s.
     """
     agents = list(real.provenance.layouts)
-    parts = [(s, k) for s in range(LONGEST_S + 1) for k in range(EPISODES_PER_DELAY)]
-    worlds = [StreetWorld(_late({EVERYWHERE: float(late_s)})) for late_s, _ in parts]
-    seeds = [derive_seed(seed, "late greens", *part) for part in parts]
-    logs = simulation.logs(worlds, policy, seeds, None, on_done)
-    each = [episode_rewards(log, agents).mean(0) for log in logs]
-    simulated = np.reshape(each, (LONGEST_S + 1, EPISODES_PER_DELAY, -1)).mean(1)
+
+    def play(pairs: Sequence[tuple[int, int]]) -> list[TransitionLog]:
+        worlds = [StreetWorld(_late({EVERYWHERE: float(late_s)})) for late_s, _ in pairs]
+        seeds = [derive_seed(seed, "late greens", *pair) for pair in pairs]
+        return simulation.logs(worlds, policy, seeds, None, on_done)
+
+    logs = under_each_delay(LONGEST_S, play)
+    simulated = np.array([episode_rewards(log, agents).mean(0) for log in logs])
     delay_s = matching_delays(episode_rewards(real, agents).mean(0), simulated)
     return dict(zip(agents, delay_s.round(1).tolist(), strict=True))
 

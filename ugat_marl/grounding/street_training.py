@@ -37,10 +37,11 @@ from ugat_marl.grounding.fitting import Fitter
 from ugat_marl.grounding.oversaturation import Oversaturation
 from ugat_marl.grounding.posterior import WorldPrior
 from ugat_marl.grounding.residual import Residual
-from ugat_marl.grounding.rival import ROLL_OUTS, Rival, late_world, matched_delays
+from ugat_marl.grounding.rival import ROLL_OUTS, Rival, judged_as, late_world, matched_delays
 from ugat_marl.grounding.state import RunState
 from ugat_marl.grounding.street import (
     ENOUGH,
+    RIVALS,
     FitHistory,
     FittedStreet,
     Simulation,
@@ -70,9 +71,7 @@ JUDGED = {
     "before": "the policy kept so far",
     "after_the_lessons": "the policy after the lessons",
     "after": "the policy after training",
-    "of_the_rival": "the policy of late greens",
-    "of_the_rival_3_s_late": "the policy of greens 3 s late",
-    "of_the_rival_5_s_late": "the policy of greens 5 s late",
+    **dict(judged_as(late_s) for rivals in RIVALS.values() for late_s in rivals),
     "of_the_rule": "the rule",
 }
 """Metrics ``judged/<name>`` of the policies that are compared in the fitted street, in words."""

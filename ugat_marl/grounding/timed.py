@@ -188,7 +188,7 @@ class TimedTransform(Transform):
         if on_top:
             self.forward.begin_as(model)
         own = fitter.further() if on_top else fitter
-        training_data = Changes("forward", view.of(street), street.outcome, street.asked)
+        training_data, _ = self.training_data(street)
         f = own.fit_changes(self.forward, training_data, fitter.split(street, stack))
         begins = _begins(data, stack)
         known = ModelErrors.of(model, replace(data, weight=rows.train * begins))

@@ -114,15 +114,13 @@ class SimulatedWorld:
             seed: Root seed, as for `collect`.
             on_done: Function called after each roll-out.
         """
-        lates = range(self._most_delay_s + 1)
-        parts = [
-            (derive_seed(seed, "matching", self._name, iteration, late, episode), late)
-            for late in lates
-            for episode in range(EPISODES_PER_DELAY)
-        ]
-        logs = self._played_by(policy, parts, on_done)
-        size = EPISODES_PER_DELAY
-        return [TransitionLog.concatenate(logs[late * size : late * size + size]) for late in lates]
+
+        def play(pairs: Sequence[tuple[int, int]]) -> list[TransitionLog]:
+            root = seed, "matching", self._name, iteration
+            parts = [(derive_seed(*root, *pair), pair[0]) for pair in pairs]
+            return self._played_by(policy, parts, on_done)
+
+        return under_each_delay(self._most_delay_s, play)
 
     @property
     def roll_outs_under_delays(self) -> int:
@@ -148,6 +146,20 @@ class SimulatedWorld:
     def stop(self) -> None:
         """Stop the running roll-outs; later ones begin as usual."""
         self._stop.set()
+
+
+def under_each_delay(
+    most_delay_s: int, play: Callable[[Sequence[tuple[int, int]]], Sequence[TransitionLog]]
+) -> list[TransitionLog]:
+    """Return a log of `EPISODES_PER_DELAY` episodes for each delay of 0, 1, ... `most_delay_s` s.
+
+    Args:
+        most_delay_s: Longest delay of all greens, in s.
+        play: Runs an episode for each pair of delay and number; returns their logs in this order.
+    """
+    size = EPISODES_PER_DELAY
+    logs = play([(late, episode) for late in range(most_delay_s + 1) for episode in range(size)])
+    return [TransitionLog.concatenate(logs[k : k + size]) for k in range(0, len(logs), size)]
 
 
 def _for_policy(make_env: Callable[..., TrafficEnv], policy: Policy) -> Callable[[], TrafficEnv]:
