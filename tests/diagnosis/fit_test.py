@@ -569,11 +569,14 @@ def test_values_that_the_data_rule_out_are_in_no_interval() -> None:
     jumping = a_fitter({"headway": 1.4}, street=17)
     jumping.engine = Jumping()
     model = jumping.simulate(start((HEADWAY, 1.4)))
-    for error in (0.01, 3.0):  # below, the range ends within two of the larger one
+    for error, end in ((0.01, 0.02), (3.0, 0.4)):  # headway 1.0 changes nothing
         bound = _possible(jumping, model, np.array([error]))
-        assert bound == pytest.approx([2 * error / 1.96], rel=1e-3)
+        assert bound == pytest.approx([end / 1.96], rel=1e-3)
     straight = a_fitter({"headway": 1.4}, street=17)
     near = _possible(straight, straight.simulate(start((HEADWAY, 1.4))), np.array([0.001]))
+    assert near == pytest.approx([0.4 / 1.96], rel=1e-3), "without it the data fit far worse"
+    mild = a_fitter({"headway": 1.02}, street=17)
+    near = _possible(mild, mild.simulate(start((HEADWAY, 1.02))), np.array([0.001]))
     assert near == [np.inf], "values so near fit as well"
 
 

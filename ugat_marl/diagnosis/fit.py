@@ -18,6 +18,7 @@ from ugat_marl.diagnosis.hypotheses import (
     WINDOWS_IN_THE_LOG,
     Hypothesis,
     Members,
+    each_left_out,
     effects_of,
 )
 from ugat_marl.diagnosis.propose import Direction
@@ -477,8 +478,10 @@ def _straightness(
 def _possible(fitter: Fitter, model: Fitted, errors: Array) -> Array:
     """Return the largest standard errors that the data leave possible, ``(free values,)``.
 
-    An interval ends before a value with which the data fit worse beyond doubt. Where no such value
-    was simulated on a side, the error has no bound.
+    An interval ends half a grid step before a value with which the data fit worse beyond doubt.
+    Such a value has to be known on both sides, as an interval is as long on one as on the other.
+    Only the value that changes nothing suffices alone: it is in no interval if the data fit so much
+    worse without the effect.
 
     Args:
         fitter: Simulator of models.
@@ -486,13 +489,23 @@ def _possible(fitter: Fitter, model: Fitted, errors: Array) -> Array:
         errors: Standard errors of its free values, ``(free values,)``.
     """
     thresholds, cost = fitter.thresholds, fitter.simulate(model.members).cost
+
+    def impossible(members: Members) -> bool:
+        return fitter.simulate(members).cost - cost > thresholds.beyond_doubt**2
+
     bounds: list[float] = []
-    for moves in _moves(fitter, model, errors):
-        nearest = {move > 0: math.inf for move, _ in moves}
-        for move, members in moves:
-            if fitter.simulate(members).cost - cost > thresholds.beyond_doubt**2:
-                nearest[move > 0] = min(nearest[move > 0], abs(move))
-        bounds.append(max(nearest.values(), default=math.inf) / thresholds.half_interval)
+    rest, tried = each_left_out(model.members), _moves(fitter, model, errors)
+    for (hypothesis, values), without in zip(model.members, rest, strict=True):
+        for value in values:
+            moves = tried[len(bounds)]
+            nearest = {move > 0: math.inf for move, _ in moves}
+            for move, members in moves:
+                if impossible(members):
+                    nearest[move > 0] = min(nearest[move > 0], abs(move))
+            end = max(nearest.values(), default=math.inf)
+            if hypothesis.nothing is not None and len(values) == 1 and impossible(without):
+                end = min(end, abs(hypothesis.nothing[0] - value))
+            bounds.append((end - hypothesis.step / 2) / thresholds.half_interval)
     return np.array(bounds)
 
 
