@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 
 from tests.interrupts import KillAt
 from tests.runs import SMALL, numbers, play_nothing, weights
-from ugat_marl.data import TransitionLog
+from ugat_marl.data import TransitionLog, write_checkpoint
 from ugat_marl.effects import DetectionZone, load_scenario, scenario_in_domain
 from ugat_marl.envs import parallel_env
 from ugat_marl.errors import CheckpointError, LogError, OptionError, UnknownNameError
@@ -143,6 +143,9 @@ def test_a_street_survives_its_file_and_refuses_another_network(
     assert again.as_dict(lanes_of) == street.as_dict(lanes_of)
     with pytest.raises(CheckpointError, match="other lanes"):
         FittedStreet.load(tmp_path / "street.pt", replace(prior, lanes=prior.lanes[:2]))
+    write_checkpoint(tmp_path / "old.pt", "street", {"lanes": list(prior.lanes)})
+    with pytest.raises(CheckpointError, match="another version"):
+        FittedStreet.load(tmp_path / "old.pt", prior)
     with pytest.raises(CheckpointError, match="another library"):
         FittedStreet.load(tmp_path / "street.pt", replace(prior, library=prior.library[:2]))
 

@@ -298,11 +298,20 @@ def test_a_turn_without_green_holds_up_the_lane_that_it_shares(tmp_path: Path) -
         going = [index[road] for road in roads]
         return "".join("G" if i in going else letter for i, letter in enumerate(letters))
 
-    def used_s(*programme: tuple[float, str]) -> float:
-        return _green_s(replace(light, programme=programme), "NM_0", {"MS": 50, "ME": 50}, 2.0)
+    def used_s(*programme: tuple[float, str], left: float = 50.0) -> float:
+        shares = {"MS": 50.0, "ME": left}
+        twice = [*light.links, *(link for link in light.links if link.to_edge == "MS")]
+        used = (
+            _green_s(replace(light, programme=programme, links=tuple(links)), "NM_0", shares, 2.0)
+            for links in (light.links, twice)
+        )
+        once, again = used
+        assert once == again, "links to one road are one road"
+        return once
 
     assert used_s((30.0, green("MS", "ME")), (60.0, letters)) == pytest.approx(30)
     assert used_s((30.0, green("MS")), (60.0, letters)) == pytest.approx(0)  # a left turn is first
+    assert used_s((30.0, green("MS")), (60.0, letters), left=1e-3) == 0  # sooner or later
     # Greens so long that each ends with a vehicle that waits for the other: 1 + 1/2 + 1/4 ... go.
     assert used_s((60.0, green("MS")), (60.0, green("ME"))) == pytest.approx(2 * 2 * 2)
     both = used_s((30.0, green("MS", "ME")), (3.0, green("ME")), (60.0, letters))

@@ -480,8 +480,8 @@ def _possible(fitter: Fitter, model: Fitted, errors: Array) -> Array:
 
     An interval ends half a grid step before a value with which the data fit worse beyond doubt.
     Such a value has to be known on both sides, as an interval is as long on one as on the other.
-    Only the value that changes nothing suffices alone: it is in no interval if the data fit so much
-    worse without the effect.
+    Only the value that changes nothing suffices alone: neither it nor the values within half of
+    `Hypothesis.least` of it are in an interval if the data fit so much worse without the effect.
 
     Args:
         fitter: Simulator of models.
@@ -504,7 +504,7 @@ def _possible(fitter: Fitter, model: Fitted, errors: Array) -> Array:
                     nearest[move > 0] = min(nearest[move > 0], abs(move))
             end = max(nearest.values(), default=math.inf)
             if hypothesis.nothing is not None and len(values) == 1 and impossible(without):
-                end = min(end, abs(hypothesis.nothing[0] - value))
+                end = min(end, abs(hypothesis.nothing[0] - value) - hypothesis.least / 2)
             bounds.append((end - hypothesis.step / 2) / thresholds.half_interval)
     return np.array(bounds)
 

@@ -229,8 +229,7 @@ class Replay:
         steps = round((begin_s - settings.begin_s) / step_s)
         earliest = round((earliest_s - settings.begin_s) / step_s, 6)
         if earliest < steps:
-            # by an even number of steps, so that lights change as `shown` says
-            steps = max(steps - 2 * math.ceil((steps - earliest) / 2), 0)
+            steps = max(math.floor(earliest), 0)
         return settings.begin_s + step_s * steps
 
     def asked(self, effects: Sequence[Effect], period: Period, seed: int) -> Mapping[str, Array]:
@@ -411,7 +410,7 @@ def _ticks(
     """
     shown: list[tuple[int, str]] = []
     for time, state in log:
-        tick = round((time - begin_s) / step_s)
+        tick = math.floor((time - begin_s) / step_s + 0.5)  # half up, whatever the begin
         if shown and shown[-1][0] == tick:
             shown[-1] = (tick, state)
         elif not shown or shown[-1][1] != state:

@@ -271,7 +271,7 @@ def _alphas(name: str, base: UgatConfig) -> list[Setting]:
     pooled = replace(dynamic, gate=replace(dynamic.gate, scope="pooled"))
     return [
         *(
-            _ugat(variant_name(name, f"α = {a:g}"), replace(base, gate=_static(base, a)))
+            _ugat(variant_name(name, f"α = {a}"), replace(base, gate=_static(base, a)))
             for a in sorted(alphas)
         ),
         _ugat(GROUNDED_NAME[name], dynamic),

@@ -124,6 +124,8 @@ def log_of_measured(
             f"see; use one of {', '.join(name for name in OBSERVATION_UNITS if name != 'waiting')}"
         )
     left_out = measured.of("heldout") if periods == "fit" else ()
+    if left_out and not measured.of("fit"):
+        raise MeasuredDataError("all periods are held out; --periods all takes them")
     if left_out:
         measured = replace(measured, periods=measured.of("fit"))
     street = _Street(measured, scenario, network, observation, source, config or DetectionConfig())

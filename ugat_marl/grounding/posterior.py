@@ -313,7 +313,7 @@ class Posterior:
 
         Args:
             worlds: The prior.
-            simulated: At least ten simulated worlds.
+            simulated: Simulated worlds, more than values that are estimated for the network and 1.
             street: Statistics of the street's log.
         """
         simulated = [replace(item, summary=item.summary.where(street.usable)) for item in simulated]
@@ -457,13 +457,8 @@ class Posterior:
         """Restore `state_dict`.
 
         Raises:
-            CheckpointError: A value is missing or of a wrong shape, or an older version wrote it.
+            CheckpointError: A value is missing or of a wrong shape.
         """
-        if "effect_errors" in state:
-            raise CheckpointError(
-                "the worlds in the checkpoint are of an older version, which estimated them "
-                "differently: begin the run anew"
-            )
         names = [*_NUMBERS, *(field.name for field in fields(Calibration))]
         try:
             parts: dict[str, NDArray[np.float64]]

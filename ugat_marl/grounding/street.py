@@ -76,6 +76,8 @@ from ugat_marl.seeding import derive_seed, numpy_generator
 
 KIND = "street"
 """Name of this kind of checkpoint, written into the file."""
+VERSION = 2
+"""Version of this kind of checkpoint. It changes with what a fit holds."""
 
 PARTS = ("channel", "eyes", "service", "effects")
 """Parts of a street, each of which can be left out."""
@@ -277,7 +279,11 @@ class FittedStreet:
             path: The file.
             simulated: Simulated worlds for a further fit.
         """
-        content: dict[str, Any] = {"lanes": list(self.lanes), "interval_s": self.interval_s}
+        content: dict[str, Any] = {
+            "version": VERSION,
+            "lanes": list(self.lanes),
+            "interval_s": self.interval_s,
+        }
         for name in ("channel", "eyes", "posterior"):
             part = getattr(self, name)
             content[name] = None if part is None else part.state_dict()
@@ -301,6 +307,11 @@ class FittedStreet:
             CheckpointError: The file is unreadable, or of another network.
         """
         content = read_checkpoint(path, KIND)
+        if content.get("version") != VERSION:
+            raise CheckpointError(
+                f"{path}: the street was fitted by another version, in another way: begin the run "
+                "anew"
+            )
         if tuple(content.get("lanes", ())) != worlds.lanes:
             raise CheckpointError(f"{path}: the street has other lanes than this network")
         if content.get("library") not in (None, [vars(item) for item in worlds.library]):

@@ -208,8 +208,12 @@ def _values_of_class(given: type, inside: tuple[int, ...]) -> list[str]:
 
 
 def _members(kind: type) -> list[tuple[str, Any]]:
-    """Return the members of a class, and of those of its bases that have no file."""
-    kinds = [one for one in kind.__mro__ if one is kind or _file_of(one) is None]
+    """Return the members of a class, and of its bases that were typed at the same place."""
+    kinds = [
+        one
+        for one in kind.__mro__
+        if one is kind or (one.__module__ == kind.__module__ and _is_typed(one))
+    ]
     return [member for one in kinds for member in vars(one).items()]
 
 
@@ -330,6 +334,12 @@ def _file_of(kind: Any) -> Path | None:
     return Path(file) if file is not None and Path(file).is_file() else None
 
 
+def _is_typed(kind: Any) -> bool:
+    """Return True for a class or function of no file, neither a source nor a compiled module."""
+    module = sys.modules.get(kind.__module__)
+    return _file_of(kind) is None and getattr(module, "__file__", None) is None
+
+
 def _file_hash(kind: Any) -> str | None:
     """Return the hash of the file that defines a class or function, or else of its code.
 
@@ -343,8 +353,9 @@ def _file_hash(kind: Any) -> str | None:
             _loaded[place] = loaded, file_hash(file)
         return _loaded[place][1]
     members = [one for _, one in _members(kind)] if inspect.isclass(kind) else [kind]
+    holding = _HOLDING if _is_typed(kind) else ()
     functions = [
-        one for each in members for one in (each, *(getattr(each, key, None) for key in _HOLDING))
+        one for each in members for one in (each, *(getattr(each, key, None) for key in holding))
     ]
     codes = [getattr(one, "__code__", None) for one in functions]
     texts = [_code_text(code) for code in codes if code is not None]

@@ -531,20 +531,28 @@ def _green_s(
         headway_s: Time between two vehicles in permanent green, s.
     """
     links = [link for link in intersection.links if link.from_lane == lane]
-    ahead = [link for link in links if flows_vph.get(link.to_edge, 0.0) > 0]
+    ahead: dict[str, list[Link]] = defaultdict(list)
+    for link in links:
+        if flows_vph.get(link.to_edge, 0.0) > 0:
+            ahead[link.to_edge].append(link)
     if not ahead:
         return sum(
             seconds * may_go([link], state) / len(links)
             for seconds, state in intersection.programme
             for link in links
         )
-    share = np.array([flows_vph[link.to_edge] for link in ahead], dtype=np.float64)
+    going = [
+        np.array([any(may_go([link], state) for link in to) for to in ahead.values()])
+        for _, state in intersection.programme
+    ]
+    if not np.all(np.any(going, axis=0)):
+        return 0.0  # a vehicle that never has green is the first one at last
+    share = np.array([flows_vph[road] for road in ahead], dtype=np.float64)
     share /= share.sum()
     count = len(ahead)
     still = np.eye(count + 1)
     cycle = still  # probability of the next first vehicle by the present one; last, the green used
-    for seconds, state in intersection.programme:
-        goes = np.array([may_go([link], state) for link in ahead])
+    for (seconds, _), goes in zip(intersection.programme, going, strict=True):
         one_leaves = still.copy()
         one_leaves[:count, :count] = np.where(goes[:, None], share, np.eye(count))
         one_leaves[:count, count] = headway_s * goes

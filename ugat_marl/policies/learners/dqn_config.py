@@ -65,7 +65,7 @@ class DQNConfig:
     with mean 0.
 
     Each number of an observation is divided by its root mean square over the same decisions; one
-    that was 0 in all of them, such as a phase that the teacher never chose, stays as it is. The
+    for which it is below 0.01, such as a phase that the teacher never chose, stays as it is. The
     reason is their size: a lane with five vehicles is 0.125 in the observation "count", the current
     phase is 1, and the weights of the lane would grow slowly.
 
