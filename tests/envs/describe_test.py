@@ -139,6 +139,7 @@ def test_workers_of_a_vector_import_the_function() -> None:
     [
         (lambda view: view.vehicles.reshape(1, -1), "shape (1,"),
         (lambda view: [float("nan")], "not finite"),
+        (lambda view: None, "returned 'None'"),
         (lambda view: "text", "returned .text. .str.; it must return one row"),
     ],
 )

@@ -316,6 +316,9 @@ def test_infos_may_hold_no_masks_and_more_than_the_agents() -> None:
     """The kit allows both."""
     policy = OwnPolicy(lambda observations: dict.fromkeys(observations, 2), "mine", {})
     assert policy.act({"a": [1]}, {"__common__": {"time_s": 1.0}, "a": {}}) == {"a": 2}
+    seen = {"a": [1], "b": [1]}
+    with pytest.raises(OptionError, match="'mine' returned a phase for 'foo'; agents: a, b"):
+        OwnPolicy(lambda _: {"a": 0, "b": 0, "foo": 0}, "mine", {}).act(seen, {})
     with pytest.raises(OptionError, match="no phase for 'b'"):
         OwnPolicy(lambda observations: {"a": 0}, "mine", {}).act({"a": [1], "b": [1]}, {})
 
@@ -391,7 +394,7 @@ class Bare(Lazy):
         (Unready, OptionError, "no network yet"),
         (Bare, OptionError, "a int has no act"),
         (Lazy(), OptionError, "give its class"),
-        (3, OptionError, "is a int"),
+        (3, OptionError, "is of the kind int"),
     ],
 )
 def test_what_a_learner_lacks_is_said_before_the_first_episode(

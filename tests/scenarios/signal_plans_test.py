@@ -345,7 +345,7 @@ def test_columns_may_have_capitals(tmp_path: Path) -> None:
         (HEAD + GOOD.replace("60,0,1,1", "60,0,x,1", 1), "line 2: ring = 'x' is not a number"),
         (HEAD + GOOD.replace("NBT NBR SBT SBR NBL SBL", ""), "line 2: movements is blank"),
         (HEAD + GOOD.replace("NBT NBR", "NBT NXR"), "it has no movement 'NXR'; it has EBL"),
-        (HEAD + GOOD.replace("NBL SBL", ""), "NBL SBL are in no phase, and"),
+        (HEAD + GOOD.replace("NBL SBL", ""), "no phase serves NBL SBL, and"),
         (HEAD + GOOD.replace("NBL SBL", "NBL SBL WBT"), "are green together and cross"),
         (HEAD + GOOD.replace("NBL SBL", "NBL SBL EBL"), "EBL are green together and cross"),
         (HEAD + (GOOD + "A1,60,0,1,1,NBL WBT,30,3,2\n").replace("A1,60", "A1,90"),

@@ -234,6 +234,8 @@ class Observer:
         assert self._function is not None
         given = self._function(view)
         try:
+            if given is None:  # which NumPy takes for a number that is not finite
+                raise TypeError
             with np.errstate(over="ignore"):  # what float32 cannot hold is infinite, and refused
                 values = np.asarray(given, dtype=np.float64).astype(np.float32)
         except (TypeError, ValueError):

@@ -152,7 +152,7 @@ class UgatConfig:
     def __post_init__(self) -> None:
         if self.grounding not in GROUNDINGS:
             raise UnknownNameError("grounding", self.grounding, GROUNDINGS)
-        require_kinds(self, "ugat")
+        require_kinds(self, "training:")
         require_least(0, pretrain_episodes=self.pretrain_episodes, iterations=self.iterations)
         require_least(1, grounded_episodes=self.grounded_episodes)
         require_least(1, sim_rollouts=self.sim_rollouts, real_rollouts=self.real_rollouts)

@@ -241,6 +241,11 @@ class OwnPolicy:
         return actions
 
     def _require_phases(self, actions: Actions, observations: Observations, infos: Infos) -> None:
+        if unknown := sorted(map(repr, actions.keys() - observations.keys())):
+            raise OptionError(
+                f"policy {self._name!r} returned a phase for {', '.join(unknown)}; agents: "
+                f"{', '.join(observations)}"
+            )
         for agent in observations:
             if agent not in actions:
                 raise OptionError(
@@ -531,7 +536,7 @@ class OwnLearnerFactory:
             )
         elif not callable(self._make):
             raise OptionError(
-                f"learner {name!r} is a {type(self._make).__name__}; give a class with "
+                f"learner {name!r} is of the kind {type(self._make).__name__}; give a class with "
                 "learn(env, episodes) and policy(), or a function that makes such an object"
             )
         self._texts = tuple(settings)

@@ -396,8 +396,8 @@ def _check_movements(plan: SignalPlan, known: set[str], source: str) -> None:
         )
     if never := sorted(known - listed):
         raise ScenarioError(
-            f"{where}: {' '.join(never)} {'is' if len(never) == 1 else 'are'} in no phase, and "
-            "vehicles there would wait for ever; add to a phase"
+            f"{where}: no phase serves {' '.join(never)}, and vehicles there would wait for ever; "
+            "add each to a phase"
         )
 
 
