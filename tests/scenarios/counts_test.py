@@ -151,7 +151,7 @@ def test_origins_and_destinations(tmp_path: Path) -> None:
             "edge,count,begin,begin_s\nwest1_A1,5,7:00,9\n",
             "begin and begin_s; keep one",
         ),
-        ("--counts", "edge,count\nwest1_A1,n/a\n", "of at least 0; write whole numbers w"),
+        ("--counts", "edge,count\nwest1_A1,n/a\n", "of at least 0; leave it blank where nobody"),
         ("--counts", "edge,count\nwest1_A1,-1\n", "line 2: count = '-1' is not a number of at"),
         ("--counts", "edge,count\nwest1_A1,1_000\n", "line 2: count = '1_000' is not a number"),
         ("--counts", "edge,count\nwest1_A1,١٢\n", "line 2: count = '١٢' is not a number"),
@@ -184,8 +184,19 @@ def test_origins_and_destinations(tmp_path: Path) -> None:
         (
             "--counts",
             "edge,count\nwest1_A1,5\nA1_B1,5\nwest1_A1,7\n",
-            "line 4: begin_s = 0 is before the end of an earlier interval of west1_A1, "
-            "end_s = 3600 (line 2); write intervals that do not overlap",
+            "line 4: west1_A1 is counted in line 2 as well, and there is no column begin; name",
+        ),
+        (
+            "--counts",
+            "from,to,count,Von,Bis\nwest1_A1,A1_B1,5,6:50,7:05\nwest1_A1,A1_B1,6,7:05,7:20\n",
+            "line 3: west1_A1 -> A1_B1 is counted in line 2 as well, and there is no column begin "
+            "(is it 'von', 'bis'?); name the interval's columns begin and end for times of day",
+        ),
+        (
+            "--counts",
+            "edge,count,begin_s,Bis\nwest1_A1,5,0,900\nwest1_A1,6,900,1800\n",
+            "line 3: west1_A1 is counted in line 2 as well, and there is no column end (is it "
+            "'bis'?)",
         ),
         (
             "--counts",

@@ -19,7 +19,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from ugat_marl.errors import ScenarioError, listed, nearest
+from ugat_marl.errors import ScenarioError, first_names, listed, nearest
 from ugat_marl.files import chunks_of, parse_xml, read_bytes, read_xml, write_whole, xml_bytes
 from ugat_marl.progress import Reporter
 from ugat_marl.scenarios.csv_tables import columns_of, delimiter_of, rows_of
@@ -155,6 +155,8 @@ def read_rows(
         raise ScenarioError(f"{path}: no row counts a vehicle; fill in the column count")
     if not pairs:
         _refuse_thousands(written, path)
+        timeless = [name for name, seconds in _TIMES.items() if not {name, seconds} & {*columns}]
+        _refuse_overlaps(rows_read, path, timeless, others)
     _refuse_all_outside(rows_read, path, begin_s, end_s)
     return rows_read
 
@@ -291,7 +293,7 @@ def _number(text: str | None, key: str, where: str) -> float:
         way_out = ""
         if key == "count":
             way_out = (
-                "; write whole numbers without separators, and leave it blank where nobody counted"
+                "; leave it blank where nobody counted, and write thousands without a separator"
             )
         elif ":" in (text or ""):
             way_out = "; write seconds, or a time of day such as 07:15"
@@ -318,7 +320,6 @@ def from_counts(path: Path, begin_s: float, length_s: float, seed: int) -> Vehic
         streets = Streets.of(root)
         _require_roads(rows, streets, path, network)
         _require_turns(rows, streets, path)
-        _refuse_overlaps(rows, path)
         with tempfile.TemporaryDirectory(prefix="ugat_marl-") as name:
             work = Path(name)
             drives = walked(streets, _CANDIDATES_VPH, (1.0, 1.0, 1.0), 3600.0, seed)
@@ -381,16 +382,33 @@ def _require_turns(rows: Iterable[Row], streets: Streets, path: Path) -> None:
                 )
 
 
-def _refuse_overlaps(rows: Iterable[Row], path: Path) -> None:
-    """Refuse counts that begin before an earlier one has ended: vehicles would count twice."""
+def _refuse_overlaps(
+    rows: Iterable[Row], path: Path, missing: Sequence[str], unread: Sequence[str]
+) -> None:
+    """Refuse counts that begin before an earlier one has ended: vehicles would count twice.
+
+    Args:
+        rows: Rows of the table.
+        path: The table.
+        missing: Times of an interval, "begin" or "end", without a column.
+        unread: Columns that are not read; one of them may hold a missing time.
+    """
     latest: dict[tuple[str, ...], Row] = {}
     for row in sorted(rows, key=lambda row: (row.begin_s, row.line)):
         before = latest.get(row.roads)
         if before and row.begin_s < before.end_s - 1e-3:  # files hold milliseconds
+            where, roads = f"{path}, line {row.line}", " -> ".join(row.roads)
+            if missing:
+                guess = f" (is it {first_names([*map(repr, unread)])}?)" if unread else ""
+                raise ScenarioError(
+                    f"{where}: {roads} is counted in line {before.line} as well, and there is no "
+                    f"column {missing[0]}{guess}; name the interval's columns begin and end for "
+                    "times of day, or begin_s and end_s for seconds"
+                )
             raise ScenarioError(
-                f"{path}, line {row.line}: {row.begin} is before the end of an earlier interval of "
-                f"{' -> '.join(row.roads)}, {before.end} (line {before.line}); write intervals "
-                "that do not overlap, and no totals of several of them"
+                f"{where}: {row.begin} is before the end of an earlier interval of {roads}, "
+                f"{before.end} (line {before.line}); write intervals that do not overlap, and no "
+                "totals of several of them"
             )
         latest[row.roads] = row
 
