@@ -490,6 +490,18 @@ WRONG: dict[str, tuple[dict[str, Change], str]] = {
         {"detectors.csv": lambda text: text.replace(",", ";").replace("40.0", "40.0;7")},
         r"line 2: \d+ cells",
     ),
+    "semicolons under commas": (
+        {"signals.csv": lambda text: text.replace(",", ";").replace(";", ",", 3)},
+        r"line 2: its cells are separated by ';', and the names in line 1 by ','",
+    ),
+    "decimal commas under commas": (
+        {"signals.csv": lambda text: text.replace(",", ";").replace(".", ",").replace(";", ",", 3)},
+        r"line 2: its cells are separated by ';', and the names in line 1 by ','",
+    ),
+    "commas under semicolons": (
+        {"signals.csv": replaced(",", ";", 3)},
+        r"line 2: its cells are separated by ',', and the names in line 1 by ';'",
+    ),
     "a line for Excel": ({"detectors.csv": lambda text: "sep=,\n" + text}, r"remove it"),
     "no detectors": ({"detectors.csv": lambda text: text.split("\n")[0] + "\n"}, r"no detectors"),
     "column twice": (

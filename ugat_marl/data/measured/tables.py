@@ -368,7 +368,7 @@ def _read_csv(path: Path, findings: list[Finding]) -> pl.DataFrame:
             "export it again"
         )
     try:
-        head = content.decode("utf-8").split("\n", 1)[0]
+        head, row = [*content.decode("utf-8").split("\n", 2), ""][:2]
     except UnicodeDecodeError as error:
         line = content[: error.start].count(b"\n") + 1
         raise MeasuredDataError(
@@ -381,6 +381,11 @@ def _read_csv(path: Path, findings: list[Finding]) -> pl.DataFrame:
             f"{path}: line 1 is {head.strip()!r}, which is for Excel alone; remove it"
         )
     mark = next((one for one in (";", "\t") if one in head and "," not in head), ",")
+    if other := _other_mark(head, row, mark):
+        raise MeasuredDataError(
+            f"{path}, line 2: its cells are separated by {other!r}, and the names in line 1 by "
+            f"{mark!r}; separate all by one of them"
+        )
     if not content.endswith((b"\n", b"\r")):
         findings.append(
             Finding(f"{path.name}: the last line has no end; the file may have been cut short")
@@ -405,6 +410,16 @@ def _read_csv(path: Path, findings: list[Finding]) -> pl.DataFrame:
 
 _DECIMAL_COMMA = r"^([-\d :T]*\d),(\d+)(Z|[+-]\d\d(?::?\d\d)?)?\s*$"
 """A number or a local time with a comma before its decimals."""
+
+
+def _other_mark(head: str, row: str, mark: str) -> str | None:
+    """Return what separates as many cells of a row as line 1 has, if `mark` does not."""
+    with contextlib.suppress(csv.Error):
+        named = len(next(csv.reader([head], delimiter=mark)))
+        cells = {one: len(next(csv.reader([row], delimiter=one), [])) for one in ",;\t"}
+        if named > 1 and cells[mark] != named:
+            return next((one for one, count in cells.items() if count == named), None)
+    return None
 
 
 def _wide_line(path: Path, content: bytes, mark: str) -> str | None:
