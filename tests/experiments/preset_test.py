@@ -135,6 +135,28 @@ def test_a_threshold_counts_in_its_own_mode_alone(
     assert GateConfig(mode="infinite", static_alpha=0.3).static_alpha == 0.3
 
 
+@pytest.mark.parametrize("mode", ["static", "infinite"])
+@pytest.mark.parametrize("epochs", ["4", "20"])
+@pytest.mark.parametrize("command", [["train", "single-v1"], ["paper", "main"]])
+def test_a_window_counts_with_a_dynamic_alpha_alone(
+    command: list[str],
+    epochs: str,
+    mode: str,
+    tmp_path: Path,
+    capsys: pytest.CaptureFixture[str],
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    monkeypatch.setattr("ugat_marl.experiments.paper.perform_all", None)
+    words = ["--gate.mode", mode, "--gate.window-epochs", epochs, "--out", str(tmp_path / "run")]
+    assert main([*command, *words]) == 2
+    told = f"--gate.window-epochs {epochs} counts with --gate.mode dynamic alone, not {mode}"
+    assert told in capsys.readouterr().err
+    gate = GateConfig(mode=mode, window_epochs=int(epochs))
+    gate.require_settings_count(also_dynamic=True)  # as the table "alpha" trains
+    GateConfig(mode=mode).require_settings_count()
+    GateConfig(window_epochs=int(epochs)).require_settings_count()
+
+
 @pytest.mark.parametrize("preset", [None, "paper"])
 def test_a_plan_is_made_from_the_defaults(preset: Any, tmp_path: Path) -> None:
     class Begun(Exception):

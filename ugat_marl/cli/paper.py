@@ -87,7 +87,7 @@ class _Paper:
     def run(self, console: Console) -> int:
         """Train and evaluate; print the table and write it as Markdown, CSV and PNG."""
         require_numbers(1, jobs=self.jobs)
-        self.config.ugat.gate.require_threshold_counts()
+        self.config.ugat.gate.require_settings_count(also_dynamic=self.table == "alpha")
         if self.ray is not None and self.config.device != "cpu":
             raise OptionError(
                 f"device = {self.config.device!r}: trainings on Ray have a core each and no GPU; "

@@ -70,7 +70,7 @@ class Train:
         if self.out == Path():
             raise OptionError("--out is the working folder itself, or empty; name a folder")
         require_numbers(1, workers=self.workers)
-        config.ugat.gate.require_threshold_counts()
+        config.ugat.gate.require_settings_count()
         directory = self.out or run_folder(config)
         with (
             continued_by(self._call(directory), f"run: {directory}"),

@@ -57,17 +57,24 @@ class GateConfig:
         if self.window_epochs < 1:
             raise OptionError(f"gate window_epochs is {self.window_epochs}; allowed: >= 1")
 
-    def require_threshold_counts(self) -> None:
-        """Refuse a static threshold that the mode would ignore.
+    def require_settings_count(self, *, also_dynamic: bool = False) -> None:
+        """Refuse settings that the mode would ignore.
+
+        Args:
+            also_dynamic: True if a dynamic alpha is trained beside the one of `mode`.
 
         Raises:
-            OptionError: The threshold is given, and the mode is another one than "static".
+            OptionError: `static_alpha` is given and no alpha is static, or `window_epochs` and no
+                alpha is dynamic.
         """
-        if self.mode != "static" and not isinstance(self.static_alpha, UsualValue):
-            raise OptionError(
-                f"--gate.static-alpha {self.static_alpha:g} counts with --gate.mode static alone, "
-                f"not {self.mode}; give both"
-            )
+        modes = {self.mode, "dynamic"} if also_dynamic else {self.mode}
+        for name, mode in (("static_alpha", "static"), ("window_epochs", "dynamic")):
+            value = getattr(self, name)
+            if mode not in modes and not isinstance(value, UsualValue):
+                raise OptionError(
+                    f"--gate.{name.replace('_', '-')} {value:g} counts with --gate.mode {mode} "
+                    f"alone, not {self.mode}; give that mode, or leave it out"
+                )
 
 
 @dataclass(frozen=True)
