@@ -9,7 +9,10 @@ from ugat_marl.cli import CommandLine, run
 
 COMMANDS: dict[str, tuple[str, str]] = {
     "train": ("ugat_marl.cli.train:Train", "train a policy across the gap and compare"),
-    "report": ("ugat_marl.cli.report:Report", "show trainings on one page: tables, curves, maps"),
+    "report": (
+        "ugat_marl.cli.report:Report",
+        "show trainings on one page, with tables, curves and maps",
+    ),
     "evaluate": (
         "ugat_marl.cli.evaluate:Evaluate",
         "measure policies and rules in any domains",
@@ -68,10 +71,7 @@ COMMANDS: dict[str, tuple[str, str]] = {
         "ugat_marl.cli.scenario_draw:ScenarioDraw",
         "draw every intersection with its phases",
     ),
-    "domains": (
-        "ugat_marl.cli.domains:Domains",
-        "list the named domains: gap, effects, counterpart",
-    ),
+    "domains": ("ugat_marl.cli.domains:Domains", "list the named domains by their gap"),
     "paper main": ("ugat_marl.cli.paper:Main", "compare UGAT with every control over seeds"),
     "paper ablation": ("ugat_marl.cli.paper:Ablation", "compare UGAT with and without its parts"),
     "paper alpha": ("ugat_marl.cli.paper:Alpha", "compare static thresholds with the dynamic one"),

@@ -69,6 +69,8 @@ def test_there_are_few_verbs(capsys: pytest.CaptureFixture[str]) -> None:
     listed = re.findall(r"^  ([a-z-]+)  +\S", capsys.readouterr().out, flags=re.MULTILINE)
     assert 10 <= len(listed) <= 20
     assert {name.split()[0] for name in COMMANDS} | {"completion"} == set(listed)
+    # the commands of a group stand behind a colon, as below
+    assert not [name for name, (_, purpose) in COMMANDS.items() if ":" in purpose]
     for group, text in GROUPS.items():
         assert main([group, "--help"]) == main([group, "--help-all"]) == 0
         lines = capsys.readouterr().out.splitlines()
