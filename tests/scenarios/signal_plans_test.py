@@ -5,6 +5,7 @@ from __future__ import annotations
 import contextlib
 import copy
 import math
+import shlex
 import xml.etree.ElementTree as ET
 from collections.abc import Callable
 from dataclasses import replace
@@ -409,7 +410,11 @@ def test_a_scenario_with_plans_keeps_its_papers(tmp_path: Path) -> None:
     for folder in ("g", "h"):
         text = (tmp_path / folder / "README.md").read_text()
         assert text.startswith(f"# {folder}\n\nIts lights have the programmes of `p.csv`")
-        assert text.endswith(before.partition("\n")[2])
+        assert before.partition("\n")[2] in text
+        words = ["ugat-marl", "plan", str(tmp_path / "g"), "--out", str(tmp_path / folder)]
+        commands = [shlex.split(line) for line in text.splitlines() if line.startswith("ugat-marl")]
+        assert [command[1] for command in commands] == ["scenario", "plan"]
+        assert commands[-1] == [*words, "--apply", table, *["--force"] * (folder == "g")]
         assert (tmp_path / folder / "counts-fit.csv").read_text() == "counted\n"
 
 
@@ -417,9 +422,12 @@ def test_a_readme_without_a_title_is_kept_whole(tmp_path: Path) -> None:
     (tmp_path / "from").mkdir()
     (tmp_path / "to").mkdir()
     (tmp_path / "from" / "README.md").write_text("Counts by the city, CC-BY.\n\nMore.\n")
-    copy_papers(tmp_path / "from", tmp_path / "to", "new", "Changed.")
+    copy_papers(tmp_path / "from", tmp_path / "to", "new", "Changed.", "ugat-marl plan x")
     text = (tmp_path / "to" / "README.md").read_text()
-    assert text == "# new\n\nChanged.\n\nCounts by the city, CC-BY.\n\nMore.\n"
+    assert text == (
+        "# new\n\nChanged.\n\nCounts by the city, CC-BY.\n\nMore.\n\n"
+        "## Changed with\n\n```sh\nugat-marl plan x\n```\n"
+    )
 
 
 def test_a_short_yellow_is_noted(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:

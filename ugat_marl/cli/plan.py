@@ -13,7 +13,7 @@ from rich.table import Table
 from rich.text import Text
 from tyro.conf import Positional, arg
 
-from ugat_marl.cli.arguments import refuse_options, require_numbers, unused
+from ugat_marl.cli.arguments import given_words, refuse_options, require_numbers, unused
 from ugat_marl.effects import load_scenario, scenario_in_domain
 from ugat_marl.errors import OptionError, counted, listed
 from ugat_marl.experiments import TUNING_SEED, policy_factory, typical_plans
@@ -139,7 +139,7 @@ class Plan:
         with new_folder(self.out, force=self.force) as folder:
             planned.write(folder)
             programmes = f"Its lights have the programmes of `{table.name}` (`ugat-marl plan`)."
-            copy_papers(Path(self.scenario), folder, self.out.name, programmes)
+            copy_papers(Path(self.scenario), folder, self.out.name, programmes, self._command())
         console.print(plan_table(plans, LightNames.of(network)))
         lights = {light.id for light in network.intersections}
         without = sorted(lights - {plan.light for plan in plans})
@@ -154,6 +154,11 @@ class Plan:
             soft_wrap=True,
         )
         return 0
+
+    def _command(self) -> str:
+        """Return the command line that makes the same scenario again."""
+        words = ["ugat-marl", "plan", self.scenario, "--out", str(self.out)]
+        return shlex.join([*words, *given_words(self)])
 
     def _lights(self) -> dict[str, str]:
         pairs: dict[str, str] = {}

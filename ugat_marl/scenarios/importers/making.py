@@ -399,14 +399,17 @@ def _stopped_in_order() -> Iterator[None]:
         signal.signal(signal.SIGTERM, signal.SIG_DFL)
 
 
-def copy_papers(source: Path, folder: Path, name: str, note: str) -> None:
+def copy_papers(source: Path, folder: Path, name: str, note: str, command: str) -> None:
     """Copy what says where a scenario is from: its README and its sheets of counts.
+
+    The command follows those of the README, so that all in their order make the scenario again.
 
     Args:
         source: Folder of the scenario; nothing is copied from a place that is none.
         folder: Folder of a scenario that is made from it.
         name: Name of the new scenario.
         note: What was changed, as a sentence in Markdown.
+        command: Command line that changed it.
     """
     for sheet in (COUNT_SHEET, FIT_SHEET):
         if (source / sheet).is_file():
@@ -415,7 +418,8 @@ def copy_papers(source: Path, folder: Path, name: str, note: str) -> None:
     if readme.is_file():
         text = readme.read_text(encoding="utf-8", errors="replace")
         rest = text.partition("\n")[2] if text.startswith("# ") else f"\n{text}"
-        write_whole(folder / readme.name, f"# {name}\n\n{note}\n{rest}")
+        then = f"## Changed with\n\n```sh\n{command}\n```\n"
+        write_whole(folder / readme.name, f"# {name}\n\n{note}\n{rest.rstrip()}\n\n{then}")
 
 
 def _require_counts_kept(made: Path, target: Path) -> None:
