@@ -197,6 +197,7 @@ def test_nothing_is_named_that_the_library_lacks(
     assert not diagnosed["effects"]
     text = capsys.readouterr().out
     assert not (tmp_path / "corrected").exists()
+    assert "of an earlier diagnosis is removed, since" in " ".join(text.split())
     assert "use it" not in text
     assert diagnosed["sentence"] in (tmp_path / "report.html").read_text()
 

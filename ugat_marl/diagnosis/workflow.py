@@ -123,7 +123,7 @@ def diagnose(
     written = replace(written, policy_gap=_known_gap(directory, written))
     # If it is killed here, no earlier verdict may stay beside another corrected scenario.
     (directory / FILE).unlink(missing_ok=True)
-    _put_corrected(corrected, directory / CORRECTED)
+    _put_corrected(corrected, directory / CORRECTED, reporter)
     written.write(directory)
     return written
 
@@ -157,12 +157,13 @@ def _require_replaceable(scenario: Scenario, place: Path) -> None:
         )
 
 
-def _put_corrected(corrected: Scenario | None, place: Path) -> None:
+def _put_corrected(corrected: Scenario | None, place: Path, reporter: Reporter) -> None:
     """Write the corrected scenario; the one of an earlier diagnosis goes when the new one is there.
 
     Args:
         corrected: The scenario; None for no correction.
         place: Its folder.
+        reporter: Told if an earlier scenario goes and none takes its place.
     """
     made, before = (place.with_name(f".{place.name}.{word}") for word in ("new", "before"))
     for rest in (made, before):  # of a diagnosis that was killed here
@@ -173,6 +174,10 @@ def _put_corrected(corrected: Scenario | None, place: Path) -> None:
         shutil.rmtree(before, ignore_errors=True)
     elif (place / "scenario.toml").is_file():
         shutil.rmtree(place)
+        reporter.say(
+            f"note: {place} of an earlier diagnosis is removed, since the scenario is not "
+            "corrected by what is found now"
+        )
 
 
 def _diagnosed(
