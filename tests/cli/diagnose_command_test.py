@@ -140,6 +140,8 @@ def test_it_names_the_effect_and_says_what_to_do_with_it(
 ) -> None:
     out, text, errors = found
     assert not errors
+    page = (Path(__file__).parents[2] / "docs" / "how-to" / "diagnose.md").read_text()
+    (options,) = re.findall("train my-city --sim found/corrected (.*) --out", page)
     flat = " ".join(text.split())
     for part in (
         "late green",
@@ -149,7 +151,7 @@ def test_it_names_the_effect_and_says_what_to_do_with_it(
         "GEH < 5",
         f"diagnosis: {out / 'diagnosis.json'}",
         f"page: {out / 'report.html'}",
-        f"ugat-marl train {street.scenario} --sim {out / 'corrected'} --real REAL",
+        f"ugat-marl train {street.scenario} --sim {out / 'corrected'} {options}",
     ):
         assert part in flat or part in text, part
     assert "Partial" not in text

@@ -189,7 +189,7 @@ def test_a_page_for_every_verdict(verdict: str, network: Network) -> None:
         assert "1.451 s (1.443 to 1.459)" in page.text
         assert "0:05:00 – 0:15:00" in page.text
         assert "99.96 %" in page.text
-        assert "--sim DIR/corrected" in page.text
+        assert "--sim DIR/corrected --real sim " in page.text
     if verdict == "unknown":
         assert "the best attempt, which is not named" in page.text
 

@@ -37,6 +37,7 @@ from ugat_marl.reporting import (
     LightNames,
     diagnosis_summary,
     require_page_place,
+    training_command,
     write_diagnosis_page,
 )
 from ugat_marl.scenarios import Network
@@ -166,10 +167,7 @@ class Diagnose:
         changed = diagnosis.unnamed or any(map(_in_the_model, used))
         if diagnosis.corrected is None or not changed:
             return []
-        corrected = str(self.out / CORRECTED)
-        return [
-            shlex.join(["ugat-marl", "train", self.scenario, "--sim", corrected]) + " --real REAL"
-        ]
+        return [training_command(self.scenario, str(self.out / CORRECTED))]
 
     def _say_where(self, diagnosis: Diagnosis, console: Console) -> None:
         lines = [f"diagnosis: {self.out / FILE}"]

@@ -7,6 +7,7 @@ from .comparison_tables import comparison_page as comparison_page
 from .comparison_tables import terminal_tables as terminal_tables
 from .diagnosis_page import DIAGNOSIS_TITLE as DIAGNOSIS_TITLE
 from .diagnosis_page import commands_on_page as commands_on_page
+from .diagnosis_page import training_command as training_command
 from .diagnosis_page import write_diagnosis_page as write_diagnosis_page
 from .diagnosis_tables import diagnosis_summary as diagnosis_summary
 from .formats import number_text as number_text

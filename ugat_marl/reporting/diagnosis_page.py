@@ -117,6 +117,19 @@ def diagnosis_page(diagnosis: Diagnosis, network: Network, commands: Sequence[st
     )
 
 
+def training_command(scenario: str, corrected: str) -> str:
+    """Return the command that trains a policy in a corrected scenario.
+
+    The street itself is no domain, so the policy is also evaluated in the scenario as it is.
+
+    Args:
+        scenario: The scenario as it is, as the command line takes it.
+        corrected: Folder of the corrected scenario.
+    """
+    command = ["ugat-marl", "train", scenario, "--sim", corrected]
+    return shlex.join([*command, "--real", "sim", "--iterations", "0", "--no-control"])
+
+
 def commands_on_page(path: Path) -> list[str]:
     """Return the commands on a page; none if the page cannot be read.
 
@@ -420,5 +433,5 @@ def _usual_commands(diagnosis: Diagnosis) -> list[str]:
     scenario = shlex.quote(diagnosis.scenario)
     lines = [f"ugat-marl diagnose {scenario} MEASURED --out DIR {options}"]
     if diagnosis.corrected:
-        lines.append(f"ugat-marl train {scenario} --sim DIR/{diagnosis.corrected} --real REAL")
+        lines.append(training_command(diagnosis.scenario, f"DIR/{diagnosis.corrected}"))
     return lines
