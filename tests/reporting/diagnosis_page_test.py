@@ -211,6 +211,19 @@ def test_effects_are_told_as_a_domain_takes_them(network: Network) -> None:
     assert words.as_domain([everywhere]) == "late_green=*,2"
 
 
+def test_intervals_are_announced_only_where_there_are_some(network: Network) -> None:
+    fitted = content_of()["effects"]
+    untested = [
+        effect | {"parameters": {name: parameter(value["value"], unit=value["unit"])}}
+        for effect in fitted
+        for name, value in effect["parameters"].items()
+    ]
+    for effects, told in ((untested, False), ([untested[0], fitted[1]], True)):
+        diagnosis = diagnosis_of("provisional", effects=effects)
+        assert ("95 % interval" in printed(diagnosis)) == told
+        assert ("95 % interval" in Page(diagnosis_page(diagnosis, network)).text) == told
+
+
 def test_headways_are_drawn_by_position_in_the_queue(network: Network) -> None:
     diagnosis = diagnosis_of("explained")
     page = Page(diagnosis_page(diagnosis, network))

@@ -143,7 +143,7 @@ def commands_on_page(path: Path) -> list[str]:
 
 
 def _effects(effects: Sequence[NamedEffect], names: LightNames) -> Grid | None:
-    """Return a table of the named effects with intervals; None without effects."""
+    """Return a table of the named effects, with intervals where known; None without effects."""
     rows = [
         (
             words.effect_name(effect),
@@ -154,7 +154,8 @@ def _effects(effects: Sequence[NamedEffect], names: LightNames) -> Grid | None:
         )
         for effect in effects
     ]
-    headings = ("effect", "where", "when", "value (95 % interval)", "grounds")
+    value = "value (95 % interval)" if any(map(words.has_interval, effects)) else "value"
+    headings = ("effect", "where", "when", value, "grounds")
     return Grid(headings, rows) if rows else None
 
 

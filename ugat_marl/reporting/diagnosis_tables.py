@@ -50,7 +50,8 @@ def diagnosis_summary(diagnosis: Diagnosis, names: LightNames) -> RenderableType
 
 
 def _effects(effects: Sequence[NamedEffect], names: LightNames) -> Table:
-    table = titled_table("effects (value with 95 % interval)")
+    certain = any(map(words.has_interval, effects))
+    table = titled_table("effects (value with 95 % interval)" if certain else "effects")
     table.add_column("effect", overflow="fold", max_width=20)
     table.add_column("where", overflow="fold", max_width=22)
     timed = any(effect.window for effect in effects)

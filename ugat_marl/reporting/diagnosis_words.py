@@ -105,6 +105,11 @@ def values(effect: EffectRecord, *, intervals: bool = True) -> str:
     return "; ".join(texts) or "as such"
 
 
+def has_interval(effect: EffectRecord) -> bool:
+    """Return True if `values` shows an interval; an effect that was not tested has none."""
+    return values(effect) != values(effect, intervals=False)
+
+
 def as_domain(effects: Iterable[EffectRecord]) -> str:
     """Return effects as ``--domain`` takes them, such as ``headway=1.451+late_green=*,2``.
 
