@@ -68,6 +68,7 @@ def test_a_correction_that_brings_travel_times_nearer_passes() -> None:
     assert check.error_before == pytest.approx(0.4, abs=0.06)
     assert check.error_after < 0.08
     assert 0.0 < check.noise < 0.1
+    assert check.days == 16, "of each model; fewer have another error"
 
 
 def test_greens_without_vehicles_are_no_journeys() -> None:
@@ -255,10 +256,11 @@ def test_why_a_scenario_is_not_corrected(verdict: str, better: bool, refused: st
 def test_a_correction_that_is_refused_says_whether_more_data_would_tell(
     before: float, after: float, noise: float, said: str
 ) -> None:
-    check = TrafficCheck("travel time and queue", before, after, noise, better=False)
+    check = TrafficCheck("travel time and queue", before, after, noise, better=False, days=4)
     conclusion: Any = SimpleNamespace(verdict="explained")
     reason = reason_against(conclusion, check)
     assert reason is not None and said in reason
+    assert f"relative errors (4 simulated days) is {100 * before:.1f} % before" in reason
     assert ("can tell" in reason) == check.undecided
     assert reason_against(conclusion, replace(check, better=True)) is None
 

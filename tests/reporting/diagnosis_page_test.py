@@ -142,7 +142,7 @@ def content_of(verdict: str = "explained", *, complete: bool = True, **more: Any
         ],
         "traffic_check": None if same else {
             "measure": "travel time and queue", "error_before": 0.482, "error_after": 0.051,
-            "noise": 0.02, "better": True,
+            "noise": 0.02, "better": True, "days": 16,
         },
         "not_corrected": None,
         "unnamed": [],
@@ -467,7 +467,12 @@ def test_the_verdict_is_told_in_terms_of_traffic(network: Network) -> None:
     for text in ("capacity, veh/h per lane in green", "1 410", "1 790"):
         assert text in page.replace("\u00a0", " "), text
     assert "Simulated travel time and queue against data that no fit used" in page
-    assert "48 % before the effects named and 5 % after, nearer." in page
+    errors = "48.2 % before the effects named and 5.1 % after, nearer."
+    assert f"sum of relative errors (16 simulated days) {errors}" in page
+    earlier = diagnosis.to_json()["traffic_check"]
+    del earlier["days"]
+    shown = " ".join(printed(diagnosis_of(traffic_check=earlier)).split())
+    assert f"sum of relative errors {errors}" in shown, "an older file has no days"
     shown = printed(diagnosis)
     assert "approach W_C" in shown, "its delay differs most"
     unknown = {**diagnosis.to_json()["approaches"][0], "approach": "N_C"}

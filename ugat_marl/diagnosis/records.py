@@ -29,7 +29,7 @@ from ugat_marl.diagnosis.features import Tally
 from ugat_marl.diagnosis.hypotheses import Members, effects_of
 from ugat_marl.diagnosis.statistics import Array, Distance, Reference
 from ugat_marl.effects import Effect
-from ugat_marl.errors import OptionError
+from ugat_marl.errors import OptionError, counted
 from ugat_marl.files import read_json, write_whole
 
 FILE = "diagnosis.json"
@@ -565,6 +565,7 @@ class TrafficCheck:
         noise: Standard error of their difference.
         better: True if the correction lowers the error by more than 1.645 times the noise, and to
             at most 1.
+        days: Number of simulated days, the same of both models; None if that is not known.
     """
 
     measure: str
@@ -572,11 +573,17 @@ class TrafficCheck:
     error_after: float
     noise: float
     better: bool
+    days: int | None = None
 
     @property
     def undecided(self) -> bool:
         """True if the error falls, but by no more than chance could do: the data are too few."""
         return not self.better and self.error_after < min(self.error_before, 1.0)
+
+    @property
+    def days_in_words(self) -> str:
+        """The number of days behind a noun, as in " (16 simulated days)"; "" if not known."""
+        return "" if self.days is None else f" ({counted(self.days, 'simulated day')})"
 
 
 @dataclass(frozen=True)

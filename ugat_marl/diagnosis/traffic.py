@@ -164,7 +164,7 @@ def _check(
     # Where even the corrected model is far off, matched vehicles are not the same ones.
     near = last <= thresholds.most_traffic_error
     better = near and first - last > thresholds.check_deviations * noise
-    return TrafficCheck(measure, first, last, noise, better)
+    return TrafficCheck(measure, first, last, noise, better, len(stretches))
 
 
 def _levelled(days: Array, stretches: Sequence[Window]) -> tuple[Array, float]:

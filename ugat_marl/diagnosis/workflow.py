@@ -433,9 +433,10 @@ def _reason_against(
         does = f"do not bring {check.measure} near to the {judged_by} periods"
         way_out = ""
     return (
-        f"The effects named {does}: the sum of relative errors is {100 * check.error_before:.1f} % "
-        f"before and {100 * check.error_after:.1f} % after (standard error of the difference: "
-        f"{100 * check.noise:.1f} %). So the scenario is not corrected by them{way_out}."
+        f"The effects named {does}: the sum of relative errors{check.days_in_words} is "
+        f"{100 * check.error_before:.1f} % before and {100 * check.error_after:.1f} % after "
+        f"(standard error of the difference: {100 * check.noise:.1f} %). So the scenario is not "
+        f"corrected by them{way_out}."
     )
 
 

@@ -20,7 +20,7 @@ from ugat_marl.diagnosis import (
     ordered,
 )
 from ugat_marl.effects import EVERYWHERE, Effect, known_effects
-from ugat_marl.reporting.formats import chance, number, share
+from ugat_marl.reporting.formats import chance, fixed, number, share
 from ugat_marl.reporting.light_names import LightNames
 
 UNTRIED = 8
@@ -230,10 +230,11 @@ def traffic_check_line(diagnosis: Diagnosis) -> str | None:
     apart = "that no fit used" if unfitted else "of periods that no fit used"
     if diagnosis.verified_on_fitted_periods:
         apart = "of the fitted periods, as none is held out"
-    before, after = share(check.error_before), share(check.error_after)
+    # The same decimals as in `not_corrected`, which may stand beside this.
+    before, after = (fixed(100 * error, 1) for error in (check.error_before, check.error_after))
     return (
-        f"Simulated {check.measure} against data {apart}: sum of relative errors {before} before "
-        f"the effects named and {after} after, {nearer}."
+        f"Simulated {check.measure} against data {apart}: sum of relative errors"
+        f"{check.days_in_words} {before} % before the effects named and {after} % after, {nearer}."
     )
 
 
