@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from ugat_marl.diagnosis import Hypothesis, Reference, Tally
+from ugat_marl.diagnosis import Hypothesis, Reference, Tally, records
 from ugat_marl.diagnosis.engine import Engine, OrdinaryDays, Replicate, spread
 from ugat_marl.diagnosis.features import BIN_FEATURES, FEATURES, INDEX
 from ugat_marl.diagnosis.fit import (
@@ -26,6 +26,7 @@ from ugat_marl.diagnosis.fit import (
 )
 from ugat_marl.diagnosis.hypotheses import Members
 from ugat_marl.diagnosis.propose import Direction
+from ugat_marl.diagnosis.prune import doubtful
 from ugat_marl.diagnosis.records import Fitted
 from ugat_marl.diagnosis.statistics import Pools
 from ugat_marl.diagnosis.thresholds import Thresholds
@@ -580,6 +581,18 @@ def test_values_that_the_data_rule_out_are_in_no_interval() -> None:
     mild = a_fitter({"headway": 1.02}, street=17)
     near = _possible(mild, mild.simulate(start((HEADWAY, 1.02))), np.array([0.001]))
     assert near == [np.inf], "values so near fit as well"
+
+
+def test_days_that_say_little_leave_no_interval_that_the_data_rule_out(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    straight = a_fitter({"headway": 1.4}, street=17)
+    model = straight.simulate(start((HEADWAY, 1.4)))
+    monkeypatch.setattr("ugat_marl.diagnosis.fit._spread_of_days", lambda *_: np.eye(1) * 100.0)
+    errors, _ = uncertainty(straight, model, steps=True)
+    assert errors == pytest.approx([(0.4 - HEADWAY.least / 2) / 1.96], rel=1e-3)
+    blank: Any = None
+    assert not doubtful(records.Tested(model, blank, errors, {}), 1.96)
 
 
 def test_moves_to_both_ends_of_a_range_may_be_crooked() -> None:

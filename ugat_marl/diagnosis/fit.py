@@ -504,8 +504,9 @@ def _possible(fitter: Fitter, model: Fitted, errors: Array) -> Array:
                     nearest[move > 0] = min(nearest[move > 0], abs(move))
             end = max(nearest.values(), default=math.inf)
             if hypothesis.nothing is not None and len(values) == 1 and impossible(without):
-                end = min(end, abs(hypothesis.nothing[0] - value) - hypothesis.least / 2)
-            bounds.append((end - hypothesis.step / 2) / thresholds.half_interval)
+                away = abs(hypothesis.nothing[0] - value)
+                end = min(end, max(away - hypothesis.least / 2, away / 2))
+            bounds.append(max(end - hypothesis.step / 2, end / 2) / thresholds.half_interval)
     return np.array(bounds)
 
 
@@ -599,5 +600,5 @@ def uncertainty(
     if steps:
         slopes, squares = _straightness(fitter, model, errors, response)
         wide = np.sqrt((errors / slopes) ** 2 + squares)
-        errors = np.maximum(errors, np.minimum(wide, _possible(fitter, model, errors)))
+        errors = np.minimum(wide, _possible(fitter, model, errors))
     return errors, extra
