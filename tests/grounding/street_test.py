@@ -279,35 +279,10 @@ def test_a_street_is_compared_with_worlds_of_the_same_length(
     assert np.array_equal(street.posterior.answer, again.posterior.answer)
 
 
-def test_a_street_is_compared_with_what_fits_behind_the_lead_of_its_log(
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
-    """A log from 40 s to 500 s, and episodes of 400 s, or of 330 s, which are too short."""
-    compared, summary = list[int](), LaneView.summary
-
-    def seen(self: LaneView, log: TransitionLog) -> Summary:
-        compared.append(log.decisions)
-        return summary(self, log)
-
-    monkeypatch.setattr(LaneView, "summary", seen)
-    config = replace(QUICK, parts=("effects",), simulated_s=600.0)
-    env = parallel_env(SCENARIO)
-    prior, view = street_prior(env, config), LaneView.of(env.network, "count")
-    env.close()
-    whole = recorded("sim", 500.0)
-    provenance = replace(whole.provenance, from_begin=True)
-    log = TransitionLog(provenance, whole.frame.filter(pl.col("step") >= 4))
-    replay = RecordedCommands(log, longest=40)
-    fit_street(log.from_step_0(), simulation(400.0), replay, prior, view, config, seed=0)
-    assert set(compared) == {36}
-    with pytest.raises(LogError, match="only 290 s of an episode are left .*--duration-s"):
-        fit_street(log.from_step_0(), simulation(330.0), replay, prior, view, config, seed=0)
-
-
-def test_a_late_period_shortens_the_comparison_of_no_other(
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
-    """Of a period from 300 s to 450 s the decisions before 400 s, the end of an episode, count."""
+def lengths_compared(
+    log: TransitionLog, episode_s: float, monkeypatch: pytest.MonkeyPatch
+) -> list[list[int]]:
+    """Return the decisions of each episode of the logs that a fit compares, the street's first."""
     compared, summary = list[list[int]](), LaneView.summary
 
     def seen(self: LaneView, log: TransitionLog) -> Summary:
@@ -319,13 +294,34 @@ def test_a_late_period_shortens_the_comparison_of_no_other(
     env = parallel_env(SCENARIO)
     prior, view = street_prior(env, config), LaneView.of(env.network, "count")
     env.close()
+    replay = RecordedCommands(log, longest=40)
+    fit_street(log.from_step_0(), simulation(episode_s), replay, prior, view, config, seed=0)
+    return compared
+
+
+def test_a_street_is_compared_with_what_fits_behind_the_lead_of_its_log(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """A log from 40 s to 500 s, and episodes of 400 s, or of 330 s, which are too short."""
+    whole = recorded("sim", 500.0)
+    provenance = replace(whole.provenance, from_begin=True)
+    log = TransitionLog(provenance, whole.frame.filter(pl.col("step") >= 4))
+    compared = lengths_compared(log, 400.0, monkeypatch)
+    assert {length for (length,) in compared} == {36}
+    with pytest.raises(LogError, match="only 290 s of an episode are left .*--duration-s"):
+        lengths_compared(log, 330.0, monkeypatch)
+
+
+def test_a_late_period_shortens_the_comparison_of_no_other(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """Of a period from 300 s to 450 s the decisions before 400 s, the end of an episode, count."""
     whole = recorded("sim", 450.0)
     log = TransitionLog.concatenate([whole.first(40), whole.first(40), whole])
     late = (pl.col("episode") < 2) | (pl.col("step") >= 30)
     log = TransitionLog(replace(log.provenance, from_begin=True), log.frame.filter(late))
-    replay = RecordedCommands(log, longest=40)
     monkeypatch.setattr(street_module, "LEAST_DECISIONS", 10)
-    fit_street(log.from_step_0(), simulation(400.0), replay, prior, view, config, seed=0)
+    compared = lengths_compared(log, 400.0, monkeypatch)
     assert compared[0] == [40, 40, 10]
     assert sorted({length for (length,) in compared[1:]}) == [10, 40]
 

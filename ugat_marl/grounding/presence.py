@@ -22,7 +22,7 @@ from __future__ import annotations
 
 import itertools
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -77,9 +77,7 @@ class Presence:
             high: Highest values, ``(k,)``.
         """
         floor = np.diag((LEAST_SPREAD * (high - low)) ** 2)
-        calibration = Calibration(
-            calibration.constant, calibration.slopes, calibration.covariance + floor
-        )
+        calibration = replace(calibration, covariance=calibration.covariance + floor)
         middle, spread = (low + high) / 2.0, (high - low) / np.sqrt(12.0)
         there = np.array(list(itertools.product((True, False), repeat=len(nominal))), np.bool_)
         there = there.reshape(-1, len(nominal))
