@@ -121,7 +121,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
         metavar=("LEAST", "MOST"),
         help="degree of saturation of the busiest intersection",
     )
-    parser.add_argument("--simulations", type=int, default=80)
+    parser.add_argument("--simulations", type=int, default=StreetConfig.simulations)
     parser.add_argument("--rule-budget", type=int, default=6)
     parser.add_argument(
         "--street-rules", type=int, help="episodes of each rule in the fitted street; 0 for none"
