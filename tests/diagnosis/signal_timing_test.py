@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import errno
 from dataclasses import replace
 from pathlib import Path
 
@@ -93,6 +94,36 @@ def test_what_the_log_tells_can_be_left_out(
     diagnosis = diagnose(scenario, measured, tmp_path / "found", config)
     assert [effect.name for effect in diagnosis.effects] == named
     assert (diagnosis.corrected is not None) == bool(named)
+
+
+def test_a_diagnosis_that_cannot_be_written_leaves_the_earlier_one(
+    scenario: Scenario, network: Network, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def diagnosed(yellow: float) -> None:
+        period = Period("day1", 0.0, 3600.0, "fit", {"C": cycles(30, yellow, 0.5)}, {})
+        measured = MeasuredData(standard_detectors(network), (period,))
+        config = DiagnosisConfig(budget_s=1e-9, cache=tmp_path / "cache")
+        diagnose(scenario, measured, tmp_path / "found", config)
+
+    def written() -> dict[Path, bytes]:
+        names = ("diagnosis.json", "corrected/*")
+        return {
+            path: path.read_bytes() for name in names for path in (tmp_path / "found").glob(name)
+        }
+
+    def full(_scenario: Scenario, place: Path) -> None:
+        raise OSError(errno.ENOSPC, "No space left on device", str(place))
+
+    diagnosed(4.5)
+    earlier = written()
+    assert len(earlier) > 2
+    monkeypatch.setattr(Scenario, "write", full)
+    with pytest.raises(OSError, match="No space left"):
+        diagnosed(4.0)
+    assert written() == earlier
+    monkeypatch.undo()
+    diagnosed(4.0)
+    assert written().keys() == earlier.keys() and written() != earlier
 
 
 def test_green_right_behind_yellow_is_no_all_red(scenario: Scenario, network: Network) -> None:

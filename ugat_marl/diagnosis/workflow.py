@@ -121,10 +121,7 @@ def diagnose(
         diagnosis = replace(diagnosis, corrected=CORRECTED)
     written = Diagnosis.from_json(diagnosis.to_json())  # numbers rounded like those of the file
     written = replace(written, policy_gap=_known_gap(directory, written))
-    # If it is killed here, no earlier verdict may stay beside another corrected scenario.
-    (directory / FILE).unlink(missing_ok=True)
-    _put_corrected(corrected, directory / CORRECTED, reporter)
-    written.write(directory)
+    _write(written, corrected, directory, reporter)
     return written
 
 
@@ -157,19 +154,26 @@ def _require_replaceable(scenario: Scenario, place: Path) -> None:
         )
 
 
-def _put_corrected(corrected: Scenario | None, place: Path, reporter: Reporter) -> None:
-    """Write the corrected scenario; the one of an earlier diagnosis goes when the new one is there.
+def _write(
+    written: Diagnosis, corrected: Scenario | None, directory: Path, reporter: Reporter
+) -> None:
+    """Write the record and the corrected scenario; those of an earlier diagnosis stay until then.
 
     Args:
+        written: The record.
         corrected: The scenario; None for no correction.
-        place: Its folder.
+        directory: Folder of both.
         reporter: Told if an earlier scenario goes and none takes its place.
     """
+    place = directory / CORRECTED
     made, before = (place.with_name(f".{place.name}.{word}") for word in ("new", "before"))
     for rest in (made, before):  # of a diagnosis that was killed here
         shutil.rmtree(rest, ignore_errors=True)
     if corrected is not None:
         corrected.write(made)
+    # If it is killed here, no earlier verdict may stay beside another corrected scenario.
+    (directory / FILE).unlink(missing_ok=True)
+    if corrected is not None:
         put_folder(made, place, before)
         shutil.rmtree(before, ignore_errors=True)
     elif (place / "scenario.toml").is_file():
@@ -178,6 +182,7 @@ def _put_corrected(corrected: Scenario | None, place: Path, reporter: Reporter) 
             f"note: {place} of an earlier diagnosis is removed, since the scenario is not "
             "corrected by what is found now"
         )
+    written.write(directory)
 
 
 def _diagnosed(
