@@ -193,6 +193,13 @@ def test_links_that_stay_green_do_not_hide_a_yellow(scenario: Scenario, network:
     assert "yellow_time=4" in found(scenario, network, tuple(rows))
 
 
+def test_yellows_that_overlap_are_timed_link_by_link(scenario: Scenario, network: Network) -> None:
+    """Two rings: the second one turns yellow 2 s after the first one."""
+    shown = [(0, "GG"), (20, "yG"), (22, "yy"), (24, "ry"), (26, "rr")]
+    log = tuple((28.0 * i + time, state) for i in range(30) for time, state in shown)
+    assert found(scenario, network, log) == ["yellow_time=4"]
+
+
 # --- counts only ---------------------------------------------------------------------------------
 
 

@@ -72,13 +72,19 @@ def _clearances(log: SignalLog) -> list[tuple[str, float]]:
     greens = {tuple(link in GREEN for link in state) for _, state in log}
     alone = sum(map(any, greens)) < 2
     durations: list[tuple[str, float]] = []
-    began = ended = math.nan
+    began: dict[int, float] = {}  # by link, since yellows of two rings overlap
+    ended = math.nan
     for (_, before), (time_s, state) in itertools.pairwise(log):
         pairs = list(zip(before, state, strict=False))
-        if any(new in AMBER and old not in AMBER for old, new in pairs):
-            began = time_s
-        if any(old in AMBER and new not in AMBER for old, new in pairs):
-            durations.append((yellow, time_s - began))
+        began |= {
+            link: time_s
+            for link, (old, new) in enumerate(pairs)
+            if new in AMBER and old not in AMBER
+        }
+        over = [link for link, (old, new) in enumerate(pairs) if old in AMBER and new not in AMBER]
+        if over:
+            begins = {began[link] for link in over if link in began}
+            durations += [(yellow, time_s - begin_s) for begin_s in sorted(begins)]
             ended = time_s
         if any(new in GREEN and old not in GREEN for old, new in pairs):
             if not alone:
