@@ -25,8 +25,9 @@ from ugat_marl.diagnosis.compared_detectors import (
 from ugat_marl.diagnosis.demand_variation import day_to_day_variation, measured_variation
 from ugat_marl.diagnosis.engine import Budget, Engine
 from ugat_marl.diagnosis.features import BIN_FEATURES, FEATURES, INDEX, DetectorLayout
-from ugat_marl.diagnosis.measurement import DetectorError
+from ugat_marl.diagnosis.measurement import DetectorError, Measurement
 from ugat_marl.diagnosis.replay import Replay
+from ugat_marl.diagnosis.sightings import ALONE, Sightings
 from ugat_marl.diagnosis.statistics import Pools
 from ugat_marl.diagnosis.study import _of_common_windows, effort_for
 from ugat_marl.diagnosis.thresholds import Effort, Thresholds
@@ -456,6 +457,21 @@ def test_every_task_of_a_diagnosis_is_part_of_the_whole() -> None:
         for number in ("1", "2"):
             name = title.replace("{number + 1}", number).replace("{what}", "library")
             assert any(name.startswith(share) for share in study.work()), name
+
+
+@pytest.mark.parametrize(("grain_s", "said"), [(0.1, False), (0.5, True), (1.0, True)])
+def test_stamps_that_are_too_coarse_for_errors_of_detectors_are_noted(
+    monkeypatch: pytest.MonkeyPatch, grain_s: float, said: bool
+) -> None:
+    passages = np.array([(0.0, ALONE, steps * grain_s, 10.0, 5.0) for steps in (1, 2, 3)])
+    pairs, nothing = np.empty((0, 4)), np.zeros((len(NAMES), 2))
+    seen = Sightings(passages, pairs, nothing, nothing, nothing, nothing[:, 0])
+    compared = Measurement(DETECTORS, seen, seen, THRESHOLDS)
+    monkeypatch.setattr(Study, "_measurement", lambda *_: compared)
+    before = replace(study(Days({}), None), measured=measured(NAMES))
+    found = before.detectors_as_they_are(Silent()).measured.findings
+    text = f"grain of {grain_s:g} s: errors of the detectors"
+    assert [text in finding.text for finding in found] == [True] * said
 
 
 @pytest.mark.parametrize(

@@ -190,6 +190,9 @@ class Measurement:
         measured: Sightings of the data.
         simulated: Sightings of simulated days.
         thresholds: Numbers of the method.
+
+    Attributes:
+        grain_s: Grain of the stamps of the data, s; 0 if it is finer than tenths of seconds.
     """
 
     def __init__(
@@ -203,21 +206,28 @@ class Measurement:
         self._measured = measured
         self._simulated = simulated
         self._thresholds = thresholds
-        self._grain_s = _grain_s(measured.passages[:, 2])
+        self.grain_s = _grain_s(measured.passages[:, 2])
         self._kinds = frozenset(detector.kind for detector in detectors)
         self._groups: dict[Group, list[int]] = {}
         for index, detector in enumerate(detectors):
             group = (detector.kind, edge_of_lane(detector.lane))
             self._groups.setdefault(group, []).append(index)
 
+    @property
+    def too_coarse(self) -> bool:
+        """True if the stamps are too coarse to show errors of detectors."""
+        return self.grain_s > self._thresholds.coarsest_clock_s
+
     def errors(self, left_out: Collection[str] = ()) -> tuple[DetectorError, ...]:
         """Return the errors of measurement that are beyond chance and large enough to matter.
+
+        None is returned if the stamps are `too_coarse`.
 
         Args:
             left_out: Names of effects that are not examined.
         """
         limit = self._thresholds
-        if self._grain_s > limit.coarsest_clock_s:
+        if self.too_coarse:
             return ()
         pulses = self._together(self._pulses())
         found = [DetectorError(DetectorPulse(place, seconds)) for place, seconds in pulses.items()]
@@ -289,7 +299,7 @@ class Measurement:
             # Times in tenths of seconds are alike too, but not far from those of simulated days.
             apart = abs(float(np.median(measured[:, 2]) - np.median(simulated[:, 2])))
             same = alike[0] > self._thresholds.pulse_share > 2.0 * alike[1]
-            if same and apart > max(self._grain_s, self._thresholds.touching_s):
+            if same and apart > max(self.grain_s, self._thresholds.touching_s):
                 seconds = round(float(np.median(measured[:, 2])), 2)
                 pulses[group] = DetectorPulse.ranges["seconds"].nearest(seconds)
         return pulses
@@ -428,7 +438,7 @@ class Measurement:
         """
         points: set[SpeedPoint | None] = {detector.speed_at for detector in self._detectors}
         stated = points.pop() if len(points) == 1 else None
-        if stated is None or stated == "mean" or self._grain_s > self._thresholds.coarsest_clock_s:
+        if stated is None or stated == "mean" or self.too_coarse:
             return None
         offsets = self._offsets(self._splashes()) if self._pairs_have_speeds else {}
         pulses = self._together(self._pulses())
@@ -514,7 +524,7 @@ class Measurement:
         bend = max(abs(usual.value), usual.spread)
         if int(measured[0, 1]) == ALONE:  # queues spread if speeds are measured elsewhere, too
             bend = max(bend, found.spread)
-        doubt = limit.inexact * over + limit.bent_here * bend + 0.5 * self._grain_s
+        doubt = limit.inexact * over + limit.bent_here * bend + 0.5 * self.grain_s
         alike = limit.bent_alone * bend
         kind, regime = one.kind, int(measured[0, 1])
         if regime != ALONE:
@@ -544,7 +554,7 @@ class Measurement:
         return Equation(
             found.value - usual.value,
             (1.0, slowness),
-            float(np.hypot(found.error, doubt + 0.5 * self._grain_s)),
+            float(np.hypot(found.error, doubt + 0.5 * self.grain_s)),
             shared={f"{kind} {steadily}": doubt},
         )
 
@@ -560,7 +570,7 @@ class Measurement:
         if expected < limit.least_touching:
             return "unknown"
         # Some gaps are too small for the clock, and no sign of vehicles apart.
-        chance = measured[1] * max(self._grain_s, limit.no_gap_s) / GAP_EDGES_S[1]
+        chance = measured[1] * max(self.grain_s, limit.no_gap_s) / GAP_EDGES_S[1]
         return "split" if measured[0] - chance > limit.merged_share * expected else "merged"
 
     def _members(self, place: str) -> list[int]:
@@ -634,7 +644,7 @@ class Measurement:
         """Return the places of detectors that report vehicles of the next lane."""
         limit = self._thresholds
         shares = Splash(
-            self._detectors, self._groups, self._measured, self._simulated, limit, self._grain_s
+            self._detectors, self._groups, self._measured, self._simulated, limit, self.grain_s
         ).shares()
         equations = {
             group: [Equation(share.value, (1.0,), share.error)] for group, share in shares.items()

@@ -286,6 +286,8 @@ class Study:
             return self._occupancies_as_they_are(reporter)
         measurement = self._measurement((), reporter)
         measured = self.measured
+        if measurement.too_coarse:
+            measured = _said(measured, [_of_coarse_stamps(measurement.grain_s)], reporter)
         if (points := measurement.contradicted_point()) is not None:
             measured = _said(measured, [_of_speed_points(*points)], reporter)
         errors = measurement.errors(self.config.leave_out)
@@ -825,6 +827,15 @@ def _tallies(
             for day, period in zip(days, periods, strict=True)
         ]
     return tuple(days)
+
+
+def _of_coarse_stamps(grain_s: float) -> Finding:
+    """Return a finding on stamps that are too coarse to show errors of the detectors."""
+    return Finding(
+        f"stamps of detections have a grain of {grain_s:g} s: errors of the detectors (extension, "
+        "zone, position, splash) were not examined, and may be taken for effects of drivers; "
+        "stamps in tenths of seconds would show them"
+    )
 
 
 def _of_speed_points(stated: SpeedPoint, seen: SpeedPoint) -> Finding:
