@@ -14,6 +14,7 @@ hide where speeds are measured.
 
 from __future__ import annotations
 
+import functools
 import math
 from collections.abc import Collection, Iterator, Mapping, Sequence
 from dataclasses import dataclass
@@ -229,10 +230,9 @@ class Measurement:
         limit = self._thresholds
         if self.too_coarse:
             return ()
-        pulses = self._together(self._pulses())
+        pulses = self._pulses
         found = [DetectorError(DetectorPulse(place, seconds)) for place, seconds in pulses.items()]
-        splashes = self._splashes()
-        offsets = self._offsets(splashes) if self._pairs_have_speeds else {}
+        offsets = self._offsets if self._pairs_have_speeds else {}
         stated = any(detector.speed_at is not None for detector in self._detectors)
         zones = self._points_and_zones(pulses, "rear", self._indices(offsets), fixed=stated)
         found += [DetectorError(DetectorSpeeds(at, point)) for at, point in zones.points.items()]
@@ -244,11 +244,11 @@ class Measurement:
                 found.append(DetectorError(self._of_zone(*number, estimate), margin, rival))
         # Without speeds, distances come from times over the zones, which any other error falsifies.
         if not self._pairs_have_speeds and not found:
-            offsets = self._offsets(splashes)
+            offsets = self._offsets
         for place, farther in offsets.items():
             wrong = DetectorOffset(place, -round(farther.value, 1))
             found.append(DetectorError(wrong, limit.half_interval * farther.error))
-        found += splashes
+        found += self._splashes
         return tuple(error for error in found if error.effect.name not in left_out)
 
     @property
@@ -283,7 +283,12 @@ class Measurement:
 
     # --- single kinds of errors -------------------------------------------------------------------
 
-    def _pulses(self) -> dict[Group, float]:
+    @functools.cached_property
+    def _pulses(self) -> dict[str, float]:
+        """Length of pulses by place, s, where detectors report no presence."""
+        return self._together(self._pulses_of_groups())
+
+    def _pulses_of_groups(self) -> dict[Group, float]:
         """Return the length of pulses by group, s, where detectors report no presence."""
         pulses: dict[Group, float] = {}
         for group, members in self._groups.items():
@@ -440,9 +445,8 @@ class Measurement:
         stated = points.pop() if len(points) == 1 else None
         if stated is None or stated == "mean" or self.too_coarse:
             return None
-        offsets = self._offsets(self._splashes()) if self._pairs_have_speeds else {}
-        pulses = self._together(self._pulses())
-        shown = self._points_and_zones(pulses, stated, self._indices(offsets)).points
+        offsets = self._offsets if self._pairs_have_speeds else {}
+        shown = self._points_and_zones(self._pulses, stated, self._indices(offsets)).points
         return next(((stated, point) for point in shown.values()), None)
 
     def _steady(self) -> float:
@@ -577,15 +581,16 @@ class Measurement:
         names = detectors_at(place, self._detectors)
         return [index for index, one in enumerate(self._detectors) if one.id in names]
 
-    def _offsets(self, splashes: Sequence[DetectorError]) -> dict[str, ValueWithError]:
-        """Return by how much advance and stop detectors are farther apart than stated, m.
+    @functools.cached_property
+    def _offsets(self) -> dict[str, ValueWithError]:
+        """By how much advance and stop detectors are farther apart than stated, m.
 
         Approaches with splash are left out: what crosses both detectors need not be one vehicle.
         """
         limit = self._thresholds
         splashed = {
             edge_of_lane(self._detectors[index].lane)
-            for error in splashes
+            for error in self._splashes
             for index in self._members(str(error.effect.record()["place"]))
         }
         speeds = self._pairs_have_speeds
@@ -640,8 +645,9 @@ class Measurement:
         advance = [self._detectors[index] for index in members]
         return float(np.median([stops[x.lane] - x.position_m for x in advance if x.lane in stops]))
 
+    @functools.cached_property
     def _splashes(self) -> list[DetectorError]:
-        """Return the places of detectors that report vehicles of the next lane."""
+        """Places of detectors that report vehicles of the next lane."""
         limit = self._thresholds
         shares = Splash(
             self._detectors, self._groups, self._measured, self._simulated, limit, self.grain_s
