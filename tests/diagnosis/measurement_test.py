@@ -587,6 +587,21 @@ def test_coarse_clocks(grain_s: float, seen: bool) -> None:
     assert [text.startswith("detector_extension=*") for text in found] == ([True] if seen else [])
 
 
+def test_the_error_of_times_over_a_zone_holds_that_of_simulated_days() -> None:
+    exact = replace(THRESHOLDS, speed_doubt=0.0, queue_doubt=0.0)
+    generator, one = np.random.default_rng(6), day(1, speeds=False)
+    compared = Measurement(DETECTORS, one, one, exact)
+
+    def passages(count: int) -> np.ndarray:
+        rows = np.tile([0.0, ALONE, 0.0, np.nan, CAR_M], (count, 1))
+        rows[:, 2] = generator.normal(0.5, 0.05, count)
+        return rows
+
+    equations = [compared._of_time(passages(400), passages(40)) for _ in range(400)]
+    chance = np.std([equation.value for equation in equations])
+    assert np.mean([equation.error for equation in equations]) == pytest.approx(chance, rel=0.15)
+
+
 def accelerating(seed: int, ratio: float) -> Sightings:
     """One period in which G of queued vehicles at the stop detectors is `ratio`."""
     generator, one = np.random.default_rng(seed), day(seed)

@@ -558,7 +558,7 @@ class Measurement:
         return Equation(
             found.value - usual.value,
             (1.0, slowness),
-            float(np.hypot(found.error, doubt + 0.5 * self.grain_s)),
+            math.hypot(found.error, usual.error, doubt + 0.5 * self.grain_s),
             shared={f"{kind} {steadily}": doubt},
         )
 
