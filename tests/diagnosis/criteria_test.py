@@ -22,6 +22,7 @@ from ugat_marl.diagnosis.verify import (
     representative,
     statistics_table,
     travel_times,
+    verify_model,
 )
 
 THRESHOLDS = Thresholds()
@@ -151,9 +152,9 @@ def test_a_statistic_without_any_difference_stays_in_the_tables() -> None:
     layout = SimpleNamespace(places=[(0, "in", "in_0")], intersections=("A",))
     pools = SimpleNamespace(pool=lambda _: {"network": np.ones((1, width, 2))})
     study: Any = SimpleNamespace(heldout=[day([1])], layout=layout, pools=pools)
-    first, second = statistics_table(study, model, model)
+    first, second = statistics_table(study, model, model, distance, distance)
     assert (first.z_before, second.z_before) == (0.0, 4.0)
-    (lane,) = lanes_table(study, model, model)
+    (lane,) = lanes_table(study.layout, distance, distance)
     assert lane.before == pytest.approx(np.sqrt(8.0))  # of a 0 and a 4
 
 
@@ -170,12 +171,52 @@ def test_rows_show_the_mean_of_the_held_out_hours() -> None:
         return Tally(sums, np.zeros((len(BIN_FEATURES), 1, 12)), window=window)
 
     quiet_and_busy = [of_hour(i % 2, (4, 12)[i % 2]) for i in range(60)]
-    model: Any = SimpleNamespace(model=SimpleNamespace(reference=Reference(pools, quiet_and_busy)))
+    reference = Reference(pools, quiet_and_busy)
+    model: Any = SimpleNamespace(model=SimpleNamespace(reference=reference))
     heldout = [of_hour(1, 13.2), of_hour(1, 13.2)]
     study: Any = SimpleNamespace(heldout=heldout, pools=pools)
-    (row,) = (x for x in statistics_table(study, model, model) if x.statistic == "count_stop")
+    distance = reference.distance(heldout)
+    rows = statistics_table(study, model, model, distance, distance)
+    (row,) = (x for x in rows if x.statistic == "count_stop")
     assert row.measured == pytest.approx(sum(day.sums[number, 0, 0] for day in heldout) / 120)
     assert row.before == pytest.approx(12, abs=0.3) and row.after == row.before
+
+
+def test_a_model_that_is_merely_noisier_is_no_gain() -> None:
+    """Held-out days of the scenario as it is, which has gaps of 2 s with a spread of 1 or 1.5."""
+    generator = np.random.default_rng(1)
+    pools = Pools({"network": np.ones((1, 8)), "lane": np.eye(8)}, THRESHOLDS)
+    rows = [INDEX[name] for name in ("gap2", "gap3", "gap4-5", "gap6-8", "lost", "speed1")]
+
+    def days(count: int, spread: float, mean: float = 2.0) -> list[Tally]:
+        found: list[Tally] = []
+        for _ in range(count):
+            sums = np.zeros((len(FEATURES), 8, 2))
+            sums[rows, :, 0] = 60 * generator.normal(mean, spread, (len(rows), 8))
+            sums[rows, :, 1] = 60
+            found.append(Tally(sums, np.zeros((len(BIN_FEATURES), 8, 12))))
+        return found
+
+    base = Reference(pools, days(60, 1.0))
+
+    def tested(reference: Reference) -> Any:
+        model = SimpleNamespace(reference=reference, members=(), tallies=(), effects=())
+        return SimpleNamespace(model=model, extra={})
+
+    def gains(mean: float, spread: float) -> list[float]:
+        """The model with this mean and spread against as many sets of held-out days."""
+        residual = SimpleNamespace(distance=0.0, expected=0.0)
+        null = SimpleNamespace(test=lambda *_: residual)
+        best = tested(Reference(pools, days(40, spread, mean), prior=base))
+        found: list[float] = []
+        for _ in range(40):
+            held: Any = SimpleNamespace(heldout=days(2, 1.0, mean), null=lambda *_, **__: null)
+            found.append(verify_model(held, tested(base), best).gain)
+        return found
+
+    noisier = np.array(gains(2.0, 1.5))
+    assert noisier.mean() < 0.0 and (noisier >= THRESHOLDS.confirmed).mean() < 0.1
+    assert np.min(gains(4.0, 1.0)) > THRESHOLDS.confirmed
 
 
 def test_travel_times_ask_for_no_further_days() -> None:

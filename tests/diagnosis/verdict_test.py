@@ -153,7 +153,7 @@ def test_what_to_measure_next_is_said_in_words() -> None:
     )
     best: Any = SimpleNamespace(model=model, residual=SimpleNamespace(p=0.0, distance=90.0))
     won: Any = SimpleNamespace(
-        before=SimpleNamespace(p=0.0, distance=1000.0), after=best.residual, shrink=0.9
+        before=SimpleNamespace(p=0.0), after=best.residual, shrink=0.9, gain=900.0
     )
     selector: Any = None
     found = conclude(
@@ -209,7 +209,7 @@ def test_only_a_search_that_ended_says_that_the_library_lacks_it(
         model=SimpleNamespace(members=tried, distance=distance), residual=residual
     )
     nothing_won: Any = SimpleNamespace(
-        before=SimpleNamespace(p=0.0, distance=1000.0), after=residual, shrink=0.1
+        before=SimpleNamespace(p=0.0), after=residual, shrink=0.1, gain=100.0
     )
     selector: Any = None
     contradicted: Any = SimpleNamespace(residual=SimpleNamespace(p=0.0))
@@ -245,7 +245,7 @@ def test_the_end_of_a_range_is_no_answer(
         residual=residual,
     )
     won: Any = SimpleNamespace(
-        before=SimpleNamespace(p=0.0, distance=1000.0), after=residual, shrink=1.0
+        before=SimpleNamespace(p=0.0), after=residual, shrink=1.0, gain=900.0
     )
     selector: Any = None
     contradicted: Any = SimpleNamespace(residual=SimpleNamespace(p=0.0))
@@ -289,7 +289,7 @@ def test_vehicles_that_leave_are_not_taken_for_counters_that_miss_them(
     model = SimpleNamespace(members=members, distance=distance)
     best: Any = SimpleNamespace(model=model, residual=residual)
     won: Any = SimpleNamespace(
-        before=SimpleNamespace(p=0.0, distance=1000.0), after=residual, shrink=1.0
+        before=SimpleNamespace(p=0.0), after=residual, shrink=1.0, gain=900.0
     )
     selector: Any = None
     contradicted: Any = SimpleNamespace(residual=SimpleNamespace(p=0.0))
@@ -321,8 +321,8 @@ def test_a_hint_that_is_not_confirmed_is_weighed_with_the_other_periods(
         model=SimpleNamespace(members=(), distance=distance),
         residual=SimpleNamespace(p=fitted, distance=900.0),
     )
-    before = SimpleNamespace(p=heldout, distance=950.0)
-    verification: Any = SimpleNamespace(before=before, after=before, shrink=None)
+    before = SimpleNamespace(p=heldout)
+    verification: Any = SimpleNamespace(before=before, after=before, shrink=None, gain=0.0)
     selector: Any = None
     found = conclude(
         located(best),

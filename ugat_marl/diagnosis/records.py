@@ -221,11 +221,14 @@ class Verified:
         shrink: Share of the gap that is gone: 1 minus the excess distance after over the excess
             distance before. The excess is the distance minus its expected value, at least 0. None
             without a gap or without a corrected model.
+        gain: Distance plus penalty for noise before, minus the same after; see `Fitted.cost`.
+            0 without a corrected model.
     """
 
     before: ResidualTest
     after: ResidualTest
     shrink: float | None
+    gain: float
 
 
 @dataclass(frozen=True, eq=False)

@@ -772,8 +772,8 @@ class Thresholds(DayThresholds):
     """Standardised difference between two models that would decide, for the number of further
     periods to measure. By hand. Halved: a quarter of these periods is asked for."""
     confirmed: float = 10.0
-    """Distance by which effects must improve the held-out periods. By hand, below `price`. Halved:
-    chance confirms more often."""
+    """Distance plus penalty for noise by which effects must improve the held-out periods. By hand,
+    below `price`. Halved: chance confirms more often."""
 
     # --- patterns in what is left -------------------------------------------------------------
 

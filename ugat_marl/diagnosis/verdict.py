@@ -62,7 +62,7 @@ def conclude(
     """
     base, best = located.base, selection.best
     alpha, thresholds = config.alpha, config.thresholds
-    confirmed = verification.before.distance - verification.after.distance >= thresholds.confirmed
+    confirmed = verification.gain >= thresholds.confirmed
     chance = base.residual.p
     if held_out:
         chance = combined(chance, verification.before.p)

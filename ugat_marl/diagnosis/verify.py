@@ -21,6 +21,7 @@ from ugat_marl.diagnosis.features import (
     INDEX,
     SATURATION_GAPS,
     SERVICE_COUNTS,
+    DetectorLayout,
     Tally,
 )
 from ugat_marl.diagnosis.records import (
@@ -36,7 +37,7 @@ from ugat_marl.diagnosis.records import (
     Verified,
 )
 from ugat_marl.diagnosis.residual import Null
-from ugat_marl.diagnosis.statistics import Array, of_the_same_stretches, sum_of
+from ugat_marl.diagnosis.statistics import Array, Distance, of_the_same_stretches, sum_of
 from ugat_marl.diagnosis.study import Study
 from ugat_marl.diagnosis.thresholds import Thresholds
 from ugat_marl.diagnosis.traffic import approach_table, traffic_check
@@ -48,7 +49,8 @@ def verify_model(study: Study, base: Tested, best: Tested) -> Verified:
     """Test both models on the held-out periods.
 
     With e the excess of the distance over its expected value, at least 0:
-    shrink = 1 - e_after / e_before.
+    shrink = 1 - e_after / e_before. The gain is compared as in a fit, with the penalty for noise: a
+    model that is merely noisier is nearer to all data.
     """
 
     def null(model: Tested) -> Null:
@@ -64,14 +66,27 @@ def verify_model(study: Study, base: Tested, best: Tested) -> Verified:
     gap = max(0.0, before.distance - before.expected)
     left = max(0.0, after.distance - after.expected)
     shrink = 1.0 - left / gap if gap > 0.0 and best.model.members else None
-    return Verified(before, after, shrink)
+    cost_before, cost_after = (
+        distance.total + distance.penalty for distance in _held_out(study, base, best)
+    )
+    return Verified(before, after, shrink, cost_before - cost_after)
+
+
+def _held_out(study: Study, base: Tested, best: Tested) -> tuple[Distance, Distance]:
+    """Return the distances of the held-out periods from both models, relative to `base`."""
+    before, after = (
+        tested.model.reference.distance(study.heldout, relative_to=base.model.reference)
+        for tested in (base, best)
+    )
+    return before, after
 
 
 def tables_of(study: Study, base: Tested, best: Tested) -> Tables:
     """Make the tables that compare both models."""
+    before, after = _held_out(study, base, best)
     return Tables(
-        statistics_table(study, base, best),
-        lanes_table(study, base, best),
+        statistics_table(study, base, best, before, after),
+        lanes_table(study.layout, before, after),
         engineering_criteria(study, base, best),
         travel_times(study, base, best),
         approach_table(
@@ -100,10 +115,18 @@ def _same_days(study: Study, base: Tested, best: Tested) -> tuple[list[Tally], l
     )
 
 
-def statistics_table(study: Study, base: Tested, best: Tested) -> tuple[StatisticRow, ...]:
-    """Compare each statistic of the network on the held-out periods, with its noise."""
-    before = base.model.reference.distance(study.heldout)
-    after = best.model.reference.distance(study.heldout, relative_to=base.model.reference)
+def statistics_table(
+    study: Study, base: Tested, best: Tested, before: Distance, after: Distance
+) -> tuple[StatisticRow, ...]:
+    """Compare each statistic of the network on the held-out periods, with its noise.
+
+    Args:
+        study: The inputs of the diagnosis.
+        base: The scenario as it is.
+        best: The selected model.
+        before: Distance of the held-out periods from `base`.
+        after: Their distance from `best`.
+    """
     block = base.model.reference.blocks["network"]
     fitted = best.model.reference.blocks["network"]
     sums = study.pools.pool(sum_of(study.heldout))["network"][0]
@@ -131,19 +154,23 @@ def statistics_table(study: Study, base: Tested, best: Tested) -> tuple[Statisti
     return tuple(rows)
 
 
-def lanes_table(study: Study, base: Tested, best: Tested) -> tuple[LaneRow, ...]:
-    """Return the root mean square of every lane's standardised differences."""
-    distance = base.model.reference.distance(study.heldout)
-    before, used = distance.z["lane"], distance.used["lane"]
-    after = best.model.reference.distance(study.heldout, relative_to=base.model.reference).z["lane"]
+def lanes_table(layout: DetectorLayout, before: Distance, after: Distance) -> tuple[LaneRow, ...]:
+    """Return the root mean square of every lane's standardised differences.
+
+    Args:
+        layout: Lanes and detectors.
+        before: Distance of the held-out periods from the scenario as it is.
+        after: Their distance from the selected model.
+    """
+    used = before.used["lane"]
     return tuple(
         LaneRow(
             lane=name,
-            tls=study.layout.intersections[owner],
-            before=_rms(before[index][used[index]]),
-            after=_rms(after[index][used[index]]),
+            tls=layout.intersections[owner],
+            before=_rms(before.z["lane"][index][used[index]]),
+            after=_rms(after.z["lane"][index][used[index]]),
         )
-        for index, (owner, _, name) in enumerate(study.layout.places)
+        for index, (owner, _, name) in enumerate(layout.places)
         if used[index].any()
     )
 

@@ -325,7 +325,7 @@ def _concluded(
             )
         )
         if conclusion.verdict == "no_discrepancy":
-            verified = Verified(verified.before, verified.before, None)
+            verified = Verified(verified.before, verified.before, None, 0.0)
             conclusion = _beside_the_log(study, located, verified, conclusion, timing)
         diagnosis = _record(study, timing, located, selected, verified, conclusion)
     except OutOfTime:
