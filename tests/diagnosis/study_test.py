@@ -155,6 +155,17 @@ def test_each_stretch_of_the_day_has_some_days() -> None:
     assert effort_for(9, hours).fit == effort_for(9).fit
 
 
+def test_an_effort_of_too_few_days_for_the_times_of_day_is_refused() -> None:
+    """With a day of each stretch in each half of a test, nothing is ever unusual."""
+    hours = [Period(f"{d} {h}", h, h + 1, "fit", {}, {}) for d in "ab" for h in range(4)]
+    few, enough = Effort(base=24, test=8), Effort(base=24, test=24)
+    assert effort_for(1, hours[:1], few) == few
+    assert effort_for(1, hours, enough) == enough
+    told = "base = 24 and test = 8 are too few days for periods at 4 times of day; give at least 24"
+    with pytest.raises(OptionError, match=told):
+        effort_for(1, hours, few)
+
+
 @pytest.mark.parametrize(
     ("lights", "mornings", "evenings"), [(9, 9, 1), (4, 19, 1), (9, 24, 6), (9, 5, 5)]
 )

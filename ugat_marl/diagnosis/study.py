@@ -83,7 +83,8 @@ class DiagnosisConfig:
         leave_out: Names of effects that are not examined.
         cache: Folder of cached days; None for the user's cache folder.
         workers: Simulations at a time, None for one per core; or an executor.
-        effort: Numbers of simulated days; None for those that suit the size of the network.
+        effort: Numbers of simulated days; None for those that suit the size of the network. Periods
+            at several times of day need at least `DAYS_OF_A_STRETCH` for each time.
         correct_anyway: Write ``corrected`` also if its effects explain only a part, or bring
             held-out traffic no nearer.
         unnamed: Try a correction of service and demand that has no name, where the named effects do
@@ -186,6 +187,7 @@ class Study:
         Raises:
             MeasuredDataError: The data hold nothing to compare, or no vehicle of the scenario
                 reaches a measured lane.
+            OptionError: The effort has too few days for the stretches of the day.
         """
         network, thresholds = Network.read(scenario), config.thresholds
         detectors, findings = compared_detectors(scenario, measured, thresholds)
@@ -197,7 +199,7 @@ class Study:
         allowed = library(config.leave_out) - ruled_out
         periods = _fitted_periods(measured, given, thresholds)
         answering = _answering(measured, layout.intersections)
-        effort = config.effort or effort_for(len(layout.intersections), measured.periods)
+        effort = effort_for(len(layout.intersections), measured.periods, config.effort)
         supplementary = SupplementaryData.of(measured)
         fit = _tallies(layout, measured, periods, thresholds, supplementary)
         heldout = _tallies(layout, measured, measured.of("heldout"), thresholds, supplementary)
@@ -791,19 +793,30 @@ def _pools(
     return Pools.of(layout, thresholds, together, supplementary.labels if supplementary else None)
 
 
-def effort_for(intersections: int, periods: Sequence[Period] = ()) -> Effort:
+def effort_for(
+    intersections: int, periods: Sequence[Period] = (), given: Effort | None = None
+) -> Effort:
     """Return the numbers of days that suit the size of a network, and the stretches of the day.
 
     Args:
         intersections: Number of intersections.
         periods: The measured periods. Each stretch of the day has a mean of its own, so that tests
             need some days of each.
+        given: Numbers to use instead.
+
+    Raises:
+        OptionError: `given` has too few days for the stretches of the day.
     """
-    effort = next((effort for most, effort in EFFORTS if intersections <= most), LEAST_EFFORT)
+    effort = given or next((own for most, own in EFFORTS if intersections <= most), LEAST_EFFORT)
     stretches = len({period.window for period in periods})
-    if stretches < 2:
-        return effort
     least = DAYS_OF_A_STRETCH * stretches
+    if stretches < 2 or min(effort.base, effort.test) >= least:
+        return effort
+    if given is not None:
+        raise OptionError(
+            f"effort base = {given.base} and test = {given.test} are too few days for periods at "
+            f"{stretches} times of day; give at least {least} for both"
+        )
     return replace(effort, base=max(effort.base, least), test=max(effort.test, least))
 
 
