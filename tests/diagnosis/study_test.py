@@ -323,6 +323,8 @@ def test_windows_that_nearly_agree_are_one_time_of_day() -> None:
         ([(0.0, 3600.0), (0.4, 3600.4), (0.8, 3600.8)], {(0.4, 3600.0), (0.8, 3600.8)}),
         # the second and the third differ by more than either from the first
         ([(0.0, 3600.0), (0.2, 3600.5), (0.3, 3599.9)], {(0.3, 3599.9)}),
+        # the second is another time of day; the third is that of the first all the same
+        ([(0.0, 3600.0), (0.1, 3600.8), (0.2, 3600.1)], {(0.2, 3600.0), (0.1, 3600.8)}),
     ],
 )
 def test_windows_are_compared_with_the_first_of_their_time_of_day(
@@ -409,6 +411,33 @@ def test_lengths_are_compared_before_windows_are_joined() -> None:
     told = r"'longer' is 3601 s long, and '\(0.3, 3599.5\)' only 3599.2 s"
     with pytest.raises(MeasuredDataError, match=told):
         module._refuse_lengths((*given, longer), (*common, longer), THRESHOLDS)
+
+
+@pytest.mark.parametrize(
+    ("other", "refused"),
+    [
+        ((0.0, 3599.4), True),
+        ((0.8, 3600.8), True),
+        ((250.0, 3850.0), True),
+        ((0.3, 3600.3), False),  # the same
+        ((900.0, 4500.0), False),  # another time of day
+        ((3600.0, 7200.0), False),
+    ],
+)
+def test_periods_of_nearly_one_time_of_day_are_refused(
+    other: tuple[float, float], refused: bool
+) -> None:
+    windows = {"first": (0.0, 3600.0), "again": (0.0, 3600.0), "other": other}
+    periods = tuple(
+        Period(name, *window, "fit", {}, {"one": SEEN}) for name, window in windows.items()
+    )
+    given = MeasuredData(DETECTORS, _of_common_windows(periods))
+    if not refused:
+        assert module._fitted_periods(given, periods, THRESHOLDS) == given.periods
+        return
+    told = rf"(?=.*'other' from {other[0]} to {other[1]} s).* are nearly the same time of day"
+    with pytest.raises(MeasuredDataError, match=told):
+        module._fitted_periods(given, periods, THRESHOLDS)
 
 
 def test_demand_that_varies_from_day_to_day_is_told_from_chance() -> None:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import functools
+import itertools
 import math
 import time
 from collections.abc import Mapping, Sequence
@@ -663,6 +664,7 @@ def _fitted_periods(
     if not (periods := measured.of("fit")):
         raise MeasuredDataError("no period has the split 'fit'; there is nothing to fit")
     _refuse_lengths(given, measured.periods, thresholds)
+    _refuse_near_windows(measured.periods, thresholds)
     return periods
 
 
@@ -735,12 +737,11 @@ def _of_common_windows(periods: tuple[Period, ...]) -> tuple[Period, ...]:
     """
     groups: list[list[tuple[float, float]]] = []
     for window in sorted({period.window for period in periods}):
-        first = groups[-1][0] if groups else (-math.inf, -math.inf)
-        near = all(abs(a - b) <= SAME_TIME_S for a, b in zip(window, first, strict=True))
-        if near:
-            groups[-1].append(window)
-        else:
+        own = next((group for group in groups if _near(window, group[0], SAME_TIME_S)), None)
+        if own is None:
             groups.append([window])
+        else:
+            own.append(window)
     common = {
         window: (max(begin for begin, _ in group), min(end for _, end in group))
         for group in groups
@@ -750,6 +751,31 @@ def _of_common_windows(periods: tuple[Period, ...]) -> tuple[Period, ...]:
         replace(period, begin_s=common[period.window][0], end_s=common[period.window][1])
         for period in periods
     )
+
+
+def _near(one: tuple[float, float], other: tuple[float, float], apart_s: float) -> bool:
+    """Return True if begins and ends of two windows differ by at most `apart_s`."""
+    return all(abs(a - b) <= apart_s for a, b in zip(one, other, strict=True))
+
+
+def _refuse_near_windows(common: Sequence[Period], thresholds: Thresholds) -> None:
+    """Refuse overlapping periods of nearly one time of day: each would be a stretch of its own.
+
+    Args:
+        common: The periods in common windows.
+        thresholds: Numbers of the method.
+
+    Raises:
+        MeasuredDataError: Two windows overlap and differ by at most a bin of time.
+    """
+    names = {period.window: period.id for period in reversed(common)}
+    for one, other in itertools.combinations(sorted(names), 2):
+        if other[0] < one[1] and _near(one, other, thresholds.bin_s):
+            raise MeasuredDataError(
+                f"periods.csv: {names[one]!r} from {one[0]} to {one[1]} s and {names[other]!r} "
+                f"from {other[0]} to {other[1]} s are nearly the same time of day; give both the "
+                "same begin_s and end_s"
+            )
 
 
 def _refuse_lengths(
