@@ -451,6 +451,20 @@ def test_a_failure_of_sumo_is_passed_on(
         made.replicates((), range(5))
 
 
+def test_days_of_other_models_are_no_days_of_the_scenario_as_it_is(
+    scenario: Scenario, layout: DetectorLayout, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(Streets, "detecting", lambda self, _: self)
+    made, _ = an_engine(scenario, layout, None, base_days=4)
+    for effects, numbers in (((), [0, 2, 7]), (HEADWAY, [0, 1, 2, 3])):
+        made.replicates(effects, numbers)
+    assert made.known_base_days == 2
+    faulty = made.detecting(FAULTY)
+    assert faulty.known_base_days == 0
+    faulty.replicates((), [3])
+    assert (faulty.known_base_days, made.known_base_days) == (1, 2)
+
+
 def test_progress_is_told_day_by_day(scenario: Scenario, layout: DetectorLayout) -> None:
     made, _ = an_engine(scenario, layout, None)
     told: list[None] = []

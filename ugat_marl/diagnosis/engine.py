@@ -361,9 +361,10 @@ class Engine:
         return days
 
     @property
-    def known(self) -> int:
-        """Number of simulated days used so far, with days from the cache."""
-        return len(self._known)
+    def known_base_days(self) -> int:
+        """Number of days of the scenario as it is that were simulated or read, up to `base_days`."""
+        keys = (self._key(self._detection, number) for number in range(self._base_days))
+        return sum(key in self._known for key in keys)
 
     @contextlib.contextmanager
     def watched(self, advance: Callable[[], None], most: int) -> Iterator[None]:

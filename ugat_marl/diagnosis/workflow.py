@@ -528,7 +528,7 @@ def _record(
 
 def _nothing_simulated(study: Study, timing: tuple[Effect, ...]) -> Diagnosis:
     """Make the record for a budget that ended before the scenario as it is was simulated."""
-    known, wanted = study.engine.known, study.effort.base
+    known, wanted = study.engine.known_base_days, study.effort.base
     there = (
         f"{known} of {wanted} simulated days of the scenario as it is are there"
         if known < wanted
