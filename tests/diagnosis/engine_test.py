@@ -323,7 +323,7 @@ def test_a_day_that_failed_is_tried_again(
 
 
 @pytest.mark.parametrize(
-    "damage", ["empty", "half", "text", "flipped", "encrypted", "method", "other"]
+    "damage", ["empty", "half", "text", "flipped", "encrypted", "method", "other", "head"]
 )
 def test_a_damaged_file_is_simulated_again(
     scenario: Scenario, layout: DetectorLayout, tmp_path: Path, damage: str
@@ -341,6 +341,10 @@ def test_a_damaged_file_is_simulated_again(
     if damage == "other":
         with file.open("wb") as stream:
             np.savez(stream, something=np.zeros(3))
+    elif damage == "head":  # of an array that is longer than what is read at once
+        with file.open("wb") as stream:
+            np.savez(stream, sums=np.zeros(9999))
+        file.write_bytes(file.read_bytes().replace(b"(9999,)", b"[(999,)"))
     else:
         changed = {
             "empty": b"",
@@ -357,6 +361,18 @@ def test_a_damaged_file_is_simulated_again(
     third, silent = an_engine(scenario, layout, tmp_path)
     assert same(third.replicates((), [0])[0], simulated), "the file was not written again"
     assert silent.calls == []
+
+
+def test_a_mistake_while_a_file_is_read_is_no_damage(
+    scenario: Scenario, layout: DetectorLayout, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def mistaken(*_: Any, **__: Any) -> None:
+        raise AssertionError("a mistake")
+
+    made, _ = an_engine(scenario, layout, tmp_path)
+    monkeypatch.setattr(module.np, "load", mistaken)
+    with pytest.raises(AssertionError, match="a mistake"):
+        made.replicates((), [0])
 
 
 def test_what_decides_a_day_decides_which_is_remembered(

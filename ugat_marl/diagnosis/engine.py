@@ -11,6 +11,9 @@ import itertools
 import math
 import threading
 import time
+import tokenize
+import zipfile
+import zlib
 from collections import OrderedDict
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from concurrent.futures import Executor, Future, ThreadPoolExecutor
@@ -39,7 +42,7 @@ from ugat_marl.diagnosis.thresholds import Thresholds
 from ugat_marl.diagnosis.unmeasured import Unmeasured
 from ugat_marl.effects import Effect
 from ugat_marl.errors import OptionError, ScenarioError, SimulatorError, UgatMarlError
-from ugat_marl.files import user_cache, write_whole
+from ugat_marl.files import MALFORMED, user_cache, write_whole
 from ugat_marl.parallel import Workers, parts_at_a_time
 from ugat_marl.scenarios import Period, Scenario
 from ugat_marl.seeding import derive_seed
@@ -112,6 +115,22 @@ VERSION = 13
 _READING = threading.Lock()
 """Held while arrays are read: numpy parses their heads with `ast`, and in Python 3.11 two threads
 that do so at once may raise a SystemError (gh-106905)."""
+
+_DAMAGED = (
+    OSError,
+    EOFError,
+    MemoryError,
+    RuntimeError,
+    SyntaxError,
+    tokenize.TokenError,
+    zipfile.BadZipFile,
+    zlib.error,
+    *MALFORMED,
+)
+"""Exceptions that zipfile and numpy raise for a damaged file.
+
+Heads of arrays are parsed before their checksums are known. They may be no Python, or claim too
+much memory."""
 
 _SUPPLEMENTARY = "between "
 """Start of the names of `Tally.supplementary` in the cache."""
@@ -362,7 +381,7 @@ class Engine:
 
     @property
     def known_base_days(self) -> int:
-        """Number of days of the scenario as it is that were simulated or read, up to `base_days`."""
+        """Number of the first `base_days` of the scenario as it is that are there."""
         keys = (self._key(self._detection, number) for number in range(self._base_days))
         return sum(key in self._known for key in keys)
 
@@ -656,7 +675,7 @@ class Engine:
         try:
             with _READING, np.load(file, allow_pickle=False) as stored:
                 return {name: stored[name] for name in stored.files}
-        except Exception:  # noqa: BLE001 - zipfile and numpy raise many kinds on damaged files
+        except _DAMAGED:
             return None
 
     def _store(self, key: str, arrays: Mapping[str, Any]) -> None:
