@@ -15,7 +15,8 @@ from ugat_marl.data import MeasuredData
 from ugat_marl.diagnosis.features import BIN_FEATURES, FEATURES, DetectorLayout, IncomingLane, Tally
 from ugat_marl.diagnosis.places import turned
 from ugat_marl.diagnosis.replay import Replay
-from ugat_marl.diagnosis.statistics import Pools, Reference
+from ugat_marl.diagnosis.residual import MatchedFilters
+from ugat_marl.diagnosis.statistics import Pools, Reference, Whitener
 from ugat_marl.diagnosis.supplementary_data import (
     EVERY_LANE,
     LANES,
@@ -149,7 +150,7 @@ def test_a_planted_turn_is_proposed_with_its_share_and_no_other() -> None:
     assert found.levels[0][0] == pytest.approx(0.25, abs=0.05)
 
 
-@pytest.mark.parametrize("periods", [5, 6, 10])
+@pytest.mark.parametrize("periods", [5, 6, 10, 18])
 def test_turns_counted_in_one_of_many_periods_are_compared(periods: int) -> None:
     """A quarter of an hour in which twice as many turned as are expected."""
     days = tuple(Period(str(k), 0.0, 3600.0, "fit", {}, {}) for k in range(periods))
@@ -168,9 +169,15 @@ def test_turns_counted_in_one_of_many_periods_are_compared(periods: int) -> None
         return np.c_[times, np.zeros_like(times)]
 
     simulated = [day(own.simulated(days[r % periods], [came(), came()], None)) for r in range(60)]
-    distance = Reference(pools, simulated).distance([day(own.measured(d.id)) for d in days])
+    reference, data = Reference(pools, simulated), [day(own.measured(d.id)) for d in days]
+    distance = reference.distance(data)
     more, same = distance.z[TURNING].ravel()
     assert more > 5.0 and abs(same) < 2.0
+    whitener = Whitener(reference, data, 0.0, blocks=[TURNING])
+    assert whitener.measured == pytest.approx([more, same]), "fits use what is compared"
+    change = {TURNING: np.array([[1.0], [0.0]])}
+    filters = MatchedFilters([change], reference, data, [TURNING])
+    assert filters(distance) == pytest.approx(more**2)
 
 
 # --- states of lanes ------------------------------------------------------------------------------

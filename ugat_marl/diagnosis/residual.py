@@ -218,7 +218,7 @@ class MatchedFilters:
         fitted: Sequence[Mapping[str, Array]] = (),
     ) -> None:
         self._thresholds = thresholds = reference.pools.thresholds
-        sums = reference.pools.pool_all(data)
+        sums, used = reference.pools.pool_all(data), reference.distance(data).used
         self._parts: list[tuple[str, list[Group]]] = []
         scales: dict[str, Array] = {}
         for name in blocks:
@@ -226,10 +226,7 @@ class MatchedFilters:
                 continue
             block = reference.blocks[name]
             weight = sums[name][..., 1] / len(data)
-            groups = correlation_groups(
-                block.used & (weight >= reference.pools.least_weight(name)), block.correlation
-            )
-            self._parts.append((name, groups))
+            self._parts.append((name, correlation_groups(used[name], block.correlation)))
             more = 0.0 if extra is None else extra[name]
             scales[name] = np.sqrt(block.noise(weight, len(data)) + more)
 

@@ -652,8 +652,7 @@ class Whitener:
         relative_to: Reference | None = None,
         blocks: Collection[str] | None = None,
     ) -> None:
-        chosen = relative_to or reference
-        distance = reference.distance(data, relative_to=chosen)
+        distance = reference.distance(data, relative_to=relative_to)
         sums = reference.pools.pool_all(data)
         self._parts: list[tuple[str, Array, list[Group]]] = []
         for name, block in reference.blocks.items():
@@ -666,8 +665,8 @@ class Whitener:
                 name, reference.pools.thresholds
             )  # 0 for blocks that are not softened
             scale = np.sqrt(noise + (max(tolerance, soft) * difference) ** 2)
-            used = chosen.blocks[name].used & (weight >= reference.pools.least_weight(name))
-            self._parts.append((name, scale, correlation_groups(used, block.correlation)))
+            groups = correlation_groups(distance.used[name], block.correlation)
+            self._parts.append((name, scale, groups))
         self.measured = self(distance.difference)
 
     def __call__(self, differences: Mapping[str, Array]) -> Array:
