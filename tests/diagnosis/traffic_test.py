@@ -272,6 +272,8 @@ def test_what_was_not_fitted_has_no_interval_and_a_window_is_a_window() -> None:
     assert surge.parameters["factor"].low is None and surge.parameters["factor"].high is None
     loops = without_search(DetectorExtension("advance", 1.0, "merged"), "detections", 0.1)
     assert (loops.window, loops.parameters["seconds"].low) == (None, pytest.approx(0.9))
+    splash = without_search(DetectorSplash("stop", 0.8), "detections", 0.4).parameters["share"]
+    assert (splash.low, splash.high) == (pytest.approx(0.4), 1.0), "no share is above 1"
 
 
 SPLASH = DetectorSplash("stop", 0.2)

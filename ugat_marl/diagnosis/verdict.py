@@ -26,7 +26,7 @@ from ugat_marl.diagnosis.records import (
 from ugat_marl.diagnosis.select import Selector
 from ugat_marl.diagnosis.study import DiagnosisConfig
 from ugat_marl.diagnosis.thresholds import Thresholds
-from ugat_marl.effects import Effect, known_effects
+from ugat_marl.effects import Effect, NumberParameter, known_effects
 from ugat_marl.errors import counted, joined
 
 NOUNS = {"swapped": "swapped detectors", "stuck": "a stuck detector"}
@@ -379,15 +379,26 @@ def effect_record(
     ranges = known_effects()[hypothesis.name].ranges
     parameters: dict[str, Parameter] = {}
     for index, (name, value) in enumerate(zip(hypothesis.free, values, strict=True)):
-        allowed, low, high = ranges[name], None, None
-        if margins is not None:
-            low = max(value - margins[index], allowed.low)
-            high = min(value + margins[index], allowed.high)
-        parameters[name] = Parameter(value, low, high, allowed.unit)
+        margin = None if margins is None else margins[index]
+        parameters[name] = parameter(value, margin, ranges[name])
     for name, value in hypothesis.fixed:
         if not isinstance(value, str) and name not in WINDOW:
-            parameters[name] = Parameter(value, None, None, ranges[name].unit)
+            parameters[name] = parameter(value, None, ranges[name])
     return EffectRecord(hypothesis.name, place, window, parameters)
+
+
+def parameter(value: float, margin: float | None, allowed: NumberParameter) -> Parameter:
+    """Return the record of a number of an effect, with its 95 % interval within its range.
+
+    Args:
+        value: The number.
+        margin: Half the width of the interval; None without an interval.
+        allowed: Range and unit of the number.
+    """
+    if margin is None:
+        return Parameter(value, None, None, allowed.unit)
+    low, high = max(value - margin, allowed.low), min(value + margin, allowed.high)
+    return Parameter(value, low, high, allowed.unit)
 
 
 # --- patterns -------------------------------------------------------------------------------------

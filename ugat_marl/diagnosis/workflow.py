@@ -35,7 +35,6 @@ from ugat_marl.diagnosis.records import (
     Located,
     LogGrounds,
     NamedEffect,
-    Parameter,
     PolicyGap,
     SearchGrounds,
     Selected,
@@ -58,6 +57,7 @@ from ugat_marl.diagnosis.verdict import (
     describe_pattern,
     effect_record,
     keys_of,
+    parameter,
     unchallenged,
     unverified,
 )
@@ -643,16 +643,13 @@ def _without_search(
     values = effect.record()
     name = str(values.pop("name"))
     texts = [str(values[key]) for key in effect.texts]
-    numbers = {key: (float(values[key]), limits.unit) for key, limits in effect.ranges.items()}
+    numbers = {key: float(values[key]) for key in effect.ranges}
     window = None
     if all(key in numbers for key in WINDOW):
-        begin_s, end_s = (numbers.pop(key)[0] for key in WINDOW)
+        begin_s, end_s = (numbers.pop(key) for key in WINDOW)
         window = (begin_s, end_s)
     parameters = {
-        key: Parameter(value, None, None, unit)
-        if margin is None
-        else Parameter(value, value - margin, value + margin, unit)
-        for key, (value, unit) in numbers.items()
+        key: parameter(value, margin, effect.ranges[key]) for key, value in numbers.items()
     }
     grounds = LogGrounds(source, None if rival is None else str(rival))
     return NamedEffect(name, ">".join(texts) or None, window, parameters, grounds)
