@@ -14,8 +14,7 @@ from pydantic import TypeAdapter
 from ugat_marl.diagnosis import DiagnosisConfig, Hypothesis
 from ugat_marl.diagnosis.features import FEATURES
 from ugat_marl.diagnosis.places import one_behind_the_other
-from ugat_marl.diagnosis.records import EffectRecord, Located, Parameter, Selected
-from ugat_marl.diagnosis.thresholds import Thresholds
+from ugat_marl.diagnosis.records import Conclusion, EffectRecord, Located, Parameter, Selected
 from ugat_marl.diagnosis.verdict import (
     _rivals,
     combined,
@@ -183,10 +182,17 @@ def test_nothing_is_found_where_held_out_periods_say_so_too(
     agrees: Any = SimpleNamespace(residual=SimpleNamespace(p=0.6))
     verified: Any = SimpleNamespace(before=SimpleNamespace(p=heldout_p))
     here = Located(agrees, (), complete=complete, examined=frozenset())
-    found = unchallenged(here, verified, Thresholds(), (), ())
-    assert found.verdict == verdict
+
+    def told(heldout: list[str]) -> Conclusion:
+        study: Any = SimpleNamespace(
+            measured=SimpleNamespace(of=lambda _: heldout), config=DiagnosisConfig(),
+            ruled_out=(), detection=(),
+        )  # fmt: skip
+        return unchallenged(study, here, verified, ())
+
+    assert (found := told(["day4"])).verdict == verdict
     assert said in found.sentence
-    assert unchallenged(here, None, Thresholds(), (), ()).verdict != "unknown", "none is held out"
+    assert told([]).verdict != "unknown", "none is held out"
 
 
 @pytest.mark.parametrize("shrink", [0.3, -0.42])

@@ -118,7 +118,9 @@ class Null:
 
     def _judge(self, distance: Distance) -> ResidualTest:
         values = _statistics(distance, self._directed, self._thresholds.added_distance)
-        chances = {name: self._chance(name, value) for name, value in values.items()}
+        chances = {
+            name: log_normal_tail(value, *self._moments[name]) for name, value in values.items()
+        }
         smallest = min(chances.values())
         return ResidualTest(
             distance.total,
@@ -133,9 +135,6 @@ class Null:
         """Total distance that 99 of 100 data sets of the model stay below."""
         mean, deviation = self._moments["total"]
         return math.exp(mean + self._thresholds.floor_deviations * deviation)
-
-    def _chance(self, name: str, value: float) -> float:
-        return log_normal_tail(value, *self._moments[name])
 
 
 def drawn_days(

@@ -24,8 +24,7 @@ from ugat_marl.diagnosis.records import (
     Verified,
 )
 from ugat_marl.diagnosis.select import Selector
-from ugat_marl.diagnosis.study import DiagnosisConfig
-from ugat_marl.diagnosis.thresholds import Thresholds
+from ugat_marl.diagnosis.study import DiagnosisConfig, Study
 from ugat_marl.effects import Effect, NumberParameter, known_effects
 from ugat_marl.errors import counted, joined
 
@@ -100,38 +99,33 @@ def conclude(
 
 
 def unchallenged(
-    located: Located,
-    verification: Verified | None,
-    thresholds: Thresholds,
-    ruled_out: Collection[str],
-    timing: Sequence[Effect],
-    detection: Sequence[DetectorError] = (),
+    study: Study, located: Located, verification: Verified, timing: Sequence[Effect]
 ) -> Conclusion:
     """Conclude that the scenario as it is could have made the fitted periods.
 
     If the held-out periods contradict it, the verdict is "unknown".
 
     Args:
+        study: The data, what they cannot show, and the errors of measurement.
         located: Comparison of the scenario as it is with the data.
-        verification: Test on the held-out periods; None without such periods.
-        thresholds: Numbers of the method.
-        ruled_out: Names of effects that the data cannot show.
+        verification: Tests on the held-out periods; not used if no period is held out.
         timing: Effects that are read off the signal log.
-        detection: Errors of measurement.
     """
+    ruled_out, detection = study.ruled_out, study.detection
     blind = f"; {counted(len(ruled_out), 'effect')} could not be examined" if ruled_out else ""
     sentence = f"Nothing in the data contradicts the scenario as it is{blind}."
     known = [f"the signal log has {' and '.join(map(str, timing))}"] if timing else []
     known += [describe_errors(detection)] if detection else []
     if known:
         sentence = f"{capitalised('; '.join(known))}; with that, nothing contradicts the scenario."
-    if verification is not None and verification.before.p < thresholds.fit_level:
+    p = verification.before.p if study.measured.of("heldout") else 1.0
+    if p < study.config.thresholds.fit_level:
         sentence = capitalised(
             "; ".join(
                 [
                     *known,
                     "the scenario agrees with the fitted periods, but not with the held-out ones "
-                    f"(p = {verification.before.p:.2g}): did something change between them?",
+                    f"(p = {p:.2g}): did something change between them?",
                 ]
             )
         )

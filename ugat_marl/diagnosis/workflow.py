@@ -301,7 +301,7 @@ def _concluded(
     study, located, selected = search.study, search.located, search.selected
     if selected is None:
         verified = verify_model(study, located.base, located.base)
-        conclusion = _unchallenged(study, located, verified, timing)
+        conclusion = unchallenged(study, located, verified, timing)
         return _record(study, timing, located, None, verified, conclusion), ()
 
     def told(conclusion: Conclusion) -> Conclusion:
@@ -445,21 +445,6 @@ def _reason_against(
     )
 
 
-def _unchallenged(
-    study: Study, located: Located, verified: Verified, timing: tuple[Effect, ...]
-) -> Conclusion:
-    """Conclude that the scenario as it is could have made the fitted periods."""
-    thresholds = study.config.thresholds
-    return unchallenged(
-        located,
-        verified if study.measured.of("heldout") else None,
-        thresholds,
-        study.ruled_out,
-        timing,
-        study.detection,
-    )
-
-
 def _beside_the_log(
     study: Study,
     located: Located,
@@ -470,7 +455,7 @@ def _beside_the_log(
     """Add effects that need no search to a conclusion that names no effects."""
     if not timing and not study.detection:
         return conclusion
-    alone = _unchallenged(study, located, verified, timing)
+    alone = unchallenged(study, located, verified, timing)
     sentence = f"{alone.sentence} {conclusion.sentence}"
     return replace(conclusion, verdict=alone.verdict, sentence=sentence)
 
