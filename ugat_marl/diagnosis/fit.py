@@ -479,9 +479,9 @@ def _possible(fitter: Fitter, model: Fitted, errors: Array) -> Array:
     """Return the largest standard errors that the data leave possible, ``(free values,)``.
 
     An interval ends half a grid step before a value with which the data fit worse beyond doubt.
-    Such a value has to be known on both sides, as an interval is as long on one as on the other.
-    Only the value that changes nothing suffices alone: neither it nor the values within half of
-    `Hypothesis.least` of it are in an interval if the data fit so much worse without the effect.
+    Intervals are symmetric, so a bound applies only if values on both sides are excluded. The
+    neutral value is enough by itself: if it is excluded, the interval ends half of
+    `Hypothesis.least` before it.
 
     Args:
         fitter: Simulator of models.

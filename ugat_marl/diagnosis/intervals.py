@@ -147,8 +147,8 @@ def implausible(
 ) -> dict[str, tuple[float, float]]:
     """Find kinds of detectors whose occupancies do not fit their counts and speeds.
 
-    Vehicles may be longer than those of the model, and then they are so at every detector. So a
-    difference is put on detectors if no traffic has it, or if it is not that of the other kinds.
+    A difference is attributed to the detectors if no vehicle length could cause it, or if other
+    kinds of detectors do not show it; longer vehicles would show at all kinds.
 
     Args:
         street: Sums of `seeming_lengths` of the measured periods.

@@ -142,8 +142,9 @@ class _Zones:
 def _changed(measured: Array, simulated: Array) -> float:
     """Return the share by which vehicles pass at another speed than simulated, from 0 to 1.
 
-    Reported speeds alone may be measured elsewhere, and times over the zone alone may be extended.
-    So it is the smaller change of both, and 0 if one says faster and the other slower.
+    A changed reported speed may come from another measuring point, a changed time over the zone
+    from an extension. Only what both show counts: the smaller change, or 0 if they disagree in
+    sign.
     """
     reported, timed = (
         np.log(np.median(street) / np.median(model))
@@ -376,11 +377,11 @@ class Measurement:
     def _without_opposites(
         self, searches: Sequence[ErrorPlaces], best: Choice, elsewhere: Mapping[str, float]
     ) -> Choice:
-        """Return the choice without longer zones that begin late, and the reverse, which cancel.
+        """Remove pairs of a longer zone and a delayed onset, or the opposites, at one place.
 
-        Both change slow vehicles, and quick ones hardly at all. So do drivers who speed up and
-        brake otherwise. Such a pair is kept if both numbers are large, and one of them would matter
-        without the other. Else the better one is kept, if it matters alone.
+        Their effects cancel except for slow vehicles, where they look like other drivers. A pair is
+        kept only if both numbers are large and either of them would matter alone. Else the better
+        one is kept, if it matters alone.
         """
         for place in dict.fromkeys(place for place, _ in best.estimates):
             pair = [(place, 0), (place, 1)]
@@ -469,9 +470,10 @@ class Measurement:
     ) -> list[Equation]:
         """Return the equations of a group for extension and zone.
 
-        Lone vehicles make two of them where they do not wait for a light, since the slow and the
-        quick half tell both apart. Of detectors that stand elsewhere only the quick half counts:
-        others accelerate and brake there as on no simulated day.
+        Free vehicles give two equations, for the slower and the faster half, which separates
+        extension from zone length. At stop lines they give one, since they may wait there. At
+        detectors in another position than stated only the faster half is used: braking there is
+        not simulated.
         """
         measured, simulated = (
             self._of(x.passages, members) for x in (self._measured, self._simulated)

@@ -126,8 +126,8 @@ class Pruner:
     def _beyond_doubt(self, tested: Tested, index: int) -> bool:
         """Return True if the data fit so much worse without the member at `index` that it stays.
 
-        The errors of the values are those of all values together, so they hold what other effects
-        could do in its place.
+        The standard errors come from a joint fit, so they include the uncertainty from other
+        effects.
         """
         hypothesis, values = tested.model.members[index]
         certain = bool((tested.errors_of(index) > 0.0).all())

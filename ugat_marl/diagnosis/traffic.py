@@ -168,11 +168,10 @@ def _check(
 
 
 def _levelled(days: Array, stretches: Sequence[Window]) -> tuple[Array, float]:
-    """Return days as if all stretches of the day had one mean, and a factor of their spread.
+    """Give all stretches of the day one mean, since differences between them are systematic.
 
-    What distinguishes a morning from an evening is no chance. Each stretch takes one degree of
-    freedom. Where most have a single day, nothing is known of chance, and the days stay as they
-    are.
+    Return also sqrt((n - 1) / (n - stretches)), which corrects the standard deviation of n days.
+    With less than two days per stretch the days stay as they are, and the factor is 1.
     """
     numbers = Counter(stretches)
     if len(numbers) == 1 or len(days) < 2 * len(numbers):
