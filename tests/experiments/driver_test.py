@@ -169,8 +169,9 @@ def test_a_setting_has_settings_of_ugat_if_it_is_grounded() -> None:
 def test_weights_that_are_not_trained_here_get_no_lessons(tmp_path: Path) -> None:
     learner = LearnerSpec(dqn=DQNConfig(lessons=1, lesson_updates=5))
     job = replace(
-        PLAIN, setting=Setting(UNTRAINED, "untrained", learner=learner), episodes=0, every=0,
-        domains=("sim",), options={**PLAIN.options, **learner.env_options(None)},
+        PLAIN, setting=Setting(UNTRAINED, "untrained", learner=learner, lessons=False),
+        episodes=0, every=0, domains=("sim",),
+        options={**PLAIN.options, **learner.env_options(None)},
     )  # fmt: skip
     perform(job, tmp_path, Silent(), 1)
     env = parallel_env("single-v1", **job.options)

@@ -76,6 +76,8 @@ def test_the_control_has_lessons_too(tmp_path: Path) -> None:
     with_control = work_of(planned_jobs(config), tmp_path, 100.0)["lessons"].units
     without = work_of(planned_jobs(replace(config, control=False)), tmp_path, 100.0)
     assert with_control == without["lessons"].units + 14 + 3 * 2 + 3
+    tuned = work_of(planned_jobs(replace(config, fine_tuned=True)), tmp_path, 100.0)
+    assert tuned["lessons"].units == with_control, "none in the real domain"
 
 
 def test_parts_are_done_beside_the_first_where_that_is_worth_it(tmp_path: Path) -> None:

@@ -20,13 +20,15 @@ from ugat_marl.__main__ import main
 from ugat_marl.data import CHECKPOINT_FOLDER, SETTINGS_FILE, TransitionLog
 from ugat_marl.data.runs import IDENTITY_FILE
 from ugat_marl.effects import load_scenario
-from ugat_marl.envs import parallel_env
+from ugat_marl.envs import TrafficEnv, parallel_env
 from ugat_marl.errors import CheckpointError, LogError, OptionError, UnknownNameError
-from ugat_marl.experiments import Evaluation, run_folder, transfer, transfers
-from ugat_marl.experiments.jobs import file_names
+from ugat_marl.experiments import Evaluation, Setting, run_folder, transfer, transfers
+from ugat_marl.experiments.jobs import LEARNER, file_names, perform
 from ugat_marl.experiments.randomised import RandomisedEnv
+from ugat_marl.experiments.row_names import DIRECT, FINE_TUNED
+from ugat_marl.experiments.transfers import planned_jobs
 from ugat_marl.grounding import InputsConfig, RandomDelays, TimedConfig, UgatConfig
-from ugat_marl.policies import make_rule, observer_of, roll_out
+from ugat_marl.policies import UNIVERSAL_NAME, DQNConfig, make_rule, observer_of, roll_out
 from ugat_marl.progress import Silent
 
 
@@ -121,6 +123,28 @@ def test_controls_are_the_trainings_that_go_by_other_names(tmp_path: Path) -> No
         ("fine-tuned-on-the-same-data", "further-in-v4"),
     ):
         assert np.array_equal(weights(tmp_path, one), weights(tmp_path, other))
+
+
+def test_fine_tuning_plays_as_many_real_episodes_as_it_states(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Lessons and the search for their teacher would be further ones."""
+    played: list[str] = []
+    reset = TrafficEnv.reset
+
+    def counted(self: TrafficEnv, *args: Any, **options: Any) -> Any:
+        played.append(self.domain)
+        return reset(self, *args, **options)
+
+    learner = {"learner": UNIVERSAL_NAME, "dqn": DQNConfig(lesson_updates=1)}
+    config = replace(SMALL, fine_tuned=True, **learner)
+    plan = planned_jobs(config)
+    (job,) = [job for job in plan if job.setting.name == FINE_TUNED]
+    direct = replace(plan[0], setting=Setting(DIRECT, "direct", learner=config.spec), episodes=2)
+    perform(direct, tmp_path / "direct", Silent())
+    monkeypatch.setattr(TrafficEnv, "reset", counted)
+    perform(replace(job, start=f"direct/{LEARNER}"), tmp_path / "tuned", Silent())
+    assert played == ["V4"] * 4  # two iterations, two roll-outs each
 
 
 @pytest.mark.slow

@@ -526,7 +526,7 @@ def _plain(
             if before is not None:
                 learner.load(before)  # its world may have had another teacher
             taught = before is not None or has_first_lessons(learner)
-            if taught and job.setting.recipe != "untrained":
+            if taught and job.setting.lessons:
                 attended(learner, env, job.seed, reporter, f"lessons: {job.setting.name}")
         marks = [mark for mark in job.marks if record.missing(job, mark) or mark == job.episodes]
         if marks[0] < learner.episodes:

@@ -108,7 +108,8 @@ def settings_of(
     if table == "main":
         rows = [direct, *_grounded(bases), *_controls(ugat, sim, constants)]
         if learner is not None and learner.dqn.start is not None:
-            rows.append(Setting(UNTRAINED, "untrained"))
+            # no lessons of its own: the rule of another network is in its weights
+            rows.append(Setting(UNTRAINED, "untrained", lessons=False))
         if "street" in bases and not observed_options((learner or LearnerSpec()).name):
             rows.append(Setting(SEEING_ORACLE, "scratch", commands=SEEN_COMMANDS))
         rows.append(rule)
@@ -192,7 +193,7 @@ def _controls(ugat: UgatConfig, sim: str, constants: Sequence[int]) -> list[Sett
         Setting(RANDOM_DELAY, "delays", sim),
         Setting(PENALTY, "penalty", sim),
         *(Setting(constant_name(s), "further", late_in(sim, s)) for s in constants),
-        Setting(FINE_TUNED, "further", episodes=seen),
+        Setting(FINE_TUNED, "further", episodes=seen, lessons=False),
         Setting(ORACLE, "scratch"),
     ]
 

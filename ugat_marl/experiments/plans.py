@@ -164,7 +164,7 @@ def work_of(
         learner = job.setting.learner
         lessons = lesson_episodes(learner.name, learner.dqn)
         if (ugat := job.setting.ugat) is None:
-            if lessons and job.setting.recipe != "untrained":
+            if lessons and job.setting.lessons:
                 add("lessons", lessons)
             add("training", job.episodes if job.start is None else job.episodes // 2)
         else:

@@ -138,8 +138,8 @@ class Setting:
             transfer trained further in `world`), "scratch" (all episodes in `world`), "randomised"
             (all episodes in worlds drawn at random), "delays" (direct transfer trained further in
             `world` while greens begin late by random times), "penalty" (the same while changes of
-            phase cost reward), "untrained" (what the learner begins
-            with), "rule" (the best rule, no training).
+            phase cost reward), "untrained" (no training episodes), "rule" (the best rule, no
+            training).
         world: Domain to train in; None for the job's real domain, or for the simulation if the job
             has no real domain.
         learner: The algorithm that learns.
@@ -151,6 +151,8 @@ class Setting:
         commands: Number of own commands that agents see in training without grounding; a fitted
             street decides it by itself.
         rules: Rules among which "rule" chooses; empty for all.
+        lessons: False if no rule teaches the learner in `world`, where it would play episodes that
+            nobody counts.
     """
 
     name: str
@@ -163,6 +165,7 @@ class Setting:
     most_delay_s: int = MOST_DELAY_S
     commands: int = 0
     rules: tuple[str, ...] = ()
+    lessons: bool = True
 
     def __post_init__(self) -> None:
         if self.recipe not in RECIPES:
@@ -213,6 +216,6 @@ class Setting:
             parts["change_cost"] = CHANGE_COST
         if self.commands:
             parts["commands"] = self.commands
-        if self.recipe == "untrained":
-            parts["lessons"] = 0  # of its own: the rule of another network is in its weights
+        if not self.lessons:
+            parts["lessons"] = 0
         return parts

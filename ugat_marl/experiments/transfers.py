@@ -280,7 +280,7 @@ class TransferConfig:
             name = f"{RANDOM_DELAY} 0-{most_s} s"
             rows.append(Setting(name, "delays", self.sim, spec, most_delay_s=most_s))
         if self.fine_tuned:
-            rows.append(Setting(FINE_TUNED, "further", None, spec, episodes=seen))
+            rows.append(Setting(FINE_TUNED, "further", None, spec, episodes=seen, lessons=False))
         if self.randomised:
             rows.append(Setting(RANDOMISED, "randomised", None, spec))
         if self.corrected is not None:
