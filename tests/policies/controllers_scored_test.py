@@ -25,10 +25,17 @@ CAPACITY = {"n_0": 40.0, "w_0": 20.0, "e_0": 10.0, "out_0": 40.0}
 AGENT = "signal_0"
 
 
-def streets(clearance_s: float = 5.0) -> ControlledNetwork:
+def streets(
+    clearance_s: float = 5.0, decision_interval_s: float = 10.0, min_green_s: float = 0.0
+) -> ControlledNetwork:
     item = Intersection("x", INCOMING, ("out_0",), LINKS, PHASES, (), (), (0.0, 0.0))
     return ControlledNetwork(
-        {AGENT: item}, CAPACITY, dict.fromkeys(CAPACITY, 20.0), 10.0, clearance_s
+        {AGENT: item},
+        CAPACITY,
+        dict.fromkeys(CAPACITY, 20.0),
+        decision_interval_s,
+        clearance_s,
+        min_green_s=min_green_s,
     )
 
 
@@ -77,10 +84,14 @@ def test_a_phase_that_can_serve_nothing_is_no_reason_to_switch():
     assert shown_by(MaxPressureLoss(streets(), 10), movements(4, 0, 0), jammed) == [0, 0]
 
 
-def test_a_clearance_longer_than_the_hold_leaves_nothing_to_gain():
-    rule = MaxPressureLoss(streets(clearance_s=12), 10)
-    assert rule.served_share == 0
-    assert shown_by(rule, movements(1, 0, 0), movements(0, 20, 10)) == [0, 0]
+@pytest.mark.parametrize("hold_s", [5, 10])
+def test_a_switch_gains_at_least_the_minimum_green(hold_s: float):
+    """No phase is shorter than 10 s, of which 5 s are green: w_0 must offer 4 / (1 - 5 / 10)."""
+    network = streets(decision_interval_s=5, min_green_s=5)
+    start = [movements(4, 0, 0)] * (int(hold_s) // 5)
+    for west in (8, 9):
+        seen = (*start, movements(4, west, 0))
+        assert shown_by(MaxPressureLoss(network, hold_s), *seen)[-1] == int(west > 8)
 
 
 def test_longest_waiting_adds_the_waiting_of_the_lanes_a_phase_serves():

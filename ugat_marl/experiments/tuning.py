@@ -27,7 +27,7 @@ from ugat_marl.policies import RULE_NAMES, RULES, TUNED_RULES, race_fields, rule
 from ugat_marl.progress import Reporter, Silent
 from ugat_marl.scenarios import Scenario
 
-VERSION = 2
+VERSION = 3
 """Version of rules and race. Increase it with every change of them: stored results expire."""
 
 BUDGET = 24

@@ -123,13 +123,14 @@ class MaxPressureLoss(MaxPressure):
     Args:
         network: The controlled network.
         hold_s: Shortest time a phase is kept, rounded up to whole decisions. Gain and loss of a
-            switch are counted over this time.
+            switch are counted over this time, or over clearance and minimum green in whole
+            decisions if that is longer.
     """
 
     def __init__(self, network: ControlledNetwork, hold_s: float = 10.0) -> None:
         super().__init__(network, hold_s)
-        lasts_s = self._hold * network.decision_interval_s
-        self.served_share = max(0.0, 1.0 - network.clearance_s / lasts_s)
+        lasts_s = network.planned_decisions(hold_s) * network.decision_interval_s
+        self.served_share = 1.0 - network.clearance_s / lasts_s
 
     def _stays(self, shown: float, best: float) -> bool:
         return max(shown, 0.0) >= self.served_share * max(best, 0.0)
