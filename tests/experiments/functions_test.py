@@ -20,11 +20,23 @@ from ugat_marl.experiments import Evaluation, PaperConfig, TransferConfig, run_f
 from ugat_marl.experiments.functions import _texts
 from ugat_marl.experiments.scores import Result as Episode
 from ugat_marl.grounding import GateConfig, TimedConfig, UgatConfig
-from ugat_marl.policies import DQNConfig
+from ugat_marl.policies import DQNConfig, learner_factory
+from ugat_marl.testing import ToyTraffic
 
 
 def scored(att_s: float) -> Scores:
     return Scores(att_s, 2, 3, 4, 5, 6, 7, 8, 9, 10)
+
+
+class Configured:
+    """A learner that keeps its settings, of which one has a type."""
+
+    def __init__(self, rate: Any, sizes: Any, hidden: Any, names: Any, tag: str) -> None:
+        self.settings = {"rate": rate, "sizes": sizes, "hidden": hidden, "names": names, "tag": tag}
+
+    def learn(self, env: Any, episodes: int) -> None: ...
+
+    def policy(self) -> Any: ...
 
 
 TABLE = Evaluation(
@@ -166,8 +178,12 @@ def test_numbers_of_numpy_are_numbers(tmp_path: Path, monkeypatch: pytest.Monkey
 
 
 def test_settings_may_be_a_dictionary() -> None:
-    assert _texts({"rate": 0.1, "sizes": (8, 16)}) == ("rate=0.1", "sizes=8,16")
-    assert _texts("rate=0.1") == _texts(["rate=0.1"]) == ("rate=0.1",)
+    given = {"rate": 0.1, "sizes": (8, 16), "hidden": (32,), "names": [], "tag": "12"}
+    texts = ("rate=0.1", "sizes=8,16", "hidden=(32,)", "names=[]", "tag=12")
+    assert _texts(f"{__name__}:Configured", given) == texts
+    made = learner_factory(f"{__name__}:Configured", texts)
+    assert made(ToyTraffic(), 0)._given.settings == given
+    assert _texts("mine", "rate=0.1") == _texts("mine", ["rate=0.1"]) == ("rate=0.1",)
 
 
 def test_what_the_package_offers_is_listed() -> None:

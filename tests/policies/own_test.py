@@ -43,7 +43,7 @@ from ugat_marl.policies import (
     own_source,
     own_values,
 )
-from ugat_marl.policies.learner_settings import parsed_settings
+from ugat_marl.policies.learner_settings import parsed_settings, setting_text
 from ugat_marl.policies.own import OwnLearner
 from ugat_marl.testing import ToyTraffic
 
@@ -758,6 +758,58 @@ def test_an_environment_that_a_learner_holds_is_known_by_what_it_is_made_of() ->
 )
 def test_settings_come_in_the_forms_of_their_types(hint: Any, text: str, value: Any) -> None:
     assert parsed_settings([f"x={text}"], ["x"], {"x": hint}, "mine") == {"x": value}
+
+
+@pytest.mark.parametrize(
+    ("hint", "value", "text"),
+    [
+        (Any, 0.1, "0.1"),
+        (Any, (8, 16), "8,16"),
+        (Any, [8, 16], "[8, 16]"),
+        (Any, (32,), "(32,)"),
+        (Any, (), "()"),
+        (Any, ["a", "b"], "['a', 'b']"),
+        (Any, "12", "'12'"),
+        (Any, "adam", "adam"),
+        (Any, {"a": 1}, "{'a': 1}"),
+        (str, "12", "12"),
+        (list[int], [8, 16], "8,16"),
+        (tuple[int, ...], (32,), "32"),
+        (tuple[int, ...], (), "()"),
+        (tuple[str, ...], ("a,b", "c"), "('a,b', 'c')"),
+        (Path, Path("a"), "a"),
+    ],
+)
+def test_values_of_python_arrive_as_they_are(hint: Any, value: Any, text: str) -> None:
+    assert setting_text("x", value, hint) == f"x={text}"
+    (read,) = parsed_settings([f"x={text}"], ["x"], {"x": hint}, "mine").values()
+    assert read == value and type(read) is type(value)
+
+
+@pytest.mark.parametrize(
+    ("hint", "value", "text"),
+    [
+        (Any, np.float64(0.1), "0.1"),
+        (float, math.nan, "nan"),
+        (tuple[int, ...], [32], "32"),
+        (np.ndarray, np.array([1, 2]), "[1, 2]"),
+    ],
+)
+def test_values_arrive_in_the_type_of_the_setting(hint: Any, value: Any, text: str) -> None:
+    assert setting_text("x", value, hint) == f"x={text}"
+
+
+@pytest.mark.parametrize(
+    ("hint", "value"), [(Any, object()), (Any, math.nan), (float | str, "0.5"), (str, "")]
+)
+def test_a_value_that_no_text_says_is_refused(hint: Any, value: Any) -> None:
+    with pytest.raises(OptionError, match=r"setting x = .*: a run keeps settings as text"):
+        setting_text("x", value, hint)
+
+
+def test_a_value_of_another_type_is_refused_as_its_text_is() -> None:
+    with pytest.raises(OptionError, match="'x=fast': .*valid number"):
+        parsed_settings([setting_text("x", "fast", float)], ["x"], {"x": float}, "mine")
 
 
 @pytest.mark.parametrize(

@@ -27,7 +27,13 @@ from ugat_marl.experiments.scores import Evaluation
 from ugat_marl.experiments.transfers import TransferConfig, transfer
 from ugat_marl.grounding import USUAL_REWARD, UgatConfig
 from ugat_marl.parallel import Workers, parts_at_a_time
-from ugat_marl.policies import DQNConfig, PolicyFactory, UsualValue, own_name
+from ugat_marl.policies import (
+    DQNConfig,
+    PolicyFactory,
+    UsualValue,
+    own_name,
+    setting_texts,
+)
 from ugat_marl.progress import Reporter, usual, usual_of_long_work
 from ugat_marl.scenarios import Scenario
 
@@ -96,7 +102,8 @@ def train(
         sim: The domain to train in.
         learner: Name of a learner, ``module:name``, or a class with ``learn(env, episodes)`` and
             ``policy()``, or a function of ``env`` and ``seed`` that makes such an object.
-        learner_settings: Settings of the learner: a dictionary, or texts ``NAME=VALUE``.
+        learner_settings: Settings of the learner: a dictionary of plain data, or texts
+            ``NAME=VALUE``.
         grounding: "street", "timed" or "phase".
         pretrain_episodes: Episodes of plain training; the policy after them is direct transfer.
         iterations: Number of times to roll out, fit and train.
@@ -149,6 +156,7 @@ def train(
     if not is_count(evaluation_seeds):
         raise OptionError(f"evaluation_seeds = {evaluation_seeds!r}: must be a whole number")
     parts_at_a_time(workers)  # refuses what is no number before anything is written
+    name = learner if isinstance(learner, str) else own_name(learner)
     config = TransferConfig(
         str(scenario),
         real=real,
@@ -161,8 +169,8 @@ def train(
         duration_s=duration_s,
         evaluation_seeds=evaluation_seeds,
         control=control,
-        learner=learner if isinstance(learner, str) else own_name(learner),
-        learner_settings=_texts(learner_settings),
+        learner=name,
+        learner_settings=_texts(name, learner_settings),
         ugat=ugat or alone,
         dqn=dqn or DQNConfig(),
     )
@@ -279,16 +287,11 @@ def _check_arguments(
         raise OptionError(f"callback = {callback!r}: must be a function, or None")
 
 
-def _texts(settings: Any) -> tuple[str, ...]:
+def _texts(learner: str, settings: Any) -> tuple[str, ...]:
     """Return settings of a learner as ``NAME=VALUE``."""
     if isinstance(settings, Mapping):
-        return tuple(f"{name}={_text(value)}" for name, value in settings.items())
+        return setting_texts(learner, settings)
     return (settings,) if isinstance(settings, str) else tuple(settings or ())
-
-
-def _text(value: Any) -> str:
-    """Return a value as a command takes it: commas separate the parts of a tuple."""
-    return ",".join(map(str, value)) if isinstance(value, list | tuple) else str(value)
 
 
 _Config = TypeVar("_Config")

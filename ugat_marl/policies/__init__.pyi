@@ -17,6 +17,7 @@ from .learners.catalogue import lesson_episodes as lesson_episodes
 from .learners.catalogue import load_baseline as load_baseline
 from .learners.catalogue import observed_options as observed_options
 from .learners.catalogue import require_known_learner as require_known_learner
+from .learners.catalogue import setting_texts as setting_texts
 from .learners.catalogue import suite_config as suite_config
 from .learners.dqn import DQN as DQN
 from .learners.dqn_config import DQNConfig as DQNConfig

@@ -3,10 +3,12 @@
 from __future__ import annotations
 
 import ast
+import contextlib
 from collections.abc import Mapping, Sequence
 from types import UnionType
 from typing import Any, Union, get_args, get_origin
 
+import numpy as np
 from pydantic import PydanticUserError, TypeAdapter, ValidationError
 
 from ugat_marl.errors import OptionError, UnknownNameError
@@ -48,6 +50,41 @@ def parsed_settings(
 def setting_name(setting: str) -> str:
     """Return the name in ``NAME=VALUE``, with ``_`` for ``-``."""
     return setting.partition("=")[0].replace("-", "_")
+
+
+def setting_text(name: str, value: Any, hint: Any) -> str:
+    """Return a value of Python as ``NAME=VALUE``, from which `parsed_settings` reads it.
+
+    Args:
+        name: Name of the setting.
+        value: A value for the type; if it is none, the text is for the message of
+            `parsed_settings`.
+        hint: Type of the setting; `Any` without one.
+
+    Raises:
+        OptionError: No text is read as the value.
+    """
+    plain = value.tolist() if isinstance(value, np.generic | np.ndarray) else value
+    usual = ",".join(map(str, plain)) if isinstance(plain, list | tuple) else str(plain)
+    try:
+        wanted = TypeAdapter(hint).validate_python(plain)
+    except PydanticUserError:
+        wanted = plain
+    except ValidationError:
+        return f"{name}={usual}"
+    for text in filter(None, (usual, repr(plain))):
+        with contextlib.suppress(ValidationError):
+            if _is_same(_converted(text, hint), wanted):
+                return f"{name}={text}"
+    raise OptionError(
+        f"learner setting {name} = {value!r}: a run keeps settings as text, from which this value "
+        "is not read again; give plain data, or functools.partial(CLASS, ...) as the learner"
+    )
+
+
+def _is_same(one: Any, other: Any) -> bool:
+    """Return True for equal values of one type, nan among them."""
+    return type(one) is type(other) and (one == other or repr(one) == repr(other))
 
 
 def _converted(text: str, hint: Any) -> Any:

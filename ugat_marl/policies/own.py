@@ -766,13 +766,17 @@ def _lacking(make: Callable[..., Any], given: Container[str]) -> list[str]:
 def _converted(make: Callable[..., Any], settings: Sequence[str], name: str) -> dict[str, Any]:
     """Return the settings of a user's learner in the types of its arguments."""
     names = [key for key in _arguments(make) if key not in ("env", "seed")]
+    return parsed_settings(settings, names, argument_types(make) if settings else {}, name)
+
+
+def argument_types(make: Callable[..., Any]) -> dict[str, Any]:
+    """Return the annotated types of the arguments of a class or function, by name."""
     hints: dict[str, Any] = {}
-    if settings:
-        function: Any = make.__init__ if inspect.isclass(make) else make
-        for key, hint in getattr(function, "__annotations__", {}).items():
-            with contextlib.suppress(NameError):  # a name that only checkers of types import
-                hints |= _resolved(function, key, hint)
-    return parsed_settings(settings, names, hints, name)
+    function: Any = make.__init__ if inspect.isclass(make) else make
+    for key, hint in getattr(function, "__annotations__", {}).items():
+        with contextlib.suppress(NameError):  # a name that only checkers of types import
+            hints |= _resolved(function, key, hint)
+    return hints
 
 
 def _resolved(function: Any, key: str, hint: Any) -> dict[str, Any]:

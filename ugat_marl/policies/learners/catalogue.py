@@ -24,10 +24,10 @@ from typing import Any, get_type_hints
 from ugat_marl.data import installed_version
 from ugat_marl.envs import AnyParallelEnv
 from ugat_marl.errors import OptionError, UnknownNameError, install_command
-from ugat_marl.policies.learner_settings import parsed_settings
+from ugat_marl.policies.learner_settings import parsed_settings, setting_name, setting_text
 from ugat_marl.policies.learners.dqn_config import DQNConfig, UsualValue
-from ugat_marl.policies.own import OwnLearnerFactory, own_learner_options
-from ugat_marl.policies.own_names import is_own, require_unchanged
+from ugat_marl.policies.own import OwnLearnerFactory, argument_types, own_learner_options
+from ugat_marl.policies.own_names import is_own, load_own, require_unchanged
 from ugat_marl.policies.protocols import Learner
 
 LearnerFactory = Callable[[AnyParallelEnv, int], Learner]
@@ -224,6 +224,28 @@ def baseline_settings(name: str, given: Sequence[str] = ()) -> dict[str, Any]:
         OptionError: A value is impossible, or the library is not installed.
     """
     return asdict(_baseline_config(name, given))
+
+
+def setting_texts(name: str, settings: Mapping[str, Any]) -> tuple[str, ...]:
+    """Return settings of a learner as ``NAME=VALUE``, as `learner_factory` takes them.
+
+    Args:
+        name: Name of the learner.
+        settings: Values of Python, by name.
+
+    Raises:
+        OptionError: A value cannot be read from a text, the library is not installed, or a user's
+            learner cannot be found.
+    """
+    hints: Mapping[str, Any] = {}
+    if is_own(name):
+        hints = argument_types(load_own(name, "learner"))
+    elif name in BASELINES:
+        hints = get_type_hints(getattr(load_baseline(name), BASELINES[name].config))
+    return tuple(
+        setting_text(key, value, hints.get(setting_name(key), Any))
+        for key, value in settings.items()
+    )
 
 
 def _baseline_config(name: str, settings: Sequence[str]) -> Any:
