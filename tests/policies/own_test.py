@@ -1031,8 +1031,32 @@ def test_a_file_that_is_no_python_is_refused_in_a_line(tmp_path: Path) -> None:
 
 def test_a_file_that_imports_a_missing_name_is_refused_in_a_line(tmp_path: Path) -> None:
     (tmp_path / "astray.py").write_text("import math\nfrom math import no_such_name\n")
-    with pytest.raises(OptionError, match=r"astray\.py, line 2: cannot import name .*name'[^\n]*$"):
+    says = r"astray\.py, line 2: ImportError: cannot import name .*name'[^\n]*$"
+    with pytest.raises(OptionError, match=says):
         load_own(f"{tmp_path}/astray.py:policy", "policy")
+
+
+def test_an_error_in_the_file_of_a_policy_is_told_with_its_place(tmp_path: Path) -> None:
+    (tmp_path / "failing.py").write_text("rate = 1\nrate / 0\n")
+    says = r"^policy '.*': .*failing\.py, line 2: ZeroDivisionError: division by zero$"
+    with pytest.raises(OptionError, match=says):
+        load_own(f"{tmp_path}/failing.py:policy", "policy")
+
+
+class Unmade:
+    def __init__(self) -> None:
+        raise KeyError("rate")
+
+
+def unmade(env: Any) -> Any:
+    return Unmade()
+
+
+@pytest.mark.parametrize("given", [Unmade, unmade, functools.partial(unmade)])
+def test_an_error_while_a_policy_is_made_is_told_with_its_place(given: Any) -> None:
+    says = r"^policy 'mine': KeyError: 'rate'.*own_test\.py, line \d+\)?$"
+    with pytest.raises(OptionError, match=says):
+        own_policy(given, "mine", ToyTraffic())
 
 
 def test_a_function_without_a_name_has_one() -> None:

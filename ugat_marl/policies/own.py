@@ -139,7 +139,7 @@ def _naming_errors(given: Any, what: str, env: CountedEnv | None = None) -> Iter
     except Exception as error:
         if env is not None and error is env.ended_by:
             raise
-        kind = given if inspect.isroutine(given) else type(given)
+        kind = given if inspect.isroutine(given) or inspect.isclass(given) else type(given)
         said = f"{type(error).__name__}: {error}{_last_line_in(kind, error)}"
         *_, last = traceback.extract_tb(error.__traceback__)
         if (raised := f"{last.filename}, line {last.lineno}") not in said:
@@ -278,13 +278,18 @@ def own_policy(given: Any, name: str, env: AnyParallelEnv) -> Policy:
             argument is called so, or has no default.
         name: Name for messages.
         env: The environment.
+
+    Raises:
+        OptionError: It cannot be made so, raised an exception, or is a learner.
     """
     if inspect.isclass(given):
         if not (_takes(given, 1) or _takes(given, 0)):
             raise OptionError(_not_made(given, name))
-        given = given(*[env] if _wants_env(given) else [])
+        with _naming_errors(given, f"policy {name!r}"):
+            given = given(*[env] if _wants_env(given) else [])
     elif _is_maker(given):
-        given = given(env)
+        with _naming_errors(given, f"policy {name!r}"):
+            given = given(env)
     if not callable(getattr(given, "act", given)) and _is_learner(given):
         raise OptionError(_in_place_of_policy(name))
     asked_options(given, name)

@@ -25,7 +25,7 @@ from typing import Any
 
 import numpy as np
 
-from ugat_marl.errors import OptionError, UnknownNameError, first_line
+from ugat_marl.errors import OptionError, UgatMarlError, UnknownNameError, first_line
 from ugat_marl.files import file_hash, with_home
 
 _NAME = re.compile(r"([\w./\\-]+|.+\.py):[A-Za-z_<][\w.<>]*")
@@ -74,7 +74,7 @@ def load_own(name: str, what: str) -> Any:
         what: Kind of thing for messages, such as "learner".
 
     Raises:
-        OptionError: The module is missing, or needs what is missing.
+        OptionError: The module is missing, needs what is missing, or raised an exception.
         UnknownNameError: The object is missing in it.
     """
     if name in _given:
@@ -104,13 +104,16 @@ def load_own(name: str, what: str) -> Any:
                 "write FILE.py:NAME, or the name of a module, a colon, and the name in it"
             )
         raise OptionError(f"{what} {name!r}: {missing}") from None
-    except ImportError as error:
-        *_, last = traceback.extract_tb(error.__traceback__)
-        where = f"{last.filename}, line {last.lineno}"
-        raise OptionError(f"{what} {name!r}: {where}: {first_line(error)}") from None
     except SyntaxError as error:
         where = f"{error.filename}, line {error.lineno}"
         raise OptionError(f"{what} {name!r}: {where} is no Python ({error.msg})") from None
+    except (UgatMarlError, MemoryError):
+        raise
+    except Exception as error:
+        *_, last = traceback.extract_tb(error.__traceback__)
+        where = f"{last.filename}, line {last.lineno}"
+        said = f"{type(error).__name__}: {first_line(error)}"
+        raise OptionError(f"{what} {name!r}: {where}: {said}") from error
     found = _member(found, path, f"{what} in {module_name}", of_learners=what == "learner")
     _file_hash(_named(found))  # keeps it
     return found
