@@ -39,10 +39,18 @@ def test_the_work_of_a_run_is_counted_by_hand(tmp_path: Path) -> None:
     # direct, UGAT, the control and two rules, in two domains, with three seeds
     assert work["evaluating"].units == 5 * 2 * 3
     assert work["plain sim"].units == 2 and work["grounded"].units == 2 * 2
-    assert work["training"].units == 3, "half of what it shares with direct transfer"
+    assert work["training"].units == 2 * 2, "without the two that it shares with direct transfer"
     assert work["best rule"].units == 2 * (14 + 7)
     assert (work["roll-outs"].units, work["roll-outs"].weight) == (4, 2 * 2.0)
     assert work["fitting"].units == 3 * 2 * 2
+
+
+def test_a_continued_training_counts_without_what_it_continues(tmp_path: Path) -> None:
+    config = replace(SMALL, fine_tuned=True, ugat=replace(SMALL.ugat, pretrain_episodes=20))
+    plan = planned_jobs(config)
+    assert work_of(plan, tmp_path, 100.0)["training"].units == 2 * 2
+    lines = described_plan(plan, tmp_path, tmp_path, 100.0)
+    assert any("fine-tuned on the same data: 4 episodes;" in line for line in lines)
 
 
 def test_a_fitted_street_simulates_shorter_worlds(tmp_path: Path) -> None:
@@ -81,7 +89,7 @@ def test_the_control_has_lessons_too(tmp_path: Path) -> None:
 
 
 def test_parts_are_done_beside_the_first_where_that_is_worth_it(tmp_path: Path) -> None:
-    config = replace(SMALL, control=True, evaluation_seeds=20)
+    config = replace(SMALL, control=True, evaluation_seeds=18)
     plan = planned_jobs(config)
     beside = jobs_beside(plan, tmp_path, 100.0, 2)
     assert beside == plan[1:] and len(beside) == 3

@@ -108,6 +108,7 @@ class Job:
         episodes: Training episodes in all, those of `start` included; 0 for a rule.
         start: File of the learner to continue from, relative to the folder that holds the jobs'
             folders; None for a fresh learner.
+        start_episodes: Training episodes of the learner at `start`; not part of `identity`.
         every: Episodes from one evaluation to the next; 0 for evaluations at the end only.
         last: Number of episodes at the end that are each followed by an evaluation.
         options: Options of the environments.
@@ -131,6 +132,7 @@ class Job:
     seed: int | None = None
     episodes: int = 0
     start: str | None = None
+    start_episodes: int = 0
     every: int = 0
     last: int = 1
     options: Mapping[str, str | int | float | None] = field(default_factory=dict)
@@ -144,7 +146,8 @@ class Job:
 
     def __post_init__(self) -> None:
         # A default of settings (`UsualValue`) is no key of the scores that files hold.
-        object.__setattr__(self, "episodes", int(self.episodes))
+        for name in ("episodes", "start_episodes"):
+            object.__setattr__(self, name, int(getattr(self, name)))
 
     @property
     def rows(self) -> dict[int, str]:
@@ -157,6 +160,11 @@ class Job:
         if self.setting.ugat is not None and self.start is None:
             names |= {int(self.setting.ugat.pretrain_episodes): DIRECT}
         return dict(sorted(names.items()))
+
+    @property
+    def own_episodes(self) -> int:
+        """Number of training episodes that the job plays itself."""
+        return self.episodes - self.start_episodes
 
     @property
     def marks(self) -> tuple[int, ...]:

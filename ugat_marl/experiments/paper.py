@@ -616,6 +616,7 @@ class Planner:
             seed=seed,
             episodes=self._episodes(row),
             start=None if base is None else f"{base.name}/{LEARNER}",
+            start_episodes=0 if base is None else base.episodes,
             options={
                 **config.spec.env_options(config.observation),
                 "reward": config.reward,

@@ -116,7 +116,7 @@ def described_plan(
                 f"for {job.target or 'the street of the log'}"
             )
         else:
-            does = f"{setting.name}: {counted(job.episodes, 'episode')}"
+            does = f"{setting.name}: {counted(job.own_episodes, 'episode')}"
         meanwhile = ", meanwhile" if job in beside else ""
         lines.append(f"  {number}. {does}; {evaluated * len(job.rows)} to judge it{meanwhile}")
     total = _total(work_of(todo, folder, episode_s))
@@ -166,7 +166,7 @@ def work_of(
         if (ugat := job.setting.ugat) is None:
             if lessons and job.setting.lessons:
                 add("lessons", lessons)
-            add("training", job.episodes if job.start is None else job.episodes // 2)
+            add("training", job.own_episodes)
         else:
             budget = ugat.street.budget_of_rules(taught=lessons > 0)
             for name, (count, weight) in _grounded_work(ugat, episode_s, budget).items():

@@ -396,15 +396,15 @@ def planned_jobs(config: TransferConfig) -> list[Job]:
     """
     ugat, kept = _grounded_job(config), config.spec.savable
     real, common = ugat.target, replace(ugat, real_log=None, probe_domains=(), target=None)
+    pretrained = config.ugat.pretrain_episodes
+    begun = {"start": f"{ugat.name}/{DIRECT_LEARNER}", "start_episodes": pretrained}
     others = [
         replace(
             common,
             setting=setting,
             target=real if setting.knows_target else None,
-            episodes=config.episodes
-            if setting.episodes is None
-            else config.ugat.pretrain_episodes + setting.episodes,
-            start=f"{ugat.name}/{DIRECT_LEARNER}" if setting.begins_with_direct and kept else None,
+            episodes=config.episodes if setting.episodes is None else pretrained + setting.episodes,
+            **(begun if setting.begins_with_direct and kept else {}),
         )
         for setting in config.settings
     ]
