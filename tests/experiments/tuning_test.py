@@ -107,6 +107,15 @@ def test_the_best_rule_is_searched_in_each_domain_by_itself(streets: Streets) ->
     assert len(streets.played) == 2 * (4 + 2)
 
 
+@pytest.mark.usefixtures("streets")
+@pytest.mark.parametrize(("rules", "seeds"), [(FIVE, []), ([], [SEED])])
+def test_a_search_among_nothing_or_without_a_seed_is_refused(
+    rules: list[str], seeds: list[int]
+) -> None:
+    with pytest.raises(OptionError, match="needs at least one rule and one seed"):
+        best_rule(load_scenario("single-v1"), "sim", rules=rules, seeds=seeds)
+
+
 @pytest.mark.parametrize("settings", [2, 3, 5, 6, 12, 18])
 @pytest.mark.parametrize("extra", [0, 1, 7, 40])
 def test_a_race_stays_within_its_budget(settings: int, extra: int) -> None:

@@ -774,6 +774,8 @@ def test_the_typical_plan_of_the_programme_is_the_programme(single: Scenario) ->
 def test_a_plan_from_the_queue_model_would_have_no_yellow(single: Scenario) -> None:
     with pytest.raises(OptionError, match="no yellow; leave out queue_model"):
         typical_plans(single, rule_factory("fixed-time:30"), "meso", (1,), Silent())
+    with pytest.raises(OptionError, match="at least one seed"):
+        typical_plans(single, rule_factory("fixed-time:30"), "sim", (), Silent())
     (plan,) = typical_plans(single, rule_factory("programme"), "meso", (1,), Silent())
     assert [phase.yellow_s for phase in plan.phases] == [3.0] * len(plan.phases)
 

@@ -158,6 +158,9 @@ def best_rule(
     """Return the spelling of the rule with the smallest mean ATT in a domain on the tuning seeds.
 
     The rules are raced: after each seed the worse half drops out.
+
+    Raises:
+        OptionError: There is no rule or no seed.
     """
     trials = race_rules(
         scenario,
@@ -199,7 +202,12 @@ def race_rules(
     Returns:
         All rules, first those of the last rung, then those that dropped out, the latest first. In
         each rung the order is by mean ATT.
+
+    Raises:
+        OptionError: There is no rule or no seed.
     """
+    if not specs or not seeds:
+        raise OptionError("a race of rules needs at least one rule and one seed")
 
     def play(rung: int, running: Sequence[str]) -> list[list[float]]:
         evaluation = evaluation_of(

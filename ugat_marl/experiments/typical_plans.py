@@ -109,8 +109,10 @@ def typical_plans(
         their programmes gives the plans of these.
 
     Raises:
-        OptionError: The policy would be played in SUMO's queue model.
+        OptionError: There is no seed, or the policy would be played in SUMO's queue model.
     """
+    if not seeds:
+        raise OptionError("a typical plan needs at least one seed")
     world = parallel_env(scenario, domain)
     policy = make(world)
     env = parallel_env(world.scenario, **policy.env_options)
