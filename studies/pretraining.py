@@ -142,7 +142,7 @@ class Pretraining:
             origin: How they were learned.
         """
         learner = next(iter(self.learners.values()))
-        return InitialWeights(learner.running_weights, learner.env_options, origin)
+        return InitialWeights.of_policy(learner.policy(), origin)
 
     def policy(self, env: AnyParallelEnv) -> NetworkPolicy:
         """Return the greedy policy of the weights so far, for any road network."""
@@ -154,7 +154,8 @@ class Pretraining:
     def set_learning_rate(self, rate: float) -> None:
         """Change the step size of all learners."""
         for learner in self.learners.values():
-            learner.set_learning_rate(rate)
+            for group in learner._adam.param_groups:
+                group["lr"] = rate
 
     def _seed_of(self, name: str) -> int:
         return derive_seed(self._seed, "pretraining", name)

@@ -15,7 +15,7 @@ from studies.bench.memory import growth_of
 from studies.bench.report import Report, Spread, Target, require_positive
 from studies.errors import MeasurementError
 from ugat_marl.errors import OptionError, install_command
-from ugat_marl.policies import learner_is_installed, require_known_learner
+from ugat_marl.policies import BASELINES, load_baseline, require_known_learner
 from ugat_marl.progress import Reporter, Silent
 
 _PROGRAM = ["-m", "studies.bench.scale_program"]
@@ -135,7 +135,7 @@ class ScaleBench:
             if part == "ray" and find_spec("ray") is None:
                 notes.append(f"Ray is not installed ({install_command('ray')}): not measured.")
                 continue
-            if part == "learner" and not learner_is_installed(self.learner):
+            if part == "learner" and not _is_installed(self.learner):
                 notes.append(f"The library of {self.learner} is not installed: not measured.")
                 continue
             figures += measured[part](reporter)
@@ -361,6 +361,15 @@ _METHOD = (
 def _told(name: str, value: Spread | float) -> Figure:
     """Make a figure without a target."""
     return Figure(name, value, float("nan"), float("nan"), True)
+
+
+def _is_installed(learner: str) -> bool:
+    if learner in BASELINES:
+        try:
+            load_baseline(learner)
+        except OptionError:
+            return False
+    return True
 
 
 def _milliseconds(runs: list[Run], what: str) -> Spread:

@@ -133,7 +133,7 @@ class StrengthBench:
 
     def _report(self, rule: str, rule_s: float, curves: Sequence[Curve]) -> Report:
         final_s = fmean(curve.final_s for curve in curves)
-        worst = max(curve.unsteadiness(self.last) for curve in curves)
+        worst = max(_unsteadiness(curve, self.last) for curve in curves)
         targets = [
             Target("ATT, mean over trainings / rule", final_s / rule_s, 1.0, at_least=False),
             Target("mean of last / best evaluation, worst", worst, STEADY, at_least=False),
@@ -175,6 +175,11 @@ class StrengthBench:
         )
 
 
+def _unsteadiness(curve: Curve, last: int) -> float:
+    """Return the mean of the last evaluations divided by the best one, at least 1."""
+    return curve.mean_of_last_s(last) / curve.best_s
+
+
 def _row(curve: Curve, last: int, rule_s: float) -> dict[str, Any]:
     return {
         "training seed": str(curve.seed),
@@ -182,6 +187,6 @@ def _row(curve: Curve, last: int, rule_s: float) -> dict[str, Any]:
         "/ rule": curve.final_s / rule_s,
         "best [s]": curve.best_s,
         f"mean of last {last} [s]": curve.mean_of_last_s(last),
-        "/ best": curve.unsteadiness(last),
+        "/ best": _unsteadiness(curve, last),
         "curve": {str(number): att_s for number, att_s in curve.att_s.items()},
     }

@@ -60,7 +60,6 @@ from ugat_marl.policies import (
     SUITE_LEARNERS,
     DQNConfig,
     NetworkPolicy,
-    learner_is_installed,
     suite_config,
 )
 from ugat_marl.progress import Silent
@@ -275,11 +274,14 @@ def test_more_episodes_train_only_those_and_fewer_are_refused(tmp_path: Path) ->
 
 @pytest.mark.parametrize("name", [DQN_NAME, *BASELINES])
 def test_every_learner_can_have_a_job(name: str, tmp_path: Path) -> None:
-    if not learner_is_installed(name):
-        pytest.skip(f"the library of {name} is not installed")
+    learner = LearnerSpec(name)
+    try:
+        learner.factory()
+    except OptionError as error:
+        pytest.skip(str(error))
     job = replace(
         PLAIN,
-        setting=Setting(name, "direct", learner=LearnerSpec(name)),
+        setting=Setting(name, "direct", learner=learner),
         episodes=1,
         every=0,
         domains=("sim",),

@@ -46,8 +46,6 @@ def test_a_curve_by_hand() -> None:
     one = Curve("dqn", "", 0, {5: 200.0, 6: 100.0, 8: 104.0, 9: 112.0})
     assert (one.final_s, one.best_s) == (112.0, 100.0)
     assert one.mean_of_last_s(3) == pytest.approx((100 + 104 + 112) / 3)
-    assert one.unsteadiness(3) == pytest.approx(1.0533, abs=1e-4)
-    assert Curve("dqn", "", 0, {1: 50.0, 2: 100.0}).unsteadiness(1) == 2.0
 
 
 def test_a_curve_is_the_means_of_a_record() -> None:

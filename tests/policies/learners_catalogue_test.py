@@ -84,14 +84,6 @@ def test_settings_are_of_their_type() -> None:
 
 
 @pytest.mark.usefixtures("planted")
-def test_a_learner_that_does_not_exist_is_not_installed() -> None:
-    found = [catalogue.learner_is_installed(name) for name in ("plain", "needy", "dqn")]
-    assert found == [True, False, True]
-    with pytest.raises(UnknownNameError, match="'plain'"):
-        catalogue.learner_is_installed("plane")
-
-
-@pytest.mark.usefixtures("planted")
 @pytest.mark.parametrize(
     ("name", "settings", "kind", "says"),
     [

@@ -81,10 +81,6 @@ class Curve:
         """Return the mean travel time of the last `count` evaluations, in s."""
         return fmean(list(self.att_s.values())[-count:])
 
-    def unsteadiness(self, count: int) -> float:
-        """Return `mean_of_last_s` divided by `best_s`, at least 1."""
-        return self.mean_of_last_s(count) / self.best_s
-
 
 @dataclass(frozen=True)
 class LearningCurves:

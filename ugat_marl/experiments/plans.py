@@ -6,7 +6,7 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 
 from ugat_marl.errors import counted, listed
-from ugat_marl.experiments.driver import OTHER_PARTS
+from ugat_marl.experiments.driver import OTHER_PARTS, record_of
 from ugat_marl.experiments.forked import jobs_fork_on
 from ugat_marl.experiments.jobs import Job, JobRecord
 from ugat_marl.grounding import EPISODES_PER_DELAY, ROLL_OUTS, UgatConfig
@@ -94,7 +94,7 @@ def described_plan(
         episode_s: Length of an episode, in s.
         beside: Jobs of the plan that are performed beside the others.
     """
-    todo = [job for job in plan if not JobRecord.read(folder / job.name).is_whole(job)]
+    todo = [job for job in plan if record_of(job, folder) is None]
     lines = [f"run: {directory}"]
     if len(todo) < len(plan):
         lines.append(f"done before: {len(plan) - len(todo)} of {len(plan)} parts")

@@ -11,7 +11,6 @@ from .learners.catalogue import UNIVERSAL_NAME as UNIVERSAL_NAME
 from .learners.catalogue import LearnerFactory as LearnerFactory
 from .learners.catalogue import baseline_settings as baseline_settings
 from .learners.catalogue import learner_factory as learner_factory
-from .learners.catalogue import learner_is_installed as learner_is_installed
 from .learners.catalogue import learner_library as learner_library
 from .learners.catalogue import lesson_episodes as lesson_episodes
 from .learners.catalogue import load_baseline as load_baseline

@@ -106,6 +106,6 @@ def test_a_training_s_time_is_divided_between_sumo_torch_and_the_rest() -> None:
 
 
 def test_a_library_that_is_not_installed_is_a_note(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("studies.bench.scale.learner_is_installed", lambda name: False)
+    monkeypatch.setattr("studies.bench.scale._is_installed", lambda name: False)
     report = ScaleBench(parts=("learner",)).run()
     assert report.rows == [] and "library of sb3-ppo is not installed" in report.notes[-1]

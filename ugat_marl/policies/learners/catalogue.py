@@ -274,21 +274,6 @@ def learner_library(name: str) -> str:
     return library and f"{library} {installed_version(library) or '-'}"
 
 
-def learner_is_installed(name: str) -> bool:
-    """Return true if the libraries of a learner are installed; the check imports them.
-
-    Raises:
-        UnknownNameError: There is no such learner.
-    """
-    require_known_learner(name)
-    if name in BASELINES:
-        try:
-            load_baseline(name)
-        except OptionError:
-            return False
-    return True
-
-
 def load_baseline(name: str) -> ModuleType:
     """Return the module of a baseline; all calls return the same object.
 

@@ -555,11 +555,6 @@ class DQN:
             )
         return reward
 
-    @property
-    def running_weights(self) -> Tensor:
-        """Running mean of the learned weights, with which `policy` acts (a copy)."""
-        return self._target_weights.detach().cpu().clone()
-
     def load_initial_weights(self, initial: InitialWeights) -> None:
         """Take weights that were learned elsewhere.
 
@@ -577,11 +572,6 @@ class DQN:
         weights = initial.weights_for(self._online)
         self._weights.data.copy_(weights)
         self._target_weights.data.copy_(weights)
-
-    def set_learning_rate(self, rate: float) -> None:
-        """Change the step size of Adam."""
-        for group in self._adam.param_groups:
-            group["lr"] = rate
 
     def share_weights(self, other: DQN) -> None:
         """Learn the weights of another learner from now on; both update the same ones.

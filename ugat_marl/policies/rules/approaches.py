@@ -236,6 +236,20 @@ def permitted(wanted: int, allowed: NDArray[np.bool_]) -> int:
     return wanted if allowed[wanted] else int(allowed.argmax())
 
 
+def permitted_phases(wanted: Mapping[str, int], infos: Infos, phases: Mapping[str, int]) -> Actions:
+    """Return the wanted phase of each agent; if it is masked, the first allowed one.
+
+    Args:
+        wanted: Phase by agent.
+        infos: The infos, with the masks.
+        phases: Number of phases by agent.
+    """
+    return {
+        agent: permitted(phase, allowed_phases(infos, agent, phases[agent]))
+        for agent, phase in wanted.items()
+    }
+
+
 def green_indices(intersection: Intersection, phase: str) -> frozenset[int]:
     """Return the indices of the links that are green in a phase."""
     return frozenset(link.index for link in intersection.links if phase[link.index] in GREEN)

@@ -10,9 +10,8 @@ from typing import Any
 from ugat_marl.envs import Actions, Infos, Observations
 from ugat_marl.policies.rules.approaches import (
     ControlledNetwork,
-    allowed_phases,
     green_indices,
-    permitted,
+    permitted_phases,
 )
 from ugat_marl.scenarios import Intersection, Link, edge_of_lane
 
@@ -122,16 +121,16 @@ class GreenWave:
 
     def act(self, observations: Observations, infos: Infos) -> Actions:
         """Return the phase whose turn it is; if it is masked, the first allowed one."""
-        actions: Actions = {}
-        for agent, phases in self._phases.items():
+        wanted: Actions = {}
+        for agent in self._phases:
             turns = self._turns[agent]
             place = (self._time - self._offsets[agent]) % sum(length for _, length in turns)
             ends = itertools.accumulate(length for _, length in turns)
-            wanted = next(phase for (phase, _), end in zip(turns, ends, strict=True) if place < end)
-            allowed = allowed_phases(infos, agent, phases)
-            actions[agent] = permitted(wanted, allowed)
+            wanted[agent] = next(
+                phase for (phase, _), end in zip(turns, ends, strict=True) if place < end
+            )
         self._time += 1
-        return actions
+        return permitted_phases(wanted, infos, self._phases)
 
     def _plan(self, road: Corridor, network: ControlledNetwork) -> None:
         main, other = map(network.planned_decisions, (self.main_s, self.green_s))

@@ -8,7 +8,11 @@ from typing import Any
 import numpy as np
 
 from ugat_marl.envs import Actions, Infos, Observations
-from ugat_marl.policies.rules.approaches import ControlledNetwork, allowed_phases, permitted
+from ugat_marl.policies.rules.approaches import (
+    ControlledNetwork,
+    allowed_phases,
+    permitted_phases,
+)
 from ugat_marl.seeding import numpy_generator
 
 
@@ -37,12 +41,8 @@ class FixedTime:
         """Return the phase whose turn it is; if it is masked, the first allowed one."""
         turn = self._time // self._decisions
         self._time += 1
-        actions: Actions = {}
-        for agent, cycle in self._cycle.items():
-            wanted = cycle[turn % len(cycle)]
-            allowed = allowed_phases(infos, agent, self._phases[agent])
-            actions[agent] = permitted(wanted, allowed)
-        return actions
+        wanted = {agent: cycle[turn % len(cycle)] for agent, cycle in self._cycle.items()}
+        return permitted_phases(wanted, infos, self._phases)
 
 
 class ProgrammeControl:

@@ -13,9 +13,8 @@ from ugat_marl.envs import Actions, Infos, Observations
 from ugat_marl.policies.rules.approaches import (
     Approach,
     ControlledNetwork,
-    allowed_phases,
     least_decisions,
-    permitted,
+    permitted_phases,
 )
 
 LONGEST_CYCLE_S = 180.0
@@ -96,7 +95,7 @@ class Webster:
 
     def act(self, observations: Observations, infos: Infos) -> Actions:
         """Return the phase whose turn it is; if it is masked, the first allowed one."""
-        actions: Actions = {}
+        wanted: Actions = {}
         for agent, approach in self._network.approaches.items():
             self._counts[agent].add(agent, observations[agent], self._network.decision_interval_s)
             if not self._left.get(agent):
@@ -104,10 +103,8 @@ class Webster:
                 self._left[agent] = [
                     phase for phase, n in zip(approach.cycle, plan, strict=True) for _ in range(n)
                 ]
-            wanted = self._left[agent].pop(0)
-            allowed = allowed_phases(infos, agent, len(approach.served))
-            actions[agent] = permitted(wanted, allowed)
-        return actions
+            wanted[agent] = self._left[agent].pop(0)
+        return permitted_phases(wanted, infos, self._network.phases)
 
     def plan(self, agent: str) -> list[int]:
         """Return the decisions of each phase of an agent's cycle, from the counts so far."""
