@@ -2,13 +2,20 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 from typing import Any, Literal
 
 import numpy as np
 import pytest
 
-from ugat_marl.errors import LISTED, OptionError, UnknownNameError, require_kinds
+from ugat_marl.errors import (
+    LISTED,
+    OptionError,
+    UnknownNameError,
+    require_kinds,
+    require_ranges,
+)
 
 
 def test_a_short_list_is_whole_and_names_with_commas_are_told_apart() -> None:
@@ -87,3 +94,48 @@ def test_values_of_their_kinds_pass(given: dict[str, Any]) -> None:
 def test_values_of_other_kinds_are_refused(given: dict[str, Any], told: str) -> None:
     with pytest.raises(OptionError, match=told):
         require_kinds(Settings(**given), "settings")
+
+
+@dataclass(frozen=True)
+class Ranged:
+    """One field per range."""
+
+    size: int = 2
+    rate: float = 1.0
+    weight: float = 0.0
+    share: float = 1.0
+    level: float = 0.0
+
+    def __post_init__(self) -> None:
+        require_ranges(
+            self,
+            "ranged",
+            at_least={"size": 2},
+            positive=("rate",),
+            non_negative=("weight",),
+            shares=("share",),
+            below_one=("level",),
+        )
+
+
+def test_numbers_at_the_ends_of_their_ranges_pass() -> None:
+    Ranged()
+    Ranged(rate=5e-324, share=0.0, level=1.0 - 2.0**-53)
+
+
+@pytest.mark.parametrize(
+    ("given", "told"),
+    [
+        ({"size": 1}, "ranged size is 1; allowed: >= 2"),
+        ({"rate": 0.0}, "rate is 0.0; allowed: > 0, finite"),
+        ({"rate": math.inf}, "rate is inf; allowed: > 0, finite"),
+        ({"weight": -5e-324}, "weight is -5e-324; allowed: >= 0, finite"),
+        ({"weight": math.inf}, "weight is inf; allowed: >= 0, finite"),
+        ({"share": 1.0 + 2.0**-52}, "allowed: 0 to 1"),
+        ({"level": 1.0}, "level is 1.0; allowed: from 0 to below 1"),
+        *(({name: math.nan}, f"{name} is nan") for name in ("rate", "weight", "share", "level")),
+    ],
+)
+def test_numbers_out_of_their_ranges_are_refused(given: dict[str, Any], told: str) -> None:
+    with pytest.raises(OptionError, match=told):
+        Ranged(**given)

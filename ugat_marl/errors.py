@@ -8,9 +8,12 @@ from __future__ import annotations
 
 import contextlib
 import difflib
+import math
+import operator
 import re
 from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
 from dataclasses import is_dataclass
+from functools import partial
 from numbers import Integral, Real
 from types import UnionType
 from typing import Literal, TypeGuard, Union, get_args, get_origin, get_type_hints
@@ -183,6 +186,47 @@ def require_kinds(settings: object, name: str) -> None:
         if not any(kind is None or kind[0](value) for kind in kinds):
             allowed = " or ".join(kind[1] for kind in kinds if kind is not None)
             raise OptionError(f"{name} {field} is {value!r}; allowed: {allowed}")
+
+
+def require_ranges(
+    settings: object,
+    name: str,
+    *,
+    at_least: Mapping[str, int] | None = None,
+    positive: Iterable[str] = (),
+    non_negative: Iterable[str] = (),
+    shares: Iterable[str] = (),
+    below_one: Iterable[str] = (),
+) -> None:
+    """Refuse a number of a data class that is out of its range; NaN is in none.
+
+    Args:
+        settings: An object of the data class.
+        name: Name of the settings for the message.
+        at_least: Field to its smallest number; None for no such field.
+        positive: Fields with finite numbers above 0.
+        non_negative: Fields with finite numbers of at least 0.
+        shares: Fields with numbers from 0 to 1.
+        below_one: Fields with numbers from 0 to below 1.
+
+    Raises:
+        OptionError: A number is out of its range.
+    """
+    ranges: list[tuple[Iterable[str], Callable[[float], bool], str]] = [
+        *(
+            ((field,), partial(operator.le, least), f">= {least}")
+            for field, least in (at_least or {}).items()
+        ),
+        (positive, lambda x: 0 < x < math.inf, "> 0, finite"),
+        (non_negative, lambda x: 0 <= x < math.inf, ">= 0, finite"),
+        (shares, lambda x: 0 <= x <= 1, "0 to 1"),
+        (below_one, lambda x: 0 <= x < 1, "from 0 to below 1"),
+    ]
+    for fields, holds, allowed in ranges:
+        for field in fields:
+            value = getattr(settings, field)
+            if not holds(value):
+                raise OptionError(f"{name} {field} is {value}; allowed: {allowed}")
 
 
 def _is_list(value: object) -> TypeGuard[Collection[object]]:

@@ -29,7 +29,13 @@ from scipy.special import bdtr
 
 from ugat_marl.data import AgentLayout, TransitionLog, Transitions, consecutive
 from ugat_marl.effects import Actuator, Commands, ControllerPart
-from ugat_marl.errors import CheckpointError, LogError, OptionError, counted, require_kinds
+from ugat_marl.errors import (
+    CheckpointError,
+    LogError,
+    counted,
+    require_kinds,
+    require_ranges,
+)
 from ugat_marl.files import MALFORMED
 from ugat_marl.grounding.draws import DRAWS, with_intervals
 from ugat_marl.scenarios import Network, SignalState, SignalTiming
@@ -86,18 +92,14 @@ class ChannelConfig:
 
     def __post_init__(self) -> None:
         require_kinds(self, "channel")
-        for name, least in (("most_lag", 0), ("least_rows", 1)):
-            if getattr(self, name) < least:
-                raise OptionError(f"channel {name} is {getattr(self, name)}; allowed: >= {least}")
-        for name in ("refused", "least_share"):
-            if not 0 <= getattr(self, name) < 1:
-                raise OptionError(
-                    f"channel {name} is {getattr(self, name)}; allowed: from 0 to below 1"
-                )
-        if not 0 < self.pull < math.inf:
-            raise OptionError(f"channel pull is {self.pull}; allowed: > 0, finite")
-        if not 0 <= self.gain < math.inf:
-            raise OptionError(f"channel gain is {self.gain}; allowed: >= 0, finite")
+        require_ranges(
+            self,
+            "channel",
+            at_least={"most_lag": 0, "least_rows": 1},
+            positive=("pull",),
+            non_negative=("gain",),
+            below_one=("refused", "least_share"),
+        )
 
 
 @dataclass(frozen=True)

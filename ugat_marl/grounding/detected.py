@@ -32,7 +32,7 @@ from numpy.typing import NDArray
 from scipy.integrate import trapezoid
 from scipy.special import gammaln, ndtr
 
-from ugat_marl.errors import OptionError, require_kinds
+from ugat_marl.errors import OptionError, require_kinds, require_ranges
 from ugat_marl.scenarios import GREEN, Detector, Lane, Passages, Period, deciding_letter
 from ugat_marl.simulation import seconds_of
 
@@ -99,13 +99,14 @@ class DetectionConfig:
 
     def __post_init__(self) -> None:
         require_kinds(self, "detection")
-        for name, value in vars(self).items():
-            if name not in ("latency_s", "late_s", "missed") and not 0 < value < math.inf:
-                raise OptionError(f"detection {name} is {value}; allowed: > 0, finite")
-        if not 0 <= self.late_s < math.inf:
-            raise OptionError(f"detection late_s is {self.late_s}; allowed: >= 0, finite")
-        if not 0 <= self.missed < 1:
-            raise OptionError(f"detection missed is {self.missed}; allowed: from 0 to below 1")
+        others = {"latency_s", "late_s", "missed"}
+        require_ranges(
+            self,
+            "detection",
+            positive=[name for name in vars(self) if name not in others],
+            non_negative=("late_s",),
+            below_one=("missed",),
+        )
         if not abs(self.latency_s) <= MOST_LATENCY_S:
             raise OptionError(
                 f"latency_s = {self.latency_s:g}: must be from -{MOST_LATENCY_S:g} to "

@@ -36,7 +36,7 @@ from ugat_marl.effects import (
     QuantisedCounts,
     Sensor,
 )
-from ugat_marl.errors import CheckpointError, OptionError, counted, require_kinds
+from ugat_marl.errors import CheckpointError, OptionError, counted, require_kinds, require_ranges
 from ugat_marl.files import MALFORMED
 from ugat_marl.grounding.draws import DRAWS, with_intervals
 from ugat_marl.grounding.summaries import CLOSE, Floats, LaneRows, LaneView
@@ -107,18 +107,14 @@ class EyesConfig:
 
     def __post_init__(self) -> None:
         require_kinds(self, "eyes")
-        for name, least in (("most_lag", 0), ("least_served", 1), ("least_stays", 1)):
-            if getattr(self, name) < least:
-                raise OptionError(f"eyes {name} is {getattr(self, name)}; allowed: >= {least}")
-        for name in ("surprise", "together", "pull"):
-            if not 0 < getattr(self, name) < math.inf:
-                raise OptionError(f"eyes {name} is {getattr(self, name)}; allowed: > 0, finite")
-        for name in ("queue", "long_queue", "fraction", "margin"):
-            if not 0 <= getattr(self, name) < math.inf:
-                raise OptionError(f"eyes {name} is {getattr(self, name)}; allowed: >= 0, finite")
-        for name in ("limit", "filled", "unseen", "shift", "least_lost"):
-            if not 0 <= getattr(self, name) <= 1:
-                raise OptionError(f"eyes {name} is {getattr(self, name)}; allowed: 0 to 1")
+        require_ranges(
+            self,
+            "eyes",
+            at_least={"most_lag": 0, "least_served": 1, "least_stays": 1},
+            positive=("surprise", "together", "pull"),
+            non_negative=("queue", "long_queue", "fraction", "margin"),
+            shares=("limit", "filled", "unseen", "shift", "least_lost"),
+        )
         for name in ("absolute", "relative"):
             tried = getattr(self, name)
             if not tried or not all(0 <= value < math.inf for value in tried):

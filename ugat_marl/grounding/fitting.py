@@ -11,7 +11,6 @@ also trained to be unsure on invented inputs (`OffData`).
 
 from __future__ import annotations
 
-import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from typing import Literal
@@ -20,7 +19,7 @@ import torch
 from torch import Tensor, nn
 
 from ugat_marl.data import TransitionLog
-from ugat_marl.errors import LogError, OptionError, require_kinds
+from ugat_marl.errors import LogError, require_kinds, require_ranges
 from ugat_marl.grounding.forward import ForwardModel
 from ugat_marl.grounding.inverse import AnswerModel
 from ugat_marl.grounding.networks import TrainableModel, full_width, rows_at_once
@@ -83,16 +82,19 @@ class FitConfig:
     def __post_init__(self) -> None:
         _ = self.method  # refuses what is impossible
         require_kinds(self, "fit")
-        for name, least in (("epochs", 1), ("batch_size", 1), ("patience", 1), ("kl_epochs", 0)):
-            if getattr(self, name) < least:
-                raise OptionError(f"fit {name} is {getattr(self, name)}; allowed: >= {least}")
-        if self.held_out_every < 2:
-            raise OptionError(f"fit held_out_every is {self.held_out_every}; allowed: >= 2")
-        if not 0 < self.learning_rate < math.inf:
-            raise OptionError(f"fit learning_rate is {self.learning_rate}; allowed: > 0, finite")
-        for name in ("kl_weight", "off_data_weight"):
-            if not 0 <= getattr(self, name) < math.inf:
-                raise OptionError(f"fit {name} is {getattr(self, name)}; allowed: >= 0, finite")
+        require_ranges(
+            self,
+            "fit",
+            at_least={
+                "epochs": 1,
+                "batch_size": 1,
+                "patience": 1,
+                "kl_epochs": 0,
+                "held_out_every": 2,
+            },
+            positive=("learning_rate",),
+            non_negative=("kl_weight", "off_data_weight"),
+        )
 
 
 # --- data of a fit

@@ -18,7 +18,7 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
-from ugat_marl.errors import CheckpointError, OptionError, require_kinds
+from ugat_marl.errors import CheckpointError, OptionError, require_kinds, require_ranges
 from ugat_marl.grounding.reports import complaint
 from ugat_marl.policies import Usual, UsualName, UsualNumber, UsualValue
 
@@ -54,8 +54,7 @@ class GateConfig:
         require_kinds(self, "gate")
         if not 0.0 < self.static_alpha <= 1.0:
             raise OptionError(f"gate static_alpha is {self.static_alpha}; allowed: in (0, 1]")
-        if self.window_epochs < 1:
-            raise OptionError(f"gate window_epochs is {self.window_epochs}; allowed: >= 1")
+        require_ranges(self, "gate", at_least={"window_epochs": 1})
 
     def require_settings_count(self, *, also_dynamic: bool = False) -> None:
         """Refuse settings that the mode would ignore.

@@ -12,7 +12,7 @@ from typing import Literal
 import torch
 from torch import Tensor
 
-from ugat_marl.errors import OptionError, require_kinds
+from ugat_marl.errors import OptionError, require_kinds, require_ranges
 from ugat_marl.grounding.networks import Standardiser, TrainableModel, by_member, rows_at_once
 from ugat_marl.grounding.stacked import Stack
 from ugat_marl.grounding.uncertainty import (
@@ -50,8 +50,7 @@ class InverseConfig:
         require_kinds(self, "inverse")
         if not self.hidden or min(self.hidden) < 1:
             raise OptionError(f"inverse hidden is {self.hidden}; allowed: one or more sizes >= 1")
-        if self.embedding < 1:
-            raise OptionError(f"inverse embedding is {self.embedding}; allowed: >= 1")
+        require_ranges(self, "inverse", at_least={"embedding": 1})
 
 
 class AnswerModel(TrainableModel):

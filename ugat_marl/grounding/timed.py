@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 from torch import Tensor, nn
 
 from ugat_marl.data import AgentLayout, TransitionLog
-from ugat_marl.errors import OptionError, require_kinds
+from ugat_marl.errors import OptionError, require_kinds, require_ranges
 from ugat_marl.grounding.delays import (
     EpisodeRewards,
     LostTime,
@@ -78,12 +78,13 @@ class TimedConfig:
 
     def __post_init__(self) -> None:
         require_kinds(self, "timed")
-        if self.most_s < 1:
-            raise OptionError(f"timed most_s is {self.most_s}; allowed: >= 1")
-        if not 0 < self.spread_s < float("inf"):
-            raise OptionError(f"timed spread_s is {self.spread_s}; allowed: > 0, finite")
-        if not 0 <= self.target_noise < float("inf"):
-            raise OptionError(f"timed target_noise is {self.target_noise}; allowed: >= 0, finite")
+        require_ranges(
+            self,
+            "timed",
+            at_least={"most_s": 1},
+            positive=("spread_s",),
+            non_negative=("target_noise",),
+        )
 
 
 class _Constants(nn.Module):

@@ -24,7 +24,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from ugat_marl.data import TransitionLog
-from ugat_marl.errors import OptionError, require_kinds
+from ugat_marl.errors import require_kinds, require_ranges
 from ugat_marl.grounding.fitting import Changes, Fitter, Split
 from ugat_marl.grounding.forward import ForwardModel
 from ugat_marl.grounding.reports import Floats, blocks_of, flat, p_of_mean
@@ -59,13 +59,7 @@ class TrustConfig:
 
     def __post_init__(self) -> None:
         require_kinds(self, "trust")
-        for name in ("margin", "level"):
-            if not 0 <= getattr(self, name) < 1:
-                raise OptionError(
-                    f"trust {name} is {getattr(self, name)}; allowed: from 0 to below 1"
-                )
-        if self.folds < 2:
-            raise OptionError(f"trust folds is {self.folds}; allowed: >= 2")
+        require_ranges(self, "trust", at_least={"folds": 2}, below_one=("margin", "level"))
 
 
 @dataclass(frozen=True)

@@ -18,7 +18,7 @@ import torch
 from torch import Tensor, nn
 
 from ugat_marl.envs import AnyParallelEnv
-from ugat_marl.errors import LogError, OptionError, first_names, require_kinds
+from ugat_marl.errors import LogError, OptionError, first_names, require_kinds, require_ranges
 from ugat_marl.grounding.stacked import Stack, StackedTransitions
 from ugat_marl.scenarios import within_hops
 
@@ -46,8 +46,7 @@ class InputsConfig:
 
     def __post_init__(self) -> None:
         require_kinds(self, "inputs")
-        if self.history < 1:
-            raise OptionError(f"inputs history is {self.history}; allowed: >= 1")
+        require_ranges(self, "inputs", at_least={"history": 1})
         if self.hops < 0:
             raise OptionError(f"inputs hops is {self.hops}; allowed: 0 or a number of roads")
 
