@@ -11,7 +11,7 @@
   SUMO's own programmes.
 - `single`, `registration`: one light as an environment of Gymnasium, and the names there.
 - `description`: tables of what agents see and choose; `rendering`: pictures of the network.
-- `types`: types of arguments and results, by agent.
+- `types`: types of arguments and results, by agent; `unwrapping`: what is inside wrappers.
 """
 
 import lazy_loader

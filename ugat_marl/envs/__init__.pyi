@@ -30,6 +30,7 @@ from .types import Infos as Infos
 from .types import Observations as Observations
 from .types import ResetResult as ResetResult
 from .types import StepResult as StepResult
+from .unwrapping import as_traffic_env as as_traffic_env
 from .vector.environment import VectorEnv as VectorEnv
 from .vector.environment import VectorStep as VectorStep
 from .vector.environment import vector_env as vector_env

@@ -566,7 +566,7 @@ def step_meanwhile(
         if left:
             left.pop()()
 
-    inner: Any = env.unwrapped
+    inner = env.unwrapped
     inner = getattr(inner, "base", inner)  # wrappers of the suite are their own `unwrapped`
     if not isinstance(inner, TrafficEnv):
         result = env.step(dict(actions))

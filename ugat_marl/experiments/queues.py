@@ -8,14 +8,13 @@ import threading
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import polars as pl
 from numpy.typing import NDArray
 
 from ugat_marl.data import damage, read_quietly, write_hashed
-from ugat_marl.envs import AnyParallelEnv
+from ugat_marl.envs import AnyParallelEnv, as_traffic_env
 from ugat_marl.errors import CheckpointError, first_line
 from ugat_marl.files import replacing
 from ugat_marl.policies import StepCallback
@@ -61,7 +60,7 @@ class QueueRecord:
         Returns:
             A callback, to be called after every decision.
         """
-        base: Any = env.unwrapped
+        base = as_traffic_env(env)
         lights = base.network.intersections
         lanes = base.network.lane_table()
         incoming = [lanes.indices(light.incoming_lanes) for light in lights]

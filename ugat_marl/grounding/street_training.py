@@ -28,10 +28,10 @@ import contextlib
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import Any
 
 from ugat_marl.data import TransitionLog
 from ugat_marl.effects import late_greens
+from ugat_marl.envs import as_traffic_env
 from ugat_marl.grounding.algorithm import Algorithm, iteration_name
 from ugat_marl.grounding.fitting import Fitter
 from ugat_marl.grounding.oversaturation import Oversaturation
@@ -237,7 +237,7 @@ class StreetTraining(Algorithm):
             seed = derive_seed(self.seed, "rival", state.iteration)
             delay_s = matched_delays(state.real[-1], self.simulation, policy, seed, advance)
         numbers = {f"rival/late_s/{agent}": late_s for agent, late_s in delay_s.items()}
-        plain: Any = self.env.unwrapped
+        plain = as_traffic_env(self.env)
         if not any(delay_s.values()) and not late_greens(plain.scenario):
             self.run.reporter.say(f"{name}: no green has to be late, so there is no rival")
             return {}, numbers

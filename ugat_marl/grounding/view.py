@@ -12,12 +12,11 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from typing import Any
 
 import torch
 from torch import Tensor, nn
 
-from ugat_marl.envs import AnyParallelEnv
+from ugat_marl.envs import AnyParallelEnv, as_traffic_env
 from ugat_marl.errors import LogError, OptionError, first_names, require_kinds, require_ranges
 from ugat_marl.grounding.stacked import Stack, StackedTransitions
 from ugat_marl.scenarios import within_hops
@@ -74,7 +73,7 @@ class InputsConfig:
 
 def neighbours_of(env: AnyParallelEnv) -> dict[str, tuple[str, ...]]:
     """Return the agents one road away from each agent of an environment, wrapped or not."""
-    base: Any = env.unwrapped
+    base = as_traffic_env(env)
     agent = {light: name for name, light in base.intersection_of.items()}
     return {
         agent[intersection.id]: tuple(agent[other] for other in intersection.neighbours)

@@ -9,7 +9,7 @@ import numpy as np
 import torch
 from pettingzoo.utils import BaseParallelWrapper
 
-from ugat_marl.envs import AnyParallelEnv, ResetResult, StepResult, memory_size
+from ugat_marl.envs import AnyParallelEnv, ResetResult, StepResult, as_traffic_env, memory_size
 from ugat_marl.errors import ActionError, OptionError
 from ugat_marl.grounding.transform import Transform
 from ugat_marl.grounding.view import Moment
@@ -194,7 +194,7 @@ class RandomDelays(BaseParallelWrapper[str, Any, Any]):
         delays = dict(zip(agents, drawn.astype(float).tolist(), strict=True))
         env: Any = self.env
         env.delay_greens(delays)
-        before = dict(zip(agents, env.unwrapped.phases, strict=True))
+        before = dict(zip(agents, as_traffic_env(self.env).phases, strict=True))
         observations, rewards, terminations, truncations, infos = self.env.step(actions)
         told = dict(infos)
         for agent in agents:  # only a green that begins can be late
@@ -220,8 +220,7 @@ class ChangePenalty(BaseParallelWrapper[str, Any, Any]):
     def step(self, actions: dict[str, Any]) -> StepResult:
         """Execute the actions, and take the cost of changes from the rewards."""
         agents = list(self.env.agents)
-        base: Any = self.env.unwrapped
-        before = dict(zip(agents, base.phases, strict=True)) if agents else {}
+        before = dict(zip(agents, as_traffic_env(self.env).phases, strict=True)) if agents else {}
         observations, rewards, terminations, truncations, infos = self.env.step(actions)
         paid = {
             agent: reward - self._cost * (infos[agent]["executed_action"] != before[agent])

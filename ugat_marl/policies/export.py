@@ -284,7 +284,7 @@ def _about(policy: NetworkPolicy, env: AnyParallelEnv | None) -> dict[str, Any]:
             "the policy was trained for other intersections than those of the environment: "
             f"{misfit}; give the scenario it was trained in"
         )
-    base: Any = env.unwrapped if env is not None else None
+    base = env.unwrapped if env is not None else None
     interval_s, made_for_s = getattr(base, "decision_interval_s", None), policy.decision_interval_s
     if interval_s is not None and made_for_s not in (None, interval_s):
         raise OptionError(

@@ -36,6 +36,7 @@ from ugat_marl.envs import (
     Observations,
     ResetResult,
     StepResult,
+    as_traffic_env,
     checked_phases,
 )
 from ugat_marl.errors import ActionError, CheckpointError, OptionError, UgatMarlError
@@ -632,8 +633,7 @@ def check_own_learner(
             f"learner {name!r} failed before its training ({said}); "
             "policy() is asked before the first learn(), too, and has to act in the environment"
         ) from error
-    spaces: Any = env.unwrapped
-    checked_phases(actions, env.agents, spaces.action_spaces)
+    checked_phases(actions, env.agents, as_traffic_env(env).action_spaces)
     return learner
 
 

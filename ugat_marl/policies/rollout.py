@@ -11,11 +11,18 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ugat_marl.data import Provenance, TransitionLog, TransitionRecorder, installed_version
-from ugat_marl.envs import OBSERVATION_UNITS, Actions, AnyParallelEnv, Infos, Observations, Observer
+from ugat_marl.envs import (
+    OBSERVATION_UNITS,
+    Actions,
+    AnyParallelEnv,
+    Infos,
+    Observations,
+    Observer,
+    as_traffic_env,
+)
 from ugat_marl.errors import OptionError
 from ugat_marl.policies.protocols import Policy
 from ugat_marl.seeding import numpy_generator
-from ugat_marl.simulation import Snapshot
 
 SIMULATING = ("libsumo", "numpy", "ugat-marl")
 """Packages whose version can change a roll-out; every log holds these versions."""
@@ -79,7 +86,7 @@ def roll_out(
     """
     if record is None:
         return _played(env, policy, seed, None, on_step, decisions)
-    base: Any = env.unwrapped
+    base = as_traffic_env(env)
     if not hasattr(base, "measure_for"):
         raise OptionError(
             f"{type(base).__name__} cannot be recorded: record needs an environment of ugat_marl"
@@ -138,7 +145,7 @@ def observer_of(
         name: Name of the observation; None for that of the environment, with its `neighbours`.
         neighbours: Number of neighbours that the observation includes.
     """
-    base: Any = env.unwrapped
+    base = as_traffic_env(env)
     if name is None:
         name, neighbours = base.options.observation, base.options.neighbours
     assert name is not None
@@ -149,12 +156,12 @@ class _Recording:
     """Transitions of one episode, seen by an observer; agents have the observer's names."""
 
     def __init__(self, env: AnyParallelEnv, observer: Observer, seed: int, infos: Infos) -> None:
-        self._base: Any = env.unwrapped
+        self._base = as_traffic_env(env)
         self._observer = observer
         self._recorder = TransitionRecorder(provenance_of(env, observer, seed))
         self._names = dict(zip(self._base.possible_agents, observer.agents, strict=True))
         self._seen = self._look()
-        self._before: Snapshot = self._base.seen
+        self._before = self._base.seen
         self._masks = self._masks_of(infos)
         self._step = 0
 
@@ -221,7 +228,7 @@ class _Recording:
 
 def provenance_of(env: AnyParallelEnv, observer: Observer, *seeds: int) -> Provenance:
     """Return the provenance of a log recorded in `env` (wrapped or not) through `observer`."""
-    base: Any = env.unwrapped
+    base = as_traffic_env(env)
     return Provenance(
         scenario=base.scenario.id,
         scenario_hash=base.scenario.hash,

@@ -26,13 +26,13 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from ugat_marl.data import Scores
 from ugat_marl.envs.agents import AgentSet
 from ugat_marl.envs.types import AnyParallelEnv
+from ugat_marl.envs.unwrapping import as_traffic_env
 from ugat_marl.envs.vector.arrays import Arrays, Shape
 from ugat_marl.envs.vector.spec import Spec, agents_of
 from ugat_marl.errors import EpisodeError, OptionError, ScenarioError
-from ugat_marl.scenarios import Scenario, confine, limit_memory
+from ugat_marl.scenarios import confine, limit_memory
 from ugat_marl.simulation import Message
 
 _KEPT = 64
@@ -174,8 +174,7 @@ class _EpisodeServer:
         except ValueError as error:
             raise OptionError(str(error)) from None
         if not self._order["spec"]["modules"]:
-            base: Any = self._running.unwrapped
-            scenario: Scenario = base.scenario
+            scenario = as_traffic_env(self._running).scenario
             files = [str(each.path) for each in scenario.documents if each.path is not None]
             confine([self._order["folder"], *files], [self._order["directory"]])
 
@@ -197,11 +196,11 @@ class _EpisodeServer:
 
     def _scores(self) -> dict[str, float] | None:
         """Return the measures of an ended episode; None if the environment has none."""
-        base: Any = self._running.unwrapped
+        base = as_traffic_env(self._running)
         if self._running.agents or not hasattr(base, "scores"):
             return None
         try:
-            scores: Scores = base.scores()
+            scores = base.scores()
         except EpisodeError:
             return None
         return asdict(scores)

@@ -14,7 +14,7 @@ from typing import Any, Literal
 from pydantic import TypeAdapter
 
 from ugat_marl.data import AgentLayout
-from ugat_marl.envs import COUNT_SCALE, AgentSet, AnyParallelEnv, memory_size
+from ugat_marl.envs import COUNT_SCALE, AgentSet, AnyParallelEnv, as_traffic_env, memory_size
 from ugat_marl.errors import OptionError
 from ugat_marl.scenarios import GREEN, Intersection, LaneTable, Link, Network, turn_of
 
@@ -81,7 +81,7 @@ class Structure:
         """
         if network == "mlp":
             return None
-        base: Any = env.unwrapped
+        base = as_traffic_env(env)
         roads, observation = getattr(base, "network", None), getattr(base, "env_options", {})
         if not isinstance(roads, Network) or "observation" not in observation:
             raise OptionError(
@@ -97,8 +97,7 @@ class Structure:
                 f"network {network!r} cannot tell what the numbers of an observation function are; "
                 "use an observation of the suite, or the network 'mlp'"
             )
-        layouts: Mapping[str, AgentLayout] = base.layouts
-        agent_layouts = [layouts.get(name) for name in agents.names]
+        agent_layouts = [base.layouts.get(name) for name in agents.names]
         for name, size, layout in zip(
             agents.names, agents.observation_sizes, agent_layouts, strict=True
         ):

@@ -7,12 +7,19 @@ from collections.abc import Hashable, Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import cached_property
 from itertools import combinations
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
-from ugat_marl.envs import WAITING_SCALE_S, Actions, AnyParallelEnv, Infos, Observations
+from ugat_marl.envs import (
+    WAITING_SCALE_S,
+    Actions,
+    AnyParallelEnv,
+    Infos,
+    Observations,
+    as_traffic_env,
+)
 from ugat_marl.errors import OptionError
 from ugat_marl.scenarios import GREEN, Intersection, Link, Network, SignalTiming, free_flow_s
 
@@ -52,9 +59,8 @@ class ControlledNetwork:
     @classmethod
     def of(cls, env: AnyParallelEnv) -> ControlledNetwork:
         """Read the network of an environment of the suite, wrapped or not."""
-        base: Any = env.unwrapped
-        network: Network = base.network
-        tls_of: Mapping[str, str] = base.intersection_of
+        base = as_traffic_env(env)
+        network, tls_of = base.network, base.intersection_of
         return cls.of_network(
             network,
             {agent: network.intersection(tls_of[agent]) for agent in base.possible_agents},

@@ -8,7 +8,6 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
-from typing import Any
 
 from ugat_marl.envs import AnyParallelEnv
 from ugat_marl.errors import OptionError, UnknownNameError
@@ -151,11 +150,11 @@ def make_rule(spec: str, env: AnyParallelEnv) -> Policy:
     """
     name, values = parse_rule(spec)
     rule = RULES[name].make(ControlledNetwork.of(env), *values)
-    inner: Any = env.unwrapped
-    if "observation" in rule.env_options and getattr(inner, "frames", 1) > 1:
+    frames = getattr(env.unwrapped, "frames", 1)
+    if "observation" in rule.env_options and frames > 1:
         raise OptionError(
             f"rule {spec!r}: a rule reads one observation, and frame_stack shows "
-            f"{inner.frames}; give the rule the environment without frame_stack"
+            f"{frames}; give the rule the environment without frame_stack"
         )
     return rule
 
