@@ -12,6 +12,7 @@ from rich.console import Console, RenderableType
 from ugat_marl.cli.plan import plan_table
 from ugat_marl.effects import load_scenario
 from ugat_marl.reporting import LightNames, approach_table, titled_table
+from ugat_marl.reporting.terminal import named_table
 from ugat_marl.scenarios import Network, SignalPlan, read_plans
 
 TODAY = Path(__file__).parents[2] / "docs" / "tutorials" / "town" / "today.csv"
@@ -37,6 +38,14 @@ def test_lines_break_between_words_as_long_as_words_have_room() -> None:
     whole = "".join("".join(lines).split())
     assert "SBL" in whole and "45" in whole
     assert len(lines_of(table)) < len(lines_of(table, 40))
+
+
+def test_a_long_name_is_broken_and_leaves_numbers_their_place() -> None:
+    table = named_table("Words", "policy")
+    table.add_column("s", justify="right")
+    table.add_row("p" * 30, "151.2")
+    _, first, second = [line.split() for line in lines_of(table) if "p" in line]
+    assert first == ["p" * 22, "151.2"] and second == ["p" * 8]
 
 
 def test_a_light_has_the_names_of_sumo_and_of_its_agent() -> None:

@@ -12,7 +12,7 @@ from rich.text import Text
 from ugat_marl.envs import OBJECTIVE_MEASURES
 from ugat_marl.experiments import Evaluation, domains_by_gap, gap_matrix
 from ugat_marl.reporting.formats import fixed, number_text
-from ugat_marl.reporting.terminal import in_tables, titled_table
+from ugat_marl.reporting.terminal import in_tables, named_table, titled_table
 
 
 def gap_matrix_table(evaluation: Evaluation) -> RenderableType:
@@ -51,8 +51,9 @@ def objective_tables(evaluation: Evaluation) -> list[RenderableType]:
     domains = [domain for domain in evaluation.domains if domain in told]
     if not domains:
         return []
-    table = titled_table(f"{evaluation.scenario}: cost of what is wanted, hidden from training")
-    table.add_column("policy", max_width=22, overflow="fold")
+    table = named_table(
+        f"{evaluation.scenario}: cost of what is wanted, hidden from training", "policy"
+    )
     for domain in domains:
         table.add_column(domain.removeprefix("want-"), justify="right", overflow="fold")
     for policy in evaluation.policies:
@@ -90,8 +91,7 @@ def _measured(evaluation: Evaluation, domains: Sequence[str]) -> list[Table]:
         alike.setdefault(tuple(values), []).append(domain)
     tables: list[Table] = []
     for values, same in alike.items():
-        table = titled_table(f"measured in {', '.join(same)}")
-        table.add_column("policy", max_width=22, overflow="fold")
+        table = named_table(f"measured in {', '.join(same)}", "policy")
         for heading in _SHORT.values():
             table.add_column(heading, justify="right")
         for place, policy in enumerate(evaluation.policies):
@@ -104,8 +104,7 @@ def _measured(evaluation: Evaluation, domains: Sequence[str]) -> list[Table]:
 def _by_domain(evaluation: Evaluation) -> RenderableType:
     tables: list[Table] = []
     for policies in in_tables(evaluation.policies, _SIDE_BY_SIDE):
-        table = titled_table("average travel time in s, domain by domain")
-        table.add_column("domain", max_width=22, overflow="fold")
+        table = named_table("average travel time in s, domain by domain", "domain")
         for policy in policies:
             table.add_column(policy, justify="right", overflow="fold")
         for domain in evaluation.domains:

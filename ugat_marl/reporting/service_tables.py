@@ -13,7 +13,7 @@ from ugat_marl.experiments import Evaluation
 from ugat_marl.reporting.formats import fixed, number_text
 from ugat_marl.reporting.light_names import LIGHT_HEADING, LightNames
 from ugat_marl.reporting.page import Grid
-from ugat_marl.reporting.terminal import in_tables, titled_table
+from ugat_marl.reporting.terminal import MOST_NAME, in_tables, named_table
 from ugat_marl.scenarios import Network, named_approaches
 
 MOST_APPROACHES = 8
@@ -77,8 +77,9 @@ def service_tables(evaluation: Evaluation, network: Network) -> list[RenderableT
         return []
     tables: list[RenderableType] = []
     for domains in in_tables(evaluation.domains, MOST_DOMAINS):
-        table = titled_table(f"{evaluation.scenario}: control delay and level of service (HCM)")
-        table.add_column("policy", max_width=22, overflow="fold")
+        table = named_table(
+            f"{evaluation.scenario}: control delay and level of service (HCM)", "policy"
+        )
         for domain in domains:
             table.add_column(domain, justify="right", overflow="fold")
         for policy in evaluation.policies:
@@ -110,13 +111,11 @@ def approach_table(title: str, delays: Mapping[str, Delays], network: Network) -
     tables: list[RenderableType] = []
     for controllers in in_tables([*delays], MOST_CONTROLLERS):
         part = {controller: delays[controller] for controller in controllers}
-        table = titled_table(f"{title}{more}")
-        for heading in (LIGHT_HEADING, "approach", "road"):
-            table.add_column(heading, overflow="fold", max_width=22)
+        table = named_table(f"{title}{more}", LIGHT_HEADING, "approach", "road")
         table.add_column("veh", justify="right")
         for controller in part:
             lines = controller.replace(":", ":\n", 1)
-            least = min(max(map(len, lines.split())), 22)
+            least = min(max(map(len, lines.split())), MOST_NAME)
             table.add_column(lines, justify="right", overflow="fold", min_width=least)
         for road in shown:
             named = names.get(road)

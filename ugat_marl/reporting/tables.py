@@ -13,7 +13,7 @@ from ugat_marl.diagnosis import PolicyGap, TravelTimeEstimate
 from ugat_marl.errors import counted
 from ugat_marl.experiments import CORRECTED, Estimate, Evaluation, Tuned, best_rule_note, check_run
 from ugat_marl.reporting.formats import ends_text, mean_text, number_text, share, signed_text
-from ugat_marl.reporting.terminal import titled_table
+from ugat_marl.reporting.terminal import named_table, titled_table
 
 
 def transfer_table(evaluation: Evaluation) -> RenderableType:
@@ -21,8 +21,7 @@ def transfer_table(evaluation: Evaluation) -> RenderableType:
     first, *others = evaluation.domains
     several = len(evaluation.seeds) > 1
     interval = " (95 % interval)" if several else ""
-    table = titled_table(f"{evaluation.scenario}: average travel time in s{interval}")
-    table.add_column("policy", max_width=22, overflow="fold")
+    table = named_table(f"{evaluation.scenario}: average travel time in s{interval}", "policy")
     table.add_column(first, justify="right", overflow="fold")
     for domain in others:
         for heading in (domain, "Δ", "regret"):

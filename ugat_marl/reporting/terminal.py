@@ -13,6 +13,9 @@ from rich.text import Text
 _MOST_WORD = 24
 """Longest word that is kept whole in a table that is too wide, in characters."""
 
+MOST_NAME = 22
+"""Widest column of names, in characters: three of them leave numbers a place in 80 columns."""
+
 
 class WholeWords(Table):
     """A table that breaks its lines between words, as long as all words have room.
@@ -76,3 +79,11 @@ def titled_table(title: str) -> Table:
         pad_edge=False,
         padding=(0, 1, 0, 0),
     )
+
+
+def named_table(title: str, *headings: str) -> Table:
+    """Return a titled table that begins with columns of names, which may be broken anywhere."""
+    table = titled_table(title)
+    for heading in headings:
+        table.add_column(heading, max_width=MOST_NAME, overflow="fold")
+    return table
