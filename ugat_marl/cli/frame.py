@@ -10,10 +10,8 @@ import itertools
 import os
 import re
 import shlex
-import signal
 import sys
 import textwrap
-import threading
 import warnings
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
@@ -32,7 +30,7 @@ from ugat_marl.cli.help import (
     options_of,
     print_help,
 )
-from ugat_marl.errors import UgatMarlError, UnknownNameError, joined, nearest
+from ugat_marl.errors import UgatMarlError, UnknownNameError, joined, nearest, terminated_as
 from ugat_marl.progress import Bars, Loudness, loudness, showing
 
 USAGE_ERROR = 2
@@ -162,7 +160,7 @@ def guarded(program: str, call: Callable[[], int | None]) -> int:
         if isinstance(stream, io.TextIOWrapper):
             stream.reconfigure(errors="replace")
     try:
-        with _ended_in_order(), _warnings_as_notes():
+        with terminated_as(Terminated()), _warnings_as_notes():
             return call() or 0
     except UgatMarlError as error:
         print(f"{program}: error: {_in_one_line(str(error))}", file=sys.stderr)
@@ -195,25 +193,6 @@ def guarded(program: str, call: Callable[[], int | None]) -> int:
             file=sys.stderr,
         )
         return USAGE_ERROR
-
-
-@contextlib.contextmanager
-def _ended_in_order() -> Iterator[None]:
-    """Turn the first SIGTERM into an exception, so that files and folders are left in order."""
-
-    def end(number: int, frame: object) -> None:
-        signal.signal(signal.SIGTERM, signal.SIG_IGN)  # the end must not be interrupted in turn
-        raise Terminated
-
-    main_thread = threading.current_thread() is threading.main_thread()
-    if not main_thread or signal.getsignal(signal.SIGTERM) is not signal.SIG_DFL:
-        yield
-        return
-    signal.signal(signal.SIGTERM, end)
-    try:
-        yield
-    finally:
-        signal.signal(signal.SIGTERM, signal.SIG_DFL)
 
 
 def _in_one_line(text: str) -> str:

@@ -10,14 +10,13 @@ import shlex
 import shutil
 import signal
 import tempfile
-import threading
 from collections.abc import Callable, Iterator, Mapping, Sequence, Set
 from dataclasses import dataclass, field, replace
 from itertools import count
 from pathlib import Path
 from typing import Any
 
-from ugat_marl.errors import OutputError, ScenarioError, counted
+from ugat_marl.errors import OutputError, ScenarioError, counted, terminated_as
 from ugat_marl.files import make_folder, put_folder, read_toml, write_whole
 from ugat_marl.progress import Reporter
 from ugat_marl.scenarios.admission import admitted
@@ -358,7 +357,7 @@ def new_folder(target: Path, *, force: bool) -> Iterator[Path]:
         ) from None
     made = folder / target.name
     try:
-        with _stopped_in_order():
+        with terminated_as(SystemExit(128 + signal.SIGTERM)):
             made.mkdir()
             yield made
             require_free(target, force=force)  # it may have appeared meanwhile
@@ -379,24 +378,6 @@ def new_folder(target: Path, *, force: bool) -> Iterator[Path]:
         ) from None
     finally:
         shutil.rmtree(folder, ignore_errors=True)
-
-
-@contextlib.contextmanager
-def _stopped_in_order() -> Iterator[None]:
-    """Turn SIGTERM into an exception, so that a terminated program removes its folder."""
-
-    def stop(number: int, _: object) -> None:
-        raise SystemExit(128 + number)
-
-    main_thread = threading.current_thread() is threading.main_thread()
-    if not main_thread or signal.getsignal(signal.SIGTERM) is not signal.SIG_DFL:
-        yield
-        return
-    signal.signal(signal.SIGTERM, stop)
-    try:
-        yield
-    finally:
-        signal.signal(signal.SIGTERM, signal.SIG_DFL)
 
 
 def copy_papers(source: Path, folder: Path, name: str, note: str, command: str) -> None:
