@@ -88,7 +88,10 @@ def load_own(name: str, what: str) -> Any:
     try:
         if file is None and not re.fullmatch(r"\w+(\.\w+)*", place):
             raise ModuleNotFoundError(name=place)  # such as ./my_algo
-        found: Any = importlib.import_module(place) if file is None else _module_in(file)
+        if file is None:
+            found: Any = importlib.import_module(place)
+        else:  # files of two folders may share their names
+            found = module_of_file(file, f"{file.stem} in {file.parent}")
     except ModuleNotFoundError as error:
         if not f"{module_name}.".startswith(f"{error.name}."):
             raise OptionError(
@@ -377,19 +380,23 @@ def _code_text(code: CodeType) -> str:
     return f"{code.co_code.hex()} {code.co_names} {code.co_varnames} {list(constants)}"
 
 
-def _module_in(file: Path) -> ModuleType:
-    """Return the module of a file, under a name of its own: files of two folders may share theirs.
+def module_of_file(path: Path, name: str) -> ModuleType:
+    """Return the module of a file; all calls with one name return the same object.
+
+    Args:
+        path: A Python file.
+        name: Name of the module in `sys.modules`.
 
     Raises:
         ModuleNotFoundError: There is no such file, or the module needs another one.
     """
-    name = f"{file.stem} in {file.parent}"
     if name in sys.modules:
         return sys.modules[name]
-    specification = importlib.util.spec_from_file_location(name, file)
-    if specification is None or specification.loader is None or not file.exists():
-        raise ModuleNotFoundError(name=file.stem)
-    module = sys.modules[name] = importlib.util.module_from_spec(specification)
+    specification = importlib.util.spec_from_file_location(name, path)
+    if specification is None or specification.loader is None or not path.is_file():
+        raise ModuleNotFoundError(name=path.stem)
+    module = importlib.util.module_from_spec(specification)
+    sys.modules[name] = module  # dataclasses look their module up here
     try:
         specification.loader.exec_module(module)
     except BaseException:

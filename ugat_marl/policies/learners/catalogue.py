@@ -13,8 +13,6 @@ A user's learner has the name ``module:name`` and needs no row here (`policies.o
 
 from __future__ import annotations
 
-import importlib.util
-import sys
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict, dataclass, field, fields, replace
 from pathlib import Path
@@ -27,7 +25,7 @@ from ugat_marl.errors import OptionError, UnknownNameError, install_command
 from ugat_marl.policies.learner_settings import parsed_settings, setting_name, setting_text
 from ugat_marl.policies.learners.dqn_config import DQNConfig, UsualValue
 from ugat_marl.policies.own import OwnLearnerFactory, argument_types, own_learner_options
-from ugat_marl.policies.own_names import is_own, load_own, require_unchanged
+from ugat_marl.policies.own_names import is_own, load_own, module_of_file, require_unchanged
 from ugat_marl.policies.protocols import Learner
 
 LearnerFactory = Callable[[AnyParallelEnv, int], Learner]
@@ -282,27 +280,19 @@ def load_baseline(name: str) -> ModuleType:
     """
     baseline = BASELINES[name]
     path = baselines_folder() / f"{baseline.file}.py"
-    module_name = f"ugat_marl_baseline_{baseline.file}"
-    if module_name in sys.modules:
-        return sys.modules[module_name]
-    spec = importlib.util.spec_from_file_location(module_name, path)
-    if spec is None or spec.loader is None or not path.is_file():
+    if not path.is_file():
         raise OptionError(f"learner {name!r}: {path} is missing; install the package again")
-    module = importlib.util.module_from_spec(spec)
-    sys.modules[module_name] = module  # dataclasses look their module up here
     try:
-        spec.loader.exec_module(module)
-    except BaseException as error:
-        del sys.modules[module_name]
-        missing = str(getattr(error, "name", "")).partition(".")[0]
-        if not isinstance(error, ModuleNotFoundError) or missing == "ugat_marl":
+        return module_of_file(path, f"ugat_marl_baseline_{baseline.file}")
+    except ModuleNotFoundError as error:
+        missing = str(error.name).partition(".")[0]
+        if missing == "ugat_marl":
             raise
         raise OptionError(
             f"learner {name!r} needs {missing}, which is not installed; run "
             f"{install_command(baseline.extra)}, or in a checkout "
             f"pip install -c constraints-baselines.txt -e '.[{baseline.extra}]'"
         ) from None
-    return module
 
 
 def baselines_folder() -> Path:
