@@ -63,3 +63,11 @@ def test_a_processor_that_would_round_is_left_alone(monkeypatch: pytest.MonkeyPa
             assert SETTING.fp32_precision == before
     finally:
         networks._is_exact.cache_clear()
+
+
+def test_members_get_the_same_rows_or_each_its_own() -> None:
+    shared = torch.arange(2 * 3 * 4).view(2, 3, 4)
+    assert torch.equal(networks.member_rows(shared, 5), shared.repeat(5, 1, 1))
+    own = torch.arange(2 * 5 * 3 * 4).view(2, 5, 3, 4)
+    rows = networks.member_rows(own, 5)
+    assert torch.equal(rows, torch.stack([own[a, m] for m in range(5) for a in range(2)]))

@@ -20,6 +20,7 @@ from ugat_marl.grounding.networks import (
     Standardiser,
     TrainableModel,
     by_member,
+    member_rows,
     rows_at_once,
 )
 from ugat_marl.grounding.stacked import Stack
@@ -147,11 +148,8 @@ class ForwardModel(TrainableModel):
 
     def read_each(self, inputs: Tensor) -> Tensor:
         """Predict with every network, ``(agents, members, batch, outputs)``."""
-        if inputs.dim() == 3:
-            inputs = inputs[:, None].expand(-1, self.members, -1, -1)
-        agents, members, rows, width = inputs.shape
-        member_inputs = inputs.transpose(0, 1).reshape(members * agents, rows, width)
-        changes = self.network(member_inputs).view(members, agents, rows, -1)
+        changes = self.network(member_rows(inputs, self.members))
+        changes = changes.unflatten(0, (self.members, len(inputs)))
         return changes.transpose(0, 1) * self.valid_outputs[:, None]
 
     def read_all(self, inputs: Tensor) -> Tensor:

@@ -75,6 +75,19 @@ def by_member(loss: Tensor) -> Tensor:
     return loss if loss.dim() == 1 else loss.transpose(0, 1).reshape(-1)
 
 
+def member_rows(inputs: Tensor, members: int) -> Tensor:
+    """Return inputs for networks side by side, ``(members * agents, batch, width)``, members first.
+
+    Args:
+        inputs: ``(agents, batch, width)`` for all members; ``(agents, members, batch, width)`` if
+            each has rows of its own.
+        members: Number of networks of an agent.
+    """
+    if inputs.dim() == 3:
+        inputs = inputs[:, None].expand(-1, members, -1, -1)
+    return inputs.transpose(0, 1).flatten(0, 1)
+
+
 class Standardiser(nn.Module):
     """Maps each agent's inputs to mean 0 and standard deviation 1 over the fitted data.
 

@@ -33,6 +33,7 @@ from torch import Tensor, nn
 from torch.nn import functional
 
 from ugat_marl.errors import OptionError
+from ugat_marl.grounding.networks import member_rows
 from ugat_marl.policies import BatchedLinear, BatchedMLP
 
 MOST_NETWORKS = 100
@@ -586,11 +587,8 @@ class EnsembleNet(AnswerNet):
 
     def logits(self, inputs: Tensor) -> Tensor:
         """Return logits ``(agents, members, batch, actions)`` for inputs of `loss` or `answer`."""
-        if inputs.dim() == 3:
-            inputs = inputs[:, None].expand(-1, self.members, -1, -1)
-        agents, members, rows, width = inputs.shape
-        member_inputs = inputs.transpose(0, 1).reshape(members * agents, rows, width)
-        encoded = torch.relu(self.encoders(member_inputs))
+        members, agents, rows = self.members, len(inputs), inputs.shape[-2]
+        encoded = torch.relu(self.encoders(member_rows(inputs, members)))
         if self.own_heads:
             return self.head(encoded).view(members, agents, rows, -1).transpose(0, 1)
         embedding = encoded.view(members, agents * rows, -1)
