@@ -26,6 +26,7 @@ from ugat_marl.errors import LogError, MeasuredDataError, OutputError, ScenarioE
 from ugat_marl.files import (
     child_texts,
     chunks_of,
+    distinct_endings,
     json_values,
     parse_xml,
     read_bytes,
@@ -43,6 +44,21 @@ def test_write_whole_writes_and_leaves_nothing_else(tmp_path: Path) -> None:
     write_whole(file, b"\x00\x01")
     assert file.read_bytes() == b"\x00\x01"
     assert list(file.parent.iterdir()) == [file]
+
+
+@pytest.mark.parametrize(
+    ("paths", "endings"),
+    [
+        ((), []),
+        (("runs/a/policy",), ["policy"]),
+        (("runs/a/policy", "runs/b/policy", "other"), ["a/policy", "b/policy", "other"]),
+        (("a/policy", "./a/policy"), None),
+    ],
+)
+def test_endings_of_paths_are_as_long_as_they_must_be_to_differ(
+    paths: tuple[str, ...], endings: list[str] | None
+) -> None:
+    assert distinct_endings(map(Path, paths)) == endings
 
 
 def test_numbers_that_json_has_not_are_null() -> None:

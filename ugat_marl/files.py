@@ -270,6 +270,16 @@ def with_home(text: str) -> Path:
     return Path(os.path.expanduser(text))  # noqa: PTH111 - Path.expanduser raises RuntimeError
 
 
+def distinct_endings(paths: Iterable[Path]) -> list[str] | None:
+    """Return the shortest endings of paths that differ from each other; None if two are equal."""
+    parts = [path.parts for path in paths]
+    for length in range(1, max(map(len, parts), default=1) + 1):
+        endings = ["/".join(path_parts[-length:]) for path_parts in parts]
+        if len(set(endings)) == len(endings):
+            return endings
+    return None
+
+
 def user_cache(name: str) -> Path:
     """Return the folder in the user's cache that keeps results of the kind `name` between runs.
 

@@ -15,7 +15,7 @@ from ugat_marl.effects import NAMED_DOMAINS, expand_domains, load_scenario
 from ugat_marl.envs import parallel_env
 from ugat_marl.errors import OptionError, OutputError, ScenarioError, UgatMarlError
 from ugat_marl.experiments import Evaluation, domains_by_gap, evaluation_of, policy_factory
-from ugat_marl.files import require_writable
+from ugat_marl.files import distinct_endings, require_writable
 from ugat_marl.progress import Bars
 from ugat_marl.reporting import (
     gap_matrix_table,
@@ -148,12 +148,6 @@ def _may_not_fit(name: str) -> bool:
 
 def names_of(policies: Sequence[str]) -> list[str]:
     """Return names for the table: rules as given, files by the shortest endings that differ."""
-    paths = [Path(spec.removesuffix(".pt")).parts for spec in policies]
-    for length in range(1, max(map(len, paths)) + 1):
-        names = ["/".join(parts[-length:]) for parts in paths]
-        if len(set(names)) == len(names):
-            break
-    else:
-        names = list(policies)
+    names = distinct_endings(Path(spec.removesuffix(".pt")) for spec in policies) or policies
     files = [Path(spec).suffix == ".pt" for spec in policies]
     return [name if file else spec for name, file, spec in zip(names, files, policies, strict=True)]

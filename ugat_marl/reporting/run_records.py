@@ -32,7 +32,7 @@ from ugat_marl.data import (
 )
 from ugat_marl.errors import CheckpointError, OptionError, UgatMarlError, listed
 from ugat_marl.experiments import QUEUES, TRAININGS, Evaluation, read_queues, result_of
-from ugat_marl.files import MALFORMED, read_json
+from ugat_marl.files import MALFORMED, distinct_endings, read_json
 from ugat_marl.reporting.formats import commands_in
 
 RUN, JOB, TABLE, SCORES = "run.json", "job.json", "table.json", "scores.json"
@@ -218,7 +218,7 @@ def read_records(paths: Sequence[Path]) -> list[RunRecord | TableRecord]:
             )
         for folder in folders:
             by_place.setdefault(folder.resolve(), folder)
-    names = _names(list(by_place.values()))
+    names = distinct_endings(by_place) or map(str, by_place)
     return [
         _table(folder, name) if (folder / TABLE_CSV).is_file() else _run(folder, name)
         for folder, name in zip(by_place.values(), names, strict=True)
@@ -245,16 +245,6 @@ def _folders(path: Path, depth: int) -> Iterable[Path]:
             return
         for folder in inner:
             yield from _folders(folder, depth - 1)
-
-
-def _names(folders: Sequence[Path]) -> list[str]:
-    """Return the shortest endings of the paths that differ from each other."""
-    parts = [folder.resolve().parts for folder in folders]
-    for length in range(1, max(map(len, parts), default=1) + 1):
-        names = ["/".join(folder_parts[-length:]) for folder_parts in parts]
-        if len(set(names)) == len(names):
-            return names
-    return [str(folder) for folder in folders]
 
 
 def _object(path: Path) -> dict[str, Any]:
