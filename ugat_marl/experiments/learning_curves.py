@@ -159,7 +159,7 @@ class CurvesConfig:
             seed=seed,
             episodes=0 if is_rule else self.episodes,
             every=0 if is_rule else self.evaluate_every,
-            options={**setting.learner.env_options(None), "duration_s": self.duration_s},
+            options=setting.learner.env_options(None, duration_s=self.duration_s),
             rule_budget=self.rule_budget if tuned else None,
             domains=(self.domain,),
             evaluation_seeds=evaluation_seeds(self.evaluation_seeds),

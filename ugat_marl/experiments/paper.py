@@ -617,12 +617,12 @@ class Planner:
             episodes=self._episodes(row),
             start=None if base is None else f"{base.name}/{LEARNER}",
             start_episodes=0 if base is None else base.episodes,
-            options={
-                **config.spec.env_options(config.observation),
-                "reward": config.reward,
-                "neighbours": config.neighbours,
-                "duration_s": config.duration_s,
-            },
+            options=config.spec.env_options(
+                config.observation,
+                reward=config.reward,
+                neighbours=config.neighbours,
+                duration_s=config.duration_s,
+            ),
             rule_budget=config.rule_budget if row.recipe == "rule" else None,
             domains=(config.sim, target) if target else (config.sim, *self._targets),
             evaluation_seeds=evaluation_seeds(config.evaluation_seeds),

@@ -8,7 +8,7 @@ from typing import Any, Literal, get_args
 
 from ugat_marl.errors import OptionError, UnknownNameError
 from ugat_marl.files import file_hash
-from ugat_marl.grounding import NEGATIVE_CONTROLS, NegativeControl, UgatConfig
+from ugat_marl.grounding import NegativeControl, UgatConfig, require_negative_control
 from ugat_marl.policies import (
     SUITE_LEARNERS,
     UNIVERSAL_NAME,
@@ -90,16 +90,16 @@ class LearnerSpec:
         """
         return learner_factory(self.name, self.settings, self.dqn, device)
 
-    def env_options(self, observation: str | None) -> dict[str, Any]:
-        """Return the options of environments about what agents see.
+    def env_options(self, observation: str | None, **others: Any) -> dict[str, Any]:
+        """Return the options of environments in which it learns.
 
         Args:
             observation: Kind of observation; None for the one that the learner needs, or `count`.
+            **others: Options that the learner does not decide.
         """
         needed = observed_options(self.name)
-        return {"observation": "count", **needed} | (
-            {} if observation is None else {"observation": observation}
-        )
+        shown = {} if observation is None else {"observation": observation}
+        return {"observation": "count", **needed, **shown, **others}
 
     @property
     def savable(self) -> bool:
@@ -175,8 +175,7 @@ class Setting:
                 f"setting {self.name!r} of recipe {self.recipe!r}: give ugat with recipe "
                 '"grounded", and with no other'
             )
-        if self.negative_control not in NEGATIVE_CONTROLS:
-            raise UnknownNameError("negative control", self.negative_control, NEGATIVE_CONTROLS)
+        require_negative_control(self.negative_control)
 
     @property
     def knows_target(self) -> bool:

@@ -32,7 +32,6 @@ from ugat_marl.errors import (
     CheckpointError,
     OptionError,
     ScenarioError,
-    UnknownNameError,
     require_distinct,
     require_least,
 )
@@ -66,12 +65,12 @@ from ugat_marl.experiments.tuning import LEAST_BUDGET
 from ugat_marl.files import file_hash, require_writable, write_whole
 from ugat_marl.grounding import (
     DIRECT_LEARNER,
-    NEGATIVE_CONTROLS,
     USUAL_REWARD,
     NegativeControl,
     UgatConfig,
     as_published,
     published_reward,
+    require_negative_control,
     require_preset,
 )
 from ugat_marl.parallel import Workers
@@ -233,8 +232,7 @@ class TransferConfig:
     def _refuse_impossible_controls(self) -> None:
         _ = self.spec  # raises an error for an unknown learner, or settings of another one
         require_device_name(self.device)
-        if self.negative_control not in NEGATIVE_CONTROLS:
-            raise UnknownNameError("negative control", self.negative_control, NEGATIVE_CONTROLS)
+        require_negative_control(self.negative_control)
         if self.negative_control == "same-world" and self.real_log is not None:
             raise OptionError(
                 'the negative control "same-world" has no street, real_log is of one; '
@@ -292,12 +290,12 @@ class TransferConfig:
     @property
     def env_options(self) -> dict[str, Any]:
         """Options of every environment of the experiment."""
-        return {
-            **self.spec.env_options(self.observation),
-            "reward": self.reward,
-            "neighbours": self.neighbours,
-            "duration_s": self.duration_s,
-        }
+        return self.spec.env_options(
+            self.observation,
+            reward=self.reward,
+            neighbours=self.neighbours,
+            duration_s=self.duration_s,
+        )
 
     @property
     def domains(self) -> list[str]:

@@ -10,10 +10,10 @@ from .config import UgatConfig as UgatConfig
 from .config import as_published as as_published
 from .config import published_reward as published_reward
 from .config import require_preset as require_preset
-from .controls import NEGATIVE_CONTROLS as NEGATIVE_CONTROLS
 from .controls import NegativeControl as NegativeControl
 from .controls import ShuffledWorld as ShuffledWorld
 from .controls import answer_with_noise as answer_with_noise
+from .controls import require_negative_control as require_negative_control
 from .delays import MATCHED_REWARDS as MATCHED_REWARDS
 from .detected import DetectionConfig as DetectionConfig
 from .eyes import detectors_in_words as detectors_in_words

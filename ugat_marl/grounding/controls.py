@@ -16,13 +16,24 @@ import torch
 from torch import Tensor
 
 from ugat_marl.data import TransitionLog
+from ugat_marl.errors import UnknownNameError
 from ugat_marl.grounding.forward import ForwardModel
 from ugat_marl.grounding.worlds import TransitionSource
 from ugat_marl.policies import Policy
 from ugat_marl.seeding import derive_seed, numpy_generator, torch_generator
 
 NegativeControl = Literal["none", "same-world", "shuffled", "noise"]
-NEGATIVE_CONTROLS: tuple[str, ...] = get_args(NegativeControl)
+
+
+def require_negative_control(name: str) -> None:
+    """Refuse the name of a negative control that does not exist.
+
+    Raises:
+        UnknownNameError: There is no such negative control.
+    """
+    known: tuple[str, ...] = get_args(NegativeControl)
+    if name not in known:
+        raise UnknownNameError("negative control", name, known)
 
 
 def answer_with_noise(model: ForwardModel, seed: int) -> None:
