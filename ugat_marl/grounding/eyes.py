@@ -40,13 +40,11 @@ from ugat_marl.errors import CheckpointError, OptionError, counted, require_kind
 from ugat_marl.files import MALFORMED
 from ugat_marl.grounding.draws import DRAWS, with_intervals
 from ugat_marl.grounding.summaries import CLOSE, Floats, LaneRows, LaneView
-from ugat_marl.scenarios import Network
+from ugat_marl.scenarios import VEHICLE_SPACE_M, Network
 from ugat_marl.seeding import numpy_generator
 
 LEVELS = (0.0, 0.5, 2.0, 5.0, 9.0, np.inf)
 """Limits of the classes of counts in which falls in red are compared."""
-VEHICLE_M = 7.5
-"""Length of a standing vehicle with its gap, in m."""
 FASTER = 1.25
 """Multiple of the speed limit that hardly anybody drives: 1 in 160 of SUMO's passenger cars."""
 ZONES_M = (10.0, 15.0, 20.0, 30.0, 45.0, 70.0, 100.0)
@@ -389,7 +387,7 @@ def _zone(
     piled_up = float((counts > cut + 0.5).mean()) <= _BEYOND * at_limit
     if not piled_up or at_limit < config.filled * reaching:
         return 0.0, 0.0
-    return VEHICLE_M * max(cut - 1.0, 0.5), VEHICLE_M * (cut + 0.5)
+    return VEHICLE_SPACE_M * max(cut - 1.0, 0.5), VEHICLE_SPACE_M * (cut + 0.5)
 
 
 def leave_unseen(
@@ -440,7 +438,7 @@ def zone_of_unseen(
     low, high = np.interp([-most, -least], -unseen, metres).tolist()
     counts = _counts(rows)
     most_seen = float(counts.max())
-    low = max(low, VEHICLE_M * (most_seen - 1.0))  # so many stand in it
+    low = max(low, VEHICLE_SPACE_M * (most_seen - 1.0))  # so many stand in it
     # and in a longer zone more of them would
     above = [(_counts(zone) > most_seen).mean() for zone in tried]
     too_long = metres[np.array(above) * len(counts) > config.surprise]

@@ -63,6 +63,7 @@ from .naming import drawing_name as drawing_name
 from .naming import edge_of_lane as edge_of_lane
 from .naming import group_names as group_names
 from .naming import member_names as member_names
+from .network import VEHICLE_SPACE_M as VEHICLE_SPACE_M
 from .network import Intersection as Intersection
 from .network import Lane as Lane
 from .network import Network as Network
