@@ -254,21 +254,21 @@ def launch_of(
     if gui:
         arguments += ["--start", "true", "--quit-on-end", "true"]
     return Launch(
-        tuple(arguments),
-        str(directory),
-        settings.begin_s,
-        settings.begin_s + settings.duration_s,
-        tuple(lanes),
-        waiting,
-        crossings,
-        gui,
-        tuple(written.items()),
-        zone_m,
-        tuple((persons or {}).items()),
-        behind,
-        turns,
-        tuple(reads),
-        scenario.outputs,
+        arguments=tuple(arguments),
+        directory=str(directory),
+        begin_s=settings.begin_s,
+        end_s=settings.begin_s + settings.duration_s,
+        lanes=tuple(lanes),
+        waiting=waiting,
+        crossings=crossings,
+        gui=gui,
+        files=tuple(written.items()),
+        zone_m=zone_m,
+        persons=tuple((persons or {}).items()),
+        behind=behind,
+        turns=turns,
+        reads=tuple(reads),
+        outputs=scenario.outputs,
     )
 
 

@@ -160,20 +160,8 @@ def record(
         SimulatorError: SUMO failed.
     """
     require_least(1, periods=periods, workers=workers)
-    if duration_s is not None and duration_s > scenario.settings.duration_s:
-        raise OptionError(
-            f"duration_s = {duration_s:g}: scenario {scenario.id!r} lasts "
-            f"{scenario.settings.duration_s:g} s, and data of longer days would not fit it"
-        )
     require_least(0, seed=seed)
-    if not 0 <= detector_length_m < math.inf:
-        raise OptionError(
-            f"detector_length_m = {detector_length_m:g}: must be 0 or more, and finite"
-        )
-    if same_demand and day_to_day:
-        raise OptionError("same_demand keeps the demand of every day; leave day_to_day out")
-    if not 0 <= day_to_day < 1:
-        raise OptionError(f"day_to_day = {day_to_day:g} must be from 0 to below 1")
+    _require_possible(scenario, duration_s, detector_length_m, day_to_day, same_demand=same_demand)
     scenario = demand_as_vehicles(scenario.with_duration(duration_s))
     base, effects = _world(scenario, domain, duration_s)
     network = Network.read(base)
@@ -188,20 +176,20 @@ def record(
     installed = installed_detectors(effects, detectors)
     _warn_of_cut_zones(detectors, installed, network.lanes)
     street = _Street(
-        base,
-        effects,
-        detectors,
-        installed,
-        network.lanes,
-        fixed,
-        watched,
-        policy,
-        seed,
-        same_demand,
-        day_to_day,
-        speeds,
-        lanes,
-        trajectories,
+        base=base,
+        effects=effects,
+        detectors=detectors,
+        installed=installed,
+        lanes_by_id=network.lanes,
+        programmes=fixed,
+        watched=watched,
+        policy=policy,
+        seed=seed,
+        same_demand=same_demand,
+        day_to_day=day_to_day,
+        speeds=speeds,
+        lanes=lanes,
+        trajectories=trajectories,
     )
     with (reporter or Silent()).task("measuring", periods) as advance:
         days = _all_days(street, periods, parts_at_a_time(workers), advance)
@@ -211,6 +199,34 @@ def record(
         lanes=_together(day.lanes for day in days) if lanes else None,
         trajectories=_together(day.trajectories for day in days) if trajectories else None,
     )
+
+
+def _require_possible(
+    scenario: Scenario,
+    duration_s: float | None,
+    detector_length_m: float,
+    day_to_day: float,
+    *,
+    same_demand: bool,
+) -> None:
+    """Refuse impossible lengths of a day and of detectors, and demands that contradict each other.
+
+    Raises:
+        OptionError: An option is impossible.
+    """
+    if duration_s is not None and duration_s > scenario.settings.duration_s:
+        raise OptionError(
+            f"duration_s = {duration_s:g}: scenario {scenario.id!r} lasts "
+            f"{scenario.settings.duration_s:g} s, and data of longer days would not fit it"
+        )
+    if not 0 <= detector_length_m < math.inf:
+        raise OptionError(
+            f"detector_length_m = {detector_length_m:g}: must be 0 or more, and finite"
+        )
+    if same_demand and day_to_day:
+        raise OptionError("same_demand keeps the demand of every day; leave day_to_day out")
+    if not 0 <= day_to_day < 1:
+        raise OptionError(f"day_to_day = {day_to_day:g} must be from 0 to below 1")
 
 
 def _world(
