@@ -72,5 +72,6 @@ def _serve(questions: _Questions, answers: _Answers) -> None:
         function, arguments = question
         try:
             answers.put((function(*arguments), None))
+        # Ctrl-C is for the main thread; an exception that ended this one would leave no answers.
         except BaseException as error:  # noqa: BLE001 - told where it was asked
             answers.put((None, error))
