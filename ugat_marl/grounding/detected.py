@@ -881,13 +881,8 @@ def _aligned(
     totals = [_Costs(0, np.zeros(1), gap)]
     for j in range(m):
         near = slice(int(low[j]), int(high[j]))
-        ride_s = last.on_s[j] - first.on_s[near]
-        speed = first.speed_mps[near]
-        mean = 0.5 * (speed + last.speed_mps[j])
-        free = np.minimum(speed, last.speed_mps[j]) >= 0.7 * free_mps
-        expected_s = way_m / np.maximum(mean, 1.0)
-        off = np.abs(ride_s - expected_s) / (0.5 + 2.0 * config.speed_spread * expected_s)
-        cost = np.where(free, np.minimum(off, 2.0 * gap), 0.0)
+        ride_s, speeds = last.on_s[j] - first.on_s[near], (first.speed_mps[near], last.speed_mps[j])
+        cost = _ride_costs(ride_s, speeds, way_m, free_mps, config)
         cost += np.where(np.abs(first.length_m[near] - last.length_m[j]) > 0.5, 2.0, 0.0)
         cost[(ride_s < fastest_s) | (ride_s > config.longest_s)] = np.inf
         costs.append(cost)
@@ -897,19 +892,55 @@ def _aligned(
         skipped = gap * np.arange(near.start, near.stop + 1)
         least: Floats = np.minimum.accumulate(best - skipped).astype(np.float64) + skipped
         totals.append(_Costs(near.start, least, gap))
+    return _traced_back(n, costs, totals, gap)
+
+
+def _ride_costs(
+    ride_s: Floats,
+    speeds_mps: tuple[Floats, float],
+    way_m: float,
+    free_mps: float,
+    config: DetectionConfig,
+) -> Floats:
+    """Return what rides between two detectors of a lane cost, ``(n,)``; 0 for a slow vehicle.
+
+    Args:
+        ride_s: Times of the rides, ``(n,)``.
+        speeds_mps: Speeds at the first detector, ``(n,)``, and at the last.
+        way_m: Distance of the detectors.
+        free_mps: Speed of free vehicles.
+        config: Settings.
+    """
+    first_mps, last_mps = speeds_mps
+    free = np.minimum(first_mps, last_mps) >= 0.7 * free_mps
+    expected_s = way_m / np.maximum(0.5 * (first_mps + last_mps), 1.0)
+    off = np.abs(ride_s - expected_s) / (0.5 + 2.0 * config.speed_spread * expected_s)
+    return np.where(free, np.minimum(off, 2.0 * config.unmatched), 0.0)
+
+
+def _traced_back(
+    count: int, costs: Sequence[Floats], totals: Sequence[_Costs], gap: float
+) -> NDArray[np.int64]:
+    """Return the pairs whose total cost is the least, ascending, ``(pairs, 2)``.
+
+    Args:
+        count: Number of vehicles of the first detector.
+        costs: Vehicle of the last detector to its costs of each that it can have been.
+        totals: Number of vehicles of the last detector to the least costs; one more than `costs`.
+        gap: Cost of a vehicle without a partner.
+    """
     pairs: list[tuple[int, int]] = []
-    i, j = n, m
+    i, j = count, len(costs)
     while i and j:
-        here, start = totals[j], int(low[j - 1])
-        if i <= start:
+        here, before, near = totals[j], totals[j - 1], costs[j - 1]
+        if i <= here.start:
             j -= 1
             continue
-        total = here.at(i)
-        possible = i <= int(high[j - 1])
-        if possible and np.isclose(total, totals[j - 1].at(i - 1) + costs[j - 1][i - 1 - start]):
+        total, place = here.at(i), i - 1 - here.start
+        if place < len(near) and np.isclose(total, before.at(i - 1) + near[place]):
             i, j = i - 1, j - 1
             pairs.append((i, j))
-        elif np.isclose(total, totals[j - 1].at(i) + gap):
+        elif np.isclose(total, before.at(i) + gap):
             j -= 1
         else:
             i -= 1

@@ -8,7 +8,7 @@ commands that were not obeyed.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import Literal, get_args
 
@@ -54,6 +54,8 @@ REWARD = "queue"
 LONG_EMPTY_S = 30.0
 """Longest time without any vehicle that is not reported: a street at night, or a camera that was
 off, have longer ones."""
+LEAST_STRANGE = 0.005
+"""Share of time with greens of no phase above which it is reported; a smaller one reads "0 %"."""
 
 
 @dataclass(frozen=True)
@@ -425,43 +427,10 @@ class _Street:
             deviation: Their standard deviations where they lead to a traffic light.
             unlike: Shares of time with greens of no phase, at each light.
         """
-        found: list[str] = []
-        if deviation:
-            worst = max(deviation, key=lambda lane: deviation[lane])
-            found.append(
-                f"vehicles on a lane are estimated to {np.median(list(deviation.values())):.1f} "
-                f"(median of {len(deviation)} lanes) to {deviation[worst]:.1f} vehicles ({worst}), "
-                "standard deviation; how many of them stand follows from the greens"
-            )
-            stuck = [
-                lane for lane in deviation if any(j.long for c in courses[lane] for j in c.jams)
-            ]
-            if stuck:
-                found.append(
-                    f"{listed(stuck, 'lane')}: a queue stood on the first detector to the end of "
-                    "a period, so how fast it grew stays unknown; the rate of free times is taken"
-                )
-            late = sum(c.unmatched for lane in deviation for c in courses[lane])
-            total = sum(len(c.leave_s) for lane in deviation for c in courses[lane])
-            if late:
-                found.append(
-                    f"{100 * late / total:.0f} % of the vehicles were seen by one detector of "
-                    "their lane only: they changed lanes, or a detector missed them"
-                )
-            alone = [
-                x for x in deviation if LaneDetectors.of(self.measured.detectors, x).advance is None
-            ]
-            if alone:
-                found.append(
-                    f"{listed(alone, 'lane')}: no advance detector, so vehicles that wait are "
-                    "known only when they leave"
-                )
-            blind_s = max(one.blind_s for own in courses.values() for one in own)
-            found.append(
-                f"the last {blind_s:.0f} s of each period are left out: vehicles that came then "
-                "had not reached a detector"
-            )
-        strange = {light: max(shares) for light, shares in unlike.items() if max(shares) > 0.005}
+        found = [*self._of_estimates(courses, deviation)] if deviation else []
+        strange = {
+            light: max(shares) for light, shares in unlike.items() if max(shares) > LEAST_STRANGE
+        }
         if strange:
             light = max(strange, key=lambda x: strange[x])
             found.append(
@@ -473,6 +442,43 @@ class _Street:
             "and delays of greens are not in the data"
         )
         return tuple(found)
+
+    def _of_estimates(
+        self, courses: Mapping[str, Sequence[LaneCourse]], deviation: Mapping[str, float]
+    ) -> Iterator[str]:
+        """Yield what is not known of estimated vehicles, for the arguments of `_findings`."""
+        worst = max(deviation, key=lambda lane: deviation[lane])
+        yield (
+            f"vehicles on a lane are estimated to {np.median(list(deviation.values())):.1f} "
+            f"(median of {len(deviation)} lanes) to {deviation[worst]:.1f} vehicles ({worst}), "
+            "standard deviation; how many of them stand follows from the greens"
+        )
+        stuck = [lane for lane in deviation if any(j.long for c in courses[lane] for j in c.jams)]
+        if stuck:
+            yield (
+                f"{listed(stuck, 'lane')}: a queue stood on the first detector to the end of "
+                "a period, so how fast it grew stays unknown; the rate of free times is taken"
+            )
+        late = sum(c.unmatched for lane in deviation for c in courses[lane])
+        total = sum(len(c.leave_s) for lane in deviation for c in courses[lane])
+        if late:
+            yield (
+                f"{100 * late / total:.0f} % of the vehicles were seen by one detector of "
+                "their lane only: they changed lanes, or a detector missed them"
+            )
+        alone = [
+            x for x in deviation if LaneDetectors.of(self.measured.detectors, x).advance is None
+        ]
+        if alone:
+            yield (
+                f"{listed(alone, 'lane')}: no advance detector, so vehicles that wait are "
+                "known only when they leave"
+            )
+        blind_s = max(one.blind_s for own in courses.values() for one in own)
+        yield (
+            f"the last {blind_s:.0f} s of each period are left out: vehicles that came then "
+            "had not reached a detector"
+        )
 
 
 def _unseen(table: pl.DataFrame) -> tuple[str, ...]:
