@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from ugat_marl.envs import CommandMemory, Observer
 from ugat_marl.errors import OptionError
 from ugat_marl.field.street import LaneCount
-from ugat_marl.scenarios import Network, Scenario, SignalTiming, within_hops
+from ugat_marl.scenarios import LaneTable, Network, Scenario, SignalTiming, within_hops
 from ugat_marl.simulation import Snapshot
 
 _COUNTED = ("count", "queue", "density", "pressure", "movements")
@@ -150,7 +150,7 @@ class Site:
         return dict(zip(self.observer.agents, seen, strict=True))
 
     @cached_property
-    def _lanes(self) -> Any:
+    def _lanes(self) -> LaneTable:
         return self.network.lane_table()
 
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -40,6 +40,9 @@ from ugat_marl.reporting.figures import (
 from ugat_marl.reporting.formats import tick_text
 from ugat_marl.reporting.run_records import RunRecord
 from ugat_marl.reporting.style import LIGHT, curve_style, styled
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
 
 RADAR_AXES: dict[str, tuple[str, str]] = {
     "att_s": ("travel time", "s"),
@@ -142,7 +145,7 @@ def gate_picture(records: Sequence[RunRecord], name: str) -> NamedFigure | None:
 
 def _plot(
     name: str, title: str, x_label: str, y_label: str, legend: Sequence[str] = ()
-) -> tuple[NamedFigure, Any]:
+) -> tuple[NamedFigure, Axes]:
     """Return a picture with one pair of axes; the horizontal axis has whole numbers."""
     below = legend_height(legend)
     picture = new_picture(name, title, 300 + below)
@@ -153,7 +156,7 @@ def _plot(
     return picture, axes
 
 
-def _label(axes: Any, x_label: str, y_label: str) -> None:
+def _label(axes: Axes, x_label: str, y_label: str) -> None:
     """Label both axes at their ends; the label of the vertical axis is horizontal text."""
     from matplotlib.ticker import FuncFormatter, MaxNLocator
 
@@ -172,7 +175,7 @@ def _points_wide(axes: Any) -> float:
 
 def _draw_curve(
     picture: NamedFigure,
-    axes: Any,
+    axes: Axes,
     number: int,
     rows: Sequence[tuple[float, float, float, float]],
     *,
@@ -247,7 +250,7 @@ def scores_picture(
 
 
 def _draw_estimates(
-    axes: Any, labels: Sequence[str], series: Mapping[str, Sequence[Estimated]], unit: str,
+    axes: Axes, labels: Sequence[str], series: Mapping[str, Sequence[Estimated]], unit: str,
     letters: int = 26,
 ) -> None:  # fmt: skip
     """Draw a row for every label, and in each row a dot with an interval for every series.
@@ -257,7 +260,7 @@ def _draw_estimates(
     from matplotlib.ticker import FuncFormatter, MaxNLocator
 
     for number, (group, estimates) in enumerate(series.items()):
-        style = {**curve_style(number), "linestyle": "none"}
+        style: dict[str, Any] = {**curve_style(number), "linestyle": "none"}
         shift = min(0.23, 0.73 / len(series)) * (number - (len(series) - 1) / 2)
         for place, (label, (mean, *ends)) in enumerate(zip(labels, estimates, strict=True)):
             if not math.isfinite(mean):
@@ -323,7 +326,7 @@ def travel_times(evaluation: Evaluation) -> dict[str, list[Estimated]]:
     }
 
 
-def _draw_policies(axes: Any, evaluation: Evaluation) -> None:
+def _draw_policies(axes: Axes, evaluation: Evaluation) -> None:
     _draw_estimates(axes, evaluation.policies, travel_times(evaluation), "s")
     seeds = len(evaluation.seeds)
     intervals = ", 95 % intervals" if seeds > 1 else ""
@@ -576,7 +579,7 @@ def calibration_picture(metrics: Metrics, path: Path) -> bool:
     return True
 
 
-def _draw_risks(axes: Any, steps: Mapping[int, Mapping[str, float]]) -> None:
+def _draw_risks(axes: Axes, steps: Mapping[int, Mapping[str, float]]) -> None:
     from matplotlib.ticker import AutoLocator
 
     title = "wrong among the answers taken; dotted: a u that says nothing"
@@ -593,7 +596,7 @@ def _draw_risks(axes: Any, steps: Mapping[int, Mapping[str, float]]) -> None:
     axes.set_ylim(0, 1.08 * axes.dataLim.ymax or 1)
 
 
-def _draw_levels(axes: Any, steps: Mapping[int, Mapping[str, float]]) -> None:
+def _draw_levels(axes: Axes, steps: Mapping[int, Mapping[str, float]]) -> None:
     _label(axes, "iteration", "mean u: does it rise where the simulation never was?")
     order = sorted(steps)
     for number, (name, label) in enumerate(

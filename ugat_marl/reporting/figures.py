@@ -13,10 +13,15 @@ from collections import Counter
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from ugat_marl.files import write_whole
 from ugat_marl.reporting.style import LIGHT, curve_style, styled
+
+if TYPE_CHECKING:
+    from matplotlib.artist import Artist
+    from matplotlib.axes import Axes
+    from matplotlib.figure import Figure
 
 WIDTH = 480.0
 """Width of a picture in points, which are also the units of its SVG."""
@@ -51,7 +56,7 @@ class NamedFigure:
 
     name: str
     title: str
-    figure: Any
+    figure: Figure
 
     def for_page(self) -> str:
         """Return an ``<svg>`` for a page whose style defines the palette as custom properties."""
@@ -172,7 +177,7 @@ def new_picture(name: str, title: str, height: float, width: float = WIDTH) -> N
 
 def add_axes(
     picture: NamedFigure, left: float, top: float, right: float, bottom: float, **more: Any
-) -> Any:
+) -> Axes:
     """Return axes whose sides have these distances, in points, from the sides of the picture."""
     width, height = picture.figure.get_size_inches() * 72
     box = left / width, bottom / height, 1 - (left + right) / width, 1 - (top + bottom) / height
@@ -199,7 +204,7 @@ def add_legend(picture: NamedFigure, labels: Sequence[str], *, lines: bool = Tru
     from matplotlib.lines import Line2D
 
     width, height = picture.figure.get_size_inches() * 72
-    handles: list[Any] = []
+    handles: list[Line2D] = []
     for number in range(len(labels)):
         style: dict[str, Any] = curve_style(number)
         if not lines:
@@ -213,7 +218,7 @@ def add_legend(picture: NamedFigure, labels: Sequence[str], *, lines: bool = Tru
     )  # fmt: skip
 
 
-def add_tip(artist: Any, text: str) -> None:
+def add_tip(artist: Artist, text: str) -> None:
     """Give a shape a text that a page shows when the reader points at the shape."""
     artist.set_gid(f"{_TIP}{printable(text)}")
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 import itertools
 import math
 from collections.abc import Iterable, Mapping, Sequence
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
@@ -29,6 +29,9 @@ from ugat_marl.reporting.style import (
     text_on,
 )
 from ugat_marl.scenarios import Network
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
 
 Point = tuple[float, float]
 
@@ -174,7 +177,7 @@ def minutes_picture(
 
 def _map(
     name: str, title: str, network: Network, points: Sequence[Point], below: float
-) -> tuple[NamedFigure, Any, float]:
+) -> tuple[NamedFigure, Axes, float]:
     """Return a picture of the roads around some points, its axes, and its scale.
 
     The scale is in points of the picture per metre.
@@ -213,7 +216,7 @@ def _radius(points: Sequence[Point]) -> float:
     return min(max(0.36 * min(distances, default=60.0), 3.0), 17.0)
 
 
-def _name(axes: Any, name: str, at: Point, down: float, colour: str = "ink") -> None:
+def _name(axes: Axes, name: str, at: Point, down: float, colour: str = "ink") -> None:
     axes.annotate(
         printable(shortened(name, 14)), at, (0, down), textcoords="offset points", ha="center",
         va="center", fontsize=11, color=LIGHT[colour], zorder=5,
@@ -236,6 +239,6 @@ def _add_scale(picture: NamedFigure, ends: tuple[float, float], unit: str) -> No
         )  # fmt: skip
         figure.add_artist(box)
     low, high = (tick_text(float(f"{end:.3g}")) for end in ends)
-    style = {"color": LIGHT["soft"], "va": "center_baseline"}
+    style: dict[str, Any] = {"color": LIGHT["soft"], "va": "center_baseline"}
     figure.text(44 / width, 18 / height, low, ha="right", **style)
     figure.text((56 + 22 * len(STEPS)) / width, 18 / height, f"{high} {unit}", **style)

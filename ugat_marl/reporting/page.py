@@ -10,12 +10,15 @@ import functools
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from ugat_marl.errors import OutputError
 from ugat_marl.files import require_writable
 from ugat_marl.reporting.figures import NamedFigure
 from ugat_marl.reporting.style import DARK, LIGHT, css_variables
+
+if TYPE_CHECKING:
+    from markupsafe import Markup
 
 _MANY = 7
 """Number of columns above which a table is set narrower."""
@@ -49,7 +52,7 @@ class Figure:
     caption: str
 
     @property
-    def svg(self) -> Any:
+    def svg(self) -> Markup:
         """The picture as HTML; an XML writer has escaped the texts in it."""
         from markupsafe import Markup
 

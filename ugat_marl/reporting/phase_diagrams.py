@@ -6,7 +6,7 @@ import math
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, Literal
+from typing import TYPE_CHECKING, Literal
 
 import numpy as np
 from numpy.typing import NDArray
@@ -23,6 +23,10 @@ from ugat_marl.scenarios import (
     drawing_name,
     green_of_file,
 )
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+    from matplotlib.figure import Figure
 
 STYLES: dict[str, tuple[str, Literal["solid", "dashed", "dotted"], str]] = {
     "G": (LIGHT["c0"], "solid", "protected green"),
@@ -184,7 +188,7 @@ def _caption(intersection: Intersection) -> str:
     return ", ".join(parts)
 
 
-def _legend(figure: Any, intersection: Intersection, height: float) -> None:
+def _legend(figure: Figure, intersection: Intersection, height: float) -> None:
     from matplotlib.lines import Line2D
 
     shown = {letter for phase in intersection.phases for letter in phase}
@@ -216,7 +220,7 @@ def _frame(intersection: Intersection, network: Network) -> Frame:
     return (float(middle[0]) - side / 2, float(middle[1]) - side / 2, side, side)
 
 
-def _roads(axes: Any, place: _Place) -> None:
+def _roads(axes: Axes, place: _Place) -> None:
     from matplotlib.collections import LineCollection
 
     intersection, network, frame = place.intersection, place.network, place.frame
@@ -253,7 +257,7 @@ def _direction(start: NDArray[np.float64], end: NDArray[np.float64]) -> NDArray[
     return (end - start) / max(float(np.linalg.norm(end - start)), 1e-9)
 
 
-def _ways(axes: Any, place: _Place, state: str) -> None:
+def _ways(axes: Axes, place: _Place, state: str) -> None:
     """Draw the links, red ones first so that green covers them, and the crossings."""
     order = "rsgG"
     for link in sorted(place.intersection.links, key=lambda each: order.find(state[each.index])):
@@ -262,7 +266,7 @@ def _ways(axes: Any, place: _Place, state: str) -> None:
     _crossings(axes, place, state)
 
 
-def _crossings(axes: Any, place: _Place, state: str = "") -> None:
+def _crossings(axes: Axes, place: _Place, state: str = "") -> None:
     """Draw crossings as stripes across the road: green ones in colour, others pale."""
     for crossing in place.intersection.crossings:
         if crossing.to_lane not in place.walks:
@@ -275,7 +279,7 @@ def _crossings(axes: Any, place: _Place, state: str = "") -> None:
         )  # fmt: skip
 
 
-def _arrow(axes: Any, curve: NDArray[np.float64], letter: str) -> None:
+def _arrow(axes: Axes, curve: NDArray[np.float64], letter: str) -> None:
     colour, style, _ = STYLES[letter]
     stopped = letter == "r"
     axes.plot(
@@ -312,7 +316,7 @@ def _curve(link: Link, network: Network) -> NDArray[np.float64]:
     return np.vstack([points, end + 4.0 * into])
 
 
-def _names(axes: Any, place: _Place) -> None:
+def _names(axes: Axes, place: _Place) -> None:
     """Draw all links, and beside every incoming road its name and the numbers of its links."""
     intersection, network = place.intersection, place.network
     left, bottom, width, height = place.frame
@@ -328,7 +332,9 @@ def _names(axes: Any, place: _Place) -> None:
                         [left + 0.83 * width, bottom + 0.95 * height])  # fmt: skip
         indices = sorted({link.index for link in intersection.links if link.from_edge == edge})
         text = f"{printable(shortened(edge, 16))}\n{_ranges(indices)}"
-        axes.text(*point, text, size=6.5, ha="center", va="center", bbox=_UNDER_TEXT, zorder=6)
+        axes.text(
+            point[0], point[1], text, size=6.5, ha="center", va="center", bbox=_UNDER_TEXT, zorder=6
+        )
     for link in intersection.links:
         _arrow(axes, _curve(link, network), "r")
     _crossings(axes, place)

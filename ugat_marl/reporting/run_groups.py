@@ -6,7 +6,7 @@ import itertools
 import json
 import math
 from collections import Counter
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Callable, Hashable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any
 
@@ -132,8 +132,10 @@ def _ugat(record: RunRecord) -> str:
     return json.dumps(record.ugat, sort_keys=True, default=str)
 
 
-def _parted(records: Iterable[RunRecord], key: Any) -> dict[Any, list[RunRecord]]:
-    parts: dict[Any, list[RunRecord]] = {}
+def _parted(
+    records: Iterable[RunRecord], key: Callable[[RunRecord], Hashable]
+) -> dict[Hashable, list[RunRecord]]:
+    parts: dict[Hashable, list[RunRecord]] = {}
     for record in records:
         parts.setdefault(key(record), []).append(record)
     return parts

@@ -13,7 +13,7 @@ import threading
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -34,6 +34,9 @@ from ugat_marl.simulation import (
     VehiclePositions,
     refuse_in_queues,
 )
+
+if TYPE_CHECKING:
+    from PIL import Image
 
 Frame = NDArray[np.uint8]
 _PILLOW = {".gif": "GIF", ".webp": "WEBP"}
@@ -292,7 +295,7 @@ def _by_pillow(pictures: Iterable[Frame], path: Path, form: str, per_second: flo
     first.save(path, format=form, save_all=True, append_images=images, loop=0, **duration)
 
 
-def _timed(images: Iterable[Any], per_second: float) -> Iterator[Any]:
+def _timed(images: Iterable[Image.Image], per_second: float) -> Iterator[Image.Image]:
     """Yield pictures of a GIF, which counts in 10 ms; players show each for 20 ms or longer."""
     from PIL import Image
 
