@@ -19,11 +19,11 @@ from ugat_marl.grounding.gate import GateConfig
 from ugat_marl.grounding.inverse import InverseConfig, InverseModel
 from ugat_marl.grounding.joint import alone, together, turns
 from ugat_marl.grounding.reports import (
-    Calibration,
     FitReport,
     Floats,
     InverseReport,
     TrainingRecord,
+    UncertaintyQuality,
     auroc,
     better_than_chance,
     complaint,
@@ -351,7 +351,7 @@ def _inverse_report(
         beats_majority=better_than_chance((~missed).double() - right_of_usual.double(), held_out),
         mean_u=np.array([u[i][kept[i]].mean() for i in rows], float),
         auroc=np.array([auroc(u[i][kept[i]], wrong[i][kept[i]]) for i in rows]),
-        calibration=Calibration.of(answer, missed, held_out.bool(), model.answer(drawn)),
+        calibration=UncertaintyQuality.of(answer, missed, held_out.bool(), model.answer(drawn)),
         uncertainty=model.method.name,
     )
 

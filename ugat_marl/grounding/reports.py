@@ -308,7 +308,7 @@ def forward_report(
 
 
 @dataclass(frozen=True)
-class Calibration:
+class UncertaintyQuality:
     """Quality of u over all agents together: wrong answers and inputs off the data need a high u.
 
     Attributes:
@@ -338,7 +338,7 @@ class Calibration:
         wrong: Tensor,
         held_out: Tensor,
         off_data: InversePrediction,
-    ) -> Calibration:
+    ) -> UncertaintyQuality:
         """Measure answers on held-out rows and answers off the data.
 
         Args:
@@ -386,7 +386,7 @@ class InverseReport(abc.ABC):
     """
 
     training: TrainingRecord
-    calibration: Calibration
+    calibration: UncertaintyQuality
     uncertainty: MethodName
 
     @abc.abstractmethod
@@ -412,8 +412,8 @@ class FitReport(abc.ABC):
     mean_u_on_predictions: Floats
 
     @property
-    def calibration(self) -> Calibration:
-        """Calibration of u."""
+    def calibration(self) -> UncertaintyQuality:
+        """Quality of u."""
         return self.inverse.calibration
 
     @property

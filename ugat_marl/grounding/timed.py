@@ -33,12 +33,12 @@ from ugat_marl.grounding.gate import GateConfig
 from ugat_marl.grounding.inverse import DelayModel, InverseConfig
 from ugat_marl.grounding.joint import running
 from ugat_marl.grounding.reports import (
-    Calibration,
     FitReport,
     Floats,
     ForwardReport,
     InverseReport,
     TrainingRecord,
+    UncertaintyQuality,
     better_than_chance,
     complaint,
     flat,
@@ -285,7 +285,7 @@ class TimedTransform(Transform):
         gain_s = (seconds.mean() - asked_s).abs() - (found_s - asked_s).abs()
         return TimedInverseReport(
             training=record,
-            calibration=Calibration.of(answer, missed, held.bool(), model.answer(drawn)),
+            calibration=UncertaintyQuality.of(answer, missed, held.bool(), model.answer(drawn)),
             uncertainty=model.method.name,
             error_s=mean_error(found_s, asked_s, held),
             error_on_transitions_s=mean_error(
