@@ -37,7 +37,7 @@ from ugat_marl.errors import (
     require_ranges,
 )
 from ugat_marl.files import MALFORMED
-from ugat_marl.grounding.draws import DRAWS, with_intervals
+from ugat_marl.grounding.draws import DRAWS, quantile_metrics
 from ugat_marl.scenarios import Network, SignalState, SignalTiming
 from ugat_marl.seeding import numpy_generator
 
@@ -181,9 +181,9 @@ class CommandChannel(ControllerPart):
         if self.late:
             arrive = self.draws[:, :, :-1] / (1.0 - self.draws[:, :, -1:]).clip(1e-9)
             late_s = interval_s * arrive @ np.arange(arrive.shape[-1])
-            numbers |= with_intervals("channel/late_s", late_s.T, self.agents)
+            numbers |= quantile_metrics("channel/late_s", late_s.T, self.agents)
         if self.lost:
-            numbers |= with_intervals("channel/missing", self.draws[:, :, -1].T, self.agents)
+            numbers |= quantile_metrics("channel/missing", self.draws[:, :, -1].T, self.agents)
         return numbers
 
     def state_dict(self) -> dict[str, Any]:

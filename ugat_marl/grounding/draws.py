@@ -11,7 +11,7 @@ DRAWS = 200
 """Draws from a fitted part, for its intervals."""
 
 
-def with_intervals(
+def quantile_metrics(
     name: str, draws: NDArray[np.floating] | NDArray[np.integer], agents: Iterable[str]
 ) -> dict[str, float]:
     """Return median and 90 % interval of a number of each agent, as metrics of a run.

@@ -38,7 +38,7 @@ from ugat_marl.effects import (
 )
 from ugat_marl.errors import CheckpointError, OptionError, counted, require_kinds, require_ranges
 from ugat_marl.files import MALFORMED
-from ugat_marl.grounding.draws import DRAWS, with_intervals
+from ugat_marl.grounding.draws import DRAWS, quantile_metrics
 from ugat_marl.grounding.summaries import CLOSE, Floats, LaneRows, LaneView
 from ugat_marl.scenarios import VEHICLE_SPACE_M, Network
 from ugat_marl.seeding import numpy_generator
@@ -200,7 +200,7 @@ class Eyes:
         if self.dead.any():
             dead = numpy_generator(0, "eyes", "dead").random((DRAWS, len(self.dead))) < self.dead
             unseen = [dead[:, list(places)].sum(1) for places in lanes_of.values()]
-            numbers |= with_intervals("eyes/unseen", np.array(unseen), lanes_of)
+            numbers |= quantile_metrics("eyes/unseen", np.array(unseen), lanes_of)
         return numbers
 
     def state_dict(self) -> dict[str, Any]:

@@ -36,7 +36,7 @@ from ugat_marl.effects import (
 )
 from ugat_marl.errors import CheckpointError, UnknownNameError
 from ugat_marl.files import MALFORMED
-from ugat_marl.grounding.draws import DRAWS, with_intervals
+from ugat_marl.grounding.draws import DRAWS, quantile_metrics
 from ugat_marl.grounding.presence import LEAST_SPREAD, Presence, lanes_differ
 from ugat_marl.grounding.regression import Calibration, Design, Floats, kernel, left_out, ridge
 from ugat_marl.grounding.summaries import Summary
@@ -444,7 +444,7 @@ class Posterior:
         for column, name in enumerate(("unused/begin_s", "unused/each_s")):
             unused_s = service_s[:, :, column]
             means_s = [unused_s[:, list(places)].mean(1) for places in lanes_of.values()]
-            numbers |= with_intervals(name, np.array(means_s), lanes_of)
+            numbers |= quantile_metrics(name, np.array(means_s), lanes_of)
         return numbers
 
     def state_dict(self) -> dict[str, Any]:
