@@ -11,7 +11,7 @@ from rich.console import Console, RenderableType
 
 from ugat_marl.cli.plan import plan_table
 from ugat_marl.effects import load_scenario
-from ugat_marl.reporting import LightNames, approach_table, titled_table
+from ugat_marl.reporting import LightNames, control_delay_table, titled_table
 from ugat_marl.reporting.terminal import named_table
 from ugat_marl.scenarios import Network, SignalPlan, read_plans
 
@@ -72,10 +72,12 @@ def test_plans_and_approaches_fit_without_divided_words(plans: list[SignalPlan])
     assert {"cluster_2_5", "(signalb_0)", "9", "(signala_0)", "turns", "all-red"} <= words
     network = Network.read(load_scenario("grid2x2-v1"))
     delays = {rule: {"A1_B1": (300.0, 60.0)} for rule in ("programme", "max-pressure-loss")}
-    words = set(" ".join(lines_of(approach_table("Delay", delays, network))).split())
+    words = set(" ".join(lines_of(control_delay_table("Delay", delays, network))).split())
     assert {"B1", "(signal_2)", "eastbound", "max-pressure-loss"} <= words
     rules = ("programme", "webster", "actuated:40", "max-pressure:20")
-    lines = lines_of(approach_table("Delay", dict.fromkeys(rules, delays["programme"]), network))
+    lines = lines_of(
+        control_delay_table("Delay", dict.fromkeys(rules, delays["programme"]), network)
+    )
     assert max(map(len, lines)) <= 80
     heads = " ".join(rules).replace(":", ": ").split()  # a name breaks at its colon
     assert {"(signal_2)", "eastbound", *heads} <= set(" ".join(lines).split())
@@ -85,7 +87,7 @@ def test_plans_and_approaches_fit_without_divided_words(plans: list[SignalPlan])
 def test_an_approach_that_nobody_passes_is_the_worst_and_hides_no_other() -> None:
     network = Network.read(load_scenario("grid2x2-v1"))
     starved = {"A1_A2": (100.0, 20.0), "A1_B1": (0.0, math.inf), "B1_A1": (50.0, 90.0)}
-    rows = lines_of(approach_table("Delay", {"mine": starved}, network))
+    rows = lines_of(control_delay_table("Delay", {"mine": starved}, network))
     found = [line.split() for line in rows if "A1" in line and "_" in line]
     assert [next(word for word in row if "_" in word and "(" not in word) for row in found] == [
         "A1_B1", "B1_A1", "A1_A2",
@@ -97,7 +99,7 @@ def test_vehicles_that_pass_are_those_of_all_controllers() -> None:
     network = Network.read(load_scenario("grid2x2-v1"))
     delays = {"a": {"A1_A2": (19.0, 20.0)}, "b": {"A1_A2": (24.4, 20.0)}, "c": {}}
     (row,) = (
-        line for line in lines_of(approach_table("Delay", delays, network)) if "A1_A2" in line
+        line for line in lines_of(control_delay_table("Delay", delays, network)) if "A1_A2" in line
     )
     assert "19-24" in row.split()
 
@@ -106,6 +108,8 @@ def test_an_approach_to_which_nobody_comes_is_not_the_worst() -> None:
     network = Network.read(load_scenario("grid2x2-v1"))
     quiet = {"A1_B1": (0.0, math.nan), "A1_A2": (100.0, 20.0)}
     rows = [
-        line for line in lines_of(approach_table("Delay", {"a": quiet}, network)) if "A1_" in line
+        line
+        for line in lines_of(control_delay_table("Delay", {"a": quiet}, network))
+        if "A1_" in line
     ]
     assert "A1_A2" in rows[0] and "none came" in rows[1]

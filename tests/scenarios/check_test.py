@@ -33,7 +33,7 @@ from ugat_marl.experiments import (
 )
 from ugat_marl.files import xml_bytes
 from ugat_marl.progress import Silent
-from ugat_marl.reporting import draw_network
+from ugat_marl.reporting import plot_network
 from ugat_marl.reporting.phase_diagrams import STYLES
 from ugat_marl.scenarios import (
     Document,
@@ -637,7 +637,7 @@ def texts(path: Path) -> list[str]:
 
 def test_every_intersection_is_drawn_with_its_phases(tmp_path: Path) -> None:
     scenario = load_scenario("mixed-v1")
-    files = draw_network(scenario, tmp_path, Silent())
+    files = plot_network(scenario, tmp_path, Silent())
     network = Network.read(scenario)
     names = {"network", *(item.id for item in network.intersections)}
     assert {path.name for path in files} == {f"{n}.{end}" for n in names for end in ("svg", "png")}
@@ -657,7 +657,7 @@ def test_every_intersection_is_drawn_with_its_phases(tmp_path: Path) -> None:
 def test_green_is_drawn_in_the_colour_of_the_legend(tmp_path: Path) -> None:
     """As many strokes in the colour of protected green as there are links with it, and the key."""
     scenario = load_scenario("single-v1")
-    draw_network(scenario, tmp_path, Silent())
+    plot_network(scenario, tmp_path, Silent())
     (item,) = Network.read(scenario).intersections
     green = sum(phase[link.index] == "G" for phase in item.phases for link in item.links)
     text = (tmp_path / "A1.svg").read_text()
@@ -668,7 +668,7 @@ def test_green_is_drawn_in_the_colour_of_the_legend(tmp_path: Path) -> None:
 
 def test_the_same_drawing_is_the_same_file(tmp_path: Path) -> None:
     for name in "ab":
-        draw_network(load_scenario("single-v1"), tmp_path / name, Silent())
+        plot_network(load_scenario("single-v1"), tmp_path / name, Silent())
     assert (tmp_path / "a" / "A1.svg").read_bytes() == (tmp_path / "b" / "A1.svg").read_bytes()
 
 
@@ -677,7 +677,7 @@ def test_many_phases_go_to_several_pages(tmp_path: Path, single: Scenario) -> No
     width = len(item.phases[0])
     phases = ["r" * i + "G" + "r" * (width - i - 1) for i in range(width)]
     phases += [p.replace("G", "g") for p in phases]
-    draw_network(spoilt(single, phases), tmp_path, Silent())
+    plot_network(spoilt(single, phases), tmp_path, Silent())
     pages = sorted(path.name for path in tmp_path.glob("A1-*.png"))
     assert len(pages) == -(-len(phases) // 15)
 

@@ -34,7 +34,7 @@ from ugat_marl.experiments import (
     remarks,
 )
 from ugat_marl.progress import Bars, Silent
-from ugat_marl.reporting import LIGHT_HEADING, LightNames, approach_table, titled_table
+from ugat_marl.reporting import LIGHT_HEADING, LightNames, control_delay_table, titled_table
 from ugat_marl.scenarios import (
     PHASE_SOURCES,
     SHORT_LANE_M,
@@ -216,7 +216,9 @@ def show(
     if runs:
         console.print(_runs(runs))
         delays = {run.rule: run.approaches for run in runs}
-        console.print(approach_table("Control delay and level of service (HCM)", delays, network))
+        console.print(
+            control_delay_table("Control delay and level of service (HCM)", delays, network)
+        )
     if rows is None:
         say("headroom: not measured; --headroom 1 measures it with one seed")
     else:

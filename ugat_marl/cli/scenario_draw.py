@@ -12,7 +12,7 @@ from tyro.conf import Positional, arg
 from ugat_marl.effects import load_scenario
 from ugat_marl.files import require_writable
 from ugat_marl.progress import Bars
-from ugat_marl.reporting import draw_network
+from ugat_marl.reporting import plot_network
 
 
 @dataclass(frozen=True)
@@ -34,6 +34,6 @@ class ScenarioDraw:
         """Draw and print the folder."""
         scenario = load_scenario(self.scenario)
         require_writable(self.out / "network.svg")
-        files = draw_network(scenario, self.out, Bars(console))
+        files = plot_network(scenario, self.out, Bars(console))
         console.print(f"{len(files)} pictures: {self.out}", soft_wrap=True)
         return 0

@@ -22,7 +22,7 @@ from ugat_marl.cli.arguments import (
 )
 from ugat_marl.errors import OptionError, counted
 from ugat_marl.progress import Bars
-from ugat_marl.reporting import LIGHT_HEADING, LightNames, draw_network, titled_table
+from ugat_marl.reporting import LIGHT_HEADING, LightNames, plot_network, titled_table
 from ugat_marl.scenarios import (
     ControlSettings,
     CountFit,
@@ -180,7 +180,7 @@ class ScenarioNew:
             settings=self._settings(),
             command=self._command(),
             force=self.force,
-            draw=lambda scenario, out: draw_network(scenario, out, reporter),
+            draw=lambda scenario, out: plot_network(scenario, out, reporter),
             reporter=reporter,
         )
         sheet = shlex.quote(str(draft.sheet))

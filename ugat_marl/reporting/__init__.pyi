@@ -21,12 +21,12 @@ from .learning_curves import curves_page as curves_page
 from .light_names import LIGHT_HEADING as LIGHT_HEADING
 from .light_names import LightNames as LightNames
 from .page import require_page_place as require_page_place
-from .phase_diagrams import draw_network as draw_network
+from .phase_diagrams import plot_network as plot_network
 from .run_records import RunRecord as RunRecord
 from .run_records import TableRecord as TableRecord
 from .run_records import read_records as read_records
 from .run_records import read_rows as read_rows
-from .service_tables import approach_table as approach_table
+from .service_tables import control_delay_table as control_delay_table
 from .service_tables import service_tables as service_tables
 from .standings import standings_table as standings_table
 from .tables import measures_table as measures_table

@@ -51,7 +51,7 @@ _NAMED = 80
 
 
 @styled()
-def draw_network(scenario: Scenario, out: Path, reporter: Reporter) -> list[Path]:
+def plot_network(scenario: Scenario, out: Path, reporter: Reporter) -> list[Path]:
     """Draw the network of a scenario and all its intersections.
 
     Args:

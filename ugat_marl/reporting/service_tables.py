@@ -91,11 +91,13 @@ def service_tables(evaluation: Evaluation, network: Network) -> list[RenderableT
         tables.append(table)
     last = evaluation.domains[-1]
     delays = {policy: measured.get((policy, last), {}) for policy in evaluation.policies}
-    by_approach = approach_table(f"The same by approach, in {last}", delays, network)
+    by_approach = control_delay_table(f"The same by approach, in {last}", delays, network)
     return [Group(*tables, by_approach)]
 
 
-def approach_table(title: str, delays: Mapping[str, Delays], network: Network) -> RenderableType:
+def control_delay_table(
+    title: str, delays: Mapping[str, Delays], network: Network
+) -> RenderableType:
     """Return delay and level of service of the worst approaches under several controllers.
 
     Args:
