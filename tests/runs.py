@@ -1,4 +1,7 @@
-"""Folders of runs of `transfer`, and stand-ins for what a test of training need not play."""
+"""Folders of runs of `transfer`, and stand-ins for what a test of training need not play.
+
+`q_values` looks into a trained policy.
+"""
 
 from __future__ import annotations
 
@@ -9,10 +12,13 @@ from typing import Any
 
 import numpy as np
 import pytest
+import torch
+from numpy.typing import NDArray
 from pydantic import TypeAdapter
 
 from ugat_marl.data import Metrics, Scores
 from ugat_marl.effects import Domain, domain_label
+from ugat_marl.envs import Observations
 from ugat_marl.experiments import Evaluation, Job, TransferConfig
 from ugat_marl.experiments.jobs import JOB, perform
 from ugat_marl.experiments.scores import Result
@@ -104,3 +110,11 @@ def perform_in_this_process(patch: pytest.MonkeyPatch) -> None:
             perform(job, Path(folder), Silent())
 
     patch.setattr("ugat_marl.experiments.driver._perform_apart", perform_job)
+
+
+def q_values(policy: NetworkPolicy, observations: Observations) -> dict[str, NDArray[np.float32]]:
+    """The values of every agent's actions, ``(actions,)``; Q is in scaled reward."""
+    agents = policy.agents
+    values = policy._network(torch.from_numpy(agents.stack(observations)).unsqueeze(1))
+    rows = zip(agents.names, agents.action_counts, values.squeeze(1), strict=True)
+    return {name: row[:count].numpy() for name, count, row in rows}

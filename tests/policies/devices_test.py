@@ -22,7 +22,7 @@ from torch.utils._python_dispatch import TorchDispatchMode
 from torch.utils._pytree import tree_leaves, tree_map
 
 from studies.bench.learning_program import Noise
-from tests.runs import SMALL, play_nothing
+from tests.runs import SMALL, play_nothing, q_values
 from ugat_marl.__main__ import main
 from ugat_marl.data import SETTINGS_FILE, AgentLayout, Provenance, TransitionLog, TransitionRecorder
 from ugat_marl.envs import AgentSet
@@ -229,7 +229,7 @@ def trained(
     made, env = learner(kind, device, greedy=greedy)
     told: list[dict[str, float]] = []
     policy = made.learn(env, 2, 0, lambda _, numbers: told.append(dict(numbers)))
-    return made, told, policy.q_values(env.reset(seed=9)[0])
+    return made, told, q_values(policy, env.reset(seed=9)[0])
 
 
 @pytest.mark.parametrize("kind", KINDS)

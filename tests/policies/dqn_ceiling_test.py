@@ -13,6 +13,7 @@ import torch
 from numpy.typing import NDArray
 
 from tests.policies.dqn_test import QUICK
+from tests.runs import q_values
 from ugat_marl.envs import AgentSet
 from ugat_marl.errors import CheckpointError, OptionError
 from ugat_marl.policies import DQN, NetworkPolicy
@@ -44,10 +45,10 @@ def test_beyond_the_ceiling_everything_looks_the_same() -> None:
     full, at_the_ceiling = seen([9, 7, 0.3], [5, 6]), seen([0.5, 0.2, 0.3], [0.1, 0.4])
     below = seen([0.4, -2, 0.9], [0.05, 0.3])
     for name in AGENTS.names:
-        own = held.q_values(full)[name]
-        assert np.array_equal(own, plain.q_values(at_the_ceiling)[name])
-        assert not np.allclose(own, plain.q_values(full)[name])
-        assert np.array_equal(held.q_values(below)[name], plain.q_values(below)[name])
+        own = q_values(held, full)[name]
+        assert np.array_equal(own, q_values(plain, at_the_ceiling)[name])
+        assert not np.allclose(own, q_values(plain, full)[name])
+        assert np.array_equal(q_values(held, below)[name], q_values(plain, below)[name])
     rng = np.random.default_rng(0)
     turned = 0
     for seed in range(100):
@@ -91,7 +92,7 @@ def test_exported_it_is_a_layer_more(hidden: tuple[int, ...], shared: bool) -> N
     for _ in range(50):
         observations = seen(rng.uniform(-1, 3, 3).tolist(), rng.uniform(-1, 3, 2).tolist())
         values = exported.values(AGENTS.stack(observations))
-        for row, own in zip(values, held.q_values(observations).values(), strict=True):
+        for row, own in zip(values, q_values(held, observations).values(), strict=True):
             np.testing.assert_allclose(row[: own.size], own, rtol=1e-4, atol=1e-4)
 
 

@@ -15,6 +15,7 @@ from gymnasium import spaces
 from pettingzoo import ParallelEnv
 from torch import Tensor
 
+from tests.runs import q_values
 from ugat_marl.envs import AgentSet, parallel_env
 from ugat_marl.envs.wrappers import frame_stack
 from ugat_marl.errors import CheckpointError, OptionError
@@ -287,8 +288,8 @@ def test_resume_equals_an_unbroken_run_and_policies_survive(tmp_path: Path):
     observations, _ = env.reset(seed=7)
     for copy in (NetworkPolicy.load(tmp_path / "policy.pt"), pickle.loads(pickle.dumps(unbroken))):  # noqa: S301
         assert copy.structure == PAIRS
-        for agent, values in unbroken.q_values(observations).items():
-            assert np.array_equal(copy.q_values(observations)[agent], values)
+        for agent, values in q_values(unbroken, observations).items():
+            assert np.array_equal(q_values(copy, observations)[agent], values)
 
 
 def test_a_policy_takes_plain_observations_and_the_learner_scaled_ones():
@@ -298,7 +299,7 @@ def test_a_policy_takes_plain_observations_and_the_learner_scaled_ones():
     observations, _ = OthersCoin().reset(seed=7)
     seen = torch.from_numpy(learner.agents.stack(observations))[:, None] * learner._inputs
     for values, expected in zip(
-        policy.q_values(observations).values(), learner._target(seen)[:, 0], strict=True
+        q_values(policy, observations).values(), learner._target(seen)[:, 0], strict=True
     ):
         assert values == pytest.approx(expected.numpy(), abs=1e-4)
 

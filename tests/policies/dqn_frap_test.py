@@ -14,6 +14,7 @@ import pytest
 import torch
 from torch import Tensor
 
+from tests.runs import q_values
 from ugat_marl.data import AgentLayout
 from ugat_marl.envs import AgentSet, pad_spaces, parallel_env
 from ugat_marl.envs.wrappers import frame_stack
@@ -291,8 +292,8 @@ def test_resume_equals_an_unbroken_run_and_policies_survive(tmp_path: Path):
     observations, _ = env.reset(seed=7)
     for copy in (NetworkPolicy.load(tmp_path / "policy.pt"), pickle.loads(pickle.dumps(unbroken))):  # noqa: S301
         assert copy.structure == toy_structure()
-        for agent, values in unbroken.q_values(observations).items():
-            assert np.array_equal(copy.q_values(observations)[agent], values)
+        for agent, values in q_values(unbroken, observations).items():
+            assert np.array_equal(q_values(copy, observations)[agent], values)
 
 
 def test_checkpoints_of_other_networks_or_intersections_are_refused(tmp_path: Path):

@@ -13,6 +13,7 @@ import torch
 from gymnasium import spaces
 from pettingzoo import ParallelEnv
 
+from tests.runs import q_values
 from ugat_marl.envs import AgentSet
 from ugat_marl.errors import CheckpointError
 from ugat_marl.policies import DQN, BatchedMLP, NetworkPolicy, Policy
@@ -177,7 +178,7 @@ def test_what_one_agent_lives_through_the_others_learn():
         generator = torch.Generator().manual_seed(0)
         for _ in range(600):
             learner.update(generator)
-        values[shared] = learner.policy().q_values({"s0": state, "s1": state})["s1"]
+        values[shared] = q_values(learner.policy(), {"s0": state, "s1": state})["s1"]
     assert values[True][1] - values[True][0] > 2.5
     assert abs(values[False][1] - values[False][0]) < 1.0
 
@@ -220,8 +221,8 @@ def test_a_policy_survives_file_and_pickle(tmp_path: Path):
     for copy in (NetworkPolicy.load(tmp_path / "policy.pt"), pickle.loads(pickle.dumps(policy))):  # noqa: S301
         assert copy.shared
         assert np.array_equal(copy.parameters, policy.parameters)
-        for agent, values in policy.q_values(observations).items():
-            assert np.array_equal(copy.q_values(observations)[agent], values)
+        for agent, values in q_values(policy, observations).items():
+            assert np.array_equal(q_values(copy, observations)[agent], values)
 
 
 @pytest.mark.parametrize("shared", [False, True])

@@ -16,6 +16,7 @@ from gymnasium import spaces
 from pettingzoo import ParallelEnv
 from torch.utils._python_dispatch import TorchDispatchMode
 
+from tests.runs import q_values
 from ugat_marl.envs import AgentSet
 from ugat_marl.errors import ActionError, CheckpointError, EpisodeError, OptionError
 from ugat_marl.policies import DQN, Learner, NetworkPolicy, Policy
@@ -213,7 +214,7 @@ def test_values_are_those_of_an_endless_or_an_ended_episode(terminates: bool):
     generator = torch.Generator().manual_seed(0)
     for _ in range(800):
         learner.update(generator)
-    value = learner.policy().q_values({agents.names[0]: end[0]})["signal_0"][0]
+    value = q_values(learner.policy(), {agents.names[0]: end[0]})["signal_0"][0]
     assert value == pytest.approx(1.0 if terminates else 2.0, abs=0.05)  # 1, or 1 / (1 - 0.5)
 
 
@@ -233,7 +234,7 @@ def test_terminal_value_is_shifted_with_the_centre_of_the_rewards():
     )
     for _ in range(3000):
         learner.update(torch.Generator().manual_seed(0))
-    value = learner.policy().q_values({"signal_0": state[0]})["signal_0"][0]
+    value = q_values(learner.policy(), {"signal_0": state[0]})["signal_0"][0]
     assert value == pytest.approx((-6.0 + 4.0) * 0.5 + 0.5 * (4.0 * 0.5 / 0.5), abs=0.05)
 
 
@@ -635,7 +636,7 @@ def test_the_policy_is_the_learner_on_plain_observations(shared: bool) -> None:
     observations, _ = FaintCueEnv().reset(seed=3)
     seen = torch.from_numpy(learner.agents.stack(observations))[:, None] * learner._inputs
     expected = learner._target(seen)[:, 0]
-    for row, values in enumerate(policy.q_values(observations).values()):
+    for row, values in enumerate(q_values(policy, observations).values()):
         assert values == pytest.approx(expected[row, : len(values)].numpy(), abs=1e-4)
 
 

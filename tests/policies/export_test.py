@@ -18,6 +18,7 @@ import pytest
 import torch
 
 import ugat_marl
+from tests.runs import q_values
 from ugat_marl.__main__ import main
 from ugat_marl.envs import AgentSet
 from ugat_marl.errors import CheckpointError, OptionError
@@ -150,7 +151,7 @@ def test_numpy_has_the_same_values(shared: bool, hidden: tuple[int, ...]) -> Non
     for _ in range(20):
         observations, _ = inputs(rng)
         values = numpy_policy.values(AGENTS.stack(observations))
-        for row, own in zip(values, policy.q_values(observations).values(), strict=True):
+        for row, own in zip(values, q_values(policy, observations).values(), strict=True):
             np.testing.assert_allclose(row[: own.size], own, rtol=1e-4, atol=1e-4)
 
 

@@ -10,6 +10,7 @@ import pytest
 import torch
 from torch import nn
 
+from tests.runs import q_values
 from ugat_marl.envs import AgentSet, agent_indicator, appended_mask, pad_spaces, parallel_env
 from ugat_marl.errors import ActionError, CheckpointError, EpisodeError, OptionError
 from ugat_marl.policies import (
@@ -78,7 +79,7 @@ def test_a_shared_network_is_read_out_agent_by_agent() -> None:
     policy = policy_of(agents, [linear_layers(network)], {"observation": "queue"})
     assert policy.shared and policy.hidden == (8, 5)
     observations, _ = ToyTraffic().reset(seed=1)
-    values = policy.q_values({name: vector + 0.3 for name, vector in observations.items()})
+    values = q_values(policy, {name: vector + 0.3 for name, vector in observations.items()})
     for row, (name, vector) in enumerate(observations.items()):
         seen = torch.zeros(agents.widest_observation + 3)
         seen[: vector.size] = torch.from_numpy(vector + 0.3)
@@ -99,7 +100,7 @@ def test_own_networks_are_read_out_too(padded: bool, hidden: tuple[int, ...]) ->
     policy = policy_of(agents, [linear_layers(network) for network in networks], {})
     assert not policy.shared
     observations, _ = ToyTraffic().reset(seed=1)
-    values = policy.q_values(observations)
+    values = q_values(policy, observations)
     for network, (name, vector) in zip(networks, observations.items(), strict=True):
         layer = linear_layers(network)[0]
         seen = nn.functional.pad(torch.from_numpy(vector), (0, layer.in_features - vector.size))
@@ -155,7 +156,7 @@ def test_libraries_see_scaled_numbers_and_policies_plain_ones() -> None:
         assert np.array_equal(seen[name], vector * factors[: vector.size])
     assert np.array_equal(world.state(), env.state() * learner.states.factors)
     # the network reads scaled numbers, the policy reads them as they are
-    values = learner.policy().q_values(plain)
+    values = q_values(learner.policy(), plain)
     shown, _ = agent_indicator(pad_spaces(world)).reset()
     for name, vector in shown.items():
         wanted = learner.network(torch.from_numpy(vector)).detach().numpy()

@@ -11,6 +11,7 @@ import pytest
 import torch
 
 from tests.policies.export_test import exported, inputs, page_loader
+from tests.runs import q_values
 from ugat_marl.envs import AgentSet, parallel_env
 from ugat_marl.errors import CheckpointError
 from ugat_marl.policies import (
@@ -90,7 +91,7 @@ def test_numpy_has_the_values_of_torch(sizes: Sizes, ceiling: bool) -> None:
     for _ in range(20):
         observations, _ = inputs(rng, policy.agents)
         values = numpy_policy.values(policy.agents.stack(observations))
-        for row, own in zip(values, policy.q_values(observations).values(), strict=True):
+        for row, own in zip(values, q_values(policy, observations).values(), strict=True):
             np.testing.assert_allclose(row[: own.size], own, rtol=1e-4, atol=1e-3)
 
 

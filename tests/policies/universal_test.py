@@ -12,6 +12,7 @@ import torch
 import tyro
 from torch import Tensor
 
+from tests.runs import q_values
 from ugat_marl.envs import AGE_SCALE_S, AgentSet, parallel_env
 from ugat_marl.errors import CheckpointError, OptionError
 from ugat_marl.experiments import TransferConfig
@@ -274,7 +275,7 @@ def test_learners_that_share_weights_update_the_same_ones():
     assert second.updates > 0
     assert np.array_equal(first.policy().parameters, second.policy().parameters)
     observations, _ = env.reset(seed=0)
-    one, two = (learner.policy().q_values(observations) for learner in (first, second))
+    one, two = (q_values(learner.policy(), observations) for learner in (first, second))
     assert all(np.array_equal(one[agent], two[agent]) for agent in one)
     dqn = DQN.of(env)
     with pytest.raises(OptionError, match=r"only learners with network = \"universal\""):

@@ -106,12 +106,6 @@ class NetworkPolicy:
     def reset(self, seed: int) -> None:
         """Do nothing: the policy is deterministic and has no memory."""
 
-    def q_values(self, observations: Observations) -> dict[str, NDArray[np.float32]]:
-        """Return the values of every agent's actions, ``(actions,)``; Q is in scaled reward."""
-        values = self._network(torch.from_numpy(self.agents.stack(observations)).unsqueeze(1))
-        rows = zip(self.agents.names, self.agents.action_counts, values.squeeze(1), strict=True)
-        return {name: row[:count].numpy() for name, count, row in rows}
-
     def act(self, observations: Observations, infos: Infos) -> Actions:
         """Return the greedy action of every agent.
 
