@@ -238,7 +238,7 @@ def test_terminal_value_is_shifted_with_the_centre_of_the_rewards():
     assert value == pytest.approx((-6.0 + 4.0) * 0.5 + 0.5 * (4.0 * 0.5 / 0.5), abs=0.05)
 
 
-def test_masked_actions_are_never_taken_nor_bootstrapped_from():
+def test_masked_actions_are_never_taken():
     env = CueEnv(masked=True)
     learner = DQN.of(env, QUICK)
     policy = learner.learn(env, 10, seed=3)  # the environment asserts at every step
@@ -246,6 +246,27 @@ def test_masked_actions_are_never_taken_nor_bootstrapped_from():
     for masks in learner._replay.state()["next_allowed"]:
         assert masks[:, 0].any()
         assert not masks[:, 0].all()
+
+
+def test_masked_actions_are_never_bootstrapped_from():
+    """In one state, action 1 pays 5 and ends; action 0 pays 1 and leads to where 1 is masked."""
+    config = DQNConfig(hidden=(8,), discount=0.5, learning_rate=1e-2, target_rate=0.1)
+    learner = DQN.of(LeverEnv(), config)
+    state = np.eye(4, dtype=np.float32)[:1]
+    for action, reward in ((0, 1.0), (1, 5.0)):
+        learner._replay.add(
+            state,
+            np.array([action]),
+            np.array([reward], np.float32),
+            np.array([action == 1]),
+            state,
+            np.array([[True, False]]),
+        )
+    generator = torch.Generator().manual_seed(0)
+    for _ in range(500):
+        learner.update(generator)
+    values = learner.policy().q_values({"signal_0": state[0]})["signal_0"]
+    assert values == pytest.approx([2.0, 5.0], abs=0.05)  # 1 / (1 - 0.5); with action 1 it is 3.5
 
 
 def test_own_action_is_stored_not_the_executed_one():
