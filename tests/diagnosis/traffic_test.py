@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from contextlib import nullcontext
 from dataclasses import dataclass, field, replace
@@ -15,7 +16,7 @@ from ugat_marl.diagnosis import TrafficCheck, workflow
 from ugat_marl.diagnosis.engine import OutOfTime
 from ugat_marl.diagnosis.features import ALL_FEATURES, BIN_FEATURES, FEATURES, INDEX, Tally
 from ugat_marl.diagnosis.thresholds import Thresholds
-from ugat_marl.diagnosis.traffic import approach_table, traffic_check
+from ugat_marl.diagnosis.traffic import _levelled, approach_table, traffic_check
 from ugat_marl.diagnosis.workflow import _reason_against as reason_against
 from ugat_marl.diagnosis.workflow import _without_search as without_search
 from ugat_marl.effects import (
@@ -169,6 +170,18 @@ def test_mornings_and_evenings_are_no_chance() -> None:
     assert check is not None and check.better
     one = traffic_check(days(1, 2, 20, 4), days(2, 16, 17, 3.4), days(2, 16, 20, 4), THRESHOLDS)
     assert one is not None and check.noise < 2 * one.noise
+
+
+def test_each_stretch_of_the_day_takes_a_degree_of_freedom() -> None:
+    sums = np.random.default_rng(1).normal(100.0, 10.0, (8, 1, 2, 2))
+    stretches = [(3600.0 * (day % 4), 3600.0 * (day % 4 + 1)) for day in range(8)]
+    level, wider = _levelled(sums, stretches)
+    assert wider == pytest.approx(math.sqrt(7 / 4))
+    for stretch in range(4):
+        assert level[stretch::4].mean(axis=0) == pytest.approx(sums.mean(axis=0))
+    same, wider = _levelled(sums, stretches[:1] * 8)
+    assert wider == 1.0
+    assert np.array_equal(same, sums)
 
 
 @pytest.mark.parametrize("each", [1, 2, 6])
