@@ -398,7 +398,9 @@ def test_every_proposal_is_an_effect(reference: Reference) -> None:
 
 def test_the_same_data_give_the_same_proposals(reference: Reference) -> None:
     data = fault("undercount=stop:a,0.25")
-    assert proposed(reference, data) == proposed(reference, data)
+    found = proposed(reference, data)
+    assert dict(first(found, "undercount").fixed) == {"place": "stop:a"}
+    assert proposed(reference, data) == found
 
 
 def test_the_traffic_light_that_starts_late() -> None:

@@ -158,6 +158,7 @@ def test_of_nothing_but_noise_nothing_is_worth_its_price(reference: Reference) -
 def test_no_effect_works_backwards(reference: Reference) -> None:
     among = directions()[:3]
     found = propose(among, whitener(reference, {"headway": -0.8}, among), THRESHOLDS)
+    assert found
     assert all("headway" not in values(item) for item in found)
 
 
