@@ -245,7 +245,19 @@ def test_any_attribute_survives(attributes: dict[str, str]) -> None:
     assert dict(parse_xml(xml_bytes(root), "r").items()) == attributes
 
 
-@given(st.binary(max_size=200))
+@st.composite
+def damaged_documents(draw: st.DrawFn) -> bytes:
+    """`DOCUMENT` with bytes changed, cut out or doubled."""
+    content = DOCUMENT
+    for _ in range(draw(st.integers(1, 3))):
+        begin = draw(st.integers(0, max(0, len(content) - 1)))
+        end = begin + draw(st.integers(1, 20))
+        other = draw(st.one_of(st.binary(max_size=1), st.just(content[begin:end] * 2)))
+        content = content[:begin] + other + content[end:]
+    return content
+
+
+@given(st.one_of(st.binary(max_size=200), damaged_documents()))
 def test_no_bytes_are_a_traceback(content: bytes) -> None:
     with contextlib.suppress(ScenarioError):
         parse_xml(content, "here")
