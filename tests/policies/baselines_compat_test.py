@@ -89,15 +89,19 @@ def test_an_unknown_learner_is_refused_before_anything_trains() -> None:
         compat.Compat(learners=("ipo",))
 
 
-def test_every_learner_is_in_the_matrix() -> None:
+def test_every_learner_of_a_library_is_an_extra_s() -> None:
     assert all(bool(item.extra) == bool(item.library) for item in BASELINES.values())
+
+
+def test_every_learner_is_in_the_matrix() -> None:
     ci = FILE.parent.parent / ".ci" / "compat.py"
-    if ci.is_file():
-        learners = load(ci, "ci_compat").LEARNERS
-        assert {name for names in learners.values() for name in names} == set(BASELINES)
-        assert all(
-            BASELINES[name].extra == extra for extra, names in learners.items() for name in names
-        )
+    if not ci.is_file():
+        pytest.skip("a wheel has no .ci")
+    learners = load(ci, "ci_compat").LEARNERS
+    assert {name for names in learners.values() for name in names} == set(BASELINES)
+    assert all(
+        BASELINES[name].extra == extra for extra, names in learners.items() for name in names
+    )
 
 
 def test_the_versions_that_fit_together_are_pinned() -> None:
