@@ -290,6 +290,7 @@ def test_the_same_values_in_worker_processes() -> None:
     for one in (there, spawned):
         for ours, theirs in zip(here.moments, one.moments, strict=True):
             first, second = ours.parts["observations"], theirs.parts["observations"]
+            assert first.keys() == second.keys()
             assert all(np.array_equal(first[agent], second[agent]) for agent in first)
 
 

@@ -180,6 +180,7 @@ def test_same_seed_same_weights_whatever_was_drawn_before() -> None:
     one = InverseModel(stack, InverseConfig(), torch_generator(3)).state_dict()
     torch.rand(9)
     two = InverseModel(stack, InverseConfig(), torch_generator(3)).state_dict()
+    assert one.keys() == two.keys()
     assert all(torch.equal(one[name], two[name]) for name in one)
 
 

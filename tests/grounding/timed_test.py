@@ -319,6 +319,7 @@ def test_fitting_twice_gives_the_same_models_and_another_seed_others() -> None:
         made.fit(real, simulated, Fitter(BRIEF, seed))
         models = made.models.items()
         states.append({f"{n}.{k}": v for n, m in models for k, v in m.state_dict().items()})
+    assert states[0].keys() == states[1].keys()
     assert all(torch.equal(states[0][name], states[1][name]) for name in states[0])
     weights = [name for name in states[0] if name.endswith("weight")]
     assert not any(torch.equal(states[0][name], states[2][name]) for name in weights)
