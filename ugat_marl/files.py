@@ -649,9 +649,9 @@ class _GrowingTree:
         self._shallow, self._new = whole, 0
 
     def whole_children(self) -> ET.Element | None:
-        """Take all children but the last, which may go on, and return them in a copy of the root.
+        """Remove the complete children and return them under a copy of the root.
 
-        Return None if there are none.
+        The last child may be incomplete, and stays. Return None if there are no others.
         """
         if self._root is None or len(self._root) < 2:
             return None
@@ -844,9 +844,12 @@ class Document:
         return parts_of_xml(self.pieces(usual()), self.source)
 
     def rows(self) -> Rows | None:
-        """Return the texts of the children, to read or change few of them; None if it is long.
+        """Return the children as texts, to read or change few of them.
 
-        They are kept with an unchanged document, because many scenarios are made of one.
+        The document is cached as it was rewritten for this, because many scenarios derive from one.
+
+        Returns:
+            None if the document is too long, or if a text in it looks like the start of a child.
         """
         document = self if self.in_rows else self._rewritten()
         if document is None or not document.in_rows:

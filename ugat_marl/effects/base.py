@@ -333,8 +333,8 @@ def with_listed_effects(
 def salt_of(scenario: Scenario, effect: Effect, *places: str) -> str:
     """Return the name of an effect's decisions about vehicles, for `hashed_uniform`.
 
-    Where the same effect was applied before, its decisions have another name. With the same one, a
-    share of 0.8 would keep all vehicles that a share of 0.8 has left.
+    A second application needs another salt: with the same one, keeping a share of 0.8 of the
+    vehicles again would remove none of them.
 
     Args:
         scenario: The scenario without the effect.

@@ -227,7 +227,7 @@ def _standings_in(texts: pl.DataFrame | None, name: str) -> pl.DataFrame:
 
 
 def require_kept(file: Path, after: pl.DataFrame, remedy: str, keeping: str = "") -> None:
-    """Refuse to replace a table by one that lacks trainings of it, or has others in their place.
+    """Refuse to replace a table if the new one lacks any of its trainings or of their results.
 
     Args:
         file: The table; if it is not there, nothing is refused.

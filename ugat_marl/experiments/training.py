@@ -181,9 +181,9 @@ def _rivals(
     seed: int,
     start: Path,
 ) -> tuple[Rival, ...]:
-    """Return the further learners of a fitted street; none where none can be.
+    """Return the rivals; none if the learner cannot be saved, or if rewards cannot be matched.
 
-    A learner that cannot be kept cannot begin where plain training ended. Rewards are matched only
+    A learner that cannot be saved cannot begin where plain training ended. Rewards are matched only
     where one policy acts in both worlds, and with rewards that fall with every delay.
     """
     matches = real.replay() is None and str(env.options.reward) in MATCHED_REWARDS

@@ -633,8 +633,8 @@ def _maximum(rows: NDArray[np.bool_], support: set[int]) -> tuple[float, Floats]
 def _own_weights(rows: NDArray[np.bool_], network: Floats, pull: float) -> Floats:
     """Return the weights of an intersection, ``(kinds,)``.
 
-    Its own weights say which of several lags made a decision. Those of the network would say of a
-    light with late commands that most of them came in time.
+    If several lags explain a decision, the intersection's own weights divide it among them. With
+    the network's weights, a light whose commands are late would look punctual.
 
     Args:
         rows: Kinds that explain each decision, ``(kinds, n)``.

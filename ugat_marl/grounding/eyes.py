@@ -332,8 +332,8 @@ def _dead(rows: Sequence[LaneRows], perfect: Sequence[LaneRows], config: EyesCon
 def _leaving(perfect: LaneRows) -> float:
     """Return how many vehicles leave a lane in a decision; infinite if that was not measured.
 
-    A lane of a metre counts what waits upstream, in the simulation. Where nobody leaves it, a
-    street that does not see so far reports 0, and has no dead detector.
+    Very short lanes: the simulation counts the upstream queue on them. If no vehicle leaves such a
+    lane, a street detector that does not reach upstream reports 0 without being dead.
     """
     left = perfect.left[np.isfinite(perfect.left)]
     return float(left.mean()) if len(left) else math.inf
@@ -477,7 +477,7 @@ def _noisy(rows: Sequence[LaneRows], perfect: Sequence[LaneRows], config: EyesCo
     """Return True if counts are no whole numbers.
 
     Lanes that share the road behind them have halves of vehicles even in the simulation, the more
-    the longer queues are. They are compared only where there are no others.
+    the longer queues are. Such lanes are used only if every lane is of this kind.
     """
     whole = [own for own, usual in zip(rows, perfect, strict=True) if not _fraction([usual])]
     if whole:

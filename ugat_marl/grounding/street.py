@@ -516,8 +516,8 @@ def fit_street(
         view: Lanes of the network, as the log shows them.
         config: Settings.
         seed: Root of every random choice.
-        on_done: Called after each simulated episode; not after the few with short zones, which
-            only a street needs whose detectors seem to have some.
+        on_done: Called after each simulated episode, except the extra ones that estimate short
+            detection zones.
         history: Results of earlier fits to the same street.
 
     Returns:

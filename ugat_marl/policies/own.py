@@ -815,8 +815,8 @@ def _captures(given: Any) -> bool:
 def _copy(given: Any, memo: dict[int, Any]) -> Any:
     """Return a deep copy, also of the functions in it that hold values.
 
-    `copy.deepcopy` returns functions themselves, so that a policy would go on learning with its
-    learner. It takes them from the memo if they are there.
+    `copy.deepcopy` shares functions, so a policy would go on learning with its learner. Those with
+    closures or defaults are copied first and put into its memo.
     """
     if _captures(given):
         _copy_function(given, memo)

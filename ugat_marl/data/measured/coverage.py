@@ -44,9 +44,9 @@ RUN_OF_STATES, CHANGING_ORDER = 16, 0.03
 """Number of states that tell the next one in a fixed programme, and share of the places at which
 they do not, above which a programme is not fixed."""
 FEW_CHANGES, CHANGING_SHARE = 4, 0.05
-"""Number and share of successive greens of other lengths above which that is so. Fixed plans have
-few: two where the plan changes, and two where rows were lost. Greens that follow the traffic may
-nearly all be of the shortest length, or of the longest."""
+"""Number and share of consecutive greens of different lengths above which a programme is not fixed.
+Fixed plans have few: two where the plan changes, and two where rows were lost. Greens that follow
+the traffic may nearly all be of the shortest length, or of the longest."""
 
 COUNTABLE = (
     "demand_level",
@@ -206,9 +206,9 @@ def is_actuated(periods: Sequence[Period], tls: str) -> bool:
 
 
 def _order_changes(states: Sequence[str]) -> bool:
-    """Return True if what follows a run of states often differs from what mostly follows it.
+    """Return True if the successor of a run of states often is not its most frequent successor.
 
-    The state after that one is no change: a row of the log was lost.
+    If it is the state that is due one step later, it does not count: a row of the log was lost.
     """
     followed: defaultdict[tuple[str, ...], Counter[str]] = defaultdict(Counter)
     for place in range(RUN_OF_STATES, len(states)):
