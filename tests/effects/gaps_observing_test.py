@@ -150,6 +150,24 @@ def test_counting_noise_is_a_share_of_the_count(network: Network) -> None:
     assert not seen("counting_noise=0.2", network, 0.0, 0.0)[0].any()
 
 
+def test_counting_noise_changes_all_counts_alike_and_no_speed(network: Network) -> None:
+    street, measured = sensors("counting_noise=1", network), snapshot(network, 20.0, 10.0, 6.0)
+    measured = replace(measured, queued_upstream=measured.halting / 2)
+    looked = [street.see(measured) for _ in range(20)]
+    factors = np.array([x.vehicles for x in looked]) / 20.0
+    assert factors.min() == 0.0, "no count is negative"
+    assert np.array([x.halting for x in looked]) == pytest.approx(10.0 * factors)
+    assert np.array([x.waiting_s for x in looked]) == pytest.approx(6.0 * factors)
+    assert np.array([x.queued_upstream for x in looked]) == pytest.approx(5.0 * factors)
+    assert np.array([x.mean_speed_mps for x in looked]) == pytest.approx(3.0)
+
+
+def test_noise_and_error_of_a_seed_are_independent(network: Network) -> None:
+    noise, _ = seen("counting_noise=0.1", network, 50.0, 50.0)
+    error, _ = seen("counting_error=5", network, 50.0, 50.0)
+    assert abs(np.corrcoef(noise.ravel(), error.ravel())[0, 1]) < 0.05
+
+
 def test_a_counting_error_is_in_vehicles_and_never_negative(network: Network) -> None:
     vehicles, halting = seen("counting_error=3", network, 50.0, 50.0)
     assert vehicles.mean() == pytest.approx(50.0, rel=0.01)
@@ -178,7 +196,9 @@ def test_a_dead_detector_reports_nothing_all_episode(network: Network) -> None:
 def test_only_the_zone_before_a_stop_line_is_seen(network: Network) -> None:
     street = sensors("detection_zone=50", network)
     assert street.zone_m == 50.0
-    looked = street.see(snapshot(network, 8.0, 4.0, 6.0))
+    measured = snapshot(network, 8.0, 4.0, 6.0)
+    looked = street.see(replace(measured, queued_upstream=measured.halting))
+    assert not looked.queued_upstream.any(), "they queue outside of the zone"
     incoming = {lane for item in network.intersections for lane in item.incoming_lanes}
     for place, lane in enumerate(network.lane_table().ids):
         expected = (4.0, 2.0, 3.0) if lane in incoming else (0.0, 0.0, 0.0)
