@@ -27,6 +27,7 @@ from ugat_marl.effects import (
     load_scenario,
     parse_domain,
 )
+from ugat_marl.effects.documents import sort_departures
 from ugat_marl.envs import parallel_env
 from ugat_marl.errors import OptionError, ScenarioError, UnknownNameError
 from ugat_marl.scenarios import (
@@ -285,6 +286,15 @@ def test_who_waits_for_a_person_is_left_alone(factor: float) -> None:
     )
     for effect in (DemandSurge("*", 10.0, 20.0, factor), DemandLevel("*", factor)):
         assert departing(apply_effects(scenario, [effect])).keys() == {"v"}
+
+
+def test_who_waits_for_a_person_stays_behind_the_vehicle_before() -> None:
+    root = ET.fromstring(
+        '<routes><vehicle id="a" depart="20"/><vehicle id="b" depart="triggered"/>'
+        '<vehicle id="c" depart="10"/><vType id="t"/><vehicle id="d" depart="15"/></routes>'
+    )
+    sort_departures(root)
+    assert [element.get("id") for element in root] == ["t", "c", "d", "a", "b"]
 
 
 def test_a_surge_stays_in_its_window() -> None:

@@ -133,6 +133,13 @@ def test_passages_are_missed_at_random_and_nested() -> None:
     assert times(everywhere, "a") == times(seen(Undercount("a", 0.5), many), "a")
 
 
+def test_each_detector_misses_vehicles_of_its_own() -> None:
+    both = passages([1000 + 0.7 * n for n in range(4000)])
+    after = seen(Undercount("*", 0.5), period(a=both, b=both))
+    common = set(times(after, "a")) & set(times(after, "b"))
+    assert len(common) == pytest.approx(1000, abs=120)
+
+
 def test_effects_on_detectors_are_picked_from_all() -> None:
     effects = [StartupDelay(1), SignalClock("A", 1), Dropout("b", 0, 5000)]
     after = apply_detector_effects(DAY, effects, DETECTORS, OWNER)

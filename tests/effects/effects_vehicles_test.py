@@ -288,6 +288,29 @@ def test_desired_speeds_of_single_vehicles(
     assert none == pytest.approx({"v0": 1, "v1": 1, "v2": 0.9, "v3": 0.9})
 
 
+def test_a_factor_of_desired_speeds_scales_all_numbers_of_a_type(crossing: Crossing) -> None:
+    types = '<vType id="cut" speedFactor="normc(1.1,0.2,0.5,1.5)"/>'
+    scenario = apply_effects(
+        load_scenario(crossing(vehicles=CARS, types=types)), [DesiredSpeed(0.5)]
+    )
+    (kind,) = [x for x in scenario.routes[0].parse().iter("vType") if x.get("id") == "cut"]
+    found = SpeedFactors.of(kind.attrib, scenario.settings.sumo)
+    expected = (0.55, 0.1, 0.25, 0.75)
+    assert (found.mean, found.deviation, found.least, found.greatest) == pytest.approx(expected)
+
+
+def test_single_vehicles_stay_within_the_limits_of_their_type(crossing: Crossing) -> None:
+    types = '<vType id="cut" speedFactor="normc(1,0.1,0.8,1.2)"/>'
+    vehicles = "".join(
+        f'<vehicle id="v{factor}" type="cut" route="north" depart="1" speedFactor="{factor}"/>'
+        for factor in (0.85, 1.0, 1.15)
+    )
+    scenario = load_scenario(crossing(vehicles=vehicles, types=types))
+    changed = apply_effects(scenario, [SpeedSpread(0.3)])
+    speeds = [x.get("speedFactor") for x in changed.routes[0].parse().iter("vehicle")]
+    assert speeds == ["0.8", "1", "1.2"]
+
+
 def test_desired_speeds_of_types(
     simulator: LibsumoSimulator, crossing: Crossing, tmp_path: Path
 ) -> None:
@@ -314,6 +337,16 @@ def test_desired_speeds_of_types(
     for name, (mean, deviation) in expected.items():
         assert moments[name] == pytest.approx((mean, deviation), abs=slack), name
     assert set(drawn["even"]) == {1.0}
+
+
+def test_a_model_inside_of_a_type_does_not_overrule_an_effect(crossing: Crossing) -> None:
+    old = '<vType id="old" tau="1"><carFollowing-IDM tau="0.9" accel="2.2"/></vType>'
+    scenario = apply_effects(
+        load_scenario(crossing(vehicles=CARS, types=old)), [Headway(1.6), Acceleration(1.5)]
+    )
+    (kind,) = [x for x in scenario.routes[0].parse().iter("vType") if x.get("id") == "old"]
+    assert [x.get("tau") for x in kind.iter()] == ["1.6", "1.6"]
+    assert [x.get("accel") for x in kind.iter()] == ["1.5", "1.5"]
 
 
 # --- heavy vehicles

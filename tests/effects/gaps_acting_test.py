@@ -14,14 +14,18 @@ from hypothesis import strategies as st
 
 import ugat_marl
 from ugat_marl.effects import (
+    LaneService,
     load_scenario,
     parse_domain,
     scenario_in_domain,
+    service_of,
+    withheld,
 )
 from ugat_marl.effects.actuators import ACTING, PHASE_ORDERS, successors
 from ugat_marl.effects.table import ON_CONTROLLERS
 from ugat_marl.envs.actuators import Actuators
 from ugat_marl.errors import OptionError, ScenarioError, UnknownNameError
+from ugat_marl.grounding import FittedService
 from ugat_marl.scenarios import Network, signals, validate_settings
 from ugat_marl.testing.episodes import play, random_actions
 
@@ -409,6 +413,24 @@ def test_the_service_of_one_lane_is_withheld_there_alone() -> None:
     assert lane.from_lane != other.from_lane
     assert [state[lane.index] for state in shown] == ["r", "G"]
     assert [state[other.index] for state in shown] == ["G", "G"]
+
+
+def test_fitted_service_is_added_to_that_of_the_scenario() -> None:
+    effects = [LaneService("a", 1.0, 2.0), LaneService("b", 5.0, 6.0), LaneService("b", 3.0, 0.0)]
+    fitted = FittedService(["a", "c"], np.array([[0.5, 0.25], [4.0, 1.0]]))
+    expected = {"a": (1.5, 2.25), "b": (3.0, 0.0), "c": (4.0, 1.0)}
+    assert service_of(effects, [fitted]) == expected
+
+
+def test_lanes_that_share_a_signal_have_the_red_of_the_slower_one() -> None:
+    network = NETWORKS["single-v1"]
+    (item,) = network.intersections
+    fast = item.links[0]
+    slow = next(link for link in item.links if link.from_lane != fast.from_lane)
+    links = tuple(replace(link, index=0) for link in (fast, slow, fast))
+    shared = replace(network, intersections=(replace(item, links=links),))
+    red = withheld(shared, {slow.from_lane: (3.0, 2.0), fast.from_lane: (1.0, 0.5)})[item.id]
+    assert (red.begin_s[0], red.each_s[0]) == (3.0, 2.0)
 
 
 def test_every_lane_may_have_its_own_service_and_the_last_one_counts() -> None:
