@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from ugat_marl.data import AgentLayout, Provenance, TransitionLog, TransitionRecorder
-from ugat_marl.grounding.summaries import NAMES, LaneView
+from ugat_marl.grounding.summaries import NAMES, LaneRows, LaneView, Summary
 
 GREEN = np.array([[True, False]])
 HOLDS, PASSED_S = np.full(1, 40.0), np.full(1, 30.0)
@@ -62,3 +62,34 @@ def test_a_missing_decision_makes_no_green_older() -> None:
     log = log_of(10.0, skipped=1)
     assert fall(log, "goes on") == pytest.approx((22.0 / 10, 10.0))  # the third one took its place
     assert fall(log, "is long") == pytest.approx((4.0, 19.0))
+
+
+def rows_of(counts: list[float], served: list[float]) -> LaneRows:
+    """Return the decisions of a lane in green, whose counts follow each other."""
+    layouts = {"a_0": AgentLayout(1, 2)}
+    recorder = TransitionRecorder(Provenance("by hand", "", "street", (), 10.0, "count", layouts))
+    seen = [{"a_0": np.array([count / 40.0, 1.0, 0.0])} for count in counts]
+    for t, left in enumerate(served):
+        stays = {"a_0": np.array([(counts[t] - left) / 40.0])}
+        ran = {"a_0": 0}
+        recorder.record(0, t, seen[t], ran, ran, {"a_0": 0.0}, seen[t + 1], served=stays)
+    (rows,) = VIEW.rows(recorder.log())
+    return rows
+
+
+def test_vehicles_that_left_are_counted_without_those_that_came() -> None:
+    rows = rows_of([20.0, 19.0, 22.0], served=[3.0, 2.0])
+    assert rows.left == pytest.approx([3.0, 2.0])
+    assert (rows.before - rows.after).tolist() == [1.0, -3.0]
+
+
+def test_a_lane_is_full_if_it_is_so_before_or_after_a_decision() -> None:
+    """It holds 40 vehicles, and is full from 36 on."""
+    assert rows_of([35.0, 36.0, 30.0, 30.0], served=[0.0] * 3).full.tolist() == [True, True, False]
+
+
+def test_the_network_s_mean_counts_decisions_and_not_lanes() -> None:
+    values, rows = np.full((3, len(NAMES)), 4.0), np.full((3, len(NAMES)), 10.0)
+    values[1], rows[1] = 1.0, 20.0
+    values[2] = np.nan
+    assert Summary(values, rows).network == pytest.approx(2.0)
