@@ -227,6 +227,27 @@ def test_a_green_from_before_the_episode_may_be_of_any_age() -> None:
     )
 
 
+def test_no_command_arrives_from_another_episode() -> None:
+    """Of commands 0, 1, 2, ... the ones before the second episode never arrive in it."""
+    layouts = {"a_0": AgentLayout(1, PHASES)}
+    recorder = TransitionRecorder(
+        Provenance("by hand", "", "street", (), INTERVAL_S, "count", layouts)
+    )
+    for row in range(6):
+        seen = {"a_0": np.array([0.0, *np.eye(PHASES)[0]])}
+        ran, asked = {"a_0": 0}, {"a_0": row % PHASES}
+        recorder.record(row // 3, row % 3, seen, asked, ran, {"a_0": 0.0}, seen)
+    log = recorder.log()
+    course = _Course.of(log.transitions("a_0"), layouts["a_0"], ChannelConfig(), held=0.0)
+    assert course.asked[:3].tolist() == [
+        [0, 1, 2, 3, 0, 1],
+        [-1, 0, 1, -1, 3, 0],
+        [-1, -1, 0, -1, -1, 3],
+    ]
+    assert course.left.tolist() == [2, 1, 0, 2, 1, 0]
+    assert course.age.tolist() == [0] * 6, "they began before the episode"
+
+
 def test_greens_that_the_simulation_holds_itself_are_not_forbidden() -> None:
     log = log_of(mask=held)
     assert fit_channel(log).forbids

@@ -132,6 +132,27 @@ def test_f_learns_from_earlier_policies_but_is_compared_on_the_latest(
     assert compared == [latest]
 
 
+@pytest.mark.parametrize("better", [[True, True], [False, True]])
+def test_actions_are_grounded_where_f_is_better_and_h_is_proven(
+    better: list[bool], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    config = replace(TIMED, gate=GateConfig(start="fitted"), least_accuracy=0.1)
+    residual = config.residual(QUEUES, 0)
+    assert residual is not None
+    fitted = SimpleNamespace(
+        trusted=lambda least: np.array([True, False]) & (least == 0.1),
+        expected_u=np.array([0.3, 0.2]),
+    )
+    trust = replace(Trust.nowhere(tuple(QUEUES)), better=np.array(better))
+    monkeypatch.setattr(residual.transform, "fit", lambda *_, **__: fitted)
+    monkeypatch.setattr("ugat_marl.grounding.residual.compare", lambda *_: trust)
+    log = queues({"a_0": 0.0, "b_0": 0.0}, seed=3, episodes=1)
+    report = residual.fit(log, log, Fitter(FIT, 0))
+    first, _ = tuple(QUEUES)
+    assert report.acting == ((first,) if better[0] else ())
+    assert residual.transform.gate.alpha.tolist() == [0.3, 0.2]
+
+
 @pytest.fixture(scope="module")
 def late_greens() -> tuple[Residual, ResidualReport]:
     """A street whose first intersection has late greens that no part of the world has."""
