@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import dataclasses
 import math
-from typing import Literal
+from types import SimpleNamespace
+from typing import Any, Literal
 
 import numpy as np
 import pytest
@@ -28,7 +29,7 @@ from ugat_marl.grounding import (
 )
 from ugat_marl.grounding.fitting import Changes, EpochCallback, OffData, split
 from ugat_marl.grounding.forward import ForwardConfig, ForwardModel
-from ugat_marl.grounding.phase import PhaseReport
+from ugat_marl.grounding.phase import PhaseReport, inverse_accuracy
 from ugat_marl.grounding.reports import (
     ForwardReport,
     TrainingRecord,
@@ -215,6 +216,20 @@ def test_h_reads_means_best_if_it_learnt_from_means() -> None:
     observed, smoothed = (found[pairs].accuracy_on_means.mean() for pairs in both)
     assert smoothed > observed + 0.05
     assert found["observed"].inverse.accuracy.mean() >= found["smoothed"].inverse.accuracy.mean()
+
+
+def test_accuracy_and_mean_u_are_of_held_out_rows() -> None:
+    answer = SimpleNamespace(
+        action=torch.tensor([[0, 1, 1, 0]]), u=torch.tensor([[0.1, 0.2, 0.3, 0.8]])
+    )
+    inverse: Any = SimpleNamespace(
+        view=SimpleNamespace(of=lambda data: data), predict=lambda *_: answer
+    )
+    data: Any = SimpleNamespace(executed=torch.tensor([[0, 1, 0, 1]]))
+    held_out = torch.tensor([[1.0, 1.0, 1.0, 0.0]])
+    accuracy, mean_u = inverse_accuracy(inverse, data, torch.zeros(1, 4, 2), held_out)
+    assert accuracy == pytest.approx([2 / 3])
+    assert mean_u == pytest.approx([0.2])
 
 
 def test_a_poor_fit_says_so() -> None:
