@@ -24,6 +24,7 @@ from ugat_marl.grounding import (
 )
 from ugat_marl.grounding.forward import DelayedForward, ForwardConfig
 from ugat_marl.grounding.inverse import DelayModel
+from ugat_marl.grounding.stacked import StackedTransitions
 from ugat_marl.grounding.timed import likely_delay
 from ugat_marl.grounding.transform import GroundedActions
 from ugat_marl.grounding.uncertainty import Method, MethodName
@@ -224,6 +225,27 @@ def test_where_h_is_not_trusted_the_constant_is_taken_and_not_zero() -> None:
     made.gate.trust(np.array([False, True]))
     outcome = made(observations, own)
     assert outcome.delay_s[0] == 2.0 and outcome.accepted.tolist() == [False, True]
+
+
+def test_f_is_compared_where_a_green_was_asked_for_that_begins() -> None:
+    """Phase 0 is shown. A command for 1 may have been lost, and 1 may run after one for 0."""
+    now = state((0, 0)).expand(-1, 3, -1)
+    asked, ran = (torch.tensor([row] * 2) for row in ([1, 0, 1], [0, 1, 1]))
+    number, weight = torch.zeros(2, 3), torch.tensor([[1.0, 1.0, 1.0], [1.0, 1.0, 0.0]])
+    times = torch.arange(3).expand(2, 3)
+    data = StackedTransitions(now, now, None, asked, ran, number, times, times, weight)
+    changes, compared = transform().training_data(data)
+    assert torch.equal(changes.action, asked)
+    assert compared.tolist() == [[1.0, 0.0, 1.0], [1.0, 0.0, 0.0]]
+
+
+def test_constant_delays_of_other_agents_are_taken_away() -> None:
+    made = transform()
+    made.constants.beyond_s.fill_(1.0)
+    made.restrict(np.array([True, False]))
+    assert made.acting.tolist() == [True, False]
+    assert torch.equal(made.constants.delay_s, USUAL_S * torch.tensor([[1.0], [0.0]]))
+    assert made.constants.beyond_s.flatten().tolist() == [1.0, 0.0]
 
 
 def test_h_that_is_sure_moves_the_delay_away_from_the_constant() -> None:
