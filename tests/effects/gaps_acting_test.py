@@ -415,6 +415,16 @@ def test_the_service_of_one_lane_is_withheld_there_alone() -> None:
     assert [state[other.index] for state in shown] == ["G", "G"]
 
 
+def test_commands_are_late_before_they_are_lost_however_that_is_named() -> None:
+    """The chance that a command is lost is drawn when it arrives."""
+    late, lost = "execution_delay=20", "lost_commands=0.5"
+    found: list[list[int]] = []
+    for domain in (f"{late}+{lost}", f"{lost}+{late}"):
+        light = Light(domain)
+        found.append([light.step(command % 8) for command in range(1, 60)])
+    assert found[0] == found[1]
+
+
 def test_fitted_service_is_added_to_that_of_the_scenario() -> None:
     effects = [LaneService("a", 1.0, 2.0), LaneService("b", 5.0, 6.0), LaneService("b", 3.0, 0.0)]
     fitted = FittedService(["a", "c"], np.array([[0.5, 0.25], [4.0, 1.0]]))

@@ -215,6 +215,21 @@ def test_late_counts(seconds: int, decisions: int, network: Network) -> None:
     assert found == [max(0, n - decisions) for n in range(1, 9)]
 
 
+def test_the_last_sensor_of_a_name_counts(network: Network) -> None:
+    street = sensors("observation_delay=20+observation_delay=10", network)
+    found = [street.see(snapshot(network, n, n)).vehicles[0] for n in range(1, 5)]
+    assert found == [0, 1, 2, 3]
+
+
+def test_sensors_act_in_the_order_of_a_street_however_they_are_named(network: Network) -> None:
+    orders = [sensors("+".join(texts), network) for texts in (EXAMPLES, EXAMPLES[::-1])]
+    measured = snapshot(network, 20.0, 10.0, 6.0)
+    for _ in range(10):
+        one, other = (street.see(measured) for street in orders)
+        assert np.array_equal(one.vehicles, other.vehicles)
+        assert np.array_equal(one.waiting_s, other.waiting_s)
+
+
 def test_lost_readings_are_seen_again(network: Network) -> None:
     street = sensors("lost_readings=0.3", network)
     found = np.array([street.see(snapshot(network, n, 0)).vehicles for n in range(1, DECISIONS)])
