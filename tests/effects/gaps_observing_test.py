@@ -190,6 +190,9 @@ def test_a_dead_detector_reports_nothing_all_episode(network: Network) -> None:
         shares.append((dead(few).mean(), dead(many).mean()))
     assert np.mean(shares, axis=0) == pytest.approx([0.2, 0.7], abs=0.03)
     before.reset(2)
+    half, measured = sensors("detector_failure=0.5", network), snapshot(network, 4.0, 2.0)
+    left = half.see(replace(measured, mean_left=np.ones_like(measured.vehicles))).mean_left
+    assert np.array_equal(left == 0.0, dead(half)), "nobody is seen to leave"
     assert dead(sensors("detector_failure=1", network)).all()
 
 
