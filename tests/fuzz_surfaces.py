@@ -289,7 +289,7 @@ def build_cityflow(folder: Path) -> None:
 
 def use_cityflow(folder: Path) -> None:
     source = from_cityflow(
-        folder / "roadnet.json", folder / "flow.json", 600.0, own_vehicles=True, exact=False
+        folder / "roadnet.json", folder / "flow.json", 0.0, 600.0, own_vehicles=True, exact=False
     )
     source(folder, Silent())
 

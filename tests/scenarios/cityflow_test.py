@@ -415,3 +415,14 @@ def test_a_flow_without_an_end_lasts_as_long_as_the_episode_of_the_others(tmp_pa
         for vehicle in routes.iter("vehicle")
     }
     assert last_s == {"0": 7000.0, "1": 6990.0}
+
+
+def test_a_flow_without_an_end_lasts_to_the_end_of_a_later_episode(tmp_path: Path) -> None:
+    words = write(tmp_path, crossroads(), [flow(["wm", "me"], 0, -1, 10.0)])
+    for name, more, length_s in (("a", ("--duration-s", "600"), 600.0), ("b", (), 3600.0)):
+        city = str(tmp_path / name)
+        assert main(["scenario", "new", city, *words, "--begin-s", "1800", *more]) == 0
+        scenario = read_scenario(city)
+        assert scenario.settings.duration_s == length_s
+        departs = [float(v.get("depart", "0")) for v in scenario.routes[0].parse().iter("vehicle")]
+        assert max(departs) == 1800.0 + length_s - 10.0

@@ -280,6 +280,22 @@ def test_a_configuration_becomes_a_scenario(link: bool, files: Path, tmp_path: P
     check_demand(scenario, Network.read(scenario))
 
 
+@pytest.mark.parametrize(
+    ("words", "episode"),
+    [
+        (["--begin-s", "300"], (300, 660)),
+        (["--begin-s", "300", "--duration-s", "900"], (300, 900)),
+        (["--begin-s", "300", "--vph", "120"], (300, 660)),
+    ],
+)
+def test_a_configuration_keeps_its_end_under_another_begin(
+    words: list[str], episode: tuple[float, float], files: Path, tmp_path: Path
+) -> None:
+    assert made(tmp_path / "a", "--sumo", files / "city.sumocfg", *words) == 0
+    settings = read_scenario(tmp_path / "a").settings
+    assert (settings.begin_s, settings.duration_s) == episode
+
+
 def test_what_a_scenario_cannot_have_is_said(
     files: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
@@ -345,7 +361,7 @@ def test_other_vehicles_for_a_configuration(
 
 @pytest.mark.parametrize(
     ("words", "begin_s", "duration_s"),
-    [((), 60, 900), (("--begin-s", "0"), 0, 900), (("--duration-s", "600"), 60, 600)],
+    [((), 60, 900), (("--begin-s", "0"), 0, 960), (("--duration-s", "600"), 60, 600)],
 )
 def test_other_vehicles_drive_at_the_times_of_the_configuration(
     words: tuple[str, ...], begin_s: float, duration_s: float, files: Path, tmp_path: Path

@@ -220,6 +220,7 @@ class ScenarioNew:
         if self.cityflow is not None:
             return from_cityflow(
                 *self.cityflow,
+                self.begin_s or 0.0,
                 self.duration_s,
                 own_vehicles=not self._demands(),
                 exact=self.exact_drivers,
@@ -232,8 +233,18 @@ class ScenarioNew:
 
     def _brings_vehicles(self) -> bool:
         """Return True if the source of roads has vehicles of its own."""
-        configured = self.sumo is not None and is_configuration(self.sumo)
-        return bool(self.draw is not None or self.cityflow or configured)
+        return bool(self.draw is not None or self.cityflow or self._configured())
+
+    def _configured(self) -> bool:
+        """Return True if the source of roads is a SUMO configuration."""
+        return self.sumo is not None and is_configuration(self.sumo)
+
+    def _episode(self) -> tuple[float, float]:
+        """Return begin and duration of the episode, s, of sources that do not bring them."""
+        if self.begin_s is not None and self.duration_s is not None:
+            return self.begin_s, self.duration_s
+        begin_s, length_s = episode_of(self.sumo, self.begin_s)
+        return begin_s, length_s if self.duration_s is None else self.duration_s
 
     def _vehicles(self) -> VehicleSource | None:
         given = self._demands()
@@ -246,9 +257,7 @@ class ScenarioNew:
             return from_routes(self.routes, link=self.link)
         if not given:
             return None
-        begin_s, length_s = episode_of(self.sumo)
-        begin_s = begin_s if self.begin_s is None else self.begin_s
-        length_s = length_s if self.duration_s is None else self.duration_s
+        begin_s, length_s = self._episode()
         if self.vph is not None:
             return from_turning_shares(self.vph, self.turns, begin_s, length_s, self.seed)
         if self.counts is not None:
@@ -258,6 +267,8 @@ class ScenarioNew:
 
     def _settings(self) -> Mapping[str, Any]:
         times = {"begin_s": self.begin_s, "duration_s": self.duration_s}
+        if self.begin_s is not None and self._configured():
+            times["duration_s"] = self._episode()[1]
         settings: dict[str, Any] = {k: v for k, v in times.items() if v is not None}
         if self.phases != "source":
             settings["control"] = {"phases": self.phases}

@@ -318,13 +318,17 @@ class SumoConfiguration:
         except ValueError:
             raise ScenarioError(f"{self.path}: {key} = {text!r} is not a time in seconds") from None
 
-    def times(self) -> tuple[float, float]:
+    def times(self, begin_s: float | None = None) -> tuple[float, float]:
         """Return begin and duration of an episode, s; an hour if there is no end.
+
+        Args:
+            begin_s: Begin in place of the configuration's, whose end stays the end.
 
         Raises:
             ScenarioError: A time is none, or the end is not after the start.
         """
-        begin, end = self.seconds("begin", "0"), self.seconds("end", "-1")
+        begin = self.seconds("begin", "0") if begin_s is None else begin_s
+        end = self.seconds("end", "-1")
         if 0 <= end <= begin:
             raise ScenarioError(f"{self.path}: end ({end:g} s) is not after begin ({begin:g} s)")
         return begin, end - begin if end >= 0 else 3600.0

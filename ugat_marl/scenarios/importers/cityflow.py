@@ -47,15 +47,22 @@ _VEHICLE = ("length", "width", "maxPosAcc", "maxNegAcc", "usualPosAcc", "usualNe
 
 
 def from_cityflow(
-    roadnet: Path, flow: Path, duration_s: float | None, *, own_vehicles: bool, exact: bool
+    roadnet: Path,
+    flow: Path,
+    begin_s: float,
+    duration_s: float | None,
+    *,
+    own_vehicles: bool,
+    exact: bool,
 ) -> RoadSource:
     """Return a source of the roads and vehicles in a ``roadnet.json`` and its ``flow.json``.
 
     Args:
         roadnet: File with the roads.
         flow: File with the vehicles.
-        duration_s: Length of an episode. None for all departures, rounded up to ten minutes, and at
-            least one hour.
+        begin_s: Start of an episode, s.
+        duration_s: Length of an episode, s. None for all departures, rounded up to ten minutes, and
+            at least one hour.
         own_vehicles: True to import the vehicles.
         exact: True for CityFlow's headways and driving without randomness.
     """
@@ -65,9 +72,11 @@ def from_cityflow(
         notes = write_network(net, folder / NETWORK)
         length_s, routes = duration_s or 3600.0, ()
         if own_vehicles:
-            last_s = write_routes(flow, net, folder / ROUTES, duration_s, reporter, exact=exact)
+            episode = (begin_s, duration_s)
+            last_s = write_routes(flow, net, folder / ROUTES, episode, reporter, exact=exact)
             routes = (ROUTES,)
-            length_s = duration_s or max(3600.0, 600.0 * (math.floor(last_s / 600) + 1))
+            tens = math.floor((last_s - begin_s) / 600) + 1
+            length_s = duration_s or max(3600.0, 600.0 * tens)
         return RoadFiles(
             f"CityFlow network {roadnet.name}",
             f"Turned from CityFlow's `{roadnet.name}` and `{flow.name}`: lanes, stop lines, turns "
@@ -346,7 +355,7 @@ def write_routes(
     path: Path,
     net: Roadnet,
     out: Path,
-    duration_s: float | None,
+    episode: tuple[float, float | None],
     reporter: Reporter,
     *,
     exact: bool,
@@ -361,8 +370,8 @@ def write_routes(
         path: File with the flows.
         net: Roads and intersections that they use.
         out: The file to write.
-        duration_s: End of the episode, s, for flows without an end; None for the end of the last
-            flow that has one, and at least one hour.
+        episode: Start and length of the episode, s. Flows without an end run to its end. Without a
+            length they run to the end of the last flow that has one, and for at least one hour.
         reporter: Shows progress if the file is long.
         exact: True for CityFlow's headways and driving without randomness.
 
@@ -376,7 +385,12 @@ def write_routes(
     routes = _Routes(net)
     types: dict[str, dict[str, str]] = {}
     drives: list[Drive] = []
-    end_s = functools.cache(lambda: duration_s or _end_s(path))  # most files need no second reading
+    begin_s, length_s = episode
+
+    @functools.cache  # most files need no second reading
+    def end_s() -> float:
+        return begin_s + length_s if length_s else max(begin_s + 3600.0, _latest_end_s(path))
+
     for number, (flow, line) in enumerate(objects(path, reporter)):
         where = f"{path}, line {line}: flow {number}"
         kind = types.setdefault(json.dumps(flow.get("vehicle"), sort_keys=True), {})
@@ -394,11 +408,11 @@ def write_routes(
     return drives[-1].depart_s
 
 
-def _end_s(path: Path) -> float:
-    """Return the end of the last flow that has one, s, and at least one hour."""
+def _latest_end_s(path: Path) -> float:
+    """Return the end of the last flow that has one, s; 0 if none has."""
     ends = (flow.get("endTime") for flow, _ in objects(path, Silent()))
     numbers = (float(end) for end in ends if isinstance(end, int | float))
-    return max([3600.0, *filter(math.isfinite, numbers)])  # others are refused in their flows
+    return max([0.0, *filter(math.isfinite, numbers)])  # others are refused in their flows
 
 
 def _departures(flow: Mapping[str, Any], end_s: Callable[[], float], where: str) -> Iterator[float]:

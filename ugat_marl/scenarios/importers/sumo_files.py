@@ -53,15 +53,19 @@ def from_sumo(path: Path, *, link: bool, own_vehicles: bool) -> RoadSource:
     return roads
 
 
-def episode_of(path: Path | None) -> tuple[float, float]:
+def episode_of(path: Path | None, begin_s: float | None = None) -> tuple[float, float]:
     """Return begin and duration of an episode, s: of a configuration, else 0 and an hour.
+
+    Args:
+        path: A ``.sumocfg``, another file, or None.
+        begin_s: Begin in place of these; the end of a configuration stays the end.
 
     Raises:
         ScenarioError: The configuration cannot be read, or has impossible times.
     """
     if path is not None and is_configuration(path):
-        return SumoConfiguration(path).times()
-    return 0.0, 3600.0
+        return SumoConfiguration(path).times(begin_s)
+    return begin_s or 0.0, 3600.0
 
 
 def from_routes(paths: Sequence[Path], *, link: bool) -> VehicleSource:
